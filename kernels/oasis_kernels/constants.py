@@ -1,0 +1,18 @@
+"""Numbers shared by the kernels, the operators and the reference twins: plain floats.
+
+Rasterization follows gsplat 1.5.3; the thresholds are float32 constants in both precisions, so that the float64
+build takes the same decisions as the float32 one.
+"""
+
+ALPHA_MAX = 0.9990000128746033
+"""Largest opacity of a single layer (0.999f). 0.99 in the original 3DGS, where two capped layers land on the stop."""
+ALPHA_MIN = 0.003921568859368563
+"""Layers fainter than 1/255 (as a float32) are skipped."""
+TRANSMITTANCE_STOP = 9.999999747378752e-05
+"""The Gaussian that would bring the transmittance to this or below ends the pixel and is not drawn (1e-4f)."""
+EXTENT_SIGMAS = 3.33
+"""Largest extent of a Gaussian's box in standard deviations; fainter ones end at sqrt(2 ln(255 opacity))."""
+JACOBIAN_LIMIT = 0.3
+"""x/z and y/z are clamped to the image plus this share of tan(half the field of view), in the Jacobian only."""
+EPS2D = 0.3
+"""Variance added to both image axes [px^2]: the default low-pass."""

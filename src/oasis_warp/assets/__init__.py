@@ -1,0 +1,9 @@
+"""Files that ship with the package: the hand, the landmark networks, one photo."""
+
+from importlib import resources
+from importlib.resources.abc import Traversable
+
+
+def asset(*parts: str) -> Traversable:
+    """A bundled file, e.g. `asset("hand", "hand_right.npz")`; open it, or use `importlib.resources.as_file` for a path."""
+    return resources.files(__package__).joinpath(*parts)

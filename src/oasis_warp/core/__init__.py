@@ -1,0 +1,1 @@
+"""The nouns that stages hand to each other, and the checks at the public border."""

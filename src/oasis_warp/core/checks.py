@@ -1,0 +1,102 @@
+"""Checks of tensor arguments at the public border: one message form, `argument: expected X, got Y. Hint`."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+FINITE_LIMIT = 1e15
+"""Magnitude above which a finite number is refused as absurd: squares of it still fit in float32."""
+
+
+def _sentence(name: str, expected: str, got: str, hint: str) -> str:
+    return f"{name}: expected {expected}, got {got}." + (f" {hint}" if hint else "")
+
+
+def check_shape(
+    name: str, tensor: Tensor, *shape: int | str, sizes: dict[str, int] | None = None, hint: str = ""
+) -> None:
+    """Check that `tensor` has `shape`; a letter stands for any size, one size a letter over all calls with `sizes`.
+
+    Raises:
+        TypeError: `tensor` is no tensor.
+        ValueError: another number of axes, or a size that differs.
+    """
+    if not isinstance(tensor, Tensor):
+        raise TypeError(_sentence(name, "a torch.Tensor", type(tensor).__name__, hint))
+    sizes = {} if sizes is None else sizes
+    want = [sizes.get(s, s) if isinstance(s, str) else s for s in shape]
+    got = list(tensor.shape)
+    if len(want) != len(got) or any(isinstance(w, int) and w != g for w, g in zip(want, got, strict=True)):
+        raise ValueError(_sentence(name, f"shape [{', '.join(map(str, want))}]", f"{got}", hint))
+    for letter, size in zip(shape, got, strict=True):
+        if isinstance(letter, str):
+            sizes[letter] = size
+
+
+def check_float(name: str, tensor: Tensor, like: Tensor | None = None) -> None:
+    """Check that `tensor` is float32 or float64 and, where `like` is given, of its dtype and device.
+
+    Raises:
+        ValueError: another dtype or device.
+    """
+    if tensor.dtype not in (torch.float32, torch.float64):
+        raise ValueError(_sentence(name, "float32 or float64", str(tensor.dtype).removeprefix("torch."), ""))
+    if like is not None and (tensor.dtype != like.dtype or tensor.device != like.device):
+        raise ValueError(
+            _sentence(name, f"{like.dtype} on {like.device}", f"{tensor.dtype} on {tensor.device}",
+                      "All arguments of one call share them.")
+        )
+
+
+def check_finite(**tensors: Tensor | None) -> None:
+    """Refuse NaN, infinities and absurd magnitudes: kernels would hide them in a plausible picture.
+
+    Raises:
+        ValueError: names the argument and how many of its values are bad.
+    """
+    for name, tensor in tensors.items():
+        if tensor is None or tensor.numel() == 0:
+            continue
+        peak = tensor.detach().abs().amax()
+        if not bool(peak <= FINITE_LIMIT):
+            bad = int((~(tensor.detach().abs() <= FINITE_LIMIT)).sum())
+            raise ValueError(
+                _sentence(name, f"finite values below {FINITE_LIMIT:g}", f"{bad} of {tensor.numel()} that are not", "")
+            )
+
+
+def check_index(name: str, tensor: Tensor, size: int, what: str) -> None:
+    """Check that integer `tensor` lies in [0, size).
+
+    Raises:
+        ValueError: not an integer tensor, or an index out of range.
+    """
+    if tensor.dtype not in (torch.int32, torch.int64):
+        raise ValueError(_sentence(name, "int32 or int64", str(tensor.dtype).removeprefix("torch."), ""))
+    if tensor.numel():
+        low, high = (int(v) for v in torch.aminmax(tensor))
+        if low < 0 or high >= size:
+            raise ValueError(
+                _sentence(name, f"indices in 0 .. {size - 1} ({size} {what})", f"values from {low} to {high}", "")
+            )
+
+
+def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Check that `value` is one of `choices`.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if value not in choices:
+        raise ValueError(_sentence(name, "one of " + ", ".join(repr(c) for c in choices), repr(value), ""))
+
+
+def check_positive(name: str, value: float) -> None:
+    """Check that the number `value` is positive and finite.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if not 0 < value < float("inf"):
+        raise ValueError(_sentence(name, "a positive finite number", repr(value), ""))

@@ -1,0 +1,61 @@
+"""`HandModel`: the skinned, shape-adjustable surface that every stage shares. Data only; `oasis_warp.hand` loads it."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+PALM_SIDE, BACK_SIDE, FLANK_SIDE = 0, 1, 2
+"""Values of `HandModel.region`."""
+
+
+@dataclass(frozen=True)
+class HandModel:
+    """A right hand at rest: metres, wrist at the origin, fingers to -x, palm to -y, thumb to +z.
+
+    Joints follow MANO: wrist, then three each of index, middle, little, ring, thumb.
+    """
+
+    name: str
+    template: Float[Tensor, "V 3"]
+    """Vertices of the mean hand [m]."""
+    faces: Int[Tensor, "F 3"]
+    """Corners, counter-clockwise seen from outside; the surface is open at the wrist."""
+    weights: Float[Tensor, "V 16"]
+    """Skinning weights; rows sum to one."""
+    shape_basis: Float[Tensor, "V 3 S"]
+    """Vertex displacement a standard deviation of each shape coefficient [m]."""
+    shape_names: tuple[str, ...]
+    joints: Float[Tensor, "16 3"]
+    joint_basis: Float[Tensor, "16 3 S"]
+    tips: Float[Tensor, "5 3"]
+    """Ends of the distal bones, thumb to little [m]."""
+    tip_basis: Float[Tensor, "5 3 S"]
+    parents: tuple[int, ...]
+    """Parent joint of each joint; -1 for the wrist."""
+    joint_names: tuple[str, ...]
+    pose_axes: Float[Tensor, "16 3 3"]
+    """Rows: unit axes of flexion (positive closes), abduction (positive to the thumb) and twist."""
+    pose_limits: Float[Tensor, "16 3 2"]
+    """Lowest and highest angle about each axis, relative to rest [rad]."""
+    rest_bend: Float[Tensor, "16"]
+    """Flexion that the rest pose already has [rad]: anatomical angle = angle + rest_bend."""
+    keypoint_index: Int[Tensor, "21"]
+    """Rows of concat(joints, tips) that are the 21 landmarks, in landmark order."""
+    corrective_basis: Float[Tensor, "V 3 C"]
+    """Displacement of the rest surface by each pose corrective at full strength [m]; C may be 0."""
+    uv: Float[Tensor, "U 2"]
+    uv_faces: Int[Tensor, "F 3"]
+    rim: Int[Tensor, "R"]
+    """Vertices of the open wrist, in order."""
+    segment: Int[Tensor, "V"]
+    """Joint with the largest weight."""
+    region: Int[Tensor, "V"]
+    """0 palm, 1 back, 2 flank."""
+    bone_t: Float[Tensor, "V"]
+    """Place along the bone of `segment`: 0 at the joint, 1 at the next."""
+    bone_theta: Float[Tensor, "V"]
+    """Angle of the normal about that bone [rad]: 0 back, +-pi palm."""
+    nail: Float[Tensor, "V"]
+    """1 on a nail, 0 off it."""
+    licence: str

@@ -1,0 +1,131 @@
+"""The nouns: what one stage hands to the next.
+
+Conventions, once for all of them: metres, radians, pixels with centres at .5; OpenCV cameras (x right, y down, z
+forward); quaternions wxyz; images are sRGB as in the photo, in [0, 1] once they are float.
+"""
+
+from typing import Literal, NamedTuple
+
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+Side = Literal["left", "right"]
+
+
+class Photo(NamedTuple):
+    """An upright colour photo."""
+
+    rgb: UInt8[Tensor, "H W 3"]
+    """sRGB, EXIF orientation applied."""
+    alpha: Float[Tensor, "H W"] | None
+    """The file's own alpha channel in [0, 1], where it says anything."""
+    focal: float | None
+    """Focal length [px] of this array, from EXIF."""
+    name: str
+    """What to call it in messages: the file's name."""
+    shrink: float
+    """Size of this array over the size of the file, 1 unless a huge file was scaled down."""
+
+
+class Landmarks(NamedTuple):
+    """The 21 points of one hand: wrist, then base to tip of thumb, index, middle, ring, little."""
+
+    xy: Float[Tensor, "21 2"]
+    """Photo coordinates [px]."""
+    world: Float[Tensor, "21 3"] | None
+    """Metric points of a mean hand [m]: x right, y down, z away from the camera; None when the user gave 2D only."""
+    side: Side
+    side_score: float
+    """Confidence in the side, 0.5 to 1."""
+    presence: float
+    """The network's probability that there is a hand, 0 to 1."""
+    source: str
+    """Which way found it: "network", "network (margin)", "file" ..."""
+
+
+class Camera(NamedTuple):
+    """A pinhole camera (OpenCV axes)."""
+
+    viewmat: Float[Tensor, "4 4"]
+    """World to camera."""
+    K: Float[Tensor, "3 3"]
+    """Intrinsics [px]."""
+    width: int
+    height: int
+
+
+class HandPose(NamedTuple):
+    """Joint angles and the place of one hand; a left hand's pose describes the mirrored model (x -> -x)."""
+
+    angles: Float[Tensor, "15 3"]
+    """Flexion, abduction, twist [rad] of joints 1 to 15 about `HandModel.pose_axes`, 0 at rest."""
+    orientation: Float[Tensor, "3 3"]
+    """Rotation from the hand's frame to the world."""
+    translation: Float[Tensor, "3"]
+    """Where the origin of the hand's frame lies in the world [m]."""
+
+
+class PosedHand(NamedTuple):
+    """The surface of the hand at rest or in a pose, in metres."""
+
+    vertices: Float[Tensor, "V 3"]
+    joints: Float[Tensor, "16 3"]
+    tips: Float[Tensor, "5 3"]
+
+
+class HandFit(NamedTuple):
+    """One hand of a photo, explained by the model. Everything here is in the photo's own frame, a left hand included."""
+
+    side: Side
+    shape: Float[Tensor, "S"]
+    """Shape coefficients in standard deviations."""
+    pose: HandPose
+    """In the camera's frame: the camera's viewmat is the identity."""
+    camera: Camera
+    landmarks: Landmarks
+    mask: Float[Tensor, "H W"]
+    """Share of each pixel that is hand, cut a little below the wrist."""
+    reprojection: float
+    """Mean distance of the 21 points to the model's [% of the longer side of their box]."""
+    worst_point: float
+    """Largest of those distances [%]."""
+    mask_iou: float
+    """Of the posed mesh and the mask, above the wrist."""
+    cost: float
+    """Of the least-squares fit; sums squared residuals in units of their sigmas."""
+    warnings: tuple[str, ...]
+    """What makes this fit doubtful, in words; empty when nothing does."""
+
+
+class Gaussians(NamedTuple):
+    """3D Gaussians ready to be drawn."""
+
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    """Unit, wxyz."""
+    scales: Float[Tensor, "N 3"]
+    """Standard deviations [m]."""
+    opacities: Float[Tensor, "N"]
+    colors: Float[Tensor, "N 3"]
+
+
+class CanonicalGaussians(NamedTuple):
+    """Gaussians tied to the hand's surface: P ride on vertices, then Q on faces; N = P + Q."""
+
+    vertex_index: Int[Tensor, "P"]
+    offsets: Float[Tensor, "P 3"]
+    """Shift of each vertex Gaussian from its vertex, in the rest frame of the surface [m]."""
+    face_index: Int[Tensor, "Q"]
+    barycentrics: Float[Tensor, "Q 3"]
+    """Weights of a face's three corners; rows sum to one."""
+    quats: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
+    opacities: Float[Tensor, "N"]
+    colors: Float[Tensor, "N 3"]
+
+
+class Render(NamedTuple):
+    """A drawn image."""
+
+    image: Float[Tensor, "H W 3"]
+    alpha: Float[Tensor, "H W"]
