@@ -97,6 +97,21 @@ class HandFit(NamedTuple):
     """What makes this fit doubtful, in words; empty when nothing does."""
 
 
+class Evidence(NamedTuple):
+    """What a prior may look at to guess the whole hand; a left hand has been mirrored."""
+
+    image: Float[Tensor, "S S 3"]
+    """Square crop around the hand."""
+    mask: Float[Tensor, "S S"]
+    """Share of each pixel that is hand."""
+    camera: Camera
+    """Of the crop."""
+    rest: PosedHand
+    """The fitted surface at rest."""
+    posed: PosedHand
+    """The fitted surface in the photo's pose, in the world of `camera`."""
+
+
 class Gaussians(NamedTuple):
     """3D Gaussians ready to be drawn."""
 
