@@ -116,7 +116,7 @@ def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: Rec
         image, mask = image.flip(1), mask.flip(1)
         camera, pose = mirrored_camera(camera), mirror_pose(pose)
     if not bool((mask > 0.5).any()):
-        raise InputError(f"{photo.name}: the mask of the hand is empty. Give landmarks with --keypoints, or another photo.")
+        raise InputError(f"{photo.name}: the mask of the hand is empty. Give --keypoints, or another photo.")
     left, top, side = square_around(mask, CROP_MARGIN)
     rest = rest_hand(hand, fit.shape)
     rest = rest._replace(vertices=rest.vertices + offsets)

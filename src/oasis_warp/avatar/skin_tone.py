@@ -27,7 +27,7 @@ _SRGB_8BIT = (
 
 
 def skin_color(melanin: Float[Tensor, "N"], blood: Float[Tensor, "N"]) -> Float[Tensor, "N 3"]:
-    """sRGB in [0, 1] of skin, interpolated over the logarithms of both shares; values beyond the table are clamped."""
+    """SRGB in [0, 1] of skin, interpolated over the logarithms of both shares; values beyond the table are clamped."""
     table = torch.tensor(_SRGB_8BIT, dtype=melanin.dtype, device=melanin.device) / 255
 
     def place(values: Tensor, knots: tuple[float, ...]) -> tuple[Tensor, Tensor]:

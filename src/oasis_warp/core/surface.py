@@ -16,7 +16,9 @@ def face_normals(
     return cross / double_area.clamp_min(1e-30)[:, None], double_area / 2
 
 
-def scatter_to_vertices(values: Float[Tensor, "F D"], faces: Int[Tensor, "F 3"], n_vertices: int) -> Float[Tensor, "V D"]:
+def scatter_to_vertices(
+    values: Float[Tensor, "F D"], faces: Int[Tensor, "F 3"], n_vertices: int
+) -> Float[Tensor, "V D"]:
     """Sum of the values of the faces around each vertex."""
     total = torch.zeros(n_vertices, values.shape[1], dtype=values.dtype, device=values.device)
     for corner in range(3):

@@ -74,7 +74,7 @@ class PosedHand(NamedTuple):
 
 
 class HandFit(NamedTuple):
-    """One hand of a photo, explained by the model. Everything here is in the photo's own frame, a left hand included."""
+    """One hand of a photo, explained by the model. All in the photo's own frame, a left hand included."""
 
     side: Side
     shape: Float[Tensor, "S"]

@@ -8,7 +8,7 @@ from oasis_warp.ops import rasterization
 
 
 def render(gaussians: Gaussians, camera: Camera, *, background: Color = BLACK) -> Render:
-    """Draw `gaussians` as `camera` sees them over a plain `background`; differentiable in the Gaussians and the camera."""
+    """Draw `gaussians` as `camera` sees them over a plain `background`; differentiable in both."""
     like = gaussians.means
     images, alphas, _ = rasterization(
         gaussians.means,
