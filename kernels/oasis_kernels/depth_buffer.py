@@ -75,7 +75,7 @@ def pixel_ray(x: int, y: int, K: wp.array2d[Any]) -> wp.vec3d:
 
 @wp.func
 def edge_plane(i: int, j: int, p: wp.vec3d, q: wp.vec3d) -> wp.vec3d:
-    """p x q, computed in the order of the vertex indices.
+    """P x q, computed in the order of the vertex indices.
 
     The two faces of an edge then get exactly opposite planes, with or without fused multiply-adds: no ray slips through.
     """
@@ -132,7 +132,7 @@ def face_boxes(
     boxes: wp.array[wp.vec4i],  # first column, last column, first row, last row; empty when first > last
 ):
     f = wp.tid()
-    n_near = int(0)
+    n_near = 0
     for k in range(3):
         if vertices[faces[f, k]][2] <= near:
             n_near += 1

@@ -10,7 +10,6 @@ from oasis_warp.core.checks import (
     check_shape,
 )
 
-
 pytestmark = pytest.mark.usefixtures("as_shipped")
 
 

@@ -30,7 +30,7 @@ def test_a_degenerate_face_has_a_zero_normal():
 
 
 def test_every_edge_is_listed_once():
-    vertices, faces, mesh = sphere()
+    _, faces, mesh = sphere()
     edges = surface.mesh_edges(faces)
     assert len(edges) == len(mesh.edges_unique)
     assert bool((edges[:, 0] < edges[:, 1]).all())
