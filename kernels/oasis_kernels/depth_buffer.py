@@ -75,9 +75,9 @@ def pixel_ray(x: int, y: int, K: wp.array2d[Any]) -> wp.vec3d:
 
 @wp.func
 def edge_plane(i: int, j: int, p: wp.vec3d, q: wp.vec3d) -> wp.vec3d:
-    """P x q, computed in the order of the vertex indices.
+    """Cross product p x q, computed in the order of the vertex indices.
 
-    The two faces of an edge then get exactly opposite planes, with or without fused multiply-adds: no ray slips through.
+    The two faces of an edge then get exactly opposite planes, fused multiply-adds or not: no ray slips through.
     """
     if i < j:
         return wp.cross(p, q)
@@ -132,7 +132,7 @@ def face_boxes(
     boxes: wp.array[wp.vec4i],  # first column, last column, first row, last row; empty when first > last
 ):
     f = wp.tid()
-    n_near = 0
+    n_near = wp.int32(0)
     for k in range(3):
         if vertices[faces[f, k]][2] <= near:
             n_near += 1
@@ -170,7 +170,7 @@ def fill_rows(
     depth: wp.array2d[wp.float64],  # +inf on entry
     face_ids: wp.array2d[wp.int32],  # -1 on entry
 ):
-    """Launched with one thread: rows `first_row` to `last_row`, faces in order, so that a tie stays with the smaller id."""
+    """One thread for rows `first_row` to `last_row`; faces in order, so that a tie stays with the smaller id."""
     for f in range(faces.shape[0]):
         box = boxes[f]
         y0 = wp.max(box[2], first_row)

@@ -6,18 +6,20 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
+from oasis_kernels import incidence as kernels
 from oasis_warp.core.checks import check_index
+from oasis_warp.ops._launch import launch, view
 
 
 class Incidence(NamedTuple):
     """An index table and its transpose, in compressed rows."""
 
     table: Tensor
-    """int32, shape [N, K]: entry (n, k) names one of `size` items."""
+    """int32, shape [N, K] or [N]: each entry names one of `size` items."""
     offsets: Tensor
     """int32, shape [size + 1]: item i is named by `entries[offsets[i] : offsets[i + 1]]`."""
     entries: Tensor
-    """int32, shape [N K]: flat places n K + k of the table, ascending for each item."""
+    """int32, shape [N K]: flat places of the table, ascending for each item."""
 
 
 _known: WeakIdKeyDictionary = WeakIdKeyDictionary()
@@ -25,7 +27,7 @@ _known: WeakIdKeyDictionary = WeakIdKeyDictionary()
 
 
 def incidence(name: str, table: Tensor, size: int, what: str) -> Incidence:
-    """The transpose of `table` [N, K] over `size` items, remembered for as long as the tensor lives.
+    """The transpose of `table`, shape [N, K] or [N], over `size` items, remembered for as long as the tensor lives.
 
     Raises:
         ValueError: `table` (called `name`) is no integer tensor or names an item outside [0, size).
@@ -45,3 +47,16 @@ def incidence(name: str, table: Tensor, size: int, what: str) -> Incidence:
     if remember:
         _known[table] = (table._version, size, found)
     return found
+
+
+def sum_at_items(rows: Tensor, index: Incidence) -> Tensor:
+    """Sum of the `rows`, one an entry of the table and D columns, that name each item, shape [size, D]; always in the same order."""
+    n_items, n_columns = len(index.offsets) - 1, rows.shape[1]
+    out = rows.new_empty((n_items, n_columns))
+    launch(
+        kernels.sum_rows,
+        (n_items, n_columns),
+        [view(rows), view(index.offsets), view(index.entries), view(out)],
+        like=rows,
+    )
+    return out

@@ -1,6 +1,7 @@
 """Run a CPU kernel on strips of an image, several at a time."""
 
 import functools
+import itertools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -28,6 +29,6 @@ def for_strips(n_rows: int, run: Callable[[int, int], None]) -> None:
         return
     n_strips = min(n_threads * STRIPS_A_THREAD, n_rows)
     starts = [n_rows * s // n_strips for s in range(n_strips + 1)]
-    strips = [(first, end - 1) for first, end in zip(starts, starts[1:], strict=False)]
+    strips = [(first, end - 1) for first, end in itertools.pairwise(starts)]
     for _ in _pool(os.getpid(), n_threads).map(lambda strip: run(*strip), strips):
         pass
