@@ -15,8 +15,10 @@ BLOOD_MEAN = 0.0125
 """Blood share of the back of the hand; one value serves the whole range of tones."""
 PALM_SMOOTHING = 5
 """Passes over the mesh that soften the border between palm and back."""
-NAIL_WHITE = 0.10
+NAIL_WHITE = 0.14
 """Share of white that the nail plate adds."""
+NAIL_RIM_SHADE = 0.25
+"""How much darker the fold around the nail is."""
 
 
 class Regions(NamedTuple):
@@ -73,8 +75,8 @@ def region_colors(regions: Regions, melanin: float) -> Float[Tensor, "V 3"]:
     skin = skin_color(amount, blood)
     bed = skin_color((log_melanin.exp() * 0.5), torch.full_like(blood, 1.9 * BLOOD_MEAN))
     nails = (1 - NAIL_WHITE) * bed + NAIL_WHITE
-    shade = 1 - 0.10 * crease - 0.04 * knuckle
-    return (1 - nail[:, None]) * skin * shade[:, None] + nail[:, None] * nails
+    shade = 1 - 0.10 * crease - 0.04 * knuckle - NAIL_RIM_SHADE * 4 * nail * (1 - nail)
+    return ((1 - nail[:, None]) * skin + nail[:, None] * nails) * shade[:, None]
 
 
 REGION_NAMES = ("palm", "back", "nail")
