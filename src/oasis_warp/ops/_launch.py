@@ -63,7 +63,7 @@ def device_and_stream(tensor: Tensor) -> tuple["wp.Device", "wp.Stream | None"]:
 
 
 def view(tensor: Tensor, dtype: Any = None) -> Any:
-    """`tensor` (contiguous) as a Warp array over the same memory; `dtype` e.g. `VEC3[tensor.dtype]` folds the last axis."""
+    """`tensor` (contiguous) as a Warp array over the same memory; a vector `dtype` folds the last axis."""
     start()
     assert tensor.is_contiguous(), "operators make their tensors contiguous before the launch"
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=False)
