@@ -10,7 +10,7 @@ from rasterization_scenes import frontal_scene, intrinsics, look_from, ordinary_
 from test_rasterization import assert_equals_twin, draw
 
 from oasis_warp.ops import rasterization
-from oasis_warp.ops._tiles import MAX_PAIRS, argsort_positive, bin_to_tiles
+from oasis_warp.ops._tiles import MAX_PAIRS, bin_by_dealing, bin_by_sorting, bin_to_tiles
 from oasis_warp.ops.projection import project
 
 STIFF = 1e-5, 1e-4
@@ -153,12 +153,24 @@ def test_more_pairs_than_can_be_counted_are_refused_with_their_number():
         bin_to_tiles(projection, size, size, 1)
 
 
-@pytest.mark.parametrize("n", [0, 1, 1000, 70_000])
-def test_depths_are_sorted_stably_over_the_whole_range(n, device):
-    g = torch.Generator().manual_seed(n)
-    exponents = torch.rand(n, generator=g, dtype=torch.float64) * 12 - 2
-    keys = (10**exponents).float().double()[torch.randint(0, max(n // 2, 1), (n,), generator=g)].to(device)
-    assert torch.equal(argsort_positive(keys), torch.argsort(keys, stable=True))
+@pytest.mark.parametrize("name", ["larger than the image", "3000 faint layers", "partly behind the camera"])
+def test_dealing_and_sorting_fill_the_same_lists(name):
+    scene = CASES[name][0]
+    scene = scene.with_(means=torch.cat([scene.means, scene.means]))  # every depth is there twice
+    twice = [torch.cat([t, t]) for t in scene.gaussians[1:]]
+    options = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3}
+    cameras, Ks = scene.viewmats.repeat(2, 1, 1), scene.Ks.repeat(2, 1, 1)
+    projection = project(scene.means, *twice, cameras, Ks, scene.width, scene.height, **options)
+    dealt, sorted_ = (f(projection, 7, 10, 10) for f in (bin_by_dealing, bin_by_sorting))
+    assert torch.equal(dealt.starts, sorted_.starts)
+    assert torch.equal(dealt.gaussians, sorted_.gaussians)
+    assert torch.equal(dealt.pair_counts, sorted_.pair_counts)
+    for lists in (dealt, sorted_):
+        # A pair's number is its Gaussian's first plus its place among that Gaussian's tiles.
+        first = lists.pair_starts[lists.gaussians.long()]
+        place = lists.pairs - first
+        assert place.min() >= 0 and (place < lists.pair_counts[lists.gaussians.long()]).all()
+        assert torch.equal(lists.pairs.sort().values, torch.arange(len(lists.pairs)))
 
 
 def test_ordinary_scenes_do_not_feel_an_absent_low_pass(device):
