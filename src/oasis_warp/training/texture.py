@@ -11,7 +11,7 @@ from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.logging import Progress
 from oasis_warp.core.types import CanonicalGaussians
 from oasis_warp.losses.image import masked_dssim, masked_l1
-from oasis_warp.training.views import FrozenView
+from oasis_warp.ops import BlendWeights, blend_colors
 
 LEARNING_RATE = 0.05
 """Of the logits of colour."""
@@ -35,10 +35,10 @@ class Texture(NamedTuple):
 def learn_texture(
     gaussians: CanonicalGaussians,
     faces: Int[Tensor, "F 3"],
-    view: FrozenView,
+    view: BlendWeights,
     target: Float[Tensor, "H W 3"],
     mask: Float[Tensor, "H W"],
-    references: list[FrozenView],
+    references: list[BlendWeights],
     config: AdaptConfig,
     progress: Progress,
 ) -> Texture:
@@ -59,7 +59,7 @@ def learn_texture(
         return torch.sigmoid(base + vertex_to_gaussians(field, faces, gaussians) + torch.cat([still, residual]))
 
     with torch.no_grad():
-        goals = [reference.image(gaussians.colors) for reference in references]
+        goals = [blend_colors(reference, gaussians.colors) for reference in references]
     photo = target * mask[..., None]
     order = torch.Generator().manual_seed(config.seed)
     optimiser = torch.optim.Adam([field, residual], lr=LEARNING_RATE)
@@ -67,12 +67,12 @@ def learn_texture(
     losses: list[float] = []
     for step in range(total):
         now = colors()
-        image = view.image(now)
+        image = blend_colors(view, now)
         loss = config.weight_rgb * masked_l1(image, target, mask)
         loss = loss + config.weight_ssim * masked_dssim(image * mask[..., None], photo, mask)
         if references:
             k = int(torch.randint(len(references), (1,), generator=order))
-            drift = masked_l1(references[k].image(now), goals[k], references[k].alpha)
+            drift = masked_l1(blend_colors(references[k], now), goals[k], references[k].alphas[..., 0])
             loss = loss + config.weight_reference * config.weight_rgb * len(references) * drift
         loss = loss + RESIDUAL_DECAY * residual.square().mean()
         optimiser.zero_grad()
