@@ -27,4 +27,4 @@ def evidence_of(hand, vertex_colors, size=96, **pose) -> tuple[Evidence, Canonic
     truth = anchors.with_colors(vertex_to_gaussians(vertex_colors, hand.faces, anchors))
     camera = orbit_camera(posed.vertices, 0.0, size=size)
     drawn = render(pose_gaussians(truth, hand.faces, rest.vertices, posed.vertices), camera)
-    return Evidence(drawn.image, drawn.alpha, camera, rest, posed), truth, hand_pose
+    return Evidence(drawn.image, drawn.alpha, torch.ones_like(drawn.alpha), camera, rest, posed), truth, hand_pose
