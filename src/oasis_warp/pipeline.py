@@ -146,7 +146,7 @@ def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: Rec
 
 @torch.no_grad()
 def input_errors(avatar: Avatar, evidence: Evidence) -> dict[str, float]:
-    """How well the avatar explains its own photo: over black, inside the mask above the wrist line, at the crop's size."""
+    """How well the avatar explains its own photo: over black, inside the mask above the wrist line, in the crop."""
     drawn = avatar.render(avatar.source_camera, avatar.source_pose, BLACK)
     image, alpha = drawn.image, drawn.alpha
     if avatar.side == "left":
