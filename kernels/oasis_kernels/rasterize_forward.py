@@ -1,4 +1,4 @@
-"""Blend the Gaussians of each tile front to back (Kerbl et al. 2023, eq. 3) into image and transmittance.
+"""Blend the Gaussians of each tile front to back (Kerbl et al. 2023, eq. 3) into image, alpha and transmittance.
 
 One thread a (tile, lane). A lane owns a rectangle of the tile's pixels: the whole tile on the CPU, where one lane
 walks the box of each Gaussian and nothing outside it; one pixel or a few on CUDA. The code is the same, each lane
@@ -41,7 +41,7 @@ def from_centre(pixel: int, whole: Any, remainder: Any):
 
 @functools.cache
 def blend(scalar: Any, channels: int) -> Any:
-    """Kernel: the tiles' Gaussians -> image over the background, transmittance, and where each pixel ended."""
+    """Kernel: the tiles' Gaussians -> image over the background, alpha, transmittance, and where each pixel ended."""
     vec4 = wp.types.vector(length=4, dtype=scalar)
     color = wp.types.vector(length=channels, dtype=scalar)
 
@@ -64,6 +64,7 @@ def blend(scalar: Any, channels: int) -> Any:
         width: int,
         height: int,
         image: wp.array(dtype=color),
+        alphas: wp.array(dtype=scalar),  # sum of weights: 1 - T has no relative accuracy where little is drawn
         transmittance: wp.array(dtype=scalar),
         stops: wp.array(dtype=wp.int32),  # place in the tile's list of the first Gaussian that was not drawn
     ):
@@ -78,6 +79,7 @@ def blend(scalar: Any, channels: int) -> Any:
             for x in range(area[0], area[2]):
                 pixel = (camera * height + y) * width + x
                 image[pixel] = color()
+                alphas[pixel] = scalar(0.0)
                 transmittance[pixel] = scalar(1.0)
                 stops[pixel] = count
         open_pixels = wp.max(area[2] - area[0], 0) * wp.max(area[3] - area[1], 0)
@@ -109,7 +111,9 @@ def blend(scalar: Any, channels: int) -> Any:
                                 stops[pixel] = place
                                 open_pixels -= 1
                             else:
-                                image[pixel] = image[pixel] + rgb * (alpha * before)
+                                weight = alpha * before
+                                image[pixel] = image[pixel] + rgb * weight
+                                alphas[pixel] = alphas[pixel] + weight
                                 transmittance[pixel] = after
 
         background = backgrounds[camera]

@@ -3,7 +3,6 @@
 Shares no code with the kernels. Thresholds are the float32 constants of gsplat 1.5.3, spelled out again.
 """
 
-import math
 
 import numpy as np
 import torch

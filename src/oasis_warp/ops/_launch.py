@@ -40,7 +40,7 @@ def start() -> None:
     with _start_lock:
         if _started:
             return
-        wp.config.quiet = True
+        wp.config.log_level = wp.LOG_WARNING
         wp.config.kernel_cache_dir = str(kernel_cache())
         wp.init()
         _started = True

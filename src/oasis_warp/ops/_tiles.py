@@ -5,9 +5,9 @@ from typing import NamedTuple
 import torch
 import warp as wp
 from jaxtyping import Int32, Int64
-from oasis_kernels import tiles
 from torch import Tensor
 
+from oasis_kernels import tiles
 from oasis_warp.ops._launch import even_cuts, launch_ranges, view
 from oasis_warp.ops.projection import Projection
 

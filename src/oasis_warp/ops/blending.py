@@ -4,14 +4,14 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from oasis_kernels import constants
-from oasis_kernels import rasterize_backward as backward_kernels
-from oasis_kernels import rasterize_forward as forward_kernels
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from warp import vec4i
 from warp.types import vector
 
+from oasis_kernels import constants
+from oasis_kernels import rasterize_backward as backward_kernels
+from oasis_kernels import rasterize_forward as forward_kernels
 from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
 from oasis_warp.ops._tiles import Tiles
 from oasis_warp.ops.projection import Projection
@@ -51,6 +51,7 @@ class _Blend(torch.autograd.Function):
         color, vec4 = vector(channels, SCALAR[dtype]), VEC4[dtype]
         image = torch.empty(n_cameras, height, width, channels, dtype=dtype, device=device)
         transmittance = torch.empty(n_cameras, height, width, 1, dtype=dtype, device=device)
+        alphas = torch.empty_like(transmittance)
         stops = torch.empty(n_cameras, height, width, dtype=torch.int32, device=device)
         lanes, lane_width, lane_height = lane_grid(tiles.size, device, CUDA_LANES)
         launch_ranges(
@@ -61,7 +62,7 @@ class _Blend(torch.autograd.Function):
                 view(projection.centers.view(-1, 4), vec4), view(projection.whitenings.view(-1, 4), vec4),
                 view(opacities.view(-1)), view(colors.view(-1, channels), color), view(backgrounds, color),
                 tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height,
-                view(image.view(-1, channels), color), view(transmittance.view(-1)), view(stops.view(-1)),
+                view(image.view(-1, channels), color), view(alphas.view(-1)), view(transmittance.view(-1)), view(stops.view(-1)),
             ],
             like=image,
             lanes=lanes,
@@ -72,7 +73,7 @@ class _Blend(torch.autograd.Function):
             projection.boxes, projection.centers, projection.whitenings,
         )  # fmt: skip
         ctx.set_materialize_grads(False)
-        return image, 1 - transmittance
+        return image, alphas
 
     @staticmethod
     @once_differentiable
@@ -168,7 +169,7 @@ def blend(
     width: int,
     height: int,
 ) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"]]:
-    """Images over the backgrounds, and alpha (Kerbl et al. 2023, eq. 3): sum of c alpha T, and 1 - T of the end.
+    """Images over the backgrounds, and alpha (Kerbl et al. 2023, eq. 3): sum of c alpha T, and sum of alpha T.
 
     D is at most 32. `projection.means2d` and `projection.covars2d` receive gradients.
     """

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 from jaxtyping import Float, Float64, Int32
-from oasis_kernels import projection as kernels
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from oasis_kernels import projection as kernels
 from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
 
 CAMERA_SUM_BLOCK = 1024
