@@ -4,21 +4,26 @@
 the faces, restricted to a strip of rows, so that strips can run on several threads) or `fill_faces` on CUDA (one
 thread a face) -> `interpolate` (one thread a pixel) and `visibility` (one thread a point).
 
-A pixel's ray is p(z) = z d with d = ((x - cx) / fx, (y - cy) / fy, 1). For a triangle a, b, c in camera axes,
-w_a = d.(b x c), w_b = d.(c x a), w_c = d.(a x b); the ray hits where the three agree in sign, at the barycentrics
-w / (w_a + w_b + w_c), which are perspective correct as they stand (Olano and Greer, "Triangle scan conversion using
-2D homogeneous coordinates", 1997). Nothing is divided by a vertex's depth, so a triangle may pass through the camera's
-plane and needs no clipping; the near test is made a pixel.
+A pixel's ray is p(z) = z (u, v, 1) with u = (x - cx) / fx, v = (y - cy) / fy. Sheared along it, a corner (X, Y, Z) in
+camera axes lands at (X - u Z, Y - v Z) and the ray at the origin; with 2D cross products w_a = b x c, w_b = c x a,
+w_c = a x b of the sheared corners, the ray hits where the three agree in sign, at the barycentrics w / (w_a + w_b + w_c),
+perspective correct as they stand. Nothing is divided by a vertex's depth, so a triangle may pass through the camera's
+plane and needs no clipping (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997); the
+near test is made a pixel.
 
-Arithmetic is float64 whatever the arrays hold: the products above cancel as (distance / edge)^2, and a hand a few
-metres away would lose its edges in float32. Scalar code is as fast in either.
+No ray slips between faces (Woop, Benthin and Wald, "Watertight ray/triangle intersection", 2013): a corner lands at the
+same rounded place for each of its faces, rounding never swaps the order of the two products of w, so its sign is right
+or it is zero, and zero counts as inside. A fused multiply-add would break that, hence `fuse_fp`, off on both back ends.
+
+Arithmetic is float64 whatever the arrays hold: the products cancel as (distance / edge)^2, and a hand a few metres away
+would lose its edges in float32. Scalar code is as fast in either.
 """
 
 from typing import Any
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BOX_MARGIN = wp.constant(wp.float64(1e-3))
 """Pixels added round a projected triangle, so that rounding of the box never decides about a pixel on an edge."""
@@ -31,12 +36,11 @@ ONE = wp.constant(wp.float64(1.0))
 
 @wp.struct
 class Triangle:
-    """What a ray needs of a triangle in camera axes."""
+    """Corners in camera axes."""
 
-    wa: wp.vec3d  # b x c
-    wb: wp.vec3d  # c x a
-    wc: wp.vec3d  # a x b
-    z: wp.vec3d  # depths of a, b, c
+    a: wp.vec3d
+    b: wp.vec3d
+    c: wp.vec3d
     flat: wp.float64  # |w_a + w_b + w_c| up to here counts as edge-on
 
 
@@ -66,53 +70,55 @@ def pixel_of(p: wp.vec3d, K: wp.array2d[Any]) -> wp.vec2d:
 
 
 @wp.func
-def pixel_ray(x: int, y: int, K: wp.array2d[Any]) -> wp.vec3d:
-    """Direction of the ray through the centre of a pixel, scaled to depth one."""
+def pixel_ray(x: int, y: int, K: wp.array2d[Any]) -> wp.vec2d:
+    """Where the ray through a pixel's centre is at depth one."""
     u = (wp.float64(x) + HALF - wp.float64(K[0, 2])) / wp.float64(K[0, 0])
     v = (wp.float64(y) + HALF - wp.float64(K[1, 2])) / wp.float64(K[1, 1])
-    return wp.vec3d(u, v, ONE)
-
-
-@wp.func
-def edge_plane(i: int, j: int, p: wp.vec3d, q: wp.vec3d) -> wp.vec3d:
-    """Cross product p x q, computed in the order of the vertex indices.
-
-    The two faces of an edge then get exactly opposite planes, fused multiply-adds or not: no ray slips through.
-    """
-    if i < j:
-        return wp.cross(p, q)
-    return -wp.cross(q, p)
+    return wp.vec2d(u, v)
 
 
 @wp.func
 def triangle(f: int, faces: wp.array2d[wp.int32], vertices: wp.array[wp.vec3d]) -> Triangle:
-    ia = faces[f, 0]
-    ib = faces[f, 1]
-    ic = faces[f, 2]
-    a = vertices[ia]
-    b = vertices[ib]
-    c = vertices[ic]
     tri = Triangle()
-    tri.wa = edge_plane(ib, ic, b, c)
-    tri.wb = edge_plane(ic, ia, c, a)
-    tri.wc = edge_plane(ia, ib, a, b)
-    tri.z = wp.vec3d(a[2], b[2], c[2])
-    tri.flat = EDGE_ON * wp.length(wp.cross(b - a, c - a))
+    tri.a = vertices[faces[f, 0]]
+    tri.b = vertices[faces[f, 1]]
+    tri.c = vertices[faces[f, 2]]
+    tri.flat = EDGE_ON * wp.length(wp.cross(tri.b - tri.a, tri.c - tri.a))
     return tri
 
 
 @wp.func
-def barycentrics(tri: Triangle, d: wp.vec3d) -> wp.vec3d:
-    """Barycentrics of the point that the ray `d` hits, edges included, from either side; all zero for a miss."""
-    wa = wp.dot(tri.wa, d)
-    wb = wp.dot(tri.wb, d)
-    wc = wp.dot(tri.wc, d)
+def sheared(p: wp.vec3d, ray: wp.vec2d) -> wp.vec2d:
+    return wp.vec2d(p[0] - ray[0] * p[2], p[1] - ray[1] * p[2])
+
+
+@wp.func
+def cross2(p: wp.vec2d, q: wp.vec2d) -> wp.float64:
+    return p[0] * q[1] - p[1] * q[0]
+
+
+@wp.func
+def barycentrics(tri: Triangle, ray: wp.vec2d) -> wp.vec3d:
+    """Barycentrics of the point that the ray hits, edges included, from either side; all zero for a miss."""
+    a = sheared(tri.a, ray)
+    b = sheared(tri.b, ray)
+    c = sheared(tri.c, ray)
+    wa = cross2(b, c)
+    wb = cross2(c, a)
+    wc = cross2(a, b)
     inside = (wa >= ZERO and wb >= ZERO and wc >= ZERO) or (wa <= ZERO and wb <= ZERO and wc <= ZERO)
     # Inside, the three have one sign: the sum loses nothing.
     total = wa + wb + wc
     if not inside or wp.abs(total) <= tri.flat:
         return wp.vec3d(ZERO, ZERO, ZERO)
     return wp.vec3d(wa / total, wb / total, wc / total)
+
+
+@wp.func
+def depth_at(tri: Triangle, ray: wp.vec2d) -> wp.float64:
+    """Depth of the point that the ray hits; 0 for a miss, which is not beyond any near plane."""
+    w = barycentrics(tri, ray)
+    return w[0] * tri.a[2] + w[1] * tri.b[2] + w[2] * tri.c[2]
 
 
 @wp.kernel
@@ -179,8 +185,7 @@ def fill_rows(
             tri = triangle(f, faces, vertices)
             for y in range(y0, y1 + 1):
                 for x in range(box[0], box[1] + 1):
-                    # A miss has z = 0, which is not beyond the near plane.
-                    z = wp.dot(barycentrics(tri, pixel_ray(x, y, K)), tri.z)
+                    z = depth_at(tri, pixel_ray(x, y, K))
                     if z > near and z < depth[y, x]:
                         depth[y, x] = z
                         face_ids[y, x] = f
@@ -209,7 +214,7 @@ def fill_faces(
     tri = triangle(f, faces, vertices)
     for y in range(box[2], box[3] + 1):
         for x in range(box[0], box[1] + 1):
-            z = wp.dot(barycentrics(tri, pixel_ray(x, y, K)), tri.z)
+            z = depth_at(tri, pixel_ray(x, y, K))
             if z > near:
                 if stage == 0:
                     wp.atomic_min(depth, y, x, z)

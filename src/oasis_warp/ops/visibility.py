@@ -57,9 +57,15 @@ def _check_camera(viewmat: Tensor, K: Tensor, width: int, height: int, near_plan
     check_finite(viewmat=viewmat, K=K)
     for name, focal in (("K[0, 0]", K[0, 0]), ("K[1, 1]", K[1, 1])):
         check_positive(name, float(focal))
-    check_positive("width", width)
-    check_positive("height", height)
+    for name, size in (("width", width), ("height", height)):
+        if size < 1:
+            raise ValueError(f"{name}: expected 1 or more pixels, got {size}.")
     check_positive("near_plane", near_plane)
+
+
+def _check_vertex_or_none(point_vertices: Tensor, n_vertices: int) -> None:
+    named = point_vertices[point_vertices != -1]
+    check_index("point_vertices", named, n_vertices, "vertices, or -1 for none")
 
 
 def _fill(
@@ -243,7 +249,7 @@ def depth_visibility(
         point_vertices = torch.empty(0, dtype=torch.int32, device=points.device)
     else:
         check_shape("point_vertices", point_vertices, len(points), hint="One vertex a point, -1 for none.")
-        check_index("point_vertices", point_vertices + 1, len(vertices) + 1, "vertices")
+        _check_vertex_or_none(point_vertices, len(vertices))
     with torch.no_grad():
         viewmat, K = viewmat.detach().contiguous(), K.detach().contiguous()
         buffer = _fill(vertices.detach().contiguous(), faces, viewmat, K, width, height, near_plane)
