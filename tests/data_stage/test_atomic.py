@@ -1,11 +1,9 @@
-import contextlib
 import errno
 import os
-import resource
-import signal
 from pathlib import Path
 
 import pytest
+from disk import full_disk
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.atomic import output_file, output_folder, write_file
@@ -13,19 +11,6 @@ from oasis_warp.data.atomic import output_file, output_folder, write_file
 
 def everything(folder: Path) -> dict[str, bytes | None]:
     return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
-
-
-@contextlib.contextmanager
-def full_disk(n_bytes: int):
-    """Let no file grow beyond `n_bytes`: writes fail in this process as on a full disk, C++ libraries' included."""
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, handler)
 
 
 def fill(folder: Path) -> None:
