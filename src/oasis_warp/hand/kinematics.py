@@ -95,9 +95,12 @@ class Rig:
         return table
 
     def chain(self, angles: np.ndarray, shape: np.ndarray) -> Chain:
-        """Pose the joints."""
+        """Pose the joints by the 26 angles of the fit."""
+        return self.chain_of(self.all_angles(angles), shape)
+
+    def chain_of(self, table: np.ndarray, shape: np.ndarray) -> Chain:
+        """Pose the joints by all angles, [16, 3]."""
         rest = self.joints + self.joint_basis @ shape
-        table = self.all_angles(angles)
         rotation, position = np.zeros((16, 3, 3)), np.zeros((16, 3))
         by_shape, axes = np.zeros((16, 3, len(shape))), np.zeros((16, 3, 3))
         rotation[0], position[0], by_shape[0] = np.eye(3), rest[0], self.joint_basis[0]
@@ -128,13 +131,13 @@ class Rig:
         """Vertices at rest [m], without pose correctives."""
         return self.template + (self.shape_basis.reshape(-1, len(shape)) @ shape).reshape(-1, 3)
 
-    def correctives(self, angles: np.ndarray) -> np.ndarray:
-        """Displacement of the rest surface by the pose correctives of the 26 `angles` [m], [V, 3]."""
+    def correctives(self, table: np.ndarray) -> np.ndarray:
+        """Displacement of the rest surface by the pose correctives of all angles ([16, 3]) [m], [V, 3]."""
         return np.zeros_like(self.template)
 
     def surface(self, chain: Chain, angles: np.ndarray, shape: np.ndarray) -> np.ndarray:
         """The posed surface, correctives included [m], [V, 3]."""
-        return self.pose_surface(chain, self.rest_surface(shape) + self.correctives(angles))
+        return self.pose_surface(chain, self.rest_surface(shape) + self.correctives(self.all_angles(angles)))
 
     def bone_shifts(self, chain: Chain) -> np.ndarray:
         """Translations that go with `chain.rotation` to carry rest points, [16, 3]."""

@@ -66,7 +66,7 @@ class MaskOutline:
 
     def match(self, rig: Rig, state: FitState) -> OutlinePairs:
         """Nearest pairs in both directions between these points and the rim of the mesh posed by `state`."""
-        displacement = rig.correctives(state.angles)
+        displacement = rig.correctives(rig.all_angles(state.angles))
         posed = rig.pose_surface(rig.chain(state.angles, state.shape), rig.rest_surface(state.shape) + displacement)
         image, rim, rim_normals = self._rim(rig, state, posed)
         if len(rim) < 10 or len(self.points) < 10:
