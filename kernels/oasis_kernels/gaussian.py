@@ -55,12 +55,15 @@ def rotation(q: wp.vec4d) -> wp.mat33d:
 def rotation_adjoint(q: wp.vec4d, g: wp.mat33d) -> wp.vec4d:
     """Gradient by the unit quaternion of sum(g * rotation(q))."""
     w, x, y, z = q[0], q[1], q[2], q[3]
-    return wp.vec4d(
-        TWO * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1])),
-        TWO * (w * (g[2, 1] - g[1, 2]) + y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) - TWO * x * (g[1, 1] + g[2, 2])),
-        TWO * (w * (g[0, 2] - g[2, 0]) + x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) - TWO * y * (g[0, 0] + g[2, 2])),
-        TWO * (w * (g[1, 0] - g[0, 1]) + x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) - TWO * z * (g[0, 0] + g[1, 1])),
-    )  # fmt: skip
+    # The antisymmetric and the symmetric off-diagonal parts of g.
+    ax, ay, az = g[2, 1] - g[1, 2], g[0, 2] - g[2, 0], g[1, 0] - g[0, 1]
+    sx, sy, sz = g[1, 2] + g[2, 1], g[0, 2] + g[2, 0], g[0, 1] + g[1, 0]
+    return TWO * wp.vec4d(
+        x * ax + y * ay + z * az,
+        w * ax + y * sz + z * sy - TWO * x * (g[1, 1] + g[2, 2]),
+        w * ay + x * sz + z * sx - TWO * y * (g[0, 0] + g[2, 2]),
+        w * az + x * sy + y * sx - TWO * z * (g[0, 0] + g[1, 1]),
+    )
 
 
 @wp.func

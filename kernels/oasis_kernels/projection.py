@@ -154,7 +154,7 @@ def project(scalar: Any) -> Any:
 
 @functools.cache
 def project_backward(scalar: Any) -> Any:
-    """Kernel: gradients by means2d, covars2d and depths -> gradients by the Gaussians, and each one's by the cameras."""
+    """Kernel: gradients by means2d, covars2d and depths -> by the Gaussians, and what each one adds to the cameras'."""
     vec2, vec3, vec4 = (wp.types.vector(length=n, dtype=scalar) for n in (2, 3, 4))
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -177,7 +177,7 @@ def project_backward(scalar: Any) -> Any:
         g_means: wp.array(dtype=vec3),  # [n]
         g_quats: wp.array(dtype=vec4),  # [n]
         g_scales: wp.array(dtype=vec3),  # [n]
-        g_cameras: wp.array2d(dtype=wp.float64),  # [C * n, 12]: by the upper three rows of viewmats; zeroed by the caller
+        g_cameras: wp.array2d(dtype=wp.float64),  # [C * n, 12]: by the upper three rows of viewmats
     ):
         i = first + wp.tid()
         mean = wp.vec3d(means[i])
@@ -236,8 +236,10 @@ def project_backward(scalar: Any) -> Any:
 
 
 @wp.kernel(enable_backward=False)
-def sum_blocks(first: int, n: int, block: int, values: wp.array2d(dtype=wp.float64), sums: wp.array2d(dtype=wp.float64)):
-    """Sums of `block` consecutive rows of each of C groups of n; one thread a (group, block, column), added in order."""
+def sum_blocks(
+    first: int, n: int, block: int, values: wp.array2d(dtype=wp.float64), sums: wp.array2d(dtype=wp.float64)
+):
+    """Sums of `block` consecutive rows of each group of n, in order; one thread a (group, block, column)."""
     task, column = wp.tid()
     task += first
     n_blocks = (n + block - 1) // block

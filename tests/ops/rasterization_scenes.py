@@ -50,7 +50,7 @@ def intrinsics(fx, fy, cx, cy):
 
 
 def ordinary_scene(
-    seed=0, n=60, width=37, height=29, channels=3, cameras=2, device="cpu", dtype=torch.float64, size=(0.04, 0.2)
+    seed=0, n=60, width=37, height=29, channels=3, cameras=2, device="cpu", dtype=torch.float32, size=(0.04, 0.2)
 ):
     """A cloud of unit size, about three units away, whose Gaussians overlap in many layers."""
     g = torch.Generator().manual_seed(seed)
@@ -76,10 +76,13 @@ def ordinary_scene(
 
 
 def frontal_scene(means, scales, opacities, width=32, height=32, focal=40.0, quats=None, colors=None, seed=0):
-    """Given Gaussians before a camera at the origin that looks along z."""
+    """Given Gaussians before a camera at the origin that looks along z; one number for scales is squeezed a little,
+    because the gradient by the rotation of a sphere is nothing but rounding.
+    """
     g = torch.Generator().manual_seed(seed)
     n = len(means)
     means = torch.as_tensor(means, dtype=torch.float64)
+    scales = torch.tensor([scales, 0.8 * scales, 0.6 * scales]) if isinstance(scales, float) else scales
     random_quats = torch.randn(n, 4, generator=g, dtype=torch.float64)
     random_colors = torch.rand(n, 3, generator=g, dtype=torch.float64)
     return Scene(

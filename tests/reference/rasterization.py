@@ -35,8 +35,8 @@ def project(means, quats, scales, viewmat, K, width, height, eps2d):
     return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), M[:, 0], M[:, 1], z
 
 
-def layers(means, quats, scales, opacities, viewmat, K, width, height, near=0.01, far=1e10, eps2d=0.3):
-    """Alphas [pixels, n] of the Gaussians `order` [n], front to back, and whether their opacity moves them."""
+def layers(means, quats, scales, opacities, viewmat, K, width, height, near=0.01, far=1e10, eps2d=0.3, decide=True):
+    """Alphas [pixels, n] of the Gaussians `order` [n], front to back; not cut or capped unless `decide`."""
     near, far, eps2d = (float(np.float32(v)) for v in (near, far, eps2d))
     z = (means @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]
     kept = ((z >= near) & (z <= far) & (opacities >= FAINTEST)).nonzero()[:, 0]
@@ -51,9 +51,11 @@ def layers(means, quats, scales, opacities, viewmat, K, width, height, near=0.01
     along, across = torch.where(wide, dx, dy), torch.where(wide, dy, dx)
     pivot = torch.where(wide, a, c)
     sigma = 0.5 * (along**2 / pivot + (across - b / pivot * along) ** 2 * pivot / det)
-    alpha = torch.clamp(opacities[kept] * torch.exp(-sigma), max=CAP)
+    alpha = opacities[kept] * torch.exp(-sigma)
+    if decide:
+        alpha = torch.where(alpha >= FAINTEST, torch.clamp(alpha, max=CAP), 0)
     order = torch.argsort(z, stable=True)
-    return torch.where(alpha >= FAINTEST, alpha, 0)[:, order], kept[order]
+    return alpha[:, order], kept[order]
 
 
 def blend_weights(alpha):
@@ -88,11 +90,13 @@ def rasterization(
     return torch.stack(images), torch.stack(alphas)
 
 
-def fragile(alpha, opacities, order, raw_cap=CAP):
-    """Pixels where a decision hangs on rounding: an alpha at the cut-off or the cap, a transmittance at the stop."""
-    after = torch.cumprod(1 - alpha, -1)
-    edges = [(alpha, FAINTEST, 3e-4), (alpha, raw_cap, 3e-4), (after, STOP, 2e-3)]
+def fragile(alpha):
+    """Pixels where a decision hangs on rounding: an alpha at the cut-off or the cap, a transmittance at the stop.
+
+    `alpha` are the undecided ones of `layers`.
+    """
+    after = torch.cumprod(1 - torch.where(alpha >= FAINTEST, alpha.clamp(max=CAP), 0), -1)
     near_edge = torch.zeros(len(alpha), dtype=torch.bool)
-    for value, edge, width in edges:
+    for value, edge, width in [(alpha, FAINTEST, 3e-4), (alpha, CAP, 3e-4), (after, STOP, 2e-3)]:
         near_edge |= ((value - edge).abs() < width * edge).any(-1)
     return near_edge

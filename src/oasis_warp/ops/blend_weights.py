@@ -73,8 +73,8 @@ def blend_weights(
     check_shape("viewmat", viewmat, 4, 4)
     check_shape("K", K, 3, 3)
     check_gaussians_and_cameras(
-        means, quats, scales, opacities, viewmat[None], K[None], width, height, near_plane, far_plane, eps2d,
-        tile_size, validate,
+        means, quats, scales, opacities, viewmat[None], K[None], width, height, near_plane, far_plane, radius_clip,
+        eps2d, tile_size, validate,
     )  # fmt: skip
     n, pixels, dtype, device = len(means), width * height, means.dtype, means.device
     with torch.no_grad():

@@ -99,15 +99,31 @@ def rasterization(
         far_plane: Nor are those farther than this [m].
         radius_clip: Nor those whose box has both half sides at or below this [px].
         eps2d: Variance added to both image axes [px^2].
-        packed: Accepted for gsplat's sake: changes nothing, and `meta` is never packed. So are `channel_chunk` and
-            `segmented`.
+        packed: Accepted for gsplat's sake: changes nothing, and `meta` is never packed.
         tile_size: Side of the square tiles that work is split into [px]; changes only the time.
         backgrounds: Colour behind the Gaussians, shape [C, D]; black where None.
         render_mode: "RGB" draws `colors`, "D" the accumulated camera z, sum z_i alpha_i T_i, "ED" the expected one,
             that sum over alpha (0 where nothing is); "RGB+D" and "RGB+ED" append it as the last channel.
-        sh_degree: Like the arguments not named here, taken by name, and refused where it is not the default.
+        channel_chunk: Like `packed`.
+        segmented: Like `packed`.
+        sh_degree: Not supported, as all that follow: known by name so that calls need no change, and refused where
+            they are not the default.
+        sparse_grad: Not supported.
+        absgrad: Not supported.
+        rasterize_mode: Not supported.
+        distributed: Not supported.
+        camera_model: Not supported.
+        covars: Not supported.
+        with_ut: Not supported.
+        with_eval3d: Not supported.
+        radial_coeffs: Not supported.
+        tangential_coeffs: Not supported.
+        thin_prism_coeffs: Not supported.
+        ftheta_coeffs: Not supported.
+        rolling_shutter: Not supported.
+        viewmats_rs: Not supported.
         validate: Look at the values of the tensors: refuse NaN, infinities, magnitudes above 1e15, zero quaternions,
-            opacities outside [0, 1] and zero focal lengths. Waits for a CUDA device; switch it off for inputs you trust.
+            opacities outside [0, 1] and zero focal lengths. Waits for a CUDA device; switch it off for trusted inputs.
 
     Returns:
         render: Shape [C, H, W, X], X being D, 1 or D + 1.
@@ -125,8 +141,9 @@ def rasterization(
         refuse_unless_default(name, arguments[name], default, hint)
     check_choice("render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
     check_gaussians_and_cameras(
-        means, quats, scales, opacities, viewmats, Ks, width, height, near_plane, far_plane, eps2d, tile_size, validate
-    )
+        means, quats, scales, opacities, viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d,
+        tile_size, validate,
+    )  # fmt: skip
     n, n_cameras = len(means), len(viewmats)
     check_colors(colors, backgrounds, means, n_cameras, validate)
 
@@ -181,6 +198,7 @@ def check_gaussians_and_cameras(
     height: int,
     near_plane: float,
     far_plane: float,
+    radius_clip: float,
     eps2d: float,
     tile_size: int,
     validate: bool,
@@ -208,6 +226,8 @@ def check_gaussians_and_cameras(
     check_positive("near_plane", near_plane)
     if not far_plane > near_plane:
         raise ValueError(f"far_plane: expected more than near_plane, {near_plane!r}, got {far_plane!r}.")
+    if not radius_clip >= 0:
+        raise ValueError(f"radius_clip: expected a number of pixels, at least 0, got {radius_clip!r}.")
     if not 0 <= eps2d < float("inf"):
         raise ValueError(f"eps2d: expected a finite variance, at least 0, got {eps2d!r}.")
     if not validate:
