@@ -6,10 +6,10 @@ thread a face) -> `interpolate` (one thread a pixel) and `visibility` (one threa
 
 A pixel's ray is p(z) = z (u, v, 1) with u = (x - cx) / fx, v = (y - cy) / fy. Sheared along it, a corner (X, Y, Z) in
 camera axes lands at (X - u Z, Y - v Z) and the ray at the origin; with 2D cross products w_a = b x c, w_b = c x a,
-w_c = a x b of the sheared corners, the ray hits where the three agree in sign, at the barycentrics w / (w_a + w_b + w_c),
-perspective correct as they stand. Nothing is divided by a vertex's depth, so a triangle may pass through the camera's
-plane and needs no clipping (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997); the
-near test is made a pixel.
+w_c = a x b of the sheared corners, the ray hits where the three agree in sign. The hit has the barycentrics
+w / (w_a + w_b + w_c), perspective correct as they stand. Nothing is divided by a vertex's depth, so a triangle may pass
+through the camera's plane and needs no clipping (Olano and Greer, "Triangle scan conversion using 2D homogeneous
+coordinates", 1997); the near test is made a pixel.
 
 No ray slips between faces (Woop, Benthin and Wald, "Watertight ray/triangle intersection", 2013): a corner lands at the
 same rounded place for each of its faces, rounding never swaps the order of the two products of w, so its sign is right
