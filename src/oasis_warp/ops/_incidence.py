@@ -55,7 +55,7 @@ def sum_at_items(rows: Tensor, index: Incidence) -> Tensor:
     out = rows.new_empty((n_items, n_columns))
     launch(
         kernels.sum_rows,
-        (n_items, n_columns),
+        n_items,
         [view(rows), view(index.offsets), view(index.entries), view(out)],
         like=rows,
     )
