@@ -1,6 +1,6 @@
 """Carry Gaussians that are tied to faces by barycentric coordinates along with a posed mesh.
 
-`pose` and `pose_backward`: one thread a Gaussian. On face f with corners v_k, barycentrics b_k and vertex rotations q_k:
+`pose` and `pose_backward`: one thread a Gaussian. At barycentrics b_k of corners v_k that turned by q_k:
 
     mean  = sum b_k v_k
     dq    = m / |m|,  m = sum b_k s_k q_k     s_k = +-1 turns q_k to the side of the corner with the largest b_k

@@ -6,10 +6,10 @@ thread a face) -> `interpolate` (one thread a pixel) and `visibility` (one threa
 
 A pixel's ray is p(z) = z (u, v, 1) with u = (x - cx) / fx, v = (y - cy) / fy. Sheared along it, a corner (X, Y, Z) in
 camera axes lands at (X - u Z, Y - v Z) and the ray at the origin; with 2D cross products w_a = b x c, w_b = c x a,
-w_c = a x b of the sheared corners, the ray hits where the three agree in sign, at the barycentrics w / (w_a + w_b + w_c),
-perspective correct as they stand. Nothing is divided by a vertex's depth, so a triangle may pass through the camera's
-plane and needs no clipping (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997); the
-near test is made a pixel.
+w_c = a x b of the sheared corners, the ray hits where the three agree in sign. The hit has the barycentrics
+w / (w_a + w_b + w_c), perspective correct as they stand. Nothing is divided by a vertex's depth, so a triangle may pass
+through the camera's plane and needs no clipping (Olano and Greer, "Triangle scan conversion using 2D homogeneous
+coordinates", 1997); the near test is made a pixel.
 
 No ray slips between faces (Woop, Benthin and Wald, "Watertight ray/triangle intersection", 2013): a corner lands at the
 same rounded place for each of its faces, rounding never swaps the order of the two products of w, so its sign is right
@@ -70,11 +70,16 @@ def pixel_of(p: wp.vec3d, K: wp.array2d[Any]) -> wp.vec2d:
 
 
 @wp.func
-def pixel_ray(x: int, y: int, K: wp.array2d[Any]) -> wp.vec2d:
-    """Where the ray through a pixel's centre is at depth one."""
-    u = (wp.float64(x) + HALF - wp.float64(K[0, 2])) / wp.float64(K[0, 0])
-    v = (wp.float64(y) + HALF - wp.float64(K[1, 2])) / wp.float64(K[1, 1])
-    return wp.vec2d(u, v)
+def pixel_rays(K: wp.array2d[Any]) -> wp.vec4d:
+    """Where rays are at depth one: the ray of pixel (x, y) at (r0 + x r2, r1 + y r3)."""
+    du = ONE / wp.float64(K[0, 0])
+    dv = ONE / wp.float64(K[1, 1])
+    return wp.vec4d((HALF - wp.float64(K[0, 2])) * du, (HALF - wp.float64(K[1, 2])) * dv, du, dv)
+
+
+@wp.func
+def pixel_ray(x: int, y: int, rays: wp.vec4d) -> wp.vec2d:
+    return wp.vec2d(rays[0] + wp.float64(x) * rays[2], rays[1] + wp.float64(y) * rays[3])
 
 
 @wp.func
@@ -177,6 +182,7 @@ def fill_rows(
     face_ids: wp.array2d[wp.int32],  # -1 on entry
 ):
     """One thread for rows `first_row` to `last_row`; faces in order, so that a tie stays with the smaller id."""
+    rays = pixel_rays(K)
     for f in range(faces.shape[0]):
         box = boxes[f]
         y0 = wp.max(box[2], first_row)
@@ -185,7 +191,7 @@ def fill_rows(
             tri = triangle(f, faces, vertices)
             for y in range(y0, y1 + 1):
                 for x in range(box[0], box[1] + 1):
-                    z = depth_at(tri, pixel_ray(x, y, K))
+                    z = depth_at(tri, pixel_ray(x, y, rays))
                     if z > near and z < depth[y, x]:
                         depth[y, x] = z
                         face_ids[y, x] = f
@@ -211,10 +217,11 @@ def fill_faces(
     box = boxes[f]
     if box[0] > box[1] or box[2] > box[3]:
         return
+    rays = pixel_rays(K)
     tri = triangle(f, faces, vertices)
     for y in range(box[2], box[3] + 1):
         for x in range(box[0], box[1] + 1):
-            z = depth_at(tri, pixel_ray(x, y, K))
+            z = depth_at(tri, pixel_ray(x, y, rays))
             if z > near:
                 if stage == 0:
                     wp.atomic_min(depth, y, x, z)
@@ -234,7 +241,7 @@ def interpolate(
     y, x = wp.tid()
     f = face_ids[y, x]
     if f >= 0:
-        b = barycentrics(triangle(f, faces, vertices), pixel_ray(x, y, K))
+        b = barycentrics(triangle(f, faces, vertices), pixel_ray(x, y, pixel_rays(K)))
         for k in range(3):
             out[y, x, k] = out.dtype(b[k])
 
@@ -244,14 +251,13 @@ def shows_vertex(
     x: int, y: int, vertex: int, faces: wp.array2d[wp.int32], face_ids: wp.array2d[wp.int32]
 ) -> wp.bool:
     """Whether one of the 3 x 3 pixels round (x, y) shows a face with the given corner."""
-    found = wp.bool(False)
     for v in range(wp.max(y - 1, 0), wp.min(y + 2, face_ids.shape[0])):
         for u in range(wp.max(x - 1, 0), wp.min(x + 2, face_ids.shape[1])):
             f = face_ids[v, u]
             if f >= 0:
                 if faces[f, 0] == vertex or faces[f, 1] == vertex or faces[f, 2] == vertex:
-                    found = True
-    return found
+                    return True
+    return False
 
 
 @wp.kernel

@@ -38,7 +38,7 @@ class Plane:
 
     e1: wp.vec3d
     e2: wp.vec3d
-    longest: wp.float64  # length of the longest edge
+    longest: wp.float64  # longest edge, squared
     area: wp.float64
     normal: wp.vec3d  # unit; zero where the triangle is flat
     proper: wp.bool
@@ -55,12 +55,12 @@ def plane(f: int, faces: wp.array2d[wp.int32], vertices: wp.array2d[Any]) -> Pla
     out = Plane()
     out.e1 = corner(vertices, faces[f, 1]) - p
     out.e2 = corner(vertices, faces[f, 2]) - p
-    out.longest = wp.max(wp.max(wp.length(out.e1), wp.length(out.e2)), wp.length(out.e2 - out.e1))
+    out.longest = wp.max(wp.max(wp.length_sq(out.e1), wp.length_sq(out.e2)), wp.length_sq(out.e2 - out.e1))
     cross = wp.cross(out.e1, out.e2)
     twice = wp.length(cross)
     out.area = HALF * twice
     out.normal = wp.vec3d(ZERO, ZERO, ZERO)
-    out.proper = twice > FLAT * out.longest * out.longest
+    out.proper = twice > FLAT * out.longest
     if out.proper:
         out.normal = cross / twice
     return out
@@ -119,7 +119,7 @@ def damped_ratio(rest: Plane, posed: Plane) -> wp.float64:
     """Posed area over rest area; 1 where the rest triangle is a point."""
     if rest.longest == ZERO:
         return ONE
-    damping = DAMPING * rest.longest * rest.longest
+    damping = DAMPING * rest.longest
     return (posed.area + damping) / (rest.area + damping)
 
 
@@ -243,12 +243,12 @@ def area_gradient(grad: wp.float64, tri: Plane) -> Edges:
 
 
 @wp.func
-def longest_squared_gradient(grad: wp.float64, tri: Plane) -> Edges:
+def longest_gradient(grad: wp.float64, tri: Plane) -> Edges:
     out = Edges()
     opposite = tri.e2 - tri.e1
-    if wp.length(tri.e1) == tri.longest:
+    if wp.length_sq(tri.e1) == tri.longest:
         out.e1 = TWO * grad * tri.e1
-    elif wp.length(tri.e2) == tri.longest:
+    elif wp.length_sq(tri.e2) == tri.longest:
         out.e2 = TWO * grad * tri.e2
     else:
         out.e1 = -TWO * grad * opposite
@@ -305,7 +305,7 @@ def face_rotations_backward(
     grad_ratio = ZERO
     ratio = ONE
     if before.longest > ZERO:
-        damped = before.area + DAMPING * before.longest * before.longest
+        damped = before.area + DAMPING * before.longest
         ratio = damped_ratio(before, after)
         grad_ratio = wp.float64(grad_area_ratio[f]) / damped
     if grad_posed.shape[0] > 0:
@@ -313,7 +313,7 @@ def face_rotations_backward(
         store_corners(grad_posed, f, after_grad.e1 + area.e1, after_grad.e2 + area.e2)
     if grad_rest.shape[0] > 0:
         area = area_gradient(grad_weight - ratio * grad_ratio, before)
-        damping = longest_squared_gradient(DAMPING * (ONE - ratio) * grad_ratio, before)
+        damping = longest_gradient(DAMPING * (ONE - ratio) * grad_ratio, before)
         store_corners(
             grad_rest, f, before_grad.e1 + area.e1 + damping.e1, before_grad.e2 + area.e2 + damping.e2
         )

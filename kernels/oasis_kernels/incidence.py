@@ -1,6 +1,6 @@
 """Sum rows that belong to the same item: the transpose of a gather, without atomics.
 
-One thread an item and column. An item adds its rows in the order of its list, so the bits never change.
+One thread an item. An item adds its rows in the order of its list, so the bits never change.
 """
 
 from typing import Any
@@ -18,11 +18,14 @@ def sum_rows(
     out: wp.array2d[Any],
 ):
     """out[i] = sum of rows[entries[j]] for offsets[i] <= j < offsets[i + 1]; in float64."""
-    i, column = wp.tid()
-    total = wp.float64(0.0)
-    for j in range(offsets[i], offsets[i + 1]):
-        total += wp.float64(rows[entries[j], column])
-    out[i, column] = out.dtype(total)
+    i = wp.tid()
+    first = offsets[i]
+    last = offsets[i + 1]
+    for column in range(out.shape[1]):
+        total = wp.float64(0.0)
+        for j in range(first, last):
+            total += wp.float64(rows[entries[j], column])
+        out[i, column] = out.dtype(total)
 
 
 for real in (wp.float32, wp.float64):

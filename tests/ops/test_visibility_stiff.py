@@ -4,6 +4,7 @@ import igl
 import numpy as np
 import pytest
 import torch
+
 from oasis_kernels import depth_buffer
 from oasis_warp.core.hand_model import BACK_SIDE, PALM_SIDE
 from oasis_warp.ops import depth_map, depth_visibility, visibility

@@ -129,8 +129,8 @@ def face_rotations(
     map of its edges (OASIS, MM '26, appendix): the same whichever corner is listed first. Its quaternion has w >= 0.
     A vertex turns by the normalised mean of its faces' quaternions, weighted with their areas at rest and sign-aligned
     to the largest of them. A face that is flat (area 0 but for rounding) at rest or posed has no weight and no gradient
-    and gets the rotation of the face with the largest rest area, as do vertices without any other face; the
-    identity where there is no face at all. The area ratio is (A' + d) / (A + d) with d = 0.5e-6 of the longest rest edge squared.
+    and gets the rotation of the face with the largest rest area, as do vertices without any other face; the identity
+    where there is no face at all. The area ratio is (A' + d) / (A + d), d = 0.5e-6 times the longest rest edge squared.
 
     Differentiable in `rest_vertices` and `posed_vertices`. Which faces touch a vertex is computed once for each `faces`
     tensor and remembered while it lives.

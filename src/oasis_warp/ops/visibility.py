@@ -15,7 +15,7 @@ from oasis_warp.ops._launch import launch, view
 from oasis_warp.ops._strips import for_strips
 
 MARGIN_TAUS = 3.0
-"""Default margin in units of tau. Without one, half a pixel of slope puts half of the visible points behind the buffer."""
+"""Default margin in units of tau: without one, half a pixel of slope hides half of the visible points."""
 
 
 class DepthMap(NamedTuple):
