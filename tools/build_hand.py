@@ -16,7 +16,7 @@ from pathlib import Path
 
 import igl
 import numpy as np
-from hand_build import anatomy, articulation, proportions, rig, shapes, subdivision
+from hand_build import anatomy, articulation, correctives, proportions, rig, shapes, subdivision
 from hand_build.anatomy import Array, Index
 from hand_build.asset import write_npz
 from hand_build.source import Source
@@ -46,6 +46,8 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
     closed_faces = np.vstack([faces, cap])
     weights = rig.skinning_weights(closed, closed_faces, points, shares)
     nail = np.append(_nail(source, source.uv, faces, uv_faces, n), 0)
+    # Before the proportions are mended, so that the HD faces stay the same when those are tuned again.
+    hd = subdivision.hd_mesh(vertices, quads, source.uv, source.uv_quads)
     closed, points = proportions.mend(closed, points, weights, nail)
     weights = rig.skinning_weights(closed, closed_faces, points, shares)
     weights[n] = np.eye(16)[0]
@@ -59,8 +61,10 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
     nail_quads = source.nail(source.uv[source.uv_quads].mean(1)) > 0.5
     axes = articulation.pose_axes(vertices, quads, points, nail_quads)
     limits, bend = articulation.pose_limits(points, axes)
+    pose_shapes = correctives.corrective_shapes(
+        correctives.RiggedSurface(closed, closed_faces, points, weights, axes, limits)
+    )
 
-    hd = subdivision.hd_mesh(vertices, quads, source.uv, source.uv_quads)
     uv_low = source.uv.min(0)
     uv_span = (source.uv.max(0) - uv_low).max()
     base_uv, hd_uv = (
@@ -84,6 +88,7 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
         "shape_names": np.array([s.name for s in basis]),
         "n_pca": np.int32(shapes.N_COMPONENTS),
         "pca_explained": explained[: shapes.N_COMPONENTS].astype(single),
+        "correctives": pose_shapes.astype(half),
         "pose_axes": axes.astype(single),
         "pose_limits": limits.astype(single),
         "rest_bend": bend.astype(single),
