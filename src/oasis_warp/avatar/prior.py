@@ -18,9 +18,9 @@ TONES = 25
 LIGHTEST, DARKEST = 0.006, 0.35
 SIGMA_COLOR = 0.05
 """Expected difference of a lit hand from its region colours [sRGB]."""
-SIGMA_EXPOSURE = 0.2
+SIGMA_EXPOSURE = 0.25
 """Expected logarithm of the photo's brightness over that of an evenly lit hand."""
-SIGMA_CAST = 0.07
+SIGMA_CAST = 0.15
 """Expected logarithms of red over green and blue over green: the photo's colour cast."""
 
 
