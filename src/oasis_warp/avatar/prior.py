@@ -20,7 +20,7 @@ SIGMA_COLOR = 0.05
 """Expected difference of a lit hand from its region colours [sRGB]."""
 SIGMA_EXPOSURE = 0.25
 """Expected logarithm of the photo's brightness over that of an evenly lit hand."""
-SIGMA_CAST = 0.15
+SIGMA_CAST = 0.22
 """Expected logarithms of red over green and blue over green: the photo's colour cast."""
 
 
