@@ -1,3 +1,4 @@
+import jaxtyping
 import pytest
 import torch
 
@@ -19,6 +20,15 @@ def pytest_collection_modifyitems(config, items):
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request):
     return torch.device(request.param)
+
+
+@pytest.fixture
+def as_shipped():
+    """Run without the shape checks of the test hook, which would fire before our own messages."""
+    was = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", was)
 
 
 @pytest.fixture(scope="session")

@@ -16,3 +16,9 @@ JACOBIAN_LIMIT = 0.3
 """x/z and y/z are clamped to the image plus this share of tan(half the field of view), in the Jacobian only."""
 EPS2D = 0.3
 """Variance added to both image axes [px^2]: the default low-pass."""
+BOX_SLACK = 1e-3
+"""Added to a Gaussian's box, relative and in pixels, so that rounding in the blending cannot reach outside it."""
+CUT_SLACK = 1e-3
+"""Added to the exponent beyond which a layer must be fainter than ALPHA_MIN; the exact test follows."""
+CHANNELS = (1, 3, 4, 8, 16, 32)
+"""Channel counts that blending kernels are built for; others are padded with zeros up to the next."""

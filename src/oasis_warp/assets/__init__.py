@@ -5,5 +5,5 @@ from importlib.resources.abc import Traversable
 
 
 def asset(*parts: str) -> Traversable:
-    """A bundled file, e.g. `asset("hand", "hand_right.npz")`; open it, or use `importlib.resources.as_file` for a path."""
+    """A bundled file, e.g. `asset("hand", "hand_right.npz")`; `importlib.resources.as_file` gives a path."""
     return resources.files(__package__).joinpath(*parts)

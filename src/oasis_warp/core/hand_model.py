@@ -1,7 +1,8 @@
 """`HandModel`: the skinned, shape-adjustable surface that every stage shares. Data only; `oasis_warp.hand` loads it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -59,3 +60,12 @@ class HandModel:
     nail: Float[Tensor, "V"]
     """1 on a nail, 0 off it."""
     licence: str
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "HandModel":
+        """The same hand on another device, its real numbers in another precision; indices stay int64."""
+        moved = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                moved[field.name] = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+        return replace(self, **moved)

@@ -74,7 +74,7 @@ class PosedHand(NamedTuple):
 
 
 class HandFit(NamedTuple):
-    """One hand of a photo, explained by the model. Everything here is in the photo's own frame, a left hand included."""
+    """One hand of a photo, explained by the model. All in the photo's own frame, a left hand included."""
 
     side: Side
     shape: Float[Tensor, "S"]
@@ -95,6 +95,23 @@ class HandFit(NamedTuple):
     """Of the least-squares fit; sums squared residuals in units of their sigmas."""
     warnings: tuple[str, ...]
     """What makes this fit doubtful, in words; empty when nothing does."""
+
+
+class Evidence(NamedTuple):
+    """What a prior may look at to guess the whole hand; a left hand has been mirrored."""
+
+    image: Float[Tensor, "S S 3"]
+    """Square crop around the hand."""
+    mask: Float[Tensor, "S S"]
+    """Share of each pixel that is hand."""
+    above_wrist: Float[Tensor, "S S"]
+    """1 on the hand's side of the wrist line: below it mask and surface end at different places."""
+    camera: Camera
+    """Of the crop."""
+    rest: PosedHand
+    """The fitted surface at rest."""
+    posed: PosedHand
+    """The fitted surface in the photo's pose, in the world of `camera`."""
 
 
 class Gaussians(NamedTuple):

@@ -49,7 +49,7 @@ def bundled_hand() -> HandModel:
         pose_limits=real(arrays["pose_limits"]),
         rest_bend=real(arrays["rest_bend"]),
         keypoint_index=whole(arrays["kp21"]),
-        corrective_basis=torch.zeros(n_vertices, 3, 0),
+        corrective_basis=real(subdivide(arrays["correctives"])),
         uv=real(arrays["hd_uv"]),
         uv_faces=whole(arrays["hd_uv_faces"]),
         rim=whole(arrays["hd_loop"]),

@@ -1,9 +1,11 @@
 """Everything between a torch tensor and a Warp launch: start Warp, view tensors, device and stream, launch."""
 
 import functools
+import itertools
 import os
 import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import warp as wp
 from torch import Tensor
 
 _start_lock = threading.Lock()
+_load_lock = threading.Lock()
 _started = False
 
 VEC2 = {torch.float32: wp.vec2f, torch.float64: wp.vec2d}
@@ -37,7 +40,7 @@ def start() -> None:
     with _start_lock:
         if _started:
             return
-        wp.config.quiet = True
+        wp.config.log_level = wp.LOG_WARNING
         wp.config.kernel_cache_dir = str(kernel_cache())
         wp.init()
         _started = True
@@ -60,7 +63,7 @@ def device_and_stream(tensor: Tensor) -> tuple["wp.Device", "wp.Stream | None"]:
 
 
 def view(tensor: Tensor, dtype: Any = None) -> Any:
-    """`tensor` (contiguous) as a Warp array over the same memory; `dtype` e.g. `VEC3[tensor.dtype]` folds the last axis."""
+    """`tensor` (contiguous) as a Warp array over the same memory; a vector `dtype` folds the last axis."""
     start()
     assert tensor.is_contiguous(), "operators make their tensors contiguous before the launch"
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=False)
@@ -72,3 +75,44 @@ def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], like: T
         return
     device, stream = device_and_stream(like)
     wp.launch(kernel, dim=dim, inputs=list(inputs), device=device, stream=stream, block_dim=block_dim)
+
+
+@functools.cache
+def _pool(process: int, n_threads: int) -> ThreadPoolExecutor:
+    # Keyed by the process: threads do not survive a fork, and a pool without its threads would wait for ever.
+    return ThreadPoolExecutor(n_threads, thread_name_prefix="oasis_warp")
+
+
+def even_cuts(n: int, least: int = 2048) -> list[int]:
+    """Bounds 0 .. n of ranges for `launch_ranges`: one a thread, but none with fewer than `least` tasks."""
+    parts = max(1, min(torch.get_num_threads(), n // least))
+    return [n * k // parts for k in range(parts + 1)]
+
+
+def launch_ranges(
+    kernel: Any, cuts: Sequence[int], inputs: Sequence[Any], like: Tensor, lanes: int | None = None
+) -> None:
+    """Launch `kernel(first, *inputs)` over the tasks 0 .. cuts[-1]; thread t does task first + t.
+
+    On the CPU, where a launch is one loop on the calling thread with the GIL released, the ranges between `cuts` are
+    shared out over `torch.get_num_threads()` threads. A task must write only what is its own; then results do not
+    depend on the cuts. On CUDA it is one launch. With `lanes` the launch has a second axis of that size.
+    """
+    device, stream = device_and_stream(like)
+    if device.is_cuda:
+        cuts = [0, cuts[-1]]
+    ranges = [(a, b) for a, b in itertools.pairwise(cuts) if b > a]
+
+    def run(bounds: tuple[int, int]) -> None:
+        first, end = bounds
+        dim = end - first if lanes is None else (end - first, lanes)
+        wp.launch(kernel, dim=dim, inputs=[first, *inputs], device=device, stream=stream, block_dim=256)
+
+    n_threads = min(torch.get_num_threads(), len(ranges))
+    if device.is_cuda or n_threads < 2:
+        for bounds in ranges:
+            run(bounds)
+        return
+    with _load_lock:  # threads that meet at an unbuilt kernel would each build it
+        kernel.module.load(device, 1)
+    list(_pool(os.getpid(), n_threads).map(run, ranges))

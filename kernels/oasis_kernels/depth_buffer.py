@@ -1,0 +1,321 @@
+"""Depth buffer of a triangle mesh with face ids, and visibility of points against it.
+
+`camera_points` (one thread a vertex) -> `face_boxes` (one thread a face) -> `fill_rows` on the CPU (a serial loop over
+the faces, restricted to a strip of rows, so that strips can run on several threads) or `fill_faces` on CUDA (one
+thread a face) -> `interpolate` (one thread a pixel) and `visibility` (one thread a point).
+
+A pixel's ray is p(z) = z (u, v, 1) with u = (x - cx) / fx, v = (y - cy) / fy. Sheared along it, a corner (X, Y, Z) in
+camera axes lands at (X - u Z, Y - v Z) and the ray at the origin; with 2D cross products w_a = b x c, w_b = c x a,
+w_c = a x b of the sheared corners, the ray hits where the three agree in sign. The hit has the barycentrics
+w / (w_a + w_b + w_c), perspective correct as they stand. Nothing is divided by a vertex's depth, so a triangle may pass
+through the camera's plane and needs no clipping (Olano and Greer, "Triangle scan conversion using 2D homogeneous
+coordinates", 1997); the near test is made a pixel.
+
+No ray slips between faces (Woop, Benthin and Wald, "Watertight ray/triangle intersection", 2013): a corner lands at the
+same rounded place for each of its faces, rounding never swaps the order of the two products of w, so its sign is right
+or it is zero, and zero counts as inside. A fused multiply-add would break that, hence `fuse_fp`, off on both back ends.
+
+Arithmetic is float64 whatever the arrays hold: the products cancel as (distance / edge)^2, and a hand a few metres away
+would lose its edges in float32. Scalar code is as fast in either.
+"""
+
+from typing import Any
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+BOX_MARGIN = wp.constant(wp.float64(1e-3))
+"""Pixels added round a projected triangle, so that rounding of the box never decides about a pixel on an edge."""
+EDGE_ON = wp.constant(wp.float64(1e-13))
+"""A ray within this sine of the triangle's plane misses it; float64 rounding of a unit normal, with a margin of 500."""
+ZERO = wp.constant(wp.float64(0.0))
+HALF = wp.constant(wp.float64(0.5))
+ONE = wp.constant(wp.float64(1.0))
+
+
+@wp.struct
+class Triangle:
+    """Corners in camera axes."""
+
+    a: wp.vec3d
+    b: wp.vec3d
+    c: wp.vec3d
+    flat: wp.float64  # |w_a + w_b + w_c| up to here counts as edge-on
+
+
+@wp.func
+def camera_point(points: wp.array2d[Any], i: int, viewmat: wp.array2d[Any]) -> wp.vec3d:
+    """Point `i` in camera axes."""
+    x = wp.float64(points[i, 0])
+    y = wp.float64(points[i, 1])
+    z = wp.float64(points[i, 2])
+    p = wp.vec3d()
+    for k in range(3):
+        p[k] = (
+            wp.float64(viewmat[k, 0]) * x
+            + wp.float64(viewmat[k, 1]) * y
+            + wp.float64(viewmat[k, 2]) * z
+            + wp.float64(viewmat[k, 3])
+        )
+    return p
+
+
+@wp.func
+def pixel_of(p: wp.vec3d, K: wp.array2d[Any]) -> wp.vec2d:
+    """Image coordinates of a point in front of the camera [px]."""
+    u = wp.float64(K[0, 0]) * p[0] / p[2] + wp.float64(K[0, 2])
+    v = wp.float64(K[1, 1]) * p[1] / p[2] + wp.float64(K[1, 2])
+    return wp.vec2d(u, v)
+
+
+@wp.func
+def pixel_rays(K: wp.array2d[Any]) -> wp.vec4d:
+    """Where rays are at depth one: the ray of pixel (x, y) at (r0 + x r2, r1 + y r3)."""
+    du = ONE / wp.float64(K[0, 0])
+    dv = ONE / wp.float64(K[1, 1])
+    return wp.vec4d((HALF - wp.float64(K[0, 2])) * du, (HALF - wp.float64(K[1, 2])) * dv, du, dv)
+
+
+@wp.func
+def pixel_ray(x: int, y: int, rays: wp.vec4d) -> wp.vec2d:
+    return wp.vec2d(rays[0] + wp.float64(x) * rays[2], rays[1] + wp.float64(y) * rays[3])
+
+
+@wp.func
+def triangle(f: int, faces: wp.array2d[wp.int32], vertices: wp.array[wp.vec3d]) -> Triangle:
+    tri = Triangle()
+    tri.a = vertices[faces[f, 0]]
+    tri.b = vertices[faces[f, 1]]
+    tri.c = vertices[faces[f, 2]]
+    tri.flat = EDGE_ON * wp.length(wp.cross(tri.b - tri.a, tri.c - tri.a))
+    return tri
+
+
+@wp.func
+def sheared(p: wp.vec3d, ray: wp.vec2d) -> wp.vec2d:
+    return wp.vec2d(p[0] - ray[0] * p[2], p[1] - ray[1] * p[2])
+
+
+@wp.func
+def cross2(p: wp.vec2d, q: wp.vec2d) -> wp.float64:
+    return p[0] * q[1] - p[1] * q[0]
+
+
+@wp.func
+def barycentrics(tri: Triangle, ray: wp.vec2d) -> wp.vec3d:
+    """Barycentrics of the point that the ray hits, edges included, from either side; all zero for a miss."""
+    a = sheared(tri.a, ray)
+    b = sheared(tri.b, ray)
+    c = sheared(tri.c, ray)
+    wa = cross2(b, c)
+    wb = cross2(c, a)
+    wc = cross2(a, b)
+    inside = (wa >= ZERO and wb >= ZERO and wc >= ZERO) or (wa <= ZERO and wb <= ZERO and wc <= ZERO)
+    # Inside, the three have one sign: the sum loses nothing.
+    total = wa + wb + wc
+    if not inside or wp.abs(total) <= tri.flat:
+        return wp.vec3d(ZERO, ZERO, ZERO)
+    return wp.vec3d(wa / total, wb / total, wc / total)
+
+
+@wp.func
+def depth_at(tri: Triangle, ray: wp.vec2d) -> wp.float64:
+    """Depth of the point that the ray hits; 0 for a miss, which is not beyond any near plane."""
+    w = barycentrics(tri, ray)
+    return w[0] * tri.a[2] + w[1] * tri.b[2] + w[2] * tri.c[2]
+
+
+@wp.kernel
+def camera_points(points: wp.array2d[Any], viewmat: wp.array2d[Any], out: wp.array[wp.vec3d]):
+    i = wp.tid()
+    out[i] = camera_point(points, i, viewmat)
+
+
+@wp.kernel
+def face_boxes(
+    vertices: wp.array[wp.vec3d],
+    faces: wp.array2d[wp.int32],
+    K: wp.array2d[Any],
+    width: int,
+    height: int,
+    near: wp.float64,
+    boxes: wp.array[wp.vec4i],  # first column, last column, first row, last row; empty when first > last
+):
+    f = wp.tid()
+    n_near = wp.int32(0)
+    for k in range(3):
+        if vertices[faces[f, k]][2] <= near:
+            n_near += 1
+    if n_near == 3:
+        boxes[f] = wp.vec4i(0, -1, 0, -1)
+        return
+    if n_near > 0:
+        # Part of the triangle is nearer than the near plane: its image has no simple bound.
+        boxes[f] = wp.vec4i(0, width - 1, 0, height - 1)
+        return
+    a = pixel_of(vertices[faces[f, 0]], K)
+    b = pixel_of(vertices[faces[f, 1]], K)
+    c = pixel_of(vertices[faces[f, 2]], K)
+    low = wp.min(a, wp.min(b, c))
+    high = wp.max(a, wp.max(b, c))
+    # Clamped as floats: the conversion of a huge float to an integer is undefined.
+    w = wp.float64(width)
+    h = wp.float64(height)
+    x0 = wp.clamp(wp.ceil(low[0] - BOX_MARGIN - HALF), ZERO, w)
+    x1 = wp.clamp(wp.floor(high[0] + BOX_MARGIN - HALF), -ONE, w - ONE)
+    y0 = wp.clamp(wp.ceil(low[1] - BOX_MARGIN - HALF), ZERO, h)
+    y1 = wp.clamp(wp.floor(high[1] + BOX_MARGIN - HALF), -ONE, h - ONE)
+    boxes[f] = wp.vec4i(int(x0), int(x1), int(y0), int(y1))
+
+
+@wp.kernel
+def fill_rows(
+    first_row: int,
+    last_row: int,
+    vertices: wp.array[wp.vec3d],
+    faces: wp.array2d[wp.int32],
+    boxes: wp.array[wp.vec4i],
+    K: wp.array2d[Any],
+    near: wp.float64,
+    depth: wp.array2d[wp.float64],  # +inf on entry
+    face_ids: wp.array2d[wp.int32],  # -1 on entry
+):
+    """One thread for rows `first_row` to `last_row`; faces in order, so that a tie stays with the smaller id."""
+    rays = pixel_rays(K)
+    for f in range(faces.shape[0]):
+        box = boxes[f]
+        y0 = wp.max(box[2], first_row)
+        y1 = wp.min(box[3], last_row)
+        if y0 <= y1 and box[0] <= box[1]:
+            tri = triangle(f, faces, vertices)
+            for y in range(y0, y1 + 1):
+                for x in range(box[0], box[1] + 1):
+                    z = depth_at(tri, pixel_ray(x, y, rays))
+                    if z > near and z < depth[y, x]:
+                        depth[y, x] = z
+                        face_ids[y, x] = f
+
+
+@wp.kernel
+def fill_faces(
+    stage: int,
+    vertices: wp.array[wp.vec3d],
+    faces: wp.array2d[wp.int32],
+    boxes: wp.array[wp.vec4i],
+    K: wp.array2d[Any],
+    near: wp.float64,
+    depth: wp.array2d[wp.float64],  # +inf on entry
+    face_ids: wp.array2d[wp.uint32],  # -1 as unsigned on entry: the largest id
+):
+    """Stage 0 finds the depths, stage 1 the smallest face at that depth.
+
+    Both are minima, so the order of the threads does not matter; both are this one kernel, so that the depths of the
+    two stages are the same to the bit.
+    """
+    f = wp.tid()
+    box = boxes[f]
+    if box[0] > box[1] or box[2] > box[3]:
+        return
+    rays = pixel_rays(K)
+    tri = triangle(f, faces, vertices)
+    for y in range(box[2], box[3] + 1):
+        for x in range(box[0], box[1] + 1):
+            z = depth_at(tri, pixel_ray(x, y, rays))
+            if z > near:
+                if stage == 0:
+                    wp.atomic_min(depth, y, x, z)
+                elif z == depth[y, x]:
+                    wp.atomic_min(face_ids, y, x, wp.uint32(f))
+
+
+@wp.kernel
+def interpolate(
+    vertices: wp.array[wp.vec3d],
+    faces: wp.array2d[wp.int32],
+    K: wp.array2d[Any],
+    face_ids: wp.array2d[wp.int32],
+    out: wp.array3d[Any],  # height, width, 3; zero on entry
+):
+    """Barycentrics of every covered pixel."""
+    y, x = wp.tid()
+    f = face_ids[y, x]
+    if f >= 0:
+        b = barycentrics(triangle(f, faces, vertices), pixel_ray(x, y, pixel_rays(K)))
+        for k in range(3):
+            out[y, x, k] = out.dtype(b[k])
+
+
+@wp.func
+def shows_vertex(
+    x: int, y: int, vertex: int, faces: wp.array2d[wp.int32], face_ids: wp.array2d[wp.int32]
+) -> wp.bool:
+    """Whether one of the 3 x 3 pixels round (x, y) shows a face with the given corner."""
+    for v in range(wp.max(y - 1, 0), wp.min(y + 2, face_ids.shape[0])):
+        for u in range(wp.max(x - 1, 0), wp.min(x + 2, face_ids.shape[1])):
+            f = face_ids[v, u]
+            if f >= 0:
+                if faces[f, 0] == vertex or faces[f, 1] == vertex or faces[f, 2] == vertex:
+                    return True
+    return False
+
+
+@wp.kernel
+def visibility(
+    points: wp.array2d[Any],
+    point_vertices: wp.array[wp.int32],  # empty: no point is known to be a vertex
+    faces: wp.array2d[wp.int32],
+    viewmat: wp.array2d[Any],
+    K: wp.array2d[Any],
+    near: wp.float64,
+    tau: wp.float64,
+    margin: wp.float64,
+    depth: wp.array2d[wp.float64],
+    face_ids: wp.array2d[wp.int32],
+    out: wp.array[Any],  # zero on entry
+    slope: wp.array[Any],  # derivative of `out` with respect to the point's depth; zero on entry
+):
+    i = wp.tid()
+    p = camera_point(points, i, viewmat)
+    if p[2] <= near:
+        return
+    uv = pixel_of(p, K)
+    inside = (
+        uv[0] >= ZERO
+        and uv[1] >= ZERO
+        and uv[0] < wp.float64(face_ids.shape[1])
+        and uv[1] < wp.float64(face_ids.shape[0])
+    )
+    if not inside:
+        return
+    x = int(uv[0])
+    y = int(uv[1])
+    if face_ids[y, x] < 0:
+        out[i] = out.dtype(ONE)
+        return
+    if point_vertices.shape[0] > 0:
+        if point_vertices[i] >= 0:
+            if shows_vertex(x, y, point_vertices[i], faces, face_ids):
+                out[i] = out.dtype(ONE)
+                return
+    # The logistic function as a tanh: it saturates without an overflow.
+    t = wp.tanh(HALF * (depth[y, x] - p[2] + margin) / tau)
+    out[i] = out.dtype(HALF + HALF * t)
+    slope[i] = slope.dtype(-(ONE - t * t) * HALF * HALF / tau)
+
+
+for real in (wp.float32, wp.float64):
+    wp.overload(camera_points, {"points": wp.array2d[real], "viewmat": wp.array2d[real]})
+    for kernel in (face_boxes, fill_rows, fill_faces):
+        wp.overload(kernel, {"K": wp.array2d[real]})
+    wp.overload(interpolate, {"K": wp.array2d[real], "out": wp.array3d[real]})
+    wp.overload(
+        visibility,
+        {
+            "points": wp.array2d[real],
+            "viewmat": wp.array2d[real],
+            "K": wp.array2d[real],
+            "out": wp.array[real],
+            "slope": wp.array[real],
+        },
+    )

@@ -1,0 +1,108 @@
+"""Place canonical Gaussians: one flat Gaussian a vertex, one a face, oriented along the surface."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from oasis_warp.core import rotation, surface
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import CanonicalGaussians, PosedHand
+
+VERTEX_SPREAD = 0.75
+"""Standard deviation of a vertex Gaussian over the radius of a disc of the vertex's area: neighbours blend at 60 %."""
+FACE_SPREAD = 1.5
+"""Standard deviations of a face Gaussian over those of a uniform triangle."""
+THICKNESS = 0.25
+"""Standard deviation across the surface over the smaller one along it."""
+MIN_SCALE = 1e-4
+"""Smallest standard deviation [m], for slivers."""
+MAX_ANISOTROPY = 3.0
+"""Largest over smallest standard deviation along the surface, for slivers."""
+OPACITY = 0.95
+RIM_FADE = 0.008
+"""The last stretch before the open wrist, over which opacity falls to nothing [m]."""
+MIN_OPACITY = 1 / 255
+"""Fainter Gaussians are never drawn, so they are left out."""
+
+
+class Anchors(NamedTuple):
+    """Canonical Gaussians without colour; fields as in `CanonicalGaussians`."""
+
+    vertex_index: Int[Tensor, "P"]
+    face_index: Int[Tensor, "Q"]
+    barycentrics: Float[Tensor, "Q 3"]
+    quats: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
+    opacities: Float[Tensor, "N"]
+
+    def with_colors(self, colors: Float[Tensor, "N 3"]) -> CanonicalGaussians:
+        """Complete canonical Gaussians that sit exactly on the surface."""
+        offsets = torch.zeros(len(self.vertex_index), 3, dtype=self.scales.dtype, device=self.scales.device)
+        return CanonicalGaussians(self.vertex_index, offsets, *self[1:], colors)
+
+
+def surface_frames(normals: Float[Tensor, "N 3"], along: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:
+    """Quaternions of frames with z along `normals` and x along `along`, made perpendicular to it."""
+    x = normalize(along - (along * normals).sum(-1, keepdim=True) * normals, dim=-1)
+    return rotation.from_matrix(torch.stack([x, torch.linalg.cross(normals, x), normals], dim=-1))
+
+
+def _vertex_shapes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    normals = surface.vertex_normals(vertices, faces)
+    spread = VERTEX_SPREAD * (surface.vertex_areas(vertices, faces) / math.pi).sqrt().clamp_min(MIN_SCALE)
+    scales = torch.stack([spread, spread, THICKNESS * spread], dim=-1)
+    axis = torch.eye(3, dtype=vertices.dtype, device=vertices.device)[normals.abs().argmin(-1)]
+    return surface_frames(normals, axis), scales
+
+
+def _face_shapes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Principal axes of each triangle as a uniform plate: covariance (1/12) sum (v - c)(v - c)^T."""
+    normals, _ = surface.face_normals(vertices, faces)
+    corners = vertices[faces]
+    arms = corners - corners.mean(1, keepdim=True)
+    variance, axes = torch.linalg.eigh(arms.transpose(1, 2) @ arms / 12)  # ascending: across, short, long
+    long, short = variance[:, 2].clamp_min(0).sqrt(), variance[:, 1].clamp_min(0).sqrt()
+    long = (FACE_SPREAD * long).clamp_min(MIN_SCALE)
+    short = torch.maximum(FACE_SPREAD * short, long / MAX_ANISOTROPY).clamp_min(MIN_SCALE)
+    scales = torch.stack([long, short, THICKNESS * short], dim=-1)
+    return surface_frames(normals, axes[:, :, 2]), scales
+
+
+def _rim_opacity(hand: HandModel, vertices: Tensor) -> Tensor:
+    distance = torch.cdist(vertices, vertices[hand.rim.to(vertices.device)]).amin(1)
+    fade = (distance / RIM_FADE).clamp(0, 1)
+    return OPACITY * fade * fade * (3 - 2 * fade)
+
+
+def place_anchors(hand: HandModel, rest: PosedHand) -> Anchors:
+    """Up to V + F Gaussians on the surface `rest`, vertices first; those that the wrist's fade hides are left out."""
+    vertices, faces = rest.vertices, hand.faces.to(rest.vertices.device)
+    opacity = _rim_opacity(hand, vertices)
+    face_opacity = opacity[faces].mean(1)
+    keep_vertex = torch.nonzero(opacity >= MIN_OPACITY)[:, 0]
+    keep_face = torch.nonzero(face_opacity >= MIN_OPACITY)[:, 0]
+    vertex_quats, vertex_scales = _vertex_shapes(vertices, faces)
+    face_quats, face_scales = _face_shapes(vertices, faces)
+    third = torch.full((len(keep_face), 3), 1 / 3, dtype=vertices.dtype, device=vertices.device)
+    return Anchors(
+        vertex_index=keep_vertex,
+        face_index=keep_face,
+        barycentrics=third,
+        quats=torch.cat([vertex_quats[keep_vertex], face_quats[keep_face]]),
+        scales=torch.cat([vertex_scales[keep_vertex], face_scales[keep_face]]),
+        opacities=torch.cat([opacity[keep_vertex], face_opacity[keep_face]]),
+    )
+
+
+def vertex_to_gaussians(
+    values: Float[Tensor, "V D"], faces: Int[Tensor, "F 3"], anchors: Anchors | CanonicalGaussians
+) -> Float[Tensor, "N D"]:
+    """A field over the vertices, read at every Gaussian."""
+    # index_select and not values[...]: its gradient adds in a fixed order, so equal seeds give equal bits
+    corners = values.index_select(0, faces[anchors.face_index].flatten()).unflatten(0, (-1, 3))
+    on_faces = (corners * anchors.barycentrics[..., None]).sum(1)
+    return torch.cat([values.index_select(0, anchors.vertex_index), on_faces])

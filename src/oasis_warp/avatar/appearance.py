@@ -1,0 +1,88 @@
+"""Mean appearance of a hand by region: palm, back, finger tips, knuckles, creases and nails, for any skin tone."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.avatar.skin_tone import skin_color
+from oasis_warp.core import surface
+from oasis_warp.core.hand_model import HandModel
+
+BLOOD_MEAN = 0.0125
+"""Blood share of the back of the hand; one value serves the whole range of tones."""
+PALM_SMOOTHING = 5
+"""Passes over the mesh that soften the border between palm and back."""
+NAIL_WHITE = 0.14
+"""Share of white that the nail plate adds."""
+NAIL_RIM_SHADE = 0.25
+"""How much darker the fold around the nail is."""
+
+
+class Regions(NamedTuple):
+    """Where things are on the surface, each in [0, 1]."""
+
+    palm: Float[Tensor, "V"]
+    finger_tip: Float[Tensor, "V"]
+    knuckle: Float[Tensor, "V"]
+    crease: Float[Tensor, "V"]
+    nail: Float[Tensor, "V"]
+
+
+def _smoothstep(x: Tensor, low: float, high: float) -> Tensor:
+    t = ((x - low) / (high - low)).clamp(0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def _bump(x: Tensor, center: float, width: float) -> Tensor:
+    return torch.exp(-(((x - center) / width) ** 2))
+
+
+def label_regions(hand: HandModel) -> Regions:
+    """Soft region labels from the model's bone coordinates."""
+    edges = surface.mesh_edges(hand.faces)
+    toward_palm = 0.5 - 0.5 * torch.cos(hand.bone_theta)
+    palm = surface.smooth_over_mesh(toward_palm[:, None], edges, PALM_SMOOTHING)[:, 0]
+    palm = _smoothstep(palm, 0.36, 0.74)
+    level = torch.where(hand.segment == 0, 0, (hand.segment - 1) % 3 + 1)  # 0 hand, 1 to 3 along a finger
+    on_finger = level > 0
+    tip = torch.where(level == 3, _smoothstep(hand.bone_t, 0.35, 0.8), 0)
+    at_joint = torch.where(on_finger, _bump(hand.bone_t, 0.0, 0.16), 0) + torch.where(
+        (level == 1) | (level == 2), _bump(hand.bone_t, 1.0, 0.16), 0
+    )
+    knuckle = at_joint.clamp(max=1) * (1 - palm)
+    bent = level >= 2
+    crease = torch.where(bent, _bump(hand.bone_t, 0.0, 0.05), 0) + torch.where(
+        (level == 1) | (level == 2), _bump(hand.bone_t, 1.0, 0.05), 0
+    )
+    crease = (crease + torch.where(level == 1, _bump(hand.bone_t, 0.52, 0.05), 0)).clamp(max=1) * palm
+    soften = surface.smooth_over_mesh(torch.stack([tip, knuckle, crease], -1), edges, 1)
+    return Regions(palm, *soften.unbind(-1), _smoothstep(hand.nail, 0.3, 0.7))
+
+
+def region_colors(regions: Regions, melanin: float) -> Float[Tensor, "V 3"]:
+    """Evenly lit sRGB colours of a hand whose back has the given `melanin` share.
+
+    Palms hold about a third of the melanin of backs, and light ones no less: the difference grows with the tone.
+    """
+    palm, tip, knuckle, crease, nail = regions
+    palm_melanin = min(0.6 * melanin, 0.006 + 0.33 * melanin)
+    log_melanin = (1 - palm) * math.log(melanin * 1.15) + palm * math.log(palm_melanin)
+    amount = log_melanin.exp() * (1 + 0.3 * knuckle + 0.25 * crease)
+    blood = BLOOD_MEAN * (1 + 0.35 * palm + 0.9 * tip * (0.4 + 0.6 * palm) + 0.7 * knuckle + 0.4 * crease)
+    skin = skin_color(amount, blood)
+    bed = skin_color((log_melanin.exp() * 0.5), torch.full_like(blood, 1.9 * BLOOD_MEAN))
+    nails = (1 - NAIL_WHITE) * bed + NAIL_WHITE
+    shade = 1 - 0.10 * crease - 0.04 * knuckle - NAIL_RIM_SHADE * 4 * nail * (1 - nail)
+    return ((1 - nail[:, None]) * skin + nail[:, None] * nails) * shade[:, None]
+
+
+REGION_NAMES = ("palm", "back", "nail")
+
+
+def region_masks(regions: Regions) -> dict[str, Float[Tensor, "V"]]:
+    """Weights that split the surface into `REGION_NAMES`, for statistics."""
+    skin = 1 - regions.nail
+    return {"palm": regions.palm * skin, "back": (1 - regions.palm) * skin, "nail": regions.nail}

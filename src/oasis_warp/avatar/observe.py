@@ -1,0 +1,55 @@
+"""What a photo says about points of the posed surface: their colours, and how far to trust them."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import grid_sample, max_pool2d, normalize
+
+from oasis_warp.core import surface
+from oasis_warp.core.camera import project
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import Evidence
+from oasis_warp.ops import depth_visibility
+
+RIM_PIXELS = 2
+"""Pixels inside the mask's border that may hold some background."""
+GRAZING, FACING = 0.15, 0.45
+"""Cosines between the normal and the view below which a point says nothing and above which it is fully trusted."""
+
+
+class Observation(NamedTuple):
+    """Colours read off the photo at the vertices of the surface."""
+
+    colors: Float[Tensor, "V 3"]
+    confidence: Float[Tensor, "V"]
+    """0 unseen, 1 seen well: visible, facing the camera and clear of the mask's border."""
+
+
+def inner_mask(mask: Float[Tensor, "S S"], pixels: int = RIM_PIXELS) -> Float[Tensor, "S S"]:
+    """The mask without its outermost `pixels`."""
+    return -max_pool2d(-mask[None, None], 2 * pixels + 1, stride=1, padding=pixels)[0, 0]
+
+
+def _sample(planes: Float[Tensor, "C S S"], uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N C"]:
+    size = planes.shape[-1]
+    grid = (uv / size * 2 - 1)[None, None]
+    return grid_sample(planes[None], grid, align_corners=False)[0, :, 0].T
+
+
+def observe(hand: HandModel, evidence: Evidence) -> Observation:
+    """Read the photo at every vertex, by projection and the depth buffer of the posed surface."""
+    vertices, camera = evidence.posed.vertices, evidence.camera
+    faces = hand.faces.to(vertices.device)
+    visible, _, _ = depth_visibility(
+        vertices, vertices, faces, camera.K, camera.viewmat, camera.width, camera.height
+    )
+    uv, _ = project(camera, vertices)
+    center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
+    toward = normalize(center - vertices, dim=-1)
+    facing = (surface.vertex_normals(vertices, faces) * toward).sum(-1)
+    trust = ((facing - GRAZING) / (FACING - GRAZING)).clamp(0, 1)
+    planes = torch.cat([evidence.image.permute(2, 0, 1), inner_mask(evidence.mask)[None]])
+    sampled = _sample(planes, uv)
+    return Observation(sampled[:, :3], visible * trust * sampled[:, 3].clamp(0, 1))

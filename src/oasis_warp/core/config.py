@@ -1,0 +1,54 @@
+"""Every option of the pipeline as a frozen dataclass; the text under a field is its `--help`."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptConfig:
+    """How an avatar is fitted to one photo. Defaults are the paper's (appendix B) unless a field says otherwise."""
+
+    calibration_steps: int = 100
+    """Steps of colour calibration after its closed-form start."""
+    texture_steps: int | None = None
+    """Steps of texture learning; None stops when the loss is flat, after 400 at most."""
+    weight_rgb: float = 10.0
+    """Of the mean absolute colour difference."""
+    weight_ssim: float = 1.0
+    """Of 1 - SSIM."""
+    weight_mean: float = 20.0
+    """Of the difference of the masked mean colours, in calibration."""
+    weight_std: float = 1.0
+    """Of the difference of the masked standard deviations, in calibration."""
+    weight_reference: float = 0.25
+    """Of the reference views, which hold the rest of the hand where the prior put it."""
+    reference_views: int = 7
+    """Views around the hand, 360 / (n + 1) degrees apart, the photo's own left out."""
+    seed: int = 0
+    """Of the order of the reference views."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructConfig:
+    """From a photo to an avatar."""
+
+    hand: Literal["left", "right", "largest"] | int = "largest"
+    """Which hand of the photo: a side, the largest, or a number from 0 for the best found, 1 for the next."""
+    steps: int | None = None
+    """Steps of texture learning; stops by itself when not given."""
+    seed: int = 0
+    """The same seed gives the same avatar."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""
+    size: int = 256
+    """Side of the square crop that the avatar is fitted to [px]."""
+    force: bool = False
+    """Go on with a fit that is too poor to be trusted."""
+
+
+Color = tuple[float, float, float] | Float[Tensor, "3"]
+WHITE = (1.0, 1.0, 1.0)
+BLACK = (0.0, 0.0, 0.0)

@@ -1,0 +1,58 @@
+"""Areas, normals and neighbourhoods of triangle meshes in torch."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+
+def face_normals(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+) -> tuple[Float[Tensor, "F 3"], Float[Tensor, "F"]]:
+    """Unit normals (right-hand rule; zero for a degenerate face) and areas of faces."""
+    a, b, c = vertices[faces].unbind(1)
+    cross = torch.linalg.cross(b - a, c - a)
+    double_area = cross.norm(dim=-1)
+    return cross / double_area.clamp_min(1e-30)[:, None], double_area / 2
+
+
+def scatter_to_vertices(
+    values: Float[Tensor, "F D"], faces: Int[Tensor, "F 3"], n_vertices: int
+) -> Float[Tensor, "V D"]:
+    """Sum of the values of the faces around each vertex."""
+    total = torch.zeros(n_vertices, values.shape[1], dtype=values.dtype, device=values.device)
+    for corner in range(3):
+        total.index_add_(0, faces[:, corner], values)
+    return total
+
+
+def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
+    """Unit area-weighted vertex normals."""
+    normals, areas = face_normals(vertices, faces)
+    return normalize(scatter_to_vertices(normals * areas[:, None], faces, len(vertices)), dim=-1, eps=1e-30)
+
+
+def vertex_areas(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V"]:
+    """A third of the area of the faces around each vertex."""
+    _, areas = face_normals(vertices, faces)
+    return scatter_to_vertices(areas[:, None] / 3, faces, len(vertices))[:, 0]
+
+
+def mesh_edges(faces: Int[Tensor, "F 3"]) -> Int[Tensor, "E 2"]:
+    """Every edge once, lower vertex first, sorted."""
+    pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return torch.unique(pairs.sort(dim=1).values, dim=0)
+
+
+def smooth_over_mesh(
+    values: Float[Tensor, "V D"], edges: Int[Tensor, "E 2"], passes: int
+) -> Float[Tensor, "V D"]:
+    """Mean of each vertex and its neighbours, `passes` times."""
+    ones = torch.ones(len(edges), 1, dtype=values.dtype, device=values.device)
+    both = torch.cat([edges, edges.flip(1)])
+    count = 1 + torch.zeros(len(values), 1, dtype=values.dtype, device=values.device).index_add_(
+        0, both[:, 0], torch.cat([ones, ones])
+    )
+    for _ in range(passes):
+        values = values.index_add(0, both[:, 0], values[both[:, 1]]) / count
+    return values

@@ -1,0 +1,100 @@
+"""Named hand poses, and smooth sequences of them."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.core.checks import check_choice
+from oasis_warp.core.hand_model import HandModel
+
+Finger = tuple[float, float, float, float]
+"""Flexion of a finger's three joints from the knuckle outwards, and abduction of the knuckle [degrees]."""
+
+Thumb = tuple[float, float, float, float, float]
+"""Flexion, abduction and twist of the thumb's base, flexion of its two outer joints [degrees]."""
+
+_FIST: dict[str, Finger] = {
+    "index": (70, 96, 58, 0),
+    "middle": (74, 98, 60, 0),
+    "ring": (74, 98, 60, 0),
+    "little": (72, 94, 58, 0),
+}
+
+# Flexion counts from a straight finger; abduction, and all of the thumb's base, from rest and towards the thumb.
+_THUMBS: dict[str, Thumb] = {
+    "open": (-10, 14, 0, 0, 0),
+    "relaxed": (8, -4, 0, 14, 16),
+    "fist": (24, 11, -23, 45, 45),
+    "pinch": (39, 0, -15, 16, 0),
+    "thumbs_up": (-12, 18, 0, 0, -6),
+    "victory": (28, 6, -20, 40, 45),
+    "point": (24, 8, -20, 40, 40),
+    "ok": (39, 0, -15, 16, 0),
+}
+
+_FINGERS: dict[str, dict[str, Finger]] = {
+    "open": {"index": (0, 0, 0, 8), "middle": (0, 0, 0, 2), "ring": (0, 0, 0, -4), "little": (0, 0, 0, -10)},
+    "relaxed": {
+        "index": (22, 28, 14, 0), "middle": (28, 34, 18, 0), "ring": (32, 38, 20, 0), "little": (34, 40, 20, 2),
+    },
+    "fist": _FIST,
+    "pinch": {
+        "index": (30, 60, 34, -10), "middle": (40, 40, 24, 0), "ring": (30, 30, 18, 0), "little": (22, 24, 14, 0),
+    },
+    "thumbs_up": _FIST,
+    "victory": {**_FIST, "index": (4, 4, 2, 12), "middle": (4, 4, 2, -8)},
+    "point": {**_FIST, "index": (2, 4, 2, 0)},
+    "ok": {"index": (30, 60, 34, -10), "middle": (8, 12, 6, 0), "ring": (4, 8, 4, -4), "little": (0, 4, 2, -8)},
+}  # fmt: skip
+
+POSE_NAMES = ("rest", *_FINGERS)
+
+
+def named_pose(hand: HandModel, name: str) -> Float[Tensor, "15 3"]:
+    """Joint angles [rad] of the pose called `name`, one of `POSE_NAMES`, as `HandPose.angles` wants them.
+
+    Raises:
+        ValueError: no pose has that name.
+    """
+    check_choice("name", name, POSE_NAMES)
+    degrees = torch.zeros(16, 3, dtype=torch.float64)
+    if name == "rest":
+        return degrees[1:].to(hand.pose_axes)
+    for finger, (knuckle, middle, end, abduction) in _FINGERS[name].items():
+        first = hand.joint_names.index(finger + "1")
+        degrees[first, 1] = abduction
+        degrees[first : first + 3, 0] = torch.tensor([knuckle, middle, end])
+    first = hand.joint_names.index("thumb1")
+    *base, middle, end = _THUMBS[name]
+    degrees[first] = torch.tensor(base)
+    degrees[first + 1 : first + 3, 0] = torch.tensor([middle, end])
+    angles = degrees.deg2rad()
+    angles[:, 0] -= hand.rest_bend.cpu().double()  # the table's 0 is a straight finger, the model's is the rest pose
+    return angles[1:].to(hand.pose_axes)
+
+
+def pose_sequence(
+    hand: HandModel, names: Sequence[str], frames_per_transition: int
+) -> list[Float[Tensor, "15 3"]]:
+    """Joint angles [rad] of an endless loop through the named poses, `frames_per_transition` for each one.
+
+    Frame `i * frames_per_transition` is pose `names[i]`; from there the angles ease into the next pose by half a
+    cosine, and the last pose eases into the first, so that the list can be repeated without a jump.
+
+    Raises:
+        ValueError: an unknown name, no name, or fewer than one frame a transition.
+    """
+    if not names:
+        raise ValueError("names: expected at least one pose, got none.")
+    if frames_per_transition < 1:
+        raise ValueError(f"frames_per_transition: expected 1 or more, got {frames_per_transition}.")
+    poses = [named_pose(hand, name) for name in names]
+    frames = []
+    for start, end in zip(poses, [*poses[1:], poses[0]], strict=True):
+        for frame in range(frames_per_transition):
+            blend = 0.5 - 0.5 * math.cos(math.pi * frame / frames_per_transition)
+            frames.append(torch.lerp(start, end, blend))
+    return frames

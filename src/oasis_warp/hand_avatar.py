@@ -1,0 +1,130 @@
+"""`Avatar`: one person's hand, ready to be posed and drawn. No image, network or estimator is needed."""
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.avatar.pose import mirror_gaussians, pose_gaussians
+from oasis_warp.core.checks import check_finite, check_shape
+from oasis_warp.core.config import WHITE, Color
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandPose, PosedHand, Render, Side
+from oasis_warp.data.avatar_file import load_avatar, save_avatar
+from oasis_warp.hand.skinning import mirror_points, mirror_pose, rest_hand, skin
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.render.render import render
+
+
+class Avatar:
+    """A hand made from a photo; see `oasis_warp.reconstruct`.
+
+    A left hand is stored as its mirror image (x -> -x) and mirrored after posing, so a pose means the same on both
+    sides: positive flexion closes, positive abduction goes to the thumb.
+    """
+
+    def __init__(
+        self,
+        *,
+        side: Side,
+        shape: Float[Tensor, "S"],
+        surface_offsets: Float[Tensor, "V 3"],
+        gaussians: CanonicalGaussians,
+        source_pose: HandPose,
+        source_camera: Camera,
+    ):
+        self.side: Side = side
+        self.shape = shape
+        """Shape coefficients of the hand model [standard deviations]."""
+        self.surface_offsets = surface_offsets
+        """What the photo's outline adds to the rest surface [m]."""
+        self.gaussians = gaussians
+        """Canonical, on the right-handed rest surface."""
+        self.source_pose = source_pose
+        """The pose in the photo, in the frame of `source_camera`."""
+        self.source_camera = source_camera
+        """The camera of the square crop that the avatar was fitted to."""
+        self.hand = bundled_hand().to(self.device)
+        plain = rest_hand(self.hand, shape)
+        self.rest = plain._replace(vertices=plain.vertices + surface_offsets)
+        """The right-handed surface at rest [m]."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the avatar's tensors are."""
+        return self.gaussians.colors.device
+
+    def _skin_right(self, pose: HandPose) -> PosedHand:
+        check_shape("pose.angles", pose.angles, 15, 3, hint="One row for each joint but the wrist.")
+        check_shape("pose.orientation", pose.orientation, 3, 3)
+        check_shape("pose.translation", pose.translation, 3)
+        check_finite(angles=pose.angles, orientation=pose.orientation, translation=pose.translation)
+        pose = HandPose(*(part.to(self.shape) for part in pose))
+        return skin(self.hand, self.rest, mirror_pose(pose) if self.side == "left" else pose)
+
+    def mesh(self, pose: HandPose) -> PosedHand:
+        """The surface in `pose` [m]; the faces of a left hand wind the other way.
+
+        Raises:
+            ValueError: a part of the pose has another shape or is not finite.
+        """
+        posed = self._skin_right(pose)
+        return PosedHand(*map(mirror_points, posed)) if self.side == "left" else posed
+
+    def pose(self, pose: HandPose) -> Gaussians:
+        """The Gaussians in `pose`, in the world of its orientation and translation.
+
+        Raises:
+            ValueError: a part of the pose has another shape or is not finite.
+        """
+        posed = self._skin_right(pose)
+        gaussians = pose_gaussians(self.gaussians, self.hand.faces, self.rest.vertices, posed.vertices)
+        return mirror_gaussians(gaussians) if self.side == "left" else gaussians
+
+    def render(self, camera: Camera, pose: HandPose, background: Color = WHITE) -> Render:
+        """A picture of the hand in `pose` over a plain `background`; differentiable in the pose and the camera."""
+        return render(self.pose(pose), camera, background=background)
+
+    def save(self, path: Path | str) -> None:
+        """Write the avatar file (safetensors, versioned; see docs/avatar_file.md)."""
+        camera, pose, gaussians = self.source_camera, self.source_pose, self.gaussians
+        tensors = {
+            "shape": self.shape,
+            "surface_offsets": self.surface_offsets,
+            **{f"gaussians.{name}": value for name, value in gaussians._asdict().items()},
+            **{f"source_pose.{name}": value for name, value in pose._asdict().items()},
+            "source_camera.viewmat": camera.viewmat,
+            "source_camera.K": camera.K,
+        }
+        header = {
+            "side": self.side,
+            "hand_model": self.hand.name,
+            "hand_licence": self.hand.licence,
+            "source_camera": {"width": camera.width, "height": camera.height},
+        }
+        save_avatar(Path(path), {name: value.detach().cpu() for name, value in tensors.items()}, header)
+
+    @classmethod
+    def load(cls, path: Path | str, device: torch.device | str = "cpu") -> "Avatar":
+        """Read an avatar file.
+
+        Raises:
+            InputError: not an avatar file, damaged, of a newer version, or made with another hand model.
+        """
+        tensors, header = load_avatar(Path(path))
+        if header["hand_model"] != "bundled":
+            raise InputError(f"{path}: made with the hand model {header['hand_model']!r}, which is not installed.")
+        tensors = {name: value.to(device) for name, value in tensors.items()}
+
+        def group(prefix: str) -> dict[str, Tensor]:
+            return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+
+        return cls(
+            side=header["side"],
+            shape=tensors["shape"],
+            surface_offsets=tensors["surface_offsets"],
+            gaussians=CanonicalGaussians(**group("gaussians.")),
+            source_pose=HandPose(**group("source_pose.")),
+            source_camera=Camera(**group("source_camera."), **header["source_camera"]),
+        )

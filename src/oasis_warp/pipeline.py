@@ -1,0 +1,163 @@
+"""`reconstruct`: one photo in, an avatar out. The only file that knows the order of the stages."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from oasis_warp.avatar.observe import inner_mask
+from oasis_warp.avatar.prior import MeanPrior, Prior
+from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.types import Evidence, HandFit, Landmarks, Photo
+from oasis_warp.data.crop import resample_square, square_around
+from oasis_warp.hand.estimator import HandEstimator, choose_hand
+from oasis_warp.hand.keypoints_file import read_keypoints
+from oasis_warp.hand.outline import wrist_line
+from oasis_warp.hand.skinning import mirror_pose, rest_hand, skin
+from oasis_warp.hand.surface_offsets import outline_offsets
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.losses.image import masked_psnr
+from oasis_warp.render.cameras import crop_camera, mirrored_camera
+from oasis_warp.training.adapt import adapt
+
+CROP_MARGIN = 1.12
+"""Side of the crop over the longer extent of the mask."""
+
+
+class Reconstruction(NamedTuple):
+    """An avatar and how it came about."""
+
+    avatar: Avatar
+    fit: HandFit
+    """In the photo's own frame."""
+    stages: dict[str, float]
+    """Seconds of each stage."""
+    errors: dict[str, float]
+    """What was measured: reprojection_percent, mask_iou, input_psnr_db, ..."""
+    warnings: tuple[str, ...]
+
+
+def reconstruct(
+    photo: Photo,
+    config: ReconstructConfig = ReconstructConfig(),  # noqa: B008 - frozen
+    *,
+    keypoints: Path | None = None,
+    prior: Prior | None = None,
+    progress: Progress = silent,
+) -> Reconstruction:
+    """Make an avatar of one hand of `photo`.
+
+    Args:
+        photo: From `oasis_warp.read_photo`.
+        config: Options.
+        keypoints: A JSON file with 21 landmarks, or with pose and camera, to use instead of the networks.
+        prior: What to assume of a hand before its photo is fitted; the mean appearance when not given.
+        progress: Called as work goes on.
+
+    Raises:
+        InputError: no such hand in the photo, a fit too poor to go on (see `ReconstructConfig.force`), a wrong file.
+    """
+    stages: dict[str, float] = {}
+
+    @contextmanager
+    def stage(name: str) -> Iterator[None]:
+        progress(name, 0, 1)
+        start = time.perf_counter()
+        yield
+        stages[name] = time.perf_counter() - start
+        progress(name, 1, 1)
+
+    hand = bundled_hand()
+    estimator = HandEstimator(hand)
+    with stage("landmarks"):
+        given = read_keypoints(keypoints, photo) if keypoints else choose_hand(
+            estimator.find(photo), config.hand, photo.name
+        )  # fmt: skip
+    with stage("fit"):
+        fit = estimator.fit(photo, given, force=config.force) if isinstance(given, Landmarks) else given
+    with stage("outline"):
+        offsets = outline_offsets(hand, fit)
+    with stage("crop"):
+        evidence = make_evidence(photo, fit, offsets, config)
+    with stage("prior"):
+        guess = (prior or MeanPrior(hand))(evidence)
+    with stage("adaptation"):
+        adaptation = adapt(
+            hand, guess, evidence, AdaptConfig(texture_steps=config.steps, seed=config.seed), progress
+        )
+    camera = evidence.camera
+    avatar = Avatar(
+        side=fit.side,
+        shape=fit.shape.to(evidence.image),
+        surface_offsets=offsets.to(evidence.image),
+        gaussians=adaptation.gaussians,
+        source_pose=fit.pose,
+        source_camera=mirrored_camera(camera) if fit.side == "left" else camera,
+    )
+    errors = {
+        "reprojection_percent": fit.reprojection,
+        "worst_point_percent": fit.worst_point,
+        "mask_iou": fit.mask_iou,
+        **input_errors(avatar, evidence),
+    }
+    return Reconstruction(avatar, fit, stages, errors, fit.warnings)
+
+
+def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: ReconstructConfig) -> Evidence:
+    """The square crop that avatars are fitted to, with the fitted surface in its camera; a left hand is mirrored."""
+    hand = bundled_hand()
+    image, mask, camera, pose = photo.rgb.float() / 255, fit.mask, fit.camera, fit.pose
+    if fit.side == "left":
+        image, mask = image.flip(1), mask.flip(1)
+        camera, pose = mirrored_camera(camera), mirror_pose(pose)
+    if not bool((mask > 0.5).any()):
+        raise InputError(f"{photo.name}: the mask of the hand is empty. Give --keypoints, or another photo.")
+    above = torch.from_numpy(wrist_line(fit.landmarks.xy.numpy()).above_mask((camera.width, camera.height))).float()
+    if fit.side == "left":
+        above = above.flip(1)
+    left, top, side = square_around(mask, CROP_MARGIN)
+    rest = rest_hand(hand, fit.shape)
+    rest = rest._replace(vertices=rest.vertices + offsets)
+    posed = skin(hand, rest, pose)
+    crop = crop_camera(camera, left, top, side, config.size)
+    device = torch.device(config.device)
+
+    def there(nouns):
+        return type(nouns)(*(part.to(device) for part in nouns))
+
+    def cut(plane):
+        return resample_square(plane.contiguous(), left, top, side, config.size).clamp(0, 1).to(device)
+
+    return Evidence(
+        image=cut(image),
+        mask=cut(mask),
+        above_wrist=cut(above),
+        camera=crop._replace(viewmat=crop.viewmat.to(device), K=crop.K.to(device)),
+        rest=there(rest),
+        posed=there(posed),
+    )
+
+
+@torch.no_grad()
+def input_errors(avatar: Avatar, evidence: Evidence) -> dict[str, float]:
+    """How well the avatar explains its own photo: over black, inside the mask above the wrist line, in the crop."""
+    drawn = avatar.render(avatar.source_camera, avatar.source_pose, BLACK)
+    image, alpha = drawn.image, drawn.alpha
+    if avatar.side == "left":
+        image, alpha = image.flip(1), alpha.flip(1)
+    judged = evidence.above_wrist > 0.5
+    inside = ((evidence.mask > 0.5) & judged).to(image)
+    covered = (alpha > 0.5) & judged
+    union = (covered | (inside > 0)).sum().clamp_min(1)
+    return {
+        "input_psnr_db": masked_psnr(image, evidence.image, inside),
+        "input_psnr_inner_db": masked_psnr(image, evidence.image, inner_mask(inside)),
+        "render_mask_iou": float((covered & (inside > 0)).sum() / union),
+        "n_gaussians": float(len(avatar.gaussians.opacities)),
+    }

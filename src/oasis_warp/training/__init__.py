@@ -1,0 +1,1 @@
+"""Fit an avatar to a photo."""

@@ -1,0 +1,99 @@
+"""Seeded scenes for the rasterizer's tests. All numbers are float32 numbers, so that both precisions see the same."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Scene:
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    backgrounds: Tensor
+    width: int
+    height: int
+
+    @property
+    def gaussians(self):
+        return self.means, self.quats, self.scales, self.opacities
+
+    @property
+    def tensors(self):
+        return {k: v for k, v in vars(self).items() if isinstance(v, Tensor)}
+
+    def to(self, *args, **kwargs):
+        return replace(self, **{k: v.to(*args, **kwargs) for k, v in self.tensors.items()})
+
+    def with_(self, **changes):
+        return replace(self, **changes)
+
+
+def look_from(eye, target=(0.0, 0.0, 0.0)):
+    """World-to-camera matrix in float64, y down."""
+    eye, target = torch.tensor(eye, dtype=torch.float64), torch.tensor(target, dtype=torch.float64)
+    z = torch.nn.functional.normalize(target - eye, dim=0)
+    x = torch.nn.functional.normalize(torch.linalg.cross(z, torch.tensor([0.1, -1.0, 0.2], dtype=torch.float64)), dim=0)
+    R = torch.stack([x, torch.linalg.cross(z, x), z])
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = R, -R @ eye
+    return viewmat
+
+
+def intrinsics(fx, fy, cx, cy):
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def ordinary_scene(
+    seed=0, n=60, width=37, height=29, channels=3, cameras=2, device="cpu", dtype=torch.float32, size=(0.04, 0.2)
+):
+    """A cloud of unit size, about three units away, whose Gaussians overlap in many layers."""
+    g = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape, low=0.0, high=1.0):
+        return torch.rand(*shape, generator=g, dtype=torch.float64) * (high - low) + low
+
+    eyes = [(0.3, -0.2, -3.0), (2.1, 0.4, -2.2), (-1.0, 1.5, 2.6), (0.1, -2.9, 0.4)]
+    focal = 1.1 * max(width, height)
+    scene = Scene(
+        means=uniform(n, 3, low=-0.9, high=0.9),
+        quats=torch.randn(n, 4, generator=g, dtype=torch.float64) * 2,
+        scales=uniform(n, 3, low=size[0], high=size[1]),
+        opacities=uniform(n, low=0.05, high=0.99),
+        colors=uniform(n, channels),
+        viewmats=torch.stack([look_from(eye) for eye in eyes[:cameras]]),
+        Ks=intrinsics(focal, 1.07 * focal, 0.52 * width, 0.47 * height).repeat(cameras, 1, 1),
+        backgrounds=uniform(cameras, channels),
+        width=width,
+        height=height,
+    )
+    return scene.to(torch.float32).to(device=device, dtype=dtype)
+
+
+def frontal_scene(means, scales, opacities, width=32, height=32, focal=40.0, quats=None, colors=None, seed=0):
+    """Given Gaussians before a camera at the origin that looks along z; one number for scales is squeezed a little,
+    because the gradient by the rotation of a sphere is nothing but rounding.
+    """
+    g = torch.Generator().manual_seed(seed)
+    n = len(means)
+    means = torch.as_tensor(means, dtype=torch.float64)
+    scales = torch.tensor([scales, 0.8 * scales, 0.6 * scales]) if isinstance(scales, float) else scales
+    random_quats = torch.randn(n, 4, generator=g, dtype=torch.float64)
+    random_colors = torch.rand(n, 3, generator=g, dtype=torch.float64)
+    return Scene(
+        means=means,
+        quats=random_quats if quats is None else torch.as_tensor(quats, dtype=torch.float64),
+        scales=torch.as_tensor(scales, dtype=torch.float64).expand(n, 3).clone(),
+        opacities=torch.as_tensor(opacities, dtype=torch.float64).expand(n).clone(),
+        colors=random_colors if colors is None else torch.as_tensor(colors, dtype=torch.float64),
+        viewmats=torch.eye(4, dtype=torch.float64)[None],
+        Ks=intrinsics(focal, focal, width / 2 + 0.3, height / 2 - 0.2)[None],
+        backgrounds=torch.rand(1, 3, generator=g, dtype=torch.float64),
+        width=width,
+        height=height,
+    ).to(torch.float32).to(torch.float64)

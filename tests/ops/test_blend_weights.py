@@ -1,0 +1,85 @@
+import pytest
+import torch
+from rasterization_scenes import ordinary_scene
+from reference import rasterization as twin
+
+from oasis_warp.ops import blend_colors, blend_weights, rasterization
+
+
+def weights_and_image(device, dtype, **options):
+    scene = ordinary_scene(seed=5, device=device, dtype=dtype)
+    weights = blend_weights(*scene.gaussians, scene.viewmats[0], scene.Ks[0], scene.width, scene.height, **options)
+    image, alphas, _ = rasterization(
+        *scene.gaussians, scene.colors, scene.viewmats[:1], scene.Ks[:1], scene.width, scene.height
+    )
+    return scene, weights, image[0], alphas[0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_weights_times_colors_is_the_rasterized_image(device, dtype):
+    scene, weights, image, alphas = weights_and_image(device, dtype)
+    rounding = 10 * torch.finfo(dtype).eps  # another order of the same sums
+    assert torch.allclose(blend_colors(weights, scene.colors), image, rtol=0, atol=rounding)
+    assert torch.allclose(weights.alphas, alphas, rtol=0, atol=rounding)
+
+
+def test_weights_equal_those_of_the_dense_twin(device):
+    scene, weights, *_ = weights_and_image(device, torch.float64)
+    alpha, order = twin.layers(
+        *(g.cpu() for g in scene.gaussians), scene.viewmats[0].cpu(), scene.Ks[0].cpu(), scene.width, scene.height
+    )
+    expected = torch.zeros(scene.width * scene.height, len(scene.means), dtype=torch.float64)
+    expected[:, order] = twin.blend_weights(alpha)[0]
+    assert torch.allclose(weights.matrix.to_dense().cpu(), expected, rtol=0, atol=1e-12)
+
+
+def test_the_transpose_is_the_matrix_transposed(device):
+    _, weights, *_ = weights_and_image(device, torch.float32)
+    assert torch.equal(weights.matrix.to_dense().T, weights.transpose.to_dense())
+
+
+def test_indices_are_sorted_so_that_torch_accepts_the_matrices(device):
+    _, weights, *_ = weights_and_image(device, torch.float32)
+    for m in (weights.matrix, weights.transpose):
+        torch.sparse_csr_tensor(m.crow_indices(), m.col_indices(), m.values(), m.shape, check_invariants=True)
+
+
+def test_gradient_by_the_colors_is_that_of_the_rasterizer(device):
+    scene, weights, *_ = weights_and_image(device, torch.float64)
+    colors = scene.colors.clone().requires_grad_()
+    g = torch.randn(scene.height, scene.width, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    g = g.to(device)
+    (mine,) = torch.autograd.grad(blend_colors(weights, colors), colors, g)
+    image, *_ = rasterization(
+        *scene.gaussians, colors, scene.viewmats[:1], scene.Ks[:1], scene.width, scene.height
+    )
+    (theirs,) = torch.autograd.grad(image, colors, g[None])
+    assert torch.allclose(mine, theirs, rtol=0, atol=1e-12)
+
+
+def test_tile_size_changes_no_bit(device):
+    _, a, *_ = weights_and_image(device, torch.float32, tile_size=5)
+    _, b, *_ = weights_and_image(device, torch.float32, tile_size=32)
+    assert torch.equal(a.matrix.to_dense(), b.matrix.to_dense())
+
+
+def test_no_gaussians_give_an_empty_matrix(device):
+    def empty(*s):
+        return torch.zeros(*s, device=device)
+
+    K = torch.tensor([[10.0, 0, 4], [0, 10, 4], [0, 0, 1]], device=device)
+    weights = blend_weights(empty(0, 3), empty(0, 4), empty(0, 3), empty(0), torch.eye(4, device=device), K, 8, 6)
+    assert weights.matrix.shape == (48, 0) and weights.transpose.shape == (0, 48)
+    assert torch.equal(blend_colors(weights, empty(0, 3)), empty(6, 8, 3))
+
+
+def test_colors_of_another_count_are_refused(device, as_shipped):
+    scene, weights, *_ = weights_and_image(device, torch.float32)
+    with pytest.raises(ValueError, match=r"colors: expected shape \[60, D\], got \[59, 3\]"):
+        blend_colors(weights, scene.colors[:-1])
+
+
+def test_a_batch_of_cameras_is_refused(device, as_shipped):
+    scene, *_ = weights_and_image(device, torch.float32)
+    with pytest.raises(ValueError, match=r"viewmat: expected shape \[4, 4\]"):
+        blend_weights(*scene.gaussians, scene.viewmats, scene.Ks[0], 8, 8)

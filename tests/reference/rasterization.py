@@ -1,0 +1,102 @@
+"""The rasterizer written out densely in torch: every pixel against every Gaussian, gradients by autograd.
+
+Shares no code with the kernels. Thresholds are the float32 constants of gsplat 1.5.3, spelled out again.
+"""
+
+
+import numpy as np
+import torch
+
+CAP = float(np.float32(0.999))
+FAINTEST = float(np.float32(1 / 255))
+STOP = float(np.float32(1e-4))
+
+
+def rotation_matrices(quats):
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    return torch.stack([
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ], -1).reshape(-1, 3, 3)  # fmt: skip
+
+
+def project(means, quats, scales, viewmat, K, width, height, eps2d):
+    """Centres [n, 2], rows p and q of M [n, 3] with covariance M M^T + eps2d, and depths [n], all with z > 0."""
+    R, t = viewmat[:3, :3], viewmat[:3, 3]
+    x, y, z = (means @ R.T + t).unbind(-1)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    margin_x, margin_y = 0.3 * 0.5 * width / fx, 0.3 * 0.5 * height / fy
+    u = torch.clamp(x / z, min=float(-cx / fx - margin_x), max=float((width - cx) / fx + margin_x))
+    v = torch.clamp(y / z, min=float(-cy / fy - margin_y), max=float((height - cy) / fy + margin_y))
+    zero = torch.zeros_like(z)
+    J = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).reshape(-1, 2, 3)
+    M = J @ R @ rotation_matrices(quats) * scales[:, None, :]
+    return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), M[:, 0], M[:, 1], z
+
+
+def layers(means, quats, scales, opacities, viewmat, K, width, height, near=0.01, far=1e10, eps2d=0.3, decide=True):
+    """Alphas [pixels, n] of the Gaussians `order` [n], front to back; not cut or capped unless `decide`."""
+    near, far, eps2d = (float(np.float32(v)) for v in (near, far, eps2d))
+    z = (means @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]
+    kept = ((z >= near) & (z <= far) & (opacities >= FAINTEST)).nonzero()[:, 0]
+    centre, p, q, z = project(means[kept], quats[kept], scales[kept], viewmat, K, width, height, eps2d)
+    a, b, c = (p * p).sum(-1) + eps2d, (p * q).sum(-1), (q * q).sum(-1) + eps2d
+    det = torch.linalg.cross(p, q).square().sum(-1) + eps2d * ((p * p).sum(-1) + (q * q).sum(-1)) + eps2d**2
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixels = torch.stack([columns, rows], -1).reshape(-1, 1, 2).to(means.dtype) + 0.5
+    dx, dy = (pixels - centre).unbind(-1)
+    # Cholesky solve, pivoted on the larger variance.
+    wide = a >= c
+    along, across = torch.where(wide, dx, dy), torch.where(wide, dy, dx)
+    pivot = torch.where(wide, a, c)
+    sigma = 0.5 * (along**2 / pivot + (across - b / pivot * along) ** 2 * pivot / det)
+    alpha = opacities[kept] * torch.exp(-sigma)
+    if decide:
+        alpha = torch.where(alpha >= FAINTEST, torch.clamp(alpha, max=CAP), 0)
+    order = torch.argsort(z, stable=True)
+    return alpha[:, order], kept[order]
+
+
+def blend_weights(alpha):
+    """Weights alpha T [pixels, n] and the transmittance left at the end [pixels]."""
+    after = torch.cumprod(1 - alpha, -1)
+    alpha = torch.where(after > STOP, alpha, 0)  # the layer that would end the pixel and all behind it
+    after = torch.cumprod(1 - alpha, -1)
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], -1)
+    return alpha * before, after[:, -1] if after.shape[1] else torch.ones_like(alpha.sum(-1))
+
+
+def rasterization(
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds=None, render_mode="RGB", **options
+):
+    """Images [C, H, W, X] and alphas [C, H, W, 1]."""
+    images, alphas = [], []
+    for c, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
+        alpha, order = layers(means, quats, scales, opacities, viewmat, K, width, height, **options)
+        weights, left = blend_weights(alpha)
+        seen = (colors[c] if colors.dim() == 3 else colors)[order]
+        depths = (means @ viewmat[:3, :3].T + viewmat[:3, 3])[order, 2:]
+        image = weights @ seen
+        if backgrounds is not None:
+            image = image + left[:, None] * backgrounds[c]
+        depth = weights @ depths
+        if "ED" in render_mode:
+            covered = left < 1
+            depth = torch.where(covered[:, None], depth / torch.where(covered, 1 - left, 1)[:, None], 0)
+        image = {"RGB": [image], "D": [depth], "ED": [depth]}.get(render_mode, [image, depth])
+        images.append(torch.cat(image, -1).reshape(height, width, -1))
+        alphas.append((1 - left).reshape(height, width, 1))
+    return torch.stack(images), torch.stack(alphas)
+
+
+def fragile(alpha):
+    """Pixels where a decision hangs on rounding: an alpha at the cut-off or the cap, a transmittance at the stop.
+
+    `alpha` are the undecided ones of `layers`.
+    """
+    after = torch.cumprod(1 - torch.where(alpha >= FAINTEST, alpha.clamp(max=CAP), 0), -1)
+    near_edge = torch.zeros(len(alpha), dtype=torch.bool)
+    for value, edge, width in [(alpha, FAINTEST, 3e-4), (alpha, CAP, 3e-4), (after, STOP, 2e-3)]:
+        near_edge |= ((value - edge).abs() < width * edge).any(-1)
+    return near_edge
