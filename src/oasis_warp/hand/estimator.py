@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Literal
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -11,18 +12,19 @@ from torch import Tensor
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandFit, Landmarks, Photo
-from oasis_warp.hand.fit import Fitter
-from oasis_warp.hand.fit_quality import DOUBTFUL, REFUSED, TINY_HAND, Quality, measure
+from oasis_warp.hand.doubts import finger_doubts, other_side_cost, place_doubts, second_looks, side_doubts
+from oasis_warp.hand.fit import Fitter, Solution
+from oasis_warp.hand.fit_quality import DOUBTFUL, REFUSED, TINY_HAND, Quality, draw, measure
 from oasis_warp.hand.fit_state import FitState
 from oasis_warp.hand.kinematics import Rig
 from oasis_warp.hand.landmarks import box_size, find_hands
 from oasis_warp.hand.networks import networks
 from oasis_warp.hand.outline import MaskOutline
 from oasis_warp.hand.right_view import RightView, array, real
-from oasis_warp.hand.segmentation import cut_at_wrist, mask_from_landmarks
+from oasis_warp.hand.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
 
-_ROUNDS = 4
-"""Rounds of pairing outlines with a mask."""
+_ROUNDS, _LAST_ROUNDS = 3, 2
+"""Rounds of pairing outlines with the first and the second mask."""
 
 
 class HandEstimator:
@@ -82,30 +84,46 @@ class HandEstimator:
                 "give a closer or larger photo."
             )
         view = RightView(photo, landmarks, focal)
-        fitter = Fitter(self.rig, view.evidence, shape=None if shape is None else array(shape))
+        known_shape = None if shape is None else array(shape)
+        fitter = Fitter(self.rig, view.evidence, shape=known_shape)
         start = fitter.fit_landmarks()
-        mask = self._first_mask(view, start.state)
-        outline = MaskOutline(mask, view.evidence.xy)
-        found = fitter.refine(start.state, lambda state: outline.match(self.rig, state), _ROUNDS)
+        found, mask, doubts = self._refine(view, fitter, start)
         quality = measure(self.rig, view.evidence, found.state, mask, found.cost)
-        return self._report(view, landmarks, found.state, mask, quality, force)
+        looks = second_looks(view.rgb, networks(), view.evidence.xy)
+        doubts += place_doubts(view.evidence, mask) + finger_doubts(view.evidence, looks)
+        if landmarks.world is not None:  # 21 points in the plane alone do not tell a palm from the other hand's back
+            other_cost = other_side_cost(self.rig, view.evidence, known_shape)
+            doubts += side_doubts(landmarks.side, start, other_cost, looks)
+        return self._report(view, landmarks, found.state, mask, quality, doubts, force)
 
-    def _first_mask(self, view: RightView, state: FitState) -> np.ndarray:
-        """Mask before anything but the landmarks is known."""
-        scale = state.focal / float(np.exp(state.place[2]))
-        if view.alpha is not None:
-            return cut_at_wrist(view.alpha, view.evidence.xy, scale)
-        return mask_from_landmarks(view.rgb, view.evidence.xy, scale)
+    def _refine(self, view: RightView, fitter: Fitter, start: Solution) -> tuple[Solution, np.ndarray, list[str]]:
+        """Fit to the mask's outline too: to a first mask, then to one that the fit has helped to cut."""
+        doubts = []
+        xy, scale = view.evidence.xy, start.state.focal / float(np.exp(start.state.place[2]))
+        ready = None if view.alpha is None else mask_from_alpha(view.alpha, xy, scale)
+        if view.alpha is not None and ready is None:
+            doubts.append("the photo's own cut-out was left aside: it does not show this hand alone and whole")
+        mask = mask_from_landmarks(view.rgb, xy, scale) if ready is None else ready
+        outline = MaskOutline(mask, xy)
+        found = fitter.refine(start.state, lambda state: outline.match(self.rig, state), _ROUNDS)
+        if ready is None:
+            drawn = draw(self.rig, found.state, view.evidence.size)
+            first, mask = mask, mask_from_fit(view.rgb, xy, scale, mask, drawn)
+            # Where the two cuts disagree, the photo does not say where the hand ends.
+            doubt = cv2.dilate(np.abs(mask - first), np.ones((5, 5), np.uint8))
+            outline = MaskOutline(mask, xy, trust=1 - 0.75 * doubt)
+            found = fitter.refine(found.state, lambda state: outline.match(self.rig, state), _LAST_ROUNDS)
+        return found, mask, doubts
 
     def _report(self, view: RightView, landmarks: Landmarks, state: FitState, mask: np.ndarray, quality: Quality,
-                force: bool) -> HandFit:  # fmt: skip
+                doubts: list[str], force: bool) -> HandFit:  # fmt: skip
         refused = quality.beyond(REFUSED)
         if refused and not force:
             raise InputError(
                 f"{view.name}: the fit of the {landmarks.side} hand is too poor to use, {' and '.join(refused)}; "
                 "give a sharper photo of the open hand, or force it."
             )
-        warnings = [f"poor fit: {words}" for words in quality.beyond(DOUBTFUL)]
+        warnings = [f"poor fit: {words}" for words in quality.beyond(DOUBTFUL)] + doubts
         return HandFit(
             side=landmarks.side,
             shape=real(state.shape),

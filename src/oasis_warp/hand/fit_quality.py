@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from oasis_warp.hand.fit import Evidence
+from oasis_warp.hand.evidence import Evidence
 from oasis_warp.hand.fit_state import FitState
 from oasis_warp.hand.kinematics import Rig
 from oasis_warp.hand.outline import wrist_line
@@ -64,11 +64,15 @@ class Quality:
 
 def measure(rig: Rig, evidence: Evidence, state: FitState, mask: np.ndarray, cost: float) -> Quality:
     """Compare the model in `state` with the landmarks and the mask ([H, W], mirrored like the evidence)."""
-    chain = rig.chain(state.angles, state.shape)
-    points = state.project(rig.landmarks(chain, state.shape)[0])
+    points = state.project(rig.landmarks(rig.chain(state.angles, state.shape), state.shape)[0])
     errors = np.linalg.norm(points - evidence.xy, axis=1) / evidence.box * 100
-    drawn = silhouette(state.project(rig.surface(chain, state.angles, state.shape)), rig.faces, evidence.size) > 0
-    return Quality(errors, overlap(drawn, mask > 0.5, evidence.xy), cost)
+    return Quality(errors, overlap(draw(rig, state, evidence.size) > 0, mask > 0.5, evidence.xy), cost)
+
+
+def draw(rig: Rig, state: FitState, size: tuple[int, int]) -> np.ndarray:
+    """Silhouette of the model in a photo of `size` (width, height), 0 or 255."""
+    surface = rig.surface(rig.chain(state.angles, state.shape), state.angles, state.shape)
+    return silhouette(state.project(surface), rig.faces, size)
 
 
 def overlap(drawn: np.ndarray, mask: np.ndarray, xy: np.ndarray) -> float:

@@ -1,7 +1,7 @@
 """One hand of a photo as a right hand: left ones are mirrored on the way in, and results mirrored back on the way out.
 
-With M = diag(-1, 1, 1), a left hand of pose (R, t) is the mirrored model M v; in the mirrored photo it is a right hand of
-pose (M R M, M t), and x becomes width - x.
+With M = diag(-1, 1, 1), a left hand of pose (R, t) is the mirrored model M v; in the mirrored photo it is a right hand
+of pose (M R M, M t), and x becomes width - x.
 """
 
 from typing import NamedTuple
@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo
-from oasis_warp.hand.fit import Evidence, evidence_of
+from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
+from oasis_warp.hand.evidence import Evidence, evidence_of
 from oasis_warp.hand.fit_state import FitState
 from oasis_warp.hand.kinematics import Rig
 
@@ -79,16 +79,22 @@ class FittedView(NamedTuple):
     mask: np.ndarray
 
 
-def fitted_view(rig: Rig, fit: HandFit) -> FittedView:
-    """A fit in the mirrored photo if the hand is a left one."""
-    table = np.concatenate([np.zeros((1, 3)), array(fit.pose.angles)])
-    turn, translation = array(fit.pose.orientation), array(fit.pose.translation)
-    xy, mask, K = array(fit.landmarks.xy), fit.mask.detach().cpu().numpy(), array(fit.camera.K)
+def right_state(rig: Rig, side: Side, shape: np.ndarray, pose: HandPose, camera: Camera) -> FitState:
+    """A pose and camera as the fit's state in the photo, which is mirrored for a left hand."""
+    turn, translation, K = array(pose.orientation), array(pose.translation), array(camera.K)
     centre = K[:2, 2]
-    if fit.side == "left":
+    if side == "left":
         turn, translation = _MIRROR[:, None] * turn * _MIRROR, translation * _MIRROR
-        xy, centre = mirror_points(xy, fit.camera.width), mirror_points(centre, fit.camera.width)
-        mask = np.ascontiguousarray(mask[:, ::-1])
+        centre = mirror_points(centre, camera.width)
     place = np.array([*(translation[:2] / translation[2]), np.log(translation[2])])
-    state = FitState(turn, place, table[tuple(rig.dofs.T)], array(fit.shape), float(K[0, 0]), centre)
-    return FittedView(state, table, xy, mask)
+    angles = array(pose.angles)[rig.dofs[:, 0] - 1, rig.dofs[:, 1]]
+    return FitState(turn, place, angles, shape, float(K[0, 0]), centre)
+
+
+def fitted_view(rig: Rig, fit: HandFit) -> FittedView:
+    """A fit in the photo, which is mirrored for a left hand."""
+    state = right_state(rig, fit.side, array(fit.shape), fit.pose, fit.camera)
+    xy, mask = array(fit.landmarks.xy), fit.mask.detach().cpu().numpy()
+    if fit.side == "left":
+        xy, mask = mirror_points(xy, fit.camera.width), np.ascontiguousarray(mask[:, ::-1])
+    return FittedView(state, np.concatenate([np.zeros((1, 3)), array(fit.pose.angles)]), xy, mask)

@@ -91,31 +91,37 @@ def mask_from_landmarks(rgb: np.ndarray, xy: np.ndarray, scale: float) -> np.nda
     return window.back(_cut(window, points, metre, seeds), rgb.shape[:2])
 
 
-def mask_from_silhouette(rgb: np.ndarray, xy: np.ndarray, scale: float, drawn: np.ndarray) -> np.ndarray:
-    """As `mask_from_landmarks`, seeded by the silhouette `drawn` ([H, W] bytes) of the fitted mesh.
+def mask_from_fit(rgb: np.ndarray, xy: np.ndarray, scale: float, mask: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """Cut again, from the first `mask` ([H, W]) and the silhouette `drawn` ([H, W] bytes) of the mesh fitted to it.
 
-    Inside by 4 mm is surely hand; 7 mm outside of the mesh and of the capsules is surely none.
+    What lies more than 7 mm outside of the mesh is no hand, which takes leaks away; what lies more than 6 mm inside and
+    within the capsules is, which closes bites.
     """
     window = window_of(rgb, xy, scale)
     points, size, metre = window.points(xy), window.rgb.shape[:2], scale * float(window.scale.mean())
     mesh = (window.part(drawn) > 127).astype(np.uint8)
     inside, outside = cv2.distanceTransform(mesh, cv2.DIST_L2, 5), cv2.distanceTransform(1 - mesh, cv2.DIST_L2, 5)
-    arm_stub = _capsules(size, points, metre, 1.0, _WRIST_CUT) & _below(size, points, 0.0)
-    seeds = Seeds(
-        sure=(inside > 0.004 * metre) | _capsules(size, points, metre, 0.25, 0.0),
-        near=(mesh > 0) | arm_stub,
-        far=(outside < 0.009 * metre) | (_below(size, points, 0.0) & _capsules(size, points, metre, 2.2, 0.04)),
-    )
-    return window.back(_cut(window, points, metre, seeds), rgb.shape[:2])
+    below = _below(size, points, -0.01 * metre)  # the mesh ends at the wrist, the arm does not
+    far = (outside < 0.007 * metre) | (below & _capsules(size, points, metre, 2.2, _WRIST_CUT + 0.02))
+    sure = _capsules(size, points, metre, 0.45, 0.5 * _WRIST_CUT)
+    sure |= (inside > 0.006 * metre) & _capsules(size, points, metre, 0.8, 0.0)
+    near = (window.part(mask) > 0.5) & far
+    return window.back(_cut(window, points, metre, Seeds(sure & far, near, far)), rgb.shape[:2])
 
 
-def cut_at_wrist(alpha: np.ndarray, xy: np.ndarray, scale: float) -> np.ndarray:
-    """A ready mask [H, W] without the arm."""
-    height, width = alpha.shape
-    up = unit(xy[KNUCKLES].mean(0) - xy[0])
-    start = xy[0] - up * _WRIST_CUT * scale
-    x, y = np.arange(width) + 0.5 - start[0], np.arange(height) + 0.5 - start[1]
-    return np.where((x * up[0])[None] + (y * up[1])[:, None] >= 0, alpha, 0).astype(np.float32)
+def mask_from_alpha(alpha: np.ndarray, xy: np.ndarray, scale: float) -> np.ndarray | None:
+    """The file's own cut-out [H, W] without the arm; None where it is not of this hand alone.
+
+    A cut-out of a hand is opaque on the hand and clear around it; one of a whole person is opaque all over.
+    """
+    metre, shape = scale, alpha.shape
+    inside = _capsules(shape, xy, metre, 0.6, 0.0)
+    hand_side = ~_below(shape, xy, 0.0)
+    around = ~_capsules(shape, xy, metre, 2.2, 0.0) & _capsules(shape, xy, metre, 3.5, 0.0) & hand_side
+    if alpha[inside].mean() < 0.8 or (around.any() and alpha[around].mean() > 0.35):
+        return None
+    mask = np.where(_below(shape, xy, _WRIST_CUT * metre), 0, alpha).astype(np.float32)
+    return np.where(_touching(mask > 0.5, inside) | (mask <= 0.5), mask, 0)
 
 
 def _below(shape: tuple[int, int], points: np.ndarray, past: float) -> np.ndarray:

@@ -133,7 +133,7 @@ def _bending(rig: Rig) -> sparse.csc_array:
     i, j, n = np.r_[a, b, c, b, c, a], np.r_[b, c, a, a, b, c], len(rig.template)
     joined = sparse.csr_array((np.ones(len(i)), (i, j)), shape=(n, n))
     joined.data[:] = 1
-    umbrella = sparse.diags_array(1 / joined.sum(axis=1)) @ joined - sparse.eye_array(n)
+    umbrella = sparse.diags_array(1 / np.asarray(joined.sum(axis=1)).ravel()) @ joined - sparse.eye_array(n)
     return (_BEND * umbrella.T @ umbrella + _STAY * sparse.eye_array(n)).tocsc()
 
 
