@@ -1,7 +1,4 @@
-"""The command line, `oasis`: read it, run the command, turn what goes wrong into one sentence and an exit code.
-
-Exit codes: 0 done, 1 `oasis doctor` found a fault, 2 bad input, 130 stopped by Ctrl-C.
-"""
+"""The command line, `oasis`: read it, run the command, turn what goes wrong into one sentence and an exit code."""
 
 import importlib
 import logging
@@ -13,6 +10,7 @@ import tyro
 
 from oasis_warp import __version__
 from oasis_warp.commands import options
+from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.errors import InputError
 
 Command = (
@@ -21,7 +19,6 @@ Command = (
     | Annotated[options.Animate, tyro.conf.subcommand("animate")]
     | Annotated[options.Doctor, tyro.conf.subcommand("doctor")]
 )
-BAD_INPUT, INTERRUPTED = 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,5 +1,6 @@
 """Draw landmarks, a mesh and a sheet of captioned panels, with OpenCV on RGB bytes."""
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -39,7 +40,7 @@ def draw_landmarks(pixels: Pixels, points: np.ndarray) -> Pixels:
 
     for finger, color in enumerate(FINGER_COLORS):
         chain = points[[0, *range(4 * finger + 1, 4 * finger + 5)]]
-        for a, b in zip(chain[:-1], chain[1:], strict=True):
+        for a, b in itertools.pairwise(chain):
             cv2.line(drawn, place(a - 0.5), place(b - 0.5), color, width, cv2.LINE_AA, 4)
         for point in chain[1:]:
             cv2.circle(drawn, place(point - 0.5), 24 * width, color, -1, cv2.LINE_AA, 4)
@@ -52,24 +53,28 @@ def draw_mesh(pixels: Pixels, shade: np.ndarray, inside: np.ndarray, opacity: fl
     grey = (np.array((150, 178, 210)) * shade[..., None]).clip(0, 255)
     blend = np.where(inside[..., None], opacity * grey + (1 - opacity) * pixels, pixels).round().astype(np.uint8)
     edges, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(np.ascontiguousarray(blend), edges, -1, OUTLINE, max(1, pixels.shape[0] // 260), cv2.LINE_AA)
+    return cv2.drawContours(blend, edges, -1, OUTLINE, max(1, pixels.shape[0] // 260), cv2.LINE_AA)
+
+
+def panel_side(n_panels: int, width: int) -> int:
+    """Side of each of `n_panels` in one row of a sheet `width` pixels wide."""
+    return (width - 2 * MARGIN - GAP * (n_panels - 1)) // n_panels
 
 
 def make_sheet(title: str, subtitle: str, rows: Sequence[Sequence[Panel]], width: int) -> Pixels:
-    """Rows of panels, each row as wide as the sheet, on plain paper; panels are scaled to fit."""
-    sides = [(width - 2 * MARGIN - GAP * (len(row) - 1)) // len(row) for row in rows]
+    """Rows of panels on plain paper; the panels of a row have the `panel_side` of their number."""
+    sides = [panel_side(len(row), width) for row in rows]
     height = 2 * MARGIN + TITLE + sum(side + CAPTION + GAP for side in sides) - GAP
     sheet = np.full((height, width, 3), PAPER, np.uint8)
-    write_text(sheet, title, MARGIN, MARGIN + 22, 24, INK, 600)
-    box = cv2.getTextSize((width, height), title, (MARGIN, MARGIN + 22), cv2.FontFace("sans"), 24, 600)
-    write_text(sheet, subtitle, box[0] + box[2] + 20, MARGIN + 22, 17, FAINT, 400)
+    place = (MARGIN, MARGIN + 22)
+    write_text(sheet, title, *place, 24, INK, 600)
+    left, _, length, _ = cv2.getTextSize((width, height), title, place, cv2.FontFace("sans"), 24, 600)
+    write_text(sheet, subtitle, left + length + 20, place[1], 17, FAINT, 400)
     top = MARGIN + TITLE
     for row, side in zip(rows, sides, strict=True):
         for column, panel in enumerate(row):
             left = MARGIN + column * (side + GAP)
-            shrinks = panel.pixels.shape[0] > side
-            scaled = cv2.resize(panel.pixels, (side, side), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
-            sheet[top : top + side, left : left + side] = scaled
+            sheet[top : top + side, left : left + side] = panel.pixels
             write_text(sheet, panel.caption, left + 1, top + side + 19, 15, FAINT, 400)
         top += side + CAPTION + GAP
     return sheet

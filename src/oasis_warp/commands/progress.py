@@ -20,8 +20,8 @@ def show_progress(console: Console) -> Iterator[Progress]:
     if not console.is_terminal:
         yield line_progress(lambda line: console.print(line, highlight=False, soft_wrap=True))
         return
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Bars(*columns, console=console, transient=True) as bars:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Bars(SpinnerColumn(), *columns, console=console, transient=True) as bars:
         yield bar_progress(bars)
 
 

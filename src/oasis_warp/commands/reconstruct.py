@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
+from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
 from oasis_warp.commands.film import turntable
 from oasis_warp.commands.look import check_device
 from oasis_warp.commands.options import Reconstruct
@@ -24,10 +25,10 @@ from oasis_warp.data.atomic import output_folder
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.data.video import write_video
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.pipeline import reconstruct
 
-TURNTABLE_FRAMES, TURNTABLE_FPS, TURNTABLE_SIZE = 60, 20.0, 320
-"""Three seconds: VP9 takes a twelfth of a second a frame."""
+TURNTABLE_FRAMES, TURNTABLE_FPS, TURNTABLE_SIZE = 48, 16.0, 320
 
 
 def run(options: Reconstruct) -> int:
@@ -58,29 +59,37 @@ def _check_photos(options: Reconstruct) -> None:
 
 def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
     """Every photo into its own folder; one that fails does not stop the others."""
-    if not options.out.exists():
-        with output_folder(options.out):
-            pass
-    n_done = 0
-    try:
-        for photo in options.photos:
-            try:
-                report = _reconstruct_one(photo, options.out / photo.stem, config, None)
-            except InputError as error:
-                print(f"oasis: {error}", file=sys.stderr)
-            else:
-                print_report(Console(), report)
-                n_done += 1
-    except KeyboardInterrupt:
-        print(f"oasis: stopped; {n_done} of {len(options.photos)} photos are done.", file=sys.stderr)
-        return 130
-    finally:
-        if not any(options.out.iterdir()):
-            options.out.rmdir()
-    if n_done < len(options.photos):
-        print(f"oasis: {n_done} of {len(options.photos)} photos are done, the others failed.", file=sys.stderr)
-        return 2
+    n_photos, n_done = len(options.photos), 0
+    with _shared_folder(options.out):
+        try:
+            for photo in options.photos:
+                try:
+                    report = _reconstruct_one(photo, options.out / photo.stem, config, None)
+                except InputError as error:
+                    print(f"oasis: {error}", file=sys.stderr)
+                else:
+                    print_report(Console(), report)
+                    n_done += 1
+        except KeyboardInterrupt:
+            print(f"oasis: stopped; {n_done} of {n_photos} photos are done.", file=sys.stderr)
+            return INTERRUPTED
+    if n_done < n_photos:
+        print(f"oasis: {n_done} of {n_photos} photos are done, the others failed.", file=sys.stderr)
+        return BAD_INPUT
     return 0
+
+
+@contextmanager
+def _shared_folder(path: Path) -> Iterator[None]:
+    """Make the folder that holds everyone's, and take it away again if it stays empty."""
+    if path.exists():
+        yield
+        return
+    with output_folder(path):
+        pass
+    yield
+    if not any(path.iterdir()):
+        path.rmdir()
 
 
 def _reconstruct_one(
@@ -104,10 +113,9 @@ def _reconstruct_one(
     return report
 
 
-def _write_turntable(path: Path, avatar: Any, progress: Progress) -> None:
-    frames = turntable(
-        avatar, avatar.source_pose, TURNTABLE_FRAMES, TURNTABLE_SIZE, elevation=0.0, background=GROUND, progress=progress
-    )
+def _write_turntable(path: Path, avatar: Avatar, progress: Progress) -> None:
+    look = {"elevation": 0.0, "background": GROUND, "progress": progress}
+    frames = turntable(avatar, avatar.source_pose, TURNTABLE_FRAMES, TURNTABLE_SIZE, **look)
     write_video(path, frames, TURNTABLE_FPS)
 
 

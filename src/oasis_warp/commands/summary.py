@@ -1,13 +1,15 @@
 """The picture that tells at a glance whether a reconstruction is good."""
 
+import itertools
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from oasis_warp.commands.drawing import Panel, draw_landmarks, draw_mesh, make_sheet
+from oasis_warp.commands.drawing import Panel, Pixels, draw_landmarks, draw_mesh, make_sheet, panel_side
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import Camera, HandFit, HandPose, Photo, PosedHand
@@ -32,39 +34,41 @@ POSES = ("open", "fist", "victory", "point", "ok")
 def draw_summary(photo: Photo, made: Reconstruction, *, progress: Progress = silent) -> UInt8[Tensor, "H W 3"]:
     """Photo, fit, mask and avatar in the photo's view; six views around; other poses. `WIDTH` pixels wide."""
     avatar, fit = made.avatar, made.fit
-    n_drawn, total = 0, VIEWS + len(POSES) + 1
+    drawn = itertools.count(1)
 
-    def draw(camera: Camera, pose: HandPose):
-        nonlocal n_drawn
-        n_drawn += 1
-        progress("summary", n_drawn, total)
-        return to_uint8(avatar.render(camera, pose, GROUND).image).numpy()
+    def draw(camera: Camera, pose: HandPose) -> Pixels:
+        picture = to_uint8(avatar.render(camera, pose, GROUND).image).numpy()
+        progress("summary", next(drawn), 1 + VIEWS + len(POSES))
+        return picture
 
-    around = avatar.mesh(fit.pose).vertices
+    side, around = panel_side(VIEWS, WIDTH), avatar.mesh(fit.pose).vertices
     views = [
-        Panel(draw(orbit_camera(around, 2 * math.pi * k / VIEWS, 0.0, 256), fit.pose), f"{360 * k // VIEWS}°")
+        Panel(draw(orbit_camera(around, 2 * math.pi * k / VIEWS, 0.0, side), fit.pose), f"{360 * k // VIEWS}°")
         for k in range(VIEWS)
     ]
-    poses = []
-    for name in POSES:
-        pose = avatar.source_pose._replace(angles=named_pose(avatar.hand, name))
-        poses.append(Panel(draw(orbit_camera(avatar.mesh(pose).vertices, 0.0, 0.0, 300), pose), name))
-    rows = [photo_row(photo, avatar, fit, draw, WIDTH // 4), views, poses]
-    measures = [
-        f"landmarks {fit.reprojection:.1f} % off",
-        f"mask overlap {fit.mask_iou:.2f}",
-        *([f"{made.errors['input_psnr_db']:.1f} dB to the photo"] if "input_psnr_db" in made.errors else []),
-        *(["see the warnings in report.json"] if made.warnings else []),
-    ]
-    sheet = make_sheet(f"{photo.name}, {fit.side} hand", ", ".join(measures), rows, WIDTH)
-    return torch.from_numpy(sheet)
+    held = {name: avatar.source_pose._replace(angles=named_pose(avatar.hand, name)) for name in POSES}
+    reach = torch.cat([avatar.mesh(pose).vertices for pose in held.values()])  # one camera: the poses compare
+    camera = orbit_camera(reach, 0.0, 0.0, panel_side(len(POSES), WIDTH))
+    poses = [Panel(draw(camera, pose), name) for name, pose in held.items()]
+    measures = [f"landmarks {fit.reprojection:.1f} % off", f"mask overlap {fit.mask_iou:.2f}"]
+    if "input_psnr_db" in made.errors:
+        measures.append(f"{made.errors['input_psnr_db']:.1f} dB to the photo")
+    if made.warnings:
+        measures.append("doubtful: see the warnings in report.json")
+    rows = [photo_row(photo, avatar, fit, draw, panel_side(4, WIDTH)), views, poses]
+    return torch.from_numpy(make_sheet(f"{photo.name}, {fit.side} hand", ", ".join(measures), rows, WIDTH))
 
 
-def photo_row(photo: Photo, avatar: Avatar, fit: HandFit, draw, size: int) -> list[Panel]:
+def photo_row(
+    photo: Photo, avatar: Avatar, fit: HandFit, draw: Callable[[Camera, HandPose], Pixels], size: int
+) -> list[Panel]:
     """Crop, fit over it, mask and avatar, all in the photo's view."""
     left, top, side = square_around(fit.mask, CROP_MARGIN)
     camera = crop_camera(fit.camera, left, top, side, size)
-    crop = to_uint8(resample_square(photo.rgb.float() / 255, left, top, side, size)).numpy()
+    rgb = photo.rgb.float() / 255
+    inside_photo = resample_square(torch.ones_like(rgb), left, top, side, size)
+    ground = torch.tensor(GROUND) * (1 - inside_photo)
+    crop = to_uint8(resample_square(rgb, left, top, side, size) + ground).numpy()
     mask = resample_square(fit.mask.contiguous(), left, top, side, size).clamp(0, 1)
     shade, inside = shade_mesh(avatar.mesh(fit.pose), avatar.hand.faces, camera)
     fitted = draw_mesh(crop, shade.numpy(), inside.numpy())
