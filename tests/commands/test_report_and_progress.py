@@ -21,7 +21,8 @@ def test_a_report_holds_the_run(scene, made):
 
 
 def test_numbers_that_json_does_not_know_become_null():
-    assert json.loads(to_json({"a": [float("nan"), {"b": float("inf")}], "c": 1.5})) == {"a": [None, {"b": None}], "c": 1.5}
+    text = to_json({"a": [float("nan"), {"b": float("inf")}], "c": 1.5})
+    assert json.loads(text) == {"a": [None, {"b": None}], "c": 1.5}
 
 
 def test_the_table_says_everything_in_words(scene, made):
