@@ -1,5 +1,6 @@
 import pytest
 import torch
+from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, evidence_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observe import observe
@@ -9,7 +10,6 @@ from oasis_warp.core.config import AdaptConfig
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.render.render import render
 from oasis_warp.training.adapt import adapt
-from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, evidence_of
 
 CAST = torch.tensor([0.90, 0.85, 0.80])  # a little dim and warm
 STEPS = AdaptConfig(texture_steps=60)
@@ -34,7 +34,8 @@ def case(hand, regions):
 
 
 def drawn(hand, gaussians, evidence):
-    return render(pose_gaussians(gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices), evidence.camera)
+    posed = pose_gaussians(gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices)
+    return render(posed, evidence.camera)
 
 
 def test_the_photo_is_explained(hand, case):
