@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.hand.correctives import corrective_coefficients
 
 _TIP_JOINT = [15, 3, 6, 12, 9]  # last joint of thumb, index, middle, ring, little
 
@@ -54,6 +55,7 @@ class Rig:
         self.joints, self.joint_basis = real(hand.joints), real(hand.joint_basis)
         self.axes, self.limits, self.rest_bend = real(hand.pose_axes), real(hand.pose_limits), real(hand.rest_bend)
         self.template, self.shape_basis = real(hand.template), real(hand.shape_basis)
+        self.corrective_basis = real(hand.corrective_basis).reshape(-1, hand.corrective_basis.shape[2])
         self.weights = real(hand.weights)
         self.faces = hand.faces.cpu().numpy().astype(np.int64)
         self.rim = hand.rim.cpu().numpy()
@@ -133,7 +135,8 @@ class Rig:
 
     def correctives(self, table: np.ndarray) -> np.ndarray:
         """Displacement of the rest surface by the pose correctives of all angles ([16, 3]) [m], [V, 3]."""
-        return np.zeros_like(self.template)
+        strengths = corrective_coefficients(self.hand, torch.from_numpy(table[1:])).numpy()
+        return (self.corrective_basis @ strengths).reshape(-1, 3)
 
     def surface(self, chain: Chain, angles: np.ndarray, shape: np.ndarray) -> np.ndarray:
         """The posed surface, correctives included [m], [V, 3]."""

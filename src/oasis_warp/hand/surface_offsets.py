@@ -131,9 +131,9 @@ def _bending(rig: Rig) -> sparse.csc_array:
     """BEND L^T L + STAY with the umbrella operator L (mean of the neighbours minus the vertex)."""
     a, b, c = rig.faces.T
     i, j, n = np.r_[a, b, c, b, c, a], np.r_[b, c, a, a, b, c], len(rig.template)
-    joined = sparse.csr_array((np.ones(len(i)), (i, j)), shape=(n, n))
-    joined.data[:] = 1
-    umbrella = sparse.diags_array(1 / np.asarray(joined.sum(axis=1)).ravel()) @ joined - sparse.eye_array(n)
+    pairs = np.unique(np.stack([i, j]), axis=1)
+    share = 1 / np.bincount(pairs[0], minlength=n)[pairs[0]]
+    umbrella = sparse.csr_array((share, tuple(pairs)), shape=(n, n)) - sparse.eye_array(n)
     return (_BEND * umbrella.T @ umbrella + _STAY * sparse.eye_array(n)).tocsc()
 
 
