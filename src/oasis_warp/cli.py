@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -35,6 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         config=(tyro.conf.OmitArgPrefixes,),
     )
     logging.basicConfig(format="oasis: %(message)s")
+    # A batch system's SIGTERM ends the work as Ctrl-C does: what is half-written is taken away.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         # The command's module imports torch and Warp, which take seconds: only now.
         command = importlib.import_module(f"oasis_warp.commands.{type(chosen).__name__.lower()}")

@@ -14,7 +14,7 @@ SKIN, GROUND = (200, 150, 120), (30, 60, 90)
 
 @pytest.fixture(scope="session")
 def scene(hand):
-    """A photo of an open hand that is known exactly, its fit, and an avatar of few Gaussians, which is quick to draw."""
+    """A photo of an open hand that is known exactly, its fit, and an avatar of few Gaussians, quick to draw."""
     shape = torch.zeros(hand.shape_basis.shape[-1])
     # Fingers up, palm to the camera: the hand's -x is the picture's -y, its -y looks to the camera.
     orientation = torch.tensor([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

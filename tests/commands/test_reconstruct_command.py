@@ -8,6 +8,7 @@ from oasis_warp.cli import main
 from oasis_warp.commands import reconstruct as command
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.avatar_file import load_avatar
+from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 
 FILES = {"avatar.safetensors", "summary.png", "turntable.mp4", "report.json"}
@@ -66,7 +67,7 @@ def test_what_was_written_can_be_read(pipeline, photo_file, tmp_path):
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert header["side"] == report["hand"]["side"] == "right"
     assert {"seed": 5, "steps": 7, "force": True, "hand": "largest"}.items() <= report["config"].items()
-    assert cv2.imread(str(tmp_path / "out" / "summary.png")).shape[1] == 1600
+    assert read_photo(tmp_path / "out" / "summary.png").rgb.shape[1] == 1600
     capture = cv2.VideoCapture(str(tmp_path / "out" / "turntable.mp4"))
     assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 4
 

@@ -15,7 +15,7 @@ LOOK = {"elevation": 0.0, "background": (1.0, 1.0, 1.0), "progress": silent}
 def draw(avatar_file, *arguments, name="x.png"):
     out = avatar_file.with_name(name)
     assert main(["render", str(avatar_file), "-o", str(out), "--size", "96", *arguments]) == 0
-    return cv2.imread(str(out), cv2.IMREAD_UNCHANGED).astype(int)
+    return np.asarray(cv2.imread(str(out), cv2.IMREAD_UNCHANGED), int)
 
 
 def test_a_picture_shows_the_photos_pose_from_where_it_was_taken(scene, avatar_file):

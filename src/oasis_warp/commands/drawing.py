@@ -73,7 +73,7 @@ def make_sheet(title: str, subtitle: str, rows: Sequence[Sequence[Panel]], width
     top = MARGIN + TITLE
     for row, side in zip(rows, sides, strict=True):
         for column, panel in enumerate(row):
-            left = MARGIN + column * (side + GAP)
+            left = MARGIN + round(column * (width - 2 * MARGIN + GAP) / len(row))
             sheet[top : top + side, left : left + side] = panel.pixels
             write_text(sheet, panel.caption, left + 1, top + side + 19, 15, FAINT, 400)
         top += side + CAPTION + GAP
