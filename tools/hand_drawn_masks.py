@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-SUPERSAMPLING = 4  # samples a pixel along each axis; a step of 1/16 in coverage, below what a hand-drawn edge is good for
+SUPERSAMPLING = 4  # samples a pixel along each axis: coverage in steps of 1/16, finer than an edge drawn by hand
 
 Coverage = npt.NDArray[np.float32]
 
