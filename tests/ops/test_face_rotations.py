@@ -77,7 +77,7 @@ def test_values_and_gradients_are_those_of_the_twin(seed, dtype, device):
         assert rel(ours, theirs) < (2e-6 if dtype == torch.float32 else 1e-9)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_gradcheck_passes_for_both_meshes(seed):
     rest, posed, faces = sheet(seed, n=2)
     meshes = (rest.requires_grad_(), posed.requires_grad_())

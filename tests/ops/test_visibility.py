@@ -96,12 +96,12 @@ def test_visibility_and_its_gradient_are_those_of_the_twin(seed, known, dtype, d
 
 def test_visibility_passes_gradcheck_in_the_points():
     vertices, faces, viewmat, K = soup(5)
-    points = some_points(vertices, faces, 5)
+    points = some_points(vertices, faces, 5, n=16)
     # Differences are safe away from the borders of pixels, where the buffer jumps.
     camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     pixel = camera[:, :2] / camera[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
     points = points[((pixel - pixel.round()).abs() > 1e-3).all(-1)].requires_grad_()
-    assert len(points) > 50
+    assert len(points) > 12
     assert torch.autograd.gradcheck(lambda p: visible(p, vertices, faces, viewmat, K).visibility, points)
 
 

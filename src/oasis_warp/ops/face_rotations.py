@@ -141,7 +141,7 @@ def face_rotations(
         rest_vertices: Vertices at rest, any unit of length, shape [V, 3], float32 or float64.
         posed_vertices: The same vertices posed, shape [V, 3].
         faces: Vertex indices, shape [F, 3]; F may be 0.
-        validate: Look at the values of the tensors too, which waits for a CUDA device; switch it off for inputs you trust.
+        validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
             Shapes and indices are always checked, indices once a tensor.
 
     Raises:

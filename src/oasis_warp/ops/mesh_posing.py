@@ -132,7 +132,7 @@ def pose_on_mesh(
         quats: Canonical rotations, wxyz, shape [Q, 4]; their norms carry over.
         scales: Canonical standard deviations [m], shape [Q, 3].
         scale_law: How scales follow the area of the face.
-        validate: Look at the values of the tensors too, which waits for a CUDA device; switch it off for trusted inputs.
+        validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
             Shapes and indices are always checked, indices once a tensor.
 
     Raises:

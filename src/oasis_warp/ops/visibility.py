@@ -145,7 +145,7 @@ def depth_map(
         width: Columns of the image.
         height: Rows of the image.
         near_plane: Depth up to which surfaces are not seen [m].
-        validate: Look at the values of the tensors too, which waits for a CUDA device; switch it off for trusted inputs.
+        validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
             Shapes and indices are always checked, indices once a tensor.
 
     Raises:
@@ -248,7 +248,7 @@ def depth_visibility(
         literal: Equation 4 as printed: `margin` is 0, and `point_vertices` is not used.
         point_vertices: Vertex that each point is, or -1, shape [P].
         near_plane: Depth up to which nothing is seen [m].
-        validate: Look at the values of the tensors too, which waits for a CUDA device; switch it off for trusted inputs.
+        validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
             Shapes and indices are always checked, indices once a tensor.
 
     Raises:
