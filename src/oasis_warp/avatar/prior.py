@@ -65,7 +65,7 @@ class MeanPrior:
 
     def __call__(self, evidence: Evidence) -> CanonicalGaussians:
         """Gaussians on the fitted surface with evenly lit mean colours; the photo is only asked for the skin tone."""
-        seen = observe(self.hand, evidence)
+        seen = Observation(*(part.cpu() for part in observe(self.hand, evidence)))
         colors = self.vertex_colors(estimate_melanin(self.regions, seen)).to(evidence.image)
         anchors = place_anchors(self.hand, evidence.rest)
         faces = self.hand.faces.to(colors.device)
