@@ -1,4 +1,4 @@
-"""The float32 blending of the CPU: `rasterize_forward.blend` and `rasterize_backward.blend_backward`, 16 pixels at once.
+"""Float32 blending on the CPU: `rasterize_forward.blend` and `rasterize_backward.blend_backward`, 16 pixels at once.
 
 One thread a tile; arguments as in the generic kernels. A tile is kept in planes (transmittance, alpha, one a channel)
 whose rows are whole vectors, so that a Gaussian that covers 7 rows of a 16-pixel tile costs 7 passes of the loop
@@ -31,7 +31,8 @@ HEAD = """
     const long long plane = (long long)rows * stride;
     const long long start = tile_starts.data[tile];
     const int count = (int)(tile_starts.data[tile + 1] - start);
-    auto pixel_of = [&](int y, int x) -> long long { return ((long long)camera * height + top + y) * width + left + x; };
+    const long long corner = ((long long)camera * height + top) * width + left;
+    auto pixel_of = [&](int y, int x) -> long long { return corner + (long long)y * width + x; };
 
     // What all pixels of one Gaussian share; `at` gives alpha for 16 of them.
     struct Layer {
@@ -105,7 +106,11 @@ FORWARD = """
 BACKWARD = """
     typedef float H __attribute__((ext_vector_type(8)));
     typedef float Q __attribute__((ext_vector_type(4)));
-    auto total = [](V v) -> float { const H h = v.lo + v.hi; const Q q = h.lo + h.hi; return (q.x + q.z) + (q.y + q.w); };
+    auto total = [](V v) -> float {
+        const H h = v.lo + v.hi;
+        const Q q = h.lo + h.hi;
+        return (q.x + q.z) + (q.y + q.w);
+    };
     float* scratch = (float*)malloc((@CHANNELS@ + 3) * plane * sizeof(float));
     float *T = scratch, *S = scratch + plane, *G = scratch + 3 * plane;
     int* last = (int*)(scratch + 2 * plane);

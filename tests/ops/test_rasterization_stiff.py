@@ -10,7 +10,7 @@ from rasterization_scenes import frontal_scene, intrinsics, look_from, ordinary_
 from test_rasterization import assert_equals_twin, draw
 
 from oasis_warp.ops import rasterization
-from oasis_warp.ops._tiles import MAX_PAIRS, bin_to_tiles
+from oasis_warp.ops._tiles import MAX_PAIRS, argsort_positive, bin_to_tiles
 from oasis_warp.ops.projection import project
 
 STIFF = 1e-5, 1e-4
@@ -137,7 +137,7 @@ def test_culled_gaussians_get_zero_gradients(device):
 def test_one_tile_can_hold_twenty_thousand_gaussians(device):
     g = torch.Generator().manual_seed(6)
     opacities = torch.rand(20_000, generator=g) * 0.01 + 0.003
-    scene = frontal_scene(cloud(20_000, spread=(0.3, 0.3, 1.0)), 0.05, opacities, 16, 16, 20.0)
+    scene = frontal_scene(cloud(20_000, spread=(0.3, 0.3, 1.0)), 0.05, opacities, 8, 7, 10.0)
     assert_equals_twin(scene, torch.float32, device, *STIFF, max_fragile=1.0)
 
 
@@ -151,6 +151,14 @@ def test_more_pairs_than_can_be_counted_are_refused_with_their_number():
     projection = project(means, quats, torch.full((n, 3), 9.0), torch.full((n,), 0.5), eye, K, size, size, **options)
     with pytest.raises(ValueError, match=f"at most {MAX_PAIRS} pairs of a Gaussian and a tile, got {n * 4096}"):
         bin_to_tiles(projection, size, size, 1)
+
+
+@pytest.mark.parametrize("n", [0, 1, 1000, 70_000])
+def test_depths_are_sorted_stably_over_the_whole_range(n, device):
+    g = torch.Generator().manual_seed(n)
+    exponents = torch.rand(n, generator=g, dtype=torch.float64) * 12 - 2
+    keys = (10**exponents).float().double()[torch.randint(0, max(n // 2, 1), (n,), generator=g)].to(device)
+    assert torch.equal(argsort_positive(keys), torch.argsort(keys, stable=True))
 
 
 def test_ordinary_scenes_do_not_feel_an_absent_low_pass(device):

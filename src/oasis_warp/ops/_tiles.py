@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import torch
 import warp as wp
-from jaxtyping import Int32, Int64
+from jaxtyping import Float64, Int32, Int64
 from torch import Tensor
 
 from oasis_kernels import tiles
@@ -52,7 +52,7 @@ def bin_to_tiles(projection_: Projection, width: int, height: int, tile_size: in
     launch_ranges(tiles.count_tiles, even_cuts(len(counts)), [boxes, tile_size, view(counts)], like=counts)
 
     drawn = counts.nonzero().squeeze(1)
-    order = drawn[torch.argsort(projection_.sort_depths.view(-1)[drawn], stable=True)]
+    order = drawn[argsort_positive(projection_.sort_depths.view(-1)[drawn])]
     ends = counts[order].cumsum(0)
     n_pairs = int(ends[-1]) if len(order) else 0
     if n_pairs > MAX_PAIRS:
@@ -75,6 +75,19 @@ def bin_to_tiles(projection_: Projection, width: int, height: int, tile_size: in
     return Tiles(
         tile_size, across, down, starts, pair_gaussians[pairs], pairs, pair_starts, counts, _even_work(starts)
     )
+
+
+def argsort_positive(keys: Float64[Tensor, "K"]) -> Int64[Tensor, "K"]:
+    """Stable order of positive float64 `keys`, whose bits sort as integers do."""
+    n = len(keys)
+    if keys.is_cuda or n == 0:
+        return torch.argsort(keys, stable=True)
+    bits = torch.empty(2 * n, dtype=torch.int64)  # the second half is the sort's own
+    order = torch.empty(2 * n, dtype=torch.int32)
+    bits[:n] = keys.view(torch.int64)
+    torch.arange(n, out=order[:n])
+    wp.utils.radix_sort_pairs(view(bits), view(order), n)  # half the time of torch's sort
+    return order[:n].long()
 
 
 def _even_work(starts: Tensor) -> list[int]:

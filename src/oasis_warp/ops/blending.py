@@ -107,8 +107,8 @@ class _Blend(torch.autograd.Function):
         def empty(*shape: int) -> Tensor:
             return torch.empty(*shape, dtype=dtype, device=device)
 
-        g_image = colors.new_zeros(pixels, channels) if g_image is None else g_image.contiguous()
-        g_alpha = colors.new_zeros(pixels) if g_alpha is None else g_alpha.contiguous()
+        of_image = colors.new_zeros(pixels, channels) if g_image is None else g_image.contiguous().view(-1, channels)
+        of_alpha = colors.new_zeros(pixels) if g_alpha is None else g_alpha.contiguous().view(-1)
         pair_moments = empty(len(tiles.pairs) if with_shape else 0, 6)
         pair_colors = empty(len(tiles.pairs), channels)
         tile_backgrounds = empty(len(tiles.starts) - 1, channels)
@@ -120,7 +120,7 @@ class _Blend(torch.autograd.Function):
                 view(tiles.starts), view(tiles.gaussians), view(tiles.pairs), view(boxes.view(-1, 4), vec4i),
                 view(centers.view(-1, 4), VEC4[dtype]), view(whitenings.view(-1, 4), VEC4[dtype]),
                 view(opacities.view(-1)), view(colors.view(-1, channels), color), view(backgrounds, color),
-                view(stops.view(-1)), view(g_image.view(-1, channels), color), view(g_alpha.view(-1)),
+                view(stops.view(-1)), view(of_image, color), view(of_alpha),
                 tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height, int(with_shape),
                 view(transmittance.view(-1).clone()), view(empty(pixels)),
                 view(pair_moments, moments), view(pair_colors, color), view(tile_backgrounds, color),
