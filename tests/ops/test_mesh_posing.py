@@ -328,6 +328,29 @@ def test_gaussians_on_the_hand_follow_a_bent_finger(hand):
     torch.testing.assert_close(turned, turn.expand_as(turned), rtol=0, atol=2e-3)
 
 
+def test_a_hand_is_posed_the_same_by_any_number_of_threads(hand, with_threads):
+    generator = torch.Generator().manual_seed(0)
+    rest, n_faces = hand.template, len(hand.faces)
+    posed = (rest + 2e-4 * torch.randn(rest.shape, generator=generator)).requires_grad_()
+    leaves = [
+        posed,
+        torch.randn(n_faces, 3, generator=generator).softmax(-1).requires_grad_(),
+        torch.randn(n_faces, 4, generator=generator).requires_grad_(),
+    ]
+    weights = torch.randn(n_faces, 10, generator=generator)
+
+    def carry_and_back():
+        turned = face_rotations(rest, posed, hand.faces)
+        got = pose_on_mesh(
+            posed, hand.faces, torch.arange(n_faces), leaves[1], turned.vertex_quats, turned.area_ratio, leaves[2],
+            torch.ones(n_faces, 3),
+        )  # fmt: skip
+        return [*got, *torch.autograd.grad((torch.cat([*got], 1) * weights).sum(), leaves)]
+
+    one, several = with_threads(1, carry_and_back), with_threads(3, carry_and_back)
+    assert all(torch.equal(a, b) for a, b in zip(one, several, strict=True))
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
 @pytest.mark.parametrize("name", FLOATS)
 def test_values_that_are_no_numbers_are_refused_by_name(name, value):

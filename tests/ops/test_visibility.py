@@ -230,18 +230,13 @@ def test_the_containing_pixel_counts_not_the_nearest_centre():
     assert seen[0] > 0.999 and seen[1] < 0.001
 
 
-@pytest.mark.parametrize("n_threads", [1, 2, 3, 5])
-def test_neither_threads_nor_repeats_change_a_bit(n_threads):
+def test_neither_threads_nor_repeats_change_a_bit(with_threads):
     scene = soup(10, near=True, dtype=torch.float32)
-    before = torch.get_num_threads()
     first = depth_map(*scene, WIDTH, HEIGHT)
-    try:
-        torch.set_num_threads(n_threads)
-        again = [depth_map(*scene, WIDTH, HEIGHT) for _ in range(3)]
-    finally:
-        torch.set_num_threads(before)
-    for other in again:
-        assert all(torch.equal(a, b) for a, b in zip(first, other, strict=True))
+    for n_threads in (1, 2, 3, 5, 40):
+        for _ in range(3):
+            again = with_threads(n_threads, depth_map, *scene, WIDTH, HEIGHT)
+            assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
 
 
 POISON = {"vertices": 0, "viewmat": 2, "K": 3}

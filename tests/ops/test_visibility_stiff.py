@@ -193,11 +193,12 @@ def test_a_curved_surface_does_not_shadow_itself():
 
 def test_the_kernel_for_cuda_fills_the_same_buffer_as_the_one_for_the_cpu(hand, monkeypatch):
     vertices, viewmat, K = palm_view(hand, 128)
-    rows = depth_map(vertices, hand.faces, viewmat, K, 128, 128)
+    twice = torch.cat([hand.faces, hand.faces])  # every pixel is a tie
+    strips = depth_map(vertices, twice, viewmat, K, 128, 128)
     monkeypatch.setattr(visibility, "_fill_strips", visibility._fill_faces)
-    faces = depth_map(vertices, hand.faces, viewmat, K, 128, 128)
-    assert (rows.face_ids >= 0).any()
-    assert all(torch.equal(a, b) for a, b in zip(rows, faces, strict=True))
+    faces = depth_map(vertices, twice, viewmat, K, 128, 128)
+    assert (strips.face_ids >= 0).any() and (strips.face_ids < len(hand.faces)).all()
+    assert all(torch.equal(a, b) for a, b in zip(strips, faces, strict=True))
 
 
 def palm_view(hand, size, distance=0.5):
@@ -208,6 +209,17 @@ def palm_view(hand, size, distance=0.5):
     viewmat[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     viewmat[:3, 3] = -viewmat[:3, :3] @ centre + torch.tensor([0, 0, distance])
     return vertices, viewmat, pinhole(2.2 * size, size, size, torch.float32)
+
+
+def test_a_hand_looks_the_same_from_any_number_of_threads(hand, with_threads):
+    vertices, viewmat, K = palm_view(hand, 200)
+
+    def look():
+        seen = depth_visibility(vertices, vertices, hand.faces, K, viewmat, 200, 200)
+        return [*seen, *depth_map(vertices, hand.faces, viewmat, K, 200, 200)]
+
+    one, several = with_threads(1, look), with_threads(3, look)
+    assert all(torch.equal(a, b) for a, b in zip(one, several, strict=True))
 
 
 @pytest.fixture(scope="module")
