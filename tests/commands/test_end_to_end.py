@@ -102,8 +102,8 @@ def test_a_huge_photo_is_scaled_down_first(tmp_path):
     assert report["photo"]["shrink"] == pytest.approx(0.5, rel=1e-3)
 
 
-@pytest.mark.parametrize("stage", ["landmarks", "calibration"])
-def test_ctrl_c_midway_leaves_nothing(tmp_path, stage):
+@pytest.mark.parametrize(("stage", "stop"), [("landmarks", signal.SIGINT), ("calibration", signal.SIGTERM)])
+def test_a_stop_midway_leaves_nothing(tmp_path, stage, stop):
     with subprocess.Popen(
         [*OASIS, "reconstruct", str(PHOTOS / "palm_open_left_02.png"), "-o", str(tmp_path / "out")],
         stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -113,7 +113,7 @@ def test_ctrl_c_midway_leaves_nothing(tmp_path, stage):
             if line.startswith(f"{stage}: "):
                 break
         time.sleep(0.5)  # into the next stage
-        process.send_signal(signal.SIGINT)
+        process.send_signal(stop)
         errors = process.stderr.read()
     assert process.returncode == 130
     assert errors.endswith("oasis: stopped, nothing written.\n")

@@ -6,6 +6,7 @@ from disk import full_disk
 
 from oasis_warp.cli import main
 from oasis_warp.commands import reconstruct as command
+from oasis_warp.commands import summary
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.avatar_file import load_avatar
 from oasis_warp.data.photo import read_photo
@@ -15,7 +16,8 @@ FILES = {"avatar.safetensors", "summary.png", "turntable.mp4", "report.json"}
 
 
 @pytest.fixture(autouse=True)
-def short_turntable(monkeypatch):
+def small_pictures(monkeypatch):
+    monkeypatch.setattr(summary, "WIDTH", 480)
     monkeypatch.setattr(command, "TURNTABLE_FRAMES", 4)
     monkeypatch.setattr(command, "TURNTABLE_SIZE", 64)
 
@@ -67,7 +69,7 @@ def test_what_was_written_can_be_read(pipeline, photo_file, tmp_path):
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert header["side"] == report["hand"]["side"] == "right"
     assert {"seed": 5, "steps": 7, "force": True, "hand": "largest"}.items() <= report["config"].items()
-    assert read_photo(tmp_path / "out" / "summary.png").rgb.shape[1] == 1600
+    assert read_photo(tmp_path / "out" / "summary.png").rgb.shape[1] == 480
     capture = cv2.VideoCapture(str(tmp_path / "out" / "turntable.mp4"))
     assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 4
 
@@ -152,9 +154,12 @@ def test_a_full_disk_is_told_and_leaves_nothing(pipeline, photo_file, tmp_path, 
         ([], "photos: expected at least one"),
         (["a/x.png", "b/x.jpg"], "would share one output folder"),
         (["a.png", "b.png", "--keypoints", "k.json"], "--keypoints: belongs to one photo"),
+        (["a.png", "--size", "8"], "--size 8: expected 64 to 1024"),
+        (["a.png", "--steps", "-1"], "--steps -1: expected 0 or more"),
+        (["a.png", "--hand", "-1"], "--hand -1: expected 0 or more"),
     ],
 )
-def test_photos_that_cannot_be_told_apart_are_refused(pipeline, tmp_path, capsys, arguments, expected):
+def test_options_that_make_no_sense_are_refused(pipeline, tmp_path, capsys, arguments, expected):
     assert main(["reconstruct", *arguments, "-o", str(tmp_path / "out")]) == 2
     assert expected in capsys.readouterr().err
     assert names(tmp_path) == set()

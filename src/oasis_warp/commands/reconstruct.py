@@ -28,6 +28,8 @@ from oasis_warp.data.video import write_video
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.pipeline import reconstruct
 
+CROP_SIDES = (64, 1024)
+"""Sides of the crop that make sense [px]: fewer show no fingers, more take too long."""
 TURNTABLE_FRAMES, TURNTABLE_FPS, TURNTABLE_SIZE = 48, 16.0, 320
 
 
@@ -39,6 +41,7 @@ def run(options: Reconstruct) -> int:
     """
     check_device(options.device)
     _check_photos(options)
+    _check_numbers(options)
     config = ReconstructConfig(**{field.name: getattr(options, field.name) for field in fields(ReconstructConfig)})
     if len(options.photos) == 1:
         report = _reconstruct_one(options.photos[0], options.out, config, options.keypoints)
@@ -55,6 +58,16 @@ def _check_photos(options: Reconstruct) -> None:
     counts = Counter(photo.stem for photo in options.photos)
     if twins := [str(photo) for photo in options.photos if counts[photo.stem] > 1]:
         raise InputError(f"photos: {' and '.join(twins)} would share one output folder; run them one by one.")
+
+
+def _check_numbers(options: Reconstruct) -> None:
+    low, high = CROP_SIDES
+    if not low <= options.size <= high:
+        raise InputError(f"--size {options.size}: expected {low} to {high} pixels; choose another size.")
+    if options.steps is not None and options.steps < 0:
+        raise InputError(f"--steps {options.steps}: expected 0 or more; leave it out to stop by itself.")
+    if isinstance(options.hand, int) and options.hand < 0:
+        raise InputError(f"--hand {options.hand}: expected 0 or more; 0 is the best hand found.")
 
 
 def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
