@@ -99,6 +99,7 @@ def test_pictures_are_differentiable_in_the_pose(right):
     angles = named_pose(right.hand, "relaxed").clone().requires_grad_(True)
     picture = right.render(right.source_camera, right.source_pose._replace(angles=angles))
     picture.image.square().mean().backward()
+    assert angles.grad is not None
     assert bool(torch.isfinite(angles.grad).all())
     assert float(angles.grad.abs().max()) > 0
 

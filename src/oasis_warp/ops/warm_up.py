@@ -25,8 +25,9 @@ def warm_up(device: torch.device | str = "cpu") -> None:
     K = torch.tensor([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]], device=device)
     with torch.no_grad():
         turned = face_rotations(vertices, vertices, faces)
+        each = torch.arange(4, device=device)
         posed = pose_on_mesh(
-            vertices, faces, torch.arange(4, device=device), thirds, turned.vertex_quats, turned.area_ratio, quats, scales
+            vertices, faces, each, thirds, turned.vertex_quats, turned.area_ratio, quats, scales
         )
         depth_visibility(vertices, vertices, faces, K, viewmat, 16, 16)
         blend_weights(*posed, ones, viewmat, K, 16, 16)
