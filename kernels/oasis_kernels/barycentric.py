@@ -1,6 +1,6 @@
 """Carry Gaussians that are tied to faces by barycentric coordinates along with a posed mesh.
 
-`pose` and `pose_backward`: one thread a Gaussian. On face f with corners v_k, barycentrics b_k and vertex rotations q_k:
+`pose` and `pose_backward`: one thread a Gaussian. At barycentrics b_k of corners v_k that turned by q_k:
 
     mean  = sum b_k v_k
     dq    = m / |m|,  m = sum b_k s_k q_k     s_k = +-1 turns q_k to the side of the corner with the largest b_k
@@ -106,6 +106,7 @@ def growth_slope(ratio: wp.float64, half_powers: int) -> wp.float64:
 
 @wp.kernel
 def pose(
+    first: int,
     vertices: wp.array2d[Any],
     faces: wp.array2d[wp.int32],
     face_index: wp.array[wp.int32],
@@ -119,7 +120,7 @@ def pose(
     posed_quats: wp.array2d[Any],
     posed_scales: wp.array2d[Any],
 ):
-    i = wp.tid()
+    i = first + wp.tid()
     f = face_index[i]
     b = row3(barycentrics, i)
     mean = wp.vec3d()
@@ -136,6 +137,7 @@ def pose(
 
 @wp.kernel
 def pose_backward(
+    first: int,
     vertices: wp.array2d[Any],
     faces: wp.array2d[wp.int32],
     face_index: wp.array[wp.int32],
@@ -156,7 +158,7 @@ def pose_backward(
     grad_quats: wp.array2d[Any],
     grad_scales: wp.array2d[Any],
 ):
-    i = wp.tid()
+    i = first + wp.tid()
     f = face_index[i]
     b = row3(barycentrics, i)
     g_mean = row3(grad_means, i)

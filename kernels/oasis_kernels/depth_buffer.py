@@ -1,24 +1,29 @@
 """Depth buffer of a triangle mesh with face ids, and visibility of points against it.
 
-`camera_points` (one thread a vertex) -> `face_boxes` (one thread a face) -> `fill_rows` on the CPU (a serial loop over
-the faces, restricted to a strip of rows, so that strips can run on several threads) or `fill_faces` on CUDA (one
-thread a face) -> `interpolate` (one thread a pixel) and `visibility` (one thread a point).
+`camera_points` (one thread a vertex) -> `face_boxes` (one thread a face) -> `fill_strips` on the CPU (one thread for a
+strip of rows, which loops over the faces) or `fill_faces` on CUDA (one thread a face) -> `interpolate` (one thread a
+pixel) and `visibility` (one thread a point).
 
-A pixel's ray is p(z) = z d with d = ((x - cx) / fx, (y - cy) / fy, 1). For a triangle a, b, c in camera axes,
-w_a = d.(b x c), w_b = d.(c x a), w_c = d.(a x b); the ray hits where the three agree in sign, at the barycentrics
-w / (w_a + w_b + w_c), which are perspective correct as they stand (Olano and Greer, "Triangle scan conversion using
-2D homogeneous coordinates", 1997). Nothing is divided by a vertex's depth, so a triangle may pass through the camera's
-plane and needs no clipping; the near test is made a pixel.
+A pixel's ray is p(z) = z (u, v, 1) with u = (x - cx) / fx, v = (y - cy) / fy. Sheared along it, a corner (X, Y, Z) in
+camera axes lands at (X - u Z, Y - v Z) and the ray at the origin; with 2D cross products w_a = b x c, w_b = c x a,
+w_c = a x b of the sheared corners, the ray hits where the three agree in sign. The hit has the barycentrics
+w / (w_a + w_b + w_c), perspective correct as they stand. Nothing is divided by a vertex's depth, so a triangle may pass
+through the camera's plane and needs no clipping (Olano and Greer, "Triangle scan conversion using 2D homogeneous
+coordinates", 1997); the near test is made a pixel.
 
-Arithmetic is float64 whatever the arrays hold: the products above cancel as (distance / edge)^2, and a hand a few
-metres away would lose its edges in float32. Scalar code is as fast in either.
+No ray slips between faces (Woop, Benthin and Wald, "Watertight ray/triangle intersection", 2013): a corner lands at the
+same rounded place for each of its faces, rounding never swaps the order of the two products of w, so its sign is right
+or it is zero, and zero counts as inside. A fused multiply-add would break that, hence `fuse_fp`, off on both back ends.
+
+Arithmetic is float64 whatever the arrays hold: the products cancel as (distance / edge)^2, and a hand a few metres away
+would lose its edges in float32. Scalar code is as fast in either.
 """
 
 from typing import Any
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BOX_MARGIN = wp.constant(wp.float64(1e-3))
 """Pixels added round a projected triangle, so that rounding of the box never decides about a pixel on an edge."""
@@ -31,12 +36,11 @@ ONE = wp.constant(wp.float64(1.0))
 
 @wp.struct
 class Triangle:
-    """What a ray needs of a triangle in camera axes."""
+    """Corners in camera axes."""
 
-    wa: wp.vec3d  # b x c
-    wb: wp.vec3d  # c x a
-    wc: wp.vec3d  # a x b
-    z: wp.vec3d  # depths of a, b, c
+    a: wp.vec3d
+    b: wp.vec3d
+    c: wp.vec3d
     flat: wp.float64  # |w_a + w_b + w_c| up to here counts as edge-on
 
 
@@ -66,47 +70,47 @@ def pixel_of(p: wp.vec3d, K: wp.array2d[Any]) -> wp.vec2d:
 
 
 @wp.func
-def pixel_ray(x: int, y: int, K: wp.array2d[Any]) -> wp.vec3d:
-    """Direction of the ray through the centre of a pixel, scaled to depth one."""
-    u = (wp.float64(x) + HALF - wp.float64(K[0, 2])) / wp.float64(K[0, 0])
-    v = (wp.float64(y) + HALF - wp.float64(K[1, 2])) / wp.float64(K[1, 1])
-    return wp.vec3d(u, v, ONE)
+def pixel_rays(K: wp.array2d[Any]) -> wp.vec4d:
+    """Where rays are at depth one: the ray of pixel (x, y) at (r0 + x r2, r1 + y r3)."""
+    du = ONE / wp.float64(K[0, 0])
+    dv = ONE / wp.float64(K[1, 1])
+    return wp.vec4d((HALF - wp.float64(K[0, 2])) * du, (HALF - wp.float64(K[1, 2])) * dv, du, dv)
 
 
 @wp.func
-def edge_plane(i: int, j: int, p: wp.vec3d, q: wp.vec3d) -> wp.vec3d:
-    """Cross product p x q, computed in the order of the vertex indices.
-
-    The two faces of an edge then get exactly opposite planes, fused multiply-adds or not: no ray slips through.
-    """
-    if i < j:
-        return wp.cross(p, q)
-    return -wp.cross(q, p)
+def pixel_ray(x: int, y: int, rays: wp.vec4d) -> wp.vec2d:
+    return wp.vec2d(rays[0] + wp.float64(x) * rays[2], rays[1] + wp.float64(y) * rays[3])
 
 
 @wp.func
 def triangle(f: int, faces: wp.array2d[wp.int32], vertices: wp.array[wp.vec3d]) -> Triangle:
-    ia = faces[f, 0]
-    ib = faces[f, 1]
-    ic = faces[f, 2]
-    a = vertices[ia]
-    b = vertices[ib]
-    c = vertices[ic]
     tri = Triangle()
-    tri.wa = edge_plane(ib, ic, b, c)
-    tri.wb = edge_plane(ic, ia, c, a)
-    tri.wc = edge_plane(ia, ib, a, b)
-    tri.z = wp.vec3d(a[2], b[2], c[2])
-    tri.flat = EDGE_ON * wp.length(wp.cross(b - a, c - a))
+    tri.a = vertices[faces[f, 0]]
+    tri.b = vertices[faces[f, 1]]
+    tri.c = vertices[faces[f, 2]]
+    tri.flat = EDGE_ON * wp.length(wp.cross(tri.b - tri.a, tri.c - tri.a))
     return tri
 
 
 @wp.func
-def barycentrics(tri: Triangle, d: wp.vec3d) -> wp.vec3d:
-    """Barycentrics of the point that the ray `d` hits, edges included, from either side; all zero for a miss."""
-    wa = wp.dot(tri.wa, d)
-    wb = wp.dot(tri.wb, d)
-    wc = wp.dot(tri.wc, d)
+def sheared(p: wp.vec3d, ray: wp.vec2d) -> wp.vec2d:
+    return wp.vec2d(p[0] - ray[0] * p[2], p[1] - ray[1] * p[2])
+
+
+@wp.func
+def cross2(p: wp.vec2d, q: wp.vec2d) -> wp.float64:
+    return p[0] * q[1] - p[1] * q[0]
+
+
+@wp.func
+def barycentrics(tri: Triangle, ray: wp.vec2d) -> wp.vec3d:
+    """Barycentrics of the point that the ray hits, edges included, from either side; all zero for a miss."""
+    a = sheared(tri.a, ray)
+    b = sheared(tri.b, ray)
+    c = sheared(tri.c, ray)
+    wa = cross2(b, c)
+    wb = cross2(c, a)
+    wc = cross2(a, b)
     inside = (wa >= ZERO and wb >= ZERO and wc >= ZERO) or (wa <= ZERO and wb <= ZERO and wc <= ZERO)
     # Inside, the three have one sign: the sum loses nothing.
     total = wa + wb + wc
@@ -115,14 +119,22 @@ def barycentrics(tri: Triangle, d: wp.vec3d) -> wp.vec3d:
     return wp.vec3d(wa / total, wb / total, wc / total)
 
 
+@wp.func
+def depth_at(tri: Triangle, ray: wp.vec2d) -> wp.float64:
+    """Depth of the point that the ray hits; 0 for a miss, which is not beyond any near plane."""
+    w = barycentrics(tri, ray)
+    return w[0] * tri.a[2] + w[1] * tri.b[2] + w[2] * tri.c[2]
+
+
 @wp.kernel
-def camera_points(points: wp.array2d[Any], viewmat: wp.array2d[Any], out: wp.array[wp.vec3d]):
-    i = wp.tid()
+def camera_points(first: int, points: wp.array2d[Any], viewmat: wp.array2d[Any], out: wp.array[wp.vec3d]):
+    i = first + wp.tid()
     out[i] = camera_point(points, i, viewmat)
 
 
 @wp.kernel
 def face_boxes(
+    first: int,
     vertices: wp.array[wp.vec3d],
     faces: wp.array2d[wp.int32],
     K: wp.array2d[Any],
@@ -131,7 +143,7 @@ def face_boxes(
     near: wp.float64,
     boxes: wp.array[wp.vec4i],  # first column, last column, first row, last row; empty when first > last
 ):
-    f = wp.tid()
+    f = first + wp.tid()
     n_near = wp.int32(0)
     for k in range(3):
         if vertices[faces[f, k]][2] <= near:
@@ -159,9 +171,9 @@ def face_boxes(
 
 
 @wp.kernel
-def fill_rows(
-    first_row: int,
-    last_row: int,
+def fill_strips(
+    first: int,
+    n_strips: int,
     vertices: wp.array[wp.vec3d],
     faces: wp.array2d[wp.int32],
     boxes: wp.array[wp.vec4i],
@@ -170,7 +182,11 @@ def fill_rows(
     depth: wp.array2d[wp.float64],  # +inf on entry
     face_ids: wp.array2d[wp.int32],  # -1 on entry
 ):
-    """One thread for rows `first_row` to `last_row`; faces in order, so that a tie stays with the smaller id."""
+    """Each strip takes the faces in order, so that a tie stays with the smaller id."""
+    strip = first + wp.tid()
+    first_row = depth.shape[0] * strip // n_strips
+    last_row = depth.shape[0] * (strip + 1) // n_strips - 1
+    rays = pixel_rays(K)
     for f in range(faces.shape[0]):
         box = boxes[f]
         y0 = wp.max(box[2], first_row)
@@ -179,8 +195,7 @@ def fill_rows(
             tri = triangle(f, faces, vertices)
             for y in range(y0, y1 + 1):
                 for x in range(box[0], box[1] + 1):
-                    # A miss has z = 0, which is not beyond the near plane.
-                    z = wp.dot(barycentrics(tri, pixel_ray(x, y, K)), tri.z)
+                    z = depth_at(tri, pixel_ray(x, y, rays))
                     if z > near and z < depth[y, x]:
                         depth[y, x] = z
                         face_ids[y, x] = f
@@ -206,10 +221,11 @@ def fill_faces(
     box = boxes[f]
     if box[0] > box[1] or box[2] > box[3]:
         return
+    rays = pixel_rays(K)
     tri = triangle(f, faces, vertices)
     for y in range(box[2], box[3] + 1):
         for x in range(box[0], box[1] + 1):
-            z = wp.dot(barycentrics(tri, pixel_ray(x, y, K)), tri.z)
+            z = depth_at(tri, pixel_ray(x, y, rays))
             if z > near:
                 if stage == 0:
                     wp.atomic_min(depth, y, x, z)
@@ -219,6 +235,7 @@ def fill_faces(
 
 @wp.kernel
 def interpolate(
+    first: int,
     vertices: wp.array[wp.vec3d],
     faces: wp.array2d[wp.int32],
     K: wp.array2d[Any],
@@ -226,10 +243,11 @@ def interpolate(
     out: wp.array3d[Any],  # height, width, 3; zero on entry
 ):
     """Barycentrics of every covered pixel."""
-    y, x = wp.tid()
+    row, x = wp.tid()
+    y = first + row
     f = face_ids[y, x]
     if f >= 0:
-        b = barycentrics(triangle(f, faces, vertices), pixel_ray(x, y, K))
+        b = barycentrics(triangle(f, faces, vertices), pixel_ray(x, y, pixel_rays(K)))
         for k in range(3):
             out[y, x, k] = out.dtype(b[k])
 
@@ -239,18 +257,18 @@ def shows_vertex(
     x: int, y: int, vertex: int, faces: wp.array2d[wp.int32], face_ids: wp.array2d[wp.int32]
 ) -> wp.bool:
     """Whether one of the 3 x 3 pixels round (x, y) shows a face with the given corner."""
-    found = wp.bool(False)
     for v in range(wp.max(y - 1, 0), wp.min(y + 2, face_ids.shape[0])):
         for u in range(wp.max(x - 1, 0), wp.min(x + 2, face_ids.shape[1])):
             f = face_ids[v, u]
             if f >= 0:
                 if faces[f, 0] == vertex or faces[f, 1] == vertex or faces[f, 2] == vertex:
-                    found = True
-    return found
+                    return True
+    return False
 
 
 @wp.kernel
 def visibility(
+    first: int,
     points: wp.array2d[Any],
     point_vertices: wp.array[wp.int32],  # empty: no point is known to be a vertex
     faces: wp.array2d[wp.int32],
@@ -264,7 +282,7 @@ def visibility(
     out: wp.array[Any],  # zero on entry
     slope: wp.array[Any],  # derivative of `out` with respect to the point's depth; zero on entry
 ):
-    i = wp.tid()
+    i = first + wp.tid()
     p = camera_point(points, i, viewmat)
     if p[2] <= near:
         return
@@ -295,7 +313,7 @@ def visibility(
 
 for real in (wp.float32, wp.float64):
     wp.overload(camera_points, {"points": wp.array2d[real], "viewmat": wp.array2d[real]})
-    for kernel in (face_boxes, fill_rows, fill_faces):
+    for kernel in (face_boxes, fill_strips, fill_faces):
         wp.overload(kernel, {"K": wp.array2d[real]})
     wp.overload(interpolate, {"K": wp.array2d[real], "out": wp.array3d[real]})
     wp.overload(

@@ -38,7 +38,7 @@ class Plane:
 
     e1: wp.vec3d
     e2: wp.vec3d
-    longest: wp.float64  # length of the longest edge
+    longest: wp.float64  # longest edge, squared
     area: wp.float64
     normal: wp.vec3d  # unit; zero where the triangle is flat
     proper: wp.bool
@@ -55,12 +55,12 @@ def plane(f: int, faces: wp.array2d[wp.int32], vertices: wp.array2d[Any]) -> Pla
     out = Plane()
     out.e1 = corner(vertices, faces[f, 1]) - p
     out.e2 = corner(vertices, faces[f, 2]) - p
-    out.longest = wp.max(wp.max(wp.length(out.e1), wp.length(out.e2)), wp.length(out.e2 - out.e1))
+    out.longest = wp.max(wp.max(wp.length_sq(out.e1), wp.length_sq(out.e2)), wp.length_sq(out.e2 - out.e1))
     cross = wp.cross(out.e1, out.e2)
     twice = wp.length(cross)
     out.area = HALF * twice
     out.normal = wp.vec3d(ZERO, ZERO, ZERO)
-    out.proper = twice > FLAT * out.longest * out.longest
+    out.proper = twice > FLAT * out.longest
     if out.proper:
         out.normal = cross / twice
     return out
@@ -119,12 +119,13 @@ def damped_ratio(rest: Plane, posed: Plane) -> wp.float64:
     """Posed area over rest area; 1 where the rest triangle is a point."""
     if rest.longest == ZERO:
         return ONE
-    damping = DAMPING * rest.longest * rest.longest
+    damping = DAMPING * rest.longest
     return (posed.area + damping) / (rest.area + damping)
 
 
 @wp.kernel
 def face_rotations(
+    first: int,
     rest: wp.array2d[Any],
     posed: wp.array2d[Any],
     faces: wp.array2d[wp.int32],
@@ -132,7 +133,7 @@ def face_rotations(
     area_ratio: wp.array[Any],
     weights: wp.array[wp.float64],  # area at rest; 0 where the face has no rotation, and its quaternion is the identity
 ):
-    f = wp.tid()
+    f = first + wp.tid()
     before = plane(f, faces, rest)
     after = plane(f, faces, posed)
     q = wp.vec4d(ONE, ZERO, ZERO, ZERO)
@@ -155,6 +156,7 @@ def unit(quats: wp.array2d[Any], i: int) -> wp.vec4d:
 
 @wp.kernel
 def vertex_rotations(
+    first: int,
     face_quats: wp.array2d[Any],
     weights: wp.array[wp.float64],
     offsets: wp.array[wp.int32],  # corners of vertex v are corners[offsets[v] : offsets[v + 1]]
@@ -164,7 +166,7 @@ def vertex_rotations(
     reference: wp.array[wp.int32],  # the face that signs are aligned to; -1 for the fallback
     norms: wp.array[wp.float64],  # length of the sum before it was normalised
 ):
-    v = wp.tid()
+    v = first + wp.tid()
     best = wp.int32(-1)
     largest = ZERO
     for j in range(offsets[v], offsets[v + 1]):
@@ -197,12 +199,13 @@ def vertex_rotations(
 
 @wp.kernel
 def vertex_rotations_backward(
+    first: int,
     quats: wp.array2d[Any],
     norms: wp.array[wp.float64],
     grad_quats: wp.array2d[Any],
     grad_sums: wp.array[wp.vec4d],  # with respect to the sum before it was normalised
 ):
-    v = wp.tid()
+    v = first + wp.tid()
     grad_sums[v] = wp.vec4d()
     if norms[v] > ZERO:
         q = unit(quats, v)
@@ -243,12 +246,12 @@ def area_gradient(grad: wp.float64, tri: Plane) -> Edges:
 
 
 @wp.func
-def longest_squared_gradient(grad: wp.float64, tri: Plane) -> Edges:
+def longest_gradient(grad: wp.float64, tri: Plane) -> Edges:
     out = Edges()
     opposite = tri.e2 - tri.e1
-    if wp.length(tri.e1) == tri.longest:
+    if wp.length_sq(tri.e1) == tri.longest:
         out.e1 = TWO * grad * tri.e1
-    elif wp.length(tri.e2) == tri.longest:
+    elif wp.length_sq(tri.e2) == tri.longest:
         out.e2 = TWO * grad * tri.e2
     else:
         out.e1 = -TWO * grad * opposite
@@ -266,6 +269,7 @@ def store_corners(rows: wp.array2d[Any], f: int, e1: wp.vec3d, e2: wp.vec3d):
 
 @wp.kernel
 def face_rotations_backward(
+    first: int,
     rest: wp.array2d[Any],
     posed: wp.array2d[Any],
     faces: wp.array2d[wp.int32],
@@ -278,7 +282,7 @@ def face_rotations_backward(
     grad_rest: wp.array2d[Any],  # nine values a face; no rows when not wanted
     grad_posed: wp.array2d[Any],  # nine values a face; no rows when not wanted
 ):
-    f = wp.tid()
+    f = first + wp.tid()
     before = plane(f, faces, rest)
     after = plane(f, faces, posed)
     before_grad = Edges()
@@ -305,7 +309,7 @@ def face_rotations_backward(
     grad_ratio = ZERO
     ratio = ONE
     if before.longest > ZERO:
-        damped = before.area + DAMPING * before.longest * before.longest
+        damped = before.area + DAMPING * before.longest
         ratio = damped_ratio(before, after)
         grad_ratio = wp.float64(grad_area_ratio[f]) / damped
     if grad_posed.shape[0] > 0:
@@ -313,7 +317,7 @@ def face_rotations_backward(
         store_corners(grad_posed, f, after_grad.e1 + area.e1, after_grad.e2 + area.e2)
     if grad_rest.shape[0] > 0:
         area = area_gradient(grad_weight - ratio * grad_ratio, before)
-        damping = longest_squared_gradient(DAMPING * (ONE - ratio) * grad_ratio, before)
+        damping = longest_gradient(DAMPING * (ONE - ratio) * grad_ratio, before)
         store_corners(
             grad_rest, f, before_grad.e1 + area.e1 + damping.e1, before_grad.e2 + area.e2 + damping.e2
         )

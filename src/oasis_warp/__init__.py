@@ -1,3 +1,51 @@
 """One photo of a hand in, an animatable 3D Gaussian avatar out."""
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from oasis_warp.core.config import ReconstructConfig as ReconstructConfig
+    from oasis_warp.core.errors import InputError as InputError
+    from oasis_warp.core.types import Camera as Camera
+    from oasis_warp.core.types import Gaussians as Gaussians
+    from oasis_warp.core.types import HandPose as HandPose
+    from oasis_warp.data.photo import read_photo as read_photo
+    from oasis_warp.hand_avatar import Avatar as Avatar
+    from oasis_warp.ops import depth_map as depth_map
+    from oasis_warp.ops import depth_visibility as depth_visibility
+    from oasis_warp.ops import face_rotations as face_rotations
+    from oasis_warp.ops import pose_on_mesh as pose_on_mesh
+    from oasis_warp.ops import rasterization as rasterization
+    from oasis_warp.pipeline import reconstruct as reconstruct
+
+# A name is imported when it is first used: torch and Warp take seconds, and `oasis --help` needs neither.
+_HOMES = {
+    "Avatar": "hand_avatar",
+    "Camera": "core.types",
+    "Gaussians": "core.types",
+    "HandPose": "core.types",
+    "InputError": "core.errors",
+    "ReconstructConfig": "core.config",
+    "depth_map": "ops",
+    "depth_visibility": "ops",
+    "face_rotations": "ops",
+    "pose_on_mesh": "ops",
+    "rasterization": "ops",
+    "read_photo": "data.photo",
+    "reconstruct": "pipeline",
+}
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -74,13 +74,14 @@ def compare_with_photo(avatar: Avatar, evidence: Evidence, pose: HandPose) -> Pa
     image, alpha = drawn.image, drawn.alpha
     if avatar.side == "left":
         image, alpha = image.flip(1), alpha.flip(1)
-    mask = evidence.mask > 0.5
-    both = (inner_mask(evidence.mask) > 0.5) & (alpha >= COVERED)
+    judged = evidence.above_wrist > 0.5
+    mask = (evidence.mask > 0.5) & judged
+    both = (inner_mask(evidence.mask) > 0.5) & (alpha >= COVERED) & judged
     weight = both.to(image)
     gain = (image * evidence.image * weight[..., None]).sum((0, 1)) / (
         (image**2 * weight[..., None]).sum((0, 1)).clamp_min(1e-6)
     )
-    covered = alpha > 0.5
+    covered = (alpha > 0.5) & judged
     return PairScore(
         psnr=masked_psnr((image * gain).clamp(0, 1), evidence.image, weight),
         psnr_plain=masked_psnr(image, evidence.image, weight),

@@ -17,11 +17,13 @@ from oasis_warp.core.types import Evidence, HandFit, Landmarks, Photo
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.keypoints_file import read_keypoints
+from oasis_warp.hand.outline import wrist_line
 from oasis_warp.hand.skinning import mirror_pose, rest_hand, skin
 from oasis_warp.hand.surface_offsets import outline_offsets
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
+from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 from oasis_warp.training.adapt import adapt
 
@@ -72,6 +74,8 @@ def reconstruct(
         stages[name] = time.perf_counter() - start
         progress(name, 1, 1)
 
+    with stage("kernels"):
+        warm_up(config.device)
     hand = bundled_hand()
     estimator = HandEstimator(hand)
     with stage("landmarks"):
@@ -117,6 +121,9 @@ def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: Rec
         camera, pose = mirrored_camera(camera), mirror_pose(pose)
     if not bool((mask > 0.5).any()):
         raise InputError(f"{photo.name}: the mask of the hand is empty. Give --keypoints, or another photo.")
+    above = torch.from_numpy(wrist_line(fit.landmarks.xy.numpy()).above_mask((camera.width, camera.height))).float()
+    if fit.side == "left":
+        above = above.flip(1)
     left, top, side = square_around(mask, CROP_MARGIN)
     rest = rest_hand(hand, fit.shape)
     rest = rest._replace(vertices=rest.vertices + offsets)
@@ -127,9 +134,13 @@ def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: Rec
     def there(nouns):
         return type(nouns)(*(part.to(device) for part in nouns))
 
+    def cut(plane):
+        return resample_square(plane.contiguous(), left, top, side, config.size).clamp(0, 1).to(device)
+
     return Evidence(
-        image=resample_square(image.contiguous(), left, top, side, config.size).clamp(0, 1).to(device),
-        mask=resample_square(mask.contiguous(), left, top, side, config.size).clamp(0, 1).to(device),
+        image=cut(image),
+        mask=cut(mask),
+        above_wrist=cut(above),
         camera=crop._replace(viewmat=crop.viewmat.to(device), K=crop.K.to(device)),
         rest=there(rest),
         posed=there(posed),
@@ -138,13 +149,14 @@ def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: Rec
 
 @torch.no_grad()
 def input_errors(avatar: Avatar, evidence: Evidence) -> dict[str, float]:
-    """How well the avatar explains its own photo: over black, inside the mask, at the crop's resolution."""
+    """How well the avatar explains its own photo: over black, inside the mask above the wrist line, in the crop."""
     drawn = avatar.render(avatar.source_camera, avatar.source_pose, BLACK)
     image, alpha = drawn.image, drawn.alpha
     if avatar.side == "left":
         image, alpha = image.flip(1), alpha.flip(1)
-    inside = (evidence.mask > 0.5).to(image)
-    covered = alpha > 0.5
+    judged = evidence.above_wrist > 0.5
+    inside = ((evidence.mask > 0.5) & judged).to(image)
+    covered = (alpha > 0.5) & judged
     union = (covered | (inside > 0)).sum().clamp_min(1)
     return {
         "input_psnr_db": masked_psnr(image, evidence.image, inside),

@@ -102,5 +102,7 @@ def vertex_to_gaussians(
     values: Float[Tensor, "V D"], faces: Int[Tensor, "F 3"], anchors: Anchors | CanonicalGaussians
 ) -> Float[Tensor, "N D"]:
     """A field over the vertices, read at every Gaussian."""
-    on_faces = (values[faces[anchors.face_index]] * anchors.barycentrics[..., None]).sum(1)
-    return torch.cat([values[anchors.vertex_index], on_faces])
+    # index_select and not values[...]: its gradient adds in a fixed order, so equal seeds give equal bits
+    corners = values.index_select(0, faces[anchors.face_index].flatten()).unflatten(0, (-1, 3))
+    on_faces = (corners * anchors.barycentrics[..., None]).sum(1)
+    return torch.cat([values.index_select(0, anchors.vertex_index), on_faces])

@@ -1,8 +1,9 @@
 """What a hand looks like before its photo is fitted. The mean prior here; a learned one is called the same way."""
 
 import math
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -15,14 +16,15 @@ from oasis_warp.core.types import CanonicalGaussians, Evidence
 TONES = 25
 """Skin tones tried, evenly spaced in the logarithm of melanin."""
 LIGHTEST, DARKEST = 0.006, 0.35
-SIGMA_COLOR = 0.10
+SIGMA_COLOR = 0.05
 """Expected difference of a lit hand from its region colours [sRGB]."""
-SIGMA_EXPOSURE = 0.35
+SIGMA_EXPOSURE = 0.25
 """Expected logarithm of the photo's brightness over that of an evenly lit hand."""
-SIGMA_CAST = 0.12
+SIGMA_CAST = 0.22
 """Expected logarithms of red over green and blue over green: the photo's colour cast."""
 
 
+@runtime_checkable
 class Prior(Protocol):
     """Canonical Gaussians of the whole hand from what one photo shows."""
 
@@ -32,27 +34,26 @@ class Prior(Protocol):
 
 
 def estimate_melanin(regions: Regions, seen: Observation) -> float:
-    """Melanin share of the hand's back: the tone that explains the seen colours with the least light and cast.
+    """Melanin share of the hand's back: the mean over the tones that explain the seen colours.
 
     For every tone the best gain of each channel has a closed form; its residual, brightness and cast are weighed by
-    their expected sizes. A photo alone cannot tell dark skin in bright light from light skin in dim light, hence the
-    weights.
+    their expected sizes. A photo alone cannot tell dark skin in bright light from light skin in dim light, nor brown
+    skin from warm light: the posterior mean of the logarithm errs least.
     """
     weight = seen.confidence[:, None]
     total = weight.sum().clamp_min(1e-6)
-    best, best_cost = LIGHTEST, math.inf
-    for step in range(TONES):
-        melanin = LIGHTEST * (DARKEST / LIGHTEST) ** (step / (TONES - 1))
+    log_melanin = torch.linspace(math.log(LIGHTEST), math.log(DARKEST), TONES)
+    costs = []
+    for melanin in log_melanin.exp().tolist():
         model = region_colors(regions, melanin)
         gain = (weight * model * seen.colors).sum(0) / (weight * model * model).sum(0).clamp_min(1e-6)
         residual = (weight * (gain * model - seen.colors) ** 2).sum() / (3 * total)
         log_gain = gain.clamp_min(1e-3).log()
         exposure = log_gain.mean() / SIGMA_EXPOSURE
         cast = (log_gain[[0, 2]] - log_gain[1]) / SIGMA_CAST
-        cost = float(residual / SIGMA_COLOR**2 + exposure**2 + (cast**2).sum())
-        if cost < best_cost:
-            best, best_cost = melanin, cost
-    return best
+        costs.append(residual / SIGMA_COLOR**2 + exposure**2 + (cast**2).sum())
+    posterior = torch.softmax(-torch.stack(costs).cpu() / 2, dim=0)
+    return float((posterior * log_melanin).sum().exp())
 
 
 class MeanPrior:
@@ -64,7 +65,7 @@ class MeanPrior:
 
     def __call__(self, evidence: Evidence) -> CanonicalGaussians:
         """Gaussians on the fitted surface with evenly lit mean colours; the photo is only asked for the skin tone."""
-        seen = observe(self.hand, evidence)
+        seen = Observation(*(part.cpu() for part in observe(self.hand, evidence)))
         colors = self.vertex_colors(estimate_melanin(self.regions, seen)).to(evidence.image)
         anchors = place_anchors(self.hand, evidence.rest)
         faces = self.hand.faces.to(colors.device)

@@ -1,11 +1,12 @@
 """The package logger and the progress callback. Nothing is printed outside `oasis_warp.cli`."""
 
 import logging
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 logger = logging.getLogger("oasis_warp")
 
 
+@runtime_checkable
 class Progress(Protocol):
     """What long work calls: the stage's name, how much of it is done and out of how much."""
 

@@ -104,6 +104,8 @@ class Evidence(NamedTuple):
     """Square crop around the hand."""
     mask: Float[Tensor, "S S"]
     """Share of each pixel that is hand."""
+    above_wrist: Float[Tensor, "S S"]
+    """1 on the hand's side of the wrist line: below it mask and surface end at different places."""
     camera: Camera
     """Of the crop."""
     rest: PosedHand

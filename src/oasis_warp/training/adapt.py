@@ -42,7 +42,7 @@ def adapt(
     faces = hand.faces.to(evidence.image.device)
     posed = pose_gaussians(prior, faces, evidence.rest.vertices, evidence.posed.vertices)
     view = freeze_view(posed, evidence.camera)
-    trusted = inner_mask(evidence.mask, 1) * (view.alpha > 0.5)
+    trusted = inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5)
 
     progress("calibration", 0, 1)
     calibration = calibrate(view, prior.colors, evidence.image, trusted, config)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.losses.image import masked_l1, masked_statistics
-from oasis_warp.training.views import FrozenView
+from oasis_warp.ops import BlendWeights, blend_colors
 
 RIDGE = 0.02
 """Weight of a plain gain against the photo's own contrast, as a variance [sRGB^2]: shading is not skin colour."""
@@ -44,7 +44,7 @@ def closed_form(
 
 
 def calibrate(
-    view: FrozenView,
+    view: BlendWeights,
     colors: Float[Tensor, "N 3"],
     target: Float[Tensor, "H W 3"],
     mask: Float[Tensor, "H W"],
@@ -55,9 +55,9 @@ def calibrate(
     The blended picture is linear in w and b, so the Gaussians are blended once.
     """
     with torch.no_grad():
-        picture = view.image(colors)
-        alpha = view.alpha[..., None]
-        start = closed_form(picture / alpha.clamp_min(1e-3), target, mask * view.alpha)
+        picture = blend_colors(view, colors)
+        alpha = view.alphas
+        start = closed_form(picture / alpha.clamp_min(1e-3), target, mask * alpha[..., 0])
     gain, offset = start.gain.clone().requires_grad_(True), start.offset.clone().requires_grad_(True)
     optimiser = torch.optim.Adam([gain, offset], lr=LEARNING_RATE)
     goal_mean, goal_std = masked_statistics(target, mask)

@@ -1,55 +1,18 @@
-"""Views of fixed geometry. Where only colours change, a picture is linear in them: image = W colours."""
+"""Views of fixed geometry: where only colours change, a picture is linear in them and is blended once."""
 
 import math
-from typing import NamedTuple
-
-import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from oasis_warp.core.types import Camera, Gaussians
-from oasis_warp.ops import blend_weights
+from oasis_warp.ops import BlendWeights, blend_weights
 
 
-class _Blend(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, colors, weights, transposed):
-        ctx.transposed = transposed
-        return weights @ colors
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        return (
-            ctx.transposed @ grad,  # colors
-            None,  # weights
-            None,  # transposed
-        )
-
-
-class FrozenView(NamedTuple):
-    """One view of Gaussians whose geometry is fixed."""
-
-    weights: Tensor
-    """Sparse [H W, N]: the share of each Gaussian in each pixel."""
-    transposed: Tensor
-    """The same, transposed, for the gradient."""
-    alpha: Float[Tensor, "H W"]
-
-    def image(self, colors: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 3"]:
-        """The picture over black."""
-        return _Blend.apply(colors, self.weights, self.transposed).view(*self.alpha.shape, 3)
-
-
-def freeze_view(gaussians: Gaussians, camera: Camera) -> FrozenView:
-    """Blend once; afterwards a picture costs one sparse product."""
-    weights = blend_weights(
-        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities,
-        camera.viewmat.to(gaussians.means), camera.K.to(gaussians.means), camera.width, camera.height,
+def freeze_view(gaussians: Gaussians, camera: Camera) -> BlendWeights:
+    """The weights of every Gaussian in every pixel; afterwards a picture costs one sparse product."""
+    like = gaussians.means
+    return blend_weights(
+        like, gaussians.quats, gaussians.scales, gaussians.opacities,
+        camera.viewmat.to(like), camera.K.to(like), camera.width, camera.height,
     )  # fmt: skip
-    transposed = weights.to_sparse_csc().transpose(0, 1)
-    alpha = weights @ torch.ones(len(gaussians.means), 1, dtype=gaussians.means.dtype, device=gaussians.means.device)
-    return FrozenView(weights, transposed, alpha.view(camera.height, camera.width))
 
 
 def reference_azimuths(count: int) -> list[float]:

@@ -1,0 +1,180 @@
+"""The avatar file: safetensors with a JSON header, so that loading one executes nothing.
+
+Tensors lie in the file as the table `TENSORS` says. Its metadata have one entry, "oasis-avatar": the header,
+a JSON object whose `version` is 1. A file of a newer version is refused. (One entry, because safetensors writes several
+in any order: the same avatar shall be the same bytes.)
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from oasis_warp import __version__
+from oasis_warp.core.checks import check_finite, check_shape
+from oasis_warp.core.errors import InputError
+from oasis_warp.data.atomic import write_file
+
+FORMAT = "oasis-avatar"
+VERSION = 1
+UNITS = {"length": "m", "angle": "rad", "quaternion": "wxyz", "color": "sRGB in [0, 1]", "camera": "OpenCV"}
+
+
+class Entry(NamedTuple):
+    """What a tensor of the file must look like."""
+
+    dtype: torch.dtype
+    shape: tuple[int | str, ...]
+    """A letter has one value over the whole file; "N" is P + Q."""
+
+
+TENSORS = {
+    # The hand the Gaussians ride on: the hand model that the header names, shaped, plus what the outline adds.
+    "shape": Entry(torch.float32, ("S",)),
+    "surface_offsets": Entry(torch.float32, ("V", 3)),
+    # The Gaussians at rest: P ride on vertices, then Q on faces.
+    "gaussians.vertex_index": Entry(torch.int64, ("P",)),
+    "gaussians.offsets": Entry(torch.float32, ("P", 3)),
+    "gaussians.face_index": Entry(torch.int64, ("Q",)),
+    "gaussians.barycentrics": Entry(torch.float32, ("Q", 3)),
+    "gaussians.quats": Entry(torch.float32, ("N", 4)),
+    "gaussians.scales": Entry(torch.float32, ("N", 3)),
+    "gaussians.opacities": Entry(torch.float32, ("N",)),
+    "gaussians.colors": Entry(torch.float32, ("N", 3)),
+    # What the photo showed.
+    "source_pose.angles": Entry(torch.float32, (15, 3)),
+    "source_pose.orientation": Entry(torch.float32, (3, 3)),
+    "source_pose.translation": Entry(torch.float32, (3,)),
+    "source_camera.viewmat": Entry(torch.float32, (4, 4)),
+    "source_camera.K": Entry(torch.float32, (3, 3)),
+}
+HEADER = {"version": int, "side": str, "hand_model": str, "hand_licence": str, "source_camera": dict}
+"""Keys that a header has at least, and their types; `source_camera` holds `width` and `height` [px]."""
+
+
+def save_avatar(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+    """Write an avatar file, all or nothing.
+
+    Args:
+        path: Where to; an existing file is replaced.
+        tensors: One for every name of `TENSORS`, on any device.
+        header: The keys of `HEADER` and any others; `version`, `units`, `counts` and `creator` are filled in.
+
+    Raises:
+        ValueError: a tensor or header key is missing, unknown or out of bounds.
+        InputError: `path` cannot be written.
+    """
+    stored = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    sizes = _check_tensors(stored)
+    counts = {"gaussians": sizes["N"], "on_vertices": sizes["P"], "on_faces": sizes["Q"]}
+    creator = f"oasis_warp {__version__}"
+    full = {**header, "version": VERSION, "units": UNITS, "counts": counts, "creator": creator}
+    _check_header(full)
+    write_file(path, save(stored, {FORMAT: json.dumps(full, allow_nan=False, sort_keys=True)}))
+
+
+def load_avatar(path: Path | str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors of an avatar file, on the CPU, and its header.
+
+    Raises:
+        InputError: missing, no avatar, of a newer version, cut short, or with tensors or header keys that are missing,
+            unknown or out of bounds.
+    """
+    path = Path(path)
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no such file"
+        raise InputError(f"{path}: expected an avatar file, found {found}; `oasis reconstruct` writes one.")
+    try:
+        with safe_open(path, framework="pt") as file:
+            text = (file.metadata() or {}).get(FORMAT)
+            if text is None:
+                raise InputError(f"{path}: a safetensors file, but no avatar; give the one `oasis reconstruct` wrote.")
+            header = _read_header(path, text)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+    except SafetensorError as error:
+        raise InputError(
+            f"{path}: expected an avatar file, got another format or a file cut short ({error}); copy it again."
+        ) from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file's permissions.") from error
+    try:
+        _check_tensors(tensors)
+    except ValueError as error:
+        raise _damaged(path, error) from error
+    return tensors, header
+
+
+def _damaged(path: Path, error: ValueError) -> InputError:
+    return InputError(f"{path}: a damaged avatar file ({str(error).rstrip('.')}); reconstruct it again.")
+
+
+def _read_header(path: Path, text: str) -> dict[str, Any]:
+    try:
+        header = json.loads(text)
+        version = header.get("version") if isinstance(header, dict) else None
+        if isinstance(version, int) and version > VERSION:  # whatever else it holds, this is what to say
+            raise InputError(
+                f"{path}: avatar file of version {version}, but {VERSION} is the last known here; update oasis-warp."
+            )
+        _check_header(header)
+    except InputError:
+        raise
+    except ValueError as error:  # json.JSONDecodeError is one
+        raise _damaged(path, error) from error
+    return header
+
+
+def _check_header(header: Any) -> None:
+    if not isinstance(header, dict):
+        raise ValueError(f"header: expected a JSON object, got {type(header).__name__}")
+    for key, kind in HEADER.items():
+        if not isinstance(header.get(key), kind):
+            raise ValueError(f"header: expected {key!r} of type {kind.__name__}, got {header.get(key)!r}")
+    if header["version"] != VERSION:
+        raise ValueError(f"header: expected version {VERSION}, got {header['version']}")
+    if header["side"] not in ("left", "right"):
+        raise ValueError(f"header: expected side 'left' or 'right', got {header['side']!r}")
+    size = [header["source_camera"].get(key) for key in ("width", "height")]
+    if not all(isinstance(n, int) and n > 0 for n in size):
+        raise ValueError(f"header: expected a source_camera with a positive width and height, got {size}")
+
+
+def _check_tensors(tensors: Mapping[str, Tensor]) -> dict[str, int]:
+    """Check the tensors against the table; the size of each letter."""
+    missing, unknown = TENSORS.keys() - tensors.keys(), tensors.keys() - TENSORS.keys()
+    if missing or unknown:
+        found = {"missing": missing, "unknown": unknown}
+        raise ValueError("tensors: " + "; ".join(f"{k} {', '.join(sorted(v))}" for k, v in found.items() if v))
+    sizes: dict[str, int] = {}
+    for name, entry in TENSORS.items():
+        check_shape(name, tensors[name], *entry.shape, sizes=sizes)
+        if tensors[name].dtype != entry.dtype:
+            raise ValueError(f"{name}: expected {entry.dtype}, got {tensors[name].dtype}")
+        if entry.dtype.is_floating_point:
+            check_finite(**{name: tensors[name]})
+    if sizes["N"] != sizes["P"] + sizes["Q"]:
+        raise ValueError(f"gaussians: expected {sizes['P']} + {sizes['Q']} rows, got {sizes['N']}")
+    _check_gaussians(tensors)
+    return sizes
+
+
+def _check_gaussians(tensors: Mapping[str, Tensor]) -> None:
+    """Refuse values that a renderer would turn into a blank or frozen picture."""
+    n_vertices = len(tensors["surface_offsets"])
+    vertices = tensors["gaussians.vertex_index"]
+    good = {
+        "gaussians.vertex_index": ((vertices >= 0) & (vertices < n_vertices), f"indices of {n_vertices} vertices"),
+        "gaussians.face_index": (tensors["gaussians.face_index"] >= 0, "no negative index"),
+        "gaussians.quats": (tensors["gaussians.quats"].norm(dim=1) > 1e-6, "no zero quaternion"),
+        "gaussians.scales": ((tensors["gaussians.scales"] > 0).all(1), "positive scales"),
+        "gaussians.opacities": (tensors["gaussians.opacities"].clamp(0, 1) == tensors["gaussians.opacities"],
+                                "opacities in [0, 1]"),
+    }
+    for name, (ok, expected) in good.items():
+        if not bool(ok.all()):
+            raise ValueError(f"{name}: expected {expected}, got {int((~ok).sum())} bad rows of {len(ok)}")

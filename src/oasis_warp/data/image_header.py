@@ -1,0 +1,105 @@
+"""Format and size of an image file from its first bytes, so that a huge one is turned away before it is decoded."""
+
+import struct
+from typing import NamedTuple
+
+from oasis_warp.data.exif import BITS, HEIGHT, SAMPLES, WIDTH, read_tags
+
+
+class ImageHeader(NamedTuple):
+    """What an image file says about itself."""
+
+    format: str
+    width: int
+    height: int
+    pixel_bytes: int
+    """Memory of one decoded pixel, at most."""
+
+
+READABLE = "JPEG, PNG, WebP, AVIF, BMP or TIFF"
+_AVIF_BRANDS = (b"avif", b"avis")
+_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
+
+
+def read_header(data: bytes) -> ImageHeader | None:
+    """The header of a JPEG, PNG, WebP, AVIF, BMP or TIFF file; None for anything else and for a header cut short."""
+    try:
+        if data.startswith(b"\xff\xd8\xff"):
+            return _jpeg(data)
+        if data.startswith(b"\x89PNG\r\n\x1a\n"):
+            width, height, depth = struct.unpack_from(">IIB", data, 16)
+            return ImageHeader("PNG", width, height, 8 if depth == 16 else 4)
+        if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+            return ImageHeader("WebP", *_webp_size(data), 4)
+        if data[4:8] == b"ftyp" and data[8:12] in _AVIF_BRANDS:
+            return _avif(data)
+        if data.startswith(b"BM"):
+            return ImageHeader("BMP", *_bmp_size(data), 4)
+        if data[:4] in (b"II*\0", b"MM\0*"):
+            return _tiff(data)
+    except (struct.error, KeyError, IndexError):
+        pass  # cut short
+    return None
+
+
+def looks_readable(data: bytes) -> bool:
+    """Whether `data` begins like a file that can be read here, whatever follows."""
+    return (
+        data.startswith((b"\xff\xd8\xff", b"\x89PNG", b"BM", b"II*\0", b"MM\0*"))
+        or (data.startswith(b"RIFF") and data[8:12] == b"WEBP")
+        or (data[4:8] == b"ftyp" and data[8:12] in _AVIF_BRANDS)
+    )
+
+
+def foreign_format(data: bytes) -> str | None:
+    """The name of a well-known format that cannot be read here, to say something more useful than "not an image"."""
+    if data[4:8] == b"ftyp":
+        return "HEIC" if data[8:12] in _HEIF_BRANDS else "video"
+    magics = {b"GIF8": "GIF", b"%PDF": "PDF", b"\x1aE\xdf\xa3": "video", b"\xff\x0a": "JPEG XL", b"<svg": "SVG"}
+    return next((name for magic, name in magics.items() if data.startswith(magic)), None)
+
+
+def _jpeg(data: bytes) -> ImageHeader:
+    place = 2
+    while True:
+        while data[place] == 0xFF:  # any number of fill bytes may stand before a marker
+            place += 1
+        marker = data[place]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
+            height, width = struct.unpack_from(">HH", data, place + 4)
+            return ImageHeader("JPEG", width, height, 3)
+        (length,) = struct.unpack_from(">H", data, place + 1)
+        place += 1 + length
+
+
+def _webp_size(data: bytes) -> tuple[int, int]:
+    kind = data[12:16]
+    if kind == b"VP8X":
+        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
+    if kind == b"VP8L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    width, height = struct.unpack_from("<HH", data, 26)
+    return width & 0x3FFF, height & 0x3FFF
+
+
+def _avif(data: bytes) -> ImageHeader:
+    # A picture made of tiles has one "ispe" box a tile and one for the whole.
+    sizes, place = [], data.index(b"ispe") if b"ispe" in data else -1
+    while place >= 0:
+        sizes.append(struct.unpack_from(">II", data, place + 8))
+        place = data.find(b"ispe", place + 4)
+    largest = sorted(sizes, key=lambda size: size[0] * size[1])[-1]
+    return ImageHeader("AVIF", *largest, 8)
+
+
+def _bmp_size(data: bytes) -> tuple[int, int]:
+    (header_size,) = struct.unpack_from("<I", data, 14)
+    width, height = struct.unpack_from("<HH" if header_size == 12 else "<ii", data, 18)
+    return width, abs(height)  # a negative height means rows from the top
+
+
+def _tiff(data: bytes) -> ImageHeader:
+    tags = read_tags(data)
+    samples, bits = tags.get(SAMPLES, 1), tags.get(BITS, 8)
+    return ImageHeader("TIFF", tags[WIDTH], tags[HEIGHT], max(samples, 4) * max(bits, 8) // 8)

@@ -1,0 +1,184 @@
+"""Read a photo: any common file in, upright 8-bit RGB out, or one sentence about what is wrong with it."""
+
+import contextlib
+import os
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import cv2
+import numpy as np
+import torch
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import Photo
+from oasis_warp.data.exif import Exif, focal_pixels, read_exif
+from oasis_warp.data.image_header import READABLE, ImageHeader, foreign_format, looks_readable, read_header
+
+MAX_PIXELS = 24_000_000
+"""Largest photo kept in memory; a hand in a larger one still has far more pixels than the crop that is fitted."""
+MAX_FILE_PIXELS = 250_000_000
+"""Largest photo that is opened at all."""
+MAX_DECODED_BYTES = 1 << 30
+"""Largest picture that is decoded whole: anything but JPEG cannot be decoded at a fraction of its size."""
+MAX_FILE_BYTES = 1 << 29
+MIN_SIDE = 32
+"""Fewer pixels than this cannot show a hand with fingers."""
+OPAQUE = 0.99
+"""An alpha channel that nowhere falls below this says nothing."""
+
+_JPEG_PARTS = {
+    1: cv2.IMREAD_UNCHANGED,
+    2: cv2.IMREAD_REDUCED_COLOR_2 | cv2.IMREAD_IGNORE_ORIENTATION,
+    4: cv2.IMREAD_REDUCED_COLOR_4 | cv2.IMREAD_IGNORE_ORIENTATION,
+    8: cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION,
+}
+_stderr_lock = threading.Lock()
+
+
+def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> Photo:
+    """Read a JPEG, PNG, WebP, AVIF, BMP or TIFF file as an upright 8-bit sRGB photo.
+
+    EXIF orientation is applied; 16-bit values are rounded to 8; grey, palette and CMYK become RGB; alpha is kept where
+    some pixel is transparent. `Photo.focal` comes from EXIF (see `exif.focal_pixels`). Colour profiles are ignored.
+
+    A photo of more than `max_pixels` is scaled down by a whole factor, averaging. In memory there are, for a moment,
+    the file, and of a JPEG at most four times `max_pixels`, of other formats the whole picture, `MAX_DECODED_BYTES` at
+    most. (The decoder of progressive JPEG keeps 3 bytes a pixel of the file on top.)
+
+    Raises:
+        InputError: missing, unreadable, no image, cut short, damaged, too small or too large.
+    """
+    path = Path(path)
+    data = _read_bytes(path)
+    header = read_header(data)
+    if header is None:
+        raise _not_an_image(path, data)
+    _check_size(path, header)
+    factor = 1
+    while header.width * header.height > max_pixels * factor**2:
+        factor += 1
+    # A JPEG can be decoded at a half, a quarter or an eighth of its size right away.
+    part = max(n for n in _JPEG_PARTS if n <= factor) if header.format == "JPEG" else 1
+    pixels, exif = _decode(path, data, header.format, _JPEG_PARTS[part])
+    del data
+    if part < factor:
+        pixels = cv2.resize(pixels, None, fx=part / factor, fy=part / factor, interpolation=cv2.INTER_AREA)
+    pixels = _to_uint8(path, _turn_upright(pixels, exif.orientation))
+    height, width = pixels.shape[:2]
+    alpha = None
+    if pixels.ndim == 3 and pixels.shape[2] == 4:
+        alpha = torch.from_numpy(np.ascontiguousarray(pixels[..., 3])).float() / 255
+        if bool(alpha.min() >= OPAQUE) or bool(alpha.max() < 1 - OPAQUE):  # all there, or all hidden
+            alpha = None
+    codes = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
+    rgb = cv2.cvtColor(pixels, codes[2 if pixels.ndim == 2 else pixels.shape[2]])
+    return Photo(
+        rgb=torch.from_numpy(rgb),
+        alpha=alpha,
+        focal=None if exif.focal_35mm is None else focal_pixels(exif.focal_35mm, width, height),
+        name=path.name,
+        shrink=max(width, height) / max(header.width, header.height),
+    )
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        if path.is_dir():
+            raise InputError(f"{path}: expected a photo, got a folder; give the files in it instead.")
+        if not path.exists():
+            raise InputError(f"{path}: expected a photo, found no such file; check the name and the folder.")
+        if not path.is_file():
+            raise InputError(f"{path}: expected a photo, got a device or pipe; save the photo to a file first.")
+        size = path.stat().st_size
+        if size > MAX_FILE_BYTES:
+            raise InputError(
+                f"{path}: expected a photo of at most {MAX_FILE_BYTES >> 20} MB, got {size >> 20} MB; save it as JPEG."
+            )
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check the file's permissions and the disk."
+        ) from error
+    if not data:
+        raise InputError(f"{path}: expected a photo, got an empty file (0 bytes); copy or download it again.")
+    return data
+
+
+def _not_an_image(path: Path, data: bytes) -> InputError:
+    if looks_readable(data):
+        return _cut_short(path, len(data))
+    if name := foreign_format(data):
+        return InputError(f"{path}: expected {READABLE}, got {name}; save the photo as JPEG or PNG first.")
+    return InputError(f"{path}: expected {READABLE}, got something that is no image; give the photo itself.")
+
+
+def _cut_short(path: Path, n_bytes: int) -> InputError:
+    return InputError(f"{path}: the image is damaged or cut short ({n_bytes} bytes); copy or download it again.")
+
+
+def _check_size(path: Path, header: ImageHeader) -> None:
+    width, height = header.width, header.height
+    if min(width, height) < MIN_SIDE:
+        raise InputError(
+            f"{path}: expected at least {MIN_SIDE} x {MIN_SIDE} pixels, got {width} x {height}; give a larger photo."
+        )
+    decoded = 0 if header.format == "JPEG" else width * height * header.pixel_bytes
+    if width * height > MAX_FILE_PIXELS or decoded > MAX_DECODED_BYTES:
+        raise InputError(
+            f"{path}: {width} x {height} pixels of {header.format} are too many to decode; scale the photo down first."
+        )
+
+
+def _decode(path: Path, data: bytes, format: str, flags: int) -> tuple[np.ndarray, Exif]:
+    """The pixels as the file stores them (BGR order, not yet upright) and what the camera says about them."""
+    with _captured_stderr() as complaints:
+        try:
+            pixels, kinds, chunks = cv2.imdecodeWithMetadata(np.frombuffer(data, np.uint8), flags)
+        except cv2.error:
+            pixels, kinds, chunks = None, (), ()
+        complaints.seek(0)
+        said = complaints.read()
+    # libjpeg fills what is missing of a closed file with grey and only mentions it.
+    if pixels is None or b"premature end" in said:
+        raise _cut_short(path, len(data))
+    if format == "TIFF":  # OpenCV turns a TIFF upright whatever the flags
+        return pixels, read_exif(data)._replace(orientation=1)
+    blobs = [bytes(chunk) for kind, chunk in zip(kinds, chunks, strict=True) if kind == cv2.IMAGE_METADATA_EXIF]
+    return pixels, read_exif(blobs[0].removeprefix(b"Exif\0\0")) if blobs else Exif(1, None)
+
+
+def _turn_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    if orientation >= 5:  # rows and columns are exchanged
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return np.ascontiguousarray(pixels)
+
+
+def _to_uint8(path: Path, pixels: np.ndarray) -> np.ndarray:
+    if pixels.dtype == np.uint8:
+        return pixels
+    if pixels.dtype == np.uint16:
+        return cv2.convertScaleAbs(pixels, alpha=1 / 257)
+    raise InputError(f"{path}: expected 8 or 16 bits a channel, got {pixels.dtype}; save the photo as JPEG or PNG.")
+
+
+@contextlib.contextmanager
+def _captured_stderr() -> Iterator[IO[bytes]]:
+    """Catch what image libraries write to the process's own stderr: noise to the user, evidence to us."""
+    with _stderr_lock, tempfile.TemporaryFile() as caught:
+        level = cv2.utils.logging.getLogLevel()
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        kept = os.dup(2)
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield caught
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            cv2.utils.logging.setLogLevel(level)

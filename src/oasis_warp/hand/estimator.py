@@ -1,0 +1,168 @@
+"""`HandEstimator`: a photo -> the hands in it -> one of them explained by the model."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import HandFit, Landmarks, Photo
+from oasis_warp.hand.doubts import finger_doubts, other_side_cost, place_doubts, second_looks, side_doubts
+from oasis_warp.hand.fit import Fitter, Solution
+from oasis_warp.hand.fit_quality import DOUBTFUL, REFUSED, TINY_HAND, Quality, draw, measure
+from oasis_warp.hand.fit_state import FitState
+from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.landmarks import box_size, find_hands
+from oasis_warp.hand.networks import networks
+from oasis_warp.hand.outline import MaskOutline
+from oasis_warp.hand.right_view import RightView, array, real
+from oasis_warp.hand.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
+
+_ROUNDS, _LAST_ROUNDS = 3, 2
+"""Rounds of pairing outlines with the first and the second mask."""
+
+
+class HandEstimator:
+    """Finds hands with the two bundled networks and fits `hand` to them. Same photo, same bits."""
+
+    def __init__(self, hand: HandModel):
+        self.hand = hand
+        self.rig = Rig(hand)
+
+    def find(self, photo: Photo) -> list[Landmarks]:
+        """The hands of a photo, best first; empty when there is none.
+
+        When nothing is found plainly, the photo is searched again with a margin, brightened, and with a lower bound;
+        `Landmarks.source` says which way found it.
+
+        Raises:
+            InputError: this installation cannot run the networks (see `networks.check_networks`).
+        """
+        found = find_hands(photo.rgb.numpy(), networks())
+        return [
+            Landmarks(
+                xy=real(hand.xy),
+                world=real(hand.world),
+                side="right" if hand.right > 0.5 else "left",
+                side_score=hand.side_score,
+                presence=hand.presence,
+                source=hand.source,
+            )
+            for hand in found
+        ]
+
+    def fit(
+        self,
+        photo: Photo,
+        landmarks: Landmarks,
+        *,
+        focal: float | None = None,
+        shape: Float[Tensor, "S"] | None = None,
+        force: bool = False,
+    ) -> HandFit:
+        """Shape, pose, camera and mask of one hand.
+
+        Args:
+            photo: The photo.
+            landmarks: The hand in it.
+            focal: Focal length [px] where it is known better than the photo's own; without either it is fitted.
+            shape: Keep these coefficients, of a person who was fitted before.
+            force: Return a fit that would be refused, its faults among the warnings.
+
+        Raises:
+            InputError: the hand is too small, or the model does not explain it.
+        """
+        size = box_size(array(landmarks.xy))
+        if size < TINY_HAND and not force:
+            raise InputError(
+                f"{photo.name}: the hand is {size:.0f} pixels large, at least {TINY_HAND} are needed; "
+                "give a closer or larger photo."
+            )
+        view = RightView(photo, landmarks, focal)
+        known_shape = None if shape is None else array(shape)
+        fitter = Fitter(self.rig, view.evidence, shape=known_shape)
+        start = fitter.fit_landmarks()
+        found, mask, doubts = self._refine(view, fitter, start)
+        quality = measure(self.rig, view.evidence, found.state, mask, found.cost)
+        looks = second_looks(view.rgb, networks(), view.evidence.xy)
+        doubts += place_doubts(view.evidence, mask) + finger_doubts(view.evidence, looks)
+        if landmarks.world is not None:  # 21 points in the plane alone do not tell a palm from the other hand's back
+            other_cost = other_side_cost(self.rig, view.evidence, known_shape)
+            doubts += side_doubts(landmarks.side, start, other_cost, looks)
+        return self._report(view, landmarks, found.state, mask, quality, doubts, force)
+
+    def _refine(self, view: RightView, fitter: Fitter, start: Solution) -> tuple[Solution, np.ndarray, list[str]]:
+        """Fit to the mask's outline too: to a first mask, then to one that the fit has helped to cut."""
+        doubts = []
+        xy, scale = view.evidence.xy, start.state.focal / float(np.exp(start.state.place[2]))
+        ready = None if view.alpha is None else mask_from_alpha(view.alpha, xy, scale)
+        if view.alpha is not None and ready is None:
+            doubts.append("the photo's own cut-out was left aside: it does not show this hand alone and whole")
+        mask = mask_from_landmarks(view.rgb, xy, scale) if ready is None else ready
+        outline = MaskOutline(mask, xy)
+        found = fitter.refine(start.state, lambda state: outline.match(self.rig, state), _ROUNDS)
+        if ready is None:
+            drawn = draw(self.rig, found.state, view.evidence.size)
+            first, mask = mask, mask_from_fit(view.rgb, xy, scale, mask, drawn)
+            # Where the two cuts disagree, the photo does not say where the hand ends.
+            doubt = cv2.dilate(np.abs(mask - first), np.ones((5, 5), np.uint8))
+            outline = MaskOutline(mask, xy, trust=1 - 0.75 * doubt)
+            found = fitter.refine(found.state, lambda state: outline.match(self.rig, state), _LAST_ROUNDS)
+        return found, mask, doubts
+
+    def _report(self, view: RightView, landmarks: Landmarks, state: FitState, mask: np.ndarray, quality: Quality,
+                doubts: list[str], force: bool) -> HandFit:  # fmt: skip
+        refused = quality.beyond(REFUSED)
+        if refused and not force:
+            raise InputError(
+                f"{view.name}: the fit of the {landmarks.side} hand is too poor to use, {' and '.join(refused)}; "
+                "give a sharper photo of the open hand, or force it."
+            )
+        warnings = [f"poor fit: {words}" for words in quality.beyond(DOUBTFUL)] + doubts
+        return HandFit(
+            side=landmarks.side,
+            shape=real(state.shape),
+            pose=view.pose(self.rig, state),
+            camera=view.camera(state),
+            landmarks=landmarks,
+            mask=torch.from_numpy(view.photo_way(mask)),
+            reprojection=quality.reprojection,
+            worst_point=quality.worst_point,
+            mask_iou=quality.mask_iou,
+            cost=quality.cost,
+            warnings=tuple(warnings),
+        )
+
+
+def choose_hand(
+    found: Sequence[Landmarks], which: Literal["left", "right", "largest"] | int, photo_name: str
+) -> Landmarks:
+    """One of the hands that were found: the first of a side, the largest, or by number, counted from 0.
+
+    Raises:
+        InputError: there is none, or not that one; the sentence lists what was found.
+    """
+    if not found:
+        raise InputError(
+            f"{photo_name}: found no hand; give a photo of one whole hand in good light, with some border around it."
+        )
+    if which == "largest":
+        return max(found, key=lambda hand: box_size(array(hand.xy)))
+    if isinstance(which, int):
+        if 0 <= which < len(found):
+            return found[which]
+        wanted = f"hand {which}"
+    else:
+        of_side = [hand for hand in found if hand.side == which]
+        if of_side:
+            return of_side[0]
+        wanted = f"a {which} hand"
+    listed = ", ".join(
+        f"{i}: {hand.side}, {box_size(array(hand.xy)):.0f} px" for i, hand in enumerate(found)
+    )
+    raise InputError(f"{photo_name}: expected {wanted}, found {listed}; choose one of these, or mirror the photo.")

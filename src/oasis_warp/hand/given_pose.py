@@ -1,0 +1,55 @@
+"""A `HandFit` from a shape, pose and camera that come from elsewhere: only the mask is looked for in the photo."""
+
+import numpy as np
+
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
+from oasis_warp.hand.doubts import place_doubts
+from oasis_warp.hand.fit_quality import DOUBTFUL, draw, measure
+from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.right_view import RightView, mirror_points, real, right_state
+from oasis_warp.hand.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
+
+
+def fit_of_pose(
+    hand: HandModel, photo: Photo, side: Side, shape: np.ndarray, pose: HandPose, camera: Camera, source: str
+) -> HandFit:
+    """The photo's hand as a given pose explains it; the landmarks are the model's own, so their error is zero.
+
+    Args:
+        hand: The model that `shape` and `pose` belong to.
+        photo: The photo.
+        side: Whose pose it is; a left hand's describes the mirrored model.
+        shape: Coefficients, [S].
+        pose: In the camera's frame.
+        camera: Of the photo, its viewmat the identity.
+        source: What to call the origin in `Landmarks.source`.
+    """
+    rig = Rig(hand)
+    state = right_state(rig, side, shape, pose, camera)
+    points = rig.landmarks(rig.chain(state.angles, state.shape), state.shape)[0]
+    xy, world = state.project(points), state.in_camera(points)
+    if side == "left":
+        xy, world = mirror_points(xy, camera.width), world * [-1, 1, 1]
+    landmarks = Landmarks(real(xy), real(world - world.mean(0)), side, 1.0, 1.0, source)
+    view = RightView(photo, landmarks, state.focal)
+    scale, seen = state.focal / float(np.exp(state.place[2])), view.evidence.xy
+    mask = None if view.alpha is None else mask_from_alpha(view.alpha, seen, scale)
+    if mask is None:
+        first = mask_from_landmarks(view.rgb, seen, scale)
+        mask = mask_from_fit(view.rgb, seen, scale, first, draw(rig, state, view.evidence.size))
+    quality = measure(rig, view.evidence, state, mask, 0.0)
+    warnings = [f"poor fit: {words}" for words in quality.beyond(DOUBTFUL)] + place_doubts(view.evidence, mask)
+    return HandFit(
+        side=side,
+        shape=real(shape),
+        pose=pose,
+        camera=camera,
+        landmarks=landmarks,
+        mask=real(view.photo_way(mask)),
+        reprojection=quality.reprojection,
+        worst_point=quality.worst_point,
+        mask_iou=quality.mask_iou,
+        cost=quality.cost,
+        warnings=tuple(warnings),
+    )

@@ -1,0 +1,179 @@
+"""Key points and vertices of the right hand with their derivatives by joint angles and shape, in numpy float64.
+
+The same forward kinematics as `skinning`, for the least-squares fit: 26 angles instead of 45, because a finger's middle
+and end joints only bend, and the wrist unrotated at its place, because the fit's camera carries the hand.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.hand.correctives import corrective_coefficients
+
+_TIP_JOINT = [15, 3, 6, 12, 9]  # last joint of thumb, index, middle, ring, little
+
+# Where the landmark network puts its points, seen from the hand's joints and tips: millimetres on a hand of 190 mm,
+# along the bone to the tip, towards the back of the hand, and along x back. Least squares over 63 photos; tips are
+# detected 3 to 4 mm short, the thumb's root lies 8 mm away, ring and little knuckles lie deeper.
+_LANDMARK_OFFSETS = np.array([
+    [3.0, 0, -.5], [3.0, 3.5, -6.5], [-1.0, 0, .5], [1.0, -3.0, -.5], [-3.0, -.5, -.5],
+    [0, -1.0, 2.5], [1.0, -.5, .5], [3.0, -2.0, -1.0], [-3.5, -1.0, 0],
+    [0, -2.0, -.5], [1.0, -1.0, -1.5], [1.0, -1.0, -.5], [-4.0, 0, -1.0],
+    [1.0, -3.0, -2.0], [1.5, 0, 0], [2.5, -1.0, 0], [-4.0, 0, -1.5],
+    [.5, -3.0, -1.5], [-.5, 0, -.5], [2.5, 0, 0], [-2.5, 0, -1.5],
+])  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The joints in one pose and shape."""
+
+    rest: np.ndarray
+    """Joints of the unposed hand, [16, 3]."""
+    rotation: np.ndarray
+    """Bone to hand, [16, 3, 3]."""
+    position: np.ndarray
+    """Posed joints, [16, 3]."""
+    position_by_shape: np.ndarray
+    """[16, 3, S]."""
+    axes: np.ndarray
+    """Posed axes of flexion, abduction and twist, [16, 3, 3]."""
+
+
+class Rig:
+    """A `HandModel` as float64 arrays, with what the derivatives need."""
+
+    def __init__(self, hand: HandModel):
+        def real(tensor: torch.Tensor) -> np.ndarray:
+            return tensor.detach().cpu().numpy().astype(np.float64)
+
+        self.hand = hand
+        self.parents = hand.parents
+        self.joints, self.joint_basis = real(hand.joints), real(hand.joint_basis)
+        self.axes, self.limits, self.rest_bend = real(hand.pose_axes), real(hand.pose_limits), real(hand.rest_bend)
+        self.template, self.shape_basis = real(hand.template), real(hand.shape_basis)
+        self.corrective_basis = real(hand.corrective_basis).reshape(-1, hand.corrective_basis.shape[2])
+        self.weights = real(hand.weights)
+        self.faces = hand.faces.cpu().numpy().astype(np.int64)
+        self.rim = hand.rim.cpu().numpy()
+        keypoints = hand.keypoint_index.cpu().numpy()
+        self.points = np.concatenate([self.joints, real(hand.tips)])[keypoints]
+        self.points_basis = np.concatenate([self.joint_basis, real(hand.tip_basis)])[keypoints]
+        self.point_joint = np.concatenate([np.arange(16), _TIP_JOINT])[keypoints]
+        self.offsets = self._landmark_offsets()
+        self.dofs = np.array([(j, a) for j in range(1, 16) for a in self._free_axes(j)])
+        """Joint and axis of each of the 26 angles."""
+        self.below = np.zeros((16, 16))
+        """below[a, j] is 1 where j is a or hangs on it."""
+        for j in range(16):
+            a = j
+            while a >= 0:
+                self.below[a, j] = 1
+                a = self.parents[a]
+
+    @staticmethod
+    def _free_axes(joint: int) -> tuple[int, ...]:
+        thumb, place = joint >= 13, (joint - 1) % 3
+        return ((0, 1, 2), (0, 1) if thumb else (0,), (0,))[place]
+
+    def _landmark_offsets(self) -> np.ndarray:
+        size = np.linalg.norm(self.points[12] - self.points[0])
+        frames = np.zeros((21, 3, 3))
+        frames[0] = [[-1, 0, 0], [0, 1, 0], [0, 0, -1]]
+        for k in range(1, 21):
+            start, end = (k - 1, k) if k % 4 == 0 else (k, k + 1)
+            along = unit(self.points[end] - self.points[start])
+            back = unit(np.cross(along, self.axes[self.point_joint[k], 0]))
+            frames[k] = along, back, np.cross(along, back)
+        return np.einsum("kab,ka->kb", frames, _LANDMARK_OFFSETS / 190 * size)
+
+    def all_angles(self, angles: np.ndarray) -> np.ndarray:
+        """The 26 angles in their places of a [16, 3] table."""
+        table = np.zeros((16, 3))
+        table[self.dofs[:, 0], self.dofs[:, 1]] = angles
+        return table
+
+    def chain(self, angles: np.ndarray, shape: np.ndarray) -> Chain:
+        """Pose the joints by the 26 angles of the fit."""
+        return self.chain_of(self.all_angles(angles), shape)
+
+    def chain_of(self, table: np.ndarray, shape: np.ndarray) -> Chain:
+        """Pose the joints by all angles, [16, 3]."""
+        rest = self.joints + self.joint_basis @ shape
+        rotation, position = np.zeros((16, 3, 3)), np.zeros((16, 3))
+        by_shape, axes = np.zeros((16, 3, len(shape))), np.zeros((16, 3, 3))
+        rotation[0], position[0], by_shape[0] = np.eye(3), rest[0], self.joint_basis[0]
+        for j in range(1, 16):
+            parent = self.parents[j]
+            turn = rotation[parent]
+            position[j] = position[parent] + turn @ (rest[j] - rest[parent])
+            by_shape[j] = by_shape[parent] + turn @ (self.joint_basis[j] - self.joint_basis[parent])
+            for a in range(3):
+                axes[j, a] = turn @ self.axes[j, a]
+                if table[j, a] != 0:
+                    turn = turn @ cv2.Rodrigues(self.axes[j, a] * table[j, a])[0]
+            rotation[j] = turn
+        return Chain(rest, rotation, position, by_shape, axes)
+
+    def landmarks(self, chain: Chain, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The 21 points where the network would put them, [21, 3] metres, and d points / d (angles, shape)."""
+        joint, dof_joint = self.point_joint, self.dofs[:, 0]
+        local = self.points + self.points_basis @ shape - chain.rest[joint] + self.offsets
+        turn = chain.rotation[joint]
+        points = (turn @ local[..., None])[..., 0] + chain.position[joint]
+        arm = points[:, None] - chain.position[dof_joint]
+        by_angle = np.cross(chain.axes[tuple(self.dofs.T)], arm) * self.below[dof_joint][:, joint].T[..., None]
+        by_shape = turn @ (self.points_basis - self.joint_basis[joint]) + chain.position_by_shape[joint]
+        return points, np.concatenate([by_angle.transpose(0, 2, 1), by_shape], 2)
+
+    def rest_surface(self, shape: np.ndarray) -> np.ndarray:
+        """Vertices at rest [m], without pose correctives."""
+        return self.template + (self.shape_basis.reshape(-1, len(shape)) @ shape).reshape(-1, 3)
+
+    def correctives(self, table: np.ndarray) -> np.ndarray:
+        """Displacement of the rest surface by the pose correctives of all angles ([16, 3]) [m], [V, 3]."""
+        strengths = corrective_coefficients(self.hand, torch.from_numpy(table[1:])).numpy()
+        return (self.corrective_basis @ strengths).reshape(-1, 3)
+
+    def surface(self, chain: Chain, angles: np.ndarray, shape: np.ndarray) -> np.ndarray:
+        """The posed surface, correctives included [m], [V, 3]."""
+        return self.pose_surface(chain, self.rest_surface(shape) + self.correctives(self.all_angles(angles)))
+
+    def bone_shifts(self, chain: Chain) -> np.ndarray:
+        """Translations that go with `chain.rotation` to carry rest points, [16, 3]."""
+        return chain.position - (chain.rotation @ chain.rest[..., None])[..., 0]
+
+    def blended(self, chain: Chain, index: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Blended bone rotation of each vertex, [V, 3, 3]."""
+        return (self.weights[index] @ chain.rotation.reshape(16, 9)).reshape(-1, 3, 3)
+
+    def pose_surface(self, chain: Chain, rest: np.ndarray) -> np.ndarray:
+        """Linear blend skinning of the whole rest surface."""
+        return (self.blended(chain) @ rest[..., None])[..., 0] + self.weights @ self.bone_shifts(chain)
+
+    def vertices(
+        self, chain: Chain, shape: np.ndarray, index: np.ndarray, displacement: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Posed vertices `index`, and d vertices / d (angles, shape); the surface's `displacement` stays constant."""
+        basis = self.shape_basis[index]
+        start, weights = self.template[index] + basis @ shape + displacement[index], self.weights[index]
+        shifts, turn = self.bone_shifts(chain), self.blended(chain, index)
+        points = (turn @ start[..., None])[..., 0] + weights @ shifts
+        dof_joint = self.dofs[:, 0]
+        below = self.below[dof_joint].T  # bone, angle
+        # Each bone's share of the vertex turns about the joint of the angle when the bone hangs on it.
+        shares = weights[:, :, None] * ((chain.rotation @ start.T).transpose(2, 0, 1) + shifts)
+        moved = np.einsum("nja,jd->nda", shares, below, optimize=True)
+        arm = moved - (weights @ below)[..., None] * chain.position[dof_joint]
+        by_angle = np.cross(chain.axes[tuple(self.dofs.T)], arm)
+        shift_by_shape = chain.position_by_shape - chain.rotation @ self.joint_basis
+        by_shape = turn @ basis + np.tensordot(weights, shift_by_shape, 1)
+        return points, np.concatenate([by_angle.transpose(0, 2, 1), by_shape], 2)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors at length one; a zero vector stays."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

@@ -1,0 +1,198 @@
+"""Photo -> hands, each with 21 landmarks: palm detector, turned crop, landmark network, a second tighter crop.
+
+The recipe of MediaPipe Hands (Zhang et al. 2020), with fallback rungs for hands that fill the frame or lie in the dark.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from oasis_warp.hand.networks import HAND_SIZE, PALM_SIZE, Networks
+
+BONES = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (0, 5), (5, 6), (6, 7), (7, 8), (0, 9), (9, 10), (10, 11), (11, 12),
+                  (0, 13), (13, 14), (14, 15), (15, 16), (0, 17), (17, 18), (18, 19), (19, 20)])  # fmt: skip
+"""Rows of landmarks that a bone joins, from the wrist outwards."""
+KNUCKLES = [5, 9, 13, 17]
+FINGERS = {"thumb": [1, 2, 3, 4], "index": [5, 6, 7, 8], "middle": [9, 10, 11, 12], "ring": [13, 14, 15, 16],
+           "little": [17, 18, 19, 20]}  # fmt: skip
+
+_MIN_PRESENCE = 0.5
+_MIN_GUESS = 0.8
+"""Presence and side score that a fallback rung must reach: there the detector sees hands that are none."""
+_MARGIN = 0.35
+"""Border replicated around the photo on the fallback rungs, in longer sides."""
+
+
+@dataclass(frozen=True)
+class FoundHand:
+    """One hand in the pixels of the image that was searched."""
+
+    xy: np.ndarray
+    """[21, 2] px."""
+    world: np.ndarray
+    """[21, 3] metres in the camera's axes, origin near the middle of the hand."""
+    presence: float
+    right: float
+    """Probability of a right hand."""
+    palm_score: float
+    source: str
+
+    @property
+    def side_score(self) -> float:
+        """Confidence in the likelier side."""
+        return max(self.right, 1 - self.right)
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A square of the image, turned so that the fingers point up in it."""
+
+    centre: np.ndarray
+    side: float
+    angle: float
+    """From the image's upright to the crop's, clockwise as seen [rad]."""
+
+
+def find_hands(rgb: np.ndarray, nets: Networks, *, most: int = 8) -> list[FoundHand]:
+    """Hands in an RGB image of bytes, best palm first; the fallback rungs are tried only when there is none."""
+    hands = _search(rgb, nets, 0.5, most, "network")
+    if hands:
+        return hands
+    margin = int(_MARGIN * max(rgb.shape[:2]))
+    wide = cv2.copyMakeBorder(rgb, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
+    light = cv2.LUT(wide, np.round(255 * (np.arange(256) / 255) ** 0.5).astype(np.uint8))
+    rungs = (
+        (wide, 0.5, "network (margin)"),
+        (light, 0.5, "network (margin, brightened)"),
+        (wide, 0.25, "network (margin, weak)"),
+        (light, 0.25, "network (margin, brightened, weak)"),
+    )
+    for image, min_score, source in rungs:
+        hands = [h for h in _search(image, nets, min_score, most, source)
+                 if min(h.presence, h.side_score) >= _MIN_GUESS]  # fmt: skip
+        if hands:
+            return [FoundHand(h.xy - margin, h.world, h.presence, h.right, h.palm_score, h.source) for h in hands]
+    return []
+
+
+def _search(rgb: np.ndarray, nets: Networks, min_score: float, most: int, source: str) -> list[FoundHand]:
+    hands: list[FoundHand] = []
+    for score, box, points in palms(rgb, nets, min_score)[:most]:
+        first = read_crop(rgb, nets, crop_of_palm(box, points), score, source)
+        second = read_crop(rgb, nets, crop_of_landmarks(first.xy), score, source)
+        hand = second if second.presence >= min(_MIN_PRESENCE, first.presence) else first
+        # Two palms may lead to one and the same hand.
+        if hand.presence >= _MIN_PRESENCE and not any(_same(hand.xy, other.xy) for other in hands):
+            hands.append(hand)
+    return hands
+
+
+def _same(a: np.ndarray, b: np.ndarray) -> bool:
+    return float(np.linalg.norm(a - b, axis=1).mean()) < 0.15 * box_size(a)
+
+
+def box_size(xy: np.ndarray) -> float:
+    """Longer side of the box of the landmarks [px]: the unit of all distances that are shares of the hand."""
+    return float(np.ptp(xy, axis=0).max())
+
+
+def palms(rgb: np.ndarray, nets: Networks, min_score: float) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Score, box (centre x, y, width, height) and seven points of each palm, in pixels of `rgb`, best first."""
+    height, width = rgb.shape[:2]
+    scale = PALM_SIZE / max(height, width)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if scale < 0.5 else cv2.INTER_LINEAR)
+    border = np.array([(PALM_SIZE - size[0]) // 2, (PALM_SIZE - size[1]) // 2])
+    letterbox = np.zeros((PALM_SIZE, PALM_SIZE, 3), np.uint8)
+    letterbox[border[1] : border[1] + size[1], border[0] : border[0] + size[0]] = small
+    raw = nets.palm(letterbox)
+    scores = 1 / (1 + np.exp(-np.clip(raw.logits, -100, 100)))
+    chosen = np.flatnonzero(scores >= min_score)
+    anchors = _anchors()[chosen] * PALM_SIZE
+    centres = (raw.boxes[chosen, 0] + anchors - border) / scale
+    boxes = np.concatenate([centres, raw.boxes[chosen, 1] / scale], 1)
+    points = (raw.boxes[chosen, 2:] + anchors[:, None] - border) / scale
+    return _merge(boxes, scores[chosen], points)
+
+
+def _anchors() -> np.ndarray:
+    """Centres in [0, 1] of the 2016 anchors: a 24 x 24 grid with two a cell, then a 12 x 12 grid with six."""
+    grids = []
+    for n, per_cell in ((24, 2), (12, 6)):
+        centre = (np.arange(n) + 0.5) / n
+        y, x = np.meshgrid(centre, centre, indexing="ij")
+        grids.append(np.repeat(np.stack([x.ravel(), y.ravel()], 1), per_cell, axis=0))
+    return np.concatenate(grids)
+
+
+def _merge(boxes: np.ndarray, scores: np.ndarray, points: np.ndarray) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Score-weighted means of overlapping boxes (IoU > 0.3) and of their points."""
+    low, high = boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2
+    area = np.maximum(boxes[:, 2:], 0).prod(1)
+    order, merged = np.argsort(-scores, kind="stable"), []
+    while len(order):
+        best = order[0]
+        extent = np.minimum(high[best], high[order]) - np.maximum(low[best], low[order])
+        overlap = np.maximum(extent, 0).prod(1)
+        same = overlap > 0.3 * (area[best] + area[order] - overlap)
+        same[0] = True
+        group = order[same]
+        weight = scores[group] / scores[group].sum()
+        merged.append((float(scores[best]), weight @ boxes[group], np.tensordot(weight, points[group], 1)))
+        order = order[~same]
+    return merged
+
+
+def crop_of_palm(box: np.ndarray, points: np.ndarray) -> Crop:
+    """The square for the first pass: wrist to middle knuckle up, moved towards the fingers, enlarged."""
+    angle = _upright(points[2] - points[0])
+    shift = 0.5 * box[3] * np.array([np.sin(angle), -np.cos(angle)])
+    return Crop(box[:2] + shift, 2.6 * float(box[2:].max()), angle)
+
+
+def crop_of_landmarks(xy: np.ndarray) -> Crop:
+    """The tighter square that known landmarks give."""
+    angle = _upright(0.25 * (xy[5] + xy[13]) + 0.5 * xy[9] - xy[0])
+    trunk = xy[[0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]]  # without the ends of the fingers
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    turned = trunk @ turn.T
+    low, high = turned.min(0), turned.max(0)
+    centre = turn.T @ ((low + high) / 2 - np.array([0, 0.1 * (high[1] - low[1])]))
+    return Crop(centre, 2.0 * float((high - low).max()), angle)
+
+
+def _upright(direction: np.ndarray) -> float:
+    """Angle of the crop in which `direction` points up, in [-pi, pi)."""
+    angle = np.pi / 2 - np.arctan2(-direction[1], direction[0])
+    return float(angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi)))
+
+
+def read_crop(
+    rgb: np.ndarray, nets: Networks, crop: Crop, palm_score: float = 1.0, source: str = "network", *,
+    mirrored: bool = False,
+) -> FoundHand:  # fmt: skip
+    """Landmarks in a crop, in pixels of `rgb`; `mirrored` shows the network the crop's mirror image."""
+    cos, sin = np.cos(crop.angle), np.sin(crop.angle)
+    turn = np.array([[cos, -sin], [sin, cos]])  # crop -> image
+    pixel = crop.side / HAND_SIZE
+    to_image = turn * pixel @ np.diag([-1.0 if mirrored else 1.0, 1.0])
+    middle = np.full(2, HAND_SIZE / 2)
+    # OpenCV counts from the centre of the first pixel, we from its corner.
+    affine = np.concatenate([to_image, (crop.centre - 0.5 - to_image @ (middle - 0.5))[:, None]], 1)
+    source_image = rgb
+    if pixel > 2:  # average before a strong reduction
+        factor = 2.0 ** -np.floor(np.log2(pixel))
+        source_image = cv2.resize(rgb, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+        affine *= np.array([[source_image.shape[1] / rgb.shape[1]], [source_image.shape[0] / rgb.shape[0]]])
+    image = cv2.warpAffine(source_image, affine, (HAND_SIZE, HAND_SIZE),
+                           flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+    seen = nets.hand(image)
+    world = seen.world.copy()
+    right = seen.right
+    if mirrored:
+        world[:, 0] *= -1
+        right = 1 - right
+    world[:, :2] = world[:, :2] @ turn.T
+    xy = (seen.points - middle) @ to_image.T + crop.centre
+    return FoundHand(xy, world, seen.presence, right, palm_score, source)

@@ -1,0 +1,100 @@
+"""One hand of a photo as a right hand: left ones are mirrored on the way in, and results mirrored back on the way out.
+
+With M = diag(-1, 1, 1), a left hand of pose (R, t) is the mirrored model M v; in the mirrored photo it is a right hand
+of pose (M R M, M t), and x becomes width - x.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
+from oasis_warp.hand.evidence import Evidence, evidence_of
+from oasis_warp.hand.fit_state import FitState
+from oasis_warp.hand.kinematics import Rig
+
+_MIRROR = np.array([-1.0, 1.0, 1.0])
+
+
+def array(tensor: Tensor) -> np.ndarray:
+    """A tensor in float64 numpy, the fit's own currency."""
+    return tensor.detach().cpu().numpy().astype(np.float64)
+
+
+def real(values: np.ndarray) -> Tensor:
+    """The float32 tensor that other stages speak."""
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+
+
+class RightView:
+    """A photo and one hand in it, mirrored if the hand is a left one."""
+
+    def __init__(self, photo: Photo, landmarks: Landmarks, focal: float | None):
+        self.name, self.mirrored = photo.name, landmarks.side == "left"
+        rgb, xy = photo.rgb.cpu().numpy(), array(landmarks.xy)
+        world = None if landmarks.world is None else array(landmarks.world)
+        height, width = rgb.shape[:2]
+        if self.mirrored:
+            xy = mirror_points(xy, width)
+            world = None if world is None else world * _MIRROR
+        self.rgb = self.photo_way(rgb)
+        self.alpha = None if photo.alpha is None else self.photo_way(photo.alpha.cpu().numpy())
+        self.evidence: Evidence = evidence_of(xy, world, (width, height), focal or photo.focal)
+
+    def photo_way(self, image: np.ndarray) -> np.ndarray:
+        """An image [H, W, ...] of the photo mirrored into this view, or back."""
+        return np.ascontiguousarray(image[:, ::-1]) if self.mirrored else image
+
+    def pose(self, rig: Rig, state: FitState) -> HandPose:
+        """The pose in the photo's own frame."""
+        mirror = _MIRROR if self.mirrored else np.ones(3)
+        return HandPose(
+            angles=real(rig.all_angles(state.angles)[1:]),
+            orientation=real(mirror[:, None] * state.turn * mirror),
+            translation=real(mirror * state.translation()),
+        )
+
+    def camera(self, state: FitState) -> Camera:
+        """The camera of the photo."""
+        width, height = self.evidence.size
+        x = width - state.centre[0] if self.mirrored else state.centre[0]
+        K = np.array([[state.focal, 0, x], [0, state.focal, state.centre[1]], [0, 0, 1]])
+        return Camera(torch.eye(4), real(K), width, height)
+
+
+def mirror_points(xy: np.ndarray, width: int) -> np.ndarray:
+    """Points of a photo in its mirror image [px]."""
+    return np.array([width, 0]) + xy * [-1, 1]
+
+
+class FittedView(NamedTuple):
+    """A `HandFit` as a right hand."""
+
+    state: FitState
+    angles: np.ndarray
+    """All angles, [16, 3]."""
+    xy: np.ndarray
+    mask: np.ndarray
+
+
+def right_state(rig: Rig, side: Side, shape: np.ndarray, pose: HandPose, camera: Camera) -> FitState:
+    """A pose and camera as the fit's state in the photo, which is mirrored for a left hand."""
+    turn, translation, K = array(pose.orientation), array(pose.translation), array(camera.K)
+    centre = K[:2, 2]
+    if side == "left":
+        turn, translation = _MIRROR[:, None] * turn * _MIRROR, translation * _MIRROR
+        centre = mirror_points(centre, camera.width)
+    place = np.array([*(translation[:2] / translation[2]), np.log(translation[2])])
+    angles = array(pose.angles)[rig.dofs[:, 0] - 1, rig.dofs[:, 1]]
+    return FitState(turn, place, angles, shape, float(K[0, 0]), centre)
+
+
+def fitted_view(rig: Rig, fit: HandFit) -> FittedView:
+    """A fit in the photo, which is mirrored for a left hand."""
+    state = right_state(rig, fit.side, array(fit.shape), fit.pose, fit.camera)
+    xy, mask = array(fit.landmarks.xy), fit.mask.detach().cpu().numpy()
+    if fit.side == "left":
+        xy, mask = mirror_points(xy, fit.camera.width), np.ascontiguousarray(mask[:, ::-1])
+    return FittedView(state, np.concatenate([np.zeros((1, 3)), array(fit.pose.angles)]), xy, mask)

@@ -1,0 +1,148 @@
+"""Close the last gap between the fitted hand and its mask: a smooth displacement of the rest surface.
+
+Where the outline of the posed mesh misses the mask's, the vertices on the rim are told how far to move along their
+normal in the image. The whole surface follows by a screened bi-Laplacian: it minimises
+
+    sum over the rim of w |D - target|^2 + BEND |L D|^2 + STAY |D|^2
+
+with the umbrella operator L, so that neighbours follow and the far side stays.
+"""
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy import sparse
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import HandFit
+from oasis_warp.hand.kinematics import Rig, unit
+from oasis_warp.hand.landmarks import box_size
+from oasis_warp.hand.outline import WRIST_LINE, wrist_line
+from oasis_warp.hand.right_view import fitted_view
+from oasis_warp.hand.silhouette import silhouette, vertex_normals
+
+LONGEST = 0.006
+"""No vertex moves farther [m]."""
+_REJECT = 0.04
+"""A gap wider than this share of the box is the mask's fault and is left."""
+_ROUNDS = 4
+_BEND, _STAY = 100.0, 0.02
+"""Weights against one observation a vertex. With edges of 2 mm an observation is shared along about 3 mm, and its
+effect ends after about 12 mm: (BEND / STAY / 16)^(1/4) edges."""
+_GRAZING = 0.5
+"""Largest |normal . view| of a vertex that speaks for the rim."""
+_STEP = 0.25
+"""Spacing of the samples across the outline, in pixels of the window."""
+_WINDOW = 1000
+"""Longer side of the picture in which outlines are compared [px]."""
+
+
+def outline_offsets(hand: HandModel, fit: HandFit) -> Float[Tensor, "V 3"]:
+    """Displacement of the rest surface of `fit` that brings the posed outline onto the mask's [m].
+
+    Add it to the vertices at rest (`skinning.rest_hand`) before skinning; for a left hand, before mirroring, as the
+    pose is. Zero where the outline says nothing: at the wrist, at the photo's border, across gaps wider than 4 % of
+    the hand, and towards the far side of the hand.
+    """
+    view = _View(hand, fit)
+    bending = _bending(view.rig)
+    moved = np.zeros_like(view.rest)
+    for _ in range(_ROUNDS):
+        vertices, target, weight = view.observe(moved)
+        if len(vertices) == 0:
+            break
+        moved = _smooth(bending, vertices, target, weight)
+        moved *= np.minimum(1, LONGEST / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-12))
+    return torch.from_numpy(moved.astype(np.float32))
+
+
+class _View:
+    """A posed hand before its camera, mirrored into a right one, and its mask."""
+
+    def __init__(self, hand: HandModel, fit: HandFit):
+        self.rig = rig = Rig(hand)
+        state, table, xy, mask = fitted_view(rig, fit)
+        chain = rig.chain_of(table, state.shape)
+        self.rest = rig.rest_surface(state.shape) + rig.correctives(table)
+        self.state, self.box, self.line = state, box_size(xy), wrist_line(xy)
+        self.turn = state.turn @ rig.blended(chain)
+        """Rest frame to camera, [V, 3, 3]."""
+        self.seen = state.in_camera(rig.pose_surface(chain, self.rest))
+        self.photo = np.array(mask.shape[::-1])
+        reach = 1.5 * _REJECT * self.box
+        image = self._image(self.seen)
+        self.low = np.maximum(image.min(0) - reach, -reach)
+        high = np.minimum(image.max(0) + reach, self.photo + reach)
+        self.scale = _WINDOW / float((high - self.low).max())
+        self.size = (int(np.ceil((high - self.low)[0] * self.scale)), int(np.ceil((high - self.low)[1] * self.scale)))
+        # Window pixel (centre) -> mask pixel (centre).
+        shift = self.low + 0.5 / self.scale - 0.5
+        affine = np.array([[1 / self.scale, 0, shift[0]], [0, 1 / self.scale, shift[1]]])
+        self.mask = cv2.warpAffine(mask, affine, self.size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+
+    def _image(self, seen: np.ndarray) -> np.ndarray:
+        return self.state.focal * seen[:, :2] / seen[:, 2:] + self.state.centre
+
+    def observe(self, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices on the rim, where in the rest frame they should be moved to [m], and how far to trust that."""
+        seen = self.seen + (self.turn @ moved[..., None])[..., 0]
+        image = self._image(seen)
+        drawn = silhouette(image, self.rig.faces, self.size, self.low, self.scale)
+        depth = cv2.distanceTransform(drawn, cv2.DIST_L2, 3)
+        pixel = np.clip(np.floor((image - self.low) * self.scale).astype(int), 0, np.array(self.size) - 1)
+        normals = vertex_normals(seen, self.rig.faces)
+        grazing = np.abs((normals * unit(seen)).sum(1)) < _GRAZING
+        rim = np.flatnonzero(grazing & (depth[pixel[:, 1], pixel[:, 0]] <= 0.008 * _WINDOW) & self.line.above(image))
+        out = unit(normals[rim, :2])
+        start, reach = (image[rim] - self.low) * self.scale, 1.5 * _REJECT * self.box * self.scale
+        mesh_edge = _crossing(drawn.astype(np.float32) / 255, start, out, reach)
+        gap = (_crossing(self.mask, start, out, reach) - mesh_edge) / self.scale
+        edge = image[rim] + out * (mesh_edge / self.scale + gap)[:, None]
+        on_photo = ((edge > 2) & (edge < self.photo - 2)).all(1)
+        good = np.isfinite(gap) & (np.abs(np.nan_to_num(gap)) < _REJECT * self.box) & on_photo
+        rim, out, gap = rim[good], out[good], gap[good]
+        shift = np.zeros((len(rim), 3))
+        shift[:, :2] = out * (gap * seen[rim, 2] / self.state.focal)[:, None]
+        target = moved[rim] + (self.turn[rim].transpose(0, 2, 1) @ shift[..., None])[..., 0]
+        # A wide gap is more often a fault of the mask; the weight fades in above the wrist line.
+        weight = 1 / (1 + (gap / (0.4 * _REJECT * self.box)) ** 2)
+        weight *= np.clip(((image[rim] - self.line.wrist) @ self.line.up / self.line.length - WRIST_LINE) / 0.15, 0, 1)
+        return rim, target, weight
+
+
+def _crossing(picture: np.ndarray, start: np.ndarray, out: np.ndarray, reach: float) -> np.ndarray:
+    """Signed way from each `start` along `out` to the nearest place where `picture` falls through a half; else NaN."""
+    t = np.arange(-reach, reach + _STEP, _STEP)
+    x, y = (start[:, k, None] + out[:, k, None] * t - 0.5 for k in (0, 1))
+    values = cv2.remap(picture, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+    before, after = values[:, :-1], values[:, 1:]
+    falls = (before >= 0.5) & (after < 0.5)
+    away = np.where(falls, np.abs(t[:-1]), np.inf)
+    row, nearest = np.arange(len(start)), away.argmin(1)
+    a, b = before[row, nearest], after[row, nearest]
+    place = t[nearest] + _STEP * (a - 0.5) / np.maximum(a - b, 1e-6)
+    return np.where(np.isfinite(away[row, nearest]), place, np.nan)
+
+
+def _bending(rig: Rig) -> sparse.csc_array:
+    """BEND L^T L + STAY with the umbrella operator L (mean of the neighbours minus the vertex)."""
+    a, b, c = rig.faces.T
+    i, j, n = np.r_[a, b, c, b, c, a], np.r_[b, c, a, a, b, c], len(rig.template)
+    pairs = np.unique(np.stack([i, j]), axis=1)
+    share = 1 / np.bincount(pairs[0], minlength=n)[pairs[0]]
+    umbrella = sparse.csr_array((share, tuple(pairs)), shape=(n, n)) - sparse.eye_array(n)
+    return (_BEND * umbrella.T @ umbrella + _STAY * sparse.eye_array(n)).tocsc()
+
+
+def _smooth(bending: sparse.csc_array, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The smooth displacement [V, 3] that comes nearest to the targets."""
+    n = bending.shape[0]
+    diagonal, right = np.zeros(n), np.zeros((n, 3))
+    diagonal[vertices] = weight
+    right[vertices] = weight[:, None] * target
+    system = (bending + sparse.diags_array(diagonal)).tocsc()
+    factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return factors.solve(right)

@@ -1,0 +1,140 @@
+import errno
+import os
+from pathlib import Path
+
+import pytest
+from disk import full_disk
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.data.atomic import output_file, output_folder, write_file
+
+
+def everything(folder: Path) -> dict[str, bytes | None]:
+    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
+
+
+def fill(folder: Path) -> None:
+    (folder / "a.txt").write_text("new a")
+    (folder / "b.txt").write_text("new b")
+
+
+def test_a_file_appears_only_when_the_block_ends(tmp_path):
+    with output_file(tmp_path / "out.txt") as part:
+        part.write_text("whole")
+        assert not (tmp_path / "out.txt").exists()
+        assert part.suffix == ".txt"
+    assert everything(tmp_path) == {"out.txt": b"whole"}
+
+
+def test_a_new_file_has_the_permissions_that_the_user_asked_for(tmp_path):
+    write_file(tmp_path / "out.txt", b"")
+    (tmp_path / "plain.txt").touch()
+    assert (tmp_path / "out.txt").stat().st_mode == (tmp_path / "plain.txt").stat().st_mode
+
+
+def test_a_link_keeps_pointing_to_the_file_that_is_replaced(tmp_path):
+    (tmp_path / "real.txt").write_text("old")
+    (tmp_path / "link.txt").symlink_to("real.txt")
+    write_file(tmp_path / "link.txt", b"new")
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "real.txt").read_bytes() == b"new"
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError, InputError])
+def test_an_interrupted_file_leaves_the_old_one(tmp_path, error):
+    (tmp_path / "out.txt").write_text("old")
+    with pytest.raises(error), output_file(tmp_path / "out.txt") as part:
+        part.write_text("half")
+        raise error
+    assert everything(tmp_path) == {"out.txt": b"old"}
+
+
+def test_a_folder_appears_whole(tmp_path):
+    with output_folder(tmp_path / "out") as part:
+        fill(part)
+        assert not (tmp_path / "out").exists()
+    assert everything(tmp_path) == {"out": None, "out/a.txt": b"new a", "out/b.txt": b"new b"}
+
+
+def test_an_existing_folder_keeps_the_files_that_are_not_written_again(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "a.txt").write_text("old a")
+    with output_folder(tmp_path) as part:
+        fill(part)
+        assert (tmp_path / "a.txt").read_text() == "old a"
+    assert everything(tmp_path) == {"mine.txt": b"mine", "a.txt": b"new a", "b.txt": b"new b"}
+
+
+@pytest.mark.parametrize("there", [True, False])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError, InputError])
+def test_an_interrupted_folder_leaves_everything_as_it_was(tmp_path, there, error):
+    if there:
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out" / "a.txt").write_text("old a")
+    before = everything(tmp_path)
+    with pytest.raises(error), output_folder(tmp_path / "out") as part:
+        fill(part)
+        raise error
+    assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_is_told_and_leaves_nothing(tmp_path, monkeypatch, code):
+    def fail(fd):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", fail)  # where file systems that delay their writes report it
+    with pytest.raises(InputError, match="no room left"):
+        write_file(tmp_path / "out.txt", b"whole")
+    with pytest.raises(InputError, match="no room left"), output_folder(tmp_path / "out") as part:
+        fill(part)
+    assert everything(tmp_path) == {}
+
+
+def test_a_disk_that_fills_up_while_writing_is_told_and_leaves_nothing(tmp_path):
+    with full_disk(1000):
+        with pytest.raises(InputError, match="no room left"):
+            write_file(tmp_path / "out.txt", bytes(5000))
+        with pytest.raises(InputError, match="no room left"), output_folder(tmp_path / "out") as part:
+            (part / "small.txt").write_bytes(bytes(10))
+            (part / "large.txt").write_bytes(bytes(5000))
+    assert everything(tmp_path) == {}
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_the_work_begins(tmp_path):
+    (tmp_path / "file").touch()
+    for path, expected in [
+        (tmp_path / "none" / "out", "found no such folder; make it first"),
+        (tmp_path / "file" / "out", "found a file; make it first"),
+    ]:
+        for writer in (output_file, output_folder):
+            with pytest.raises(InputError, match=expected), writer(path):
+                pytest.fail("the block must not run")
+    with pytest.raises(InputError, match="found a folder; add a file name"), output_file(tmp_path):
+        pytest.fail("the block must not run")
+    with pytest.raises(InputError, match="found a device or pipe"), output_file("/dev/null"):
+        pytest.fail("the block must not run")
+    with pytest.raises(InputError, match="found a file; choose another name"), output_folder(tmp_path / "file"):
+        pytest.fail("the block must not run")
+
+
+def test_a_closed_folder_is_refused_before_the_work_begins(tmp_path, monkeypatch):
+    tmp_path.chmod(0o500)
+    if os.access(tmp_path, os.W_OK):  # root may write anywhere
+
+        def refuse(self, *args, **kwargs):
+            raise PermissionError(errno.EACCES, "Permission denied", str(self))
+
+        monkeypatch.setattr(Path, "mkdir", refuse)
+        monkeypatch.setattr(Path, "touch", refuse)
+    for writer in (output_file, output_folder):
+        with pytest.raises(InputError, match=r"cannot be written \(Permission denied\)"), writer(tmp_path / "out"):
+            pytest.fail("the block must not run")
+    tmp_path.chmod(0o700)
+
+
+def test_an_error_that_has_nothing_to_do_with_the_output_passes_unchanged(tmp_path):
+    for writer in (output_file, output_folder):
+        with pytest.raises(FileNotFoundError), writer(tmp_path / "out"):
+            (tmp_path / "some input").read_text()
+    assert everything(tmp_path) == {}

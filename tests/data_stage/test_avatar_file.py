@@ -1,0 +1,174 @@
+import json
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.data.avatar_file import FORMAT, TENSORS, UNITS, VERSION, load_avatar, save_avatar
+
+SIZES = {"S": 4, "V": 30, "P": 5, "Q": 7, "N": 12}
+HEADER = {
+    "side": "left",
+    "hand_model": "bundled",
+    "hand_licence": "CC0-1.0",
+    "source_camera": {"width": 256, "height": 256},
+}
+
+
+@pytest.fixture
+def tensors():
+    generator = torch.Generator().manual_seed(3)
+    made = {}
+    for name, entry in TENSORS.items():
+        shape = [SIZES.get(size, size) for size in entry.shape]
+        if entry.dtype == torch.int64:
+            made[name] = torch.randint(0, SIZES["V"], shape, generator=generator)
+        else:
+            made[name] = torch.rand(shape, generator=generator) + 0.01
+    made["gaussians.opacities"].clamp_(0, 1)
+    return made
+
+
+@pytest.fixture
+def written(tmp_path, tensors):
+    path = tmp_path / "avatar.safetensors"
+    save_avatar(path, tensors, HEADER)
+    return path
+
+
+def rewrite(path, tensors=None, **changes):
+    """Store other tensors or another header in the file, as a foreign program might."""
+    with safe_open(path, framework="pt") as file:
+        header = json.loads(file.metadata()[FORMAT])
+    save_file(load_file(path) if tensors is None else tensors, path, {FORMAT: json.dumps(header | changes)})
+
+
+def test_an_avatar_comes_back_as_it_was(written, tensors):
+    back, header = load_avatar(written)
+    assert back.keys() == tensors.keys()
+    assert all(torch.equal(back[name], tensors[name]) and back[name].dtype == tensors[name].dtype for name in tensors)
+    assert {key: header[key] for key in HEADER} == HEADER
+    assert header["units"] == UNITS
+    assert header["counts"] == {"gaussians": 12, "on_vertices": 5, "on_faces": 7}
+    assert header["creator"].startswith("oasis_warp ")
+
+
+def test_tensors_that_carry_gradients_or_strides_are_stored(tmp_path, tensors):
+    tensors["gaussians.colors"].requires_grad_()
+    tensors["source_camera.K"] = tensors["source_camera.K"].T
+    save_avatar(tmp_path / "a.safetensors", tensors, HEADER)
+    back, _ = load_avatar(tmp_path / "a.safetensors")
+    assert torch.equal(back["source_camera.K"], tensors["source_camera.K"])
+
+
+def test_the_same_avatar_is_the_same_file(tmp_path, tensors):
+    save_avatar(tmp_path / "a", tensors, HEADER)
+    save_avatar(tmp_path / "b", dict(reversed(tensors.items())), dict(reversed(HEADER.items())))
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_nothing_wrong_is_ever_written(tmp_path, tensors):
+    path = tmp_path / "a.safetensors"
+    for bad in (
+        {**tensors, "more": torch.zeros(1)},
+        {**tensors, "gaussians.quats": torch.zeros(12, 4)},
+        {**tensors, "gaussians.scales": torch.full((12, 3), torch.nan)},
+        {**tensors, "source_camera.K": torch.eye(4)},
+    ):
+        with pytest.raises(ValueError, match=r"expected|unknown more"):
+            save_avatar(path, bad, HEADER)
+    with pytest.raises(ValueError, match="header: expected 'side' of type str, got None"):
+        save_avatar(path, tensors, {**HEADER, "side": None})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("gaussians.scales", torch.full((12, 3), torch.nan), "scales: expected finite values"),
+        ("gaussians.scales", torch.zeros(12, 3), "scales: expected positive scales, got 12 bad rows"),
+        ("gaussians.offsets", torch.full((5, 3), torch.inf), "offsets: expected finite values"),
+        ("gaussians.quats", torch.zeros(12, 4), "quats: expected no zero quaternion"),
+        ("gaussians.quats", torch.ones(12, 3), r"quats: expected shape \[N, 4\], got \[12, 3\]"),
+        ("gaussians.opacities", torch.full((12,), 1.5), r"opacities: expected opacities in \[0, 1\]"),
+        ("gaussians.vertex_index", torch.full((5,), 30), "vertex_index: expected indices of 30 vertices"),
+        ("gaussians.face_index", torch.full((7,), -1), "face_index: expected no negative index"),
+        ("gaussians.face_index", torch.zeros(7), "face_index: expected torch.int64, got torch.float32"),
+        ("gaussians.colors", torch.ones(11, 3), r"colors: expected shape \[12, 3\]"),
+        ("source_camera.K", torch.eye(3, dtype=torch.float64), "K: expected torch.float32"),
+    ],
+)
+def test_a_tensor_that_cannot_be_right_is_named(written, tensors, name, value, expected):
+    rewrite(written, {**tensors, name: value})
+    with pytest.raises(InputError, match=f"damaged avatar file.*{expected}"):
+        load_avatar(written)
+
+
+def test_rows_that_do_not_add_up_are_refused(written, tensors):
+    tensors["gaussians.vertex_index"] = tensors["gaussians.vertex_index"][:4]
+    tensors["gaussians.offsets"] = tensors["gaussians.offsets"][:4]
+    rewrite(written, tensors)
+    with pytest.raises(InputError, match=r"expected 4 \+ 7 rows, got 12"):
+        load_avatar(written)
+
+
+def test_a_missing_and_an_unknown_tensor_are_named(written, tensors):
+    del tensors["shape"]
+    rewrite(written, {**tensors, "extra": torch.zeros(2)})
+    with pytest.raises(InputError, match="missing shape; unknown extra"):
+        load_avatar(written)
+
+
+def test_a_newer_version_is_refused_with_the_remedy(written):
+    rewrite(written, version=VERSION + 1, side=None)
+    with pytest.raises(InputError, match=f"version {VERSION + 1}.*update oasis-warp"):
+        load_avatar(written)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"version": 0}, "expected version 1, got 0"),
+        ({"version": "1"}, "expected 'version' of type int, got '1'"),
+        ({"side": "both"}, "expected side 'left' or 'right', got 'both'"),
+        ({"hand_model": None}, "expected 'hand_model' of type str, got None"),
+        ({"source_camera": {"width": 0, "height": 9}}, "positive width and height"),
+    ],
+)
+def test_a_header_that_cannot_be_right_is_refused(written, changes, expected):
+    rewrite(written, **changes)
+    with pytest.raises(InputError, match=f"damaged avatar file.*{expected}"):
+        load_avatar(written)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "1"])
+def test_a_header_that_is_no_json_object_is_refused(written, tensors, text):
+    save_file(tensors, written, {FORMAT: text})
+    with pytest.raises(InputError, match="damaged avatar file"):
+        load_avatar(written)
+
+
+def test_another_safetensors_file_is_no_avatar(tmp_path):
+    save_file({"weight": torch.zeros(2)}, tmp_path / "net.safetensors")
+    with pytest.raises(InputError, match="no avatar"):
+        load_avatar(tmp_path / "net.safetensors")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.99])
+def test_a_file_cut_short_is_refused(written, share):
+    data = written.read_bytes()
+    written.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(InputError, match="another format or a file cut short"):
+        load_avatar(written)
+
+
+def test_another_format_is_refused(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\n" + bytes(100))
+    with pytest.raises(InputError, match="another format"):
+        load_avatar(tmp_path / "a.ply")
+    with pytest.raises(InputError, match="no such file"):
+        load_avatar(tmp_path / "none")
+    with pytest.raises(InputError, match="found a folder"):
+        load_avatar(tmp_path)

@@ -1,0 +1,368 @@
+"""Face and vertex rotations: twin, gradients, laws, hard meshes, poison values, messages."""
+
+import math
+
+import pytest
+import torch
+from reference import face_rotations as twin
+
+from oasis_warp.core.rotation import from_axis_angle, from_matrix, multiply, to_matrix
+from oasis_warp.core.types import HandPose
+from oasis_warp.hand.skinning import rest_hand, skin
+from oasis_warp.ops import face_rotations
+
+
+def sheet(seed, n=4, bend=0.4, dtype=torch.float64, device="cpu"):
+    """A rumpled grid and the same grid rumpled otherwise and turned; faces of unlike areas."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def noise(size):
+        return size * torch.randn((n + 1) ** 2, 3, generator=generator, dtype=torch.float64)
+
+    ticks = torch.arange(n + 1, dtype=torch.float64)
+    y, x = torch.meshgrid(ticks, ticks, indexing="ij")
+    flat = torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3)
+    rest = flat + noise(0.15)
+    turn = to_matrix(torch.randn(4, generator=generator, dtype=torch.float64))
+    posed = (rest * torch.tensor([1.3, 0.8, 1.0]) + noise(0.5 * bend)) @ turn.T
+    a = (torch.arange(n)[:, None] * (n + 1) + torch.arange(n)).reshape(-1)
+    faces = torch.cat([torch.stack([a, a + 1, a + n + 2], 1), torch.stack([a, a + n + 2, a + n + 1], 1)])
+    return rest.to(device, dtype), posed.to(device, dtype), faces.to(device)
+
+
+def angle_between(a, b):
+    """Angle of the rotation between unit quaternions [rad], sign or none; exact for small and large ones."""
+    a, b = a.double().cpu(), b.double().cpu()
+    b = torch.where((a * b).sum(-1, keepdim=True) < 0, -b, b)
+    return 4 * torch.atan2((a - b).norm(dim=-1), (a + b).norm(dim=-1))
+
+
+def about(axis, angle):
+    """Rotation matrix about `axis` by `angle`."""
+    axis = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0)
+    return from_axis_angle(axis, torch.tensor(angle, dtype=torch.float64))
+
+
+def rel(a, b):
+    """Relative L2 distance."""
+    return (a.double().cpu() - b).norm() / b.norm()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("seed", range(6))
+def test_values_and_gradients_are_those_of_the_twin(seed, dtype, device):
+    rest, posed, faces = sheet(seed, dtype=dtype, device=device)
+    leaves = [rest.requires_grad_(), posed.requires_grad_()]
+    got = face_rotations(rest, posed, faces)
+    wide = [t.detach().cpu().double().requires_grad_() for t in leaves]
+    want = twin.face_rotations(*wide, faces.cpu())
+
+    tolerance = 2e-7 if dtype == torch.float32 else 1e-12
+    assert angle_between(got.face_quats.detach(), want[1].detach()).max() < 10 * tolerance
+    assert angle_between(got.vertex_quats.detach(), want[0].detach()).max() < 10 * tolerance
+    assert rel(got.area_ratio.detach(), want[2].detach()) < tolerance
+    assert (got.face_quats[:, 0] >= 0).all()
+    assert ((got.vertex_quats.norm(dim=-1) - 1).abs() < 10 * tolerance).all()
+
+    generator = torch.Generator().manual_seed(seed)
+    loss = wide_loss = 0
+    for ours, theirs in zip(got, want, strict=True):
+        weights = torch.randn(theirs.shape, generator=generator, dtype=torch.float64)
+        # A quaternion and its opposite are one rotation: give both the sign of the twin.
+        signs = (ours.detach().cpu() * theirs.detach()).sum(-1, keepdim=True).sign() if theirs.ndim == 2 else 1
+        loss = loss + (ours * (signs * weights).to(ours)).sum()
+        wide_loss = wide_loss + (theirs * weights).sum()
+    grads = torch.autograd.grad(loss, leaves)
+    for ours, theirs in zip(grads, torch.autograd.grad(wide_loss, wide), strict=True):
+        assert rel(ours, theirs) < (2e-6 if dtype == torch.float32 else 1e-9)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_gradcheck_passes_for_both_meshes(seed):
+    rest, posed, faces = sheet(seed, n=2)
+    meshes = (rest.requires_grad_(), posed.requires_grad_())
+    assert torch.autograd.gradcheck(lambda r, p: tuple(face_rotations(r, p, faces)), meshes)
+
+
+def test_gradcheck_passes_at_rest_and_for_a_rigid_motion():
+    # Where rest and posed agree all stretches are equal: an adjoint through an SVD would divide by their differences.
+    rest, _, faces = sheet(0, n=2)
+    for turn in (torch.eye(3, dtype=torch.float64), about([1.0, 2, 3], 2.0)):
+        posed = (rest @ turn.T).requires_grad_()
+        assert torch.autograd.gradcheck(lambda p: tuple(face_rotations(rest, p, faces)), posed)
+
+
+def test_a_mesh_without_requires_grad_gets_no_gradient():
+    rest, posed, faces = sheet(1)
+    for needs in ((True, False), (False, True)):
+        leaves = [t.clone().requires_grad_(n) for t, n in zip((rest, posed), needs, strict=True)]
+        face_rotations(*leaves, faces).vertex_quats.sum().backward()
+        assert [leaf.grad is not None for leaf in leaves] == list(needs)
+    assert not any(t.requires_grad for t in face_rotations(rest, posed, faces))
+
+
+def test_the_gradient_of_one_output_is_its_share_of_the_gradient_of_all():
+    rest, posed, faces = sheet(2)
+    posed.requires_grad_()
+    parts = [torch.autograd.grad(face_rotations(rest, posed, faces)[k].sum(), posed)[0] for k in range(3)]
+    together = torch.autograd.grad(sum(out.sum() for out in face_rotations(rest, posed, faces)), posed)[0]
+    torch.testing.assert_close(sum(parts), together)
+
+
+def test_a_second_derivative_is_refused():
+    rest, posed, faces = sheet(0)
+    posed.requires_grad_()
+    squares = face_rotations(rest, posed, faces).vertex_quats.square() * torch.arange(4)
+    (first,) = torch.autograd.grad(squares.sum(), posed, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        first.sum().backward()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("angle", [0.0, 1e-4, 1.0, math.pi - 1e-3, math.pi - 1e-6, math.pi])
+@pytest.mark.parametrize("axis", [[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [1.0, -2, 3]])
+def test_a_rigid_motion_turns_every_face_and_vertex_by_its_rotation(axis, angle, dtype):
+    rest, _, faces = sheet(3)
+    turn = about(axis, angle)
+    posed = rest @ turn.T + torch.tensor([0.3, -0.2, 0.5])
+    got = face_rotations(rest.to(dtype), posed.to(dtype), faces)
+    # The rounding of float32 vertices turns edges of length 1 by up to 3e-7, thin faces by more.
+    tolerance = 1.4e-5 if dtype == torch.float32 else 1e-13
+    assert angle_between(got.face_quats, from_matrix(turn)).max() < tolerance
+    assert angle_between(got.vertex_quats, from_matrix(turn)).max() < tolerance
+    torch.testing.assert_close(got.area_ratio, torch.ones_like(got.area_ratio), rtol=tolerance, atol=0)
+
+
+def test_turning_the_posed_mesh_multiplies_from_the_left_and_the_rest_mesh_from_the_right():
+    rest, posed, faces = sheet(4)
+    turn = about([1.0, 1, 0], 1.1)
+    q = from_matrix(turn)
+    plain = face_rotations(rest, posed, faces)
+    left = face_rotations(rest, posed @ turn.T, faces)
+    right = face_rotations(rest @ turn, posed, faces)
+    for before, after, other in list(zip(plain, left, right, strict=True))[:2]:
+        assert angle_between(multiply(q.expand_as(before), before), after).max() < 1e-13
+        assert angle_between(multiply(before, q.expand_as(before)), other).max() < 1e-13
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_uniform_scaling_turns_nothing_and_squares_in_the_area(factor):
+    rest, _, faces = sheet(5)
+    got = face_rotations(rest, factor * rest, faces)
+    assert angle_between(got.vertex_quats, torch.tensor([1.0, 0, 0, 0])).max() < 1e-13
+    # The damping pulls the ratio to one by its share of the area, 1e-6 and more for thin faces.
+    torch.testing.assert_close(got.area_ratio, torch.full_like(got.area_ratio, factor**2), rtol=2e-5, atol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("corners", [[1, 2, 0], [2, 0, 1], [0, 2, 1]])
+def test_the_order_of_corners_changes_no_rotation(corners, dtype):
+    rest, posed, faces = sheet(6, bend=1.0, dtype=dtype)
+    plain, other = face_rotations(rest, posed, faces), face_rotations(rest, posed, faces[:, corners])
+    tolerance = 5e-7 if dtype == torch.float32 else 1e-12
+    assert angle_between(plain.face_quats, other.face_quats).max() < tolerance
+    assert angle_between(plain.vertex_quats, other.vertex_quats).max() < tolerance
+
+
+def test_the_order_of_faces_permutes_the_result_and_a_second_copy_of_them_changes_none():
+    rest, posed, faces = sheet(7)
+    order = torch.randperm(len(faces), generator=torch.Generator().manual_seed(0))
+    plain = face_rotations(rest, posed, faces)
+    shuffled = face_rotations(rest, posed, faces[order])
+    assert torch.equal(plain.face_quats[order], shuffled.face_quats)
+    assert angle_between(plain.vertex_quats, shuffled.vertex_quats).max() < 1e-13
+    twice = face_rotations(rest, posed, torch.cat([faces, faces]))
+    assert angle_between(plain.vertex_quats, twice.vertex_quats).max() < 1e-13
+
+
+def test_a_sheared_face_turns_by_its_polar_factor():
+    # Shear x += s y turns by -atan(s / 2), whatever the edges do one by one.
+    rest = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+    shear = torch.tensor([[1.0, 0.8, 0], [0, 1, 0], [0, 0, 1]], dtype=torch.float64)
+    got = face_rotations(rest, rest @ shear.T, torch.tensor([[0, 1, 2]])).face_quats
+    assert angle_between(got, from_matrix(about([0.0, 0, 1], -math.atan(0.4)))).max() < 1e-15
+
+
+def test_a_vertex_mean_weighs_faces_by_their_area_at_rest():
+    # Two faces share vertex 0: area 3 stays, area 1 turns by a right angle and is blown up besides.
+    rest = torch.tensor([[0.0, 0, 0], [3, 0, 0], [3, 2, 0], [-1, 0, 0], [-1, -2, 0]], dtype=torch.float64)
+    posed = rest.clone()
+    posed[3:] = 10 * rest[3:] @ about([0.0, 0, 1], math.pi / 2).T
+    got = face_rotations(rest, posed, torch.tensor([[0, 1, 2], [0, 3, 4]])).vertex_quats[0]
+    mean = 3 * torch.tensor([1.0, 0, 0, 0]) + torch.tensor([math.sqrt(0.5), 0, 0, math.sqrt(0.5)])
+    torch.testing.assert_close(got, (mean / mean.norm()).double())
+
+
+def test_a_sheet_rolled_more_than_once_has_no_seam():
+    # Rotations pass 180 degrees twice: quaternions of neighbours come with opposite signs.
+    n = 200
+    along = torch.linspace(0, 10.5, n, dtype=torch.float64)
+    rest = torch.cat([torch.stack([along, torch.full_like(along, y), 0 * along], 1) for y in (0.0, 0.1)])
+    rolled = torch.stack([along.sin(), rest[n:, 1], 1 - along.cos()], 1)
+    posed = torch.cat([rolled * torch.tensor([1.0, 0, 1]), rolled])
+    a = torch.arange(n - 1)
+    faces = torch.cat([torch.stack([a, a + 1, a + n], 1), torch.stack([a + 1, a + n + 1, a + n], 1)])
+    got = face_rotations(rest.float(), posed.float(), faces).vertex_quats
+    expected = torch.stack([from_matrix(about([0.0, 1, 0], -float(t))) for t in along]).repeat(2, 1)
+    # A face's rotation is that of its middle, half a step of 0.053 rad from its vertices.
+    assert angle_between(got, expected).max() < 0.03
+
+
+def test_a_root_rotation_of_nearly_half_a_turn_leaves_the_vertices_alone():
+    rest, posed, faces = sheet(8, bend=0.3)
+    root = about([1.0, 0.2, 0.1], math.radians(179.4))
+    still = face_rotations(rest, posed, faces).vertex_quats
+    turned = face_rotations(rest, posed @ root.T, faces).vertex_quats
+    assert angle_between(multiply(from_matrix(root).expand_as(still), still), turned).max() < 1e-12
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e-6, 1e3, 1e12])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_unit_of_length_does_not_matter(dtype, unit):
+    rest, posed, faces = sheet(9, dtype=dtype)
+    leaf = (unit * posed).requires_grad_()
+    plain, scaled = face_rotations(rest, posed, faces), face_rotations(unit * rest, leaf, faces)
+    assert angle_between(plain.vertex_quats, scaled.vertex_quats.detach()).max() < 2e-5
+    torch.testing.assert_close(plain.area_ratio, scaled.area_ratio.detach(), rtol=1e-5, atol=0)
+    (grad,) = torch.autograd.grad(sum(out.sum() for out in scaled), leaf)
+    assert grad.isfinite().all() and grad.any()
+
+
+def test_thin_faces_and_flipped_faces_stay_unit_and_finite():
+    rest = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.5, 1e-4, 0], [0.5, -1, 0]])
+    posed = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.5, -1e-4, 0], [0.5, 1, 0]]).requires_grad_()
+    got = face_rotations(rest, posed, torch.tensor([[0, 1, 2], [1, 0, 3]]))
+    assert ((got.face_quats.norm(dim=-1) - 1).abs() < 2e-6).all()
+    assert angle_between(got.face_quats.detach(), torch.tensor([0.0, 1, 0, 0])).max() < 1e-3  # both turned over
+    (grad,) = torch.autograd.grad(sum(out.sum() for out in got), posed)
+    assert grad.isfinite().all()
+
+
+@pytest.mark.parametrize("flat", ["rest", "posed"])
+def test_a_face_without_area_has_no_weight_no_gradient_and_the_rotation_of_the_largest(flat):
+    rest, _, faces = sheet(0)
+    turn = about([1.0, 1, 1], 2.0)
+    posed = rest @ turn.T
+    n = len(rest)
+    line = torch.tensor([[9.0, 9, 0], [10, 10, 0], [11, 11, 0]], dtype=torch.float64)
+    proper = torch.tensor([[9.0, 9, 0], [10, 9, 0], [11, 11, 0]], dtype=torch.float64)
+    more_rest, more_posed = (line, proper) if flat == "rest" else (proper, line)
+    all_faces = torch.cat([faces, torch.tensor([[n, n + 1, n + 2], [0, 0, 1], [3, 3, 3]])])
+    leaf = torch.cat([posed, more_posed]).requires_grad_()
+    got = face_rotations(torch.cat([rest, more_rest]), leaf, all_faces)
+    plain = face_rotations(rest, posed, faces)
+    assert torch.equal(got.vertex_quats[:n], plain.vertex_quats)
+    assert angle_between(got.face_quats.detach(), from_matrix(turn)).max() < 1e-13
+    assert angle_between(got.vertex_quats.detach(), from_matrix(turn)).max() < 1e-13
+    weights = torch.randn(4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    (grad,) = torch.autograd.grad((got.vertex_quats @ weights).sum() + (got.face_quats @ weights).sum(), leaf)
+    assert grad.isfinite().all() and not grad[n:].any() and grad[:n].any()
+    (grad,) = torch.autograd.grad(face_rotations(torch.cat([rest, more_rest]), leaf, all_faces).area_ratio.sum(), leaf)
+    assert grad.isfinite().all()
+
+
+def test_a_face_folded_onto_its_neighbour_is_unit_finite_and_always_the_same():
+    rest = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    posed = rest.clone()
+    posed[3] = rest[2]
+    faces = torch.tensor([[0, 1, 2], [1, 0, 3]])
+    got = [face_rotations(rest, posed, faces).vertex_quats for _ in range(3)]
+    assert ((got[0].norm(dim=-1) - 1).abs() < 2e-6).all()
+    assert torch.equal(got[0], got[1]) and torch.equal(got[0], got[2])
+
+
+def test_lonely_vertices_points_and_empty_meshes_have_the_identity():
+    identity = torch.tensor([1.0, 0, 0, 0])
+    nothing = torch.zeros(0, 3, dtype=torch.int64)
+    for rest, faces in [
+        (torch.rand(5, 3), nothing),
+        (torch.zeros(0, 3), nothing),
+        (torch.ones(4, 3), torch.tensor([[0, 1, 2], [1, 2, 3]])),
+    ]:
+        leaf = rest.clone().requires_grad_()
+        got = face_rotations(rest, leaf, faces)
+        assert got.vertex_quats.shape == (len(rest), 4) and got.face_quats.shape == (len(faces), 4)
+        assert (got.vertex_quats == identity).all() and (got.face_quats == identity).all()
+        assert (got.area_ratio == 1).all()
+        (grad,) = torch.autograd.grad(sum(out.sum() for out in got), leaf)
+        assert grad.shape == leaf.shape and not grad.any()
+
+
+def test_repeats_are_equal_to_the_bit_forwards_and_backwards():
+    rest, posed, faces = sheet(3, n=12, dtype=torch.float32)
+    runs = []
+    for _ in range(3):
+        leaves = [rest.clone().requires_grad_(), posed.clone().requires_grad_()]
+        got = face_rotations(*leaves, faces.clone())
+        loss = sum((out * torch.arange(out.numel()).view_as(out)).sum() for out in got)
+        runs.append([*got, *torch.autograd.grad(loss, leaves)])
+    for run in runs[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(runs[0], run, strict=True))
+
+
+def test_faces_changed_in_place_are_looked_at_again():
+    rest, posed, faces = sheet(1)
+    face_rotations(rest, posed, faces)
+    faces[0] = faces[5]
+    changed = face_rotations(rest, posed, faces)
+    assert torch.equal(changed.face_quats[0], changed.face_quats[5])
+    fresh = face_rotations(rest, posed, faces.clone())
+    assert torch.equal(changed.vertex_quats, fresh.vertex_quats)
+    faces[0, 0] = -1
+    with pytest.raises(ValueError, match=r"^faces: "):
+        face_rotations(rest, posed, faces)
+
+
+def test_a_bent_finger_of_the_hand_turns_by_the_rotation_of_its_bone(hand):
+    rest = rest_hand(hand, torch.zeros(hand.shape_basis.shape[2]))
+    angles = torch.zeros(15, 3)
+    angles[0:3, 0] = 0.6  # the index finger flexes at its three joints
+    posed = skin(hand, rest, HandPose(angles, about([0.0, 0, 1], 0.7).float(), torch.tensor([0.1, 0, 0.4])))
+    got = face_rotations(rest.vertices, posed.vertices, hand.faces)
+    firm = hand.weights.amax(1) > 0.999  # a vertex and its whole neighbourhood follow one bone
+    index_tip = firm & (hand.segment == 3)
+    axis = hand.pose_axes[1:4, 0]
+    bend = [from_axis_angle(a, torch.tensor(0.6)) for a in axis]
+    bone = from_matrix(about([0.0, 0, 1], 0.7).float() @ bend[0] @ bend[1] @ bend[2])
+    assert index_tip.sum() > 50
+    assert angle_between(got.vertex_quats[index_tip], bone).median() < 1e-3
+    assert got.vertex_quats.isfinite().all() and (got.area_ratio > 0).all()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
+@pytest.mark.parametrize("name", ["rest_vertices", "posed_vertices"])
+def test_values_that_are_no_numbers_are_refused_by_name(name, value):
+    rest, posed, faces = sheet(0)
+    (rest if name == "rest_vertices" else posed)[2, 1] = value
+    with pytest.raises(ValueError, match=rf"^{name}: expected finite values .* got 1 of 75"):
+        face_rotations(rest, posed, faces)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rest_vertices": torch.zeros(25, 2).double()}, r"rest_vertices: expected shape \[V, 3\], got \[25, 2\]."),
+        ({"posed_vertices": torch.zeros(24, 3).double()}, r"posed_vertices: expected shape \[25, 3\], got \[24, 3\]."),
+        ({"posed_vertices": torch.zeros(25, 3)}, "posed_vertices: expected torch.float64 on cpu, got torch.float32"),
+        ({"rest_vertices": torch.zeros(25, 3).half()}, "rest_vertices: expected float32 or float64, got float16."),
+        ({"faces": torch.zeros(8, 4, dtype=torch.int64)}, r"faces: expected shape \[F, 3\], got \[8, 4\]. Three"),
+        ({"faces": torch.zeros(8, 3)}, "faces: expected int32 or int64, got float32."),
+        ({"faces": torch.full((8, 3), -1)}, r"faces: expected indices in 0 .. 24 \(25 vertices\), got values from -1"),
+        ({"faces": torch.full((8, 3), 25)}, r"faces: expected indices in 0 .. 24 \(25 vertices\), got values from 25"),
+    ],
+)
+def test_a_wrong_argument_is_named_with_what_was_expected(change, message, as_shipped):
+    arguments = dict(zip(("rest_vertices", "posed_vertices", "faces"), sheet(0), strict=True)) | change
+    with pytest.raises(ValueError, match="^" + message):
+        face_rotations(**arguments)
+
+
+def test_without_validation_values_go_through_and_indices_do_not():
+    rest, posed, faces = sheet(1)
+    plain, trusted = face_rotations(rest, posed, faces), face_rotations(rest, posed, faces, validate=False)
+    assert all(torch.equal(a, b) for a, b in zip(plain, trusted, strict=True))
+    posed[0] = math.nan
+    assert face_rotations(rest, posed, faces, validate=False).area_ratio.isnan().any()
+    faces[0, 0] = 25
+    with pytest.raises(ValueError, match="^faces: "):
+        face_rotations(rest, posed, faces, validate=False)

@@ -1,0 +1,302 @@
+"""Depth buffer and visibility: twin, gradients, laws, poison values, messages."""
+
+import math
+
+import pytest
+import torch
+from reference import visibility as twin
+
+from oasis_warp.core.rotation import to_matrix
+from oasis_warp.ops import depth_map, depth_visibility
+
+WIDTH, HEIGHT = 37, 26
+TAU = 0.05
+
+
+def soup(seed, n_faces=25, near=False, dtype=torch.float64, device="cpu"):
+    """Triangles at random in front of a turned camera; with `near`, also across its plane and behind it."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    depth = 4 * torch.rand(n_faces, 1, generator=generator, dtype=torch.float64) + (-1.5 if near else 2.0)
+    centres = torch.cat([0.7 * normal(n_faces, 2), depth], 1)
+    in_camera = (centres[:, None] + (1.0 if near else 0.5) * normal(n_faces, 3, 3)).reshape(-1, 3)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = to_matrix(normal(4))
+    viewmat[:3, 3] = normal(3)
+    vertices = (in_camera - viewmat[:3, 3]) @ viewmat[:3, :3]
+    K = torch.tensor([[30.0, 0, 18.3], [0, 28.0, 13.1], [0, 0, 1]], dtype=torch.float64)
+    faces = torch.arange(3 * n_faces).view(-1, 3)
+    return [vertices.to(device, dtype), faces.to(device), viewmat.to(device, dtype), K.to(device, dtype)]
+
+
+def some_points(vertices, faces, seed, n=60):
+    """Points near the faces: in front of them, on them, behind them."""
+    generator = torch.Generator().manual_seed(seed)
+    weights = torch.rand(n, 3, generator=generator, dtype=torch.float64).softmax(-1).to(vertices)
+    chosen = torch.randint(len(faces), (n,), generator=generator).to(faces.device)
+    jitter = TAU * torch.randn(n, 3, generator=generator, dtype=torch.float64).to(vertices)
+    return (weights[..., None] * vertices[faces[chosen]]).sum(1) + jitter
+
+
+def wide(tensor):
+    """The same numbers for the twin: on the CPU, in double precision."""
+    tensor = tensor.detach().cpu()
+    return tensor.double() if tensor.is_floating_point() else tensor
+
+
+def visible(points, vertices, faces, viewmat, K, **options):
+    return depth_visibility(points, vertices, faces, K, viewmat, WIDTH, HEIGHT, **{"tau": TAU, **options})
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("near", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_depths_faces_and_barycentrics_are_those_of_the_twin(seed, near, dtype, device):
+    scene = soup(seed, near=near, dtype=dtype, device=device)
+    got = depth_map(*scene, WIDTH, HEIGHT)
+    want = twin.depth_map(*map(wide, scene), WIDTH, HEIGHT)
+    assert got.depth.dtype == dtype
+    assert torch.equal(got.face_ids.cpu().long(), want[1])
+    # Both sides are exact to float64 rounding of the float inputs: what is left is the rounding of the output. The
+    # twin's linear solve loses digits on triangles that are nearly edge-on.
+    rtol = 1e-7 if dtype == torch.float32 else 1e-9
+    torch.testing.assert_close(wide(got.depth), want[0], rtol=rtol, atol=0)
+    torch.testing.assert_close(wide(got.barycentrics), want[2], rtol=0, atol=100 * rtol)
+    assert (want[1] >= 0).any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_visibility_and_its_gradient_are_those_of_the_twin(seed, known, dtype, device):
+    vertices, faces, viewmat, K = soup(seed, dtype=dtype, device=device)
+    points = some_points(vertices, faces, seed)
+    point_vertices = None
+    if known:
+        points = torch.cat([points, vertices])
+        point_vertices = torch.cat([torch.full((60,), -1, device=device), torch.arange(len(vertices), device=device)])
+    points.requires_grad_()
+    got = visible(points, vertices, faces, viewmat, K, point_vertices=point_vertices)
+    (grad,) = torch.autograd.grad(got.visibility.sum(), points)
+
+    twin_points = wide(points).requires_grad_()
+    depth, face_ids, _ = twin.depth_map(*map(wide, (vertices, faces, viewmat, K)), WIDTH, HEIGHT)
+    want = twin.depth_visibility(
+        twin_points, depth, face_ids, faces.cpu(), wide(K), wide(viewmat), TAU, 3 * TAU, point_vertices
+    )
+    (twin_grad,) = torch.autograd.grad(want.sum(), twin_points)
+    tolerance = 1e-6 if dtype == torch.float32 else 1e-9
+    torch.testing.assert_close(wide(got.visibility), want.detach(), rtol=0, atol=tolerance)
+    assert (wide(grad) - twin_grad).norm() <= 10 * tolerance * twin_grad.norm()
+    assert ((want > 0.1) & (want < 0.9)).any()
+
+
+def test_visibility_passes_gradcheck_in_the_points():
+    vertices, faces, viewmat, K = soup(5)
+    points = some_points(vertices, faces, 5, n=16)
+    # Differences are safe away from the borders of pixels, where the buffer jumps.
+    camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    pixel = camera[:, :2] / camera[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
+    points = points[((pixel - pixel.round()).abs() > 1e-3).all(-1)].requires_grad_()
+    assert len(points) > 12
+    assert torch.autograd.gradcheck(lambda p: visible(p, vertices, faces, viewmat, K).visibility, points)
+
+
+def test_a_second_derivative_is_refused():
+    vertices, faces, viewmat, K = soup(0)
+    points = some_points(vertices, faces, 0).requires_grad_()
+    squares = visible(points, vertices, faces, viewmat, K).visibility.square()
+    (first,) = torch.autograd.grad(squares.sum(), points, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        first.sum().backward()
+
+
+def test_the_depth_map_carries_no_gradient_and_the_mesh_gets_none():
+    vertices, faces, viewmat, K = soup(1)
+    vertices.requires_grad_()
+    assert not any(t.requires_grad for t in depth_map(vertices, faces, viewmat, K, WIDTH, HEIGHT))
+    points = some_points(vertices.detach(), faces, 1).requires_grad_()
+    seen = visible(points, vertices, faces, viewmat, K)
+    assert not seen.depth_map.requires_grad
+    from_vertices, from_points = torch.autograd.grad(seen.visibility.sum(), [vertices, points], allow_unused=True)
+    assert from_vertices is None and from_points.any()
+
+
+def test_the_literal_formula_has_neither_margin_nor_identity():
+    vertices, faces, viewmat, K = soup(2)
+    everywhere = torch.arange(len(vertices))
+    literal = visible(vertices, vertices, faces, viewmat, K, literal=True, point_vertices=everywhere)
+    plain = visible(vertices, vertices, faces, viewmat, K, margin=0.0)
+    assert torch.equal(literal.visibility, plain.visibility)
+    assert not torch.equal(literal.visibility, visible(vertices, vertices, faces, viewmat, K).visibility)
+
+
+def test_moving_mesh_points_and_camera_together_changes_nothing():
+    vertices, faces, viewmat, K = soup(3)
+    points = some_points(vertices, faces, 3)
+    rotation = to_matrix(torch.tensor([0.3, -0.8, 0.2, 0.5], dtype=torch.float64))
+    shift = torch.tensor([0.4, -1.0, 2.0], dtype=torch.float64)
+    moved_view = viewmat.clone()
+    moved_view[:3, :3] = viewmat[:3, :3] @ rotation.T
+    moved_view[:3, 3] = viewmat[:3, 3] - moved_view[:3, :3] @ shift
+    before = visible(points, vertices, faces, viewmat, K)
+    after = visible(points @ rotation.T + shift, vertices @ rotation.T + shift, faces, moved_view, K)
+    assert torch.equal(before.face_ids, after.face_ids)
+    torch.testing.assert_close(before.visibility, after.visibility, rtol=0, atol=1e-10)
+
+
+def test_scaling_the_world_and_tau_changes_nothing():
+    vertices, faces, viewmat, K = soup(4)
+    points = some_points(vertices, faces, 4)
+    larger = viewmat.clone()
+    larger[:3, 3] *= 1000
+    small = visible(points, vertices, faces, viewmat, K)
+    large = visible(1000 * points, 1000 * vertices, faces, larger, K, tau=1000 * TAU, near_plane=10.0)
+    torch.testing.assert_close(small.visibility, large.visibility, rtol=0, atol=1e-10)
+
+
+def test_the_order_of_faces_and_corners_changes_no_depth():
+    vertices, faces, viewmat, K = soup(6, near=True)
+    order = torch.randperm(len(faces), generator=torch.Generator().manual_seed(0))
+    plain = depth_map(vertices, faces, viewmat, K, WIDTH, HEIGHT)
+    shuffled = depth_map(vertices, faces[order], viewmat, K, WIDTH, HEIGHT)
+    torch.testing.assert_close(plain.depth, shuffled.depth, rtol=1e-12, atol=0)
+    assert torch.equal(plain.face_ids >= 0, shuffled.face_ids >= 0)
+    assert torch.equal(plain.face_ids[plain.face_ids >= 0].long(), order[shuffled.face_ids[plain.face_ids >= 0].long()])
+    for corners in ([1, 2, 0], [0, 2, 1]):  # turned, and wound the other way
+        other = depth_map(vertices, faces[:, corners], viewmat, K, WIDTH, HEIGHT)
+        assert torch.equal(plain.face_ids, other.face_ids)
+        torch.testing.assert_close(plain.depth, other.depth, rtol=1e-12, atol=0)
+        torch.testing.assert_close(plain.barycentrics[..., corners], other.barycentrics, rtol=0, atol=1e-10)
+
+
+def test_of_two_equal_faces_the_first_is_kept():
+    vertices, faces, viewmat, K = soup(7)
+    twice = depth_map(vertices, torch.cat([faces, faces]), viewmat, K, WIDTH, HEIGHT)
+    once = depth_map(vertices, faces, viewmat, K, WIDTH, HEIGHT)
+    assert torch.equal(once.face_ids, twice.face_ids) and torch.equal(once.depth, twice.depth)
+
+
+def test_a_wall_behind_everything_changes_no_covered_pixel_and_one_in_front_hides_every_point():
+    vertices, faces, viewmat, K = soup(8)
+    points = some_points(vertices, faces, 8)
+    corners = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]], dtype=torch.float64)
+
+    def with_wall(depth):
+        wall = torch.cat([100 * depth * corners, torch.full((4, 1), depth, dtype=torch.float64)], 1)
+        wall = (wall - viewmat[:3, 3]) @ viewmat[:3, :3]
+        more = torch.tensor([[0, 1, 2], [0, 2, 3]]) + len(vertices)
+        return torch.cat([vertices, wall]), torch.cat([faces, more]), viewmat, K
+
+    open_map = depth_map(vertices, faces, viewmat, K, WIDTH, HEIGHT)
+    walled = depth_map(*with_wall(50.0), WIDTH, HEIGHT)
+    covered = open_map.face_ids >= 0
+    assert walled.depth.isfinite().all()
+    assert torch.equal(open_map.depth[covered], walled.depth[covered])
+    assert torch.equal(open_map.face_ids[covered], walled.face_ids[covered])
+
+    camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    beyond = camera[:, 2] > 0.2 + 20 * TAU
+    hidden = visible(points[beyond], *with_wall(0.2)).visibility
+    assert beyond.sum() > 30 and hidden.max() < 1e-6
+    free = visible(points, vertices, faces, viewmat, K).visibility
+    assert (visible(points, *with_wall(3.0)).visibility <= free + 1e-12).all()
+
+
+def test_a_point_that_comes_nearer_along_its_ray_is_never_less_visible():
+    vertices, faces, viewmat, K = soup(9)
+    points = some_points(vertices, faces, 9)
+    eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    last = torch.zeros(len(points), dtype=torch.float64)
+    for share in torch.linspace(1.2, 0.2, 11):
+        now = visible(eye + share * (points - eye), vertices, faces, viewmat, K).visibility
+        assert ((now >= 0) & (now <= 1)).all() and (now >= last - 1e-12).all()
+        last = now
+
+
+def test_the_containing_pixel_counts_not_the_nearest_centre():
+    # Two walls meet at the border of columns 4 and 5; a point just left of it belongs to column 4.
+    K = torch.tensor([[10.0, 0, 5], [0, 10, 5], [0, 0, 1]], dtype=torch.float64)
+    near_wall = torch.tensor([[0.0, -2, 1], [2, -2, 1], [2, 2, 1], [0, 2, 1]], dtype=torch.float64)
+    far_wall = torch.tensor([[-6.0, -6, 3], [6, -6, 3], [6, 6, 3], [-6, 6, 3]], dtype=torch.float64)
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    vertices, eye = torch.cat([near_wall, far_wall]), torch.eye(4, dtype=torch.float64)
+    columns = torch.tensor([4.9, 5.1], dtype=torch.float64)
+    points = torch.stack([(columns - 5) / 10 * 2, torch.zeros(2), torch.full((2,), 2.0)], 1).double()
+    seen = depth_visibility(points, vertices, faces, K, eye, 10, 10, tau=0.01).visibility
+    assert seen[0] > 0.999 and seen[1] < 0.001
+
+
+def test_neither_threads_nor_repeats_change_a_bit(with_threads):
+    scene = soup(10, near=True, dtype=torch.float32)
+    first = depth_map(*scene, WIDTH, HEIGHT)
+    for n_threads in (1, 2, 3, 5, 40):
+        for _ in range(3):
+            again = with_threads(n_threads, depth_map, *scene, WIDTH, HEIGHT)
+            assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+POISON = {"vertices": 0, "viewmat": 2, "K": 3}
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
+@pytest.mark.parametrize("name", [*POISON, "points"])
+def test_values_that_are_no_numbers_are_refused_by_name(name, value):
+    scene = soup(0)
+    points = some_points(scene[0], scene[1], 0)
+    (points if name == "points" else scene[POISON[name]])[0, 0] = value
+    with pytest.raises(ValueError, match=rf"^{name}: expected finite values"):
+        visible(points, *scene)
+
+
+@pytest.mark.parametrize("index", [-1, 75])
+def test_a_face_that_names_no_vertex_is_refused(index):
+    vertices, faces, viewmat, K = soup(0)
+    faces[3, 1] = index
+    with pytest.raises(ValueError, match=r"^faces: expected indices in 0 .. 74 \(75 vertices\)"):
+        depth_map(vertices, faces, viewmat, K, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 0}, "width: expected 1 or more pixels, got 0."),
+        ({"height": -3}, "height: expected 1 or more pixels, got -3."),
+        ({"near_plane": 0.0}, "near_plane: expected a positive"),
+        ({"tau": 0.0}, "tau: expected a positive"),
+        ({"tau": math.nan}, "tau: expected a positive"),
+        ({"margin": -1.0}, "margin: expected a finite number, 0 or more, got -1.0."),
+        ({"margin": math.nan}, "margin: expected a finite number"),
+        ({"points": torch.zeros(3, 2).double()}, r"points: expected shape \[P, 3\], got \[3, 2\]."),
+        ({"points": torch.zeros(3, 3)}, "points: expected torch.float64 on cpu, got torch.float32 on cpu."),
+        ({"vertices": torch.zeros(3, 4, dtype=torch.float64)}, r"vertices: expected shape \[V, 3\]"),
+        ({"faces": torch.zeros(3, 4).long()}, r"faces: expected shape \[F, 3\], got \[3, 4\]. Three vertex"),
+        ({"faces": torch.zeros(3, 3)}, "faces: expected int32 or int64, got float32."),
+        ({"viewmat": torch.eye(3).double()}, r"viewmat: expected shape \[4, 4\].* World to camera."),
+        ({"K": torch.diag(torch.tensor([0.0, 1, 1])).double()}, r"K\[0, 0\]: expected a positive"),
+        ({"K": torch.eye(3)}, "K: expected torch.float64"),
+        ({"point_vertices": torch.zeros(3).long()}, r"point_vertices: expected shape \[60\], got \[3\]."),
+        ({"point_vertices": torch.full((60,), 75)}, r"point_vertices: expected indices in 0 .. 74"),
+    ],
+)
+def test_a_wrong_argument_is_named_with_what_was_expected(change, message, as_shipped):
+    vertices, faces, viewmat, K = soup(0)
+    arguments = {"points": some_points(vertices, faces, 0), "vertices": vertices, "faces": faces, "K": K}
+    arguments |= {"viewmat": viewmat, "width": WIDTH, "height": HEIGHT} | change
+    with pytest.raises(ValueError, match="^" + message):
+        depth_visibility(**arguments)
+
+
+def test_without_validation_values_that_are_no_numbers_stay_inside_the_buffer():
+    scene = soup(1)
+    points = some_points(scene[0], scene[1], 1)
+    plain, trusted = visible(points, *scene), visible(points, *scene, validate=False)
+    assert all(torch.equal(a, b) for a, b in zip(plain, trusted, strict=True))
+    for value in (math.nan, math.inf, -math.inf):
+        scene[0][0], points[0] = value, value
+        broken = visible(points, *scene, validate=False)
+        assert broken.visibility[0] == 0 and broken.visibility.isfinite().all()
+        assert (broken.face_ids > 0).any()
