@@ -74,7 +74,7 @@ def collect(
     totals: wp.array(dtype=wp.int64),  # drawn Gaussians, pairs
 ):
     """Drawn Gaussians, numbers of their pairs in order of memory, and first places of the tiles. One thread in all."""
-    n_drawn = 0
+    n_drawn = wp.int32(0)  # not a bare literal: those are constants to Warp
     n_pairs = wp.int64(0)
     for camera in range(boxes.shape[0] // n):
         above = camera * tiles_y
