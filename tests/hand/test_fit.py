@@ -6,10 +6,10 @@ import pytest
 
 from oasis_warp.hand.evidence import evidence_of
 from oasis_warp.hand.fit import Fitter, OutlinePairs
+from oasis_warp.hand.fit_quality import draw, overlap
 from oasis_warp.hand.fit_state import FitState
 from oasis_warp.hand.kinematics import Rig
 from oasis_warp.hand.outline import MaskOutline, wrist_line
-from oasis_warp.hand.fit_quality import draw, overlap
 
 SIZE = (480, 400)
 

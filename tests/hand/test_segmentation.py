@@ -84,6 +84,7 @@ def test_masks_are_repeatable(drawing):
 def test_the_cut_out_of_a_hand_is_its_mask_without_the_arm(drawing):
     _, xy, scale, truth = drawing
     mask = mask_from_alpha(truth.astype(np.float32), xy, scale)
+    assert mask is not None
     above = hand_side(xy, truth.shape) > 0
     np.testing.assert_array_equal(mask[above], truth[above])
     assert mask[-10:].max() == 0

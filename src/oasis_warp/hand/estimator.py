@@ -12,7 +12,7 @@ from torch import Tensor
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandFit, Landmarks, Photo
-from oasis_warp.hand.doubts import finger_doubts, other_side_cost, place_doubts, second_looks, side_doubts
+from oasis_warp.hand.doubts import MANY_FINGERS, finger_doubts, other_side_cost, place_doubts, second_looks, side_doubts
 from oasis_warp.hand.fit import Fitter, Solution
 from oasis_warp.hand.fit_quality import DOUBTFUL, REFUSED, TINY_HAND, Quality, draw, measure
 from oasis_warp.hand.fit_state import FitState
@@ -90,11 +90,20 @@ class HandEstimator:
         found, mask, doubts = self._refine(view, fitter, start)
         quality = measure(self.rig, view.evidence, found.state, mask, found.cost)
         looks = second_looks(view.rgb, networks(), view.evidence.xy)
-        doubts += place_doubts(view.evidence, mask) + finger_doubts(view.evidence, looks)
+        fingers = finger_doubts(view.evidence, looks)
+        doubts += place_doubts(view.evidence, mask) + fingers
         if landmarks.world is not None:  # 21 points in the plane alone do not tell a palm from the other hand's back
             other_cost = other_side_cost(self.rig, view.evidence, known_shape)
             doubts += side_doubts(landmarks.side, start, other_cost, looks)
-        return self._report(view, landmarks, found.state, mask, quality, doubts, force)
+        refused = quality.beyond(REFUSED)
+        if len(fingers) >= MANY_FINGERS:
+            refused.append("the network sees the hand elsewhere")
+        if refused and not force:
+            raise InputError(
+                f"{photo.name}: the fit of the {landmarks.side} hand is too poor to use, {' and '.join(refused)}; "
+                "give a sharper photo of the open hand, or force it."
+            )
+        return self._report(view, landmarks, found.state, mask, quality, doubts)
 
     def _refine(self, view: RightView, fitter: Fitter, start: Solution) -> tuple[Solution, np.ndarray, list[str]]:
         """Fit to the mask's outline too: to a first mask, then to one that the fit has helped to cut."""
@@ -116,13 +125,7 @@ class HandEstimator:
         return found, mask, doubts
 
     def _report(self, view: RightView, landmarks: Landmarks, state: FitState, mask: np.ndarray, quality: Quality,
-                doubts: list[str], force: bool) -> HandFit:  # fmt: skip
-        refused = quality.beyond(REFUSED)
-        if refused and not force:
-            raise InputError(
-                f"{view.name}: the fit of the {landmarks.side} hand is too poor to use, {' and '.join(refused)}; "
-                "give a sharper photo of the open hand, or force it."
-            )
+                doubts: list[str]) -> HandFit:  # fmt: skip
         warnings = [f"poor fit: {words}" for words in quality.beyond(DOUBTFUL)] + doubts
         return HandFit(
             side=landmarks.side,
