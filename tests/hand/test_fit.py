@@ -44,7 +44,8 @@ def seen(rig, state, **kwargs):
 
 def error(rig, fitter, state):
     """Mean distance of the points, share of the box."""
-    return np.linalg.norm(state.project(landmarks(rig, state)) - fitter.evidence.xy, axis=1).mean() / fitter.evidence.box
+    gaps = np.linalg.norm(state.project(landmarks(rig, state)) - fitter.evidence.xy, axis=1)
+    return gaps.mean() / fitter.evidence.box
 
 
 def test_derivatives_of_all_terms_are_those_of_differences(rig):

@@ -49,7 +49,7 @@ def test_the_arm_is_cut_a_little_below_the_wrist(drawing):
 def test_a_mask_follows_its_photo(drawing):
     picture, xy, scale, _ = drawing
     wide = cv2.copyMakeBorder(picture, 40, 60, 70, 30, cv2.BORDER_REPLICATE)
-    inner = mask_from_landmarks(wide, xy + [70, 40], scale)[40:-60, 70:-30]
+    inner = mask_from_landmarks(wide, xy + np.array([70, 40]), scale)[40:-60, 70:-30]
     assert iou(inner > 0.5, mask_from_landmarks(picture, xy, scale) > 0.5) > 0.98
 
 
