@@ -94,6 +94,35 @@ def test_a_known_shape_and_focal_length_are_kept(estimator, fitted):
     assert again.camera.K[0, 0] == 900.0
 
 
+@pytest.mark.parametrize("name", [RIGHT, LEFT])
+def test_a_large_photo_gives_the_same_hand_at_its_own_size(estimator, fitted, name):
+    photo, landmarks, fit = fitted(name)
+    large = cv2.resize(photo.rgb.numpy(), None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+    again = estimator.fit(photo._replace(rgb=torch.from_numpy(large)), landmarks._replace(xy=4 * landmarks.xy))
+    assert again.mask.shape == large.shape[:2]
+    assert (again.camera.width, again.camera.height) == large.shape[1::-1]
+    torch.testing.assert_close(again.camera.K[:2] / 4, fit.camera.K[:2], rtol=0.05, atol=0)
+    torch.testing.assert_close(again.pose.angles, fit.pose.angles, atol=0.15, rtol=0)
+    small = cv2.resize(again.mask.numpy(), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    assert overlap(small > 0.5, fit.mask.numpy() > 0.5, landmarks.xy.numpy()) > 0.97
+    assert again.mask_iou == pytest.approx(fit.mask_iou, abs=0.02)
+
+
+def test_landmarks_of_which_most_lie_outside_the_photo_are_no_crash(estimator, fitted):
+    photo, landmarks, _ = fitted(RIGHT)
+    away = landmarks._replace(xy=landmarks.xy - landmarks.xy.amax(0) + 10)
+    with pytest.raises(InputError, match="too poor"):
+        estimator.fit(photo, away)
+    fit = estimator.fit(photo, away, force=True)
+    assert any("cut by the photo's border" in warning for warning in fit.warnings)
+
+
+def test_points_that_are_no_hand_are_refused_even_by_force(estimator, fitted):
+    photo, landmarks, _ = fitted(RIGHT)
+    with pytest.raises(InputError, match="the hand is 0 pixels large, at least 16"):
+        estimator.fit(photo, landmarks._replace(xy=torch.full((21, 2), 50.0)), force=True)
+
+
 def test_a_cut_out_is_its_own_mask(fitted):
     photo, landmarks, fit = fitted("thumb_up_cutout_right_07.png")
     alpha = photo.alpha.numpy()

@@ -5,7 +5,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -23,6 +22,8 @@ from oasis_warp.hand.outline import MaskOutline
 from oasis_warp.hand.right_view import RightView, array, real
 from oasis_warp.hand.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
 
+_NO_HAND = 16
+"""Smaller hands are refused even by force [px]."""
 _ROUNDS, _LAST_ROUNDS = 3, 2
 """Rounds of pairing outlines with the first and the second mask."""
 
@@ -78,9 +79,10 @@ class HandEstimator:
             InputError: the hand is too small, or the model does not explain it.
         """
         size = box_size(array(landmarks.xy))
-        if size < TINY_HAND and not force:
+        least = _NO_HAND if force else TINY_HAND
+        if size < least:
             raise InputError(
-                f"{photo.name}: the hand is {size:.0f} pixels large, at least {TINY_HAND} are needed; "
+                f"{photo.name}: the hand is {size:.0f} pixels large, at least {least} are needed; "
                 "give a closer or larger photo."
             )
         view = RightView(photo, landmarks, focal)
@@ -133,7 +135,7 @@ class HandEstimator:
             pose=view.pose(self.rig, state),
             camera=view.camera(state),
             landmarks=landmarks,
-            mask=torch.from_numpy(view.photo_way(mask)),
+            mask=real(view.in_photo(mask)),
             reprojection=quality.reprojection,
             worst_point=quality.worst_point,
             mask_iou=quality.mask_iou,
