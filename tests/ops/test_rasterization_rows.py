@@ -1,9 +1,9 @@
-"""The vector kernels of the CPU against the generic ones they stand in for."""
+"""The vector kernels of the CPU against the generic ones they stand in for, and these with CUDA's share of work."""
 
 import pytest
 import torch
 from rasterization_scenes import ordinary_scene
-from test_rasterization import INPUTS, rel, values_and_gradients
+from test_rasterization import INPUTS, draw, rel, values_and_gradients
 from test_rasterization_stiff import CASES
 
 from oasis_warp.ops import blending
@@ -52,3 +52,14 @@ def test_rows_that_end_in_mid_vector_draw_the_same_bits(size, monkeypatch):
 @pytest.mark.parametrize("name", ["opaque stack", "3000 faint layers", "larger than the image", "at the near plane"])
 def test_rows_of_stiff_scenes_draw_the_same_bits(name, monkeypatch):
     assert_same(*both_ways(CASES[name][0].to(torch.float32), monkeypatch))
+
+
+@pytest.mark.parametrize("tile_size", [1, 5, 16, 20])
+@pytest.mark.parametrize("grid", [blending.CUDA_LANES, blending.CUDA_WARP_LANES])
+def test_lanes_share_a_tile_without_gap_or_overlap(tile_size, grid, monkeypatch):
+    scene = ordinary_scene(4, n=100, dtype=torch.float64)  # float64: the generic kernel, which also runs on CUDA
+    alone = draw(scene, tile_size=tile_size)
+    cuda, lane_grid = torch.device("cuda"), blending.lane_grid
+    monkeypatch.setattr(blending, "lane_grid", lambda size, *_: lane_grid(size, cuda, grid))
+    shared = draw(scene, tile_size=tile_size)
+    assert torch.equal(alone[0], shared[0]) and torch.equal(alone[1], shared[1])
