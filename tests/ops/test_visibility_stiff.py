@@ -61,6 +61,17 @@ def test_edges_at_odd_angles_through_pixel_centres_leave_no_hole():
     assert (got.face_ids >= 0).all()
 
 
+@pytest.mark.parametrize("focal", [20.0, 33.3, 71.7, 1234.5])
+def test_vertices_at_all_pixel_centres_at_random_depths_leave_no_hole(focal):
+    # Every pixel is a matter of rounding for the six faces round its vertex, and for their boxes.
+    vertices, faces = grid(61, z=1.0, spacing=1.0)
+    depths = 0.3 + torch.rand(len(vertices), 1, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    vertices = torch.cat([vertices[:, :2] / focal, vertices[:, 2:]], 1) * depths
+    got = depth_map(vertices, faces, EYE, pinhole(focal, 60, 60), 60, 60)
+    assert (got.face_ids >= 0).all()
+    torch.testing.assert_close(got.depth, depths.view(62, 62)[1:61, 1:61], rtol=1e-9, atol=0)
+
+
 def test_degenerate_faces_change_nothing():
     vertices, faces = grid(6, z=1.5, spacing=0.1)
     line = torch.tensor([[0, 0, 1], [2, 2, 2], [0, 1, 2], [0, 8, 16]])  # corners repeated, and in a line
