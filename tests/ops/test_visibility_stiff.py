@@ -82,9 +82,13 @@ def test_degenerate_faces_change_nothing():
     assert torch.equal(plain.face_ids, torch.where(more.face_ids >= 0, more.face_ids - 4, -1))
 
 
-def test_a_face_seen_edge_on_covers_nothing():
-    edge_on = torch.tensor([[0.0, -1, 1], [0, 1, 1], [0, 0, 3]], dtype=torch.float64)
-    got = depth_map(edge_on, torch.tensor([[0, 1, 2]]), EYE, pinhole(20.0, 33, 33), 33, 33)
+def test_faces_seen_edge_on_cover_nothing():
+    # In planes through the camera and through pixel centres: x = 0, and x = 3 y, where all is a matter of rounding.
+    upright = torch.tensor([[0.0, -1, 1], [0, 1, 1], [0, 0, 3]], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    y, z = 4 * torch.rand(2, 300, generator=generator, dtype=torch.float64) - torch.tensor([[2.0], [-1.0]])
+    vertices = torch.cat([upright, torch.stack([3 * y, y, z], 1)])
+    got = depth_map(vertices, torch.arange(303).view(-1, 3), EYE, pinhole(21.7, 33, 33), 33, 33)
     assert (got.face_ids == -1).all() and got.depth.isinf().all() and not got.barycentrics.any()
 
 
