@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -7,6 +8,7 @@ from safetensors.torch import load_file, save_file
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.avatar_file import FORMAT, TENSORS, UNITS, VERSION, load_avatar, save_avatar
+from oasis_warp.data.avatar_file import HEADER as FILE_HEADER
 
 SIZES = {"S": 4, "V": 30, "P": 5, "Q": 7, "N": 12}
 HEADER = {
@@ -172,3 +174,12 @@ def test_another_format_is_refused(tmp_path):
         load_avatar(tmp_path / "none")
     with pytest.raises(InputError, match="found a folder"):
         load_avatar(tmp_path)
+
+
+def test_the_documentation_lists_every_tensor_and_header_key():
+    page = (Path(__file__).parents[2] / "docs" / "avatar_file.md").read_text()
+    for name, entry in TENSORS.items():
+        shape = ", ".join(map(str, entry.shape))
+        assert f"| `{name}` | {str(entry.dtype).removeprefix('torch.')} | {shape} |" in page
+    for key in FILE_HEADER:
+        assert f"| `{key}` |" in page
