@@ -64,9 +64,9 @@ def start() -> None:
 
 
 @functools.cache
-def _cuda_stream(device_index: int, cuda_stream: int) -> "wp.Stream":
-    # Kept for the life of the process: making one costs 5 us, and torch's pool of streams is small.
-    stream = torch.cuda.ExternalStream(cuda_stream, device=device_index)
+def _warp_stream(stream: torch.cuda.Stream) -> "wp.Stream":
+    # Kept for the life of the process: making one costs 5 us, and torch's pool of streams is small. The stream comes as
+    # the object: rebuilt from its handle, the default stream (handle 0) would become another one, out of order.
     return wp.stream_from_torch(stream)
 
 
@@ -76,7 +76,7 @@ def device_and_stream(tensor: Tensor) -> tuple["wp.Device", "wp.Stream | None"]:
     if tensor.device.type == "cpu":
         return wp.get_device("cpu"), None
     current = torch.cuda.current_stream(tensor.device)
-    return wp.device_from_torch(tensor.device), _cuda_stream(current.device_index, current.cuda_stream)
+    return wp.device_from_torch(tensor.device), _warp_stream(current)
 
 
 def view(tensor: Tensor, dtype: Any = None) -> Any:
