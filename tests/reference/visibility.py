@@ -30,7 +30,7 @@ def depth_visibility(points, depth, face_ids, faces, K, viewmat, tau, margin, po
             continue
         u, v = int(u), int(v)
         around = face_ids[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
-        seen = point_vertices is not None and bool((faces[around[around >= 0]] == point_vertices[i]).any())
+        seen = point_vertices is not None and bool((faces[around[around >= 0]] == int(point_vertices[i])).any())
         if seen or face_ids[v, u] < 0:
             out.append(0 * z + 1)
         else:
