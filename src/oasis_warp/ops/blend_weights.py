@@ -131,6 +131,7 @@ def _csr(rows: Tensor, columns: Tensor, values: Tensor, size: tuple[int, int]) -
     starts = torch.searchsorted(rows, ends, out_int32=True)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        warnings.filterwarnings("ignore", message="Sparse invariant checks are implicitly disabled")  # torch < 2.13
         return torch.sparse_csr_tensor(starts, columns, values, size, check_invariants=False)
 
 
