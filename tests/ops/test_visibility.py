@@ -7,7 +7,7 @@ import torch
 from reference import visibility as twin
 
 from oasis_warp.core.rotation import to_matrix
-from oasis_warp.ops import depth_map, depth_visibility
+from oasis_warp.ops import depth_map, depth_visibility, visibility
 
 WIDTH, HEIGHT = 37, 26
 TAU = 0.05
@@ -51,10 +51,17 @@ def visible(points, vertices, faces, viewmat, K, **options):
     return depth_visibility(points, vertices, faces, K, viewmat, WIDTH, HEIGHT, **{"tau": TAU, **options})
 
 
+@pytest.fixture(params=["strips", "faces"])
+def way(request, monkeypatch):
+    """Both ways to fill the buffer: the one for CUDA, a thread a face, runs on the CPU too."""
+    if request.param == "faces":
+        monkeypatch.setattr(visibility, "_fill_strips", visibility._fill_faces)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("near", [False, True])
 @pytest.mark.parametrize("seed", range(4))
-def test_depths_faces_and_barycentrics_are_those_of_the_twin(seed, near, dtype, device):
+def test_depths_faces_and_barycentrics_are_those_of_the_twin(seed, near, dtype, device, way):
     scene = soup(seed, near=near, dtype=dtype, device=device)
     got = depth_map(*scene, WIDTH, HEIGHT)
     want = twin.depth_map(*map(wide, scene), WIDTH, HEIGHT)
@@ -173,7 +180,7 @@ def test_the_order_of_faces_and_corners_changes_no_depth():
         torch.testing.assert_close(plain.barycentrics[..., corners], other.barycentrics, rtol=0, atol=1e-10)
 
 
-def test_of_two_equal_faces_the_first_is_kept():
+def test_of_two_equal_faces_the_first_is_kept(way):
     vertices, faces, viewmat, K = soup(7)
     twice = depth_map(vertices, torch.cat([faces, faces]), viewmat, K, WIDTH, HEIGHT)
     once = depth_map(vertices, faces, viewmat, K, WIDTH, HEIGHT)

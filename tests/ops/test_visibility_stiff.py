@@ -61,6 +61,17 @@ def test_edges_at_odd_angles_through_pixel_centres_leave_no_hole():
     assert (got.face_ids >= 0).all()
 
 
+@pytest.mark.parametrize("focal", [20.0, 33.3, 71.7, 1234.5])
+def test_vertices_at_all_pixel_centres_at_random_depths_leave_no_hole(focal):
+    # Every pixel is a matter of rounding for the six faces round its vertex, and for their boxes.
+    vertices, faces = grid(61, z=1.0, spacing=1.0)
+    depths = 0.3 + torch.rand(len(vertices), 1, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    vertices = torch.cat([vertices[:, :2] / focal, vertices[:, 2:]], 1) * depths
+    got = depth_map(vertices, faces, EYE, pinhole(focal, 60, 60), 60, 60)
+    assert (got.face_ids >= 0).all()
+    torch.testing.assert_close(got.depth, depths.view(62, 62)[1:61, 1:61], rtol=1e-9, atol=0)
+
+
 def test_degenerate_faces_change_nothing():
     vertices, faces = grid(6, z=1.5, spacing=0.1)
     line = torch.tensor([[0, 0, 1], [2, 2, 2], [0, 1, 2], [0, 8, 16]])  # corners repeated, and in a line
@@ -71,9 +82,13 @@ def test_degenerate_faces_change_nothing():
     assert torch.equal(plain.face_ids, torch.where(more.face_ids >= 0, more.face_ids - 4, -1))
 
 
-def test_a_face_seen_edge_on_covers_nothing():
-    edge_on = torch.tensor([[0.0, -1, 1], [0, 1, 1], [0, 0, 3]], dtype=torch.float64)
-    got = depth_map(edge_on, torch.tensor([[0, 1, 2]]), EYE, pinhole(20.0, 33, 33), 33, 33)
+def test_faces_seen_edge_on_cover_nothing():
+    # In planes through the camera and through pixel centres: x = 0, and x = 3 y, where all is a matter of rounding.
+    upright = torch.tensor([[0.0, -1, 1], [0, 1, 1], [0, 0, 3]], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    y, z = 4 * torch.rand(2, 300, generator=generator, dtype=torch.float64) - torch.tensor([[2.0], [-1.0]])
+    vertices = torch.cat([upright, torch.stack([3 * y, y, z], 1)])
+    got = depth_map(vertices, torch.arange(303).view(-1, 3), EYE, pinhole(21.7, 33, 33), 33, 33)
     assert (got.face_ids == -1).all() and got.depth.isinf().all() and not got.barycentrics.any()
 
 

@@ -75,7 +75,8 @@ def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
     n_photos, n_done = len(options.photos), 0
     with _shared_folder(options.out):
         try:
-            for photo in options.photos:
+            for number, photo in enumerate(options.photos, 1):
+                print(f"{photo}, {number} of {n_photos}", file=sys.stderr)
                 try:
                     report = _reconstruct_one(photo, options.out / photo.stem, config, None)
                 except InputError as error:
@@ -100,9 +101,11 @@ def _shared_folder(path: Path) -> Iterator[None]:
         return
     with output_folder(path):
         pass
-    yield
-    if not any(path.iterdir()):
-        path.rmdir()
+    try:
+        yield
+    finally:
+        if not any(path.iterdir()):
+            path.rmdir()
 
 
 def _reconstruct_one(

@@ -66,9 +66,8 @@ def photo_row(
     left, top, side = square_around(fit.mask, CROP_MARGIN)
     camera = crop_camera(fit.camera, left, top, side, size)
     rgb = photo.rgb.float() / 255
-    inside_photo = resample_square(torch.ones_like(rgb), left, top, side, size)
-    ground = torch.tensor(GROUND) * (1 - inside_photo)
-    crop = to_uint8(resample_square(rgb, left, top, side, size) + ground).numpy()
+    beyond = 1 - resample_square(torch.ones(rgb.shape[:2]), left, top, side, size)[..., None]
+    crop = to_uint8(resample_square(rgb, left, top, side, size) + beyond * torch.tensor(GROUND)).numpy()
     mask = resample_square(fit.mask.contiguous(), left, top, side, size).clamp(0, 1)
     shade, inside = shade_mesh(avatar.mesh(fit.pose), avatar.hand.faces, camera)
     fitted = draw_mesh(crop, shade.numpy(), inside.numpy())

@@ -16,6 +16,8 @@ SIDE_RATIO = 1.15
 """The other side's cost over this one's: at least 1.3 on 63 right fits, so less is a doubt."""
 _FINGER_GAP = 0.06
 """Share of the box by which a finger may move when the network looks again; right ones move by 0.04 at most."""
+MANY_FINGERS = 4
+"""So many doubtful fingers are a hand somewhere else."""
 _TURN = 0.3
 """Angle by which the second look is turned [rad]."""
 _MIN_PRESENCE = 0.5

@@ -5,14 +5,13 @@ from typing import Literal
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandFit, Landmarks, Photo
-from oasis_warp.hand.doubts import finger_doubts, other_side_cost, place_doubts, second_looks, side_doubts
+from oasis_warp.hand.doubts import MANY_FINGERS, finger_doubts, other_side_cost, place_doubts, second_looks, side_doubts
 from oasis_warp.hand.fit import Fitter, Solution
 from oasis_warp.hand.fit_quality import DOUBTFUL, REFUSED, TINY_HAND, Quality, draw, measure
 from oasis_warp.hand.fit_state import FitState
@@ -23,6 +22,8 @@ from oasis_warp.hand.outline import MaskOutline
 from oasis_warp.hand.right_view import RightView, array, real
 from oasis_warp.hand.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
 
+_NO_HAND = 16
+"""Smaller hands are refused even by force [px]."""
 _ROUNDS, _LAST_ROUNDS = 3, 2
 """Rounds of pairing outlines with the first and the second mask."""
 
@@ -78,9 +79,10 @@ class HandEstimator:
             InputError: the hand is too small, or the model does not explain it.
         """
         size = box_size(array(landmarks.xy))
-        if size < TINY_HAND and not force:
+        least = _NO_HAND if force else TINY_HAND
+        if size < least:
             raise InputError(
-                f"{photo.name}: the hand is {size:.0f} pixels large, at least {TINY_HAND} are needed; "
+                f"{photo.name}: the hand is {size:.0f} pixels large, at least {least} are needed; "
                 "give a closer or larger photo."
             )
         view = RightView(photo, landmarks, focal)
@@ -90,11 +92,20 @@ class HandEstimator:
         found, mask, doubts = self._refine(view, fitter, start)
         quality = measure(self.rig, view.evidence, found.state, mask, found.cost)
         looks = second_looks(view.rgb, networks(), view.evidence.xy)
-        doubts += place_doubts(view.evidence, mask) + finger_doubts(view.evidence, looks)
+        fingers = finger_doubts(view.evidence, looks)
+        doubts += place_doubts(view.evidence, mask) + fingers
         if landmarks.world is not None:  # 21 points in the plane alone do not tell a palm from the other hand's back
             other_cost = other_side_cost(self.rig, view.evidence, known_shape)
             doubts += side_doubts(landmarks.side, start, other_cost, looks)
-        return self._report(view, landmarks, found.state, mask, quality, doubts, force)
+        refused = quality.beyond(REFUSED)
+        if len(fingers) >= MANY_FINGERS:
+            refused.append("the network sees the hand elsewhere")
+        if refused and not force:
+            raise InputError(
+                f"{photo.name}: the fit of the {landmarks.side} hand is too poor to use, {' and '.join(refused)}; "
+                "give a sharper photo of the open hand, or force it."
+            )
+        return self._report(view, landmarks, found.state, mask, quality, doubts)
 
     def _refine(self, view: RightView, fitter: Fitter, start: Solution) -> tuple[Solution, np.ndarray, list[str]]:
         """Fit to the mask's outline too: to a first mask, then to one that the fit has helped to cut."""
@@ -116,13 +127,7 @@ class HandEstimator:
         return found, mask, doubts
 
     def _report(self, view: RightView, landmarks: Landmarks, state: FitState, mask: np.ndarray, quality: Quality,
-                doubts: list[str], force: bool) -> HandFit:  # fmt: skip
-        refused = quality.beyond(REFUSED)
-        if refused and not force:
-            raise InputError(
-                f"{view.name}: the fit of the {landmarks.side} hand is too poor to use, {' and '.join(refused)}; "
-                "give a sharper photo of the open hand, or force it."
-            )
+                doubts: list[str]) -> HandFit:  # fmt: skip
         warnings = [f"poor fit: {words}" for words in quality.beyond(DOUBTFUL)] + doubts
         return HandFit(
             side=landmarks.side,
@@ -130,7 +135,7 @@ class HandEstimator:
             pose=view.pose(self.rig, state),
             camera=view.camera(state),
             landmarks=landmarks,
-            mask=torch.from_numpy(view.photo_way(mask)),
+            mask=real(view.in_photo(mask)),
             reprojection=quality.reprojection,
             worst_point=quality.worst_point,
             mask_iou=quality.mask_iou,

@@ -1,5 +1,7 @@
 """A `HandFit` from a shape, pose and camera that come from elsewhere: only the mask is looked for in the photo."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from oasis_warp.core.hand_model import HandModel
@@ -33,6 +35,7 @@ def fit_of_pose(
         xy, world = mirror_points(xy, camera.width), world * [-1, 1, 1]
     landmarks = Landmarks(real(xy), real(world - world.mean(0)), side, 1.0, 1.0, source)
     view = RightView(photo, landmarks, state.focal)
+    state = replace(state, focal=state.focal * float(view.scale[0]), centre=state.centre * view.scale)
     scale, seen = state.focal / float(np.exp(state.place[2])), view.evidence.xy
     mask = None if view.alpha is None else mask_from_alpha(view.alpha, seen, scale)
     if mask is None:
@@ -46,7 +49,7 @@ def fit_of_pose(
         pose=pose,
         camera=camera,
         landmarks=landmarks,
-        mask=real(view.photo_way(mask)),
+        mask=real(view.in_photo(mask)),
         reprojection=quality.reprojection,
         worst_point=quality.worst_point,
         mask_iou=quality.mask_iou,

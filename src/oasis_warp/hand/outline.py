@@ -13,7 +13,7 @@ from oasis_warp.hand.silhouette import silhouette, vertex_normals
 
 WRIST_LINE = 0.10
 """The line across the arm above which outlines count: share of the way from the wrist point to the knuckles."""
-_WINDOW = 288
+_WINDOW = 400
 """Longer side of the picture in which the mesh's rim is looked for [px]."""
 _GRAZING = 0.35
 """Largest |normal . view| of a vertex on the rim."""
@@ -68,27 +68,32 @@ class MaskOutline:
         """Nearest pairs in both directions between these points and the rim of the mesh posed by `state`."""
         displacement = rig.correctives(rig.all_angles(state.angles))
         posed = rig.pose_surface(rig.chain(state.angles, state.shape), rig.rest_surface(state.shape) + displacement)
-        image, rim, rim_normals = self._rim(rig, state, posed)
+        edge, rim, rim_normals, inset = self._rim(rig, state, posed)
         if len(rim) < 10 or len(self.points) < 10:
             return OutlinePairs(np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), displacement)
-        p, q = self.points / self.box, image[rim] / self.box
+        p, q = self.points / self.box, edge / self.box
         squared = (p**2).sum(1)[:, None] + (q**2).sum(1) - 2 * p @ q.T
         squared[self.normals @ rim_normals.T < _SAME_WAY] = np.inf
         to_rim, to_mask = squared.argmin(1), squared.argmin(0)
         near = np.flatnonzero(squared[np.arange(len(p)), to_rim] < _REACH**2)
         back = np.flatnonzero(squared[to_mask, np.arange(len(q))] < _REACH**2)
         back = back[:: max(1, -(-len(back) // _MOST_POINTS))]
-        row = np.r_[near, to_mask[back]]
+        row, col = np.r_[near, to_mask[back]], np.r_[to_rim[near], back]
         return OutlinePairs(
-            vertex=np.r_[rim[to_rim[near]], rim[back]],
-            target=self.points[row],
+            vertex=rim[col],
+            target=self.points[row] - self.normals[row] * inset[col, None],
             normal=self.normals[row],
             trust=self.trust[row],
             displacement=displacement,
         )
 
-    def _rim(self, rig: Rig, state: FitState, posed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Image of all vertices, those on the visible rim above the wrist, and their normals in the image."""
+    def _rim(
+        self, rig: Rig, state: FitState, posed: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Points on the mesh's outline above the wrist: where, of which vertex, with which normal, how far outside it.
+
+        No vertex lies on the outline exactly; taking the nearest ones for it would fit a hand that is too thick.
+        """
         seen = state.in_camera(posed)
         image = state.focal * seen[:, :2] / seen[:, 2:] + state.centre
         normals = vertex_normals(seen, rig.faces)
@@ -98,8 +103,10 @@ class MaskOutline:
         depth = cv2.distanceTransform(drawn, cv2.DIST_L2, 3)
         pixel = np.clip(np.floor((image - self.low) * scale).astype(int), 0, size - 1)
         grazing = np.abs((normals * unit(seen)).sum(1)) < _GRAZING
-        rim = np.flatnonzero(grazing & (depth[pixel[:, 1], pixel[:, 0]] <= 2) & self.line.above(image))
-        return image, rim, unit(normals[rim, :2])
+        depth = depth[pixel[:, 1], pixel[:, 0]]
+        rim = np.flatnonzero(grazing & (depth <= 3) & self.line.above(image))
+        out, inset = unit(normals[rim, :2]), np.maximum(depth[rim] - 0.5, 0) / scale
+        return image[rim] + out * inset[:, None], rim, out, inset
 
 
 def contour(mask: np.ndarray, box: float) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ of pose (M R M, M t), and x becomes width - x.
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,8 +15,11 @@ from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, S
 from oasis_warp.hand.evidence import Evidence, evidence_of
 from oasis_warp.hand.fit_state import FitState
 from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.landmarks import box_size
 
 _MIRROR = np.array([-1.0, 1.0, 1.0])
+_LARGEST = 800.0
+"""Larger hands are fitted in a reduced photo: the mask is cut from fewer pixels anyway [px]."""
 
 
 def array(tensor: Tensor) -> np.ndarray:
@@ -29,23 +33,38 @@ def real(values: np.ndarray) -> Tensor:
 
 
 class RightView:
-    """A photo and one hand in it, mirrored if the hand is a left one."""
+    """A photo and one hand in it, mirrored if the hand is a left one, and reduced if it is very large."""
 
     def __init__(self, photo: Photo, landmarks: Landmarks, focal: float | None):
         self.name, self.mirrored = photo.name, landmarks.side == "left"
         rgb, xy = photo.rgb.cpu().numpy(), array(landmarks.xy)
         world = None if landmarks.world is None else array(landmarks.world)
-        height, width = rgb.shape[:2]
+        self.photo_size = rgb.shape[1], rgb.shape[0]
+        factor = min(1.0, _LARGEST / max(box_size(xy), 1.0))
+        size = (max(8, round(rgb.shape[1] * factor)), max(8, round(rgb.shape[0] * factor)))
+        self.scale = np.array(size) / self.photo_size
+        """Pixels of this view a pixel of the photo, x and y."""
+        xy = xy * self.scale
         if self.mirrored:
-            xy = mirror_points(xy, width)
+            xy = mirror_points(xy, size[0])
             world = None if world is None else world * _MIRROR
-        self.rgb = self.photo_way(rgb)
-        self.alpha = None if photo.alpha is None else self.photo_way(photo.alpha.cpu().numpy())
-        self.evidence: Evidence = evidence_of(xy, world, (width, height), focal or photo.focal)
+        self.rgb = self._seen(rgb, size)
+        self.alpha = None if photo.alpha is None else self._seen(photo.alpha.cpu().numpy(), size)
+        known = focal or photo.focal
+        self.evidence: Evidence = evidence_of(xy, world, size, known and known * float(self.scale[0]))
 
-    def photo_way(self, image: np.ndarray) -> np.ndarray:
-        """An image [H, W, ...] of the photo mirrored into this view, or back."""
+    def _seen(self, image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """An image [H, W, ...] of the photo in this view."""
+        if size != self.photo_size:
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         return np.ascontiguousarray(image[:, ::-1]) if self.mirrored else image
+
+    def in_photo(self, mask: np.ndarray) -> np.ndarray:
+        """A mask [h, w] of this view in the photo."""
+        mask = mask[:, ::-1] if self.mirrored else mask
+        if mask.shape[::-1] == self.photo_size:
+            return mask
+        return cv2.resize(np.ascontiguousarray(mask), self.photo_size, interpolation=cv2.INTER_LINEAR)
 
     def pose(self, rig: Rig, state: FitState) -> HandPose:
         """The pose in the photo's own frame."""
@@ -58,10 +77,11 @@ class RightView:
 
     def camera(self, state: FitState) -> Camera:
         """The camera of the photo."""
-        width, height = self.evidence.size
-        x = width - state.centre[0] if self.mirrored else state.centre[0]
-        K = np.array([[state.focal, 0, x], [0, state.focal, state.centre[1]], [0, 0, 1]])
-        return Camera(torch.eye(4), real(K), width, height)
+        x, y = state.centre
+        x = self.evidence.size[0] - x if self.mirrored else x
+        K = np.array([[state.focal, 0, x], [0, state.focal, y], [0, 0, 1]])
+        K[:2] /= self.scale[:, None]
+        return Camera(torch.eye(4), real(K), *self.photo_size)
 
 
 def mirror_points(xy: np.ndarray, width: int) -> np.ndarray:

@@ -20,6 +20,8 @@ _WRIST_CUT = 0.02
 _WORK_SIZE = 384
 """Longer side of the picture that is cut [px]."""
 _ITERATIONS = 4
+_LEAST = 20
+"""Pixels from which colours can be learnt."""
 _SUBPIXEL = 16
 
 
@@ -161,6 +163,9 @@ def _capsules(shape: tuple[int, int], points: np.ndarray, metre: float, grow: fl
 
 def _cut(window: Window, points: np.ndarray, metre: float, seeds: Seeds) -> np.ndarray:
     """GrabCut in the window: soft mask [h, w] float32."""
+    arm = _below(window.rgb.shape[:2], points, _WRIST_CUT * metre)
+    if seeds.sure.sum() < _LEAST:  # nearly all of the hand lies outside the photo
+        return (seeds.near & ~arm).astype(np.float32)
     colour = cv2.cvtColor(window.rgb, cv2.COLOR_RGB2YCrCb).astype(np.float64)
     own = colour[seeds.sure]
     away = colour - own.mean(0)
@@ -169,9 +174,9 @@ def _cut(window: Window, points: np.ndarray, metre: float, seeds: Seeds) -> np.n
     labels[seeds.far] = cv2.GC_PR_BGD
     labels[(seeds.near & (unlike < 25)) | (seeds.far & (unlike < 6))] = cv2.GC_PR_FGD
     labels[seeds.sure] = cv2.GC_FGD
-    arm = _below(labels.shape, points, _WRIST_CUT * metre)
     labels[arm & (unlike < 12)] = cv2.GC_PR_FGD
-    if (labels == cv2.GC_BGD).any() or (labels == cv2.GC_PR_BGD).any():
+    ground = np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD))
+    if ground.sum() >= _LEAST:  # else the hand fills the photo
         cv2.setRNGSeed(0)  # GrabCut starts from random clusters
         cv2.grabCut(window.rgb[..., ::-1].copy(), labels, None, np.zeros((1, 65)), np.zeros((1, 65)),
                     _ITERATIONS, cv2.GC_INIT_WITH_MASK)  # fmt: skip

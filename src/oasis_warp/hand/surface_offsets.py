@@ -54,7 +54,7 @@ def outline_offsets(hand: HandModel, fit: HandFit) -> Float[Tensor, "V 3"]:
         vertices, target, weight = view.observe(moved)
         if len(vertices) == 0:
             break
-        moved = _smooth(bending, vertices, target, weight)
+        moved = _smooth(bending, len(moved), vertices, target, weight)
         moved *= np.minimum(1, LONGEST / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-12))
     return torch.from_numpy(moved.astype(np.float32))
 
@@ -137,10 +137,11 @@ def _bending(rig: Rig) -> sparse.csc_array:
     return (_BEND * umbrella.T @ umbrella + _STAY * sparse.eye_array(n)).tocsc()
 
 
-def _smooth(bending: sparse.csc_array, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _smooth(
+    bending: sparse.csc_array, n_vertices: int, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray
+) -> np.ndarray:
     """The smooth displacement [V, 3] that comes nearest to the targets."""
-    n = bending.shape[0]
-    diagonal, right = np.zeros(n), np.zeros((n, 3))
+    diagonal, right = np.zeros(n_vertices), np.zeros((n_vertices, 3))
     diagonal[vertices] = weight
     right[vertices] = weight[:, None] * target
     system = (bending + sparse.diags_array(diagonal)).tocsc()

@@ -1,0 +1,157 @@
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from oasis_warp.hand.evidence import evidence_of
+from oasis_warp.hand.fit import Fitter, OutlinePairs
+from oasis_warp.hand.fit_quality import draw, overlap
+from oasis_warp.hand.fit_state import FitState
+from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.outline import MaskOutline, wrist_line
+
+SIZE = (480, 400)
+
+
+@pytest.fixture(scope="module")
+def rig(hand):
+    return Rig(hand)
+
+
+def posed_hand(rig, seed):
+    """A right hand in an ordinary pose before a camera: palm or back, tilted a little."""
+    rng = np.random.default_rng(seed)
+    fitter = Fitter(rig, evidence_of(np.zeros((21, 2)), None, SIZE, 500.0))
+    angles = np.clip(fitter.relaxed + 0.25 * rng.normal(size=26) * fitter.angle_sigma, fitter.low, fitter.high)
+    shape = 0.7 * rng.normal(size=40)
+    shape[6:10] = 0
+    facing = cv2.Rodrigues(np.array([np.pi / 2 + np.pi * rng.integers(2), 0, 0]))[0]
+    turn = cv2.Rodrigues(rng.normal(size=3) * 0.3)[0] @ cv2.Rodrigues(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))[0]
+    state = FitState(turn @ facing, np.array([0, 0, np.log(0.45)]), angles, shape, 500.0, np.array(SIZE) / 2)
+    middle = state.project(landmarks(rig, state)).mean(0)
+    return replace(state, place=state.place - np.array([*((middle - state.centre) / state.focal), 0]))
+
+
+def landmarks(rig, state):
+    return rig.landmarks(rig.chain(state.angles, state.shape), state.shape)[0]
+
+
+def seen(rig, state, **kwargs):
+    points = landmarks(rig, state)
+    return evidence_of(state.project(points), state.in_camera(points), SIZE, **kwargs)
+
+
+def error(rig, fitter, state):
+    """Mean distance of the points, share of the box."""
+    gaps = np.linalg.norm(state.project(landmarks(rig, state)) - fitter.evidence.xy, axis=1)
+    return gaps.mean() / fitter.evidence.box
+
+
+def test_derivatives_of_all_terms_are_those_of_differences(rig):
+    state = posed_hand(rig, 0)
+    fitter = Fitter(rig, seen(rig, posed_hand(rig, 1)))
+    rng = np.random.default_rng(0)
+    index = rng.integers(0, len(rig.template), 30)
+    normal = np.stack([np.cos(index), np.sin(index)], 1)
+    target = rng.uniform(100, 300, (30, 2))
+    pairs = OutlinePairs(index, target, normal, np.ones(30), np.zeros_like(rig.template))
+    _, slope, _ = fitter.system(state, pairs=pairs)
+    # Reweighting makes the gradient of the robust cost 2 J^T r, whatever the loss.
+    residual = fitter.system(state, pairs=pairs)[0]
+    gradient = 2 * slope.T @ residual
+    step = 1e-6
+    free = fitter.everything
+    eye = np.eye(slope.shape[1])
+    differences = [
+        (fitter.system(state.moved(step * eye[k]), pairs=pairs)[2]
+         - fitter.system(state.moved(-step * eye[k]), pairs=pairs)[2]) / (2 * step)
+        for k in free
+    ]  # fmt: skip
+    np.testing.assert_allclose(gradient[free], differences, rtol=1e-4, atol=1e-4 * np.abs(gradient[free]).max())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_perfect_landmarks_are_explained(rig, seed):
+    truth = posed_hand(rig, seed)
+    fitter = Fitter(rig, seen(rig, truth))
+    found = fitter.fit_landmarks().state
+    assert error(rig, fitter, found) < 0.0075, "what the priors cost"
+    aligned = landmarks(rig, found) @ found.turn.T
+    true = landmarks(rig, truth) @ truth.turn.T
+    aligned, true = aligned - aligned[0], true - true[0]
+    scale = (true * aligned).sum() / (aligned**2).sum()
+    assert np.linalg.norm(scale * aligned - true, axis=1).mean() < 0.008, "metres, up to the size no photo shows"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_landmarks_without_world_points_are_explained(rig, seed):
+    truth = posed_hand(rig, seed)
+    fitter = Fitter(rig, evidence_of(seen(rig, truth).xy, None, SIZE))
+    found = fitter.fit_landmarks()
+    assert error(rig, fitter, found.state) < 0.01
+
+
+def test_one_wild_landmark_does_not_carry_the_hand_away(rig):
+    truth = posed_hand(rig, 2)
+    evidence = seen(rig, truth)
+    spoilt = evidence.xy.copy()
+    spoilt[8] += 0.3 * evidence.box
+    fitter = Fitter(rig, replace(evidence, xy=spoilt))
+    found = fitter.fit_landmarks().state
+    others = np.delete(np.arange(21), [5, 6, 7, 8])
+    gaps = np.linalg.norm(found.project(landmarks(rig, found)) - evidence.xy, axis=1)[others] / evidence.box
+    assert gaps.mean() < 0.02
+
+
+def test_joints_stay_near_their_limits(rig):
+    evidence = seen(rig, posed_hand(rig, 3))
+    wild = evidence.xy + np.random.default_rng(0).normal(size=(21, 2)) * 0.1 * evidence.box
+    fitter = Fitter(rig, replace(evidence, xy=wild))
+    angles = fitter.fit_landmarks().state.angles
+    assert np.maximum(angles - fitter.high, fitter.low - angles).max() < np.radians(15)
+
+
+def test_a_known_focal_length_and_shape_are_kept(rig):
+    truth = posed_hand(rig, 1)
+    shape = np.linspace(-1, 1, 40)
+    fitter = Fitter(rig, seen(rig, truth, focal=777.0), shape=shape)
+    found = fitter.fit_landmarks().state
+    assert found.focal == 777.0
+    np.testing.assert_allclose(found.shape, shape, atol=1e-5)
+
+
+def test_principal_components_that_no_photo_shows_stay_zero(rig):
+    found = Fitter(rig, seen(rig, posed_hand(rig, 0))).fit_landmarks().state
+    np.testing.assert_allclose(found.shape[6:10], 0, atol=1e-5)
+
+
+def test_the_outline_brings_the_mesh_onto_the_mask(rig):
+    truth = posed_hand(rig, 0)
+    mask = (draw(rig, truth, SIZE) > 0).astype(np.float32)
+    evidence = seen(rig, truth)
+    noisy = evidence.xy + np.random.default_rng(1).normal(size=(21, 2)) * 0.008 * evidence.box
+    fitter = Fitter(rig, replace(evidence, xy=noisy))
+    start = fitter.fit_landmarks()
+    outline = MaskOutline(mask, noisy)
+    found = fitter.refine(start.state, lambda state: outline.match(rig, state), 4)
+    before, after = (overlap(draw(rig, s, SIZE) > 0, mask > 0, noisy) for s in (start.state, found.state))
+    assert 1 - after < min(0.7 * (1 - before), 0.035)
+
+
+def test_the_wrist_line_separates_hand_from_arm(rig):
+    xy = seen(rig, posed_hand(rig, 2)).xy
+    line = wrist_line(xy)
+    arm = xy[0] - (xy[9] - xy[0])
+    np.testing.assert_array_equal(line.above(np.stack([xy[9], xy[5], xy[0], arm])), [True, True, False, False])
+    where = line.above_mask(SIZE)
+    for point in (xy[9], arm):
+        x, y = np.clip(point.astype(int), 0, np.array(SIZE) - 1)
+        assert where[y, x] == line.above(np.array([[x + 0.5, y + 0.5]]))[0]
+
+
+def test_a_fit_is_repeatable(rig):
+    evidence = seen(rig, posed_hand(rig, 1))
+    first, second = (Fitter(rig, evidence).fit_landmarks() for _ in range(2))
+    assert first.cost == second.cost
+    np.testing.assert_array_equal(first.state.angles, second.state.angles)

@@ -1,0 +1,142 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import HandFit, Landmarks
+from oasis_warp.hand.keypoints_file import read_keypoints
+
+NAME = "ok_sign_left_10.jpg"
+
+
+def landmark_data(landmarks):
+    return {"side": landmarks.side, "xy": landmarks.xy.tolist(), "world": landmarks.world.tolist()}
+
+
+def pose_data(fit):
+    return {
+        "side": fit.side,
+        "angles": fit.pose.angles.tolist(),
+        "orientation": fit.pose.orientation.tolist(),
+        "translation": fit.pose.translation.tolist(),
+        "shape": fit.shape.tolist(),
+        "focal": float(fit.camera.K[0, 0]),
+    }
+
+
+def write(path, data):
+    path.write_text(data if isinstance(data, str) else json.dumps(data))
+    return path
+
+
+def test_landmarks_come_back(fitted, tmp_path):
+    photo, landmarks, _ = fitted(NAME)
+    read = read_keypoints(write(tmp_path / "k.json", landmark_data(landmarks)), photo)
+    assert isinstance(read, Landmarks)
+    torch.testing.assert_close(read.xy, landmarks.xy)
+    torch.testing.assert_close(read.world, landmarks.world)
+    assert (read.side, read.source) == ("left", "file")
+
+
+def test_pixels_of_the_file_are_scaled_to_a_photo_that_was_shrunk(fitted, tmp_path):
+    photo, landmarks, _ = fitted(NAME)
+    path = write(tmp_path / "k.json", {"side": "left", "xy": (4 * landmarks.xy).tolist()})
+    read = read_keypoints(path, photo._replace(shrink=0.25))
+    torch.testing.assert_close(read.xy, landmarks.xy)
+    assert read.world is None
+
+
+def test_landmarks_in_the_plane_alone_are_fitted(estimator, fitted, tmp_path):
+    photo, landmarks, with_world = fitted(NAME)
+    path = write(tmp_path / "k.json", {"side": "left", "xy": landmarks.xy.tolist()})
+    fit = estimator.fit(photo, read_keypoints(path, photo))
+    assert fit.reprojection < 2
+    assert fit.mask_iou > 0.9
+    # The same side of the hand faces the camera.
+    assert (fit.pose.orientation[:, 1] * with_world.pose.orientation[:, 1]).sum() > 0.7
+
+
+def test_a_pose_comes_back_as_a_fit_with_its_mask(hand, fitted, tmp_path):
+    photo, _, fit = fitted(NAME)
+    read = read_keypoints(write(tmp_path / "k.json", pose_data(fit)), photo)
+    assert isinstance(read, HandFit)
+    torch.testing.assert_close(read.pose.angles, fit.pose.angles)
+    torch.testing.assert_close(read.pose.translation, fit.pose.translation)
+    torch.testing.assert_close(read.camera.K, fit.camera.K)
+    assert read.reprojection == pytest.approx(0, abs=0.01), "the landmarks are the model's own"
+    assert read.mask_iou == pytest.approx(fit.mask_iou, abs=0.02)
+    gap = (read.landmarks.xy - fit.landmarks.xy).norm(dim=1).mean() / np.ptp(fit.landmarks.xy.numpy(), 0).max()
+    assert 100 * gap == pytest.approx(fit.reprojection, abs=0.05), "they lie where the fit's do"
+
+
+def test_a_pose_elsewhere_is_warned_about(fitted, tmp_path):
+    photo, _, fit = fitted(NAME)
+    data = pose_data(fit)
+    data["translation"][0] += 0.04
+    read = read_keypoints(write(tmp_path / "k.json", data), photo)
+    assert any("outline badly" in warning for warning in read.warnings)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"side": "both"}, r'"side" must be "left" or "right", got "both"'),
+        ({"xy": [[1, 2]] * 20}, r'"xy" must be 21 x 2 numbers'),
+        ({"xy": [[1, 2]] * 20 + [[1, "a"]]}, r'"xy" must be 21 x 2 numbers'),
+        ({"xy": [[1, 2]] * 20 + [[1]]}, r'"xy" must be 21 x 2 numbers'),
+        ({"xy": [[1, 2]] * 20 + [[1, float("nan")]]}, r'"xy" must be 21 x 2 numbers, all finite'),
+        ({"xy": [[-5, -5]] * 21}, r'none of the points of "xy" lies in'),
+        ({"world": [[0, 0]] * 21}, r'"world" must be 21 x 3 numbers'),
+        ({"angles": [[0, 0, 0]] * 15}, r'either "xy" .* or "angles"'),
+        ({"depth": 3}, r'the key "depth" is not known'),
+    ],
+)
+def test_wrong_landmarks_get_one_sentence_that_names_the_key(fitted, tmp_path, change, words):
+    photo, landmarks, _ = fitted(NAME)
+    path = write(tmp_path / "k.json", landmark_data(landmarks) | change)
+    with pytest.raises(InputError, match=words) as caught:
+        read_keypoints(path, photo)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"focal": None}, r'"focal" must be a number'),
+        ({"focal": -1}, r'"focal" must be a positive number'),
+        ({"orientation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "must be a rotation matrix"),
+        ({"translation": [0, 0, -0.5]}, "behind the camera"),
+        ({"shape": [0, 0]}, r'"shape" must be 40 numbers'),
+        ({"angles": [0] * 45}, r'"angles" must be 15 x 3 numbers'),
+        ({"centre": "middle"}, r'"centre" must be 2 numbers'),
+    ],
+)
+def test_a_wrong_pose_gets_one_sentence_that_names_the_key(fitted, tmp_path, change, words):
+    photo, _, fit = fitted(NAME)
+    with pytest.raises(InputError, match=words):
+        read_keypoints(write(tmp_path / "k.json", pose_data(fit) | change), photo)
+
+
+@pytest.mark.parametrize("missing", ["angles", "orientation", "translation", "focal"])
+def test_a_pose_that_lacks_something_says_what(fitted, tmp_path, missing):
+    photo, _, fit = fitted(NAME)
+    data = pose_data(fit)
+    del data[missing]
+    with pytest.raises(InputError, match=missing):
+        read_keypoints(write(tmp_path / "k.json", data), photo)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", "3", "\x00\x01", "[" * 100_000])
+def test_what_is_no_object_of_json_is_refused(fitted, tmp_path, text):
+    photo, _, _ = fitted(NAME)
+    with pytest.raises(InputError, match="expected"):
+        read_keypoints(write(tmp_path / "k.json", text), photo)
+
+
+def test_a_missing_file_is_named(fitted, tmp_path):
+    photo, _, _ = fitted(NAME)
+    with pytest.raises(InputError, match=r"gone\.json: cannot be read"):
+        read_keypoints(tmp_path / "gone.json", photo)

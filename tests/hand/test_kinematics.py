@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+import torch
+
+from oasis_warp.core.types import HandPose
+from oasis_warp.hand.fit_state import FitState
+from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.skinning import rest_hand, skin
+
+STEP = 1e-6
+
+
+@pytest.fixture(scope="module")
+def rig(hand):
+    return Rig(hand)
+
+
+@pytest.fixture
+def bent(rig):
+    rng = np.random.default_rng(3)
+    return rng.uniform(-0.3, 1.2, len(rig.dofs)), rng.normal(size=rig.shape_basis.shape[2])
+
+
+def test_surface_is_that_of_skinning_with_its_correctives(hand, rig, bent):
+    angles, shape = bent
+    table = rig.all_angles(angles)
+    pose = HandPose(torch.from_numpy(table[1:]).float(), torch.eye(3), torch.zeros(3))
+    posed = skin(hand, rest_hand(hand, torch.from_numpy(shape).float()), pose)
+    chain = rig.chain(angles, shape)
+    # float32 of a hand of 0.2 m
+    np.testing.assert_allclose(rig.surface(chain, angles, shape), posed.vertices, atol=3e-7)
+    np.testing.assert_allclose(chain.position, posed.joints, atol=3e-7)
+
+
+def test_landmark_derivatives_are_those_of_differences(rig, bent):
+    angles, shape = bent
+
+    def points(step):
+        chain = rig.chain(angles + step[:26], shape + step[26:])
+        return rig.landmarks(chain, shape + step[26:])
+
+    _, slope = points(np.zeros(slope_size(bent)))
+    check_slope(lambda step: points(step)[0], slope)
+
+
+def test_vertex_derivatives_are_those_of_differences(rig, bent):
+    angles, shape = bent
+    index = np.random.default_rng(1).integers(0, len(rig.template), 40)
+    fixed = rig.correctives(rig.all_angles(angles))
+
+    def points(step):
+        chain = rig.chain(angles + step[:26], shape + step[26:])
+        return rig.vertices(chain, shape + step[26:], index, fixed)
+
+    _, slope = points(np.zeros(slope_size(bent)))
+    check_slope(lambda step: points(step)[0], slope)
+
+
+def test_image_derivatives_are_those_of_differences(rig, bent):
+    angles, shape = bent
+    turn = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    state = FitState(turn, np.array([0.1, -0.2, -0.5]), angles, shape, 600.0, np.array([200.0, 150.0]))
+
+    def seen(state):
+        return state.linearize(*rig.landmarks(rig.chain(state.angles, state.shape), state.shape))
+
+    slope = seen(state).d_image
+    check_slope(lambda step: seen(state.moved(step)).image, slope, scale=1e3)
+
+
+def slope_size(bent):
+    return len(bent[0]) + len(bent[1])
+
+
+def check_slope(function, slope, scale=1.0):
+    n = slope.shape[2]
+    eye = np.eye(n) * STEP
+    differences = np.stack([(function(eye[k]) - function(-eye[k])) / (2 * STEP) for k in range(n)], -1)
+    # Rounding of central differences: 1e-16 * scale / STEP, and the cubic term STEP^2.
+    np.testing.assert_allclose(slope, differences, atol=1e-8 * scale)

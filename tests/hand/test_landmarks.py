@@ -1,0 +1,103 @@
+import cv2
+import numpy as np
+import pytest
+
+from oasis_warp.data.photo import read_photo
+from oasis_warp.hand.landmarks import FINGERS, box_size, crop_of_landmarks, find_hands, read_crop
+from oasis_warp.hand.networks import networks
+
+HANDS = {
+    "palm_open_right_01.jpg": "right",
+    "palm_open_left_02.png": "left",
+    "back_flat_right_04.jpg": "right",
+    "thumb_up_left_06.jpg": "left",
+    "fist_front_right_08.jpg": "right",
+}
+
+
+def pixels(photos, name):
+    return read_photo(photos / name).rgb.numpy()
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_a_hand_is_found_with_its_side(photos, estimator, name):
+    found = estimator.find(read_photo(photos / name))
+    assert [hand.side for hand in found] == [HANDS[name]]
+    assert found[0].source == "network"
+    assert found[0].presence > 0.9
+    assert found[0].side_score > 0.9
+
+
+@pytest.mark.slow
+def test_the_side_is_right_in_every_photo_that_names_it(photos, estimator):
+    wrong = []
+    for path in sorted(photos.rglob("*.jpg")):
+        side = next((s for s in ("left", "right") if s in str(path.relative_to(photos))), None)
+        if side and any(hand.side != side for hand in estimator.find(read_photo(path))):
+            wrong.append(path.name)
+    assert wrong == []
+
+
+def test_no_hand_is_found_where_there_is_none(photos):
+    rng = np.random.default_rng(0)
+    pictures = [
+        pixels(photos, "no_hand_cup_15.jpg"),
+        rng.integers(0, 256, (120, 160, 3), dtype=np.uint8),
+        np.zeros((1, 1, 3), np.uint8),
+        np.full((3, 900, 3), 128, np.uint8),
+    ]
+    assert [find_hands(picture, networks()) for picture in pictures] == [[], [], [], []]
+
+
+def test_two_hands_are_told_apart(photos):
+    found = find_hands(pixels(photos, "backs_two_left_05.jpg"), networks())
+    assert len(found) == 2
+    assert abs(found[0].xy.mean(0)[0] - found[1].xy.mean(0)[0]) > 100
+
+
+def test_a_hand_in_the_dark_is_found_by_a_fallback_rung_in_its_own_place(photos):
+    picture = pixels(photos, "backlit_victory_14.jpg")
+    (hand,) = find_hands(picture, networks())
+    assert hand.source == "network (margin, brightened)"
+    assert (hand.xy > 0).all()
+    assert (hand.xy < picture.shape[1::-1]).all()
+    assert hand.xy[[8, 12], 1].max() < hand.xy[0, 1], "two fingers up"
+
+
+def test_landmarks_turn_with_the_photo(photos):
+    picture = pixels(photos, "victory_right_09.jpg")
+    (upright,) = find_hands(picture, networks())
+    (turned,) = find_hands(np.ascontiguousarray(np.rot90(picture)), networks())
+    back = np.stack([picture.shape[1] - turned.xy[:, 1], turned.xy[:, 0]], 1)
+    assert np.linalg.norm(back - upright.xy, axis=1).mean() < 0.02 * box_size(upright.xy)
+    # World points turn along: x to the right and y down in each photo.
+    world = np.stack([-turned.world[:, 1], turned.world[:, 0], turned.world[:, 2]], 1)
+    assert np.linalg.norm(world - upright.world, axis=1).mean() < 0.01
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_another_crop_of_the_same_hand_gives_the_same_landmarks(photos, mirrored):
+    picture = pixels(photos, "palm_open_left_02.png")
+    (hand,) = find_hands(picture, networks())
+    again = read_crop(picture, networks(), crop_of_landmarks(hand.xy), mirrored=mirrored)
+    assert np.linalg.norm(again.xy - hand.xy, axis=1).max() < 0.05 * box_size(hand.xy)
+    assert np.linalg.norm(again.world - hand.world, axis=1).mean() < 0.01
+    assert again.right < 0.2, "a left hand, mirrored in the crop or not"
+
+
+def test_a_photo_of_twice_the_size_gives_points_twice_as_far(photos):
+    picture = pixels(photos, "victory_right_09.jpg")
+    (small,) = find_hands(picture, networks())
+    (large,) = find_hands(cv2.resize(picture, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC), networks())
+    assert np.linalg.norm(large.xy / 4 - small.xy, axis=1).mean() < 0.01 * box_size(small.xy)
+
+
+def test_finding_is_repeatable(photos):
+    picture = pixels(photos, "ok_sign_left_10.jpg")
+    first, second = (find_hands(picture, networks())[0] for _ in range(2))
+    np.testing.assert_array_equal(first.xy, second.xy)
+    np.testing.assert_array_equal(first.world, second.world)
+
+
+def test_fingers_cover_all_points_but_the_wrist():
+    assert sorted(row for rows in FINGERS.values() for row in rows) == list(range(1, 21))

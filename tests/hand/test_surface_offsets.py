@@ -1,0 +1,123 @@
+import numpy as np
+import pytest
+import torch
+
+from oasis_warp.hand.fit_quality import overlap
+from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.right_view import fitted_view, mirror_points
+from oasis_warp.hand.silhouette import silhouette, vertex_normals
+from oasis_warp.hand.surface_offsets import LONGEST, outline_offsets
+
+RIGHT, LEFT = "victory_right_09.jpg", "ok_sign_left_10.jpg"
+
+
+@pytest.fixture(scope="module")
+def rig(hand):
+    return Rig(hand)
+
+
+@pytest.fixture(scope="module")
+def offsets(hand, fitted):
+    done = {}
+
+    def get(name):
+        if name not in done:
+            done[name] = outline_offsets(hand, fitted(name)[2])
+        return done[name]
+
+    return get
+
+
+def posed(rig, fit, shift):
+    view = fitted_view(rig, fit)
+    rest = rig.rest_surface(view.state.shape) + rig.correctives(view.angles) + shift
+    return view.state, rest, rig.pose_surface(rig.chain_of(view.angles, view.state.shape), rest)
+
+
+def iou(rig, fit, shift):
+    state, _, vertices = posed(rig, fit, shift)
+    drawn = silhouette(state.project(vertices), rig.faces, (fit.camera.width, fit.camera.height)) > 0
+    view = fitted_view(rig, fit)
+    return overlap(drawn, view.mask > 0.5, view.xy)
+
+
+@pytest.mark.parametrize("name", [RIGHT, LEFT])
+def test_the_outline_comes_to_lie_on_the_masks(rig, fitted, offsets, name):
+    fit = fitted(name)[2]
+    before, after = iou(rig, fit, 0.0), iou(rig, fit, offsets(name).numpy())
+    assert after > 0.98
+    assert 1 - after < 0.4 * (1 - before)
+
+
+@pytest.mark.parametrize("name", [RIGHT, LEFT])
+def test_displacements_are_small_and_smooth(rig, fitted, offsets, name):
+    shift = offsets(name).numpy().astype(float)
+    assert shift.shape == rig.template.shape
+    assert np.linalg.norm(shift, axis=1).max() <= LONGEST + 1e-6
+    a, b, c = rig.faces.T
+    step = np.linalg.norm(np.concatenate([shift[a] - shift[b], shift[b] - shift[c]]), axis=1)
+    _, rest, _ = posed(rig, fitted(name)[2], 0.0)
+    edge = np.linalg.norm(np.concatenate([rest[a] - rest[b], rest[b] - rest[c]]), axis=1)
+    # A spike would move one end of an edge as far as the edge is long.
+    assert (step / edge).max() < 0.7
+    assert np.percentile(step / edge, 99) < 0.3
+
+
+@pytest.mark.parametrize("name", [RIGHT, LEFT])
+def test_the_surface_does_not_fold(rig, fitted, offsets, name):
+    _, rest, _ = posed(rig, fitted(name)[2], 0.0)
+    before, after = vertex_normals(rest, rig.faces), vertex_normals(rest + offsets(name).numpy(), rig.faces)
+    assert (before * after).sum(1).min() > 0.5
+
+
+def test_the_wrist_stays(rig, offsets):
+    at_wrist = np.abs(rig.template[:, 0] - rig.template[rig.rim, 0].mean()) < 0.01
+    assert at_wrist.any()
+    assert torch.linalg.norm(offsets(RIGHT)[torch.from_numpy(at_wrist)], dim=1).max() < 0.0015
+
+
+def test_a_fit_that_covers_its_mask_is_left_as_it_is(hand, rig, fitted):
+    fit = fitted(RIGHT)[2]
+    state, _, vertices = posed(rig, fit, 0.0)
+    drawn = silhouette(state.project(vertices), rig.faces, (fit.camera.width, fit.camera.height))
+    shift = outline_offsets(hand, fit._replace(mask=torch.from_numpy(drawn).float() / 255))
+    # Half a pixel of the photo is 0.3 mm.
+    assert torch.linalg.norm(shift, dim=1).max() < 0.0007
+
+
+def test_a_mask_that_is_wrong_somewhere_does_no_harm_there(hand, rig, fitted, offsets):
+    fit = fitted(RIGHT)[2]
+    xy = fit.landmarks.xy.numpy()
+    mask = fit.mask.clone()
+    x, y = xy[8]
+    mask[int(y) - 30 : int(y) + 35, int(x) - 40 : int(x) + 40] = 1.0  # a patch around the tip of the index finger
+    shift = outline_offsets(hand, fit._replace(mask=mask))
+    tip = torch.linalg.norm(hand.template - hand.tips[1], dim=1) < 0.012
+    assert torch.linalg.norm(shift[tip], dim=1).mean() < 0.004
+    assert iou(rig, fit, shift.numpy()) > 0.85
+    # Away from the patch the outline is followed as before.
+    little = torch.linalg.norm(hand.template - hand.tips[4], dim=1) < 0.012
+    torch.testing.assert_close(shift[little], offsets(RIGHT)[little], atol=0.0005, rtol=0)
+
+
+def test_an_empty_mask_moves_nothing(hand, fitted):
+    fit = fitted(RIGHT)[2]
+    assert not outline_offsets(hand, fit._replace(mask=torch.zeros_like(fit.mask))).any()
+
+
+def test_a_left_hands_offsets_are_those_of_the_mirrored_photo(hand, fitted, offsets):
+    fit = fitted(LEFT)[2]
+    mirror = torch.tensor([-1.0, 1, 1])
+    xy = torch.from_numpy(mirror_points(fit.landmarks.xy.numpy(), fit.camera.width)).float()
+    mirrored = fit._replace(
+        side="right",
+        pose=fit.pose._replace(orientation=mirror[:, None] * fit.pose.orientation * mirror,
+                               translation=mirror * fit.pose.translation),
+        mask=fit.mask.flip(1),
+        landmarks=fit.landmarks._replace(xy=xy, side="right"),
+    )  # fmt: skip
+    torch.testing.assert_close(outline_offsets(hand, mirrored), offsets(LEFT), atol=1e-4, rtol=0)
+
+
+def test_offsets_are_the_same_bits_again(hand, fitted, offsets):
+    assert torch.equal(outline_offsets(hand, fitted(RIGHT)[2]), offsets(RIGHT))
