@@ -134,6 +134,16 @@ def test_culled_gaussians_get_zero_gradients(device):
     assert not g[1::2].any() and g[::2].any()
 
 
+def test_a_gaussian_in_the_plane_of_the_camera_gets_a_zero_gradient(device):
+    # Dividing by its depth, even where the result is multiplied by zero, would give NaN.
+    scene = frontal_scene([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]], 0.3, 0.8).to(device)
+    inputs = [t.clone().requires_grad_() for t in (*scene.gaussians, scene.viewmats)]
+    image, *_ = rasterization(*inputs[:4], scene.colors, inputs[4], scene.Ks, 32, 32, render_mode="RGB+D")
+    *gradients, g_viewmats = torch.autograd.grad(image.square().sum(), inputs)
+    assert all(not g[0].any() and g[1].any() for g in gradients)
+    assert torch.isfinite(g_viewmats).all()
+
+
 def test_one_tile_can_hold_twenty_thousand_gaussians(device):
     g = torch.Generator().manual_seed(6)
     opacities = torch.rand(20_000, generator=g) * 0.01 + 0.003
