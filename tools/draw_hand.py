@@ -19,6 +19,8 @@ from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 
 Array = NDArray[np.float64]
+Image = np.ndarray
+"""Blue, green, red in 8 bits, [H, W, 3]."""
 
 # Rows: right, down and away from the eye, in the hand's frame. Fingers point up.
 PALM = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
@@ -36,7 +38,7 @@ SUBPIXEL_BITS = 4
 CORRECTED_POSES = ("fist", "thumbs_up", "pinch", "ok", "open")
 
 
-def draw(vertices: Array, faces: NDArray[np.int64], view: Array, size: int) -> NDArray[np.uint8]:
+def draw(vertices: Array, faces: NDArray[np.int64], view: Array, size: int) -> Image:
     """The surface in orthographic projection, [size, size, 3], drawn from back to front at twice the size."""
     fine = 2 * size
     at = (vertices - CENTRE) @ view.T
@@ -56,14 +58,14 @@ def draw(vertices: Array, faces: NDArray[np.int64], view: Array, size: int) -> N
     return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
 
 
-def pose_strip(hand: HandModel, name: str, size: int) -> NDArray[np.uint8]:
+def pose_strip(hand: HandModel, name: str, size: int) -> Image:
     """A named pose from all sides, side by side."""
     pose = HandPose(named_pose(hand, name), torch.eye(3), torch.zeros(3))
     vertices = skin(hand, rest_hand(hand, torch.zeros(len(hand.shape_names))), pose).vertices.double().numpy()
     return np.hstack([draw(vertices, hand.faces.numpy(), view, size) for view in VIEWS])
 
 
-def label(image: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+def label(image: Image, text: str) -> Image:
     """The image with a word in its corner."""
     return cv2.putText(image, text, (5, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
 
@@ -79,8 +81,8 @@ def main() -> None:
     cv2.imwrite(str(folder / "hand_poses.png"), np.hstack([np.vstack(strips[:half]), np.vstack(strips[half:])]))
     rows = []
     for name in CORRECTED_POSES:
-        before, after = label(pose_strip(plain, name, 190), f"{name}, before"), label(pose_strip(hand, name, 190), "after")
-        rows.append(np.hstack([before, after]))
+        before, after = (pose_strip(model, name, 190) for model in (plain, hand))
+        rows.append(np.hstack([label(before, f"{name}, before"), label(after, "after")]))
     cv2.imwrite(str(folder / "hand_correctives.png"), np.vstack(rows))
 
 
