@@ -86,7 +86,7 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
         "joint_shapedirs": point_basis[:16].astype(single),
         "tip_shapedirs": point_basis[16:].astype(single),
         "shape_names": np.array([s.name for s in basis]),
-        "n_pca": np.int32(shapes.N_COMPONENTS),
+        "n_pca": np.array(shapes.N_COMPONENTS, np.int32),
         "pca_explained": explained[: shapes.N_COMPONENTS].astype(single),
         "correctives": pose_shapes.astype(half),
         "pose_axes": axes.astype(single),

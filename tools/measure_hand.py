@@ -1,6 +1,6 @@
 """Print how well the bundled hand bends, with and without its pose correctives, as a Markdown table.
 
-    PYTHONPATH=src:kernels python tools/measure_hand.py
+Run it as `python tools/measure_hand.py`.
 """
 
 import dataclasses

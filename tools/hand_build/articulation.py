@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import igl
 import numpy as np
+
 from hand_build.anatomy import FINGERS, FIRST, Array, Index, bone_ends, finger_chain, unit
 
 # Anatomical ranges of flexion, abduction and twist [degrees]; 0 flexion is a straight finger, the thumb's base counts

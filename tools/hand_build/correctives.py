@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import igl
 import numpy as np
+
 from hand_build.anatomy import FINGERS, FIRST, PARENTS, Array, Index, bone_ends, descendants, unit
 from hand_build.elastic import ElasticSurface, Fold
 
@@ -30,9 +31,9 @@ BACK_SOFTNESS = 0.15
 """Of the skin on the back of a joint, which lies on bone, relative to the palm side's."""
 UNTOUCHED = 0.02
 """Softness below which skin moves with its bones alone."""
-HINGE_SWELLING, BASE_SWELLING = 0.1, 0.3
+HINGE_SWELLING, KNUCKLE_SWELLING, THUMB_BASE_SWELLING = 0.1, 0.12, 0.3
 """Share of the lost volume that comes back as a bulge near the joint. All of it would be a mushroom, for real flesh
-gives way along the whole finger; judged by pictures."""
+gives way along the whole finger; judged by pictures, and at the knuckles by crossings with the next finger."""
 SMALLEST = 1e-5
 """Displacements below are dropped [m]."""
 
@@ -97,9 +98,10 @@ def _settle_base(
     palm = _facing(turned, hand.faces, np.cross(axis, _rotation(axis, angle / 2) @ along))
     shared = 4 * share * (1 - share)
     free = shared > UNTOUCHED
+    swelling = THUMB_BASE_SWELLING if joint == FIRST["thumb"] else KNUCKLE_SWELLING
     return surface.relax(
         turned, _hold(np.maximum(palm, BACK_SOFTNESS) * shared, free), swell=np.where(free, palm * shared, 0),
-        volume=_swollen(hand, surface, turned, BASE_SWELLING),
+        volume=_swollen(hand, surface, turned, swelling),
     )  # fmt: skip
 
 
@@ -130,7 +132,8 @@ def _settle_hinge(
 
 def _facing(vertices: Array, faces: Index, way: Array) -> Array:
     """1 where the surface faces `way`, 0 where it faces away, [V]."""
-    return np.clip((igl.per_vertex_normals(vertices, faces) @ way + 0.3) / 0.8, 0, 1)
+    normals = np.asarray(igl.per_vertex_normals(vertices, faces))
+    return np.clip((normals @ way + 0.3) / 0.8, 0, 1)
 
 
 def _hold(soft: Array, free: Array) -> Array:

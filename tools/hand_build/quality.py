@@ -2,8 +2,9 @@
 
 import numpy as np
 import trimesh
-from hand_build.anatomy import Array, Index
 from scipy.spatial import cKDTree
+
+from hand_build.anatomy import Array, Index
 
 FLAT = 1e-6
 """Sine-like measure of an edge and a face below which they count as parallel: neighbours in a flat region."""

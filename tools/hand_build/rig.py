@@ -5,6 +5,7 @@ import numpy as np
 import scipy.optimize
 import scipy.sparse as sp
 import scipy.sparse.linalg
+
 from hand_build.anatomy import FINGERS, FIRST, JOINTS, Array, Index, finger_chain, unit
 
 HEAT = 1.0
@@ -45,7 +46,7 @@ def _heat_weights(vertices: Array, faces: Index, bones: list[list[tuple[Array, A
     wanted = nearest / nearest.sum(1, keepdims=True)
     mass = igl.massmatrix(vertices, faces, igl.MASSMATRIX_TYPE_VORONOI)
     pull = mass @ sp.diags(HEAT / distance.min(1) ** 2)
-    return scipy.sparse.linalg.spsolve((-igl.cotmatrix(vertices, faces) + pull).tocsc(), pull @ wanted)
+    return scipy.sparse.linalg.splu((-igl.cotmatrix(vertices, faces) + pull).tocsc()).solve(pull @ wanted)
 
 
 def skinning_weights(vertices: Array, faces: Index, points: Array, phalanx_shares: dict[str, Array]) -> Array:

