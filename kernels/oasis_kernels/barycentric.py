@@ -106,6 +106,7 @@ def growth_slope(ratio: wp.float64, half_powers: int) -> wp.float64:
 
 @wp.kernel
 def pose(
+    first: int,
     vertices: wp.array2d[Any],
     faces: wp.array2d[wp.int32],
     face_index: wp.array[wp.int32],
@@ -119,7 +120,7 @@ def pose(
     posed_quats: wp.array2d[Any],
     posed_scales: wp.array2d[Any],
 ):
-    i = wp.tid()
+    i = first + wp.tid()
     f = face_index[i]
     b = row3(barycentrics, i)
     mean = wp.vec3d()
@@ -136,6 +137,7 @@ def pose(
 
 @wp.kernel
 def pose_backward(
+    first: int,
     vertices: wp.array2d[Any],
     faces: wp.array2d[wp.int32],
     face_index: wp.array[wp.int32],
@@ -156,7 +158,7 @@ def pose_backward(
     grad_quats: wp.array2d[Any],
     grad_scales: wp.array2d[Any],
 ):
-    i = wp.tid()
+    i = first + wp.tid()
     f = face_index[i]
     b = row3(barycentrics, i)
     g_mean = row3(grad_means, i)

@@ -1,8 +1,8 @@
 """Depth buffer of a triangle mesh with face ids, and visibility of points against it.
 
-`camera_points` (one thread a vertex) -> `face_boxes` (one thread a face) -> `fill_rows` on the CPU (a serial loop over
-the faces, restricted to a strip of rows, so that strips can run on several threads) or `fill_faces` on CUDA (one
-thread a face) -> `interpolate` (one thread a pixel) and `visibility` (one thread a point).
+`camera_points` (one thread a vertex) -> `face_boxes` (one thread a face) -> `fill_strips` on the CPU (one thread for a
+strip of rows, which loops over the faces) or `fill_faces` on CUDA (one thread a face) -> `interpolate` (one thread a
+pixel) and `visibility` (one thread a point).
 
 A pixel's ray is p(z) = z (u, v, 1) with u = (x - cx) / fx, v = (y - cy) / fy. Sheared along it, a corner (X, Y, Z) in
 camera axes lands at (X - u Z, Y - v Z) and the ray at the origin; with 2D cross products w_a = b x c, w_b = c x a,
@@ -127,13 +127,14 @@ def depth_at(tri: Triangle, ray: wp.vec2d) -> wp.float64:
 
 
 @wp.kernel
-def camera_points(points: wp.array2d[Any], viewmat: wp.array2d[Any], out: wp.array[wp.vec3d]):
-    i = wp.tid()
+def camera_points(first: int, points: wp.array2d[Any], viewmat: wp.array2d[Any], out: wp.array[wp.vec3d]):
+    i = first + wp.tid()
     out[i] = camera_point(points, i, viewmat)
 
 
 @wp.kernel
 def face_boxes(
+    first: int,
     vertices: wp.array[wp.vec3d],
     faces: wp.array2d[wp.int32],
     K: wp.array2d[Any],
@@ -142,7 +143,7 @@ def face_boxes(
     near: wp.float64,
     boxes: wp.array[wp.vec4i],  # first column, last column, first row, last row; empty when first > last
 ):
-    f = wp.tid()
+    f = first + wp.tid()
     n_near = wp.int32(0)
     for k in range(3):
         if vertices[faces[f, k]][2] <= near:
@@ -170,9 +171,9 @@ def face_boxes(
 
 
 @wp.kernel
-def fill_rows(
-    first_row: int,
-    last_row: int,
+def fill_strips(
+    first: int,
+    n_strips: int,
     vertices: wp.array[wp.vec3d],
     faces: wp.array2d[wp.int32],
     boxes: wp.array[wp.vec4i],
@@ -181,7 +182,10 @@ def fill_rows(
     depth: wp.array2d[wp.float64],  # +inf on entry
     face_ids: wp.array2d[wp.int32],  # -1 on entry
 ):
-    """One thread for rows `first_row` to `last_row`; faces in order, so that a tie stays with the smaller id."""
+    """Each strip takes the faces in order, so that a tie stays with the smaller id."""
+    strip = first + wp.tid()
+    first_row = depth.shape[0] * strip // n_strips
+    last_row = depth.shape[0] * (strip + 1) // n_strips - 1
     rays = pixel_rays(K)
     for f in range(faces.shape[0]):
         box = boxes[f]
@@ -231,6 +235,7 @@ def fill_faces(
 
 @wp.kernel
 def interpolate(
+    first: int,
     vertices: wp.array[wp.vec3d],
     faces: wp.array2d[wp.int32],
     K: wp.array2d[Any],
@@ -238,7 +243,8 @@ def interpolate(
     out: wp.array3d[Any],  # height, width, 3; zero on entry
 ):
     """Barycentrics of every covered pixel."""
-    y, x = wp.tid()
+    row, x = wp.tid()
+    y = first + row
     f = face_ids[y, x]
     if f >= 0:
         b = barycentrics(triangle(f, faces, vertices), pixel_ray(x, y, pixel_rays(K)))
@@ -262,6 +268,7 @@ def shows_vertex(
 
 @wp.kernel
 def visibility(
+    first: int,
     points: wp.array2d[Any],
     point_vertices: wp.array[wp.int32],  # empty: no point is known to be a vertex
     faces: wp.array2d[wp.int32],
@@ -275,7 +282,7 @@ def visibility(
     out: wp.array[Any],  # zero on entry
     slope: wp.array[Any],  # derivative of `out` with respect to the point's depth; zero on entry
 ):
-    i = wp.tid()
+    i = first + wp.tid()
     p = camera_point(points, i, viewmat)
     if p[2] <= near:
         return
@@ -306,7 +313,7 @@ def visibility(
 
 for real in (wp.float32, wp.float64):
     wp.overload(camera_points, {"points": wp.array2d[real], "viewmat": wp.array2d[real]})
-    for kernel in (face_boxes, fill_rows, fill_faces):
+    for kernel in (face_boxes, fill_strips, fill_faces):
         wp.overload(kernel, {"K": wp.array2d[real]})
     wp.overload(interpolate, {"K": wp.array2d[real], "out": wp.array3d[real]})
     wp.overload(

@@ -125,6 +125,7 @@ def damped_ratio(rest: Plane, posed: Plane) -> wp.float64:
 
 @wp.kernel
 def face_rotations(
+    first: int,
     rest: wp.array2d[Any],
     posed: wp.array2d[Any],
     faces: wp.array2d[wp.int32],
@@ -132,7 +133,7 @@ def face_rotations(
     area_ratio: wp.array[Any],
     weights: wp.array[wp.float64],  # area at rest; 0 where the face has no rotation, and its quaternion is the identity
 ):
-    f = wp.tid()
+    f = first + wp.tid()
     before = plane(f, faces, rest)
     after = plane(f, faces, posed)
     q = wp.vec4d(ONE, ZERO, ZERO, ZERO)
@@ -155,6 +156,7 @@ def unit(quats: wp.array2d[Any], i: int) -> wp.vec4d:
 
 @wp.kernel
 def vertex_rotations(
+    first: int,
     face_quats: wp.array2d[Any],
     weights: wp.array[wp.float64],
     offsets: wp.array[wp.int32],  # corners of vertex v are corners[offsets[v] : offsets[v + 1]]
@@ -164,7 +166,7 @@ def vertex_rotations(
     reference: wp.array[wp.int32],  # the face that signs are aligned to; -1 for the fallback
     norms: wp.array[wp.float64],  # length of the sum before it was normalised
 ):
-    v = wp.tid()
+    v = first + wp.tid()
     best = wp.int32(-1)
     largest = ZERO
     for j in range(offsets[v], offsets[v + 1]):
@@ -197,12 +199,13 @@ def vertex_rotations(
 
 @wp.kernel
 def vertex_rotations_backward(
+    first: int,
     quats: wp.array2d[Any],
     norms: wp.array[wp.float64],
     grad_quats: wp.array2d[Any],
     grad_sums: wp.array[wp.vec4d],  # with respect to the sum before it was normalised
 ):
-    v = wp.tid()
+    v = first + wp.tid()
     grad_sums[v] = wp.vec4d()
     if norms[v] > ZERO:
         q = unit(quats, v)
@@ -266,6 +269,7 @@ def store_corners(rows: wp.array2d[Any], f: int, e1: wp.vec3d, e2: wp.vec3d):
 
 @wp.kernel
 def face_rotations_backward(
+    first: int,
     rest: wp.array2d[Any],
     posed: wp.array2d[Any],
     faces: wp.array2d[wp.int32],
@@ -278,7 +282,7 @@ def face_rotations_backward(
     grad_rest: wp.array2d[Any],  # nine values a face; no rows when not wanted
     grad_posed: wp.array2d[Any],  # nine values a face; no rows when not wanted
 ):
-    f = wp.tid()
+    f = first + wp.tid()
     before = plane(f, faces, rest)
     after = plane(f, faces, posed)
     before_grad = Edges()

@@ -12,18 +12,19 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def sum_rows(
+    first: int,
     rows: wp.array2d[Any],
     offsets: wp.array[wp.int32],
     entries: wp.array[wp.int32],
     out: wp.array2d[Any],
 ):
     """out[i] = sum of rows[entries[j]] for offsets[i] <= j < offsets[i + 1]; in float64."""
-    i = wp.tid()
-    first = offsets[i]
-    last = offsets[i + 1]
+    i = first + wp.tid()
+    begin = offsets[i]
+    end = offsets[i + 1]
     for column in range(out.shape[1]):
         total = wp.float64(0.0)
-        for j in range(first, last):
+        for j in range(begin, end):
             total += wp.float64(rows[entries[j], column])
         out[i, column] = out.dtype(total)
 

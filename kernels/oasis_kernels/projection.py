@@ -107,7 +107,8 @@ def project(scalar: Any) -> Any:
         centers[index] = vec4()
         whitenings[index] = vec4()
         opacity = wp.float64(opacities[i])
-        if depth < near or depth > far or opacity < ALPHA_MIN:
+        # Written so that a NaN, where the caller did not want to be checked, is culled too.
+        if not (depth >= near and depth <= far and opacity >= ALPHA_MIN):
             return
 
         q, _norm = unit_quaternion(wp.vec4d(quats[i]))
@@ -116,7 +117,7 @@ def project(scalar: Any) -> Any:
         s = splat(point, camera, rotation(q), wp.vec3d(scales[i]), intrinsics, size)
         cov = wp.vec3d(wp.dot(s.m0, s.m0) + eps2d, wp.dot(s.m0, s.m1), wp.dot(s.m1, s.m1) + eps2d)
         det = determinant(s.m0, s.m1, eps2d)
-        if det <= wp.float64(0.0):  # flat in the image, and eps2d is 0
+        if not (det > wp.float64(0.0)):  # flat in the image, and eps2d is 0
             return
 
         x = intrinsics[0] * point[0] / depth + intrinsics[2]

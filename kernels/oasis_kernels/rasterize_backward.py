@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from oasis_kernels import constants
-from oasis_kernels.gaussian import whitened
+from oasis_kernels.gaussian import falloff, whitened
 from oasis_kernels.rasterize_forward import from_centre, lane_pixels
 
 
@@ -117,7 +117,7 @@ def blend_backward(scalar: Any, channels: int) -> Any:
                     y0, y1 = whitened(w, dx, dy)
                     sigma = scalar(0.5) * (y0 * y0 + y1 * y1)
                     if sigma < cut:
-                        raw = opacity * wp.exp(-sigma)
+                        raw = opacity * falloff(-sigma)
                         alpha = wp.min(raw, scalar(constants.ALPHA_MAX))
                         pixel = (camera * height + y) * width + x
                         if alpha >= scalar(constants.ALPHA_MIN) and place < stops[pixel]:

@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from oasis_kernels import constants
-from oasis_kernels.gaussian import whitened
+from oasis_kernels.gaussian import falloff, whitened
 
 
 @wp.func
@@ -101,7 +101,7 @@ def blend(scalar: Any, channels: int) -> Any:
                     u, v = whitened(w, dx, dy)
                     sigma = scalar(0.5) * (u * u + v * v)
                     if sigma < cut:
-                        alpha = wp.min(opacity * wp.exp(-sigma), scalar(constants.ALPHA_MAX))
+                        alpha = wp.min(opacity * falloff(-sigma), scalar(constants.ALPHA_MAX))
                         pixel = (camera * height + y) * width + x
                         before = transmittance[pixel]
                         if alpha >= scalar(constants.ALPHA_MIN) and before > scalar(0.0):

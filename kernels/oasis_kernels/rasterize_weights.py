@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from oasis_kernels import constants
-from oasis_kernels.gaussian import whitened
+from oasis_kernels.gaussian import falloff, whitened
 from oasis_kernels.rasterize_forward import from_centre, lane_pixels
 
 
@@ -65,7 +65,7 @@ def weigh(scalar: Any) -> Any:
                     u, v = whitened(w, dx, dy)
                     sigma = scalar(0.5) * (u * u + v * v)
                     if sigma < cut:
-                        alpha = wp.min(opacity * wp.exp(-sigma), scalar(constants.ALPHA_MAX))
+                        alpha = wp.min(opacity * falloff(-sigma), scalar(constants.ALPHA_MAX))
                         pixel = y * width + x
                         before = transmittance[pixel]
                         if alpha >= scalar(constants.ALPHA_MIN) and before > scalar(0.0):

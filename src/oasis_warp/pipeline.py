@@ -23,6 +23,7 @@ from oasis_warp.hand.surface_offsets import outline_offsets
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
+from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 from oasis_warp.training.adapt import adapt
 
@@ -73,6 +74,8 @@ def reconstruct(
         stages[name] = time.perf_counter() - start
         progress(name, 1, 1)
 
+    with stage("kernels"):
+        warm_up(config.device)
     hand = bundled_hand()
     estimator = HandEstimator(hand)
     with stage("landmarks"):

@@ -45,7 +45,7 @@ def test_five_nails_lie_on_the_back_near_the_tips(hand, regions):
 
 
 def test_regions_lie_between_zero_and_one(regions):
-    for field in regions:
+    for field in regions[:-1]:
         assert float(field.min()) >= 0
         assert float(field.max()) <= 1
 
@@ -63,3 +63,11 @@ def test_region_masks_split_the_surface(regions):
     masks = region_masks(regions)
     assert tuple(masks) == REGION_NAMES
     torch.testing.assert_close(sum(masks.values()), torch.ones_like(regions.palm))
+
+
+def test_skin_is_mottled_the_same_way_every_time(hand, regions):
+    assert torch.equal(label_regions(hand).mottle, regions.mottle)
+    assert abs(float(regions.mottle.mean())) < 0.05
+    colors = region_colors(regions, 0.04)
+    back = (regions.palm < 0.05) & (regions.nail < 0.1) & (regions.knuckle < 0.1)
+    assert 0.005 < float(colors[back].std(0).mean()) < 0.04

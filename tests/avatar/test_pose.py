@@ -1,9 +1,9 @@
 import torch
+from synthetic import PALM_TO_CAMERA, posed_hand
 
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.pose import mirror_gaussians, pose_gaussians
 from oasis_warp.core import rotation
-from synthetic import PALM_TO_CAMERA, posed_hand
 
 
 def canonical_and_rest(hand):
@@ -40,7 +40,8 @@ def test_offsets_turn_with_the_surface(hand):
     canonical, rest = canonical_and_rest(hand)
     outwards = torch.zeros_like(canonical.offsets)
     outwards[:, 1] = 0.002
-    posed = pose_gaussians(canonical._replace(offsets=outwards), hand.faces, rest.vertices, rest.vertices @ PALM_TO_CAMERA.T)
+    lifted = canonical._replace(offsets=outwards)
+    posed = pose_gaussians(lifted, hand.faces, rest.vertices, rest.vertices @ PALM_TO_CAMERA.T)
     n = len(canonical.vertex_index)
     expected = (rest.vertices[canonical.vertex_index] + outwards) @ PALM_TO_CAMERA.T
     torch.testing.assert_close(posed.means[:n], expected, atol=1e-6, rtol=0)

@@ -101,6 +101,12 @@ def test_a_disk_that_fills_up_while_writing_is_told_and_leaves_nothing(tmp_path)
     assert everything(tmp_path) == {}
 
 
+def test_an_error_names_the_place_that_the_user_knows(tmp_path):
+    with full_disk(1000), pytest.raises(InputError) as caught, output_folder(tmp_path / "out") as part:
+        write_file(part / "large.txt", bytes(5000))
+    assert str(caught.value).startswith(f"{tmp_path / 'out' / 'large.txt'}: no room left")
+
+
 def test_a_place_that_cannot_be_written_is_refused_before_the_work_begins(tmp_path):
     (tmp_path / "file").touch()
     for path, expected in [

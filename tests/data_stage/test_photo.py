@@ -209,6 +209,22 @@ def test_what_is_no_photo_is_refused_in_one_sentence(read, data, expected):
     assert "\n" not in message
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".avif", ".bmp", ".tiff"])
+def test_random_damage_gives_a_photo_or_one_sentence(read, suffix):
+    rng = np.random.default_rng(5)
+    whole = encode(suffix, picture(), exif(6, 28) if suffix in (".jpg", ".png", ".webp") else None)
+    for _ in range(40):
+        data = bytearray(whole)
+        for place in rng.integers(0, min(len(data), 400), rng.integers(1, 5)):  # most of what can go wrong is in front
+            data[place] = rng.integers(256)
+        try:
+            photo = read(bytes(data), suffix)
+        except InputError as error:
+            assert "\n" not in str(error)
+        else:
+            assert photo.rgb.ndim == 3
+
+
 def test_places_that_hold_no_photo_are_named(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_photo(tmp_path / "none.jpg")

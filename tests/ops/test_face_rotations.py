@@ -77,7 +77,7 @@ def test_values_and_gradients_are_those_of_the_twin(seed, dtype, device):
         assert rel(ours, theirs) < (2e-6 if dtype == torch.float32 else 1e-9)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_gradcheck_passes_for_both_meshes(seed):
     rest, posed, faces = sheet(seed, n=2)
     meshes = (rest.requires_grad_(), posed.requires_grad_())
@@ -224,8 +224,8 @@ def test_the_unit_of_length_does_not_matter(dtype, unit):
     plain, scaled = face_rotations(rest, posed, faces), face_rotations(unit * rest, leaf, faces)
     assert angle_between(plain.vertex_quats, scaled.vertex_quats.detach()).max() < 2e-5
     torch.testing.assert_close(plain.area_ratio, scaled.area_ratio.detach(), rtol=1e-5, atol=0)
-    sum(out.sum() for out in scaled).backward()
-    assert leaf.grad.isfinite().all() and leaf.grad.any()
+    (grad,) = torch.autograd.grad(sum(out.sum() for out in scaled), leaf)
+    assert grad.isfinite().all() and grad.any()
 
 
 def test_thin_faces_and_flipped_faces_stay_unit_and_finite():
@@ -234,8 +234,8 @@ def test_thin_faces_and_flipped_faces_stay_unit_and_finite():
     got = face_rotations(rest, posed, torch.tensor([[0, 1, 2], [1, 0, 3]]))
     assert ((got.face_quats.norm(dim=-1) - 1).abs() < 2e-6).all()
     assert angle_between(got.face_quats.detach(), torch.tensor([0.0, 1, 0, 0])).max() < 1e-3  # both turned over
-    sum(out.sum() for out in got).backward()
-    assert posed.grad.isfinite().all()
+    (grad,) = torch.autograd.grad(sum(out.sum() for out in got), posed)
+    assert grad.isfinite().all()
 
 
 @pytest.mark.parametrize("flat", ["rest", "posed"])
@@ -284,8 +284,8 @@ def test_lonely_vertices_points_and_empty_meshes_have_the_identity():
         assert got.vertex_quats.shape == (len(rest), 4) and got.face_quats.shape == (len(faces), 4)
         assert (got.vertex_quats == identity).all() and (got.face_quats == identity).all()
         assert (got.area_ratio == 1).all()
-        sum(out.sum() for out in got).backward()
-        assert leaf.grad.shape == leaf.shape and not leaf.grad.any()
+        (grad,) = torch.autograd.grad(sum(out.sum() for out in got), leaf)
+        assert grad.shape == leaf.shape and not grad.any()
 
 
 def test_repeats_are_equal_to_the_bit_forwards_and_backwards():
@@ -294,8 +294,8 @@ def test_repeats_are_equal_to_the_bit_forwards_and_backwards():
     for _ in range(3):
         leaves = [rest.clone().requires_grad_(), posed.clone().requires_grad_()]
         got = face_rotations(*leaves, faces.clone())
-        sum((out * torch.arange(out.numel()).view_as(out)).sum() for out in got).backward()
-        runs.append([*got, *(leaf.grad for leaf in leaves)])
+        loss = sum((out * torch.arange(out.numel()).view_as(out)).sum() for out in got)
+        runs.append([*got, *torch.autograd.grad(loss, leaves)])
     for run in runs[1:]:
         assert all(torch.equal(a, b) for a, b in zip(runs[0], run, strict=True))
 
@@ -355,3 +355,14 @@ def test_a_wrong_argument_is_named_with_what_was_expected(change, message, as_sh
     arguments = dict(zip(("rest_vertices", "posed_vertices", "faces"), sheet(0), strict=True)) | change
     with pytest.raises(ValueError, match="^" + message):
         face_rotations(**arguments)
+
+
+def test_without_validation_values_go_through_and_indices_do_not():
+    rest, posed, faces = sheet(1)
+    plain, trusted = face_rotations(rest, posed, faces), face_rotations(rest, posed, faces, validate=False)
+    assert all(torch.equal(a, b) for a, b in zip(plain, trusted, strict=True))
+    posed[0] = math.nan
+    assert face_rotations(rest, posed, faces, validate=False).area_ratio.isnan().any()
+    faces[0, 0] = 25
+    with pytest.raises(ValueError, match="^faces: "):
+        face_rotations(rest, posed, faces, validate=False)

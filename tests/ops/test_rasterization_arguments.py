@@ -45,6 +45,18 @@ def test_validate_false_skips_the_look_at_values(call):
     assert image[..., 0].isnan().any() and not image[..., 1:].isnan().any()
 
 
+@pytest.mark.parametrize("value", POISON)
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "viewmats", "Ks"])
+def test_unchecked_values_that_are_not_finite_do_not_reach_other_gaussians(name, value, call):
+    bad = call.arguments[name].clone().double()
+    bad.view(-1)[1] = value
+    doubles = {k: v.double() for k, v in call.arguments.items() if isinstance(v, torch.Tensor)}
+    for precision in (torch.float32, torch.float64):
+        arguments = {k: v.to(precision) for k, v in {**doubles, name: bad}.items()}
+        image, alphas, _ = call(**arguments, validate=False)
+        assert torch.isfinite(image).all() and torch.isfinite(alphas).all()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

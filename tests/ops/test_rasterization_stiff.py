@@ -10,7 +10,7 @@ from rasterization_scenes import frontal_scene, intrinsics, look_from, ordinary_
 from test_rasterization import assert_equals_twin, draw
 
 from oasis_warp.ops import rasterization
-from oasis_warp.ops._tiles import MAX_PAIRS, bin_to_tiles
+from oasis_warp.ops._tiles import MAX_PAIRS, bin_by_dealing, bin_by_sorting, bin_to_tiles
 from oasis_warp.ops.projection import project
 
 STIFF = 1e-5, 1e-4
@@ -137,7 +137,7 @@ def test_culled_gaussians_get_zero_gradients(device):
 def test_one_tile_can_hold_twenty_thousand_gaussians(device):
     g = torch.Generator().manual_seed(6)
     opacities = torch.rand(20_000, generator=g) * 0.01 + 0.003
-    scene = frontal_scene(cloud(20_000, spread=(0.3, 0.3, 1.0)), 0.05, opacities, 16, 16, 20.0)
+    scene = frontal_scene(cloud(20_000, spread=(0.3, 0.3, 1.0)), 0.05, opacities, 8, 7, 10.0)
     assert_equals_twin(scene, torch.float32, device, *STIFF, max_fragile=1.0)
 
 
@@ -151,6 +151,26 @@ def test_more_pairs_than_can_be_counted_are_refused_with_their_number():
     projection = project(means, quats, torch.full((n, 3), 9.0), torch.full((n,), 0.5), eye, K, size, size, **options)
     with pytest.raises(ValueError, match=f"at most {MAX_PAIRS} pairs of a Gaussian and a tile, got {n * 4096}"):
         bin_to_tiles(projection, size, size, 1)
+
+
+@pytest.mark.parametrize("name", ["larger than the image", "3000 faint layers", "partly behind the camera"])
+def test_dealing_and_sorting_fill_the_same_lists(name):
+    scene = CASES[name][0]
+    scene = scene.with_(means=torch.cat([scene.means, scene.means]))  # every depth is there twice
+    twice = [torch.cat([t, t]) for t in scene.gaussians[1:]]
+    options = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3}
+    cameras, Ks = scene.viewmats.repeat(2, 1, 1), scene.Ks.repeat(2, 1, 1)
+    projection = project(scene.means, *twice, cameras, Ks, scene.width, scene.height, **options)
+    dealt, sorted_ = (f(projection, 7, 10, 10) for f in (bin_by_dealing, bin_by_sorting))
+    assert torch.equal(dealt.starts, sorted_.starts)
+    assert torch.equal(dealt.gaussians, sorted_.gaussians)
+    assert torch.equal(dealt.pair_counts, sorted_.pair_counts)
+    for lists in (dealt, sorted_):
+        # A pair's number is its Gaussian's first plus its place among that Gaussian's tiles.
+        first = lists.pair_starts[lists.gaussians.long()]
+        place = lists.pairs - first
+        assert place.min() >= 0 and (place < lists.pair_counts[lists.gaussians.long()]).all()
+        assert torch.equal(lists.pairs.sort().values, torch.arange(len(lists.pairs)))
 
 
 def test_ordinary_scenes_do_not_feel_an_absent_low_pass(device):

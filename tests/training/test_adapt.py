@@ -1,15 +1,16 @@
 import pytest
 import torch
+from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, evidence_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observe import observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, estimate_melanin
 from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.types import CanonicalGaussians, Evidence
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.render.render import render
 from oasis_warp.training.adapt import adapt
-from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, evidence_of
 
 CAST = torch.tensor([0.90, 0.85, 0.80])  # a little dim and warm
 STEPS = AdaptConfig(texture_steps=60)
@@ -34,7 +35,8 @@ def case(hand, regions):
 
 
 def drawn(hand, gaussians, evidence):
-    return render(pose_gaussians(gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices), evidence.camera)
+    posed = pose_gaussians(gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices)
+    return render(posed, evidence.camera)
 
 
 def test_the_photo_is_explained(hand, case):
@@ -76,6 +78,21 @@ def test_the_same_seed_gives_the_same_bits(hand, case):
     few = AdaptConfig(texture_steps=5)
     first, second = (adapt(hand, prior, evidence, few).gaussians.colors for _ in range(2))
     assert torch.equal(first, second)
+
+
+@pytest.mark.gpu
+def test_a_gpu_finds_what_the_cpu_finds(hand, case):
+    evidence, _, _, adapted = case
+
+    def there(nouns):
+        return type(nouns)(*(part.cuda() if isinstance(part, torch.Tensor) else part for part in nouns))
+
+    moved = Evidence(*(part.cuda() if isinstance(part, torch.Tensor) else there(part) for part in evidence))
+    found = adapt(hand, MeanPrior(hand)(moved), moved, STEPS).gaussians
+    assert found.colors.is_cuda
+    back = CanonicalGaussians(*(part.cpu() for part in found))
+    pictures = [drawn(hand, gaussians, evidence).image for gaussians in (back, adapted.gaussians)]
+    assert masked_psnr(*pictures, torch.ones_like(evidence.mask)) > 45
 
 
 def test_colours_stay_colours(case):

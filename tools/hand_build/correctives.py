@@ -4,8 +4,9 @@ Blend skinning averages positions, which thins a bent joint and folds the palm s
 every joint and a few angles of flexion the surface is bent as flesh would be:
 
 1. each vertex turns about the joint by its share of the angle, which keeps its distance from the joint;
-2. the skin near the joint relaxes as an elastic surface, the palm side more freely than the back;
-3. at the hinges of the fingers, the two sides of the crease press against each other and the flesh swells a little.
+2. the skin near the joint relaxes as an elastic surface, the palm side more freely than the back, and swells a little
+   where flesh is squeezed;
+3. at the outer joints the two sides of the crease press against each other.
 
 What blend skinning misses of that, carried back to rest, is fitted by two shapes a joint with strengths
 c = 1 - cos(flexion) and c^2. To second order the shrinking of blend skinning goes with flexion^2, hence with c.
@@ -27,9 +28,11 @@ HOLD_SOFT, HOLD_FIRM, HOLD_RIGID = 0.03, 4.0, 1e4
 """Pull to the bones, in units of cotangents, on soft, on firm and on untouched skin."""
 BACK_SOFTNESS = 0.15
 """Of the skin on the back of a joint, which lies on bone, relative to the palm side's."""
-SWELLING = 0.1
-"""Share of the volume lost in a crease that comes back as a bulge. All of it would be a mushroom: real flesh gives way
-along the whole finger."""
+UNTOUCHED = 0.02
+"""Softness below which skin moves with its bones alone."""
+HINGE_SWELLING, BASE_SWELLING = 0.1, 0.3
+"""Share of the lost volume that comes back as a bulge near the joint. All of it would be a mushroom, for real flesh
+gives way along the whole finger; judged by pictures."""
 SMALLEST = 1e-5
 """Displacements below are dropped [m]."""
 
@@ -75,38 +78,70 @@ def _missed_by_blending(hand: RiggedSurface, surface: ElasticSurface, joint: int
 
 
 def _bend(hand: RiggedSurface, surface: ElasticSurface, joint: int, angle: float, share: Array) -> Array:
-    """The hand as flesh with one joint bent."""
-    vertices, centre, axis = hand.vertices, hand.points[joint], hand.axes[joint, 0]
-    turned = _turn(vertices, centre, axis, share * angle)
+    """The hand as flesh with one joint bent; `share` [V] of the angle is what each vertex turns by."""
+    turned = _turn(hand.vertices, hand.points[joint], hand.axes[joint, 0], share * angle)
+    settle = _settle_base if joint in {FIRST[finger] for finger in FINGERS} else _settle_hinge
+    return settle(hand, surface, joint, angle, share, turned)
+
+
+def _settle_base(
+    hand: RiggedSurface, surface: ElasticSurface, joint: int, angle: float, share: Array, turned: Array
+) -> Array:
+    """Knuckles and the thumb's base: soft wherever palm and finger share the skin.
+
+    There is no crease of one finger alone, for its flesh is the palm's and the neighbours' too, and their shapes add
+    up. What is squeezed between finger and palm bulges: the ball of the thumb, the pads below the fingers.
+    """
+    axis = hand.axes[joint, 0]
+    along = unit(bone_ends(hand.points)[joint] - hand.points[joint])
+    palm = _facing(turned, hand.faces, np.cross(axis, _rotation(axis, angle / 2) @ along))
+    shared = 4 * share * (1 - share)
+    free = shared > UNTOUCHED
+    return surface.relax(
+        turned, _hold(np.maximum(palm, BACK_SOFTNESS) * shared, free), swell=np.where(free, palm * shared, 0),
+        volume=_swollen(hand, surface, turned, BASE_SWELLING),
+    )  # fmt: skip
+
+
+def _settle_hinge(
+    hand: RiggedSurface, surface: ElasticSurface, joint: int, angle: float, share: Array, turned: Array
+) -> Array:
+    """The outer joints: soft on the palm side, where the two sides of a crease press against each other."""
+    centre, axis = hand.points[joint], hand.axes[joint, 0]
     before = unit(centre - hand.points[PARENTS[joint]])
     along = unit(before + unit(bone_ends(hand.points)[joint] - centre))
     along = unit(along - (along @ axis) * axis)
-    offset = vertices - centre
-    place, aside = offset @ along, np.abs(offset @ axis)
+    offset = hand.vertices - centre
+    place = offset @ along
+    distance = np.linalg.norm(offset, axis=1)
 
-    palm_side = igl.per_vertex_normals(vertices, hand.faces) @ np.cross(axis, along)
-    palm = np.clip((palm_side + 0.3) / 0.8, 0, 1)
+    palm = _facing(hand.vertices, hand.faces, np.cross(axis, along))
     near = np.exp(-((place / REACH) ** 2))
-    if PARENTS[joint] == 0:
-        own = (aside < FINGER_HALF_WIDTH - 0.001).astype(float)
-    else:
-        own = np.clip((share + hand.weights[:, PARENTS[joint]] - 0.6) / 0.3, 0, 1)
-    soft = palm * near * own * (np.linalg.norm(offset, axis=1) < 0.04)
-    soft = np.maximum(soft, BACK_SOFTNESS * 4 * share * (1 - share))
-    free = soft > 0.02
-    hold = np.where(free, HOLD_SOFT + HOLD_FIRM * (1 - soft) ** 3, HOLD_RIGID)
-    if joint in {FIRST[finger] for finger in FINGERS}:
-        # No crease of one finger alone: its flesh is the palm's and the neighbours' too, and their shapes would add up.
-        return surface.relax(turned, hold)
-
+    own = np.clip((share + hand.weights[:, PARENTS[joint]] - 0.6) / 0.3, 0, 1)
+    soft = np.maximum(palm * near * own * (distance < 0.04), BACK_SOFTNESS * 4 * share * (1 - share))
+    free = soft > UNTOUCHED
     normal = _rotation(axis, angle / 2) @ along
-    creased = free & (aside < FINGER_HALF_WIDTH) & (np.linalg.norm(offset, axis=1) < 0.035)
-    fold = Fold(centre, normal, np.sign(place) * creased, np.cross(axis, normal), depth=0.0015)
-    lost = surface.volume(vertices) - surface.volume(turned)
+    creased = free & (np.abs(offset @ axis) < FINGER_HALF_WIDTH) & (distance < 0.035)
     return surface.relax(
-        turned, hold, fold=fold, swell=np.where(free, palm**2 * near, 0),
-        volume=surface.volume(turned) + SWELLING * lost,
+        turned, _hold(soft, free), fold=Fold(centre, normal, np.sign(place) * creased, np.cross(axis, normal), 0.0015),
+        swell=np.where(free, palm**2 * near, 0), volume=_swollen(hand, surface, turned, HINGE_SWELLING),
     )  # fmt: skip
+
+
+def _facing(vertices: Array, faces: Index, way: Array) -> Array:
+    """1 where the surface faces `way`, 0 where it faces away, [V]."""
+    return np.clip((igl.per_vertex_normals(vertices, faces) @ way + 0.3) / 0.8, 0, 1)
+
+
+def _hold(soft: Array, free: Array) -> Array:
+    """How firmly each vertex is held to the bones, from its softness in 0 to 1."""
+    return np.where(free, HOLD_SOFT + HOLD_FIRM * (1 - soft) ** 3, HOLD_RIGID)
+
+
+def _swollen(hand: RiggedSurface, surface: ElasticSurface, turned: Array, share: float) -> float:
+    """The volume [m^3] once `share` of what the bend has lost is back."""
+    now = surface.volume(turned)
+    return now + share * (surface.volume(hand.vertices) - now)
 
 
 def _turn(points: Array, centre: Array, axis: Array, angles: Array) -> Array:

@@ -12,7 +12,7 @@ SMALLEST_COTANGENT = 0.01
 """Edge weights are cotangents, clamped: obtuse corners would push instead of pull."""
 CONTACT_STIFFNESS = 30.0
 """Of a vertex pressed against a plane, in units of cotangents: ten times an edge, so contact wins over shape."""
-CONTACT_GAP = 2e-4
+CONTACT_GAP = 5e-4
 """Distance that contact leaves to its plane, so that the two sides of a fold do not touch [m]."""
 
 

@@ -21,14 +21,28 @@ NAIL_RIM_SHADE = 0.25
 """How much darker the fold around the nail is."""
 
 
+MOTTLE_PASSES = (2, 25)
+"""Smoothings of white noise that give the fine and the coarse blotches of skin: about 3 and 12 mm."""
+MOTTLE_MELANIN, MOTTLE_BLOOD = 0.07, 0.12
+"""Standard deviations of the blotches, as shares of melanin and blood: evenly coloured skin looks like plastic."""
+
+
 class Regions(NamedTuple):
-    """Where things are on the surface, each in [0, 1]."""
+    """Where things are on the surface, each in [0, 1]; `mottle` has mean 0 and standard deviation 1."""
 
     palm: Float[Tensor, "V"]
     finger_tip: Float[Tensor, "V"]
     knuckle: Float[Tensor, "V"]
     crease: Float[Tensor, "V"]
     nail: Float[Tensor, "V"]
+    mottle: Float[Tensor, "V"]
+
+
+def _mottle(n_vertices: int, edges: Tensor) -> Tensor:
+    noise = torch.randn(n_vertices, 1, generator=torch.Generator().manual_seed(0))
+    layers = [surface.smooth_over_mesh(noise, edges, passes)[:, 0] for passes in MOTTLE_PASSES]
+    total = sum((layer - layer.mean()) / layer.std() for layer in layers)
+    return total / total.std()
 
 
 def _smoothstep(x: Tensor, low: float, high: float) -> Tensor:
@@ -59,7 +73,9 @@ def label_regions(hand: HandModel) -> Regions:
     )
     crease = (crease + torch.where(level == 1, _bump(hand.bone_t, 0.52, 0.05), 0)).clamp(max=1) * palm
     soften = surface.smooth_over_mesh(torch.stack([tip, knuckle, crease], -1), edges, 1)
-    return Regions(palm, *soften.unbind(-1), _smoothstep(hand.nail, 0.3, 0.7))
+    return Regions(
+        palm, *soften.unbind(-1), _smoothstep(hand.nail, 0.3, 0.7), _mottle(len(hand.template), edges)
+    )
 
 
 def region_colors(regions: Regions, melanin: float) -> Float[Tensor, "V 3"]:
@@ -67,11 +83,12 @@ def region_colors(regions: Regions, melanin: float) -> Float[Tensor, "V 3"]:
 
     Palms hold about a third of the melanin of backs, and light ones no less: the difference grows with the tone.
     """
-    palm, tip, knuckle, crease, nail = regions
+    palm, tip, knuckle, crease, nail, mottle = regions
     palm_melanin = min(0.6 * melanin, 0.006 + 0.33 * melanin)
     log_melanin = (1 - palm) * math.log(melanin * 1.15) + palm * math.log(palm_melanin)
-    amount = log_melanin.exp() * (1 + 0.3 * knuckle + 0.25 * crease)
+    amount = log_melanin.exp() * (1 + 0.3 * knuckle + 0.25 * crease) * (1 + MOTTLE_MELANIN * mottle)
     blood = BLOOD_MEAN * (1 + 0.35 * palm + 0.9 * tip * (0.4 + 0.6 * palm) + 0.7 * knuckle + 0.4 * crease)
+    blood = blood * (1 + MOTTLE_BLOOD * mottle)
     skin = skin_color(amount, blood)
     bed = skin_color((log_melanin.exp() * 0.5), torch.full_like(blood, 1.9 * BLOOD_MEAN))
     nails = (1 - NAIL_WHITE) * bed + NAIL_WHITE

@@ -20,7 +20,7 @@ SIGMA_COLOR = 0.05
 """Expected difference of a lit hand from its region colours [sRGB]."""
 SIGMA_EXPOSURE = 0.25
 """Expected logarithm of the photo's brightness over that of an evenly lit hand."""
-SIGMA_CAST = 0.15
+SIGMA_CAST = 0.22
 """Expected logarithms of red over green and blue over green: the photo's colour cast."""
 
 
@@ -65,7 +65,7 @@ class MeanPrior:
 
     def __call__(self, evidence: Evidence) -> CanonicalGaussians:
         """Gaussians on the fitted surface with evenly lit mean colours; the photo is only asked for the skin tone."""
-        seen = observe(self.hand, evidence)
+        seen = Observation(*(part.cpu() for part in observe(self.hand, evidence)))
         colors = self.vertex_colors(estimate_melanin(self.regions, seen)).to(evidence.image)
         anchors = place_anchors(self.hand, evidence.rest)
         faces = self.hand.faces.to(colors.device)

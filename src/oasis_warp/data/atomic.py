@@ -84,6 +84,8 @@ def output_folder(path: Path | str) -> Iterator[Path]:
                 os.replace(file, final / file.name)
         else:
             os.replace(part, final)
+    except InputError as error:  # from a writer inside, which knows the file by its hidden place only
+        raise InputError(str(error).replace(str(part), str(path))) from error
     except OSError as error:
         if _is_about(part, error):
             raise _explain(path, error) from error

@@ -29,10 +29,11 @@ MIN_SIDE = 32
 OPAQUE = 0.99
 """An alpha channel that nowhere falls below this says nothing."""
 
-_JPEG_FRACTIONS = {
-    2: cv2.IMREAD_REDUCED_COLOR_2,
-    4: cv2.IMREAD_REDUCED_COLOR_4,
-    8: cv2.IMREAD_REDUCED_COLOR_8,
+_JPEG_PARTS = {
+    1: cv2.IMREAD_UNCHANGED,
+    2: cv2.IMREAD_REDUCED_COLOR_2 | cv2.IMREAD_IGNORE_ORIENTATION,
+    4: cv2.IMREAD_REDUCED_COLOR_4 | cv2.IMREAD_IGNORE_ORIENTATION,
+    8: cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION,
 }
 _stderr_lock = threading.Lock()
 
@@ -43,8 +44,9 @@ def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> Photo:
     EXIF orientation is applied; 16-bit values are rounded to 8; grey, palette and CMYK become RGB; alpha is kept where
     some pixel is transparent. `Photo.focal` comes from EXIF (see `exif.focal_pixels`). Colour profiles are ignored.
 
-    A photo of more than `max_pixels` is scaled down by a whole factor, averaging. A JPEG is decoded at that size right
-    away; of the other formats the whole picture is in memory once, at most `MAX_DECODED_BYTES`.
+    A photo of more than `max_pixels` is scaled down by a whole factor, averaging. In memory there are, for a moment,
+    the file, and of a JPEG at most four times `max_pixels`, of other formats the whole picture, `MAX_DECODED_BYTES` at
+    most. (The decoder of progressive JPEG keeps 3 bytes a pixel of the file on top.)
 
     Raises:
         InputError: missing, unreadable, no image, cut short, damaged, too small or too large.
@@ -58,9 +60,13 @@ def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> Photo:
     factor = 1
     while header.width * header.height > max_pixels * factor**2:
         factor += 1
-    pixels, exif = _decode(path, data, header, factor)
+    # A JPEG can be decoded at a half, a quarter or an eighth of its size right away.
+    part = max(n for n in _JPEG_PARTS if n <= factor) if header.format == "JPEG" else 1
+    pixels, exif = _decode(path, data, header.format, _JPEG_PARTS[part])
     del data
-    pixels = _to_uint8(path, _turn_upright(_shrink(pixels, header, factor), exif.orientation))
+    if part < factor:
+        pixels = cv2.resize(pixels, None, fx=part / factor, fy=part / factor, interpolation=cv2.INTER_AREA)
+    pixels = _to_uint8(path, _turn_upright(pixels, exif.orientation))
     height, width = pixels.shape[:2]
     alpha = None
     if pixels.ndim == 3 and pixels.shape[2] == 4:
@@ -126,13 +132,8 @@ def _check_size(path: Path, header: ImageHeader) -> None:
         )
 
 
-def _decode(path: Path, data: bytes, header: ImageHeader, factor: int) -> tuple[np.ndarray, Exif]:
+def _decode(path: Path, data: bytes, format: str, flags: int) -> tuple[np.ndarray, Exif]:
     """The pixels as the file stores them (BGR order, not yet upright) and what the camera says about them."""
-    flags = cv2.IMREAD_UNCHANGED
-    if header.format == "JPEG":
-        fraction = max((f for f in _JPEG_FRACTIONS if f <= factor), default=None)
-        if fraction is not None:
-            flags = _JPEG_FRACTIONS[fraction] | cv2.IMREAD_IGNORE_ORIENTATION
     with _captured_stderr() as complaints:
         try:
             pixels, kinds, chunks = cv2.imdecodeWithMetadata(np.frombuffer(data, np.uint8), flags)
@@ -143,18 +144,10 @@ def _decode(path: Path, data: bytes, header: ImageHeader, factor: int) -> tuple[
     # libjpeg fills what is missing of a closed file with grey and only mentions it.
     if pixels is None or b"premature end" in said:
         raise _cut_short(path, len(data))
-    if header.format == "TIFF":  # OpenCV turns a TIFF upright whatever the flags
+    if format == "TIFF":  # OpenCV turns a TIFF upright whatever the flags
         return pixels, read_exif(data)._replace(orientation=1)
     blobs = [bytes(chunk) for kind, chunk in zip(kinds, chunks, strict=True) if kind == cv2.IMAGE_METADATA_EXIF]
     return pixels, read_exif(blobs[0].removeprefix(b"Exif\0\0")) if blobs else Exif(1, None)
-
-
-def _shrink(pixels: np.ndarray, header: ImageHeader, factor: int) -> np.ndarray:
-    """Scale to 1 / `factor` of the file's size, of which the decoder may have done a part."""
-    done = round(max(header.width, header.height) / max(pixels.shape[:2]))
-    if done == factor:
-        return pixels
-    return cv2.resize(pixels, None, fx=done / factor, fy=done / factor, interpolation=cv2.INTER_AREA)
 
 
 def _turn_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:

@@ -18,13 +18,19 @@ def bundled_hand() -> HandModel:
     """
     with asset("hand", "hand_right.npz").open("rb") as file, np.load(file, allow_pickle=False) as stored:
         arrays = {key: stored[key] for key in stored.files}
-    n_vertices, n_base = (int(n) for n in arrays["hd_shape"])
+    n_fine, n_base = (int(n) for n in arrays["hd_shape"])
+    rows = np.repeat(np.arange(n_fine), np.diff(arrays["hd_indptr"]))
+    subdivision = torch.sparse_coo_tensor(
+        torch.from_numpy(np.stack([rows, arrays["hd_indices"].astype(np.int64)])),
+        torch.from_numpy(arrays["hd_data"]).double(),
+        (n_fine, n_base),
+        check_invariants=True,
+    )
 
-    def subdivide(base: np.ndarray) -> np.ndarray:
-        """Carry an array over the base vertices to the HD mesh: CSR rows times the array; no row is empty."""
-        flat = base[:n_base].reshape(n_base, -1).astype(np.float64)
-        rows = arrays["hd_data"].astype(np.float64)[:, None] * flat[arrays["hd_indices"]]
-        return np.add.reduceat(rows, arrays["hd_indptr"][:-1], axis=0).reshape(n_vertices, *base.shape[1:])
+    def subdivide(key: str) -> Tensor:
+        """An array over the base vertices carried to the HD mesh; the base's last vertex only closes the wrist."""
+        base = torch.from_numpy(arrays[key])[:n_base].double()
+        return (subdivision @ base.flatten(1)).unflatten(1, base.shape[1:]).float()
 
     def real(array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
@@ -34,10 +40,10 @@ def bundled_hand() -> HandModel:
 
     return HandModel(
         name="bundled",
-        template=real(subdivide(arrays["v_template"])),
+        template=subdivide("v_template"),
         faces=whole(arrays["hd_faces"]),
-        weights=real(subdivide(arrays["weights"])),
-        shape_basis=real(subdivide(arrays["shapedirs"])),
+        weights=subdivide("weights"),
+        shape_basis=subdivide("shapedirs"),
         shape_names=tuple(str(name) for name in arrays["shape_names"]),
         joints=real(arrays["joints"]),
         joint_basis=real(arrays["joint_shapedirs"]),
@@ -49,7 +55,7 @@ def bundled_hand() -> HandModel:
         pose_limits=real(arrays["pose_limits"]),
         rest_bend=real(arrays["rest_bend"]),
         keypoint_index=whole(arrays["kp21"]),
-        corrective_basis=real(subdivide(arrays["correctives"])),
+        corrective_basis=subdivide("correctives"),
         uv=real(arrays["hd_uv"]),
         uv_faces=whole(arrays["hd_uv_faces"]),
         rim=whole(arrays["hd_loop"]),

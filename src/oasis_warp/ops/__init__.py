@@ -12,3 +12,4 @@ from oasis_warp.ops.visibility import DepthMap as DepthMap
 from oasis_warp.ops.visibility import DepthVisibility as DepthVisibility
 from oasis_warp.ops.visibility import depth_map as depth_map
 from oasis_warp.ops.visibility import depth_visibility as depth_visibility
+from oasis_warp.ops.warm_up import warm_up as warm_up

@@ -8,7 +8,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from oasis_kernels import incidence as kernels
 from oasis_warp.core.checks import check_index
-from oasis_warp.ops._launch import launch, view
+from oasis_warp.ops._launch import even_cuts, launch_ranges, view
 
 
 class Incidence(NamedTuple):
@@ -53,9 +53,9 @@ def sum_at_items(rows: Tensor, index: Incidence) -> Tensor:
     """Sum of the rows [N K, D], one an entry of the table, that name each item, shape [size, D]; in a fixed order."""
     n_items, n_columns = len(index.offsets) - 1, rows.shape[1]
     out = rows.new_empty((n_items, n_columns))
-    launch(
+    launch_ranges(
         kernels.sum_rows,
-        n_items,
+        even_cuts(n_items),
         [view(rows), view(index.offsets), view(index.entries), view(out)],
         like=rows,
     )

@@ -3,9 +3,11 @@
 import functools
 import itertools
 import os
+import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,20 @@ def kernel_cache() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "oasis_warp"
 
 
+@contextmanager
+def _native_stderr_closed() -> Iterator[None]:
+    """Send what native code prints to nowhere: on a machine without a GPU Warp warns of the missing driver."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
 def start() -> None:
     """Initialise Warp once a process, quietly, with the kernel cache in our own folder."""
     global _started
@@ -42,7 +58,8 @@ def start() -> None:
             return
         wp.config.log_level = wp.LOG_WARNING
         wp.config.kernel_cache_dir = str(kernel_cache())
-        wp.init()
+        with nullcontext() if torch.cuda.is_available() else _native_stderr_closed():
+            wp.init()
         _started = True
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Int32, Int64
 from torch import Tensor
 
 from oasis_kernels import tiles
-from oasis_warp.ops._launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._launch import even_cuts, launch, launch_ranges, view
 from oasis_warp.ops.projection import Projection
 
 MAX_PAIRS = 2**31 - 1
@@ -37,29 +37,31 @@ class Tiles(NamedTuple):
     """Bounds of ranges of tiles of about equal work, for `launch_ranges`."""
 
 
-def bin_to_tiles(projection_: Projection, width: int, height: int, tile_size: int) -> Tiles:
+def bin_to_tiles(projection: Projection, width: int, height: int, tile_size: int) -> Tiles:
     """Sort the drawn Gaussians of each tile by depth, ties by index.
 
     Raises:
         ValueError: more than `MAX_PAIRS` pairs.
     """
-    n_cameras, n = projection_.depths.shape
     across, down = -(-width // tile_size), -(-height // tile_size)
-    n_tiles = n_cameras * across * down
-    device = projection_.depths.device
-    boxes = view(projection_.boxes.view(-1, 4), wp.vec4i)
+    if projection.depths.is_cuda:
+        return bin_by_sorting(projection, tile_size, across, down)
+    return bin_by_dealing(projection, tile_size, across, down)
+
+
+def bin_by_sorting(projection: Projection, tile_size: int, across: int, down: int) -> Tiles:
+    """`bin_to_tiles` with torch's parallel sorts."""
+    n_cameras, n = projection.depths.shape
+    device = projection.depths.device
+    boxes = view(projection.boxes.view(-1, 4), wp.vec4i)
     counts = torch.zeros(n_cameras * n, dtype=torch.int64, device=device)
     launch_ranges(tiles.count_tiles, even_cuts(len(counts)), [boxes, tile_size, view(counts)], like=counts)
 
     drawn = counts.nonzero().squeeze(1)
-    order = drawn[torch.argsort(projection_.sort_depths.view(-1)[drawn], stable=True)]
+    order = drawn[torch.argsort(projection.sort_depths.view(-1)[drawn], stable=True)]
     ends = counts[order].cumsum(0)
     n_pairs = int(ends[-1]) if len(order) else 0
-    if n_pairs > MAX_PAIRS:
-        raise ValueError(
-            f"tile_size: expected at most {MAX_PAIRS} pairs of a Gaussian and a tile, got {n_pairs}. "
-            "Draw fewer or smaller Gaussians, a smaller image, or larger tiles."
-        )
+    _check_pairs(n_pairs)
     pair_starts = torch.zeros_like(counts)
     pair_starts[order] = ends - counts[order]
     pair_tiles = torch.empty(n_pairs, dtype=torch.int32, device=device)
@@ -71,10 +73,59 @@ def bin_to_tiles(projection_: Projection, width: int, height: int, tile_size: in
         like=counts,
     )
     sorted_tiles, pairs = torch.sort(pair_tiles, stable=True)
-    starts = torch.searchsorted(sorted_tiles, torch.arange(n_tiles + 1, dtype=torch.int32, device=device))
+    every_tile = torch.arange(n_cameras * across * down + 1, dtype=torch.int32, device=device)
+    starts = torch.searchsorted(sorted_tiles, every_tile)
     return Tiles(
         tile_size, across, down, starts, pair_gaussians[pairs], pairs, pair_starts, counts, _even_work(starts)
     )
+
+
+def bin_by_dealing(projection: Projection, tile_size: int, across: int, down: int) -> Tiles:
+    """`bin_to_tiles` on one CPU thread, which is faster there than any parallel sort."""
+    n_cameras, n = projection.depths.shape
+    total, n_tiles = n_cameras * n, n_cameras * across * down
+    boxes = view(projection.boxes.view(-1, 4), wp.vec4i)
+
+    def int64(size: int) -> Tensor:
+        return torch.empty(size, dtype=torch.int64)
+
+    pair_starts, pair_counts, totals = int64(total), int64(total), torch.zeros(2, dtype=torch.int64)
+    starts = torch.zeros(n_tiles + 1, dtype=torch.int64)
+    tile_boxes = view(torch.empty(total, 4, dtype=torch.int32), wp.vec4i)
+    keys, order = int64(2 * total), torch.empty(2 * total, dtype=torch.int32)  # the sort needs room for two
+    launch(
+        tiles.collect,
+        1 if total else 0,
+        [
+            boxes, view(projection.sort_depths.view(-1)), n, tile_size, across, down, view(pair_starts),
+            view(pair_counts), tile_boxes, view(keys.view(torch.float64)), view(order), view(starts), view(totals),
+        ],
+        like=starts,
+    )  # fmt: skip
+    n_drawn, n_pairs = totals.tolist()
+    _check_pairs(n_pairs)
+    gaussians, pairs = torch.empty(n_pairs, dtype=torch.int32), int64(n_pairs)
+    if n_drawn:
+        # Depths are positive: their bits sort as integers do. The sort is stable.
+        wp.utils.radix_sort_pairs(view(keys), view(order), n_drawn)
+        launch(
+            tiles.deal,
+            1,
+            [
+                view(order), n_drawn, tile_boxes, across, view(pair_starts), view(starts.clone()), view(gaussians),
+                view(pairs),
+            ],
+            like=starts,
+        )  # fmt: skip
+    return Tiles(tile_size, across, down, starts, gaussians, pairs, pair_starts, pair_counts, _even_work(starts))
+
+
+def _check_pairs(n_pairs: int) -> None:
+    if n_pairs > MAX_PAIRS:
+        raise ValueError(
+            f"tile_size: expected at most {MAX_PAIRS} pairs of a Gaussian and a tile, got {n_pairs}. "
+            "Draw fewer or smaller Gaussians, a smaller image, or larger tiles."
+        )
 
 
 def _even_work(starts: Tensor) -> list[int]:

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from warp import vec4i
 
+from oasis_kernels import constants
 from oasis_kernels import rasterize_weights as kernels
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._launch import SCALAR, VEC4, launch_ranges, view
@@ -42,7 +43,7 @@ def blend_weights(
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     radius_clip: float = 0.0,
-    eps2d: float = 0.3,
+    eps2d: float = constants.EPS2D,
     tile_size: int = 16,
     validate: bool = True,
 ) -> BlendWeights:

@@ -12,6 +12,7 @@ from warp.types import vector
 from oasis_kernels import constants
 from oasis_kernels import rasterize_backward as backward_kernels
 from oasis_kernels import rasterize_forward as forward_kernels
+from oasis_kernels import rasterize_rows as row_kernels
 from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
 from oasis_warp.ops._tiles import Tiles
 from oasis_warp.ops.projection import Projection
@@ -29,6 +30,20 @@ def lane_grid(tile_size: int, device: torch.device, grid: tuple[int, int]) -> tu
     across, down = grid
     # The grid keeps its size where the tile does not divide by it; lanes without pixels idle.
     return across * down, -(-tile_size // across), -(-tile_size // down)
+
+
+def blend_kernel(tensor: Tensor, channels: int) -> Any:
+    """The forward kernel for tensors like `tensor`."""
+    if tensor.device.type == "cpu" and tensor.dtype == torch.float32:
+        return row_kernels.blend(channels)
+    return forward_kernels.blend(SCALAR[tensor.dtype], channels)
+
+
+def blend_backward_kernel(tensor: Tensor, channels: int) -> Any:
+    """The backward kernel for tensors like `tensor`."""
+    if tensor.device.type == "cpu" and tensor.dtype == torch.float32:
+        return row_kernels.blend_backward(channels)
+    return backward_kernels.blend_backward(SCALAR[tensor.dtype], channels)
 
 
 class _Blend(torch.autograd.Function):
@@ -55,7 +70,7 @@ class _Blend(torch.autograd.Function):
         stops = torch.empty(n_cameras, height, width, dtype=torch.int32, device=device)
         lanes, lane_width, lane_height = lane_grid(tiles.size, device, CUDA_LANES)
         launch_ranges(
-            forward_kernels.blend(SCALAR[dtype], channels),
+            blend_kernel(colors, channels),
             tiles.cuts,
             [
                 view(tiles.starts), view(tiles.gaussians), view(projection.boxes.view(-1, 4), vec4i),
@@ -92,20 +107,20 @@ class _Blend(torch.autograd.Function):
         def empty(*shape: int) -> Tensor:
             return torch.empty(*shape, dtype=dtype, device=device)
 
-        g_image = colors.new_zeros(pixels, channels) if g_image is None else g_image.contiguous()
-        g_alpha = colors.new_zeros(pixels) if g_alpha is None else g_alpha.contiguous()
+        of_image = colors.new_zeros(pixels, channels) if g_image is None else g_image.contiguous().view(-1, channels)
+        of_alpha = colors.new_zeros(pixels) if g_alpha is None else g_alpha.contiguous().view(-1)
         pair_moments = empty(len(tiles.pairs) if with_shape else 0, 6)
         pair_colors = empty(len(tiles.pairs), channels)
         tile_backgrounds = empty(len(tiles.starts) - 1, channels)
         lanes, lane_width, lane_height = lane_grid(tiles.size, device, CUDA_WARP_LANES)
         launch_ranges(
-            backward_kernels.blend_backward(scalar, channels),
+            blend_backward_kernel(colors, channels),
             tiles.cuts,
             [
                 view(tiles.starts), view(tiles.gaussians), view(tiles.pairs), view(boxes.view(-1, 4), vec4i),
                 view(centers.view(-1, 4), VEC4[dtype]), view(whitenings.view(-1, 4), VEC4[dtype]),
                 view(opacities.view(-1)), view(colors.view(-1, channels), color), view(backgrounds, color),
-                view(stops.view(-1)), view(g_image.view(-1, channels), color), view(g_alpha.view(-1)),
+                view(stops.view(-1)), view(of_image, color), view(of_alpha),
                 tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height, int(with_shape),
                 view(transmittance.view(-1).clone()), view(empty(pixels)),
                 view(pair_moments, moments), view(pair_colors, color), view(tile_backgrounds, color),

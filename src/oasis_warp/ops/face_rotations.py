@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from oasis_kernels import face_rotation as kernels
 from oasis_warp.core.checks import check_finite, check_float, check_shape
 from oasis_warp.ops._incidence import Incidence, incidence, sum_at_items
-from oasis_warp.ops._launch import launch, view
+from oasis_warp.ops._launch import even_cuts, launch_ranges, view
 
 
 class FaceRotations(NamedTuple):
@@ -31,9 +31,9 @@ class _FaceRotations(torch.autograd.Function):
         face_quats = rest_vertices.new_empty((n_faces, 4))
         area_ratio = rest_vertices.new_empty(n_faces)
         weights = rest_vertices.new_empty(n_faces, dtype=torch.float64)
-        launch(
+        launch_ranges(
             kernels.face_rotations,
-            n_faces,
+            even_cuts(n_faces),
             [
                 view(rest_vertices),
                 view(posed_vertices),
@@ -52,9 +52,9 @@ class _FaceRotations(torch.autograd.Function):
         vertex_quats = rest_vertices.new_empty((n_vertices, 4))
         reference = faces.new_empty(n_vertices)
         norms = weights.new_empty(n_vertices)
-        launch(
+        launch_ranges(
             kernels.vertex_rotations,
-            n_vertices,
+            even_cuts(n_vertices),
             [
                 view(face_quats),
                 view(weights),
@@ -79,9 +79,9 @@ class _FaceRotations(torch.autograd.Function):
         rest_vertices, posed_vertices, face_quats, vertex_quats, weights, reference, norms = ctx.saved_tensors
         faces = ctx.corners.table
         grad_sums = norms.new_empty((len(norms), 4))
-        launch(
+        launch_ranges(
             kernels.vertex_rotations_backward,
-            len(norms),
+            even_cuts(len(norms)),
             [
                 view(vertex_quats),
                 view(norms),
@@ -93,9 +93,9 @@ class _FaceRotations(torch.autograd.Function):
         needs_rest, needs_posed, _ = ctx.needs_input_grad
         rest_rows = rest_vertices.new_empty((len(faces) if needs_rest else 0, 9))
         posed_rows = rest_vertices.new_empty((len(faces) if needs_posed else 0, 9))
-        launch(
+        launch_ranges(
             kernels.face_rotations_backward,
-            len(faces),
+            even_cuts(len(faces)),
             [
                 view(rest_vertices),
                 view(posed_vertices),
@@ -122,6 +122,8 @@ def face_rotations(
     rest_vertices: Float[Tensor, "V 3"],
     posed_vertices: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
+    *,
+    validate: bool = True,
 ) -> FaceRotations:
     """Rotation of every face and vertex from rest to posed, and the growth of every face.
 
@@ -139,6 +141,8 @@ def face_rotations(
         rest_vertices: Vertices at rest, any unit of length, shape [V, 3], float32 or float64.
         posed_vertices: The same vertices posed, shape [V, 3].
         faces: Vertex indices, shape [F, 3]; F may be 0.
+        validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
+            Shapes and indices are always checked, indices once a tensor.
 
     Raises:
         ValueError: a wrong shape, dtype or index, or a value that is not finite.
@@ -148,7 +152,8 @@ def face_rotations(
     check_shape("posed_vertices", posed_vertices, "V", 3, sizes=sizes, hint="One for each rest vertex.")
     check_float("rest_vertices", rest_vertices)
     check_float("posed_vertices", posed_vertices, rest_vertices)
-    check_finite(rest_vertices=rest_vertices, posed_vertices=posed_vertices)
+    if validate:
+        check_finite(rest_vertices=rest_vertices, posed_vertices=posed_vertices)
     check_shape("faces", faces, "F", 3, hint="Three vertex indices a face.")
     corners = incidence("faces", faces, len(rest_vertices), "vertices")
     return FaceRotations(*_FaceRotations.apply(rest_vertices.contiguous(), posed_vertices.contiguous(), corners))

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from oasis_kernels import barycentric as kernels
 from oasis_warp.core.checks import check_choice, check_finite, check_float, check_shape
 from oasis_warp.ops._incidence import Incidence, incidence, sum_at_items
-from oasis_warp.ops._launch import launch, view
+from oasis_warp.ops._launch import even_cuts, launch_ranges, view
 
 HALF_POWERS = {"sqrt_area": 1, "area": 2, "none": 0}
 """Twice the exponent of the area ratio in each scale law."""
@@ -48,7 +48,7 @@ class _PoseOnMesh(torch.autograd.Function):
         inputs = (posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales)
         posed = (torch.empty_like(barycentrics), torch.empty_like(quats), torch.empty_like(scales))
         arguments = _arguments(inputs, corners, riders, half_powers)
-        launch(kernels.pose, len(quats), [*arguments, *map(view, posed)], like=quats)
+        launch_ranges(kernels.pose, even_cuts(len(quats)), [*arguments, *map(view, posed)], like=quats)
         ctx.save_for_backward(*inputs)
         ctx.corners, ctx.riders, ctx.half_powers = corners, riders, half_powers
         return posed
@@ -64,9 +64,9 @@ class _PoseOnMesh(torch.autograd.Function):
             for needed, width in zip(ctx.needs_input_grad[:6], widths, strict=True)
         ]
         vertex_rows, barycentric_rows, vertex_quat_rows, ratio_rows, quat_rows, scale_rows = rows
-        launch(
+        launch_ranges(
             kernels.pose_backward,
-            n,
+            even_cuts(n),
             [
                 *_arguments(inputs, ctx.corners, ctx.riders, ctx.half_powers),
                 view(grad_means.contiguous()),
@@ -109,6 +109,8 @@ def pose_on_mesh(
     quats: Float[Tensor, "Q 4"],
     scales: Float[Tensor, "Q 3"],
     scale_law: Literal["sqrt_area", "area", "none"] = "sqrt_area",
+    *,
+    validate: bool = True,
 ) -> PosedOnMesh:
     """Gaussians on the faces of a mesh, carried into its pose (OASIS, MM '26, eq. 7 and appendix).
 
@@ -130,6 +132,8 @@ def pose_on_mesh(
         quats: Canonical rotations, wxyz, shape [Q, 4]; their norms carry over.
         scales: Canonical standard deviations [m], shape [Q, 3].
         scale_law: How scales follow the area of the face.
+        validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
+            Shapes and indices are always checked, indices once a tensor.
 
     Raises:
         ValueError: a wrong shape, dtype, index or law, or a value that is not finite.
@@ -153,7 +157,8 @@ def pose_on_mesh(
     check_shape("scales", scales, "Q", 3, sizes=sizes)
     for name, tensor in floats.items():
         check_float(name, tensor, posed_vertices)
-    check_finite(**floats)
+    if validate:
+        check_finite(**floats)
     check_choice("scale_law", scale_law, tuple(HALF_POWERS))
     corners = incidence("faces", faces, len(posed_vertices), "vertices")
     riders = incidence("face_index", face_index, len(faces), "faces")

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_kernels import constants
 from oasis_warp.core.checks import check_choice, check_finite, check_float, check_positive, check_shape
 from oasis_warp.ops._tiles import Tiles, bin_to_tiles
 from oasis_warp.ops.blending import blend
@@ -48,7 +49,7 @@ def rasterization(
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     radius_clip: float = 0.0,
-    eps2d: float = 0.3,
+    eps2d: float = constants.EPS2D,
     sh_degree: int | None = None,
     packed: bool = True,
     tile_size: int = 16,

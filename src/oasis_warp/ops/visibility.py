@@ -1,6 +1,6 @@
 """What a camera sees of a mesh: a depth buffer with face ids, and the visibility of points against it."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -11,8 +11,7 @@ from torch.autograd.function import once_differentiable
 from oasis_kernels import depth_buffer as kernels
 from oasis_warp.core.checks import check_finite, check_float, check_index, check_positive, check_shape
 from oasis_warp.ops._incidence import incidence
-from oasis_warp.ops._launch import launch, view
-from oasis_warp.ops._strips import for_strips
+from oasis_warp.ops._launch import even_cuts, launch, launch_ranges, view
 
 MARGIN_TAUS = 3.0
 """Default margin in units of tau: without one, half a pixel of slope hides half of the visible points."""
@@ -40,6 +39,10 @@ class DepthVisibility(NamedTuple):
     """As `DepthMap.face_ids`."""
 
 
+STRIPS_A_THREAD = 3
+"""Strips of the image a CPU thread: a hand covers the middle rows, and strips of one height are unequal work."""
+
+
 class _Buffer(NamedTuple):
     """A filled depth buffer, in float64 whatever the inputs, and what it was made of."""
 
@@ -49,23 +52,33 @@ class _Buffer(NamedTuple):
     faces: Tensor
 
 
-def _check_camera(viewmat: Tensor, K: Tensor, width: int, height: int, near_plane: float, like: Tensor) -> None:
+def _check_scene(
+    vertices: Tensor,
+    faces: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    validate: bool,
+) -> Tensor:
+    """Check a mesh and a camera; the faces as contiguous int32."""
+    check_shape("vertices", vertices, "V", 3)
+    check_float("vertices", vertices)
+    check_shape("faces", faces, "F", 3, hint="Three vertex indices a face.")
     check_shape("viewmat", viewmat, 4, 4, hint="World to camera.")
+    check_float("viewmat", viewmat, vertices)
     check_shape("K", K, 3, 3)
-    check_float("viewmat", viewmat, like)
-    check_float("K", K, like)
-    check_finite(viewmat=viewmat, K=K)
-    for name, focal in (("K[0, 0]", K[0, 0]), ("K[1, 1]", K[1, 1])):
-        check_positive(name, float(focal))
+    check_float("K", K, vertices)
     for name, size in (("width", width), ("height", height)):
         if size < 1:
             raise ValueError(f"{name}: expected 1 or more pixels, got {size}.")
     check_positive("near_plane", near_plane)
-
-
-def _check_vertex_or_none(point_vertices: Tensor, n_vertices: int) -> None:
-    named = point_vertices[point_vertices != -1]
-    check_index("point_vertices", named, n_vertices, "vertices, or -1 for none")
+    if validate:
+        check_finite(vertices=vertices, viewmat=viewmat, K=K)
+        check_positive("K[0, 0]", float(K[0, 0]))
+        check_positive("K[1, 1]", float(K[1, 1]))
+    return incidence("faces", faces, len(vertices), "vertices").table
 
 
 def _fill(
@@ -80,32 +93,30 @@ def _fill(
     if len(faces) == 0:
         return buffer
 
-    K_, near = view(K), wp.float64(near_plane)
-    vertices_, faces_, boxes_ = view(camera_vertices, wp.vec3d), view(faces), view(boxes, wp.vec4i)
-    launch(kernels.camera_points, len(vertices), [view(vertices), view(viewmat), vertices_], like=vertices)
-    launch(
-        kernels.face_boxes, len(faces), [vertices_, faces_, K_, width, height, near, boxes_], like=vertices
-    )
-    mesh = [vertices_, faces_, boxes_, K_, near, view(depth)]
-    if device.type == "cpu":
-        ids_ = view(face_ids)
-        for_strips(
-            height, lambda first, last: launch(kernels.fill_rows, 1, [first, last, *mesh, ids_], like=vertices)
-        )
-    else:
-        ids_ = view(face_ids, wp.uint32)
-        for stage in (0, 1):
-            launch(kernels.fill_faces, len(faces), [stage, *mesh, ids_], like=vertices)
+    near = wp.float64(near_plane)
+    vertices_, faces_, boxes_, K_ = view(camera_vertices, wp.vec3d), view(faces), view(boxes, wp.vec4i), view(K)
+    points = [view(vertices), view(viewmat), vertices_]
+    launch_ranges(kernels.camera_points, even_cuts(len(vertices)), points, like=vertices)
+    corners = [vertices_, faces_, K_, width, height, near, boxes_]
+    launch_ranges(kernels.face_boxes, even_cuts(len(faces)), corners, like=vertices)
+    fill = _fill_strips if device.type == "cpu" else _fill_faces
+    fill([vertices_, faces_, boxes_, K_, near], depth, face_ids)
     return buffer
 
 
-def _check_mesh(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Check a mesh; its faces as contiguous int32."""
-    check_shape("vertices", vertices, "V", 3)
-    check_float("vertices", vertices)
-    check_finite(vertices=vertices)
-    check_shape("faces", faces, "F", 3, hint="Three vertex indices a face.")
-    return incidence("faces", faces, len(vertices), "vertices").table
+def _fill_strips(mesh: list[Any], depth: Tensor, face_ids: Tensor) -> None:
+    """The way of the CPU: face after face, in strips of rows."""
+    n_threads = torch.get_num_threads()
+    n_strips = 1 if n_threads == 1 else min(STRIPS_A_THREAD * n_threads, len(depth))
+    arguments = [n_strips, *mesh, view(depth), view(face_ids)]
+    launch_ranges(kernels.fill_strips, range(n_strips + 1), arguments, like=depth)
+
+
+def _fill_faces(mesh: list[Any], depth: Tensor, face_ids: Tensor) -> None:
+    """The way of CUDA: all faces at once, first for the depths, then for the smallest face at that depth."""
+    n_faces = mesh[1].shape[0]
+    for stage in (0, 1):
+        launch(kernels.fill_faces, n_faces, [stage, *mesh, view(depth), view(face_ids, wp.uint32)], like=depth)
 
 
 @torch.no_grad()
@@ -117,6 +128,8 @@ def depth_map(
     width: int,
     height: int,
     near_plane: float = 0.01,
+    *,
+    validate: bool = True,
 ) -> DepthMap:
     """The nearest surface behind each pixel's centre, from either side; nothing here carries a gradient.
 
@@ -132,21 +145,23 @@ def depth_map(
         width: Columns of the image.
         height: Rows of the image.
         near_plane: Depth up to which surfaces are not seen [m].
+        validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
+            Shapes and indices are always checked, indices once a tensor.
 
     Raises:
         ValueError: a wrong shape, dtype or index, a value that is not finite, or a size or focal length that is not
             positive.
     """
-    faces = _check_mesh(vertices, faces)
-    _check_camera(viewmat, K, width, height, near_plane, vertices)
+    faces = _check_scene(vertices, faces, viewmat, K, width, height, near_plane, validate)
     K = K.contiguous()
     buffer = _fill(vertices.contiguous(), faces, viewmat.contiguous(), K, width, height, near_plane)
     barycentrics = torch.zeros((height, width, 3), dtype=vertices.dtype, device=vertices.device)
-    launch(
+    launch_ranges(
         kernels.interpolate,
-        (height, width),
+        even_cuts(height, least=64),
         [view(buffer.camera_vertices, wp.vec3d), view(faces), view(K), view(buffer.face_ids), view(barycentrics)],
         like=vertices,
+        lanes=width,
     )
     return DepthMap(buffer.depth.to(vertices.dtype), buffer.face_ids, barycentrics)
 
@@ -156,9 +171,9 @@ class _Visibility(torch.autograd.Function):
     def forward(ctx, points, point_vertices, buffer, viewmat, K, near_plane, tau, margin):
         visibility = torch.zeros(len(points), dtype=points.dtype, device=points.device)
         slope = torch.zeros_like(visibility)
-        launch(
+        launch_ranges(
             kernels.visibility,
-            len(points),
+            even_cuts(len(points)),
             [
                 view(points),
                 view(point_vertices),
@@ -207,6 +222,8 @@ def depth_visibility(
     literal: bool = False,
     point_vertices: Int[Tensor, "P"] | None = None,
     near_plane: float = 0.01,
+    *,
+    validate: bool = True,
 ) -> DepthVisibility:
     """How visible points are past a mesh: p = sigmoid((dz + margin) / tau), dz = depth buffer - depth of the point.
 
@@ -231,6 +248,8 @@ def depth_visibility(
         literal: Equation 4 as printed: `margin` is 0, and `point_vertices` is not used.
         point_vertices: Vertex that each point is, or -1, shape [P].
         near_plane: Depth up to which nothing is seen [m].
+        validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
+            Shapes and indices are always checked, indices once a tensor.
 
     Raises:
         ValueError: a wrong shape, dtype or index, a value that is not finite, or a `tau`, size or focal length that is
@@ -238,18 +257,20 @@ def depth_visibility(
     """
     check_shape("points", points, "P", 3)
     check_float("points", points, vertices)
-    check_finite(points=points)
-    faces = _check_mesh(vertices, faces)
-    _check_camera(viewmat, K, width, height, near_plane, vertices)
+    faces = _check_scene(vertices, faces, viewmat, K, width, height, near_plane, validate)
     check_positive("tau", tau)
     margin = MARGIN_TAUS * tau if margin is None else margin
     if not 0 <= margin < float("inf"):
         raise ValueError(f"margin: expected a finite number, 0 or more, got {margin!r}.")
+    if point_vertices is not None:
+        check_shape("point_vertices", point_vertices, len(points), hint="One vertex a point, -1 for none.")
+    if validate:
+        check_finite(points=points)
+        if point_vertices is not None:
+            named = point_vertices[point_vertices != -1]
+            check_index("point_vertices", named, len(vertices), "vertices, or -1 for none")
     if point_vertices is None or literal:
         point_vertices = torch.empty(0, dtype=torch.int32, device=points.device)
-    else:
-        check_shape("point_vertices", point_vertices, len(points), hint="One vertex a point, -1 for none.")
-        _check_vertex_or_none(point_vertices, len(vertices))
     with torch.no_grad():
         viewmat, K = viewmat.detach().contiguous(), K.detach().contiguous()
         buffer = _fill(vertices.detach().contiguous(), faces, viewmat, K, width, height, near_plane)

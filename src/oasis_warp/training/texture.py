@@ -51,10 +51,10 @@ def learn_texture(
     """Learn colours on `target` inside `mask`, starting from `gaussians.colors`.
 
     The unknowns are the logits of a field over the vertices, read by vertex and face Gaussians alike, and a small
-    residual of every face Gaussian. The photo itself shows through where the Gaussians leave it free, as at the wrist:
-    over black they would learn to glow there. A Gaussian that hides behind its neighbours in the photo therefore learns with
-    them, and does not come out as a speckle when another pose shows it. Reference views must stay as `gaussians`
-    draws them; one of them takes part in each step.
+    residual of every face Gaussian. A Gaussian that hides behind its neighbours in the photo therefore learns with
+    them, and does not come out as a speckle when another pose shows it. The photo itself shows through where the
+    Gaussians leave it free, as at the wrist: over black they would learn to glow there. Reference views must stay as
+    `gaussians` draws them; one of them takes part in each step.
     """
     base = torch.logit(gaussians.colors, COLOR_MARGIN)
     n_vertices, n_points = int(faces.max()) + 1, len(gaussians.vertex_index)

@@ -1,0 +1,50 @@
+"""The command line, `oasis`: read it, run the command, turn what goes wrong into one sentence and an exit code."""
+
+import importlib
+import logging
+import signal
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+from oasis_warp import __version__
+from oasis_warp.commands import options
+from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
+from oasis_warp.core.errors import InputError
+
+Command = (
+    Annotated[options.Reconstruct, tyro.conf.subcommand("reconstruct")]
+    | Annotated[options.Render, tyro.conf.subcommand("render")]
+    | Annotated[options.Animate, tyro.conf.subcommand("animate")]
+    | Annotated[options.Doctor, tyro.conf.subcommand("doctor")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command that `arguments` (the process's own when not given) ask for; the exit code."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments == ["--version"]:
+        print(f"oasis_warp {__version__}")
+        return 0
+    chosen = tyro.cli(
+        Command,
+        prog="oasis",
+        description=f"One photo of a hand in, an animatable 3D Gaussian avatar out. oasis_warp {__version__}",
+        args=arguments,
+        config=(tyro.conf.OmitArgPrefixes,),
+    )
+    logging.basicConfig(format="oasis: %(message)s")
+    # A batch system's SIGTERM ends the work as Ctrl-C does: what is half-written is taken away.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        # The command's module imports torch and Warp, which take seconds: only now.
+        command = importlib.import_module(f"oasis_warp.commands.{type(chosen).__name__.lower()}")
+        return command.run(chosen)
+    except InputError as error:
+        print(f"oasis: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("oasis: stopped, nothing written.", file=sys.stderr)
+        return INTERRUPTED

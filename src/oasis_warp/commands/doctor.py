@@ -1,0 +1,242 @@
+"""`oasis doctor`: one line for each thing that the rest relies on, and what to do about those that fail.
+
+Packages are imported inside the checks: a broken one is a line of the answer, not the end of it.
+"""
+
+import importlib.metadata
+import math
+import os
+import platform
+import re
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+
+from oasis_warp import __version__
+from oasis_warp.commands.exit_codes import FAULT
+from oasis_warp.commands.options import Doctor
+
+PACKAGES = {
+    "warp-lang": ("1.19", "1.20"),
+    "torch": ("2.6", "2.14"),
+    "trimesh": ("4", None),
+    "libigl": ("2.6", None),
+    "scipy": ("1.14", None),
+    "opencv-contrib-python-headless": ("5.0.0.93", None),
+    "numpy": ("2", None),
+    "safetensors": ("0.5", None),
+    "jaxtyping": ("0.3", None),
+    "tyro": ("0.9", None),
+    "rich": ("13", None),
+}
+"""Lowest version that works, and the first that is not known to; as in pyproject.toml."""
+OTHER_OPENCVS = ("opencv-python", "opencv-python-headless", "opencv-contrib-python")
+"""Distributions that put another `cv2` into the same folder: which of them is imported is chance."""
+HAND_SIZE = (12_337, 24_608)
+"""Vertices and faces of the bundled hand."""
+TOLERANCE = 5e-6
+"""Of colours in float32: a handful of roundings of numbers below 1."""
+
+
+class FaultError(Exception):
+    """A check failed; the message says what is wrong, `remedy` what to do."""
+
+    def __init__(self, message: str, remedy: str):
+        super().__init__(message)
+        self.remedy = remedy
+
+
+Check = Callable[[], str]
+"""What a check found, in a few words; raises `FaultError`, or whatever a broken package raises."""
+
+
+def run(options: Doctor) -> int:
+    """Print a line for every check; the exit code."""
+    del options  # there are none
+    console, faults, to_do = Console(), 0, checks()
+    width = max(map(len, to_do))
+    for name, check in to_do.items():
+        try:
+            mark, text = "[green]ok  [/]", check()
+        except Exception as error:  # whatever a broken installation raises is what the user came to learn
+            remedy = error.remedy if isinstance(error, FaultError) else "reinstall with `pip install -e .`"
+            mark, text = "[red]FAIL[/]", f"{error or type(error).__name__}; {remedy}"
+            faults += 1
+        console.print(mark, f"{name:{width}}", text, highlight=False, soft_wrap=True)
+    if faults:
+        console.print(f"{faults} of {len(to_do)} checks failed.", style="red")
+    return FAULT if faults else 0
+
+
+def checks() -> dict[str, Check]:
+    """Every check by its name, in the order in which they are made."""
+    packages = {name: lambda name=name: check_package(name) for name in PACKAGES}
+    return {
+        "oasis_warp": check_python,
+        **packages,
+        "one OpenCV": check_single_opencv,
+        "CPU": check_cpu,
+        "CUDA": check_cuda,
+        "hand": check_hand,
+        "networks": check_networks,
+        "kernels": check_kernels,
+        "videos": check_videos,
+    }
+
+
+def check_python() -> str:
+    """Versions of this program, Python and the system."""
+    return f"{__version__}, Python {platform.python_version()}, {platform.platform()}"
+
+
+def parse_version(text: str) -> tuple[int, ...]:
+    """The leading numbers of a version: "2.13.0+cpu" -> (2, 13, 0)."""
+    return tuple(int(part) for part in re.findall(r"^\d+|(?<=\.)\d+", text.split("+")[0]))
+
+
+def check_package(name: str) -> str:
+    """The installed version of a package, which must be in the range that works."""
+    low, high = PACKAGES[name]
+    wanted = f">={low}" + (f",<{high}" if high else "")
+    try:
+        version = importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        raise FaultError("not installed", f'run `pip install "{name}{wanted}"`') from None
+    number = parse_version(version)
+    if number < parse_version(low) or (high and number >= parse_version(high)):
+        raise FaultError(f"{version}, expected {wanted}", f'run `pip install "{name}{wanted}"`')
+    return version
+
+
+def check_single_opencv() -> str:
+    """No second OpenCV stands in the way of the right one."""
+    import cv2
+
+    others = []
+    for name in OTHER_OPENCVS:
+        try:
+            importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        others.append(name)
+    if others:
+        ours = "opencv-contrib-python-headless"
+        remedy = f"run `pip uninstall -y {' '.join(others)}`, then `pip install --force-reinstall --no-deps {ours}`"
+        raise FaultError(f"{', '.join(others)} installed as well", remedy)
+    return f"cv2 {cv2.__version__}"
+
+
+def check_cpu() -> str:
+    """What torch computes with."""
+    import torch
+
+    features = torch.backends.cpu.get_cpu_capability()
+    return f"{torch.get_num_threads()} threads on {os.cpu_count()} cores, {features}"
+
+
+def check_cuda() -> str:
+    """The CUDA devices; none is fine."""
+    import torch
+
+    if not torch.cuda.is_available():
+        return "no device; everything runs on the CPU"
+    devices = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
+    return ", ".join(f"{device.name} ({device.total_memory >> 30} GiB)" for device in devices)
+
+
+def check_hand() -> str:
+    """The bundled hand loads and has the size that avatars count on."""
+    import hashlib
+
+    from oasis_warp.assets import asset
+    from oasis_warp.hand.template import bundled_hand
+
+    hand = bundled_hand()
+    if (len(hand.template), len(hand.faces)) != HAND_SIZE:
+        raise FaultError(f"{len(hand.template)} vertices, {len(hand.faces)} faces", "reinstall oasis-warp")
+    digest = hashlib.sha256(asset("hand", "hand_right.npz").read_bytes()).hexdigest()
+    return f"{len(hand.template)} vertices, {len(hand.faces)} faces, sha256 {digest[:12]}"
+
+
+def check_networks() -> str:
+    """The landmark networks give known answers."""
+    from oasis_warp.hand.networks import check_networks
+
+    check_networks()
+    return "palm detection and hand landmarks give the known answers"
+
+
+def check_kernels() -> str:
+    """The rasterizer draws one Gaussian as the formula says, on every device."""
+    import torch
+
+    from oasis_warp.ops._launch import kernel_cache
+
+    cache = kernel_cache()
+    if not _can_write(cache):
+        raise FaultError(f"the kernel cache {cache} cannot be written", "set OASIS_WARP_CACHE to a folder of your own")
+    seconds = {}
+    for device in ["cpu"] + ["cuda"] * torch.cuda.is_available():
+        start = time.perf_counter()
+        error = gaussian_error(device)
+        seconds[device] = time.perf_counter() - start
+        if not error <= TOLERANCE:
+            raise FaultError(f"{device}: a Gaussian is off by {error:.1e}", f"delete {cache} and run this again")
+    times = ", ".join(f"{took:.1f} s on {device}" for device, took in seconds.items())
+    return f"draw what the formula says; loaded or compiled in {times}; cache {cache}"
+
+
+def gaussian_error(device: str) -> float:
+    """Largest difference between one drawn Gaussian and opacity * exp(-d^2 / 2 / variance) * colour."""
+    import torch
+
+    from oasis_warp.ops import rasterization
+
+    size, focal, depth, scale, opacity = 33, 100.0, 1.0, 0.04, 0.8
+    color = torch.tensor([[1.0, 0.5, 0.25]], device=device)
+    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], device=device)
+    image, alpha, _ = rasterization(
+        means=torch.tensor([[0.0, 0.0, depth]], device=device),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device),
+        scales=torch.full((1, 3), scale, device=device),
+        opacities=torch.tensor([opacity], device=device),
+        colors=color,
+        viewmats=torch.eye(4, device=device)[None],
+        Ks=K[None],
+        width=size,
+        height=size,
+    )
+    # On the optical axis the projection is exact: a round Gaussian, plus the 0.3 px^2 of the pixel's own blur.
+    variance = (focal * scale / depth) ** 2 + 0.3
+    offset = torch.arange(size, device=device, dtype=torch.float64) - size // 2
+    squared = offset[:, None] ** 2 + offset[None, :] ** 2
+    expected = opacity * torch.exp(-squared / 2 / variance)
+    inside = squared < 4 * variance  # two standard deviations: well inside the cut at 1/255
+    drawn = torch.cat([image[0], alpha[0]], -1).double()
+    formula = torch.cat([expected[..., None] * color.double(), expected[..., None]], -1)
+    return float((drawn - formula)[inside].abs().max())
+
+
+def _can_write(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def check_videos() -> str:
+    """A film of each kind can be written and read back."""
+    import torch
+
+    from oasis_warp.data.video import VIDEO_SUFFIXES, write_video
+
+    frames = [torch.full((64, 64, 3), int(127 + 100 * math.sin(i)), dtype=torch.uint8) for i in range(3)]
+    with tempfile.TemporaryDirectory() as folder:
+        for suffix in VIDEO_SUFFIXES:
+            write_video(Path(folder) / f"film{suffix}", frames, 24.0)
+    return " and ".join(VIDEO_SUFFIXES)

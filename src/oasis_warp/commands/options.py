@@ -1,0 +1,96 @@
+"""The options of every command; the text under a field is its `--help`.
+
+Nothing heavy is imported here, so that `oasis --help` answers at once.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+Output = Annotated[Path, arg(aliases=["-o"], metavar="PATH")]
+PoseName = Literal["photo", "rest", "open", "relaxed", "fist", "pinch", "thumbs_up", "victory", "point", "ok"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct:
+    """Turn photos of a hand into avatars: avatar.safetensors, summary.png, turntable.mp4 and report.json.
+
+    One photo's files go into the folder --out itself, those of several into a folder each, --out/NAME for NAME.jpg.
+    Files of an earlier run are replaced, all other files in the folder stay.
+    """
+
+    photos: Positional[tuple[Path, ...]]
+    """JPEG, PNG, WebP, AVIF, BMP or TIFF files."""
+    out: Output
+    """Folder for the results; its parent must exist."""
+    hand: Literal["left", "right", "largest"] | int = "largest"
+    """Which hand of the photo: a side, the largest, or a number from 0 for the best found, 1 for the next."""
+    keypoints: Path | None = None
+    """JSON file with 21 landmarks, or with pose and camera, to use instead of the networks; for one photo only."""
+    steps: int | None = None
+    """Steps of texture learning; stops by itself when not given."""
+    seed: int = 0
+    """The same seed gives the same avatar."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""
+    size: int = 256
+    """Side of the square crop that the avatar is fitted to [px]."""
+    force: FlagCreatePairsOff[bool] = False
+    """Go on with a fit that is too poor to be trusted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """Draw an avatar: one picture of any pose from any side."""
+
+    avatar: Positional[Path]
+    """avatar.safetensors of `oasis reconstruct`."""
+    out: Output
+    """Picture to write: .png, .webp or .jpg."""
+    pose: PoseName = "photo"
+    """Pose of the hand; "photo" is the one in the photo."""
+    azimuth: float = 0.0
+    """Degrees around the hand; 0 is where the photo was taken from."""
+    elevation: float = 0.0
+    """Degrees above the hand."""
+    size: int = 512
+    """Side of the picture [px]."""
+    background: str = "white"
+    """white, black, transparent, or a colour as rrggbb."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Animate:
+    """Make a film of an avatar: a turn around it, or a walk through poses. Both loop."""
+
+    avatar: Positional[Path]
+    """avatar.safetensors of `oasis reconstruct`."""
+    out: Output
+    """Film to write: .mp4 or .gif."""
+    motion: Literal["turntable", "poses"] = "turntable"
+    """Turn around the hand in one pose, or stand still and change poses."""
+    pose: PoseName = "photo"
+    """Pose of the hand on the turntable."""
+    poses: str = "open,fist,victory,point,ok"
+    """Poses to walk through, with commas between them."""
+    seconds: float = 4.0
+    """Length of the film."""
+    fps: float = 24.0
+    """Frames a second."""
+    elevation: float = 0.0
+    """Degrees above the hand."""
+    size: int = 384
+    """Side of the picture [px]."""
+    background: str = "white"
+    """white, black, or a colour as rrggbb."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor:
+    """Check that everything is there and computes what it should; each failing line says what to do."""

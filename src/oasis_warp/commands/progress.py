@@ -1,0 +1,57 @@
+"""Show how far the work is: bars with the time left on a terminal, plain lines anywhere else."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bars
+
+from oasis_warp.core.logging import Progress
+
+LINE_EVERY = 5.0
+"""Seconds between the lines of one stage where there is no terminal."""
+
+
+@contextlib.contextmanager
+def show_progress(console: Console) -> Iterator[Progress]:
+    """A `Progress` that shows itself on `console` for as long as the block runs."""
+    if not console.is_terminal:
+        yield line_progress(lambda line: console.print(line, highlight=False, soft_wrap=True))
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Bars(SpinnerColumn(), *columns, console=console, transient=True) as bars:
+        yield bar_progress(bars)
+
+
+def bar_progress(bars: Bars) -> Progress:
+    """A bar a stage."""
+    tasks = {}
+
+    def progress(stage: str, done: int, total: int) -> None:
+        if stage not in tasks:
+            tasks[stage] = bars.add_task(stage, total=total)
+        bars.update(tasks[stage], completed=done, total=total)
+
+    return progress
+
+
+def line_progress(write: Callable[[str], object], clock: Callable[[], float] = time.monotonic) -> Progress:
+    """A line when a stage ends, and every `LINE_EVERY` seconds while it lasts."""
+    started: dict[str, float] = {}
+    written: dict[str, float] = {}
+
+    def progress(stage: str, done: int, total: int) -> None:
+        now = clock()
+        start = started.setdefault(stage, now)
+        if done >= total:
+            write(f"{stage}: {now - start:.1f} s")
+            del started[stage]
+            written.pop(stage, None)
+        elif done and now - written.setdefault(stage, start) >= LINE_EVERY:
+            written[stage] = now
+            left = (now - start) / done * (total - done)
+            write(f"{stage}: {done} of {total}, about {left:.0f} s left")
+
+    return progress

@@ -1,0 +1,84 @@
+"""What a run did, how long it took and how well it went: as JSON for programs, as a table for people."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from oasis_warp import __version__
+from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.types import Photo
+from oasis_warp.pipeline import Reconstruction
+
+MEASURES = {
+    "reprojection_percent": ("landmarks miss the model by", "{:.1f} % of the hand"),
+    "worst_point_percent": ("the worst of them by", "{:.1f} %"),
+    "mask_iou": ("overlap of fit and mask", "{:.3f}"),
+    "input_psnr_db": ("likeness to the photo", "{:.1f} dB"),
+    "input_psnr_inner_db": ("likeness away from the outline", "{:.1f} dB"),
+    "render_mask_iou": ("overlap of avatar and mask", "{:.3f}"),
+    "coverage_percent": ("surface that the photo shows", "{:.0f} %"),
+    "n_gaussians": ("Gaussians", "{:.0f}"),
+}
+"""Words and unit for what `Reconstruction.errors` holds; a measure without an entry is shown under its own name."""
+
+
+def make_report(
+    photo: Photo, made: Reconstruction, config: ReconstructConfig, stages: Mapping[str, float]
+) -> dict[str, Any]:
+    """Everything about a run that JSON can hold; `stages` [s] replaces `made.stages`."""
+    height, width = photo.rgb.shape[:2]
+    landmarks = made.fit.landmarks
+    return {
+        "creator": f"oasis_warp {__version__}",
+        "photo": {
+            "name": photo.name,
+            "width": width,
+            "height": height,
+            "shrink": photo.shrink,
+            "focal_px": photo.focal,
+            "has_alpha": photo.alpha is not None,
+        },
+        "hand": {
+            "side": made.fit.side,
+            "side_score": landmarks.side_score,
+            "presence": landmarks.presence,
+            "landmarks_from": landmarks.source,
+        },
+        "config": asdict(config),
+        "seconds": {**stages, "total": sum(stages.values())},
+        "errors": made.errors,
+        "warnings": list(made.warnings),
+    }
+
+
+def to_json(report: Mapping[str, Any]) -> str:
+    """`report` as JSON; a number that is not finite becomes null."""
+
+    def clean(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: clean(item) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [clean(item) for item in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(clean(report), indent=2, allow_nan=False) + "\n"
+
+
+def print_report(console: Console, report: Mapping[str, Any]) -> None:
+    """Print the stages with their times, the measures and the warnings in words."""
+    table = Table(title=f"{report['photo']['name']}: {report['hand']['side']} hand", show_header=False)
+    table.add_column()
+    table.add_column(justify="right")
+    for stage, seconds in report["seconds"].items():
+        table.add_row(stage, f"{seconds:.2f} s", end_section=stage == "total")
+    for name, value in report["errors"].items():
+        words, unit = MEASURES.get(name, (name, "{:.4g}"))
+        table.add_row(words, unit.format(value))
+    console.print(table)
+    for warning in report["warnings"]:
+        console.print(f"Warning: {warning}", style="yellow", highlight=False, soft_wrap=True)

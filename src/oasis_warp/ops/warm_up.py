@@ -1,0 +1,34 @@
+"""Compile what an avatar needs before it is needed, so that the wait can be shown."""
+
+import torch
+
+from oasis_warp.ops.blend_weights import blend_weights
+from oasis_warp.ops.face_rotations import face_rotations
+from oasis_warp.ops.mesh_posing import pose_on_mesh
+from oasis_warp.ops.rasterization import rasterization
+from oasis_warp.ops.visibility import depth_visibility
+
+
+def warm_up(device: torch.device | str = "cpu") -> None:
+    """Run the float32 forward of every operator once on a tetrahedron.
+
+    The first time on a machine this compiles the kernels into the kernel cache, within a minute; afterwards it takes
+    milliseconds.
+    """
+    vertices = torch.tensor([[0.0, 0, 1], [0.1, 0, 1], [0, 0.1, 1], [0, 0, 1.1]], device=device)
+    faces = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], device=device)
+    thirds = torch.full((4, 3), 1 / 3, device=device)
+    quats = torch.tensor([[1.0, 0, 0, 0]], device=device).expand(4, 4).contiguous()
+    scales = torch.full((4, 3), 0.02, device=device)
+    ones = torch.ones(4, device=device)
+    viewmat = torch.eye(4, device=device)
+    K = torch.tensor([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]], device=device)
+    with torch.no_grad():
+        turned = face_rotations(vertices, vertices, faces)
+        each = torch.arange(4, device=device)
+        posed = pose_on_mesh(
+            vertices, faces, each, thirds, turned.vertex_quats, turned.area_ratio, quats, scales
+        )
+        depth_visibility(vertices, vertices, faces, K, viewmat, 16, 16)
+        blend_weights(*posed, ones, viewmat, K, 16, 16)
+        rasterization(*posed, ones, thirds, viewmat[None], K[None], 16, 16, backgrounds=ones[None, :3])

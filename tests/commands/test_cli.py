@@ -1,0 +1,94 @@
+import dataclasses
+import subprocess
+import sys
+from typing import get_args
+
+import pytest
+
+from oasis_warp import __version__
+from oasis_warp.cli import main
+from oasis_warp.commands import options
+from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.hand.poses import POSE_NAMES
+
+LIST_IMPORTS = """
+import sys
+from oasis_warp.cli import main
+try:
+    main(sys.argv[1:])
+finally:
+    print(*(name for name in ("torch", "warp", "cv2", "numpy") if name in sys.modules), file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["reconstruct", "--help"], ["animate", "--help"]])
+def test_help_imports_nothing_that_takes_seconds(arguments):
+    done = subprocess.run([sys.executable, "-c", LIST_IMPORTS, *arguments], capture_output=True, text=True)
+    assert done.returncode == 0
+    assert done.stderr.strip() == ""
+    assert done.stdout
+
+
+def test_the_version_is_printed(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"oasis_warp {__version__}\n"
+
+
+def test_the_module_runs_as_the_command_does():
+    done = subprocess.run([sys.executable, "-m", "oasis_warp", "--version"], capture_output=True, text=True)
+    assert done.stdout == f"oasis_warp {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["frobnicate"], ["reconstruct", "a.jpg"], ["reconstruct", "a.jpg", "-o", "x", "--hand", "both"],
+     ["render", "a.safetensors", "-o", "x.png", "--pose", "frog"]],
+)  # fmt: skip
+def test_a_wrong_command_line_exits_with_two(arguments, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_bad_input_is_one_sentence_and_exits_with_two(capsys, tmp_path):
+    assert main(["render", str(tmp_path / "none"), "-o", str(tmp_path / "x.png")]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("oasis: ")
+    assert captured.err.count("\n") == 1
+
+
+def test_an_interrupt_is_told_and_exits_with_130(capsys, monkeypatch, avatar_file):
+    from oasis_warp.commands import render
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(render, "orbit_camera", interrupt)
+    assert main(["render", str(avatar_file), "-o", str(avatar_file.with_name("x.png"))]) == 130
+    assert capsys.readouterr().err == "oasis: stopped, nothing written.\n"
+    assert not avatar_file.with_name("x.png").exists()
+
+
+def test_an_error_of_ours_is_not_dressed_up_as_bad_input(monkeypatch, avatar_file):
+    from oasis_warp.commands import render
+
+    def fail(*args):
+        raise ValueError("a bug")
+
+    monkeypatch.setattr(render, "orbit_camera", fail)
+    with pytest.raises(ValueError, match="a bug"):
+        main(["render", str(avatar_file), "-o", str(avatar_file.with_name("x.png"))])
+
+
+def test_the_command_line_offers_the_options_of_the_config_with_its_defaults():
+    offered = {field.name: (field.default, field.type) for field in dataclasses.fields(options.Reconstruct)}
+    for field in dataclasses.fields(ReconstructConfig):
+        default, kind = offered[field.name]
+        assert default == field.default
+        assert kind == field.type or bool in get_args(kind)
+
+
+def test_the_command_line_offers_every_pose():
+    assert get_args(options.PoseName) == ("photo", *POSE_NAMES)

@@ -1,0 +1,139 @@
+"""The command as a user runs it, with the whole pipeline: minutes, so marked slow."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+PHOTOS = Path(__file__).parents[1] / "data" / "photos"
+FILES = {"avatar.safetensors", "summary.png", "turntable.mp4", "report.json"}
+OASIS = [sys.executable, "-m", "oasis_warp"]
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+def oasis(*arguments, **options):
+    return subprocess.run([*OASIS, *map(str, arguments)], capture_output=True, text=True, **options)
+
+
+def names(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+def assert_refused(done, folder, expected, left=frozenset()):
+    """Exit code 2, one sentence, no traceback, nothing written."""
+    assert done.returncode == 2
+    sentences = [line for line in done.stderr.splitlines() if line.startswith("oasis: ")]
+    assert len(sentences) == 1
+    assert expected in sentences[0]
+    assert "Traceback" not in done.stderr
+    assert names(folder) == set(left)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A folder that one run on an ordinary photo has filled."""
+    folder = tmp_path_factory.mktemp("finished") / "out"
+    done = oasis("reconstruct", PHOTOS / "palm_open_left_02.png", "-o", folder, "--steps", 20)
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+def test_a_photo_becomes_an_avatar_that_looks_like_it(finished):
+    folder, done = finished
+    assert names(folder) == FILES
+    report = json.loads((folder / "report.json").read_text())
+    assert report["hand"]["side"] == "left"
+    assert report["errors"]["input_psnr_db"] > 20
+    assert report["errors"]["mask_iou"] > 0.85
+    assert {"read", "landmarks", "fit", "adaptation", "summary", "turntable", "save"} <= report["seconds"].keys()
+    assert "left hand" in done.stdout
+    assert "texture" in done.stderr
+
+
+def test_the_avatar_can_be_drawn_and_animated_without_its_photo(finished, tmp_path):
+    avatar = finished[0] / "avatar.safetensors"
+    assert oasis("render", avatar, "-o", tmp_path / "fist.png", "--pose", "fist", "--size", 128).returncode == 0
+    picture = cv2.imread(str(tmp_path / "fist.png"))
+    assert picture is not None
+    assert picture.shape == (128, 128, 3)
+    assert 0.05 < (picture < 230).any(-1).mean() < 0.9
+    film = tmp_path / "film.gif"
+    assert oasis("animate", avatar, "-o", film, "--motion", "poses", "--seconds", 0.5, "--size", 96).returncode == 0
+    assert names(tmp_path) == {"fist.png", "film.gif"}
+
+
+def test_a_photo_without_a_hand_is_refused(tmp_path):
+    done = oasis("reconstruct", PHOTOS / "no_hand_cup_15.jpg", "-o", tmp_path / "out")
+    assert_refused(done, tmp_path, "no_hand_cup_15.jpg")
+
+
+def test_one_of_several_hands_is_chosen_by_number(tmp_path):
+    photo = PHOTOS / "backs_two_left_05.jpg"
+    done = oasis("reconstruct", photo, "-o", tmp_path / "out", "--hand", 1, "--steps", 1, "--force")
+    assert done.returncode == 0, done.stderr
+    assert_refused(oasis("reconstruct", photo, "-o", tmp_path / "more", "--hand", 7), tmp_path, "backs_two", {"out"})
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", '{"landmarks": "none"}'])
+def test_a_wrong_keypoints_file_is_refused(tmp_path, text):
+    (tmp_path / "points.json").write_text(text)
+    done = oasis(
+        "reconstruct", PHOTOS / "palm_open_left_02.png", "-o", tmp_path / "out", "--keypoints", tmp_path / "points.json"
+    )
+    assert_refused(done, tmp_path, "points.json", {"points.json"})
+
+
+def test_a_huge_photo_is_scaled_down_first(tmp_path):
+    photo = cv2.imread(str(PHOTOS / "palm_open_left_02.png"))
+    canvas = cv2.resize(photo, (8200, 10000), interpolation=cv2.INTER_CUBIC)
+    cv2.imwrite(str(tmp_path / "huge.jpg"), np.ascontiguousarray(canvas))
+    done = oasis("reconstruct", tmp_path / "huge.jpg", "-o", tmp_path / "out", "--steps", 1)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["photo"]["shrink"] == pytest.approx(0.5, rel=1e-3)
+
+
+@pytest.mark.parametrize(("stage", "stop"), [("landmarks", signal.SIGINT), ("calibration", signal.SIGTERM)])
+def test_a_stop_midway_leaves_nothing(tmp_path, stage, stop):
+    with subprocess.Popen(
+        [*OASIS, "reconstruct", str(PHOTOS / "palm_open_left_02.png"), "-o", str(tmp_path / "out")],
+        stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stderr is not None
+        for line in process.stderr:
+            if line.startswith(f"{stage}: "):
+                break
+        time.sleep(0.5)  # into the next stage
+        process.send_signal(stop)
+        errors = process.stderr.read()
+    assert process.returncode == 130
+    assert errors.endswith("oasis: stopped, nothing written.\n")
+    assert names(tmp_path) == set()
+
+
+def test_a_full_disk_at_the_very_end_leaves_nothing(tmp_path):
+    def fill():  # in the child: no file grows beyond 1 MB, and the avatar is larger
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
+
+    # Kernels are compiled already: the cache must not be what runs out of room.
+    photo = PHOTOS / "palm_open_left_02.png"
+    done = oasis("reconstruct", photo, "-o", tmp_path / "out", "--steps", 1, preexec_fn=fill, env=dict(os.environ))
+    assert_refused(done, tmp_path, "free some")
+
+
+def test_the_example_runs_without_arguments(tmp_path):
+    example = Path(__file__).parents[2] / "examples" / "reconstruct.py"
+    done = subprocess.run([sys.executable, example], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert names(tmp_path) == {"fist.png", "fist.safetensors"}
+    assert "left hand" in done.stdout

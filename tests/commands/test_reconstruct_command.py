@@ -1,0 +1,165 @@
+import json
+
+import cv2
+import pytest
+from disk import full_disk
+
+from oasis_warp.cli import main
+from oasis_warp.commands import reconstruct as command
+from oasis_warp.commands import summary
+from oasis_warp.core.errors import InputError
+from oasis_warp.data.avatar_file import load_avatar
+from oasis_warp.data.photo import read_photo
+from oasis_warp.data.pictures import write_picture
+
+FILES = {"avatar.safetensors", "summary.png", "turntable.mp4", "report.json"}
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    monkeypatch.setattr(summary, "WIDTH", 480)
+    monkeypatch.setattr(command, "TURNTABLE_FRAMES", 4)
+    monkeypatch.setattr(command, "TURNTABLE_SIZE", 64)
+
+
+@pytest.fixture
+def pipeline(monkeypatch, made):
+    """The pipeline, already knowing the answer; a photo whose name has "bad" in it is refused."""
+
+    def answer(photo, config, *, keypoints, progress):
+        calls.append((photo, config, keypoints))
+        if "bad" in photo.name:
+            raise InputError(f"{photo.name}: no hand was found; give another photo.")
+        if "stop" in photo.name:
+            raise KeyboardInterrupt
+        progress("landmarks", 1, 1)
+        return made
+
+    calls = []
+    monkeypatch.setattr(command, "reconstruct", answer)
+    return calls
+
+
+@pytest.fixture
+def photo_file(tmp_path, scene):
+    def write(name="hand.png"):
+        write_picture(tmp_path / name, scene[0].rgb)
+        return str(tmp_path / name)
+
+    return write
+
+
+def names(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+def test_one_photo_fills_the_folder_itself(pipeline, photo_file, tmp_path, capsys):
+    assert main(["reconstruct", photo_file(), "-o", str(tmp_path / "out")]) == 0
+    assert names(tmp_path / "out") == FILES
+    assert names(tmp_path) == {"hand.png", "out"}
+    captured = capsys.readouterr()
+    assert "hand.png: right hand" in captured.out
+    assert "30.0 dB" in captured.out
+    assert "landmarks: " in captured.err
+
+
+def test_what_was_written_can_be_read(pipeline, photo_file, tmp_path):
+    main(["reconstruct", photo_file(), "-o", str(tmp_path / "out"), "--seed", "5", "--steps", "7", "--force"])
+    _, header = load_avatar(tmp_path / "out" / "avatar.safetensors")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert header["side"] == report["hand"]["side"] == "right"
+    assert {"seed": 5, "steps": 7, "force": True, "hand": "largest"}.items() <= report["config"].items()
+    assert read_photo(tmp_path / "out" / "summary.png").rgb.shape[1] == 480
+    capture = cv2.VideoCapture(str(tmp_path / "out" / "turntable.mp4"))
+    assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 4
+
+
+def test_options_reach_the_pipeline(pipeline, photo_file, tmp_path):
+    keypoints = tmp_path / "points.json"
+    main(["reconstruct", photo_file(), "-o", str(tmp_path / "out"), "--hand", "1", "--keypoints", str(keypoints)])
+    photo, config, got = pipeline[0]
+    assert (photo.name, config.hand, got) == ("hand.png", 1, keypoints)
+
+
+def test_several_photos_get_a_folder_each(pipeline, photo_file, tmp_path):
+    photos = [photo_file("a.png"), photo_file("b.png")]
+    assert main(["reconstruct", *photos, "-o", str(tmp_path / "out")]) == 0
+    assert names(tmp_path / "out") == {"a", "b"}
+    assert names(tmp_path / "out" / "a") == names(tmp_path / "out" / "b") == FILES
+
+
+def test_a_photo_that_fails_does_not_stop_the_others(pipeline, photo_file, tmp_path, capsys):
+    photos = [photo_file("a.png"), photo_file("bad.png"), str(tmp_path / "none.png"), photo_file("b.png")]
+    assert main(["reconstruct", *photos, "-o", str(tmp_path / "out")]) == 2
+    assert names(tmp_path / "out") == {"a", "b"}
+    errors = capsys.readouterr().err
+    assert "oasis: bad.png: no hand was found" in errors
+    assert "none.png: expected a photo, found no such file" in errors
+    assert errors.endswith("oasis: 2 of 4 photos are done, the others failed.\n")
+
+
+def test_a_failure_leaves_nothing(pipeline, photo_file, tmp_path):
+    photos = [photo_file("bad.png"), photo_file("bad2.png")]
+    assert main(["reconstruct", photos[0], "-o", str(tmp_path / "out")]) == 2
+    assert main(["reconstruct", *photos, "-o", str(tmp_path / "out")]) == 2
+    assert names(tmp_path) == {"bad.png", "bad2.png"}
+
+
+def test_an_interrupt_leaves_nothing(pipeline, photo_file, tmp_path, capsys):
+    assert main(["reconstruct", photo_file("stop.png"), "-o", str(tmp_path / "out")]) == 130
+    assert names(tmp_path) == {"stop.png"}
+    assert capsys.readouterr().err == "oasis: stopped, nothing written.\n"
+
+
+def test_an_interrupt_keeps_the_photos_that_are_done(pipeline, photo_file, tmp_path, capsys):
+    photos = [photo_file("a.png"), photo_file("stop.png"), photo_file("b.png")]
+    assert main(["reconstruct", *photos, "-o", str(tmp_path / "out")]) == 130
+    assert names(tmp_path / "out") == {"a"}
+    assert capsys.readouterr().err.endswith("oasis: stopped; 1 of 3 photos are done.\n")
+
+
+def test_a_second_run_replaces_its_files_and_keeps_the_others(pipeline, photo_file, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    (out / "report.json").write_text("old")
+    assert main(["reconstruct", photo_file(), "-o", str(out)]) == 0
+    assert names(out) == {*FILES, "notes.txt"}
+    assert (out / "notes.txt").read_text() == "mine"
+    assert json.loads((out / "report.json").read_text())
+
+
+def test_the_output_is_checked_before_the_work_begins(pipeline, photo_file, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "none" / "out", tmp_path / "file", tmp_path / "file" / "out"):
+        assert main(["reconstruct", photo_file(), "-o", str(out)]) == 2
+        assert main(["reconstruct", photo_file("a.png"), photo_file("b.png"), "-o", str(out)]) == 2
+    assert not pipeline
+    assert "Traceback" not in capsys.readouterr().err
+    assert names(tmp_path) == {"file", "hand.png", "a.png", "b.png"}
+
+
+@pytest.mark.parametrize("room", [2_000, 50_000, 150_000])
+def test_a_full_disk_is_told_and_leaves_nothing(pipeline, photo_file, tmp_path, capsys, room):
+    photo = photo_file()
+    with full_disk(room):
+        assert main(["reconstruct", photo, "-o", str(tmp_path / "out")]) == 2
+    assert "free some" in capsys.readouterr().err
+    assert names(tmp_path) == {"hand.png"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "photos: expected at least one"),
+        (["a/x.png", "b/x.jpg"], "would share one output folder"),
+        (["a.png", "b.png", "--keypoints", "k.json"], "--keypoints: belongs to one photo"),
+        (["a.png", "--size", "8"], "--size 8: expected 64 to 1024"),
+        (["a.png", "--steps", "-1"], "--steps -1: expected 0 or more"),
+        (["a.png", "--hand", "-1"], "--hand -1: expected 0 or more"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(pipeline, tmp_path, capsys, arguments, expected):
+    assert main(["reconstruct", *arguments, "-o", str(tmp_path / "out")]) == 2
+    assert expected in capsys.readouterr().err
+    assert names(tmp_path) == set()

@@ -1,0 +1,114 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from oasis_warp.cli import main
+from oasis_warp.commands.film import pose_film, turntable
+from oasis_warp.core.logging import silent
+from oasis_warp.data.pictures import to_uint8
+from oasis_warp.render.cameras import orbit_camera
+
+LOOK = {"elevation": 0.0, "background": (1.0, 1.0, 1.0), "progress": silent}
+
+
+def draw(avatar_file, *arguments, name="x.png"):
+    out = avatar_file.with_name(name)
+    assert main(["render", str(avatar_file), "-o", str(out), "--size", "96", *arguments]) == 0
+    return np.asarray(cv2.imread(str(out), cv2.IMREAD_UNCHANGED), int)
+
+
+def test_a_picture_shows_the_photos_pose_from_where_it_was_taken(scene, avatar_file):
+    avatar = scene[2]
+    camera = orbit_camera(avatar.mesh(avatar.source_pose).vertices, 0.0, 0.0, 96)
+    expected = to_uint8(avatar.render(camera, avatar.source_pose).image).numpy()
+    assert np.array_equal(draw(avatar_file)[..., ::-1], expected)
+
+
+@pytest.mark.parametrize("arguments", [["--pose", "fist"], ["--azimuth", "90"], ["--elevation", "45"]])
+def test_pose_and_place_change_the_picture(avatar_file, arguments):
+    assert np.abs(draw(avatar_file, *arguments) - draw(avatar_file)).max() > 100
+
+
+def test_a_full_turn_is_none(avatar_file):
+    assert np.abs(draw(avatar_file, "--azimuth", "360") - draw(avatar_file)).max() <= 2
+
+
+def test_a_transparent_picture_laid_over_a_colour_is_the_picture_on_that_colour(avatar_file):
+    clear = draw(avatar_file, "--background", "transparent")
+    solid = draw(avatar_file, "--background", "#2060c0")
+    alpha = clear[..., 3:] / 255
+    laid = clear[..., :3] * alpha + np.array([0xC0, 0x60, 0x20]) * (1 - alpha)
+    assert clear[..., 3].min() == 0
+    assert np.abs(laid - solid).max() <= 2  # alpha and colour are rounded apart
+
+
+def test_a_picture_replaces_an_older_one(avatar_file):
+    first = draw(avatar_file)
+    assert not np.array_equal(draw(avatar_file, "--pose", "fist"), first)
+
+
+def test_a_turntable_turns_once_and_starts_at_the_photo(scene):
+    avatar = scene[2]
+    frames = list(turntable(avatar, avatar.source_pose, 4, 64, **LOOK))
+    camera = orbit_camera(avatar.mesh(avatar.source_pose).vertices, 0.0, 0.0, 64)
+    assert torch.equal(frames[0], to_uint8(avatar.render(camera, avatar.source_pose).image))
+    # From behind, a hand's outline is the mirror image, but for perspective.
+    front, back = ((frame < 250).any(-1) for frame in (frames[0], frames[2].flip(1)))
+    assert (front & back).sum() / (front | back).sum() > 0.8
+    assert len({frame.numpy().tobytes() for frame in frames}) == 4
+
+
+def test_a_pose_film_keeps_every_pose_in_the_picture(scene):
+    frames = list(pose_film(scene[2], ["open", "fist"], 8, 64, **LOOK))
+    assert len(frames) == 8
+    for frame in frames:
+        border = torch.cat([frame[0], frame[-1], frame[:, 0], frame[:, -1]])
+        assert (border == 255).all()
+        assert (frame < 250).any()
+
+
+@pytest.mark.parametrize("motion", ["turntable", "poses"])
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_film_has_the_length_that_was_asked_for(avatar_file, motion, suffix, capsys):
+    out = avatar_file.with_name(f"film{suffix}")
+    arguments = ["--motion", motion, "--poses", "open, fist", "--seconds", "0.5", "--fps", "12", "--size", "64"]
+    assert main(["animate", str(avatar_file), "-o", str(out), *arguments]) == 0
+    capture, count = cv2.VideoCapture(str(out), cv2.CAP_FFMPEG), 0
+    while capture.grab():
+        count += 1
+    assert count == 6
+    assert f"{motion}: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["render", "-o", "x.bmp"], "ends in .png or .webp"),
+        (["render", "-o", "x.jpg", "--background", "transparent"], "JPEG has no transparency"),
+        (["render", "-o", "x.png", "--background", "mauve"], "--background mauve: expected white, black or six hex"),
+        (["render", "-o", "x.png", "--size", "0"], "--size 0: expected 16 to"),
+        (["render", "-o", "x.png", "--size", "100000"], "--size 100000: expected 16 to"),
+        (["render", "-o", "none/x.png"], "found no such folder"),
+        (["animate", "-o", "x.avi"], "ends in .mp4 or .gif"),
+        (["animate", "-o", "x.mp4", "--fps", "0"], "--fps 0: expected 1 to 120"),
+        (["animate", "-o", "x.mp4", "--seconds", "0"], "--seconds 0: expected 1 to"),
+        (["animate", "-o", "x.mp4", "--seconds", "nan"], "--seconds nan: expected 1 to"),
+        (["animate", "-o", "x.mp4", "--motion", "poses", "--poses", "fist,frog"], "got frog"),
+        (["animate", "-o", "x.mp4", "--motion", "poses", "--poses", ","], "got none"),
+        (["animate", "-o", "x.mp4", "--background", "transparent"], "--background transparent: expected white"),
+    ],
+)
+def test_a_wrong_option_is_refused_in_one_sentence(avatar_file, arguments, expected, capsys, monkeypatch):
+    monkeypatch.chdir(avatar_file.parent)
+    assert main([arguments[0], "avatar.safetensors", *arguments[1:]]) == 2
+    error = capsys.readouterr().err
+    assert expected in error
+    assert error.count("\n") == 1
+    assert [path.name for path in avatar_file.parent.iterdir()] == ["avatar.safetensors"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_a_device_that_is_not_there_is_refused(avatar_file, capsys):
+    assert main(["render", str(avatar_file), "-o", "x.png", "--device", "cuda"]) == 2
+    assert "torch finds no CUDA device" in capsys.readouterr().err

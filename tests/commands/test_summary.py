@@ -1,0 +1,66 @@
+import numpy as np
+import torch
+
+from oasis_warp.commands.drawing import FINGER_COLORS, PAPER, Panel, draw_landmarks, draw_mesh, make_sheet, panel_side
+from oasis_warp.commands.summary import POSES, VIEWS, WIDTH, draw_summary, shade_mesh
+
+
+def test_the_summary_has_three_rows_of_panels_that_all_show_something(scene, made):
+    reports = []
+    sheet = draw_summary(scene[0], made, progress=lambda *report: reports.append(report)).numpy()
+    assert sheet.shape[1] == WIDTH
+    total = 1 + VIEWS + len(POSES)
+    assert reports == [("summary", n, total) for n in range(1, total + 1)]
+    painted = (sheet != PAPER).any(-1)[:, 60].astype(int)  # a column through the first panel of each row
+    rows = np.diff(np.flatnonzero(np.diff(painted)))
+    for n_panels in (4, VIEWS, len(POSES)):
+        assert panel_side(n_panels, WIDTH) in rows
+
+
+def test_the_avatars_panel_matches_the_photos(scene, made):
+    sheet = draw_summary(scene[0], made).numpy().astype(int)
+    side, top = panel_side(4, WIDTH), 24 + 44
+    photo, _, mask, avatar = (sheet[top : top + side, 24 + k * (side + 12) :][:, :side] for k in range(4))
+    hand = mask[..., 0] > 250
+    assert np.abs(photo[hand] - (200, 150, 120)).max() <= 5  # the edge blends in
+    assert np.abs(avatar[hand].mean(0) - (200, 150, 120)).max() < 15
+    assert (avatar[mask[..., 0] < 5].mean(0) > 220).all()
+
+
+def test_doubts_are_mentioned(scene, made):
+    sure, doubtful = (draw_summary(scene[0], made._replace(warnings=w)) for w in ((), ("a finger is hidden",)))
+    assert (sure[:68] != doubtful[:68]).any()
+    assert torch.equal(sure[68:], doubtful[68:])
+
+
+def test_a_surface_is_brightest_where_it_faces_the_camera(scene, hand):
+    _, fit, avatar = scene
+    shade, inside = shade_mesh(avatar.mesh(fit.pose), hand.faces, fit.camera)
+    assert torch.equal(inside, fit.mask)
+    assert (shade[inside == 0] == 0).all()
+    assert 0.34 < shade[inside == 1].min() < 0.7
+    assert 0.95 < shade.max() <= 1.0001
+
+
+def test_landmarks_are_drawn_where_they_are():
+    points = np.stack([np.linspace(10, 90, 21), np.tile([20.0, 50.0, 80.0], 7)], 1)
+    drawn = draw_landmarks(np.zeros((100, 100, 3), np.uint8), points)
+    for finger, color in enumerate(FINGER_COLORS):
+        x, y = points[4 * finger + 4]
+        assert tuple(drawn[int(y), int(x)]) == color
+
+
+def test_a_mesh_leaves_the_picture_around_it_alone():
+    picture = np.full((60, 60, 3), 77, np.uint8)
+    inside = np.zeros((60, 60))
+    inside[20:40, 20:40] = 1
+    drawn = draw_mesh(picture, inside, inside)
+    assert (drawn[:18] == 77).all()
+    assert (drawn[25:35, 25:35] != 77).all()
+
+
+def test_panels_stand_beside_each_other_untouched():
+    panels = [Panel(np.full((panel_side(2, 200),) * 2 + (3,), value, np.uint8), "x") for value in (10, 90)]
+    sheet = make_sheet("title", "more", [panels], 200)
+    assert (sheet == 10).all(-1).sum() >= panel_side(2, 200) ** 2
+    assert (sheet == 90).all(-1).sum() >= panel_side(2, 200) ** 2

@@ -1,0 +1,100 @@
+"""Pose correctives do nothing at rest, and bend fingers without losing volume or crossing themselves."""
+
+import dataclasses
+
+import pytest
+import torch
+from hand_build.quality import closed, self_crossings, signed_volume
+
+from oasis_warp.core.types import HandPose
+from oasis_warp.hand.correctives import corrected_rest, corrective_coefficients
+from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand.skinning import rest_hand, skin
+
+HINGES = [2, 3, 5, 6, 8, 9, 11, 12, 14, 15]
+
+
+@pytest.fixture(scope="module")
+def plain(hand):
+    return dataclasses.replace(hand, corrective_basis=hand.corrective_basis[..., :0])
+
+
+def bent(hand, joint, share):
+    angles = torch.zeros(15, 3)
+    angles[joint - 1, 0] = share * hand.pose_limits[joint, 0, 1]
+    return angles
+
+
+def surface(hand, angles):
+    pose = HandPose(angles, torch.eye(3), torch.zeros(3))
+    return skin(hand, rest_hand(hand, torch.zeros(40)), pose).vertices.double().numpy()
+
+
+def volume(hand, angles):
+    return signed_volume(*closed(surface(hand, angles), hand.faces.numpy(), hand.rim.numpy()))
+
+
+def test_at_rest_strengths_and_their_slopes_are_zero(hand):
+    angles = torch.zeros(15, 3, requires_grad=True)
+    strengths = corrective_coefficients(hand, angles)
+    assert strengths.eq(0).all()
+    (slope,) = torch.autograd.grad(strengths.sum(), angles)
+    assert slope.eq(0).all()
+
+
+def test_strengths_have_gradients_that_match_finite_differences(hand):
+    exact = hand.to(dtype=torch.float64)
+    angles = torch.rand(15, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda a: corrective_coefficients(exact, a), angles)
+
+
+def test_strengths_are_those_that_the_shapes_were_fitted_to(hand):
+    from hand_build.correctives import strengths
+
+    angles = torch.rand(15, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    got = corrective_coefficients(hand.to(dtype=torch.float64), angles)
+    torch.testing.assert_close(got, torch.from_numpy(strengths(angles[:, 0].numpy()).ravel()), rtol=0, atol=1e-15)
+
+
+def test_a_hand_without_correctives_keeps_its_rest_surface(plain):
+    angles = torch.full((15, 3), 0.3)
+    assert corrective_coefficients(plain, angles).shape == (0,)
+    assert corrected_rest(plain, plain.template, angles) is plain.template
+
+
+def test_a_hand_with_other_correctives_is_refused(hand):
+    odd = dataclasses.replace(hand, corrective_basis=hand.corrective_basis[..., :7])
+    with pytest.raises(ValueError, match="hand: expected 0 or 30 pose correctives, got 7"):
+        corrective_coefficients(odd, torch.zeros(15, 3))
+
+
+def test_each_joint_corrects_its_own_neighbourhood(hand):
+    reach = hand.corrective_basis.unflatten(-1, (15, 2)).abs().amax((1, 3)) > 1e-4
+    for joint in range(1, 16):
+        touched = hand.template[reach[:, joint - 1]]
+        limit = 0.045 if joint in HINGES else 0.085  # palm, webs and thumb base are one piece of flesh
+        assert len(touched) > 50
+        assert (touched - hand.joints[joint]).norm(dim=-1).max() < limit
+
+
+@pytest.mark.parametrize("joint", HINGES)
+def test_a_finger_joint_folds_without_crossing_itself(hand, joint):
+    assert self_crossings(surface(hand, bent(hand, joint, 0.75)), hand.faces.numpy()) == 0
+
+
+def test_blend_skinning_alone_would_cross_itself(hand, plain):
+    angles = bent(hand, hand.joint_names.index("index2"), 0.75)
+    assert self_crossings(surface(plain, angles), hand.faces.numpy()) > 20
+
+
+@pytest.mark.parametrize(("name", "regained"), [("fist", 0.35), ("thumbs_up", 0.4), ("pinch", 0.35), ("ok", 0.4)])
+def test_a_pose_keeps_more_of_the_hands_volume(hand, plain, name, regained):
+    rest = volume(hand, torch.zeros(15, 3))
+    angles = named_pose(hand, name)
+    lost_before, lost = rest - volume(plain, angles), rest - volume(hand, angles)
+    assert 0 < lost < (1 - regained) * lost_before
+
+
+def test_nails_keep_their_shape(hand):
+    moved = hand.corrective_basis[hand.nail > 0.5].norm(dim=1).amax()
+    assert moved < 1e-3  # at strength 1, a bend by 90 degrees

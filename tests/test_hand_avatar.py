@@ -1,0 +1,129 @@
+import pytest
+import torch
+from synthetic import PALM_TO_CAMERA, evidence_of
+
+from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.pose import mirror_gaussians
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import CanonicalGaussians, HandPose
+from oasis_warp.data.avatar_file import save_avatar
+from oasis_warp.evaluation import coverage
+from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand.skinning import mirror_pose
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.render.cameras import mirrored_camera
+
+
+@pytest.fixture(scope="module")
+def right(hand):
+    evidence, truth, pose = evidence_of(hand, region_colors(label_regions(hand), 0.03), size=64)
+    return Avatar(
+        side="right",
+        shape=torch.zeros(len(hand.shape_names)),
+        surface_offsets=torch.zeros_like(hand.template),
+        gaussians=truth,
+        source_pose=pose,
+        source_camera=evidence.camera,
+    )
+
+
+@pytest.fixture(scope="module")
+def left(right):
+    return Avatar(
+        side="left",
+        shape=right.shape,
+        surface_offsets=right.surface_offsets,
+        gaussians=right.gaussians,
+        source_pose=mirror_pose(right.source_pose),
+        source_camera=mirrored_camera(right.source_camera),
+    )
+
+
+def test_a_left_hand_is_the_mirror_image_of_a_right_hand(left, right):
+    mirrored = mirror_gaussians(right.pose(right.source_pose))
+    for ours, theirs in zip(left.pose(left.source_pose), mirrored, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=0)
+    pictures = [a.render(a.source_camera, a.source_pose).image for a in (left, right)]
+    torch.testing.assert_close(pictures[0].flip(1), pictures[1], atol=2e-4, rtol=0)
+
+
+def test_the_mesh_carries_the_gaussians(left):
+    pose = left.source_pose._replace(angles=named_pose(left.hand, "fist"))
+    vertices, means = left.mesh(pose).vertices, left.pose(pose).means
+    torch.testing.assert_close(means[:100], vertices[left.gaussians.vertex_index[:100]])
+
+
+def test_an_avatar_survives_its_file_bit_for_bit(left, tmp_path):
+    left.save(tmp_path / "a.safetensors")
+    loaded = Avatar.load(tmp_path / "a.safetensors")
+    assert loaded.side == "left"
+    pose = HandPose(named_pose(left.hand, "pinch"), PALM_TO_CAMERA, torch.tensor([0.0, 0.1, 0.5]))
+    for ours, theirs in zip(loaded.pose(pose), left.pose(pose), strict=True):
+        assert torch.equal(ours, theirs)
+    assert (loaded.source_camera.width, loaded.source_camera.height) == (64, 64)
+
+
+def test_an_avatar_of_another_hand_model_is_refused(right, tmp_path, monkeypatch):
+    path = tmp_path / "a.safetensors"
+    written = {}
+
+    def keep(_, tensors, header):
+        written.update(t=tensors, h=header)
+
+    monkeypatch.setattr("oasis_warp.hand_avatar.save_avatar", keep)
+    right.save(path)
+    save_avatar(path, written["t"], {**written["h"], "hand_model": "mano"})
+    with pytest.raises(InputError, match="mano"):
+        Avatar.load(path)
+
+
+@pytest.mark.usefixtures("as_shipped")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"angles": torch.zeros(14, 3)}, r"pose\.angles: expected shape \[15, 3\], got \[14, 3\]"),
+        ({"orientation": torch.eye(4)}, r"pose\.orientation: expected shape \[3, 3\]"),
+        ({"translation": torch.tensor([0.0, float("nan"), 0])}, "translation: expected finite"),
+    ],
+)
+def test_a_pose_that_is_none_is_refused(right, change, message):
+    with pytest.raises(ValueError, match=message):
+        right.pose(right.source_pose._replace(**change))
+
+
+def test_no_side_of_any_pose_has_holes(right):
+    assert float(coverage(right, size=96).min()) >= 0.99
+
+
+def test_pictures_are_differentiable_in_the_pose(right):
+    angles = named_pose(right.hand, "relaxed").clone().requires_grad_(True)
+    picture = right.render(right.source_camera, right.source_pose._replace(angles=angles))
+    picture.image.square().mean().backward()
+    assert angles.grad is not None
+    assert bool(torch.isfinite(angles.grad).all())
+    assert float(angles.grad.abs().max()) > 0
+
+
+@pytest.mark.gpu
+def test_a_gpu_draws_what_the_cpu_draws(right, tmp_path):
+    right.save(tmp_path / "a.safetensors")
+    there = Avatar.load(tmp_path / "a.safetensors", device="cuda")
+    picture = there.render(there.source_camera, there.source_pose).image
+    assert picture.is_cuda
+    torch.testing.assert_close(
+        picture.cpu(), right.render(right.source_camera, right.source_pose).image, atol=2e-3, rtol=0
+    )
+
+
+def test_fewer_gaussians_make_a_smaller_file_and_still_an_avatar(right):
+    n = len(right.gaussians.vertex_index)
+    empty = torch.zeros(0, dtype=torch.int64)
+    few = CanonicalGaussians(
+        right.gaussians.vertex_index, right.gaussians.offsets, empty, torch.zeros(0, 3),
+        *(part[:n] for part in right.gaussians[4:]),
+    )  # fmt: skip
+    avatar = Avatar(
+        side="right", shape=right.shape, surface_offsets=right.surface_offsets, gaussians=few,
+        source_pose=right.source_pose, source_camera=right.source_camera,
+    )  # fmt: skip
+    assert len(avatar.pose(avatar.source_pose).means) == n
