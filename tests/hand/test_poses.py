@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from hand_build.quality import self_crossings
 
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import POSE_NAMES, named_pose, pose_sequence
@@ -44,6 +45,11 @@ def test_thumb_and_index_meet(hand, name):
     assert gap < 0.003
     tips = hand21(surface, hand)[[4, 8]]
     assert (tips[0] - tips[1]).norm() < 0.025  # two half finger thicknesses
+
+
+@pytest.mark.parametrize("name", ["rest", "open", "relaxed", "pinch", "ok"])
+def test_poses_without_a_fist_do_not_cross_themselves(hand, name):
+    assert self_crossings(posed(hand, name).vertices.double().numpy(), hand.faces.numpy()) == 0
 
 
 def test_a_fist_hides_the_finger_tips_in_the_palm_under_the_thumb(hand):

@@ -24,7 +24,7 @@ _FIST: dict[str, Finger] = {
 }
 
 # Flexion counts from a straight finger; abduction, and all of the thumb's base, from rest and towards the thumb.
-# Where fingers touch, the numbers were searched for a gap below 1 mm without the surfaces crossing.
+# Where the thumb touches a finger, the numbers were searched for the smallest gap at which the two do not cross.
 _THUMBS: dict[str, Thumb] = {
     "open": (-10, 14, 0, 0, 0),
     "relaxed": (8, -4, 0, 14, 16),

@@ -12,7 +12,7 @@ from oasis_warp.core.hand_model import HandModel
 
 @functools.cache
 def bundled_hand() -> HandModel:
-    """The permissive hand that ships with the package: 12,337 vertices, 24,608 faces, 40 shape coefficients.
+    """The permissive hand that ships with the package: 12,337 vertices, 24,608 faces, 40 shapes, 30 pose correctives.
 
     Made by `tools/build_hand.py` from CC0 data. Float tensors are float32 on the CPU.
     """
