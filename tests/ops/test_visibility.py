@@ -187,6 +187,16 @@ def test_of_two_equal_faces_the_first_is_kept(way):
     assert torch.equal(once.face_ids, twice.face_ids) and torch.equal(once.depth, twice.depth)
 
 
+def test_a_face_through_the_near_plane_is_seen_beyond_it_only(way):
+    # The floor y = 0.5 has depth 20 / (row below the horizon): with the near plane at 2 m, its last rows are too near.
+    floor = torch.tensor([[-300.0, 0.5, -300], [300, 0.5, -300], [0, 0.5, 900]], dtype=torch.float64)
+    K = torch.tensor([[40.0, 0, 8], [0, 40, 0], [0, 0, 1]], dtype=torch.float64)
+    eye = torch.eye(4, dtype=torch.float64)
+    got = depth_map(floor, torch.tensor([[0, 1, 2]]), eye, K, 16, 16, near_plane=2.0)
+    below = torch.arange(16) + 0.5
+    assert torch.equal(got.face_ids >= 0, (20 / below > 2)[:, None].expand(16, 16))
+
+
 def test_a_wall_behind_everything_changes_no_covered_pixel_and_one_in_front_hides_every_point():
     vertices, faces, viewmat, K = soup(8)
     points = some_points(vertices, faces, 8)
