@@ -29,6 +29,7 @@ from oasis_warp.data.photo import read_photo
 from oasis_warp.evaluation import compare_with_photo, coverage
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.pipeline import make_evidence, reconstruct
 from oasis_warp.render.cameras import orbit_camera
@@ -38,9 +39,9 @@ TILE = 192
 
 
 def photos_below(folder: Path) -> list[Path]:
-    """Every photo in `folder` and its subfolders, contact sheets left out."""
-    found = (p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and "contact_sheet" not in p.name)
-    return sorted(found)
+    """The photos in `folder`, or, when it has none itself, in its subfolders."""
+    direct = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    return direct or sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES)
 
 
 def tiles(avatar: Avatar, photo_crop: torch.Tensor) -> np.ndarray:
@@ -92,17 +93,16 @@ def measure(path: Path, root: Path, out: Path, seed: int) -> dict[str, object]:
 
 def measure_pairs(folder: Path, out: Path) -> list[dict[str, object]]:
     """Rows of every ordered pair of photos in `folder`; avatars must lie in `out` already."""
-    estimator, config, rows = None, ReconstructConfig(force=True), []
+    estimator, config, rows = HandEstimator(bundled_hand()), ReconstructConfig(force=True), []
     paths = photos_below(folder)
     for target in paths:
         photo = read_photo(target)
+        landmarks = choose_hand(estimator.find(photo), "largest", photo.name)
         for source in paths:
             file = (out / folder.name / source.stem).with_suffix(".safetensors")
             if source == target or not file.exists():
                 continue
             avatar = Avatar.load(file)
-            estimator = estimator or HandEstimator(avatar.hand)
-            landmarks = choose_hand(estimator.find(photo), "largest", photo.name)
             fit = estimator.fit(photo, landmarks, shape=avatar.shape, force=True)
             if fit.side != avatar.side:
                 continue
