@@ -108,7 +108,7 @@ def test_crossings_are_counted_where_two_sheets_cross():
     blade = np.array([[0.2, 0.2, -1], [0.2, 0.2, 1], [0.3, 0.1, 1.0]])
     faces = np.array([[0, 1, 2], [3, 4, 5]])
     assert self_crossings(np.vstack([sheet, blade]), faces) == 2  # two edges of the blade pass through the sheet
-    assert self_crossings(np.vstack([sheet, blade + [2, 0, 0]]), faces) == 0
+    assert self_crossings(np.vstack([sheet, blade + np.array([2.0, 0, 0])]), faces) == 0
 
 
 def test_triangles_are_neither_slivers_nor_coincident(hand):
