@@ -36,6 +36,10 @@ from oasis_warp.render.cameras import orbit_camera
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".webp"}
 TILE = 192
+LEFT_OUT = (
+    "result", "worst_point_percent", "coverage_mean", "warnings", "n_gaussians", "kernels_s", "crop_s", "prior_s"
+)  # fmt: skip
+"""Columns of the CSV that the short table does not show."""
 
 
 def photos_below(folder: Path) -> list[Path]:
@@ -81,10 +85,10 @@ def measure(path: Path, root: Path, out: Path, seed: int) -> dict[str, object]:
         "photo": name,
         "result": "ok",
         "side": made.fit.side,
-        **{key: round(value, 4) for key, value in made.errors.items()},
+        **{key: round(value, 3) for key, value in made.errors.items()},
         "coverage_worst": round(float(shares.min()), 4),
         "coverage_mean": round(float(shares.mean()), 4),
-        **{f"{stage}_s": round(value, 3) for stage, value in made.stages.items()},
+        **{f"{stage}_s": round(value, 2) for stage, value in made.stages.items()},
         "total_s": round(seconds, 2),
         "peak_gib": round(peak, 2),
         "warnings": "; ".join(made.warnings),
@@ -158,7 +162,7 @@ def main() -> None:
         paths = photos_below(options.folder)
         row_of = functools.partial(measure, root=options.folder, out=options.out, seed=options.seed)
         rows = list(pool.map(row_of, paths))
-        write_table(rows, options.out / "photos", leave_out=("worst_point_percent", "coverage_mean", "warnings"))
+        write_table(rows, options.out / "photos", leave_out=LEFT_OUT)
         strips = [cv2.imread(str((options.out / str(row["photo"])).with_suffix(".png"))) for row in rows
                   if row["result"] == "ok"]  # fmt: skip
         if strips:
