@@ -16,11 +16,11 @@ from oasis_warp.core.types import CanonicalGaussians, Evidence
 TONES = 25
 """Skin tones tried, evenly spaced in the logarithm of melanin."""
 LIGHTEST, DARKEST = 0.006, 0.35
-SIGMA_COLOR = 0.05
+SIGMA_COLOR = 0.035
 """Expected difference of a lit hand from its region colours [sRGB]."""
-SIGMA_EXPOSURE = 0.25
+SIGMA_EXPOSURE = 0.18
 """Expected logarithm of the photo's brightness over that of an evenly lit hand."""
-SIGMA_CAST = 0.22
+SIGMA_CAST = 0.155
 """Expected logarithms of red over green and blue over green: the photo's colour cast."""
 
 
