@@ -12,6 +12,10 @@ def test_every_public_name_has_a_home_and_a_docstring(name):
     assert name in dir(oasis_warp)
 
 
+def test_the_list_of_names_is_the_table_of_homes():
+    assert sorted(oasis_warp.__all__) == sorted(oasis_warp._HOMES)
+
+
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'no_such_name'"):
         _ = oasis_warp.no_such_name

@@ -36,7 +36,10 @@ _HOMES = {
     "read_photo": "data.photo",
     "reconstruct": "pipeline",
 }
-__all__ = sorted(_HOMES)
+__all__ = [
+    "Avatar", "Camera", "Gaussians", "HandPose", "InputError", "ReconstructConfig", "depth_map", "depth_visibility",
+    "face_rotations", "pose_on_mesh", "rasterization", "read_photo", "reconstruct",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -29,7 +29,7 @@ def complete_field(
     points = vertices.detach().cpu().numpy().astype(np.float64)
     triangles = faces.detach().cpu().numpy().astype(np.int64)
     laplacian = -igl.cotmatrix(points, triangles)
-    mass = np.asarray(igl.massmatrix(points, triangles, igl.MASSMATRIX_TYPE_BARYCENTRIC).diagonal())
+    mass = igl.massmatrix(points, triangles, igl.MASSMATRIX_TYPE_BARYCENTRIC).diagonal().astype(np.float64)
     data = mass * confidence.detach().cpu().numpy().astype(np.float64) / DETAIL_LENGTH**2
     system = laplacian + sparse.diags(data + mass / FADE_LENGTH**2)
     right = data[:, None] * observed.detach().cpu().numpy().astype(np.float64)
