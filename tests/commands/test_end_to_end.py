@@ -104,9 +104,12 @@ def test_a_huge_photo_is_scaled_down_first(tmp_path):
 
 @pytest.mark.parametrize(("stage", "stop"), [("landmarks", signal.SIGINT), ("calibration", signal.SIGTERM)])
 def test_a_stop_midway_leaves_nothing(tmp_path, stage, stop):
+    def heed_interrupts():  # a shell's background jobs, such as a CI's, inherit an ignored Ctrl-C
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
     with subprocess.Popen(
         [*OASIS, "reconstruct", str(PHOTOS / "palm_open_left_02.png"), "-o", str(tmp_path / "out")],
-        stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, preexec_fn=heed_interrupts,
     ) as process:  # fmt: skip
         assert process.stderr is not None
         for line in process.stderr:
