@@ -74,8 +74,6 @@ def reconstruct(
         stages[name] = time.perf_counter() - start
         progress(name, 1, 1)
 
-    with stage("kernels"):
-        warm_up(config.device)
     hand = bundled_hand()
     estimator = HandEstimator(hand)
     with stage("landmarks"):
@@ -86,6 +84,8 @@ def reconstruct(
         fit = estimator.fit(photo, given, force=config.force) if isinstance(given, Landmarks) else given
     with stage("outline"):
         offsets = outline_offsets(hand, fit)
+    with stage("kernels"):  # compiled only once there is a hand to draw
+        warm_up(config.device)
     with stage("crop"):
         evidence = make_evidence(photo, fit, offsets, config)
     with stage("prior"):
