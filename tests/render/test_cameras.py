@@ -5,7 +5,7 @@ import torch
 
 from oasis_warp.core.camera import project
 from oasis_warp.core.types import Camera
-from oasis_warp.render.cameras import crop_camera, mirrored_camera, orbit_camera, resized_camera
+from oasis_warp.render.cameras import crop_camera, mirrored_camera, orbit_camera
 
 
 @pytest.fixture
@@ -48,12 +48,6 @@ def test_a_crop_shows_the_same_points_moved_and_scaled(points, camera):
     uv, _ = project(camera, points)
     cropped, _ = project(crop_camera(camera, 30.5, 40.0, 200.0, 100), points)
     torch.testing.assert_close(cropped, (uv - torch.tensor([30.5, 40.0])) * 0.5, atol=1e-3, rtol=0)
-
-
-def test_resizing_scales_coordinates(points, camera):
-    uv, _ = project(camera, points)
-    small, _ = project(resized_camera(camera, 160, 120), points)
-    torch.testing.assert_close(small, uv * torch.tensor([0.5, 0.25]), atol=1e-3, rtol=0)
 
 
 def test_the_mirrored_camera_sees_the_mirrored_world_mirrored(points, camera):

@@ -23,14 +23,6 @@ def crop_camera(camera: Camera, left: float, top: float, side: float, size: int)
     return Camera(camera.viewmat, K, size, size)
 
 
-def resized_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The same view at another resolution."""
-    K = camera.K.clone()
-    K[0] *= width / camera.width
-    K[1] *= height / camera.height
-    return Camera(camera.viewmat, K, width, height)
-
-
 def mirrored_camera(camera: Camera) -> Camera:
     """The camera that sees the mirrored world (x -> -x) as the mirror image of what `camera` sees."""
     K = camera.K.clone()
