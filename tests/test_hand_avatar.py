@@ -91,6 +91,15 @@ def test_a_pose_that_is_none_is_refused(right, change, message):
         right.pose(right.source_pose._replace(**change))
 
 
+@pytest.mark.usefixtures("as_shipped")
+def test_a_camera_that_is_none_is_refused(right):
+    camera = right.source_camera
+    with pytest.raises(ValueError, match="K: expected finite"):
+        right.render(camera._replace(K=camera.K * float("nan")), right.source_pose)
+    with pytest.raises(ValueError, match=r"camera\.viewmat: expected shape \[4, 4\], got \[3, 4\]"):
+        right.render(camera._replace(viewmat=camera.viewmat[:3]), right.source_pose)
+
+
 def test_no_side_of_any_pose_has_holes(right):
     assert float(coverage(right, size=96).min()) >= 0.99
 

@@ -83,7 +83,14 @@ class Avatar:
         return mirror_gaussians(gaussians) if self.side == "left" else gaussians
 
     def render(self, camera: Camera, pose: HandPose, background: Color = WHITE) -> Render:
-        """A picture of the hand in `pose` over a plain `background`; differentiable in the pose and the camera."""
+        """A picture of the hand in `pose` over a plain `background`; differentiable in the pose and the camera.
+
+        Raises:
+            ValueError: a part of the pose or the camera has another shape or is not finite.
+        """
+        check_shape("camera.viewmat", camera.viewmat, 4, 4)
+        check_shape("camera.K", camera.K, 3, 3)
+        check_finite(viewmat=camera.viewmat, K=camera.K)
         return render(self.pose(pose), camera, background=background)
 
     def save(self, path: Path | str) -> None:

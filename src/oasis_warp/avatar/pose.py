@@ -18,9 +18,10 @@ def pose_gaussians(
     """Gaussians that follow the surface from `rest_vertices` to `posed_vertices` (the paper's appendix B.1).
 
     Face Gaussians keep their barycentrics, turn by the blended rotation of the face's corners and grow with the root
-    of the face's area; vertex Gaussians turn with their vertex and grow with the mean of the faces around it.
+    of the face's area; vertex Gaussians turn with their vertex and grow with the mean of the faces around it. Values
+    are not checked here: who poses has checked the pose.
     """
-    turned = face_rotations(rest_vertices, posed_vertices, faces)
+    turned = face_rotations(rest_vertices, posed_vertices, faces, validate=False)
     on_faces = slice(len(canonical.vertex_index), None)
     face_means, face_quats, face_scales = pose_on_mesh(
         posed_vertices,
@@ -31,6 +32,7 @@ def pose_gaussians(
         turned.area_ratio,
         canonical.quats[on_faces],
         canonical.scales[on_faces],
+        validate=False,
     )
     index = canonical.vertex_index
     vertex_turn = turned.vertex_quats[index]

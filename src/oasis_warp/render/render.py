@@ -8,7 +8,10 @@ from oasis_warp.ops import rasterization
 
 
 def render(gaussians: Gaussians, camera: Camera, *, background: Color = BLACK) -> Render:
-    """Draw `gaussians` as `camera` sees them over a plain `background`; differentiable in both."""
+    """Draw `gaussians` as `camera` sees them over a plain `background`; differentiable in both.
+
+    Values are not checked here, shapes are.
+    """
     like = gaussians.means
     images, alphas, _ = rasterization(
         gaussians.means,
@@ -21,5 +24,6 @@ def render(gaussians: Gaussians, camera: Camera, *, background: Color = BLACK) -
         camera.width,
         camera.height,
         backgrounds=torch.as_tensor(background, dtype=like.dtype, device=like.device)[None],
+        validate=False,
     )
     return Render(images[0], alphas[0, ..., 0])
