@@ -18,12 +18,10 @@ from oasis_warp.data.pictures import to_uint8
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
-from oasis_warp.pipeline import Reconstruction
+from oasis_warp.pipeline import CROP_MARGIN, Reconstruction
 from oasis_warp.render.cameras import crop_camera, orbit_camera
 
 WIDTH = 1600
-CROP_MARGIN = 1.12
-"""Side of the square shown of the photo over the longer extent of the mask."""
 GROUND = (0.93, 0.93, 0.92)
 """Behind the avatar."""
 VIEWS = 6

@@ -5,16 +5,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def from_xyzw(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """The same quaternions, wxyz; for borders where xyzw comes in (Warp, glTF, SciPy)."""
-    return quats[..., [3, 0, 1, 2]]
-
-
-def to_xyzw(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """The same quaternions, xyzw."""
-    return quats[..., [1, 2, 3, 0]]
-
-
 def multiply(a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """Hamilton product: first rotates by `b`, then by `a`."""
     aw, ax, ay, az = a.unbind(-1)

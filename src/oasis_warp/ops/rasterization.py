@@ -1,6 +1,6 @@
 """3D Gaussians -> images: the public rasterizer, with gsplat's signature."""
 
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -12,7 +12,6 @@ from oasis_warp.ops._tiles import Tiles, bin_to_tiles
 from oasis_warp.ops.blending import blend
 from oasis_warp.ops.projection import Projection, project
 
-RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 MAX_CHANNELS = 32
 MAX_PIXELS = 2**31 - 1
 
