@@ -4,6 +4,8 @@ Rasterization follows gsplat 1.5.3; the thresholds are float32 constants in both
 build takes the same decisions as the float32 one.
 """
 
+from dataclasses import dataclass
+
 ALPHA_MAX = 0.9990000128746033
 """Largest opacity of a single layer (0.999f). 0.99 in the original 3DGS, where two capped layers land on the stop."""
 ALPHA_MIN = 0.003921568859368563
@@ -22,3 +24,14 @@ CUT_SLACK = 1e-3
 """Added to the exponent beyond which a layer must be fainter than ALPHA_MIN; the exact test follows."""
 CHANNELS = (1, 3, 4, 8, 16, 32)
 """Channel counts that blending kernels are built for; others are padded with zeros up to the next."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What a kernel of the rasterizer is built to draw by; the defaults are the rules of gsplat 1.5.3."""
+
+    alpha_min: float = ALPHA_MIN
+    transmittance_stop: float = TRANSMITTANCE_STOP
+    extent_sigmas: float = EXTENT_SIGMAS
+    exp_degree: int = 5
+    """Degree of the polynomial of 2^f in the float32 CPU kernels: 3, 4 or 5."""

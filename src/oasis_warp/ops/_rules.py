@@ -1,0 +1,24 @@
+"""The rasterizer's thresholds, replaceable for measuring what each of them costs and buys."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+from oasis_kernels.constants import Rules
+
+_rules: ContextVar[Rules] = ContextVar("rules", default=Rules())
+
+
+def current_rules() -> Rules:
+    """What the operators called from here draw by: gsplat's, unless inside `using`."""
+    return _rules.get()
+
+
+@contextmanager
+def using(rules: Rules) -> Iterator[None]:
+    """Draw by other `rules` inside the block; forward and backward of one picture belong in the same block."""
+    token = _rules.set(rules)
+    try:
+        yield
+    finally:
+        _rules.reset(token)
