@@ -54,7 +54,8 @@ ON_VERTICES = """
         const V4 place = rows([&](int lane) -> Q { return at3(vertices, v[lane]); });
         V4 q = rows([&](int lane) -> Q { return load_row(turns + 4ll * v[lane]); });
         const V length = root(dot4(q, q));
-        q = scaled4(1.f / length, q);
+        const V per_length = length > 0.f ? 1.f / length : zero;
+        q = scaled4(per_length, q);
         const V3 u = {q.x, q.y, q.z}, o = get3(offsets + 3ll * i, count), t = scaled((V)(2.f), cross(u, o));
         const V grown = growth(pick(ratios, v), half_powers);
 """
@@ -70,8 +71,7 @@ ON_VERTICES_FORWARD = """
 ON_VERTICES_BACKWARD = """
         const V3 g_mean = get3_or_zero(floats(9), i, count), g_scale = get3_or_zero(floats(11), i, count);
         const V4 g_quat = get4_or_zero(floats(10), i, count);
-        float *rows_out = floats(12), *weights = floats(13), *g_offsets = floats(14);
-        float *g_quats = floats(15), *g_scales = floats(16);
+        float *rows_out = floats(12), *g_offsets = floats(13), *g_quats = floats(14), *g_scales = floats(15);
         if (g_offsets) {
             const V3 back = scaled((V)(-2.f), cross(u, g_mean));
             put3(g_offsets + 3ll * i, count, plus(g_mean, plus(scaled(q.w, back), scaled((V)(-1.f), cross(u, back)))));
@@ -85,7 +85,7 @@ ON_VERTICES_BACKWARD = """
                                        scaled(4.f * dot3(g_mean, o), u)));
             V4 g = plus4(product(g_quat, conjugate(get4(quats + 4ll * i, count))),
                          {dot3(g_mean, t), by_u.x, by_u.y, by_u.z});
-            g = scaled4(1.f / length, plus4(g, scaled4(-dot4(g, q), q)));
+            g = scaled4(per_length, plus4(g, scaled4(-dot4(g, q), q)));
             const V by_ratio = growth_slope(pick(ratios, v), half_powers)
                              * dot3(g_scale, get3(scales + 3ll * i, count));
             put4(rows_out + 8ll * i, count, {g_mean.x, g_mean.y, g_mean.z, by_ratio}, 8);
