@@ -58,12 +58,10 @@ def depth_map(scene: MeshScene, near_plane: float = 0.01) -> Surface:
     return Surface(nearest.view(height, width), torch.where(ids == unseen, -1, ids).view(height, width))
 
 
-def depth_visibility(
-    points: Float[Tensor, "P 3"], scene: MeshScene, tau: float = 0.0015, near_plane: float = 0.01
-) -> Float[Tensor, "P"]:
-    """`oasis_warp.ops.depth_visibility` with its default margin, of points that are no vertices."""
+def depth_visibility(scene: MeshScene, tau: float = 0.0015, near_plane: float = 0.01) -> Float[Tensor, "P"]:
+    """`oasis_warp.ops.depth_visibility` of the scene's points with the default margin."""
     surface, K = depth_map(scene, near_plane), scene.K
-    at = points @ scene.viewmat[:3, :3].T + scene.viewmat[:3, 3]
+    at = scene.points @ scene.viewmat[:3, :3].T + scene.viewmat[:3, 3]
     z = torch.where(at[:, 2] > near_plane, at[:, 2], 1)
     column, row = ((at[:, :2] / z[:, None]) * K[[0, 1], [0, 1]] + K[:2, 2]).detach().floor().long().unbind(-1)
     inside = (at[:, 2] > near_plane) & (column >= 0) & (column < scene.width) & (row >= 0) & (row < scene.height)
@@ -93,8 +91,9 @@ def _frames(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return torch.stack([t, s, n], -1), edges, area / 2
 
 
-def face_rotations(rest: Float[Tensor, "V 3"], posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Rotations:
+def face_rotations(scene: MeshScene) -> Rotations:
     """`oasis_warp.ops.face_rotations` of a mesh without flat faces or lonely vertices."""
+    rest, posed, faces = scene.rest_vertices, scene.posed_vertices, scene.faces
     frame, edges, area = _frames(rest, faces)
     posed_frame, posed_edges, posed_area = _frames(posed, faces)
     # Polar factor of the map of the edges, P adj(Q) up to a positive factor: its angle has this cosine and sine.
@@ -131,18 +130,16 @@ class Posed(NamedTuple):
     scales: Float[Tensor, "Q 3"]
 
 
-def pose_on_mesh(
-    scene: MeshScene, vertex_quats: Float[Tensor, "V 4"], area_ratio: Float[Tensor, "F"]
-) -> Posed:
+def pose_on_mesh(scene: MeshScene) -> Posed:
     """`oasis_warp.ops.pose_on_mesh` with its default scale law."""
     corners = scene.faces[scene.face_index]
     weights = scene.barycentrics
-    turns = vertex_quats[corners]
+    turns = scene.vertex_quats[corners]
     leading = torch.take_along_dim(turns, weights.argmax(-1)[:, None, None].expand(-1, 1, 4), 1)
     signs = torch.where((turns * leading).sum(-1) < 0, -1.0, 1.0).to(weights)
     mix = ((weights * signs)[..., None] * turns).sum(1)
     return Posed(
         (weights[..., None] * scene.posed_vertices[corners]).sum(1),
         multiply(normalize(mix, dim=-1), scene.quats),
-        scene.scales * area_ratio[scene.face_index].clamp(1e-4, 1e4).sqrt()[:, None],
+        scene.scales * scene.area_ratio[scene.face_index].clamp(1e-4, 1e4).sqrt()[:, None],
     )
