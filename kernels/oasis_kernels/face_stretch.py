@@ -1,7 +1,7 @@
 """Carry Gaussians on the faces of a mesh along with all that happens to the face: not only turned, but stretched.
 
-`pose` and `pose_backward`: one thread a Gaussian. With edges e_1, e_2 and unit normal n of its face at rest, primes when
-posed, the map of the face and the Gaussian are
+`pose` and `pose_backward`: one thread a Gaussian. With edges e_1, e_2 and unit normal n of its face at rest, primes
+when posed, the map of the face and the Gaussian are
 
     F = [e_1' e_2' n'] [e_1 e_2 n]^-1,    mean = sum b_k v_k',    covariance' = F R(q) diag(s)^2 R(q)^T F^T
 

@@ -129,7 +129,8 @@ SUM_BLENDS = """
         memset(sums, 0, n_joints * 16 * sizeof(T));
         for (long long i = (long long)b * @BLOCK@; i < wp::min((b + 1ll) * @BLOCK@, n_points); i++) {
             const V by = load(g_blends + 16 * i);
-            for (int j = 0; j < n_joints; j++) store(sums + 16 * j, load(sums + 16 * j) + weights[i * n_joints + j] * by);
+            for (int j = 0; j < n_joints; j++)
+                store(sums + 16 * j, load(sums + 16 * j) + weights[i * n_joints + j] * by);
         }
     }
 """

@@ -1,4 +1,4 @@
-"""What all operators of posing owe torch and their callers: compiled graphs, odd memory, threads, bounds, other CPUs."""
+"""What the operators of posing owe torch and their callers: graphs, odd memory, threads, bounds, other CPUs."""
 
 import json
 import os
@@ -153,7 +153,10 @@ def test_broadcast_inputs_and_gradients_are_read_as_what_they_stand_for(name):
     for a, b in zip(broadcast, plain, strict=True):
         assert torch.equal(a, b)
     # The gradient of a sum is one number, expanded.
-    shares = [torch.autograd.grad(sum(o.sum() for o in out), leaves) for out, leaves in ((broadcast, repeated), (plain, full))]
+    shares = [
+        torch.autograd.grad(sum(o.sum() for o in out), leaves)
+        for out, leaves in ((broadcast, repeated), (plain, full))
+    ]
     assert all(torch.equal(a, b) for a, b in zip(*shares, strict=True))
 
 
@@ -240,7 +243,7 @@ print(json.dumps(out))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flags", ["-march=x86-64-v3", "-march=x86-64-v2"])
+@pytest.mark.parametrize("flags", ["-target-cpu x86-64-v3", "-target-cpu x86-64-v2"])
 def test_narrower_vectors_give_the_same_results(flags, tmp_path):
     here = os.path.dirname(__file__)
     environment = os.environ | {"OASIS_WARP_CPU_FLAGS": flags, "OASIS_WARP_CACHE": str(tmp_path)}
