@@ -4,6 +4,7 @@ Kernels do not know how long arrays are: `check_arrays` proves it before each la
 """
 
 import ctypes
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -11,7 +12,11 @@ import warp as wp
 from torch import Tensor
 
 from oasis_kernels import projection as generic
-from oasis_kernels import projection_vectors as vectors
+from oasis_kernels.projection_vectors import CHUNK
+from oasis_kernels.projection_vectors_backward import BackwardBlock
+from oasis_kernels.projection_vectors_backward import project_backward as vector_backward
+from oasis_kernels.projection_vectors_forward import ForwardBlock
+from oasis_kernels.projection_vectors_forward import project as vector_forward
 from oasis_warp.core.checks import FINITE_LIMIT
 from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, view
 from oasis_warp.ops._rules import current_rules
@@ -66,13 +71,13 @@ def as_float32(value: float) -> float:
     return ctypes.c_float(value).value
 
 
-def empty_outputs(means: Tensor, n_cameras: int) -> list[Tensor]:
+def empty_outputs(means: Tensor, n_cameras: int) -> tuple[Tensor, ...]:
     """Memory for `OUTPUTS`."""
-    start = n_cameras, len(means)
-    return [
-        torch.empty(*start, *([size] if size else []), dtype=dtype or means.dtype, device=means.device)
+    shape = n_cameras, means.shape[0]
+    return tuple(
+        torch.empty((*shape, size) if size else shape, dtype=dtype or means.dtype, device=means.device)
         for _name, size, dtype in OUTPUTS
-    ]
+    )
 
 
 def check_arrays(scene: Scene, **others: tuple[Tensor | None, tuple[int, ...], torch.dtype]) -> None:
@@ -108,25 +113,25 @@ def _block_of(scene: Scene) -> dict[str, int]:
 
 
 def _launch_chunks(kernel: object, block: ctypes.Structure, like: Tensor) -> None:
-    chunks = -(-len(like) // vectors.CHUNK)
+    chunks = -(-len(like) // CHUNK)
     launch_ranges(kernel, even_cuts(chunks, FEWEST_CHUNKS), [ctypes.addressof(block)], like=like)
 
 
-def project_vectors(scene: Scene, opacities: Tensor, limits: Limits, out: list[Tensor]) -> bool:
+def project_vectors(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[Tensor]) -> bool:
     """Fill `out` by the vector kernel; False where an input was not finite or outside its range."""
     rules = current_rules()
-    block = vectors.ForwardBlock(
+    block = ForwardBlock(
         **_block_of(scene),
         **{name: tensor.data_ptr() for (name, *_), tensor in zip(OUTPUTS, out, strict=True)},
         opacities=opacities.data_ptr(), near=as_float32(limits.near_plane), far=as_float32(limits.far_plane),
         radius_clip=limits.radius_clip, eps2d=as_float32(limits.eps2d), alpha_min=as_float32(rules.alpha_min),
         extent_sigmas=rules.extent_sigmas, limit=FINITE_LIMIT,
     )  # fmt: skip
-    _launch_chunks(vectors.project(), block, scene.means)
+    _launch_chunks(vector_forward(), block, scene.means)
     return not block.bad
 
 
-def project_generic(scene: Scene, opacities: Tensor, limits: Limits, out: list[Tensor]) -> None:
+def project_generic(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[Tensor]) -> None:
     """Fill `out` by the generic kernel."""
     rules = current_rules()
     launch_ranges(
@@ -142,64 +147,53 @@ def project_generic(scene: Scene, opacities: Tensor, limits: Limits, out: list[T
     )  # fmt: skip
 
 
-def backward_vectors(
-    scene: Scene,
-    radii: Tensor,
-    g_means2d: Tensor | None,
-    g_covars2d: Tensor | None,
-    g_depths: Tensor | None,
-    g_gaussians: dict[str, Tensor],
-    g_viewmats: Tensor | None,
-) -> None:
-    """Fill `g_gaussians`, any of g_means, g_quats, g_scales and g_covars, and `g_viewmats` by the vector kernel."""
+class Incoming(NamedTuple):
+    """Gradients by what was projected; None stands for zeros."""
+
+    means2d: Tensor | None
+    covars2d: Tensor | None
+    depths: Tensor | None
+
+    def contiguous(self) -> "Incoming":
+        """The same for kernels, which know no strides."""
+        return Incoming(*(t if t is None else t.contiguous() for t in self))
+
+
+def backward_vectors(scene: Scene, radii: Tensor, incoming: Incoming, out: Mapping[str, Tensor]) -> None:
+    """Fill `out`, gradients by any of means, quats, scales, covars and viewmats, by the vector kernel."""
     n_cameras, n = len(scene.viewmats), len(scene.means)
-    tensors = {"radii": radii, "g_means2d": g_means2d, "g_covars2d": g_covars2d, "g_depths": g_depths, **g_gaussians}
-    sums = None
+    tensors = {"radii": radii} | {f"g_{name}": tensor for name, tensor in (incoming._asdict() | dict(out)).items()}
+    g_viewmats = tensors.pop("g_viewmats", None)
     if g_viewmats is not None:
-        sums = radii.new_empty(n_cameras * -(-n // vectors.CHUNK), 12, dtype=torch.float64)
-        tensors["g_cameras"] = sums
+        tensors["g_cameras"] = radii.new_empty(n_cameras * -(-n // CHUNK), 12, dtype=torch.float64)
     pointers = {name: tensor.data_ptr() for name, tensor in tensors.items() if tensor is not None}
-    _launch_chunks(vectors.project_backward(), vectors.BackwardBlock(**_block_of(scene), **pointers), scene.means)
-    if g_viewmats is not None and sums is not None:
-        _fill_viewmats(g_viewmats, sums)
+    _launch_chunks(vector_backward(), BackwardBlock(**_block_of(scene), **pointers), scene.means)
+    if g_viewmats is not None:
+        _fill_viewmats(g_viewmats, tensors["g_cameras"])
 
 
-def backward_generic(
-    scene: Scene,
-    radii: Tensor,
-    g_means2d: Tensor | None,
-    g_covars2d: Tensor | None,
-    g_depths: Tensor | None,
-    g_gaussians: dict[str, Tensor],
-    g_viewmats: Tensor | None,
-) -> None:
-    """`backward_vectors` by the generic kernel, which fills what nobody asks for too."""
-    n_cameras, n = len(scene.viewmats), len(scene.means)
+def backward_generic(scene: Scene, radii: Tensor, incoming: Incoming, out: Mapping[str, Tensor]) -> None:
+    """`backward_vectors` by the generic kernel, which works out what nobody asks for too."""
+    n_cameras, n, dtype = len(scene.viewmats), len(scene.means), scene.means.dtype
 
-    def given(gradient: Tensor | None, size: int, dtype: torch.dtype = scene.means.dtype) -> object:
-        if gradient is None:
-            gradient = radii.new_zeros(n_cameras * n, *([size] if size else []), dtype=dtype)
-        return _rows(gradient, size)
+    def given(gradient: Tensor | None, *size: int, dtype: torch.dtype = dtype) -> Tensor:
+        return radii.new_zeros(n_cameras, n, *size, dtype=dtype) if gradient is None else gradient
 
-    def filled(name: str, size: int) -> object:
-        like = getattr(scene, name)
-        if like is None:
-            return _rows(scene.means.new_empty(0, size), size)
-        wanted = g_gaussians.get(f"g_{name}")
-        return _rows(torch.empty_like(like) if wanted is None else wanted, size)
+    def filled(name: str, *size: int) -> Tensor:
+        wanted, like = out.get(name), getattr(scene, name)
+        return wanted if wanted is not None else scene.means.new_empty(0 if like is None else n, *size)
 
-    g_covars = g_gaussians.get("g_covars")
-    if g_covars is None:
-        g_covars = scene.means.new_empty(0, 3, 3) if scene.covars is None else torch.empty_like(scene.covars)
+    g_viewmats = out.get("viewmats")
     sums = radii.new_empty(0 if g_viewmats is None else n_cameras * n, 12, dtype=torch.float64)
     launch_ranges(
-        generic.project_backward(SCALAR[scene.means.dtype]),
+        generic.project_backward(SCALAR[dtype]),
         even_cuts(n),
         [
             n, n_cameras, *_gaussian_views(scene), view(scene.viewmats), view(scene.Ks), scene.width, scene.height,
-            _rows(radii, 2), given(g_means2d, 2), given(g_covars2d, 3, torch.float64), given(g_depths, 0),
-            int(g_viewmats is not None), filled("means", 3), filled("quats", 4), filled("scales", 3), view(g_covars),
-            view(sums),
+            _rows(radii, 2), _rows(given(incoming.means2d, 2), 2),
+            _rows(given(incoming.covars2d, 3, dtype=torch.float64), 3), _rows(given(incoming.depths), 0),
+            int(g_viewmats is not None), _rows(filled("means", 3), 3), _rows(filled("quats", 4), 4),
+            _rows(filled("scales", 3), 3), view(filled("covars", 3, 3)), view(sums),
         ],
         like=scene.means,
     )  # fmt: skip
