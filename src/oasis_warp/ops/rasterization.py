@@ -8,7 +8,6 @@ from torch import Tensor
 
 from oasis_kernels import constants
 from oasis_warp.core.checks import check_choice, check_finite, check_float, check_positive, check_shape
-from oasis_warp.ops._tiles import Tiles, bin_to_tiles
 from oasis_warp.ops.blending import blend
 from oasis_warp.ops.projection import Projection, project
 from oasis_warp.ops.spherical_harmonics import check_degree, spherical_harmonics
@@ -156,7 +155,6 @@ def rasterization(
         means, quats, scales, opacities, viewmats, Ks, width, height,
         near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
     )  # fmt: skip
-    tiles = bin_to_tiles(projection, width, height, tile_size)
     opacities = opacities.expand(n_cameras, n)
     channels = layers_to_blend(colors.expand(n_cameras, n, colors.shape[-1]), projection.depths, render_mode)
     if backgrounds is None:
@@ -165,12 +163,12 @@ def rasterization(
         behind = channels.new_zeros(n_cameras, 1)
     else:
         behind = torch.nn.functional.pad(backgrounds, (0, channels.shape[-1] - backgrounds.shape[-1]))
-    render, alphas = blend(projection, tiles, opacities, channels, behind, width, height)
+    render, alphas = blend(projection, opacities, channels, behind, width, height, tile_size)
     if render_mode in ("ED", "RGB+ED"):
         drawn = alphas > 0
         expected = torch.where(drawn, render[..., -1:] / torch.where(drawn, alphas, 1), 0)
         render = torch.cat([render[..., :-1], expected], -1)
-    return render, alphas, describe(projection, tiles, opacities, width, height)
+    return render, alphas, describe(projection, opacities, width, height, tile_size)
 
 
 def refuse_unless_default(name: str, value: Any, default: Any, hint: str) -> None:
@@ -300,9 +298,10 @@ def check_colors(
         check_finite(colors=colors, backgrounds=backgrounds)
 
 
-def describe(projection: Projection, tiles: Tiles, opacities: Tensor, width: int, height: int) -> dict[str, Any]:
+def describe(
+    projection: Projection, opacities: Tensor, width: int, height: int, tile_size: int
+) -> dict[str, Any]:
     """The `meta` of `rasterization`."""
-    n_cameras, n = projection.depths.shape
     return {
         "camera_ids": None,
         "gaussian_ids": None,
@@ -311,13 +310,8 @@ def describe(projection: Projection, tiles: Tiles, opacities: Tensor, width: int
         "conics": projection.conics,
         "radii": projection.radii,
         "opacities": opacities,
-        "tile_width": tiles.across,
-        "tile_height": tiles.down,
-        "tile_size": tiles.size,
-        "tiles_per_gauss": tiles.pair_counts.view(n_cameras, n),
-        "isect_offsets": tiles.starts[:-1].view(n_cameras, tiles.down, tiles.across),
-        "flatten_ids": tiles.gaussians,
+        "tile_size": tile_size,
         "width": width,
         "height": height,
-        "n_cameras": n_cameras,
+        "n_cameras": len(projection.depths),
     }
