@@ -1,17 +1,14 @@
 """Float32 projection on the CPU, eight Gaussians at once: what forward and backward share.
 
-One thread a chunk of `CHUNK` Gaussians, through all cameras. Arithmetic is float64 as in the generic kernels, eight
-lanes a vector, so that the two agree to the rounding of the stored float32. Arrays are raw pointers in one parameter
-block, whose sizes the operator has proved. A block of fewer than eight Gaussians at the end of the arrays is copied to
-and from buffers of eight on the stack: nothing outside the arrays is read or written, and the same instructions compute
-every Gaussian, wherever it stands.
+A task is a chunk of `CHUNK` Gaussians, through all cameras. Arithmetic is float64 as in the generic kernels, eight
+lanes a vector, so that the two agree to the rounding of the stored float32. A block of fewer than eight Gaussians at
+the end of the arrays is copied to and from buffers of eight on the stack: nothing outside the arrays is read or
+written, and the same instructions compute every Gaussian, wherever it stands.
 
 Both passes use factors: covariance = F F^T with F = R(q) S, or F the Cholesky factor of a given covariance. With B the
 2 x 3 matrix J R_camera and M = B F, the covariance in the image is M M^T + eps2d (Zwicker et al. 2001, eq. 31). The
 adjoint is B^T G B by the covariance and 2 G B covariance by B, where G is the symmetric gradient in the image.
 """
-
-import ctypes
 
 from oasis_kernels import constants
 
@@ -21,38 +18,24 @@ CHUNK = 512
 SCENE = {
     "n": "long long",
     "n_cameras": "long long",
+    "width": "double",
+    "height": "double",
     "means": "const float*",  # [n, 3]
     "quats": "const float*",  # [n, 4], or null where covars is given
     "scales": "const float*",  # [n, 3], or null
     "covars": "const float*",  # [n, 3, 3], or null; read as its symmetric part
     "viewmats": "const float*",  # [C, 4, 4]
     "Ks": "const float*",  # [C, 3, 3]
-    "width": "double",
-    "height": "double",
 }
-"""Fields that both parameter blocks begin with, and their C++ types; every field has eight bytes."""
+"""Parameters of both directions, and their C++ types."""
 
 
-def block(name: str, fields: dict[str, str]) -> type[ctypes.Structure]:
-    """A parameter block as Python fills it; what is not given is 0 or null."""
-    kinds = {"double": ctypes.c_double, "long long": ctypes.c_longlong}
-    members = [(field, kinds.get(kind, ctypes.c_void_p)) for field, kind in fields.items()]
-    return type(name, (ctypes.Structure,), {"_fields_": members})
-
-
-def snippet(fields: dict[str, str], body: str) -> str:
-    """C++ of one chunk: `HEAD` and `body`, which find the parameter block in `p`, with the constants written in."""
-    struct = "struct P { " + " ".join(f"{kind} {name};" for name, kind in fields.items()) + " };"
-    values = {
-        "PARAMETERS": struct,
-        "CHUNK": CHUNK,
-        "JACOBIAN_LIMIT": constants.JACOBIAN_LIMIT,
-        "BOX_SLACK": constants.BOX_SLACK,
-    }
-    text = HEAD + body
-    for name, value in values.items():
-        text = text.replace(f"@{name}@", str(value))
-    return text
+def snippet(body: str) -> str:
+    """`HEAD` and `body` with the constants written in."""
+    text = "\n    {" + HEAD + body + "    }\n"  # a block, at whose start the pragma must stand
+    for name in ("JACOBIAN_LIMIT", "BOX_SLACK"):
+        text = text.replace(f"@{name}@", repr(getattr(constants, name)))
+    return text.replace("@CHUNK@", str(CHUNK))
 
 
 HEAD = """
@@ -108,12 +91,11 @@ HEAD = """
             __builtin_shufflevector(xy, zw, 4, 12, 20, 28, 5, 13, 21, 29, 6, 14, 22, 30, 7, 15, 23, 31);
     };
 
-    @PARAMETERS@
     struct Camera {
         double r[9], t[3], fx, fy, cx, cy, u_low, u_high, v_low, v_high;  // r by rows; limits of x/z and y/z in J
     };
-    auto camera_at = [](const P& p, long long c) -> Camera {
-        const float *view = p.viewmats + 16 * c, *K = p.Ks + 9 * c;
+    auto camera_at = [&](long long c) -> Camera {
+        const float *view = viewmats + 16 * c, *K = Ks + 9 * c;
         Camera out;
         for (int row = 0; row < 3; row++) {
             for (int column = 0; column < 3; column++) out.r[3 * row + column] = view[4 * row + column];
@@ -123,12 +105,12 @@ HEAD = """
         out.fy = K[4];
         out.cx = K[2];
         out.cy = K[5];
-        const double margin_x = @JACOBIAN_LIMIT@ * 0.5 * p.width / out.fx;
-        const double margin_y = @JACOBIAN_LIMIT@ * 0.5 * p.height / out.fy;
+        const double margin_x = @JACOBIAN_LIMIT@ * 0.5 * width / out.fx;
+        const double margin_y = @JACOBIAN_LIMIT@ * 0.5 * height / out.fy;
         out.u_low = -(out.cx / out.fx) - margin_x;
-        out.u_high = (p.width - out.cx) / out.fx + margin_x;
+        out.u_high = (width - out.cx) / out.fx + margin_x;
         out.v_low = -(out.cy / out.fy) - margin_y;
-        out.v_high = (p.height - out.cy) / out.fy + margin_y;
+        out.v_high = (height - out.cy) / out.fy + margin_y;
         return out;
     };
 
@@ -153,9 +135,8 @@ HEAD = """
             s[k][lane] = 0.5 * ((double)p[9 * lane + pair[k][0]] + (double)p[9 * lane + pair[k][1]]);
     };
 
-    P& p = *(P*)params;
-    const long long first = (long long)chunk * @CHUNK@, end = first + @CHUNK@ < p.n ? first + @CHUNK@ : p.n;
-    Camera* cameras = (Camera*)malloc(p.n_cameras * sizeof(Camera));
-    for (long long c = 0; c < p.n_cameras; c++) cameras[c] = camera_at(p, c);
+    const long long n_chunks = (n + @CHUNK@ - 1) / @CHUNK@;
+    Camera* cameras = (Camera*)malloc(n_cameras * sizeof(Camera));
+    for (long long c = 0; c < n_cameras; c++) cameras[c] = camera_at(c);
 """
-"""C++: transposition, cameras, rotations, and the chunk [first, end)."""
+"""C++: transposition, rotations, covariances, and the cameras, which are for the body to free."""

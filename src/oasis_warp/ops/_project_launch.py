@@ -12,19 +12,16 @@ import warp as wp
 from torch import Tensor
 
 from oasis_kernels import projection as generic
+from oasis_kernels import projection_vectors_backward as vector_backward
+from oasis_kernels import projection_vectors_forward as vector_forward
+from oasis_kernels.native import PHASE_WORDS
 from oasis_kernels.projection_vectors import CHUNK
-from oasis_kernels.projection_vectors_backward import BackwardBlock
-from oasis_kernels.projection_vectors_backward import project_backward as vector_backward
-from oasis_kernels.projection_vectors_forward import ForwardBlock
-from oasis_kernels.projection_vectors_forward import project as vector_forward
 from oasis_warp.core.checks import FINITE_LIMIT
-from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, view
+from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, address, even_cuts, launch_ranges, run_native, view
 from oasis_warp.ops._rules import current_rules
 
 CAMERA_SUM_BLOCK = 1024
 """Gaussians whose camera gradients one thread of the generic kernel adds up; fixed, so that threads change no sum."""
-FEWEST_CHUNKS = 4
-"""Chunks of Gaussians below which another thread does not pay."""
 OUTPUTS = (
     ("means2d", 2, None), ("covars2d", 3, torch.float64), ("depths", 0, None), ("conics", 3, None),
     ("radii", 2, torch.int32), ("sort_depths", 0, torch.float64), ("centers", 4, None), ("whitenings", 4, None),
@@ -102,33 +99,30 @@ def check_arrays(scene: Scene, **others: tuple[Tensor | None, tuple[int, ...], t
             )
 
 
-def _block_of(scene: Scene) -> dict[str, int]:
-    """Fields of a parameter block that both directions share."""
-    pointers = {
-        name: tensor.data_ptr() for name, tensor in scene._asdict().items() if isinstance(tensor, Tensor)
+def _words(scene: Scene, **others: Tensor | None) -> dict[str, int]:
+    """Parameters of a native kernel: the scene, and other tensors by name, all of which the caller keeps alive."""
+    tensors = {name: value for name, value in scene._asdict().items() if not isinstance(value, int)} | others
+    words = {
+        name: 0 if tensor is None else address(tensor, tensor.dtype, tensor.numel()) for name, tensor in tensors.items()
     }
-    return pointers | {
-        "n": len(scene.means), "n_cameras": len(scene.viewmats), "width": scene.width, "height": scene.height
-    }  # fmt: skip
-
-
-def _launch_chunks(kernel: object, block: ctypes.Structure, like: Tensor) -> None:
-    chunks = -(-len(like) // CHUNK)
-    launch_ranges(kernel, even_cuts(chunks, FEWEST_CHUNKS), [ctypes.addressof(block)], like=like)
+    sizes = {"n": len(scene.means), "n_cameras": len(scene.viewmats), "width": scene.width, "height": scene.height}
+    return words | sizes
 
 
 def project_vectors(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[Tensor]) -> bool:
     """Fill `out` by the vector kernel; False where an input was not finite or outside its range."""
     rules = current_rules()
-    block = ForwardBlock(
-        **_block_of(scene),
-        **{name: tensor.data_ptr() for (name, *_), tensor in zip(OUTPUTS, out, strict=True)},
-        opacities=opacities.data_ptr(), near=as_float32(limits.near_plane), far=as_float32(limits.far_plane),
-        radius_clip=limits.radius_clip, eps2d=as_float32(limits.eps2d), alpha_min=as_float32(rules.alpha_min),
-        extent_sigmas=rules.extent_sigmas, limit=FINITE_LIMIT,
+    near, far, radius_clip, eps2d = limits
+    numbers = torch.tensor(
+        [as_float32(near), as_float32(far), radius_clip, as_float32(eps2d), as_float32(rules.alpha_min),
+         rules.extent_sigmas, FINITE_LIMIT],
+        dtype=torch.float64,
     )  # fmt: skip
-    _launch_chunks(vector_forward(), block, scene.means)
-    return not block.bad
+    state = torch.zeros(PHASE_WORDS + 1, dtype=torch.int64)
+    outputs = {name: tensor for (name, *_), tensor in zip(OUTPUTS, out, strict=True)}
+    words = _words(scene, opacities=opacities, limits=numbers, state=state, bad=state[PHASE_WORDS:], **outputs)
+    run_native(vector_forward.project(), words, -(-len(scene.means) // CHUNK))
+    return not state[PHASE_WORDS]
 
 
 def project_generic(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[Tensor]) -> None:
@@ -161,15 +155,18 @@ class Incoming(NamedTuple):
 
 def backward_vectors(scene: Scene, radii: Tensor, incoming: Incoming, out: Mapping[str, Tensor]) -> None:
     """Fill `out`, gradients by any of means, quats, scales, covars and viewmats, by the vector kernel."""
-    n_cameras, n = len(scene.viewmats), len(scene.means)
-    tensors = {"radii": radii} | {f"g_{name}": tensor for name, tensor in (incoming._asdict() | dict(out)).items()}
-    g_viewmats = tensors.pop("g_viewmats", None)
-    if g_viewmats is not None:
-        tensors["g_cameras"] = radii.new_empty(n_cameras * -(-n // CHUNK), 12, dtype=torch.float64)
-    pointers = {name: tensor.data_ptr() for name, tensor in tensors.items() if tensor is not None}
-    _launch_chunks(vector_backward(), BackwardBlock(**_block_of(scene), **pointers), scene.means)
-    if g_viewmats is not None:
-        _fill_viewmats(g_viewmats, tensors["g_cameras"])
+    chunks, n_cameras = -(-len(scene.means) // CHUNK), len(scene.viewmats)
+    chunk_cameras = torch.empty(n_cameras if "viewmats" in out else 0, chunks, 12, dtype=torch.float64)
+    state = torch.zeros(vector_backward.STATE, dtype=torch.int64)
+    words = _words(
+        scene,
+        radii=radii,
+        **{f"g_{name}": gradient for name, gradient in incoming._asdict().items()},
+        **{f"g_{name}": out.get(name) for name in ("means", "quats", "scales", "covars", "viewmats")},
+        chunk_cameras=chunk_cameras,
+        state=state,
+    )
+    run_native(vector_backward.project_backward(), words, max(chunks, n_cameras))
 
 
 def backward_generic(scene: Scene, radii: Tensor, incoming: Incoming, out: Mapping[str, Tensor]) -> None:
