@@ -206,7 +206,8 @@ BACKWARD = """
             if (g_quats || g_scales) {
                 V h[9], g_scale[3];  // h = 2 g R: by F = R S it is h S, by R itself h S S
                 for (int row = 0; row < 3; row++) for (int column = 0; column < 3; column++) {
-                    const V half = g[3 * row] * r[column] + g[3 * row + 1] * r[3 + column] + g[3 * row + 2] * r[6 + column];
+                    const V half = g[3 * row] * r[column] + g[3 * row + 1] * r[3 + column]
+                        + g[3 * row + 2] * r[6 + column];
                     h[3 * row + column] = half + half;
                 }
                 for (int e = 0; e < 3; e++) {

@@ -94,8 +94,10 @@ FORWARD = """
             From from = {means + 3 * i, quats + 4 * i, scales + 3 * i, covars + 9 * i, opacities + i};
             if (!whole) {  // fill the lanes behind the end with the last Gaussian
                 auto fill = [&](float* spare, const float*& from, int size) {
-                    for (int lane = 0; lane < 8; lane++)
-                        memcpy(spare + lane * size, from + (lane < count ? lane : count - 1) * size, size * sizeof(float));
+                    for (int lane = 0; lane < 8; lane++) {
+                        const int row = lane < count ? lane : count - 1;
+                        memcpy(spare + lane * size, from + row * size, size * sizeof(float));
+                    }
                     from = spare;
                 };
                 fill(spare.in_means, from.means, 3);
@@ -201,15 +203,17 @@ FORWARD = """
                     };
                     const V slack_x = extent_x * (1.0 + @BOX_SLACK@) + @BOX_SLACK@;
                     const V slack_y = extent_y * (1.0 + @BOX_SLACK@) + @BOX_SLACK@;
-                    store4((float*)to.boxes, whole_number(low(x, slack_x, width)), whole_number(low(y, slack_y, height)),
-                           whole_number(high(x, slack_x, width)), whole_number(high(y, slack_y, height)));
+                    const F x0 = whole_number(low(x, slack_x, width)), x1 = whole_number(high(x, slack_x, width));
+                    const F y0 = whole_number(low(y, slack_y, height)), y1 = whole_number(high(y, slack_y, height));
+                    store4((float*)to.boxes, x0, y0, x1, y1);
                     const V largest = (V)(2147483647.0);
                     store2((float*)to.radii, whole_number(radius_x < largest ? radius_x : largest),
                            whole_number(radius_y < largest ? radius_y : largest));
                     store2(to.means2d, narrow(kept(x)), narrow(kept(y)));
-                    const F whole_x = narrow(kept(__builtin_elementwise_floor(x)));
-                    const F whole_y = narrow(kept(__builtin_elementwise_floor(y)));
-                    store4(to.centers, whole_x, whole_y, narrow(kept(x) - wide(whole_x)), narrow(kept(y) - wide(whole_y)));
+                    const F floor_x = narrow(kept(__builtin_elementwise_floor(x)));
+                    const F floor_y = narrow(kept(__builtin_elementwise_floor(y)));
+                    store4(to.centers, floor_x, floor_y, narrow(kept(x) - wide(floor_x)),
+                           narrow(kept(y) - wide(floor_y)));
 
                     const V sound = drawn ? det : (V)(1.0), inverse_det = 1.0 / sound;
                     store3(to.conics, narrow(kept(yy * inverse_det)), narrow(kept(-xy * inverse_det)),
