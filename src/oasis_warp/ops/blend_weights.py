@@ -11,11 +11,11 @@ from torch.autograd.function import once_differentiable
 from oasis_kernels import constants
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._blend_tiles import Splats
+from oasis_warp.ops._scene_checks import check_cameras, check_gaussians
 from oasis_warp.ops._weigh_strips import weigh as weigh_strips
 from oasis_warp.ops._weigh_tiles import weigh as weigh_tiles
 from oasis_warp.ops.blending import draws_strips
 from oasis_warp.ops.projection import project
-from oasis_warp.ops.rasterization import check_gaussians_and_cameras
 
 
 class BlendWeights(NamedTuple):
@@ -72,15 +72,15 @@ def blend_weights(
     """
     check_shape("viewmat", viewmat, 4, 4)
     check_shape("K", K, 3, 3)
-    check_gaussians_and_cameras(
-        means, quats, scales, opacities, viewmat[None], K[None], width, height, near_plane, far_plane, radius_clip,
-        eps2d, tile_size, validate,
-    )  # fmt: skip
+    check_gaussians(means, quats, scales, None, opacities)
+    check_cameras(
+        viewmat[None], K[None], means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size
+    )
     n, pixels, dtype = len(means), width * height, means.dtype
     with torch.no_grad():
         projection = project(
             means, quats, scales, opacities, viewmat[None], K[None], width, height,
-            near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
+            near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d, validate=validate,
         )  # fmt: skip
         splats = Splats(
             projection.sort_depths, projection.centers, projection.whitenings, projection.boxes,
