@@ -415,7 +415,7 @@ DRAW = """
                 }
             }
         };
-        auto settle = [&](int f, unsigned open, long long i, int x, int y, F inverse) __attribute__((noinline)) {
+        auto settle = [&](int f, unsigned open, int i, int x, int y, F inverse) __attribute__((noinline)) {
             for (; open; open &= open - 1) {
                 const int k = __builtin_ctz(open);
                 if (x + k / 4 >= width || y + k % 4 >= height) continue;
@@ -474,43 +474,71 @@ DRAW = """
             const unsigned fast = bits(fine);
 
             // Edge functions are kept `doubt` too high: from 0 on a pixel may be inside, from 2 doubt on it is.
-            float of[14][16] __attribute__((aligned(64)));
-            int boxes[4][16] __attribute__((aligned(64)));
-            *(F*)of[0] = slope_xa; *(F*)of[1] = slope_ya; *(F*)of[2] = doubt - slope_xa * bx - slope_ya * by;
-            *(F*)of[3] = slope_xb; *(F*)of[4] = slope_yb; *(F*)of[5] = doubt - slope_xb * cx - slope_yb * cy;
-            *(F*)of[6] = slope_xc; *(F*)of[7] = slope_yc; *(F*)of[8] = doubt - slope_xc * ax - slope_yc * ay;
-            *(F*)of[9] = pa - doubt * (along_b + along_c); *(F*)of[10] = along_b; *(F*)of[11] = along_c;
-            *(F*)of[12] = doubt + doubt; *(F*)of[13] = nearest * (2.f * DOUBT);
-            *(I*)boxes[0] = x0; *(I*)boxes[1] = x1; *(I*)boxes[2] = top; *(I*)boxes[3] = y1;
+            const F start_a = doubt - slope_xa * bx - slope_ya * by;
+            const F start_b = doubt - slope_xb * cx - slope_yb * cy;
+            const F start_c = doubt - slope_xc * ax - slope_yc * ay;
+            float of[11][16] __attribute__((aligned(64)));
+            *(F*)of[0] = slope_xa; *(F*)of[1] = slope_ya;
+            *(F*)of[2] = slope_xb; *(F*)of[3] = slope_yb;
+            *(F*)of[4] = slope_xc; *(F*)of[5] = slope_yc;
+            *(F*)of[6] = pa - doubt * (along_b + along_c); *(F*)of[7] = along_b; *(F*)of[8] = along_c;
+            *(F*)of[9] = doubt + doubt; *(F*)of[10] = nearest * (2.f * DOUBT);
+            auto draw_block = [&](int k, int f, float a, float b, float c, int i, int x, int y) {
+                const F wa = fma((F)(of[0][k]), column, fma((F)(of[1][k]), row, (F)(a)));
+                const F wb = fma((F)(of[2][k]), column, fma((F)(of[3][k]), row, (F)(b)));
+                const F wc = fma((F)(of[4][k]), column, fma((F)(of[5][k]), row, (F)(c)));
+                const F least = lower(lower(wa, wb), wc);
+                const F inverse = fma(wc, (F)(of[8][k]), fma(wb, (F)(of[7][k]), (F)(of[6][k])));
+                const F before = *(const FU*)(inverses + i);
+                const F apart = inverse - before;
+                const I won = (least >= of[9][k]) & (apart > of[10][k]);
+                const unsigned certain = bits(won), possible = bits((least >= 0.f) & (apart >= -of[10][k]));
+                *(FU*)(inverses + i) = won ? inverse : before;
+                *(IU*)(ids + i) = won ? (I)(f) : (I)*(const IU*)(ids + i);
+                if (possible != certain) settle(f, possible & ~certain, i, x, y, inverse);
+            };
 
-            for (unsigned rest = todo; rest; rest &= rest - 1) {
+            // Faces within 2 x 2 blocks: no loop a face, whose length the processor could not foretell.
+            const I place_of = top * (stride / 4) + x0 * 4;
+            const I wide = x1 - x0 >= 4, high = y1 - top >= 4;
+            const unsigned large = bits((x1 - x0 >= 8) | (y1 - top >= 8)), small = todo & fast & ~large;
+            float starts[3][4][16] __attribute__((aligned(64)));
+            int places[4][16] __attribute__((aligned(64))), xs[16] __attribute__((aligned(64)));
+            int ys[16] __attribute__((aligned(64)));
+            *(I*)xs = x0;
+            *(I*)ys = top;
+            unsigned long long blocks = 0;
+            for (int block = 0; block < 4; block++) {
+                const float across = (float)(block % 2 * 4), down = (float)(block / 2 * 4);
+                const F a = fma(slope_xa, (F)(across), fma(slope_ya, (F)(down), start_a));
+                const F b = fma(slope_xb, (F)(across), fma(slope_yb, (F)(down), start_b));
+                const F c = fma(slope_xc, (F)(across), fma(slope_yc, (F)(down), start_c));
+                *(F*)starts[0][block] = a; *(F*)starts[1][block] = b; *(F*)starts[2][block] = c;
+                *(I*)places[block] = place_of + (block % 2 * 16 + block / 2 * stride);
+                // Where an edge function is negative in all corners of the block, nothing of the face is there.
+                auto most = [&](F at, F x, F y) -> F { return at + 3.f * (upper(x, (F)(0.f)) + upper(y, (F)(0.f))); };
+                I touched = (most(a, slope_xa, slope_ya) >= 0.f) & (most(b, slope_xb, slope_yb) >= 0.f) &
+                            (most(c, slope_xc, slope_yc) >= 0.f);
+                if (block % 2) touched &= wide;
+                if (block / 2) touched &= high;
+                blocks |= (unsigned long long)(bits(touched) & small) << 16 * block;
+            }
+            for (; blocks; blocks &= blocks - 1) {
+                const int j = __builtin_ctzll(blocks), k = j % 16, block = j / 16;
+                draw_block(k, k * groups + g, (&starts[0][0][0])[j], (&starts[1][0][0])[j], (&starts[2][0][0])[j],
+                           (&places[0][0])[j], xs[k] + block % 2 * 4, ys[k] + block / 2 * 4);
+            }
+
+            for (unsigned rest = todo & ~small; rest; rest &= rest - 1) {
                 const int k = __builtin_ctz(rest), f = k * groups + g;
                 if (!(fast >> k & 1)) { draw_exactly(f); continue; }
-                const F xa = (F)(of[0][k]), ya = (F)(of[1][k]), xb = (F)(of[3][k]), yb = (F)(of[4][k]);
-                const F xc = (F)(of[6][k]), yc = (F)(of[7][k]);
-                const F ea = fma(xa, column, fma(ya, row, (F)(of[2][k])));
-                const F eb = fma(xb, column, fma(yb, row, (F)(of[5][k])));
-                const F ec = fma(xc, column, fma(yc, row, (F)(of[8][k])));
-                const F start = (F)(of[9][k]), along_b = (F)(of[10][k]), along_c = (F)(of[11][k]);
-                const F sure = (F)(of[12][k]), doubt = (F)(of[13][k]);
-                const int left = boxes[0][k], right = boxes[1][k], bottom = boxes[3][k];
-                F down = (F)(0.f);
-                for (int y = boxes[2][k]; y <= bottom; y += 4, down += 4.f) {
-                    long long i = (long long)(y / 4) * stride + 4 * left;
-                    const F ra = fma(ya, down, ea), rb = fma(yb, down, eb), rc = fma(yc, down, ec);
-                    F across = (F)(0.f);
-                    for (int x = left; x <= right; x += 4, i += 16, across += 4.f) {
-                        const F wa = fma(xa, across, ra), wb = fma(xb, across, rb), wc = fma(xc, across, rc);
-                        const F least = lower(lower(wa, wb), wc);
-                        const F inverse = fma(wc, along_c, fma(wb, along_b, start));
-                        const F before = *(const FU*)(inverses + i);
-                        const F apart = inverse - before;
-                        const I won = (least >= sure) & (apart > doubt);
-                        const unsigned certain = bits(won), possible = bits((least >= 0.f) & (apart >= -doubt));
-                        *(FU*)(inverses + i) = won ? inverse : before;
-                        *(IU*)(ids + i) = won ? (I)(f) : (I)*(const IU*)(ids + i);
-                        if (possible != certain) settle(f, possible & ~certain, i, x, y, inverse);
-                    }
+                const int left = xs[k], right = x1[k], bottom = y1[k];
+                for (int y = ys[k]; y <= bottom; y += 4) for (int x = left; x <= right; x += 4) {
+                    const float across = (float)(x - left), down = (float)(y - ys[k]);
+                    draw_block(k, f, starts[0][0][k] + across * of[0][k] + down * of[1][k],
+                               starts[1][0][k] + across * of[2][k] + down * of[3][k],
+                               starts[2][0][k] + across * of[4][k] + down * of[5][k],
+                               y / 4 * stride + 4 * x, x, y);
                 }
             }
         }
