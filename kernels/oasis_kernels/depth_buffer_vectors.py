@@ -195,7 +195,7 @@ TRANSFORM = """
     typedef float F __attribute__((ext_vector_type(8)));
     typedef int I4 __attribute__((ext_vector_type(4)));
     typedef int I4U __attribute__((ext_vector_type(4), aligned(4)));
-    const int ranges = (job.n_vertices + @VERTICES_A_TASK@ - 1) / @VERTICES_A_TASK@;
+    const int ranges = wp::max((job.n_vertices + @VERTICES_A_TASK@ - 1) / @VERTICES_A_TASK@, 1);
     const double units = (double)(1 << job.fraction_bits);
     const double reach = (double)(1 << 30) / units;             // of fixed point round the picture's middle [px]
     const double middle_x = width / 2, middle_y = height / 2;
@@ -224,13 +224,15 @@ TRANSFORM = """
             const D u = view.fx * X * inverse + view.cx, v = view.fy * Y * inverse + view.cy;
             const D from_x = u - middle_x, from_y = v - middle_y;
             // Depths that float32 cannot invert, and those a rounding away from the near plane, are odd as well.
+            const L placed = finite & ~(before & ~((absolute(u) < 1e100) & (absolute(v) < 1e100)));
             const L even = (absolute(from_x) < reach) & (absolute(from_y) < reach) & (inverse < 1e30) &
                            (inverse > 1e-30) & (Z > near_plane * (1 + 1e-9));
-            const L marks = (finite & ~before & (L)(BEHIND)) | (~finite & (L)(LOST)) | (before & ~even & (L)(ODD)) |
+            const L marks = (finite & ~before & (L)(BEHIND)) | (~placed & (L)(LOST)) | (before & ~even & (L)(ODD)) |
                             (before & (((u < 0.0) & (L)(LEFT)) | ((u > (double)width) & (L)(RIGHT)) |
                                        ((v < 0.0) & (L)(ABOVE)) | ((v > (double)height) & (L)(BELOW))));
             const L kept = before & even;
-            const D fixed_x = (kept ? from_x * units : (D)(0.0)) + round, fixed_y = (kept ? from_y * units : (D)(0.0)) + round;
+            const D fixed_x = (kept ? from_x * units : (D)(0.0)) + round;
+            const D fixed_y = (kept ? from_y * units : (D)(0.0)) + round;
             const I sx = __builtin_convertvector(__builtin_bit_cast(L, fixed_x), I);
             const I sy = __builtin_convertvector(__builtin_bit_cast(L, fixed_y), I);
             const I sw = __builtin_bit_cast(I, __builtin_convertvector(kept ? inverse : (D)(1.0), F));
@@ -330,8 +332,9 @@ DRAW = """
     typedef int I4 __attribute__((ext_vector_type(4)));
     typedef int I8 __attribute__((ext_vector_type(8)));
     typedef int I4U __attribute__((ext_vector_type(4), aligned(4)));
-    auto lower = [](auto a, auto b) { return __builtin_elementwise_min(a, b); };
-    auto upper = [](auto a, auto b) { return __builtin_elementwise_max(a, b); };
+    // Not the builtins: those care for NaN, at twice the instructions.
+    auto lower = [](auto a, auto b) { return a < b ? a : b; };
+    auto upper = [](auto a, auto b) { return a > b ? a : b; };
     auto size_of = [](F a) -> F { return __builtin_elementwise_abs(a); };
     #if defined(__FMA__) || defined(__aarch64__)
     auto fma = [](F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
@@ -367,7 +370,9 @@ DRAW = """
     };
     // Columns or rows whose centre may lie between the fixed-point numbers `low` and `high`: each is half a unit off.
     auto first_of = [&](I low, int centre) -> I { return upper((low - 1 - centre + (unit - 1)) >> shift, (I)(0)); };
-    auto last_of = [&](I high, int centre, int size) -> I { return lower((high + 1 - centre) >> shift, (I)(size - 1)); };
+    auto last_of = [&](I high, int centre, int size) -> I {
+        return lower((high + 1 - centre) >> shift, (I)(size - 1));
+    };
 
     for (;;) {
         const int task = __atomic_fetch_add(&job.next_draw, 1, __ATOMIC_RELAXED);
@@ -400,11 +405,16 @@ DRAW = """
             // Rounding of the box never decides about a pixel on an edge.
             const double slack_x = 1e-3 + 1e-9 * (wp::abs(low_x) + wp::abs(high_x));
             const double slack_y = 1e-3 + 1e-9 * (wp::abs(low_y) + wp::abs(high_y));
-            // Clamped as doubles: the conversion of a huge one to an integer is undefined.
-            const int x0 = (int)wp::min(wp::max(__builtin_ceil(low_x - slack_x - 0.5), 0.0), (double)width);
-            const int x1 = (int)wp::max(wp::min(__builtin_floor(high_x + slack_x - 0.5), width - 1.0), -1.0);
-            const int y0 = (int)wp::min(wp::max(__builtin_ceil(low_y - slack_y - 0.5), 0.0), (double)height);
-            const int y1 = (int)wp::max(wp::min(__builtin_floor(high_y + slack_y - 0.5), height - 1.0), -1.0);
+            // Clamped as doubles, because the conversion of a huge one to an integer is undefined; where overflow has
+            // left NaN, to the whole picture.
+            auto first_from = [](double v, int size) -> int { return v > 0.0 ? (int)(v < size ? v : size) : 0; };
+            auto last_from = [](double v, int size) -> int {
+                return v < size - 1 ? (int)(v > -1.0 ? v : -1.0) : size - 1;
+            };
+            const int x0 = first_from(__builtin_ceil(low_x - slack_x - 0.5), width);
+            const int x1 = last_from(__builtin_floor(high_x + slack_x - 0.5), width);
+            const int y0 = first_from(__builtin_ceil(low_y - slack_y - 0.5), height);
+            const int y1 = last_from(__builtin_floor(high_y + slack_y - 0.5), height);
             for (int y = y0; y <= y1; y++) for (int x = x0; x <= x1; x += 8) {
                 const D z = exact(scene, f, x, y);
                 for (int hit = bits8(z > 0.0) & ((2 << wp::min(x1 - x, 7)) - 1); hit; hit &= hit - 1) {
@@ -552,7 +562,7 @@ WRITE = """
     typedef int I8 __attribute__((ext_vector_type(8)));
     typedef int I8U __attribute__((ext_vector_type(8), aligned(4)));
     const int tasks = (quads + @QUADS_A_TASK@ - 1) / @QUADS_A_TASK@;
-    const F none = (F)(0.f);
+    const I8 index8 = {0, 1, 2, 3, 4, 5, 6, 7};
     for (;;) {
         const int task = __atomic_fetch_add(&job.next_write, 1, __ATOMIC_RELAXED);
         if (task >= job.batch * tasks) break;
@@ -581,28 +591,37 @@ WRITE = """
             }
         };
         // Depths and barycentrics in float64 of up to eight pixels from (x, y), of which `n` exist.
-        auto write_exactly = [&](int x, int y, int n) {
+        auto write_exactly = [&](int x, int y, int n, I8 id) {
             const long long i = (long long)y * width + x;
-            int chosen[8], covered = 0;
-            for (int k = 0; k < 8; k++) {
-                const int id = k < n ? face_ids[i + k] : -1;
-                covered |= (id >= 0) << k;
-                chosen[k] = id >= 0 ? id : 0;
+            const L covered = __builtin_convertvector((id >= 0) & (index8 < n), L);
+            D z = (D)(__builtin_inf()), wa = (D)(0.0), wb = wa, wc = wa;
+            if (bits8(covered)) {
+                int chosen[8];
+                *(I8U*)chosen = id < 0 ? (I8)(0) : id;
+                const Corner p = gather(scene.camera, chosen, 0), q = gather(scene.camera, chosen, 1);
+                const Corner r = gather(scene.camera, chosen, 2);
+                const D u = view.u0 + (eight + (double)x) * view.du, v = (D)(view.v0 + (double)y * view.dv);
+                const Weights w = weigh(p, q, r, u, v);
+                z = covered ? depth_of(w, p.z, q.z, r.z) : z;
+                wa = covered ? w.a / w.sum : wa;
+                wb = covered ? w.b / w.sum : wb;
+                wc = covered ? w.c / w.sum : wc;
             }
-            if (!covered) return;
-            const Corner p = gather(scene.camera, chosen, 0), q = gather(scene.camera, chosen, 1);
-            const Corner r = gather(scene.camera, chosen, 2);
-            const D u = view.u0 + (eight + (double)x) * view.du, v = (D)(view.v0 + (double)y * view.dv);
-            const Weights w = weigh(p, q, r, u, v);
-            const D z = depth_of(w, p.z, q.z, r.z), wa = w.a / w.sum, wb = w.b / w.sum, wc = w.c / w.sum;
-            for (; covered; covered &= covered - 1) {
-                const int k = __builtin_ctz(covered);
-                depth[i + k] = (T)z[k];
-                if (!barycentrics) continue;
-                barycentrics[3 * (i + k)] = (T)wa[k];
-                barycentrics[3 * (i + k) + 1] = (T)wb[k];
-                barycentrics[3 * (i + k) + 2] = (T)wc[k];
-            }
+            T spare[32];
+            T* depth_out = n == 8 ? depth + i : spare;
+            *(T8U*)depth_out = __builtin_convertvector(z, T8);
+            if (n < 8) memcpy(depth + i, spare, n * sizeof(T));
+            if (!barycentrics) return;
+            T* out = n == 8 ? barycentrics + 3 * i : spare;
+            const T8 a = __builtin_convertvector(wa, T8), b = __builtin_convertvector(wb, T8);
+            const T8 c = __builtin_convertvector(wc, T8);
+            *(T8U*)out = __builtin_shufflevector(
+                __builtin_shufflevector(a, b, 0, 8, -1, 1, 9, -1, 2, 10), c, 0, 1, 8, 3, 4, 9, 6, 7);
+            *(T8U*)(out + 8) = __builtin_shufflevector(
+                __builtin_shufflevector(a, b, -1, 3, 11, -1, 4, 12, -1, 5), c, 10, 1, 2, 11, 4, 5, 12, 7);
+            *(T8U*)(out + 16) = __builtin_shufflevector(
+                __builtin_shufflevector(a, b, 13, -1, 6, 14, -1, 7, 15, -1), c, 0, 13, 2, 3, 14, 5, 6, 15);
+            if (n < 8) memcpy(barycentrics + 3 * i, spare, 3 * n * sizeof(T));
         };
         auto write_row = [&](int x, int y, F inverse, I id) {
             if (y >= height) return;
@@ -619,12 +638,12 @@ WRITE = """
                 face_ids[i + k] = shown[k];
             }
             if (!barycentrics && sizeof(T) == 4) return;
-            if (barycentrics) memset(barycentrics + 3 * i, 0, 3 * n * sizeof(T));
-            write_exactly(x, y, wp::min(n, 8));
-            if (n > 8) write_exactly(x + 8, y, n - 8);
+            write_exactly(x, y, wp::min(n, 8), shown.lo);
+            if (n > 8) write_exactly(x + 8, y, n - 8, shown.hi);
         };
 
-        for (int quad = first; quad < wp::min(first + @QUADS_A_TASK@, quads); quad++) for (int x = 0; x < width; x += 16) {
+        const int end = wp::min(first + @QUADS_A_TASK@, quads);
+        for (int quad = first; quad < end; quad++) for (int x = 0; x < width; x += 16) {
             const long long i = (long long)quad * stride + 4 * x;
             for (int part = 1; part < job.parts; part++) {
                 const float* other = planes(entry, part);
@@ -649,6 +668,8 @@ WRITE = """
 """
 
 SCORE = """
+    typedef int I __attribute__((ext_vector_type(8)));
+    typedef int I8U __attribute__((ext_vector_type(8), aligned(4)));
     const int ranges = (job.n_points + @POINTS_A_TASK@ - 1) / @POINTS_A_TASK@;
     const int* vertex_of = (const int*)job.point_vertices;
     // e^-x for x >= 0: 2^-n with n the whole number nearest to x / ln 2, times the series of the rest, |r| < 0.35.
@@ -695,8 +716,9 @@ SCORE = """
         };
         auto shows_near = [&](int x, int y, int vertex) -> bool {
             if (shows(x, y, vertex)) return true;
-            for (int v = wp::max(y - 1, 0); v <= wp::min(y + 1, height - 1); v++)
-                for (int u = wp::max(x - 1, 0); u <= wp::min(x + 1, width - 1); u++) if (shows(u, v, vertex)) return true;
+            const int x0 = wp::max(x - 1, 0), x1 = wp::min(x + 1, width - 1);
+            const int y0 = wp::max(y - 1, 0), y1 = wp::min(y + 1, height - 1);
+            for (int v = y0; v <= y1; v++) for (int u = x0; u <= x1; u++) if (shows(u, v, vertex)) return true;
             return false;
         };
 
@@ -710,40 +732,44 @@ SCORE = """
             const D divisor = Z > near_plane ? Z : (D)(1.0);
             const D u = view.fx * X / divisor + view.cx, v = view.fy * Y / divisor + view.cy;
             const L inside = (Z > near_plane) & (u >= 0.0) & (v >= 0.0) & (u < (double)width) & (v < (double)height);
-            const int in_picture = bits8(inside);
-            const D safe_u = inside ? u : (D)(0.0), safe_v = inside ? v : (D)(0.0);
-            int chosen[8], soft = 0, whole = 0;
-            D column = (D)(0.0), row = (D)(0.0);
-            for (int k = 0; k < 8; k++) {
-                chosen[k] = 0;
-                if (k >= n || !(in_picture >> k & 1)) continue;
-                const int x = (int)safe_u[k], y = (int)safe_v[k], id = ids[(long long)y * width + x];
-                column[k] = x;
-                row[k] = y;
-                if (id < 0 || (job.identity && vertex_of[i + k] >= 0 && shows_near(x, y, vertex_of[i + k]))) {
-                    whole |= 1 << k;
-                } else {
-                    soft |= 1 << k;
-                    chosen[k] = id;
+            const I x = __builtin_convertvector(inside ? u : (D)(0.0), I);
+            const I y = __builtin_convertvector(inside ? v : (D)(0.0), I);
+            const I pixel = y * width + x;
+            I id;
+            for (int k = 0; k < 8; k++) id[k] = ids[pixel[k]];
+            L seen = inside & __builtin_convertvector(id < 0, L);
+            if (job.identity) {
+                I known = (I)(0);
+                for (int k = 0; k < n; k++) {
+                    const int vertex = vertex_of[i + k];
+                    known[k] = vertex >= 0 && shows_near(x[k], y[k], vertex) ? -1 : 0;
                 }
+                seen |= inside & __builtin_convertvector(known, L);
             }
-            D p = (D)(0.0), slope = (D)(0.0);
-            if (soft) {
-                const Corner a = gather(camera, chosen, 0), b = gather(camera, chosen, 1), c = gather(camera, chosen, 2);
-                const Weights w = weigh(a, b, c, view.u0 + column * view.du, view.v0 + row * view.dv);
-                const D x = (depth_of(w, a.z, b.z, c.z) - Z + job.margin) / job.tau;
-                const D e = falloff(absolute(x));
+            const L soft = inside & ~seen;
+            D p = seen ? (D)(1.0) : (D)(0.0), slope = (D)(0.0);
+            if (bits8(soft)) {
+                int chosen[8];
+                *(I8U*)chosen = id < 0 ? (I)(0) : id;
+                const Corner a = gather(camera, chosen, 0), b = gather(camera, chosen, 1);
+                const Corner c = gather(camera, chosen, 2);
+                const Weights w = weigh(a, b, c, view.u0 + __builtin_convertvector(x, D) * view.du,
+                                        view.v0 + __builtin_convertvector(y, D) * view.dv);
+                const D t = (depth_of(w, a.z, b.z, c.z) - Z + job.margin) / job.tau;
+                const D e = falloff(absolute(t));
                 const D part = 1.0 / (1.0 + e);
-                p = x >= 0.0 ? part : e * part;
-                slope = -(e * part) * part / job.tau;
+                p = soft ? (t >= 0.0 ? part : e * part) : p;
+                slope = soft ? -(e * part) * part / job.tau : slope;
             }
-            for (int k = 0; k < n; k++) {
-                const bool is_soft = soft >> k & 1;
-                visibility[i + k] = is_soft ? (T)p[k] : (T)(whole >> k & 1);
-                if (slopes) {
-                    slopes[i + k] = is_soft ? (T)slope[k] : (T)0;
-                    pixels[i + k] = is_soft ? (int)row[k] * width + (int)column[k] : -1;
-                }
+            const I at = __builtin_convertvector(soft, I) ? pixel : (I)(-1);
+            if (n == 8) {
+                *(T8U*)(visibility + i) = __builtin_convertvector(p, T8);
+                if (slopes) *(T8U*)(slopes + i) = __builtin_convertvector(slope, T8);
+                if (slopes) *(I8U*)(pixels + i) = at;
+            } else for (int k = 0; k < n; k++) {
+                visibility[i + k] = (T)p[k];
+                if (slopes) slopes[i + k] = (T)slope[k];
+                if (slopes) pixels[i + k] = at[k];
             }
             if (vertex_of) for (int k = 0; k < n; k++) {
                 if (vertex_of[i + k] < -1 || vertex_of[i + k] >= job.n_vertices) found |= @BAD_POINT_VERTICES@;
@@ -774,20 +800,20 @@ BODIES = {
 
 
 def _kernel(stage: str, text: str, module: Any) -> Any:
-    def native(thread: wp.int32, address: wp.uint64): ...
+    def native(address: wp.uint64): ...
 
     native.__name__ = native.__qualname__ = f"{stage}_native"
     body = wp.func_native(text)(native)
 
-    def run(thread: wp.int32, address: wp.uint64):
-        body(thread, address)
+    def run(address: wp.uint64):
+        body(address)
 
     return wp.Kernel(run, key=stage, module=module)
 
 
 @functools.cache
 def kernels(dtype: str) -> dict[str, Any]:
-    """The kernel of each stage of `BODIES`, for inputs of C type "float" or "double": (thread, address of a `Job`)."""
+    """The kernel of each stage in `BODIES`, for inputs of C type "float" or "double"; it takes the address of a `Job`."""
     module = wp.get_module(f"{__name__}.{dtype}")
     wp.set_module_options(cpu_options(), module=module)
     made = {}
