@@ -1,7 +1,8 @@
 """The depth buffer on the CPU: what `depth_buffer` computes, 8 or 16 numbers at a time, to the same face ids.
 
-Three kernels, one launch a thread each; the threads take tasks off a counter of the call until none is left.
-`transform` (a task is a range of vertices) -> `draw` (a strip of rows) -> `score` (a range of points).
+`transform` (a task is a range of vertices) -> `draw` (a part of the faces, into a buffer of its own) -> `write` (rows
+of the buffers, merged) -> `score` (a range of points). Each is launched once a thread, and the threads take tasks off a
+counter of the call until none is left.
 
 Drawing is a filter. Faces are set up 16 at a time in float32, from corners in fixed point on the screen (2^-20 px for
 pictures up to 512 px) and their inverse depths, and then tested against blocks of 4 x 4 pixels: one vector for each
@@ -12,13 +13,13 @@ filter costs no exactness and opens no seam: which face a pixel shows depends ne
 the threads, nor on whether the processor fuses. What a filter cannot serve (triangles through the near plane, far
 outside the picture, or too thin for its bounds) is drawn in float64, 8 pixels at a time.
 
-A strip is kept in blocks: pixel (x, y) at (y / 4) * stride + 4 x + y % 4, so that the 4 x 4 pixels at any column are
+A buffer is kept in blocks: pixel (x, y) at (y / 4) * stride + 4 x + y % 4, so that the 4 x 4 pixels at any column are
 one unaligned load.
 """
 
 import ctypes
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -29,14 +30,12 @@ POINTS_A_TASK = 2048
 QUADS_A_TASK = 8
 """Rows of blocks that `write` takes at a time."""
 SPARE_COLUMNS = 4
-"""Columns of a strip past the picture's last, for blocks that reach beyond it."""
+"""Columns of a buffer past the picture's last, for blocks that reach beyond it."""
 
-BAD_VERTICES, BAD_VIEWMAT, BAD_K, BAD_POINTS, BAD_POINT_VERTICES = 1, 2, 4, 8, 16
-"""Bits of `Job.found`: arguments with values that are refused."""
 
 
 class Job(ctypes.Structure):
-    """Arguments of all three kernels. Pointers are addresses; sizes of what they point to in brackets."""
+    """Arguments of all kernels. Pointers are addresses; sizes of what they point to in brackets."""
 
     _fields_ = (
         ("vertices", ctypes.c_longlong),  # T [batch or 1][n_vertices][3]
@@ -71,7 +70,7 @@ class Job(ctypes.Structure):
         ("next_draw", ctypes.c_int),
         ("next_write", ctypes.c_int),
         ("next_score", ctypes.c_int),
-        ("found", ctypes.c_int),
+        ("found", ctypes.c_int),  # not 0: there may be values that are refused
         ("near_plane", ctypes.c_double),
         ("tau", ctypes.c_double),
         ("margin", ctypes.c_double),
@@ -116,9 +115,9 @@ HEAD = (
         const T* m = (const T*)job.viewmats + b * job.viewmats_step;
         const T* K = (const T*)job.Ks + b * job.Ks_step;
         view.bad = 0;
-        for (int i = 0; i < 16; i++) if (!(m[i] <= (T)1e15 && m[i] >= (T)-1e15)) view.bad |= @BAD_VIEWMAT@;
-        for (int i = 0; i < 9; i++) if (!(K[i] <= (T)1e15 && K[i] >= (T)-1e15)) view.bad |= @BAD_K@;
-        if (!(K[0] > 0) || !(K[4] > 0)) view.bad |= @BAD_K@;
+        for (int i = 0; i < 16; i++) if (!(m[i] <= (T)1e15 && m[i] >= (T)-1e15)) view.bad = 1;
+        for (int i = 0; i < 9; i++) if (!(K[i] <= (T)1e15 && K[i] >= (T)-1e15)) view.bad = 1;
+        if (!(K[0] > 0) || !(K[4] > 0)) view.bad = 1;
         for (int i = 0; i < 12; i++) view.r[i] = m[i];
         view.fx = K[0]; view.fy = K[4]; view.cx = K[2]; view.cy = K[5];
         view.du = 1.0 / view.fx; view.dv = 1.0 / view.fy;
@@ -216,15 +215,15 @@ TRANSFORM = """
             const int n = wp::min(end - i, 8);
             D x, y, z;
             load3(vertices + 3ll * i, n, x, y, z);
-            bad |= ~((absolute(x) <= 1e15) & (absolute(y) <= 1e15) & (absolute(z) <= 1e15));
+            bad |= ~(absolute(x) + absolute(y) + absolute(z) <= 1e15);
             const D X = in_camera(view, 0, x, y, z), Y = in_camera(view, 1, x, y, z), Z = in_camera(view, 2, x, y, z);
-            const L finite = (absolute(X) < 1e100) & (absolute(Y) < 1e100) & (absolute(Z) < 1e100);
+            const L finite = absolute(X) + absolute(Y) + absolute(Z) < 1e100;
             const L before = finite & (Z > near_plane);
             const D inverse = 1.0 / (before ? Z : (D)(1.0));
             const D u = view.fx * X * inverse + view.cx, v = view.fy * Y * inverse + view.cy;
             const D from_x = u - middle_x, from_y = v - middle_y;
             // Depths that float32 cannot invert, and those a rounding away from the near plane, are odd as well.
-            const L placed = finite & ~(before & ~((absolute(u) < 1e100) & (absolute(v) < 1e100)));
+            const L placed = finite & (~before | (absolute(u) + absolute(v) < 1e100));
             const L even = (absolute(from_x) < reach) & (absolute(from_y) < reach) & (inverse < 1e30) &
                            (inverse > 1e-30) & (Z > near_plane * (1 + 1e-9));
             const L marks = (finite & ~before & (L)(BEHIND)) | (~placed & (L)(LOST)) | (before & ~even & (L)(ODD)) |
@@ -265,9 +264,9 @@ TRANSFORM = """
                 }
             }
         }
-        if (bits8(bad)) found |= @BAD_VERTICES@;
+        if (bits8(bad)) found = 1;
     }
-    if (found) __atomic_fetch_or(&job.found, found, __ATOMIC_RELAXED);
+    if (found) __atomic_store_n(&job.found, 1, __ATOMIC_RELAXED);
 """
 
 BUFFER = """
@@ -348,15 +347,13 @@ DRAW = """
     // The centre of column x is at x unit + centre_x in fixed point.
     const int centre_x = unit / 2 - width / 2 * unit, centre_y = unit / 2 - height / 2 * unit;
 
-    // A group is 16 faces from all over the mesh. Neighbours would draw on the same pixels one after the other, each
-    // waiting for the other's stores.
-    const int groups = (job.n_faces + 15) / 16;
+    // Corner j of the 16 faces from `first`, those past the last being the last.
     struct Place { I x, y, inverse, marks; };
-    auto place = [&](const int* screen, int g, int j) -> Place {
+    auto place = [&](const int* screen, int first, int j) -> Place {
         I4 r[16];
         for (int k = 0; k < 16; k++) {
-            const long long f = wp::min(g + k * (long long)groups, job.n_faces - 1ll);
-            r[k] = *(const I4U*)(screen + 4ll * faces[3 * f + j]);
+            const int f = wp::min(first + k, job.n_faces - 1);
+            r[k] = *(const I4U*)(screen + 4ll * faces[3ll * f + j]);
         }
         I quad[4];
         for (int k = 0; k < 4; k++) {
@@ -434,10 +431,9 @@ DRAW = """
             }
         };
 
-        const int first_group = (int)((long long)groups * part / job.parts);
-        const int end_group = (int)((long long)groups * (part + 1) / job.parts);
-        for (int g = first_group; g < end_group; g++) {
-            const Place a = place(screen, g, 0), b = place(screen, g, 1), c = place(screen, g, 2);
+        const int end = (int)((long long)job.n_faces * (part + 1) / job.parts);
+        for (int first = (int)((long long)job.n_faces * part / job.parts); first < end; first += 16) {
+            const Place a = place(screen, first, 0), b = place(screen, first, 1), c = place(screen, first, 2);
             const I all = a.marks & b.marks & c.marks, any = a.marks | b.marks | c.marks;
             const I x0 = first_of(lower(a.x, lower(b.x, c.x)), centre_x);
             const I y0 = first_of(lower(a.y, lower(b.y, c.y)), centre_y);
@@ -445,7 +441,7 @@ DRAW = """
             const I y1 = last_of(upper(a.y, upper(b.y, c.y)), centre_y, height);
             // Off the picture or behind the near plane as a whole; without a place; in no pixel.
             const I odd = (any & (BEHIND | ODD)) != 0;
-            const I drawn = (lane * groups + g < job.n_faces) & ((all & ~ODD) == 0) & ((any & LOST) == 0);
+            const I drawn = (lane < end - first) & ((all & ~ODD) == 0) & ((any & LOST) == 0);
             const unsigned todo = bits(drawn & (odd | ((x0 <= x1) & (y0 <= y1))));
             if (!todo) continue;
 
@@ -525,22 +521,17 @@ DRAW = """
                 const F c = fma(slope_xc, (F)(across), fma(slope_yc, (F)(down), start_c));
                 *(F*)starts[0][block] = a; *(F*)starts[1][block] = b; *(F*)starts[2][block] = c;
                 *(I*)places[block] = place_of + (block % 2 * 16 + block / 2 * stride);
-                // Where an edge function is negative in all corners of the block, nothing of the face is there.
-                auto most = [&](F at, F x, F y) -> F { return at + 3.f * (upper(x, (F)(0.f)) + upper(y, (F)(0.f))); };
-                I touched = (most(a, slope_xa, slope_ya) >= 0.f) & (most(b, slope_xb, slope_yb) >= 0.f) &
-                            (most(c, slope_xc, slope_yc) >= 0.f);
-                if (block % 2) touched &= wide;
-                if (block / 2) touched &= high;
-                blocks |= (unsigned long long)(bits(touched) & small) << 16 * block;
+                const unsigned reached = bits((block % 2 ? wide : (I)(-1)) & (block / 2 ? high : (I)(-1)));
+                blocks |= (unsigned long long)(reached & small) << 16 * block;
             }
             for (; blocks; blocks &= blocks - 1) {
                 const int j = __builtin_ctzll(blocks), k = j % 16, block = j / 16;
-                draw_block(k, k * groups + g, (&starts[0][0][0])[j], (&starts[1][0][0])[j], (&starts[2][0][0])[j],
+                draw_block(k, first + k, (&starts[0][0][0])[j], (&starts[1][0][0])[j], (&starts[2][0][0])[j],
                            (&places[0][0])[j], xs[k] + block % 2 * 4, ys[k] + block / 2 * 4);
             }
 
             for (unsigned rest = todo & ~small; rest; rest &= rest - 1) {
-                const int k = __builtin_ctz(rest), f = k * groups + g;
+                const int k = __builtin_ctz(rest), f = first + k;
                 if (!(fast >> k & 1)) { draw_exactly(f); continue; }
                 const int left = xs[k], right = x1[k], bottom = y1[k];
                 for (int y = ys[k]; y <= bottom; y += 4) for (int x = left; x <= right; x += 4) {
@@ -672,6 +663,7 @@ SCORE = """
     typedef int I8U __attribute__((ext_vector_type(8), aligned(4)));
     const int ranges = (job.n_points + @POINTS_A_TASK@ - 1) / @POINTS_A_TASK@;
     const int* vertex_of = (const int*)job.point_vertices;
+    const double per_tau = 1.0 / job.tau;
     // e^-x for x >= 0: 2^-n with n the whole number nearest to x / ln 2, times the series of the rest, |r| < 0.35.
     auto falloff = [](D x) -> D {
         x = x < 700.0 ? x : (D)(700.0);
@@ -726,7 +718,7 @@ SCORE = """
             const int n = wp::min(end - i, 8);
             D px, py, pz;
             load3(points + 3ll * i, n, px, py, pz);
-            bad |= ~((absolute(px) <= 1e15) & (absolute(py) <= 1e15) & (absolute(pz) <= 1e15));
+            bad |= ~(absolute(px) + absolute(py) + absolute(pz) <= 1e15);
             const D X = in_camera(view, 0, px, py, pz), Y = in_camera(view, 1, px, py, pz);
             const D Z = in_camera(view, 2, px, py, pz);
             const D divisor = Z > near_plane ? Z : (D)(1.0);
@@ -755,11 +747,11 @@ SCORE = """
                 const Corner c = gather(camera, chosen, 2);
                 const Weights w = weigh(a, b, c, view.u0 + __builtin_convertvector(x, D) * view.du,
                                         view.v0 + __builtin_convertvector(y, D) * view.dv);
-                const D t = (depth_of(w, a.z, b.z, c.z) - Z + job.margin) / job.tau;
+                const D t = (depth_of(w, a.z, b.z, c.z) - Z + job.margin) * per_tau;
                 const D e = falloff(absolute(t));
                 const D part = 1.0 / (1.0 + e);
                 p = soft ? (t >= 0.0 ? part : e * part) : p;
-                slope = soft ? -(e * part) * part / job.tau : slope;
+                slope = soft ? -(e * part) * part * per_tau : slope;
             }
             const I at = __builtin_convertvector(soft, I) ? pixel : (I)(-1);
             if (n == 8) {
@@ -772,12 +764,12 @@ SCORE = """
                 if (slopes) pixels[i + k] = at[k];
             }
             if (vertex_of) for (int k = 0; k < n; k++) {
-                if (vertex_of[i + k] < -1 || vertex_of[i + k] >= job.n_vertices) found |= @BAD_POINT_VERTICES@;
+                if (vertex_of[i + k] < -1 || vertex_of[i + k] >= job.n_vertices) found = 1;
             }
         }
-        if (bits8(bad)) found |= @BAD_POINTS@;
+        if (bits8(bad)) found = 1;
     }
-    if (found) __atomic_fetch_or(&job.found, found, __ATOMIC_RELAXED);
+    if (found) __atomic_store_n(&job.found, 1, __ATOMIC_RELAXED);
 """
 
 CONSTANTS = {
@@ -785,11 +777,6 @@ CONSTANTS = {
     "POINTS_A_TASK": POINTS_A_TASK,
     "QUADS_A_TASK": QUADS_A_TASK,
     "SPARE_COLUMNS": SPARE_COLUMNS,
-    "BAD_VERTICES": BAD_VERTICES,
-    "BAD_VIEWMAT": BAD_VIEWMAT,
-    "BAD_K": BAD_K,
-    "BAD_POINTS": BAD_POINTS,
-    "BAD_POINT_VERTICES": BAD_POINT_VERTICES,
 }
 BODIES = {
     "transform": HEAD + MARKS + TRANSFORM,
@@ -799,26 +786,53 @@ BODIES = {
 }
 
 
-def _kernel(stage: str, text: str, module: Any) -> Any:
-    def native(address: wp.uint64): ...
+class Kernels(NamedTuple):
+    """Kernels of one scalar type. Their one argument is the address of a `Job`."""
 
-    native.__name__ = native.__qualname__ = f"{stage}_native"
-    body = wp.func_native(text)(native)
-
-    def run(address: wp.uint64):
-        body(address)
-
-    return wp.Kernel(run, key=stage, module=module)
+    transform: Any
+    draw: Any
+    write: Any
+    score: Any
+    all: Any
+    """The four, one after the other, for a single thread."""
 
 
 @functools.cache
-def kernels(dtype: str) -> dict[str, Any]:
-    """The kernel of each stage in `BODIES`, for inputs of C type "float" or "double"; it takes the address of a `Job`."""
+def kernels(dtype: str) -> Kernels:
+    """The kernels for inputs of C type "float" or "double"."""
     module = wp.get_module(f"{__name__}.{dtype}")
     wp.set_module_options(cpu_options(), module=module)
-    made = {}
-    for stage, text in BODIES.items():
+
+    def native(stage: str) -> Any:
+        text = BODIES[stage]
         for name, value in {"T": dtype, **CONSTANTS}.items():
             text = text.replace(f"@{name}@", str(value))
-        made[stage] = _kernel(stage, text, module)
-    return made
+
+        def stub(address: wp.uint64): ...
+
+        stub.__name__ = stub.__qualname__ = f"{stage}_natively"
+        return wp.func_native(text)(stub)
+
+    transform_natively, draw_natively = native("transform"), native("draw")
+    write_natively, score_natively = native("write"), native("score")
+
+    def transform(address: wp.uint64):
+        transform_natively(address)
+
+    def draw(address: wp.uint64):
+        draw_natively(address)
+
+    def write(address: wp.uint64):
+        write_natively(address)
+
+    def score(address: wp.uint64):
+        score_natively(address)
+
+    def transform_draw_write_score(address: wp.uint64):
+        transform_natively(address)
+        draw_natively(address)
+        write_natively(address)
+        score_natively(address)
+
+    functions = (transform, draw, write, score, transform_draw_write_score)
+    return Kernels(*(wp.Kernel(function, module=module) for function in functions))

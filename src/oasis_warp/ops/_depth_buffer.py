@@ -6,7 +6,7 @@ Everything has a leading batch axis here. A tensor that is the same for the whol
 import ctypes
 import os
 import threading
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -138,9 +138,12 @@ def draw_by_vectors(
         scene.room(height, width, dtype=torch.int32),
         scene.room(height, width, 3) if barycentrics else None,
     )
-    camera_vertices = scene.room(n_vertices, 4, dtype=torch.float64)
-    screen_vertices = scene.room(n_vertices, 4, dtype=torch.int32)
-    planes = scene.room(parts, 2, plane_size(width, height), dtype=torch.float32)
+    plane = plane_size(width, height)
+    # One block: camera_vertices, screen_vertices and planes, in numbers of 4 bytes.
+    room = scene.room(12 * n_vertices + 2 * parts * plane, dtype=torch.float32)
+    camera_vertices = room.data_ptr()
+    screen_vertices = camera_vertices + 32 * batch * n_vertices
+    planes = screen_vertices + 16 * batch * n_vertices
     job = vectors.Job(
         vertices=vertices.data_ptr(),
         viewmats=viewmats.data_ptr(),
@@ -149,9 +152,9 @@ def draw_by_vectors(
         vertices_step=vertices_step,
         viewmats_step=viewmats_step,
         Ks_step=Ks_step,
-        camera_vertices=camera_vertices.data_ptr(),
-        screen_vertices=screen_vertices.data_ptr(),
-        planes=planes.data_ptr(),
+        camera_vertices=camera_vertices,
+        screen_vertices=screen_vertices,
+        planes=planes,
         depth=buffer.depth.data_ptr(),
         face_ids=buffer.face_ids.data_ptr(),
         barycentrics=0 if buffer.barycentrics is None else buffer.barycentrics.data_ptr(),
@@ -164,27 +167,21 @@ def draw_by_vectors(
         fraction_bits=_fraction_bits(width, height),
         near_plane=scene.near_plane,
     )
-    dtype = C_TYPES[vertices.dtype]
-    _run("transform", dtype, batch * -(-n_vertices // vectors.VERTICES_A_TASK), job)
-    if validate and job.found:
-        refuse_bad_values(scene, query)
-    _run("draw", dtype, batch * parts, job)
-    _run("write", dtype, batch * -(-height // (4 * vectors.QUADS_A_TASK)), job)
-    if query is None:
-        return buffer, None
-
-    points, job.points_step = _shared(query.points)
-    n_points = job.n_points = points.shape[-2]
-    kept = n_points if query.keep else 0
-    scores = Scores(scene.room(n_points), scene.room(kept), scene.room(kept, dtype=torch.int32))
-    job.points = points.data_ptr()
-    job.point_vertices = 0 if query.point_vertices is None else query.point_vertices.data_ptr()
-    job.identity = query.by_identity
-    job.tau, job.margin = query.tau, query.margin
-    job.visibility = scores.visibility.data_ptr()
-    if query.keep:
-        job.slopes, job.pixels = scores.slopes.data_ptr(), scores.pixels.data_ptr()
-    _run("score", dtype, batch * -(-n_points // vectors.POINTS_A_TASK), job)
+    scores = None
+    if query is not None:
+        points, job.points_step = _shared(query.points)
+        n_points = job.n_points = query.points.shape[1]
+        kept = n_points if query.keep else 0
+        scores = Scores(scene.room(n_points), scene.room(kept), scene.room(kept, dtype=torch.int32))
+        job.points = points.data_ptr()
+        job.point_vertices = 0 if query.point_vertices is None else query.point_vertices.data_ptr()
+        job.identity = query.by_identity
+        job.tau, job.margin = query.tau, query.margin
+        job.visibility = scores.visibility.data_ptr()
+        if query.keep:
+            job.slopes, job.pixels = scores.slopes.data_ptr(), scores.pixels.data_ptr()
+    _run_all(job, C_TYPES[vertices.dtype])
+    # Values that are refused do no harm on the way.
     if validate and job.found:
         refuse_bad_values(scene, query)
     return buffer, scores
@@ -193,26 +190,35 @@ def draw_by_vectors(
 _recorded = threading.local()
 
 
-def _run(stage: str, dtype: str, n_tasks: int, job: vectors.Job) -> None:
-    """Run a stage on as many of torch's threads as there are tasks."""
+def _run_all(job: vectors.Job, dtype: str) -> None:
+    """Run the stages on as many of torch's threads as they have tasks for."""
     start()
-    n_threads = min(torch.get_num_threads(), n_tasks)
     address = ctypes.addressof(job)
-    if n_threads < 2:
-        _run_here(stage, dtype, address)
+    if torch.get_num_threads() == 1:
+        _run("all", dtype, address)
         return
-    list(_pool(os.getpid(), n_threads).map(lambda _: _run_here(stage, dtype, address), range(n_threads)))
+    for stage, tasks in {
+        "transform": -(-job.n_vertices // vectors.VERTICES_A_TASK),
+        "draw": job.parts,
+        "write": -(-job.height // (4 * vectors.QUADS_A_TASK)),
+        "score": -(-job.n_points // vectors.POINTS_A_TASK),
+    }.items():
+        n_threads = min(torch.get_num_threads(), job.batch * tasks)
+        if n_threads < 2:
+            _run(stage, dtype, address)
+        else:
+            list(_pool(os.getpid(), n_threads).map(_run, *zip(*[(stage, dtype, address)] * n_threads, strict=True)))
 
 
-def _run_here(stage: str, dtype: str, address: int) -> None:
+def _run(stage: str, dtype: str, address: int) -> None:
+    """Run a stage on this thread."""
     # A recorded launch takes 3 us instead of 19, and belongs to one thread: its arguments are part of it.
-    launches = _recorded.__dict__
-    recorded = launches.get(stage + dtype)
+    recorded = getattr(_recorded, stage + dtype, None)
     if recorded is None:
         with _load_lock:
-            kernel = vectors.kernels(dtype)[stage]
-            recorded = wp.launch(kernel, dim=1, inputs=[address], device="cpu", record_cmd=True)
-        launches[stage + dtype] = recorded
+            kernel = getattr(vectors.kernels(dtype), stage)
+            recorded: Any = wp.launch(kernel, dim=1, inputs=[address], device="cpu", record_cmd=True)
+        setattr(_recorded, stage + dtype, recorded)
     recorded.set_param_at_index(0, address)
     recorded.launch()
 
