@@ -1,18 +1,21 @@
-"""The rasterizer written out densely in torch: every pixel against every Gaussian, gradients by autograd.
+"""The rasterizer written out densely: every pixel against every Gaussian.
 
-Shares no code with the kernels. Thresholds are the float32 constants of gsplat 1.5.3, spelled out again.
+Thresholds are the float32 constants of gsplat 1.5.3, spelled out again.
 """
-
 
 import numpy as np
 import torch
+from torch import Tensor
 
 CAP = float(np.float32(0.999))
 FAINTEST = float(np.float32(1 / 255))
 STOP = float(np.float32(1e-4))
+EPS2D = float(np.float32(0.3))
+NEAR = float(np.float32(0.01))
 
 
-def rotation_matrices(quats):
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Of quaternions wxyz of any positive norm."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     return torch.stack([
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -52,13 +55,17 @@ def layers(means, quats, scales, opacities, viewmat, K, width, height, near=0.01
     pivot = torch.where(wide, a, c)
     sigma = 0.5 * (along**2 / pivot + (across - b / pivot * along) ** 2 * pivot / det)
     alpha = opacities[kept] * torch.exp(-sigma)
-    if decide:
-        alpha = torch.where(alpha >= FAINTEST, torch.clamp(alpha, max=CAP), 0)
     order = torch.argsort(z, stable=True)
-    return alpha[:, order], kept[order]
+    alpha = alpha[:, order]
+    return decided(alpha) if decide else alpha, kept[order]
 
 
-def blend_weights(alpha):
+def decided(alpha: Tensor) -> Tensor:
+    """Alphas of layers: skipped where too faint, capped where too strong."""
+    return torch.where(alpha >= FAINTEST, torch.clamp(alpha, max=CAP), 0)
+
+
+def blend_weights(alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Weights alpha T [pixels, n] and the transmittance left at the end [pixels]."""
     after = torch.cumprod(1 - alpha, -1)
     alpha = torch.where(after > STOP, alpha, 0)  # the layer that would end the pixel and all behind it
@@ -71,10 +78,23 @@ def rasterization(
     means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds=None, render_mode="RGB", **options
 ):
     """Images [C, H, W, X] and alphas [C, H, W, 1]."""
-    images, alphas = [], []
+    return drawn(
+        means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, render_mode, **options
+    )[:2]
+
+
+def drawn(
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds=None, render_mode="RGB",
+    slack=1.0, **options,
+):  # fmt: skip
+    """Images, alphas, and which pixels [C, H, W] are not `fragile`."""
+    images, alphas, sound = [], [], []
     for c, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
-        alpha, order = layers(means, quats, scales, opacities, viewmat, K, width, height, **options)
-        weights, left = blend_weights(alpha)
+        alpha, order = layers(
+            means, quats, scales, opacities, viewmat, K, width, height, decide=False, **options
+        )
+        sound.append(~fragile(alpha.detach(), slack).reshape(height, width))
+        weights, left = blend_weights(decided(alpha))
         seen = (colors[c] if colors.dim() == 3 else colors)[order]
         depths = (means @ viewmat[:3, :3].T + viewmat[:3, 3])[order, 2:]
         image = weights @ seen
@@ -87,16 +107,16 @@ def rasterization(
         image = {"RGB": [image], "D": [depth], "ED": [depth]}.get(render_mode, [image, depth])
         images.append(torch.cat(image, -1).reshape(height, width, -1))
         alphas.append((1 - left).reshape(height, width, 1))
-    return torch.stack(images), torch.stack(alphas)
+    return torch.stack(images), torch.stack(alphas), torch.stack(sound)
 
 
-def fragile(alpha):
+def fragile(alpha: Tensor, slack: float = 1.0) -> Tensor:
     """Pixels where a decision hangs on rounding: an alpha at the cut-off or the cap, a transmittance at the stop.
 
-    `alpha` are the undecided ones of `layers`.
+    `alpha` are the undecided ones of `layers`; `slack` widens what counts as close.
     """
-    after = torch.cumprod(1 - torch.where(alpha >= FAINTEST, alpha.clamp(max=CAP), 0), -1)
+    after = torch.cumprod(1 - decided(alpha), -1)
     near_edge = torch.zeros(len(alpha), dtype=torch.bool)
     for value, edge, width in [(alpha, FAINTEST, 3e-4), (alpha, CAP, 3e-4), (after, STOP, 2e-3)]:
-        near_edge |= ((value - edge).abs() < width * edge).any(-1)
+        near_edge |= ((value - edge).abs() < slack * width * edge).any(-1)
     return near_edge
