@@ -6,8 +6,8 @@ import weakref
 
 import pytest
 import torch
-from reference import mesh_posing as twin
 
+from oasis_warp.certify.twins import mesh_posing as twin
 from oasis_warp.core.rotation import from_axis_angle, multiply, to_matrix
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.skinning import rest_hand, skin

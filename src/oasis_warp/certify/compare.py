@@ -151,7 +151,7 @@ def compare(
             found.append(measured("single elements", name, peak, bounds.peak))
     for name, error in gradient_errors(case, got, want).items():
         found.append(measured("gradients", name, error, gradients_bound))
-    found.append(measured("numbers that are not finite", "all", float(unfinished(got)), 0.0))
+    found.append(measured("not finite", "all", float(unfinished(got)), 0.0))
     if family.name == "rasterization":
         error = max(
             float(((a - b).abs() * (1 - m)).max()) / (1 + float(b.abs().max()))
@@ -165,3 +165,27 @@ def unfinished(answer: Answer) -> int:
     """How many numbers are NaN or infinite."""
     tensors = [*answer.outputs, *(g for taken in answer.gradients for g in taken.values())]
     return sum(int((~t.isfinite()).sum()) for t in tensors)
+
+
+NEARLY = 2e-5
+"""Difference of two pixels that rounding explains, over the largest element."""
+SHARE = 1e-4
+"""Of elements that may differ by more: those on the edge of a decision."""
+
+
+def agree(
+    family: Family, case: Case, check: str, dtype: torch.dtype, there: torch.device, here: torch.device
+) -> list[Measurement]:
+    """The float32 operator `here` against the operator in `dtype` `there`, on a scene of any size."""
+    shapes = tuple(out.detach() for out in family.read(family.call(case.arguments(dtype, there))))
+    weights = weighings(case, shapes, tuple(torch.ones(()) for _ in shapes))
+    want = ask_operator(family, case, weights, dtype, there)
+    got = ask_operator(family, case, weights, torch.float32, here)
+    bound = 2 * case.bounds.gradients  # both sides may be off
+    found = []
+    for name, a, b in zip(family.outputs, got.outputs, want.outputs, strict=True):
+        off = ((a - b).abs() > NEARLY * largest(b)).double().mean()
+        found.append(Measurement(family.name, f"{check}: values off", f"{case}: {name}", float(off), SHARE))
+    for name, error in gradient_errors(case, got, want).items():
+        found.append(Measurement(family.name, f"{check}: gradients", f"{case}: {name}", error, bound))
+    return found

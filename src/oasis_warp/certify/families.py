@@ -1,7 +1,7 @@
 """The operators under certification: how each is called, what of its answer counts, and its float64 twin."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -32,8 +32,12 @@ class Family:
     case: Callable[..., Case]
     """(condition, seed, ...) to a scene."""
     conditions: tuple[str, ...]
-    indices: tuple[str, ...] = ()
-    """Index arguments, which are refused at -1 and past the end."""
+    large: dict[str, Any]
+    """Arguments of `case` for a scene that work is shared out for, too large for the twin."""
+    indices: dict[str, tuple[str, int]] = field(default_factory=dict)
+    """Index arguments: the argument whose rows each names, and the least index."""
+    smooth: Callable[[Case], bool] = bool
+    """Whether a small step changes no decision of a scene but those that `twin` leaves out."""
 
     def call(self, arguments: dict[str, Any]) -> Any:
         """The operator, found at the time of the call."""
@@ -45,7 +49,7 @@ class Family:
 
 
 def squares(quats: Tensor) -> Tensor:
-    """q q^T of quaternions [..., 4], which does not know their sign."""
+    """The products q q^T of quaternions [..., 4], which does not know their sign."""
     return quats[..., :, None] * quats[..., None, :]
 
 
@@ -99,8 +103,8 @@ def _read_face_rotations(answer: Any) -> Outputs:
 
 def _face_rotations(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
     vertex_quats, face_quats, ratio, sound = face_rotations.turned(*arguments.values())
-    ones = torch.ones_like(ratio)
-    return (squares(vertex_quats), squares(face_quats), ratio), (sound.double()[:, None, None], ones[:, None, None], ones)
+    every = torch.ones(()).double()
+    return (squares(vertex_quats), squares(face_quats), ratio), (sound.double()[:, None, None], every, every)
 
 
 def _read_pose_on_mesh(answer: Any) -> Outputs:
@@ -118,28 +122,35 @@ def _pose_on_mesh(case: Case, arguments: dict[str, Any], slack: float) -> tuple[
     return (means, squares(quats), scales), (every, aligned, every)
 
 
+LARGE_MESH = {"n": 1500, "size": (160, 120)}
+
 FAMILIES = {
     family.name: family
     for family in (
         Family(
             "rasterization", ("image", "alphas"), _read_rasterization, _rasterization,
             rasterization_scenes.rasterization_case, tuple(rasterization_scenes.CONDITIONS),
+            {"n": 5000, "size": (128, 96), "n_cameras": 2, "channels": 3, "mode": "RGB+ED", "spread": 0.25},
+            smooth=rasterization_scenes.is_smooth,
         ),
         Family(
             "depth_map", ("1 / depth", "barycentrics"), _read_depth_map, _depth_map,
-            mesh_scenes.depth_map_case, tuple(mesh_scenes.CONDITIONS), ("faces",),
+            mesh_scenes.depth_map_case, tuple(mesh_scenes.CONDITIONS), LARGE_MESH, {"faces": ("vertices", 0)},
         ),
         Family(
             "depth_visibility", ("visibility",), _read_depth_visibility, _depth_visibility,
-            mesh_scenes.depth_visibility_case, tuple(mesh_scenes.CONDITIONS), ("faces", "point_vertices"),
+            mesh_scenes.depth_visibility_case, tuple(mesh_scenes.CONDITIONS),
+            LARGE_MESH | {"n_points": 5000}, {"faces": ("vertices", 0), "point_vertices": ("vertices", -1)},
         ),
         Family(
             "face_rotations", ("vertex_quats", "face_quats", "area_ratio"), _read_face_rotations, _face_rotations,
-            surface_scenes.face_rotations_case, tuple(surface_scenes.CONDITIONS), ("faces",),
+            surface_scenes.face_rotations_case, tuple(surface_scenes.CONDITIONS), {"side": 50},
+            {"faces": ("rest_vertices", 0)},
         ),
         Family(
             "pose_on_mesh", ("means", "quats", "scales"), _read_pose_on_mesh, _pose_on_mesh,
-            surface_scenes.pose_on_mesh_case, tuple(surface_scenes.RIDERS), ("faces", "face_index"),
+            surface_scenes.pose_on_mesh_case, tuple(surface_scenes.RIDERS),
+            {"n": 10_000}, {"faces": ("posed_vertices", 0), "face_index": ("area_ratio", 0)},
         ),
     )
 }  # fmt: skip

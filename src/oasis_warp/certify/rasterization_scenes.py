@@ -18,6 +18,8 @@ WORK = 60_000
 """Most pixels times Gaussians of a scene, over all its cameras: what the dense twin does in some 20 ms."""
 EYES = ((0.3, -0.2, -3.0), (2.1, 0.4, -2.2), (-1.0, 1.5, 2.6))
 WANTED = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
+SAFE = 1e-3
+"""Distance from a kink that no finite difference reaches."""
 DEPTH_TIE = 2e-6
 """Relative difference of two depths below which rounding may swap them, unless they are equal."""
 
@@ -39,6 +41,8 @@ class Cloud:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Added to the world, cameras included."""
     planes: tuple[float, float] | None = None
+    no_gradient: float = 0.0
+    """What counts as zero in a gradient of places and shapes: that of an image without structure is rounding."""
 
 
 Condition = Callable[[Draw, int], Cloud]
@@ -110,9 +114,8 @@ def _(draw: Draw, n: int) -> Cloud:
 
 @condition("larger than integers")
 def _(draw: Draw, n: int) -> Cloud:
-    # The image is uniform: randomly signed pixels cancel in the gradient by the means, to a tenth or less.
-    return frontal(draw, min(n, 7), (1e12, 1e9, 1e10), opacities=draw.uniform(min(n, 7), low=0.02, high=0.3),
-                   bounds=Bounds(1e-5, 1e-3))  # fmt: skip
+    n = min(n, 7)
+    return frontal(draw, n, (1e12, 1e9, 1e10), opacities=draw.uniform(n, low=0.02, high=0.3), no_gradient=1e-10)
 
 
 @condition("at the near plane")
@@ -141,7 +144,7 @@ def _(draw: Draw, n: int) -> Cloud:
 
 @condition("beyond the clamp of the Jacobian")
 def _(draw: Draw, n: int) -> Cloud:
-    return frontal(draw, n, (0.5, 0.4, 0.3), spread=(6.0, 6.0, 0.5), distance=1.2)
+    return frontal(draw, n, (0.8, 0.6, 0.5), spread=(3.0, 3.0, 0.5), distance=1.2)
 
 
 @condition("wide angle")
@@ -244,23 +247,35 @@ def look_from(eye: tuple[float, float, float]) -> Tensor:
 
 
 def rasterization_case(
-    name: str, seed: int, n: int | None = None, size: tuple[int, int] | None = None, **fixed: object
+    name: str,
+    seed: int,
+    n: int | None = None,
+    size: tuple[int, int] | None = None,
+    n_cameras: int | None = None,
+    channels: int | None = None,
+    mode: str | None = None,
+    spread: float = 1.0,
 ) -> Case:
-    """A scene under the condition `name`; what is not `fixed` is drawn: channels, n_cameras, mode, per_camera."""
+    """A scene under the condition `name`; what is None is drawn; `spread` scales the Gaussians."""
     draw = Draw(seed)
     width, height = draw.pick(SIZES) if size is None else size
-    n_cameras = fixed.get("n_cameras", draw.pick((1, 1, 2, 3)))
-    drawn_n = draw.pick([count for count in COUNTS if count * width * height * n_cameras <= WORK])
-    cloud = CONDITIONS[name](draw, drawn_n if n is None else n)
-    channels, mode = fixed.get("channels", draw.pick(CHANNELS)), fixed.get("mode", draw.pick(MODES))
-    per_camera, has_background = fixed.get("per_camera", draw.pick((False, True))), draw.pick((True, True, False))
-    return finish(name, seed, draw, cloud, (width, height), n_cameras, channels, mode, per_camera, has_background)
+    n_cameras = draw.pick((1, 1, 2, 3)) if n_cameras is None else n_cameras
+    if n is None:
+        n = draw.pick([count for count in COUNTS if count * width * height * n_cameras <= WORK])
+    cloud = CONDITIONS[name](draw, n)
+    cloud.scales *= spread
+    channels = draw.pick(CHANNELS) if channels is None else channels
+    mode = draw.pick(MODES) if mode is None else mode
+    return finish(name, seed, draw, cloud, (width, height), n_cameras, channels, mode)
 
 
-def finish(name, seed, draw, cloud, size, n_cameras, channels, mode, per_camera, has_background) -> Case:
+def finish(
+    name: str, seed: int, draw: Draw, cloud: Cloud, size: tuple[int, int], n_cameras: int, channels: int, mode: str
+) -> Case:
     """Cameras, rotations and colours for a cloud."""
     width, height = size
     n = len(cloud.means)
+    per_camera, has_background = draw.pick((False, True)), draw.pick((True, True, False))
     if cloud.eye is None:
         viewmats = torch.stack([look_from(eye) for eye in EYES[:n_cameras]])
     else:
@@ -294,7 +309,8 @@ def finish(name, seed, draw, cloud, size, n_cameras, channels, mode, per_camera,
     wanted = [key for key in WANTED if has_background or key != "backgrounds"]
     if not has_background:
         del floats["backgrounds"]
-    return Case(name, seed, floats, tuple(wanted), others, bounds)
+    floors = dict.fromkeys(("means", "quats", "scales", "viewmats"), cloud.no_gradient)
+    return Case(name, seed, floats, tuple(wanted), others, bounds, floors)
 
 
 def without_near_ties(means: Tensor, viewmats: Tensor, opacities: Tensor) -> Tensor:
@@ -308,3 +324,17 @@ def without_near_ties(means: Tensor, viewmats: Tensor, opacities: Tensor) -> Ten
         opacities[order[1:][close]] = 0.0
         opacities[(z != NEAR) & ((z - NEAR).abs() < DEPTH_TIE * NEAR)] = 0.0
     return opacities
+
+
+def is_smooth(case: Case) -> bool:
+    """Whether a small step swaps no two layers and passes no end of the Jacobian's clamp."""
+    width, height = case.others["width"], case.others["height"]
+    for viewmat, K in zip(case.floats["viewmats"], case.floats["Ks"], strict=True):
+        x, y, z = (case.floats["means"] @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
+        if bool((z.sort().values.diff() < SAFE).any()):
+            return False
+        for place, size, focal, centre in ((x / z, width, K[0, 0], K[0, 2]), (y / z, height, K[1, 1], K[1, 2])):
+            for end in (-centre - 0.15 * size, size - centre + 0.15 * size):
+                if bool(((place - end / focal).abs() < SAFE).any()):
+                    return False
+    return True
