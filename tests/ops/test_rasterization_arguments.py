@@ -103,7 +103,7 @@ def test_something_that_is_no_tensor_is_refused(call):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("sh_degree", 0), ("sh_degree", 3), ("sparse_grad", True), ("absgrad", True),
+        ("sparse_grad", True), ("absgrad", True),
         ("rasterize_mode", "antialiased"), ("distributed", True), ("camera_model", "fisheye"),
         ("covars", torch.zeros(60, 3, 3)), ("with_ut", True), ("with_eval3d", True),
         ("radial_coeffs", torch.zeros(2, 6)), ("tangential_coeffs", torch.zeros(2, 2)),

@@ -8,6 +8,7 @@ from oasis_warp.ops.face_rotations import face_rotations as face_rotations
 from oasis_warp.ops.mesh_posing import PosedOnMesh as PosedOnMesh
 from oasis_warp.ops.mesh_posing import pose_on_mesh as pose_on_mesh
 from oasis_warp.ops.rasterization import rasterization as rasterization
+from oasis_warp.ops.spherical_harmonics import spherical_harmonics as spherical_harmonics
 from oasis_warp.ops.visibility import DepthMap as DepthMap
 from oasis_warp.ops.visibility import DepthVisibility as DepthVisibility
 from oasis_warp.ops.visibility import depth_map as depth_map

@@ -8,15 +8,14 @@ from torch import Tensor
 
 from oasis_kernels import constants
 from oasis_warp.core.checks import check_choice, check_finite, check_float, check_positive, check_shape
-from oasis_warp.ops._tiles import Tiles, bin_to_tiles
 from oasis_warp.ops.blending import blend
 from oasis_warp.ops.projection import Projection, project
+from oasis_warp.ops.spherical_harmonics import check_degree, spherical_harmonics
 
 MAX_CHANNELS = 32
 MAX_PIXELS = 2**31 - 1
 
 UNSUPPORTED: dict[str, tuple[Any, str]] = {
-    "sh_degree": (None, "Evaluate spherical harmonics first and pass colours."),
     "sparse_grad": (False, "Gradients are dense."),
     "absgrad": (False, "The gradient of meta['means2d'] is the plain one."),
     "rasterize_mode": ("classic", "Antialiasing by opacity compensation is not built in."),
@@ -40,7 +39,7 @@ def rasterization(
     quats: Float[Tensor, "N 4"],
     scales: Float[Tensor, "N 3"],
     opacities: Float[Tensor, "N"],
-    colors: Float[Tensor, "N D"] | Float[Tensor, "C N D"],
+    colors: Float[Tensor, "N D"] | Float[Tensor, "C N D"] | Float[Tensor, "N K 3"] | Float[Tensor, "C N K 3"],
     viewmats: Float[Tensor, "C 4 4"],
     Ks: Float[Tensor, "C 3 3"],
     width: int,
@@ -90,7 +89,8 @@ def rasterization(
         quats: Rotations wxyz of any positive norm, shape [N, 4].
         scales: Standard deviations [m], shape [N, 3].
         opacities: In [0, 1], shape [N].
-        colors: D <= 32 channels, shape [N, D] or [C, N, D].
+        colors: D <= 32 channels, shape [N, D] or [C, N, D]. With `sh_degree`, coefficients of spherical harmonics,
+            shape [N, K, 3] or [C, N, K, 3].
         viewmats: World to camera (OpenCV axes), shape [C, 4, 4]; the last row is not read.
         Ks: Intrinsics [px], shape [C, 3, 3]; skew is not read.
         width: Of the images [px].
@@ -104,11 +104,12 @@ def rasterization(
         backgrounds: Colour behind the Gaussians, shape [C, D]; black where None.
         render_mode: "RGB" draws `colors`, "D" the accumulated camera z, sum z_i alpha_i T_i, "ED" the expected one,
             that sum over alpha (0 where nothing is); "RGB+D" and "RGB+ED" append it as the last channel.
+        sh_degree: 0 to 3: the colour of a Gaussian is max(0, 0.5 + its harmonics), seen from the camera's centre (see
+            `spherical_harmonics`). None: colors are colours.
         channel_chunk: Like `packed`.
         segmented: Like `packed`.
-        sh_degree: Not supported, as all that follow: known by name so that calls need no change, and refused where
+        sparse_grad: Not supported, as all that follow: known by name so that calls need no change, and refused where
             they are not the default.
-        sparse_grad: Not supported.
         absgrad: Not supported.
         rasterize_mode: Not supported.
         distributed: Not supported.
@@ -145,13 +146,15 @@ def rasterization(
         tile_size, validate,
     )  # fmt: skip
     n, n_cameras = len(means), len(viewmats)
+    if sh_degree is not None:
+        check_coefficients(colors, sh_degree, means, n_cameras)
+        colors = seen_colors(sh_degree, means, colors, viewmats, validate)
     check_colors(colors, backgrounds, means, n_cameras, validate)
 
     projection = project(
         means, quats, scales, opacities, viewmats, Ks, width, height,
         near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
     )  # fmt: skip
-    tiles = bin_to_tiles(projection, width, height, tile_size)
     opacities = opacities.expand(n_cameras, n)
     channels = layers_to_blend(colors.expand(n_cameras, n, colors.shape[-1]), projection.depths, render_mode)
     if backgrounds is None:
@@ -160,12 +163,12 @@ def rasterization(
         behind = channels.new_zeros(n_cameras, 1)
     else:
         behind = torch.nn.functional.pad(backgrounds, (0, channels.shape[-1] - backgrounds.shape[-1]))
-    render, alphas = blend(projection, tiles, opacities, channels, behind, width, height)
+    render, alphas = blend(projection, opacities, channels, behind, width, height, tile_size)
     if render_mode in ("ED", "RGB+ED"):
         drawn = alphas > 0
         expected = torch.where(drawn, render[..., -1:] / torch.where(drawn, alphas, 1), 0)
         render = torch.cat([render[..., :-1], expected], -1)
-    return render, alphas, describe(projection, tiles, opacities, width, height)
+    return render, alphas, describe(projection, opacities, width, height, tile_size)
 
 
 def refuse_unless_default(name: str, value: Any, default: Any, hint: str) -> None:
@@ -176,6 +179,35 @@ def refuse_unless_default(name: str, value: Any, default: Any, hint: str) -> Non
         return
     got = repr(value) if isinstance(value, bool | int | str) else type(value).__name__
     raise ValueError(f"{name}: expected {default!r}, got {got}. Not supported in this version. {hint}")
+
+
+def check_coefficients(coefficients: Tensor, sh_degree: int, means: Tensor, n_cameras: int) -> None:
+    """Shape and type of coefficients of spherical harmonics."""
+    sizes = {"N": len(means), "C": n_cameras}
+    if isinstance(coefficients, Tensor) and coefficients.dim() == 4:
+        check_shape("colors", coefficients, "C", "N", "K", 3, sizes=sizes, hint="Or [N, K, 3].")
+    else:
+        hint = "With sh_degree they are K coefficients of three channels for each centre."
+        check_shape("colors", coefficients, "N", "K", 3, sizes=sizes, hint=hint)
+    check_float("colors", coefficients, like=means)
+    check_degree("sh_degree", sh_degree, coefficients.shape[-2])
+
+
+def seen_colors(
+    sh_degree: int,
+    means: Float[Tensor, "N 3"],
+    coefficients: Float[Tensor, "N K 3"] | Float[Tensor, "C N K 3"],
+    viewmats: Float[Tensor, "C 4 4"],
+    validate: bool,
+) -> Float[Tensor, "C N 3"]:
+    """Colours of the Gaussians as each camera sees them.
+
+    A far camera's centre cancels against the means in float32: their difference is taken in float64.
+    """
+    pose = viewmats.double()
+    centres, _ = torch.linalg.solve_ex(pose[:, :3, :3], -pose[:, :3, 3:])
+    directions = (means.double() - centres.mT).to(means.dtype)
+    return (spherical_harmonics(sh_degree, directions, coefficients, validate=validate) + 0.5).clamp_min(0)
 
 
 def layers_to_blend(colors: Tensor, depths: Tensor, render_mode: str) -> Tensor:
@@ -266,9 +298,10 @@ def check_colors(
         check_finite(colors=colors, backgrounds=backgrounds)
 
 
-def describe(projection: Projection, tiles: Tiles, opacities: Tensor, width: int, height: int) -> dict[str, Any]:
+def describe(
+    projection: Projection, opacities: Tensor, width: int, height: int, tile_size: int
+) -> dict[str, Any]:
     """The `meta` of `rasterization`."""
-    n_cameras, n = projection.depths.shape
     return {
         "camera_ids": None,
         "gaussian_ids": None,
@@ -277,13 +310,8 @@ def describe(projection: Projection, tiles: Tiles, opacities: Tensor, width: int
         "conics": projection.conics,
         "radii": projection.radii,
         "opacities": opacities,
-        "tile_width": tiles.across,
-        "tile_height": tiles.down,
-        "tile_size": tiles.size,
-        "tiles_per_gauss": tiles.pair_counts.view(n_cameras, n),
-        "isect_offsets": tiles.starts[:-1].view(n_cameras, tiles.down, tiles.across),
-        "flatten_ids": tiles.gaussians,
+        "tile_size": tile_size,
         "width": width,
         "height": height,
-        "n_cameras": n_cameras,
+        "n_cameras": len(projection.depths),
     }
