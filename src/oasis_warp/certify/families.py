@@ -10,7 +10,7 @@ from torch import Tensor
 from oasis_warp import ops
 from oasis_warp.certify import mesh_scenes, rasterization_scenes, surface_scenes
 from oasis_warp.certify.case import Case
-from oasis_warp.certify.twins import face_rotations, mesh_posing, rasterization, visibility
+from oasis_warp.certify.twins import face_rotations, harmonics, mesh_posing, rasterization, visibility
 
 Outputs = tuple[Tensor, ...]
 
@@ -53,15 +53,22 @@ def squares(quats: Tensor) -> Tensor:
     return quats[..., :, None] * quats[..., None, :]
 
 
+def bounded(ratios: Tensor) -> Tensor:
+    """Area ratios as they act on scales: of a face that was flat at rest, all further digits are rounding."""
+    return ratios.clamp(1 / mesh_posing.LIMIT, mesh_posing.LIMIT)
+
+
 def _read_rasterization(answer: Any) -> Outputs:
     return answer[0].double(), answer[1].double()
 
 
 def _rasterization(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
     renamed = {"near_plane": "near", "far_plane": "far"}
-    image, alphas, sound = rasterization.drawn(
-        **{renamed.get(name, name): value for name, value in arguments.items()}, slack=slack
-    )
+    given = {renamed.get(name, name): value for name, value in arguments.items()}
+    degree = given.pop("sh_degree", None)
+    if degree is not None:
+        given["colors"] = harmonics.seen_colors(degree, given["means"], given["colors"], given["viewmats"])
+    image, alphas, sound = rasterization.drawn(**given, slack=slack)
     keep = sound[..., None].double()
     return (image, alphas), (keep, keep)
 
@@ -97,14 +104,15 @@ def _depth_visibility(case: Case, arguments: dict[str, Any], slack: float) -> tu
 
 
 def _read_face_rotations(answer: Any) -> Outputs:
-    vertex_quats, face_quats, area_ratio = (t.double() for t in answer)
-    return squares(vertex_quats), squares(face_quats), area_ratio
+    vertex_quats, face_quats, *ratios = (t.double() for t in answer)
+    return squares(vertex_quats), squares(face_quats), *map(bounded, ratios)
 
 
 def _face_rotations(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    vertex_quats, face_quats, ratio, sound = face_rotations.turned(*arguments.values())
+    vertex_quats, face_quats, *ratios, sound = face_rotations.turned(*arguments.values())
     every = torch.ones(()).double()
-    return (squares(vertex_quats), squares(face_quats), ratio), (sound.double()[:, None, None], every, every)
+    keep = sound.double()[:, None, None], every, every, every
+    return (squares(vertex_quats), squares(face_quats), *map(bounded, ratios)), keep
 
 
 def _read_pose_on_mesh(answer: Any) -> Outputs:
@@ -117,7 +125,8 @@ def _pose_on_mesh(case: Case, arguments: dict[str, Any], slack: float) -> tuple[
     with torch.no_grad():
         corners = arguments["faces"][arguments["face_index"]]
         dots = mesh_posing.dots_with_leading(arguments["vertex_quats"][corners], arguments["barycentrics"])
-        aligned = (dots.abs() > slack * 1e-5).all(-1).double()[:, None, None]
+        aligned = (dots.abs() > slack * 1e-5).all(-1).double()
+        aligned = torch.cat([torch.ones(len(quats) - len(aligned)), aligned])[:, None, None]
     every = torch.ones(()).double()
     return (means, squares(quats), scales), (every, aligned, every)
 
@@ -143,14 +152,16 @@ FAMILIES = {
             LARGE_MESH | {"n_points": 5000}, {"faces": ("vertices", 0), "point_vertices": ("vertices", -1)},
         ),
         Family(
-            "face_rotations", ("vertex_quats", "face_quats", "area_ratio"), _read_face_rotations, _face_rotations,
+            "face_rotations", ("vertex_quats", "face_quats", "area_ratio", "vertex_area_ratio"),
+            _read_face_rotations, _face_rotations,
             surface_scenes.face_rotations_case, tuple(surface_scenes.CONDITIONS), {"side": 50},
             {"faces": ("rest_vertices", 0)},
         ),
         Family(
             "pose_on_mesh", ("means", "quats", "scales"), _read_pose_on_mesh, _pose_on_mesh,
             surface_scenes.pose_on_mesh_case, tuple(surface_scenes.RIDERS),
-            {"n": 10_000}, {"faces": ("posed_vertices", 0), "face_index": ("area_ratio", 0)},
+            {"n": 10_000}, 
+            {"faces": ("posed_vertices", 0), "face_index": ("area_ratio", 0), "vertex_index": ("posed_vertices", 0)},
         ),
     )
 }  # fmt: skip

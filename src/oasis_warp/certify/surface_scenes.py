@@ -171,7 +171,6 @@ def face_rotations_case(name: str, seed: int, side: int | None = None) -> Case:
 
 
 LAWS = ("sqrt_area", "area", "none")
-RIDER_WANTED = ("posed_vertices", "barycentrics", "vertex_quats", "area_ratio", "quats", "scales")
 RIDERS: dict[str, Callable[[Draw, dict[str, Tensor]], Bounds]] = {}
 
 
@@ -235,8 +234,8 @@ def _(draw: Draw, floats: dict[str, Tensor]) -> Bounds:
 @rider("any unit of length")
 def _(draw: Draw, floats: dict[str, Tensor]) -> Bounds:
     unit = draw.pick((1e-12, 1e-6, 1e3, 1e12))
-    floats["posed_vertices"] *= unit
-    floats["scales"] *= unit
+    for length in {"posed_vertices", "scales", "offsets"} & set(floats):
+        floats[length] *= unit
     return STIFF
 
 
@@ -258,16 +257,22 @@ def pose_on_mesh_case(name: str, seed: int, n: int | None = None, law: str | Non
     n_vertices, n_faces = draw.pick(((3, 1), (14, 11), (60, 90)))
     n = draw.pick(GAUSSIANS) if n is None else n
     law = draw.pick(LAWS) if law is None else law
-    vertex_quats, quats = draw.normal(n_vertices, 4), draw.normal(n, 4)
+    n_on_vertices = draw.pick((None, 1, 20))
+    n_all = n + (n_on_vertices or 0)
+    vertex_quats, quats = draw.normal(n_vertices, 4), draw.normal(n_all, 4)
     floats = {
         "posed_vertices": draw.normal(n_vertices, 3),
         "barycentrics": draw.normal(n, 3).softmax(-1),
         "vertex_quats": vertex_quats / vertex_quats.norm(dim=-1, keepdim=True),
         "area_ratio": draw.normal(n_faces).exp(),
         "quats": quats / quats.norm(dim=-1, keepdim=True),
-        "scales": draw.normal(n, 3).exp(),
+        "scales": draw.normal(n_all, 3).exp(),
     }
+    if n_on_vertices:
+        floats |= {"offsets": draw.normal(n_on_vertices, 3), "vertex_area_ratio": draw.normal(n_vertices).exp()}
     bounds = RIDERS[name](draw, floats)
     faces = torch.stack([torch.randperm(n_vertices, generator=draw.generator)[:3] for _ in range(n_faces)])
     others = {"faces": faces, "face_index": draw.integers(n_faces, n), "scale_law": law}
-    return Case(name, seed, floats, RIDER_WANTED, others, bounds)
+    if n_on_vertices:
+        others["vertex_index"] = draw.integers(n_vertices, n_on_vertices)
+    return Case(name, seed, floats, tuple(floats), others, bounds)

@@ -52,8 +52,8 @@ def face_rotations(rest: Tensor, posed: Tensor, faces: Tensor) -> tuple[Tensor, 
     return turned(rest, posed, faces)[:3]
 
 
-def turned(rest: Tensor, posed: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """As `face_rotations`, and for which vertices [V] no sign hangs on rounding."""
+def turned(rest: Tensor, posed: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """As `face_rotations`, area ratios of vertices, and for which vertices [V] no sign hangs on rounding."""
     before, after = plane(rest, faces), plane(posed, faces)
     proper = before.proper & after.proper
     (p, q), (r, s) = before.edges.unbind(1)[0].unbind(-1), before.edges.unbind(1)[1].unbind(-1)
@@ -76,7 +76,7 @@ def turned(rest: Tensor, posed: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, 
     around = touches * weights
     if len(faces) == 0:
         lonely = torch.ones(len(rest), dtype=torch.bool)
-        return identity.expand(len(rest), 4), face_quats, before.area, lonely
+        return identity.expand(len(rest), 4), face_quats, before.area, torch.ones(len(rest)).to(rest), lonely
     reference = around.detach().argmax(1)
     dots = (face_quats[reference] @ face_quats.T).detach()
     total = (around * torch.where(dots < 0, -1.0, 1.0)) @ face_quats
@@ -88,5 +88,11 @@ def turned(rest: Tensor, posed: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, 
     a_point = before.longest == 0
     ratio = (after.area + damping) / torch.where(a_point, 1, before.area + damping)
     ratio = torch.where(a_point, 1, ratio)
+    corners = torch.zeros(len(rest), len(faces)).to(rest)
+    for corner in faces.T:
+        corners[corner, torch.arange(len(faces))] += 1.0
+    rest_sum, posed_sum = corners @ (before.area + damping), corners @ (after.area + damping)
+    alone = rest_sum == 0
+    vertex_ratio = torch.where(alone, 1, posed_sum / torch.where(alone, 1, rest_sum))
     right_angle = (dots.abs() < 1e-4) & (around > 0)
-    return vertex_quats, face_quats, ratio, ~right_angle.any(1)
+    return vertex_quats, face_quats, ratio, vertex_ratio, ~right_angle.any(1)

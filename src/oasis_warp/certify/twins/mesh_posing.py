@@ -3,14 +3,32 @@
 import torch
 from torch import Tensor
 
-from oasis_warp.core.rotation import multiply
+from oasis_warp.core.rotation import multiply, to_matrix
 
 EXPONENTS = {"sqrt_area": 0.5, "area": 1.0, "none": 0.0}
 LIMIT = 1e4
 
 
-def pose_on_mesh(posed_vertices, faces, face_index, barycentrics, vertex_quats, area_ratio, quats, scales, scale_law):
-    """Means [Q, 3], quats [Q, 4] and scales [Q, 3]."""
+def pose_on_mesh(
+    posed_vertices, faces, face_index, barycentrics, vertex_quats, area_ratio, quats, scales, scale_law,
+    vertex_index=None, offsets=None, vertex_area_ratio=None,
+):  # fmt: skip
+    """Means [N, 3], quats [N, 4] and scales [N, 3], of the Gaussians on vertices and then of those on faces."""
+    on_faces = posed_vertices, faces, face_index, barycentrics, vertex_quats, area_ratio
+    if vertex_index is None:
+        return pose_on_faces(*on_faces, quats, scales, scale_law)
+    n = len(vertex_index)
+    faced = pose_on_faces(*on_faces, quats[n:], scales[n:], scale_law)
+    turn = vertex_quats[vertex_index]
+    turn = turn / turn.norm(dim=-1, keepdim=True)
+    means = posed_vertices[vertex_index] + (to_matrix(turn) @ offsets[..., None])[..., 0]
+    growth = vertex_area_ratio[vertex_index].clamp(1 / LIMIT, LIMIT) ** EXPONENTS[scale_law]
+    own = means, multiply(turn, quats[:n]), scales[:n] * growth[:, None]
+    return tuple(torch.cat(pair) for pair in zip(own, faced, strict=True))
+
+
+def pose_on_faces(posed_vertices, faces, face_index, barycentrics, vertex_quats, area_ratio, quats, scales, scale_law):
+    """Those on faces alone."""
     corners = faces[face_index]
     means = (barycentrics[..., None] * posed_vertices[corners]).sum(1)
     turns = vertex_quats[corners]
