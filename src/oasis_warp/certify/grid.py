@@ -44,6 +44,10 @@ def run_grid(
     try:
         for done in as_completed([pool.submit(check_chunk, chunk, str(device)) for chunk in chunks]):
             yield done.result()
+    except BaseException:  # Ctrl-C above all: do not wait for what is being measured
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -84,7 +84,7 @@ def _(draw: Draw, n: int) -> Cloud:
 
 @condition("needles longer than the image")
 def _(draw: Draw, n: int) -> Cloud:
-    return frontal(draw, n, (20.0, 1e-4, 1.1e-4), bounds=LONG_NEEDLES)
+    return frontal(draw, n, (6.0, 1e-4, 1.1e-4), bounds=LONG_NEEDLES)  # 2 images long; 570 px in the widest
 
 
 @condition("pancakes")
@@ -254,6 +254,7 @@ def rasterization_case(
     n_cameras: int | None = None,
     channels: int | None = None,
     mode: str | None = None,
+    sh_degree: int | None = None,
     spread: float = 1.0,
 ) -> Case:
     """A scene under the condition `name`; what is None is drawn; `spread` scales the Gaussians."""
@@ -266,11 +267,21 @@ def rasterization_case(
     cloud.scales *= spread
     channels = draw.pick(CHANNELS) if channels is None else channels
     mode = draw.pick(MODES) if mode is None else mode
-    return finish(name, seed, draw, cloud, (width, height), n_cameras, channels, mode)
+    if draw.pick((False,) * 4 + (True,)) and sh_degree is None:
+        sh_degree = draw.pick((0, 1, 2, 3))
+    return finish(name, seed, draw, cloud, (width, height), n_cameras, channels, mode, sh_degree)
 
 
 def finish(
-    name: str, seed: int, draw: Draw, cloud: Cloud, size: tuple[int, int], n_cameras: int, channels: int, mode: str
+    name: str,
+    seed: int,
+    draw: Draw,
+    cloud: Cloud,
+    size: tuple[int, int],
+    n_cameras: int,
+    channels: int,
+    mode: str,
+    sh_degree: int | None,
 ) -> Case:
     """Cameras, rotations and colours for a cloud."""
     width, height = size
@@ -298,12 +309,17 @@ def finish(
         "Ks": K.repeat(n_cameras, 1, 1),
         "backgrounds": draw.uniform(n_cameras, channels),
     }
+    others = {"width": width, "height": height, "render_mode": mode, "eps2d": cloud.eps2d}
+    if sh_degree is not None:
+        # As many coefficients as a degree more would have: those beyond `sh_degree` are not read.
+        floats["colors"] = 0.3 * draw.normal(*([n_cameras] if per_camera else []), n, (sh_degree + 2) ** 2, 3)
+        floats["backgrounds"] = draw.uniform(n_cameras, 3)
+        others["sh_degree"] = sh_degree
     floats["opacities"] = without_near_ties(floats["means"], viewmats.float().double(), cloud.opacities)
     bounds = cloud.bounds
-    if name == "telephoto" and "ED" in mode:
-        # Expected depths are differences of numbers like 1000, which float32 holds to 6e-5.
+    if name in ("telephoto", "equal depths", "duplicates") and "ED" in mode:
+        # An expected depth changes by differences of depths: of 1000 m, which float32 holds to 6e-5, or of equal ones.
         bounds = dataclasses.replace(bounds, gradients=5e-3)
-    others = {"width": width, "height": height, "render_mode": mode, "eps2d": cloud.eps2d}
     if cloud.planes:
         others |= {"near_plane": cloud.planes[0], "far_plane": cloud.planes[1]}
     wanted = [key for key in WANTED if has_background or key != "backgrounds"]
