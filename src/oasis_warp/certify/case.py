@@ -41,7 +41,8 @@ class Case:
     """Index tensors, sizes, modes."""
     bounds: Bounds = ORDINARY
     floors: dict[str, float] = field(default_factory=dict)
-    """Size of an output or of an input's gradient below which errors are relative to this number instead."""
+    """Size of the elements of an output or of an input's gradient that counts as little: errors of smaller ones are
+    relative to this number."""
 
     def __post_init__(self):
         for name, tensor in self.floats.items():

@@ -21,6 +21,7 @@ SMALL: dict[str, list[dict[str, Any]]] = {
         *({"name": "ordinary", "mode": mode} for mode in ("RGB", "D", "ED", "RGB+D", "RGB+ED")),
         *({"name": "ordinary", "channels": channels} for channels in (1, 32)),
         *({"name": "ordinary", "sh_degree": degree} for degree in (0, 3)),
+        {"name": "covariances"},
         {"name": "ordinary", "n_cameras": 3},
         *({"name": name} for name in ("beyond the clamp of the Jacobian", "opaque and wide", "nearly opaque front")),
     ],

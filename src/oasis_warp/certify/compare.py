@@ -91,8 +91,8 @@ def ask_operator(
 
 
 def relative(got: Tensor, want: Tensor, floor: float = 0.0) -> float:
-    """L2 distance over the norm of `want`, or over `floor` where that is larger; the distance itself over zero."""
-    size = max(float(want.norm()), floor)
+    """L2 distance over the norm of `want`, or of as many elements of `floor`; the distance itself over zero."""
+    size = max(float(want.norm()), floor * want.numel() ** 0.5)
     distance = float((got - want).norm())
     return distance / size if size > 0 else distance
 

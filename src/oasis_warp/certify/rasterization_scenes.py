@@ -8,6 +8,7 @@ from torch import Tensor
 
 from oasis_warp.certify.case import LONG_NEEDLES, STIFF, Bounds, Case, Draw
 from oasis_warp.certify.twins.rasterization import NEAR
+from oasis_warp.core.rotation import to_matrix
 
 SIZES = ((1, 1), (1, 9), (11, 1), (5, 4), (16, 16), (17, 15), (31, 33), (37, 29), (65, 63), (257, 2))
 """Width and height: single pixels and rows, sizes that are no multiple of a tile, strip or vector."""
@@ -17,7 +18,8 @@ MODES = ("RGB", "RGB", "RGB", "D", "ED", "RGB+D", "RGB+ED")
 WORK = 60_000
 """Most pixels times Gaussians of a scene, over all its cameras: what the dense twin does in some 20 ms."""
 EYES = ((0.3, -0.2, -3.0), (2.1, 0.4, -2.2), (-1.0, 1.5, 2.6))
-WANTED = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
+FAINT = 0.02
+"""Alpha is 1 - T, and T has the rounding of 1."""
 SAFE = 1e-3
 """Distance from a kink that no finite difference reaches."""
 DEPTH_TIE = 2e-6
@@ -41,6 +43,8 @@ class Cloud:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Added to the world, cameras included."""
     planes: tuple[float, float] | None = None
+    covars: bool = False
+    """Whether covariances are given, not quaternions and scales."""
     no_gradient: float = 0.0
     """What counts as zero in a gradient of places and shapes: that of an image without structure is rounding."""
 
@@ -228,6 +232,12 @@ def _(draw: Draw, n: int) -> Cloud:
     return Cloud(means, scales, draw.uniform(n, low=0.05, high=0.99), planes=(2.5, 3.4))
 
 
+@condition("covariances")
+def _(draw: Draw, n: int) -> Cloud:
+    means, scales = draw.uniform(n, 3, low=-0.9, high=0.9), draw.uniform(n, 3, low=0.04, high=0.2)
+    return Cloud(means, scales, draw.uniform(n, low=0.05, high=0.99), covars=True)
+
+
 @condition("transparent")
 def _(draw: Draw, n: int) -> Cloud:
     opacities = draw.uniform(n, low=0.1, high=0.9) * draw.integers(2, n)
@@ -320,12 +330,17 @@ def finish(
     if name in ("telephoto", "equal depths", "duplicates") and "ED" in mode:
         # An expected depth changes by differences of depths: of 1000 m, which float32 holds to 6e-5, or of equal ones.
         bounds = dataclasses.replace(bounds, gradients=5e-3)
+    if cloud.covars:
+        half = to_matrix(floats.pop("quats")) * floats.pop("scales")[:, None]
+        twist = 1e-3 * draw.normal(n, 3, 3)  # of which the antisymmetric part must not count
+        floats["covars"] = half @ half.mT + twist - twist.mT
+        others |= {"quats": None, "scales": None}
     if cloud.planes:
         others |= {"near_plane": cloud.planes[0], "far_plane": cloud.planes[1]}
-    wanted = [key for key in WANTED if has_background or key != "backgrounds"]
     if not has_background:
         del floats["backgrounds"]
-    floors = dict.fromkeys(("means", "quats", "scales", "viewmats"), cloud.no_gradient)
+    wanted = [key for key in floats if key != "Ks"]
+    floors = dict.fromkeys(("means", "quats", "scales", "viewmats"), cloud.no_gradient) | {"alphas": FAINT}
     return Case(name, seed, floats, tuple(wanted), others, bounds, floors)
 
 

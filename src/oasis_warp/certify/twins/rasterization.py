@@ -24,8 +24,8 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     ], -1).reshape(-1, 3, 3)  # fmt: skip
 
 
-def project(means, quats, scales, viewmat, K, width, height, eps2d):
-    """Centres [n, 2], rows p and q of M [n, 3] with covariance M M^T + eps2d, and depths [n], all with z > 0."""
+def image_rows(means, viewmat, K, width, height):
+    """Centres [n, 2], rows of the map from the world to the image round each [n, 2, 3], and depths [n], all > 0."""
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     x, y, z = (means @ R.T + t).unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -34,18 +34,44 @@ def project(means, quats, scales, viewmat, K, width, height, eps2d):
     v = torch.clamp(y / z, min=float(-cy / fy - margin_y), max=float((height - cy) / fy + margin_y))
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).reshape(-1, 2, 3)
-    M = J @ R @ rotation_matrices(quats) * scales[:, None, :]
-    return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), M[:, 0], M[:, 1], z
+    return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), J @ R, z
 
 
-def layers(means, quats, scales, opacities, viewmat, K, width, height, near=0.01, far=1e10, eps2d=0.3, decide=True):
+def project(means, quats, scales, viewmat, K, width, height, eps2d):
+    """Centres [n, 2], rows p and q of M [n, 3] with covariance M M^T + eps2d, and depths [n]."""
+    centre, rows, z = image_rows(means, viewmat, K, width, height)
+    M = rows @ rotation_matrices(quats) * scales[:, None, :]
+    return centre, M[:, 0], M[:, 1], z
+
+
+def covariances(quats, scales, rows, eps2d):
+    """Entries a, b, c of the covariance in the image, and its determinant, which does not cancel (Cauchy-Binet)."""
+    M = rows @ rotation_matrices(quats) * scales[:, None, :]
+    p, q = M[:, 0], M[:, 1]
+    a, b, c = (p * p).sum(-1), (p * q).sum(-1), (q * q).sum(-1)
+    det = torch.linalg.cross(p, q).square().sum(-1) + eps2d * (a + c) + eps2d**2
+    return a + eps2d, b, c + eps2d, det
+
+
+def given_covariances(covars, rows, eps2d):
+    """The same from covariances in the world, of which the symmetric part counts."""
+    image = rows @ ((covars + covars.transpose(1, 2)) / 2) @ rows.transpose(1, 2)
+    a, b, c = image[:, 0, 0] + eps2d, image[:, 0, 1], image[:, 1, 1] + eps2d
+    return a, b, c, a * c - b * b
+
+
+def layers(
+    means, quats, scales, opacities, viewmat, K, width, height, near=0.01, far=1e10, eps2d=0.3, covars=None, decide=True
+):
     """Alphas [pixels, n] of the Gaussians `order` [n], front to back; not cut or capped unless `decide`."""
     near, far, eps2d = (float(np.float32(v)) for v in (near, far, eps2d))
     z = (means @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]
     kept = ((z >= near) & (z <= far) & (opacities >= FAINTEST)).nonzero()[:, 0]
-    centre, p, q, z = project(means[kept], quats[kept], scales[kept], viewmat, K, width, height, eps2d)
-    a, b, c = (p * p).sum(-1) + eps2d, (p * q).sum(-1), (q * q).sum(-1) + eps2d
-    det = torch.linalg.cross(p, q).square().sum(-1) + eps2d * ((p * p).sum(-1) + (q * q).sum(-1)) + eps2d**2
+    centre, image, z = image_rows(means[kept], viewmat, K, width, height)
+    if covars is None:
+        a, b, c, det = covariances(quats[kept], scales[kept], image, eps2d)
+    else:
+        a, b, c, det = given_covariances(covars[kept], image, eps2d)
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixels = torch.stack([columns, rows], -1).reshape(-1, 1, 2).to(means.dtype) + 0.5
     dx, dy = (pixels - centre).unbind(-1)
