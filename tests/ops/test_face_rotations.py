@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from reference import face_rotations as twin
 
+from oasis_warp.certify.twins import face_rotations as twin
 from oasis_warp.core.rotation import from_axis_angle, from_matrix, multiply, to_matrix
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.correctives import corrected_rest
