@@ -27,8 +27,10 @@ class SpeedRow:
     way: str
     """"warp" is ours; "scalar" our generic kernels in float32, one pixel or item at a time; "torch"; or a peer."""
     scene: str
-    gaussians: int | None
+    gaussians: int
+    """In the scene."""
     faces: int | None
+    """Of its mesh, where it has one."""
     width: int
     height: int
     device: str
@@ -144,7 +146,7 @@ def measure_operator(
                 pass_=pass_,
                 way=way,
                 scene=scene.name,
-                gaussians=len(scene.means) if isinstance(scene, Scene) else None,
+                gaussians=len(scene.means if isinstance(scene, Scene) else scene.quats),
                 faces=len(scene.faces) if isinstance(scene, MeshScene) else None,
                 width=scene.width,
                 height=scene.height,
