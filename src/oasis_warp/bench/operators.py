@@ -51,6 +51,8 @@ class Operator:
     """Fields of the scene that gradients are taken by; none where the operator has no gradient."""
     graded: int | None = None
     """How many of the outputs the loss is made of; all when None."""
+    vectorised: bool = True
+    """Whether it has kernels of its own to vectorise."""
     image: bool = False
     """Whether the first output is an image in [0, 1]."""
     comparable: Callable[[Outputs], Outputs] = field(default=as_it_is)
@@ -151,7 +153,7 @@ OPERATORS = {
         ),
         Operator(
             "blend_colors", Scene, lambda scene: (blend_colors(scene.weights, scene.colors)[None],),
-            _torch_blend_colors, leaves=("colors",), image=True, prepare=_weighted,
+            _torch_blend_colors, leaves=("colors",), vectorised=False, image=True, prepare=_weighted,
         ),
         Operator(
             "depth_map", MeshScene, _depth_map, lambda scene: (torch_mesh.depth_map(scene).depth,),
