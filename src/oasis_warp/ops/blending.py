@@ -8,6 +8,7 @@ from torch import Tensor
 
 from oasis_kernels import constants
 from oasis_kernels.strips import RECORD
+from oasis_warp.core.checks import check_finite
 from oasis_warp.ops import _blend_strips as strips
 from oasis_warp.ops import _blend_tiles as tiles
 from oasis_warp.ops._blend_tiles import Splats
@@ -18,7 +19,6 @@ from oasis_warp.ops._registration import (
     hidden_like_fake,
     needs_gradient,
     operator,
-    revealed,
 )
 from oasis_warp.ops._tiles import Tiles
 from oasis_warp.ops.projection import Projection
@@ -75,7 +75,11 @@ def _blend(
     height: int,
     tile_size: int,
     keep: bool,
+    validate: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    if validate:
+        shared = colors.stride(0) == 0  # by the cameras: each value counts once
+        check_finite(colors=colors[:1] if shared else colors, backgrounds=backgrounds)
     splats = Splats(*(t.contiguous() for t in (depths, centers, whitenings, boxes, opacities, colors, backgrounds)))
     if draws_strips(colors):
         cut = strips.cut_strips(colors.shape[0], colors.shape[1], width, height, tile_size)
@@ -109,6 +113,7 @@ def _blend_fake(
     height: int,
     tile_size: int,
     keep: bool,
+    validate: bool,
 ) -> tuple[Tensor, ...]:
     n_cameras, n, channels = colors.shape
     image, alphas = (colors.new_empty(n_cameras, height, width, k) for k in (channels, 1))
@@ -216,7 +221,7 @@ _adjoint = adjoint("blend_backward", _blend_backward, _blend_backward_fake)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    _, _, *splats, width, height, tile_size, _ = inputs
+    _, _, *splats, width, height, tile_size, _, _ = inputs
     ctx.size = width, height, tile_size
     ctx.save_for_backward(*splats, *output[2:])
     ctx.set_materialize_grads(False)
@@ -228,8 +233,8 @@ def _back(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, *_: Tensor |
     gradients = (None,) * 5
     if g_image is not None or g_alpha is not None:
         gradients = _adjoint(g_image, g_alpha, *ctx.saved_tensors, *ctx.size, *wanted)
-    # None for depths, centers, whitenings, boxes, width, height, tile_size and keep.
-    return *(g if need else None for g, need in zip(gradients, needs[:5], strict=True)), *(None,) * 8
+    # None for depths, centers, whitenings, boxes, width, height, tile_size, keep and validate.
+    return *(g if need else None for g, need in zip(gradients, needs[:5], strict=True)), *(None,) * 9
 
 
 differentiable(_forward, _back, _save)
@@ -243,10 +248,15 @@ def blend(
     width: int,
     height: int,
     tile_size: int,
+    *,
+    validate: bool = False,
 ) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"]]:
     """Images over the backgrounds, and alpha (Kerbl et al. 2023, eq. 3): sum of c alpha T, and sum of alpha T.
 
     D is at most 32. `projection.means2d` and `projection.covars2d` receive gradients.
+
+    Raises:
+        ValueError: with `validate`, colours or backgrounds that are not finite.
     """
     channels = colors.shape[-1]
     padding = next(c for c in constants.CHANNELS if c >= channels) - channels
@@ -257,6 +267,6 @@ def blend(
     image, alphas, *_ = _forward(
         means2d, covars2d, opacities, colors, backgrounds, projection.sort_depths, projection.centers,
         projection.whitenings, projection.boxes, width, height, tile_size,
-        needs_gradient(means2d, covars2d, opacities, colors, backgrounds),
+        needs_gradient(means2d, covars2d, opacities, colors, backgrounds), validate,
     )  # fmt: skip
     return (image[..., :channels] if padding else image), alphas
