@@ -12,7 +12,7 @@ LOW_PASS = float(torch.tensor(OPTIONS["eps2d"], dtype=torch.float32))  # a float
 
 
 def dense(means, covars, viewmats, Ks):
-    """Covariances J R A R^T J^T + low-pass in the images, xx, xy, yy, with A the symmetric part; no slope is clamped."""
+    """J R A R^T J^T + low-pass, xx, xy, yy, with A the symmetric part of `covars`; no slope is clamped."""
     out = []
     for viewmat, K in zip(viewmats, Ks, strict=True):
         R = viewmat[:3, :3]
