@@ -5,7 +5,7 @@ Every number is a float32 number, so that both precisions see the same scene. A 
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -24,6 +24,7 @@ from oasis_warp.render.cameras import orbit_camera
 
 PALM_TO_CAMERA = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """Orientation of the hand, fingers up."""
+HAND_GAUSSIANS = 36_881
 MELANIN = 0.05
 """Skin tone of the hand."""
 TEXTURE = 0.05
@@ -34,12 +35,14 @@ OFFSET = 5e-4
 POINT_NOISE = 0.002
 """Standard deviation of the points of a mesh scene about its vertices [m]: visibility takes all values there."""
 
+Bundle = TypeVar("Bundle", bound="_Tensors")
+
 
 @dataclass(frozen=True)
 class _Tensors:
     """A bundle of tensors and plain numbers."""
 
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
+    def to(self: Bundle, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Bundle:
         """The same on another device; floating-point tensors in another precision."""
         moved: dict[str, Any] = {}
         for field in fields(self):
