@@ -184,6 +184,16 @@ def test_a_sheared_face_turns_by_its_polar_factor():
     assert angle_between(got, from_matrix(about([0.0, 0, 1], -math.atan(0.4)))).max() < 1e-15
 
 
+def test_the_area_ratio_of_a_vertex_is_that_of_its_faces_together():
+    rest, posed, faces = sheet(3)
+    posed[faces[0]] = posed[faces[0]].mean(0)  # one collapses: it turns nothing but still counts
+    got = face_rotations(rest, posed, faces).vertex_area_ratio
+    before, after = twin.areas(rest, faces), twin.areas(posed, faces)
+    around = torch.stack([(faces == v).any(1) for v in range(len(rest))]).double()
+    # The damping pulls ratios to one by its share of the area, 1e-6 and more for thin faces.
+    torch.testing.assert_close(got, (around @ after) / (around @ before), rtol=1e-5, atol=1e-5)
+
+
 def test_a_vertex_mean_weighs_faces_by_their_area_at_rest():
     # Two faces share vertex 0: area 3 stays, area 1 turns by a right angle and is blown up besides.
     rest = torch.tensor([[0.0, 0, 0], [3, 0, 0], [3, 2, 0], [-1, 0, 0], [-1, -2, 0]], dtype=torch.float64)

@@ -42,3 +42,16 @@ def dots_with_leading(turns: Tensor, barycentrics: Tensor) -> Tensor:
     """Of the three rotations of each Gaussian with that of its heaviest corner [Q, 3]."""
     heaviest = barycentrics.detach().argmax(-1)[:, None, None].expand(-1, 1, 4)
     return (turns * torch.take_along_dim(turns, heaviest, 1)).sum(-1)
+
+
+def pose_on_mesh_covars(rest_vertices, posed_vertices, faces, face_index, barycentrics, quats, scales):
+    """Means [Q, 3] and covariances [Q, 3, 3] of Gaussians stretched with their faces."""
+
+    def frames(vertices):
+        a, b, c = vertices[faces[face_index]].unbind(1)
+        normal = torch.linalg.cross(b - a, c - a)
+        return torch.stack([b - a, c - a, normal / normal.norm(dim=-1, keepdim=True)], -1)
+
+    means = (barycentrics[..., None] * posed_vertices[faces[face_index]]).sum(1)
+    half = frames(posed_vertices) @ torch.linalg.inv(frames(rest_vertices)) @ to_matrix(quats) * scales[:, None]
+    return means, half @ half.transpose(1, 2)
