@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from reference import face_rotations as twin
 
+from oasis_warp.certify.twins import face_rotations as twin
 from oasis_warp.core.rotation import from_axis_angle, from_matrix, multiply, to_matrix
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.correctives import corrected_rest
@@ -188,7 +188,7 @@ def test_the_area_ratio_of_a_vertex_is_that_of_its_faces_together():
     rest, posed, faces = sheet(3)
     posed[faces[0]] = posed[faces[0]].mean(0)  # one collapses: it turns nothing but still counts
     got = face_rotations(rest, posed, faces).vertex_area_ratio
-    before, after = twin.areas(rest, faces), twin.areas(posed, faces)
+    before, after = (twin.plane(vertices, faces).area for vertices in (rest, posed))
     around = torch.stack([(faces == v).any(1) for v in range(len(rest))]).double()
     # The damping pulls ratios to one by its share of the area, 1e-6 and more for thin faces.
     torch.testing.assert_close(got, (around @ after) / (around @ before), rtol=1e-5, atol=1e-5)
