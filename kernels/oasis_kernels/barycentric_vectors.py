@@ -24,12 +24,19 @@ COMMON = """
         const I inside = (ratio >= 1.f / @LIMIT@) & (ratio <= @LIMIT@);
         return inside ? slope : zero;
     };
-    int last_indices[48];
-    auto indices_of = [&](const int* from, int count, int width) -> const int* {
+    int last_indices[16];
+    auto indices_of = [&](const int* from, int count) -> const int* {
         if (count == 16) return from;
         memset(last_indices, 0, sizeof last_indices);
-        memcpy(last_indices, from, width * count * sizeof(int));
+        memcpy(last_indices, from, count * sizeof(int));
         return last_indices;
+    };
+    const I lanes = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+    int gathered[48];
+    auto corners_of = [&](const int* f) -> const int* {  // often the faces follow one another, as their corners do then
+        if (__builtin_reduce_and(*(const IU*)f == f[0] + lanes)) return faces + 3ll * f[0];
+        for (int lane = 0; lane < 16; lane++) memcpy(gathered + 3 * lane, faces + 3ll * f[lane], 3 * sizeof(int));
+        return gathered;
     };
     auto pick = [&](const float* from, const int* index) -> V {
         V v;
@@ -45,7 +52,7 @@ COMMON = """
 """
 
 ON_VERTEX = """
-            const int* v = indices_of(vertex_index + i, count, 1);
+            const int* v = indices_of(vertex_index + i, count);
             V4 q = rows([&](int lane) -> Q { return load_row(vertex_quats + 4ll * v[lane]); });
             const V length = root(dot4(q, q));
             const V per_length = length > 0.f ? 1.f / length : zero;
@@ -56,11 +63,12 @@ ON_VERTEX = """
 
 ON_FACE = """
             const long long at = n_on_vertices + (long long)i;
-            const int* f = indices_of(face_index + i, count, 1);
+            const int* f = indices_of(face_index + i, count);
+            const int* c = corners_of(f);
             const V3 b = get3(barycentrics + 3ll * i, count);
             V4 q[3];
             for (int k = 0; k < 3; k++)
-                q[k] = rows([&](int lane) -> Q { return load_row(vertex_quats + 4ll * faces[3ll * f[lane] + k]); });
+                q[k] = rows([&](int lane) -> Q { return load_row(vertex_quats + 4ll * c[3 * lane + k]); });
             const I second = (b.y > b.x) & (b.y >= b.z), third = ~second & (b.z > b.x);
             const V4 reference = choose4(second, q[1], choose4(third, q[2], q[0]));
             auto aligned = [&](V4 a) -> V { return dot4(a, reference) < 0.f ? -one : one; };
@@ -93,7 +101,7 @@ POSE = """
 @ON_FACE@
             V3 mean = {zero, zero, zero};
             for (int k = 0; k < 3; k++) {
-                const V4 p = rows([&](int lane) -> Q { return at3(table, faces[3ll * f[lane] + k]); });
+                const V4 p = rows([&](int lane) -> Q { return at3(table, c[3 * lane + k]); });
                 mean = plus(mean, scaled(k == 0 ? b.x : k == 1 ? b.y : b.z, {p.w, p.x, p.y}));
             }
             put3(means + 3ll * at, count, mean);
@@ -155,7 +163,7 @@ POSE_BACKWARD = """
                 if (g_barycentrics) {
                     V by[3];
                     for (int k = 0; k < 3; k++) {
-                        const V4 p = rows([&](int lane) -> Q { return at3(table, faces[3ll * f[lane] + k]); });
+                        const V4 p = rows([&](int lane) -> Q { return at3(table, c[3 * lane + k]); });
                         const V turn_sign = k == 0 ? sign.x : k == 1 ? sign.y : sign.z;
                         by[k] = dot3(g_mean, {p.w, p.x, p.y}) + turn_sign * dot4(g, q[k]);
                     }
