@@ -44,10 +44,16 @@ class Strips(NamedTuple):
         }  # fmt: skip
 
 
-def cut_strips(n_cameras: int, n: int, width: int, height: int, tile_size: int) -> Strips:
-    """Strips of `TILES_ACROSS` x `TILES_DOWN` tiles, whole vectors wide, but none much larger than the image."""
-    strip_width = min(TILES_ACROSS * tile_size, -(-width // strips.PAD) * strips.PAD)
-    strip_height = min(TILES_DOWN * tile_size, height + height % 2)
+def _power_of_two(at_least: int) -> int:
+    return 1 << (at_least - 1).bit_length()
+
+
+def cut_strips(
+    n_cameras: int, n: int, width: int, height: int, tile_size: int, tiles_across: int = TILES_ACROSS
+) -> Strips:
+    """Strips of `tiles_across` x `TILES_DOWN` tiles, rounded up to powers of two, but none much larger than the image."""
+    strip_width = _power_of_two(min(tiles_across * tile_size, max(width, strips.COLUMNS)))
+    strip_height = _power_of_two(min(TILES_DOWN * tile_size, max(height, 2)))
     across, down = -(-width // strip_width), -(-height // strip_height)
     chunk = max(strips.CHUNK, -(-n_cameras * n // strips.MAX_CHUNKS))
     return Strips(
