@@ -2,8 +2,8 @@
 
 Strips are as wide as the image, so that a strip's pixels, and a Gaussian's strips, follow each other in both matrices.
 The strips are drawn twice, without colours. `count_weights` adds up the weights of every pixel and of every pair;
-`fill_weights` writes a pair's weights, row by row, into the matrix by Gaussians, and then goes through the pairs of each
-strip in order of memory to copy them into the matrix by pixels: both come out sorted.
+`fill_weights` writes a pair's weights, row by row, into the matrix by Gaussians, and then goes through the pairs of
+each strip in order of memory to copy them into the matrix by pixels: both come out sorted.
 """
 
 import functools
@@ -19,7 +19,8 @@ WALK = """
     auto pair_of = [&](long long index, int strip) -> long long {
         return pair_starts[index] + strip - (boxes[4 * index + 1] >> height_bits);
     };
-    // Draw a strip on plane `t`: `vector(place, y, x, weight, drawn)` sees every vector, `layer(place)` follows its last.
+    // Draw a strip: `vector(y, x, weight, drawn)` sees every vector, `row_pair(y)` follows the last of two rows, and
+    // `layer(gaussian)` the last of all.
     auto walk = [&](const Strip& p, const int* list, int count, float* plane, auto&& vector, auto&& row_pair,
                     auto&& layer) {
         for (int y = 0; y < p.rows; y += 2) for (int x = 0; x < strip_width + @PAD@; x += @COLUMNS@) {
@@ -60,7 +61,7 @@ WALK = """
 COUNT = """
     float* plane = nullptr;
     Histogram* histograms = nullptr;
-    phase(state + 16, n_strips, [&](long long turn) {
+    share(state + 16, n_strips, [&](long long turn) {
         const long long s = order[turn];
         const Strip p = strip_of(s);
         const long long start = starts[s];
@@ -95,7 +96,7 @@ WRITE = """
     float* plane = nullptr;
     float* weights = nullptr;
     int* pixels = nullptr;
-    phase(state, n_strips, [&](long long turn) {
+    share(state, n_strips, [&](long long turn) {
         const long long s = order[turn];
         const Strip p = strip_of(s);
         const long long start = starts[s];
