@@ -127,9 +127,9 @@ def draw_backward(
         even_work(tiles.starts),
         [
             view(tiles.starts), view(revealed(tiles.gaussians)), view(pair_numbers),
-            view(splats.boxes.view(-1, 4), vec4i), view(splats.centers.view(-1, 4), vec4), view(splats.whitenings.view(-1, 4), vec4),
-            view(splats.opacities.view(-1)), view(splats.colors.view(-1, channels), color),
-            view(splats.backgrounds, color), view(stops.view(-1)), view(of_image, color), view(of_alpha),
+            view(splats.boxes.view(-1, 4), vec4i), view(splats.centers.view(-1, 4), vec4),
+            view(splats.whitenings.view(-1, 4), vec4), view(splats.opacities.view(-1)),
+            view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color), view(stops.view(-1)), view(of_image, color), view(of_alpha),
             tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height, int(with_shape),
             view(transmittance.view(-1).clone()), view(empty(pixels)),
             view(pair_moments, moments), view(pair_colors, color), view(tile_backgrounds, color),
