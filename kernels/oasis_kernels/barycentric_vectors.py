@@ -21,7 +21,8 @@ COMMON = """
     };
     auto growth_slope = [&](V ratio, int half_powers) -> V {
         const V slope = 0.5f * (float)half_powers * growth(ratio, half_powers) / ratio;
-        return (ratio >= 1.f / @LIMIT@) & (ratio <= @LIMIT@) ? slope : zero;
+        const I inside = (ratio >= 1.f / @LIMIT@) & (ratio <= @LIMIT@);
+        return inside ? slope : zero;
     };
     int last_indices[48];
     auto indices_of = [&](const int* from, int count, int width) -> const int* {
@@ -111,7 +112,8 @@ ON_FACES = """
         const V4 reference = choose4(second, q[1], choose4(third, q[2], q[0]));
         auto aligned = [&](V4 a) -> V { return dot4(a, reference) < 0.f ? -one : one; };
         const V3 sign = {aligned(q[0]), aligned(q[1]), aligned(q[2])};
-        const V4 sum = plus4(scaled4(b.x * sign.x, q[0]), plus4(scaled4(b.y * sign.y, q[1]), scaled4(b.z * sign.z, q[2])));
+        const V4 rest = plus4(scaled4(b.y * sign.y, q[1]), scaled4(b.z * sign.z, q[2]));
+        const V4 sum = plus4(scaled4(b.x * sign.x, q[0]), rest);
         const V length = root(dot4(sum, sum));
         const I mixed = length > 0.f;
         const V per_length = mixed ? 1.f / length : zero;
@@ -152,7 +154,8 @@ ON_FACES_BACKWARD = """
                 V by[3];
                 for (int k = 0; k < 3; k++) {
                     const V4 p = rows([&](int lane) -> Q { return at3(vertices, faces[3ll * f[lane] + k]); });
-                    by[k] = dot3(g_mean, {p.w, p.x, p.y}) + (k == 0 ? sign.x : k == 1 ? sign.y : sign.z) * dot4(g, q[k]);
+                    const V turn_sign = k == 0 ? sign.x : k == 1 ? sign.y : sign.z;
+                    by[k] = dot3(g_mean, {p.w, p.x, p.y}) + turn_sign * dot4(g, q[k]);
                 }
                 put3(g_barycentrics + 3ll * i, count, {by[0], by[1], by[2]});
             }

@@ -252,14 +252,17 @@ FACES_BACKWARD = """
         V g_weight = zero, by_posed = zero, by_rest = zero;  // with respect to areas
         const V3 sign = get3(signs + 3ll * i, turns ? count : 0);
         for (int k = 0; k < 3; k++) {
+            auto from_corner = [&](const float* table) -> V4 {
+                return rows([&](int lane) -> Q { return load_row(table + 8ll * corners[3 * lane + k]); });
+            };
             if (turns) {
-                V4 sum = rows([&](int lane) -> Q { return load_row(at_vertices + 8ll * corners[3 * lane + k]); });
+                V4 sum = from_corner(at_vertices);
                 sum = scaled4(k == 0 ? sign.x : k == 1 ? sign.y : sign.z, sum);
                 g = plus4(g, scaled4(p.weight, sum));
                 g_weight += dot4(sum, q);
             }
             if (grows) {
-                const V4 sum = rows([&](int lane) -> Q { return load_row(at_vertices + 8ll * corners[3 * lane + k] + 4); });
+                const V4 sum = from_corner(at_vertices + 4);
                 by_posed += sum.w;
                 by_rest += sum.x;
             }

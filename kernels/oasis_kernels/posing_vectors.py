@@ -161,13 +161,20 @@ HEAD = f"""
 """
 
 
-def kernel(module: str, name: str, body: str) -> Any:
-    """A Warp kernel of one thread that does tasks `first` to `end` - 1 of the call whose block is at `params`."""
+def kernel(module: str, name: str, body: str, head: str = HEAD) -> Any:
+    """A Warp kernel of one thread that does tasks `first` to `end` - 1 of the call whose block is at `params`.
+
+    Args:
+        module: Of this package; kernels of one module are compiled together.
+        name: Of the kernel, one in its module.
+        body: C++ of the tasks.
+        head: C++ before it.
+    """
 
     def tasks(params: wp.uint64, first: int, end: int): ...
 
     tasks.__name__ = f"{name}_tasks"
-    native = wp.func_native(HEAD + body)(tasks)
+    native = wp.func_native(head + body)(tasks)
 
     def run(params: wp.uint64, first: int, end: int):
         native(params, first, end)

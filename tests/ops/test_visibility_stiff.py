@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from oasis_warp.core.hand_model import BACK_SIDE, PALM_SIDE
-from oasis_warp.ops import depth_map, depth_visibility, visibility
+from oasis_warp.ops import _depth_buffer, depth_map, depth_visibility
 
 EYE = torch.eye(4, dtype=torch.float64)
 
@@ -209,11 +209,11 @@ def test_a_curved_surface_does_not_shadow_itself():
 def test_the_kernel_for_cuda_fills_the_same_buffer_as_the_one_for_the_cpu(hand, monkeypatch):
     vertices, viewmat, K = palm_view(hand, 128)
     twice = torch.cat([hand.faces, hand.faces])  # every pixel is a tie
-    strips = depth_map(vertices, twice, viewmat, K, 128, 128)
-    monkeypatch.setattr(visibility, "_fill_strips", visibility._fill_faces)
+    vectors = depth_map(vertices, twice, viewmat, K, 128, 128)
+    monkeypatch.setattr(_depth_buffer, "draw_by_vectors", _depth_buffer.draw_by_faces)
     faces = depth_map(vertices, twice, viewmat, K, 128, 128)
-    assert (strips.face_ids >= 0).any() and (strips.face_ids < len(hand.faces)).all()
-    assert all(torch.equal(a, b) for a, b in zip(strips, faces, strict=True))
+    assert (vectors.face_ids >= 0).any() and (vectors.face_ids < len(hand.faces)).all()
+    assert all(torch.equal(a, b) for a, b in zip(vectors, faces, strict=True))
 
 
 def palm_view(hand, size, distance=0.5):

@@ -26,7 +26,10 @@ class FaceRotations(NamedTuple):
     """The same of all faces round a vertex together; 1 where there is none."""
 
 
-def _outputs(rest: Tensor, posed: Tensor, faces: Tensor, keep: bool, validate: bool) -> tuple[Tensor, ...]:
+Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+def _outputs(rest: Tensor, posed: Tensor, faces: Tensor, keep: bool, validate: bool) -> Outputs:
     """Empty tensors for the results and for what the adjoint needs: signs of corners, sums at vertices."""
     n_vertices, n_faces = len(rest), len(faces)
     return (
@@ -41,7 +44,7 @@ def _outputs(rest: Tensor, posed: Tensor, faces: Tensor, keep: bool, validate: b
 
 def _face_rotations(
     rest: Tensor, posed: Tensor, faces: Tensor, keep: bool, validate: bool
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> Outputs:
     if validate:
         check_finite(rest_vertices=rest, posed_vertices=posed)
     corners = incidence("faces", faces, len(rest), "vertices")
