@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from reference import visibility as twin
 
+from oasis_warp.certify.twins import visibility as twin
 from oasis_warp.core.rotation import to_matrix
 from oasis_warp.ops import _depth_buffer, depth_map, depth_visibility
 

@@ -9,7 +9,12 @@ from oasis_warp.ops.face_rotations import FaceRotations as FaceRotations
 from oasis_warp.ops.face_rotations import face_rotations as face_rotations
 from oasis_warp.ops.mesh_posing import PosedOnMesh as PosedOnMesh
 from oasis_warp.ops.mesh_posing import pose_on_mesh as pose_on_mesh
+from oasis_warp.ops.mesh_posing_covars import PosedCovars as PosedCovars
+from oasis_warp.ops.mesh_posing_covars import pose_on_mesh_covars as pose_on_mesh_covars
 from oasis_warp.ops.rasterization import rasterization as rasterization
+from oasis_warp.ops.skinning import Skinned as Skinned
+from oasis_warp.ops.skinning import skin as skin
+from oasis_warp.ops.spherical_harmonics import spherical_harmonics as spherical_harmonics
 from oasis_warp.ops.visibility import DepthVisibility as DepthVisibility
 from oasis_warp.ops.visibility import depth_visibility as depth_visibility
 from oasis_warp.ops.warm_up import warm_up as warm_up

@@ -6,7 +6,8 @@ from contextvars import ContextVar
 
 from oasis_kernels.constants import Rules
 
-_rules: ContextVar[Rules] = ContextVar("rules", default=Rules())
+_GSPLAT = Rules()
+_rules: ContextVar[Rules] = ContextVar("rules", default=_GSPLAT)
 
 
 def current_rules() -> Rules:

@@ -1,0 +1,83 @@
+"""Gaussians coloured by spherical harmonics: `sh_degree` of the rasterizer."""
+
+import pytest
+import torch
+from rasterization_scenes import ordinary_scene
+
+from oasis_warp.certify.twins.harmonics import seen_colors as expected_colors
+from oasis_warp.ops import rasterization
+from oasis_warp.ops.rasterization import seen_colors
+
+
+def scene_and_coefficients(degree=3, cameras=2, dtype=torch.float64, per_camera=False):
+    scene = ordinary_scene(11, n=30, cameras=cameras, dtype=dtype)
+    g = torch.Generator().manual_seed(12)
+    shape = (cameras,) if per_camera else ()
+    return scene, torch.randn(*shape, 30, (degree + 1) ** 2, 3, generator=g, dtype=torch.float64).to(dtype)
+
+
+def draw(scene, colors, **options):
+    return rasterization(
+        *scene.gaussians, colors, scene.viewmats, scene.Ks, scene.width, scene.height,
+        backgrounds=scene.backgrounds, **options,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("per_camera", [False, True])
+@pytest.mark.parametrize("degree", range(4))
+def test_harmonics_are_drawn_as_the_colours_they_stand_for(degree, per_camera, device):
+    scene, coefficients = scene_and_coefficients(per_camera=per_camera)
+    expected, alphas, _ = draw(scene.to(device), expected_colors(degree, scene.means, coefficients, scene.viewmats).to(device))
+    got, got_alphas, _ = draw(scene.to(device), coefficients.to(device), sh_degree=degree)
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-12)
+    assert torch.equal(got_alphas, alphas)
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_gradients_reach_means_coefficients_and_cameras(device):
+    scene, coefficients = scene_and_coefficients(degree=2, cameras=1)
+    inputs = [t.to(device).requires_grad_() for t in (scene.means.clone(), coefficients, scene.viewmats.clone())]
+    scene = scene.to(device)
+    weights = torch.randn(3, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
+
+    def total(means, coefficients, viewmats):
+        image, *_ = draw(scene.with_(means=means, viewmats=viewmats), coefficients, sh_degree=2)
+        return (image * weights).mean()
+
+    got = torch.autograd.grad(total(*inputs), inputs)
+    g = torch.Generator().manual_seed(2)
+    for k, gradient in enumerate(got):
+        direction = torch.randn(gradient.shape, generator=g, dtype=torch.float64).to(device)
+        step = 1e-5
+
+        def moved(by, k=k, direction=direction):
+            return total(*[t.detach() + (by * direction if i == k else 0) for i, t in enumerate(inputs)])
+
+        slope = (8 * (moved(step) - moved(-step)) - (moved(2 * step) - moved(-2 * step))) / (12 * step)
+        assert abs(float((gradient * direction).sum() - slope)) <= 1e-6 * abs(float(slope))
+
+
+def test_a_far_camera_sees_the_same_colours(device):
+    scene, coefficients = scene_and_coefficients(cameras=1, dtype=torch.float32)
+    shift = torch.tensor([1024.0, -512.0, 2048.0])
+    far = scene.viewmats.double().clone()
+    far[:, :3, 3] -= (far[:, :3, :3] @ shift.double())
+    # Means on a grid that float32 still holds at that distance.
+    near = scene.with_(means=(scene.means * 1024).round() / 1024).to(device)
+    moved = near.with_(means=near.means + shift.to(device), viewmats=far.to(torch.float32).to(device))
+    exact = moved.to("cpu").to(torch.float64)
+    truth = expected_colors(3, exact.means, coefficients.double(), exact.viewmats)
+    got = seen_colors(3, moved.means, coefficients.to(device), moved.viewmats, True).cpu()
+    assert (got - truth).norm() <= 1e-6 * truth.norm()
+
+
+@pytest.mark.usefixtures("as_shipped")
+@pytest.mark.parametrize(
+    ("degree", "shape", "words"),
+    [(4, (30, 25, 3), "sh_degree: expected a degree from 0 to 3"), (3, (30, 9, 3), "sh_degree: expected at most"),
+     (1, (30, 3), "colors: expected shape"), (1, (30, 4, 5), "colors: expected shape")],
+)  # fmt: skip
+def test_a_wrong_degree_or_shape_is_refused_by_name(degree, shape, words):
+    scene, _ = scene_and_coefficients(dtype=torch.float32)
+    with pytest.raises(ValueError, match=words):
+        draw(scene, torch.zeros(shape), sh_degree=degree)
