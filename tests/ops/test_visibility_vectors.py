@@ -233,7 +233,7 @@ torch.save(out, sys.argv[1])
 @pytest.mark.slow
 def test_narrower_vectors_give_the_same_pictures(tmp_path):
     answers = []
-    for k, flags in enumerate([None, "-march=x86-64-v3", "-march=x86-64-v2"]):
+    for k, flags in enumerate([None, "-target-cpu x86-64-v3", "-target-cpu x86-64-v2"]):
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
         environment |= {} if flags is None else {"OASIS_WARP_CPU_FLAGS": flags}
         command = [sys.executable, "-c", PICTURES, str(tmp_path / f"{k}.pt"), str(Path(__file__).parent)]

@@ -228,7 +228,7 @@ def _run(stage: str, dtype: str, address: int) -> None:
             kernel = getattr(vectors.kernels(dtype), stage)
             recorded: Any = wp.launch(kernel, dim=1, inputs=[address], device="cpu", record_cmd=True)
         setattr(_recorded, stage + dtype, recorded)
-    recorded.set_param_at_index(0, address)
+    recorded.set_param_at_index_from_ctype(0, address)
     recorded.launch()
 
 
