@@ -344,6 +344,15 @@ DRAW = """
     #else
     auto fma = [](F a, F b, F c) -> F { return a * b + c; };
     #endif
+    // A choice between new and old is compiled to a masked store. Those of AVX2 take many times as long as plain ones
+    // on some processors; a volatile one stays plain.
+    #if defined(__AVX512F__)
+    typedef FU FOut;
+    typedef IU IOut;
+    #else
+    typedef volatile FU FOut;
+    typedef volatile IU IOut;
+    #endif
     const I lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
     const F column = __builtin_convertvector(lane / 4, F), row = __builtin_convertvector(lane % 4, F);
     const int shift = job.fraction_bits, unit = 1 << shift;
@@ -503,8 +512,8 @@ DRAW = """
                 const F apart = inverse - before;
                 const I won = (least >= of[9][k]) & (apart > of[10][k]);
                 const unsigned certain = bits(won), possible = bits((least >= 0.f) & (apart >= -of[10][k]));
-                *(FU*)(inverses + i) = won ? inverse : before;
-                *(IU*)(ids + i) = won ? (I)(f) : (I)*(const IU*)(ids + i);
+                *(FOut*)(inverses + i) = won ? inverse : before;
+                *(IOut*)(ids + i) = won ? (I)(f) : (I)*(const IU*)(ids + i);
                 if (possible != certain) settle(f, possible & ~certain, i, x, y, inverse);
             };
 
