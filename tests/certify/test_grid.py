@@ -7,6 +7,7 @@ import torch
 
 from oasis_warp import ops
 from oasis_warp.certify import grid
+from oasis_warp.certify.certification import EXACT_STIFF
 from oasis_warp.certify.compare import LAYER, Measurement, compare
 from oasis_warp.certify.families import FAMILIES
 
@@ -20,6 +21,14 @@ def test_float32_operators_keep_their_bounds_on_the_first_scenes_of_the_grid(nam
     measured = [m for seed in range(part, A_FAMILY, PARTS) for m in grid.check_scene(name, seed, device)]
     assert len(measured) > A_FAMILY // PARTS
     assert not [m for m in measured if not m.passed]
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_float64_operators_are_exact_on_the_first_scenes_of_the_grid(name, device):
+    family = FAMILIES[name]
+    for seed in range(len(family.conditions)):
+        measured = compare(family, family.scene(seed), torch.float64, device, EXACT_STIFF)
+        assert not [m for m in measured if not m.passed]
 
 
 @pytest.mark.parametrize("name", FAMILIES)

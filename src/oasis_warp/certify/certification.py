@@ -42,6 +42,7 @@ SMALL_SIZES: dict[str, dict[str, Any]] = {
     "face_rotations": {"side": 2},
     "pose_on_mesh": {"n": 7},
 }
+EXACT_STIFF = (1e-9, 1e-7)
 STIFF_SEEDS = 3
 ORDINARY_SEEDS = 8
 REPEATS = 10
@@ -69,6 +70,7 @@ def steps(family: Family, device: torch.device, seed: int) -> Iterator[Step]:
         if name != "ordinary":
             for s in range(seed, seed + STIFF_SEEDS):
                 yield partial(compare, family, family.case(name, s), torch.float32, device)
+            yield partial(compare, family, family.case(name, seed), torch.float64, device, EXACT_STIFF)
     large = family.case("ordinary", seed, **family.large)
     yield partial(agree, family, large, "float32 against float64 kernel", torch.float64, device, device)
     if device.type != "cpu":

@@ -160,7 +160,7 @@ FAMILIES = {
         Family(
             "pose_on_mesh", ("means", "quats", "scales"), _read_pose_on_mesh, _pose_on_mesh,
             surface_scenes.pose_on_mesh_case, tuple(surface_scenes.RIDERS),
-            {"n": 10_000}, 
+            {"n": 10_000},
             {"faces": ("posed_vertices", 0), "face_index": ("area_ratio", 0), "vertex_index": ("posed_vertices", 0)},
         ),
     )

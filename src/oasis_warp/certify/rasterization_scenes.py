@@ -39,7 +39,7 @@ class Cloud:
     eye: tuple[float, float, float] | None = None
     """World origin of a camera that looks along z; several cameras round the origin when None."""
     quat_norm: float = 2.0
-    eps2d: float = 0.3
+    eps2d: float | None = None
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Added to the world, cameras included."""
     planes: tuple[float, float] | None = None
@@ -319,7 +319,9 @@ def finish(
         "Ks": K.repeat(n_cameras, 1, 1),
         "backgrounds": draw.uniform(n_cameras, channels),
     }
-    others = {"width": width, "height": height, "render_mode": mode, "eps2d": cloud.eps2d}
+    others = {"width": width, "height": height, "render_mode": mode}
+    if cloud.eps2d is not None:
+        others["eps2d"] = cloud.eps2d
     if sh_degree is not None:
         # As many coefficients as a degree more would have: those beyond `sh_degree` are not read.
         floats["colors"] = 0.3 * draw.normal(*([n_cameras] if per_camera else []), n, (sh_degree + 2) ** 2, 3)

@@ -68,9 +68,9 @@ def as_float32(value: float) -> float:
     return ctypes.c_float(value).value
 
 
-def empty_outputs(means: Tensor, n_cameras: int) -> tuple[Tensor, ...]:
+def empty_outputs(means: Tensor, viewmats: Tensor) -> tuple[Tensor, ...]:
     """Memory for `OUTPUTS`."""
-    shape = n_cameras, means.shape[0]
+    shape = viewmats.shape[0], means.shape[0]
     return tuple(
         torch.empty((*shape, size) if size else shape, dtype=dtype or means.dtype, device=means.device)
         for _name, size, dtype in OUTPUTS

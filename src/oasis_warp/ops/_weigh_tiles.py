@@ -10,6 +10,7 @@ from oasis_kernels import rasterize_weights as kernels
 from oasis_warp.ops._blend_tiles import CUDA_LANES, Splats, lane_grid
 from oasis_warp.ops._launch import SCALAR, VEC4, launch_ranges, view
 from oasis_warp.ops._registration import revealed
+from oasis_warp.ops._rules import current_rules
 from oasis_warp.ops._tiles import bin_to_tiles, even_work
 
 MAX_WEIGHTS = 2**31 - 1
@@ -47,7 +48,7 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
 
     def run(write: bool, starts: Tensor, columns: Tensor, values: Tensor) -> None:
         launch_ranges(
-            kernels.weigh(SCALAR[dtype]),
+            kernels.weigh(SCALAR[dtype], current_rules()),
             even_work(tiles.starts),
             [
                 view(tiles.starts), view(revealed(tiles.gaussians)), view(splats.boxes.view(-1, 4), vec4i),

@@ -105,7 +105,7 @@ def _project(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
     check_arrays(scene, opacities=(opacities, means.shape[:1], means.dtype))
-    out = empty_outputs(means, len(viewmats))
+    out = empty_outputs(means, viewmats)
     sound = False
     if len(means) and len(viewmats):
         if has_vectors(means):
@@ -127,7 +127,7 @@ def _project_fake(
     viewmats: Tensor,
     *_: Any,
 ) -> tuple[Tensor, ...]:
-    return empty_outputs(means, viewmats.shape[0])
+    return empty_outputs(means, viewmats)
 
 
 def _project_backward(
