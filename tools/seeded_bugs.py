@@ -5,10 +5,13 @@ from typing import NamedTuple
 KERNELS = "kernels/oasis_kernels"
 GRID = "tests/certify/test_grid.py"
 TESTS = {
-    "rasterization": [GRID, "-k", "rasterization and scenes_of_the_grid"],
-    "depth": [GRID, "-k", "depth and scenes_of_the_grid"],
-    "faces": [GRID, "-k", "face_rotations and scenes_of_the_grid"],
-    "posing": [GRID, "-k", "pose_on_mesh and scenes_of_the_grid"],
+    operator: [GRID, "-k", f"small_scenes and ({families})"]
+    for operator, families in {
+        "rasterization": "rasterization",
+        "depth": "depth_map or depth_visibility",
+        "faces": "face_rotations",
+        "posing": "pose_on_mesh",
+    }.items()
 }
 """The tests that have to catch the bugs of an operator: arguments of pytest."""
 
