@@ -55,7 +55,7 @@ def lane_grid(tile_size: int, device: torch.device, grid: tuple[int, int]) -> tu
 
 def draw(splats: Splats, width: int, height: int, tile_size: int) -> Drawn:
     """Images over the backgrounds, and alpha."""
-    n_cameras, n, channels = splats.colors.shape
+    n_cameras, _, channels = splats.colors.shape
     dtype, device = splats.colors.dtype, splats.colors.device
     start()
     color, vec4 = vector(channels, SCALAR[dtype]), VEC4[dtype]
@@ -126,10 +126,10 @@ def draw_backward(
         backward_kernels.blend_backward(scalar, channels, current_rules()),
         even_work(tiles.starts),
         [
-            view(tiles.starts), view(revealed(tiles.gaussians)), view(pair_numbers), view(splats.boxes.view(-1, 4), vec4i),
-            view(splats.centers.view(-1, 4), vec4), view(splats.whitenings.view(-1, 4), vec4),
-            view(splats.opacities.view(-1)), view(splats.colors.view(-1, channels), color),
-            view(splats.backgrounds, color), view(stops.view(-1)), view(of_image, color), view(of_alpha),
+            view(tiles.starts), view(revealed(tiles.gaussians)), view(pair_numbers),
+            view(splats.boxes.view(-1, 4), vec4i), view(splats.centers.view(-1, 4), vec4),
+            view(splats.whitenings.view(-1, 4), vec4), view(splats.opacities.view(-1)),
+            view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color), view(stops.view(-1)), view(of_image, color), view(of_alpha),
             tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height, int(with_shape),
             view(transmittance.view(-1).clone()), view(empty(pixels)),
             view(pair_moments, moments), view(pair_colors, color), view(tile_backgrounds, color),

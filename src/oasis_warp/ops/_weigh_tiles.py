@@ -25,6 +25,8 @@ class SparseWeights(NamedTuple):
     gaussian_starts: Tensor
     pixels: Tensor
     by_gaussian: Tensor
+    alphas: Tensor
+    """[H * W]: sums of the pixels' weights."""
 
 
 def check_weights(n_weights: int) -> None:
@@ -74,8 +76,10 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
     columns, by_gaussian = torch.sort(columns, stable=True)
     rows, values = rows[by_gaussian], values[by_gaussian]
     pixels, by_pixel = torch.sort(rows, stable=True)
+    of_pixels = values[by_pixel]
+    alphas = torch.segment_reduce(of_pixels, "sum", offsets=starts, initial=0)
     return SparseWeights(
-        _row_starts(pixels, n_pixels), columns[by_pixel], values[by_pixel], _row_starts(columns, n), rows, values
+        _row_starts(pixels, n_pixels), columns[by_pixel], of_pixels, _row_starts(columns, n), rows, values, alphas
     )
 
 

@@ -100,21 +100,23 @@ def _project(
     Ks: Tensor,
     width: int,
     height: int,
-    limits: list[float],
+    limits: list[float],  # as `Limits`
     validate: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
     check_arrays(scene, opacities=(opacities, means.shape[:1], means.dtype))
     out = empty_outputs(means, viewmats)
-    sound = False
-    if len(means) and len(viewmats):
-        if has_vectors(means):
-            # The kernel looks at the values as it reads them; what is wrong with them is for the slow checks to say.
-            sound = project_vectors(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
-        else:
-            project_generic(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
-    if validate and not sound:
+    if len(means) and len(viewmats) and has_vectors(means):
+        # The kernel looks at the values as it reads them; what is wrong with them is for the slow checks to say.
+        sound = project_vectors(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
+        if validate and not sound:
+            check_values(means, quats, scales, covars, opacities, viewmats, Ks)
+            raise AssertionError("the kernel has met a bad value that is not in its inputs")
+        return out
+    if validate:
         check_values(means, quats, scales, covars, opacities, viewmats, Ks)
+    if len(means) and len(viewmats):
+        project_generic(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
     return out
 
 
