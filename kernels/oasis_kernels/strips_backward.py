@@ -119,7 +119,7 @@ ADJOINT = """
     });
     free(planes);
 
-    phase(state + 16, n_chunks, [&](long long c) {
+    share(state + 16, n_chunks, [&](long long c) {
         typedef double D __attribute__((ext_vector_type(8)));
         const long long first = c * chunk, end = first + chunk < n ? first + chunk : n;
         for (long long i0 = first; i0 < end; i0 += 8) {
@@ -173,8 +173,9 @@ READ_FEW = """
 """
 
 READ_MANY = """
-                for (int side = 0; side < rows; side++) for (int c = 0; c < columns; c++) for (int k = 0; k < @CHANNELS@; k++)
-                    first[k * stride + 2 * c + side] = g_image[(pixel[side] + x + c) * @CHANNELS@ + k];
+                for (int side = 0; side < rows; side++) for (int c = 0; c < columns; c++)
+                    for (int k = 0; k < @CHANNELS@; k++)
+                        first[k * stride + 2 * c + side] = g_image[(pixel[side] + x + c) * @CHANNELS@ + k];
 """
 
 BACKWARD = GRID | {

@@ -188,7 +188,7 @@ def test_the_area_ratio_of_a_vertex_is_that_of_its_faces_together():
     rest, posed, faces = sheet(3)
     posed[faces[0]] = posed[faces[0]].mean(0)  # one collapses: it turns nothing but still counts
     got = face_rotations(rest, posed, faces).vertex_area_ratio
-    before, after = twin.areas(rest, faces), twin.areas(posed, faces)
+    before, after = (twin.plane(vertices, faces).area for vertices in (rest, posed))
     around = torch.stack([(faces == v).any(1) for v in range(len(rest))]).double()
     # The damping pulls ratios to one by its share of the area, 1e-6 and more for thin faces.
     torch.testing.assert_close(got, (around @ after) / (around @ before), rtol=1e-5, atol=1e-5)

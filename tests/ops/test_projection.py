@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from projection_runs import OPTIONS, assert_equal_bits, bits, covariances, incoming, run
 from rasterization_scenes import ordinary_scene
 from test_rasterization_stiff import CASES
 
@@ -16,30 +17,9 @@ from oasis_warp.ops import projection as module
 from oasis_warp.ops._rules import using
 from oasis_warp.ops.projection import Projection, project
 
-OPTIONS = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3}
 # Both kernels compute in float64: what differs is the rounding of the stored float32, 6e-8 relative.
 ROUNDING = 2e-7
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
-
-
-def incoming(projection, seed=0):
-    """Random gradients by means2d, covars2d and depths: float32 numbers, the same for either precision."""
-    g = torch.Generator().manual_seed(seed)
-    return [torch.randn(out.shape, generator=g).to(out) for out in projection[:3]]
-
-
-def run(scene, covars=None, by=("means", "quats", "scales", "covars", "viewmats"), seed=0, **options):
-    """The projection of a scene, and gradients of a random sum over it."""
-    shapes = {"quats": scene.quats, "scales": scene.scales} if covars is None else {"covars": covars}
-    inputs = {"means": scene.means, **shapes, "viewmats": scene.viewmats}
-    inputs = {k: v.detach().requires_grad_(k in by) for k, v in inputs.items()}
-    out = project(
-        inputs["means"], inputs.get("quats"), inputs.get("scales"), scene.opacities, inputs["viewmats"], scene.Ks,
-        scene.width, scene.height, covars=inputs.get("covars"), **(OPTIONS | options),
-    )  # fmt: skip
-    asked = {k: v for k, v in inputs.items() if k in by}
-    gradients = torch.autograd.grad(out[:3], list(asked.values()), incoming(out, seed))
-    return Projection(*(t.detach() for t in out)), dict(zip(asked, gradients, strict=True))
 
 
 def assert_same(vectors, generic):
@@ -62,16 +42,6 @@ def assert_same(vectors, generic):
 
 def both(scene, **options):
     return run(scene.to("cpu", torch.float32), **options), run(scene.to("cpu", torch.float64), **options)
-
-
-def bits(result):
-    projection, gradients = result
-    return [*projection, *gradients.values()]
-
-
-def assert_equal_bits(one, other):
-    for a, b in zip(bits(one), bits(other), strict=True):
-        assert torch.equal(a, b)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -105,6 +75,16 @@ def test_vectors_cull_what_the_generic_kernel_culls(options):
 def test_vectors_bear_quaternions_of_any_norm(norm):
     scene = ordinary_scene(6)
     assert_same(*both(scene.with_(quats=(scene.quats * norm).float())))
+
+
+def test_vectors_bear_needles_whose_determinant_would_cancel_in_float64():
+    scene = ordinary_scene(18, n=30)
+    scales = torch.tensor([3e5, 1e-4, 1e-4]).repeat(30, 1)
+    (vectors, _), (generic, _) = both(scene.with_(scales=scales))
+    xx, xy, yy = generic.covars2d.unbind(-1)
+    det = generic.conics[..., 0] * generic.conics[..., 2] - generic.conics[..., 1] ** 2
+    assert (generic.radii > 0).any() and not torch.allclose((xx * yy - xy * xy) * det, torch.ones_like(det))
+    torch.testing.assert_close(vectors.whitenings.double(), generic.whitenings, rtol=ROUNDING, atol=0.0)
 
 
 def test_vectors_bear_cameras_far_from_the_origin():
@@ -283,29 +263,17 @@ def test_nothing_is_read_or_written_beside_the_arrays(n, with_covars, monkeypatc
         assert (whole[:GUARD] == 77).all() and (whole[-GUARD:] == 77).all()
 
 
-def covariances(scene):
-    """R S S R^T of a scene's quats and scales."""
-    w, x, y, z = torch.nn.functional.normalize(scene.quats, dim=-1).unbind(-1)
-    R = torch.stack([
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ], -1).reshape(-1, 3, 3)  # fmt: skip
-    M = R * scene.scales[:, None]
-    return M @ M.mT
-
-
 NARROW = """
 import sys, torch
 sys.path.insert(0, {folder!r})
-from test_projection import bits, run
+from projection_runs import bits, run
 from rasterization_scenes import ordinary_scene
 torch.save(bits(run(ordinary_scene(17, n=29, cameras=2))), sys.argv[1])
 """
 
 
 @pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="flags of x86")
-@pytest.mark.parametrize("flags", ["-march=x86-64-v3", "-march=x86-64-v2"])
+@pytest.mark.parametrize("flags", ["-target-cpu x86-64-v3", "-target-cpu x86-64-v2"])
 def test_narrower_vectors_give_the_same(flags, tmp_path):
     script = NARROW.format(folder=str(Path(__file__).parent))
     environment = os.environ | {"OASIS_WARP_CPU_FLAGS": flags}

@@ -164,6 +164,14 @@ def address(tensor: Tensor, dtype: torch.dtype, size: int) -> int:
     return tensor.data_ptr()
 
 
+@functools.cache
+def _give_way() -> int:
+    """Address of the C library's sched_yield, 0 where there is none."""
+    if os.name != "posix":
+        return 0
+    return ctypes.cast(ctypes.CDLL(None).sched_yield, ctypes.c_void_p).value or 0
+
+
 def run_native(native: Native, words: dict[str, int], n_tasks: int) -> None:
     """Run a native kernel with the parameter block `words` on the CPU, and return when it is done.
 
@@ -176,6 +184,7 @@ def run_native(native: Native, words: dict[str, int], n_tasks: int) -> None:
         n_tasks: The largest number of tasks in one of its phases.
     """
     start()
+    words = {"give_way": _give_way(), **words}
     block = (ctypes.c_longlong * len(native.parameters))(*[words[name] for name in native.parameters])
     place = ctypes.addressof(block)
     helpers = min(torch.get_num_threads(), n_tasks) - 1

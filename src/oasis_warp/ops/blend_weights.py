@@ -76,7 +76,7 @@ def blend_weights(
     check_cameras(
         viewmat[None], K[None], means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size
     )
-    n, pixels, dtype = len(means), width * height, means.dtype
+    n, pixels = len(means), width * height
     with torch.no_grad():
         projection = project(
             means, quats, scales, opacities, viewmat[None], K[None], width, height,
@@ -90,8 +90,7 @@ def blend_weights(
         w = weigh(splats, width, height, tile_size)
         matrix = _csr(w.pixel_starts, w.gaussians, w.by_pixel, (pixels, n))
         transpose = _csr(w.gaussian_starts, w.pixels, w.by_gaussian, (n, pixels))
-        alphas = matrix @ torch.ones(n, 1, dtype=dtype, device=means.device)
-    return BlendWeights(matrix, transpose, alphas.view(height, width, 1))
+    return BlendWeights(matrix, transpose, w.alphas.view(height, width, 1))
 
 
 def _csr(starts: Tensor, columns: Tensor, values: Tensor, size: tuple[int, int]) -> Tensor:
