@@ -21,6 +21,8 @@ TILE = 8
 """Side of a tile [px]."""
 LONGEST = 2048
 """Longest list that a warp sorts in shared memory."""
+WARPS = 8
+"""Warps that share a tile: the forward pass hands each a segment of its list."""
 MAX_GAUSSIANS = 1 << 24
 """Indices that a key has room for."""
 
@@ -116,7 +118,7 @@ def fill_tiles(
 
 HEAD = """
 #if defined(__CUDA_ARCH__)
-    const int lane = threadIdx.x & 31;
+    const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
     const unsigned all = 0xffffffffu;
     const int camera = tile / (tiles_x * tiles_y);
     const int left = (tile % tiles_x) * 8, top = (tile / tiles_x - camera * tiles_y) * 8;
@@ -125,6 +127,12 @@ HEAD = """
     const bool in0 = px < width && py0 < height, in1 = px < width && py1 < height;
     const long long row = (long long)camera * height;
     const long long pixel0 = (row + py0) * width + px, pixel1 = (row + py1) * width + px;
+    // The list is cut into equal segments, one a warp, each of 32 layers or more.
+    int segments = @WARPS@;
+    while (segments > 1 && count <= 32 * (segments / 2)) segments >>= 1;
+    const int segment = ((count + segments - 1) / segments + 3) & ~3;
+    const int from = min(warp * segment, count), to = min(from + segment, count);
+
     // Offsets of the pixels' centres from the tile's corner: small, exact numbers.
     const float x = (float)(lane & 7), y0 = (float)(lane >> 3), y1 = y0 + 4.f;
 
@@ -143,75 +151,79 @@ HEAD = """
 
 SORT = """
     __shared__ unsigned long long keys_of_tile[@LONGEST@];
-    // A bitonic network over keys in registers: key k of the list is register k / 32 of lane k % 32.
-    auto exchange = [&](unsigned long long mine, int step, bool keep_smaller) -> unsigned long long {
-        const unsigned long long other = __shfl_xor_sync(all, mine, step);
-        return (mine < other) == keep_smaller ? mine : other;
-    };
-    auto sort_registers = [&](auto registers) {
-        constexpr int R = sizeof(*registers);  // a size is how a lambda can take a constant
-        unsigned long long v[R];
-        #pragma unroll
-        for (int r = 0; r < R; r++) v[r] = r * 32 + lane < count ? keys.data[start + r * 32 + lane] : ~0ull;
-        #pragma unroll
-        for (int block = 2; block <= 32 * R; block <<= 1) {
-            #pragma unroll
-            for (int step = block >> 1; step > 0; step >>= 1) {
-                if (step >= 32) {
-                    #pragma unroll
-                    for (int r = 0; r < R; r++) if (!(r & (step >> 5))) {
-                        const int other = r | (step >> 5);
-                        const bool ascending = !((r << 5) & block);
-                        const unsigned long long low = v[r] < v[other] ? v[r] : v[other];
-                        const unsigned long long high = v[r] < v[other] ? v[other] : v[r];
-                        v[r] = ascending ? low : high;
-                        v[other] = ascending ? high : low;
-                    }
-                } else {
-                    #pragma unroll
-                    for (int r = 0; r < R; r++)
-                        v[r] = exchange(v[r], step, !(lane & step) == !(((r << 5) | lane) & block));
-                }
-            }
+    int size = 32;
+    while (size < count) size <<= 1;
+    for (int k = threadIdx.x; k < size; k += blockDim.x) keys_of_tile[k] = k < count ? keys.data[start + k] : ~0ull;
+    __syncthreads();
+    for (int block = 2; block <= size; block <<= 1) for (int step = block >> 1; step > 0; step >>= 1) {
+        for (int k = threadIdx.x; k < size / 2; k += blockDim.x) {
+            const int a = ((k & ~(step - 1)) << 1) | (k & (step - 1)), b = a + step;
+            const unsigned long long u = keys_of_tile[a], v = keys_of_tile[b];
+            if ((u > v) == ((a & block) == 0)) { keys_of_tile[a] = v; keys_of_tile[b] = u; }
         }
-        #pragma unroll
-        for (int r = 0; r < R; r++) if (r * 32 + lane < count) keys_of_tile[r * 32 + lane] = v[r];
-    };
-    if (count <= 32) sort_registers((char(*)[1])nullptr);
-    else if (count <= 64) sort_registers((char(*)[2])nullptr);
-    else if (count <= 128) sort_registers((char(*)[4])nullptr);
-    else if (count <= 256) sort_registers((char(*)[8])nullptr);
-    else if (count <= 512) sort_registers((char(*)[16])nullptr);
-    else {
-        int size = 1024;
-        while (size < count) size <<= 1;
-        for (int k = lane; k < size; k += 32) keys_of_tile[k] = k < count ? keys.data[start + k] : ~0ull;
-        __syncwarp();
-        for (int block = 2; block <= size; block <<= 1) for (int step = block >> 1; step > 0; step >>= 1) {
-            #pragma unroll 8
-            for (int k = lane; k < size / 2; k += 32) {
-                const int a = ((k & ~(step - 1)) << 1) | (k & (step - 1)), b = a + step;
-                const unsigned long long u = keys_of_tile[a], v = keys_of_tile[b];
-                const bool swap = (u > v) == ((a & block) == 0);
-                keys_of_tile[a] = swap ? v : u;
-                keys_of_tile[b] = swap ? u : v;
-            }
-            __syncwarp();
-        }
+        __syncthreads();
     }
-    __syncwarp();
 """
 
 FORWARD = (
     SORT
     + """
-    __shared__ Layer batch[32];
-    __shared__ float batch_colors[32 * @CHANNELS@];
-    for (int k = lane; k < count; k += 32)
+    __shared__ __align__(16) float pool[@WARPS@ * (256 + 32 * @CHANNELS@ + 64 * @CHANNELS@ / 2)];
+    __shared__ float passes[@WARPS@][64];
+    Layer* batch = (Layer*)pool + 32 * warp;
+    float* batch_colors = pool + 256 * @WARPS@ + 32 * @CHANNELS@ * warp;
+    for (int k = threadIdx.x; k < count; k += blockDim.x)
         tile_gaussians.data[start + k] = camera * n + (int)(keys_of_tile[k] & 0xffffff);
+    auto load = [&](int first, bool with_colors) {
+        __syncwarp();
+        const int k = first + lane;
+        if (k < to) {
+            const int g = camera * n + (int)(keys_of_tile[k] & 0xffffff);
+            batch[lane] = layer(g);
+            const float* rgb = (const float*)(colors.data + g);
+            if (with_colors) for (int c = 0; c < @CHANNELS@; c++) batch_colors[lane * @CHANNELS@ + c] = rgb[c];
+        } else {
+            batch[lane] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, -1e9f, 0.f};  // fainter than any cut-off
+            for (int c = 0; c < @CHANNELS@; c++) batch_colors[lane * @CHANNELS@ + c] = 0.f;
+        }
+        __syncwarp();
+    };
+    auto alphas_of = [&](const Layer& l, float& alpha0, float& alpha1) {
+        const float dx = x - l.cx, d0 = y0 - l.cy, d1 = y1 - l.cy;
+        const float u0 = l.w0 * dx + l.w1 * d0, v0 = l.w2 * dx + l.w3 * d0;
+        const float u1 = l.w0 * dx + l.w1 * d1, v1 = l.w2 * dx + l.w3 * d1;
+        alpha0 = fminf(power(l.lo - (u0 * u0 + v0 * v0)), @ALPHA_MAX@);
+        alpha1 = fminf(power(l.lo - (u1 * u1 + v1 * v1)), @ALPHA_MAX@);
+    };
+
+    // First how much each segment lets through, whatever lies in front of it; then every segment knows the
+    // transmittance that it starts with.
+    float P0 = 1.f, P1 = 1.f;
+    if (warp < segments - 1) for (int first = from; first < to; first += 32) {
+        load(first, false);
+        const int m = min(32, to - first);
+        for (int j = 0; j < m; j += 4) {
+            #pragma unroll
+            for (int i = 0; i < 4; i++) {
+                float alpha0, alpha1;
+                alphas_of(batch[j + i], alpha0, alpha1);
+                P0 *= alpha0 >= @ALPHA_MIN@ ? 1.f - alpha0 : 1.f;
+                P1 *= alpha1 >= @ALPHA_MIN@ ? 1.f - alpha1 : 1.f;
+            }
+        }
+    }
+    passes[warp][lane] = P0;
+    passes[warp][lane + 32] = P1;
+    __syncthreads();
     float T0 = 1.f, T1 = 1.f, A0 = 0.f, A1 = 0.f, C0[@CHANNELS@] = {}, C1[@CHANNELS@] = {};
+    for (int k = 0; k < warp && k < segments; k++) {
+        T0 *= passes[k][lane];
+        T1 *= passes[k][lane + 32];
+    }
     int stop0 = count, stop1 = count;
-    bool open0 = in0, open1 = in1;
+    bool open0 = in0 && T0 > @STOP@, open1 = in1 && T1 > @STOP@;
+    if (!open0) stop0 = from;
+    if (!open1) stop1 = from;
     auto draw = [&](float alpha, int place, const float* rgb, bool& open, float& T, float& A, float* C, int& stop) {
         const bool seen = open && alpha >= @ALPHA_MIN@;
         const float after = T * (1.f - alpha);
@@ -223,60 +235,69 @@ FORWARD = (
         A += weight;
         for (int k = 0; k < @CHANNELS@; k++) C[k] += rgb[k] * weight;
     };
-    for (int from = 0; from < count && __any_sync(all, open0 || open1); from += 32) {
-        __syncwarp();
-        if (from + lane < count) {
-            const int g = camera * n + (int)(keys_of_tile[from + lane] & 0xffffff);
-            batch[lane] = layer(g);
-            const float* rgb = (const float*)(colors.data + g);
-            for (int k = 0; k < @CHANNELS@; k++) batch_colors[lane * @CHANNELS@ + k] = rgb[k];
-        } else {
-            batch[lane] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, -1e9f, 0.f};  // fainter than any cut-off
-        }
-        __syncwarp();
+    if (warp < segments) for (int first = from; first < to && __any_sync(all, open0 || open1); first += 32) {
+        load(first, true);
         // Four layers at a time: their alphas do not wait for each other, only the blending does.
-        const int m = min(32, count - from);
+        const int m = min(32, to - first);
         for (int j = 0; j < m; j += 4) {
             float alpha0[4], alpha1[4];
             bool any = false;
             #pragma unroll
             for (int i = 0; i < 4; i++) {
-                const Layer l = batch[j + i];
-                const float dx = x - l.cx, d0 = y0 - l.cy, d1 = y1 - l.cy;
-                const float u0 = l.w0 * dx + l.w1 * d0, v0 = l.w2 * dx + l.w3 * d0;
-                const float u1 = l.w0 * dx + l.w1 * d1, v1 = l.w2 * dx + l.w3 * d1;
-                alpha0[i] = fminf(power(l.lo - (u0 * u0 + v0 * v0)), @ALPHA_MAX@);
-                alpha1[i] = fminf(power(l.lo - (u1 * u1 + v1 * v1)), @ALPHA_MAX@);
+                alphas_of(batch[j + i], alpha0[i], alpha1[i]);
                 any = any || (open0 && alpha0[i] >= @ALPHA_MIN@) || (open1 && alpha1[i] >= @ALPHA_MIN@);
             }
             if (!__any_sync(all, any)) continue;
             #pragma unroll
             for (int i = 0; i < 4; i++) {
                 const float* rgb = batch_colors + (j + i) * @CHANNELS@;
-                draw(alpha0[i], from + j + i, rgb, open0, T0, A0, C0, stop0);
-                draw(alpha1[i], from + j + i, rgb, open1, T1, A1, C1, stop1);
+                draw(alpha0[i], first + j + i, rgb, open0, T0, A0, C0, stop0);
+                draw(alpha1[i], first + j + i, rgb, open1, T1, A1, C1, stop1);
             }
         }
     }
+
+    // What the segments add, front to back. A pixel ends where the first of them says so.
+    __syncthreads();  // the batches have been read
+    auto sums = [&](int k, int c, int p) -> float& { return pool[(k * (@CHANNELS@ + 2) + c) * 64 + p]; };
+    __shared__ int ends[@WARPS@][64];
+    if (warp < segments) {
+        for (int k = 0; k < @CHANNELS@; k++) { sums(warp, k, lane) = C0[k]; sums(warp, k, lane + 32) = C1[k]; }
+        sums(warp, @CHANNELS@, lane) = A0; sums(warp, @CHANNELS@, lane + 32) = A1;
+        sums(warp, @CHANNELS@ + 1, lane) = T0; sums(warp, @CHANNELS@ + 1, lane + 32) = T1;
+        ends[warp][lane] = stop0; ends[warp][lane + 32] = stop1;
+    }
+    __syncthreads();
+    if (warp >= 2) return;
+    const int p = lane + 32 * warp;
+    if (!(warp ? in1 : in0)) return;
+    float A = 0.f, T = 1.f, C[@CHANNELS@] = {};
+    int stop = count;
+    for (int k = 0; k < segments; k++) {
+        A += sums(k, @CHANNELS@, p);
+        for (int c = 0; c < @CHANNELS@; c++) C[c] += sums(k, c, p);
+        // A segment that was not entered (it stops where it starts) leaves the transmittance of the one before.
+        if (ends[k][p] > k * segment || k == 0) T = sums(k, @CHANNELS@ + 1, p);
+        if (ends[k][p] < count) { stop = ends[k][p]; break; }
+    }
+    const long long pixel = warp ? pixel1 : pixel0;
     const float* background = (const float*)(backgrounds.data + camera);
-    auto finish = [&](bool inside, long long pixel, float T, float A, const float* C, int stop) {
-        if (!inside) return;
-        transmittance.data[pixel] = T;
-        alphas.data[pixel] = A;
-        stops.data[pixel] = stop;
-        float* out = (float*)(image.data + pixel);
-        for (int k = 0; k < @CHANNELS@; k++) out[k] = C[k] + background[k] * T;
-    };
-    finish(in0, pixel0, T0, A0, C0, stop0);
-    finish(in1, pixel1, T1, A1, C1, stop1);
+    transmittance.data[pixel] = T;
+    alphas.data[pixel] = A;
+    stops.data[pixel] = stop;
+    float* out = (float*)(image.data + pixel);
+    for (int k = 0; k < @CHANNELS@; k++) out[k] = C[k] + background[k] * T;
 #endif
 """
 )
 
 BACKWARD = """
-    __shared__ Layer batch[32];
-    __shared__ float batch_colors[32 * @CHANNELS@];
-    __shared__ int batch_pairs[32];
+    __shared__ Layer batches[@WARPS@][32];
+    __shared__ float batch_colors_of[@WARPS@][32 * @CHANNELS@];
+    __shared__ int batch_pairs_of[@WARPS@][32];
+    Layer* batch = batches[warp];
+    float* batch_colors = batch_colors_of[warp];
+    int* batch_pairs = batch_pairs_of[warp];
     auto pair_of = [&](int g) -> int {
         const int* box = (const int*)(boxes.data + g);
         const int x0 = box[0] / 8, y0 = box[1] / 8, x1 = (box[2] - 1) / 8 + 1;
@@ -316,30 +337,75 @@ BACKWARD = """
     };
     open_pixel(in0, pixel0, T0, S0, G0, stop0);
     open_pixel(in1, pixel1, T1, S1, G1, stop1);
-    for (int k = 0; k < @CHANNELS@; k++) {
+    if (warp == 0) for (int k = 0; k < @CHANNELS@; k++) {
         float sum = by_background[k];
         for (int offset = 16; offset > 0; offset >>= 1) sum += __shfl_xor_sync(all, sum, offset);
         if (lane == 0) ((float*)(tile_backgrounds.data + tile))[k] = sum;
     }
-    const int last = __reduce_max_sync(all, max(stop0, stop1));
-    for (int place = last + lane; place < count; place += 32) {  // behind every pixel's end
+    auto load = [&](int first) {
+        __syncwarp();
+        if (first + lane < to) {
+            const int g = tile_gaussians.data[start + first + lane];
+            batch[lane] = layer(g);
+            batch_pairs[lane] = pair_of(g);
+            const float* rgb = (const float*)(colors.data + g);
+            for (int k = 0; k < @CHANNELS@; k++) batch_colors[lane * @CHANNELS@ + k] = rgb[k];
+        } else {
+            batch[lane] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, -1e9f, 0.f};
+            for (int k = 0; k < @CHANNELS@; k++) batch_colors[lane * @CHANNELS@ + k] = 0.f;
+        }
+        __syncwarp();
+    };
+
+    // First what each segment lets through and shows by itself; then every segment knows the transmittance at its end
+    // and what is seen behind it.
+    __shared__ float passes[@WARPS@][64], shows[@WARPS@][64];
+    float P0 = 1.f, P1 = 1.f, c0 = 0.f, c1 = 0.f;
+    for (int first = from; first < to; first += 32) {
+        load(first);
+        const int m = min(32, to - first);
+        for (int j = 0; j < m; j += 4) {
+            #pragma unroll
+            for (int i = 0; i < 4; i++) {
+                const Layer l = batch[j + i];
+                const float* rgb = batch_colors + (j + i) * @CHANNELS@;
+                const float dx = x - l.cx;
+                auto pass = [&](float dy, int stop, const float* G, float& P, float& c) {
+                    const float u = l.w0 * dx + l.w1 * dy, v = l.w2 * dx + l.w3 * dy;
+                    const float alpha = fminf(power(l.lo - (u * u + v * v)), @ALPHA_MAX@);
+                    const float a = alpha >= @ALPHA_MIN@ && first + j + i < stop ? alpha : 0.f;
+                    float gc = 0.f;
+                    #pragma unroll
+                    for (int k = 0; k < @CHANNELS@; k++) gc += G[k] * rgb[k];
+                    c += P * a * gc;
+                    P *= 1.f - a;
+                };
+                pass(y0 - l.cy, stop0, G0, P0, c0);
+                pass(y1 - l.cy, stop1, G1, P1, c1);
+            }
+        }
+    }
+    passes[warp][lane] = P0; passes[warp][lane + 32] = P1;
+    shows[warp][lane] = c0; shows[warp][lane + 32] = c1;
+    __syncthreads();
+    if (warp >= segments) return;
+    T0 = 1.f, T1 = 1.f;
+    for (int k = 0; k <= warp; k++) { T0 *= passes[k][lane]; T1 *= passes[k][lane + 32]; }
+    for (int k = segments - 1; k > warp; k--) {
+        S0 = shows[k][lane] + passes[k][lane] * S0;
+        S1 = shows[k][lane + 32] + passes[k][lane + 32] * S1;
+    }
+    const int last = max(from, min(to, __reduce_max_sync(all, max(stop0, stop1))));
+    for (int place = last + lane; place < to; place += 32) {  // behind every pixel's end
         const long long pair = pair_of(tile_gaussians.data[start + place]);
         float* c = (float*)(pair_colors.data + pair);
         for (int k = 0; k < @CHANNELS@; k++) c[k] = 0.f;
         if (with_shape) for (int k = 0; k < 8; k++) ((float*)(pair_moments.data + pair))[k] = 0.f;
     }
-    for (int from = (last - 1) / 32 * 32; from >= 0 && last > 0; from -= 32) {
-        __syncwarp();
-        if (from + lane < last) {
-            const int g = tile_gaussians.data[start + from + lane];
-            batch[lane] = layer(g);
-            batch_pairs[lane] = pair_of(g);
-            const float* rgb = (const float*)(colors.data + g);
-            for (int k = 0; k < @CHANNELS@; k++) batch_colors[lane * @CHANNELS@ + k] = rgb[k];
-        }
-        __syncwarp();
+    for (int first = from + ((last - from - 1) & ~31); first >= from && last > from; first -= 32) {
+        load(first);
         // As in the forward pass: four at a time, whose offsets and alphas do not wait for each other.
-        for (int j = (min(32, last - from) - 1) & ~3; j >= 0; j -= 4) {
+        for (int j = (min(32, last - first) - 1) & ~3; j >= 0; j -= 4) {
             float u[4][2], v[4][2], raw[4][2];
             bool drawn[4][2];
             #pragma unroll
@@ -352,12 +418,12 @@ BACKWARD = """
                     u[i][h] = l.w0 * dx + l.w1 * dy;
                     v[i][h] = l.w2 * dx + l.w3 * dy;
                     raw[i][h] = power(l.lo - (u[i][h] * u[i][h] + v[i][h] * v[i][h]));
-                    drawn[i][h] = raw[i][h] >= @ALPHA_MIN@ && from + j + i < (h ? stop1 : stop0);
+                    drawn[i][h] = raw[i][h] >= @ALPHA_MIN@ && first + j + i < (h ? stop1 : stop0);
                 }
             }
             #pragma unroll
             for (int i = 3; i >= 0; i--) {
-                if (from + j + i >= last) continue;
+                if (first + j + i >= last) continue;
                 const float* rgb = batch_colors + (j + i) * @CHANNELS@;
                 const long long pair = batch_pairs[j + i];
                 const bool any = __any_sync(all, drawn[i][0] || drawn[i][1]);
@@ -413,7 +479,7 @@ def _snippet(body: str, channels: int) -> str:
     }  # fmt: skip
     for name, value in values.items():
         text = text.replace(f"@{name}@", f"{value!r}f")
-    return text.replace("@CHANNELS@", str(channels)).replace("@LONGEST@", str(LONGEST))
+    return text.replace("@CHANNELS@", str(channels)).replace("@LONGEST@", str(LONGEST)).replace("@WARPS@", str(WARPS))
 
 
 @functools.cache
