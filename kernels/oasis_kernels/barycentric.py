@@ -1,14 +1,16 @@
-"""Carry Gaussians that are tied to faces by barycentric coordinates along with a posed mesh.
+"""Carry Gaussians that are tied to faces by barycentric coordinates, or to vertices, along with a posed mesh.
 
-`pose` and `pose_backward`: one thread a Gaussian. At barycentrics b_k of corners v_k that turned by q_k:
+`pose_on_faces`, `pose_on_vertices` and their backwards: one thread a Gaussian. At barycentrics b_k of corners v_k that
+turned by q_k:
 
     mean  = sum b_k v_k
     dq    = m / |m|,  m = sum b_k s_k q_k     s_k = +-1 turns q_k to the side of the corner with the largest b_k
     quat  = dq * canonical quat
     scale = canonical scale * r^h             r: area ratio of the face, bounded; h = 1/2 (a length), 1 or 0
 
-With b_k >= 0 the part of m along that corner's rotation is at least the largest b_k: m cannot vanish. Backward writes
-gradients of the three corners as one row a Gaussian; `incidence.sum_rows` adds them to faces, then to vertices.
+With b_k >= 0 the part of m along that corner's rotation is at least the largest b_k: m cannot vanish. On a vertex v
+that turned by q the mean is v + R(q) offset, and dq = q. Backward writes gradients of the vertices as rows of each
+Gaussian; `incidence.sum_rows` adds them up.
 """
 
 from typing import Any
@@ -22,6 +24,7 @@ AREA_RATIO_LIMIT = wp.constant(wp.float64(1e4))
 ZERO = wp.constant(wp.float64(0.0))
 HALF = wp.constant(wp.float64(0.5))
 ONE = wp.constant(wp.float64(1.0))
+TWO = wp.constant(wp.float64(2.0))
 
 
 @wp.struct
@@ -105,7 +108,7 @@ def growth_slope(ratio: wp.float64, half_powers: int) -> wp.float64:
 
 
 @wp.kernel
-def pose(
+def pose_on_faces(
     first: int,
     vertices: wp.array2d[Any],
     faces: wp.array2d[wp.int32],
@@ -136,7 +139,7 @@ def pose(
 
 
 @wp.kernel
-def pose_backward(
+def pose_on_faces_backward(
     first: int,
     vertices: wp.array2d[Any],
     faces: wp.array2d[wp.int32],
@@ -198,10 +201,130 @@ def pose_backward(
             grad_scales[i, k] = grad_scales.dtype(factor * g_grown[k])
 
 
-INPUTS = ("vertices", "barycentrics", "vertex_quats", "quats", "scales")
+@wp.func
+def turn_of(q: wp.vec4d) -> Mix:
+    """The rotation of one vertex as `mix` gives that of a place on a face."""
+    out = Mix()
+    out.norm = wp.length(q)
+    out.unit = q
+    if out.norm > ZERO:
+        out.unit = q / out.norm
+    return out
+
+
+@wp.func
+def rotate(q: wp.vec4d, v: wp.vec3d) -> wp.vec3d:
+    """R(q) v for a unit wxyz quaternion."""
+    u = wp.vec3d(q[1], q[2], q[3])
+    t = TWO * wp.cross(u, v)
+    return v + q[0] * t + wp.cross(u, t)
+
+
+@wp.func
+def rotate_gradient(q: wp.vec4d, v: wp.vec3d, g: wp.vec3d) -> wp.vec4d:
+    """Gradient by `q` of g . rotate(q, v)."""
+    u = wp.vec3d(q[1], q[2], q[3])
+    by_u = TWO * (
+        q[0] * wp.cross(v, g) + wp.dot(g, u) * v + wp.dot(u, v) * g - TWO * wp.dot(g, v) * u
+    )
+    return wp.vec4d(TWO * wp.dot(g, wp.cross(u, v)), by_u[0], by_u[1], by_u[2])
+
+
+@wp.kernel
+def pose_on_vertices(
+    first: int,
+    vertices: wp.array2d[Any],
+    vertex_index: wp.array[wp.int32],
+    vertex_quats: wp.array2d[Any],
+    area_ratio: wp.array[Any],
+    offsets: wp.array2d[Any],
+    quats: wp.array2d[Any],
+    scales: wp.array2d[Any],
+    half_powers: int,
+    posed_means: wp.array2d[Any],
+    posed_quats: wp.array2d[Any],
+    posed_scales: wp.array2d[Any],
+):
+    i = first + wp.tid()
+    v = vertex_index[i]
+    turn = turn_of(row4(vertex_quats, v)).unit
+    mean = row3(vertices, v) + rotate(turn, row3(offsets, i))
+    turned = multiply(turn, row4(quats, i))
+    scale = growth(wp.float64(area_ratio[v]), half_powers) * row3(scales, i)
+    for k in range(3):
+        posed_means[i, k] = posed_means.dtype(mean[k])
+        posed_scales[i, k] = posed_scales.dtype(scale[k])
+    for k in range(4):
+        posed_quats[i, k] = posed_quats.dtype(turned[k])
+
+
+@wp.kernel
+def pose_on_vertices_backward(
+    first: int,
+    vertices: wp.array2d[Any],
+    vertex_index: wp.array[wp.int32],
+    vertex_quats: wp.array2d[Any],
+    area_ratio: wp.array[Any],
+    offsets: wp.array2d[Any],
+    quats: wp.array2d[Any],
+    scales: wp.array2d[Any],
+    half_powers: int,
+    grad_means: wp.array2d[Any],
+    grad_turned: wp.array2d[Any],
+    grad_grown: wp.array2d[Any],
+    # Each of these has a row a Gaussian, or none when it is not wanted.
+    grad_vertices: wp.array2d[Any],
+    grad_vertex_quats: wp.array2d[Any],
+    grad_area_ratio: wp.array2d[Any],
+    grad_offsets: wp.array2d[Any],
+    grad_quats: wp.array2d[Any],
+    grad_scales: wp.array2d[Any],
+):
+    i = first + wp.tid()
+    v = vertex_index[i]
+    g_mean = row3(grad_means, i)
+    g_turned = row4(grad_turned, i)
+    g_grown = row3(grad_grown, i)
+    turn = turn_of(row4(vertex_quats, v))
+    ratio = wp.float64(area_ratio[v])
+
+    if grad_vertices.shape[0] > 0:
+        for k in range(3):
+            grad_vertices[i, k] = grad_vertices.dtype(g_mean[k])
+    if grad_vertex_quats.shape[0] > 0:
+        g = multiply(g_turned, conjugate(row4(quats, i))) + rotate_gradient(turn.unit, row3(offsets, i), g_mean)
+        g_sum = wp.vec4d()
+        if turn.norm > ZERO:
+            g_sum = (g - wp.dot(g, turn.unit) * turn.unit) / turn.norm
+        for k in range(4):
+            grad_vertex_quats[i, k] = grad_vertex_quats.dtype(g_sum[k])
+    if grad_area_ratio.shape[0] > 0:
+        slope = growth_slope(ratio, half_powers)
+        grad_area_ratio[i, 0] = grad_area_ratio.dtype(slope * wp.dot(g_grown, row3(scales, i)))
+    if grad_offsets.shape[0] > 0:
+        back = rotate(conjugate(turn.unit), g_mean)
+        for k in range(3):
+            grad_offsets[i, k] = grad_offsets.dtype(back[k])
+    if grad_quats.shape[0] > 0:
+        g_quat = multiply(conjugate(turn.unit), g_turned)
+        for k in range(4):
+            grad_quats[i, k] = grad_quats.dtype(g_quat[k])
+    if grad_scales.shape[0] > 0:
+        factor = growth(ratio, half_powers)
+        for k in range(3):
+            grad_scales[i, k] = grad_scales.dtype(factor * g_grown[k])
+
+
+COMMON = ("vertices", "vertex_quats", "quats", "scales")
 OUTPUTS = ("posed_means", "posed_quats", "posed_scales")
-GRADIENTS = ("grad_means", "grad_turned", "grad_grown", "grad_area_ratio", *(f"grad_{name}" for name in INPUTS))
+UPSTREAM = ("grad_means", "grad_turned", "grad_grown", "grad_area_ratio")
 for real in (wp.float32, wp.float64):
     ratio = {"area_ratio": wp.array[real]}
-    wp.overload(pose, ratio | dict.fromkeys((*INPUTS, *OUTPUTS), wp.array2d[real]))
-    wp.overload(pose_backward, ratio | dict.fromkeys((*INPUTS, *GRADIENTS), wp.array2d[real]))
+    for forward, backward, place in (
+        (pose_on_faces, pose_on_faces_backward, "barycentrics"),
+        (pose_on_vertices, pose_on_vertices_backward, "offsets"),
+    ):
+        inputs = (*COMMON, place)
+        gradients = (*UPSTREAM, *(f"grad_{name}" for name in inputs))
+        wp.overload(forward, ratio | dict.fromkeys((*inputs, *OUTPUTS), wp.array2d[real]))
+        wp.overload(backward, ratio | dict.fromkeys((*inputs, *gradients), wp.array2d[real]))

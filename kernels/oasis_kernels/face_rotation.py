@@ -11,7 +11,7 @@ phi = atan2(l' x - l x', l' y + l y'), and the second argument is positive for a
 
 Vertex. The mean of the faces' quaternions, weighted with the areas at rest, each with the sign that brings it nearest
 to the face of the largest area, normalised. Every term then has a positive part along that face's quaternion, so the
-sum cannot cancel.
+sum cannot cancel. Its area ratio is that of all its faces together.
 
 Arithmetic is float64 whatever the arrays hold: it costs scalar code nothing, and lets meshes be of any size.
 """
@@ -131,7 +131,7 @@ def face_rotations(
     faces: wp.array2d[wp.int32],
     quats: wp.array2d[Any],
     area_ratio: wp.array[Any],
-    weights: wp.array[wp.float64],  # area at rest; 0 where the face has no rotation, and its quaternion is the identity
+    areas: wp.array2d[wp.float64],  # weight (the rest area, or 0 and the identity); damped rest and posed areas
 ):
     f = first + wp.tid()
     before = plane(f, faces, rest)
@@ -144,7 +144,9 @@ def face_rotations(
     for k in range(4):
         quats[f, k] = quats.dtype(q[k])
     area_ratio[f] = area_ratio.dtype(damped_ratio(before, after))
-    weights[f] = weight
+    areas[f, 0] = weight
+    areas[f, 1] = before.area + DAMPING * before.longest
+    areas[f, 2] = after.area + DAMPING * before.longest
 
 
 @wp.func
@@ -158,25 +160,28 @@ def unit(quats: wp.array2d[Any], i: int) -> wp.vec4d:
 def vertex_rotations(
     first: int,
     face_quats: wp.array2d[Any],
-    weights: wp.array[wp.float64],
+    areas: wp.array2d[wp.float64],
     offsets: wp.array[wp.int32],  # corners of vertex v are corners[offsets[v] : offsets[v + 1]]
     corners: wp.array[wp.int32],  # 3 face + corner
     fallback: wp.array[wp.int32],  # one face: whose rotation a vertex without a proper face gets
     quats: wp.array2d[Any],
-    reference: wp.array[wp.int32],  # the face that signs are aligned to; -1 for the fallback
-    norms: wp.array[wp.float64],  # length of the sum before it was normalised
+    area_ratio: wp.array[Any],
+    signs: wp.array[Any],  # for each corner, what its face's quaternion counted with; nothing if not wanted
+    sums: wp.array2d[Any],  # length of the sum before it was normalised; rest areas; nothing if not wanted
 ):
     v = first + wp.tid()
     best = wp.int32(-1)
     largest = ZERO
+    rest = ZERO
+    posed = ZERO
     for j in range(offsets[v], offsets[v + 1]):
         f = corners[j] // 3
-        weight = weights[f]
-        if weight > largest:
-            largest = weight
+        rest += areas[f, 1]
+        posed += areas[f, 2]
+        if areas[f, 0] > largest:
+            largest = areas[f, 0]
             best = f
-    reference[v] = best
-    norms[v] = ZERO
+    norm = ZERO
     q = wp.vec4d(ONE, ZERO, ZERO, ZERO)
     if best >= 0:
         ref = unit(face_quats, best)
@@ -184,33 +189,52 @@ def vertex_rotations(
         for j in range(offsets[v], offsets[v + 1]):
             f = corners[j] // 3
             q_face = unit(face_quats, f)
-            weight = weights[f]
+            sign = ONE
             if wp.dot(q_face, ref) < ZERO:
-                weight = -weight
-            total += weight * q_face
+                sign = -ONE
+            if signs.shape[0] > 0:
+                signs[corners[j]] = signs.dtype(sign)
+            total += sign * areas[f, 0] * q_face
         norm = wp.length(total)
-        norms[v] = norm
         q = total / norm
     elif fallback.shape[0] > 0:
         q = unit(face_quats, fallback[0])
     for k in range(4):
         quats[v, k] = quats.dtype(q[k])
+    ratio = ONE
+    if rest > ZERO:
+        ratio = posed / rest
+    area_ratio[v] = area_ratio.dtype(ratio)
+    if sums.shape[0] > 0:
+        sums[0, v] = sums.dtype(norm)
+        sums[1, v] = sums.dtype(rest)
 
 
 @wp.kernel
 def vertex_rotations_backward(
     first: int,
     quats: wp.array2d[Any],
-    norms: wp.array[wp.float64],
+    area_ratio: wp.array[Any],
+    sums: wp.array2d[Any],
     grad_quats: wp.array2d[Any],
-    grad_sums: wp.array[wp.vec4d],  # with respect to the sum before it was normalised
+    grad_area_ratio: wp.array[Any],
+    grad_sums: wp.array2d[wp.float64],  # by the sum of quaternions before it was normalised, of posed and of rest areas
 ):
     v = first + wp.tid()
-    grad_sums[v] = wp.vec4d()
-    if norms[v] > ZERO:
+    norm = wp.float64(sums[0, v])
+    rest = wp.float64(sums[1, v])
+    g_sum = wp.vec4d()
+    if norm > ZERO:
         q = unit(quats, v)
         g = unit(grad_quats, v)
-        grad_sums[v] = (g - wp.dot(g, q) * q) / norms[v]
+        g_sum = (g - wp.dot(g, q) * q) / norm
+    for k in range(4):
+        grad_sums[v, k] = g_sum[k]
+    by_posed = ZERO
+    if rest > ZERO:
+        by_posed = wp.float64(grad_area_ratio[v]) / rest
+    grad_sums[v, 4] = by_posed
+    grad_sums[v, 5] = -wp.float64(area_ratio[v]) * by_posed
 
 
 @wp.struct
@@ -274,9 +298,8 @@ def face_rotations_backward(
     posed: wp.array2d[Any],
     faces: wp.array2d[wp.int32],
     face_quats: wp.array2d[Any],
-    weights: wp.array[wp.float64],
-    reference: wp.array[wp.int32],
-    grad_sums: wp.array[wp.vec4d],
+    signs: wp.array[Any],
+    grad_sums: wp.array2d[wp.float64],
     grad_face_quats: wp.array2d[Any],
     grad_area_ratio: wp.array[Any],
     grad_rest: wp.array2d[Any],  # nine values a face; no rows when not wanted
@@ -287,17 +310,26 @@ def face_rotations_backward(
     after = plane(f, faces, posed)
     before_grad = Edges()
     after_grad = Edges()
-    grad_weight = ZERO
-    if weights[f] > ZERO:
+    by_posed = ZERO
+    by_rest = ZERO
+    for k in range(3):
+        by_posed += grad_sums[faces[f, k], 4]
+        by_rest += grad_sums[faces[f, k], 5]
+    if before.longest > ZERO:
+        by_ratio = wp.float64(grad_area_ratio[f]) / (before.area + DAMPING * before.longest)
+        by_posed += by_ratio
+        by_rest -= damped_ratio(before, after) * by_ratio
+    by_damping = by_posed + by_rest
+
+    if before.proper and after.proper:
         q = unit(face_quats, f)
         g = unit(grad_face_quats, f)
         for k in range(3):
             v = faces[f, k]
-            sign = ONE
-            if wp.dot(q, unit(face_quats, reference[v])) < ZERO:
-                sign = -ONE
-            g += sign * weights[f] * grad_sums[v]
-            grad_weight += sign * wp.dot(grad_sums[v], q)
+            sign = wp.float64(signs[3 * f + k])
+            g_sum = wp.vec4d(grad_sums[v, 0], grad_sums[v, 1], grad_sums[v, 2], grad_sums[v, 3])
+            g += sign * before.area * g_sum
+            by_rest += sign * wp.dot(g_sum, q)
         # A spin d of the rotation changes its quaternion by (0, d) q / 2.
         g_vector = wp.vec3d(g[1], g[2], g[3])
         q_vector = wp.vec3d(q[1], q[2], q[3])
@@ -306,18 +338,12 @@ def face_rotations_backward(
         after_grad = turn_gradient(omega, after, rotate(q, before.e1), rotate(q, before.e2))
         before_grad = turn_gradient(-rotate(back, omega), before, rotate(back, after.e1), rotate(back, after.e2))
 
-    grad_ratio = ZERO
-    ratio = ONE
-    if before.longest > ZERO:
-        damped = before.area + DAMPING * before.longest
-        ratio = damped_ratio(before, after)
-        grad_ratio = wp.float64(grad_area_ratio[f]) / damped
     if grad_posed.shape[0] > 0:
-        area = area_gradient(grad_ratio, after)
+        area = area_gradient(by_posed, after)
         store_corners(grad_posed, f, after_grad.e1 + area.e1, after_grad.e2 + area.e2)
     if grad_rest.shape[0] > 0:
-        area = area_gradient(grad_weight - ratio * grad_ratio, before)
-        damping = longest_gradient(DAMPING * (ONE - ratio) * grad_ratio, before)
+        area = area_gradient(by_rest, before)
+        damping = longest_gradient(DAMPING * by_damping, before)
         store_corners(
             grad_rest, f, before_grad.e1 + area.e1 + damping.e1, before_grad.e2 + area.e2 + damping.e2
         )
@@ -326,14 +352,20 @@ def face_rotations_backward(
 for real in (wp.float32, wp.float64):
     rows, values = wp.array2d[real], wp.array[real]
     wp.overload(face_rotations, {"rest": rows, "posed": rows, "quats": rows, "area_ratio": values})
-    wp.overload(vertex_rotations, {"face_quats": rows, "quats": rows})
-    wp.overload(vertex_rotations_backward, {"quats": rows, "grad_quats": rows})
+    wp.overload(
+        vertex_rotations, {"face_quats": rows, "quats": rows, "area_ratio": values, "signs": values, "sums": rows}
+    )
+    wp.overload(
+        vertex_rotations_backward,
+        {"quats": rows, "area_ratio": values, "sums": rows, "grad_quats": rows, "grad_area_ratio": values},
+    )
     wp.overload(
         face_rotations_backward,
         {
             "rest": rows,
             "posed": rows,
             "face_quats": rows,
+            "signs": values,
             "grad_face_quats": rows,
             "grad_area_ratio": values,
             "grad_rest": rows,

@@ -20,14 +20,13 @@ TWO = wp.constant(wp.float64(2.0))
 class Splat:
     """A Gaussian in a camera's frame and on its image plane: M M^T + eps2d is the covariance in the image."""
 
-    point: wp.vec3d  # camera coordinates
     slope: wp.vec2d  # x/z and y/z, clamped to the widened image
     inside: wp.vec2d  # 1 where `slope` was not clamped, else 0: its derivative
-    j0: wp.vec3d  # rows of the Jacobian of the perspective projection at `slope`
+    j0: wp.vec3d  # rows of J, the Jacobian of the perspective projection at `slope`
     j1: wp.vec3d
-    a0: wp.vec3d  # rows of J R_camera R(q)
-    a1: wp.vec3d
-    m0: wp.vec3d  # rows of M = J R_camera R(q) S
+    b0: wp.vec3d  # rows of B = J R_camera
+    b1: wp.vec3d
+    m0: wp.vec3d  # rows of M = B F, where F F^T is the covariance in the world
     m1: wp.vec3d
 
 
@@ -77,17 +76,45 @@ def clamped_slope(slope: wp.float64, focal: wp.float64, centre: wp.float64, size
 
 
 @wp.func
-def splat(
-    point: wp.vec3d,
-    camera: wp.mat33d,
-    rotated: wp.mat33d,
-    scale: wp.vec3d,
-    intrinsics: wp.vec4d,
-    size: wp.vec2d,
-) -> Splat:
-    """The Gaussian at `point` (z > 0) with axes `rotated`: EWA splatting (Zwicker et al. 2001, eq. 23 to 31)."""
+def symmetric_part(covars: wp.array3d(dtype=Any), i: int) -> wp.mat33d:
+    """Covariance i, (A + A^T) / 2: what a covariance off by rounding means, and gradients by it are symmetric."""
+    a = wp.mat33d(
+        wp.float64(covars[i, 0, 0]), wp.float64(covars[i, 0, 1]), wp.float64(covars[i, 0, 2]),
+        wp.float64(covars[i, 1, 0]), wp.float64(covars[i, 1, 1]), wp.float64(covars[i, 1, 2]),
+        wp.float64(covars[i, 2, 0]), wp.float64(covars[i, 2, 1]), wp.float64(covars[i, 2, 2]),
+    )  # fmt: skip
+    return wp.float64(0.5) * (a + wp.transpose(a))
+
+
+@wp.func
+def factor(covariance: wp.mat33d) -> wp.mat33d:
+    """F with F F^T = `covariance`, by Cholesky with the largest diagonal first.
+
+    The order of the pivots bears matrices without full rank; what rounding has made negative counts as 0.
+    """
+    f = wp.mat33d()
+    rest = covariance
+    for column in range(3):
+        pivot = int(0)
+        if rest[1, 1] > rest[0, 0]:
+            pivot = 1
+        if rest[2, 2] > rest[pivot, pivot]:
+            pivot = 2
+        diagonal = rest[pivot, pivot]
+        if diagonal > wp.float64(0.0):
+            v = wp.vec3d(rest[0, pivot], rest[1, pivot], rest[2, pivot]) / wp.sqrt(diagonal)
+            rest = rest - wp.outer(v, v)
+            for k in range(3):
+                f[k, column] = v[k]
+                rest[k, pivot] = wp.float64(0.0)
+                rest[pivot, k] = wp.float64(0.0)
+    return f
+
+
+@wp.func
+def splat(point: wp.vec3d, camera: wp.mat33d, f: wp.mat33d, intrinsics: wp.vec4d, size: wp.vec2d) -> Splat:
+    """The Gaussian at `point` (z > 0) with covariance f f^T: EWA splatting (Zwicker et al. 2001, eq. 23 to 31)."""
     s = Splat()
-    s.point = point
     fx, fy = intrinsics[0], intrinsics[1]
     depth = point[2]
     u, u_inside = clamped_slope(point[0] / depth, fx, intrinsics[2], size[0])
@@ -97,11 +124,10 @@ def splat(
     zero = wp.float64(0.0)
     s.j0 = wp.vec3d(fx / depth, zero, -fx * u / depth)
     s.j1 = wp.vec3d(zero, fy / depth, -fy * v / depth)
-    linear = camera * rotated
-    s.a0 = wp.transpose(linear) * s.j0
-    s.a1 = wp.transpose(linear) * s.j1
-    s.m0 = wp.cw_mul(s.a0, scale)
-    s.m1 = wp.cw_mul(s.a1, scale)
+    s.b0 = wp.transpose(camera) * s.j0
+    s.b1 = wp.transpose(camera) * s.j1
+    s.m0 = wp.transpose(f) * s.b0
+    s.m1 = wp.transpose(f) * s.b1
     return s
 
 

@@ -16,15 +16,15 @@ import warp as wp
 from oasis_kernels import constants
 from oasis_kernels.gaussian import (
     determinant,
+    factor,
     rotation,
     rotation_adjoint,
     splat,
+    symmetric_part,
     unit_quaternion,
     whitening,
 )
 
-ALPHA_MIN = wp.constant(wp.float64(constants.ALPHA_MIN))
-EXTENT_SIGMAS = wp.constant(wp.float64(constants.EXTENT_SIGMAS))
 BOX_SLACK = wp.constant(wp.float64(constants.BOX_SLACK))
 
 
@@ -71,6 +71,8 @@ def project(scalar: Any) -> Any:
         means: wp.array(dtype=vec3),
         quats: wp.array(dtype=vec4),
         scales: wp.array(dtype=vec3),
+        covars: wp.array3d(dtype=scalar),  # [n, 3, 3], instead of quats and scales
+        with_covars: int,
         opacities: wp.array(dtype=scalar),  # [n]
         viewmats: wp.array3d(dtype=scalar),  # [C, 4, 4]
         Ks: wp.array3d(dtype=scalar),  # [C, 3, 3]
@@ -80,12 +82,14 @@ def project(scalar: Any) -> Any:
         far: wp.float64,
         eps2d: wp.float64,
         radius_clip: wp.float64,
+        alpha_min: wp.float64,
+        extent_sigmas: wp.float64,
         means2d: wp.array(dtype=vec2),  # [C * n], as all that follow
         covars2d: wp.array(dtype=wp.vec3d),  # xx, xy, yy, with eps2d
-        conics: wp.array(dtype=vec3),  # the inverse
         depths: wp.array(dtype=scalar),
-        sort_depths: wp.array(dtype=wp.float64),
+        conics: wp.array(dtype=vec3),  # the inverse of covars2d
         radii: wp.array(dtype=wp.vec2i),
+        sort_depths: wp.array(dtype=wp.float64),
         centers: wp.array(dtype=vec4),  # whole x, whole y, remainder x, remainder y
         whitenings: wp.array(dtype=vec4),
         boxes: wp.array(dtype=wp.vec4i),  # pixels x0, y0, x1, y1, past the end
@@ -108,13 +112,18 @@ def project(scalar: Any) -> Any:
         whitenings[index] = vec4()
         opacity = wp.float64(opacities[i])
         # Written so that a NaN, where the caller did not want to be checked, is culled too.
-        if not (depth >= near and depth <= far and opacity >= ALPHA_MIN):
+        if not (depth >= near and depth <= far and opacity >= alpha_min):
             return
 
-        q, _norm = unit_quaternion(wp.vec4d(quats[i]))
+        f = wp.mat33d()
+        if with_covars != 0:
+            f = factor(symmetric_part(covars, i))
+        else:
+            q, _norm = unit_quaternion(wp.vec4d(quats[i]))
+            f = rotation(q) * wp.diag(wp.vec3d(scales[i]))
         intrinsics = camera_intrinsics(Ks, c)
         size = wp.vec2d(wp.float64(width), wp.float64(height))
-        s = splat(point, camera, rotation(q), wp.vec3d(scales[i]), intrinsics, size)
+        s = splat(point, camera, f, intrinsics, size)
         cov = wp.vec3d(wp.dot(s.m0, s.m0) + eps2d, wp.dot(s.m0, s.m1), wp.dot(s.m1, s.m1) + eps2d)
         det = determinant(s.m0, s.m1, eps2d)
         if not (det > wp.float64(0.0)):  # flat in the image, and eps2d is 0
@@ -122,7 +131,7 @@ def project(scalar: Any) -> Any:
 
         x = intrinsics[0] * point[0] / depth + intrinsics[2]
         y = intrinsics[1] * point[1] / depth + intrinsics[3]
-        reach = wp.min(EXTENT_SIGMAS, wp.sqrt(wp.float64(2.0) * wp.log(opacity / ALPHA_MIN)))
+        reach = wp.min(extent_sigmas, wp.sqrt(wp.float64(2.0) * wp.log(opacity / alpha_min)))
         extent_x = reach * wp.sqrt(cov[0])
         extent_y = reach * wp.sqrt(cov[2])
         one = wp.float64(1.0)
@@ -166,6 +175,8 @@ def project_backward(scalar: Any) -> Any:
         means: wp.array(dtype=vec3),
         quats: wp.array(dtype=vec4),
         scales: wp.array(dtype=vec3),
+        covars: wp.array3d(dtype=scalar),  # [n, 3, 3], instead of quats and scales
+        with_covars: int,
         viewmats: wp.array3d(dtype=scalar),
         Ks: wp.array3d(dtype=scalar),
         width: int,
@@ -176,20 +187,25 @@ def project_backward(scalar: Any) -> Any:
         g_depths: wp.array(dtype=scalar),  # [C * n]
         per_camera: int,  # 1: fill g_cameras
         g_means: wp.array(dtype=vec3),  # [n]
-        g_quats: wp.array(dtype=vec4),  # [n]
-        g_scales: wp.array(dtype=vec3),  # [n]
+        g_quats: wp.array(dtype=vec4),  # [n], not filled where covars is given
+        g_scales: wp.array(dtype=vec3),  # the same
+        g_covars: wp.array3d(dtype=scalar),  # [n, 3, 3], filled only there
         g_cameras: wp.array2d(dtype=wp.float64),  # [C * n, 12]: by the upper three rows of viewmats
     ):
         i = first + wp.tid()
         mean = wp.vec3d(means[i])
-        scale = wp.vec3d(scales[i])
-        q, norm = unit_quaternion(wp.vec4d(quats[i]))
-        axes = rotation(q)
+        f = wp.mat33d()
+        covariance = wp.mat33d()
+        if with_covars != 0:
+            covariance = symmetric_part(covars, i)
+        else:
+            unit, _norm = unit_quaternion(wp.vec4d(quats[i]))
+            f = rotation(unit) * wp.diag(wp.vec3d(scales[i]))
+            covariance = f * wp.transpose(f)
         size = wp.vec2d(wp.float64(width), wp.float64(height))
-        two = wp.float64(2.0)
+        half, two = wp.float64(0.5), wp.float64(2.0)
         sum_mean = wp.vec3d()
-        sum_scale = wp.vec3d()
-        sum_axes = wp.mat33d()
+        sum_covariance = wp.mat33d()
         for c in range(n_cameras):
             index = c * n + i
             camera = camera_rotation(viewmats, c)
@@ -199,16 +215,13 @@ def project_backward(scalar: Any) -> Any:
                 point = camera * mean + camera_translation(viewmats, c)
                 intrinsics = camera_intrinsics(Ks, c)
                 fx, fy = intrinsics[0], intrinsics[1]
-                s = splat(point, camera, axes, scale, intrinsics, size)
+                s = splat(point, camera, f, intrinsics, size)
                 g = g_covars2d[index]  # by xy once: half of it belongs to either off-diagonal entry
-                g_m0 = two * g[0] * s.m0 + g[1] * s.m1
-                g_m1 = g[1] * s.m0 + two * g[2] * s.m1
-                sum_scale += wp.cw_mul(g_m0, s.a0) + wp.cw_mul(g_m1, s.a1)
-                g_a0 = wp.cw_mul(g_m0, scale)
-                g_a1 = wp.cw_mul(g_m1, scale)
-                sum_axes += wp.outer(wp.transpose(camera) * s.j0, g_a0) + wp.outer(wp.transpose(camera) * s.j1, g_a1)
-                g_b0 = axes * g_a0  # by the rows of J R_camera
-                g_b1 = axes * g_a1
+                row0 = g[0] * s.b0 + half * g[1] * s.b1  # of G B
+                row1 = half * g[1] * s.b0 + g[2] * s.b1
+                sum_covariance += wp.outer(s.b0, row0) + wp.outer(s.b1, row1)
+                g_b0 = two * (covariance * row0)
+                g_b1 = two * (covariance * row1)
                 g_camera = wp.outer(s.j0, g_b0) + wp.outer(s.j1, g_b1)
                 g_j0 = camera * g_b0
                 g_j1 = camera * g_b1
@@ -229,9 +242,22 @@ def project_backward(scalar: Any) -> Any:
                         g_cameras[index, row * 4 + column] = g_camera[row, column]
                     g_cameras[index, row * 4 + 3] = g_point[row]
         g_means[i] = vec3(sum_mean)
-        g_scales[i] = vec3(sum_scale)
-        g_unit = rotation_adjoint(q, sum_axes)
-        g_quats[i] = vec4((g_unit - wp.dot(g_unit, q) * q) / norm)
+        if with_covars != 0:
+            for row in range(3):
+                for column in range(3):
+                    g_covars[i, row, column] = scalar(sum_covariance[row, column])
+        else:
+            scale = wp.vec3d(scales[i])
+            q, norm = unit_quaternion(wp.vec4d(quats[i]))
+            axes = rotation(q)
+            g_f = two * (sum_covariance * f)  # f = axes * scale
+            g_scales[i] = vec3(
+                wp.vec3d(
+                    wp.dot(axes[:, 0], g_f[:, 0]), wp.dot(axes[:, 1], g_f[:, 1]), wp.dot(axes[:, 2], g_f[:, 2])
+                )
+            )
+            g_unit = rotation_adjoint(q, g_f * wp.diag(scale))
+            g_quats[i] = vec4((g_unit - wp.dot(g_unit, q) * q) / norm)
 
     return project_backward
 

@@ -18,6 +18,7 @@ Command = (
     Annotated[options.Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[options.Render, tyro.conf.subcommand("render")]
     | Annotated[options.Animate, tyro.conf.subcommand("animate")]
+    | Annotated[options.Bench, tyro.conf.subcommand("bench")]
     | Annotated[options.Doctor, tyro.conf.subcommand("doctor")]
 )
 
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="oasis",
         description=f"One photo of a hand in, an animatable 3D Gaussian avatar out. oasis_warp {__version__}",
         args=arguments,
-        config=(tyro.conf.OmitArgPrefixes,),
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
     )
     logging.basicConfig(format="oasis: %(message)s")
     # A batch system's SIGTERM ends the work as Ctrl-C does: what is half-written is taken away.

@@ -17,7 +17,47 @@ def spherical_harmonics():
     return lambda d, c: ops.spherical_harmonics(3, d, c), [directions, coefficients]
 
 
-CASES = [spherical_harmonics]
+def gaussians(n=6):
+    g = torch.Generator().manual_seed(1)
+    means = torch.randn(n, 3, generator=g) * 0.3
+    quats, scales = torch.randn(n, 4, generator=g), torch.rand(n, 3, generator=g) * 0.2 + 0.05
+    return means, quats, scales, torch.rand(n, generator=g) * 0.8 + 0.1
+
+
+def camera():
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 2.0
+    return viewmat, torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]])
+
+
+def rasterization():
+    viewmat, K = camera()
+
+    def draw(means, quats, scales, opacities, colors, backgrounds, viewmats):
+        image, alphas, meta = ops.rasterization(
+            means, quats, scales, opacities, colors, viewmats, K[None], 17, 15, backgrounds=backgrounds,
+            render_mode="RGB+ED",
+        )  # fmt: skip
+        return image, alphas, meta["means2d"]
+
+    return draw, [*gaussians(), torch.rand(6, 3), torch.rand(1, 3), viewmat[None]]
+
+
+def rasterization_of_harmonics_and_covariances():
+    viewmat, K = camera()
+    means, _, scales, opacities = gaussians()
+
+    def draw(means, variances, opacities, coefficients):
+        covars = torch.diag_embed(variances)
+        image, alphas, _ = ops.rasterization(
+            means, None, None, opacities, coefficients, viewmat[None], K[None], 17, 15, covars=covars, sh_degree=1
+        )
+        return image, alphas
+
+    return draw, [means, scales.square(), opacities, torch.rand(6, 4, 3)]
+
+
+CASES = [spherical_harmonics, rasterization, rasterization_of_harmonics_and_covariances]
 
 
 def gradients(call, inputs):

@@ -67,7 +67,7 @@ def test_values_and_gradients_are_those_of_the_twin(seed, dtype, device):
 
     generator = torch.Generator().manual_seed(seed)
     loss = wide_loss = 0
-    for ours, theirs in zip(got, want, strict=True):
+    for ours, theirs in zip(got[:3], want, strict=True):
         weights = torch.randn(theirs.shape, generator=generator, dtype=torch.float64)
         # A quaternion and its opposite are one rotation: give both the sign of the twin.
         signs = (ours.detach().cpu() * theirs.detach()).sum(-1, keepdim=True).sign() if theirs.ndim == 2 else 1
@@ -105,7 +105,7 @@ def test_a_mesh_without_requires_grad_gets_no_gradient():
 def test_the_gradient_of_one_output_is_its_share_of_the_gradient_of_all():
     rest, posed, faces = sheet(2)
     posed.requires_grad_()
-    parts = [torch.autograd.grad(face_rotations(rest, posed, faces)[k].sum(), posed)[0] for k in range(3)]
+    parts = [torch.autograd.grad(face_rotations(rest, posed, faces)[k].sum(), posed)[0] for k in range(4)]
     together = torch.autograd.grad(sum(out.sum() for out in face_rotations(rest, posed, faces)), posed)[0]
     torch.testing.assert_close(sum(parts), together)
 
@@ -115,7 +115,7 @@ def test_a_second_derivative_is_refused():
     posed.requires_grad_()
     squares = face_rotations(rest, posed, faces).vertex_quats.square() * torch.arange(4)
     (first,) = torch.autograd.grad(squares.sum(), posed, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
+    with pytest.raises(RuntimeError, match="face_rotations: expected one derivative"):
         first.sum().backward()
 
 

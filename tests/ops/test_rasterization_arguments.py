@@ -105,7 +105,7 @@ def test_something_that_is_no_tensor_is_refused(call):
     [
         ("sparse_grad", True), ("absgrad", True),
         ("rasterize_mode", "antialiased"), ("distributed", True), ("camera_model", "fisheye"),
-        ("covars", torch.zeros(60, 3, 3)), ("with_ut", True), ("with_eval3d", True),
+        ("with_ut", True), ("with_eval3d", True),
         ("radial_coeffs", torch.zeros(2, 6)), ("tangential_coeffs", torch.zeros(2, 2)),
         ("thin_prism_coeffs", torch.zeros(2, 4)), ("ftheta_coeffs", object()), ("rolling_shutter", "LEFT_TO_RIGHT"),
         ("viewmats_rs", torch.zeros(2, 4, 4)),
@@ -120,7 +120,7 @@ def test_arguments_of_gsplat_at_their_defaults_change_nothing(call):
     plain = call()[0]
     defaults = {
         "sh_degree": None, "packed": True, "sparse_grad": False, "absgrad": False, "rasterize_mode": "classic",
-        "channel_chunk": 32, "distributed": False, "camera_model": "pinhole", "segmented": False, "covars": None,
+        "channel_chunk": 32, "distributed": False, "camera_model": "pinhole", "segmented": False,
         "with_ut": False, "with_eval3d": False, "radial_coeffs": None, "tangential_coeffs": None,
         "thin_prism_coeffs": None, "ftheta_coeffs": None, "viewmats_rs": None,
     }  # fmt: skip

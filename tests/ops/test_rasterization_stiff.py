@@ -10,6 +10,7 @@ from rasterization_scenes import frontal_scene, intrinsics, look_from, ordinary_
 from test_rasterization import assert_equals_twin, draw
 
 from oasis_warp.ops import rasterization
+from oasis_warp.ops._registration import revealed
 from oasis_warp.ops._tiles import MAX_PAIRS, bin_by_dealing, bin_by_sorting, bin_to_tiles
 from oasis_warp.ops.projection import project
 
@@ -160,7 +161,7 @@ def test_more_pairs_than_can_be_counted_are_refused_with_their_number():
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
     projection = project(means, quats, torch.full((n, 3), 9.0), torch.full((n,), 0.5), eye, K, size, size, **options)
     with pytest.raises(ValueError, match=f"at most {MAX_PAIRS} pairs of a Gaussian and a tile, got {n * 4096}"):
-        bin_to_tiles(projection, size, size, 1)
+        bin_to_tiles(projection.boxes, projection.sort_depths, size, size, 1)
 
 
 @pytest.mark.parametrize("name", ["larger than the image", "3000 faint layers", "partly behind the camera"])
@@ -171,16 +172,17 @@ def test_dealing_and_sorting_fill_the_same_lists(name):
     options = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3}
     cameras, Ks = scene.viewmats.repeat(2, 1, 1), scene.Ks.repeat(2, 1, 1)
     projection = project(scene.means, *twice, cameras, Ks, scene.width, scene.height, **options)
-    dealt, sorted_ = (f(projection, 7, 10, 10) for f in (bin_by_dealing, bin_by_sorting))
+    dealt, sorted_ = (f(projection.boxes, projection.sort_depths, 7, 10, 10) for f in (bin_by_dealing, bin_by_sorting))
     assert torch.equal(dealt.starts, sorted_.starts)
-    assert torch.equal(dealt.gaussians, sorted_.gaussians)
+    assert torch.equal(revealed(dealt.gaussians), revealed(sorted_.gaussians))
     assert torch.equal(dealt.pair_counts, sorted_.pair_counts)
     for lists in (dealt, sorted_):
+        gaussians, pairs = revealed(lists.gaussians), revealed(lists.pairs)
         # A pair's number is its Gaussian's first plus its place among that Gaussian's tiles.
-        first = lists.pair_starts[lists.gaussians.long()]
-        place = lists.pairs - first
-        assert place.min() >= 0 and (place < lists.pair_counts[lists.gaussians.long()]).all()
-        assert torch.equal(lists.pairs.sort().values, torch.arange(len(lists.pairs)))
+        first = lists.pair_starts[gaussians.long()]
+        place = pairs - first
+        assert place.min() >= 0 and (place < lists.pair_counts[gaussians.long()]).all()
+        assert torch.equal(pairs.sort().values, torch.arange(len(pairs)))
 
 
 def test_ordinary_scenes_do_not_feel_an_absent_low_pass(device):

@@ -4,7 +4,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_warp.core import rotation, surface
 from oasis_warp.core.types import CanonicalGaussians, Gaussians
 from oasis_warp.ops import face_rotations, pose_on_mesh
 
@@ -18,35 +17,25 @@ def pose_gaussians(
     """Gaussians that follow the surface from `rest_vertices` to `posed_vertices` (the paper's appendix B.1).
 
     Face Gaussians keep their barycentrics, turn by the blended rotation of the face's corners and grow with the root
-    of the face's area; vertex Gaussians turn with their vertex and grow with the mean of the faces around it. Values
-    are not checked here: who poses has checked the pose.
+    of the face's area; vertex Gaussians turn with their vertex and grow with the faces around it together. Values are
+    not checked here: who poses has checked the pose.
     """
     turned = face_rotations(rest_vertices, posed_vertices, faces, validate=False)
-    on_faces = slice(len(canonical.vertex_index), None)
-    face_means, face_quats, face_scales = pose_on_mesh(
+    means, quats, scales = pose_on_mesh(
         posed_vertices,
         faces,
         canonical.face_index,
         canonical.barycentrics,
         turned.vertex_quats,
         turned.area_ratio,
-        canonical.quats[on_faces],
-        canonical.scales[on_faces],
+        canonical.quats,
+        canonical.scales,
+        vertex_index=canonical.vertex_index,
+        offsets=canonical.offsets,
+        vertex_area_ratio=turned.vertex_area_ratio,
         validate=False,
     )
-    index = canonical.vertex_index
-    vertex_turn = turned.vertex_quats[index]
-    shift = (rotation.to_matrix(vertex_turn) @ canonical.offsets[..., None])[..., 0]
-    rest_area = surface.vertex_areas(rest_vertices, faces)[index]
-    grown = surface.vertex_areas(posed_vertices, faces)[index] / rest_area
-    on_vertices = slice(len(index))
-    return Gaussians(
-        means=torch.cat([posed_vertices[index] + shift, face_means]),
-        quats=torch.cat([rotation.multiply(vertex_turn, canonical.quats[on_vertices]), face_quats]),
-        scales=torch.cat([canonical.scales[on_vertices] * grown.sqrt()[:, None], face_scales]),
-        opacities=canonical.opacities,
-        colors=canonical.colors,
-    )
+    return Gaussians(means, quats, scales, canonical.opacities, canonical.colors)
 
 
 def mirror_gaussians(gaussians: Gaussians) -> Gaussians:

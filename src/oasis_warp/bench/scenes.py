@@ -19,6 +19,7 @@ from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
+from oasis_warp.ops import face_rotations
 from oasis_warp.render.cameras import orbit_camera
 
 PALM_TO_CAMERA = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -27,6 +28,9 @@ MELANIN = 0.05
 """Skin tone of the hand."""
 TEXTURE = 0.05
 """Standard deviation of the seeded noise on its colours [sRGB]: a bare mean hand has no detail to lose."""
+
+POINT_NOISE = 0.002
+"""Standard deviation of the points of a mesh scene about its vertices [m]: visibility takes all values there."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +67,18 @@ class Scene(_Tensors):
 
 @dataclass(frozen=True)
 class MeshScene(_Tensors):
-    """A mesh at rest and posed, Gaussians that ride on its faces, and one camera."""
+    """A mesh at rest and posed, Gaussians that ride on its faces, points round it, and one camera."""
 
     name: str
     seed: int
     rest_vertices: Float[Tensor, "V 3"]
     posed_vertices: Float[Tensor, "V 3"]
     faces: Int[Tensor, "F 3"]
+    vertex_quats: Float[Tensor, "V 4"]
+    """This and the next as `face_rotations` gives them, rounded from float64."""
+    area_ratio: Float[Tensor, "F"]
+    points: Float[Tensor, "V 3"]
+    """Whose visibility is asked: the posed vertices, moved at random."""
     face_index: Int[Tensor, "Q"]
     barycentrics: Float[Tensor, "Q 3"]
     quats: Float[Tensor, "Q 4"]
@@ -97,11 +106,19 @@ def hand_scenes(size: int = 256, seed: int = 0) -> tuple[Scene, MeshScene]:
     drawn = Scene(
         "hand", seed, *gaussians, camera.viewmat[None], camera.K[None], torch.zeros(1, 3), size, size
     )  # fmt: skip
+    points = posed + POINT_NOISE * torch.randn(posed.shape, generator=generator)
     mesh = MeshScene(
-        "hand", seed, rest.vertices, posed, hand.faces, anchors.face_index, anchors.barycentrics,
-        anchors.quats[on_faces], anchors.scales[on_faces], camera.viewmat, camera.K, size, size,
+        "hand", seed, rest.vertices, posed, hand.faces, *turns(rest.vertices, posed, hand.faces), points,
+        anchors.face_index, anchors.barycentrics, anchors.quats[on_faces], anchors.scales[on_faces],
+        camera.viewmat, camera.K, size, size,
     )  # fmt: skip
     return drawn, mesh
+
+
+def turns(rest_vertices: Tensor, posed_vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Vertex quaternions and area ratios, the same whatever becomes of the float32 kernels."""
+    turned = face_rotations(rest_vertices.double(), posed_vertices.double(), faces)
+    return turned.vertex_quats.to(rest_vertices), turned.area_ratio.to(rest_vertices)
 
 
 def hand(size: int = 256, seed: int = 0) -> Scene:
@@ -205,5 +222,9 @@ def slivers(size: int = 256, seed: int = 0) -> MeshScene:
     _, mesh = hand_scenes(size, seed)
     axis = normalize(torch.tensor([1.0, 0.7, 0.4]), dim=0)
     middle = mesh.posed_vertices.mean(0)
-    along = ((mesh.posed_vertices - middle) @ axis)[:, None] * axis
-    return replace(mesh, name="slivers", posed_vertices=mesh.posed_vertices - 0.999 * along)
+    posed = mesh.posed_vertices - 0.999 * ((mesh.posed_vertices - middle) @ axis)[:, None] * axis
+    vertex_quats, area_ratio = turns(mesh.rest_vertices, posed, mesh.faces)
+    points = posed + (mesh.points - mesh.posed_vertices)
+    return replace(
+        mesh, name="slivers", posed_vertices=posed, vertex_quats=vertex_quats, area_ratio=area_ratio, points=points
+    )

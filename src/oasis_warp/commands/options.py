@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
 Output = Annotated[Path, arg(aliases=["-o"], metavar="PATH")]
 PoseName = Literal["photo", "rest", "open", "relaxed", "fist", "pinch", "thumbs_up", "victory", "point", "ok"]
@@ -89,6 +89,57 @@ class Animate:
     """white, black, or a colour as rrggbb."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorTime:
+    """What each threshold and option of the operators costs and buys: error_time.csv, .json and a plot an operator.
+
+    Every knob is turned alone, on the bundled hand and on scenes that are hard to compute. Errors are those against
+    the float64 kernels with the default rules; times are medians of calls timed in turns.
+    """
+
+    out: Output
+    """Folder for the results; its parent must exist."""
+    quick: FlagCreatePairsOff[bool] = False
+    """The bundled hand only, and few repeats: for a look, not for a verdict."""
+    repeats: int | None = None
+    """Timed calls of each setting: 20 when not given, 5 with --quick."""
+    size: int = 256
+    """Side of the pictures of the hand [px]; a multiple of 4."""
+    seed: int = 0
+    """Of the scenes and the gradients' weights."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""
+    threads: int = 1
+    """CPU threads of the default setting; the knob "threads" tries other numbers up to that of the cores."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kernels:
+    """How fast every operator is, and how exact, beside the same in torch and a scalar kernel, in one run."""
+
+    json: Path | None = None
+    """File to write the numbers to as well."""
+    repeats: int = 30
+    """Timed calls of each."""
+    size: int = 256
+    """Side of the picture [px]."""
+    gaussians: int = 20_000
+    """Gaussians that are drawn, of the bundled hand's 36,881; fewer are larger."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""
+    threads: int = 1
+    """CPU threads."""
+    peer: Literal["gsplat"] | None = None
+    """Time another rasterizer too, on the same scene."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """Measure the operators on this machine: error against run time, or speed."""
+
+    what: Annotated[ErrorTime, subcommand("error-time")] | Annotated[Kernels, subcommand("kernels")]
 
 
 @dataclass(frozen=True, kw_only=True)

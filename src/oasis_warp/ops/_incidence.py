@@ -1,5 +1,6 @@
 """Which rows of an index table name each item: faces round a vertex, Gaussians on a face. Computed once a tensor."""
 
+import weakref
 from typing import NamedTuple
 
 import torch
@@ -38,14 +39,45 @@ def incidence(name: str, table: Tensor, size: int, what: str) -> Incidence:
         if version == table._version and known_size == size:
             return known
     check_index(name, table, size, what)
+    found = _transposed(table, size)
+    if remember:
+        _known[table] = (table._version, size, found)
+    return found
+
+
+def _transposed(table: Tensor, size: int) -> Incidence:
     flat = table.reshape(-1)
     order = torch.argsort(flat, stable=True)
     bounds = torch.arange(size + 1, dtype=flat.dtype, device=flat.device)
     offsets = torch.searchsorted(flat[order], bounds)
-    # Detached, because a value that held its own key would never be forgotten.
-    found = Incidence(table.detach().to(torch.int32).contiguous(), offsets.to(torch.int32), order.to(torch.int32))
+    # A copy, because a value that held its own key would never be forgotten.
+    table = table.detach().to(torch.int32, copy=True).contiguous()
+    return Incidence(table, offsets.to(torch.int32), order.to(torch.int32))
+
+
+_known_riders: WeakIdKeyDictionary = WeakIdKeyDictionary()
+"""Index of faces -> (the other two tensors, weakly; all versions; size; incidence)."""
+
+
+def riders_at_vertices(faces: Tensor, face_index: Tensor, vertex_index: Tensor | None, size: int) -> Incidence:
+    """Which of the Gaussians that ride on vertices and on faces hang on each of `size` vertices; remembered.
+
+    The table has P + 3 Q entries: the vertices `vertex_index`, shape [P] or None, then the corners of the faces
+    `face_index`, shape [Q]. All indices have been checked.
+    """
+    tables = (face_index, faces, *([] if vertex_index is None else [vertex_index]))
+    remember = not any(table.is_inference() for table in tables)
+    versions = tuple(table._version for table in tables) if remember else ()
+    if remember and face_index in _known_riders:
+        others, known_versions, known_size, known = _known_riders[face_index]
+        same = len(others) == len(tables) - 1 and all(o() is t for o, t in zip(others, tables[1:], strict=True))
+        if same and known_versions == versions and known_size == size:
+            return known
+    corners = faces[face_index].reshape(-1)
+    found = _transposed(corners if vertex_index is None else torch.cat([vertex_index, corners]), size)
     if remember:
-        _known[table] = (table._version, size, found)
+        others = tuple(weakref.ref(table) for table in tables[1:])
+        _known_riders[face_index] = (others, versions, size, found)
     return found
 
 

@@ -1,5 +1,6 @@
 """Everything between a torch tensor and a Warp launch: start Warp, view tensors, device and stream, launch."""
 
+import ctypes
 import functools
 import itertools
 import os
@@ -14,6 +15,8 @@ from typing import Any
 import torch
 import warp as wp
 from torch import Tensor
+
+from oasis_kernels.native import Native
 
 _start_lock = threading.Lock()
 _load_lock = threading.Lock()
@@ -133,3 +136,57 @@ def launch_ranges(
     with _load_lock:  # threads that meet at an unbuilt kernel would each build it
         kernel.module.load(device, 1)
     list(_pool(os.getpid(), n_threads).map(run, ranges))
+
+
+class _Recorded(threading.local):
+    """Launches of native kernels, recorded once a thread: replaying one costs a fifth of `wp.launch`."""
+
+    def __init__(self) -> None:
+        self.launches: dict[int, Any] = {}
+
+
+_recorded = _Recorded()
+
+
+def _launch_native(native: Native, block: int) -> None:
+    launch = _recorded.launches.get(id(native))
+    if launch is None:
+        with _load_lock:
+            launch = wp.launch(native.kernel, dim=1, inputs=[block], device="cpu", record_cmd=True)
+        _recorded.launches[id(native)] = launch
+    launch.set_param_at_index_from_ctype(0, block)
+    launch.launch()
+
+
+def address(tensor: Tensor, dtype: torch.dtype, size: int) -> int:
+    """Where the data of a CPU `tensor` begin, for a native kernel that expects `size` contiguous elements there."""
+    assert tensor.dtype == dtype and tensor.numel() == size and tensor.is_contiguous() and tensor.device.type == "cpu"
+    return tensor.data_ptr()
+
+
+def run_native(native: Native, words: dict[str, int], n_tasks: int) -> None:
+    """Run a native kernel with the parameter block `words` on the CPU, and return when it is done.
+
+    Up to `n_tasks` of torch's threads work on it together, this one among them; the kernel deals out its tasks, so that
+    one that comes late, or never, costs time only.
+
+    Args:
+        native: From a factory that keeps it: it is recognised by its identity.
+        words: A number or an `address` for each of its parameters; others are ignored.
+        n_tasks: The largest number of tasks in one of its phases.
+    """
+    start()
+    block = (ctypes.c_longlong * len(native.parameters))(*[words[name] for name in native.parameters])
+    place = ctypes.addressof(block)
+    helpers = min(torch.get_num_threads(), n_tasks) - 1
+    if helpers < 1:
+        _launch_native(native, place)
+        return
+    pool = _pool(os.getpid(), helpers)
+    futures = [pool.submit(_launch_native, native, place) for _ in range(helpers)]
+    try:
+        _launch_native(native, place)
+    finally:
+        for future in futures:
+            if not future.cancel():
+                future.result()

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from oasis_kernels import tiles
 from oasis_warp.ops._launch import even_cuts, launch, launch_ranges, view
-from oasis_warp.ops.projection import Projection
+from oasis_warp.ops._registration import hidden, revealed
 
 MAX_PAIRS = 2**31 - 1
 """Pairs of a Gaussian and a tile that one call can hold."""
@@ -26,42 +26,46 @@ class Tiles(NamedTuple):
     down: int
     starts: Int64[Tensor, "tiles_plus_one"]
     """First place of each tile, camera by camera, row by row; at the end P."""
-    gaussians: Int32[Tensor, "P"]
-    """camera * N + gaussian at each place."""
-    pairs: Int64[Tensor, "P"]
-    """Number of the pair at each place; a Gaussian's pairs have consecutive numbers."""
+    gaussians: Int32[Tensor, "1"]
+    """`hidden` [P]: camera * N + gaussian at each place."""
+    pairs: Int64[Tensor, "1"]
+    """`hidden` [P]: number of the pair at each place; a Gaussian's pairs have consecutive numbers."""
     pair_starts: Int64[Tensor, "M"]
     """First number of each Gaussian's pairs, by camera * N + gaussian."""
     pair_counts: Int64[Tensor, "M"]
-    cuts: list[int]
-    """Bounds of ranges of tiles of about equal work, for `launch_ranges`."""
 
 
-def bin_to_tiles(projection: Projection, width: int, height: int, tile_size: int) -> Tiles:
+def bin_to_tiles(boxes: Tensor, depths: Tensor, width: int, height: int, tile_size: int) -> Tiles:
     """Sort the drawn Gaussians of each tile by depth, ties by index.
+
+    Args:
+        boxes: Pixels x0, y0, x1, y1 (past the end), shape [C, N, 4]; int32.
+        depths: Positive, shape [C, N]; float64.
+        width: Of the images [px].
+        height: Of the images [px].
+        tile_size: Side of a tile [px].
 
     Raises:
         ValueError: more than `MAX_PAIRS` pairs.
     """
     across, down = -(-width // tile_size), -(-height // tile_size)
-    if projection.depths.is_cuda:
-        return bin_by_sorting(projection, tile_size, across, down)
-    return bin_by_dealing(projection, tile_size, across, down)
+    bin_by = bin_by_sorting if depths.is_cuda else bin_by_dealing
+    return bin_by(boxes, depths, tile_size, across, down)
 
 
-def bin_by_sorting(projection: Projection, tile_size: int, across: int, down: int) -> Tiles:
+def bin_by_sorting(boxes: Tensor, depths: Tensor, tile_size: int, across: int, down: int) -> Tiles:
     """`bin_to_tiles` with torch's parallel sorts."""
-    n_cameras, n = projection.depths.shape
-    device = projection.depths.device
-    boxes = view(projection.boxes.view(-1, 4), wp.vec4i)
+    n_cameras, n = depths.shape
+    device = depths.device
+    pixels = view(boxes.view(-1, 4), wp.vec4i)
     counts = torch.zeros(n_cameras * n, dtype=torch.int64, device=device)
-    launch_ranges(tiles.count_tiles, even_cuts(len(counts)), [boxes, tile_size, view(counts)], like=counts)
+    launch_ranges(tiles.count_tiles, even_cuts(len(counts)), [pixels, tile_size, view(counts)], like=counts)
 
     drawn = counts.nonzero().squeeze(1)
-    order = drawn[torch.argsort(projection.sort_depths.view(-1)[drawn], stable=True)]
+    order = drawn[torch.argsort(depths.view(-1)[drawn], stable=True)]
     ends = counts[order].cumsum(0)
     n_pairs = int(ends[-1]) if len(order) else 0
-    _check_pairs(n_pairs)
+    check_pairs(n_pairs)
     pair_starts = torch.zeros_like(counts)
     pair_starts[order] = ends - counts[order]
     pair_tiles = torch.empty(n_pairs, dtype=torch.int32, device=device)
@@ -69,22 +73,23 @@ def bin_by_sorting(projection: Projection, tile_size: int, across: int, down: in
     launch_ranges(
         tiles.emit_pairs,
         even_cuts(len(order)),
-        [view(order), view(pair_starts), boxes, n, tile_size, across, down, view(pair_tiles), view(pair_gaussians)],
+        [view(order), view(pair_starts), pixels, n, tile_size, across, down, view(pair_tiles), view(pair_gaussians)],
         like=counts,
     )
     sorted_tiles, pairs = torch.sort(pair_tiles, stable=True)
     every_tile = torch.arange(n_cameras * across * down + 1, dtype=torch.int32, device=device)
     starts = torch.searchsorted(sorted_tiles, every_tile)
-    return Tiles(
-        tile_size, across, down, starts, pair_gaussians[pairs], pairs, pair_starts, counts, _even_work(starts)
-    )
+    hidden_gaussians, hidden_pairs = (hidden(n_pairs, dtype, device) for dtype in (torch.int32, torch.int64))
+    torch.index_select(pair_gaussians, 0, pairs, out=revealed(hidden_gaussians))
+    revealed(hidden_pairs).copy_(pairs)
+    return Tiles(tile_size, across, down, starts, hidden_gaussians, hidden_pairs, pair_starts, counts)
 
 
-def bin_by_dealing(projection: Projection, tile_size: int, across: int, down: int) -> Tiles:
+def bin_by_dealing(boxes: Tensor, depths: Tensor, tile_size: int, across: int, down: int) -> Tiles:
     """`bin_to_tiles` on one CPU thread, which is faster there than any parallel sort."""
-    n_cameras, n = projection.depths.shape
+    n_cameras, n = depths.shape
     total, n_tiles = n_cameras * n, n_cameras * across * down
-    boxes = view(projection.boxes.view(-1, 4), wp.vec4i)
+    pixels = view(boxes.view(-1, 4), wp.vec4i)
 
     def int64(size: int) -> Tensor:
         return torch.empty(size, dtype=torch.int64)
@@ -97,14 +102,14 @@ def bin_by_dealing(projection: Projection, tile_size: int, across: int, down: in
         tiles.collect,
         1 if total else 0,
         [
-            boxes, view(projection.sort_depths.view(-1)), n, tile_size, across, down, view(pair_starts),
+            pixels, view(depths.view(-1)), n, tile_size, across, down, view(pair_starts),
             view(pair_counts), tile_boxes, view(keys.view(torch.float64)), view(order), view(starts), view(totals),
         ],
         like=starts,
     )  # fmt: skip
     n_drawn, n_pairs = totals.tolist()
-    _check_pairs(n_pairs)
-    gaussians, pairs = torch.empty(n_pairs, dtype=torch.int32), int64(n_pairs)
+    check_pairs(n_pairs)
+    gaussians, pairs = (hidden(n_pairs, dtype, starts.device) for dtype in (torch.int32, torch.int64))
     if n_drawn:
         # Depths are positive: their bits sort as integers do. The sort is stable.
         wp.utils.radix_sort_pairs(view(keys), view(order), n_drawn)
@@ -112,15 +117,16 @@ def bin_by_dealing(projection: Projection, tile_size: int, across: int, down: in
             tiles.deal,
             1,
             [
-                view(order), n_drawn, tile_boxes, across, view(pair_starts), view(starts.clone()), view(gaussians),
-                view(pairs),
+                view(order), n_drawn, tile_boxes, across, view(pair_starts), view(starts.clone()),
+                view(revealed(gaussians)), view(revealed(pairs)),
             ],
             like=starts,
         )  # fmt: skip
-    return Tiles(tile_size, across, down, starts, gaussians, pairs, pair_starts, pair_counts, _even_work(starts))
+    return Tiles(tile_size, across, down, starts, gaussians, pairs, pair_starts, pair_counts)
 
 
-def _check_pairs(n_pairs: int) -> None:
+def check_pairs(n_pairs: int) -> None:
+    """Refuse more pairs than can be numbered."""
     if n_pairs > MAX_PAIRS:
         raise ValueError(
             f"tile_size: expected at most {MAX_PAIRS} pairs of a Gaussian and a tile, got {n_pairs}. "
@@ -128,7 +134,7 @@ def _check_pairs(n_pairs: int) -> None:
         )
 
 
-def _even_work(starts: Tensor) -> list[int]:
+def even_work(starts: Tensor) -> list[int]:
     """Bounds of ranges of tiles with about as many pairs each; a tile counts a little even when it is empty."""
     n_tiles = len(starts) - 1
     parts = min(RANGES_A_THREAD * torch.get_num_threads(), n_tiles)

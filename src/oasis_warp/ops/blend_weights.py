@@ -12,11 +12,12 @@ from warp import vec4i
 from oasis_kernels import constants
 from oasis_kernels import rasterize_weights as kernels
 from oasis_warp.core.checks import check_float, check_shape
+from oasis_warp.ops._blend_tiles import CUDA_LANES, lane_grid
 from oasis_warp.ops._launch import SCALAR, VEC4, launch_ranges, view
-from oasis_warp.ops._tiles import bin_to_tiles
-from oasis_warp.ops.blending import CUDA_LANES, lane_grid
+from oasis_warp.ops._registration import revealed
+from oasis_warp.ops._scene_checks import check_cameras, check_gaussians
+from oasis_warp.ops._tiles import bin_to_tiles, even_work
 from oasis_warp.ops.projection import project
-from oasis_warp.ops.rasterization import check_gaussians_and_cameras
 
 
 class BlendWeights(NamedTuple):
@@ -73,17 +74,17 @@ def blend_weights(
     """
     check_shape("viewmat", viewmat, 4, 4)
     check_shape("K", K, 3, 3)
-    check_gaussians_and_cameras(
-        means, quats, scales, opacities, viewmat[None], K[None], width, height, near_plane, far_plane, radius_clip,
-        eps2d, tile_size, validate,
-    )  # fmt: skip
+    check_gaussians(means, quats, scales, None, opacities)
+    check_cameras(
+        viewmat[None], K[None], means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size
+    )
     n, pixels, dtype, device = len(means), width * height, means.dtype, means.device
     with torch.no_grad():
         projection = project(
             means, quats, scales, opacities, viewmat[None], K[None], width, height,
-            near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
+            near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d, validate=validate,
         )  # fmt: skip
-        tiles = bin_to_tiles(projection, width, height, tile_size)
+        tiles = bin_to_tiles(projection.boxes, projection.sort_depths, width, height, tile_size)
         opacities = opacities.contiguous()
         scratch = torch.empty(pixels, dtype=dtype, device=device)
         counts = torch.empty(pixels, dtype=torch.int32, device=device)
@@ -92,9 +93,9 @@ def blend_weights(
         def weigh(write: bool, starts: Tensor, columns: Tensor, values: Tensor) -> None:
             launch_ranges(
                 kernels.weigh(SCALAR[dtype]),
-                tiles.cuts,
+                even_work(tiles.starts),
                 [
-                    view(tiles.starts), view(tiles.gaussians), view(projection.boxes.view(-1, 4), vec4i),
+                    view(tiles.starts), view(revealed(tiles.gaussians)), view(projection.boxes.view(-1, 4), vec4i),
                     view(projection.centers.view(-1, 4), VEC4[dtype]),
                     view(projection.whitenings.view(-1, 4), VEC4[dtype]), view(opacities),
                     tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height, int(write),

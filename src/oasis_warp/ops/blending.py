@@ -1,201 +1,272 @@
 """Projected Gaussians -> image and alpha, differentiable in their places, shapes, opacities, colours, backgrounds."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
-from warp import vec4i
-from warp.types import vector
 
 from oasis_kernels import constants
-from oasis_kernels import rasterize_backward as backward_kernels
-from oasis_kernels import rasterize_forward as forward_kernels
-from oasis_kernels import rasterize_rows as row_kernels
-from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
+from oasis_kernels.strips import RECORD
+from oasis_warp.core.checks import check_finite
+from oasis_warp.ops import _blend_strips as strips
+from oasis_warp.ops import _blend_tiles as tiles
+from oasis_warp.ops._blend_tiles import Splats
+from oasis_warp.ops._registration import (
+    adjoint,
+    differentiable,
+    hidden,
+    hidden_like_fake,
+    needs_gradient,
+    operator,
+)
 from oasis_warp.ops._tiles import Tiles
 from oasis_warp.ops.projection import Projection
 
-CUDA_LANES = 16, 16
-"""Lanes across and down a tile on CUDA: with the default tile of 16 pixels, one lane a pixel."""
-CUDA_WARP_LANES = 4, 8
-"""The same for the backward pass, where the lanes of one warp share a tile."""
+
+class Kept(NamedTuple):
+    """What the adjoint needs, as strips (S) or tiles (T) have it; all empty where there will be none."""
+
+    transmittance: Tensor
+    """Of the end. S: [strips * plane]. T: [C, H, W]."""
+    stops: Tensor
+    """The same shape, int32: place in the list of the first Gaussian that was not drawn."""
+    starts: Tensor
+    """[strips or tiles + 1], int64: first place of each list."""
+    pair_starts: Tensor
+    """[M]: number of a Gaussian's first pair. S: int32. T: int64."""
+    shares: Tensor
+    """S: [strips], int32, in which order strips are drawn. T: [M], int64, how many pairs a Gaussian has."""
+    records: Tensor
+    """S: [M, 16], float32. T: empty."""
+    gaussians: Tensor
+    """`hidden`, int32: the lists, nearest first."""
+    pairs: Tensor
+    """`hidden`, int64. S: empty. T: numbers of the pairs in the lists."""
 
 
-def lane_grid(tile_size: int, device: torch.device, grid: tuple[int, int]) -> tuple[int, int, int]:
-    """Number of lanes of a tile, and the width and height of their rectangles [px]; one lane on the CPU."""
-    if device.type == "cpu":
-        return 1, tile_size, tile_size
-    across, down = grid
-    # The grid keeps its size where the tile does not divide by it; lanes without pixels idle.
-    return across * down, -(-tile_size // across), -(-tile_size // down)
+def draws_strips(like: Tensor) -> bool:
+    """Whether there are vector kernels for tensors like this one."""
+    return like.device.type == "cpu" and like.dtype == torch.float32
 
 
-def blend_kernel(tensor: Tensor, channels: int) -> Any:
-    """The forward kernel for tensors like `tensor`."""
-    if tensor.device.type == "cpu" and tensor.dtype == torch.float32:
-        return row_kernels.blend(channels)
-    return forward_kernels.blend(SCALAR[tensor.dtype], channels)
+def _nothing_kept(like: Tensor) -> Kept:
+    def empty(dtype: torch.dtype) -> Tensor:
+        return torch.empty(0, dtype=dtype, device=like.device)
+
+    whole = torch.int32 if draws_strips(like) else torch.int64
+    return Kept(
+        empty(like.dtype), empty(torch.int32), empty(torch.int64), empty(whole), empty(whole), empty(like.dtype),
+        hidden(0, torch.int32, like.device), hidden(0, torch.int64, like.device),
+    )  # fmt: skip
 
 
-def blend_backward_kernel(tensor: Tensor, channels: int) -> Any:
-    """The backward kernel for tensors like `tensor`."""
-    if tensor.device.type == "cpu" and tensor.dtype == torch.float32:
-        return row_kernels.blend_backward(channels)
-    return backward_kernels.blend_backward(SCALAR[tensor.dtype], channels)
-
-
-class _Blend(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        means2d: Tensor,
-        covars2d: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        backgrounds: Tensor,
-        projection: Projection,
-        tiles: Tiles,
-        width: int,
-        height: int,
-    ) -> tuple[Tensor, Tensor]:
-        n_cameras, _, channels = colors.shape
-        dtype, device = colors.dtype, colors.device
-        start()
-        color, vec4 = vector(channels, SCALAR[dtype]), VEC4[dtype]
-        image = torch.empty(n_cameras, height, width, channels, dtype=dtype, device=device)
-        transmittance = torch.empty(n_cameras, height, width, 1, dtype=dtype, device=device)
-        alphas = torch.empty_like(transmittance)
-        stops = torch.empty(n_cameras, height, width, dtype=torch.int32, device=device)
-        lanes, lane_width, lane_height = lane_grid(tiles.size, device, CUDA_LANES)
-        launch_ranges(
-            blend_kernel(colors, channels),
-            tiles.cuts,
-            [
-                view(tiles.starts), view(tiles.gaussians), view(projection.boxes.view(-1, 4), vec4i),
-                view(projection.centers.view(-1, 4), vec4), view(projection.whitenings.view(-1, 4), vec4),
-                view(opacities.view(-1)), view(colors.view(-1, channels), color), view(backgrounds, color),
-                tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height,
-                view(image.view(-1, channels), color), view(alphas.view(-1)), view(transmittance.view(-1)),
-                view(stops.view(-1)),
-            ],
-            like=image,
-            lanes=lanes,
+def _blend(
+    means2d: Tensor,
+    covars2d: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    backgrounds: Tensor,
+    depths: Tensor,
+    centers: Tensor,
+    whitenings: Tensor,
+    boxes: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    keep: bool,
+    validate: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    if validate:
+        shared = colors.stride(0) == 0  # by the cameras: each value counts once
+        check_finite(colors=colors[:1] if shared else colors, backgrounds=backgrounds)
+    splats = Splats(*(t.contiguous() for t in (depths, centers, whitenings, boxes, opacities, colors, backgrounds)))
+    if draws_strips(colors):
+        cut = strips.cut_strips(colors.shape[0], colors.shape[1], width, height, tile_size)
+        drawn = strips.draw(splats, cut, keep)
+        lists = drawn.lists
+        kept = Kept(
+            drawn.transmittance, drawn.stops, lists.starts, lists.pair_starts, lists.order, lists.records, lists.ids,
+            hidden(0, torch.int64, colors.device),
         )  # fmt: skip
-        ctx.tiles, ctx.size = tiles, (width, height)
-        ctx.save_for_backward(
-            opacities, colors, backgrounds, transmittance, stops,
-            projection.boxes, projection.centers, projection.whitenings,
+    else:
+        drawn = tiles.draw(splats, width, height, tile_size)
+        lists = drawn.tiles
+        kept = Kept(
+            drawn.transmittance, drawn.stops, lists.starts, lists.pair_starts, lists.pair_counts, colors.new_empty(0),
+            lists.gaussians, lists.pairs,
         )  # fmt: skip
-        ctx.set_materialize_grads(False)
-        return image, alphas
+    return drawn.image, drawn.alphas, *(kept if keep else _nothing_kept(colors))
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None) -> tuple[Tensor | None, ...]:
-        opacities, colors, backgrounds, transmittance, stops, boxes, centers, whitenings = ctx.saved_tensors
-        tiles: Tiles = ctx.tiles
-        width, height = ctx.size
-        n_cameras, n, channels = colors.shape
-        dtype, device = colors.dtype, colors.device
-        scalar = SCALAR[dtype]
-        color, moments = vector(channels, scalar), vector(6, scalar)
-        with_shape = any(ctx.needs_input_grad[:3])
-        pixels = n_cameras * height * width
 
-        def empty(*shape: int) -> Tensor:
-            return torch.empty(*shape, dtype=dtype, device=device)
+def _blend_fake(
+    means2d: Tensor,
+    covars2d: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    backgrounds: Tensor,
+    depths: Tensor,
+    centers: Tensor,
+    whitenings: Tensor,
+    boxes: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    keep: bool,
+    validate: bool,
+) -> tuple[Tensor, ...]:
+    n_cameras, n, channels = colors.shape
+    image, alphas = (colors.new_empty(n_cameras, height, width, k) for k in (channels, 1))
+    if not keep:
+        return image, alphas, *_nothing_kept(colors)
+    int32, int64 = torch.int32, torch.int64
+    if draws_strips(colors):
+        cut = strips.cut_strips(n_cameras, n, width, height, tile_size)
+        shape, whole, records = (cut.n_strips * cut.plane,), int32, (n_cameras * n, RECORD)
+        lists = shares = cut.n_strips
+    else:
+        shape, whole, records, shares = (n_cameras, height, width), int64, (0,), n_cameras * n
+        lists = n_cameras * -(-width // tile_size) * -(-height // tile_size)
+    kept = Kept(
+        colors.new_empty(shape),
+        colors.new_empty(shape, dtype=int32),
+        colors.new_empty(lists + 1, dtype=int64),
+        colors.new_empty(n_cameras * n, dtype=whole),
+        colors.new_empty(shares, dtype=whole),
+        colors.new_empty(records),
+        hidden_like_fake(int32, colors.device),
+        hidden_like_fake(int64, colors.device),
+    )
+    return image, alphas, *kept
 
-        of_image = colors.new_zeros(pixels, channels) if g_image is None else g_image.contiguous().view(-1, channels)
-        of_alpha = colors.new_zeros(pixels) if g_alpha is None else g_alpha.contiguous().view(-1)
-        pair_moments = empty(len(tiles.pairs) if with_shape else 0, 6)
-        pair_colors = empty(len(tiles.pairs), channels)
-        tile_backgrounds = empty(len(tiles.starts) - 1, channels)
-        lanes, lane_width, lane_height = lane_grid(tiles.size, device, CUDA_WARP_LANES)
-        launch_ranges(
-            blend_backward_kernel(colors, channels),
-            tiles.cuts,
-            [
-                view(tiles.starts), view(tiles.gaussians), view(tiles.pairs), view(boxes.view(-1, 4), vec4i),
-                view(centers.view(-1, 4), VEC4[dtype]), view(whitenings.view(-1, 4), VEC4[dtype]),
-                view(opacities.view(-1)), view(colors.view(-1, channels), color), view(backgrounds, color),
-                view(stops.view(-1)), view(of_image, color), view(of_alpha),
-                tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height, int(with_shape),
-                view(transmittance.view(-1).clone()), view(empty(pixels)),
-                view(pair_moments, moments), view(pair_colors, color), view(tile_backgrounds, color),
-            ],
-            like=colors,
-            lanes=lanes,
-        )  # fmt: skip
 
-        cuts = even_cuts(n_cameras * n)
-        spans = [view(tiles.pair_starts), view(tiles.pair_counts)]
-        g_means2d = g_covars2d = g_opacities = g_colors = g_backgrounds = None
-        if with_shape:
-            g_means2d = empty(n_cameras, n, 2)
-            g_covars2d = torch.empty(n_cameras, n, 3, dtype=torch.float64, device=device)
-            g_opacities = empty(n_cameras, n)
-            launch_ranges(
-                backward_kernels.gather_shape(scalar),
-                cuts,
-                [
-                    *spans, view(pair_moments, moments), view(whitenings.view(-1, 4), VEC4[dtype]),
-                    view(opacities.view(-1)), view(g_means2d.view(-1, 2), VEC2[dtype]),
-                    view(g_covars2d.view(-1, 3), VEC3[torch.float64]), view(g_opacities.view(-1)),
-                ],
-                like=colors,
-            )  # fmt: skip
-        if ctx.needs_input_grad[3]:
-            g_colors = empty(n_cameras, n, channels)
-            launch_ranges(
-                backward_kernels.gather_colors(scalar, channels),
-                cuts,
-                [*spans, view(pair_colors, color), view(g_colors.view(-1, channels), color)],
-                like=colors,
-            )
-        if ctx.needs_input_grad[4]:
-            g_backgrounds = empty(n_cameras, channels)
-            per_camera = tiles.across * tiles.down
-            launch_ranges(
-                backward_kernels.sum_backgrounds(scalar, channels),
-                [0, n_cameras],
-                [per_camera, view(tile_backgrounds, color), view(g_backgrounds, color)],
-                like=colors,
-            )
-        return (
-            g_means2d,
-            g_covars2d,
-            g_opacities,
-            g_colors,
-            g_backgrounds,
-            None,  # projection
-            None,  # tiles
-            None,  # width
-            None,  # height
-        )
+def _blend_backward(
+    g_image: Tensor | None,
+    g_alpha: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor,
+    backgrounds: Tensor,
+    depths: Tensor,
+    centers: Tensor,
+    whitenings: Tensor,
+    boxes: Tensor,
+    transmittance: Tensor,
+    stops: Tensor,
+    starts: Tensor,
+    pair_starts: Tensor,
+    shares: Tensor,
+    records: Tensor,
+    gaussians: Tensor,
+    pairs: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    with_shape: bool,
+    with_colors: bool,
+    with_backgrounds: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    splats = Splats(*(t.contiguous() for t in (depths, centers, whitenings, boxes, opacities, colors, backgrounds)))
+    incoming = [None if g is None else g.contiguous() for g in (g_image, g_alpha)]
+    wanted = with_shape, with_colors, with_backgrounds
+    if draws_strips(colors):
+        cut = strips.cut_strips(colors.shape[0], colors.shape[1], width, height, tile_size)
+        lists = strips.Lists(records, starts, pair_starts, shares, gaussians)
+        gradients = strips.draw_backward(*incoming, splats, cut, transmittance, stops, lists, *wanted)
+    else:
+        across, down = -(-width // tile_size), -(-height // tile_size)
+        lists = Tiles(tile_size, across, down, starts, gaussians, pairs, pair_starts, shares)
+        gradients = tiles.draw_backward(*incoming, splats, transmittance, stops, lists, *wanted)
+    return tuple(colors.new_empty(0) if g is None else g for g in gradients)
+
+
+def _blend_backward_fake(
+    g_image: Tensor | None,
+    g_alpha: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor,
+    backgrounds: Tensor,
+    depths: Tensor,
+    centers: Tensor,
+    whitenings: Tensor,
+    boxes: Tensor,
+    transmittance: Tensor,
+    stops: Tensor,
+    starts: Tensor,
+    pair_starts: Tensor,
+    shares: Tensor,
+    records: Tensor,
+    gaussians: Tensor,
+    pairs: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    with_shape: bool,
+    with_colors: bool,
+    with_backgrounds: bool,
+) -> tuple[Tensor, ...]:
+    n_cameras, n, channels = colors.shape
+    none = colors.new_empty(0)
+    covars2d = colors.new_empty(n_cameras, n, 3, dtype=torch.float64)
+    return (
+        colors.new_empty(n_cameras, n, 2) if with_shape else none,
+        covars2d if with_shape else colors.new_empty(0),
+        colors.new_empty(n_cameras, n) if with_shape else colors.new_empty(0),
+        colors.new_empty(n_cameras, n, channels) if with_colors else colors.new_empty(0),
+        colors.new_empty(n_cameras, channels) if with_backgrounds else colors.new_empty(0),
+    )
+
+
+_forward = operator("blend", _blend, _blend_fake)
+_adjoint = adjoint("blend_backward", _blend_backward, _blend_backward_fake)
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    _, _, *splats, width, height, tile_size, _, _ = inputs
+    ctx.size = width, height, tile_size
+    ctx.save_for_backward(*splats, *output[2:])
+    ctx.set_materialize_grads(False)
+
+
+def _back(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, *_: Tensor | None) -> tuple[Tensor | None, ...]:
+    needs = ctx.needs_input_grad
+    wanted = any(needs[:3]), needs[3], needs[4]
+    gradients = (None,) * 5
+    if g_image is not None or g_alpha is not None:
+        gradients = _adjoint(g_image, g_alpha, *ctx.saved_tensors, *ctx.size, *wanted)
+    # None for depths, centers, whitenings, boxes, width, height, tile_size, keep and validate.
+    return *(g if need else None for g, need in zip(gradients, needs[:5], strict=True)), *(None,) * 9
+
+
+differentiable(_forward, _back, _save)
 
 
 def blend(
     projection: Projection,
-    tiles: Tiles,
     opacities: Float[Tensor, "C N"],
     colors: Float[Tensor, "C N D"],
     backgrounds: Float[Tensor, "C D"],
     width: int,
     height: int,
+    tile_size: int,
+    *,
+    validate: bool = False,
 ) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"]]:
     """Images over the backgrounds, and alpha (Kerbl et al. 2023, eq. 3): sum of c alpha T, and sum of alpha T.
 
     D is at most 32. `projection.means2d` and `projection.covars2d` receive gradients.
+
+    Raises:
+        ValueError: with `validate`, colours or backgrounds that are not finite.
     """
     channels = colors.shape[-1]
     padding = next(c for c in constants.CHANNELS if c >= channels) - channels
     if padding:
         colors = torch.nn.functional.pad(colors, (0, padding))
         backgrounds = torch.nn.functional.pad(backgrounds, (0, padding))
-    image, alphas = _Blend.apply(
-        projection.means2d, projection.covars2d, opacities.contiguous(), colors.contiguous(),
-        backgrounds.contiguous(), projection, tiles, width, height,
+    means2d, covars2d = projection.means2d, projection.covars2d
+    image, alphas, *_ = _forward(
+        means2d, covars2d, opacities, colors, backgrounds, projection.sort_depths, projection.centers,
+        projection.whitenings, projection.boxes, width, height, tile_size,
+        needs_gradient(means2d, covars2d, opacities, colors, backgrounds), validate,
     )  # fmt: skip
-    return image[..., :channels], alphas
+    return (image[..., :channels] if padding else image), alphas

@@ -1,17 +1,18 @@
 """Rotations and area ratios of faces and vertices between a rest mesh and a posed one."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from oasis_kernels import face_rotation as kernels
+from oasis_kernels import face_rotation_vectors as vector_kernels
 from oasis_warp.core.checks import check_finite, check_float, check_shape
-from oasis_warp.ops._incidence import Incidence, incidence, sum_at_items
+from oasis_warp.ops._incidence import incidence, sum_at_items
 from oasis_warp.ops._launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._native import is_vectorised, run_tasks
+from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
 
 
 class FaceRotations(NamedTuple):
@@ -21,101 +22,189 @@ class FaceRotations(NamedTuple):
     face_quats: Float[Tensor, "F 4"]
     area_ratio: Float[Tensor, "F"]
     """Posed area over rest area."""
+    vertex_area_ratio: Float[Tensor, "V"]
+    """The same of all faces round a vertex together; 1 where there is none."""
 
 
-class _FaceRotations(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, rest_vertices, posed_vertices, corners: Incidence):
-        faces = corners.table
-        n_faces, n_vertices = len(faces), len(rest_vertices)
-        face_quats = rest_vertices.new_empty((n_faces, 4))
-        area_ratio = rest_vertices.new_empty(n_faces)
-        weights = rest_vertices.new_empty(n_faces, dtype=torch.float64)
-        launch_ranges(
-            kernels.face_rotations,
-            even_cuts(n_faces),
-            [
-                view(rest_vertices),
-                view(posed_vertices),
-                view(faces),
-                view(face_quats),
-                view(area_ratio),
-                view(weights),
-            ],
-            like=rest_vertices,
-        )
-        # What has no rotation of its own gets that of the largest face, so that a rigid motion still acts rigidly.
-        fallback = weights.argmax(keepdim=True) if n_faces else weights.new_empty(0, dtype=torch.int64)
-        if n_faces:
-            face_quats = torch.where(weights[:, None] > 0, face_quats, face_quats[fallback])
+def _outputs(rest: Tensor, posed: Tensor, faces: Tensor, keep: bool, validate: bool) -> tuple[Tensor, ...]:
+    """Empty tensors for the results and for what the adjoint needs: signs of corners, sums at vertices."""
+    n_vertices, n_faces = len(rest), len(faces)
+    return (
+        rest.new_empty((n_vertices, 4)),
+        rest.new_empty((n_faces, 4)),
+        rest.new_empty(n_faces),
+        rest.new_empty(n_vertices),
+        rest.new_empty(3 * n_faces if keep else 0),
+        rest.new_empty((2 if keep else 0, n_vertices)),
+    )
 
-        vertex_quats = rest_vertices.new_empty((n_vertices, 4))
-        reference = faces.new_empty(n_vertices)
-        norms = weights.new_empty(n_vertices)
-        launch_ranges(
-            kernels.vertex_rotations,
-            even_cuts(n_vertices),
-            [
-                view(face_quats),
-                view(weights),
-                view(corners.offsets),
-                view(corners.entries),
-                view(fallback.to(torch.int32)),
-                view(vertex_quats),
-                view(reference),
-                view(norms),
-            ],
-            like=rest_vertices,
-        )
-        ctx.corners = corners
-        ctx.save_for_backward(
-            rest_vertices, posed_vertices, face_quats, vertex_quats, weights, reference, norms
-        )
-        return vertex_quats, face_quats, area_ratio
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad_vertex_quats, grad_face_quats, grad_area_ratio):
-        rest_vertices, posed_vertices, face_quats, vertex_quats, weights, reference, norms = ctx.saved_tensors
-        faces = ctx.corners.table
-        grad_sums = norms.new_empty((len(norms), 4))
-        launch_ranges(
-            kernels.vertex_rotations_backward,
-            even_cuts(len(norms)),
+def _face_rotations(
+    rest: Tensor, posed: Tensor, faces: Tensor, keep: bool, validate: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    if validate:
+        check_finite(rest_vertices=rest, posed_vertices=posed)
+    corners = incidence("faces", faces, len(rest), "vertices")
+    rest, posed = rest.contiguous(), posed.contiguous()
+    n_vertices, n_faces = len(rest), len(faces)
+    out = _outputs(rest, posed, faces, keep, validate)
+    vertex_quats, face_quats, area_ratio, vertex_area_ratio, signs, sums = out
+    if is_vectorised(rest):
+        areas, weighted = rest.new_empty((2, n_faces, 4))
+        run_tasks(
+            vector_kernels.faces,
+            n_faces,
+            [rest, posed, corners.table, n_vertices, face_quats, area_ratio, areas, weighted],
+        )
+        run_tasks(
+            vector_kernels.vertices,
+            n_vertices,
             [
-                view(vertex_quats),
-                view(norms),
-                view(grad_vertex_quats.contiguous()),
-                view(grad_sums, wp.vec4d),
+                n_faces, corners.offsets, corners.entries, face_quats, areas, weighted, vertex_quats,
+                vertex_area_ratio, signs if keep else None, sums if keep else None, n_vertices,
             ],
-            like=norms,
+        )  # fmt: skip
+        return out
+
+    areas = rest.new_empty((n_faces, 3), dtype=torch.float64)
+    launch_ranges(
+        kernels.face_rotations,
+        even_cuts(n_faces),
+        [*map(view, (rest, posed, corners.table, face_quats, area_ratio, areas))],
+        like=rest,
+    )
+    # What has no rotation of its own gets that of the largest face, so that a rigid motion still acts rigidly.
+    fallback = areas[:, 0].argmax(keepdim=True) if n_faces else faces.new_empty(0, dtype=torch.int64)
+    if n_faces:
+        face_quats.copy_(torch.where(areas[:, :1] > 0, face_quats, face_quats[fallback]))
+    launch_ranges(
+        kernels.vertex_rotations,
+        even_cuts(n_vertices),
+        [
+            *map(view, (face_quats, areas, corners.offsets, corners.entries, fallback.to(torch.int32))),
+            *map(view, (vertex_quats, vertex_area_ratio, signs, sums)),
+        ],
+        like=rest,
+    )
+    return out
+
+
+def _gradients(rest: Tensor, posed: Tensor, needs_rest: bool, needs_posed: bool) -> tuple[Tensor, Tensor]:
+    return (
+        rest.new_empty((len(rest) if needs_rest else 0, 3)),
+        posed.new_empty((len(posed) if needs_posed else 0, 3)),
+    )
+
+
+def _fake_backward(rest: Tensor, posed: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
+    return _gradients(rest, posed, *others[-2:])
+
+
+def _face_rotations_backward(
+    rest: Tensor,
+    posed: Tensor,
+    faces: Tensor,
+    vertex_quats: Tensor,
+    face_quats: Tensor,
+    vertex_area_ratio: Tensor,
+    signs: Tensor,
+    sums: Tensor,
+    grad_vertex_quats: Tensor | None,
+    grad_face_quats: Tensor | None,
+    grad_area_ratio: Tensor | None,
+    grad_vertex_area_ratio: Tensor | None,
+    needs_rest: bool,
+    needs_posed: bool,
+) -> tuple[Tensor, Tensor]:
+    corners = incidence("faces", faces, len(rest), "vertices")
+    rest, posed = rest.contiguous(), posed.contiguous()
+    n_vertices, n_faces = len(rest), len(faces)
+    if is_vectorised(rest):
+        grad_vertex_quats, grad_face_quats, grad_area_ratio, grad_vertex_area_ratio = (
+            None if grad is None else grad.contiguous()
+            for grad in (grad_vertex_quats, grad_face_quats, grad_area_ratio, grad_vertex_area_ratio)
         )
-        needs_rest, needs_posed, _ = ctx.needs_input_grad
-        rest_rows = rest_vertices.new_empty((len(faces) if needs_rest else 0, 9))
-        posed_rows = rest_vertices.new_empty((len(faces) if needs_posed else 0, 9))
-        launch_ranges(
-            kernels.face_rotations_backward,
-            even_cuts(len(faces)),
+        turns, grows = grad_vertex_quats is not None, grad_vertex_area_ratio is not None
+        at_vertices = rest.new_empty((n_vertices, 8))
+        if turns or grows:
+            run_tasks(
+                vector_kernels.vertices_backward,
+                n_vertices,
+                [
+                    vertex_quats, vertex_area_ratio, sums, n_vertices, grad_vertex_quats, grad_vertex_area_ratio,
+                    at_vertices,
+                ],
+            )  # fmt: skip
+        edges = rest.new_empty((2, n_faces, 8))
+        run_tasks(
+            vector_kernels.faces_backward,
+            n_faces,
             [
-                view(rest_vertices),
-                view(posed_vertices),
-                view(faces),
-                view(face_quats),
-                view(weights),
-                view(reference),
-                view(grad_sums, wp.vec4d),
-                view(grad_face_quats.contiguous()),
-                view(grad_area_ratio.contiguous()),
-                view(rest_rows),
-                view(posed_rows),
+                rest, posed, corners.table, n_vertices, face_quats, signs, at_vertices, grad_face_quats,
+                grad_area_ratio, int(turns), int(grows), edges[0] if needs_rest else None,
+                edges[1] if needs_posed else None,
             ],
-            like=norms,
-        )
-        return (
-            sum_at_items(rest_rows.view(-1, 3), ctx.corners) if needs_rest else None,  # rest_vertices
-            sum_at_items(posed_rows.view(-1, 3), ctx.corners) if needs_posed else None,  # posed_vertices
-            None,  # corners
-        )
+        )  # fmt: skip
+        out = _gradients(rest, posed, needs_rest, needs_posed)
+        for of_mesh, grad in zip(edges, out, strict=True):
+            run_tasks(vector_kernels.gather_edges, len(grad), [corners.offsets, corners.entries, of_mesh, grad])
+        return out
+
+    def given(grad: Tensor | None, like: Tensor) -> Tensor:
+        return torch.zeros_like(like) if grad is None else grad.contiguous()
+
+    grad_sums = rest.new_empty((n_vertices, 6), dtype=torch.float64)
+    launch_ranges(
+        kernels.vertex_rotations_backward,
+        even_cuts(n_vertices),
+        [
+            *map(view, (vertex_quats, vertex_area_ratio, sums, given(grad_vertex_quats, vertex_quats))),
+            *map(view, (given(grad_vertex_area_ratio, vertex_area_ratio), grad_sums)),
+        ],
+        like=rest,
+    )
+    rest_rows = rest.new_empty((n_faces if needs_rest else 0, 9))
+    posed_rows = rest.new_empty((n_faces if needs_posed else 0, 9))
+    by_ratio = torch.zeros_like(face_quats[:, 0]) if grad_area_ratio is None else grad_area_ratio.contiguous()
+    launch_ranges(
+        kernels.face_rotations_backward,
+        even_cuts(n_faces),
+        [
+            *map(view, (rest, posed, corners.table, face_quats, signs, grad_sums)),
+            *map(view, (given(grad_face_quats, face_quats), by_ratio, rest_rows, posed_rows)),
+        ],
+        like=rest,
+    )
+    return (
+        sum_at_items(rest_rows.view(-1, 3), corners) if needs_rest else rest_rows.view(-1, 3),
+        sum_at_items(posed_rows.view(-1, 3), corners) if needs_posed else posed_rows.view(-1, 3),
+    )
+
+
+_operator = operator("face_rotations", _face_rotations, _outputs)
+_adjoint = adjoint("face_rotations_backward", _face_rotations_backward, _fake_backward)
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    ctx.set_materialize_grads(False)
+    vertex_quats, face_quats, _, vertex_area_ratio, signs, sums = output
+    ctx.mark_non_differentiable(signs, sums)
+    ctx.save_for_backward(*inputs[:3], vertex_quats, face_quats, vertex_area_ratio, signs, sums)
+
+
+def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+    needs_rest, needs_posed = ctx.needs_input_grad[:2]
+    rest, posed = _adjoint(*ctx.saved_tensors, *grads[:4], needs_rest, needs_posed)
+    return (
+        rest if needs_rest else None,  # rest
+        posed if needs_posed else None,  # posed
+        None,  # faces
+        None,  # keep
+        None,  # validate
+    )
+
+
+differentiable(_operator, _backward, _save)
 
 
 def face_rotations(
@@ -132,7 +221,8 @@ def face_rotations(
     A vertex turns by the normalised mean of its faces' quaternions, weighted with their areas at rest and sign-aligned
     to the largest of them. A face that is flat (area 0 but for rounding) at rest or posed has no weight and no gradient
     and gets the rotation of the face with the largest rest area, as do vertices without any other face; the identity
-    where there is no face at all. The area ratio is (A' + d) / (A + d), d = 0.5e-6 times the longest rest edge squared.
+    where there is no face at all. The area ratio is (A' + d) / (A + d), d = 0.5e-6 times the longest rest edge squared;
+    that of a vertex has the sums over its faces above and below.
 
     Differentiable in `rest_vertices` and `posed_vertices`. Which faces touch a vertex is computed once for each `faces`
     tensor and remembered while it lives.
@@ -152,8 +242,6 @@ def face_rotations(
     check_shape("posed_vertices", posed_vertices, "V", 3, sizes=sizes, hint="One for each rest vertex.")
     check_float("rest_vertices", rest_vertices)
     check_float("posed_vertices", posed_vertices, rest_vertices)
-    if validate:
-        check_finite(rest_vertices=rest_vertices, posed_vertices=posed_vertices)
     check_shape("faces", faces, "F", 3, hint="Three vertex indices a face.")
-    corners = incidence("faces", faces, len(rest_vertices), "vertices")
-    return FaceRotations(*_FaceRotations.apply(rest_vertices.contiguous(), posed_vertices.contiguous(), corners))
+    keep = needs_gradient(rest_vertices, posed_vertices)
+    return FaceRotations(*_operator(rest_vertices, posed_vertices, faces, keep, validate)[:4])

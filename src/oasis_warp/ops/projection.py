@@ -1,19 +1,27 @@
-"""Gaussians and cameras -> what the rasterizer draws, differentiable in means, quats, scales and viewmats."""
+"""Gaussians and cameras -> what the rasterizer draws, differentiable in means, shapes and viewmats.
 
-import ctypes
+A shape is a quaternion with three scales, or a covariance.
+"""
+
 from typing import Any, NamedTuple
 
 import torch
-import warp as wp
 from jaxtyping import Float, Float64, Int32
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from oasis_kernels import projection as kernels
-from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
-
-CAMERA_SUM_BLOCK = 1024
-"""Gaussians whose camera gradients one thread adds up; fixed, so that the sum does not depend on threads."""
+from oasis_warp.core.checks import check_finite
+from oasis_warp.ops._project_launch import (
+    Limits,
+    Scene,
+    backward_generic,
+    backward_vectors,
+    check_arrays,
+    empty_outputs,
+    has_vectors,
+    project_generic,
+    project_vectors,
+)
+from oasis_warp.ops._registration import adjoint, differentiable, operator
 
 
 class Projection(NamedTuple):
@@ -39,132 +47,204 @@ class Projection(NamedTuple):
     """Pixels x0, y0, x1, y1 (past the end) that the Gaussian can reach."""
 
 
-def as_float32(value: float) -> float:
-    """`value` rounded to float32, so that float32 and float64 calls take the same decisions by it."""
-    return ctypes.c_float(value).value
+def check_values(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    covars: Tensor | None,
+    opacities: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+) -> None:
+    """Refuse values that a kernel would hide in a plausible picture.
 
-
-class _Project(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        viewmats: Tensor,
-        opacities: Tensor,
-        Ks: Tensor,
-        width: int,
-        height: int,
-        near_plane: float,
-        far_plane: float,
-        radius_clip: float,
-        eps2d: float,
-    ) -> tuple[Tensor, ...]:
-        n, n_cameras, dtype = len(means), len(viewmats), means.dtype
-
-        def empty(*shape: int, dtype: torch.dtype = dtype) -> Tensor:
-            return torch.empty(n_cameras, n, *shape, dtype=dtype, device=means.device)
-
-        out = Projection(
-            means2d=empty(2),
-            covars2d=empty(3, dtype=torch.float64),
-            depths=empty(),
-            conics=empty(3),
-            radii=empty(2, dtype=torch.int32),
-            sort_depths=empty(dtype=torch.float64),
-            centers=empty(4),
-            whitenings=empty(4),
-            boxes=empty(4, dtype=torch.int32),
-        )
-        if n and n_cameras:
-            start()
-            vec2, vec3, vec4 = VEC2[dtype], VEC3[dtype], VEC4[dtype]
-            launch_ranges(
-                kernels.project(SCALAR[dtype]),
-                even_cuts(n_cameras * n),
-                [
-                    n, view(means, vec3), view(quats, vec4), view(scales, vec3), view(opacities), view(viewmats),
-                    view(Ks), width, height, as_float32(near_plane), as_float32(far_plane), as_float32(eps2d),
-                    float(radius_clip),
-                    view(out.means2d.view(-1, 2), vec2), view(out.covars2d.view(-1, 3), VEC3[torch.float64]),
-                    view(out.conics.view(-1, 3), vec3), view(out.depths.view(-1)), view(out.sort_depths.view(-1)),
-                    view(out.radii.view(-1, 2), wp.vec2i), view(out.centers.view(-1, 4), vec4),
-                    view(out.whitenings.view(-1, 4), vec4), view(out.boxes.view(-1, 4), wp.vec4i),
-                ],
-                like=means,
-            )  # fmt: skip
-        ctx.size = width, height
-        ctx.save_for_backward(means, quats, scales, viewmats, Ks, out.radii)
-        ctx.mark_non_differentiable(*out[3:])
-        ctx.set_materialize_grads(False)
-        return tuple(out)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, g_means2d: Tensor | None, g_covars2d: Tensor | None, g_depths: Tensor | None, *_: None):
-        means, quats, scales, viewmats, Ks, radii = ctx.saved_tensors
-        n, n_cameras, dtype = len(means), len(viewmats), means.dtype
-        float64 = torch.float64
-
-        def given(gradient: Tensor | None, *shape: int, dtype: torch.dtype = dtype) -> Tensor:
-            if gradient is None:
-                return torch.zeros(n_cameras * n, *shape, dtype=dtype, device=means.device)
-            return gradient.contiguous().view(n_cameras * n, *shape)
-
-        g_means, g_quats, g_scales = (torch.empty_like(t) for t in (means, quats, scales))
-        with_cameras = ctx.needs_input_grad[3]
-        g_cameras = torch.zeros(n_cameras * n if with_cameras else 0, 12, dtype=float64, device=means.device)
-        if n:
-            vec2, vec3, vec4 = VEC2[dtype], VEC3[dtype], VEC4[dtype]
-            launch_ranges(
-                kernels.project_backward(SCALAR[dtype]),
-                even_cuts(n),
-                [
-                    n, n_cameras, view(means, vec3), view(quats, vec4), view(scales, vec3), view(viewmats), view(Ks),
-                    *ctx.size, view(radii.view(-1, 2), wp.vec2i), view(given(g_means2d, 2), vec2),
-                    view(given(g_covars2d, 3, dtype=float64), VEC3[float64]), view(given(g_depths)),
-                    int(with_cameras), view(g_means, vec3), view(g_quats, vec4), view(g_scales, vec3), view(g_cameras),
-                ],
-                like=means,
-            )  # fmt: skip
-        g_viewmats = None
-        if with_cameras:
-            g_viewmats = torch.zeros_like(viewmats)
-            sums = _sum_rows(_sum_rows(g_cameras, n, CAMERA_SUM_BLOCK), -(-n // CAMERA_SUM_BLOCK), max(n, 1))
-            g_viewmats[:, :3] = sums.view(n_cameras, 3, 4).to(dtype) if n else 0.0
-        return (
-            g_means if ctx.needs_input_grad[0] else None,
-            g_quats if ctx.needs_input_grad[1] else None,
-            g_scales if ctx.needs_input_grad[2] else None,
-            g_viewmats,
-            None,  # opacities: they decide what is drawn, and no more
-            None,  # Ks
-            None,  # width
-            None,  # height
-            None,  # near_plane
-            None,  # far_plane
-            None,  # radius_clip
-            None,  # eps2d
-        )
-
-
-def _sum_rows(values: Tensor, n: int, block: int) -> Tensor:
-    """Sums of blocks of rows of each group of `n` rows, in order."""
-    if n == 0:
-        return values
-    tasks = len(values) // n * -(-n // block)
-    sums = torch.empty(tasks, values.shape[1], dtype=values.dtype, device=values.device)
-    launch_ranges(
-        kernels.sum_blocks, [0, tasks], [n, block, view(values), view(sums)], like=values, lanes=values.shape[1]
+    Raises:
+        ValueError: names the argument: NaN, infinities and magnitudes above 1e15, zero quaternions, negative variances,
+            opacities outside [0, 1], zero focal lengths.
+    """
+    check_finite(
+        means=means, quats=quats, scales=scales, covars=covars, opacities=opacities, viewmats=viewmats, Ks=Ks
     )
-    return sums
+    if quats is not None:
+        zeros = int((quats.detach() == 0).all(-1).sum())
+        if zeros:
+            raise ValueError(f"quats: expected rows that are not zero, got {zeros} zero rows. (1, 0, 0, 0) is no turn.")
+    if covars is not None:
+        negative = int((covars.detach().diagonal(dim1=-2, dim2=-1) < 0).any(-1).sum())
+        if negative:
+            raise ValueError(
+                f"covars: expected variances of at least 0, got {negative} matrices with a negative one. "
+                "A covariance is R S S^T R^T."
+            )
+    if opacities.numel():
+        low, high = (float(v) for v in opacities.detach().aminmax())
+        if low < 0 or high > 1:
+            raise ValueError(
+                f"opacities: expected values in [0, 1], got {low:g} to {high:g}. Logits go through a sigmoid first."
+            )
+    if bool((Ks.detach()[:, [0, 1], [0, 1]] == 0).any()):
+        raise ValueError("Ks: expected focal lengths other than 0, got 0.")
+
+
+def _project(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    covars: Tensor | None,
+    opacities: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    far_plane: float,
+    radius_clip: float,
+    eps2d: float,
+    validate: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
+    check_arrays(scene, opacities=(opacities, means.shape[:1], means.dtype))
+    scene, opacities = scene.contiguous(), opacities.contiguous()
+    limits = Limits(near_plane, far_plane, radius_clip, eps2d)
+    out = empty_outputs(means, len(viewmats))
+    if len(means) and len(viewmats) and has_vectors(means):
+        # The kernel looks at the values as it reads them; what is wrong with them is for the slow checks to say.
+        sound = project_vectors(scene, opacities, limits, out)
+    else:
+        sound = False
+        project_generic(scene, opacities, limits, out)
+    if validate and not sound:
+        check_values(means, quats, scales, covars, opacities, viewmats, Ks)
+    return tuple(out)
+
+
+def _project_fake(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    covars: Tensor | None,
+    opacities: Tensor,
+    viewmats: Tensor,
+    *_: Any,
+) -> tuple[Tensor, ...]:
+    return tuple(empty_outputs(means, viewmats.shape[0]))
+
+
+def _project_backward(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    covars: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    radii: Tensor,
+    g_means2d: Tensor | None,
+    g_covars2d: Tensor | None,
+    g_depths: Tensor | None,
+    by_means: bool,
+    by_quats: bool,
+    by_scales: bool,
+    by_covars: bool,
+    by_viewmats: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
+    shape, dtype = (len(viewmats), len(means)), means.dtype
+    check_arrays(
+        scene,
+        radii=(radii, (*shape, 2), torch.int32),
+        g_means2d=(g_means2d, (*shape, 2), dtype),
+        g_covars2d=(g_covars2d, (*shape, 3), torch.float64),
+        g_depths=(g_depths, shape, dtype),
+    )
+    out = _empty_gradients(means, quats, scales, covars, viewmats, by_means, by_quats, by_scales, by_covars, by_viewmats)
+    if not (len(means) and len(viewmats)):
+        return tuple(g.zero_() for g in out)
+    names = {"g_means": by_means, "g_quats": by_quats, "g_scales": by_scales, "g_covars": by_covars}
+    run = backward_vectors if has_vectors(means) else backward_generic
+    run(
+        scene.contiguous(),
+        radii,
+        *(None if g is None else g.contiguous() for g in (g_means2d, g_covars2d, g_depths)),
+        {name: g for (name, wanted), g in zip(names.items(), out, strict=False) if wanted},
+        out[-1] if by_viewmats else None,
+    )
+    return out
+
+
+def _project_backward_fake(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    covars: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    radii: Tensor,
+    g_means2d: Tensor | None,
+    g_covars2d: Tensor | None,
+    g_depths: Tensor | None,
+    *wanted: bool,
+) -> tuple[Tensor, ...]:
+    return _empty_gradients(means, quats, scales, covars, viewmats, *wanted)
+
+
+def _empty_gradients(*inputs_and_wanted: Any) -> tuple[Tensor, ...]:
+    """Memory for gradients by the first half of the arguments where the second half says so, else of size 0."""
+    half = len(inputs_and_wanted) // 2
+    inputs, wanted = inputs_and_wanted[:half], inputs_and_wanted[half:]
+    return tuple(
+        inputs[0].new_empty(like.shape if flag else 0) for like, flag in zip(inputs, wanted, strict=True)
+    )
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    means, quats, scales, covars, _opacities, viewmats, Ks, width, height, *_ = inputs
+    ctx.size = width, height
+    ctx.save_for_backward(means, quats, scales, covars, viewmats, Ks, output[4])
+    ctx.mark_non_differentiable(*output[3:])
+    ctx.set_materialize_grads(False)
+
+
+def _differentiate(
+    ctx: Any, g_means2d: Tensor | None, g_covars2d: Tensor | None, g_depths: Tensor | None, *_: None
+) -> tuple[Tensor | None, ...]:
+    *scene, radii = ctx.saved_tensors
+    needs = ctx.needs_input_grad
+    wanted = [*needs[:4], needs[5]]
+    out = project_backward_op(*scene, *ctx.size, radii, g_means2d, g_covars2d, g_depths, *wanted)
+    g_means, g_quats, g_scales, g_covars, g_viewmats = (
+        g if flag else None for g, flag in zip(out, wanted, strict=True)
+    )
+    return (
+        g_means,
+        g_quats,
+        g_scales,
+        g_covars,
+        None,  # opacities: they decide what is drawn, and no more
+        g_viewmats,
+        None,  # Ks
+        None,  # width
+        None,  # height
+        None,  # near_plane
+        None,  # far_plane
+        None,  # radius_clip
+        None,  # eps2d
+        None,  # validate
+    )
+
+
+project_op = operator("project", _project, _project_fake)
+project_backward_op = adjoint("project_backward", _project_backward, _project_backward_fake)
+differentiable(project_op, _differentiate, _save)
 
 
 def project(
     means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"] | None,
+    scales: Float[Tensor, "N 3"] | None,
     opacities: Float[Tensor, "N"],
     viewmats: Float[Tensor, "C 4 4"],
     Ks: Float[Tensor, "C 3 3"],
@@ -175,12 +255,19 @@ def project(
     far_plane: float,
     radius_clip: float,
     eps2d: float,
+    covars: Float[Tensor, "N 3 3"] | None = None,
+    validate: bool = False,
 ) -> Projection:
-    """The Gaussians on each camera's image plane; arguments as in `rasterization`, which has checked them."""
+    """The Gaussians on each camera's image plane (Zwicker et al. 2001); arguments as in `rasterization`.
+
+    Shapes are quats and scales, or covars, of which the symmetric part is read: gradients by it are symmetric.
+
+    Raises:
+        ValueError: shapes, types or devices that do not belong together; with `validate`, as `check_values`.
+    """
     return Projection(
-        *_Project.apply(
-            means.contiguous(), quats.contiguous(), scales.contiguous(), viewmats.contiguous(),
-            opacities.detach().contiguous(), Ks.detach().contiguous(), width, height,
-            near_plane, far_plane, radius_clip, eps2d,
+        *project_op(
+            means, quats, scales, covars, opacities, viewmats, Ks, width, height,
+            near_plane, far_plane, radius_clip, eps2d, validate,
         )
     )  # fmt: skip

@@ -1,0 +1,194 @@
+"""How fast every operator is: beside a yardstick, the same in torch, and other rasterizers, in one run."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import torch
+
+from oasis_warp.bench.errors import relative_error
+from oasis_warp.bench.operators import OPERATORS, Exact, Operator, Outputs, Pass, exact, forward, gradients
+from oasis_warp.bench.rows import commit, device_name, versions
+from oasis_warp.bench.scenes import MeshScene, Scene, hand_scenes, surfels
+from oasis_warp.bench.timing import Timed, peak_megabytes, time_together
+from oasis_warp.bench.yardstick import make_yardstick
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.logging import Progress, silent
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeedRow:
+    """One way to compute an operator. Ratios are those of the fastest calls, which other work disturbs least."""
+
+    op: str
+    pass_: str
+    """Called `pass` in files."""
+    way: str
+    """"warp" is ours; "scalar" our generic kernels in float32, one pixel or item at a time; "torch"; or a peer."""
+    scene: str
+    gaussians: int | None
+    faces: int | None
+    width: int
+    height: int
+    device: str
+    threads: int
+    median_ms: float
+    iqr_ms: float
+    fastest_ms: float
+    first_ms: float
+    repeats: int
+    peak_mb: float | None
+    over_yardstick: float
+    """Time over the yardstick's."""
+    over_warp: float
+    """Time over ours."""
+    rel_l2: float
+    """Largest relative error of any output against our float64 kernels, fragile pixels left out."""
+    gradient_rel_l2: float | None
+    seed: int
+    commit: str
+    versions: str
+
+
+Way = Callable[[Operator], Callable[..., Outputs] | None]
+"""From an operator to what computes it in another way, where there is one."""
+
+
+def gsplat_way(device: torch.device) -> Way:
+    """The rasterizer of gsplat.
+
+    Raises:
+        InputError: it is not installed, or cannot draw on the device.
+    """
+    if find_spec("gsplat") is None:
+        raise InputError("--peer gsplat: the package is not installed; `pip install gsplat` brings it.")
+    if device.type != "cuda":
+        raise InputError("--peer gsplat: it draws on CUDA devices only; add --device cuda.")
+    import gsplat
+
+    def draw(scene: Scene) -> Outputs:
+        image, alphas, _ = gsplat.rasterization(
+            scene.means, scene.quats, scene.scales, scene.opacities, scene.colors, scene.viewmats, scene.Ks,
+            scene.width, scene.height, backgrounds=scene.backgrounds, packed=False,
+        )  # fmt: skip
+        return image, alphas
+
+    return lambda operator: draw if operator.name == "rasterization" else None
+
+
+def measure(
+    *,
+    device: torch.device,
+    gaussians: int,
+    size: int,
+    threads: int,
+    repeats: int,
+    seed: int = 0,
+    peers: dict[str, Way] | None = None,
+    progress: Progress = silent,
+) -> list[SpeedRow]:
+    """Rows of every way to compute every operator, each operator's timed in turns.
+
+    Args:
+        device: Where to compute.
+        gaussians: Of the hand, to be drawn.
+        size: Side of the picture [px].
+        threads: CPU threads.
+        repeats: Timed calls of each.
+        seed: Of the scene.
+        peers: More ways, by name.
+        progress: Told after every round.
+    """
+    drawn, mesh = surfels(gaussians, size, seed), hand_scenes(size, seed)[1]
+    ways: dict[str, Way] = {"warp": lambda o: o.call, "torch": lambda o: o.torch_peer, **(peers or {})}
+    rows: list[SpeedRow] = []
+    for place, operator in enumerate(OPERATORS.values()):
+
+        def after_round(n: int, done: int = place * repeats) -> None:
+            progress("speed", done + n, len(OPERATORS) * repeats)
+
+        scene = (drawn if operator.scene is Scene else mesh).to(device=device)
+        calls = {name: call for name, way in ways.items() if (call := way(operator)) is not None}
+        rows += measure_operator(operator, scene, calls, device, threads, repeats, after_round)
+    return rows
+
+
+def measure_operator(
+    operator: Operator,
+    scene: Scene | MeshScene,
+    calls: dict[str, Callable[..., Outputs]],
+    device: torch.device,
+    threads: int,
+    repeats: int,
+    after_round: Callable[[int], object],
+) -> list[SpeedRow]:
+    """Rows of one operator; the first of `calls` is ours."""
+    truth = exact(operator, scene)
+    prepared = operator.prepare(scene)
+    runs = {
+        (pass_, way): one_pass(operator, call, prepared, pass_, truth)
+        for pass_ in operator.passes
+        for way, call in calls.items()
+    }
+    timed = [Timed(make_yardstick(), 1), *(Timed(run, threads) for run in runs.values())]
+    yardstick, *timings = time_together(timed, repeats, after_round)
+    fastest = {key: timing.fastest_ms for key, timing in zip(runs, timings, strict=True)}
+    ours = next(iter(calls))
+    rows = []
+    for ((pass_, way), run), timing in zip(runs.items(), timings, strict=True):
+        value_error, gradient_error = errors(operator, runs, pass_, way, truth)
+        rows.append(
+            SpeedRow(
+                op=operator.name,
+                pass_=pass_,
+                way=way,
+                scene=scene.name,
+                gaussians=len(scene.means) if isinstance(scene, Scene) else None,
+                faces=len(scene.faces) if isinstance(scene, MeshScene) else None,
+                width=scene.width,
+                height=scene.height,
+                device=device_name(device),
+                threads=threads,
+                median_ms=timing.median_ms,
+                iqr_ms=timing.iqr_ms,
+                fastest_ms=timing.fastest_ms,
+                first_ms=timing.first_ms,
+                repeats=repeats,
+                peak_mb=peak_megabytes(run, device),
+                over_yardstick=timing.fastest_ms / yardstick.fastest_ms,
+                over_warp=timing.fastest_ms / fastest[pass_, ours],
+                rel_l2=value_error,
+                gradient_rel_l2=gradient_error,
+                seed=scene.seed,
+                commit=commit(),
+                versions=versions(),
+            )
+        )
+    return rows
+
+
+def one_pass(
+    operator: Operator, call: Callable[..., Outputs], scene: Any, pass_: Pass, truth: Exact
+) -> Callable[[], Outputs]:
+    """The call that is timed."""
+    if pass_ == "forward":
+        return lambda: forward(call, scene, {})
+    weights = tuple(w.to(torch.float32) for w in truth.weights)
+    return lambda: gradients(operator, call, scene, {}, weights)
+
+
+def errors(
+    operator: Operator, runs: dict[tuple[Pass, str], Callable[[], Outputs]], pass_: Pass, way: str, truth: Exact
+) -> tuple[float, float | None]:
+    """Largest relative errors of values and, in a backward pass, of gradients."""
+    outputs = operator.comparable(runs["forward", way]())
+    judged = None if truth.judged is None else truth.judged[..., None]
+    values = [
+        relative_error(o, e, None if judged is None else judged.expand_as(e))
+        for o, e in zip(outputs, truth.outputs, strict=True)
+    ]
+    if pass_ == "forward":
+        return max(values), None
+    found = runs[pass_, way]()
+    return max(values), max(relative_error(g, e) for g, e in zip(found, truth.gradients, strict=True))

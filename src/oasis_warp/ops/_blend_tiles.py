@@ -1,0 +1,173 @@
+"""Blend tile by tile with the generic kernels: on CUDA, and in float64 on the CPU."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from warp import vec4i
+from warp.types import vector
+
+from oasis_kernels import rasterize_backward as backward_kernels
+from oasis_kernels import rasterize_forward as forward_kernels
+from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
+from oasis_warp.ops._registration import revealed
+from oasis_warp.ops._tiles import Tiles, bin_to_tiles, even_work
+
+CUDA_LANES = 16, 16
+"""Lanes across and down a tile on CUDA: with the default tile of 16 pixels, one lane a pixel."""
+CUDA_WARP_LANES = 4, 8
+"""The same for the backward pass, where the lanes of one warp share a tile."""
+
+
+class Splats(NamedTuple):
+    """What is drawn, as the projection made it: see `Projection`. M = cameras * Gaussians."""
+
+    depths: Tensor
+    centers: Tensor
+    whitenings: Tensor
+    boxes: Tensor
+    opacities: Tensor
+    colors: Tensor
+    backgrounds: Tensor
+
+
+class Drawn(NamedTuple):
+    """Images, and what their adjoint needs."""
+
+    image: Tensor
+    alphas: Tensor
+    transmittance: Tensor
+    """[C, H, W], of the end."""
+    stops: Tensor
+    """[C, H, W], place in the tile's list of the first Gaussian that was not drawn."""
+    tiles: Tiles
+
+
+def lane_grid(tile_size: int, device: torch.device, grid: tuple[int, int]) -> tuple[int, int, int]:
+    """Number of lanes of a tile, and the width and height of their rectangles [px]; one lane on the CPU."""
+    if device.type == "cpu":
+        return 1, tile_size, tile_size
+    across, down = grid
+    # The grid keeps its size where the tile does not divide by it; lanes without pixels idle.
+    return across * down, -(-tile_size // across), -(-tile_size // down)
+
+
+def draw(splats: Splats, width: int, height: int, tile_size: int) -> Drawn:
+    """Images over the backgrounds, and alpha."""
+    n_cameras, n, channels = splats.colors.shape
+    dtype, device = splats.colors.dtype, splats.colors.device
+    start()
+    color, vec4 = vector(channels, SCALAR[dtype]), VEC4[dtype]
+    tiles = bin_to_tiles(splats.boxes, splats.depths, width, height, tile_size)
+    image = torch.empty(n_cameras, height, width, channels, dtype=dtype, device=device)
+    alphas = torch.empty(n_cameras, height, width, 1, dtype=dtype, device=device)
+    transmittance = torch.empty(n_cameras, height, width, dtype=dtype, device=device)
+    stops = torch.empty(n_cameras, height, width, dtype=torch.int32, device=device)
+    lanes, lane_width, lane_height = lane_grid(tile_size, device, CUDA_LANES)
+    launch_ranges(
+        forward_kernels.blend(SCALAR[dtype], channels),
+        even_work(tiles.starts),
+        [
+            view(tiles.starts), view(revealed(tiles.gaussians)), view(splats.boxes.view(-1, 4), vec4i),
+            view(splats.centers.view(-1, 4), vec4), view(splats.whitenings.view(-1, 4), vec4),
+            view(splats.opacities.view(-1)), view(splats.colors.view(-1, channels), color),
+            view(splats.backgrounds, color), tile_size, lane_width, lane_height, tiles.across, tiles.down, width,
+            height, view(image.view(-1, channels), color), view(alphas.view(-1)), view(transmittance.view(-1)),
+            view(stops.view(-1)),
+        ],
+        like=image,
+        lanes=lanes,
+    )  # fmt: skip
+    return Drawn(image, alphas, transmittance, stops, tiles)
+
+
+class Gradients(NamedTuple):
+    """By what was drawn; what was not asked for is None."""
+
+    means2d: Tensor | None
+    covars2d: Tensor | None
+    opacities: Tensor | None
+    colors: Tensor | None
+    backgrounds: Tensor | None
+
+
+def draw_backward(
+    g_image: Tensor | None,
+    g_alpha: Tensor | None,
+    splats: Splats,
+    transmittance: Tensor,
+    stops: Tensor,
+    tiles: Tiles,
+    with_shape: bool,
+    with_colors: bool,
+    with_backgrounds: bool,
+) -> Gradients:
+    """Gradients from those by image and alpha, None standing for zeros."""
+    n_cameras, n, channels = splats.colors.shape
+    _, height, width = transmittance.shape
+    dtype, device = splats.colors.dtype, splats.colors.device
+    start()
+    scalar, vec4 = SCALAR[dtype], VEC4[dtype]
+    color, moments = vector(channels, scalar), vector(6, scalar)
+    pixels = n_cameras * height * width
+
+    def empty(*shape: int) -> Tensor:
+        return torch.empty(*shape, dtype=dtype, device=device)
+
+    of_image = splats.colors.new_zeros(pixels, channels) if g_image is None else g_image.view(-1, channels)
+    of_alpha = splats.colors.new_zeros(pixels) if g_alpha is None else g_alpha.view(-1)
+    pair_numbers = revealed(tiles.pairs)
+    pair_moments = empty(len(pair_numbers) if with_shape else 0, 6)
+    pair_colors = empty(len(pair_numbers), channels)
+    tile_backgrounds = empty(len(tiles.starts) - 1, channels)
+    lanes, lane_width, lane_height = lane_grid(tiles.size, device, CUDA_WARP_LANES)
+    launch_ranges(
+        backward_kernels.blend_backward(scalar, channels),
+        even_work(tiles.starts),
+        [
+            view(tiles.starts), view(revealed(tiles.gaussians)), view(pair_numbers), view(splats.boxes.view(-1, 4), vec4i),
+            view(splats.centers.view(-1, 4), vec4), view(splats.whitenings.view(-1, 4), vec4),
+            view(splats.opacities.view(-1)), view(splats.colors.view(-1, channels), color),
+            view(splats.backgrounds, color), view(stops.view(-1)), view(of_image, color), view(of_alpha),
+            tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height, int(with_shape),
+            view(transmittance.view(-1).clone()), view(empty(pixels)),
+            view(pair_moments, moments), view(pair_colors, color), view(tile_backgrounds, color),
+        ],
+        like=pair_colors,
+        lanes=lanes,
+    )  # fmt: skip
+
+    cuts = even_cuts(n_cameras * n)
+    spans = [view(tiles.pair_starts), view(tiles.pair_counts)]
+    g_means2d = g_covars2d = g_opacities = g_colors = g_backgrounds = None
+    if with_shape:
+        g_means2d = empty(n_cameras, n, 2)
+        g_covars2d = torch.empty(n_cameras, n, 3, dtype=torch.float64, device=device)
+        g_opacities = empty(n_cameras, n)
+        launch_ranges(
+            backward_kernels.gather_shape(scalar),
+            cuts,
+            [
+                *spans, view(pair_moments, moments), view(splats.whitenings.view(-1, 4), vec4),
+                view(splats.opacities.view(-1)), view(g_means2d.view(-1, 2), VEC2[dtype]),
+                view(g_covars2d.view(-1, 3), VEC3[torch.float64]), view(g_opacities.view(-1)),
+            ],
+            like=pair_colors,
+        )  # fmt: skip
+    if with_colors:
+        g_colors = empty(n_cameras, n, channels)
+        launch_ranges(
+            backward_kernels.gather_colors(scalar, channels),
+            cuts,
+            [*spans, view(pair_colors, color), view(g_colors.view(-1, channels), color)],
+            like=pair_colors,
+        )
+    if with_backgrounds:
+        g_backgrounds = empty(n_cameras, channels)
+        launch_ranges(
+            backward_kernels.sum_backgrounds(scalar, channels),
+            [0, n_cameras],
+            [tiles.across * tiles.down, view(tile_backgrounds, color), view(g_backgrounds, color)],
+            like=pair_colors,
+        )
+    return Gradients(g_means2d, g_covars2d, g_opacities, g_colors, g_backgrounds)

@@ -1,0 +1,239 @@
+"""Launches of the projection kernels: the vector ones for float32 on the CPU, the generic ones for all else.
+
+Kernels do not know how long arrays are: `check_arrays` proves it before each launch.
+"""
+
+import ctypes
+from typing import NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from oasis_kernels import projection as generic
+from oasis_kernels import projection_vectors as vectors
+from oasis_warp.core.checks import FINITE_LIMIT
+from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, view
+from oasis_warp.ops._rules import current_rules
+
+CAMERA_SUM_BLOCK = 1024
+"""Gaussians whose camera gradients one thread of the generic kernel adds up; fixed, so that threads change no sum."""
+FEWEST_CHUNKS = 4
+"""Chunks of Gaussians below which another thread does not pay."""
+OUTPUTS = (
+    ("means2d", 2, None), ("covars2d", 3, torch.float64), ("depths", 0, None), ("conics", 3, None),
+    ("radii", 2, torch.int32), ("sort_depths", 0, torch.float64), ("centers", 4, None), ("whitenings", 4, None),
+    ("boxes", 4, torch.int32),
+)  # fmt: skip
+"""Name, numbers a Gaussian (0: no axis for them) and type (None: that of the inputs) of what projection writes."""
+VECTORS = {dtype: {2: VEC2[dtype], 3: VEC3[dtype], 4: VEC4[dtype]} for dtype in (torch.float32, torch.float64)}
+VECTORS[torch.int32] = {2: wp.vec2i, 4: wp.vec4i}
+
+
+class Scene(NamedTuple):
+    """What is projected, and by which cameras. Either `quats` and `scales` are None, or `covars` is."""
+
+    means: Tensor
+    quats: Tensor | None
+    scales: Tensor | None
+    covars: Tensor | None
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+
+    def contiguous(self) -> "Scene":
+        """The same for kernels, which know no strides."""
+        return Scene(*(t.contiguous() if isinstance(t, Tensor) else t for t in self))
+
+
+class Limits(NamedTuple):
+    """What decides on drawing a Gaussian, besides its opacity."""
+
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+
+
+def has_vectors(tensor: Tensor) -> bool:
+    """Whether the vector kernels take tensors like this one."""
+    return tensor.device.type == "cpu" and tensor.dtype == torch.float32
+
+
+def as_float32(value: float) -> float:
+    """`value` rounded to float32, so that float32 and float64 calls take the same decisions by it."""
+    return ctypes.c_float(value).value
+
+
+def empty_outputs(means: Tensor, n_cameras: int) -> list[Tensor]:
+    """Memory for `OUTPUTS`."""
+    start = n_cameras, len(means)
+    return [
+        torch.empty(*start, *([size] if size else []), dtype=dtype or means.dtype, device=means.device)
+        for _name, size, dtype in OUTPUTS
+    ]
+
+
+def check_arrays(scene: Scene, **others: tuple[Tensor | None, tuple[int, ...], torch.dtype]) -> None:
+    """Refuse tensors whose shapes, types or devices do not belong together.
+
+    Raises:
+        ValueError: names the argument.
+    """
+    means, quats, scales, covars, viewmats, Ks, *_ = scene
+    n, c, dtype = means.shape[0], viewmats.shape[0], means.dtype
+    if (quats is None or scales is None) if covars is None else not (quats is None and scales is None):
+        raise ValueError("covars: expected either covars, or quats and scales, got neither or both.")
+    expected = {
+        "means": (means, (n, 3), dtype), "quats": (quats, (n, 4), dtype), "scales": (scales, (n, 3), dtype),
+        "covars": (covars, (n, 3, 3), dtype), "viewmats": (viewmats, (c, 4, 4), dtype), "Ks": (Ks, (c, 3, 3), dtype),
+    } | others  # fmt: skip
+    for name, (tensor, shape, kind) in expected.items():
+        if tensor is not None and (tensor.shape != shape or tensor.dtype != kind or tensor.device != means.device):
+            raise ValueError(
+                f"{name}: expected shape {list(shape)}, {kind} on {means.device}, "
+                f"got {list(tensor.shape)}, {tensor.dtype} on {tensor.device}."
+            )
+
+
+def _block_of(scene: Scene) -> dict[str, int]:
+    """Fields of a parameter block that both directions share."""
+    pointers = {
+        name: tensor.data_ptr() for name, tensor in scene._asdict().items() if isinstance(tensor, Tensor)
+    }
+    return pointers | {
+        "n": len(scene.means), "n_cameras": len(scene.viewmats), "width": scene.width, "height": scene.height
+    }  # fmt: skip
+
+
+def _launch_chunks(kernel: object, block: ctypes.Structure, like: Tensor) -> None:
+    chunks = -(-len(like) // vectors.CHUNK)
+    launch_ranges(kernel, even_cuts(chunks, FEWEST_CHUNKS), [ctypes.addressof(block)], like=like)
+
+
+def project_vectors(scene: Scene, opacities: Tensor, limits: Limits, out: list[Tensor]) -> bool:
+    """Fill `out` by the vector kernel; False where an input was not finite or outside its range."""
+    rules = current_rules()
+    block = vectors.ForwardBlock(
+        **_block_of(scene),
+        **{name: tensor.data_ptr() for (name, *_), tensor in zip(OUTPUTS, out, strict=True)},
+        opacities=opacities.data_ptr(), near=as_float32(limits.near_plane), far=as_float32(limits.far_plane),
+        radius_clip=limits.radius_clip, eps2d=as_float32(limits.eps2d), alpha_min=as_float32(rules.alpha_min),
+        extent_sigmas=rules.extent_sigmas, limit=FINITE_LIMIT,
+    )  # fmt: skip
+    _launch_chunks(vectors.project(), block, scene.means)
+    return not block.bad
+
+
+def project_generic(scene: Scene, opacities: Tensor, limits: Limits, out: list[Tensor]) -> None:
+    """Fill `out` by the generic kernel."""
+    rules = current_rules()
+    launch_ranges(
+        generic.project(SCALAR[scene.means.dtype]),
+        even_cuts(len(scene.viewmats) * len(scene.means)),
+        [
+            len(scene.means), *_gaussian_views(scene), view(opacities), view(scene.viewmats), view(scene.Ks),
+            scene.width, scene.height, as_float32(limits.near_plane), as_float32(limits.far_plane),
+            as_float32(limits.eps2d), limits.radius_clip, as_float32(rules.alpha_min), rules.extent_sigmas,
+            *(_rows(tensor, size) for (_name, size, _dtype), tensor in zip(OUTPUTS, out, strict=True)),
+        ],
+        like=scene.means,
+    )  # fmt: skip
+
+
+def backward_vectors(
+    scene: Scene,
+    radii: Tensor,
+    g_means2d: Tensor | None,
+    g_covars2d: Tensor | None,
+    g_depths: Tensor | None,
+    g_gaussians: dict[str, Tensor],
+    g_viewmats: Tensor | None,
+) -> None:
+    """Fill `g_gaussians`, any of g_means, g_quats, g_scales and g_covars, and `g_viewmats` by the vector kernel."""
+    n_cameras, n = len(scene.viewmats), len(scene.means)
+    tensors = {"radii": radii, "g_means2d": g_means2d, "g_covars2d": g_covars2d, "g_depths": g_depths, **g_gaussians}
+    sums = None
+    if g_viewmats is not None:
+        sums = radii.new_empty(n_cameras * -(-n // vectors.CHUNK), 12, dtype=torch.float64)
+        tensors["g_cameras"] = sums
+    pointers = {name: tensor.data_ptr() for name, tensor in tensors.items() if tensor is not None}
+    _launch_chunks(vectors.project_backward(), vectors.BackwardBlock(**_block_of(scene), **pointers), scene.means)
+    if g_viewmats is not None and sums is not None:
+        _fill_viewmats(g_viewmats, sums)
+
+
+def backward_generic(
+    scene: Scene,
+    radii: Tensor,
+    g_means2d: Tensor | None,
+    g_covars2d: Tensor | None,
+    g_depths: Tensor | None,
+    g_gaussians: dict[str, Tensor],
+    g_viewmats: Tensor | None,
+) -> None:
+    """`backward_vectors` by the generic kernel, which fills what nobody asks for too."""
+    n_cameras, n = len(scene.viewmats), len(scene.means)
+
+    def given(gradient: Tensor | None, size: int, dtype: torch.dtype = scene.means.dtype) -> object:
+        if gradient is None:
+            gradient = radii.new_zeros(n_cameras * n, *([size] if size else []), dtype=dtype)
+        return _rows(gradient, size)
+
+    def filled(name: str, size: int) -> object:
+        like = getattr(scene, name)
+        if like is None:
+            return _rows(scene.means.new_empty(0, size), size)
+        wanted = g_gaussians.get(f"g_{name}")
+        return _rows(torch.empty_like(like) if wanted is None else wanted, size)
+
+    g_covars = g_gaussians.get("g_covars")
+    if g_covars is None:
+        g_covars = scene.means.new_empty(0, 3, 3) if scene.covars is None else torch.empty_like(scene.covars)
+    sums = radii.new_empty(0 if g_viewmats is None else n_cameras * n, 12, dtype=torch.float64)
+    launch_ranges(
+        generic.project_backward(SCALAR[scene.means.dtype]),
+        even_cuts(n),
+        [
+            n, n_cameras, *_gaussian_views(scene), view(scene.viewmats), view(scene.Ks), scene.width, scene.height,
+            _rows(radii, 2), given(g_means2d, 2), given(g_covars2d, 3, torch.float64), given(g_depths, 0),
+            int(g_viewmats is not None), filled("means", 3), filled("quats", 4), filled("scales", 3), view(g_covars),
+            view(sums),
+        ],
+        like=scene.means,
+    )  # fmt: skip
+    if g_viewmats is not None:
+        _fill_viewmats(g_viewmats, _sum_rows(sums, n, CAMERA_SUM_BLOCK))
+
+
+def _gaussian_views(scene: Scene) -> list[object]:
+    """Arguments means, quats, scales, covars, with_covars of the generic kernels; what is None is empty."""
+    means = scene.means
+    quats = means.new_empty(0, 4) if scene.quats is None else scene.quats
+    scales = means.new_empty(0, 3) if scene.scales is None else scene.scales
+    covars = means.new_empty(0, 3, 3) if scene.covars is None else scene.covars
+    return [_rows(means, 3), _rows(quats, 4), _rows(scales, 3), view(covars), int(scene.covars is not None)]
+
+
+def _rows(tensor: Tensor, size: int) -> object:
+    """A contiguous tensor as an array of vectors of `size` numbers, or of numbers where it is 0."""
+    return view(tensor.view(-1, size), VECTORS[tensor.dtype][size]) if size else view(tensor.view(-1))
+
+
+def _fill_viewmats(g_viewmats: Tensor, sums: Tensor) -> None:
+    """Add up sums over parts of the Gaussians, camera by camera, to the upper three rows; the last one is not read."""
+    n_cameras = len(g_viewmats)
+    parts = len(sums) // n_cameras
+    g_viewmats[:, :3] = _sum_rows(sums, parts, parts).view(n_cameras, 3, 4)
+    g_viewmats[:, 3] = 0
+
+
+def _sum_rows(values: Tensor, n: int, block: int) -> Tensor:
+    """Sums of blocks of rows of each group of `n` rows, in order."""
+    tasks = len(values) // n * -(-n // block)
+    sums = values.new_empty(tasks, values.shape[1])
+    launch_ranges(
+        generic.sum_blocks, [0, tasks], [n, block, view(values), view(sums)], like=values, lanes=values.shape[1]
+    )
+    return sums

@@ -1,0 +1,111 @@
+"""Shapes, types and plain numbers that the rasterizer is called with; values are for its operators to look at."""
+
+import torch
+from torch import Tensor
+
+from oasis_warp.core.checks import check_float, check_positive, check_shape
+from oasis_warp.ops.spherical_harmonics import check_degree
+
+MAX_CHANNELS = 32
+MAX_PIXELS = 2**31 - 1
+
+
+def check_gaussians(
+    means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor
+) -> None:
+    """Refuse Gaussians whose tensors do not belong together.
+
+    Raises:
+        ValueError: names the argument.
+    """
+    sizes: dict[str, int] = {}
+    check_shape("means", means, "N", 3, sizes=sizes)
+    check_float("means", means)
+    tensors = {"opacities": opacities}
+    check_shape("opacities", opacities, "N", sizes=sizes, hint="One number for each centre.")
+    if covars is not None:
+        check_shape("covars", covars, "N", 3, 3, sizes=sizes, hint="One matrix for each centre.")
+        tensors["covars"] = covars
+    elif quats is None or scales is None:
+        name = "quats" if quats is None else "scales"
+        raise ValueError(f"{name}: expected a tensor, got None. Shapes are quats with scales, or covars.")
+    else:
+        check_shape("quats", quats, "N", 4, sizes=sizes, hint="One wxyz row for each centre.")
+        check_shape("scales", scales, "N", 3, sizes=sizes, hint="One row for each centre.")
+        tensors |= {"quats": quats, "scales": scales}
+    for name, tensor in tensors.items():
+        check_float(name, tensor, like=means)
+
+
+def check_cameras(
+    viewmats: Tensor,
+    Ks: Tensor,
+    means: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    far_plane: float,
+    radius_clip: float,
+    eps2d: float,
+    tile_size: int,
+) -> None:
+    """Refuse cameras, images and limits that kernels cannot draw.
+
+    Raises:
+        ValueError: names the argument.
+    """
+    sizes: dict[str, int] = {}
+    check_shape("viewmats", viewmats, "C", 4, 4, sizes=sizes, hint="A single camera is viewmat[None].")
+    check_shape("Ks", Ks, "C", 3, 3, sizes=sizes, hint="One matrix for each viewmat.")
+    check_float("viewmats", viewmats, like=means)
+    check_float("Ks", Ks, like=means)
+    for name, value in {"width": width, "height": height, "tile_size": tile_size}.items():
+        if not isinstance(value, int | torch.SymInt) or isinstance(value, bool) or value < 1:
+            raise ValueError(f"{name}: expected a whole number of pixels, at least 1, got {value!r}.")
+    if sizes["C"] * width * height > MAX_PIXELS:
+        raise ValueError(
+            f"width: expected at most {MAX_PIXELS} pixels in all images, got {sizes['C']} x {height} x {width}. "
+            "Draw fewer cameras a call."
+        )
+    check_positive("near_plane", near_plane)
+    if not far_plane > near_plane:
+        raise ValueError(f"far_plane: expected more than near_plane, {near_plane!r}, got {far_plane!r}.")
+    if not radius_clip >= 0:
+        raise ValueError(f"radius_clip: expected a number of pixels, at least 0, got {radius_clip!r}.")
+    if not 0 <= eps2d < float("inf"):
+        raise ValueError(f"eps2d: expected a finite variance, at least 0, got {eps2d!r}.")
+
+
+def check_coefficients(coefficients: Tensor, sh_degree: int, means: Tensor, n_cameras: int) -> None:
+    """Refuse coefficients of spherical harmonics that do not belong to the Gaussians, cameras and degree.
+
+    Raises:
+        ValueError: names the argument.
+    """
+    sizes = {"N": len(means), "C": n_cameras}
+    if isinstance(coefficients, Tensor) and coefficients.dim() == 4:
+        check_shape("colors", coefficients, "C", "N", "K", 3, sizes=sizes, hint="Or [N, K, 3].")
+    else:
+        hint = "With sh_degree they are K coefficients of three channels for each centre."
+        check_shape("colors", coefficients, "N", "K", 3, sizes=sizes, hint=hint)
+    check_float("colors", coefficients, like=means)
+    check_degree("sh_degree", sh_degree, coefficients.shape[-2])
+
+
+def check_colors(colors: Tensor, backgrounds: Tensor | None, means: Tensor, n_cameras: int) -> None:
+    """Refuse colours and backgrounds that do not belong to the Gaussians and cameras.
+
+    Raises:
+        ValueError: names the argument.
+    """
+    sizes = {"N": len(means), "C": n_cameras}
+    if isinstance(colors, Tensor) and colors.dim() == 2:
+        check_shape("colors", colors, "N", "D", sizes=sizes, hint="One row for each centre.")
+    else:
+        check_shape("colors", colors, "C", "N", "D", sizes=sizes, hint="Or [N, D], the same for all cameras.")
+    check_float("colors", colors, like=means)
+    if not 1 <= colors.shape[-1] <= MAX_CHANNELS:
+        raise ValueError(f"colors: expected 1 to {MAX_CHANNELS} channels, got {colors.shape[-1]}. Draw the rest apart.")
+    if backgrounds is not None:
+        check_shape("backgrounds", backgrounds, "C", "D", sizes=sizes, hint="One row for each camera.")
+        check_float("backgrounds", backgrounds, like=means)
