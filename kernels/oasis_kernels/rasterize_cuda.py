@@ -1,13 +1,17 @@
-"""Float32 blending on CUDA: a warp a tile of 8 x 8 pixels, two pixels a lane; binning without a global sort.
+"""Float32 rasterization on CUDA: a block of warps a tile of 8 x 8 pixels, two pixels a lane, no global sort.
 
 `count_pairs` (one thread a Gaussian) numbers the pairs of a Gaussian and a tile and counts those of each tile;
 `fill_tiles` (one thread a Gaussian) writes a sorting key for each pair into its tile's list, in any order; `blend` (one
-warp a tile) sorts the list in shared memory and blends it front to back; `blend_backward` replays it back to front and
-leaves one record a pair, at the pair's number, for the same gather that the other kernels use.
+block a tile) sorts the list in shared memory and blends it front to back; `blend_backward` replays it back to front and
+leaves one record a pair, at the pair's number; `gather` (one thread a Gaussian) adds them up.
+
+The longest lists decide the time, so a list is cut into segments, one a warp. A first pass over its segment tells each
+warp how much light the segment lets through (and, going backward, what it shows); products over the segments in front
+give the transmittance that the second pass starts with. A pixel that ends in one segment is not entered by the next.
 
 Numbers come from atomic counters and differ from run to run, but nothing that is drawn depends on them: a key holds
-depth and index, so a sorted list is the same whatever order it was filled in, and a Gaussian adds its own pairs tile
-after tile. A key is 40 bits of depth (exponents from 2^-10 to 2^53, 34 bits of mantissa) above 24 bits of index.
+depth and index, so a sorted list is the same whatever order it was filled in, segments depend on its length alone, and
+a Gaussian adds its own pairs tile after tile.
 """
 
 import functools
@@ -15,16 +19,21 @@ from typing import Any
 
 import warp as wp
 
-from oasis_kernels import constants
+from oasis_kernels.constants import ALPHA_MAX, Rules
 
 TILE = 8
 """Side of a tile [px]."""
+WARPS = 4
+"""Warps that share a tile, at most: each takes a segment of the list, of 32 layers or more."""
 LONGEST = 2048
-"""Longest list that a warp sorts in shared memory."""
-WARPS = 8
-"""Warps that share a tile: the forward pass hands each a segment of its list."""
-MAX_GAUSSIANS = 1 << 24
-"""Indices that a key has room for."""
+"""Longest list that is sorted in shared memory; longer ones come in sorted."""
+INDEX_BITS = 24
+"""Of a key, for the index of a Gaussian among those of its camera. 39 bits hold its depth: 7 of exponent, from 2^-64
+to 2^63, and 32 of mantissa."""
+SCALE = 0.8493218183517456
+"""sqrt(log2(e) / 2) as a float32: e^(-|y|^2 / 2) = 2^(-|SCALE y|^2)."""
+BLOCK = 32 * WARPS
+"""Threads a tile."""
 
 
 @wp.func_native("""
@@ -60,10 +69,11 @@ def take(counts: wp.array(dtype=wp.int32), place: int) -> int: ...
 
 
 @wp.func_native("""
-    const long long bits = __builtin_bit_cast(long long, depth) - (1013ll << 52);
-    return ((unsigned long long)(bits >> 18) << 24) | (unsigned long long)index;
+    long long bits = __builtin_bit_cast(long long, depth) - (959ll << 52);
+    bits = bits < 0 ? 0 : bits;
+    return (bits >> 20) << 24 | index;
 """)
-def sorting_key(depth: wp.float64, index: int) -> wp.uint64: ...
+def sorting_key(depth: wp.float64, index: int) -> wp.int64: ...
 
 
 @wp.func
@@ -102,7 +112,7 @@ def fill_tiles(
     tiles_y: int,
     tile_starts: wp.array(dtype=wp.int32),
     tile_cursors: wp.array(dtype=wp.int32),  # zero on entry
-    keys: wp.array(dtype=wp.uint64),
+    keys: wp.array(dtype=wp.int64),
 ):
     index = wp.tid()
     t = tile_box(boxes[index])
@@ -142,43 +152,43 @@ HEAD = """
     auto layer = [&](int g) -> Layer {
         const float4 c = *(const float4*)(centers.data + g);
         const float4 w = *(const float4*)(whitenings.data + g);
-        const float s = 0.84932180028801904f;  // sqrt(log2(e) / 2)
+        const float s = @SCALE@;
         return {(c.x - (float)left) + (c.z - 0.5f), (c.y - (float)top) + (c.w - 0.5f), w.x * s, w.y * s, w.z * s,
                 w.w * s, log2f(opacities.data[g]), 0.f};
     };
     auto power = [](float x) -> float { float r; asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return r; };
 """
 
-SORT = """
-    __shared__ unsigned long long keys_of_tile[@LONGEST@];
-    int size = 32;
-    while (size < count) size <<= 1;
-    for (int k = threadIdx.x; k < size; k += blockDim.x) keys_of_tile[k] = k < count ? keys.data[start + k] : ~0ull;
-    __syncthreads();
-    for (int block = 2; block <= size; block <<= 1) for (int step = block >> 1; step > 0; step >>= 1) {
-        for (int k = threadIdx.x; k < size / 2; k += blockDim.x) {
-            const int a = ((k & ~(step - 1)) << 1) | (k & (step - 1)), b = a + step;
-            const unsigned long long u = keys_of_tile[a], v = keys_of_tile[b];
-            if ((u > v) == ((a & block) == 0)) { keys_of_tile[a] = v; keys_of_tile[b] = u; }
-        }
-        __syncthreads();
-    }
-"""
-
-FORWARD = (
-    SORT
-    + """
-    __shared__ __align__(16) float pool[@WARPS@ * (256 + 32 * @CHANNELS@ + 64 * @CHANNELS@ / 2)];
+FORWARD = """
+    // One after the other, this memory holds the keys, batches of layers, and what the segments add.
+    __shared__ __align__(16) float pool[@POOL@];
     __shared__ float passes[@WARPS@][64];
     Layer* batch = (Layer*)pool + 32 * warp;
     float* batch_colors = pool + 256 * @WARPS@ + 32 * @CHANNELS@ * warp;
-    for (int k = threadIdx.x; k < count; k += blockDim.x)
-        tile_gaussians.data[start + k] = camera * n + (int)(keys_of_tile[k] & 0xffffff);
+    if (!sorted) {
+        long long* sorting = (long long*)pool;  // a bitonic network
+        int size = 32;
+        while (size < count) size <<= 1;
+        for (int k = threadIdx.x; k < size; k += blockDim.x)
+            sorting[k] = k < count ? keys.data[start + k] : 0x7fffffffffffffffll;
+        __syncthreads();
+        for (int block = 2; block <= size; block <<= 1) for (int step = block >> 1; step > 0; step >>= 1) {
+            for (int k = threadIdx.x; k < size / 2; k += blockDim.x) {
+                const int a = ((k & ~(step - 1)) << 1) | (k & (step - 1)), b = a + step;
+                const long long u = sorting[a], v = sorting[b];
+                if ((u > v) == ((a & block) == 0)) { sorting[a] = v; sorting[b] = u; }
+            }
+            __syncthreads();
+        }
+        for (int k = threadIdx.x; k < count; k += blockDim.x)
+            tile_gaussians.data[start + k] = camera * n + (int)(sorting[k] & 0xffffff);
+        __syncthreads();
+    }
     auto load = [&](int first, bool with_colors) {
         __syncwarp();
         const int k = first + lane;
         if (k < to) {
-            const int g = camera * n + (int)(keys_of_tile[k] & 0xffffff);
+            const int g = tile_gaussians.data[start + k];
             batch[lane] = layer(g);
             const float* rgb = (const float*)(colors.data + g);
             if (with_colors) for (int c = 0; c < @CHANNELS@; c++) batch_colors[lane * @CHANNELS@ + c] = rgb[c];
@@ -289,7 +299,6 @@ FORWARD = (
     for (int k = 0; k < @CHANNELS@; k++) out[k] = C[k] + background[k] * T;
 #endif
 """
-)
 
 BACKWARD = """
     __shared__ Layer batches[@WARPS@][32];
@@ -472,28 +481,31 @@ BACKWARD = """
 """
 
 
-def _snippet(body: str, channels: int) -> str:
+def _snippet(body: str, channels: int, rules: Rules) -> str:
+    """C++ of one block with the numbers written in, floats as literals that read back to the same number."""
     text = HEAD + body
-    values = {
-        "ALPHA_MIN": constants.ALPHA_MIN, "ALPHA_MAX": constants.ALPHA_MAX, "STOP": constants.TRANSMITTANCE_STOP
-    }  # fmt: skip
-    for name, value in values.items():
-        text = text.replace(f"@{name}@", f"{value!r}f")
-    return text.replace("@CHANNELS@", str(channels)).replace("@LONGEST@", str(LONGEST)).replace("@WARPS@", str(WARPS))
+    pool = max(2 * LONGEST, WARPS * max(256 + 32 * channels, 64 * (channels + 2)))
+    for name, value in {
+        "ALPHA_MIN": f"{rules.alpha_min!r}f", "ALPHA_MAX": f"{ALPHA_MAX!r}f", "STOP": f"{rules.transmittance_stop!r}f",
+        "SCALE": f"{SCALE!r}f", "CHANNELS": channels, "WARPS": WARPS, "POOL": pool,
+    }.items():  # fmt: skip
+        text = text.replace(f"@{name}@", str(value))
+    return text
 
 
 @functools.cache
-def blend(channels: int) -> Any:
-    """Kernel: sort and blend the tiles; launched with (tiles, 32) threads in blocks of 32."""
+def blend(channels: int, rules: Rules) -> Any:
+    """Kernel: sort and blend the tiles; launched with (tiles, BLOCK) threads in blocks of BLOCK."""
     vec4 = wp.types.vector(length=4, dtype=wp.float32)
     color = wp.types.vector(length=channels, dtype=wp.float32)
 
-    @wp.func_native(_snippet(FORWARD, channels))
+    @wp.func_native(_snippet(FORWARD, channels, rules))
     def blend_tile(
         tile: int,
         n: int,
         tile_starts: wp.array(dtype=wp.int32),
-        keys: wp.array(dtype=wp.uint64),
+        keys: wp.array(dtype=wp.int64),
+        sorted: int,  # 1: `tile_gaussians` comes in filled
         centers: wp.array(dtype=vec4),
         whitenings: wp.array(dtype=vec4),
         opacities: wp.array(dtype=wp.float32),
@@ -514,7 +526,8 @@ def blend(channels: int) -> Any:
     def blend(
         n: int,
         tile_starts: wp.array(dtype=wp.int32),
-        keys: wp.array(dtype=wp.uint64),
+        keys: wp.array(dtype=wp.int64),
+        sorted: int,  # 1: `tile_gaussians` comes in filled
         centers: wp.array(dtype=vec4),
         whitenings: wp.array(dtype=vec4),
         opacities: wp.array(dtype=wp.float32),
@@ -532,21 +545,24 @@ def blend(channels: int) -> Any:
     ):
         tile, _lane = wp.tid()
         blend_tile(
-            tile, n, tile_starts, keys, centers, whitenings, opacities, colors, backgrounds, tiles_x, tiles_y, width,
-            height, image, alphas, transmittance, stops, tile_gaussians,
+            tile, n, tile_starts, keys, sorted, centers, whitenings, opacities, colors, backgrounds, tiles_x, tiles_y,
+            width, height, image, alphas, transmittance, stops, tile_gaussians,
         )  # fmt: skip
 
     return blend
 
 
 @functools.cache
-def blend_backward(channels: int) -> Any:
-    """Kernel: gradients by image and alpha -> one record a pair, one background gradient a tile; as `blend`."""
+def blend_backward(channels: int, rules: Rules) -> Any:
+    """Kernel: gradients by image and alpha -> one record a pair, one background gradient a tile; launched as `blend`.
+
+    A record holds sums over the tile's pixels as in `rasterize_backward`, of the scaled offset y = SCALE W d.
+    """
     vec4 = wp.types.vector(length=4, dtype=wp.float32)
     moments = wp.types.vector(length=8, dtype=wp.float32)  # of the scaled offsets; the last two are zero
     color = wp.types.vector(length=channels, dtype=wp.float32)
 
-    @wp.func_native(_snippet(BACKWARD, channels))
+    @wp.func_native(_snippet(BACKWARD, channels, rules))
     def blend_tile_backward(
         tile: int,
         tile_starts: wp.array(dtype=wp.int32),
@@ -606,3 +622,58 @@ def blend_backward(channels: int) -> Any:
         )  # fmt: skip
 
     return blend_backward
+
+
+@functools.cache
+def gather(channels: int) -> Any:
+    """Kernel: records -> gradients by means2d, covars2d, opacities and colours; one thread a (camera, Gaussian)."""
+    moments = wp.types.vector(length=8, dtype=wp.float32)
+    color = wp.types.vector(length=channels, dtype=wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def gather(
+        boxes: wp.array(dtype=wp.vec4i),
+        pair_starts: wp.array(dtype=wp.int32),
+        pair_moments: wp.array(dtype=moments),
+        pair_colors: wp.array(dtype=color),
+        whitenings: wp.array(dtype=wp.vec4),
+        opacities: wp.array(dtype=wp.float32),
+        with_shape: int,
+        with_colors: int,
+        g_means2d: wp.array(dtype=wp.vec2),
+        g_covars2d: wp.array(dtype=wp.vec3d),
+        g_opacities: wp.array(dtype=wp.float32),
+        g_colors: wp.array(dtype=color),
+    ):
+        index = wp.tid()
+        t = tile_box(boxes[index])
+        count = (t[2] - t[0]) * (t[3] - t[1])
+        start = pair_starts[index]
+        if with_colors != 0:
+            total = color()
+            for k in range(count):
+                total += pair_colors[start + k]
+            g_colors[index] = total
+        if with_shape != 0:
+            m = moments()
+            for k in range(count):
+                m += pair_moments[start + k]
+            g_opacity = wp.float32(0.0)
+            if count > 0:
+                g_opacity = m[0] / opacities[index]
+            scale = wp.float64(SCALE)
+            w = wp.vec4d(whitenings[index])
+            y0, y1 = wp.float64(m[1]) / scale, wp.float64(m[2]) / scale
+            y00 = wp.float64(m[3]) / (scale * scale)
+            y01 = wp.float64(m[4]) / (scale * scale)
+            y11 = wp.float64(m[5]) / (scale * scale)
+            # As in `rasterize_backward.gather_shape`.
+            g_means2d[index] = wp.vec2(wp.float32(w[0] * y0 + w[2] * y1), wp.float32(w[1] * y0 + w[3] * y1))
+            xx = w[0] * (w[0] * y00 + w[2] * y01) + w[2] * (w[0] * y01 + w[2] * y11)
+            xy = w[1] * (w[0] * y00 + w[2] * y01) + w[3] * (w[0] * y01 + w[2] * y11)
+            yy = w[1] * (w[1] * y00 + w[3] * y01) + w[3] * (w[1] * y01 + w[3] * y11)
+            half = wp.float64(0.5)
+            g_covars2d[index] = wp.vec3d(half * xx, xy, half * yy)
+            g_opacities[index] = g_opacity
+
+    return gather
