@@ -407,8 +407,7 @@ BACKWARD = """
     const int last = max(from, min(to, __reduce_max_sync(all, max(stop0, stop1))));
     for (int place = last + lane; place < to; place += 32) {  // behind every pixel's end
         const long long pair = pair_of(tile_gaussians.data[start + place]);
-        float* c = (float*)(pair_colors.data + pair);
-        for (int k = 0; k < @CHANNELS@; k++) c[k] = 0.f;
+        if (with_colors) for (int k = 0; k < @CHANNELS@; k++) ((float*)(pair_colors.data + pair))[k] = 0.f;
         if (with_shape) for (int k = 0; k < 8; k++) ((float*)(pair_moments.data + pair))[k] = 0.f;
     }
     for (int first = from + ((last - from - 1) & ~31); first >= from && last > from; first -= 32) {
