@@ -22,8 +22,9 @@ BOX_SLACK = 1e-3
 """Added to a Gaussian's box, relative and in pixels, so that rounding in the blending cannot reach outside it."""
 CUT_SLACK = 1e-3
 """Added to the exponent beyond which a layer must be fainter than ALPHA_MIN; the exact test follows."""
-CHANNELS = (1, 3, 4, 8, 16, 32)
-"""Channel counts that blending kernels are built for; others are padded with zeros up to the next."""
+CHANNELS = (1, 3, 4, 8, 16, 32, 34)
+"""Channel counts that blending kernels are built for; others are padded with zeros up to the next. The last is the
+largest number of colours with a depth and a one."""
 
 
 @dataclass(frozen=True)

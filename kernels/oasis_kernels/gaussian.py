@@ -95,7 +95,7 @@ def factor(covariance: wp.mat33d) -> wp.mat33d:
     f = wp.mat33d()
     rest = covariance
     for column in range(3):
-        pivot = int(0)
+        pivot = int(0)  # noqa: UP018  (a variable to Warp, where 0 would be a constant)
         if rest[1, 1] > rest[0, 0]:
             pivot = 1
         if rest[2, 2] > rest[pivot, pivot]:

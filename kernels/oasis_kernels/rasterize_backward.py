@@ -17,6 +17,7 @@ from typing import Any
 import warp as wp
 
 from oasis_kernels import constants
+from oasis_kernels.constants import Rules
 from oasis_kernels.gaussian import falloff, whitened
 from oasis_kernels.rasterize_forward import from_centre, lane_pixels
 
@@ -40,11 +41,12 @@ def add_lanes(value: wp.float64) -> wp.float64: ...  # noqa: F811
 
 
 @functools.cache
-def blend_backward(scalar: Any, channels: int) -> Any:
+def blend_backward(scalar: Any, channels: int, rules: Rules) -> Any:
     """Kernel: gradients by image and alpha -> one record a pair and one background gradient a tile.
 
     One thread a (tile, lane); on CUDA the 32 lanes of a warp share a tile, on the CPU one lane has all of it.
     """
+    alpha_min = rules.alpha_min
     vec4 = wp.types.vector(length=4, dtype=scalar)
     moments = wp.types.vector(length=6, dtype=scalar)
     color = wp.types.vector(length=channels, dtype=scalar)
@@ -107,7 +109,7 @@ def blend_backward(scalar: Any, channels: int) -> Any:
             w = whitenings[index]
             opacity = opacities[index]
             rgb = colors[index]
-            cut = wp.log(opacity / scalar(constants.ALPHA_MIN)) + scalar(constants.CUT_SLACK)
+            cut = wp.log(opacity / scalar(alpha_min)) + scalar(constants.CUT_SLACK)
             m = moments()
             g_color = color()
             for y in range(wp.max(area[1], box[1]), wp.min(area[3], box[3])):
@@ -120,7 +122,7 @@ def blend_backward(scalar: Any, channels: int) -> Any:
                         raw = opacity * falloff(-sigma)
                         alpha = wp.min(raw, scalar(constants.ALPHA_MAX))
                         pixel = (camera * height + y) * width + x
-                        if alpha >= scalar(constants.ALPHA_MIN) and place < stops[pixel]:
+                        if alpha >= scalar(alpha_min) and place < stops[pixel]:
                             t = transmittance[pixel] / (scalar(1.0) - alpha)
                             transmittance[pixel] = t
                             g = g_image[pixel]

@@ -15,6 +15,7 @@ from typing import Any
 import warp as wp
 
 from oasis_kernels import constants
+from oasis_kernels.constants import Rules
 from oasis_kernels.gaussian import falloff, whitened
 
 
@@ -40,8 +41,9 @@ def from_centre(pixel: int, whole: Any, remainder: Any):
 
 
 @functools.cache
-def blend(scalar: Any, channels: int) -> Any:
+def blend(scalar: Any, channels: int, rules: Rules) -> Any:
     """Kernel: the tiles' Gaussians -> image over the background, alpha, transmittance, and where each pixel ended."""
+    alpha_min, stop = rules.alpha_min, rules.transmittance_stop
     vec4 = wp.types.vector(length=4, dtype=scalar)
     color = wp.types.vector(length=channels, dtype=scalar)
 
@@ -93,7 +95,7 @@ def blend(scalar: Any, channels: int) -> Any:
             w = whitenings[g]
             opacity = opacities[g]
             rgb = colors[g]
-            cut = wp.log(opacity / scalar(constants.ALPHA_MIN)) + scalar(constants.CUT_SLACK)
+            cut = wp.log(opacity / scalar(alpha_min)) + scalar(constants.CUT_SLACK)
             for y in range(wp.max(area[1], box[1]), wp.min(area[3], box[3])):
                 dy = from_centre(y, center[1], center[3])
                 for x in range(wp.max(area[0], box[0]), wp.min(area[2], box[2])):
@@ -104,9 +106,9 @@ def blend(scalar: Any, channels: int) -> Any:
                         alpha = wp.min(opacity * falloff(-sigma), scalar(constants.ALPHA_MAX))
                         pixel = (camera * height + y) * width + x
                         before = transmittance[pixel]
-                        if alpha >= scalar(constants.ALPHA_MIN) and before > scalar(0.0):
+                        if alpha >= scalar(alpha_min) and before > scalar(0.0):
                             after = before * (scalar(1.0) - alpha)
-                            if after <= scalar(constants.TRANSMITTANCE_STOP):
+                            if after <= scalar(stop):
                                 transmittance[pixel] = -before
                                 stops[pixel] = place
                                 open_pixels -= 1

@@ -10,13 +10,15 @@ from typing import Any
 import warp as wp
 
 from oasis_kernels import constants
+from oasis_kernels.constants import Rules
 from oasis_kernels.gaussian import falloff, whitened
 from oasis_kernels.rasterize_forward import from_centre, lane_pixels
 
 
 @functools.cache
-def weigh(scalar: Any) -> Any:
+def weigh(scalar: Any, rules: Rules) -> Any:
     """Kernel: the tiles' Gaussians -> layers a pixel and, where `write`, their Gaussians and weights."""
+    alpha_min, stop = rules.alpha_min, rules.transmittance_stop
     vec4 = wp.types.vector(length=4, dtype=scalar)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -57,7 +59,7 @@ def weigh(scalar: Any) -> Any:
             center = centers[g]
             w = whitenings[g]
             opacity = opacities[g]
-            cut = wp.log(opacity / scalar(constants.ALPHA_MIN)) + scalar(constants.CUT_SLACK)
+            cut = wp.log(opacity / scalar(alpha_min)) + scalar(constants.CUT_SLACK)
             for y in range(wp.max(area[1], box[1]), wp.min(area[3], box[3])):
                 dy = from_centre(y, center[1], center[3])
                 for x in range(wp.max(area[0], box[0]), wp.min(area[2], box[2])):
@@ -68,9 +70,9 @@ def weigh(scalar: Any) -> Any:
                         alpha = wp.min(opacity * falloff(-sigma), scalar(constants.ALPHA_MAX))
                         pixel = y * width + x
                         before = transmittance[pixel]
-                        if alpha >= scalar(constants.ALPHA_MIN) and before > scalar(0.0):
+                        if alpha >= scalar(alpha_min) and before > scalar(0.0):
                             after = before * (scalar(1.0) - alpha)
-                            if after <= scalar(constants.TRANSMITTANCE_STOP):
+                            if after <= scalar(stop):
                                 transmittance[pixel] = -before
                             else:
                                 transmittance[pixel] = after

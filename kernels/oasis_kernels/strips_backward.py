@@ -9,13 +9,12 @@ from typing import NamedTuple
 
 from oasis_kernels.constants import Rules
 from oasis_kernels.native import PHASE_WORDS, Native, native
-from oasis_kernels.strips import LAYER, RECORD_CHANNELS, VECTORS, snippet
+from oasis_kernels.strips import LAYER, MAX_SHUFFLED, RECORD_CHANNELS, VECTORS, planes_from_pixels, snippet
 from oasis_kernels.strips_binning import GRID, STRIPS_OF
 from oasis_kernels.strips_forward import inside
 
 REDUCE = """
     // Sums of the lanes of four vectors: two rounds add neighbours and interleave, two more add quarters.
-    typedef float H __attribute__((ext_vector_type(8)));
     typedef float Q __attribute__((ext_vector_type(4)));
     typedef float QU __attribute__((ext_vector_type(4), aligned(4)));
     auto ab = [](V a, V b) -> V {
@@ -56,13 +55,16 @@ ADJOINT = """
             float* t = planes + y / 2 * block_size;
             memcpy(t, transmittance + s * plane + y / 2 * stride, stride * sizeof(float));
             memset(t + stride, 0, (@PLANES@ - 1) * stride * sizeof(float));
-            for (int side = 0; side < 2 && y + side < p.rows; side++) {
-                const long long pixel = corner + (y + side) * width;
-                if (@CHANNELS@) for (int x = 0; x < p.columns; x++) for (int k = 0; k < @CHANNELS@; k++)
-                    t[(k + 2) * stride + 2 * x + side] = g_image[(pixel + x) * @CHANNELS@ + k];
-                if (g_alpha) for (int x = 0; x < p.columns; x++) t[stride + 2 * x + side] = -g_alpha[pixel + x];
+            const int rows = p.rows - y < 2 ? 1 : 2;
+            const long long pixel[2] = {corner + y * width, corner + (y + 1) * width};
+            if (g_alpha) for (int side = 0; side < rows; side++) for (int x = 0; x < p.columns; x++)
+                t[stride + 2 * x + side] = -g_alpha[pixel[side] + x];
+            for (int x = 0; x < p.columns; x += @COLUMNS@) {
+                const int columns = p.columns - x < @COLUMNS@ ? p.columns - x : @COLUMNS@;
+                float* first = t + 2 * stride + 2 * x;
+                @READ@
             }
-            for (long long i = 0; i < stride; i += 16) {
+            for (long long i = 0; i < stride; i += @LANES@) {
                 V behind = load(t + stride + i);
                 for (int k = 0; k < @CHANNELS@; k++) {
                     const V g = load(t + (k + 2) * stride + i);
@@ -94,14 +96,14 @@ ADJOINT = """
                 const V u0 = fma((V)l.w1, dy, (V)(l.w0 * l.rx)), v0 = fma((V)l.w3, dy, (V)(l.w2 * l.rx));
                 float* t = planes + y / 2 * block_size + 2 * l.x0;
                 const int* ended = stop + y / 2 * stride + 2 * l.x0;
-                for (int x = l.x0; x < l.x1; x += 8, t += 16, ended += 16) {
-                    const V X = column + (float)(p.left + x);
+                V X = column + (float)(p.left + l.x0);
+                for (int x = l.x0; x < l.x1; x += @COLUMNS@, t += @LANES@, ended += @LANES@, X += (float)@COLUMNS@) {
                     const V d = X - l.whole_x;
                     const V u = fma((V)l.w0, d, u0), v = fma((V)l.w2, d, v0);
                     const V e = fma(-v, v, fma(-u, u, (V)l.lo));
-                    const I drawn = (e >= @CUT@) & (*(const IU*)ended > place)@INSIDE@;
+                    const I drawn = (e >= cut()) & (*(const IU*)ended > place)@INSIDE@;
                     const V raw = exp2(e);
-                    const V alpha = drawn ? (raw < @CAP@ ? raw : (V)@CAP@) : (V)(0.f);
+                    const V alpha = drawn ? (raw < cap() ? raw : cap()) : (V)(0.f);
                     const V before = load(t) / (1.f - alpha);
                     store(t, before);
                     const V weight = alpha * before;
@@ -117,7 +119,7 @@ ADJOINT = """
     });
     free(planes);
 
-    phase(state + 16, n_chunks, [&](long long c) {
+    share(state + 16, n_chunks, [&](long long c) {
         typedef double D __attribute__((ext_vector_type(8)));
         const long long first = c * chunk, end = first + chunk < n ? first + chunk : n;
         for (long long i0 = first; i0 < end; i0 += 8) {
@@ -159,6 +161,21 @@ ADJOINT = """
             }
         }
     });
+"""
+
+READ_FEW = """
+                H pixels[2][@CHANNELS@] = {};
+                for (int side = 0; side < rows; side++)
+                    copy(pixels[side], g_image + (pixel[side] + x) * @CHANNELS@, columns, @CHANNELS@ * sizeof(float));
+                V v[@CHANNELS@];
+                planes_of(pixels[0], pixels[1], v);
+                for (int k = 0; k < @CHANNELS@; k++) store(first + k * stride, v[k]);
+"""
+
+READ_MANY = """
+                for (int side = 0; side < rows; side++) for (int c = 0; c < columns; c++)
+                    for (int k = 0; k < @CHANNELS@; k++)
+                        first[k * stride + 2 * c + side] = g_image[(pixel[side] + x + c) * @CHANNELS@ + k];
 """
 
 BACKWARD = GRID | {
@@ -207,7 +224,7 @@ def draw_backward(wanted: Wanted, rules: Rules) -> Native:
         sums.append(f"""
                     const V step = {seen};
                     store(t + stride, fma(alpha, step, load(t + stride)));
-                    const V q = raw <= @CAP@ ? weight * step : (V)(0.f);
+                    const V q = raw <= cap() ? weight * step : (V)(0.f);
                     const V qu = q * u, qv = q * v;
                     m0 += q; m1 += qu; m2 += qv;
                     m3 = fma(qu, u, m3); m4 = fma(qu, v, m4); m5 = fma(qv, v, m5);""")
@@ -222,14 +239,17 @@ def draw_backward(wanted: Wanted, rules: Rules) -> Native:
         "CHANNELS": wanted.channels, "PLANES": wanted.channels + 2, "AHEAD": 8, "SHAPE": int(wanted.shape),
         "SUMMED": wanted.channels * wanted.color, "VALUES": len(values), "RECORD": len(padded),
     }  # fmt: skip
+    few = 0 < wanted.channels <= MAX_SHUFFLED
     body = (
-        ADJOINT.replace("@COLOR@", "r + 9" if in_record else "colors + index * @CHANNELS@")
+        ADJOINT.replace("@READ@", READ_FEW if few else READ_MANY)
+        .replace("@COLOR@", "r + 9" if in_record else "colors + index * @CHANNELS@")
         .replace("@ACCUMULATORS@", " ".join(f"V c{k} = {{}};" for k in channels))
         .replace("@SUMS@", "\n".join(sums))
         .replace("@REDUCE@", "\n".join(reduce))
         .replace("@INSIDE@", inside(rules))
     )
-    text = snippet(VECTORS + REDUCE + STRIPS_OF + LAYER + body, rules, **words)
+    shuffles = planes_from_pixels(wanted.channels) if few else ""
+    text = snippet(VECTORS + shuffles + REDUCE + STRIPS_OF + LAYER + body, rules, **words)
     return native(f"draw_backward_{wanted.channels}_{wanted.shape:d}{wanted.color:d}", BACKWARD, text)
 
 

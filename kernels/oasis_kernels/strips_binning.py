@@ -14,7 +14,7 @@ import functools
 
 from oasis_kernels.constants import Rules
 from oasis_kernels.native import PHASE_WORDS, Native, native
-from oasis_kernels.strips import snippet
+from oasis_kernels.strips import VECTORS, snippet
 
 GRID = {
     "n": "long long",  # cameras * per_camera, as all arrays of Gaussians
@@ -46,29 +46,34 @@ BINNING = GRID | {
 """Parameters of the kernels that fill lists."""
 
 STRIPS_OF = """
-    // Whole quotients by a multiplication: exact for numbers and divisors below 2^31.
-    const unsigned long long per_width = ~0ull / (unsigned long long)strip_width + 1;
-    const unsigned long long per_height = ~0ull / (unsigned long long)strip_height + 1;
-    auto divide = [](int x, unsigned long long per) -> int {
-        return (int)(((unsigned __int128)(unsigned)x * per) >> 64);
-    };
+    const int width_bits = __builtin_ctzll(strip_width), height_bits = __builtin_ctzll(strip_height);
     struct Span { int x0, y0, x1, y1; };  // strips, past the end
     auto span_of = [&](const int* box) -> Span {
-        return {divide(box[0], per_width), divide(box[1], per_height), divide(box[2] - 1, per_width) + 1,
-                divide(box[3] - 1, per_height) + 1};
+        return {box[0] >> width_bits, box[1] >> height_bits, ((box[2] - 1) >> width_bits) + 1,
+                ((box[3] - 1) >> height_bits) + 1};
+    };
+    // The strips of a span, one loop with one way out: most spans have one strip.
+    auto each_strip = [&](const Span& s, auto&& visit) {
+        long long strip = (long long)s.y0 * across + s.x0;
+        const int wide = s.x1 - s.x0, number = wide * (s.y1 - s.y0);
+        for (int k = 0, x = 0; k < number; k++) {
+            visit(strip);
+            x++;
+            strip += x == wide ? across - wide + 1 : 1;
+            x = x == wide ? 0 : x;
+        }
+        return number;
     };
     auto is_drawn = [](const int* box) -> bool { return box[0] < box[2] && box[1] < box[3]; };
 """
 
 COLLECT = """
-    // log2 of a normal number: exponent, and the series of artanh for a mantissa between sqrt(1/2) and sqrt(2).
-    auto log2 = [](float x) -> float {
-        int bits = __builtin_bit_cast(int, x);
-        const int above = (bits - 0x3f3504f3) >> 23;
-        const float m = __builtin_bit_cast(float, bits - (above << 23));
-        const float s = (m - 1.f) / (m + 1.f), q = s * s;
-        return (float)above + s * (2.885390082f + q * (0.9617966939f + q * (0.5770780164f + q * (0.4121985832f
-               + q * 0.3205988980f))));
+    // log2 of normal numbers: exponent, and the series of artanh for a mantissa between sqrt(1/2) and sqrt(2).
+    auto log2 = [](V x) -> V {
+        const I bits = __builtin_bit_cast(I, x), above = (bits - 0x3f3504f3) >> 23;
+        const V m = __builtin_bit_cast(V, bits - (above << 23)), s = (m - 1.f) / (m + 1.f), q = s * s;
+        return __builtin_convertvector(above, V) + s * (2.885390082f + q * (0.9617966939f + q * (0.5770780164f
+               + q * (0.4121985832f + q * 0.3205988980f))));
     };
     auto finite = [](float w) -> float { return w > 1e18f ? 1e18f : w < -1e18f ? -1e18f : w; };
     phase(state, n_chunks, [&](long long c) {
@@ -77,15 +82,20 @@ COLLECT = """
         memset(count, 0, n_strips * sizeof(int));
         long long pairs = 0, low = 0x7fffffffffffffffll, high = 0;
         long long camera = first / per_camera, next = (camera + 1) * per_camera;
+        float logs[@LANES@];
         int* of_camera = count + camera * across * down;
         for (long long i = first; i < end; i++) {
             if (i == next) { next += per_camera; of_camera += across * down; }
+            if ((i - first) % @LANES@ == 0) {
+                V some = (V)(1.f);
+                memcpy(&some, opacities + i, (end - i < @LANES@ ? end - i : @LANES@) * sizeof(float));
+                store(logs, log2(some));
+            }
             const int* box = boxes + 4 * i;
             pair_starts[i] = (int)pairs;
             if (!is_drawn(box)) continue;
             const Span s = span_of(box);
-            for (int y = s.y0; y < s.y1; y++) for (int x = s.x0; x < s.x1; x++) of_camera[y * across + x]++;
-            pairs += (long long)(s.x1 - s.x0) * (s.y1 - s.y0);
+            pairs += each_strip(s, [&](long long strip) { of_camera[strip]++; });
             low = depths[i] < low ? depths[i] : low;
             high = depths[i] > high ? depths[i] : high;
             float* r = records + 16 * i;
@@ -93,7 +103,7 @@ COLLECT = """
             r[0] = center[0]; r[1] = center[1]; r[2] = 0.5f - center[2]; r[3] = 0.5f - center[3];
             // sqrt(log2(e) / 2); capped, so that no lane far outside becomes infinite and poisons a masked sum
             for (int k = 0; k < 4; k++) r[4 + k] = finite(0.8493218003f * w[k]);
-            r[8] = log2(opacities[i]);
+            r[8] = logs[(i - first) % @LANES@];
             for (int k = 0; k < @IN_RECORD@; k++) r[9 + k] = colors[@IN_RECORD@ * i + k];
             memcpy(r + 12, box, 4 * sizeof(int));
         }
@@ -101,7 +111,7 @@ COLLECT = """
         lows[c] = low;
         highs[c] = high;
     });
-    phase(state + 16, 1, [&](long long) {
+    share(state + 16, 1, [&](long long) {
         long long pairs = 0, low = 0x7fffffffffffffffll, high = 0, place = 0;
         for (long long c = 0; c < n_chunks; c++) {
             const long long here = chunk_pairs[c];
@@ -152,10 +162,7 @@ FILL = """
             if (!is_drawn(box)) continue;
             const long long item = ((depths[i] - low) >> drop) << 31 | i;
             const Span s = span_of(box);
-            for (int y = s.y0; y < s.y1; y++) for (int x = s.x0; x < s.x1; x++) {
-                const long long strip = strip0 + y * across + x;
-                items[starts[strip] + place[strip]++] = item;
-            }
+            each_strip(s, [&](long long strip) { items[starts[strip0 + strip] + place[strip0 + strip]++] = item; });
         }
     });
 """
@@ -210,7 +217,7 @@ def collect(channels: int) -> Native:
         "lows": "long long*",  # [n_chunks]: least and largest depth bits
         "highs": "long long*",
     }
-    body = snippet(STRIPS_OF + COLLECT, Rules(), IN_RECORD=channels)
+    body = snippet(VECTORS + STRIPS_OF + COLLECT, Rules(), IN_RECORD=channels)
     return native(f"collect_{channels}", BINNING | extra, body)
 
 

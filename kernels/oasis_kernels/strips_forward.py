@@ -2,8 +2,8 @@
 
 What the generic kernel decides on alpha is decided on its logarithm here, and 1 - alpha is applied as T - alpha T: the
 same but for rounding. A pixel that has ended keeps its transmittance with a minus sign. The pixels' sums lie in planes
-on a scratch of each thread until the strip is done. Two rows of a plane are followed by the same rows of the next plane:
-planes apart by a power of two would compete for the same lines of the cache.
+on a scratch of each thread until the strip is done. Two rows of a plane are followed by the same rows of the next
+plane: planes apart by a power of two would compete for the same lines of the cache.
 """
 
 import functools
@@ -11,15 +11,20 @@ import math
 
 from oasis_kernels.constants import Rules
 from oasis_kernels.native import PHASE_WORDS, Native, native
-from oasis_kernels.strips import LAYER, RECORD_CHANNELS, VECTORS, snippet
+from oasis_kernels.strips import LAYER, MAX_SHUFFLED, RECORD_CHANNELS, VECTORS, pixels_from_planes, snippet
 from oasis_kernels.strips_binning import BINNING, FILL, SORT, STRIPS_OF
 
 DRAW = """
     const long long stride = 2 * (strip_width + @PAD@), block_size = @PLANES@ * stride;  // two rows of all planes
     const long long plane = (strip_height + 1) / 2 * stride;
+    struct Ended {
+        long long bits, at;  // lanes of the vector that begins there in a plane
+        int place;
+    };
     float* planes = nullptr;
+    Ended* ended = nullptr;
     Histogram* histograms = nullptr;
-    phase(state + 16, n_strips, [&](long long turn) {
+    share(state + 16, n_strips, [&](long long turn) {
         const long long s = order[turn];
         const Strip p = strip_of(s);
         const long long start = starts[s];
@@ -38,6 +43,7 @@ DRAW = """
         }
         if (!planes) {
             planes = (float*)malloc((strip_height + 1) / 2 * block_size * sizeof(float));
+            ended = (Ended*)malloc((strip_width * strip_height + 1) * sizeof(Ended));
             histograms = (Histogram*)malloc(3 * sizeof(Histogram));
         }
         int* list = ids + start;
@@ -47,7 +53,7 @@ DRAW = """
         int* stop = stops + s * plane;
         for (int y = 0; y < p.rows; y += 2) {
             float* t = planes + y / 2 * block_size;
-            for (int x = 0; x < strip_width + @PAD@; x += 8) {
+            for (int x = 0; x < strip_width + @PAD@; x += @COLUMNS@) {
                 const I inside = (column + (float)x < (float)p.columns) & (row + (float)y < (float)p.rows);
                 store(t + 2 * x, inside ? (V)(1.f) : (V)(-1.f));
                 if (keep) *(IU*)(stop + y / 2 * stride + 2 * x) = inside ? (I)(count) : (I)(0);
@@ -55,6 +61,16 @@ DRAW = """
             memset(t + stride, 0, @CHANNELS@ * stride * sizeof(float));
         }
         int open = p.rows * p.columns;
+        // Every third layer of a hand ends some pixel: a branch would be mispredicted at each. So vectors with pixels
+        // that end are noted without one, and looked at now and then. A pixel ends once, which bounds their number.
+        Ended* noted = ended;
+        auto look = [&] {
+            for (Ended* e = ended; e < noted; e++) for (long long bits = e->bits; bits; bits &= bits - 1) {
+                if (keep) stop[e->at + __builtin_ctzll(bits)] = e->place;
+                open--;
+            }
+            noted = ended;
+        };
         for (int place = 0; place < count && open > 0; place++) {
             __builtin_prefetch(records + 16ll * list[place + @AHEAD@ < count ? place + @AHEAD@ : place]);
             const float* r = records + 16ll * list[place];
@@ -65,39 +81,41 @@ DRAW = """
                 const V dy = (Y - l.whole_y) + l.ry;
                 const V u0 = fma((V)l.w1, dy, (V)(l.w0 * l.rx)), v0 = fma((V)l.w3, dy, (V)(l.w2 * l.rx));
                 float* t = planes + y / 2 * block_size + 2 * l.x0;
-                for (int x = l.x0; x < l.x1; x += 8, t += 16) {
-                    const V X = column + (float)(p.left + x);
+                long long at = y / 2 * stride + 2 * l.x0;
+                V X = column + (float)(p.left + l.x0);
+                for (int x = l.x0; x < l.x1; x += @COLUMNS@, t += @LANES@, at += @LANES@, X += (float)@COLUMNS@) {
                     const V d = X - l.whole_x;
                     const V u = fma((V)l.w0, d, u0), v = fma((V)l.w2, d, v0);
                     const V e = fma(-v, v, fma(-u, u, (V)l.lo));
                     const V before = load(t);
-                    const I drawn = (e >= @CUT@) & (before > 0.f)@INSIDE@;
+                    const I drawn = (e >= cut()) & (before > 0.f)@INSIDE@;
                     const V raw = exp2(e);
-                    const V alpha = drawn ? (raw < @CAP@ ? raw : (V)@CAP@) : (V)(0.f);
+                    const V alpha = drawn ? (raw < cap() ? raw : cap()) : (V)(0.f);
                     const V full = alpha * before;
                     const V after = before - full;
-                    const I ends = drawn & (after <= @STOP@);
+                    const I ends = drawn & (after <= last());
                     const V weight = ends ? (V)(0.f) : full;
                     store(t, ends ? -before : after);
                     @ADD@
-                    if (__builtin_expect(__builtin_reduce_or(ends) != 0, 0)) {
-                        for (int k = 0; k < 16; k++) if (ends[k]) {
-                            if (keep) stop[y / 2 * stride + 2 * x + k] = place;
-                            open--;
-                        }
-                    }
+                    noted->bits = bits_of(ends);
+                    noted->at = at;
+                    noted->place = place;
+                    noted += noted->bits != 0;
                 }
             }
+            if (place % 64 == 63) look();
         }
+        look();
 
-        for (int y = 0; y < p.rows; y++) {
-            const float* t = planes + y / 2 * block_size + y % 2;
-            float* out = picture + y * width * @CHANNELS@;
-            for (int x = 0; x < p.columns; x++) {
-                const float rest = __builtin_fabsf(t[2 * x]);
-                cover[y * width + x] = 1.f - rest;
-                for (int k = 0; k < @CHANNELS@; k++)
-                    *out++ = __builtin_fmaf(background[k], rest, t[(k + 1) * stride + 2 * x]);
+        for (int y = 0; y < p.rows; y += 2) {
+            const float* t = planes + y / 2 * block_size;
+            float* out[2] = {picture + y * width * @CHANNELS@, picture + (y + 1) * width * @CHANNELS@};
+            float* covered[2] = {cover + y * width, cover + (y + 1) * width};
+            const int rows = p.rows - y < 2 ? 1 : 2;
+            for (int x = 0; x < p.columns; x += @COLUMNS@, t += @LANES@) {
+                const int columns = p.columns - x < @COLUMNS@ ? p.columns - x : @COLUMNS@;
+                const V rest = __builtin_elementwise_abs(load(t));
+                @WRITE@
             }
         }
         if (keep) for (int y = 0; y < p.rows; y += 2) {
@@ -107,7 +125,31 @@ DRAW = """
         }
     });
     free(planes);
+    free(ended);
     free(histograms);
+"""
+
+WRITE_FEW = """
+                V v[@CHANNELS@];
+                for (int k = 0; k < @CHANNELS@; k++) v[k] = fma((V)background[k], rest, load(t + (k + 1) * stride));
+                H pixels[2][@CHANNELS@];
+                pixels0(v, pixels[0]);
+                pixels1(v, pixels[1]);
+                const V one = 1.f - rest;
+                const H alpha[2] = {one.even, one.odd};
+                for (int side = 0; side < rows; side++) {
+                    copy(out[side] + x * @CHANNELS@, pixels[side], columns, @CHANNELS@ * sizeof(float));
+                    copy(covered[side] + x, alpha + side, columns, sizeof(float));
+                }
+"""
+
+WRITE_MANY = """
+                for (int side = 0; side < rows; side++) for (int c = 0; c < columns; c++) {
+                    float* pixel = out[side] + (x + c) * @CHANNELS@;
+                    for (int k = 0; k < @CHANNELS@; k++)
+                        pixel[k] = background[k] * rest[2 * c + side] + t[(k + 1) * stride + 2 * c + side];
+                    covered[side][x + c] = 1.f - rest[2 * c + side];
+                }
 """
 
 PICTURE = {
@@ -139,8 +181,10 @@ def draw(channels: int, rules: Rules) -> Native:
         f"store(t + {k + 1} * stride, fma((V)color[{k}], weight, load(t + {k + 1} * stride)));" for k in range(channels)
     )
     color = "r + 9" if channels <= RECORD_CHANNELS else "colors + (long long)list[place] * @CHANNELS@"
-    body = DRAW.replace("@COLOR@", color).replace("@ADD@", add).replace("@INSIDE@", inside(rules))
-    text = VECTORS + STRIPS_OF + LAYER + FILL + SORT + body
+    few = channels <= MAX_SHUFFLED
+    body = DRAW.replace("@WRITE@", WRITE_FEW if few else WRITE_MANY).replace("@COLOR@", color)
+    body = body.replace("@ADD@", add).replace("@INSIDE@", inside(rules))
+    text = VECTORS + (pixels_from_planes(channels) if few else "") + STRIPS_OF + LAYER + FILL + SORT + body
     words = {"CHANNELS": channels, "PLANES": channels + 1, "AHEAD": 8}
     return native(f"draw_{channels}", BINNING | PICTURE, snippet(text, rules, **words))
 

@@ -1,8 +1,8 @@
 import pytest
 import torch
 from rasterization_scenes import ordinary_scene
-from reference import rasterization as twin
 
+from oasis_warp.certify.twins import rasterization as twin
 from oasis_warp.ops import blend_colors, blend_weights, rasterization
 
 

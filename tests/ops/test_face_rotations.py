@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from reference import face_rotations as twin
 
+from oasis_warp.certify.twins import face_rotations as twin
 from oasis_warp.core.rotation import from_axis_angle, from_matrix, multiply, to_matrix
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.correctives import corrected_rest
@@ -182,6 +182,16 @@ def test_a_sheared_face_turns_by_its_polar_factor():
     shear = torch.tensor([[1.0, 0.8, 0], [0, 1, 0], [0, 0, 1]], dtype=torch.float64)
     got = face_rotations(rest, rest @ shear.T, torch.tensor([[0, 1, 2]])).face_quats
     assert angle_between(got, from_matrix(about([0.0, 0, 1], -math.atan(0.4)))).max() < 1e-15
+
+
+def test_the_area_ratio_of_a_vertex_is_that_of_its_faces_together():
+    rest, posed, faces = sheet(3)
+    posed[faces[0]] = posed[faces[0]].mean(0)  # one collapses: it turns nothing but still counts
+    got = face_rotations(rest, posed, faces).vertex_area_ratio
+    before, after = (twin.plane(vertices, faces).area for vertices in (rest, posed))
+    around = torch.stack([(faces == v).any(1) for v in range(len(rest))]).double()
+    # The damping pulls ratios to one by its share of the area, 1e-6 and more for thin faces.
+    torch.testing.assert_close(got, (around @ after) / (around @ before), rtol=1e-5, atol=1e-5)
 
 
 def test_a_vertex_mean_weighs_faces_by_their_area_at_rest():

@@ -6,8 +6,8 @@ import weakref
 
 import pytest
 import torch
-from reference import mesh_posing as twin
 
+from oasis_warp.certify.twins import mesh_posing as twin
 from oasis_warp.core.rotation import from_axis_angle, multiply, to_matrix
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.skinning import rest_hand, skin
@@ -101,6 +101,90 @@ def test_a_second_derivative_is_refused():
     (first,) = torch.autograd.grad(squares, arguments["posed_vertices"], create_graph=True)
     with pytest.raises(RuntimeError, match="pose_on_mesh: expected one derivative"):
         first.sum().backward()
+
+
+def with_vertices(arguments, seed=0, n=9):
+    """`arguments` of a scene with Gaussians that ride on vertices, several on some, in front."""
+    generator = torch.Generator().manual_seed(100 + seed)
+    like, n_vertices = arguments["quats"], len(arguments["posed_vertices"])
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(like)
+
+    return arguments | {
+        "quats": torch.cat([normal(n, 4), arguments["quats"]]),
+        "scales": torch.cat([normal(n, 3).exp(), arguments["scales"]]),
+        "vertex_index": torch.randint(n_vertices - 3, (n,), generator=generator).to(like.device),
+        "offsets": normal(n, 3),
+        "vertex_area_ratio": normal(n_vertices).exp(),
+    }
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("n", [1, 9, 50])
+def test_gaussians_on_vertices_come_first_and_are_those_of_their_twin(n, law, dtype, device):
+    ours = with_vertices(scene(n, dtype=dtype, device=device), n, n)
+    theirs = {k: v.cpu().double() if v.is_floating_point() else v.cpu() for k, v in ours.items()}
+    floats = (*FLOATS, "offsets", "vertex_area_ratio")
+    for name in floats:
+        ours[name].requires_grad_()
+        theirs[name].requires_grad_()
+    got = pose_on_mesh(**ours, scale_law=law)
+    want = twin.pose_on_mesh(**theirs, scale_law=law)
+    tolerance = 2e-7 if dtype == torch.float32 else 1e-14
+    generator = torch.Generator().manual_seed(n)
+    loss = twin_loss = 0
+    for a, b in zip(got, want, strict=True):
+        assert a.dtype == dtype and rel(a.detach(), b.detach()) < tolerance
+        weights = torch.randn(b.shape, generator=generator, dtype=torch.float64)
+        loss, twin_loss = loss + (a * weights.to(a)).sum(), twin_loss + (b * weights).sum()
+    grads = torch.autograd.grad(loss, [ours[name] for name in floats])
+    twin_grads = torch.autograd.grad(twin_loss, [theirs[name] for name in floats])
+    for name, a, b in zip(floats, grads, twin_grads, strict=True):
+        if name.endswith("area_ratio") and law == "none":
+            assert not a.any()
+        else:
+            assert rel(a, b) < 10 * tolerance, name
+
+
+def test_gradcheck_passes_for_gaussians_on_vertices():
+    names = (*FLOATS, "offsets", "vertex_area_ratio")
+    arguments = with_vertices(scene(3, n_gaussians=2), n=3)
+    floats = [arguments.pop(name).requires_grad_() for name in names]
+
+    def posed(*values):
+        return tuple(pose_on_mesh(**dict(zip(names, values, strict=True)), **arguments))
+
+    assert torch.autograd.gradcheck(posed, floats)
+
+
+def test_gaussians_on_vertices_alone_need_no_barycentrics():
+    arguments = with_vertices(scene(4))
+    both = pose_on_mesh(**arguments)
+    for name, n in {"face_index": 0, "barycentrics": 0, "quats": 9, "scales": 9}.items():
+        arguments[name] = arguments[name][:n]
+    got = pose_on_mesh(**arguments)
+    assert len(got.means) == 9 and all(torch.equal(a, b[:9]) for a, b in zip(got, both, strict=True))
+
+
+def test_another_mesh_for_the_same_riders_is_noticed():
+    # Who hangs on which vertex is remembered with `face_index`, but follows from the faces too.
+    arguments = with_vertices(scene(5))
+    arguments["posed_vertices"].requires_grad_()
+    weights = torch.arange(49.0)[:, None].double()
+
+    def gradient(arguments):
+        return torch.autograd.grad((pose_on_mesh(**arguments).means * weights).sum(), arguments["posed_vertices"])[0]
+
+    before = gradient(arguments)
+    fresh = {"face_index": arguments["face_index"].clone()}
+    for change in ({"faces": arguments["faces"].flip(1)}, {"vertex_index": arguments["vertex_index"].flip(0)}):
+        changed = gradient(arguments | change)
+        assert not torch.equal(changed, before)
+        assert torch.equal(changed, gradient(arguments | change | fresh))
+    arguments["faces"][:] = arguments["faces"].flip(1).clone()
+    assert torch.equal(gradient(arguments), gradient(arguments | fresh))
 
 
 def on_a_sheet(seed, dtype=torch.float64):
@@ -376,11 +460,29 @@ def test_values_that_are_no_numbers_are_refused_by_name(name, value):
         ({"area_ratio": torch.zeros(12).double()}, r"area_ratio: expected shape \[11\], got \[12\]. One ratio a face."),
         ({"quats": torch.zeros(40, 3).double()}, r"quats: expected shape \[40, 4\], got \[40, 3\].*wxyz"),
         ({"scales": torch.zeros(40, 3)}, "scales: expected torch.float64 on cpu, got torch.float32 on cpu."),
+        ({"offsets": torch.zeros(9, 3).double()}, "offsets: expected None, got a tensor. It goes with vertex_index."),
+        ({"vertex_index": torch.zeros(9).long()}, "offsets: expected a tensor, got None. It goes with vertex_index."),
     ],
 )
 def test_a_wrong_argument_is_named_with_what_was_expected(change, message, as_shipped):
     with pytest.raises(ValueError, match="^" + message):
         pose_on_mesh(**scene(0) | change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"vertex_index": torch.zeros(9, 1).long()}, r"vertex_index: expected shape \[P\], got \[9, 1\]. One vertex a"),
+        ({"vertex_index": torch.full((9,), 14)}, r"vertex_index: expected indices in 0 .. 13 \(14 vertices\)"),
+        ({"offsets": torch.zeros(8, 3).double()}, r"offsets: expected shape \[9, 3\], got \[8, 3\]."),
+        ({"offsets": torch.full((9, 3), math.nan).double()}, "offsets: expected finite values"),
+        ({"vertex_area_ratio": torch.zeros(13).double()}, r"vertex_area_ratio: expected shape \[14\], got \[13\]."),
+        ({"quats": torch.zeros(40, 4).double()}, r"quats: expected shape \[49, 4\], got \[40, 4\]."),
+    ],
+)
+def test_a_wrong_argument_of_gaussians_on_vertices_is_named(change, message, as_shipped):
+    with pytest.raises(ValueError, match="^" + message):
+        pose_on_mesh(**with_vertices(scene(0)) | change)
 
 
 def test_without_validation_values_go_through_and_indices_do_not():

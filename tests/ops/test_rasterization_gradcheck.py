@@ -8,8 +8,8 @@ the Jacobian's clamp, while gradcheck's steps of 1e-6 move any of them by about 
 import pytest
 import torch
 from rasterization_scenes import frontal_scene
-from reference import rasterization as twin
 
+from oasis_warp.certify.twins import rasterization as twin
 from oasis_warp.ops import rasterization
 
 MARGIN = 1e-3

@@ -3,8 +3,8 @@
 import pytest
 import torch
 from rasterization_scenes import ordinary_scene
-from reference.spherical_harmonics import basis
 
+from oasis_warp.certify.twins.harmonics import seen_colors as expected_colors
 from oasis_warp.ops import rasterization
 from oasis_warp.ops.rasterization import seen_colors
 
@@ -23,22 +23,11 @@ def draw(scene, colors, **options):
     )  # fmt: skip
 
 
-def expected_colors(scene, coefficients, degree):
-    centres = torch.linalg.inv(scene.viewmats)[:, :3, 3]
-    per_camera = coefficients if coefficients.dim() == 4 else coefficients.expand(len(centres), *coefficients.shape)
-    return torch.stack(
-        [
-            ((basis(degree, scene.means - centre)[..., None] * own[:, : (degree + 1) ** 2]).sum(1) + 0.5).clamp_min(0)
-            for centre, own in zip(centres, per_camera, strict=True)
-        ]
-    )
-
-
 @pytest.mark.parametrize("per_camera", [False, True])
 @pytest.mark.parametrize("degree", range(4))
 def test_harmonics_are_drawn_as_the_colours_they_stand_for(degree, per_camera, device):
     scene, coefficients = scene_and_coefficients(per_camera=per_camera)
-    expected, alphas, _ = draw(scene.to(device), expected_colors(scene, coefficients, degree).to(device))
+    expected, alphas, _ = draw(scene.to(device), expected_colors(degree, scene.means, coefficients, scene.viewmats).to(device))
     got, got_alphas, _ = draw(scene.to(device), coefficients.to(device), sh_degree=degree)
     torch.testing.assert_close(got, expected, rtol=0, atol=1e-12)
     assert torch.equal(got_alphas, alphas)
@@ -76,7 +65,8 @@ def test_a_far_camera_sees_the_same_colours(device):
     # Means on a grid that float32 still holds at that distance.
     near = scene.with_(means=(scene.means * 1024).round() / 1024).to(device)
     moved = near.with_(means=near.means + shift.to(device), viewmats=far.to(torch.float32).to(device))
-    truth = expected_colors(moved.to("cpu").to(torch.float64), coefficients.double(), 3)
+    exact = moved.to("cpu").to(torch.float64)
+    truth = expected_colors(3, exact.means, coefficients.double(), exact.viewmats)
     got = seen_colors(3, moved.means, coefficients.to(device), moved.viewmats, True).cpu()
     assert (got - truth).norm() <= 1e-6 * truth.norm()
 

@@ -1,11 +1,36 @@
+import numpy as np
 import pytest
 import torch
-from reference.spherical_harmonics import basis
+from scipy.special import sph_harm_y
 
+from oasis_warp.certify.twins import harmonics as twin
 from oasis_warp.ops import spherical_harmonics
 from oasis_warp.ops.spherical_harmonics import _forward
 
 DEGREES = range(4)
+
+
+def textbook_basis(degree, directions):
+    """[N, (degree + 1)^2] in float64 by SciPy; directions [N, 3] need not be unit."""
+    x, y, z = torch.nn.functional.normalize(directions.double(), dim=-1).numpy().T
+    polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
+    columns = []
+    for degree_l in range(degree + 1):
+        for m in range(-degree_l, degree_l + 1):
+            value = sph_harm_y(degree_l, abs(m), polar, azimuth)  # carries the Condon-Shortley sign
+            if m < 0:
+                columns.append(np.sqrt(2) * value.imag)
+            elif m == 0:
+                columns.append(value.real)
+            else:
+                columns.append(np.sqrt(2) * value.real)
+    return torch.from_numpy(np.stack(columns, -1))
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_the_twin_is_the_textbook_basis(degree):
+    directions, _ = directions_and_coefficients(degree)
+    torch.testing.assert_close(twin.basis(degree, directions), textbook_basis(degree, directions))
 
 
 def directions_and_coefficients(degree, n=50, seed=0, dtype=torch.float64):
@@ -20,7 +45,7 @@ def directions_and_coefficients(degree, n=50, seed=0, dtype=torch.float64):
 @pytest.mark.parametrize("degree", DEGREES)
 def test_sums_are_those_of_the_textbook_basis(degree, device):
     directions, coefficients = directions_and_coefficients(degree)
-    expected = (basis(degree, directions)[..., None] * coefficients).sum(1)
+    expected = (textbook_basis(degree, directions)[..., None] * coefficients).sum(1)
     got = spherical_harmonics(degree, directions.to(device), coefficients.to(device)).cpu()
     torch.testing.assert_close(got, expected, rtol=1e-12, atol=1e-12)
 

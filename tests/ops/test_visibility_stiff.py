@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from oasis_warp.core.hand_model import BACK_SIDE, PALM_SIDE
-from oasis_warp.ops import depth_map, depth_visibility, visibility
+from oasis_warp.ops import _depth_buffer, depth_map, depth_visibility
 
 EYE = torch.eye(4, dtype=torch.float64)
 
@@ -156,7 +156,8 @@ def test_what_is_nearer_than_the_near_plane_is_not_seen():
 def test_a_mesh_without_faces_hides_nothing_and_no_points_give_an_empty_answer(n_points):
     vertices = torch.zeros(4, 3)
     nothing = torch.zeros(0, 3, dtype=torch.int64)
-    points = (torch.rand(n_points, 3) - 0.5 + torch.tensor([0, 0, 2.0])).requires_grad_()
+    inside = 0.5 * torch.rand(n_points, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0, 0, 2.0])
+    points = inside.requires_grad_()
     got = depth_visibility(points, vertices, nothing, pinhole(20.0, 16, 12, torch.float32), EYE.float(), 16, 12)
     assert got.visibility.shape == (n_points,) and (got.visibility == 1).all()
     assert got.depth_map.shape == (12, 16) and got.depth_map.isinf().all() and (got.face_ids == -1).all()
@@ -209,11 +210,11 @@ def test_a_curved_surface_does_not_shadow_itself():
 def test_the_kernel_for_cuda_fills_the_same_buffer_as_the_one_for_the_cpu(hand, monkeypatch):
     vertices, viewmat, K = palm_view(hand, 128)
     twice = torch.cat([hand.faces, hand.faces])  # every pixel is a tie
-    strips = depth_map(vertices, twice, viewmat, K, 128, 128)
-    monkeypatch.setattr(visibility, "_fill_strips", visibility._fill_faces)
+    vectors = depth_map(vertices, twice, viewmat, K, 128, 128)
+    monkeypatch.setattr(_depth_buffer, "draw_by_vectors", _depth_buffer.draw_by_faces)
     faces = depth_map(vertices, twice, viewmat, K, 128, 128)
-    assert (strips.face_ids >= 0).any() and (strips.face_ids < len(hand.faces)).all()
-    assert all(torch.equal(a, b) for a, b in zip(strips, faces, strict=True))
+    assert (vectors.face_ids >= 0).any() and (vectors.face_ids < len(hand.faces)).all()
+    assert all(torch.equal(a, b) for a, b in zip(vectors, faces, strict=True))
 
 
 def palm_view(hand, size, distance=0.5):

@@ -28,8 +28,8 @@ from oasis_warp.bench.yardstick import make_yardstick
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.ops._rules import using
 
-SWEPT = ("rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh")
-"""Operators that have knobs of their own: `blend_weights` draws by the rasterizer's."""
+SWEPT = ("rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "skin")
+"""Operators that have knobs of their own: `blend_weights` draws by the rasterizer's, posing is two of these."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +169,7 @@ def make_row(
         scene=scene.name,
         width=scene.width,
         height=scene.height,
-        gaussians=len(scene.means) if is_scene else len(scene.quats) if operator.name == "pose_on_mesh" else None,
+        gaussians=len(scene.means if is_scene else scene.quats),
         faces=None if is_scene else len(scene.faces),
         op=operator.name,
         pass_=pass_,

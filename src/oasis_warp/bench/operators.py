@@ -18,6 +18,7 @@ from oasis_warp.ops import (
     face_rotations,
     pose_on_mesh,
     rasterization,
+    skin,
 )
 
 Outputs = tuple[Tensor, ...]
@@ -39,7 +40,7 @@ class Weighted:
 
 @dataclass(frozen=True)
 class Operator:
-    """One public function of `oasis_warp.ops`."""
+    """One public function of `oasis_warp.ops`, or, as "posing", face_rotations and pose_on_mesh in a row."""
 
     name: str
     scene: type[Scene] | type[MeshScene]
@@ -51,6 +52,8 @@ class Operator:
     """Fields of the scene that gradients are taken by; none where the operator has no gradient."""
     graded: int | None = None
     """How many of the outputs the loss is made of; all when None."""
+    vectorised: bool = True
+    """Whether it has other kernels for the CPU than vectorised ones."""
     image: bool = False
     """Whether the first output is an image in [0, 1]."""
     comparable: Callable[[Outputs], Outputs] = field(default=as_it_is)
@@ -125,9 +128,23 @@ def _pose_on_mesh(scene: MeshScene, **options: Any) -> Outputs:
     return tuple(
         pose_on_mesh(
             scene.posed_vertices, scene.faces, scene.face_index, scene.barycentrics, scene.vertex_quats,
-            scene.area_ratio, scene.quats, scene.scales, **options,
+            scene.area_ratio, scene.quats, scene.scales, vertex_index=scene.vertex_index, offsets=scene.offsets,
+            vertex_area_ratio=scene.vertex_area_ratio, **options,
         )
     )  # fmt: skip
+
+
+def _skin(scene: MeshScene, **options: Any) -> Outputs:
+    skinned = skin(scene.rest_vertices, scene.covars, scene.skin_weights, scene.transforms, **options)
+    return skinned.means, skinned.covars
+
+
+def _posing(scene: MeshScene, **options: Any) -> Outputs:
+    vertex_quats, _, area_ratio, vertex_area_ratio = _face_rotations(scene, **options)
+    turned = replace(
+        scene, vertex_quats=vertex_quats, area_ratio=area_ratio, vertex_area_ratio=vertex_area_ratio
+    )  # fmt: skip
+    return _pose_on_mesh(turned, **options)
 
 
 OPERATORS = {
@@ -142,7 +159,7 @@ OPERATORS = {
         ),
         Operator(
             "blend_colors", Scene, lambda scene: (blend_colors(scene.weights, scene.colors)[None],),
-            _torch_blend_colors, leaves=("colors",), image=True, prepare=_weighted,
+            _torch_blend_colors, leaves=("colors",), vectorised=False, image=True, prepare=_weighted,
         ),
         Operator(
             "depth_map", MeshScene, _depth_map, lambda scene: (torch_mesh.depth_map(scene).depth,),
@@ -158,7 +175,18 @@ OPERATORS = {
         ),
         Operator(
             "pose_on_mesh", MeshScene, _pose_on_mesh, lambda scene: tuple(torch_mesh.pose_on_mesh(scene)),
-            leaves=("posed_vertices", "barycentrics", "vertex_quats", "area_ratio", "quats", "scales"),
+            leaves=(
+                "posed_vertices", "barycentrics", "vertex_quats", "area_ratio", "vertex_area_ratio", "offsets",
+                "quats", "scales",
+            ),
+        ),
+        Operator(
+            "skin", MeshScene, _skin, lambda scene: tuple(torch_mesh.skin(scene)),
+            leaves=("rest_vertices", "covars", "skin_weights", "transforms"), vectorised=False,
+        ),
+        Operator(
+            "posing", MeshScene, _posing, lambda scene: tuple(torch_mesh.pose(scene)),
+            leaves=("rest_vertices", "posed_vertices", "barycentrics", "offsets", "quats", "scales"),
         ),
     )
 }  # fmt: skip

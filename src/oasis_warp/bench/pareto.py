@@ -32,6 +32,7 @@ def plot_operator(rows: Sequence[Row], op: str, path: Path, scenes: Sequence[str
         path: The picture to write; its suffix says the format.
         scenes: Those to draw; all when None.
     """
+    from matplotlib import colormaps
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -40,7 +41,7 @@ def plot_operator(rows: Sequence[Row], op: str, path: Path, scenes: Sequence[str
     names = list(dict.fromkeys(g.scene for g in shown))
     passes = list(dict.fromkeys(g.pass_ for g in shown))
     knobs = list(dict.fromkeys(row.knob for g in shown for row in g.rows if not row.is_default))
-    colors = {knob: f"C{k}" for k, knob in enumerate(knobs)}
+    colors = {knob: colormaps["tab20"](k) for k, knob in enumerate(knobs)}
     figure = Figure(figsize=(4.4 * len(passes) + 1.8, 3.2 * len(names) + 0.4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(names), len(passes), squeeze=False)
@@ -54,8 +55,9 @@ def plot_operator(rows: Sequence[Row], op: str, path: Path, scenes: Sequence[str
         figure.savefig(part, dpi=110)
 
 
-def draw_panel(axes: Any, group: Group, colors: dict[str, str]) -> None:
+def draw_panel(axes: Any, group: Group, colors: dict[str, Any]) -> None:
     """One operator on one scene in one pass, on matplotlib's `axes`."""
+    from matplotlib.ticker import LogFormatter, LogLocator
 
     def height(row: Row) -> float:
         return max(row.error, LEAST_ERROR)
@@ -78,7 +80,10 @@ def draw_panel(axes: Any, group: Group, colors: dict[str, str]) -> None:
         axes.axhline(floor, color="0.4", linestyle="--", linewidth=0.8)
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(9, 9)))
+    axes.xaxis.set_minor_formatter("")
     axes.set_title(f"{group.scene}, {group.pass_}", fontsize=9)
     axes.set_xlabel("median time [ms]", fontsize=8)
     axes.set_ylabel(WORDS[group.pass_], fontsize=8)
-    axes.tick_params(labelsize=7)
+    axes.tick_params(which="both", labelsize=7)

@@ -26,9 +26,10 @@ class Row:
     scene: str
     width: int
     height: int
-    gaussians: int | None
-    """In the scene; None for operators on meshes alone."""
+    gaussians: int
+    """In the scene."""
     faces: int | None
+    """Of its mesh, where it has one."""
     op: str
     pass_: str
     """Called `pass` in files: "forward" or "forward + backward"."""

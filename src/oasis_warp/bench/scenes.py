@@ -5,7 +5,7 @@ Every number is a float32 number, so that both precisions see the same scene. A 
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -17,27 +17,34 @@ from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.skinning import rest_hand, skin
+from oasis_warp.hand.skinning import bone_transforms, rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import face_rotations
 from oasis_warp.render.cameras import orbit_camera
 
 PALM_TO_CAMERA = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """Orientation of the hand, fingers up."""
+HAND_GAUSSIANS = 36_881
 MELANIN = 0.05
 """Skin tone of the hand."""
 TEXTURE = 0.05
 """Standard deviation of the seeded noise on its colours [sRGB]: a bare mean hand has no detail to lose."""
 
+OFFSET = 5e-4
+"""Standard deviation of what Gaussians on vertices are shifted by [m]."""
+VERTEX_GAUSSIAN = 1e-3
+"""Size of the Gaussians that are skinned with their vertices [m]."""
 POINT_NOISE = 0.002
 """Standard deviation of the points of a mesh scene about its vertices [m]: visibility takes all values there."""
+
+Bundle = TypeVar("Bundle", bound="_Tensors")
 
 
 @dataclass(frozen=True)
 class _Tensors:
     """A bundle of tensors and plain numbers."""
 
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
+    def to(self: Bundle, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Bundle:
         """The same on another device; floating-point tensors in another precision."""
         moved: dict[str, Any] = {}
         for field in fields(self):
@@ -67,7 +74,7 @@ class Scene(_Tensors):
 
 @dataclass(frozen=True)
 class MeshScene(_Tensors):
-    """A mesh at rest and posed, Gaussians that ride on its faces, points round it, and one camera."""
+    """A mesh at rest and posed, Gaussians on its vertices (P) and faces (Q), its bones, points round it, a camera."""
 
     name: str
     seed: int
@@ -75,14 +82,22 @@ class MeshScene(_Tensors):
     posed_vertices: Float[Tensor, "V 3"]
     faces: Int[Tensor, "F 3"]
     vertex_quats: Float[Tensor, "V 4"]
-    """This and the next as `face_rotations` gives them, rounded from float64."""
+    """This and the next two as `face_rotations` gives them, rounded from float64."""
     area_ratio: Float[Tensor, "F"]
+    vertex_area_ratio: Float[Tensor, "V"]
+    covars: Float[Tensor, "V 3 3"]
+    """Of a Gaussian at each vertex [m^2]."""
+    skin_weights: Float[Tensor, "V J"]
+    transforms: Float[Tensor, "J 3 4"]
+    """Of the bones, rest to posed."""
     points: Float[Tensor, "V 3"]
     """Whose visibility is asked: the posed vertices, moved at random."""
+    vertex_index: Int[Tensor, "P"]
+    offsets: Float[Tensor, "P 3"]
     face_index: Int[Tensor, "Q"]
     barycentrics: Float[Tensor, "Q 3"]
-    quats: Float[Tensor, "Q 4"]
-    scales: Float[Tensor, "Q 3"]
+    quats: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
     viewmat: Float[Tensor, "4 4"]
     K: Float[Tensor, "3 3"]
     width: int
@@ -102,23 +117,27 @@ def hand_scenes(size: int = 256, seed: int = 0) -> tuple[Scene, MeshScene]:
     canonical = anchors.with_colors(vertex_to_gaussians(skin_colors, hand.faces, anchors))
     gaussians = pose_gaussians(canonical, hand.faces, rest.vertices, posed)
     camera = orbit_camera(posed, 0.0, size=size)
-    on_faces = slice(len(anchors.vertex_index), None)
     drawn = Scene(
         "hand", seed, *gaussians, camera.viewmat[None], camera.K[None], torch.zeros(1, 3), size, size
     )  # fmt: skip
     points = posed + POINT_NOISE * torch.randn(posed.shape, generator=generator)
+    offsets = OFFSET * torch.randn(len(anchors.vertex_index), 3, generator=generator)
+    axes = VERTEX_GAUSSIAN * torch.randn(len(posed), 3, 3, generator=generator)
+    rotations, translations = bone_transforms(hand, rest.joints, pose)
     mesh = MeshScene(
-        "hand", seed, rest.vertices, posed, hand.faces, *turns(rest.vertices, posed, hand.faces), points,
-        anchors.face_index, anchors.barycentrics, anchors.quats[on_faces], anchors.scales[on_faces],
+        "hand", seed, rest.vertices, posed, hand.faces, *turns(rest.vertices, posed, hand.faces),
+        axes @ axes.transpose(1, 2), hand.weights, torch.cat([rotations, translations[..., None]], -1), points,
+        anchors.vertex_index, offsets, anchors.face_index, anchors.barycentrics, anchors.quats, anchors.scales,
         camera.viewmat, camera.K, size, size,
     )  # fmt: skip
     return drawn, mesh
 
 
-def turns(rest_vertices: Tensor, posed_vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+def turns(rest_vertices: Tensor, posed_vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Vertex quaternions and area ratios, the same whatever becomes of the float32 kernels."""
     turned = face_rotations(rest_vertices.double(), posed_vertices.double(), faces)
-    return turned.vertex_quats.to(rest_vertices), turned.area_ratio.to(rest_vertices)
+    vertex_quats, _, area_ratio, vertex_area_ratio = (part.to(rest_vertices) for part in turned)
+    return vertex_quats, area_ratio, vertex_area_ratio
 
 
 def hand(size: int = 256, seed: int = 0) -> Scene:
@@ -223,8 +242,8 @@ def slivers(size: int = 256, seed: int = 0) -> MeshScene:
     axis = normalize(torch.tensor([1.0, 0.7, 0.4]), dim=0)
     middle = mesh.posed_vertices.mean(0)
     posed = mesh.posed_vertices - 0.999 * ((mesh.posed_vertices - middle) @ axis)[:, None] * axis
-    vertex_quats, area_ratio = turns(mesh.rest_vertices, posed, mesh.faces)
-    points = posed + (mesh.points - mesh.posed_vertices)
+    vertex_quats, area_ratio, vertex_area_ratio = turns(mesh.rest_vertices, posed, mesh.faces)
     return replace(
-        mesh, name="slivers", posed_vertices=posed, vertex_quats=vertex_quats, area_ratio=area_ratio, points=points
-    )
+        mesh, name="slivers", posed_vertices=posed, vertex_quats=vertex_quats, area_ratio=area_ratio,
+        vertex_area_ratio=vertex_area_ratio, points=posed + (mesh.points - mesh.posed_vertices),
+    )  # fmt: skip

@@ -1,15 +1,16 @@
 """How fast every operator is: beside a yardstick, the same in torch, and other rasterizers, in one run."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any
 
 import torch
 
 from oasis_warp.bench.errors import relative_error
 from oasis_warp.bench.operators import OPERATORS, Exact, Operator, Outputs, Pass, exact, forward, gradients
 from oasis_warp.bench.rows import commit, device_name, versions
+from oasis_warp.bench.scalar import generic_kernels
 from oasis_warp.bench.scenes import MeshScene, Scene, hand_scenes, surfels
 from oasis_warp.bench.timing import Timed, peak_megabytes, time_together
 from oasis_warp.bench.yardstick import make_yardstick
@@ -25,10 +26,12 @@ class SpeedRow:
     pass_: str
     """Called `pass` in files."""
     way: str
-    """"warp" is ours; "scalar" our generic kernels in float32, one pixel or item at a time; "torch"; or a peer."""
+    """"warp" is ours, "scalar" our generic kernels in float32 on the CPU, "torch" the same in torch; or a peer."""
     scene: str
-    gaussians: int | None
+    gaussians: int
+    """In the scene."""
     faces: int | None
+    """Of its mesh, where it has one."""
     width: int
     height: int
     device: str
@@ -51,8 +54,19 @@ class SpeedRow:
     versions: str
 
 
-Way = Callable[[Operator], Callable[..., Outputs] | None]
-"""From an operator to what computes it in another way, where there is one."""
+@dataclass(frozen=True)
+class Way:
+    """How operators are computed."""
+
+    choose: Callable[[Operator], Callable[..., Outputs] | None]
+    """From an operator to the call that computes it, where there is one."""
+    around: Callable[[], AbstractContextManager[object]] = nullcontext
+    """Surroundings of every call."""
+
+
+WARP = Way(lambda operator: operator.call)
+SCALAR = Way(lambda operator: operator.call if operator.vectorised else None, generic_kernels)
+TORCH = Way(lambda operator: operator.torch_peer)
 
 
 def gsplat_way(device: torch.device) -> Way:
@@ -74,7 +88,7 @@ def gsplat_way(device: torch.device) -> Way:
         )  # fmt: skip
         return image, alphas
 
-    return lambda operator: draw if operator.name == "rasterization" else None
+    return Way(lambda operator: draw if operator.name == "rasterization" else None)
 
 
 def measure(
@@ -101,7 +115,7 @@ def measure(
         progress: Told after every round.
     """
     drawn, mesh = surfels(gaussians, size, seed), hand_scenes(size, seed)[1]
-    ways: dict[str, Way] = {"warp": lambda o: o.call, "torch": lambda o: o.torch_peer, **(peers or {})}
+    ways = {"warp": WARP, **({"scalar": SCALAR} if device.type == "cpu" else {}), "torch": TORCH, **(peers or {})}
     rows: list[SpeedRow] = []
     for place, operator in enumerate(OPERATORS.values()):
 
@@ -109,42 +123,39 @@ def measure(
             progress("speed", done + n, len(OPERATORS) * repeats)
 
         scene = (drawn if operator.scene is Scene else mesh).to(device=device)
-        calls = {name: call for name, way in ways.items() if (call := way(operator)) is not None}
-        rows += measure_operator(operator, scene, calls, device, threads, repeats, after_round)
+        rows += measure_operator(operator, scene, ways, device, threads, repeats, after_round)
     return rows
 
 
 def measure_operator(
     operator: Operator,
     scene: Scene | MeshScene,
-    calls: dict[str, Callable[..., Outputs]],
+    ways: dict[str, Way],
     device: torch.device,
     threads: int,
     repeats: int,
-    after_round: Callable[[int], object],
+    after_round: Callable[[int], object] | None = None,
 ) -> list[SpeedRow]:
-    """Rows of one operator; the first of `calls` is ours."""
+    """Rows of one operator; the first of `ways` is ours."""
     truth = exact(operator, scene)
-    prepared = operator.prepare(scene)
-    runs = {
-        (pass_, way): one_pass(operator, call, prepared, pass_, truth)
-        for pass_ in operator.passes
-        for way, call in calls.items()
-    }
-    timed = [Timed(make_yardstick(), 1), *(Timed(run, threads) for run in runs.values())]
-    yardstick, *timings = time_together(timed, repeats, after_round)
+    runs = timed_passes(operator, scene, ways, truth, threads)
+    yardstick, *timings = time_together([Timed(make_yardstick(), 1), *runs.values()], repeats, after_round)
     fastest = {key: timing.fastest_ms for key, timing in zip(runs, timings, strict=True)}
-    ours = next(iter(calls))
+    ours = next(iter(ways))
     rows = []
-    for ((pass_, way), run), timing in zip(runs.items(), timings, strict=True):
-        value_error, gradient_error = errors(operator, runs, pass_, way, truth)
+    for ((pass_, way), timed), timing in zip(runs.items(), timings, strict=True):
+        with timed.ready():
+            value_error, gradient_error = errors(
+                operator, truth, runs["forward", way].run(), timed.run() if pass_ != "forward" else None
+            )
+            memory = peak_megabytes(timed.run, device)
         rows.append(
             SpeedRow(
                 op=operator.name,
                 pass_=pass_,
                 way=way,
                 scene=scene.name,
-                gaussians=len(scene.means) if isinstance(scene, Scene) else None,
+                gaussians=len(scene.means if isinstance(scene, Scene) else scene.quats),
                 faces=len(scene.faces) if isinstance(scene, MeshScene) else None,
                 width=scene.width,
                 height=scene.height,
@@ -155,7 +166,7 @@ def measure_operator(
                 fastest_ms=timing.fastest_ms,
                 first_ms=timing.first_ms,
                 repeats=repeats,
-                peak_mb=peak_megabytes(run, device),
+                peak_mb=memory,
                 over_yardstick=timing.fastest_ms / yardstick.fastest_ms,
                 over_warp=timing.fastest_ms / fastest[pass_, ours],
                 rel_l2=value_error,
@@ -168,27 +179,35 @@ def measure_operator(
     return rows
 
 
-def one_pass(
-    operator: Operator, call: Callable[..., Outputs], scene: Any, pass_: Pass, truth: Exact
-) -> Callable[[], Outputs]:
-    """The call that is timed."""
-    if pass_ == "forward":
-        return lambda: forward(call, scene, {})
+def timed_passes(
+    operator: Operator, scene: Scene | MeshScene, ways: dict[str, Way], truth: Exact, threads: int
+) -> dict[tuple[Pass, str], Timed]:
+    """What is timed, by pass and name of the way."""
+    prepared = operator.prepare(scene)
     weights = tuple(w.to(torch.float32) for w in truth.weights)
-    return lambda: gradients(operator, call, scene, {}, weights)
+
+    def run(call: Callable[..., Outputs], pass_: Pass) -> Callable[[], Outputs]:
+        if pass_ == "forward":
+            return lambda: forward(call, prepared, {})
+        return lambda: gradients(operator, call, prepared, {}, weights)
+
+    return {
+        (pass_, name): Timed(run(call, pass_), threads, way.around)
+        for pass_ in operator.passes
+        for name, way in ways.items()
+        if (call := way.choose(operator)) is not None
+    }
 
 
 def errors(
-    operator: Operator, runs: dict[tuple[Pass, str], Callable[[], Outputs]], pass_: Pass, way: str, truth: Exact
+    operator: Operator, truth: Exact, outputs: Outputs, found: Outputs | None
 ) -> tuple[float, float | None]:
-    """Largest relative errors of values and, in a backward pass, of gradients."""
-    outputs = operator.comparable(runs["forward", way]())
+    """Largest relative errors of values and, where there are some, of gradients."""
     judged = None if truth.judged is None else truth.judged[..., None]
     values = [
         relative_error(o, e, None if judged is None else judged.expand_as(e))
-        for o, e in zip(outputs, truth.outputs, strict=True)
+        for o, e in zip(operator.comparable(outputs), truth.outputs, strict=True)
     ]
-    if pass_ == "forward":
+    if found is None:
         return max(values), None
-    found = runs[pass_, way]()
     return max(values), max(relative_error(g, e) for g, e in zip(found, truth.gradients, strict=True))

@@ -8,6 +8,9 @@ from oasis_warp.bench.rows import Row
 BUDGETS: tuple[tuple[str, float | None], ...] = (("1e-2", 1e-2), ("1e-3", 1e-3), ("1e-4", 1e-4), ("exact", None))
 """Largest error allowed; None: no more than that of the default, whose arithmetic is exact up to rounding."""
 
+WORTHWHILE = 0.03
+"""Least share of the time that a setting has to save: less is within what medians differ by."""
+
 
 class Group(NamedTuple):
     """Rows that can be compared: one operator on one scene in one pass."""
@@ -39,8 +42,9 @@ def fits(row: Row, budget: float | None, default: Row) -> bool:
 
 
 def fastest(group: Group, budget: float | None) -> Row:
-    """The fastest setting that keeps an error budget; the default keeps the strictest."""
-    return min((row for row in group.rows if fits(row, budget, group.default)), key=lambda row: row.median_ms)
+    """The fastest setting that keeps an error budget; the default where none gains more than `WORTHWHILE`."""
+    best = min((row for row in group.rows if fits(row, budget, group.default)), key=lambda row: row.median_ms)
+    return best if best.median_ms < (1 - WORTHWHILE) * group.default.median_ms else group.default
 
 
 def non_dominated(rows: Sequence[Row]) -> list[Row]:

@@ -7,7 +7,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +24,14 @@ class Timed:
     run: Callable[[], object]
     threads: int
     """CPU threads that torch and our kernels may use."""
+    around: Callable[[], AbstractContextManager[object]] = nullcontext
+    """Surroundings of the call, whose own time does not count."""
+
+    @contextmanager
+    def ready(self) -> Iterator[None]:
+        """Everything about the call set up inside the block."""
+        with using_threads(self.threads), self.around():
+            yield
 
 
 @dataclass(frozen=True)
@@ -94,7 +102,7 @@ def time_together(
         raise ValueError(f"repeats: expected 2 or more, got {repeats}.")
     first, times = [], []
     for call in calls:
-        with using_threads(call.threads):
+        with call.ready():
             first.append(milliseconds(call.run))
             times.append([milliseconds(call.run)])
     warm = [t[0] for t in times]
@@ -104,7 +112,7 @@ def time_together(
         for done in range(repeats):
             for place in range(len(calls)):
                 k = (place + done) % len(calls)
-                with using_threads(calls[k].threads):
+                with calls[k].ready():
                     if warm[k] < SLOW_MS:
                         calls[k].run()
                     times[k].append(milliseconds(calls[k].run))

@@ -4,6 +4,7 @@ The peers that the kernels are timed against, and implementations apart from the
 with the kernels.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from oasis_warp.bench.scenes import MeshScene
-from oasis_warp.core.rotation import from_matrix, multiply
+from oasis_warp.core.rotation import from_matrix, multiply, to_matrix
 
 
 class Surface(NamedTuple):
@@ -77,6 +78,7 @@ class Rotations(NamedTuple):
     vertex_quats: Float[Tensor, "V 4"]
     face_quats: Float[Tensor, "F 4"]
     area_ratio: Float[Tensor, "F"]
+    vertex_area_ratio: Float[Tensor, "V"]
 
 
 def _frames(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -119,27 +121,60 @@ def face_rotations(scene: MeshScene) -> Rotations:
     vertex_quats = normalize(face_quats.new_zeros(n_vertices, 4).index_add(0, corner_vertex, weighted), dim=-1)
     longest = (rest[faces] - rest[faces.roll(1, 1)]).norm(dim=-1).amax(1)
     damping = 0.5e-6 * longest**2
-    return Rotations(vertex_quats, face_quats, (posed_area + damping) / (area + damping))
+    before, after = area + damping, posed_area + damping
+    round_vertices = before.new_zeros(n_vertices, 2)
+    round_vertices = round_vertices.index_add(0, corner_vertex, torch.stack([before, after], -1)[corner_face])
+    return Rotations(vertex_quats, face_quats, after / before, round_vertices[:, 1] / round_vertices[:, 0])
 
 
 class Posed(NamedTuple):
     """As `oasis_warp.ops.PosedOnMesh`."""
 
-    means: Float[Tensor, "Q 3"]
-    quats: Float[Tensor, "Q 4"]
-    scales: Float[Tensor, "Q 3"]
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
 
 
 def pose_on_mesh(scene: MeshScene) -> Posed:
     """`oasis_warp.ops.pose_on_mesh` with its default scale law."""
-    corners = scene.faces[scene.face_index]
-    weights = scene.barycentrics
+    corners, weights = scene.faces[scene.face_index], scene.barycentrics
     turns = scene.vertex_quats[corners]
     leading = torch.take_along_dim(turns, weights.argmax(-1)[:, None, None].expand(-1, 1, 4), 1)
     signs = torch.where((turns * leading).sum(-1) < 0, -1.0, 1.0).to(weights)
-    mix = ((weights * signs)[..., None] * turns).sum(1)
+    mix = normalize(((weights * signs)[..., None] * turns).sum(1), dim=-1)
+    at, turn = scene.posed_vertices[scene.vertex_index], normalize(scene.vertex_quats[scene.vertex_index], dim=-1)
+    shifts = (to_matrix(turn) @ scene.offsets[..., None])[..., 0]
+    growth = torch.cat([scene.vertex_area_ratio[scene.vertex_index], scene.area_ratio[scene.face_index]])
     return Posed(
-        (weights[..., None] * scene.posed_vertices[corners]).sum(1),
-        multiply(normalize(mix, dim=-1), scene.quats),
-        scene.scales * scene.area_ratio[scene.face_index].clamp(1e-4, 1e4).sqrt()[:, None],
+        torch.cat([at + shifts, (weights[..., None] * scene.posed_vertices[corners]).sum(1)]),
+        multiply(torch.cat([turn, mix]), scene.quats),
+        scene.scales * growth.clamp(1e-4, 1e4).sqrt()[:, None],
     )
+
+
+class Skinned(NamedTuple):
+    """As `oasis_warp.ops.Skinned`."""
+
+    means: Float[Tensor, "V 3"]
+    covars: Float[Tensor, "V 3 3"]
+
+
+def skin(scene: MeshScene) -> Skinned:
+    """`oasis_warp.ops.skin` of the rest vertices and their covariances."""
+    blends = (scene.skin_weights @ scene.transforms.flatten(1)).unflatten(-1, (3, 4))
+    turn, shift = blends[..., :3], blends[..., 3]
+    return Skinned(
+        (turn @ scene.rest_vertices[..., None])[..., 0] + shift, turn @ scene.covars @ turn.transpose(1, 2)
+    )
+
+
+def pose(scene: MeshScene) -> Posed:
+    """`pose_on_mesh` by the rotations of `face_rotations`."""
+    turned = face_rotations(scene)
+    scene = replace(
+        scene,
+        vertex_quats=turned.vertex_quats,
+        area_ratio=turned.area_ratio,
+        vertex_area_ratio=turned.vertex_area_ratio,
+    )
+    return pose_on_mesh(scene)

@@ -8,6 +8,7 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.core.types import HandPose, PosedHand
 from oasis_warp.hand.correctives import corrected_rest
+from oasis_warp.ops.skinning import skin as blend_skin
 
 
 def rest_hand(hand: HandModel, shape: Float[Tensor, "S"]) -> PosedHand:
@@ -47,9 +48,9 @@ def skin(hand: HandModel, rest: PosedHand, pose: HandPose) -> PosedHand:
     Differentiable in shape and pose. `hand`, `rest` and `pose` share one dtype and device (`HandModel.to`).
     """
     rotation, translation = bone_transforms(hand, rest.joints, pose)
-    blend = (hand.weights @ rotation.flatten(1)).unflatten(1, (3, 3))
     surface = corrected_rest(hand, rest.vertices, pose.angles)
-    vertices = (blend @ surface[..., None])[..., 0] + hand.weights @ translation
+    transforms = torch.cat([rotation, translation[..., None]], -1)
+    vertices = blend_skin(surface, None, hand.weights, transforms, validate=False).means
     joints = (rotation @ rest.joints[..., None])[..., 0] + translation
     last = torch.tensor([15, 3, 6, 12, 9], device=rotation.device)  # thumb, index, middle, ring, little
     tips = (rotation[last] @ rest.tips[..., None])[..., 0] + translation[last]

@@ -44,10 +44,16 @@ class Strips(NamedTuple):
         }  # fmt: skip
 
 
-def cut_strips(n_cameras: int, n: int, width: int, height: int, tile_size: int) -> Strips:
-    """Strips of `TILES_ACROSS` x `TILES_DOWN` tiles, whole vectors wide, but none much larger than the image."""
-    strip_width = min(TILES_ACROSS * tile_size, -(-width // strips.PAD) * strips.PAD)
-    strip_height = min(TILES_DOWN * tile_size, height + height % 2)
+def _power_of_two(at_least: int) -> int:
+    return 1 << (at_least - 1).bit_length()
+
+
+def cut_strips(
+    n_cameras: int, n: int, width: int, height: int, tile_size: int, tiles_across: int = TILES_ACROSS
+) -> Strips:
+    """Strips of `tiles_across` x `TILES_DOWN` tiles, or of the image if that is less, rounded up to powers of two."""
+    strip_width = _power_of_two(min(tiles_across * tile_size, max(width, strips.COLUMNS)))
+    strip_height = _power_of_two(min(TILES_DOWN * tile_size, max(height, 2)))
     across, down = -(-width // strip_width), -(-height // strip_height)
     chunk = max(strips.CHUNK, -(-n_cameras * n // strips.MAX_CHUNKS))
     return Strips(
@@ -216,10 +222,13 @@ def draw_backward(
         "g_colors": address(colors, torch.float32, channels * total * wanted.color),
     }
     run_native(strips_backward.draw_backward(wanted, current_rules()), words, max(s.n_chunks, s.n_strips))
+    backgrounds = strip_backgrounds.sum(1) if with_strips else torch.zeros_like(splats.backgrounds)
+    if with_colors and not wanted.color:
+        colors = torch.zeros_like(splats.colors)
     return Gradients(
         means2d if with_shape else None,
         covars2d if with_shape else None,
         opacities if with_shape else None,
-        (colors if wanted.color else torch.zeros_like(splats.colors)) if with_colors else None,
-        (strip_backgrounds.sum(1) if with_strips else torch.zeros_like(splats.backgrounds)) if with_backgrounds else None,
+        colors if with_colors else None,
+        backgrounds if with_backgrounds else None,
     )

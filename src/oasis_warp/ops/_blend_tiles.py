@@ -11,6 +11,7 @@ from oasis_kernels import rasterize_backward as backward_kernels
 from oasis_kernels import rasterize_forward as forward_kernels
 from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
 from oasis_warp.ops._registration import revealed
+from oasis_warp.ops._rules import current_rules
 from oasis_warp.ops._tiles import Tiles, bin_to_tiles, even_work
 
 CUDA_LANES = 16, 16
@@ -54,7 +55,7 @@ def lane_grid(tile_size: int, device: torch.device, grid: tuple[int, int]) -> tu
 
 def draw(splats: Splats, width: int, height: int, tile_size: int) -> Drawn:
     """Images over the backgrounds, and alpha."""
-    n_cameras, n, channels = splats.colors.shape
+    n_cameras, _, channels = splats.colors.shape
     dtype, device = splats.colors.dtype, splats.colors.device
     start()
     color, vec4 = vector(channels, SCALAR[dtype]), VEC4[dtype]
@@ -65,7 +66,7 @@ def draw(splats: Splats, width: int, height: int, tile_size: int) -> Drawn:
     stops = torch.empty(n_cameras, height, width, dtype=torch.int32, device=device)
     lanes, lane_width, lane_height = lane_grid(tile_size, device, CUDA_LANES)
     launch_ranges(
-        forward_kernels.blend(SCALAR[dtype], channels),
+        forward_kernels.blend(SCALAR[dtype], channels, current_rules()),
         even_work(tiles.starts),
         [
             view(tiles.starts), view(revealed(tiles.gaussians)), view(splats.boxes.view(-1, 4), vec4i),
@@ -122,13 +123,13 @@ def draw_backward(
     tile_backgrounds = empty(len(tiles.starts) - 1, channels)
     lanes, lane_width, lane_height = lane_grid(tiles.size, device, CUDA_WARP_LANES)
     launch_ranges(
-        backward_kernels.blend_backward(scalar, channels),
+        backward_kernels.blend_backward(scalar, channels, current_rules()),
         even_work(tiles.starts),
         [
-            view(tiles.starts), view(revealed(tiles.gaussians)), view(pair_numbers), view(splats.boxes.view(-1, 4), vec4i),
-            view(splats.centers.view(-1, 4), vec4), view(splats.whitenings.view(-1, 4), vec4),
-            view(splats.opacities.view(-1)), view(splats.colors.view(-1, channels), color),
-            view(splats.backgrounds, color), view(stops.view(-1)), view(of_image, color), view(of_alpha),
+            view(tiles.starts), view(revealed(tiles.gaussians)), view(pair_numbers),
+            view(splats.boxes.view(-1, 4), vec4i), view(splats.centers.view(-1, 4), vec4),
+            view(splats.whitenings.view(-1, 4), vec4), view(splats.opacities.view(-1)),
+            view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color), view(stops.view(-1)), view(of_image, color), view(of_alpha),
             tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height, int(with_shape),
             view(transmittance.view(-1).clone()), view(empty(pixels)),
             view(pair_moments, moments), view(pair_colors, color), view(tile_backgrounds, color),

@@ -142,18 +142,18 @@ class _Recorded(threading.local):
     """Launches of native kernels, recorded once a thread: replaying one costs a fifth of `wp.launch`."""
 
     def __init__(self) -> None:
-        self.launches: dict[int, Any] = {}
+        self.launches: dict[Any, Any] = {}  # by kernel
 
 
 _recorded = _Recorded()
 
 
 def _launch_native(native: Native, block: int) -> None:
-    launch = _recorded.launches.get(id(native))
+    launch = _recorded.launches.get(native.kernel)
     if launch is None:
         with _load_lock:
             launch = wp.launch(native.kernel, dim=1, inputs=[block], device="cpu", record_cmd=True)
-        _recorded.launches[id(native)] = launch
+        _recorded.launches[native.kernel] = launch
     launch.set_param_at_index_from_ctype(0, block)
     launch.launch()
 
@@ -164,6 +164,14 @@ def address(tensor: Tensor, dtype: torch.dtype, size: int) -> int:
     return tensor.data_ptr()
 
 
+@functools.cache
+def _give_way() -> int:
+    """Address of the C library's sched_yield, 0 where there is none."""
+    if os.name != "posix":
+        return 0
+    return ctypes.cast(ctypes.CDLL(None).sched_yield, ctypes.c_void_p).value or 0
+
+
 def run_native(native: Native, words: dict[str, int], n_tasks: int) -> None:
     """Run a native kernel with the parameter block `words` on the CPU, and return when it is done.
 
@@ -171,11 +179,12 @@ def run_native(native: Native, words: dict[str, int], n_tasks: int) -> None:
     one that comes late, or never, costs time only.
 
     Args:
-        native: From a factory that keeps it: it is recognised by its identity.
+        native: The kernel.
         words: A number or an `address` for each of its parameters; others are ignored.
         n_tasks: The largest number of tasks in one of its phases.
     """
     start()
+    words = {"give_way": _give_way(), **words}
     block = (ctypes.c_longlong * len(native.parameters))(*[words[name] for name in native.parameters])
     place = ctypes.addressof(block)
     helpers = min(torch.get_num_threads(), n_tasks) - 1

@@ -4,6 +4,7 @@ Kernels do not know how long arrays are: `check_arrays` proves it before each la
 """
 
 import ctypes
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -11,15 +12,16 @@ import warp as wp
 from torch import Tensor
 
 from oasis_kernels import projection as generic
-from oasis_kernels import projection_vectors as vectors
+from oasis_kernels import projection_vectors_backward as vector_backward
+from oasis_kernels import projection_vectors_forward as vector_forward
+from oasis_kernels.native import PHASE_WORDS
+from oasis_kernels.projection_vectors import CHUNK
 from oasis_warp.core.checks import FINITE_LIMIT
-from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, view
+from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, address, even_cuts, launch_ranges, run_native, view
 from oasis_warp.ops._rules import current_rules
 
 CAMERA_SUM_BLOCK = 1024
 """Gaussians whose camera gradients one thread of the generic kernel adds up; fixed, so that threads change no sum."""
-FEWEST_CHUNKS = 4
-"""Chunks of Gaussians below which another thread does not pay."""
 OUTPUTS = (
     ("means2d", 2, None), ("covars2d", 3, torch.float64), ("depths", 0, None), ("conics", 3, None),
     ("radii", 2, torch.int32), ("sort_depths", 0, torch.float64), ("centers", 4, None), ("whitenings", 4, None),
@@ -66,13 +68,13 @@ def as_float32(value: float) -> float:
     return ctypes.c_float(value).value
 
 
-def empty_outputs(means: Tensor, n_cameras: int) -> list[Tensor]:
+def empty_outputs(means: Tensor, viewmats: Tensor) -> tuple[Tensor, ...]:
     """Memory for `OUTPUTS`."""
-    start = n_cameras, len(means)
-    return [
-        torch.empty(*start, *([size] if size else []), dtype=dtype or means.dtype, device=means.device)
+    shape = viewmats.shape[0], means.shape[0]
+    return tuple(
+        torch.empty((*shape, size) if size else shape, dtype=dtype or means.dtype, device=means.device)
         for _name, size, dtype in OUTPUTS
-    ]
+    )
 
 
 def check_arrays(scene: Scene, **others: tuple[Tensor | None, tuple[int, ...], torch.dtype]) -> None:
@@ -97,36 +99,33 @@ def check_arrays(scene: Scene, **others: tuple[Tensor | None, tuple[int, ...], t
             )
 
 
-def _block_of(scene: Scene) -> dict[str, int]:
-    """Fields of a parameter block that both directions share."""
-    pointers = {
-        name: tensor.data_ptr() for name, tensor in scene._asdict().items() if isinstance(tensor, Tensor)
+def _words(scene: Scene, **others: Tensor | None) -> dict[str, int]:
+    """Parameters of a native kernel: the scene, and other tensors by name, all of which the caller keeps alive."""
+    tensors = {name: value for name, value in scene._asdict().items() if not isinstance(value, int)} | others
+    words = {
+        name: 0 if tensor is None else address(tensor, tensor.dtype, tensor.numel()) for name, tensor in tensors.items()
     }
-    return pointers | {
-        "n": len(scene.means), "n_cameras": len(scene.viewmats), "width": scene.width, "height": scene.height
-    }  # fmt: skip
+    sizes = {"n": len(scene.means), "n_cameras": len(scene.viewmats), "width": scene.width, "height": scene.height}
+    return words | sizes
 
 
-def _launch_chunks(kernel: object, block: ctypes.Structure, like: Tensor) -> None:
-    chunks = -(-len(like) // vectors.CHUNK)
-    launch_ranges(kernel, even_cuts(chunks, FEWEST_CHUNKS), [ctypes.addressof(block)], like=like)
-
-
-def project_vectors(scene: Scene, opacities: Tensor, limits: Limits, out: list[Tensor]) -> bool:
+def project_vectors(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[Tensor]) -> bool:
     """Fill `out` by the vector kernel; False where an input was not finite or outside its range."""
     rules = current_rules()
-    block = vectors.ForwardBlock(
-        **_block_of(scene),
-        **{name: tensor.data_ptr() for (name, *_), tensor in zip(OUTPUTS, out, strict=True)},
-        opacities=opacities.data_ptr(), near=as_float32(limits.near_plane), far=as_float32(limits.far_plane),
-        radius_clip=limits.radius_clip, eps2d=as_float32(limits.eps2d), alpha_min=as_float32(rules.alpha_min),
-        extent_sigmas=rules.extent_sigmas, limit=FINITE_LIMIT,
+    near, far, radius_clip, eps2d = limits
+    numbers = torch.tensor(
+        [as_float32(near), as_float32(far), radius_clip, as_float32(eps2d), as_float32(rules.alpha_min),
+         rules.extent_sigmas, FINITE_LIMIT],
+        dtype=torch.float64,
     )  # fmt: skip
-    _launch_chunks(vectors.project(), block, scene.means)
-    return not block.bad
+    state = torch.zeros(PHASE_WORDS + 1, dtype=torch.int64)
+    outputs = {name: tensor for (name, *_), tensor in zip(OUTPUTS, out, strict=True)}
+    words = _words(scene, opacities=opacities, limits=numbers, state=state, bad=state[PHASE_WORDS:], **outputs)
+    run_native(vector_forward.project(), words, -(-len(scene.means) // CHUNK))
+    return not state[PHASE_WORDS]
 
 
-def project_generic(scene: Scene, opacities: Tensor, limits: Limits, out: list[Tensor]) -> None:
+def project_generic(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[Tensor]) -> None:
     """Fill `out` by the generic kernel."""
     rules = current_rules()
     launch_ranges(
@@ -142,64 +141,56 @@ def project_generic(scene: Scene, opacities: Tensor, limits: Limits, out: list[T
     )  # fmt: skip
 
 
-def backward_vectors(
-    scene: Scene,
-    radii: Tensor,
-    g_means2d: Tensor | None,
-    g_covars2d: Tensor | None,
-    g_depths: Tensor | None,
-    g_gaussians: dict[str, Tensor],
-    g_viewmats: Tensor | None,
-) -> None:
-    """Fill `g_gaussians`, any of g_means, g_quats, g_scales and g_covars, and `g_viewmats` by the vector kernel."""
-    n_cameras, n = len(scene.viewmats), len(scene.means)
-    tensors = {"radii": radii, "g_means2d": g_means2d, "g_covars2d": g_covars2d, "g_depths": g_depths, **g_gaussians}
-    sums = None
-    if g_viewmats is not None:
-        sums = radii.new_empty(n_cameras * -(-n // vectors.CHUNK), 12, dtype=torch.float64)
-        tensors["g_cameras"] = sums
-    pointers = {name: tensor.data_ptr() for name, tensor in tensors.items() if tensor is not None}
-    _launch_chunks(vectors.project_backward(), vectors.BackwardBlock(**_block_of(scene), **pointers), scene.means)
-    if g_viewmats is not None and sums is not None:
-        _fill_viewmats(g_viewmats, sums)
+class Incoming(NamedTuple):
+    """Gradients by what was projected; None stands for zeros."""
+
+    means2d: Tensor | None
+    covars2d: Tensor | None
+    depths: Tensor | None
+
+    def contiguous(self) -> "Incoming":
+        """The same for kernels, which know no strides."""
+        return Incoming(*(t if t is None else t.contiguous() for t in self))
 
 
-def backward_generic(
-    scene: Scene,
-    radii: Tensor,
-    g_means2d: Tensor | None,
-    g_covars2d: Tensor | None,
-    g_depths: Tensor | None,
-    g_gaussians: dict[str, Tensor],
-    g_viewmats: Tensor | None,
-) -> None:
-    """`backward_vectors` by the generic kernel, which fills what nobody asks for too."""
-    n_cameras, n = len(scene.viewmats), len(scene.means)
+def backward_vectors(scene: Scene, radii: Tensor, incoming: Incoming, out: Mapping[str, Tensor]) -> None:
+    """Fill `out`, gradients by any of means, quats, scales, covars and viewmats, by the vector kernel."""
+    chunks, n_cameras = -(-len(scene.means) // CHUNK), len(scene.viewmats)
+    chunk_cameras = torch.empty(n_cameras if "viewmats" in out else 0, chunks, 12, dtype=torch.float64)
+    state = torch.zeros(vector_backward.STATE, dtype=torch.int64)
+    words = _words(
+        scene,
+        radii=radii,
+        **{f"g_{name}": gradient for name, gradient in incoming._asdict().items()},
+        **{f"g_{name}": out.get(name) for name in ("means", "quats", "scales", "covars", "viewmats")},
+        chunk_cameras=chunk_cameras,
+        state=state,
+    )
+    run_native(vector_backward.project_backward(), words, max(chunks, n_cameras))
 
-    def given(gradient: Tensor | None, size: int, dtype: torch.dtype = scene.means.dtype) -> object:
-        if gradient is None:
-            gradient = radii.new_zeros(n_cameras * n, *([size] if size else []), dtype=dtype)
-        return _rows(gradient, size)
 
-    def filled(name: str, size: int) -> object:
-        like = getattr(scene, name)
-        if like is None:
-            return _rows(scene.means.new_empty(0, size), size)
-        wanted = g_gaussians.get(f"g_{name}")
-        return _rows(torch.empty_like(like) if wanted is None else wanted, size)
+def backward_generic(scene: Scene, radii: Tensor, incoming: Incoming, out: Mapping[str, Tensor]) -> None:
+    """`backward_vectors` by the generic kernel, which works out what nobody asks for too."""
+    n_cameras, n, dtype = len(scene.viewmats), len(scene.means), scene.means.dtype
 
-    g_covars = g_gaussians.get("g_covars")
-    if g_covars is None:
-        g_covars = scene.means.new_empty(0, 3, 3) if scene.covars is None else torch.empty_like(scene.covars)
+    def given(gradient: Tensor | None, *size: int, dtype: torch.dtype = dtype) -> Tensor:
+        return radii.new_zeros(n_cameras, n, *size, dtype=dtype) if gradient is None else gradient
+
+    def filled(name: str, *size: int) -> Tensor:
+        wanted, like = out.get(name), getattr(scene, name)
+        return wanted if wanted is not None else scene.means.new_empty(0 if like is None else n, *size)
+
+    g_viewmats = out.get("viewmats")
     sums = radii.new_empty(0 if g_viewmats is None else n_cameras * n, 12, dtype=torch.float64)
     launch_ranges(
-        generic.project_backward(SCALAR[scene.means.dtype]),
+        generic.project_backward(SCALAR[dtype]),
         even_cuts(n),
         [
             n, n_cameras, *_gaussian_views(scene), view(scene.viewmats), view(scene.Ks), scene.width, scene.height,
-            _rows(radii, 2), given(g_means2d, 2), given(g_covars2d, 3, torch.float64), given(g_depths, 0),
-            int(g_viewmats is not None), filled("means", 3), filled("quats", 4), filled("scales", 3), view(g_covars),
-            view(sums),
+            _rows(radii, 2), _rows(given(incoming.means2d, 2), 2),
+            _rows(given(incoming.covars2d, 3, dtype=torch.float64), 3), _rows(given(incoming.depths), 0),
+            int(g_viewmats is not None), _rows(filled("means", 3), 3), _rows(filled("quats", 4), 4),
+            _rows(filled("scales", 3), 3), view(filled("covars", 3, 3)), view(sums),
         ],
         like=scene.means,
     )  # fmt: skip

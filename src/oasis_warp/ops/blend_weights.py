@@ -7,16 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from warp import vec4i
 
 from oasis_kernels import constants
-from oasis_kernels import rasterize_weights as kernels
 from oasis_warp.core.checks import check_float, check_shape
-from oasis_warp.ops._blend_tiles import CUDA_LANES, lane_grid
-from oasis_warp.ops._launch import SCALAR, VEC4, launch_ranges, view
-from oasis_warp.ops._registration import revealed
+from oasis_warp.ops._blend_tiles import Splats
 from oasis_warp.ops._scene_checks import check_cameras, check_gaussians
-from oasis_warp.ops._tiles import bin_to_tiles, even_work
+from oasis_warp.ops._weigh_strips import weigh as weigh_strips
+from oasis_warp.ops._weigh_tiles import weigh as weigh_tiles
+from oasis_warp.ops.blending import draws_strips
 from oasis_warp.ops.projection import project
 
 
@@ -78,58 +76,25 @@ def blend_weights(
     check_cameras(
         viewmat[None], K[None], means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size
     )
-    n, pixels, dtype, device = len(means), width * height, means.dtype, means.device
+    n, pixels = len(means), width * height
     with torch.no_grad():
         projection = project(
             means, quats, scales, opacities, viewmat[None], K[None], width, height,
             near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d, validate=validate,
         )  # fmt: skip
-        tiles = bin_to_tiles(projection.boxes, projection.sort_depths, width, height, tile_size)
-        opacities = opacities.contiguous()
-        scratch = torch.empty(pixels, dtype=dtype, device=device)
-        counts = torch.empty(pixels, dtype=torch.int32, device=device)
-        lanes, lane_width, lane_height = lane_grid(tile_size, device, CUDA_LANES)
-
-        def weigh(write: bool, starts: Tensor, columns: Tensor, values: Tensor) -> None:
-            launch_ranges(
-                kernels.weigh(SCALAR[dtype]),
-                even_work(tiles.starts),
-                [
-                    view(tiles.starts), view(revealed(tiles.gaussians)), view(projection.boxes.view(-1, 4), vec4i),
-                    view(projection.centers.view(-1, 4), VEC4[dtype]),
-                    view(projection.whitenings.view(-1, 4), VEC4[dtype]), view(opacities),
-                    tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height, int(write),
-                    view(starts), view(scratch), view(counts), view(columns), view(values),
-                ],
-                like=means,
-                lanes=lanes,
-            )  # fmt: skip
-
-        starts = torch.zeros(pixels + 1, dtype=torch.int64, device=device)
-        columns, values = torch.empty(0, dtype=torch.int32, device=device), torch.empty(0, dtype=dtype, device=device)
-        weigh(False, starts, columns, values)
-        starts[1:] = counts.cumsum(0)
-        n_weights = int(starts[-1])
-        if n_weights > 2**31 - 1:
-            raise ValueError(f"width: expected at most {2**31 - 1} weights, got {n_weights}. Draw a smaller image.")
-        columns, values = columns.new_empty(n_weights), values.new_empty(n_weights)
-        weigh(True, starts, columns, values)
-
-        # Two stable sorts: by Gaussian gives the transpose, and that by pixel gives rows with sorted columns.
-        rows = torch.repeat_interleave(torch.arange(pixels, dtype=torch.int32, device=device), counts)
-        columns, by_gaussian = torch.sort(columns, stable=True)
-        rows, values = rows[by_gaussian], values[by_gaussian]
-        transpose = _csr(columns, rows, values, (n, pixels))
-        rows, by_pixel = torch.sort(rows, stable=True)
-        matrix = _csr(rows, columns[by_pixel], values[by_pixel], (pixels, n))
-        alphas = matrix @ torch.ones(n, 1, dtype=dtype, device=device)
-    return BlendWeights(matrix, transpose, alphas.view(height, width, 1))
+        splats = Splats(
+            projection.sort_depths, projection.centers, projection.whitenings, projection.boxes,
+            opacities[None].contiguous(), means.new_empty(1, n, 0), means.new_empty(1, 0),
+        )  # fmt: skip
+        weigh = weigh_strips if draws_strips(means) else weigh_tiles
+        w = weigh(splats, width, height, tile_size)
+        matrix = _csr(w.pixel_starts, w.gaussians, w.by_pixel, (pixels, n))
+        transpose = _csr(w.gaussian_starts, w.pixels, w.by_gaussian, (n, pixels))
+    return BlendWeights(matrix, transpose, w.alphas.view(height, width, 1))
 
 
-def _csr(rows: Tensor, columns: Tensor, values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Sparse matrix of sorted `rows`; int32 indices, which MKL multiplies fastest with."""
-    ends = torch.arange(size[0] + 1, dtype=torch.int32, device=rows.device)
-    starts = torch.searchsorted(rows, ends, out_int32=True)
+def _csr(starts: Tensor, columns: Tensor, values: Tensor, size: tuple[int, int]) -> Tensor:
+    """Sparse matrix with int32 indices, which MKL multiplies fastest with."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
         warnings.filterwarnings("ignore", message="Sparse invariant checks are implicitly disabled")  # torch < 2.13

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from oasis_warp.core.checks import check_finite
 from oasis_warp.ops._project_launch import (
+    Incoming,
     Limits,
     Scene,
     backward_generic,
@@ -22,6 +23,9 @@ from oasis_warp.ops._project_launch import (
     project_vectors,
 )
 from oasis_warp.ops._registration import adjoint, differentiable, operator
+
+INPUTS = "means", "quats", "scales", "covars", "viewmats"
+"""Arguments that receive gradients."""
 
 
 class Projection(NamedTuple):
@@ -96,26 +100,24 @@ def _project(
     Ks: Tensor,
     width: int,
     height: int,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
-    eps2d: float,
+    limits: list[float],  # as `Limits`
     validate: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
     check_arrays(scene, opacities=(opacities, means.shape[:1], means.dtype))
-    scene, opacities = scene.contiguous(), opacities.contiguous()
-    limits = Limits(near_plane, far_plane, radius_clip, eps2d)
-    out = empty_outputs(means, len(viewmats))
+    out = empty_outputs(means, viewmats)
     if len(means) and len(viewmats) and has_vectors(means):
         # The kernel looks at the values as it reads them; what is wrong with them is for the slow checks to say.
-        sound = project_vectors(scene, opacities, limits, out)
-    else:
-        sound = False
-        project_generic(scene, opacities, limits, out)
-    if validate and not sound:
+        sound = project_vectors(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
+        if validate and not sound:
+            check_values(means, quats, scales, covars, opacities, viewmats, Ks)
+            raise AssertionError("the kernel has met a bad value that is not in its inputs")
+        return out
+    if validate:
         check_values(means, quats, scales, covars, opacities, viewmats, Ks)
-    return tuple(out)
+    if len(means) and len(viewmats):
+        project_generic(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
+    return out
 
 
 def _project_fake(
@@ -127,7 +129,7 @@ def _project_fake(
     viewmats: Tensor,
     *_: Any,
 ) -> tuple[Tensor, ...]:
-    return tuple(empty_outputs(means, viewmats.shape[0]))
+    return empty_outputs(means, viewmats)
 
 
 def _project_backward(
@@ -143,33 +145,24 @@ def _project_backward(
     g_means2d: Tensor | None,
     g_covars2d: Tensor | None,
     g_depths: Tensor | None,
-    by_means: bool,
-    by_quats: bool,
-    by_scales: bool,
-    by_covars: bool,
-    by_viewmats: bool,
+    wanted: list[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
-    shape, dtype = (len(viewmats), len(means)), means.dtype
+    shape = len(viewmats), len(means)
     check_arrays(
         scene,
         radii=(radii, (*shape, 2), torch.int32),
-        g_means2d=(g_means2d, (*shape, 2), dtype),
+        g_means2d=(g_means2d, (*shape, 2), means.dtype),
         g_covars2d=(g_covars2d, (*shape, 3), torch.float64),
-        g_depths=(g_depths, shape, dtype),
+        g_depths=(g_depths, shape, means.dtype),
     )
-    out = _empty_gradients(means, quats, scales, covars, viewmats, by_means, by_quats, by_scales, by_covars, by_viewmats)
+    out = _empty_gradients(means, quats, scales, covars, viewmats, wanted)
     if not (len(means) and len(viewmats)):
         return tuple(g.zero_() for g in out)
-    names = {"g_means": by_means, "g_quats": by_quats, "g_scales": by_scales, "g_covars": by_covars}
+    incoming = Incoming(g_means2d, g_covars2d, g_depths).contiguous()
     run = backward_vectors if has_vectors(means) else backward_generic
-    run(
-        scene.contiguous(),
-        radii,
-        *(None if g is None else g.contiguous() for g in (g_means2d, g_covars2d, g_depths)),
-        {name: g for (name, wanted), g in zip(names.items(), out, strict=False) if wanted},
-        out[-1] if by_viewmats else None,
-    )
+    named = {name: g for name, g, asked in zip(INPUTS, out, wanted, strict=True) if asked}
+    run(scene.contiguous(), radii.contiguous(), incoming, named)
     return out
 
 
@@ -186,25 +179,33 @@ def _project_backward_fake(
     g_means2d: Tensor | None,
     g_covars2d: Tensor | None,
     g_depths: Tensor | None,
-    *wanted: bool,
+    wanted: list[bool],
 ) -> tuple[Tensor, ...]:
-    return _empty_gradients(means, quats, scales, covars, viewmats, *wanted)
+    return _empty_gradients(means, quats, scales, covars, viewmats, wanted)
 
 
-def _empty_gradients(*inputs_and_wanted: Any) -> tuple[Tensor, ...]:
-    """Memory for gradients by the first half of the arguments where the second half says so, else of size 0."""
-    half = len(inputs_and_wanted) // 2
-    inputs, wanted = inputs_and_wanted[:half], inputs_and_wanted[half:]
+def _empty_gradients(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    covars: Tensor | None,
+    viewmats: Tensor,
+    wanted: list[bool],
+) -> tuple[Tensor, ...]:
+    """Memory for the gradients by `INPUTS` that are `wanted`, and tensors of size 0 for the others."""
+    inputs = means, quats, scales, covars, viewmats
     return tuple(
-        inputs[0].new_empty(like.shape if flag else 0) for like, flag in zip(inputs, wanted, strict=True)
+        means.new_empty(tensor.shape if asked and tensor is not None else 0)
+        for tensor, asked in zip(inputs, wanted, strict=True)
     )
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
     means, quats, scales, covars, _opacities, viewmats, Ks, width, height, *_ = inputs
+    projection = Projection(*output)
     ctx.size = width, height
-    ctx.save_for_backward(means, quats, scales, covars, viewmats, Ks, output[4])
-    ctx.mark_non_differentiable(*output[3:])
+    ctx.save_for_backward(means, quats, scales, covars, viewmats, Ks, projection.radii)
+    ctx.mark_non_differentiable(*projection[3:])
     ctx.set_materialize_grads(False)
 
 
@@ -214,9 +215,9 @@ def _differentiate(
     *scene, radii = ctx.saved_tensors
     needs = ctx.needs_input_grad
     wanted = [*needs[:4], needs[5]]
-    out = project_backward_op(*scene, *ctx.size, radii, g_means2d, g_covars2d, g_depths, *wanted)
+    out = project_backward_op(*scene, *ctx.size, radii, g_means2d, g_covars2d, g_depths, wanted)
     g_means, g_quats, g_scales, g_covars, g_viewmats = (
-        g if flag else None for g, flag in zip(out, wanted, strict=True)
+        g if asked else None for g, asked in zip(out, wanted, strict=True)
     )
     return (
         g_means,
@@ -228,10 +229,7 @@ def _differentiate(
         None,  # Ks
         None,  # width
         None,  # height
-        None,  # near_plane
-        None,  # far_plane
-        None,  # radius_clip
-        None,  # eps2d
+        None,  # limits
         None,  # validate
     )
 
@@ -268,6 +266,6 @@ def project(
     return Projection(
         *project_op(
             means, quats, scales, covars, opacities, viewmats, Ks, width, height,
-            near_plane, far_plane, radius_clip, eps2d, validate,
+            [near_plane, far_plane, radius_clip, eps2d], validate,
         )
     )  # fmt: skip

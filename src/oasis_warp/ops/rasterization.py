@@ -153,17 +153,17 @@ def rasterization(
     )  # fmt: skip
     opacities = opacities.expand(n_cameras, n)
     channels = layers_to_blend(colors.expand(n_cameras, n, colors.shape[-1]), projection.depths, render_mode)
-    if backgrounds is None:
+    if backgrounds is None or render_mode in ("D", "ED"):
         behind = channels.new_zeros(n_cameras, channels.shape[-1])
-    elif render_mode in ("D", "ED"):
-        behind = channels.new_zeros(n_cameras, 1)
     else:
         behind = torch.nn.functional.pad(backgrounds, (0, channels.shape[-1] - backgrounds.shape[-1]))
     render, alphas = blend(projection, opacities, channels, behind, width, height, tile_size, validate=validate)
     if render_mode in ("ED", "RGB+ED"):
-        drawn = alphas > 0
-        expected = torch.where(drawn, render[..., -1:] / torch.where(drawn, alphas, 1), 0)
-        render = torch.cat([render[..., :-1], expected], -1)
+        # Over the weights' own sum: alpha, as 1 - T, has lost digits where little was drawn.
+        depth, cover = render[..., -2:-1], render[..., -1:]
+        drawn = cover > 0
+        expected = torch.where(drawn, depth / torch.where(drawn, cover, 1), 0)
+        render = torch.cat([render[..., :-2], expected], -1)
     return render, alphas, describe(projection, opacities, width, height, tile_size)
 
 
@@ -195,12 +195,12 @@ def seen_colors(
 
 
 def layers_to_blend(colors: Tensor, depths: Tensor, render_mode: str) -> Tensor:
-    """Channels [C, N, X] that a render mode draws."""
+    """Channels [C, N, X] that a render mode draws: colours, depth, and for expected depths a one to divide by."""
     if render_mode == "RGB":
         return colors
-    if render_mode in ("D", "ED"):
-        return depths[..., None]
-    return torch.cat([colors, depths[..., None]], -1)
+    drawn = [] if render_mode in ("D", "ED") else [colors]
+    ones = [torch.ones_like(depths)[..., None]] if render_mode in ("ED", "RGB+ED") else []
+    return torch.cat([*drawn, depths[..., None], *ones], -1)
 
 
 def describe(

@@ -1,18 +1,21 @@
-"""The rasterizer written out densely in torch: every pixel against every Gaussian, gradients by autograd.
+"""The rasterizer written out densely: every pixel against every Gaussian.
 
-Shares no code with the kernels. Thresholds are the float32 constants of gsplat 1.5.3, spelled out again.
+Thresholds are the float32 constants of gsplat 1.5.3, spelled out again.
 """
-
 
 import numpy as np
 import torch
+from torch import Tensor
 
 CAP = float(np.float32(0.999))
 FAINTEST = float(np.float32(1 / 255))
 STOP = float(np.float32(1e-4))
+EPS2D = float(np.float32(0.3))
+NEAR = float(np.float32(0.01))
 
 
-def rotation_matrices(quats):
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Of quaternions wxyz of any positive norm."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     return torch.stack([
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -21,8 +24,8 @@ def rotation_matrices(quats):
     ], -1).reshape(-1, 3, 3)  # fmt: skip
 
 
-def project(means, quats, scales, viewmat, K, width, height, eps2d):
-    """Centres [n, 2], rows p and q of M [n, 3] with covariance M M^T + eps2d, and depths [n], all with z > 0."""
+def image_rows(means, viewmat, K, width, height):
+    """Centres [n, 2], rows of the map from the world to the image round each [n, 2, 3], and depths [n], all > 0."""
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     x, y, z = (means @ R.T + t).unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -31,18 +34,44 @@ def project(means, quats, scales, viewmat, K, width, height, eps2d):
     v = torch.clamp(y / z, min=float(-cy / fy - margin_y), max=float((height - cy) / fy + margin_y))
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).reshape(-1, 2, 3)
-    M = J @ R @ rotation_matrices(quats) * scales[:, None, :]
-    return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), M[:, 0], M[:, 1], z
+    return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), J @ R, z
 
 
-def layers(means, quats, scales, opacities, viewmat, K, width, height, near=0.01, far=1e10, eps2d=0.3, decide=True):
+def project(means, quats, scales, viewmat, K, width, height, eps2d):
+    """Centres [n, 2], rows p and q of M [n, 3] with covariance M M^T + eps2d, and depths [n]."""
+    centre, rows, z = image_rows(means, viewmat, K, width, height)
+    M = rows @ rotation_matrices(quats) * scales[:, None, :]
+    return centre, M[:, 0], M[:, 1], z
+
+
+def covariances(quats, scales, rows, eps2d):
+    """Entries a, b, c of the covariance in the image, and its determinant, which does not cancel (Cauchy-Binet)."""
+    M = rows @ rotation_matrices(quats) * scales[:, None, :]
+    p, q = M[:, 0], M[:, 1]
+    a, b, c = (p * p).sum(-1), (p * q).sum(-1), (q * q).sum(-1)
+    det = torch.linalg.cross(p, q).square().sum(-1) + eps2d * (a + c) + eps2d**2
+    return a + eps2d, b, c + eps2d, det
+
+
+def given_covariances(covars, rows, eps2d):
+    """The same from covariances in the world, of which the symmetric part counts."""
+    image = rows @ ((covars + covars.transpose(1, 2)) / 2) @ rows.transpose(1, 2)
+    a, b, c = image[:, 0, 0] + eps2d, image[:, 0, 1], image[:, 1, 1] + eps2d
+    return a, b, c, a * c - b * b
+
+
+def layers(
+    means, quats, scales, opacities, viewmat, K, width, height, near=0.01, far=1e10, eps2d=0.3, covars=None, decide=True
+):
     """Alphas [pixels, n] of the Gaussians `order` [n], front to back; not cut or capped unless `decide`."""
     near, far, eps2d = (float(np.float32(v)) for v in (near, far, eps2d))
     z = (means @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]
     kept = ((z >= near) & (z <= far) & (opacities >= FAINTEST)).nonzero()[:, 0]
-    centre, p, q, z = project(means[kept], quats[kept], scales[kept], viewmat, K, width, height, eps2d)
-    a, b, c = (p * p).sum(-1) + eps2d, (p * q).sum(-1), (q * q).sum(-1) + eps2d
-    det = torch.linalg.cross(p, q).square().sum(-1) + eps2d * ((p * p).sum(-1) + (q * q).sum(-1)) + eps2d**2
+    centre, image, z = image_rows(means[kept], viewmat, K, width, height)
+    if covars is None:
+        a, b, c, det = covariances(quats[kept], scales[kept], image, eps2d)
+    else:
+        a, b, c, det = given_covariances(covars[kept], image, eps2d)
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixels = torch.stack([columns, rows], -1).reshape(-1, 1, 2).to(means.dtype) + 0.5
     dx, dy = (pixels - centre).unbind(-1)
@@ -52,13 +81,17 @@ def layers(means, quats, scales, opacities, viewmat, K, width, height, near=0.01
     pivot = torch.where(wide, a, c)
     sigma = 0.5 * (along**2 / pivot + (across - b / pivot * along) ** 2 * pivot / det)
     alpha = opacities[kept] * torch.exp(-sigma)
-    if decide:
-        alpha = torch.where(alpha >= FAINTEST, torch.clamp(alpha, max=CAP), 0)
     order = torch.argsort(z, stable=True)
-    return alpha[:, order], kept[order]
+    alpha = alpha[:, order]
+    return decided(alpha) if decide else alpha, kept[order]
 
 
-def blend_weights(alpha):
+def decided(alpha: Tensor) -> Tensor:
+    """Alphas of layers: skipped where too faint, capped where too strong."""
+    return torch.where(alpha >= FAINTEST, torch.clamp(alpha, max=CAP), 0)
+
+
+def blend_weights(alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Weights alpha T [pixels, n] and the transmittance left at the end [pixels]."""
     after = torch.cumprod(1 - alpha, -1)
     alpha = torch.where(after > STOP, alpha, 0)  # the layer that would end the pixel and all behind it
@@ -71,10 +104,23 @@ def rasterization(
     means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds=None, render_mode="RGB", **options
 ):
     """Images [C, H, W, X] and alphas [C, H, W, 1]."""
-    images, alphas = [], []
+    return drawn(
+        means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, render_mode, **options
+    )[:2]
+
+
+def drawn(
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds=None, render_mode="RGB",
+    slack=1.0, **options,
+):  # fmt: skip
+    """Images, alphas, and which pixels [C, H, W] are not `fragile`."""
+    images, alphas, sound = [], [], []
     for c, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
-        alpha, order = layers(means, quats, scales, opacities, viewmat, K, width, height, **options)
-        weights, left = blend_weights(alpha)
+        alpha, order = layers(
+            means, quats, scales, opacities, viewmat, K, width, height, decide=False, **options
+        )
+        sound.append(~fragile(alpha.detach(), slack).reshape(height, width))
+        weights, left = blend_weights(decided(alpha))
         seen = (colors[c] if colors.dim() == 3 else colors)[order]
         depths = (means @ viewmat[:3, :3].T + viewmat[:3, 3])[order, 2:]
         image = weights @ seen
@@ -87,16 +133,16 @@ def rasterization(
         image = {"RGB": [image], "D": [depth], "ED": [depth]}.get(render_mode, [image, depth])
         images.append(torch.cat(image, -1).reshape(height, width, -1))
         alphas.append((1 - left).reshape(height, width, 1))
-    return torch.stack(images), torch.stack(alphas)
+    return torch.stack(images), torch.stack(alphas), torch.stack(sound)
 
 
-def fragile(alpha):
+def fragile(alpha: Tensor, slack: float = 1.0) -> Tensor:
     """Pixels where a decision hangs on rounding: an alpha at the cut-off or the cap, a transmittance at the stop.
 
-    `alpha` are the undecided ones of `layers`.
+    `alpha` are the undecided ones of `layers`; `slack` widens what counts as close.
     """
-    after = torch.cumprod(1 - torch.where(alpha >= FAINTEST, alpha.clamp(max=CAP), 0), -1)
+    after = torch.cumprod(1 - decided(alpha), -1)
     near_edge = torch.zeros(len(alpha), dtype=torch.bool)
     for value, edge, width in [(alpha, FAINTEST, 3e-4), (alpha, CAP, 3e-4), (after, STOP, 2e-3)]:
-        near_edge |= ((value - edge).abs() < width * edge).any(-1)
+        near_edge |= ((value - edge).abs() < slack * width * edge).any(-1)
     return near_edge

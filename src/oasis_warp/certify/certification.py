@@ -1,0 +1,88 @@
+"""Everything that `oasis gradcheck` measures without options, as a list of small steps."""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import count, islice
+from typing import Any
+
+import torch
+
+from oasis_warp.certify.case import Case
+from oasis_warp.certify.compare import Measurement, agree, compare
+from oasis_warp.certify.determinism import differing
+from oasis_warp.certify.differences import finite_differences
+from oasis_warp.certify.families import FAMILIES, Family
+from oasis_warp.certify.refusals import refusals
+
+Step = Callable[[], list[Measurement]]
+
+SMALL: dict[str, list[dict[str, Any]]] = {
+    "rasterization": [
+        *({"name": "ordinary", "mode": mode} for mode in ("RGB", "D", "ED", "RGB+D", "RGB+ED")),
+        *({"name": "ordinary", "channels": channels} for channels in (1, 32)),
+        *({"name": "ordinary", "sh_degree": degree} for degree in (0, 3)),
+        {"name": "covariances"},
+        {"name": "ordinary", "n_cameras": 3},
+        *({"name": name} for name in ("beyond the clamp of the Jacobian", "opaque and wide", "nearly opaque front")),
+    ],
+    "depth_visibility": [{"name": "ordinary"}, {"name": "closed surface"}, {"name": "through the camera's plane"}],
+    "face_rotations": [
+        {"name": name}
+        for name in ("ordinary", "rigid motion", "root turned by nearly half a turn", "rolled up", "mirrored")
+    ],
+    "pose_on_mesh": [
+        {"name": "ordinary", "law": "sqrt_area"}, {"name": "ordinary", "law": "area"},
+        {"name": "ordinary", "law": "none"}, {"name": "opposite signs"}, {"name": "half turns between corners"},
+    ],
+}  # fmt: skip
+"""Scenes for finite differences, a hundred calls each."""
+SMALL_SIZES: dict[str, dict[str, Any]] = {
+    "rasterization": {"n": 9, "size": (11, 8)},
+    "depth_visibility": {"n": 25, "size": (16, 12), "n_points": 30},
+    "face_rotations": {"side": 2},
+    "pose_on_mesh": {"n": 7},
+}
+EXACT_STIFF = (1e-9, 1e-7)
+STIFF_SEEDS = 3
+ORDINARY_SEEDS = 8
+REPEATS = 10
+EXACT = (1e-9, 1e-8)
+"""Values and gradients of the float64 operator: rounding, magnified where a scene divides by little."""
+
+
+def small_scenes(family: Family, seed: int) -> Iterator[Case]:
+    """The scenes for finite differences: for each kind the first that is smooth."""
+    for kind in SMALL.get(family.name, []):
+        wanted = {"n_cameras": 1} if family.name == "rasterization" else {}
+        drawn = (family.case(seed=s, **SMALL_SIZES[family.name] | wanted | kind) for s in count(seed))
+        yield next(case for case in islice(drawn, 1000) if family.smooth(case))
+
+
+def steps(family: Family, device: torch.device, seed: int) -> Iterator[Step]:
+    """All measurements of one operator."""
+    cpu = torch.device("cpu")
+    for case in small_scenes(family, seed):
+        yield partial(finite_differences, family, case, device)
+    for s in range(seed, seed + ORDINARY_SEEDS):
+        yield partial(compare, family, family.case("ordinary", s), torch.float64, device, EXACT)
+        yield partial(compare, family, family.case("ordinary", s), torch.float32, device)
+    for name in family.conditions:
+        if name != "ordinary":
+            for s in range(seed, seed + STIFF_SEEDS):
+                yield partial(compare, family, family.case(name, s), torch.float32, device)
+            yield partial(compare, family, family.case(name, seed), torch.float64, device, EXACT_STIFF)
+    large = family.case("ordinary", seed, **family.large)
+    yield partial(agree, family, large, "float32 against float64 kernel", torch.float64, device, device)
+    if device.type != "cpu":
+        for s in range(seed, seed + ORDINARY_SEEDS):
+            other = family.case("ordinary", s, **family.large)
+            yield partial(agree, family, other, f"{device.type} against cpu", torch.float32, cpu, device)
+    yield partial(differing, family, large, device, REPEATS)
+    full = next(case for case in map(family.scene, count(seed)) if all(t.numel() for t in case.floats.values())
+                and set(family.indices) <= set(case.others) and case.condition == "ordinary")  # fmt: skip
+    yield partial(refusals, family, full, device)
+
+
+def all_steps(names: tuple[str, ...], device: torch.device, seed: int) -> list[tuple[str, Step]]:
+    """(operator, measurement) for the operators of these names."""
+    return [(name, step) for name in names for step in steps(FAMILIES[name], device, seed)]

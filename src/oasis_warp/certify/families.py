@@ -1,0 +1,167 @@
+"""The operators under certification: how each is called, what of its answer counts, and its float64 twin."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from oasis_warp import ops
+from oasis_warp.certify import mesh_scenes, rasterization_scenes, surface_scenes
+from oasis_warp.certify.case import Case
+from oasis_warp.certify.twins import face_rotations, harmonics, mesh_posing, rasterization, visibility
+
+Outputs = tuple[Tensor, ...]
+
+
+@dataclass(frozen=True)
+class Family:
+    """An operator of `oasis_warp.ops`."""
+
+    name: str
+    outputs: tuple[str, ...]
+    """Names of what `read` returns."""
+    read: Callable[[Any], Outputs]
+    """The operator's answer in a form whose error means something: float64, finite, the same for q and -q."""
+    twin: Callable[[Case, dict[str, Any], float], tuple[Outputs, Outputs]]
+    """The same from the twin, and for each output the elements (1 or 0, broadcast) that do not hang on rounding.
+
+    Takes the case, its arguments in float64, and how much wider than for float32 rounding that is to be understood.
+    """
+    case: Callable[..., Case]
+    """(condition, seed, ...) to a scene."""
+    conditions: tuple[str, ...]
+    large: dict[str, Any]
+    """Arguments of `case` for a scene that work is shared out for, too large for the twin."""
+    indices: dict[str, tuple[str, int]] = field(default_factory=dict)
+    """Index arguments: the argument whose rows each names, and the least index."""
+    smooth: Callable[[Case], bool] = bool
+    """Whether a small step changes no decision of a scene but those that `twin` leaves out."""
+
+    def call(self, arguments: dict[str, Any]) -> Any:
+        """The operator, found at the time of the call."""
+        return getattr(ops, self.name)(**arguments)
+
+    def scene(self, seed: int) -> Case:
+        """A scene of the grid: conditions take turns, all else is drawn from the seed."""
+        return self.case(self.conditions[seed % len(self.conditions)], seed)
+
+
+def squares(quats: Tensor) -> Tensor:
+    """The products q q^T of quaternions [..., 4], which does not know their sign."""
+    return quats[..., :, None] * quats[..., None, :]
+
+
+def bounded(ratios: Tensor) -> Tensor:
+    """Area ratios as they act on scales: of a face that was flat at rest, all further digits are rounding."""
+    return ratios.clamp(1 / mesh_posing.LIMIT, mesh_posing.LIMIT)
+
+
+def _read_rasterization(answer: Any) -> Outputs:
+    return answer[0].double(), answer[1].double()
+
+
+def _rasterization(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
+    renamed = {"near_plane": "near", "far_plane": "far"}
+    given = {renamed.get(name, name): value for name, value in arguments.items()}
+    degree = given.pop("sh_degree", None)
+    if degree is not None:
+        given["colors"] = harmonics.seen_colors(degree, given["means"], given["colors"], given["viewmats"])
+    image, alphas, sound = rasterization.drawn(**given, slack=slack)
+    keep = sound[..., None].double()
+    return (image, alphas), (keep, keep)
+
+
+def _read_depth_map(answer: Any) -> Outputs:
+    # 1 / depth is 0 over the background; barycentrics are compared where the face is beyond doubt.
+    return 1 / answer.depth.double(), answer.barycentrics.double()
+
+
+def _depth_map(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
+    hits = visibility.cast(**arguments, slack=slack)
+    shape = arguments["height"], arguments["width"]
+    outputs = 1 / hits.depth.view(shape), hits.weights.view(*shape, 3)
+    return outputs, (hits.sound.view(shape).double(), hits.clear.view(*shape, 1).double())
+
+
+def _read_depth_visibility(answer: Any) -> Outputs:
+    return (answer.visibility.double(),)
+
+
+def _depth_visibility(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
+    points, vertices, faces, viewmat, K = (arguments[k] for k in ("points", "vertices", "faces", "viewmat", "K"))
+    size, near, tau = (arguments["width"], arguments["height"]), arguments["near_plane"], arguments["tau"]
+    literal = arguments.get("literal", False)
+    named = None if literal else arguments.get("point_vertices")
+    margin = 0.0 if literal else arguments.get("margin", 3 * tau)
+    hits = visibility.cast(vertices, faces, viewmat, K, *size, near, slack)
+    shape = size[::-1]
+    depth, face_ids = hits.depth.detach().view(shape), hits.face_ids.view(shape)
+    scores = visibility.depth_visibility(points, depth, face_ids, faces, K, viewmat, tau, margin, named, near)
+    keep = visibility.sound_points(points, hits, K, viewmat, *size, named is not None, near, slack)
+    return (scores,), (keep.double(),)
+
+
+def _read_face_rotations(answer: Any) -> Outputs:
+    vertex_quats, face_quats, *ratios = (t.double() for t in answer)
+    return squares(vertex_quats), squares(face_quats), *map(bounded, ratios)
+
+
+def _face_rotations(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
+    vertex_quats, face_quats, *ratios, sound = face_rotations.turned(*arguments.values())
+    every = torch.ones(()).double()
+    keep = sound.double()[:, None, None], every, every, every
+    return (squares(vertex_quats), squares(face_quats), *map(bounded, ratios)), keep
+
+
+def _read_pose_on_mesh(answer: Any) -> Outputs:
+    means, quats, scales = (t.double() for t in answer)
+    return means, squares(quats), scales
+
+
+def _pose_on_mesh(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
+    means, quats, scales = mesh_posing.pose_on_mesh(**arguments)
+    with torch.no_grad():
+        corners = arguments["faces"][arguments["face_index"]]
+        dots = mesh_posing.dots_with_leading(arguments["vertex_quats"][corners], arguments["barycentrics"])
+        aligned = (dots.abs() > slack * 1e-5).all(-1).double()
+        aligned = torch.cat([torch.ones(len(quats) - len(aligned)), aligned])[:, None, None]
+    every = torch.ones(()).double()
+    return (means, squares(quats), scales), (every, aligned, every)
+
+
+LARGE_MESH = {"n": 1500, "size": (160, 120)}
+
+FAMILIES = {
+    family.name: family
+    for family in (
+        Family(
+            "rasterization", ("image", "alphas"), _read_rasterization, _rasterization,
+            rasterization_scenes.rasterization_case, tuple(rasterization_scenes.CONDITIONS),
+            {"n": 5000, "size": (128, 96), "n_cameras": 2, "channels": 3, "mode": "RGB+ED", "spread": 0.25},
+            smooth=rasterization_scenes.is_smooth,
+        ),
+        Family(
+            "depth_map", ("1 / depth", "barycentrics"), _read_depth_map, _depth_map,
+            mesh_scenes.depth_map_case, tuple(mesh_scenes.CONDITIONS), LARGE_MESH, {"faces": ("vertices", 0)},
+        ),
+        Family(
+            "depth_visibility", ("visibility",), _read_depth_visibility, _depth_visibility,
+            mesh_scenes.depth_visibility_case, tuple(mesh_scenes.CONDITIONS),
+            LARGE_MESH | {"n_points": 5000}, {"faces": ("vertices", 0), "point_vertices": ("vertices", -1)},
+        ),
+        Family(
+            "face_rotations", ("vertex_quats", "face_quats", "area_ratio", "vertex_area_ratio"),
+            _read_face_rotations, _face_rotations,
+            surface_scenes.face_rotations_case, tuple(surface_scenes.CONDITIONS), {"side": 50},
+            {"faces": ("rest_vertices", 0)},
+        ),
+        Family(
+            "pose_on_mesh", ("means", "quats", "scales"), _read_pose_on_mesh, _pose_on_mesh,
+            surface_scenes.pose_on_mesh_case, tuple(surface_scenes.RIDERS),
+            {"n": 10_000},
+            {"faces": ("posed_vertices", 0), "face_index": ("area_ratio", 0), "vertex_index": ("posed_vertices", 0)},
+        ),
+    )
+}  # fmt: skip

@@ -1,0 +1,1 @@
+"""The operators written out in plain float64 torch, a formula a line; gradients come from autograd."""

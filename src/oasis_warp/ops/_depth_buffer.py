@@ -1,0 +1,358 @@
+"""Draw meshes into depth buffers and score points against them: the vectorised kernels on the CPU, else the plain ones.
+
+Everything has a leading batch axis here. A tensor that is the same for the whole batch may come expanded.
+"""
+
+import ctypes
+import functools
+import os
+import threading
+from typing import Any, NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from oasis_kernels import depth_buffer as kernels
+from oasis_kernels import depth_buffer_vectors as vectors
+from oasis_warp.core.checks import check_finite, check_index, check_positive
+from oasis_warp.ops._incidence import incidence, sum_at_items
+from oasis_warp.ops._launch import _load_lock, _pool, launch, start, view
+
+C_TYPES = {torch.float32: "float", torch.float64: "double"}
+MAX_FRACTION_BITS = 22
+FACES_A_PART = 4096
+"""A mesh is drawn in parts, one a thread, of no fewer faces than this."""
+
+
+class Scene(NamedTuple):
+    """Meshes and cameras. B batch entries, V vertices, F faces."""
+
+    vertices: Tensor
+    """[B, V, 3]."""
+    faces: Tensor
+    """int32 [F, 3], contiguous, every index in [0, V)."""
+    viewmats: Tensor
+    """[B, 4, 4]."""
+    Ks: Tensor
+    """[B, 3, 3]."""
+    width: int
+    height: int
+    near_plane: float
+
+    def room(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
+        """An empty tensor of `shape` for each batch entry, of the vertices' type unless told."""
+        return self.vertices.new_empty((self.vertices.shape[0], *shape), dtype=dtype)
+
+
+class Query(NamedTuple):
+    """Points to be scored."""
+
+    points: Tensor
+    """[B, P, 3]."""
+    point_vertices: Tensor | None
+    """int32 [P], contiguous: the vertex that each point is, or -1."""
+    by_identity: bool
+    """Whether points that are vertices of a face in view are seen by that alone."""
+    tau: float
+    margin: float
+    keep: bool
+    """Whether `Scores.slopes` and `pixels` are wanted."""
+
+
+class Buffer(NamedTuple):
+    """What the cameras see."""
+
+    depth: Tensor
+    """[B, H, W]."""
+    face_ids: Tensor
+    """int32 [B, H, W]."""
+    barycentrics: Tensor | None
+    """[B, H, W, 3]."""
+
+
+class Scores(NamedTuple):
+    """Visibility of the points of a `Query`, and what its adjoint needs."""
+
+    visibility: Tensor
+    """[B, P]."""
+    slopes: Tensor
+    """Derivative with respect to the point's depth, [B, P]; [B, 0] unless kept."""
+    pixels: Tensor
+    """int32: row * width + column where the score is soft, else -1; as `slopes`."""
+
+
+def draw(scene: Scene, query: Query | None, barycentrics: bool, validate: bool) -> tuple[Buffer, Scores | None]:
+    """Fill the depth buffers and score the points, if any.
+
+    Raises:
+        ValueError: with `validate`, a value that is not finite, a focal length that is not positive, or a point's
+            vertex that is none.
+    """
+    method = draw_by_vectors if scene.vertices.device.type == "cpu" else draw_by_faces
+    return method(scene, query, barycentrics, validate)
+
+
+def refuse_bad_values(scene: Scene, query: Query | None) -> None:
+    """Raise what is wrong with the values, if anything is."""
+    check_finite(vertices=scene.vertices, viewmat=scene.viewmats, K=scene.Ks)
+    for i in (0, 1):
+        focal = scene.Ks[:, i, i]
+        check_positive(f"K[{i}, {i}]", float(focal.min()) if len(focal) else 1.0)
+    if query is not None:
+        check_finite(points=query.points)
+        if query.point_vertices is not None:
+            named = query.point_vertices[query.point_vertices != -1]
+            check_index("point_vertices", named, scene.vertices.shape[1], "vertices, or -1 for none")
+
+
+def plane_size(width: int, height: int) -> int:
+    """Numbers in a plane of blocks of 4 x 4 pixels."""
+    columns = -(-(width + vectors.SPARE_COLUMNS) // 16) * 16
+    return -(-height // 4) * 4 * columns
+
+
+def _shared(tensor: Tensor) -> tuple[Tensor, int]:
+    """A contiguous tensor and the step from one batch entry to the next: 0 where they are the same."""
+    if tensor.shape[0] == 1 or (tensor.stride(0) == 0 and tensor.shape[0] > 1):
+        return tensor[0].contiguous(), 0
+    return tensor.contiguous(), tensor[:1].numel()
+
+
+def _fraction_bits(width: int, height: int) -> int:
+    """Bits after the point of coordinates on the screen that reach half a picture beyond its borders in 31 bits."""
+    return min(MAX_FRACTION_BITS, 30 - (max(width, height) - 1).bit_length())
+
+
+def _job(scene: Scene, **more: int) -> tuple[vectors.Job, list[Tensor]]:
+    """A job for `scene`, and the tensors it points to, which must outlive it; `more` are further fields."""
+    vertices, vertices_step = _shared(scene.vertices)
+    viewmats, viewmats_step = _shared(scene.viewmats)
+    Ks, Ks_step = _shared(scene.Ks)
+    job = vectors.Job(
+        vertices=vertices.data_ptr(),
+        viewmats=viewmats.data_ptr(),
+        Ks=Ks.data_ptr(),
+        faces=scene.faces.data_ptr(),
+        vertices_step=vertices_step,
+        viewmats_step=viewmats_step,
+        Ks_step=Ks_step,
+        batch=scene.vertices.shape[0],
+        n_vertices=scene.vertices.shape[1],
+        n_faces=scene.faces.shape[0],
+        width=scene.width,
+        height=scene.height,
+        fraction_bits=_fraction_bits(scene.width, scene.height),
+        near_plane=scene.near_plane,
+        **more,
+    )
+    return job, [vertices, viewmats, Ks]
+
+
+def draw_by_vectors(
+    scene: Scene, query: Query | None, barycentrics: bool, validate: bool
+) -> tuple[Buffer, Scores | None]:
+    """The way of the CPU."""
+    batch, n_vertices, _ = scene.vertices.shape
+    width, height = scene.width, scene.height
+    parts = max(1, min(-(-torch.get_num_threads() // max(batch, 1)), scene.faces.shape[0] // FACES_A_PART))
+    buffer = Buffer(
+        scene.room(height, width),
+        scene.room(height, width, dtype=torch.int32),
+        scene.room(height, width, 3) if barycentrics else None,
+    )
+    # One block: camera_vertices, screen_vertices and planes, in numbers of 4 bytes.
+    room = scene.room(12 * n_vertices + 2 * parts * plane_size(width, height), dtype=torch.float32)
+    first = room.data_ptr()
+    job, _alive = _job(
+        scene,
+        camera_vertices=first,
+        screen_vertices=first + 32 * batch * n_vertices,
+        planes=first + 48 * batch * n_vertices,
+        parts=parts,
+        depth=buffer.depth.data_ptr(),
+        face_ids=buffer.face_ids.data_ptr(),
+        barycentrics=0 if buffer.barycentrics is None else buffer.barycentrics.data_ptr(),
+    )
+    scores = None
+    if query is not None:
+        points, job.points_step = _shared(query.points)
+        n_points = job.n_points = query.points.shape[1]
+        kept = n_points if query.keep else 0
+        scores = Scores(scene.room(n_points), scene.room(kept), scene.room(kept, dtype=torch.int32))
+        job.points = points.data_ptr()
+        job.point_vertices = 0 if query.point_vertices is None else query.point_vertices.data_ptr()
+        job.identity = query.by_identity
+        job.tau, job.margin = query.tau, query.margin
+        job.visibility = scores.visibility.data_ptr()
+        if query.keep:
+            job.slopes, job.pixels = scores.slopes.data_ptr(), scores.pixels.data_ptr()
+    _run_all(job, C_TYPES[scene.vertices.dtype])
+    # Values that are refused do no harm on the way.
+    if validate and job.found:
+        refuse_bad_values(scene, query)
+    return buffer, scores
+
+
+_recorded = threading.local()
+
+
+def _run_all(job: vectors.Job, dtype: str) -> None:
+    """Run the stages of a forward pass on as many of torch's threads as they have tasks for."""
+    if torch.get_num_threads() == 1:
+        _run("all", dtype, ctypes.addressof(job))
+        return
+    _run_tasks("transform", dtype, job, -(-job.n_vertices // vectors.VERTICES_A_TASK))
+    _run_tasks("draw", dtype, job, job.parts)
+    _run_tasks("write", dtype, job, -(-job.height // (4 * vectors.QUADS_A_TASK)))
+    _run_tasks("score", dtype, job, -(-job.n_points // vectors.POINTS_A_TASK))
+
+
+def _run_tasks(stage: str, dtype: str, job: vectors.Job, tasks: int) -> None:
+    """Run a stage that has a number of tasks for each batch entry."""
+    n_threads = min(torch.get_num_threads(), job.batch * tasks)
+    if n_threads < 2:
+        _run(stage, dtype, ctypes.addressof(job))
+    else:
+        run = functools.partial(_run, stage, dtype)
+        list(_pool(os.getpid(), n_threads).map(run, [ctypes.addressof(job)] * n_threads))
+
+
+def _run(stage: str, dtype: str, address: int) -> None:
+    """Run a stage on this thread."""
+    # A recorded launch takes 3 us instead of 19, and belongs to one thread: its arguments are part of it.
+    recorded = getattr(_recorded, stage + dtype, None)
+    if recorded is None:
+        start()
+        with _load_lock:
+            kernel = getattr(vectors.kernels(dtype), stage)
+            recorded: Any = wp.launch(kernel, dim=1, inputs=[address], device="cpu", record_cmd=True)
+        setattr(_recorded, stage + dtype, recorded)
+    recorded.set_param_at_index_from_ctype(0, address)
+    recorded.launch()
+
+
+def draw_by_faces(
+    scene: Scene, query: Query | None, barycentrics: bool, validate: bool
+) -> tuple[Buffer, Scores | None]:
+    """The way of CUDA: all faces at once, first for the depths, then for the smallest face at that depth."""
+    if validate:
+        refuse_bad_values(scene, query)
+    batch, n_vertices, _ = scene.vertices.shape
+    n_faces, width, height = len(scene.faces), scene.width, scene.height
+    like = scene.vertices
+    viewmats, Ks = view(scene.viewmats.contiguous()), view(scene.Ks.contiguous())
+    depth = scene.room(height, width, dtype=torch.float64).fill_(torch.inf)
+    face_ids = scene.room(height, width, dtype=torch.int32).fill_(-1)
+    camera_vertices = scene.room(n_vertices, 3, dtype=torch.float64)
+    boxes = scene.room(n_faces, 4, dtype=torch.int32)
+    vertices, faces = view(camera_vertices, wp.vec3d), view(scene.faces)
+    near = wp.float64(scene.near_plane)
+    launch(
+        kernels.camera_points, (batch, n_vertices), [view(scene.vertices.contiguous()), viewmats, vertices], like=like
+    )
+    launch(
+        kernels.face_boxes,
+        (batch, n_faces),
+        [vertices, faces, Ks, width, height, near, view(boxes, wp.vec4i)],
+        like=like,
+    )
+    for stage in (0, 1):
+        launch(
+            kernels.fill_faces,
+            (batch, n_faces),
+            [stage, vertices, faces, view(boxes, wp.vec4i), Ks, near, view(depth), view(face_ids, wp.uint32)],
+            like=like,
+        )
+    weights = None
+    if barycentrics:
+        weights = scene.room(height, width, 3).zero_()
+        launch(
+            kernels.interpolate,
+            (batch, height, width),
+            [vertices, faces, Ks, view(face_ids), view(weights)],
+            like=like,
+        )
+    buffer = Buffer(depth.to(like.dtype), face_ids, weights)
+    if query is None:
+        return buffer, None
+
+    n_points = query.points.shape[1]
+    kept = n_points if query.keep else 0
+    known = query.point_vertices if query.by_identity else None
+    scores = Scores(
+        scene.room(n_points).zero_(), scene.room(kept).zero_(), scene.room(kept, dtype=torch.int32).fill_(-1)
+    )
+    launch(
+        kernels.visibility,
+        (batch, n_points),
+        [
+            view(query.points.contiguous()),
+            view(face_ids.new_empty(0) if known is None else known),
+            faces,
+            viewmats,
+            Ks,
+            near,
+            wp.float64(query.tau),
+            wp.float64(query.margin),
+            view(depth),
+            view(face_ids),
+            *(view(t) for t in scores),
+        ],
+        like=like,
+    )
+    return buffer, scores
+
+
+def vertex_gradients(
+    scene: Scene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
+) -> Tensor:
+    """Gradient of scores by the vertices of the faces in their pixels, [B, V, 3]; its sums have a fixed order."""
+    method = vertex_gradients_by_vectors if slopes.device.type == "cpu" else vertex_gradients_by_points
+    return method(scene, face_ids, grad_visibility.contiguous(), slopes, pixels)
+
+
+def vertex_gradients_by_vectors(
+    scene: Scene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
+) -> Tensor:
+    """The way of the CPU: point after point."""
+    batch, n_vertices, _ = scene.vertices.shape
+    grad_vertices = scene.room(n_vertices, 3)
+    # One block: camera_vertices, sums and screen_vertices, in numbers of 8 bytes.
+    room = scene.room(9 * n_vertices, dtype=torch.float64)
+    first = room.data_ptr()
+    job, _alive = _job(
+        scene,
+        camera_vertices=first,
+        sums=first + 32 * batch * n_vertices,
+        screen_vertices=first + 56 * batch * n_vertices,
+        face_ids=face_ids.data_ptr(),
+        n_points=slopes.shape[1],
+        grad_visibility=grad_visibility.data_ptr(),
+        slopes=slopes.data_ptr(),
+        pixels=pixels.data_ptr(),
+        grad_vertices=grad_vertices.data_ptr(),
+    )
+    dtype = C_TYPES[slopes.dtype]
+    _run_tasks("transform", dtype, job, -(-n_vertices // vectors.VERTICES_A_TASK))
+    _run_tasks("pull", dtype, job, 1)
+    return grad_vertices
+
+
+def vertex_gradients_by_points(
+    scene: Scene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
+) -> Tensor:
+    """The way of CUDA: all points at once, then for each vertex the sum over the points that name it."""
+    batch, n_points = slopes.shape
+    n_vertices = scene.vertices.shape[1]
+    rows = scene.room(n_points, 3, 3)
+    tensors = (
+        grad_visibility, slopes, pixels, face_ids, scene.vertices, scene.faces, scene.viewmats, scene.Ks, rows
+    )  # fmt: skip
+    launch(kernels.corner_gradients, (batch, n_points), [view(t.contiguous()) for t in tensors], like=slopes)
+    # Scores that are not soft name the first vertex, with rows of zeros.
+    seen = face_ids.flatten(1).gather(1, pixels.clamp_min(0).long()).where(pixels >= 0, 0)
+    corners = scene.faces[seen.long()] if len(scene.faces) else scene.faces.new_zeros((batch, n_points, 3))
+    corners = corners + n_vertices * torch.arange(batch, device=corners.device, dtype=torch.int32)[:, None, None]
+    index = incidence("corners", corners.view(-1, 3), batch * n_vertices, "vertices")
+    return sum_at_items(rows.view(-1, 3), index).view_as(scene.vertices)

@@ -1,0 +1,133 @@
+"""What a camera sees of a mesh: depths, face ids and barycentrics, a pixel each."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from oasis_warp.core.checks import check_float, check_positive, check_shape
+from oasis_warp.ops._depth_buffer import Scene, draw, plane_size
+from oasis_warp.ops._incidence import incidence
+from oasis_warp.ops._registration import operator
+
+
+class DepthMap(NamedTuple):
+    """The nearest surface of each pixel. The batch axis B is there if an argument has one."""
+
+    depth: Float[Tensor, "H W"] | Float[Tensor, "B H W"]
+    """Depth along the camera's z axis [m], +inf where there is no surface."""
+    face_ids: Int[Tensor, "H W"] | Int[Tensor, "B H W"]
+    """Index of the face, -1 where there is none."""
+    barycentrics: Float[Tensor, "H W 3"] | Float[Tensor, "B H W 3"]
+    """Weights of that face's corners at the pixel's centre, perspective correct; 0 where there is none."""
+
+
+def check_batched(name: str, tensor: Tensor, *shape: int | str, sizes: dict[str, int], hint: str = "") -> None:
+    """Check that `tensor` has `shape`, or that with a batch axis B before it."""
+    batched = isinstance(tensor, Tensor) and tensor.dim() > len(shape)
+    check_shape(name, tensor, *(("B", *shape) if batched else shape), sizes=sizes if batched else None, hint=hint)
+
+
+def check_scene(
+    vertices: Tensor, faces: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, near_plane: float
+) -> dict[str, int]:
+    """Check shapes and types of a mesh and a camera; the size of their batch as B, if they have one."""
+    sizes: dict[str, int] = {}
+    check_batched("vertices", vertices, "V", 3, sizes=sizes)
+    check_float("vertices", vertices)
+    check_shape("faces", faces, "F", 3, hint="Three vertex indices a face.")
+    check_batched("viewmat", viewmat, 4, 4, sizes=sizes, hint="World to camera.")
+    check_float("viewmat", viewmat, vertices)
+    check_batched("K", K, 3, 3, sizes=sizes)
+    check_float("K", K, vertices)
+    for name, size in (("width", width), ("height", height)):
+        if size < 1:
+            raise ValueError(f"{name}: expected 1 or more pixels, got {size}.")
+    if plane_size(width, height) >= 2**31:
+        raise ValueError(f"width: expected fewer than 2^31 pixels, got {width} x {height}. Draw the picture in tiles.")
+    check_positive("near_plane", near_plane)
+    return sizes
+
+
+def batched(tensor: Tensor, batch: int, n_axes: int) -> Tensor:
+    """`tensor`, of `n_axes` without a batch axis, the same for all of the batch."""
+    if tensor.dim() > n_axes:
+        return tensor
+    return tensor[None] if batch == 1 else tensor.expand(batch, *tensor.shape)
+
+
+def _depth_map(
+    vertices: Tensor,
+    faces: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    validate: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    table = incidence("faces", faces, vertices.shape[1], "vertices").table
+    scene = Scene(vertices, table, viewmats, Ks, width, height, near_plane)
+    (depth, face_ids, barycentrics), _ = draw(scene, None, True, validate)
+    assert barycentrics is not None
+    return depth, face_ids, barycentrics
+
+
+def _depth_map_fake(vertices, faces, viewmats, Ks, width, height, near_plane, validate):
+    shape = (len(vertices), height, width)
+    return (
+        vertices.new_empty(shape),
+        vertices.new_empty(shape, dtype=torch.int32),
+        vertices.new_empty((*shape, 3)),
+    )
+
+
+_op = operator("depth_map", _depth_map, _depth_map_fake)
+
+
+@torch.no_grad()
+def depth_map(
+    vertices: Float[Tensor, "V 3"] | Float[Tensor, "B V 3"],
+    faces: Int[Tensor, "F 3"],
+    viewmat: Float[Tensor, "4 4"] | Float[Tensor, "B 4 4"],
+    K: Float[Tensor, "3 3"] | Float[Tensor, "B 3 3"],
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    *,
+    validate: bool = True,
+) -> DepthMap:
+    """The nearest surface behind each pixel's centre, from either side; nothing here carries a gradient.
+
+    Edges belong to both of their faces, so a closed surface has no holes; of faces at one depth the smallest index is
+    kept. Faces may pass through the camera's plane (2D homogeneous rasterization, Olano and Greer 1997); a face that
+    contains no pixel's centre is missed. Decided and interpolated in float64, so that distance costs no digits;
+    deterministic, for any number of threads, and in a batch as alone.
+
+    The map is a renderer of its own. The silhouette is `face_ids >= 0`; with `corners = values[faces[face_ids]]` of
+    shape [H, W, 3, D], `(corners * barycentrics[..., None]).sum(-2)` interpolates any values of the vertices over the
+    picture (colours, texture coordinates, normals), 0 over the background; `normals[face_ids]` shows values of faces.
+
+    Args:
+        vertices: Vertices of the mesh [m], shape [V, 3] or a batch [B, V, 3], float32 or float64.
+        faces: Vertex indices, shape [F, 3], the same for all of the batch; F may be 0. Winding does not matter.
+        viewmat: World to camera (x right, y down, z forward), shape [4, 4] or [B, 4, 4].
+        K: Intrinsics [px], shape [3, 3] or [B, 3, 3]; pixel centres at .5. Skew is not used.
+        width: Columns of the image.
+        height: Rows of the image.
+        near_plane: Depth up to which surfaces are not seen [m].
+        validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
+            Shapes and indices are always checked, indices once a tensor.
+
+    Raises:
+        ValueError: a wrong shape, dtype or index, a value that is not finite, or a size or focal length that is not
+            positive.
+    """
+    sizes = check_scene(vertices, faces, viewmat, K, width, height, near_plane)
+    batch = sizes.get("B", 1)
+    out = _op(
+        batched(vertices, batch, 2), faces, batched(viewmat, batch, 2), batched(K, batch, 2), width, height,
+        near_plane, validate,
+    )  # fmt: skip
+    return DepthMap(*(out if "B" in sizes else (t[0] for t in out)))

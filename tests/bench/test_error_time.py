@@ -1,0 +1,172 @@
+import csv
+import json
+
+import pytest
+import torch
+
+from oasis_warp.bench import knobs
+from oasis_warp.bench.error_time import Sweep, measure, standard_plan
+from oasis_warp.bench.knobs import DEFAULT, Setting
+from oasis_warp.bench.operators import OPERATORS
+from oasis_warp.bench.rows import write_rows
+from oasis_warp.bench.scenes import equal_depths, hand_scenes, layered
+from oasis_warp.bench.torch_rasterizer import draw
+from oasis_warp.ops._rules import Rules
+
+COARSE_STOP = Setting("stop", "0.01", Rules(transmittance_stop=1e-2))
+
+
+def sweep(scene, op, *settings, **options):
+    return measure(
+        Sweep(
+            plan=((scene, op),), device=torch.device("cpu"), repeats=2,
+            settings=lambda *_: (DEFAULT, *settings), **options,
+        )
+    )  # fmt: skip
+
+
+def by_setting(rows, pass_="forward"):
+    return {row.knob: row for row in rows if row.pass_ == pass_}
+
+
+@pytest.fixture(scope="module")
+def layers():
+    """Rows of the rasterizer on the layered scene."""
+    half = Setting("Gaussians", "50%", share=0.5)
+    return sweep(layered(), "rasterization", COARSE_STOP, knobs.FLOAT64, knobs.TORCH, half, knobs.SIZES[0])
+
+
+def test_there_is_one_row_a_setting_and_pass(layers):
+    knobs_seen = ["default", "stop", "precision", "torch", "Gaussians", "resolution"]
+    assert [(r.knob, r.pass_) for r in layers] == [
+        (knob, pass_) for knob in knobs_seen for pass_ in ("forward", "forward + backward")
+    ]
+    assert all(r.median_ms > 0 and r.repeats == 2 and r.yardstick_ms > 0 for r in layers)
+
+
+def test_the_default_is_exact_but_for_rounding(layers):
+    for row in layers[:2]:
+        assert row.is_default
+        assert row.rel_l2 <= 1e-6
+        assert row.bit_equal
+    assert layers[1].gradient_rel_l2 <= 1e-5
+    assert layers[0].gradient_rel_l2 is None
+
+
+def test_a_stop_at_a_hundredth_costs_what_it_must(layers):
+    row = by_setting(layers)["stop"]
+    assert 42 <= row.psnr_db <= 50  # 47 dB: what is not drawn has at most weight 0.01, mostly less
+    assert 1e-3 < row.rel_l2 < 2e-2
+    assert not row.bit_equal
+
+
+def test_another_order_of_the_gaussians_moves_float32_by_rounding_and_float64_by_less(layers):
+    rows = by_setting(layers)
+    assert rows["default"].floor_rel_l2 <= 1e-6
+    assert rows["precision"].floor_rel_l2 <= 1e-14
+    assert rows["stop"].floor_rel_l2 is None
+
+
+def test_float64_is_what_errors_are_measured_from(layers):
+    rows = by_setting(layers, "forward + backward")
+    assert (rows["precision"].rel_l2, rows["precision"].gradient_rel_l2) == (0, 0)
+    assert 0 < rows["torch"].error < 1e-4
+
+
+def test_dropping_gaussians_loses_their_gradients_too(layers):
+    row = by_setting(layers, "forward + backward")["Gaussians"]
+    assert row.gaussians == 1500
+    assert 0.1 < row.gradient_rel_l2 < 10
+    assert row.psnr_db < 30
+
+
+def test_gradients_of_smaller_images_are_not_compared(layers):
+    row = by_setting(layers, "forward + backward")["resolution"]
+    assert row.gradient_rel_l2 is None
+    assert 5 < row.psnr_db < 40
+
+
+def test_fragile_pixels_are_told(layers):
+    share = 100 * float(draw(layered().to(dtype=torch.float64)).fragile.double().mean())
+    assert layers[0].fragile_percent == pytest.approx(share)
+    assert 0 < share < 10
+
+
+def test_threads_change_no_bit():
+    rows = sweep(equal_depths(), "rasterization", Setting("threads", "2", threads=2))
+    assert [r.threads for r in rows] == [1, 1, 2, 2]
+    assert all(r.bit_equal for r in rows)
+
+
+def test_equal_depths_keep_their_order_when_the_list_is_shuffled():
+    (row,) = [r for r in sweep(equal_depths(), "rasterization") if r.pass_ == "forward"]
+    assert row.floor_rel_l2 <= 1e-6
+
+
+@pytest.fixture(scope="module")
+def small_hand():
+    return hand_scenes(32)[1]
+
+
+def test_a_coarser_depth_buffer_hides_the_wrong_points(small_hand):
+    rows = by_setting(sweep(small_hand, "depth_visibility", knobs.SIZES[0], knobs.FLOAT64), "forward + backward")
+    assert rows["default"].rel_l2 < 1e-4
+    assert 0.01 < rows["resolution"].rel_l2 < 1
+    assert rows["resolution"].gradient_rel_l2 is not None  # by the same points
+    assert rows["default"].psnr_db is None
+
+
+@pytest.mark.parametrize("op", ["depth_map", "face_rotations", "pose_on_mesh"])
+def test_every_operator_on_meshes_is_exact_by_default(small_hand, op):
+    for row in sweep(small_hand, op):
+        assert row.error < 5e-6
+        assert row.floor_rel_l2 < 1e-6
+        assert row.bit_equal
+        assert row.fragile_percent is None
+
+
+def test_the_plan_covers_every_operator_that_is_swept_and_quick_the_avatar_alone():
+    quick, full = standard_plan(32, 0, True), standard_plan(32, 0, False)
+    ops = [op for op in OPERATORS if op not in ("blend_weights", "blend_colors", "posing")]
+    assert [op for _, op in quick] == ops
+    assert {scene.name for scene, _ in quick} == {"hand"}
+    assert [(s.name, op) for s, op in full[: len(quick)]] == [(s.name, op) for s, op in quick]
+    assert {s.name for s, _ in full} == {
+        "hand", "far hand", "layered", "needles", "opaque", "equal depths", "slivers",
+    }  # fmt: skip
+
+
+def test_every_knob_that_is_tried_differs_from_the_default():
+    rules = Rules()
+    for op in OPERATORS:
+        chosen = knobs.settings(op, torch.device("cpu"), 1, 2)
+        assert [s.knob for s in chosen].count("default") == 1
+        for s in chosen[1:]:
+            turned = [
+                s.rules != rules, s.dtype != torch.float32, s.threads is not None, bool(s.options), s.share != 1,
+                s.shrink != 1, s.torch,
+            ]  # fmt: skip
+            assert sum(turned) == 1
+        labels = [(s.knob, s.value) for s in chosen]
+        assert len(set(labels)) == len(labels)
+
+
+def test_exponentials_are_a_knob_of_the_cpu_only():
+    cpu, cuda = (knobs.settings("rasterization", torch.device(d), 1, 1) for d in ("cpu", "cuda"))
+    assert {s.knob for s in cpu} - {s.knob for s in cuda} == {"exp degree"}
+
+
+def test_files_hold_every_row(layers, tmp_path):
+    write_rows(layers, tmp_path / "e.csv", tmp_path / "e.json")
+    records = list(csv.DictReader((tmp_path / "e.csv").read_text().splitlines()))
+    assert len(records) == len(json.loads((tmp_path / "e.json").read_text())) == len(layers)
+
+
+def test_progress_ends_where_it_said(small):
+    told = []
+    measure(
+        Sweep(plan=((small, "rasterization"),) * 2, device=torch.device("cpu"), repeats=2,
+              settings=lambda *_: (DEFAULT,)),
+        lambda stage, done, total: told.append((done, total)),
+    )  # fmt: skip
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]

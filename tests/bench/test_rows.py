@@ -1,0 +1,67 @@
+import csv
+import io
+import json
+import math
+from dataclasses import replace
+
+import pytest
+
+from oasis_warp.bench import rows
+from oasis_warp.bench.rows import KEYS, Row, csv_text, json_text, read_csv, write_rows
+from oasis_warp.core.errors import InputError
+
+ROW = Row(
+    scene="layered", width=64, height=64, gaussians=1500, faces=None, op="rasterization", pass_="forward",
+    knob="stop", value="0.01", device="a CPU, with a comma", threads=1, median_ms=1.25, iqr_ms=0.5, fastest_ms=1.0,
+    repeats=20, first_ms=300.0, yardstick_ms=11.6, peak_mb=None, rel_l2=1e-2, max_abs=0.1, psnr_db=45.5,
+    gradient_rel_l2=None, floor_rel_l2=2e-7, fragile_percent=3.9, bit_equal=False, seed=0, commit="abc",
+    versions="oasis_warp 0",
+)  # fmt: skip
+
+
+def test_csv_and_json_have_the_same_keys_and_values():
+    table = [ROW, replace(ROW, pass_="forward + backward", gradient_rel_l2=3e-2, bit_equal=True)]
+    from_csv = list(csv.DictReader(io.StringIO(csv_text(table))))
+    from_json = json.loads(json_text(table))
+    assert [tuple(record) for record in from_csv] == [tuple(record) for record in from_json] == [KEYS] * 2
+    for text, value in zip(from_csv, from_json, strict=True):
+        for key in KEYS:
+            one = value[key]
+            words = {True: "yes", False: "no"} if isinstance(one, bool) else {None: ""}
+            assert text[key] == words.get(one, str(one))
+
+
+def test_the_keys_are_those_that_were_promised():
+    promised = {
+        "scene", "width", "height", "gaussians", "faces", "op", "pass", "knob", "value", "device", "threads",
+        "median_ms", "iqr_ms", "repeats", "first_ms", "peak_mb", "rel_l2", "max_abs", "psnr_db", "gradient_rel_l2",
+        "fragile_percent", "bit_equal", "seed", "commit", "versions",
+    }  # fmt: skip
+    assert promised <= set(KEYS)
+
+
+def test_a_table_is_read_back_as_it_was_written(tmp_path):
+    table = [ROW, replace(ROW, bit_equal=True, peak_mb=1.5, psnr_db=None)]
+    write_rows(table, tmp_path / "t.csv", tmp_path / "t.json")
+    assert read_csv(tmp_path / "t.csv") == table
+
+
+def test_what_is_not_finite_is_empty():
+    infinite = replace(ROW, psnr_db=math.inf, gradient_rel_l2=math.nan)
+    assert json.loads(json_text([infinite]))[0]["psnr_db"] is None
+    assert ",nan," not in csv_text([infinite])
+
+
+@pytest.mark.parametrize("text", [None, "", "scene,width\nhand,64\n"])
+def test_another_file_is_refused_in_one_sentence(tmp_path, text):
+    path = tmp_path / "t.csv"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(InputError, match=r"t\.csv: expected the CSV of `oasis bench error-time`"):
+        read_csv(path)
+
+
+def test_the_commit_is_that_of_the_checkout(monkeypatch, tmp_path):
+    assert rows.commit() == "" or len(rows.commit().rstrip("+")) == 10
+    monkeypatch.setattr(rows, "__file__", str(tmp_path / "rows.py"))
+    assert rows.commit() == ""  # outside of any checkout

@@ -1,0 +1,73 @@
+import json
+
+import pytest
+import torch
+
+from oasis_warp.bench import speed
+from oasis_warp.bench.operators import OPERATORS, forward
+from oasis_warp.bench.rows import json_text
+from oasis_warp.bench.scalar import QUESTIONS, generic_kernels
+from oasis_warp.bench.scenes import hand_scenes
+from oasis_warp.core.errors import InputError
+
+WAYS = {"warp": speed.WARP, "scalar": speed.SCALAR, "torch": speed.TORCH}
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return hand_scenes(32)[1]
+
+
+def test_every_way_is_timed_in_every_pass_and_all_agree(small, cpu):
+    rows = speed.measure_operator(OPERATORS["rasterization"], small, WAYS, cpu, 1, 2)
+    assert [(r.pass_, r.way) for r in rows] == [
+        (pass_, way) for pass_ in ("forward", "forward + backward") for way in ("warp", "scalar", "torch")
+    ]
+    for row in rows:
+        assert row.rel_l2 < 5e-6
+        assert (row.gradient_rel_l2 is None) == (row.pass_ == "forward")
+        assert row.gradient_rel_l2 is None or row.gradient_rel_l2 < 1e-3
+        assert row.over_yardstick > 0
+        assert (row.over_warp == 1) == (row.way == "warp")
+
+
+@pytest.mark.parametrize("name", OPERATORS)
+def test_generic_kernels_give_float32_answers_of_their_own(name, small, mesh):
+    operator = OPERATORS[name]
+    scene = operator.prepare(small if operator.scene is type(small) else mesh)
+    vectors = operator.comparable(forward(operator.call, scene, {}))
+    with generic_kernels():
+        scalars = operator.comparable(forward(operator.call, scene, {}))
+    again = operator.comparable(forward(operator.call, scene, {}))
+    for a, b, c in zip(vectors, scalars, again, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+        assert torch.equal(a, c)  # and afterwards everything is as it was
+
+
+def test_generic_kernels_answer_no_to_every_question_of_the_operators():
+    import sys
+
+    def answers():
+        like = torch.zeros(1)
+        modules = [m for name, m in sys.modules.items() if name.startswith("oasis_warp.ops.")]
+        return [getattr(m, q)(like) for m in modules for q in QUESTIONS if hasattr(m, q)]
+
+    assert all(answers())
+    with generic_kernels():
+        assert not any(answers())
+
+
+def test_rows_are_plain_json(small, cpu):
+    rows = speed.measure_operator(OPERATORS["blend_colors"], small, WAYS, cpu, 1, 2)
+    records = json.loads(json_text(rows))
+    assert [r["way"] for r in records] == ["warp", "torch"] * 2  # sparse products are torch's: nothing to vectorise
+    assert {r["pass"] for r in records} == {"forward", "forward + backward"}
+
+
+def test_a_peer_that_is_not_there_is_told_in_one_sentence(monkeypatch, cpu):
+    monkeypatch.setattr(speed, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"--peer gsplat: the package is not installed; `pip install gsplat`"):
+        speed.gsplat_way(cpu)
+    monkeypatch.setattr(speed, "find_spec", lambda name: object())
+    with pytest.raises(InputError, match=r"--peer gsplat: it draws on CUDA devices only; add --device cuda\."):
+        speed.gsplat_way(cpu)

@@ -1,0 +1,66 @@
+import sys
+import time
+
+import pytest
+import torch
+
+from oasis_warp.bench.timing import Timed, Timing, peak_megabytes, time_together
+
+
+def test_calls_take_turns_and_each_begins_a_round():
+    log = []
+    calls = [Timed(lambda name=name: log.append(name), 1) for name in "ab"]
+    rounds = []
+    timings = time_together(calls, repeats=2, after_round=rounds.append)
+    assert "".join(log) == "aabb" + "aabb" + "bbaa"  # warm-up, then each twice a round: once to warm the caches
+    assert rounds == [1, 2]
+    assert [len(t.times_ms) for t in timings] == [2, 2]
+
+
+def test_a_time_is_that_of_the_call_in_milliseconds():
+    (timing,) = time_together([Timed(lambda: time.sleep(0.002), 1)], repeats=3)
+    assert timing.fastest_ms >= 2
+    assert timing.first_ms >= 2
+    assert timing.median_ms < 200
+
+
+def test_every_call_has_its_threads_and_surroundings_and_they_are_not_timed():
+    from contextlib import contextmanager
+
+    seen, before = [], torch.get_num_threads()
+
+    @contextmanager
+    def slow_to_prepare():
+        time.sleep(0.01)
+        seen.append("in")
+        yield
+        seen.append("out")
+
+    call = Timed(lambda: seen.append(torch.get_num_threads()), threads=2, around=slow_to_prepare)
+    (timing,) = time_together([call], repeats=2)
+    assert seen[:4] == ["in", 2, 2, "out"]
+    assert timing.fastest_ms < 5
+    assert torch.get_num_threads() == before
+
+
+def test_median_and_quartiles_are_those_of_the_times():
+    timing = Timing(first_ms=99.0, times_ms=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0))
+    assert (timing.median_ms, timing.iqr_ms, timing.fastest_ms) == (4.0, 4.0, 1.0)
+
+
+def test_a_single_repeat_is_refused():
+    with pytest.raises(ValueError, match="repeats: expected 2 or more, got 1"):
+        time_together([], repeats=1)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells")
+def test_peak_memory_is_what_a_call_holds_at_once():
+    def run():
+        first = torch.ones(6 * 2**20)  # 24 MiB
+        second = first + 1
+        del first
+        return second + 1
+
+    megabytes = peak_megabytes(run, torch.device("cpu"))
+    assert megabytes is not None
+    assert 47 <= megabytes <= 60

@@ -1,0 +1,257 @@
+"""What the operators of posing owe torch and their callers: graphs, odd memory, threads, bounds, other CPUs."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from oasis_warp.ops import _launch, _words, face_rotations, pose_on_mesh, pose_on_mesh_covars, skin
+
+
+def mesh(seed, n, dtype):
+    """A rumpled grid of n x n cells, at rest and posed."""
+    generator = torch.Generator().manual_seed(seed)
+    y, x = torch.meshgrid(torch.arange(n + 1.0), torch.arange(n + 1.0), indexing="ij")
+    flat = torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3)
+    rest = flat + 0.2 * torch.randn(flat.shape, generator=generator)
+    posed = rest * torch.tensor([1.2, 0.9, 1.0]) + 0.3 * torch.randn(flat.shape, generator=generator)
+    a = (torch.arange(n)[:, None] * (n + 1) + torch.arange(n)).reshape(-1)
+    faces = torch.cat([torch.stack([a, a + 1, a + n + 2], 1), torch.stack([a, a + n + 2, a + n + 1], 1)])
+    return rest.to(dtype), posed.to(dtype), faces
+
+
+def calls(seed=0, n=4, dtype=torch.float32):
+    """Of each operator: a function of float tensors, and these."""
+    generator = torch.Generator().manual_seed(seed)
+    rest, posed, faces = mesh(seed, n, dtype)
+    n_vertices, n_faces = len(rest), len(faces)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator).to(dtype)
+
+    face_index = torch.randint(n_faces, (n_faces + 3,), generator=generator)
+    vertex_index = torch.randint(n_vertices, (n_vertices // 2,), generator=generator)
+    q, p = len(face_index), len(vertex_index)
+    unit = torch.nn.functional.normalize(normal(n_vertices, 4), dim=1)
+    barycentrics = normal(q, 3).softmax(-1)
+
+    def on_both(posed, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio):
+        return pose_on_mesh(
+            posed, faces, face_index, barycentrics, vertex_quats, area_ratio, quats, scales,
+            vertex_index=vertex_index, offsets=offsets, vertex_area_ratio=vertex_area_ratio,
+        )  # fmt: skip
+
+    def on_faces(posed, barycentrics, vertex_quats, area_ratio, quats, scales):
+        return pose_on_mesh(posed, faces, face_index, barycentrics, vertex_quats, area_ratio, quats, scales, "area")
+
+    on_mesh = [posed, barycentrics, unit, normal(n_faces).exp()]
+    return {
+        "face_rotations": (lambda rest, posed: face_rotations(rest, posed, faces), [rest, posed]),
+        "pose_on_mesh": (
+            on_both,
+            [*on_mesh, normal(p + q, 4), normal(p + q, 3).exp(), normal(p, 3), normal(n_vertices).exp()],
+        ),
+        "pose_on_mesh faces": (on_faces, [*on_mesh, normal(q, 4), normal(q, 3).exp()]),
+        "pose_on_mesh_covars": (
+            lambda rest, posed, *others: pose_on_mesh_covars(rest, posed, faces, face_index, *others),
+            [rest, posed, barycentrics, normal(q, 4), normal(q, 3).exp()],
+        ),
+        "skin": (skin, [normal(37, 3), normal(37, 3, 3), normal(37, 5).softmax(-1), normal(5, 3, 4)]),
+        "skin rotation_only": (
+            lambda *inputs: skin(*inputs, rotation_only=True),
+            [normal(37, 3), normal(37, 3, 3), normal(37, 5).softmax(-1), normal(5, 4, 4)],
+        ),
+        "skin points": (
+            lambda means, *others: skin(means, None, *others)[:1],
+            [normal(37, 3), normal(37, 5).softmax(-1), normal(5, 3, 4)],
+        ),
+    }
+
+
+NAMES = tuple(calls())
+
+
+def results(name, function=None, **which):
+    """Outputs, and gradients of a random weighting of them."""
+    plain, inputs = calls(**which)[name]
+    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
+    out = (function or plain)(*leaves)
+    return [tensor.detach() for tensor in out] + weighted_gradients(out, leaves)
+
+
+def weighted_gradients(out, leaves):
+    generator = torch.Generator().manual_seed(5)
+    loss = sum((o * torch.randn(o.shape, generator=generator).to(o)).sum() for o in out)
+    return list(torch.autograd.grad(loss, leaves))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_operator_compiles_into_one_graph_with_its_gradient(name, as_shipped):
+    function, _ = calls()[name]
+    torch._dynamo.reset()
+    compiled = torch.compile(lambda *inputs: tuple(function(*inputs)), fullgraph=True, backend="aot_eager")
+    assert all(torch.equal(a, b) for a, b in zip(results(name), results(name, compiled), strict=True))
+
+
+@pytest.mark.parametrize("name", ["face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "skin"])
+@pytest.mark.parametrize("backward", [False, True])
+def test_what_torch_is_told_of_an_operator_is_true(name, backward):
+    # Each custom op is called once by the public function: take its arguments from there.
+    function, inputs = calls()[name]
+    seen = []
+    op = getattr(torch.ops.oasis_warp, name + ("_backward" if backward else "")).default
+    class Spy(torch.utils._python_dispatch.TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            if func is op:
+                seen.append(args)
+            return func(*args, **(kwargs or {}))
+
+    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
+    with Spy():
+        weighted_gradients(function(*leaves), leaves)
+    ((*arguments,),) = seen
+    arguments = [
+        a.detach().requires_grad_(not backward and a.is_floating_point()) if isinstance(a, torch.Tensor) else a
+        for a in arguments
+    ]
+    torch.library.opcheck(op, tuple(arguments))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_memory_of_any_layout_gives_the_same_bits(name):
+    def spread(tensor):
+        wide = torch.full((*tensor.shape[:-1], 2 * tensor.shape[-1] + 1), torch.nan, dtype=tensor.dtype)
+        wide[..., 1::2] = tensor
+        return wide[..., 1::2]
+
+    function, inputs = calls()[name]
+    leaves = [spread(tensor.detach()).requires_grad_() for tensor in inputs]
+    assert not any(leaf.is_contiguous() for leaf in leaves if leaf.ndim > 1)
+    out = function(*leaves)
+    # Gradients come in transposed memory too.
+    generator = torch.Generator().manual_seed(5)
+    weights = [torch.randn(o.shape, generator=generator).to(o) for o in out]
+    weights = [w.mT.contiguous().mT if w.ndim > 1 else w for w in weights]
+    grads = torch.autograd.grad(list(out), leaves, weights)
+    for a, b in zip([*out, *grads], results(name), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_broadcast_inputs_and_gradients_are_read_as_what_they_stand_for(name):
+    function, inputs = calls()[name]
+    repeated = [tensor[:1].expand_as(tensor) for tensor in inputs]
+    full = [tensor.contiguous() for tensor in repeated]
+    for leaves in (repeated, full):
+        for leaf in leaves:
+            leaf.requires_grad_()
+    broadcast, plain = ([*function(*leaves)] for leaves in (repeated, full))
+    for a, b in zip(broadcast, plain, strict=True):
+        assert torch.equal(a, b)
+    # The gradient of a sum is one number, expanded.
+    shares = [
+        torch.autograd.grad(sum(o.sum() for o in out), leaves)
+        for out, leaves in ((broadcast, repeated), (plain, full))
+    ]
+    assert all(torch.equal(a, b) for a, b in zip(*shares, strict=True))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 17])
+@pytest.mark.parametrize("name", NAMES)
+def test_float32_agrees_with_the_generic_kernels_in_float64(name, n):
+    _, inputs = calls(1, n)[name]
+    wide = calls(1, n, torch.float64)[name][1]
+    for a, b in zip(inputs, wide, strict=True):
+        b.copy_(a)
+    function, _ = calls(1, n)[name]
+    exact, _ = calls(1, n, torch.float64)[name]
+    leaves, wide = ([t.clone().requires_grad_() for t in tensors] for tensors in (inputs, wide))
+    out, want = function(*leaves), exact(*wide)
+    for a, b in zip(out, want, strict=True):
+        # A quaternion and its opposite are one rotation; signs may differ where two faces are equally large.
+        assert (a.double() - b).norm() <= 5e-6 * b.norm()
+    for a, b in zip(weighted_gradients(out, leaves), weighted_gradients(want, wide), strict=True):
+        assert (a.double() - b).norm() <= 5e-5 * b.norm()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_number_of_threads_gives_the_same_bits(name, with_threads):
+    one, two, seven = (with_threads(k, results, name, None) for k in (1, 2, 7))
+    assert all(torch.equal(a, b) and torch.equal(a, c) for a, b, c in zip(one, two, seven, strict=True))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_gradient_is_worked_out_that_nobody_wants(name):
+    function, inputs = calls()[name]
+    with torch.no_grad():
+        plain = function(*[tensor.clone().requires_grad_() for tensor in inputs])
+    assert not any(out.requires_grad for out in plain)
+    whole = results(name)[len(plain) :]
+    for k, tensor in enumerate(inputs):
+        leaves = [t.clone().requires_grad_(j == k) for j, t in enumerate(inputs)]
+        (grad,) = weighted_gradients(function(*leaves), [leaves[k]])
+        assert torch.equal(grad, whole[k]) and grad.shape == tensor.shape
+
+
+GUARD = 64
+
+
+def test_kernels_stay_inside_their_memory(monkeypatch):
+    """Every tensor a vectorised kernel is given moves between guards, whose values must not matter nor change."""
+    moved = []
+    checked = 0
+
+    def guarded_address(tensor, dtype, size):
+        _launch.address(tensor, dtype, size)
+        poison = torch.nan if tensor.is_floating_point() else torch.iinfo(dtype).max
+        yard = torch.full((size + 2 * GUARD,), poison, dtype=dtype)
+        inside = yard[GUARD : GUARD + size].view(tensor.shape)
+        inside.copy_(tensor)
+        moved.append((yard, tensor, inside))
+        return inside.data_ptr()
+
+    def guarded_run(native, words, n_tasks):
+        nonlocal checked
+        _launch.run_native(native, words, n_tasks)
+        while moved:
+            yard, tensor, inside = moved.pop()
+            guards = torch.cat([yard[:GUARD], yard[GUARD + tensor.numel() :]])
+            assert guards.isnan().all() if yard.is_floating_point() else (guards == torch.iinfo(yard.dtype).max).all()
+            tensor.copy_(inside)
+            checked += 1
+
+    plain = {(name, n): results(name, n=n) for name in NAMES for n in (1, 2, 5)}
+    monkeypatch.setattr(_words, "address", guarded_address)
+    for module in ("_riders", "face_rotations", "skinning"):
+        monkeypatch.setattr(sys.modules[f"oasis_warp.ops.{module}"], "run_native", guarded_run)
+    for (name, n), want in plain.items():
+        for a, b in zip(results(name, n=n), want, strict=True):
+            assert torch.equal(a, b), (name, n)
+    assert checked > 300
+
+
+DIGEST = """
+import json, sys, torch
+sys.path.insert(0, sys.argv[1])
+import test_posing_operators as t
+out = {name: [r.flatten().double().tolist() for r in t.results(name, n=5)] for name in t.NAMES}
+print(json.dumps(out))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("flags", ["-target-cpu x86-64-v3", "-target-cpu x86-64-v2"])
+def test_narrower_vectors_give_the_same_results(flags, tmp_path):
+    here = os.path.dirname(__file__)
+    environment = os.environ | {"OASIS_WARP_CPU_FLAGS": flags, "OASIS_WARP_CACHE": str(tmp_path)}
+    run = subprocess.run(
+        [sys.executable, "-c", DIGEST, here], env=environment, capture_output=True, text=True, check=True
+    )
+    other = json.loads(run.stdout.splitlines()[-1])
+    for name in NAMES:
+        for a, b in zip(results(name, n=5), other[name], strict=True):
+            b = torch.tensor(b, dtype=torch.float64)
+            assert (a.flatten().double() - b).norm() <= 3e-6 * b.norm(), name

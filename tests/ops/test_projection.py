@@ -1,0 +1,282 @@
+"""Projection: the vector kernels of the CPU against the generic float64 one, and laws that both obey."""
+
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from projection_runs import OPTIONS, assert_equal_bits, bits, covariances, incoming, run
+from rasterization_scenes import ordinary_scene
+from test_rasterization_stiff import CASES
+
+from oasis_kernels.constants import Rules
+from oasis_warp.ops import projection as module
+from oasis_warp.ops._rules import using
+from oasis_warp.ops.projection import Projection, project
+
+# Both kernels compute in float64: what differs is the rounding of the stored float32, 6e-8 relative.
+ROUNDING = 2e-7
+DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+
+
+def assert_same(vectors, generic):
+    """A float32 projection and its gradients against float64 ones: values one by one, gradients by rel-L2."""
+    (got, g_got), (want, g_want) = vectors, generic
+    for name, a, b in zip(Projection._fields, got, want, strict=True):
+        if a.dtype == torch.int32:
+            assert torch.equal(a, b), name
+            continue
+        if name == "centers":  # what is whole depends on the rounding of large coordinates, the sum does not
+            a, b = (t[..., :2].double() + t[..., 2:].double() for t in (a, b))
+        assert torch.isfinite(a).all(), name
+        scale = float(b.abs().max()) if b.numel() else 0.0
+        atol = 1e-7 if name == "centers" else 1e-12 * scale  # the remainder is rounded as a number of up to 1 pixel
+        torch.testing.assert_close(a.double(), b.double(), rtol=ROUNDING, atol=atol, msg=name)
+    for name, b in g_want.items():
+        error = float((g_got[name].double() - b).norm() / b.norm().clamp_min(1e-300))
+        assert error <= ROUNDING, f"{name}: {error:.1e}"
+
+
+def both(scene, **options):
+    return run(scene.to("cpu", torch.float32), **options), run(scene.to("cpu", torch.float64), **options)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_vectors_equal_the_generic_kernel_on_ordinary_scenes(seed):
+    assert_same(*both(ordinary_scene(seed, n=100 + 7 * seed, cameras=1 + seed)))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_vectors_equal_the_generic_kernel_on_stiff_scenes(name):
+    assert_same(*both(CASES[name][0]))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"near_plane": 2.9, "far_plane": 3.3},
+        {"radius_clip": 6.0},
+        {"eps2d": 0.0},
+        {"near_plane": 50.0, "far_plane": 60.0},
+    ],
+    ids=["planes", "radius clip", "no low-pass", "nothing drawn"],
+)
+def test_vectors_cull_what_the_generic_kernel_culls(options):
+    scene = ordinary_scene(5, n=150, cameras=2)
+    (got, g_got), (want, g_want) = both(scene, **options)
+    assert not (want.radii > 0).all() or "eps2d" in options
+    assert_same((got, g_got), (want, g_want))
+
+
+@pytest.mark.parametrize("norm", [1e-18, 1e-3, 1e18])
+def test_vectors_bear_quaternions_of_any_norm(norm):
+    scene = ordinary_scene(6)
+    assert_same(*both(scene.with_(quats=(scene.quats * norm).float())))
+
+
+def test_vectors_bear_needles_whose_determinant_would_cancel_in_float64():
+    scene = ordinary_scene(18, n=30)
+    scales = torch.tensor([3e5, 1e-4, 1e-4]).repeat(30, 1)
+    (vectors, _), (generic, _) = both(scene.with_(scales=scales))
+    xx, xy, yy = generic.covars2d.unbind(-1)
+    det = generic.conics[..., 0] * generic.conics[..., 2] - generic.conics[..., 1] ** 2
+    assert (generic.radii > 0).any() and not torch.allclose((xx * yy - xy * xy) * det, torch.ones_like(det))
+    torch.testing.assert_close(vectors.whitenings.double(), generic.whitenings, rtol=ROUNDING, atol=0.0)
+
+
+def test_vectors_bear_cameras_far_from_the_origin():
+    scene = ordinary_scene(7)
+    shift = torch.tensor([3000.0, -500.0, 2000.0])
+    viewmats = scene.viewmats.clone()
+    viewmats[:, :3, 3] -= viewmats[:, :3, :3] @ shift
+    assert_same(*both(scene.with_(means=scene.means + shift, viewmats=viewmats)))
+
+
+@pytest.mark.parametrize("n", [0, 1, 7, 8, 9, 15, 16, 17])
+@DTYPES
+def test_the_first_gaussians_do_not_depend_on_how_many_follow(n, dtype):
+    scene = ordinary_scene(8, n=40, cameras=2, dtype=dtype)
+    few = scene.with_(**{k: getattr(scene, k)[:n] for k in ("means", "quats", "scales", "opacities")})
+    per_gaussian = "means", "quats", "scales"
+    arguments = [scene.Ks, scene.width, scene.height]
+    results = []
+    for s in (few, scene):
+        inputs = {k: getattr(s, k).clone().requires_grad_() for k in per_gaussian}
+        out = project(*inputs.values(), s.opacities, s.viewmats, *arguments, **OPTIONS)
+        given = [g[:, : len(s.means)] for g in incoming_like(scene, out)]
+        gradients = torch.autograd.grad(out[:3], list(inputs.values()), given)
+        results.append([*(t.detach()[:, :n] for t in out), *(g[:n] for g in gradients)])
+    for a, b in zip(*results, strict=True):
+        assert torch.equal(a, b)
+
+
+def incoming_like(scene, projection):
+    """`incoming` for all Gaussians of `scene`, in the types of `projection`."""
+    g = torch.Generator().manual_seed(0)
+    shape = len(scene.viewmats), len(scene.means)
+    sizes = [(*shape, 2), (*shape, 3), shape]
+    return [torch.randn(size, generator=g).to(out) for size, out in zip(sizes, projection, strict=False)]
+
+
+@DTYPES
+def test_threads_and_repetition_change_no_bit(dtype, with_threads):
+    scene = ordinary_scene(9, n=3001, cameras=2, dtype=dtype)
+    alone = with_threads(1, run, scene)
+    assert_equal_bits(alone, with_threads(1, run, scene))
+    for n_threads in (2, 3, 4):
+        assert_equal_bits(alone, with_threads(n_threads, run, scene))
+
+
+@DTYPES
+def test_strided_and_broadcast_inputs_are_read_as_they_are(dtype, device):
+    scene = ordinary_scene(10, n=21, dtype=dtype, device=device)
+    scene = scene.with_(scales=scene.scales[:1].expand(21, 3), Ks=scene.Ks[:1].expand(2, 3, 3))
+
+    def strided(t):
+        wide = torch.full((*t.shape[:-1], 2 * t.shape[-1]), float("nan"), dtype=t.dtype, device=t.device)
+        wide[..., ::2] = t
+        return wide[..., ::2]
+
+    names = "means", "quats", "viewmats", "opacities"
+    apart = scene.with_(**{k: strided(getattr(scene, k)) for k in names})
+    plain = scene.with_(scales=scene.scales.contiguous(), Ks=scene.Ks.contiguous())
+    assert not apart.means.is_contiguous() and apart.scales.stride(0) == 0
+    assert_equal_bits(run(apart), run(plain))
+
+
+@DTYPES
+def test_strided_and_broadcast_gradients_are_read_as_they_are(dtype, device):
+    scene = ordinary_scene(11, n=21, dtype=dtype, device=device)
+    means = scene.means.clone().requires_grad_()
+    out = project(
+        means, scene.quats, scene.scales, scene.opacities, scene.viewmats, scene.Ks, scene.width, scene.height,
+        **OPTIONS,
+    )  # fmt: skip
+    one = torch.ones((), dtype=dtype, device=device)
+    broadcast = [one.to(t).expand(t.shape) for t in out[:3]]
+    got = torch.autograd.grad(out[:3], means, broadcast, retain_graph=True)[0]
+    assert torch.equal(got, torch.autograd.grad(out[:3], means, [t.contiguous() for t in broadcast])[0])
+
+
+@DTYPES
+def test_each_gradient_is_the_same_alone_and_with_the_others(dtype, device):
+    scene = ordinary_scene(12, dtype=dtype, device=device)
+    together = run(scene)[1]
+    for name, want in together.items():
+        assert torch.equal(run(scene, by=(name,))[1][name], want), name
+
+
+@DTYPES
+def test_gradients_of_single_outputs_add_up(dtype, device):
+    scene = ordinary_scene(13, dtype=torch.float64).to(device, dtype)
+    inputs = [getattr(scene, k).clone().requires_grad_() for k in ("means", "quats", "scales", "viewmats")]
+    out = project(*inputs[:3], scene.opacities, inputs[3], scene.Ks, scene.width, scene.height, **OPTIONS)
+    given = incoming(out)
+
+    def gradients(outputs, g):
+        found = torch.autograd.grad(outputs, inputs, g, retain_graph=True, allow_unused=True)
+        return [torch.zeros_like(t) if f is None else f for t, f in zip(inputs, found, strict=True)]
+
+    whole = gradients(out[:3], given)
+    parts = [gradients([o], [g]) for o, g in zip(out[:3], given, strict=True)]
+    error = 1e-5 if dtype == torch.float32 else 1e-13
+    for total, *terms in zip(whole, *parts, strict=True):
+        assert float((sum(terms) - total).norm()) <= error * float(total.norm())
+
+
+@DTYPES
+def test_gaussians_that_are_not_drawn_pass_on_the_gradient_of_depth_only(dtype, device):
+    scene = ordinary_scene(14, n=19, dtype=dtype, device=device)
+    inputs = [getattr(scene, k).clone().requires_grad_() for k in ("means", "quats", "scales")]
+    out = project(
+        *inputs, scene.opacities, scene.viewmats, scene.Ks, scene.width, scene.height,
+        **(OPTIONS | {"near_plane": 100.0, "far_plane": 200.0}),
+    )  # fmt: skip
+    assert not out.radii.any() and not any(t.any() for t in (out.means2d, out.covars2d, out.conics, out.boxes))
+    g_means, g_quats, g_scales = torch.autograd.grad(out[:3], inputs, incoming(out))
+    towards = scene.viewmats[:, None, 2, :3] * incoming(out)[2][..., None]
+    torch.testing.assert_close(g_means, towards.sum(0))
+    assert not g_quats.any() and not g_scales.any()
+
+
+@DTYPES
+def test_rules_decide_what_is_drawn_and_how_far_it_reaches(dtype, device):
+    scene = ordinary_scene(15, dtype=dtype, device=device)
+    plain, _ = run(scene)
+    with using(Rules(alpha_min=0.3)):
+        strict, _ = run(scene)
+    with using(Rules(extent_sigmas=1.0)):
+        narrow, _ = run(scene)
+    drawn = (plain.radii > 0).all(-1)
+    assert torch.equal((strict.radii > 0).all(-1) & drawn, (scene.opacities >= 0.3) & (strict.radii > 0).all(-1))
+    assert not strict.radii[:, scene.opacities < 0.3].any() and strict.radii.any()
+    sigma = narrow.covars2d[..., [0, 2]].sqrt()
+    wide = sigma[(narrow.radii > 0).all(-1) & (scene.opacities > 0.9)]
+    radii = narrow.radii[(narrow.radii > 0).all(-1) & (scene.opacities > 0.9)]
+    assert len(wide) and torch.equal(radii, wide.ceil().int())
+
+
+GUARD = 64
+"""Elements on either side of a guarded tensor."""
+
+
+def guarded(like, fill):
+    """Memory for a tensor like this one in the middle of a larger one, and that one."""
+    whole = torch.full((like.numel() + 2 * GUARD,), fill, dtype=like.dtype)
+    return whole[GUARD : GUARD + like.numel()].view(like.shape), whole
+
+
+@pytest.mark.parametrize("n", [1, 7, 8, 13, 16, 519])
+@pytest.mark.parametrize("with_covars", [False, True], ids=["quats", "covars"])
+def test_nothing_is_read_or_written_beside_the_arrays(n, with_covars, monkeypatch):
+    wholes = []
+
+    def surround(make):
+        def made(*arguments):
+            inner = []
+            for tensor in make(*arguments):
+                middle, whole = guarded(tensor, 77)
+                wholes.append(whole)
+                inner.append(middle)
+            return tuple(inner)
+
+        return made
+
+    monkeypatch.setattr(module, "empty_outputs", surround(module.empty_outputs))
+    monkeypatch.setattr(module, "_empty_gradients", surround(module._empty_gradients))
+
+    def amid_nan(t):
+        middle, _ = guarded(t, float("nan"))
+        return middle.copy_(t)
+
+    scene = ordinary_scene(16, n=n, cameras=2)
+    covars = covariances(scene) if with_covars else None
+    plain = run(scene, covars)
+    scene = scene.with_(**{k: amid_nan(v) for k, v in scene.tensors.items()})
+    # What lies around the inputs is NaN: to read it would fail the check of values or change a result.
+    assert_equal_bits(run(scene, amid_nan(covars) if with_covars else None, validate=True), plain)
+    assert len(wholes) == 2 * (9 + 5)
+    for whole in wholes:
+        assert (whole[:GUARD] == 77).all() and (whole[-GUARD:] == 77).all()
+
+
+NARROW = """
+import sys, torch
+sys.path.insert(0, {folder!r})
+from projection_runs import bits, run
+from rasterization_scenes import ordinary_scene
+torch.save(bits(run(ordinary_scene(17, n=29, cameras=2))), sys.argv[1])
+"""
+
+
+@pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="flags of x86")
+@pytest.mark.parametrize("flags", ["-target-cpu x86-64-v3", "-target-cpu x86-64-v2"])
+def test_narrower_vectors_give_the_same(flags, tmp_path):
+    script = NARROW.format(folder=str(Path(__file__).parent))
+    environment = os.environ | {"OASIS_WARP_CPU_FLAGS": flags}
+    subprocess.run([sys.executable, "-c", script, str(tmp_path / "out.pt")], env=environment, check=True, timeout=250)
+    for a, b in zip(torch.load(tmp_path / "out.pt"), bits(run(ordinary_scene(17, n=29, cameras=2))), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-7 * float(b.abs().max()))

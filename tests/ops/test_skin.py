@@ -1,0 +1,231 @@
+"""Linear blend skinning: twin, gradients, laws, hard cases, poison values, messages."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from oasis_warp.certify.twins import skinning as twin
+
+from oasis_warp.core.rotation import from_axis_angle, to_matrix
+from oasis_warp.ops import skinning
+
+
+def skin(*args, **options) -> Any:
+    """For the type checker: covariances are there."""
+    return skinning.skin(*args, **options)
+
+
+FLOATS = ("means", "covars", "weights", "transforms")
+
+
+def scene(seed, n=41, n_joints=16, dtype=torch.float64, device="cpu", rigid=False):
+    """Points, covariances (not even symmetric ones), weights and transforms without any structure, or rigid ones."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    linear = to_matrix(normal(n_joints, 4)) if rigid else normal(n_joints, 3, 3)
+    floats = {
+        "means": normal(n, 3),
+        "covars": normal(n, 3, 3),
+        "weights": normal(n, n_joints).softmax(-1),
+        "transforms": torch.cat([linear, normal(n_joints, 3, 1)], -1),
+    }
+    return {name: tensor.to(device, dtype) for name, tensor in floats.items()}
+
+
+def rel(a, b):
+    """Relative L2 distance."""
+    return (a.detach().double().cpu() - b.detach()).norm() / b.detach().norm()
+
+
+def gradients(out, leaves, seed=0):
+    """Of a random weighting of all outputs."""
+    generator = torch.Generator().manual_seed(seed)
+    loss = sum(
+        (o * torch.randn(o.shape, generator=generator, dtype=torch.float64).to(o)).sum() for o in out if o is not None
+    )
+    return torch.autograd.grad(loss, leaves)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("rotation_only", [False, True])
+@pytest.mark.parametrize(("n", "n_joints"), [(1, 1), (3, 16), (300, 16), (17, 33)])
+def test_values_and_gradients_are_those_of_the_twin(n, n_joints, rotation_only, dtype, device):
+    ours = scene(n, n, n_joints, dtype, device)
+    theirs = {name: tensor.cpu().double() for name, tensor in ours.items()}
+    leaves = [ours[name].requires_grad_() for name in FLOATS]
+    wide = [theirs[name].requires_grad_() for name in FLOATS]
+    got = skin(**ours, rotation_only=rotation_only)
+    want = twin.skin(**theirs, rotation_only=rotation_only)
+    # The nearest rotation of a random matrix may be ill-determined, its gradient more so.
+    tolerance = (2e-7 if dtype == torch.float32 else 1e-14) * (10 if rotation_only else 1)
+    for a, b in zip(got, want, strict=True):
+        assert a.dtype == dtype and rel(a, b) < tolerance
+    for name, a, b in zip(FLOATS, gradients(got, leaves), gradients(want, wide), strict=True):
+        assert rel(a, b) < 10 * tolerance * (10 if rotation_only else 1), name
+
+
+@pytest.mark.parametrize("rotation_only", [False, True])
+def test_gradcheck_passes_for_every_input(rotation_only):
+    leaves = [tensor.requires_grad_() for tensor in scene(2, 5, 4, rigid=True).values()]
+    assert torch.autograd.gradcheck(lambda *inputs: tuple(skin(*inputs, rotation_only=rotation_only)), leaves)
+
+
+def test_points_alone_move_as_with_covariances_and_none_come_out():
+    arguments = scene(3)
+    leaves = [arguments[name].requires_grad_() for name in ("means", "weights", "transforms")]
+    both = skin(**arguments)
+    alone = skin(**arguments | {"covars": None})
+    assert alone.covars is None and torch.equal(alone.means, both.means)
+    weights = torch.arange(float(both.means.numel())).view_as(both.means)
+    first, second = (torch.autograd.grad((out.means * weights).sum(), leaves) for out in (both, alone))
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("rotation_only", [False, True])
+@pytest.mark.parametrize("wanted", FLOATS)
+def test_only_inputs_that_require_a_gradient_get_one_and_it_is_the_same(wanted, rotation_only):
+    alone, together = scene(4), scene(4)
+    alone[wanted].requires_grad_()
+    for name in FLOATS:
+        together[name].requires_grad_()
+    for arguments in (alone, together):
+        got = skin(**arguments, rotation_only=rotation_only)
+        sum((out * torch.arange(out.numel()).view_as(out)).sum() for out in got).backward()
+    assert [name for name in FLOATS if alone[name].grad is not None] == [wanted]
+    assert torch.equal(alone[wanted].grad, together[wanted].grad)
+
+
+def test_the_gradient_of_one_output_is_its_share_of_the_gradient_of_both():
+    leaves = [tensor.requires_grad_() for tensor in scene(5).values()]
+    means, covars = ((out * torch.arange(out.numel()).view_as(out)).sum() for out in skin(*leaves))
+    shares = [
+        torch.autograd.grad(part, leaves, retain_graph=True, allow_unused=True, materialize_grads=True)
+        for part in (means, covars)
+    ]
+    for a, b, whole in zip(*shares, torch.autograd.grad(means + covars, leaves), strict=True):
+        torch.testing.assert_close(a + b, whole)
+
+
+def test_a_second_derivative_is_refused():
+    arguments = scene(6)
+    arguments["means"].requires_grad_()
+    means = skin(**arguments).means
+    (first,) = torch.autograd.grad(means.square().sum(), arguments["means"], create_graph=True)
+    with pytest.raises(RuntimeError, match="skin: expected one derivative"):
+        first.sum().backward()
+
+
+def test_transforms_of_four_rows_are_those_of_three_and_their_last_row_gets_no_gradient():
+    arguments = scene(7)
+    last = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(16, 1, 4)
+    square = torch.cat([arguments["transforms"], last], 1).requires_grad_()
+    got = skin(**arguments | {"transforms": square})
+    assert all(torch.equal(a, b) for a, b in zip(got, skin(**arguments), strict=True))
+    (grad,) = torch.autograd.grad(got.means.sum(), square)
+    assert grad[:, :3].any() and not grad[:, 3].any()
+
+
+@pytest.mark.parametrize("rotation_only", [False, True])
+def test_one_rigid_motion_of_all_bones_moves_everything_rigidly(rotation_only):
+    arguments = scene(8)
+    turn = to_matrix(torch.randn(4, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    shift = torch.tensor([1.0, -2, 3], dtype=torch.float64)
+    arguments["transforms"] = torch.cat([turn, shift[:, None]], 1).expand(16, 3, 4)
+    got = skin(**arguments, rotation_only=rotation_only)
+    torch.testing.assert_close(got.means, arguments["means"] @ turn.T + shift)
+    torch.testing.assert_close(got.covars, turn @ arguments["covars"] @ turn.T)
+
+
+def test_rotation_only_keeps_the_axes_lengths():
+    arguments = scene(9, rigid=True)
+    half = arguments["covars"]
+    arguments["covars"] = half @ half.transpose(1, 2)
+    got = skin(**arguments, rotation_only=True).covars
+    torch.testing.assert_close(torch.linalg.eigvalsh(got), torch.linalg.eigvalsh(arguments["covars"]))
+
+
+def blend_of_turns(angles, axis=(0.0, 0.0, 1.0)):
+    """One point between two bones, turned by these angles [rad] about `axis`, with equal shares."""
+    axis = torch.tensor(axis, dtype=torch.float64)
+    turns = torch.stack([from_axis_angle(axis, torch.tensor(a, dtype=torch.float64)) for a in angles])
+    return {
+        "means": torch.zeros(1, 3, dtype=torch.float64),
+        "covars": torch.diag(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))[None],
+        "weights": torch.full((1, 2), 0.5, dtype=torch.float64),
+        "transforms": torch.cat([turns, torch.zeros(2, 3, 1, dtype=torch.float64)], -1),
+    }
+
+
+@pytest.mark.parametrize("gap", [1.0, 1e-2, 1e-5])
+def test_between_almost_opposite_bones_the_rotation_is_the_one_half_way(gap):
+    # Turns of 0 and pi - gap: the blend is almost flat, but the nearest rotation is well-defined.
+    arguments = blend_of_turns([0.0, math.pi - gap])
+    arguments["transforms"].requires_grad_()
+    got = skin(**arguments, rotation_only=True).covars
+    angle = torch.tensor((math.pi - gap) / 2, dtype=torch.float64)
+    half = from_axis_angle(torch.tensor([0.0, 0, 1]).double(), angle)
+    torch.testing.assert_close(got.detach(), half @ arguments["covars"] @ half.T, rtol=0, atol=1e-14 / gap)
+    (grad,) = torch.autograd.grad(got[0, 0, 1], arguments["transforms"])
+    assert grad.isfinite().all() and grad.any()
+
+
+def test_where_the_nearest_rotation_is_not_unique_there_is_one_without_gradient():
+    for arguments in (blend_of_turns([0.0, math.pi]), blend_of_turns([0.0, 0.0])):
+        if arguments["transforms"][0].equal(arguments["transforms"][1]):
+            arguments["transforms"] = torch.zeros_like(arguments["transforms"])
+        arguments["transforms"].requires_grad_()
+        got = skin(**arguments, rotation_only=True).covars
+        assert torch.allclose(torch.linalg.eigvalsh(got.detach())[0], torch.tensor([1.0, 2.0, 3.0]).double())
+        (grad,) = torch.autograd.grad(got.square().sum(), arguments["transforms"])
+        assert not grad.any()
+
+
+def test_a_mirroring_blend_still_turns_by_a_proper_rotation():
+    arguments = scene(10, n_joints=1)
+    linear = arguments["transforms"][0, :, :3]
+    arguments["transforms"][0, 0] *= -torch.det(linear).sign()
+    assert torch.det(arguments["transforms"][0, :, :3]) < 0
+    got = skin(**arguments, rotation_only=True).covars
+    torch.testing.assert_close(got, twin.skin(**arguments, rotation_only=True)[1])
+    torch.testing.assert_close(got.det(), arguments["covars"].det())
+
+
+@pytest.mark.parametrize("rotation_only", [False, True])
+def test_a_set_without_points_is_empty_and_gives_zero_gradients(rotation_only):
+    leaves = [tensor.requires_grad_() for tensor in scene(0, n=0).values()]
+    got = skin(*leaves, rotation_only=rotation_only)
+    assert [out.shape for out in got] == [(0, 3), (0, 3, 3)]
+    for grad, leaf in zip(torch.autograd.grad(sum(out.sum() for out in got), leaves), leaves, strict=True):
+        assert grad.shape == leaf.shape and not grad.any()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
+@pytest.mark.parametrize("name", FLOATS)
+def test_values_that_are_no_numbers_are_refused_by_name(name, value):
+    arguments = scene(0)
+    arguments[name].view(-1)[5] = value
+    with pytest.raises(ValueError, match=rf"^{name}: expected finite values .* got 1 of "):
+        skin(**arguments)
+    skin(**arguments, validate=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"means": torch.zeros(41, 2).double()}, r"means: expected shape \[N, 3\], got \[41, 2\]."),
+        ({"covars": torch.zeros(40, 3, 3).double()}, r"covars: expected shape \[41, 3, 3\], got \[40, 3, 3\]. One for"),
+        ({"weights": torch.zeros(40, 16).double()}, r"weights: expected shape \[41, J\], got \[40, 16\]. One row for"),
+        ({"transforms": torch.zeros(15, 3, 4).double()}, r"transforms: expected shape \[16, 3, 4\], got \[15, 3, 4\]."),
+        ({"transforms": torch.zeros(16, 5, 4).double()}, r"transforms: expected shape \[16, 4, 4\], got \[16, 5, 4\]."),
+        ({"transforms": torch.zeros(16, 3, 4)}, "transforms: expected torch.float64 on cpu, got torch.float32 on cpu."),
+        ({"means": torch.zeros(41, 3).half()}, "means: expected float32 or float64, got float16."),
+        ({"covars": None, "rotation_only": True}, "rotation_only: expected False without covars, got True."),
+    ],
+)
+def test_a_wrong_argument_is_named_with_what_was_expected(change, message, as_shipped):
+    with pytest.raises(ValueError, match="^" + message):
+        skin(**scene(0) | change)
