@@ -136,7 +136,7 @@ def _pose_on_mesh(scene: MeshScene, **options: Any) -> Outputs:
 
 def _skin(scene: MeshScene, **options: Any) -> Outputs:
     skinned = skin(scene.rest_vertices, scene.covars, scene.skin_weights, scene.transforms, **options)
-    return skinned.means, skinned.covars
+    return tuple(part for part in skinned if part is not None)
 
 
 def _posing(scene: MeshScene, **options: Any) -> Outputs:
