@@ -8,10 +8,10 @@ from warp import vec2f, vec3d, vec4f, vec4i
 from warp.types import vector
 
 from oasis_kernels import rasterize_cuda as kernels
-from oasis_warp.ops._blend_tiles import Gradients, Splats
 from oasis_warp.ops._launch import SCALAR, launch, view
-from oasis_warp.ops._registration import hidden, revealed
+from oasis_warp.ops._registration import hidden, hidden_like_fake, revealed
 from oasis_warp.ops._rules import current_rules
+from oasis_warp.ops._splats import Frame, Gradients, Splats, Wanted
 from oasis_warp.ops._tiles import check_pairs
 
 
@@ -26,33 +26,29 @@ class Lists(NamedTuple):
     """`hidden` [P], int32: Gaussians, nearest first."""
 
 
-class Drawn(NamedTuple):
-    """Images, and what their adjoint needs."""
+class Kept(NamedTuple):
+    """What the adjoint needs."""
 
-    image: Tensor
-    alphas: Tensor
     transmittance: Tensor
     """[C, H, W], of the end."""
     stops: Tensor
-    """[C, H, W], place in the tile's list of the first Gaussian that was not drawn."""
-    lists: Lists
+    """[C, H, W], int32: place in the tile's list of the first Gaussian that was not drawn."""
+    starts: Tensor
+    """As in `Lists`, like all below."""
+    pair_starts: Tensor
+    gaussians: Tensor
 
 
-def count_tiles(width: int, height: int) -> tuple[int, int]:
+def _count_tiles(width: int, height: int) -> tuple[int, int]:
     """Tiles across and down an image."""
     return -(-width // kernels.TILE), -(-height // kernels.TILE)
-
-
-def fits(n: int) -> bool:
-    """Whether this many Gaussians a camera can be told apart in a sorting key."""
-    return n <= 1 << kernels.INDEX_BITS
 
 
 def _bin(splats: Splats, width: int, height: int) -> tuple[Lists, Tensor, bool]:
     """Lists of the tiles, sorting keys in their place, and whether the lists are sorted already."""
     n_cameras, n = splats.depths.shape
     device = splats.depths.device
-    across, down = count_tiles(width, height)
+    across, down = _count_tiles(width, height)
     n_tiles = n_cameras * across * down
     counts, cursors, total = torch.zeros(2 * n_tiles + 1, dtype=torch.int32, device=device).split([n_tiles, n_tiles, 1])
     pair_starts = torch.empty(n_cameras * n, dtype=torch.int32, device=device)
@@ -92,11 +88,33 @@ def _sort(keys: Tensor, counts: Tensor, tiles_a_camera: int, n: int, gaussians: 
     gaussians.copy_(tiles // tiles_a_camera * n + index)
 
 
-def draw(splats: Splats, width: int, height: int) -> Drawn:
-    """Images over the backgrounds, and alpha."""
+def kept_like(colors: Tensor, frame: Frame) -> Kept:
+    """Empty tensors of the shapes that `draw` keeps."""
+    n_cameras, n, _ = colors.shape
+    across, down = _count_tiles(frame.width, frame.height)
+
+    def empty(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
+        return colors.new_empty(shape, dtype=dtype)
+
+    return Kept(
+        empty(n_cameras, frame.height, frame.width, dtype=torch.float32),
+        empty(n_cameras, frame.height, frame.width),
+        empty(n_cameras * across * down + 1),
+        empty(n_cameras * n),
+        hidden_like_fake(torch.int32, colors.device),
+    )
+
+
+def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept | None]:
+    """Images over the backgrounds, alpha, and what the adjoint needs if it is to be kept.
+
+    Raises:
+        ValueError: more pairs of a Gaussian and a tile than can be numbered.
+    """
+    width, height, _ = frame
     n_cameras, n, channels = splats.colors.shape
     color = vector(channels, SCALAR[torch.float32])
-    across, down = count_tiles(width, height)
+    across, down = _count_tiles(width, height)
     lists, keys, in_order = _bin(splats, width, height)
 
     def empty(*shape: int) -> Tensor:
@@ -117,30 +135,23 @@ def draw(splats: Splats, width: int, height: int) -> Drawn:
         like=image,
         block_dim=kernels.BLOCK,
     )  # fmt: skip
-    return Drawn(image, alphas, transmittance, stops, lists)
+    return image, alphas, Kept(transmittance, stops, *lists) if keep else None
 
 
 def draw_backward(
-    g_image: Tensor | None,
-    g_alpha: Tensor | None,
-    splats: Splats,
-    transmittance: Tensor,
-    stops: Tensor,
-    lists: Lists,
-    with_shape: bool,
-    with_colors: bool,
-    with_backgrounds: bool,
+    g_image: Tensor | None, g_alpha: Tensor | None, splats: Splats, frame: Frame, kept: Kept, wanted: Wanted
 ) -> Gradients:
     """Gradients from those by image and alpha, None standing for zeros."""
+    width, height, _ = frame
+    with_shape, with_colors, with_backgrounds = wanted
     n_cameras, n, channels = splats.colors.shape
-    _, height, width = transmittance.shape
     color, moments = (vector(k, SCALAR[torch.float32]) for k in (channels, 8))
-    across, down = count_tiles(width, height)
+    across, down = _count_tiles(width, height)
     pixels, n_tiles = n_cameras * height * width, n_cameras * across * down
     new = splats.colors
     of_image = new.new_zeros(pixels, channels) if g_image is None else g_image.view(-1, channels)
     of_alpha = new.new_zeros(pixels) if g_alpha is None else g_alpha.view(-1)
-    gaussians = revealed(lists.gaussians)
+    gaussians = revealed(kept.gaussians)
     n_pairs, total = len(gaussians), n_cameras * n
     pair_moments = new.new_empty(n_pairs if with_shape else 0, 8)
     pair_colors = new.new_empty(n_pairs if with_colors else 0, channels)
@@ -151,10 +162,10 @@ def draw_backward(
         kernels.blend_backward(channels, current_rules()),
         (n_tiles, kernels.BLOCK),
         [
-            view(lists.starts), view(gaussians), view(lists.pair_starts), boxes,
+            view(kept.starts), view(gaussians), view(kept.pair_starts), boxes,
             view(splats.centers.view(-1, 4), vec4f), whitenings, opacities,
             view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color), across, down, width,
-            height, view(transmittance.view(-1)), view(stops.view(-1)), view(of_image, color), view(of_alpha),
+            height, view(kept.transmittance.view(-1)), view(kept.stops.view(-1)), view(of_image, color), view(of_alpha),
             int(with_shape), int(with_colors), view(pair_moments, moments), view(pair_colors, color),
             view(tile_backgrounds, color),
         ],
@@ -170,7 +181,7 @@ def draw_backward(
             kernels.gather(channels),
             total,
             [
-                boxes, view(lists.pair_starts), view(pair_moments, moments), view(pair_colors, color), whitenings,
+                boxes, view(kept.pair_starts), view(pair_moments, moments), view(pair_colors, color), whitenings,
                 opacities, int(with_shape), int(with_colors), view(g_means2d, vec2f), view(g_covars2d, vec3d),
                 view(g_opacities), view(g_colors, color),
             ],
