@@ -2,7 +2,7 @@
 
 `transform` (a task is a range of vertices) -> `draw` (a part of the faces, into a buffer of its own) -> `write` (rows
 of the buffers, merged) -> `score` (a range of points). Each is launched once a thread, and the threads take tasks off a
-counter of the call until none is left.
+counter of the call until none is left. Backwards, `pull` (a batch entry) gives the corners of the faces their gradient.
 
 Drawing is a filter. Faces are set up 16 at a time in float32, from corners in fixed point on the screen (2^-20 px for
 pictures up to 512 px) and their inverse depths, and then tested against blocks of 4 x 4 pixels: one vector for each
@@ -57,6 +57,9 @@ class Job(ctypes.Structure):
         ("visibility", ctypes.c_longlong),  # T [batch][n_points]
         ("slopes", ctypes.c_longlong),  # T [batch][n_points], or 0
         ("pixels", ctypes.c_longlong),  # int [batch][n_points], or 0
+        ("grad_visibility", ctypes.c_longlong),  # T [batch][n_points]
+        ("sums", ctypes.c_longlong),  # double [batch][n_vertices][3]
+        ("grad_vertices", ctypes.c_longlong),  # T [batch][n_vertices][3]
         ("batch", ctypes.c_int),
         ("n_vertices", ctypes.c_int),
         ("n_faces", ctypes.c_int),
@@ -70,6 +73,7 @@ class Job(ctypes.Structure):
         ("next_draw", ctypes.c_int),
         ("next_write", ctypes.c_int),
         ("next_score", ctypes.c_int),
+        ("next_pull", ctypes.c_int),
         ("found", ctypes.c_int),  # not 0: there may be values that are refused
         ("near_plane", ctypes.c_double),
         ("tau", ctypes.c_double),
@@ -340,6 +344,15 @@ DRAW = """
     #else
     auto fma = [](F a, F b, F c) -> F { return a * b + c; };
     #endif
+    // A choice between new and old is compiled to a masked store. Those of AVX2 take many times as long as plain ones
+    // on some processors; a volatile one stays plain.
+    #if defined(__AVX512F__)
+    typedef FU FOut;
+    typedef IU IOut;
+    #else
+    typedef volatile FU FOut;
+    typedef volatile IU IOut;
+    #endif
     const I lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
     const F column = __builtin_convertvector(lane / 4, F), row = __builtin_convertvector(lane % 4, F);
     const int shift = job.fraction_bits, unit = 1 << shift;
@@ -499,8 +512,8 @@ DRAW = """
                 const F apart = inverse - before;
                 const I won = (least >= of[9][k]) & (apart > of[10][k]);
                 const unsigned certain = bits(won), possible = bits((least >= 0.f) & (apart >= -of[10][k]));
-                *(FU*)(inverses + i) = won ? inverse : before;
-                *(IU*)(ids + i) = won ? (I)(f) : (I)*(const IU*)(ids + i);
+                *(FOut*)(inverses + i) = won ? inverse : before;
+                *(IOut*)(ids + i) = won ? (I)(f) : (I)*(const IU*)(ids + i);
                 if (possible != certain) settle(f, possible & ~certain, i, x, y, inverse);
             };
 
@@ -772,6 +785,61 @@ SCORE = """
     if (found) __atomic_store_n(&job.found, 1, __ATOMIC_RELAXED);
 """
 
+PULL = """
+    typedef int I __attribute__((ext_vector_type(8)));
+    typedef int I8U __attribute__((ext_vector_type(8), aligned(4)));
+    for (;;) {
+        const int b = __atomic_fetch_add(&job.next_pull, 1, __ATOMIC_RELAXED);
+        if (b >= job.batch) break;
+        const View view = view_of(b);
+        const double* camera = (const double*)job.camera_vertices + 4ll * b * job.n_vertices;
+        const int* ids = (const int*)job.face_ids + (long long)b * height * width;
+        const T* grads = (const T*)job.grad_visibility + (long long)b * job.n_points;
+        const T* slopes = (const T*)job.slopes + (long long)b * job.n_points;
+        const int* pixels = (const int*)job.pixels + (long long)b * job.n_points;
+        double* sums = (double*)job.sums + 3ll * b * job.n_vertices;
+        memset(sums, 0, 3ll * job.n_vertices * sizeof(double));
+        for (int i = 0; i < job.n_points; i += 8) {
+            const int n = wp::min(job.n_points - i, 8);
+            I pixel = (I)(-1);
+            D pull = (D)(0.0);
+            for (int k = 0; k < n; k++) {
+                pixel[k] = pixels[i + k];
+                // The buffer's depth acts as the point's, with the other sign.
+                pull[k] = -(double)grads[i + k] * (double)slopes[i + k];
+            }
+            const I soft = pixel >= 0;
+            if (!bits8(__builtin_convertvector(soft, L))) continue;
+            const I at = soft ? pixel : (I)(0);
+            int chosen[8];
+            for (int k = 0; k < 8; k++) chosen[k] = pixel[k] < 0 ? 0 : ids[at[k]];
+            const I y = at / width, x = at - y * width;
+            const D u = view.u0 + __builtin_convertvector(x, D) * view.du;
+            const D v = view.v0 + __builtin_convertvector(y, D) * view.dv;
+            const Corner p = gather(camera, chosen, 0), q = gather(camera, chosen, 1), r = gather(camera, chosen, 2);
+            const Weights w = weigh(p, q, r, u, v);
+            const D ex = q.x - p.x, ey = q.y - p.y, ez = q.z - p.z, fx = r.x - p.x, fy = r.y - p.y, fz = r.z - p.z;
+            const D nx = ey * fz - ez * fy, ny = ez * fx - ex * fz, nz = ex * fy - ey * fx;
+            const D along = pull / ((nx * u + ny * v + nz) * w.sum);
+            const D gx = along * (view.r[0] * nx + view.r[4] * ny + view.r[8] * nz);
+            const D gy = along * (view.r[1] * nx + view.r[5] * ny + view.r[9] * nz);
+            const D gz = along * (view.r[2] * nx + view.r[6] * ny + view.r[10] * nz);
+            const D weight[3] = {w.a, w.b, w.c};
+            for (int k = 0; k < n; k++) {
+                if (pixel[k] < 0) continue;
+                for (int j = 0; j < 3; j++) {
+                    double* to = sums + 3ll * faces[3ll * chosen[k] + j];
+                    to[0] += weight[j][k] * gx[k];
+                    to[1] += weight[j][k] * gy[k];
+                    to[2] += weight[j][k] * gz[k];
+                }
+            }
+        }
+        T* grad_vertices = (T*)job.grad_vertices + 3ll * b * job.n_vertices;
+        for (long long i = 0; i < 3ll * job.n_vertices; i++) grad_vertices[i] = (T)sums[i];
+    }
+"""
+
 CONSTANTS = {
     "VERTICES_A_TASK": VERTICES_A_TASK,
     "POINTS_A_TASK": POINTS_A_TASK,
@@ -783,6 +851,7 @@ BODIES = {
     "draw": HEAD + MARKS + BUFFER + DRAW,
     "write": HEAD + BUFFER + WRITE,
     "score": HEAD + SCORE,
+    "pull": HEAD + PULL,
 }
 
 
@@ -793,8 +862,9 @@ class Kernels(NamedTuple):
     draw: Any
     write: Any
     score: Any
+    pull: Any
     all: Any
-    """The four, one after the other, for a single thread."""
+    """`transform`, `draw`, `write` and `score`, one after the other, for a single thread."""
 
 
 @functools.cache
@@ -814,7 +884,7 @@ def kernels(dtype: str) -> Kernels:
         return wp.func_native(text)(stub)
 
     transform_natively, draw_natively = native("transform"), native("draw")
-    write_natively, score_natively = native("write"), native("score")
+    write_natively, score_natively, pull_natively = native("write"), native("score"), native("pull")
 
     def transform(address: wp.uint64):
         transform_natively(address)
@@ -828,11 +898,14 @@ def kernels(dtype: str) -> Kernels:
     def score(address: wp.uint64):
         score_natively(address)
 
+    def pull(address: wp.uint64):
+        pull_natively(address)
+
     def transform_draw_write_score(address: wp.uint64):
         transform_natively(address)
         draw_natively(address)
         write_natively(address)
         score_natively(address)
 
-    functions = (transform, draw, write, score, transform_draw_write_score)
+    functions = (transform, draw, write, score, pull, transform_draw_write_score)
     return Kernels(*(wp.Kernel(function, module=module) for function in functions))

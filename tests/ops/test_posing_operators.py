@@ -8,8 +8,7 @@ import sys
 import pytest
 import torch
 
-from oasis_warp.ops import face_rotations, pose_on_mesh, pose_on_mesh_covars, skin
-from oasis_warp.ops._native import run_tasks
+from oasis_warp.ops import _launch, _words, face_rotations, pose_on_mesh, pose_on_mesh_covars, skin
 
 
 def mesh(seed, n, dtype):
@@ -202,31 +201,32 @@ GUARD = 64
 
 def test_kernels_stay_inside_their_memory(monkeypatch):
     """Every tensor a vectorised kernel is given moves between guards, whose values must not matter nor change."""
+    moved = []
     checked = 0
 
-    def guarded(kernel, n_tasks, arguments, least=4096):
+    def guarded_address(tensor, dtype, size):
+        _launch.address(tensor, dtype, size)
+        poison = torch.nan if tensor.is_floating_point() else torch.iinfo(dtype).max
+        yard = torch.full((size + 2 * GUARD,), poison, dtype=dtype)
+        inside = yard[GUARD : GUARD + size].view(tensor.shape)
+        inside.copy_(tensor)
+        moved.append((yard, tensor, inside))
+        return inside.data_ptr()
+
+    def guarded_run(native, words, n_tasks):
         nonlocal checked
-        fenced, yards = [], []
-        for argument in arguments:
-            if not isinstance(argument, torch.Tensor):
-                fenced.append(argument)
-                continue
-            poison = torch.nan if argument.is_floating_point() else 2**31 - 1
-            yard = torch.full((argument.numel() + 2 * GUARD,), poison, dtype=argument.dtype)
-            inside = yard[GUARD:-GUARD].view(argument.shape)
-            inside.copy_(argument)
-            fenced.append(inside)
-            yards.append((yard, poison, argument, inside))
-        run_tasks(kernel, n_tasks, fenced, least)
-        for yard, poison, argument, inside in yards:
-            for guard in (yard[:GUARD], yard[-GUARD:]):
-                assert guard.isnan().all() if poison != poison else (guard == poison).all()
-            argument.copy_(inside)
+        _launch.run_native(native, words, n_tasks)
+        while moved:
+            yard, tensor, inside = moved.pop()
+            guards = torch.cat([yard[:GUARD], yard[GUARD + tensor.numel() :]])
+            assert guards.isnan().all() if yard.is_floating_point() else (guards == torch.iinfo(yard.dtype).max).all()
+            tensor.copy_(inside)
             checked += 1
 
     plain = {(name, n): results(name, n=n) for name in NAMES for n in (1, 2, 5)}
-    for module in ("face_rotations", "mesh_posing", "skinning"):
-        monkeypatch.setattr(sys.modules[f"oasis_warp.ops.{module}"], "run_tasks", guarded)
+    monkeypatch.setattr(_words, "address", guarded_address)
+    for module in ("_riders", "face_rotations", "skinning"):
+        monkeypatch.setattr(sys.modules[f"oasis_warp.ops.{module}"], "run_native", guarded_run)
     for (name, n), want in plain.items():
         for a, b in zip(results(name, n=n), want, strict=True):
             assert torch.equal(a, b), (name, n)

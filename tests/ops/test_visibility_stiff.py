@@ -156,7 +156,8 @@ def test_what_is_nearer_than_the_near_plane_is_not_seen():
 def test_a_mesh_without_faces_hides_nothing_and_no_points_give_an_empty_answer(n_points):
     vertices = torch.zeros(4, 3)
     nothing = torch.zeros(0, 3, dtype=torch.int64)
-    points = (torch.rand(n_points, 3) - 0.5 + torch.tensor([0, 0, 2.0])).requires_grad_()
+    inside = 0.5 * torch.rand(n_points, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0, 0, 2.0])
+    points = inside.requires_grad_()
     got = depth_visibility(points, vertices, nothing, pinhole(20.0, 16, 12, torch.float32), EYE.float(), 16, 12)
     assert got.visibility.shape == (n_points,) and (got.visibility == 1).all()
     assert got.depth_map.shape == (12, 16) and got.depth_map.isinf().all() and (got.face_ids == -1).all()

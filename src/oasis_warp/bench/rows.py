@@ -45,7 +45,7 @@ class Row:
     first_ms: float
     """The first call, with compiling or loading kernels."""
     yardstick_ms: float
-    """Median of the yardstick in the same rounds: times over it can be compared between runs."""
+    """The yardstick's fastest in the same rounds: times over it can be compared between runs."""
     peak_mb: float | None
     """Memory beyond what was in use before the call [MiB]."""
     rel_l2: float
@@ -56,8 +56,9 @@ class Row:
     """Of the image, fragile pixels included; None where it is equal, or there is none."""
     gradient_rel_l2: float | None
     """Largest relative error of any gradient, of a loss without the fragile pixels."""
-    floor_rel_l2: float | None
-    """What the same computation differs by when the Gaussians or faces are listed in another order."""
+    floor_rel_l2: float
+    """How far the exact results are known: what torch in float64, with the Gaussians or faces listed in another order,
+    differs from them by in the first output. Smaller errors than this say nothing."""
     fragile_percent: float | None
     """Share of the pixels where a decision hangs on rounding."""
     bit_equal: bool

@@ -1,7 +1,7 @@
 """The generic kernels in float32 on the CPU, where the operators choose vectorised ones: what the vectors gain.
 
 No option of the operators, for nobody but a benchmark wants it: inside `generic_kernels` the questions "is there a
-vectorised kernel for this tensor" are answered with no.
+vectorised kernel for this tensor" are answered with no, and depth buffers are filled as on CUDA.
 """
 
 import sys
@@ -10,6 +10,8 @@ from contextlib import ExitStack, contextmanager
 from unittest.mock import patch
 
 from torch import Tensor
+
+from oasis_warp.ops import _depth_buffer
 
 QUESTIONS = ("is_vectorised", "has_vectors", "draws_strips")
 """Functions of `oasis_warp.ops` from a tensor to whether it has a vectorised kernel."""
@@ -29,4 +31,5 @@ def generic_kernels() -> Iterator[None]:
             assert askers, f"no operator asks {question} any more"
             for module in askers:
                 patched.enter_context(patch.object(module, question, no))
+        patched.enter_context(patch.object(_depth_buffer, "draw_by_vectors", _depth_buffer.draw_by_faces))
         yield

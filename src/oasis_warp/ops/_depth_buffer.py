@@ -4,6 +4,7 @@ Everything has a leading batch axis here. A tensor that is the same for the whol
 """
 
 import ctypes
+import functools
 import os
 import threading
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ from torch import Tensor
 from oasis_kernels import depth_buffer as kernels
 from oasis_kernels import depth_buffer_vectors as vectors
 from oasis_warp.core.checks import check_finite, check_index, check_positive
+from oasis_warp.ops._incidence import incidence, sum_at_items
 from oasis_warp.ops._launch import _load_lock, _pool, launch, start, view
 
 C_TYPES = {torch.float32: "float", torch.float64: "double"}
@@ -40,7 +42,7 @@ class Scene(NamedTuple):
 
     def room(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
         """An empty tensor of `shape` for each batch entry, of the vertices' type unless told."""
-        return self.vertices.new_empty((len(self.vertices), *shape), dtype=dtype)
+        return self.vertices.new_empty((self.vertices.shape[0], *shape), dtype=dtype)
 
 
 class Query(NamedTuple):
@@ -112,7 +114,7 @@ def plane_size(width: int, height: int) -> int:
 
 def _shared(tensor: Tensor) -> tuple[Tensor, int]:
     """A contiguous tensor and the step from one batch entry to the next: 0 where they are the same."""
-    if tensor.shape[0] == 1 or (tensor.shape[0] > 1 and tensor.stride(0) == 0):
+    if tensor.shape[0] == 1 or (tensor.stride(0) == 0 and tensor.shape[0] > 1):
         return tensor[0].contiguous(), 0
     return tensor.contiguous(), tensor[:1].numel()
 
@@ -122,28 +124,11 @@ def _fraction_bits(width: int, height: int) -> int:
     return min(MAX_FRACTION_BITS, 30 - (max(width, height) - 1).bit_length())
 
 
-def draw_by_vectors(
-    scene: Scene, query: Query | None, barycentrics: bool, validate: bool
-) -> tuple[Buffer, Scores | None]:
-    """The way of the CPU."""
+def _job(scene: Scene, **more: int) -> tuple[vectors.Job, list[Tensor]]:
+    """A job for `scene`, and the tensors it points to, which must outlive it; `more` are further fields."""
     vertices, vertices_step = _shared(scene.vertices)
     viewmats, viewmats_step = _shared(scene.viewmats)
     Ks, Ks_step = _shared(scene.Ks)
-    batch, n_vertices, _ = scene.vertices.shape
-    n_faces, n_threads = len(scene.faces), torch.get_num_threads()
-    parts = max(1, min(-(-n_threads // max(batch, 1)), n_faces // FACES_A_PART))
-    width, height = scene.width, scene.height
-    buffer = Buffer(
-        scene.room(height, width),
-        scene.room(height, width, dtype=torch.int32),
-        scene.room(height, width, 3) if barycentrics else None,
-    )
-    plane = plane_size(width, height)
-    # One block: camera_vertices, screen_vertices and planes, in numbers of 4 bytes.
-    room = scene.room(12 * n_vertices + 2 * parts * plane, dtype=torch.float32)
-    camera_vertices = room.data_ptr()
-    screen_vertices = camera_vertices + 32 * batch * n_vertices
-    planes = screen_vertices + 16 * batch * n_vertices
     job = vectors.Job(
         vertices=vertices.data_ptr(),
         viewmats=viewmats.data_ptr(),
@@ -152,20 +137,42 @@ def draw_by_vectors(
         vertices_step=vertices_step,
         viewmats_step=viewmats_step,
         Ks_step=Ks_step,
-        camera_vertices=camera_vertices,
-        screen_vertices=screen_vertices,
-        planes=planes,
+        batch=scene.vertices.shape[0],
+        n_vertices=scene.vertices.shape[1],
+        n_faces=scene.faces.shape[0],
+        width=scene.width,
+        height=scene.height,
+        fraction_bits=_fraction_bits(scene.width, scene.height),
+        near_plane=scene.near_plane,
+        **more,
+    )
+    return job, [vertices, viewmats, Ks]
+
+
+def draw_by_vectors(
+    scene: Scene, query: Query | None, barycentrics: bool, validate: bool
+) -> tuple[Buffer, Scores | None]:
+    """The way of the CPU."""
+    batch, n_vertices, _ = scene.vertices.shape
+    width, height = scene.width, scene.height
+    parts = max(1, min(-(-torch.get_num_threads() // max(batch, 1)), scene.faces.shape[0] // FACES_A_PART))
+    buffer = Buffer(
+        scene.room(height, width),
+        scene.room(height, width, dtype=torch.int32),
+        scene.room(height, width, 3) if barycentrics else None,
+    )
+    # One block: camera_vertices, screen_vertices and planes, in numbers of 4 bytes.
+    room = scene.room(12 * n_vertices + 2 * parts * plane_size(width, height), dtype=torch.float32)
+    first = room.data_ptr()
+    job, _alive = _job(
+        scene,
+        camera_vertices=first,
+        screen_vertices=first + 32 * batch * n_vertices,
+        planes=first + 48 * batch * n_vertices,
+        parts=parts,
         depth=buffer.depth.data_ptr(),
         face_ids=buffer.face_ids.data_ptr(),
         barycentrics=0 if buffer.barycentrics is None else buffer.barycentrics.data_ptr(),
-        batch=batch,
-        n_vertices=n_vertices,
-        n_faces=n_faces,
-        width=width,
-        height=height,
-        parts=parts,
-        fraction_bits=_fraction_bits(width, height),
-        near_plane=scene.near_plane,
     )
     scores = None
     if query is not None:
@@ -180,7 +187,7 @@ def draw_by_vectors(
         job.visibility = scores.visibility.data_ptr()
         if query.keep:
             job.slopes, job.pixels = scores.slopes.data_ptr(), scores.pixels.data_ptr()
-    _run_all(job, C_TYPES[vertices.dtype])
+    _run_all(job, C_TYPES[scene.vertices.dtype])
     # Values that are refused do no harm on the way.
     if validate and job.found:
         refuse_bad_values(scene, query)
@@ -191,23 +198,24 @@ _recorded = threading.local()
 
 
 def _run_all(job: vectors.Job, dtype: str) -> None:
-    """Run the stages on as many of torch's threads as they have tasks for."""
-    start()
-    address = ctypes.addressof(job)
+    """Run the stages of a forward pass on as many of torch's threads as they have tasks for."""
     if torch.get_num_threads() == 1:
-        _run("all", dtype, address)
+        _run("all", dtype, ctypes.addressof(job))
         return
-    for stage, tasks in {
-        "transform": -(-job.n_vertices // vectors.VERTICES_A_TASK),
-        "draw": job.parts,
-        "write": -(-job.height // (4 * vectors.QUADS_A_TASK)),
-        "score": -(-job.n_points // vectors.POINTS_A_TASK),
-    }.items():
-        n_threads = min(torch.get_num_threads(), job.batch * tasks)
-        if n_threads < 2:
-            _run(stage, dtype, address)
-        else:
-            list(_pool(os.getpid(), n_threads).map(_run, *zip(*[(stage, dtype, address)] * n_threads, strict=True)))
+    _run_tasks("transform", dtype, job, -(-job.n_vertices // vectors.VERTICES_A_TASK))
+    _run_tasks("draw", dtype, job, job.parts)
+    _run_tasks("write", dtype, job, -(-job.height // (4 * vectors.QUADS_A_TASK)))
+    _run_tasks("score", dtype, job, -(-job.n_points // vectors.POINTS_A_TASK))
+
+
+def _run_tasks(stage: str, dtype: str, job: vectors.Job, tasks: int) -> None:
+    """Run a stage that has a number of tasks for each batch entry."""
+    n_threads = min(torch.get_num_threads(), job.batch * tasks)
+    if n_threads < 2:
+        _run(stage, dtype, ctypes.addressof(job))
+    else:
+        run = functools.partial(_run, stage, dtype)
+        list(_pool(os.getpid(), n_threads).map(run, [ctypes.addressof(job)] * n_threads))
 
 
 def _run(stage: str, dtype: str, address: int) -> None:
@@ -215,11 +223,12 @@ def _run(stage: str, dtype: str, address: int) -> None:
     # A recorded launch takes 3 us instead of 19, and belongs to one thread: its arguments are part of it.
     recorded = getattr(_recorded, stage + dtype, None)
     if recorded is None:
+        start()
         with _load_lock:
             kernel = getattr(vectors.kernels(dtype), stage)
             recorded: Any = wp.launch(kernel, dim=1, inputs=[address], device="cpu", record_cmd=True)
         setattr(_recorded, stage + dtype, recorded)
-    recorded.set_param_at_index(0, address)
+    recorded.set_param_at_index_from_ctype(0, address)
     recorded.launch()
 
 
@@ -295,14 +304,55 @@ def draw_by_faces(
     return buffer, scores
 
 
-def corner_gradients(
+def vertex_gradients(
     scene: Scene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
 ) -> Tensor:
-    """What each point's score gives to the corners of the face in its pixel, shape [B, P, 3, 3]."""
+    """Gradient of scores by the vertices of the faces in their pixels, [B, V, 3]; its sums have a fixed order."""
+    method = vertex_gradients_by_vectors if slopes.device.type == "cpu" else vertex_gradients_by_points
+    return method(scene, face_ids, grad_visibility.contiguous(), slopes, pixels)
+
+
+def vertex_gradients_by_vectors(
+    scene: Scene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
+) -> Tensor:
+    """The way of the CPU: point after point."""
+    batch, n_vertices, _ = scene.vertices.shape
+    grad_vertices = scene.room(n_vertices, 3)
+    # One block: camera_vertices, sums and screen_vertices, in numbers of 8 bytes.
+    room = scene.room(9 * n_vertices, dtype=torch.float64)
+    first = room.data_ptr()
+    job, _alive = _job(
+        scene,
+        camera_vertices=first,
+        sums=first + 32 * batch * n_vertices,
+        screen_vertices=first + 56 * batch * n_vertices,
+        face_ids=face_ids.data_ptr(),
+        n_points=slopes.shape[1],
+        grad_visibility=grad_visibility.data_ptr(),
+        slopes=slopes.data_ptr(),
+        pixels=pixels.data_ptr(),
+        grad_vertices=grad_vertices.data_ptr(),
+    )
+    dtype = C_TYPES[slopes.dtype]
+    _run_tasks("transform", dtype, job, -(-n_vertices // vectors.VERTICES_A_TASK))
+    _run_tasks("pull", dtype, job, 1)
+    return grad_vertices
+
+
+def vertex_gradients_by_points(
+    scene: Scene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
+) -> Tensor:
+    """The way of CUDA: all points at once, then for each vertex the sum over the points that name it."""
     batch, n_points = slopes.shape
+    n_vertices = scene.vertices.shape[1]
     rows = scene.room(n_points, 3, 3)
     tensors = (
         grad_visibility, slopes, pixels, face_ids, scene.vertices, scene.faces, scene.viewmats, scene.Ks, rows
     )  # fmt: skip
-    launch(kernels.corner_gradients, (batch, n_points), [view(t.contiguous()) for t in tensors], like=scene.vertices)
-    return rows
+    launch(kernels.corner_gradients, (batch, n_points), [view(t.contiguous()) for t in tensors], like=slopes)
+    # Scores that are not soft name the first vertex, with rows of zeros.
+    seen = face_ids.flatten(1).gather(1, pixels.clamp_min(0).long()).where(pixels >= 0, 0)
+    corners = scene.faces[seen.long()] if len(scene.faces) else scene.faces.new_zeros((batch, n_points, 3))
+    corners = corners + n_vertices * torch.arange(batch, device=corners.device, dtype=torch.int32)[:, None, None]
+    index = incidence("corners", corners.view(-1, 3), batch * n_vertices, "vertices")
+    return sum_at_items(rows.view(-1, 3), index).view_as(scene.vertices)

@@ -52,7 +52,9 @@ def check_scene(
 
 def batched(tensor: Tensor, batch: int, n_axes: int) -> Tensor:
     """`tensor`, of `n_axes` without a batch axis, the same for all of the batch."""
-    return tensor if tensor.dim() > n_axes else tensor[None].expand(batch, *tensor.shape)
+    if tensor.dim() > n_axes:
+        return tensor
+    return tensor[None] if batch == 1 else tensor.expand(batch, *tensor.shape)
 
 
 def _depth_map(

@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_warp.core.checks import check_float, check_positive, check_shape
-from oasis_warp.ops._depth_buffer import Query, Scene, corner_gradients, draw
-from oasis_warp.ops._incidence import incidence, sum_at_items
+from oasis_warp.ops._depth_buffer import Query, Scene, draw, vertex_gradients
+from oasis_warp.ops._incidence import incidence
 from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
 from oasis_warp.ops.depth_map import batched, check_batched, check_scene
 
@@ -77,32 +77,26 @@ def _visibility_backward(
     faces: Tensor,
     viewmats: Tensor,
     Ks: Tensor,
+    near_plane: float,
     needs_points: bool,
     needs_vertices: bool,
 ) -> tuple[Tensor, Tensor]:
-    batch, n_vertices, _ = vertices.shape
-    grad_points = grad_vertices = vertices.new_empty(0)
+    grad_points, grad_vertices = vertices.new_empty(0), vertices.new_empty(0)
     if needs_points:
         # The point's depth is the third row of the view.
         grad_points = (grad_visibility * slopes)[..., None] * viewmats[:, None, 2, :3]
     if needs_vertices:
-        table = incidence("faces", faces, n_vertices, "vertices").table
+        table = incidence("faces", faces, vertices.shape[1], "vertices").table
         height, width = face_ids.shape[1:]
-        scene = Scene(vertices, table, viewmats, Ks, width, height, 0.0)
-        rows = corner_gradients(scene, face_ids, grad_visibility, slopes, pixels)
-        # Scores that are not soft name the first vertex, with rows of zeros.
-        soft = pixels >= 0
-        faces_seen = face_ids.flatten(1).gather(1, pixels.clamp_min(0).long()).where(soft, 0)
-        corners = table[faces_seen.long()] if len(table) else table.new_zeros((*pixels.shape, 3))
-        corners += n_vertices * torch.arange(batch, device=corners.device, dtype=corners.dtype)[:, None, None]
-        index = incidence("corners", corners.view(-1, 3), batch * n_vertices, "vertices")
-        grad_vertices = sum_at_items(rows.view(-1, 3), index).view_as(vertices)
+        scene = Scene(vertices, table, viewmats, Ks, width, height, near_plane)
+        grad_vertices = vertex_gradients(scene, face_ids, grad_visibility, slopes, pixels)
     return grad_points, grad_vertices
 
 
 def _visibility_backward_fake(
-    grad_visibility, slopes, pixels, face_ids, vertices, faces, viewmats, Ks, needs_points, needs_vertices
-):
+    grad_visibility, slopes, pixels, face_ids, vertices, faces, viewmats, Ks, near_plane, needs_points,
+    needs_vertices,
+):  # fmt: skip
     nothing = vertices.new_empty(0)
     return (
         vertices.new_empty((*slopes.shape, 3)) if needs_points else nothing,
@@ -115,7 +109,8 @@ _op_backward = adjoint("depth_visibility_backward", _visibility_backward, _visib
 
 
 def _save(ctx, inputs, output) -> None:
-    _, vertices, faces, viewmats, Ks, *_ = inputs
+    _, vertices, faces, viewmats, Ks, _, _, _, _, near_plane, *_ = inputs
+    ctx.near_plane = near_plane
     _, depth, face_ids, slopes, pixels = output
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(depth, slopes)
@@ -126,7 +121,9 @@ def _backward(ctx, grad_visibility, *_):
     needs_points, needs_vertices = ctx.needs_input_grad[:2]
     grad_points = grad_vertices = None
     if grad_visibility is not None:
-        grad_points, grad_vertices = _op_backward(grad_visibility, *ctx.saved_tensors, needs_points, needs_vertices)
+        grad_points, grad_vertices = _op_backward(
+            grad_visibility, *ctx.saved_tensors, ctx.near_plane, needs_points, needs_vertices
+        )
     return (
         grad_points if needs_points else None,  # points
         grad_vertices if needs_vertices else None,  # vertices
