@@ -1,5 +1,11 @@
 """The vector kernels of the CPU: against the generic ones, by themselves, and what they do to memory."""
 
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 from rasterization_scenes import frontal_scene, ordinary_scene
@@ -301,3 +307,28 @@ def test_broadcast_colors_and_gradients_are_taken():
     again, *_ = rasterization(*scene.gaussians, dense, scene.viewmats, scene.Ks, scene.width, scene.height)
     assert torch.equal(image, again)
     assert torch.equal(g, torch.autograd.grad(again, dense, torch.ones_like(again))[0])
+
+
+CPU_FLAGS = "-target-cpu x86-64-v3", "-target-cpu x86-64-v2"
+ANOTHER_CPU = """
+import sys
+import torch
+sys.path[:0] = [{tests!r}, {tests!r} + "/ops"]
+from rasterization_scenes import ordinary_scene
+from test_rasterization import values_and_gradients
+torch.save(values_and_gradients(ordinary_scene(19)), {file!r})
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the flags are of x86")
+@pytest.mark.parametrize("flags", CPU_FLAGS)
+def test_kernels_for_cpus_with_narrower_vectors_draw_the_same(flags, tmp_path):
+    file = tmp_path / "picture.pt"
+    script = ANOTHER_CPU.format(tests=str(Path(__file__).parents[1]), file=str(file))
+    environment = os.environ | {"OASIS_WARP_CPU_FLAGS": flags}
+    subprocess.run([sys.executable, "-c", script], env=environment, check=True, timeout=280)
+    here, there = values_and_gradients(ordinary_scene(19)), torch.load(file)
+    assert rel(there[0], here[0].double()) <= 1e-6 and rel(there[1], here[1].double()) <= 1e-6
+    for name, got, want in zip(INPUTS, there[2], here[2], strict=True):
+        assert rel(got, want.double()) <= 1e-5, name
