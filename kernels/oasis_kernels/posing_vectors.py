@@ -108,8 +108,9 @@ HEAD = RANGES + f"""
         else memcpy(p, &v, count * sizeof(float));
     }};
     auto get3 = [&](const float* from, int count) -> V3 {{
-        float buffer[48] = {{}};
+        float buffer[48];
         if (count < 16) {{
+            memset(buffer, 0, sizeof buffer);
             memcpy(buffer, from, 3 * count * sizeof(float));
             from = buffer;
         }}
@@ -126,8 +127,9 @@ HEAD = RANGES + f"""
         if (count < 16) memcpy(to, buffer, 3 * count * sizeof(float));
     }};
     auto get4 = [&](const float* from, int count) -> V4 {{
-        float buffer[64] = {{}};
+        float buffer[64];
         if (count < 16) {{
+            memset(buffer, 0, sizeof buffer);
             memcpy(buffer, from, 4 * count * sizeof(float));
             from = buffer;
         }}

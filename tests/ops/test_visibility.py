@@ -315,3 +315,32 @@ def test_without_validation_values_that_are_no_numbers_stay_inside_the_buffer():
         broken = visible(points, *scene, validate=False)
         assert broken.visibility[0] == 0 and broken.visibility.isfinite().all()
         assert (broken.face_ids > 0).any()
+
+
+def test_a_map_gives_masks_normals_and_textured_pictures(device):
+    # A tilted wall, coloured by a linear function of the world: interpolation over the picture must return it.
+    in_view = torch.tensor([[-0.5, -0.4, 1], [0.8, -0.5, 2], [0.1, 0.6, 1.5]], dtype=torch.float64)
+    _, _, viewmat, K = soup(12)
+    wall = (in_view - viewmat[:3, 3]) @ viewmat[:3, :3]
+    faces = torch.tensor([[0, 1, 2]])
+    slope = torch.tensor([[0.3, -0.2, 0.5], [0.1, 0.4, -0.7]], dtype=torch.float64)
+    values = wall @ slope.T + 1
+    seen = depth_map(*(t.to(device) for t in (wall, faces, viewmat, K)), WIDTH, HEIGHT)
+    depth, face_ids, barycentrics = (t.cpu() for t in seen)
+
+    mask = face_ids >= 0
+    pixels = (in_view[:, :2] / in_view[:, 2:]) * K[[0, 1], [0, 1]] + K[:2, 2]
+    (ax, ay), (bx, by), (cx, cy) = pixels.tolist()
+    area = abs((bx - ax) * (cy - ay) - (by - ay) * (cx - ax)) / 2
+    assert abs(int(mask.sum()) - area) < 0.05 * area
+
+    x, y = torch.meshgrid(torch.arange(WIDTH).double() + 0.5, torch.arange(HEIGHT).double() + 0.5, indexing="xy")
+    rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1)
+    hits = (rays[mask] * depth[mask][:, None] - viewmat[:3, 3]) @ viewmat[:3, :3]
+    corners = values[faces[face_ids.clamp_min(0).long()]]
+    picture = (corners * barycentrics[..., None]).sum(-2)
+    torch.testing.assert_close(picture[mask], hits @ slope.T + 1, rtol=0, atol=1e-10)
+    assert not picture[~mask].any()
+
+    normals = torch.nn.functional.normalize(torch.linalg.cross(wall[1] - wall[0], wall[2] - wall[0]), dim=0)[None]
+    assert ((hits - wall[0]) * normals[face_ids[mask].long()]).sum(-1).abs().max() < 1e-10

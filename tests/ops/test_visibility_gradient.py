@@ -207,7 +207,7 @@ def test_any_layout_of_the_inputs_gives_the_same_bits():
     assert all(torch.equal(a, b) for a, b in zip(plain, look(*inputs), strict=True))
 
 
-def test_torch_compiles_both_functions_without_a_break():
+def test_torch_compiles_both_functions_without_a_break(as_shipped):
     vertices, faces, viewmat, K = soup(3)
     points = some_points(vertices, faces, 3)
 

@@ -34,6 +34,11 @@ SMALL: dict[str, list[dict[str, Any]]] = {
         {"name": "ordinary", "law": "sqrt_area"}, {"name": "ordinary", "law": "area"},
         {"name": "ordinary", "law": "none"}, {"name": "opposite signs"}, {"name": "half turns between corners"},
     ],
+    "pose_on_mesh_covars": [{"name": name} for name in ("ordinary", "rigid motion", "large bends")],
+    "skin": [
+        {"name": "ordinary", "rotation_only": turn, "with_covars": covars}
+        for turn, covars in ((False, True), (True, True), (False, False))
+    ],
 }  # fmt: skip
 """Scenes for finite differences, a hundred calls each."""
 SMALL_SIZES: dict[str, dict[str, Any]] = {
@@ -41,6 +46,8 @@ SMALL_SIZES: dict[str, dict[str, Any]] = {
     "depth_visibility": {"n": 25, "size": (16, 12), "n_points": 30},
     "face_rotations": {"side": 2},
     "pose_on_mesh": {"n": 7},
+    "pose_on_mesh_covars": {"side": 2, "n": 7},
+    "skin": {"n": 7, "n_joints": 4},
 }
 EXACT_STIFF = (1e-9, 1e-7)
 STIFF_SEEDS = 3

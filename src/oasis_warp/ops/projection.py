@@ -13,6 +13,7 @@ from oasis_warp.core.checks import check_finite
 from oasis_warp.ops._project_launch import (
     Incoming,
     Limits,
+    Outputs,
     Scene,
     backward_generic,
     backward_vectors,
@@ -26,6 +27,7 @@ from oasis_warp.ops._registration import adjoint, differentiable, operator
 
 INPUTS = "means", "quats", "scales", "covars", "viewmats"
 """Arguments that receive gradients."""
+Gradients = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 class Projection(NamedTuple):
@@ -102,7 +104,7 @@ def _project(
     height: int,
     limits: list[float],  # as `Limits`
     validate: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> Outputs:
     scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
     check_arrays(scene, opacities=(opacities, means.shape[:1], means.dtype))
     out = empty_outputs(means, viewmats)
@@ -128,7 +130,7 @@ def _project_fake(
     opacities: Tensor,
     viewmats: Tensor,
     *_: Any,
-) -> tuple[Tensor, ...]:
+) -> Outputs:
     return empty_outputs(means, viewmats)
 
 
@@ -146,7 +148,7 @@ def _project_backward(
     g_covars2d: Tensor | None,
     g_depths: Tensor | None,
     wanted: list[bool],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> Gradients:
     scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
     shape = len(viewmats), len(means)
     check_arrays(
@@ -158,7 +160,9 @@ def _project_backward(
     )
     out = _empty_gradients(means, quats, scales, covars, viewmats, wanted)
     if not (len(means) and len(viewmats)):
-        return tuple(g.zero_() for g in out)
+        for gradient in out:
+            gradient.zero_()
+        return out
     incoming = Incoming(g_means2d, g_covars2d, g_depths).contiguous()
     run = backward_vectors if has_vectors(means) else backward_generic
     named = {name: g for name, g, asked in zip(INPUTS, out, wanted, strict=True) if asked}
@@ -180,7 +184,7 @@ def _project_backward_fake(
     g_covars2d: Tensor | None,
     g_depths: Tensor | None,
     wanted: list[bool],
-) -> tuple[Tensor, ...]:
+) -> Gradients:
     return _empty_gradients(means, quats, scales, covars, viewmats, wanted)
 
 
@@ -191,13 +195,14 @@ def _empty_gradients(
     covars: Tensor | None,
     viewmats: Tensor,
     wanted: list[bool],
-) -> tuple[Tensor, ...]:
+) -> Gradients:
     """Memory for the gradients by `INPUTS` that are `wanted`, and tensors of size 0 for the others."""
     inputs = means, quats, scales, covars, viewmats
-    return tuple(
+    g_means, g_quats, g_scales, g_covars, g_viewmats = (
         means.new_empty(tensor.shape if asked and tensor is not None else 0)
         for tensor, asked in zip(inputs, wanted, strict=True)
     )
+    return g_means, g_quats, g_scales, g_covars, g_viewmats
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
