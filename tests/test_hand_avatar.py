@@ -44,7 +44,9 @@ def test_a_left_hand_is_the_mirror_image_of_a_right_hand(left, right):
     for ours, theirs in zip(left.pose(left.source_pose), mirrored, strict=True):
         torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=0)
     pictures = [a.render(a.source_camera, a.source_pose).image for a in (left, right)]
-    torch.testing.assert_close(pictures[0].flip(1), pictures[1], atol=2e-4, rtol=0)
+    difference = (pictures[0].flip(1) - pictures[1]).abs().amax(-1)
+    # A layer at the cut of 1/255 may be drawn in one picture and left out of the other.
+    assert difference.max() <= 6e-3 and (difference > 2e-4).float().mean() <= 2e-3
 
 
 def test_the_mesh_carries_the_gaussians(left):

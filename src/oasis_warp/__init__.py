@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from oasis_warp.ops import depth_visibility as depth_visibility
     from oasis_warp.ops import face_rotations as face_rotations
     from oasis_warp.ops import pose_on_mesh as pose_on_mesh
+    from oasis_warp.ops import pose_on_mesh_covars as pose_on_mesh_covars
     from oasis_warp.ops import rasterization as rasterization
+    from oasis_warp.ops import skin as skin
+    from oasis_warp.ops import spherical_harmonics as spherical_harmonics
     from oasis_warp.pipeline import reconstruct as reconstruct
 
 # A name is imported when it is first used: torch and Warp take seconds, and `oasis --help` needs neither.
@@ -32,13 +35,17 @@ _HOMES = {
     "depth_visibility": "ops",
     "face_rotations": "ops",
     "pose_on_mesh": "ops",
+    "pose_on_mesh_covars": "ops",
     "rasterization": "ops",
     "read_photo": "data.photo",
     "reconstruct": "pipeline",
+    "skin": "ops",
+    "spherical_harmonics": "ops",
 }
 __all__ = [
     "Avatar", "Camera", "Gaussians", "HandPose", "InputError", "ReconstructConfig", "depth_map", "depth_visibility",
-    "face_rotations", "pose_on_mesh", "rasterization", "read_photo", "reconstruct",
+    "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "rasterization", "read_photo", "reconstruct", "skin",
+    "spherical_harmonics",
 ]  # fmt: skip
 
 
