@@ -34,7 +34,8 @@ Every float argument holds numbers that float32 can hold, so that both precision
 - **float64**: the float64 operator against the twin.
 - **float32**: values and gradients against the twin, relative L2 for each tensor; `single elements` is the largest
   difference of one element over the largest element. Ordinary scenes have the tight bounds, stiff ones their own.
-- **float32 against float64 kernel**: on scenes too large for a twin, the share of values that differ by more than 2e-5.
+- **float32 to float64**: one operator against itself on scenes too large for a twin; the share of values that differ
+  by more than 2e-5.
 - **Bits**: repeats on one, two and three threads, forwards and backwards. **Refusals**: NaN, infinities, wrong shapes
   and indices in every argument end in a ValueError that begins with the argument's name.
 

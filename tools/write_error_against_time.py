@@ -19,7 +19,7 @@ TEMPLATE = """# Error against run time
 
 What each threshold and option of the operators costs and buys, and why the defaults are what they are. Every knob is
 turned alone. Errors are those against the float64 kernels with the default rules on the same float32 numbers; times are
-the fastest of {repeats} calls, taken in turns with those of all other settings. Written by a tool from
+CPU times, the least of {repeats} calls, taken in turns with those of all other settings. Written by a tool from
 
 ```sh
 {commands}
@@ -135,7 +135,7 @@ class Measured:
 
     def time(self, knob: str, value: str, op: str = "rasterization", pass_: str = "forward") -> float:
         """Its time over the default's."""
-        return self.row(knob, value, op, pass_).fastest_ms / self.group(op, pass_=pass_).default.fastest_ms
+        return self.row(knob, value, op, pass_).cost_ms / self.group(op, pass_=pass_).default.cost_ms
 
     def settings(self, op: str, scene: str) -> str:
         """Both passes of every setting of an operator on a scene, a line a setting."""
@@ -146,8 +146,8 @@ class Measured:
             both = backward.rows[k] if backward else None
             psnr = "" if row.psnr_db is None or math.isinf(row.psnr_db) else f"{row.psnr_db:.1f}"
             lines.append([
-                row.knob, "" if row.is_default else row.value, f"{row.fastest_ms / forward.default.fastest_ms:.2f}",
-                f"{both.fastest_ms / backward.default.fastest_ms:.2f}" if both and backward else "",
+                row.knob, "" if row.is_default else row.value, f"{row.cost_ms / forward.default.cost_ms:.2f}",
+                f"{both.cost_ms / backward.default.cost_ms:.2f}" if both and backward else "",
                 power(row.rel_l2), power(row.max_abs), psnr, power(both.gradient_rel_l2) if both else "",
                 "yes" if (both or row).bit_equal else "no",
             ])  # fmt: skip
@@ -173,7 +173,7 @@ class Measured:
             cells = []
             for _, budget in BUDGETS:
                 best = fastest(group, budget)
-                ratio = f"{best.fastest_ms / group.default.fastest_ms:.2f}"
+                ratio = f"{best.cost_ms / group.default.cost_ms:.2f}"
                 cells.append("default" if best.is_default else f"{best.knob} {best.value}: {ratio}")
             lines.append([op, scene, pass_, *cells])
         return table(["operator", "scene", "pass", *(name for name, _ in BUDGETS)], lines)
@@ -196,9 +196,9 @@ def words(m: Measured) -> dict[str, object]:
     return {
         "repeats": forward.repeats, "device": forward.device, "versions": forward.versions, "commit": forward.commit,
         "fragile": forward.fragile_percent, "gaussians": forward.gaussians, "width": forward.width,
-        "height": forward.height, "forward_ms": forward.fastest_ms, "backward_ms": backward.fastest_ms,
-        "forward_yards": forward.fastest_ms / forward.yardstick_ms,
-        "backward_yards": backward.fastest_ms / backward.yardstick_ms,
+        "height": forward.height, "forward_ms": forward.cost_ms, "backward_ms": backward.cost_ms,
+        "forward_yards": forward.cost_ms / forward.yardstick_ms,
+        "backward_yards": backward.cost_ms / backward.yardstick_ms,
         "hand": m.settings("rasterization", "hand"), "layered": m.settings("rasterization", "layered"),
         "layered_gaussians": layered.gaussians, "layered_size": layered.width,
         "float64_forward": m.time("precision", "float64"),
@@ -221,7 +221,7 @@ def words(m: Measured) -> dict[str, object]:
         "stiff": m.stiff(),
         "visibility": m.settings("depth_visibility", "hand"),
         "vis_half": m.row("resolution", "1/2", "depth_visibility").rel_l2, "vis_default": power(seen.rel_l2),
-        "vis_ms": seen.fastest_ms,
+        "vis_ms": seen.cost_ms,
         "posing": "\n\n".join(f"`{op}`\n\n{m.settings(op, 'hand')}" for op in ("face_rotations", "pose_on_mesh")),
         "rot64": m.time("precision", "float64", "face_rotations"),
         "pose64": m.time("precision", "float64", "pose_on_mesh"),

@@ -174,7 +174,8 @@ POSE_BACKWARD = """
     });
 
     // A vertex's places: 0 .. n - 1 are Gaussians on it, n + 3 i + k is the corner k of Gaussian n + i.
-    if (rows_of_riders) ranges(state + 2 * @PHASE_WORDS@, n_vertices, [&](int first, int end) {
+    const bool wanted = g_vertices || g_vertex_quats || g_vertex_area_ratio;
+    if (wanted) ranges(state + 2 * @PHASE_WORDS@, n_vertices, [&](int first, int end) {
         for (int v = first; v < end; v++) {
             Q low = (Q)(0.f), high = (Q)(0.f);  // by position and area ratio; by rotation
             for (int j = vertex_starts[v]; j < vertex_starts[v + 1]; j++) {
@@ -250,7 +251,7 @@ pose_backward = native(
         "places": "const int*",  # [P + 3 Q]; i < P: the Gaussian i on a vertex; P + 3 i + k: corner k of Gaussian P + i
         "face_starts": "const int*",  # [F + 1]; of `riders`, for each face
         "riders": "const int*",  # [Q]
-        "rows_of_riders": "float*",  # [P + Q, 8], scratch; 0 if nothing of vertices is wanted
+        "rows_of_riders": "float*",  # [P + Q, 8], scratch; 0 if nothing of vertices is wanted, or nothing rides
         "weights": "float*",  # [Q, 3], scratch, with the rows
         "by_ratio": "float*",  # [Q], scratch; 0 if area ratios are not wanted
         "g_vertices": "float*",  # each of these is 0 if not wanted

@@ -2,7 +2,7 @@
 
 Tensors keep their layout: rows of three or four numbers become lanes by shuffles, and the other way round. Partial
 blocks of 16 go through a buffer, so nothing outside a tensor is read or written. A pointer of 0 says that a tensor is
-not there, or not wanted.
+not there, or not wanted, or empty.
 
 Multiply-adds fuse where the CPU can (`fused`); no other freedom is given to the compiler.
 """

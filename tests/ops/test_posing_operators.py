@@ -23,8 +23,8 @@ def mesh(seed, n, dtype):
     return rest.to(dtype), posed.to(dtype), faces
 
 
-def calls(seed=0, n=4, dtype=torch.float32):
-    """Of each operator: a function of float tensors, and these."""
+def calls(seed=0, n=4, dtype=torch.float32, empty=False):
+    """Of each operator: a function of float tensors, and these; `empty`: no points and no riders."""
     generator = torch.Generator().manual_seed(seed)
     rest, posed, faces = mesh(seed, n, dtype)
     n_vertices, n_faces = len(rest), len(faces)
@@ -34,7 +34,9 @@ def calls(seed=0, n=4, dtype=torch.float32):
 
     face_index = torch.randint(n_faces, (n_faces + 3,), generator=generator)
     vertex_index = torch.randint(n_vertices, (n_vertices // 2,), generator=generator)
-    q, p = len(face_index), len(vertex_index)
+    if empty:
+        face_index, vertex_index = face_index[:0], vertex_index[:0]
+    q, p, k = len(face_index), len(vertex_index), 0 if empty else 37
     unit = torch.nn.functional.normalize(normal(n_vertices, 4), dim=1)
     barycentrics = normal(q, 3).softmax(-1)
 
@@ -59,14 +61,14 @@ def calls(seed=0, n=4, dtype=torch.float32):
             lambda rest, posed, *others: pose_on_mesh_covars(rest, posed, faces, face_index, *others),
             [rest, posed, barycentrics, normal(q, 4), normal(q, 3).exp()],
         ),
-        "skin": (skin, [normal(37, 3), normal(37, 3, 3), normal(37, 5).softmax(-1), normal(5, 3, 4)]),
+        "skin": (skin, [normal(k, 3), normal(k, 3, 3), normal(k, 5).softmax(-1), normal(5, 3, 4)]),
         "skin rotation_only": (
             lambda *inputs: skin(*inputs, rotation_only=True),
-            [normal(37, 3), normal(37, 3, 3), normal(37, 5).softmax(-1), normal(5, 4, 4)],
+            [normal(k, 3), normal(k, 3, 3), normal(k, 5).softmax(-1), normal(5, 4, 4)],
         ),
         "skin points": (
             lambda means, *others: skin(means, None, *others)[:1],
-            [normal(37, 3), normal(37, 5).softmax(-1), normal(5, 3, 4)],
+            [normal(k, 3), normal(k, 5).softmax(-1), normal(5, 3, 4)],
         ),
     }
 
@@ -196,6 +198,21 @@ def test_no_gradient_is_worked_out_that_nobody_wants(name):
         assert torch.equal(grad, whole[k]) and grad.shape == tensor.shape
 
 
+@pytest.mark.parametrize("empty", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_comes_out_that_nobody_wrote(name, dtype, empty):
+    plain = results(name, dtype=dtype, empty=empty)
+    torch.use_deterministic_algorithms(True)  # new memory is full of NaN
+    try:
+        assert torch.empty(1).isnan()
+        filled = results(name, dtype=dtype, empty=empty)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    for a, b in zip(plain, filled, strict=True):
+        assert b.isfinite().all() and torch.equal(a, b)
+
+
 GUARD = 64
 
 
@@ -223,13 +240,14 @@ def test_kernels_stay_inside_their_memory(monkeypatch):
             tensor.copy_(inside)
             checked += 1
 
-    plain = {(name, n): results(name, n=n) for name in NAMES for n in (1, 2, 5)}
+    cases = [(name, {"n": n, "empty": empty}) for name in NAMES for n in (1, 2, 5) for empty in (False, True)]
+    plain = [results(name, **which) for name, which in cases]
     monkeypatch.setattr(_words, "address", guarded_address)
     for module in ("_riders", "face_rotations", "skinning"):
         monkeypatch.setattr(sys.modules[f"oasis_warp.ops.{module}"], "run_native", guarded_run)
-    for (name, n), want in plain.items():
-        for a, b in zip(results(name, n=n), want, strict=True):
-            assert torch.equal(a, b), (name, n)
+    for (name, which), want in zip(cases, plain, strict=True):
+        for a, b in zip(results(name, **which), want, strict=True):
+            assert torch.equal(a, b), (name, which)
     assert checked > 300
 
 

@@ -1,6 +1,6 @@
 """What a table of errors and times says: the best trade-offs, and the fastest setting for a given error.
 
-Settings are ranked by the fastest of their calls, which other work on the machine disturbs least.
+Settings are ranked by `Row.cost_ms`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -50,8 +50,8 @@ def fastest(group: Group, budget: float | None) -> Row:
     More threads are no setting of their own here: they trade no error, and every setting can have them.
     """
     within = [row for row in group.rows if row.knob != "threads" and fits(row, budget, group.default)]
-    best = min(within, key=lambda row: row.fastest_ms)
-    return best if best.fastest_ms < (1 - WORTHWHILE) * group.default.fastest_ms else group.default
+    best = min(within, key=lambda row: row.cost_ms)
+    return best if best.cost_ms < (1 - WORTHWHILE) * group.default.cost_ms else group.default
 
 
 def non_dominated(rows: Sequence[Row]) -> list[Row]:

@@ -53,6 +53,7 @@ EXACT_STIFF = (1e-9, 1e-7)
 STIFF_SEEDS = 3
 ORDINARY_SEEDS = 8
 REPEATS = 10
+FULL_AMONG = 200
 EXACT = (1e-9, 1e-8)
 """Values and gradients of the float64 operator: rounding, magnified where a scene divides by little."""
 
@@ -79,15 +80,26 @@ def steps(family: Family, device: torch.device, seed: int) -> Iterator[Step]:
                 yield partial(compare, family, family.case(name, s), torch.float32, device)
             yield partial(compare, family, family.case(name, seed), torch.float64, device, EXACT_STIFF)
     large = family.case("ordinary", seed, **family.large)
-    yield partial(agree, family, large, "float32 against float64 kernel", torch.float64, device, device)
+    yield partial(agree, family, large, "float32 to float64", torch.float64, device, device)
     if device.type != "cpu":
         for s in range(seed, seed + ORDINARY_SEEDS):
             other = family.case("ordinary", s, **family.large)
             yield partial(agree, family, other, f"{device.type} against cpu", torch.float32, cpu, device)
     yield partial(differing, family, large, device, REPEATS)
-    full = next(case for case in map(family.scene, count(seed)) if all(t.numel() for t in case.floats.values())
-                and set(family.indices) <= set(case.others) and case.condition == "ordinary")  # fmt: skip
-    yield partial(refusals, family, full, device)
+    yield partial(refusals, family, full_scene(family, seed), device)
+
+
+def full_scene(family: Family, seed: int) -> Case:
+    """The first ordinary scene that reads every optional argument too, with nothing empty and nothing of width one."""
+    cases = [family.case("ordinary", s) for s in range(seed, seed + FULL_AMONG)]
+    most = max(len(case.floats) + len(case.others) - ("sh_degree" in case.others) for case in cases)
+    for case in cases:
+        sizes = [size for tensor in case.floats.values() for size in (tensor.numel(), tensor.shape[-1])]
+        draws_colors = case.others.get("render_mode", "RGB") in ("RGB", "RGB+D", "RGB+ED")
+        plain = draws_colors and "sh_degree" not in case.others
+        if min(sizes) > 1 and plain and len(case.floats) + len(case.others) == most:
+            return case
+    raise AssertionError(f"{family.name}: no full scene among {FULL_AMONG}")
 
 
 def all_steps(names: tuple[str, ...], device: torch.device, seed: int) -> list[tuple[str, Step]]:

@@ -89,6 +89,11 @@ def view(tensor: Tensor, dtype: Any = None) -> Any:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=False)
 
 
+def has_vectors(tensor: Tensor) -> bool:
+    """Whether kernels for tensors like this one have a vectorised form: float32 on the CPU."""
+    return tensor.device.type == "cpu" and tensor.dtype == torch.float32
+
+
 def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], like: Tensor, block_dim: int = 256) -> None:
     """Launch `kernel` over `dim` threads on the device and current stream of `like`; an empty launch is skipped."""
     if 0 in ([dim] if isinstance(dim, int) else list(dim)):
@@ -149,7 +154,7 @@ _recorded = _Recorded()
 
 
 def _launch_native(native: Native, block: int) -> None:
-    launch = _recorded.launches.get(native.kernel)
+    launch: Any = _recorded.launches.get(native.kernel)
     if launch is None:
         with _load_lock:
             launch = wp.launch(native.kernel, dim=1, inputs=[block], device="cpu", record_cmd=True)

@@ -59,11 +59,6 @@ class Limits(NamedTuple):
     eps2d: float
 
 
-def has_vectors(tensor: Tensor) -> bool:
-    """Whether the vector kernels take tensors like this one."""
-    return tensor.device.type == "cpu" and tensor.dtype == torch.float32
-
-
 def as_float32(value: float) -> float:
     """`value` rounded to float32, so that float32 and float64 calls take the same decisions by it."""
     return ctypes.c_float(value).value

@@ -5,10 +5,10 @@ from torch import Tensor
 
 from oasis_kernels import strips_weights
 from oasis_warp.ops._blend_strips import count, cut_strips
-from oasis_warp.ops._blend_tiles import Splats
 from oasis_warp.ops._launch import address, run_native
 from oasis_warp.ops._registration import revealed
 from oasis_warp.ops._rules import current_rules
+from oasis_warp.ops._splats import Splats
 from oasis_warp.ops._weigh_tiles import SparseWeights, check_weights
 
 

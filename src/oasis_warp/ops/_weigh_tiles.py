@@ -7,10 +7,11 @@ from torch import Tensor
 from warp import vec4i
 
 from oasis_kernels import rasterize_weights as kernels
-from oasis_warp.ops._blend_tiles import CUDA_LANES, Splats, lane_grid
+from oasis_warp.ops._blend_tiles import CUDA_LANES, lane_grid
 from oasis_warp.ops._launch import SCALAR, VEC4, launch_ranges, view
 from oasis_warp.ops._registration import revealed
 from oasis_warp.ops._rules import current_rules
+from oasis_warp.ops._splats import Splats
 from oasis_warp.ops._tiles import bin_to_tiles, even_work
 
 MAX_WEIGHTS = 2**31 - 1

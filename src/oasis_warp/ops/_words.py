@@ -7,11 +7,6 @@ from oasis_kernels.posing_vectors import TASK
 from oasis_warp.ops._launch import address
 
 
-def is_vectorised(tensor: Tensor) -> bool:
-    """Whether kernels for `tensor` have a vectorised form: float32 on the CPU."""
-    return tensor.dtype == torch.float32 and tensor.device.type == "cpu"
-
-
 def place(tensor: Tensor | None, size: int, dtype: torch.dtype = torch.float32) -> int:
     """The `address` of a tensor of `size` elements; 0 for none."""
     return 0 if tensor is None else address(tensor, dtype, size)

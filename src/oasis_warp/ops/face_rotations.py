@@ -10,9 +10,9 @@ from oasis_kernels import face_rotation as kernels
 from oasis_kernels import face_rotation_vectors as vector_kernels
 from oasis_warp.core.checks import check_finite, check_float, check_shape
 from oasis_warp.ops._incidence import Incidence, incidence, sum_at_items
-from oasis_warp.ops._launch import even_cuts, launch_ranges, run_native, view
+from oasis_warp.ops._launch import even_cuts, has_vectors, launch_ranges, run_native, view
 from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
-from oasis_warp.ops._words import is_vectorised, place, task_count
+from oasis_warp.ops._words import place, task_count
 
 
 class FaceRotations(NamedTuple):
@@ -67,7 +67,7 @@ def _face_rotations(
     n_vertices, n_faces = len(rest), len(faces)
     out = _outputs(rest, posed, faces, keep, validate)
     vertex_quats, face_quats, area_ratio, vertex_area_ratio, signs, sums = out
-    if is_vectorised(rest):
+    if has_vectors(rest):
         rows_of_faces = rest.new_empty((n_faces, 8))
         state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
         words = _mesh_words(rest, posed, corners, state) | {
@@ -135,7 +135,7 @@ def _face_rotations_backward(
     corners = incidence("faces", faces, len(rest), "vertices")
     rest, posed = rest.contiguous(), posed.contiguous()
     n_vertices, n_faces = len(rest), len(faces)
-    if is_vectorised(rest):
+    if has_vectors(rest):
         by_vertex_quats, by_face_quats, by_ratio, by_vertex_ratio = (
             None if grad is None else grad.contiguous()
             for grad in (grad_vertex_quats, grad_face_quats, grad_area_ratio, grad_vertex_area_ratio)

@@ -8,10 +8,9 @@ from torch import Tensor
 from oasis_kernels import barycentric as kernels
 from oasis_warp.core.checks import check_choice, check_finite, check_float, check_shape
 from oasis_warp.ops._incidence import sum_at_items
-from oasis_warp.ops._launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._launch import even_cuts, has_vectors, launch_ranges, view
 from oasis_warp.ops._registration import adjoint, differentiable, operator
 from oasis_warp.ops._riders import Floats, Riders, find_riders, pose_backward_vectorised, pose_vectorised
-from oasis_warp.ops._words import is_vectorised
 
 HALF_POWERS = {"sqrt_area": 1, "area": 2, "none": 0}
 """Twice the exponent of the area ratio in each scale law."""
@@ -71,7 +70,7 @@ def _pose_on_mesh(
         )
     )
     posed = _posed_like(quats)
-    if is_vectorised(quats):
+    if has_vectors(quats):
         pose_vectorised(inputs, riders, half_powers, posed)
         return posed
 
@@ -158,7 +157,7 @@ def _pose_on_mesh_backward(
     at_vertices = wanted.vertices or wanted.vertex_quats or wanted.vertex_area_ratio
     riders = find_riders(faces, face_index, vertex_index, len(posed_vertices), transposed=at_vertices)
     grads = _contiguous(grad_means, grad_quats, grad_scales)
-    if is_vectorised(quats):
+    if has_vectors(quats):
         g = [grad if needed else None for grad, needed in zip(found, needs, strict=True)]
         pose_backward_vectorised(inputs, riders, half_powers, grads, g)
         return found

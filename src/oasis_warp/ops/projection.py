@@ -10,6 +10,7 @@ from jaxtyping import Float, Float64, Int32
 from torch import Tensor
 
 from oasis_warp.core.checks import check_finite
+from oasis_warp.ops._launch import has_vectors
 from oasis_warp.ops._project_launch import (
     Incoming,
     Limits,
@@ -19,7 +20,6 @@ from oasis_warp.ops._project_launch import (
     backward_vectors,
     check_arrays,
     empty_outputs,
-    has_vectors,
     project_generic,
     project_vectors,
 )
