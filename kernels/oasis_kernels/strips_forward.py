@@ -18,11 +18,12 @@ DRAW = """
     const long long stride = 2 * (strip_width + @PAD@), block_size = @PLANES@ * stride;  // two rows of all planes
     const long long plane = (strip_height + 1) / 2 * stride;
     struct Ended {
-        long long bits, at;  // lanes of the vector that begins there in a plane
         int place;
+        long long first_mask;
     };
     float* planes = nullptr;
-    Ended* ended = nullptr;
+    Ended ended[@BATCH@ + 1];
+    unsigned short* masks = nullptr;  // of as many layers, each as large as the strip
     Histogram* histograms = nullptr;
     share(state + 16, n_strips, [&](long long turn) {
         const long long s = order[turn];
@@ -43,7 +44,7 @@ DRAW = """
         }
         if (!planes) {
             planes = (float*)malloc((strip_height + 1) / 2 * block_size * sizeof(float));
-            ended = (Ended*)malloc((strip_width * strip_height + 1) * sizeof(Ended));
+            if (keep) masks = (unsigned short*)malloc(@BATCH@ * (plane / @LANES@) * sizeof(unsigned short));
             histograms = (Histogram*)malloc(3 * sizeof(Histogram));
         }
         int* list = ids + start;
@@ -60,30 +61,39 @@ DRAW = """
             }
             memset(t + stride, 0, @CHANNELS@ * stride * sizeof(float));
         }
-        int open = p.rows * p.columns;
-        // Every third layer of a hand ends some pixel: a branch would be mispredicted at each. So vectors with pixels
-        // that end are noted without one, and looked at now and then. A pixel ends once, which bounds their number.
-        Ended* noted = ended;
+        // Every third layer of a hand ends some pixel: a branch would be mispredicted at each. So masks of the lanes
+        // that end are kept for a while, and looked at where a layer had any.
+        long long n_masks = 0;
+        int n_ended = 0;
         auto look = [&] {
-            for (Ended* e = ended; e < noted; e++) for (long long bits = e->bits; bits; bits &= bits - 1) {
-                if (keep) stop[e->at + __builtin_ctzll(bits)] = e->place;
-                open--;
+            for (int k = 0; k < n_ended; k++) {
+                const Layer l = layer_of(records + 16ll * list[ended[k].place], p);
+                const unsigned short* mask = masks + ended[k].first_mask;
+                for (int y = l.y0; y < l.y1; y += 2) for (int x = l.x0; x < l.x1; x += @COLUMNS@)
+                    for (int bits = *mask++; bits; bits &= bits - 1)
+                        stop[y / 2 * stride + 2 * x + __builtin_ctz(bits)] = ended[k].place;
             }
-            noted = ended;
+            n_masks = n_ended = 0;
         };
-        for (int place = 0; place < count && open > 0; place++) {
+        auto any_open = [&]() -> bool {
+            for (int y = 0; y < p.rows; y += 2) for (long long k = 0; k < stride; k += @LANES@)
+                if (bits_of(load(planes + y / 2 * block_size + k) > 0.f)) return true;
+            return false;
+        };
+        for (int place = 0; place < count; place++) {
             __builtin_prefetch(records + 16ll * list[place + @AHEAD@ < count ? place + @AHEAD@ : place]);
             const float* r = records + 16ll * list[place];
             const Layer l = layer_of(r, p);
             const float* color = @COLOR@;
+            const long long first_mask = n_masks;
+            int any = 0;
             for (int y = l.y0; y < l.y1; y += 2) {
                 const V Y = row + (float)(p.top + y);
                 const V dy = (Y - l.whole_y) + l.ry;
                 const V u0 = fma((V)l.w1, dy, (V)(l.w0 * l.rx)), v0 = fma((V)l.w3, dy, (V)(l.w2 * l.rx));
                 float* t = planes + y / 2 * block_size + 2 * l.x0;
-                long long at = y / 2 * stride + 2 * l.x0;
                 V X = column + (float)(p.left + l.x0);
-                for (int x = l.x0; x < l.x1; x += @COLUMNS@, t += @LANES@, at += @LANES@, X += (float)@COLUMNS@) {
+                for (int x = l.x0; x < l.x1; x += @COLUMNS@, t += @LANES@, X += (float)@COLUMNS@) {
                     const V d = X - l.whole_x;
                     const V u = fma((V)l.w0, d, u0), v = fma((V)l.w2, d, v0);
                     const V e = fma(-v, v, fma(-u, u, (V)l.lo));
@@ -95,17 +105,24 @@ DRAW = """
                     const V after = before - full;
                     const I ends = drawn & (after <= last());
                     const V weight = ends ? (V)(0.f) : full;
+                    @READ@
                     store(t, ends ? -before : after);
                     @ADD@
-                    noted->bits = bits_of(ends);
-                    noted->at = at;
-                    noted->place = place;
-                    noted += noted->bits != 0;
+                    if (keep) {
+                        const int bits = (int)bits_of(ends);
+                        masks[n_masks++] = (unsigned short)bits;
+                        any |= bits;
+                    }
                 }
             }
-            if (place % 64 == 63) look();
+            if (keep) {
+                ended[n_ended] = {place, first_mask};
+                n_ended += any != 0;
+                if (place % @BATCH@ == @BATCH@ - 1) look();
+            }
+            if (place % 256 == 255 && !any_open()) break;
         }
-        look();
+        if (keep) look();
 
         for (int y = 0; y < p.rows; y += 2) {
             const float* t = planes + y / 2 * block_size;
@@ -125,7 +142,7 @@ DRAW = """
         }
     });
     free(planes);
-    free(ended);
+    free(masks);
     free(histograms);
 """
 
@@ -177,15 +194,16 @@ def inside(rules: Rules) -> str:
 @functools.cache
 def draw(channels: int, rules: Rules) -> Native:
     """Kernel: records and counts -> image over the backgrounds, alpha, and what the adjoint needs."""
-    add = "\n".join(
-        f"store(t + {k + 1} * stride, fma((V)color[{k}], weight, load(t + {k + 1} * stride)));" for k in range(channels)
-    )
-    color = "r + 9" if channels <= RECORD_CHANNELS else "colors + (long long)list[place] * @CHANNELS@"
     few = channels <= MAX_SHUFFLED
+    sums = [f"fma((V)color[{k}], weight, load(t + {k + 1} * stride))" for k in range(channels)]
+    # A few sums are read before anything is stored: what is read after a store waits for it in part.
+    read = "".join(f"const V sum{k} = {value};" for k, value in enumerate(sums)) if few else ""
+    add = "".join(f"store(t + {k + 1} * stride, {f'sum{k}' if few else v});" for k, v in enumerate(sums))
+    color = "r + 9" if channels <= RECORD_CHANNELS else "colors + (long long)list[place] * @CHANNELS@"
     body = DRAW.replace("@WRITE@", WRITE_FEW if few else WRITE_MANY).replace("@COLOR@", color)
-    body = body.replace("@ADD@", add).replace("@INSIDE@", inside(rules))
+    body = body.replace("@READ@", read).replace("@ADD@", add).replace("@INSIDE@", inside(rules))
     text = VECTORS + (pixels_from_planes(channels) if few else "") + STRIPS_OF + LAYER + FILL + SORT + body
-    words = {"CHANNELS": channels, "PLANES": channels + 1, "AHEAD": 8}
+    words = {"CHANNELS": channels, "PLANES": channels + 1, "AHEAD": 8, "BATCH": 64}
     return native(f"draw_{channels}", BINNING | PICTURE, snippet(text, rules, **words))
 
 
