@@ -21,7 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-from seeded_bugs import BUGS, TESTS, Bug
+from seeded_bugs import BUGS, Bug
 
 ROOT = Path(__file__).resolve().parent.parent
 TREE = ("kernels/oasis_kernels", "src", "tests", "tools", "pyproject.toml")
@@ -73,17 +73,15 @@ def run_tests(folder: Path, cache: Path, tests: Sequence[str]) -> tuple[bool, st
 def plant(bug: Bug, folder: Path, cache: Path) -> Outcome:
     """Run the tests with one bug in place; the copy is as before afterwards."""
     start = time.monotonic()
-    sources = {name: (folder / name).read_text() for name in bug.paths}
-    for name, source in sources.items():
-        if source.count(bug.old) != 1:
-            found = f"{name}: {source.count(bug.old)} times"
-            return Outcome(bug, "stale", found, 0.0)
-        (folder / name).write_text(source.replace(bug.old, bug.new))
+    file = folder / bug.path
+    source = file.read_text()
+    if source.count(bug.old) != 1:
+        return Outcome(bug, "stale", f"{source.count(bug.old)} times in {bug.path}", 0.0)
+    file.write_text(source.replace(bug.old, bug.new))
     try:
-        passed, test = run_tests(folder, cache, TESTS[bug.operator])
+        passed, test = run_tests(folder, cache, bug.tests)
     finally:
-        for name, source in sources.items():
-            (folder / name).write_text(source)
+        file.write_text(source)
     return Outcome(bug, "missed" if passed else "caught", test, time.monotonic() - start)
 
 
@@ -97,10 +95,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="seeded_bugs_") as place:
         cache = Path(place) / "kernels"
         copies = [copy_tree(Path(place) / f"copy_{i}") for i in range(options.jobs)]
-        for operator in dict.fromkeys(bug.operator for bug in bugs):
-            passed, test = run_tests(copies[0], cache, TESTS[operator])  # which also builds the kernels without bugs
+        for tests in dict.fromkeys(bug.tests for bug in bugs):
+            passed, test = run_tests(copies[0], cache, tests)  # which also builds the kernels without bugs
             if not passed:
-                print(f"The tests of {operator} fail without a bug: {test}")
+                print(f"{' '.join(tests)}: fails without a bug: {test}")
                 return 1
         free = list(copies)
 

@@ -16,39 +16,43 @@ from oasis_kernels.vectors import cpu_options
 
 @dataclass(frozen=True)
 class Native:
-    """A compiled snippet and the names of its parameters, in order."""
+    """A snippet as a kernel, and the names of its parameters, in order."""
 
     kernel: Any
     parameters: tuple[str, ...]
+    """The first is `give_way`: the address of a function without arguments that lets other threads run, or 0."""
 
 
 PHASE = """
-    auto rest = [] {
-    #if defined(__x86_64__)
-        __builtin_ia32_pause();
-    #elif defined(__aarch64__)
-        asm volatile("yield");
-    #endif
-    };
-    // Do the tasks 0 .. n - 1 of a phase together with whoever else has this block, and return when all are done. A
-    // thread waits only for tasks that another one has begun: it never matters whether, or when, a thread arrives.
-    auto phase = [&](long long* state, long long n, auto&& task) {
+    // Do the tasks 0 .. n - 1 of a phase together with whoever else has this block. A thread waits only for tasks that
+    // another one has begun: it never matters whether, or when, a thread arrives. `share` returns when none is left to
+    // begin, and is for the last phase of a kernel; `phase` when all are done.
+    auto share = [&](long long* state, long long n, auto&& task) {
         long long t;
         while ((t = __atomic_fetch_add(state, 1, __ATOMIC_RELAXED)) < n) {
             task(t);
             __atomic_fetch_add(state + 8, 1, __ATOMIC_RELEASE);
         }
-        while (__atomic_load_n(state + 8, __ATOMIC_ACQUIRE) < n) rest();
+    };
+    auto phase = [&](long long* state, long long n, auto&& task) {
+        share(state, n, task);
+        for (int spins = 0; __atomic_load_n(state + 8, __ATOMIC_ACQUIRE) < n; spins++) {
+    #if defined(__x86_64__)
+            __builtin_ia32_pause();
+    #endif
+            if (spins > 1000 && give_way) ((void (*)())give_way)();  // the other one may wait for this core
+        }
     };
 """
-"""C++: `phase(state, n, task)`. `state` are 16 words of zeros: the next task, and the number of those done, each on a
-cache line of its own."""
+"""C++: `phase(state, n, task)` and `share`. `state` are 16 words of zeros: the next task, and the number of those done,
+each on a cache line of its own."""
 
 PHASE_WORDS = 16
 
 
 def native(name: str, parameters: dict[str, str], body: str) -> Native:
     """Build the kernel `name` from the C++ `body`, which sees each of `parameters` (name: C++ type) as a constant."""
+    parameters = {"give_way": "long long", **parameters}
     words = [f"{kind} const {p} = ({kind})words[{k}];" for k, (p, kind) in enumerate(parameters.items())]
     text = "\n    ".join(["const long long* words = (const long long*)block;", *words]) + PHASE + body
 

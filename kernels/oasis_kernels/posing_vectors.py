@@ -1,20 +1,15 @@
 """What the vectorised CPU kernels of posing share: 16 faces, vertices or Gaussians at once, one in each lane.
 
-Each kernel does the tasks first .. end - 1 of one call. Its arguments stand in a block of 64-bit numbers, addresses of
-float32 and int32 memory (0: not there) and sizes, so that a recorded launch serves every call; whoever fills the block
-proves the sizes. Memory keeps the layout of the tensors: rows of three or four numbers, turned into lanes by shuffles.
-Partial blocks of 16 go through a buffer, so nothing outside a tensor is read or written.
+Tensors keep their layout: rows of three or four numbers become lanes by shuffles, and the other way round. Partial
+blocks of 16 go through a buffer, so nothing outside a tensor is read or written. A pointer of 0 says that a tensor is
+not there, or not wanted, or empty.
 
-Multiply-adds fuse where the CPU can (`fp contract`); no other freedom is given to the compiler.
+Multiply-adds fuse where the CPU can (`fused`); no other freedom is given to the compiler.
 """
 
-from typing import Any
-
-import warp as wp
-
-from oasis_kernels.vectors import cpu_options
-
 LANES = 16
+TASK = 1024
+"""Items a thread takes at a time."""
 
 
 def _indices(values: list[int]) -> str:
@@ -37,8 +32,16 @@ def _interleave(part: int) -> str:
     return f"__builtin_shufflevector(__builtin_shufflevector(x, y, {first}), z, {second})"
 
 
-HEAD = f"""
-    #pragma clang fp contract(fast)
+RANGES = f"""
+    // `phase`, for n items in ranges: range(first, end).
+    auto ranges = [&](long long* progress, long long n, auto&& range) {{
+        phase(progress, (n + {TASK - 1}) / {TASK}, [&](long long task) {{
+            range((int)(task * {TASK}), (int)wp::min(task * {TASK} + {TASK}, n));
+        }});
+    }};
+"""
+
+HEAD = RANGES + f"""
     typedef float V __attribute__((ext_vector_type(16)));
     typedef float VU __attribute__((ext_vector_type(16), aligned(4)));  // tensors have no alignment
     typedef float Q __attribute__((ext_vector_type(4)));
@@ -48,9 +51,6 @@ HEAD = f"""
     typedef int IU __attribute__((ext_vector_type(16), aligned(4)));
     struct V3 {{ V x, y, z; }};
     struct V4 {{ V w, x, y, z; }};
-    const long long* block = (const long long*)params;
-    auto floats = [&](int k) -> float* {{ return (float*)block[k]; }};
-    auto ints = [&](int k) -> const int* {{ return (const int*)block[k]; }};
     const V zero = (V)(0.f), one = (V)(1.f);
 
     auto load = [](const float* p) -> V {{ return *(const VU*)p; }};
@@ -108,8 +108,9 @@ HEAD = f"""
         else memcpy(p, &v, count * sizeof(float));
     }};
     auto get3 = [&](const float* from, int count) -> V3 {{
-        float buffer[48] = {{}};
+        float buffer[48];
         if (count < 16) {{
+            memset(buffer, 0, sizeof buffer);
             memcpy(buffer, from, 3 * count * sizeof(float));
             from = buffer;
         }}
@@ -126,8 +127,9 @@ HEAD = f"""
         if (count < 16) memcpy(to, buffer, 3 * count * sizeof(float));
     }};
     auto get4 = [&](const float* from, int count) -> V4 {{
-        float buffer[64] = {{}};
+        float buffer[64];
         if (count < 16) {{
+            memset(buffer, 0, sizeof buffer);
             memcpy(buffer, from, 4 * count * sizeof(float));
             from = buffer;
         }}
@@ -152,8 +154,9 @@ HEAD = f"""
     // Rows of three anywhere in a table of `size` rows, read as rows of four: the last one through a copy.
     struct Table {{ const float* rows; int last; Q tail; }};
     auto table3 = [&](const float* p, int size) -> Table {{
-        const float* end = p + 3ll * (size - 1);
-        return {{p, size - 1, (Q){{end[0], end[1], end[2], 0.f}}}};
+        Table table = {{p, size - 1, (Q)(0.f)}};
+        if (size) memcpy(&table.tail, p + 3ll * table.last, 3 * sizeof(float));
+        return table;
     }};
     auto at3 = [&](const Table& t, int i) -> Q {{
         return i == t.last ? t.tail : load_row(t.rows + 3ll * i);
@@ -161,24 +164,6 @@ HEAD = f"""
 """
 
 
-def kernel(module: str, name: str, body: str, head: str = HEAD) -> Any:
-    """A Warp kernel of one thread that does tasks `first` to `end` - 1 of the call whose block is at `params`.
-
-    Args:
-        module: Of this package; kernels of one module are compiled together.
-        name: Of the kernel, one in its module.
-        body: C++ of the tasks.
-        head: C++ before it.
-    """
-
-    def tasks(params: wp.uint64, first: int, end: int): ...
-
-    tasks.__name__ = f"{name}_tasks"
-    native = wp.func_native(head + body)(tasks)
-
-    def run(params: wp.uint64, first: int, end: int):
-        native(params, first, end)
-
-    unit = wp.get_module(f"{__package__}.{module}")
-    wp.set_module_options(cpu_options(), module=unit)
-    return wp.Kernel(run, key=name, module=unit)
+def fused(body: str) -> str:
+    """C++ `body`, its multiply-adds fused where the CPU can."""
+    return "{\n    #pragma clang fp contract(fast)\n" + body + "}\n"

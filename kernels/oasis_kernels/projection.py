@@ -204,6 +204,7 @@ def project_backward(scalar: Any) -> Any:
             covariance = f * wp.transpose(f)
         size = wp.vec2d(wp.float64(width), wp.float64(height))
         half, two = wp.float64(0.5), wp.float64(2.0)
+        drawn = int(0)  # noqa: UP018  (a variable to Warp, where 0 would be a constant)
         sum_mean = wp.vec3d()
         sum_covariance = wp.mat33d()
         for c in range(n_cameras):
@@ -212,6 +213,7 @@ def project_backward(scalar: Any) -> Any:
             g_point = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(g_depths[index]))
             g_camera = wp.mat33d()
             if radii[index][0] > 0:
+                drawn = 1
                 point = camera * mean + camera_translation(viewmats, c)
                 intrinsics = camera_intrinsics(Ks, c)
                 fx, fy = intrinsics[0], intrinsics[1]
@@ -236,7 +238,9 @@ def project_backward(scalar: Any) -> Any:
                 g_point += inverse * wp.vec3d(g_u, g_v, -g_u * u - g_v * v - inverse * g_inverse)
             sum_mean += wp.transpose(camera) * g_point
             if per_camera != 0:
-                g_camera += wp.outer(g_point, mean)
+                # Without a gradient there may be no number either, where the caller did not want to be checked.
+                if wp.length_sq(g_point) != wp.float64(0.0):
+                    g_camera += wp.outer(g_point, mean)
                 for row in range(3):
                     for column in range(3):
                         g_cameras[index, row * 4 + column] = g_camera[row, column]
@@ -246,6 +250,9 @@ def project_backward(scalar: Any) -> Any:
             for row in range(3):
                 for column in range(3):
                     g_covars[i, row, column] = scalar(sum_covariance[row, column])
+        elif drawn == 0:
+            g_quats[i] = vec4()
+            g_scales[i] = vec3()
         else:
             scale = wp.vec3d(scales[i])
             q, norm = unit_quaternion(wp.vec4d(quats[i]))

@@ -88,6 +88,12 @@ ADJOINT = """
             const float* r = records + 16 * index;
             const Layer l = layer_of(r, p);
             const float* color = @COLOR@;
+            const int* box = (const int*)r + 12;
+            const Span span = span_of(box);
+            float* out = pairs + (pair_starts[index] + (long long)(strip_y - span.y0) * (span.x1 - span.x0)
+                                  + (strip_x - span.x0)) * @RECORD@;
+            __builtin_prefetch(out, 1);
+            __builtin_prefetch(out + @RECORD@ - 1, 1);
             V m0 = {}, m1 = {}, m2 = {}, m3 = {}, m4 = {}, m5 = {};
             @ACCUMULATORS@
             for (int y = l.y0; y < l.y1; y += 2) {
@@ -105,21 +111,17 @@ ADJOINT = """
                     const V raw = exp2(e);
                     const V alpha = drawn ? (raw < cap() ? raw : cap()) : (V)(0.f);
                     const V before = load(t) / (1.f - alpha);
-                    store(t, before);
                     const V weight = alpha * before;
                     @SUMS@
+                    store(t, before);
                 }
             }
-            const int* box = (const int*)r + 12;
-            const Span span = span_of(box);
-            float* out = pairs + (pair_starts[index] + (long long)(strip_y - span.y0) * (span.x1 - span.x0)
-                                  + (strip_x - span.x0)) * @RECORD@;
             @REDUCE@
         }
     });
     free(planes);
 
-    phase(state + 16, n_chunks, [&](long long c) {
+    share(state + 16, n_chunks, [&](long long c) {
         typedef double D __attribute__((ext_vector_type(8)));
         const long long first = c * chunk, end = first + chunk < n ? first + chunk : n;
         for (long long i0 = first; i0 < end; i0 += 8) {
@@ -173,8 +175,9 @@ READ_FEW = """
 """
 
 READ_MANY = """
-                for (int side = 0; side < rows; side++) for (int c = 0; c < columns; c++) for (int k = 0; k < @CHANNELS@; k++)
-                    first[k * stride + 2 * c + side] = g_image[(pixel[side] + x + c) * @CHANNELS@ + k];
+                for (int side = 0; side < rows; side++) for (int c = 0; c < columns; c++)
+                    for (int k = 0; k < @CHANNELS@; k++)
+                        first[k * stride + 2 * c + side] = g_image[(pixel[side] + x + c) * @CHANNELS@ + k];
 """
 
 BACKWARD = GRID | {
@@ -215,21 +218,23 @@ def pair_words(wanted: Wanted) -> int:
 def draw_backward(wanted: Wanted, rules: Rules) -> Native:
     """Kernel: gradients by image and alpha -> by means2d, covars2d, opacities, colours, and the strips' backgrounds."""
     channels = range(wanted.channels)
-    sums, values = [], []
+    # All is read before anything is stored: for the compiler, a store could change what is read after it.
+    sums, values = [f"const V g{k} = load(t + {k + 2} * stride);" for k in channels], []
     if wanted.shape:
-        seen = "-load(t + stride)"
+        step = "-behind"
         for k in channels:
-            seen = f"fma(load(t + {k + 2} * stride), (V)color[{k}], {seen})"
+            step = f"fma(g{k}, (V)color[{k}], {step})"
         sums.append(f"""
-                    const V step = {seen};
-                    store(t + stride, fma(alpha, step, load(t + stride)));
+                    const V behind = load(t + stride);
+                    const V step = {step};
                     const V q = raw <= cap() ? weight * step : (V)(0.f);
                     const V qu = q * u, qv = q * v;
                     m0 += q; m1 += qu; m2 += qv;
-                    m3 = fma(qu, u, m3); m4 = fma(qu, v, m4); m5 = fma(qv, v, m5);""")
+                    m3 = fma(qu, u, m3); m4 = fma(qu, v, m4); m5 = fma(qv, v, m5);
+                    store(t + stride, fma(alpha, step, behind));""")
         values += [f"m{k}" for k in range(6)]
     if wanted.color:
-        sums += [f"c{k} = fma(weight, load(t + {k + 2} * stride), c{k});" for k in channels]
+        sums += [f"c{k} = fma(weight, g{k}, c{k});" for k in channels]
         values += [f"c{k}" for k in channels]
     padded = values + ["(V)(0.f)"] * (-len(values) % 4)
     reduce = [f"reduce({', '.join(padded[k : k + 4])}, out + {k});" for k in range(0, len(padded), 4)]

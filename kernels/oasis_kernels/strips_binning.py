@@ -111,7 +111,7 @@ COLLECT = """
         lows[c] = low;
         highs[c] = high;
     });
-    phase(state + 16, 1, [&](long long) {
+    share(state + 16, 1, [&](long long) {
         long long pairs = 0, low = 0x7fffffffffffffffll, high = 0, place = 0;
         for (long long c = 0; c < n_chunks; c++) {
             const long long here = chunk_pairs[c];

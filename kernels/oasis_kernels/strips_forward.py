@@ -2,8 +2,8 @@
 
 What the generic kernel decides on alpha is decided on its logarithm here, and 1 - alpha is applied as T - alpha T: the
 same but for rounding. A pixel that has ended keeps its transmittance with a minus sign. The pixels' sums lie in planes
-on a scratch of each thread until the strip is done. Two rows of a plane are followed by the same rows of the next plane:
-planes apart by a power of two would compete for the same lines of the cache.
+on a scratch of each thread until the strip is done. Two rows of a plane are followed by the same rows of the next
+plane: planes apart by a power of two would compete for the same lines of the cache.
 """
 
 import functools
@@ -24,7 +24,7 @@ DRAW = """
     float* planes = nullptr;
     Ended* ended = nullptr;
     Histogram* histograms = nullptr;
-    phase(state + 16, n_strips, [&](long long turn) {
+    share(state + 16, n_strips, [&](long long turn) {
         const long long s = order[turn];
         const Strip p = strip_of(s);
         const long long start = starts[s];
@@ -61,8 +61,8 @@ DRAW = """
             memset(t + stride, 0, @CHANNELS@ * stride * sizeof(float));
         }
         int open = p.rows * p.columns;
-        // Every third layer ends some pixel: a branch would be mispredicted at each. So vectors with pixels that end are
-        // noted without one, and looked at now and then. A pixel ends once, which bounds their number.
+        // Every third layer of a hand ends some pixel: a branch would be mispredicted at each. So vectors with pixels
+        // that end are noted without one, and looked at now and then. A pixel ends once, which bounds their number.
         Ended* noted = ended;
         auto look = [&] {
             for (Ended* e = ended; e < noted; e++) for (long long bits = e->bits; bits; bits &= bits - 1) {
@@ -182,7 +182,8 @@ def draw(channels: int, rules: Rules) -> Native:
     )
     color = "r + 9" if channels <= RECORD_CHANNELS else "colors + (long long)list[place] * @CHANNELS@"
     few = channels <= MAX_SHUFFLED
-    body = DRAW.replace("@WRITE@", WRITE_FEW if few else WRITE_MANY).replace("@COLOR@", color).replace("@ADD@", add).replace("@INSIDE@", inside(rules))
+    body = DRAW.replace("@WRITE@", WRITE_FEW if few else WRITE_MANY).replace("@COLOR@", color)
+    body = body.replace("@ADD@", add).replace("@INSIDE@", inside(rules))
     text = VECTORS + (pixels_from_planes(channels) if few else "") + STRIPS_OF + LAYER + FILL + SORT + body
     words = {"CHANNELS": channels, "PLANES": channels + 1, "AHEAD": 8}
     return native(f"draw_{channels}", BINNING | PICTURE, snippet(text, rules, **words))

@@ -2,8 +2,8 @@
 
 Strips are as wide as the image, so that a strip's pixels, and a Gaussian's strips, follow each other in both matrices.
 The strips are drawn twice, without colours. `count_weights` adds up the weights of every pixel and of every pair;
-`fill_weights` writes a pair's weights, row by row, into the matrix by Gaussians, and then goes through the pairs of each
-strip in order of memory to copy them into the matrix by pixels: both come out sorted.
+`fill_weights` writes a pair's weights, row by row, into the matrix by Gaussians, and then goes through the pairs of
+each strip in order of memory to copy them into the matrix by pixels: both come out sorted.
 """
 
 import functools
@@ -19,7 +19,8 @@ WALK = """
     auto pair_of = [&](long long index, int strip) -> long long {
         return pair_starts[index] + strip - (boxes[4 * index + 1] >> height_bits);
     };
-    // Draw a strip on plane `t`: `vector(place, y, x, weight, drawn)` sees every vector, `layer(place)` follows its last.
+    // Draw a strip: `vector(y, x, weight, drawn)` sees every vector, `row_pair(y)` follows the last of two rows, and
+    // `layer(gaussian)` the last of all.
     auto walk = [&](const Strip& p, const int* list, int count, float* plane, auto&& vector, auto&& row_pair,
                     auto&& layer) {
         for (int y = 0; y < p.rows; y += 2) for (int x = 0; x < strip_width + @PAD@; x += @COLUMNS@) {
@@ -60,7 +61,7 @@ WALK = """
 COUNT = """
     float* plane = nullptr;
     Histogram* histograms = nullptr;
-    phase(state + 16, n_strips, [&](long long turn) {
+    share(state + 16, n_strips, [&](long long turn) {
         const long long s = order[turn];
         const Strip p = strip_of(s);
         const long long start = starts[s];
@@ -92,63 +93,74 @@ COUNT = """
 """
 
 WRITE = """
-    float* plane = nullptr;
-    float* weights = nullptr;
-    int* pixels = nullptr;
-    phase(state, n_strips, [&](long long turn) {
+    const long long size = (strip_height + 1) / 2 * stride;
+    float *plane = nullptr, *weights = nullptr, *lower_weights = nullptr;
+    int *pixels = nullptr, *lower_pixels = nullptr;
+    share(state, n_strips, [&](long long turn) {
         const long long s = order[turn];
         const Strip p = strip_of(s);
         const long long start = starts[s];
         const int count = (int)(starts[s + 1] - start);
         if (!plane) {
-            plane = (float*)malloc((strip_height + 1) / 2 * stride * sizeof(float));
-            weights = (float*)malloc(stride * sizeof(float));
-            pixels = (int*)malloc(stride * sizeof(int));
+            plane = (float*)malloc((4 * size + 2 * (stride + 2 * @LANES@)) * sizeof(float));
+            weights = plane + size;
+            lower_weights = weights + size + @LANES@;
+            pixels = (int*)(lower_weights + stride + @LANES@);
+            lower_pixels = pixels + size + @LANES@;
         }
-        // A vector's weights of the upper and of the lower row, packed together without a branch.
-        int number[2] = {0, 0};
-        long long of_pair = 0;
-        int current = 0;
+        // The weights of a pair, row after row. Lanes are packed without a branch: what does not count is overwritten.
+        long long of_pair = 0, of_lower = 0;
         auto pack = [&](int y, int x, V weight, I drawn) {
-            for (int side = 0; side < 2; side++) {
-                const long long half = side * stride / 2;
-                int n = number[side];
-                const int first = (int)((p.top + y + side) * width) + x;
+            float lanes[@LANES@];
+            store(lanes, weight);
+            const long long bits = bits_of(drawn);
+            const int first = (int)((p.top + y) * width) + x;
+            auto put = [&](long long lower, float* to, int* at) -> long long {
+                long long number = 0;
                 for (int c = 0; c < @COLUMNS@; c++) {
-                    weights[half + n] = weight[2 * c + side];
-                    pixels[half + n] = first + c;
-                    n -= drawn[2 * c + side];
+                    to[number] = lanes[2 * c + lower];
+                    at[number] = first + c + (int)(lower * width);
+                    number += bits >> (2 * c + lower) & 1;
                 }
-                number[side] = n;
-            }
+                return number;
+            };
+            of_pair += put(0, weights + of_pair, pixels + of_pair);
+            of_lower += put(1, lower_weights + of_lower, lower_pixels + of_lower);
         };
-        auto flush = [&](int) {
-            for (int side = 0; side < 2; side++) {
-                const long long half = side * stride / 2;
-                const long long to = pair_places[pair_of(ids[start + current], (int)s)] + of_pair;
-                memcpy(gaussian_weights + to, weights + half, number[side] * sizeof(float));
-                memcpy(gaussian_pixels + to, pixels + half, number[side] * sizeof(int));
-                of_pair += number[side];
-                number[side] = 0;
+        auto append_lower = [&](int) {
+            for (long long k = 0; k < of_lower; k += @LANES@) {
+                store(weights + of_pair + k, load(lower_weights + k));
+                *(IU*)(pixels + of_pair + k) = *(const IU*)(lower_pixels + k);
             }
+            of_pair += of_lower;
+            of_lower = 0;
         };
-        walk(p, ids + start, count, plane, pack, flush, [&](int) {
-            current++;
+        auto write = [&](int index) {
+            const long long to = pair_places[pair_of(index, (int)s)];
+            memcpy(gaussian_weights + to, weights, of_pair * sizeof(float));
+            memcpy(gaussian_pixels + to, pixels, of_pair * sizeof(int));
             of_pair = 0;
-        });
+        };
+        walk(p, ids + start, count, plane, pack, append_lower, write);
+        for (int y = 0; y < p.rows; y++) for (int x = 0; x < p.columns; x++)
+            alphas[(p.top + y) * width + x] = 1.f - __builtin_fabsf(plane[y / 2 * stride + 2 * x + y % 2]);
         const int* member = members + start;
+        int* const next = pixel_places;
+        int* const to = pixel_gaussians;
+        float* const values = pixel_values;
         for (int k = 0; k < count; k++) {
             const long long index = member[k], pair = pair_of(index, (int)s);
-            for (long long w = pair_places[pair]; w < pair_places[pair + 1]; w++) {
-                const long long place = pixel_places[gaussian_pixels[w]]++;
-                pixel_gaussians[place] = (int)index;
-                pixel_values[place] = gaussian_weights[w];
+            const long long first = pair_places[pair], number = pair_places[pair + 1] - first;
+            const int* pixel = gaussian_pixels + first;
+            const float* value = gaussian_weights + first;
+            for (long long w = 0; w < number; w++) {
+                const int place = next[pixel[w]]++;
+                to[place] = (int)index;
+                values[place] = value[w];
             }
         }
     });
     free(plane);
-    free(weights);
-    free(pixels);
 """
 
 FILL_MEMBERS = FILL.replace(
@@ -176,6 +188,7 @@ FILLING = GRID | {
     "gaussian_weights": "float*",
     "pixel_gaussians": "int*",  # [weights], by pixel
     "pixel_values": "float*",
+    "alphas": "float*",  # [height * width]
 }
 
 

@@ -6,7 +6,7 @@ import torch
 
 from oasis_warp.bench import knobs
 from oasis_warp.bench.error_time import Sweep, measure, standard_plan
-from oasis_warp.bench.knobs import DEFAULT, Setting
+from oasis_warp.bench.knobs import DEFAULT, Setting, in_other_order
 from oasis_warp.bench.operators import OPERATORS
 from oasis_warp.bench.rows import write_rows
 from oasis_warp.bench.scenes import equal_depths, hand_scenes, layered
@@ -60,11 +60,9 @@ def test_a_stop_at_a_hundredth_costs_what_it_must(layers):
     assert not row.bit_equal
 
 
-def test_another_order_of_the_gaussians_moves_float32_by_rounding_and_float64_by_less(layers):
-    rows = by_setting(layers)
-    assert rows["default"].floor_rel_l2 <= 1e-6
-    assert rows["precision"].floor_rel_l2 <= 1e-14
-    assert rows["stop"].floor_rel_l2 is None
+def test_the_exact_picture_is_known_far_better_than_what_is_judged_by_it(layers):
+    assert {row.floor_rel_l2 for row in layers} == {layers[0].floor_rel_l2}
+    assert 0 < layers[0].floor_rel_l2 <= 1e-12
 
 
 def test_float64_is_what_errors_are_measured_from(layers):
@@ -98,9 +96,12 @@ def test_threads_change_no_bit():
     assert all(r.bit_equal for r in rows)
 
 
-def test_equal_depths_keep_their_order_when_the_list_is_shuffled():
-    (row,) = [r for r in sweep(equal_depths(), "rasterization") if r.pass_ == "forward"]
-    assert row.floor_rel_l2 <= 1e-6
+@pytest.mark.parametrize("make", [layered, equal_depths])
+def test_another_order_of_the_list_draws_the_same(make):
+    scene = make().to(dtype=torch.float64)
+    other = in_other_order(scene)
+    assert not torch.equal(other.means, scene.means)
+    torch.testing.assert_close(draw(other).image, draw(scene).image, rtol=0, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +121,7 @@ def test_a_coarser_depth_buffer_hides_the_wrong_points(small_hand):
 def test_every_operator_on_meshes_is_exact_by_default(small_hand, op):
     for row in sweep(small_hand, op):
         assert row.error < 5e-6
-        assert row.floor_rel_l2 < 1e-6
+        assert row.floor_rel_l2 < 1e-5
         assert row.bit_equal
         assert row.fragile_percent is None
 

@@ -13,7 +13,7 @@ from oasis_warp.core.errors import InputError
 ROW = Row(
     scene="layered", width=64, height=64, gaussians=1500, faces=None, op="rasterization", pass_="forward",
     knob="stop", value="0.01", device="a CPU, with a comma", threads=1, median_ms=1.25, iqr_ms=0.5, fastest_ms=1.0,
-    repeats=20, first_ms=300.0, yardstick_ms=11.6, peak_mb=None, rel_l2=1e-2, max_abs=0.1, psnr_db=45.5,
+    repeats=20, first_ms=300.0, cpu_ms=1.0, yardstick_ms=11.6, peak_mb=None, rel_l2=1e-2, max_abs=0.1, psnr_db=45.5,
     gradient_rel_l2=None, floor_rel_l2=2e-7, fragile_percent=3.9, bit_equal=False, seed=0, commit="abc",
     versions="oasis_warp 0",
 )  # fmt: skip

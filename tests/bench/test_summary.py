@@ -7,7 +7,7 @@ from oasis_warp.bench.summary import BUDGETS, fastest, groups, non_dominated
 
 
 def row(knob, ms, error, **changes):
-    return replace(ROW, knob=knob, value=str(ms), median_ms=ms, rel_l2=error, **changes)
+    return replace(ROW, knob=knob, value=str(ms), median_ms=ms, fastest_ms=ms, cpu_ms=ms, rel_l2=error, **changes)
 
 
 DEFAULT, FAST, FASTER, SLOW, SAME = (
@@ -58,3 +58,11 @@ def test_pictures_show_what_is_asked_for(tmp_path):
     assert (tmp_path / "all.png").read_bytes().startswith(b"\x89PNG")
     assert "layered, forward" in (tmp_path / "one.svg").read_text()
     assert {p.name for p in tmp_path.iterdir()} == {"all.png", "one.svg"}
+
+
+def test_other_work_on_the_machine_does_not_decide():
+    delayed = replace(SAME, fastest_ms=50.0, median_ms=90.0)
+    (group,) = groups([DEFAULT, delayed])
+    assert fastest(group, None) == delayed
+    assert replace(SAME, threads=2, fastest_ms=50.0).cost_ms == 50  # CPU time of two threads is no time to wait
+    assert replace(SAME, cpu_ms=None, fastest_ms=3.0).cost_ms == 3

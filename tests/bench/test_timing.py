@@ -22,6 +22,7 @@ def test_a_time_is_that_of_the_call_in_milliseconds():
     assert timing.fastest_ms >= 2
     assert timing.first_ms >= 2
     assert timing.median_ms < 200
+    assert timing.cpu_ms < 1  # sleeping is no work
 
 
 def test_every_call_has_its_threads_and_surroundings_and_they_are_not_timed():
@@ -44,7 +45,8 @@ def test_every_call_has_its_threads_and_surroundings_and_they_are_not_timed():
 
 
 def test_median_and_quartiles_are_those_of_the_times():
-    timing = Timing(first_ms=99.0, times_ms=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0))
+    times = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
+    timing = Timing(first_ms=99.0, times_ms=times, cpu_times_ms=times)
     assert (timing.median_ms, timing.iqr_ms, timing.fastest_ms) == (4.0, 4.0, 1.0)
 
 

@@ -111,7 +111,7 @@ def test_an_interrupt_ends_the_processes_of_the_grid_and_leaves_no_file(tmp_path
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     time.sleep(6)
     running.send_signal(signal.SIGINT)
-    out, err = running.communicate(timeout=60)
+    _, err = running.communicate(timeout=60)
     assert running.returncode == 130
     assert err.splitlines()[-1] == "oasis: stopped, nothing written." and "Traceback" not in err
     assert not list(tmp_path.iterdir())

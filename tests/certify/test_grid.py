@@ -23,6 +23,20 @@ def test_float32_operators_keep_their_bounds_on_the_first_scenes_of_the_grid(nam
     assert not [m for m in measured if not m.passed]
 
 
+SMALL = {"rasterization": {"n": 40, "size": (17, 15), "channels": 3, "mode": "RGB"}}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize("name", FAMILIES)
+def test_small_scenes_of_every_condition_equal_the_twins(name, dtype, device):
+    family = FAMILIES[name]
+    for condition in family.conditions:
+        for seed in (0, 1):
+            case = family.case(condition, seed, **SMALL.get(name, {}))
+            found = compare(family, case, dtype, device, EXACT_STIFF if dtype == torch.float64 else None)
+            assert not [m for m in found if not m.passed]
+
+
 @pytest.mark.parametrize("name", FAMILIES)
 def test_float64_operators_are_exact_on_the_first_scenes_of_the_grid(name, device):
     family = FAMILIES[name]

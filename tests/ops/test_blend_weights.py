@@ -1,9 +1,10 @@
 import pytest
 import torch
 from rasterization_scenes import ordinary_scene
+from test_strips import Guards
 
 from oasis_warp.certify.twins import rasterization as twin
-from oasis_warp.ops import blend_colors, blend_weights, rasterization
+from oasis_warp.ops import _blend_strips, _weigh_strips, blend_colors, blend_weights, rasterization
 
 
 def weights_and_image(device, dtype, **options):
@@ -85,3 +86,38 @@ def test_a_batch_of_cameras_is_refused(device, as_shipped):
     scene, *_ = weights_and_image(device, torch.float32)
     with pytest.raises(ValueError, match=r"viewmat: expected shape \[4, 4\]"):
         blend_weights(*scene.gaussians, scene.viewmats, scene.Ks[0], 8, 8)
+
+
+def test_threads_and_strips_change_no_bit_of_float32_weights(with_threads):
+    scene = ordinary_scene(seed=6, n=5000, width=90, height=140, size=(0.01, 0.05))
+
+    def weights(tile_size=16):
+        w = blend_weights(*scene.gaussians, scene.viewmats[0], scene.Ks[0], 90, 140, tile_size=tile_size)
+        matrices = w.matrix, w.transpose
+        return [w.alphas, *(part for m in matrices for part in (m.crow_indices(), m.col_indices(), m.values()))]
+
+    alone = with_threads(1, weights)
+    for other in (with_threads(3, weights), with_threads(2, weights, 1)):
+        assert all(torch.equal(a, b) for a, b in zip(alone, other, strict=True))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (257, 2), (65, 63)])
+@pytest.mark.parametrize("name", ["ordinary", "all culled", "larger than the image"])
+def test_nothing_is_written_past_a_buffer_of_float32_weights(name, size, monkeypatch):
+    scene = ordinary_scene(seed=7, n=40, width=size[0], height=size[1])
+    if name == "all culled":
+        scene = scene.with_(opacities=torch.zeros(40))
+    if name == "larger than the image":
+        scene = scene.with_(scales=40 * scene.scales)
+    expected = blend_weights(*scene.gaussians, scene.viewmats[0], scene.Ks[0], *size)
+    guards = Guards()
+    with monkeypatch.context() as patch:
+        for module in (_blend_strips, _weigh_strips):
+            patch.setattr(module, "torch", guards)
+            patch.setattr(module, "revealed", guards.revealed)
+        patch.setattr(_blend_strips, "hidden", guards.hidden)
+        got = blend_weights(*scene.gaussians, scene.viewmats[0], scene.Ks[0], *size)
+    guards.check()
+    assert torch.equal(got.alphas, expected.alphas)
+    assert torch.equal(got.matrix.to_dense(), expected.matrix.to_dense())
+    assert torch.equal(got.transpose.to_dense(), expected.transpose.to_dense())

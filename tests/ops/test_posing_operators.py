@@ -8,8 +8,7 @@ import sys
 import pytest
 import torch
 
-from oasis_warp.ops import face_rotations, pose_on_mesh, pose_on_mesh_covars, skin
-from oasis_warp.ops._native import run_tasks
+from oasis_warp.ops import _launch, _words, face_rotations, pose_on_mesh, pose_on_mesh_covars, skin
 
 
 def mesh(seed, n, dtype):
@@ -24,8 +23,8 @@ def mesh(seed, n, dtype):
     return rest.to(dtype), posed.to(dtype), faces
 
 
-def calls(seed=0, n=4, dtype=torch.float32):
-    """Of each operator: a function of float tensors, and these."""
+def calls(seed=0, n=4, dtype=torch.float32, empty=False):
+    """Of each operator: a function of float tensors, and these; `empty`: no points and no riders."""
     generator = torch.Generator().manual_seed(seed)
     rest, posed, faces = mesh(seed, n, dtype)
     n_vertices, n_faces = len(rest), len(faces)
@@ -35,7 +34,9 @@ def calls(seed=0, n=4, dtype=torch.float32):
 
     face_index = torch.randint(n_faces, (n_faces + 3,), generator=generator)
     vertex_index = torch.randint(n_vertices, (n_vertices // 2,), generator=generator)
-    q, p = len(face_index), len(vertex_index)
+    if empty:
+        face_index, vertex_index = face_index[:0], vertex_index[:0]
+    q, p, k = len(face_index), len(vertex_index), 0 if empty else 37
     unit = torch.nn.functional.normalize(normal(n_vertices, 4), dim=1)
     barycentrics = normal(q, 3).softmax(-1)
 
@@ -60,14 +61,14 @@ def calls(seed=0, n=4, dtype=torch.float32):
             lambda rest, posed, *others: pose_on_mesh_covars(rest, posed, faces, face_index, *others),
             [rest, posed, barycentrics, normal(q, 4), normal(q, 3).exp()],
         ),
-        "skin": (skin, [normal(37, 3), normal(37, 3, 3), normal(37, 5).softmax(-1), normal(5, 3, 4)]),
+        "skin": (skin, [normal(k, 3), normal(k, 3, 3), normal(k, 5).softmax(-1), normal(5, 3, 4)]),
         "skin rotation_only": (
             lambda *inputs: skin(*inputs, rotation_only=True),
-            [normal(37, 3), normal(37, 3, 3), normal(37, 5).softmax(-1), normal(5, 4, 4)],
+            [normal(k, 3), normal(k, 3, 3), normal(k, 5).softmax(-1), normal(5, 4, 4)],
         ),
         "skin points": (
             lambda means, *others: skin(means, None, *others)[:1],
-            [normal(37, 3), normal(37, 5).softmax(-1), normal(5, 3, 4)],
+            [normal(k, 3), normal(k, 5).softmax(-1), normal(5, 3, 4)],
         ),
     }
 
@@ -197,39 +198,56 @@ def test_no_gradient_is_worked_out_that_nobody_wants(name):
         assert torch.equal(grad, whole[k]) and grad.shape == tensor.shape
 
 
+@pytest.mark.parametrize("empty", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_comes_out_that_nobody_wrote(name, dtype, empty):
+    plain = results(name, dtype=dtype, empty=empty)
+    torch.use_deterministic_algorithms(True)  # new memory is full of NaN
+    try:
+        assert torch.empty(1).isnan()
+        filled = results(name, dtype=dtype, empty=empty)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    for a, b in zip(plain, filled, strict=True):
+        assert b.isfinite().all() and torch.equal(a, b)
+
+
 GUARD = 64
 
 
 def test_kernels_stay_inside_their_memory(monkeypatch):
     """Every tensor a vectorised kernel is given moves between guards, whose values must not matter nor change."""
+    moved = []
     checked = 0
 
-    def guarded(kernel, n_tasks, arguments, least=4096):
+    def guarded_address(tensor, dtype, size):
+        _launch.address(tensor, dtype, size)
+        poison = torch.nan if tensor.is_floating_point() else torch.iinfo(dtype).max
+        yard = torch.full((size + 2 * GUARD,), poison, dtype=dtype)
+        inside = yard[GUARD : GUARD + size].view(tensor.shape)
+        inside.copy_(tensor)
+        moved.append((yard, tensor, inside))
+        return inside.data_ptr()
+
+    def guarded_run(native, words, n_tasks):
         nonlocal checked
-        fenced, yards = [], []
-        for argument in arguments:
-            if not isinstance(argument, torch.Tensor):
-                fenced.append(argument)
-                continue
-            poison = torch.nan if argument.is_floating_point() else 2**31 - 1
-            yard = torch.full((argument.numel() + 2 * GUARD,), poison, dtype=argument.dtype)
-            inside = yard[GUARD:-GUARD].view(argument.shape)
-            inside.copy_(argument)
-            fenced.append(inside)
-            yards.append((yard, poison, argument, inside))
-        run_tasks(kernel, n_tasks, fenced, least)
-        for yard, poison, argument, inside in yards:
-            for guard in (yard[:GUARD], yard[-GUARD:]):
-                assert guard.isnan().all() if poison != poison else (guard == poison).all()
-            argument.copy_(inside)
+        _launch.run_native(native, words, n_tasks)
+        while moved:
+            yard, tensor, inside = moved.pop()
+            guards = torch.cat([yard[:GUARD], yard[GUARD + tensor.numel() :]])
+            assert guards.isnan().all() if yard.is_floating_point() else (guards == torch.iinfo(yard.dtype).max).all()
+            tensor.copy_(inside)
             checked += 1
 
-    plain = {(name, n): results(name, n=n) for name in NAMES for n in (1, 2, 5)}
-    for module in ("face_rotations", "mesh_posing", "skinning"):
-        monkeypatch.setattr(sys.modules[f"oasis_warp.ops.{module}"], "run_tasks", guarded)
-    for (name, n), want in plain.items():
-        for a, b in zip(results(name, n=n), want, strict=True):
-            assert torch.equal(a, b), (name, n)
+    cases = [(name, {"n": n, "empty": empty}) for name in NAMES for n in (1, 2, 5) for empty in (False, True)]
+    plain = [results(name, **which) for name, which in cases]
+    monkeypatch.setattr(_words, "address", guarded_address)
+    for module in ("_riders", "face_rotations", "skinning"):
+        monkeypatch.setattr(sys.modules[f"oasis_warp.ops.{module}"], "run_native", guarded_run)
+    for (name, which), want in zip(cases, plain, strict=True):
+        for a, b in zip(results(name, **which), want, strict=True):
+            assert torch.equal(a, b), (name, which)
     assert checked > 300
 
 

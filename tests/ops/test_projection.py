@@ -77,6 +77,16 @@ def test_vectors_bear_quaternions_of_any_norm(norm):
     assert_same(*both(scene.with_(quats=(scene.quats * norm).float())))
 
 
+def test_vectors_bear_needles_whose_determinant_would_cancel_in_float64():
+    scene = ordinary_scene(18, n=30)
+    scales = torch.tensor([3e5, 1e-4, 1e-4]).repeat(30, 1)
+    (vectors, _), (generic, _) = both(scene.with_(scales=scales))
+    xx, xy, yy = generic.covars2d.unbind(-1)
+    det = generic.conics[..., 0] * generic.conics[..., 2] - generic.conics[..., 1] ** 2
+    assert (generic.radii > 0).any() and not torch.allclose((xx * yy - xy * xy) * det, torch.ones_like(det))
+    torch.testing.assert_close(vectors.whitenings.double(), generic.whitenings, rtol=ROUNDING, atol=0.0)
+
+
 def test_vectors_bear_cameras_far_from_the_origin():
     scene = ordinary_scene(7)
     shift = torch.tensor([3000.0, -500.0, 2000.0])

@@ -103,6 +103,7 @@ def test_unchecked_a_bad_gaussian_is_not_drawn_and_harms_no_other(name, value, d
     bad[5] = value
     names = "means", "quats", "scales"
     got, want = run(scene.with_(**{name: bad}), by=names), run(scene, by=names)
+    assert all(torch.isfinite(g).all() for g in got[1].values())
     assert not got[0].radii[:, 5].any() and not got[0].boxes[:, 5].any()
     others = torch.arange(N, device=device) != 5
     for field, a, b in zip(Projection._fields, got[0], want[0], strict=True):

@@ -27,7 +27,8 @@ def draw(scene, colors, **options):
 @pytest.mark.parametrize("degree", range(4))
 def test_harmonics_are_drawn_as_the_colours_they_stand_for(degree, per_camera, device):
     scene, coefficients = scene_and_coefficients(per_camera=per_camera)
-    expected, alphas, _ = draw(scene.to(device), expected_colors(degree, scene.means, coefficients, scene.viewmats).to(device))
+    colors = expected_colors(degree, scene.means, coefficients, scene.viewmats)
+    expected, alphas, _ = draw(scene.to(device), colors.to(device))
     got, got_alphas, _ = draw(scene.to(device), coefficients.to(device), sh_degree=degree)
     torch.testing.assert_close(got, expected, rtol=0, atol=1e-12)
     assert torch.equal(got_alphas, alphas)

@@ -1,5 +1,11 @@
 """The vector kernels of the CPU: against the generic ones, by themselves, and what they do to memory."""
 
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 from rasterization_scenes import frontal_scene, ordinary_scene
@@ -10,6 +16,7 @@ from oasis_kernels.constants import Rules
 from oasis_warp.ops import _blend_strips, _tiles, blending, rasterization
 from oasis_warp.ops._registration import revealed
 from oasis_warp.ops._rules import using
+from oasis_warp.ops._splats import Frame, Splats, Wanted
 from oasis_warp.ops.projection import project
 
 SIZES = [(1, 1), (16, 16), (257, 2), (2, 65), (65, 63)]
@@ -18,7 +25,7 @@ SIZES = [(1, 1), (16, 16), (257, 2), (2, 65), (65, 63)]
 def generically(monkeypatch, function, *args, **options):
     """Call `function` while float32 on the CPU is drawn by the kernels of CUDA and float64."""
     with monkeypatch.context() as patch:
-        patch.setattr(blending, "draws_strips", lambda like: False)
+        patch.setattr(blending, "has_vectors", lambda like: False)
         return function(*args, **options)
 
 
@@ -160,11 +167,12 @@ def test_lists_hold_each_strips_gaussians_by_depth_and_then_by_index(n, distinct
         scene.means[:, 2] += 3
     p = projected(scene)
     cut = _blend_strips.cut_strips(2, n, 80, 70, 8)
-    splats = _blend_strips.Splats(
+    splats = Splats(
         p.sort_depths, p.centers, p.whitenings, p.boxes, scene.opacities.expand(2, n).contiguous(),
         scene.colors.expand(2, n, 3).contiguous(), scene.backgrounds,
     )  # fmt: skip
-    lists = _blend_strips.draw(splats, cut, True).lists
+    _, _, lists = _blend_strips.draw(splats, Frame(80, 70, 8), True)
+    assert lists is not None
     ids = revealed(lists.ids)
     boxes, depths = p.boxes.view(-1, 4), p.sort_depths.view(-1)
     x0, y0, x1, y1 = boxes.unbind(1)
@@ -247,18 +255,17 @@ def test_nothing_is_written_past_a_buffer_nor_read_from_there(name, channels, ti
     opacities = scene.opacities.expand(n_cameras, n).contiguous()
     g_image = torch.rand(n_cameras, scene.height, scene.width, channels, generator=g)
     g_alpha = torch.rand(n_cameras, scene.height, scene.width, 1, generator=g)
-    cut = _blend_strips.cut_strips(n_cameras, n, scene.width, scene.height, tile_size)
+    frame, wanted = Frame(scene.width, scene.height, tile_size), Wanted(True, True, True)
 
     def run(copy):
-        splats = _blend_strips.Splats(
+        splats = Splats(
             *map(copy, (p.sort_depths, p.centers, p.whitenings, p.boxes, opacities, colors, backgrounds))
         )
-        plain = _blend_strips.draw(splats, cut, False)
-        drawn = _blend_strips.draw(splats, cut, True)
-        back = _blend_strips.draw_backward(
-            copy(g_image), copy(g_alpha), splats, cut, drawn.transmittance, drawn.stops, drawn.lists, True, True, True
-        )
-        return [plain.image, plain.alphas, drawn.image, drawn.alphas, *back]
+        *plain, nothing = _blend_strips.draw(splats, frame, False)
+        *drawn, kept = _blend_strips.draw(splats, frame, True)
+        assert nothing is None and kept is not None
+        back = _blend_strips.draw_backward(copy(g_image), copy(g_alpha), splats, frame, kept, wanted)
+        return [*plain, *drawn, *back]
 
     expected = run(lambda t: t)
     guards = Guards()
@@ -300,3 +307,28 @@ def test_broadcast_colors_and_gradients_are_taken():
     again, *_ = rasterization(*scene.gaussians, dense, scene.viewmats, scene.Ks, scene.width, scene.height)
     assert torch.equal(image, again)
     assert torch.equal(g, torch.autograd.grad(again, dense, torch.ones_like(again))[0])
+
+
+CPU_FLAGS = "-target-cpu x86-64-v3", "-target-cpu x86-64-v2"
+ANOTHER_CPU = """
+import sys
+import torch
+sys.path[:0] = [{tests!r}, {tests!r} + "/ops"]
+from rasterization_scenes import ordinary_scene
+from test_rasterization import values_and_gradients
+torch.save(values_and_gradients(ordinary_scene(19)), {file!r})
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the flags are of x86")
+@pytest.mark.parametrize("flags", CPU_FLAGS)
+def test_kernels_for_cpus_with_narrower_vectors_draw_the_same(flags, tmp_path):
+    file = tmp_path / "picture.pt"
+    script = ANOTHER_CPU.format(tests=str(Path(__file__).parents[1]), file=str(file))
+    environment = os.environ | {"OASIS_WARP_CPU_FLAGS": flags}
+    subprocess.run([sys.executable, "-c", script], env=environment, check=True, timeout=280)
+    here, there = values_and_gradients(ordinary_scene(19)), torch.load(file)
+    assert rel(there[0], here[0].double()) <= 1e-6 and rel(there[1], here[1].double()) <= 1e-6
+    for name, got, want in zip(INPUTS, there[2], here[2], strict=True):
+        assert rel(got, want.double()) <= 1e-5, name

@@ -18,6 +18,7 @@ from oasis_warp.ops import (
     face_rotations,
     pose_on_mesh,
     rasterization,
+    skin,
 )
 
 Outputs = tuple[Tensor, ...]
@@ -52,7 +53,7 @@ class Operator:
     graded: int | None = None
     """How many of the outputs the loss is made of; all when None."""
     vectorised: bool = True
-    """Whether it has kernels of its own to vectorise."""
+    """Whether it has other kernels for the CPU than vectorised ones."""
     image: bool = False
     """Whether the first output is an image in [0, 1]."""
     comparable: Callable[[Outputs], Outputs] = field(default=as_it_is)
@@ -133,6 +134,11 @@ def _pose_on_mesh(scene: MeshScene, **options: Any) -> Outputs:
     )  # fmt: skip
 
 
+def _skin(scene: MeshScene, **options: Any) -> Outputs:
+    skinned = skin(scene.rest_vertices, scene.covars, scene.skin_weights, scene.transforms, **options)
+    return tuple(part for part in skinned if part is not None)
+
+
 def _posing(scene: MeshScene, **options: Any) -> Outputs:
     vertex_quats, _, area_ratio, vertex_area_ratio = _face_rotations(scene, **options)
     turned = replace(
@@ -173,6 +179,10 @@ OPERATORS = {
                 "posed_vertices", "barycentrics", "vertex_quats", "area_ratio", "vertex_area_ratio", "offsets",
                 "quats", "scales",
             ),
+        ),
+        Operator(
+            "skin", MeshScene, _skin, lambda scene: tuple(torch_mesh.skin(scene)),
+            leaves=("rest_vertices", "covars", "skin_weights", "transforms"), vectorised=False,
         ),
         Operator(
             "posing", MeshScene, _posing, lambda scene: tuple(torch_mesh.pose(scene)),

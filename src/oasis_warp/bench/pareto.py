@@ -23,8 +23,8 @@ def can_plot() -> bool:
 def plot_operator(rows: Sequence[Row], op: str, path: Path, scenes: Sequence[str] | None = None) -> None:
     """Write a picture: time to the right, error upwards, both logarithmic; one colour a knob.
 
-    The default is ringed, settings that no other beats in both are joined, and the dashed line is what rounding alone
-    changes: the difference between two orders of the same Gaussians or faces.
+    The default is ringed, settings that no other beats in both are joined, and the dashed line is how far the exact
+    results are known.
 
     Args:
         rows: Of `oasis bench error-time`.

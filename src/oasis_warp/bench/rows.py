@@ -44,8 +44,10 @@ class Row:
     repeats: int
     first_ms: float
     """The first call, with compiling or loading kernels."""
+    cpu_ms: float | None
+    """CPU time of all threads in the call with the least; None on CUDA."""
     yardstick_ms: float
-    """Median of the yardstick in the same rounds: times over it can be compared between runs."""
+    """The yardstick's CPU time in the same rounds: times over it can be compared between runs."""
     peak_mb: float | None
     """Memory beyond what was in use before the call [MiB]."""
     rel_l2: float
@@ -56,8 +58,9 @@ class Row:
     """Of the image, fragile pixels included; None where it is equal, or there is none."""
     gradient_rel_l2: float | None
     """Largest relative error of any gradient, of a loss without the fragile pixels."""
-    floor_rel_l2: float | None
-    """What the same computation differs by when the Gaussians or faces are listed in another order."""
+    floor_rel_l2: float
+    """How far the exact results are known: what torch in float64, with the Gaussians or faces listed in another order,
+    differs from them by in the first output. Smaller errors than this say nothing."""
     fragile_percent: float | None
     """Share of the pixels where a decision hangs on rounding."""
     bit_equal: bool
@@ -70,6 +73,14 @@ class Row:
     def error(self) -> float:
         """The larger of the errors of values and gradients, as far as the pass has them."""
         return max(self.rel_l2, self.gradient_rel_l2 or 0.0)
+
+    @property
+    def cost_ms(self) -> float:
+        """What settings are compared by: CPU time where one thread does the work, else the fastest call.
+
+        Other work on the machine delays a call, but hardly adds to its CPU time.
+        """
+        return self.fastest_ms if self.cpu_ms is None or self.threads > 1 else self.cpu_ms
 
     @property
     def is_default(self) -> bool:

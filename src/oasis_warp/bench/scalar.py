@@ -1,7 +1,7 @@
 """The generic kernels in float32 on the CPU, where the operators choose vectorised ones: what the vectors gain.
 
-No option of the operators, for nobody but a benchmark wants it: inside `generic_kernels` the questions "is there a
-vectorised kernel for this tensor" are answered with no.
+No option of the operators, for nobody but a benchmark wants it: inside `generic_kernels` the question "is there a
+vectorised kernel for this tensor" is answered with no, and depth buffers are filled as on CUDA.
 """
 
 import sys
@@ -11,8 +11,7 @@ from unittest.mock import patch
 
 from torch import Tensor
 
-QUESTIONS = ("is_vectorised", "has_vectors", "draws_strips")
-"""Functions of `oasis_warp.ops` from a tensor to whether it has a vectorised kernel."""
+from oasis_warp.ops import _depth_buffer
 
 
 @contextmanager
@@ -24,9 +23,8 @@ def generic_kernels() -> Iterator[None]:
 
     modules = [module for name, module in sys.modules.items() if name.startswith("oasis_warp.ops.")]
     with ExitStack() as patched:
-        for question in QUESTIONS:
-            askers = [module for module in modules if hasattr(module, question)]
-            assert askers, f"no operator asks {question} any more"
-            for module in askers:
-                patched.enter_context(patch.object(module, question, no))
+        for module in modules:
+            if hasattr(module, "has_vectors"):
+                patched.enter_context(patch.object(module, "has_vectors", no))
+        patched.enter_context(patch.object(_depth_buffer, "draw_by_vectors", _depth_buffer.draw_by_faces))
         yield

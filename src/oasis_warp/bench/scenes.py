@@ -17,7 +17,7 @@ from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.skinning import rest_hand, skin
+from oasis_warp.hand.skinning import bone_transforms, rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import face_rotations
 from oasis_warp.render.cameras import orbit_camera
@@ -32,6 +32,8 @@ TEXTURE = 0.05
 
 OFFSET = 5e-4
 """Standard deviation of what Gaussians on vertices are shifted by [m]."""
+VERTEX_GAUSSIAN = 1e-3
+"""Size of the Gaussians that are skinned with their vertices [m]."""
 POINT_NOISE = 0.002
 """Standard deviation of the points of a mesh scene about its vertices [m]: visibility takes all values there."""
 
@@ -72,7 +74,7 @@ class Scene(_Tensors):
 
 @dataclass(frozen=True)
 class MeshScene(_Tensors):
-    """A mesh at rest and posed, Gaussians that ride on its vertices (P) and faces (Q), points round it, a camera."""
+    """A mesh at rest and posed, Gaussians on its vertices (P) and faces (Q), its bones, points round it, a camera."""
 
     name: str
     seed: int
@@ -83,6 +85,11 @@ class MeshScene(_Tensors):
     """This and the next two as `face_rotations` gives them, rounded from float64."""
     area_ratio: Float[Tensor, "F"]
     vertex_area_ratio: Float[Tensor, "V"]
+    covars: Float[Tensor, "V 3 3"]
+    """Of a Gaussian at each vertex [m^2]."""
+    skin_weights: Float[Tensor, "V J"]
+    transforms: Float[Tensor, "J 3 4"]
+    """Of the bones, rest to posed."""
     points: Float[Tensor, "V 3"]
     """Whose visibility is asked: the posed vertices, moved at random."""
     vertex_index: Int[Tensor, "P"]
@@ -115,8 +122,11 @@ def hand_scenes(size: int = 256, seed: int = 0) -> tuple[Scene, MeshScene]:
     )  # fmt: skip
     points = posed + POINT_NOISE * torch.randn(posed.shape, generator=generator)
     offsets = OFFSET * torch.randn(len(anchors.vertex_index), 3, generator=generator)
+    axes = VERTEX_GAUSSIAN * torch.randn(len(posed), 3, 3, generator=generator)
+    rotations, translations = bone_transforms(hand, rest.joints, pose)
     mesh = MeshScene(
-        "hand", seed, rest.vertices, posed, hand.faces, *turns(rest.vertices, posed, hand.faces), points,
+        "hand", seed, rest.vertices, posed, hand.faces, *turns(rest.vertices, posed, hand.faces),
+        axes @ axes.transpose(1, 2), hand.weights, torch.cat([rotations, translations[..., None]], -1), points,
         anchors.vertex_index, offsets, anchors.face_index, anchors.barycentrics, anchors.quats, anchors.scales,
         camera.viewmat, camera.K, size, size,
     )  # fmt: skip

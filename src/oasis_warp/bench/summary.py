@@ -1,4 +1,7 @@
-"""What a table of errors and times says: the best trade-offs, and the fastest setting for a given error."""
+"""What a table of errors and times says: the best trade-offs, and the fastest setting for a given error.
+
+Settings are ranked by `Row.cost_ms`.
+"""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -9,7 +12,7 @@ BUDGETS: tuple[tuple[str, float | None], ...] = (("1e-2", 1e-2), ("1e-3", 1e-3),
 """Largest error allowed; None: no more than that of the default, whose arithmetic is exact up to rounding."""
 
 WORTHWHILE = 0.03
-"""Least share of the time that a setting has to save: less is within what medians differ by."""
+"""Least share of the time that a setting has to save: less is within what such times differ by."""
 
 
 class Group(NamedTuple):
@@ -42,9 +45,13 @@ def fits(row: Row, budget: float | None, default: Row) -> bool:
 
 
 def fastest(group: Group, budget: float | None) -> Row:
-    """The fastest setting that keeps an error budget; the default where none gains more than `WORTHWHILE`."""
-    best = min((row for row in group.rows if fits(row, budget, group.default)), key=lambda row: row.median_ms)
-    return best if best.median_ms < (1 - WORTHWHILE) * group.default.median_ms else group.default
+    """The fastest setting that keeps an error budget; the default where none gains more than `WORTHWHILE`.
+
+    More threads are no setting of their own here: they trade no error, and every setting can have them.
+    """
+    within = [row for row in group.rows if row.knob != "threads" and fits(row, budget, group.default)]
+    best = min(within, key=lambda row: row.cost_ms)
+    return best if best.cost_ms < (1 - WORTHWHILE) * group.default.cost_ms else group.default
 
 
 def non_dominated(rows: Sequence[Row]) -> list[Row]:

@@ -20,14 +20,15 @@ def setting_table(group: Group) -> Table:
     table = Table(title=f"{group.op} on {group.scene}, {group.pass_}", title_justify="left")
     for heading in ("knob", "value"):
         table.add_column(heading, no_wrap=True)
-    for heading in ("ms", "quartiles", "MiB", "rel-L2", "max", "PSNR", "gradient", "same bits"):
+    for heading in ("ms", "quartiles", "fastest", "CPU", "MiB", "rel-L2", "max", "PSNR", "gradient", "same bits"):
         table.add_column(heading, justify="right", no_wrap=True)
     for row in group.rows:
         psnr = "" if row.psnr_db is None or not math.isfinite(row.psnr_db) else f"{row.psnr_db:.1f}"
         table.add_row(
             row.knob, row.value if not row.is_default else "", f"{row.median_ms:.2f}", f"{row.iqr_ms:.2f}",
-            "" if row.peak_mb is None else f"{row.peak_mb:.1f}", number(row.rel_l2), number(row.max_abs), psnr,
-            number(row.gradient_rel_l2), "yes" if row.bit_equal else "no",
+            f"{row.fastest_ms:.2f}", "" if row.cpu_ms is None else f"{row.cpu_ms:.2f}",
+            "" if row.peak_mb is None else f"{row.peak_mb:.1f}", number(row.rel_l2),
+            number(row.max_abs), psnr, number(row.gradient_rel_l2), "yes" if row.bit_equal else "no",
         )  # fmt: skip
     return table
 
@@ -41,7 +42,7 @@ def budget_table(rows: Sequence[Row]) -> Table:
         cells = []
         for _, budget in BUDGETS:
             best = fastest(group, budget)
-            ratio = best.median_ms / group.default.median_ms
+            ratio = best.cost_ms / group.default.cost_ms
             cells.append("default" if best.is_default else f"{best.knob} {best.value}, {ratio:.2f}x")
         table.add_row(group.op, group.scene, group.pass_, *cells)
     return table
@@ -52,13 +53,14 @@ def speed_table(rows: Sequence[SpeedRow]) -> Table:
     table = Table(title_justify="left")
     for heading in ("operator", "pass", "way"):
         table.add_column(heading, no_wrap=True)
-    for heading in ("ms", "quartiles", "fastest", "/ yardstick", "/ warp", "MiB", "rel-L2", "gradient"):
+    for heading in ("ms", "quartiles", "fastest", "CPU", "/ yardstick", "/ warp", "MiB", "rel-L2", "gradient"):
         table.add_column(heading, justify="right", no_wrap=True)
     for k, row in enumerate(rows):
         last = k + 1 == len(rows) or rows[k + 1].op != row.op
         table.add_row(
             row.op, row.pass_, row.way, f"{row.median_ms:.2f}", f"{row.iqr_ms:.2f}", f"{row.fastest_ms:.2f}",
-            f"{row.over_yardstick:.3f}", f"{row.over_warp:.1f}", "" if row.peak_mb is None else f"{row.peak_mb:.1f}",
+            "" if row.cpu_ms is None else f"{row.cpu_ms:.2f}", f"{row.over_yardstick:.3f}", f"{row.over_warp:.1f}",
+            "" if row.peak_mb is None else f"{row.peak_mb:.1f}",
             number(row.rel_l2), number(row.gradient_rel_l2), end_section=last,
         )  # fmt: skip
     return table

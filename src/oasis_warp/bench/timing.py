@@ -36,11 +36,12 @@ class Timed:
 
 @dataclass(frozen=True)
 class Timing:
-    """Wall time of a synchronised call."""
+    """Wall time of a synchronised call, and the CPU time of the process in it."""
 
     first_ms: float
     """The first call, with compiling or loading its kernels."""
     times_ms: tuple[float, ...]
+    cpu_times_ms: tuple[float, ...]
 
     @property
     def median_ms(self) -> float:
@@ -57,6 +58,11 @@ class Timing:
     def fastest_ms(self) -> float:
         """What it takes at best."""
         return min(self.times_ms)
+
+    @property
+    def cpu_ms(self) -> float:
+        """CPU time at best, that of all threads added up: what waiting for other work does not inflate."""
+        return min(self.cpu_times_ms)
 
 
 @contextmanager
@@ -76,13 +82,14 @@ def synchronise() -> None:
         torch.cuda.synchronize()
 
 
-def milliseconds(run: Callable[[], object]) -> float:
-    """Wall time of one call."""
+def milliseconds(run: Callable[[], object]) -> tuple[float, float]:
+    """Wall and CPU time of one call."""
     synchronise()
-    start = time.perf_counter()
+    start, start_cpu = time.perf_counter(), time.process_time()
     run()
     synchronise()
-    return 1e3 * (time.perf_counter() - start)
+    end, end_cpu = time.perf_counter(), time.process_time()
+    return 1e3 * (end - start), 1e3 * (end_cpu - start_cpu)
 
 
 def time_together(
@@ -100,12 +107,12 @@ def time_together(
     """
     if repeats < 2:
         raise ValueError(f"repeats: expected 2 or more, got {repeats}.")
-    first, times = [], []
+    first, warm = [], []
+    times: list[list[tuple[float, float]]] = [[] for _ in calls]
     for call in calls:
         with call.ready():
-            first.append(milliseconds(call.run))
-            times.append([milliseconds(call.run)])
-    warm = [t[0] for t in times]
+            first.append(milliseconds(call.run)[0])
+            warm.append(milliseconds(call.run)[0])
     collecting = gc.isenabled()
     gc.disable()
     try:
@@ -122,7 +129,7 @@ def time_together(
     finally:
         if collecting:
             gc.enable()
-    return [Timing(f, tuple(t[1:])) for f, t in zip(first, times, strict=True)]
+    return [Timing(f, *zip(*t, strict=True)) for f, t in zip(first, times, strict=True)]
 
 
 def peak_megabytes(run: Callable[[], object], device: torch.device) -> float | None:

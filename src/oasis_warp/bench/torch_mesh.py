@@ -152,6 +152,22 @@ def pose_on_mesh(scene: MeshScene) -> Posed:
     )
 
 
+class Skinned(NamedTuple):
+    """As `oasis_warp.ops.Skinned`."""
+
+    means: Float[Tensor, "V 3"]
+    covars: Float[Tensor, "V 3 3"]
+
+
+def skin(scene: MeshScene) -> Skinned:
+    """`oasis_warp.ops.skin` of the rest vertices and their covariances."""
+    blends = (scene.skin_weights @ scene.transforms.flatten(1)).unflatten(-1, (3, 4))
+    turn, shift = blends[..., :3], blends[..., 3]
+    return Skinned(
+        (turn @ scene.rest_vertices[..., None])[..., 0] + shift, turn @ scene.covars @ turn.transpose(1, 2)
+    )
+
+
 def pose(scene: MeshScene) -> Posed:
     """`pose_on_mesh` by the rotations of `face_rotations`."""
     turned = face_rotations(scene)

@@ -34,6 +34,11 @@ SMALL: dict[str, list[dict[str, Any]]] = {
         {"name": "ordinary", "law": "sqrt_area"}, {"name": "ordinary", "law": "area"},
         {"name": "ordinary", "law": "none"}, {"name": "opposite signs"}, {"name": "half turns between corners"},
     ],
+    "pose_on_mesh_covars": [{"name": name} for name in ("ordinary", "rigid motion", "large bends")],
+    "skin": [
+        {"name": "ordinary", "rotation_only": turn, "with_covars": covars}
+        for turn, covars in ((False, True), (True, True), (False, False))
+    ],
 }  # fmt: skip
 """Scenes for finite differences, a hundred calls each."""
 SMALL_SIZES: dict[str, dict[str, Any]] = {
@@ -41,11 +46,14 @@ SMALL_SIZES: dict[str, dict[str, Any]] = {
     "depth_visibility": {"n": 25, "size": (16, 12), "n_points": 30},
     "face_rotations": {"side": 2},
     "pose_on_mesh": {"n": 7},
+    "pose_on_mesh_covars": {"side": 2, "n": 7},
+    "skin": {"n": 7, "n_joints": 4},
 }
 EXACT_STIFF = (1e-9, 1e-7)
 STIFF_SEEDS = 3
 ORDINARY_SEEDS = 8
 REPEATS = 10
+FULL_AMONG = 200
 EXACT = (1e-9, 1e-8)
 """Values and gradients of the float64 operator: rounding, magnified where a scene divides by little."""
 
@@ -72,15 +80,26 @@ def steps(family: Family, device: torch.device, seed: int) -> Iterator[Step]:
                 yield partial(compare, family, family.case(name, s), torch.float32, device)
             yield partial(compare, family, family.case(name, seed), torch.float64, device, EXACT_STIFF)
     large = family.case("ordinary", seed, **family.large)
-    yield partial(agree, family, large, "float32 against float64 kernel", torch.float64, device, device)
+    yield partial(agree, family, large, "float32 to float64", torch.float64, device, device)
     if device.type != "cpu":
         for s in range(seed, seed + ORDINARY_SEEDS):
             other = family.case("ordinary", s, **family.large)
             yield partial(agree, family, other, f"{device.type} against cpu", torch.float32, cpu, device)
     yield partial(differing, family, large, device, REPEATS)
-    full = next(case for case in map(family.scene, count(seed)) if all(t.numel() for t in case.floats.values())
-                and set(family.indices) <= set(case.others) and case.condition == "ordinary")  # fmt: skip
-    yield partial(refusals, family, full, device)
+    yield partial(refusals, family, full_scene(family, seed), device)
+
+
+def full_scene(family: Family, seed: int) -> Case:
+    """The first ordinary scene that reads every optional argument too, with nothing empty and nothing of width one."""
+    cases = [family.case("ordinary", s) for s in range(seed, seed + FULL_AMONG)]
+    most = max(len(case.floats) + len(case.others) - ("sh_degree" in case.others) for case in cases)
+    for case in cases:
+        sizes = [size for tensor in case.floats.values() for size in (tensor.numel(), tensor.shape[-1])]
+        draws_colors = case.others.get("render_mode", "RGB") in ("RGB", "RGB+D", "RGB+ED")
+        plain = draws_colors and "sh_degree" not in case.others
+        if min(sizes) > 1 and plain and len(case.floats) + len(case.others) == most:
+            return case
+    raise AssertionError(f"{family.name}: no full scene among {FULL_AMONG}")
 
 
 def all_steps(names: tuple[str, ...], device: torch.device, seed: int) -> list[tuple[str, Step]]:

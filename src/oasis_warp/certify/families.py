@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from oasis_warp import ops
-from oasis_warp.certify import mesh_scenes, rasterization_scenes, surface_scenes
+from oasis_warp.certify import mesh_scenes, rasterization_scenes, skinning_scenes, surface_scenes
 from oasis_warp.certify.case import Case
-from oasis_warp.certify.twins import face_rotations, harmonics, mesh_posing, rasterization, visibility
+from oasis_warp.certify.twins import face_rotations, harmonics, mesh_posing, rasterization, skinning, visibility
 
 Outputs = tuple[Tensor, ...]
 
@@ -79,10 +79,32 @@ def _read_depth_map(answer: Any) -> Outputs:
 
 
 def _depth_map(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    hits = visibility.cast(**arguments, slack=slack)
     shape = arguments["height"], arguments["width"]
-    outputs = 1 / hits.depth.view(shape), hits.weights.view(*shape, 3)
-    return outputs, (hits.sound.view(shape).double(), hits.clear.view(*shape, 1).double())
+    outputs, keep = [], []
+    for single in singles(arguments):
+        hits = visibility.cast(**single, slack=slack)
+        outputs.append((1 / hits.depth.view(shape), hits.weights.view(*shape, 3)))
+        keep.append((hits.sound.view(shape).double(), hits.clear.view(*shape, 1).double()))
+    return together(outputs, arguments), together(keep, arguments)
+
+
+BATCHED = {"points": 2, "vertices": 2, "viewmat": 2, "K": 2}
+"""Arguments of the depth buffer that may have a batch axis before so many others."""
+
+
+def singles(arguments: dict[str, Any]) -> list[dict[str, Any]]:
+    """The arguments for each entry of a batch."""
+    n = max(len(v) if v.dim() > BATCHED[k] else 1 for k, v in arguments.items() if k in BATCHED)
+    return [
+        {k: v[i] if k in BATCHED and v.dim() > BATCHED[k] else v for k, v in arguments.items()} for i in range(n)
+    ]
+
+
+def together(parts: list[Outputs], arguments: dict[str, Any]) -> Outputs:
+    """What the entries of a batch gave, with a batch axis where an argument had one."""
+    if any(arguments[k].dim() > n for k, n in BATCHED.items() if k in arguments):
+        return tuple(torch.stack(same) for same in zip(*parts, strict=True))
+    return parts[0]
 
 
 def _read_depth_visibility(answer: Any) -> Outputs:
@@ -90,6 +112,11 @@ def _read_depth_visibility(answer: Any) -> Outputs:
 
 
 def _depth_visibility(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
+    parts = [_single_visibility(single, slack) for single in singles(arguments)]
+    return together([out for out, _ in parts], arguments), together([keep for _, keep in parts], arguments)
+
+
+def _single_visibility(arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
     points, vertices, faces, viewmat, K = (arguments[k] for k in ("points", "vertices", "faces", "viewmat", "K"))
     size, near, tau = (arguments["width"], arguments["height"]), arguments["near_plane"], arguments["tau"]
     literal = arguments.get("literal", False)
@@ -97,7 +124,7 @@ def _depth_visibility(case: Case, arguments: dict[str, Any], slack: float) -> tu
     margin = 0.0 if literal else arguments.get("margin", 3 * tau)
     hits = visibility.cast(vertices, faces, viewmat, K, *size, near, slack)
     shape = size[::-1]
-    depth, face_ids = hits.depth.detach().view(shape), hits.face_ids.view(shape)
+    depth, face_ids = hits.depth.view(shape), hits.face_ids.view(shape)
     scores = visibility.depth_visibility(points, depth, face_ids, faces, K, viewmat, tau, margin, named, near)
     keep = visibility.sound_points(points, hits, K, viewmat, *size, named is not None, near, slack)
     return (scores,), (keep.double(),)
@@ -131,6 +158,23 @@ def _pose_on_mesh(case: Case, arguments: dict[str, Any], slack: float) -> tuple[
     return (means, squares(quats), scales), (every, aligned, every)
 
 
+def _read_pose_on_mesh_covars(answer: Any) -> Outputs:
+    return answer.means.double(), answer.covars.double()
+
+
+def _pose_on_mesh_covars(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
+    every = torch.ones(()).double()
+    return mesh_posing.pose_on_mesh_covars(**arguments), (every, every)
+
+
+def _read_skin(answer: Any) -> Outputs:
+    return tuple(t.double() for t in answer if t is not None)
+
+
+def _skin(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
+    return skinning.skin(**arguments), tuple(torch.ones(()).double() for _ in range(1 + ("covars" in case.floats)))
+
+
 LARGE_MESH = {"n": 1500, "size": (160, 120)}
 
 FAMILIES = {
@@ -162,6 +206,15 @@ FAMILIES = {
             surface_scenes.pose_on_mesh_case, tuple(surface_scenes.RIDERS),
             {"n": 10_000},
             {"faces": ("posed_vertices", 0), "face_index": ("area_ratio", 0), "vertex_index": ("posed_vertices", 0)},
+        ),
+        Family(
+            "pose_on_mesh_covars", ("means", "covars"), _read_pose_on_mesh_covars, _pose_on_mesh_covars,
+            surface_scenes.pose_on_mesh_covars_case, tuple(surface_scenes.CONDITIONS), {"side": 20, "n": 10_000},
+            {"faces": ("rest_vertices", 0)},
+        ),
+        Family(
+            "skin", ("means", "covars"), _read_skin, _skin,
+            skinning_scenes.skin_case, tuple(skinning_scenes.CONDITIONS), {"n": 10_000, "n_joints": 16},
         ),
     )
 }  # fmt: skip

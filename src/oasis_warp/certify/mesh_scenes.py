@@ -180,8 +180,8 @@ def _(draw: Draw, n: int) -> Mesh:
     return Mesh(draw.normal(4, 3), torch.zeros(0, 3, dtype=torch.int64))
 
 
-def scene(draw: Draw, mesh: Mesh, size: tuple[int, int]) -> tuple[dict[str, Tensor], dict, Tensor]:
-    """Float arguments, other arguments, and the inverse of the view's rotation."""
+def scene(draw: Draw, mesh: Mesh, size: tuple[int, int]) -> tuple[dict[str, Tensor], dict]:
+    """Float arguments and other arguments; now and then a batch of two, of which the second sees a little else."""
     width, height = size
     viewmat = torch.eye(4, dtype=torch.float64)
     if mesh.turned:
@@ -196,7 +196,11 @@ def scene(draw: Draw, mesh: Mesh, size: tuple[int, int]) -> tuple[dict[str, Tens
     viewmat[:3, 3] *= mesh.unit
     floats = {"vertices": mesh.unit * vertices, "viewmat": viewmat, "K": K}
     near = mesh.near_plane * mesh.unit
-    return floats, {"faces": mesh.faces, "width": width, "height": height, "near_plane": near}, viewmat
+    if draw.pick((False, False, False, True)):
+        for name in draw.pick((("vertices",), ("viewmat", "K"), ("vertices", "viewmat"))):
+            nudge = 1 + 0.02 * draw.uniform(1)
+            floats[name] = torch.stack([floats[name], nudge * floats[name] if name == "vertices" else floats[name]])
+    return floats, {"faces": mesh.faces, "width": width, "height": height, "near_plane": near}
 
 
 def depth_map_case(name: str, seed: int, n: int | None = None, size: tuple[int, int] | None = None) -> Case:
@@ -204,7 +208,7 @@ def depth_map_case(name: str, seed: int, n: int | None = None, size: tuple[int, 
     draw = Draw(seed)
     size = draw.pick(SIZES) if size is None else size
     n = draw.pick(FACE_COUNTS) if n is None else n
-    floats, others, _ = scene(draw, CONDITIONS[name](draw, n), size)
+    floats, others = scene(draw, CONDITIONS[name](draw, n), size)
     return Case(name, seed, floats, (), others, DEPTHS)
 
 
@@ -217,9 +221,10 @@ def depth_visibility_case(
     n = draw.pick(FACE_COUNTS) if n is None else n
     n_points = draw.pick(POINT_COUNTS) if n_points is None else n_points
     mesh = CONDITIONS[name](draw, n)
-    floats, others, viewmat = scene(draw, mesh, size)
+    floats, others = scene(draw, mesh, size)
     named = draw.pick((False, True))
-    points, vertex = points_round(draw, floats["vertices"], mesh, n_points, named)
+    viewmat, vertices = floats["viewmat"].view(-1, 4, 4)[0], floats["vertices"].view(-1, *mesh.vertices.shape)[0]
+    points, vertex = points_round(draw, vertices, mesh, n_points, named)
     # A rounding of the depth of 1 ulp moves the score by that much over tau.
     depth = float((points @ viewmat[2, :3] + viewmat[2, 3]).abs().max()) / mesh.unit if len(points) else 0.0
     error = 2e-5 + (1e-5 if mesh.distance else 2.4e-7 * depth / mesh.tau)
@@ -230,8 +235,9 @@ def depth_visibility_case(
         others |= draw.pick(({}, {"literal": True}, {"margin": 0.5 * mesh.tau * mesh.unit}))
     bounds = Bounds(error, max(1e-3, error), error)
     floats = {"points": points} | floats
-    floor = {"points": MISS / mesh.tau / mesh.unit, "visibility": 1.0}
-    return Case(name, seed, floats, ("points",), others, bounds, floor)
+    slope = MISS / mesh.tau / mesh.unit
+    floors = {"points": slope, "vertices": slope, "visibility": 1.0}
+    return Case(name, seed, floats, ("points", "vertices"), others, bounds, floors)
 
 
 def points_round(draw: Draw, vertices: Tensor, mesh: Mesh, n: int, named: bool) -> tuple[Tensor, Tensor]:

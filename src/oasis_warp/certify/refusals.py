@@ -29,22 +29,27 @@ def attempts(family: Family, case: Case, device: torch.device) -> Iterator[tuple
         for value in POISON:
             bad = good[name].detach().clone()
             bad.view(-1)[bad.numel() // 2] = value
-            yield "NaN and infinities", name, f"with {value}", is_refused(family, good, name, bad)
+            yield "NaN or Inf", name, f"with {value}", is_refused(family, good, name, bad)
         bad = good[name].detach()[..., :-1] if good[name].dim() > 1 else good[name].detach()[:-1]
         yield "wrong shapes", name, f"of shape {list(bad.shape)}", is_refused(family, good, name, bad)
     for name, (rows, least) in family.indices.items():
-        for value in (least - 1, len(case.floats[rows])) if name in good else ():
+        named = case.floats[rows]
+        for value in (least - 1, named.shape[-2] if named.dim() > 1 else len(named)) if name in good else ():
             bad = good[name].clone()
             bad.view(-1)[bad.numel() // 2] = value
             yield "wrong indices", name, f"with {value}", is_refused(family, good, name, bad)
 
 
 def is_refused(family: Family, good: dict[str, Any], name: str, bad: Tensor) -> bool:
-    """Whether the call with `bad` in the place of one argument ends as it should."""
+    """Whether the call with `bad` in the place of one argument ends as it should.
+
+    Of two shapes that do not go together either argument may be named.
+    """
+    blamed = {name} if bad.shape == good[name].shape else set(good)
     try:
         family.call(good | {name: bad})
     except ValueError as error:
-        return str(error).startswith(f"{name}: ")
+        return str(error).split(":")[0] in blamed
     except Exception:  # whatever else a bad argument breaks is what this looks for
         return False
     return False

@@ -251,6 +251,23 @@ def _(draw: Draw, floats: dict[str, Tensor]) -> Bounds:
     return STIFF
 
 
+def pose_on_mesh_covars_case(name: str, seed: int, side: int | None = None, n: int | None = None) -> Case:
+    """Gaussians on the faces of a mesh that bends under the condition `name`, stretched with it."""
+    draw = Draw(seed)
+    made = CONDITIONS[name](draw, draw.pick(SIDES) if side is None else side)
+    n = draw.pick(GAUSSIANS) if n is None else n
+    n = n if len(made.faces) else 0
+    floats = {
+        "rest_vertices": made.rest,
+        "posed_vertices": made.posed,
+        "barycentrics": draw.normal(n, 3).softmax(-1),
+        "quats": draw.normal(n, 4),
+        "scales": draw.normal(n, 3).exp() * float(made.rest.abs().max() if len(made.rest) else 1.0),
+    }
+    face_index = draw.integers(max(len(made.faces), 1), n)
+    return Case(name, seed, floats, tuple(floats), {"faces": made.faces, "face_index": face_index}, made.bounds)
+
+
 def pose_on_mesh_case(name: str, seed: int, n: int | None = None, law: str | None = None) -> Case:
     """Gaussians on faces that share vertices at random, under the condition `name`."""
     draw = Draw(seed)

@@ -10,7 +10,9 @@ from typing import Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
 Output = Annotated[Path, arg(aliases=["-o"], metavar="PATH")]
-FamilyName = Literal["rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh"]
+FamilyName = Literal[
+    "rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "skin"
+]
 PoseName = Literal["photo", "rest", "open", "relaxed", "fist", "pinch", "thumbs_up", "victory", "point", "ok"]
 
 

@@ -8,7 +8,7 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.core.types import HandPose, PosedHand
 from oasis_warp.hand.correctives import corrected_rest
-from oasis_warp.ops.skinning import skin as blend_skin
+from oasis_warp.ops import skin as blend_skin
 
 
 def rest_hand(hand: HandModel, shape: Float[Tensor, "S"]) -> PosedHand:

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from oasis_kernels import strips, strips_backward, strips_binning, strips_forward
-from oasis_warp.ops._blend_tiles import Gradients, Splats
 from oasis_warp.ops._launch import address, run_native
-from oasis_warp.ops._registration import hidden, revealed
+from oasis_warp.ops._registration import hidden, hidden_like_fake, revealed
 from oasis_warp.ops._rules import current_rules
+from oasis_warp.ops._splats import Frame, Gradients, Splats, Wanted
 from oasis_warp.ops._tiles import check_pairs
 
 TILES_ACROSS, TILES_DOWN = 16, 2
@@ -51,7 +51,7 @@ def _power_of_two(at_least: int) -> int:
 def cut_strips(
     n_cameras: int, n: int, width: int, height: int, tile_size: int, tiles_across: int = TILES_ACROSS
 ) -> Strips:
-    """Strips of `tiles_across` x `TILES_DOWN` tiles, rounded up to powers of two, but none much larger than the image."""
+    """Strips of `tiles_across` x `TILES_DOWN` tiles, or of the image if that is less, rounded up to powers of two."""
     strip_width = _power_of_two(min(tiles_across * tile_size, max(width, strips.COLUMNS)))
     strip_height = _power_of_two(min(TILES_DOWN * tile_size, max(height, 2)))
     across, down = -(-width // strip_width), -(-height // strip_height)
@@ -128,24 +128,51 @@ def count(splats: Splats, s: Strips) -> Counted:
     return Counted(lists, words, n_pairs, (counts, by_chunk, totals))
 
 
-class Drawn(NamedTuple):
-    """Images, and what their adjoint needs; without `keep` nothing of that is filled in."""
+class Kept(NamedTuple):
+    """What the adjoint needs."""
 
-    image: Tensor
-    alphas: Tensor
     transmittance: Tensor
-    """[strips, plane], of the end, as the strips have their pixels."""
+    """[strips * plane], of the end, as the strips have their pixels."""
     stops: Tensor
-    """[strips, plane]: place in the strip's list of the first Gaussian that was not drawn."""
-    lists: Lists
+    """[strips * plane]: place in the strip's list of the first Gaussian that was not drawn."""
+    records: Tensor
+    """As in `Lists`, like all below."""
+    starts: Tensor
+    pair_starts: Tensor
+    order: Tensor
+    ids: Tensor
 
 
-def draw(splats: Splats, s: Strips, keep: bool) -> Drawn:
-    """Images over the backgrounds, and alpha.
+def _strips_of(colors: Tensor, frame: Frame) -> Strips:
+    return cut_strips(colors.shape[0], colors.shape[1], *frame)
+
+
+def kept_like(colors: Tensor, frame: Frame) -> Kept:
+    """Empty tensors of the shapes that `draw` keeps."""
+    s = _strips_of(colors, frame)
+    total = s.n_cameras * s.n
+
+    def empty(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
+        return colors.new_empty(shape, dtype=dtype)
+
+    return Kept(
+        empty(s.n_strips * s.plane, dtype=torch.float32),
+        empty(s.n_strips * s.plane),
+        empty(total, strips.RECORD, dtype=torch.float32),
+        empty(s.n_strips + 1, dtype=torch.int64),
+        empty(total),
+        empty(s.n_strips),
+        hidden_like_fake(torch.int32, colors.device),
+    )
+
+
+def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept | None]:
+    """Images over the backgrounds, alpha, and what the adjoint needs if it is to be kept.
 
     Raises:
         ValueError: more pairs of a Gaussian and a strip than can be numbered.
     """
+    s = _strips_of(splats.colors, frame)
     channels, pixels = splats.colors.shape[-1], s.n_cameras * s.height * s.width
     counted = count(splats, s)
     kept = s.n_strips * s.plane if keep else 0
@@ -167,65 +194,61 @@ def draw(splats: Splats, s: Strips, keep: bool) -> Drawn:
         "stops": address(stops, torch.int32, kept),
     }
     run_native(strips_forward.draw(channels, current_rules()), words, max(s.n_chunks, s.n_strips))
-    return Drawn(image, alphas, transmittance, stops, counted.lists)
+    return image, alphas, Kept(transmittance, stops, *counted.lists) if keep else None
 
 
 def draw_backward(
-    g_image: Tensor | None,
-    g_alpha: Tensor | None,
-    splats: Splats,
-    s: Strips,
-    transmittance: Tensor,
-    stops: Tensor,
-    lists: Lists,
-    with_shape: bool,
-    with_colors: bool,
-    with_backgrounds: bool,
+    g_image: Tensor | None, g_alpha: Tensor | None, splats: Splats, frame: Frame, kept: Kept, wanted: Wanted
 ) -> Gradients:
     """Gradients from those by image and alpha, None standing for zeros."""
+    s = _strips_of(splats.colors, frame)
+    with_shape, with_colors, with_backgrounds = wanted
     channels, pixels = splats.colors.shape[-1], s.n_cameras * s.height * s.width
-    total, kept = s.n_cameras * s.n, s.n_strips * s.plane
+    total, pixels_kept = s.n_cameras * s.n, s.n_strips * s.plane
     if g_image is None:  # as with a loss on silhouettes: colours play no part, and get none
-        wanted = strips_backward.Wanted(0, with_shape, False)
+        summed = strips_backward.Wanted(0, with_shape, False)
     else:
-        wanted = strips_backward.Wanted(channels, with_shape, with_colors)
+        summed = strips_backward.Wanted(channels, with_shape, with_colors)
     with_strips = with_backgrounds and g_image is not None
-    ids = revealed(lists.ids)
-    pairs = torch.empty(len(ids) * strips_backward.pair_words(wanted))
+    ids = revealed(kept.ids)
+    pairs = torch.empty(len(ids) * strips_backward.pair_words(summed))
     strip_backgrounds = torch.empty(s.n_cameras, s.across * s.down, channels if with_strips else 0)
     means2d = torch.empty(s.n_cameras, s.n if with_shape else 0, 2)
     covars2d = torch.empty(s.n_cameras, s.n if with_shape else 0, 3, dtype=torch.float64)
     opacities = torch.empty(s.n_cameras, s.n if with_shape else 0)
-    colors = torch.empty(s.n_cameras, s.n if wanted.color else 0, channels)
+    colors = torch.empty(s.n_cameras, s.n if summed.color else 0, channels)
     state = torch.zeros(strips_backward.BACKWARD_STATE, dtype=torch.int64)
     words = s.words | {
         "boxes": address(splats.boxes, torch.int32, 4 * total),
-        "records": address(lists.records, torch.float32, strips.RECORD * total),
-        "starts": address(lists.starts, torch.int64, s.n_strips + 1),
-        "pair_starts": address(lists.pair_starts, torch.int32, total),
-        "order": address(lists.order, torch.int32, s.n_strips),
+        "records": address(kept.records, torch.float32, strips.RECORD * total),
+        "starts": address(kept.starts, torch.int64, s.n_strips + 1),
+        "pair_starts": address(kept.pair_starts, torch.int32, total),
+        "order": address(kept.order, torch.int32, s.n_strips),
         "state": address(state, torch.int64, strips_backward.BACKWARD_STATE),
         "whitenings": address(splats.whitenings, torch.float32, 4 * total),
         "opacities": address(splats.opacities, torch.float32, total),
         "colors": address(splats.colors, torch.float32, total * channels),
         "backgrounds": address(splats.backgrounds, torch.float32, s.n_cameras * channels),
         "ids": address(ids, torch.int32, len(ids)),
-        "transmittance": address(transmittance, torch.float32, kept),
-        "stops": address(stops, torch.int32, kept),
+        "transmittance": address(kept.transmittance, torch.float32, pixels_kept),
+        "stops": address(kept.stops, torch.int32, pixels_kept),
         "g_image": 0 if g_image is None else address(g_image, torch.float32, pixels * channels),
         "g_alpha": 0 if g_alpha is None else address(g_alpha, torch.float32, pixels),
-        "pairs": address(pairs, torch.float32, len(ids) * strips_backward.pair_words(wanted)),
+        "pairs": address(pairs, torch.float32, len(ids) * strips_backward.pair_words(summed)),
         "strip_backgrounds": strip_backgrounds.data_ptr() if with_strips else 0,
         "g_means2d": address(means2d, torch.float32, 2 * total * with_shape),
         "g_covars2d": address(covars2d, torch.float64, 3 * total * with_shape),
         "g_opacities": address(opacities, torch.float32, total * with_shape),
-        "g_colors": address(colors, torch.float32, channels * total * wanted.color),
+        "g_colors": address(colors, torch.float32, channels * total * summed.color),
     }
-    run_native(strips_backward.draw_backward(wanted, current_rules()), words, max(s.n_chunks, s.n_strips))
+    run_native(strips_backward.draw_backward(summed, current_rules()), words, max(s.n_chunks, s.n_strips))
+    backgrounds = strip_backgrounds.sum(1) if with_strips else torch.zeros_like(splats.backgrounds)
+    if with_colors and not summed.color:
+        colors = torch.zeros_like(splats.colors)
     return Gradients(
         means2d if with_shape else None,
         covars2d if with_shape else None,
         opacities if with_shape else None,
-        (colors if wanted.color else torch.zeros_like(splats.colors)) if with_colors else None,
-        (strip_backgrounds.sum(1) if with_strips else torch.zeros_like(splats.backgrounds)) if with_backgrounds else None,
+        colors if with_colors else None,
+        backgrounds if with_backgrounds else None,
     )

@@ -10,8 +10,9 @@ from warp.types import vector
 from oasis_kernels import rasterize_backward as backward_kernels
 from oasis_kernels import rasterize_forward as forward_kernels
 from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
-from oasis_warp.ops._registration import revealed
+from oasis_warp.ops._registration import hidden_like_fake, revealed
 from oasis_warp.ops._rules import current_rules
+from oasis_warp.ops._splats import Frame, Gradients, Splats, Wanted
 from oasis_warp.ops._tiles import Tiles, bin_to_tiles, even_work
 
 CUDA_LANES = 16, 16
@@ -20,28 +21,39 @@ CUDA_WARP_LANES = 4, 8
 """The same for the backward pass, where the lanes of one warp share a tile."""
 
 
-class Splats(NamedTuple):
-    """What is drawn, as the projection made it: see `Projection`. M = cameras * Gaussians."""
+class Kept(NamedTuple):
+    """What the adjoint needs. P pairs of a Gaussian and a tile."""
 
-    depths: Tensor
-    centers: Tensor
-    whitenings: Tensor
-    boxes: Tensor
-    opacities: Tensor
-    colors: Tensor
-    backgrounds: Tensor
-
-
-class Drawn(NamedTuple):
-    """Images, and what their adjoint needs."""
-
-    image: Tensor
-    alphas: Tensor
     transmittance: Tensor
     """[C, H, W], of the end."""
     stops: Tensor
-    """[C, H, W], place in the tile's list of the first Gaussian that was not drawn."""
-    tiles: Tiles
+    """[C, H, W], int32: place in the tile's list of the first Gaussian that was not drawn."""
+    starts: Tensor
+    """As in `Tiles`, like all below."""
+    pair_starts: Tensor
+    pair_counts: Tensor
+    gaussians: Tensor
+    pairs: Tensor
+
+
+def kept_like(colors: Tensor, frame: Frame) -> Kept:
+    """Empty tensors of the shapes that `draw` keeps."""
+    n_cameras, n, _ = colors.shape
+    width, height, tile_size = frame
+    n_tiles = n_cameras * -(-width // tile_size) * -(-height // tile_size)
+
+    def empty(*shape: int, dtype: torch.dtype) -> Tensor:
+        return colors.new_empty(shape, dtype=dtype)
+
+    return Kept(
+        empty(n_cameras, height, width, dtype=colors.dtype),
+        empty(n_cameras, height, width, dtype=torch.int32),
+        empty(n_tiles + 1, dtype=torch.int64),
+        empty(n_cameras * n, dtype=torch.int64),
+        empty(n_cameras * n, dtype=torch.int64),
+        hidden_like_fake(torch.int32, colors.device),
+        hidden_like_fake(torch.int64, colors.device),
+    )
 
 
 def lane_grid(tile_size: int, device: torch.device, grid: tuple[int, int]) -> tuple[int, int, int]:
@@ -53,9 +65,10 @@ def lane_grid(tile_size: int, device: torch.device, grid: tuple[int, int]) -> tu
     return across * down, -(-tile_size // across), -(-tile_size // down)
 
 
-def draw(splats: Splats, width: int, height: int, tile_size: int) -> Drawn:
-    """Images over the backgrounds, and alpha."""
-    n_cameras, n, channels = splats.colors.shape
+def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept | None]:
+    """Images over the backgrounds, alpha, and what the adjoint needs if it is to be kept."""
+    width, height, tile_size = frame
+    n_cameras, _, channels = splats.colors.shape
     dtype, device = splats.colors.dtype, splats.colors.device
     start()
     color, vec4 = vector(channels, SCALAR[dtype]), VEC4[dtype]
@@ -79,33 +92,22 @@ def draw(splats: Splats, width: int, height: int, tile_size: int) -> Drawn:
         like=image,
         lanes=lanes,
     )  # fmt: skip
-    return Drawn(image, alphas, transmittance, stops, tiles)
-
-
-class Gradients(NamedTuple):
-    """By what was drawn; what was not asked for is None."""
-
-    means2d: Tensor | None
-    covars2d: Tensor | None
-    opacities: Tensor | None
-    colors: Tensor | None
-    backgrounds: Tensor | None
+    if not keep:
+        return image, alphas, None
+    lists = tiles.starts, tiles.pair_starts, tiles.pair_counts, tiles.gaussians, tiles.pairs
+    return image, alphas, Kept(transmittance, stops, *lists)
 
 
 def draw_backward(
-    g_image: Tensor | None,
-    g_alpha: Tensor | None,
-    splats: Splats,
-    transmittance: Tensor,
-    stops: Tensor,
-    tiles: Tiles,
-    with_shape: bool,
-    with_colors: bool,
-    with_backgrounds: bool,
+    g_image: Tensor | None, g_alpha: Tensor | None, splats: Splats, frame: Frame, kept: Kept, wanted: Wanted
 ) -> Gradients:
     """Gradients from those by image and alpha, None standing for zeros."""
     n_cameras, n, channels = splats.colors.shape
-    _, height, width = transmittance.shape
+    width, height, tile_size = frame
+    transmittance, stops, starts, pair_starts, pair_counts, gaussians, pairs = kept
+    across, down = -(-width // tile_size), -(-height // tile_size)
+    tiles = Tiles(tile_size, across, down, starts, gaussians, pairs, pair_starts, pair_counts)
+    with_shape, with_colors, with_backgrounds = wanted
     dtype, device = splats.colors.dtype, splats.colors.device
     start()
     scalar, vec4 = SCALAR[dtype], VEC4[dtype]
@@ -126,11 +128,12 @@ def draw_backward(
         backward_kernels.blend_backward(scalar, channels, current_rules()),
         even_work(tiles.starts),
         [
-            view(tiles.starts), view(revealed(tiles.gaussians)), view(pair_numbers), view(splats.boxes.view(-1, 4), vec4i),
-            view(splats.centers.view(-1, 4), vec4), view(splats.whitenings.view(-1, 4), vec4),
-            view(splats.opacities.view(-1)), view(splats.colors.view(-1, channels), color),
-            view(splats.backgrounds, color), view(stops.view(-1)), view(of_image, color), view(of_alpha),
-            tiles.size, lane_width, lane_height, tiles.across, tiles.down, width, height, int(with_shape),
+            view(tiles.starts), view(revealed(tiles.gaussians)), view(pair_numbers),
+            view(splats.boxes.view(-1, 4), vec4i), view(splats.centers.view(-1, 4), vec4),
+            view(splats.whitenings.view(-1, 4), vec4), view(splats.opacities.view(-1)),
+            view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color),
+            view(stops.view(-1)), view(of_image, color), view(of_alpha), tiles.size, lane_width,
+            lane_height, tiles.across, tiles.down, width, height, int(with_shape),
             view(transmittance.view(-1).clone()), view(empty(pixels)),
             view(pair_moments, moments), view(pair_colors, color), view(tile_backgrounds, color),
         ],

@@ -89,6 +89,11 @@ def view(tensor: Tensor, dtype: Any = None) -> Any:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=False)
 
 
+def has_vectors(tensor: Tensor) -> bool:
+    """Whether kernels for tensors like this one have a vectorised form: float32 on the CPU."""
+    return tensor.device.type == "cpu" and tensor.dtype == torch.float32
+
+
 def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], like: Tensor, block_dim: int = 256) -> None:
     """Launch `kernel` over `dim` threads on the device and current stream of `like`; an empty launch is skipped."""
     if 0 in ([dim] if isinstance(dim, int) else list(dim)):
@@ -149,7 +154,7 @@ _recorded = _Recorded()
 
 
 def _launch_native(native: Native, block: int) -> None:
-    launch = _recorded.launches.get(native.kernel)
+    launch: Any = _recorded.launches.get(native.kernel)
     if launch is None:
         with _load_lock:
             launch = wp.launch(native.kernel, dim=1, inputs=[block], device="cpu", record_cmd=True)
@@ -164,6 +169,14 @@ def address(tensor: Tensor, dtype: torch.dtype, size: int) -> int:
     return tensor.data_ptr()
 
 
+@functools.cache
+def _give_way() -> int:
+    """Address of the C library's sched_yield, 0 where there is none."""
+    if os.name != "posix":
+        return 0
+    return ctypes.cast(ctypes.CDLL(None).sched_yield, ctypes.c_void_p).value or 0
+
+
 def run_native(native: Native, words: dict[str, int], n_tasks: int) -> None:
     """Run a native kernel with the parameter block `words` on the CPU, and return when it is done.
 
@@ -176,6 +189,7 @@ def run_native(native: Native, words: dict[str, int], n_tasks: int) -> None:
         n_tasks: The largest number of tasks in one of its phases.
     """
     start()
+    words = {"give_way": _give_way(), **words}
     block = (ctypes.c_longlong * len(native.parameters))(*[words[name] for name in native.parameters])
     place = ctypes.addressof(block)
     helpers = min(torch.get_num_threads(), n_tasks) - 1

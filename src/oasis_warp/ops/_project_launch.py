@@ -28,6 +28,7 @@ OUTPUTS = (
     ("boxes", 4, torch.int32),
 )  # fmt: skip
 """Name, numbers a Gaussian (0: no axis for them) and type (None: that of the inputs) of what projection writes."""
+Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 VECTORS = {dtype: {2: VEC2[dtype], 3: VEC3[dtype], 4: VEC4[dtype]} for dtype in (torch.float32, torch.float64)}
 VECTORS[torch.int32] = {2: wp.vec2i, 4: wp.vec4i}
 
@@ -58,23 +59,19 @@ class Limits(NamedTuple):
     eps2d: float
 
 
-def has_vectors(tensor: Tensor) -> bool:
-    """Whether the vector kernels take tensors like this one."""
-    return tensor.device.type == "cpu" and tensor.dtype == torch.float32
-
-
 def as_float32(value: float) -> float:
     """`value` rounded to float32, so that float32 and float64 calls take the same decisions by it."""
     return ctypes.c_float(value).value
 
 
-def empty_outputs(means: Tensor, viewmats: Tensor) -> tuple[Tensor, ...]:
+def empty_outputs(means: Tensor, viewmats: Tensor) -> Outputs:
     """Memory for `OUTPUTS`."""
     shape = viewmats.shape[0], means.shape[0]
-    return tuple(
+    means2d, covars2d, depths, conics, radii, sort_depths, centers, whitenings, boxes = (
         torch.empty((*shape, size) if size else shape, dtype=dtype or means.dtype, device=means.device)
         for _name, size, dtype in OUTPUTS
     )
+    return means2d, covars2d, depths, conics, radii, sort_depths, centers, whitenings, boxes
 
 
 def check_arrays(scene: Scene, **others: tuple[Tensor | None, tuple[int, ...], torch.dtype]) -> None:

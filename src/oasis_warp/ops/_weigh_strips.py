@@ -5,10 +5,10 @@ from torch import Tensor
 
 from oasis_kernels import strips_weights
 from oasis_warp.ops._blend_strips import count, cut_strips
-from oasis_warp.ops._blend_tiles import Splats
 from oasis_warp.ops._launch import address, run_native
 from oasis_warp.ops._registration import revealed
 from oasis_warp.ops._rules import current_rules
+from oasis_warp.ops._splats import Splats
 from oasis_warp.ops._weigh_tiles import SparseWeights, check_weights
 
 
@@ -45,7 +45,7 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
     pixel_starts = _starts(pixel_weights).to(torch.int32)
     places = pixel_starts[:-1].clone()
     pixels, gaussians = (torch.empty(n_weights, dtype=torch.int32) for _ in range(2))
-    by_gaussian, by_pixel = torch.empty(n_weights), torch.empty(n_weights)
+    by_gaussian, by_pixel, alphas = torch.empty(n_weights), torch.empty(n_weights), torch.empty(n_pixels)
     state = torch.zeros(strips_weights.FILL_STATE, dtype=torch.int64)
     words |= {
         "state": address(state, torch.int64, strips_weights.FILL_STATE),
@@ -55,11 +55,12 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
         "gaussian_weights": address(by_gaussian, torch.float32, n_weights),
         "pixel_gaussians": address(gaussians, torch.int32, n_weights),
         "pixel_values": address(by_pixel, torch.float32, n_weights),
+        "alphas": address(alphas, torch.float32, n_pixels),
     }
     run_native(strips_weights.fill_weights(current_rules()), words, n_tasks)
     # A Gaussian without pairs starts where the next one does.
     starts = pair_places[torch.cat([counted.lists.pair_starts.long(), torch.tensor([n_pairs])])]
-    return SparseWeights(pixel_starts, gaussians, by_pixel, starts.to(torch.int32), pixels, by_gaussian)
+    return SparseWeights(pixel_starts, gaussians, by_pixel, starts.to(torch.int32), pixels, by_gaussian, alphas)
 
 
 def _starts(counts: Tensor) -> Tensor:

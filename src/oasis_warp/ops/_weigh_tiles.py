@@ -7,10 +7,11 @@ from torch import Tensor
 from warp import vec4i
 
 from oasis_kernels import rasterize_weights as kernels
-from oasis_warp.ops._blend_tiles import CUDA_LANES, Splats, lane_grid
+from oasis_warp.ops._blend_tiles import CUDA_LANES, lane_grid
 from oasis_warp.ops._launch import SCALAR, VEC4, launch_ranges, view
 from oasis_warp.ops._registration import revealed
 from oasis_warp.ops._rules import current_rules
+from oasis_warp.ops._splats import Splats
 from oasis_warp.ops._tiles import bin_to_tiles, even_work
 
 MAX_WEIGHTS = 2**31 - 1
@@ -25,6 +26,8 @@ class SparseWeights(NamedTuple):
     gaussian_starts: Tensor
     pixels: Tensor
     by_gaussian: Tensor
+    alphas: Tensor
+    """[H * W]: sums of the pixels' weights."""
 
 
 def check_weights(n_weights: int) -> None:
@@ -74,8 +77,10 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
     columns, by_gaussian = torch.sort(columns, stable=True)
     rows, values = rows[by_gaussian], values[by_gaussian]
     pixels, by_pixel = torch.sort(rows, stable=True)
+    of_pixels = values[by_pixel]
+    alphas = torch.segment_reduce(of_pixels, "sum", offsets=starts, initial=0)
     return SparseWeights(
-        _row_starts(pixels, n_pixels), columns[by_pixel], values[by_pixel], _row_starts(columns, n), rows, values
+        _row_starts(pixels, n_pixels), columns[by_pixel], of_pixels, _row_starts(columns, n), rows, values, alphas
     )
 
 

@@ -10,11 +10,11 @@ from torch.autograd.function import once_differentiable
 
 from oasis_kernels import constants
 from oasis_warp.core.checks import check_float, check_shape
-from oasis_warp.ops._blend_tiles import Splats
+from oasis_warp.ops._launch import has_vectors
 from oasis_warp.ops._scene_checks import check_cameras, check_gaussians
+from oasis_warp.ops._splats import Splats
 from oasis_warp.ops._weigh_strips import weigh as weigh_strips
 from oasis_warp.ops._weigh_tiles import weigh as weigh_tiles
-from oasis_warp.ops.blending import draws_strips
 from oasis_warp.ops.projection import project
 
 
@@ -76,7 +76,7 @@ def blend_weights(
     check_cameras(
         viewmat[None], K[None], means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size
     )
-    n, pixels, dtype = len(means), width * height, means.dtype
+    n, pixels = len(means), width * height
     with torch.no_grad():
         projection = project(
             means, quats, scales, opacities, viewmat[None], K[None], width, height,
@@ -86,12 +86,11 @@ def blend_weights(
             projection.sort_depths, projection.centers, projection.whitenings, projection.boxes,
             opacities[None].contiguous(), means.new_empty(1, n, 0), means.new_empty(1, 0),
         )  # fmt: skip
-        weigh = weigh_strips if draws_strips(means) else weigh_tiles
+        weigh = weigh_strips if has_vectors(means) else weigh_tiles
         w = weigh(splats, width, height, tile_size)
         matrix = _csr(w.pixel_starts, w.gaussians, w.by_pixel, (pixels, n))
         transpose = _csr(w.gaussian_starts, w.pixels, w.by_gaussian, (n, pixels))
-        alphas = matrix @ torch.ones(n, 1, dtype=dtype, device=means.device)
-    return BlendWeights(matrix, transpose, alphas.view(height, width, 1))
+    return BlendWeights(matrix, transpose, w.alphas.view(height, width, 1))
 
 
 def _csr(starts: Tensor, columns: Tensor, values: Tensor, size: tuple[int, int]) -> Tensor:

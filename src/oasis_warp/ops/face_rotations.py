@@ -9,10 +9,10 @@ from torch import Tensor
 from oasis_kernels import face_rotation as kernels
 from oasis_kernels import face_rotation_vectors as vector_kernels
 from oasis_warp.core.checks import check_finite, check_float, check_shape
-from oasis_warp.ops._incidence import incidence, sum_at_items
-from oasis_warp.ops._launch import even_cuts, launch_ranges, view
-from oasis_warp.ops._native import is_vectorised, run_tasks
+from oasis_warp.ops._incidence import Incidence, incidence, sum_at_items
+from oasis_warp.ops._launch import even_cuts, has_vectors, launch_ranges, run_native, view
 from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
+from oasis_warp.ops._words import place, task_count
 
 
 class FaceRotations(NamedTuple):
@@ -42,6 +42,21 @@ def _outputs(rest: Tensor, posed: Tensor, faces: Tensor, keep: bool, validate: b
     )
 
 
+def _mesh_words(rest: Tensor, posed: Tensor, corners: Incidence, state: Tensor) -> dict[str, int]:
+    """What the vectorised kernels are told of the two meshes."""
+    n_vertices, n_faces = len(rest), len(corners.table)
+    return {
+        "n_vertices": n_vertices,
+        "n_faces": n_faces,
+        "rest_vertices": place(rest, 3 * n_vertices),
+        "posed_vertices": place(posed, 3 * n_vertices),
+        "faces": place(corners.table, 3 * n_faces, torch.int32),
+        "offsets": place(corners.offsets, n_vertices + 1, torch.int32),
+        "corners": place(corners.entries, 3 * n_faces, torch.int32),
+        "state": place(state, vector_kernels.STATE, torch.int64),
+    }
+
+
 def _face_rotations(
     rest: Tensor, posed: Tensor, faces: Tensor, keep: bool, validate: bool
 ) -> Outputs:
@@ -52,21 +67,19 @@ def _face_rotations(
     n_vertices, n_faces = len(rest), len(faces)
     out = _outputs(rest, posed, faces, keep, validate)
     vertex_quats, face_quats, area_ratio, vertex_area_ratio, signs, sums = out
-    if is_vectorised(rest):
-        areas, weighted = rest.new_empty((2, n_faces, 4))
-        run_tasks(
-            vector_kernels.faces,
-            n_faces,
-            [rest, posed, corners.table, n_vertices, face_quats, area_ratio, areas, weighted],
-        )
-        run_tasks(
-            vector_kernels.vertices,
-            n_vertices,
-            [
-                n_faces, corners.offsets, corners.entries, face_quats, areas, weighted, vertex_quats,
-                vertex_area_ratio, signs if keep else None, sums if keep else None, n_vertices,
-            ],
-        )  # fmt: skip
+    if has_vectors(rest):
+        rows_of_faces = rest.new_empty((n_faces, 8))
+        state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
+        words = _mesh_words(rest, posed, corners, state) | {
+            "rows_of_faces": place(rows_of_faces, 8 * n_faces),
+            "vertex_quats": place(vertex_quats, 4 * n_vertices),
+            "face_quats": place(face_quats, 4 * n_faces),
+            "area_ratio": place(area_ratio, n_faces),
+            "vertex_area_ratio": place(vertex_area_ratio, n_vertices),
+            "signs": place(signs if keep else None, 3 * n_faces),
+            "sums": place(sums if keep else None, 2 * n_vertices),
+        }
+        run_native(vector_kernels.turn, words, task_count(n_faces, n_vertices))
         return out
 
     areas = rest.new_empty((n_faces, 3), dtype=torch.float64)
@@ -122,36 +135,34 @@ def _face_rotations_backward(
     corners = incidence("faces", faces, len(rest), "vertices")
     rest, posed = rest.contiguous(), posed.contiguous()
     n_vertices, n_faces = len(rest), len(faces)
-    if is_vectorised(rest):
-        grad_vertex_quats, grad_face_quats, grad_area_ratio, grad_vertex_area_ratio = (
+    if has_vectors(rest):
+        by_vertex_quats, by_face_quats, by_ratio, by_vertex_ratio = (
             None if grad is None else grad.contiguous()
             for grad in (grad_vertex_quats, grad_face_quats, grad_area_ratio, grad_vertex_area_ratio)
         )
-        turns, grows = grad_vertex_quats is not None, grad_vertex_area_ratio is not None
         at_vertices = rest.new_empty((n_vertices, 8))
-        if turns or grows:
-            run_tasks(
-                vector_kernels.vertices_backward,
-                n_vertices,
-                [
-                    vertex_quats, vertex_area_ratio, sums, n_vertices, grad_vertex_quats, grad_vertex_area_ratio,
-                    at_vertices,
-                ],
-            )  # fmt: skip
-        edges = rest.new_empty((2, n_faces, 8))
-        run_tasks(
-            vector_kernels.faces_backward,
-            n_faces,
-            [
-                rest, posed, corners.table, n_vertices, face_quats, signs, at_vertices, grad_face_quats,
-                grad_area_ratio, int(turns), int(grows), edges[0] if needs_rest else None,
-                edges[1] if needs_posed else None,
-            ],
-        )  # fmt: skip
-        out = _gradients(rest, posed, needs_rest, needs_posed)
-        for of_mesh, grad in zip(edges, out, strict=True):
-            run_tasks(vector_kernels.gather_edges, len(grad), [corners.offsets, corners.entries, of_mesh, grad])
-        return out
+        rest_edges = rest.new_empty((n_faces, 8)) if needs_rest else None
+        posed_edges = rest.new_empty((n_faces, 8)) if needs_posed else None
+        state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
+        found = _gradients(rest, posed, needs_rest, needs_posed)
+        words = _mesh_words(rest, posed, corners, state) | {
+            "vertex_quats": place(vertex_quats, 4 * n_vertices),
+            "face_quats": place(face_quats, 4 * n_faces),
+            "vertex_area_ratio": place(vertex_area_ratio, n_vertices),
+            "signs": place(signs, 3 * n_faces),
+            "sums": place(sums, 2 * n_vertices),
+            "g_vertex_quats": place(by_vertex_quats, 4 * n_vertices),
+            "g_face_quats": place(by_face_quats, 4 * n_faces),
+            "g_area_ratio": place(by_ratio, n_faces),
+            "g_vertex_area_ratio": place(by_vertex_ratio, n_vertices),
+            "at_vertices": place(at_vertices, 8 * n_vertices),
+            "rest_edges": place(rest_edges, 8 * n_faces),
+            "posed_edges": place(posed_edges, 8 * n_faces),
+            "g_rest": place(found[0] if needs_rest else None, 3 * n_vertices),
+            "g_posed": place(found[1] if needs_posed else None, 3 * n_vertices),
+        }
+        run_native(vector_kernels.turn_backward, words, task_count(n_faces, n_vertices))
+        return found
 
     def given(grad: Tensor | None, like: Tensor) -> Tensor:
         return torch.zeros_like(like) if grad is None else grad.contiguous()

@@ -1,18 +1,16 @@
 """Carry Gaussians that ride on the faces and vertices of a mesh into a pose."""
 
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels import barycentric as kernels
-from oasis_kernels import barycentric_vectors as vector_kernels
 from oasis_warp.core.checks import check_choice, check_finite, check_float, check_shape
-from oasis_warp.ops._incidence import Incidence, incidence, riders_at_vertices, sum_at_items
-from oasis_warp.ops._launch import even_cuts, launch_ranges, view
-from oasis_warp.ops._native import is_vectorised, run_tasks
+from oasis_warp.ops._incidence import sum_at_items
+from oasis_warp.ops._launch import even_cuts, has_vectors, launch_ranges, view
 from oasis_warp.ops._registration import adjoint, differentiable, operator
+from oasis_warp.ops._riders import Floats, Riders, find_riders, pose_backward_vectorised, pose_vectorised
 
 HALF_POWERS = {"sqrt_area": 1, "area": 2, "none": 0}
 """Twice the exponent of the area ratio in each scale law."""
@@ -26,27 +24,17 @@ class PosedOnMesh(NamedTuple):
     scales: Float[Tensor, "N 3"]
 
 
-class _Indices(NamedTuple):
-    """Who rides on what, checked."""
-
-    corners: Incidence
-    on_faces: Incidence
-    on_vertices: Tensor | None
-    """int32."""
-
-
-def _indices(faces: Tensor, face_index: Tensor, vertex_index: Tensor | None, n_vertices: int) -> _Indices:
-    corners = incidence("faces", faces, n_vertices, "vertices")
-    on_faces = incidence("face_index", face_index, len(faces), "faces")
-    if vertex_index is None:
-        return _Indices(corners, on_faces, None)
-    return _Indices(corners, on_faces, incidence("vertex_index", vertex_index, n_vertices, "vertices").table)
+def _posed_like(quats: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    n = len(quats)
+    return quats.new_empty((n, 3)), quats.new_empty((n, 4)), quats.new_empty((n, 3))
 
 
 def _fake(*inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
-    quats, scales = inputs[6:8]
-    n = len(quats)
-    return scales.new_empty((n, 3)), quats.new_empty((n, 4)), scales.new_empty((n, 3))
+    return _posed_like(inputs[6])
+
+
+def _contiguous(*tensors: Tensor | None) -> list[Any]:
+    return [None if tensor is None else tensor.contiguous() for tensor in tensors]
 
 
 def _pose_on_mesh(
@@ -75,71 +63,66 @@ def _pose_on_mesh(
             offsets=offsets,
             vertex_area_ratio=vertex_area_ratio,
         )
-    indices = _indices(faces, face_index, vertex_index, len(posed_vertices))
-    floats = (posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio)
-    vertices, barycentrics, turns, ratios, quats, scales, offsets, vertex_ratios = _contiguous(floats)
-    means, turned, grown = _fake(*[None] * 6, quats, scales)
-    n = 0 if indices.on_vertices is None else len(indices.on_vertices)
-    corners, on_faces = indices.corners.table, indices.on_faces.table
-    if is_vectorised(vertices):
-        if n:
-            run_tasks(
-                vector_kernels.on_vertices,
-                n,
-                [
-                    vertices, len(vertices), indices.on_vertices, turns, vertex_ratios, offsets, quats, scales,
-                    half_powers, means, turned, grown,
-                ],
-            )  # fmt: skip
-        run_tasks(
-            vector_kernels.on_faces,
-            len(on_faces),
-            [
-                vertices, len(vertices), corners, on_faces, turns, ratios, barycentrics, quats[n:], scales[n:],
-                half_powers, means[n:], turned[n:], grown[n:],
-            ],
-        )  # fmt: skip
-        return means, turned, grown
+    riders = find_riders(faces, face_index, vertex_index, len(posed_vertices), transposed=False)
+    inputs = Floats(
+        *_contiguous(
+            posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio
+        )
+    )
+    posed = _posed_like(quats)
+    if has_vectors(quats):
+        pose_vectorised(inputs, riders, half_powers, posed)
+        return posed
 
-    if n:
+    p = riders.p
+    if riders.on_vertices is not None:
         launch_ranges(
             kernels.pose_on_vertices,
-            even_cuts(n),
-            [
-                *map(view, (vertices, indices.on_vertices, turns, vertex_ratios, offsets, quats, scales)),
-                half_powers,
-                *map(view, (means, turned, grown)),
-            ],
+            even_cuts(p),
+            [*_vertex_arguments(inputs, riders), half_powers, *map(view, posed)],
             like=quats,
         )
     launch_ranges(
         kernels.pose_on_faces,
-        even_cuts(len(on_faces)),
-        [
-            *map(view, (vertices, corners, on_faces, barycentrics, turns, ratios, quats[n:], scales[n:])),
-            half_powers,
-            *map(view, (means[n:], turned[n:], grown[n:])),
-        ],
+        even_cuts(riders.q),
+        [*_face_arguments(inputs, riders), half_powers, *(view(out[p:]) for out in posed)],
         like=quats,
     )
-    return means, turned, grown
+    return posed
 
 
-def _contiguous(tensors: Sequence[Tensor | None]) -> list[Any]:
-    return [None if tensor is None else tensor.contiguous() for tensor in tensors]
+def _vertex_arguments(inputs: Floats, riders: Riders) -> list[Any]:
+    assert riders.on_vertices is not None
+    return [
+        view(tensor)
+        for tensor in (
+            inputs.vertices, riders.on_vertices.table, inputs.vertex_quats, inputs.vertex_area_ratio, inputs.offsets,
+            inputs.quats, inputs.scales,
+        )
+    ]  # fmt: skip
 
 
-# Places of the float inputs among all, and so of `needs` below.
+def _face_arguments(inputs: Floats, riders: Riders) -> list[Any]:
+    p = riders.p
+    return [
+        view(tensor)
+        for tensor in (
+            inputs.vertices, riders.corners.table, riders.on_faces.table, inputs.barycentrics, inputs.vertex_quats,
+            inputs.area_ratio, inputs.quats[p:], inputs.scales[p:],
+        )
+    ]  # fmt: skip
+
+
 _FLOATS = (0, 3, 4, 5, 6, 7, 9, 10)
+"""Places of `Floats` among the inputs."""
 
 
 def _fake_backward(*inputs: Any) -> list[Tensor]:
-    """An empty tensor for each float input, of no rows where no gradient is needed."""
-    needs = inputs[-1]
+    """An empty tensor for each of `Floats`, of no elements where no gradient is wanted."""
     floats = [inputs[place] for place in _FLOATS]
-    like = floats[0]
     return [
-        like.new_empty(tensor.shape if needed else (0,)) for tensor, needed in zip(floats, needs, strict=True)
+        inputs[0].new_empty(tensor.shape if needed and tensor is not None else (0,))
+        for tensor, needed in zip(floats, inputs[-1], strict=True)
     ]
 
 
@@ -161,86 +144,51 @@ def _pose_on_mesh_backward(
     grad_scales: Tensor | None,
     needs: list[bool],
 ) -> list[Tensor]:
-    indices = _indices(faces, face_index, vertex_index, len(posed_vertices))
-    n = 0 if indices.on_vertices is None else len(indices.on_vertices)
-    q = len(face_index)
-    g_vertices, g_barycentrics, g_turns, g_ratios, g_quats, g_scales, g_offsets, g_vertex_ratios = (
-        posed_vertices.new_empty(tensor.shape) if needed and tensor is not None else None
-        for tensor, needed in zip(
-            (posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio),
-            needs,
-            strict=True,
+    inputs = Floats(
+        *_contiguous(
+            posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio
         )
     )
-    floats = (posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio)
-    vertices, barycentrics, turns, ratios, quats, scales, offsets, vertex_ratios = _contiguous(floats)
-    grads = _contiguous((grad_means, grad_quats, grad_scales))
-    corners, on_faces = indices.corners.table, indices.on_faces.table
-    at_vertices = g_vertices is not None or g_turns is not None or g_vertex_ratios is not None
+    found = [
+        quats.new_empty(tensor.shape if needed and tensor is not None else (0,))
+        for tensor, needed in zip(inputs, needs, strict=True)
+    ]
+    wanted = Floats(*needs)
+    at_vertices = wanted.vertices or wanted.vertex_quats or wanted.vertex_area_ratio
+    riders = find_riders(faces, face_index, vertex_index, len(posed_vertices), transposed=at_vertices)
+    grads = _contiguous(grad_means, grad_quats, grad_scales)
+    if has_vectors(quats):
+        g = [grad if needed else None for grad, needed in zip(found, needs, strict=True)]
+        pose_backward_vectorised(inputs, riders, half_powers, grads, g)
+        return found
 
-    def of_riders(tensor: Tensor | None, on_face: bool) -> Tensor | None:
-        return None if tensor is None else tensor[n:] if on_face else tensor[:n]
+    given = [
+        like.zero_() if grad is None else grad for grad, like in zip(grads, _posed_like(quats), strict=True)
+    ]
+    p, q = riders.p, riders.q
 
-    if is_vectorised(vertices):
-        rows = vertices.new_empty((n + q, 8)) if at_vertices else None
-        weights = vertices.new_empty((q, 3)) if at_vertices else None
-        by_ratio = vertices.new_empty(q) if g_ratios is not None else None
-        if n:
-            run_tasks(
-                vector_kernels.on_vertices_backward,
-                n,
-                [
-                    vertices, len(vertices), indices.on_vertices, turns, vertex_ratios, offsets, quats, scales,
-                    half_powers, *grads, rows, g_offsets, g_quats, g_scales,
-                ],
-            )  # fmt: skip
-        run_tasks(
-            vector_kernels.on_faces_backward,
-            q,
-            [
-                vertices, len(vertices), corners, on_faces, turns, ratios, barycentrics, quats[n:], scales[n:],
-                half_powers, *(of_riders(grad, True) for grad in grads), of_riders(rows, True), weights, by_ratio,
-                g_barycentrics, of_riders(g_quats, True), of_riders(g_scales, True),
-            ],
-        )  # fmt: skip
-        if at_vertices:
-            riders = riders_at_vertices(faces, face_index, vertex_index, len(vertices))
-            run_tasks(
-                vector_kernels.gather_vertices,
-                len(vertices),
-                [
-                    riders.offsets, riders.entries, n, rows, barycentrics, weights, g_vertices, g_turns,
-                    g_vertex_ratios,
-                ],
-            )  # fmt: skip
-        if g_ratios is not None:
-            sums = [indices.on_faces.offsets, indices.on_faces.entries, by_ratio, g_ratios]
-            run_tasks(vector_kernels.gather_faces, len(g_ratios), sums)
-        found = (g_vertices, g_barycentrics, g_turns, g_ratios, g_quats, g_scales, g_offsets, g_vertex_ratios)
-        return [vertices.new_empty(0) if grad is None else grad for grad in found]
+    def rows(needed: bool, n: int, width: int) -> Tensor:
+        return quats.new_empty((n if needed else 0, width))
 
-    g_means, g_turned, g_grown = (
-        like.new_zeros(like.shape) if grad is None else grad
-        for grad, like in zip(grads, _fake(*[None] * 6, quats, scales), strict=True)
-    )
+    def out(needed: bool, grad: Tensor, width: int) -> Tensor:
+        return grad if needed else quats.new_empty((0, width))
+
     # Rows for vertices: first those of Gaussians on vertices, then three for each on a face.
-    vertex_rows = vertices.new_empty((n + 3 * q if g_vertices is not None else 0, 3))
-    turn_rows = vertices.new_empty((n + 3 * q if g_turns is not None else 0, 4))
-    ratio_rows = vertices.new_empty((q if g_ratios is not None else 0, 1))
-    vertex_ratio_rows = vertices.new_empty((n if g_vertex_ratios is not None else 0, 1))
-
-    def wanted(grad: Tensor | None, width: int) -> Tensor:
-        return vertices.new_empty((0, width)) if grad is None else grad
-
-    if n:
+    vertex_rows = rows(wanted.vertices, p + 3 * q, 3)
+    turn_rows = rows(wanted.vertex_quats, p + 3 * q, 4)
+    ratio_rows = rows(wanted.area_ratio, q, 1)
+    vertex_ratio_rows = rows(wanted.vertex_area_ratio, p, 1)
+    g = Floats(*found)
+    g_quats, g_scales = out(wanted.quats, g.quats, 4), out(wanted.scales, g.scales, 3)
+    if riders.on_vertices is not None:
         launch_ranges(
             kernels.pose_on_vertices_backward,
-            even_cuts(n),
+            even_cuts(p),
             [
-                *map(view, (vertices, indices.on_vertices, turns, vertex_ratios, offsets, quats, scales)),
+                *_vertex_arguments(inputs, riders),
                 half_powers,
-                *map(view, (g_means, g_turned, g_grown, vertex_rows, turn_rows, vertex_ratio_rows)),
-                *map(view, (wanted(g_offsets, 3), wanted(g_quats, 4), wanted(g_scales, 3))),
+                *map(view, (*given, vertex_rows, turn_rows, vertex_ratio_rows)),
+                *map(view, (out(wanted.offsets, g.offsets, 3), g_quats, g_scales)),
             ],
             like=quats,
         )
@@ -248,26 +196,24 @@ def _pose_on_mesh_backward(
         kernels.pose_on_faces_backward,
         even_cuts(q),
         [
-            *map(view, (vertices, corners, on_faces, barycentrics, turns, ratios, quats[n:], scales[n:])),
+            *_face_arguments(inputs, riders),
             half_powers,
-            *map(view, (g_means[n:], g_turned[n:], g_grown[n:])),
-            *map(view, (vertex_rows[n:].view(-1, 9), turn_rows[n:].view(-1, 12), ratio_rows)),
-            *map(view, (wanted(g_barycentrics, 3), wanted(g_quats, 4)[n:], wanted(g_scales, 3)[n:])),
+            *(view(grad[p:]) for grad in given),
+            *map(view, (vertex_rows[p:].view(-1, 9), turn_rows[p:].view(-1, 12), ratio_rows)),
+            *map(view, (out(wanted.barycentrics, g.barycentrics, 3), g_quats[p:], g_scales[p:])),
         ],
         like=quats,
     )
-    riders = riders_at_vertices(faces, face_index, vertex_index, len(vertices))
-    if g_vertices is not None:
-        g_vertices = sum_at_items(vertex_rows, riders)
-    if g_turns is not None:
-        g_turns = sum_at_items(turn_rows, riders)
-    if g_ratios is not None:
-        g_ratios = sum_at_items(ratio_rows, indices.on_faces).view(-1)
-    if g_vertex_ratios is not None:
-        on_vertices = incidence("vertex_index", vertex_index, len(vertices), "vertices")
-        g_vertex_ratios = sum_at_items(vertex_ratio_rows, on_vertices).view(-1)
-    found = (g_vertices, g_barycentrics, g_turns, g_ratios, g_quats, g_scales, g_offsets, g_vertex_ratios)
-    return [vertices.new_empty(0) if grad is None else grad for grad in found]
+    sums = {
+        "vertices": (vertex_rows, riders.at_vertices),
+        "vertex_quats": (turn_rows, riders.at_vertices),
+        "area_ratio": (ratio_rows, riders.on_faces),
+        "vertex_area_ratio": (vertex_ratio_rows, riders.on_vertices),
+    }
+    for name, (summands, index) in sums.items():
+        if getattr(wanted, name):
+            found[Floats._fields.index(name)] = sum_at_items(summands, index).view_as(getattr(g, name))
+    return found
 
 
 _operator = operator("pose_on_mesh", _pose_on_mesh, _fake)
@@ -283,7 +229,7 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None
 def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
     needs = [ctx.needs_input_grad[place] for place in _FLOATS]
     found = _adjoint(*ctx.saved_tensors, ctx.half_powers, *grads, needs)
-    out: list[Tensor | None] = [None] * 13
+    out: list[Tensor | None] = [None] * len(ctx.needs_input_grad)
     for place, needed, grad in zip(_FLOATS, needs, found, strict=True):
         out[place] = grad if needed else None
     return tuple(out)

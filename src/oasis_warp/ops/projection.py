@@ -10,15 +10,16 @@ from jaxtyping import Float, Float64, Int32
 from torch import Tensor
 
 from oasis_warp.core.checks import check_finite
+from oasis_warp.ops._launch import has_vectors
 from oasis_warp.ops._project_launch import (
     Incoming,
     Limits,
+    Outputs,
     Scene,
     backward_generic,
     backward_vectors,
     check_arrays,
     empty_outputs,
-    has_vectors,
     project_generic,
     project_vectors,
 )
@@ -26,6 +27,7 @@ from oasis_warp.ops._registration import adjoint, differentiable, operator
 
 INPUTS = "means", "quats", "scales", "covars", "viewmats"
 """Arguments that receive gradients."""
+Gradients = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 class Projection(NamedTuple):
@@ -100,21 +102,23 @@ def _project(
     Ks: Tensor,
     width: int,
     height: int,
-    limits: list[float],
+    limits: list[float],  # as `Limits`
     validate: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> Outputs:
     scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
     check_arrays(scene, opacities=(opacities, means.shape[:1], means.dtype))
     out = empty_outputs(means, viewmats)
-    sound = False
-    if len(means) and len(viewmats):
-        if has_vectors(means):
-            # The kernel looks at the values as it reads them; what is wrong with them is for the slow checks to say.
-            sound = project_vectors(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
-        else:
-            project_generic(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
-    if validate and not sound:
+    if len(means) and len(viewmats) and has_vectors(means):
+        # The kernel looks at the values as it reads them; what is wrong with them is for the slow checks to say.
+        sound = project_vectors(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
+        if validate and not sound:
+            check_values(means, quats, scales, covars, opacities, viewmats, Ks)
+            raise AssertionError("the kernel has met a bad value that is not in its inputs")
+        return out
+    if validate:
         check_values(means, quats, scales, covars, opacities, viewmats, Ks)
+    if len(means) and len(viewmats):
+        project_generic(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
     return out
 
 
@@ -126,7 +130,7 @@ def _project_fake(
     opacities: Tensor,
     viewmats: Tensor,
     *_: Any,
-) -> tuple[Tensor, ...]:
+) -> Outputs:
     return empty_outputs(means, viewmats)
 
 
@@ -144,7 +148,7 @@ def _project_backward(
     g_covars2d: Tensor | None,
     g_depths: Tensor | None,
     wanted: list[bool],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> Gradients:
     scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
     shape = len(viewmats), len(means)
     check_arrays(
@@ -156,7 +160,9 @@ def _project_backward(
     )
     out = _empty_gradients(means, quats, scales, covars, viewmats, wanted)
     if not (len(means) and len(viewmats)):
-        return tuple(g.zero_() for g in out)
+        for gradient in out:
+            gradient.zero_()
+        return out
     incoming = Incoming(g_means2d, g_covars2d, g_depths).contiguous()
     run = backward_vectors if has_vectors(means) else backward_generic
     named = {name: g for name, g, asked in zip(INPUTS, out, wanted, strict=True) if asked}
@@ -178,7 +184,7 @@ def _project_backward_fake(
     g_covars2d: Tensor | None,
     g_depths: Tensor | None,
     wanted: list[bool],
-) -> tuple[Tensor, ...]:
+) -> Gradients:
     return _empty_gradients(means, quats, scales, covars, viewmats, wanted)
 
 
@@ -189,13 +195,14 @@ def _empty_gradients(
     covars: Tensor | None,
     viewmats: Tensor,
     wanted: list[bool],
-) -> tuple[Tensor, ...]:
+) -> Gradients:
     """Memory for the gradients by `INPUTS` that are `wanted`, and tensors of size 0 for the others."""
     inputs = means, quats, scales, covars, viewmats
-    return tuple(
+    g_means, g_quats, g_scales, g_covars, g_viewmats = (
         means.new_empty(tensor.shape if asked and tensor is not None else 0)
         for tensor, asked in zip(inputs, wanted, strict=True)
     )
+    return g_means, g_quats, g_scales, g_covars, g_viewmats
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:

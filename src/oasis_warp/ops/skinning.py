@@ -9,9 +9,9 @@ from torch import Tensor
 from oasis_kernels import skinning as kernels
 from oasis_kernels import skinning_vectors as vector_kernels
 from oasis_warp.core.checks import check_finite, check_float, check_shape
-from oasis_warp.ops._launch import even_cuts, launch_ranges, view
-from oasis_warp.ops._native import run_tasks
+from oasis_warp.ops._launch import even_cuts, launch_ranges, run_native, view
 from oasis_warp.ops._registration import adjoint, differentiable, operator
+from oasis_warp.ops._words import place, task_count
 
 SCALAR_NAMES = {torch.float32: "float", torch.float64: "double"}
 
@@ -28,6 +28,21 @@ def _outputs(means: Tensor, covars: Tensor | None, *_: Any) -> tuple[Tensor, Ten
     return means.new_empty((len(means), 3)), means.new_empty((0 if covars is None else len(means), 3, 3))
 
 
+def _input_words(
+    means: Tensor, covars: Tensor | None, weights: Tensor, transforms: Tensor, state: Tensor
+) -> dict[str, int]:
+    n, n_joints, dtype = len(means), len(transforms), means.dtype
+    return {
+        "n": n,
+        "n_joints": n_joints,
+        "means": place(means, 3 * n, dtype),
+        "covars": place(covars, 9 * n, dtype),
+        "weights": place(weights, n * n_joints, dtype),
+        "transforms": place(transforms, 12 * n_joints, dtype),
+        "state": place(state, vector_kernels.STATE, torch.int64),
+    }
+
+
 def _skin(
     means: Tensor, covars: Tensor | None, weights: Tensor, transforms: Tensor, rotation_only: bool, validate: bool
 ) -> tuple[Tensor, Tensor]:
@@ -37,13 +52,12 @@ def _skin(
     means, weights, transforms = means.contiguous(), weights.contiguous(), transforms.contiguous()
     given = out_covars if covars is None else covars.contiguous()
     if means.device.type == "cpu" and not rotation_only:
-        run_tasks(
-            vector_kernels.skin[SCALAR_NAMES[means.dtype]],
-            len(means),
-            [
-                means, None if covars is None else given, weights, transforms, len(transforms), out_means, out_covars,
-            ],
-        )  # fmt: skip
+        state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
+        words = _input_words(means, None if covars is None else given, weights, transforms, state) | {
+            "out_means": place(out_means, 3 * len(means), means.dtype),
+            "out_covars": 0 if covars is None else place(out_covars, 9 * len(means), means.dtype),
+        }
+        run_native(vector_kernels.skin(SCALAR_NAMES[means.dtype]), words, task_count(len(means)))
     else:
         launch_ranges(
             kernels.skin,
@@ -91,17 +105,18 @@ def _skin_backward(
     n, n_joints = len(means), len(transforms)
     by_blends = means.new_empty((n if needs_transforms else 0, 16))
     if means.device.type == "cpu" and not rotation_only:
-        run_tasks(
-            vector_kernels.skin_backward[SCALAR_NAMES[means.dtype]],
-            n,
-            [
-                means, None if covars is None else covars.contiguous(), weights, transforms, n_joints,
-                None if grad_means is None else grad_means.contiguous(),
-                None if grad_covars is None else grad_covars.contiguous(),
-                by_means if needs_means else None, by_covars if needs_covars else None,
-                by_weights if needs_weights else None, by_blends if needs_transforms else None,
-            ],
-        )  # fmt: skip
+        dtype = means.dtype
+        given = [None if t is None else t.contiguous() for t in (covars, grad_means, grad_covars)]
+        state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
+        words = _input_words(means, given[0], weights, transforms, state) | {
+            "g_out_means": place(given[1], 3 * n, dtype),
+            "g_out_covars": place(given[2], 9 * n, dtype),
+            "g_means": place(by_means if needs_means else None, 3 * n, dtype),
+            "g_covars": place(by_covars if needs_covars else None, 9 * n, dtype),
+            "g_weights": place(by_weights if needs_weights else None, n * n_joints, dtype),
+            "g_blends": place(by_blends if needs_transforms else None, 16 * n, dtype),
+        }
+        run_native(vector_kernels.skin_backward(SCALAR_NAMES[dtype]), words, task_count(n))
     else:
         none = means.new_empty((0, 3, 3))
         launch_ranges(
@@ -125,11 +140,20 @@ def _sum_blends(by_blends: Tensor, weights: Tensor, out: Tensor) -> None:
     """Gradients of transforms from those of blended ones: the sum over points of weight times row."""
     n, n_joints = weights.shape
     if by_blends.device.type == "cpu":
-        scalar = SCALAR_NAMES[by_blends.dtype]
-        n_blocks = -(-n // vector_kernels.BLOCK)
+        dtype, n_blocks = by_blends.dtype, -(-n // vector_kernels.BLOCK)
         sums = by_blends.new_empty((n_blocks, n_joints, 16))
-        run_tasks(vector_kernels.sum_blends[scalar], n_blocks, [weights, by_blends, n_joints, n, sums], least=16)
-        run_tasks(vector_kernels.add_blocks[scalar], n_joints, [sums, n_joints, n_blocks, out])
+        state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
+        words = {
+            "n": n,
+            "n_joints": n_joints,
+            "n_blocks": n_blocks,
+            "weights": place(weights, n * n_joints, dtype),
+            "g_blends": place(by_blends, 16 * n, dtype),
+            "sums": place(sums, n_blocks * n_joints * 16, dtype),
+            "g_transforms": place(out, 12 * n_joints, dtype),
+            "state": place(state, vector_kernels.STATE, torch.int64),
+        }
+        run_native(vector_kernels.sum_blends(SCALAR_NAMES[dtype]), words, n_blocks)
     else:
         out.copy_((weights.T @ by_blends).view(n_joints, 4, 4)[:, :, :3].transpose(1, 2))
 

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from oasis_warp.certify.twins.face_rotations import plane
 from oasis_warp.core.rotation import multiply, to_matrix
 
 EXPONENTS = {"sqrt_area": 0.5, "area": 1.0, "none": 0.0}
@@ -46,12 +47,17 @@ def dots_with_leading(turns: Tensor, barycentrics: Tensor) -> Tensor:
 
 def pose_on_mesh_covars(rest_vertices, posed_vertices, faces, face_index, barycentrics, quats, scales):
     """Means [Q, 3] and covariances [Q, 3, 3] of Gaussians stretched with their faces."""
+    ridden = faces[face_index]
+    proper = (plane(rest_vertices, ridden).proper & plane(posed_vertices, ridden).proper)[:, None, None]
+    identity = torch.eye(3).to(quats)
 
     def frames(vertices):
-        a, b, c = vertices[faces[face_index]].unbind(1)
+        a, b, c = vertices[ridden].unbind(1)
         normal = torch.linalg.cross(b - a, c - a)
-        return torch.stack([b - a, c - a, normal / normal.norm(dim=-1, keepdim=True)], -1)
+        length = torch.where(proper[:, 0], normal.norm(dim=-1, keepdim=True), 1)
+        return torch.where(proper, torch.stack([b - a, c - a, normal / length], -1), identity)
 
-    means = (barycentrics[..., None] * posed_vertices[faces[face_index]]).sum(1)
-    half = frames(posed_vertices) @ torch.linalg.inv(frames(rest_vertices)) @ to_matrix(quats) * scales[:, None]
-    return means, half @ half.transpose(1, 2)
+    means = (barycentrics[..., None] * posed_vertices[ridden]).sum(1)
+    stretch = frames(posed_vertices) @ torch.linalg.inv(frames(rest_vertices))
+    half = stretch @ to_matrix(quats) * scales[:, None]
+    return means, half @ half.mT

@@ -16,15 +16,22 @@ def skin(means: Tensor, covars: Tensor | None, weights: Tensor, transforms: Tens
 
 
 def nearest_rotations(matrices: Tensor) -> Tensor:
-    """Proper rotations nearest to matrices with three different singular values."""
-    u, _, vt = torch.linalg.svd(matrices)
-    sign = torch.linalg.det(u @ vt).detach().sign()
-    last = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)
-    return u * last[:, None, :] @ vt
+    """Proper rotations nearest to matrices: R exp(hat(omega)) to first order round the R of an SVD.
 
-
-def spread(matrices: Tensor) -> Tensor:
-    """How far each nearest rotation is from not being unique: the smallest denominator of its derivative [N]."""
-    s = torch.linalg.svdvals(matrices.detach())
-    smallest = s[:, 2] * torch.linalg.det(matrices.detach()).sign()
-    return (s[:, 1] + smallest) / s[:, 0].clamp(min=1e-300)
+    The adjoint of the SVD itself divides by differences of singular values, which are equal for a rotation. Here
+    (tr(P) - P) omega = vee(R^T M - M^T R), P = R^T M the stretch, and only sums of two singular values are divided by.
+    """
+    u, _, vt = torch.linalg.svd(matrices.detach())
+    last = torch.ones(len(matrices), 3).to(matrices)
+    last[:, 2] = torch.linalg.det(u @ vt)
+    rotation = u * last[:, None, :] @ vt
+    moved = rotation.mT @ matrices
+    stretch = moved.detach()
+    trace = stretch.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]
+    skewed = moved - moved.mT
+    vee = torch.stack([skewed[:, 2, 1], skewed[:, 0, 2], skewed[:, 1, 0]], -1)
+    omega = torch.linalg.solve(trace * torch.eye(3).to(matrices) - stretch, vee)
+    x, y, z = omega.unbind(-1)
+    zero = torch.zeros_like(x)
+    hat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).view(-1, 3, 3)
+    return rotation + rotation @ hat

@@ -24,6 +24,8 @@ class Hits(NamedTuple):
     """Whether the depth does not hang on rounding."""
     clear: Tensor
     """Whether the face does not, either: no other one is as near."""
+    lone: Tensor
+    """The same but for copies of the face, which have its corners in some order."""
 
 
 def cast(vertices, faces, viewmat, K, width, height, near_plane=0.01, slack=1.0) -> Hits:
@@ -43,7 +45,7 @@ def cast(vertices, faces, viewmat, K, width, height, near_plane=0.01, slack=1.0)
     depth = torch.where(flat, -1.0, (weights * corners[..., 2]).sum(-1))
     hit = (weights >= 0).all(-1) & (depth > near_plane) & ~flat
     may, surely = margins(w, edges, total, normal, rays, K, depth, near_plane, slack)
-    return choose(hit, depth, weights, may & ~degenerate, surely)
+    return choose(hit, depth, weights, may & ~degenerate, surely, faces)
 
 
 def margins(w, edges, total, normal, rays, K, depth, near_plane, slack):
@@ -57,13 +59,13 @@ def margins(w, edges, total, normal, rays, K, depth, near_plane, slack):
     return may.detach(), ((inside > 1) & (beyond > 1) & ~grazing).detach()
 
 
-def choose(hit, depth, weights, may, surely) -> Hits:
+def choose(hit, depth, weights, may, surely, faces) -> Hits:
     """The nearest of all hits of each pixel."""
     n_pixels, n_faces = hit.shape
     if n_faces == 0:
         empty = torch.full((n_pixels,), torch.inf).to(depth)
         yes = torch.ones(n_pixels, dtype=torch.bool)
-        return Hits(empty, torch.full((n_pixels,), -1), torch.zeros(n_pixels, 3).to(depth), yes, yes)
+        return Hits(empty, torch.full((n_pixels,), -1), torch.zeros(n_pixels, 3).to(depth), yes, yes, yes)
     found, face_ids = torch.where(hit, depth, torch.inf).min(-1)
     nothing = found.isinf()
     here = torch.arange(n_pixels)
@@ -72,8 +74,10 @@ def choose(hit, depth, weights, may, surely) -> Hits:
     doubtful = nearer & ~surely
     sound = ~doubtful.any(-1)
     clear = sound & (nearer.sum(-1) <= 1)
+    triangle = torch.unique(faces.sort(1).values, dim=0, return_inverse=True)[1]
+    lone = sound & ~(nearer & (triangle != triangle[face_ids][:, None])).any(-1)
     picked = torch.where(nothing[:, None], 0, weights[here, face_ids])
-    return Hits(found, torch.where(nothing, -1, face_ids), picked, sound, clear)
+    return Hits(found, torch.where(nothing, -1, face_ids), picked, sound, clear, lone)
 
 
 def depth_map(vertices, faces, viewmat, K, width, height, near_plane=0.01):
@@ -103,7 +107,7 @@ def depth_visibility(points, depth, face_ids, faces, K, viewmat, tau, margin, po
 
 def sound_points(points, hits: Hits, K, viewmat, width, height, named, near_plane=0.01, slack=1.0):
     """Which points [P] have a score that does not hang on rounding; `named` says that `point_vertices` counts."""
-    sound, clear = hits.sound.view(height, width), hits.clear.view(height, width)
+    lone, clear = hits.lone.view(height, width), hits.clear.view(height, width)
     x, y, z = (points.detach() @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
     safe_z = torch.where(z.abs() > 1e-30, z, 1e-30)
     keep = (z - near_plane).abs() > slack * NEAR_TIE * near_plane
@@ -115,4 +119,4 @@ def sound_points(points, hits: Hits, K, viewmat, width, height, named, near_plan
         pixel.append(u.clamp(0, size - 1).long())
     padded = torch.nn.functional.pad(clear[None, None].double(), (1, 1, 1, 1), value=1.0)
     all_clear = -torch.nn.functional.max_pool2d(-padded, 3, 1)[0, 0] > 0
-    return keep & (all_clear if named else sound)[pixel[1], pixel[0]]
+    return keep & (all_clear if named else lone)[pixel[1], pixel[0]]
