@@ -2,7 +2,7 @@
 
 import ctypes
 
-VERTICES_A_TASK = 4096
+VERTICES_A_TASK = 16384
 POINTS_A_TASK = 2048
 QUADS_A_TASK = 8
 """Rows of blocks that `write` takes at a time."""

@@ -4,7 +4,6 @@ Everything has a leading batch axis here. A tensor that is the same for the whol
 """
 
 import ctypes
-import functools
 import os
 import threading
 from typing import Any, NamedTuple
@@ -212,11 +211,17 @@ def _run_all(job: Job, dtype: str) -> None:
 def _run_tasks(stage: str, dtype: str, job: Job, tasks: int) -> None:
     """Run a stage that has a number of tasks for each batch entry."""
     n_threads = min(torch.get_num_threads(), job.batch * tasks)
+    arguments = stage, dtype, ctypes.addressof(job)
     if n_threads < 2:
-        _run(stage, dtype, ctypes.addressof(job))
-    else:
-        run = functools.partial(_run, stage, dtype)
-        list(_pool(os.getpid(), n_threads).map(run, [ctypes.addressof(job)] * n_threads))
+        _run(*arguments)
+        return
+    pool = _pool(os.getpid(), n_threads)
+    others = [pool.submit(_run, *arguments) for _ in range(n_threads - 1)]
+    try:
+        _run(*arguments)
+    finally:  # they point into the job
+        for other in others:
+            other.result()
 
 
 def _run(stage: str, dtype: str, address: int) -> None:
