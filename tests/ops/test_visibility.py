@@ -267,6 +267,14 @@ def test_values_that_are_no_numbers_are_refused_by_name(name, value):
         visible(points, *scene)
 
 
+def test_large_values_below_the_limit_are_no_error():
+    # Their sum is above it, which is what the kernels look at first.
+    vertices, faces, viewmat, K = soup(0)
+    vertices[0], points = 0.9e15, some_points(vertices, faces, 0)
+    points[1] = -0.9e15
+    assert visible(points, vertices, faces, viewmat, K).visibility.isfinite().all()
+
+
 @pytest.mark.parametrize("index", [-1, 75])
 def test_a_face_that_names_no_vertex_is_refused(index):
     vertices, faces, viewmat, K = soup(0)

@@ -79,11 +79,14 @@ def thin_layers(generator, K, width, height):
 
 def slivers(generator, K, width, height):
     n = 150
-    a = uniform(generator, n, 2) * torch.tensor([width, height])
-    along = 8 * normal(generator, n, 2)
-    off = 10 ** (-9 * uniform(generator, n, 1)) * normal(generator, n, 2)
-    pixels = torch.stack([a, a + along, a + 0.5 * along + off], 1).reshape(-1, 2)
-    return unproject(pixels, 1 + uniform(generator, len(pixels)), K), torch.arange(3 * n).view(-1, 3)
+    centre = (uniform(generator, n, 2) * torch.tensor([width, height])).floor() + 0.5
+    along, off = 8 * normal(generator, n, 2), 10 ** (-6 * uniform(generator, n, 1)) * normal(generator, n, 2)
+    # Each holds a pixel's centre, however thin it is.
+    pixels = torch.stack([centre - along - off, centre + along - off, centre + 2 * off], 1).reshape(-1, 2)
+    depths = 1 + uniform(generator, 3 * n)
+    # Each with another just behind it, so that their steep depths must be right.
+    vertices = torch.cat([unproject(pixels, depths * behind, K) for behind in (1 + 3e-5, 1, 1 + 1e-4)])
+    return vertices, torch.arange(9 * n).view(-1, 3)
 
 
 def huge_triangles(generator, K, width, height):

@@ -4,7 +4,6 @@ Everything has a leading batch axis here. A tensor that is the same for the whol
 """
 
 import ctypes
-import functools
 import os
 import threading
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from oasis_kernels import depth_buffer as kernels
 from oasis_kernels import depth_buffer_vectors as vectors
+from oasis_kernels.depth_buffer_job import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
 from oasis_warp.core.checks import check_finite, check_index, check_positive
 from oasis_warp.ops._incidence import incidence, sum_at_items
 from oasis_warp.ops._launch import _load_lock, _pool, launch, start, view
@@ -108,7 +108,7 @@ def refuse_bad_values(scene: Scene, query: Query | None) -> None:
 
 def plane_size(width: int, height: int) -> int:
     """Numbers in a plane of blocks of 4 x 4 pixels."""
-    columns = -(-(width + vectors.SPARE_COLUMNS) // 16) * 16
+    columns = -(-(width + SPARE_COLUMNS) // 16) * 16
     return -(-height // 4) * 4 * columns
 
 
@@ -124,12 +124,12 @@ def _fraction_bits(width: int, height: int) -> int:
     return min(MAX_FRACTION_BITS, 30 - (max(width, height) - 1).bit_length())
 
 
-def _job(scene: Scene, **more: int) -> tuple[vectors.Job, list[Tensor]]:
+def _job(scene: Scene, **more: int) -> tuple[Job, list[Tensor]]:
     """A job for `scene`, and the tensors it points to, which must outlive it; `more` are further fields."""
     vertices, vertices_step = _shared(scene.vertices)
     viewmats, viewmats_step = _shared(scene.viewmats)
     Ks, Ks_step = _shared(scene.Ks)
-    job = vectors.Job(
+    job = Job(
         vertices=vertices.data_ptr(),
         viewmats=viewmats.data_ptr(),
         Ks=Ks.data_ptr(),
@@ -197,25 +197,31 @@ def draw_by_vectors(
 _recorded = threading.local()
 
 
-def _run_all(job: vectors.Job, dtype: str) -> None:
+def _run_all(job: Job, dtype: str) -> None:
     """Run the stages of a forward pass on as many of torch's threads as they have tasks for."""
     if torch.get_num_threads() == 1:
         _run("all", dtype, ctypes.addressof(job))
         return
-    _run_tasks("transform", dtype, job, -(-job.n_vertices // vectors.VERTICES_A_TASK))
+    _run_tasks("transform", dtype, job, -(-job.n_vertices // VERTICES_A_TASK))
     _run_tasks("draw", dtype, job, job.parts)
-    _run_tasks("write", dtype, job, -(-job.height // (4 * vectors.QUADS_A_TASK)))
-    _run_tasks("score", dtype, job, -(-job.n_points // vectors.POINTS_A_TASK))
+    _run_tasks("write", dtype, job, -(-job.height // (4 * QUADS_A_TASK)))
+    _run_tasks("score", dtype, job, -(-job.n_points // POINTS_A_TASK))
 
 
-def _run_tasks(stage: str, dtype: str, job: vectors.Job, tasks: int) -> None:
+def _run_tasks(stage: str, dtype: str, job: Job, tasks: int) -> None:
     """Run a stage that has a number of tasks for each batch entry."""
     n_threads = min(torch.get_num_threads(), job.batch * tasks)
+    arguments = stage, dtype, ctypes.addressof(job)
     if n_threads < 2:
-        _run(stage, dtype, ctypes.addressof(job))
-    else:
-        run = functools.partial(_run, stage, dtype)
-        list(_pool(os.getpid(), n_threads).map(run, [ctypes.addressof(job)] * n_threads))
+        _run(*arguments)
+        return
+    pool = _pool(os.getpid(), n_threads)
+    others = [pool.submit(_run, *arguments) for _ in range(n_threads - 1)]
+    try:
+        _run(*arguments)
+    finally:  # they point into the job
+        for other in others:
+            other.result()
 
 
 def _run(stage: str, dtype: str, address: int) -> None:
@@ -334,7 +340,7 @@ def vertex_gradients_by_vectors(
         grad_vertices=grad_vertices.data_ptr(),
     )
     dtype = C_TYPES[slopes.dtype]
-    _run_tasks("transform", dtype, job, -(-n_vertices // vectors.VERTICES_A_TASK))
+    _run_tasks("transform", dtype, job, -(-n_vertices // VERTICES_A_TASK))
     _run_tasks("pull", dtype, job, 1)
     return grad_vertices
 
