@@ -28,6 +28,23 @@ def test_other_calls_in_between_change_no_bit(name, device):
         assert all(map(same_bits, first, everything(family, case, device)))
 
 
+def leave_behind(value):
+    """Fill memory with `value` and give it back: the next call is given some of it."""
+    sizes = [2**k * m for k in range(15) for m in (1, 3, 9)]
+    _ = [torch.full((size,), value) for size in sizes for _ in range(3)]
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_nothing_shows_of_what_memory_held_before(name):
+    family = FAMILIES[name]
+    for seed in range(45):
+        case = family.scene(seed)
+        leave_behind(3e37)
+        first = everything(family, case, torch.device("cpu"))
+        leave_behind(-7.0)
+        assert all(map(same_bits, first, everything(family, case, torch.device("cpu")))), case
+
+
 def test_one_bit_in_one_gradient_is_found(monkeypatch):
     family, calls = FAMILIES["pose_on_mesh"], []
     right = ops.pose_on_mesh

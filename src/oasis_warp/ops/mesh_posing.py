@@ -153,6 +153,8 @@ def _pose_on_mesh_backward(
         quats.new_empty(tensor.shape if needed and tensor is not None else (0,))
         for tensor, needed in zip(inputs, needs, strict=True)
     ]
+    if not len(quats):  # empty scratch has no address, by which kernels know what is wanted
+        return [grad.zero_() for grad in found]
     wanted = Floats(*needs)
     at_vertices = wanted.vertices or wanted.vertex_quats or wanted.vertex_area_ratio
     riders = find_riders(faces, face_index, vertex_index, len(posed_vertices), transposed=at_vertices)
