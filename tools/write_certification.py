@@ -54,7 +54,9 @@ by one layer of 1/255.
 {grid_verdict} Worst over bound for each kind of scene:
 
 {conditions}
+"""
 
+BUGS = """
 ## Seeded bugs
 
 `python tools/seed_bugs.py` plants one mistake at a time in a copy of the tree: {bugs}
@@ -107,27 +109,27 @@ def condition_table(report: dict[str, Any]) -> str:
 def main() -> None:
     """Read the folder, write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="holds certification.json, grid.json and bugs.txt")
+    parser.add_argument("folder", type=Path, help="holds certification.json, grid.json, perhaps bugs.txt")
     parser.add_argument("page", type=Path)
     options = parser.parse_args()
     small = json.loads((options.folder / "certification.json").read_text())
     grid = json.loads((options.folder / "grid.json").read_text())
-    bugs = (options.folder / "bugs.txt").read_text().strip().splitlines()[-1]
     commands = [line.strip() for line in (__doc__ or "").splitlines() if line.startswith("    oasis")]
     bound = next(row["bound"] for row in small["checks"] if row["check"] == "finite differences")
-    options.page.write_text(
-        TEMPLATE.format(
-            commands="\n".join(commands),
-            fd_bound=number(bound),
-            machine=machine(small),
-            verdict=verdict(small),
-            checks=check_table(small),
-            n_scenes=grid["scenes"],
-            grid_verdict=verdict(grid),
-            conditions=condition_table(grid),
-            bugs=bugs,
-        )
+    page = TEMPLATE.format(
+        commands="\n".join(commands),
+        fd_bound=number(bound),
+        machine=machine(small),
+        verdict=verdict(small),
+        checks=check_table(small),
+        n_scenes=grid["scenes"],
+        grid_verdict=verdict(grid),
+        conditions=condition_table(grid),
     )
+    bugs = options.folder / "bugs.txt"
+    if bugs.exists():
+        page += BUGS.format(bugs=bugs.read_text().strip().splitlines()[-1])
+    options.page.write_text(page)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """Measurements put together: for each operator and check how many, and the one nearest to its bound or beyond."""
 
+import importlib.metadata
 import platform
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-import warp as wp
 
 from oasis_warp.certify.compare import Measurement
 
@@ -64,7 +64,7 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
         "system": platform.platform(),
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "warp": wp.__version__,
+        "warp": importlib.metadata.version("warp-lang"),
         "threads": torch.get_num_threads(),
     }
 

@@ -16,7 +16,7 @@ def pose_on_mesh(
 ):  # fmt: skip
     """Means [N, 3], quats [N, 4] and scales [N, 3], of the Gaussians on vertices and then of those on faces."""
     on_faces = posed_vertices, faces, face_index, barycentrics, vertex_quats, area_ratio
-    if vertex_index is None or offsets is None or vertex_area_ratio is None:
+    if vertex_index is None or offsets is None or vertex_area_ratio is None:  # they come together
         return pose_on_faces(*on_faces, quats, scales, scale_law)
     n = len(vertex_index)
     faced = pose_on_faces(*on_faces, quats[n:], scales[n:], scale_law)
