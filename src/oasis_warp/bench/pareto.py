@@ -5,12 +5,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from oasis_warp.bench.rows import Row
 from oasis_warp.bench.summary import Group, groups, non_dominated
 from oasis_warp.data.atomic import output_file
 
-LEAST_ERROR = 1e-17
-"""Where points without error are drawn."""
 WORDS = {"forward": "error of values", "forward + backward": "error of values and gradients"}
 MISSING = "matplotlib is not installed, so no pictures are drawn; `pip install 'oasis-warp[bench]'` brings it."
 
@@ -24,7 +24,7 @@ def plot_operator(rows: Sequence[Row], op: str, path: Path, scenes: Sequence[str
     """Write a picture: time to the right, error upwards, both logarithmic; one colour a knob.
 
     The default is ringed, settings that no other beats in both are joined, and the dashed line is how far the exact
-    results are known.
+    results are known: smaller errors are drawn on it. Time is `Row.cost_ms`.
 
     Args:
         rows: Of `oasis bench error-time`.
@@ -57,33 +57,33 @@ def plot_operator(rows: Sequence[Row], op: str, path: Path, scenes: Sequence[str
 
 def draw_panel(axes: Any, group: Group, colors: dict[str, Any]) -> None:
     """One operator on one scene in one pass, on matplotlib's `axes`."""
-    from matplotlib.ticker import LogFormatter, LogLocator
+    from matplotlib.ticker import LogLocator
 
-    def height(row: Row) -> float:
-        return max(row.error, LEAST_ERROR)
+    floor = max(group.default.floor_rel_l2, torch.finfo(torch.float64).eps)
+
+    def place(row: Row) -> tuple[float, float]:
+        return row.cost_ms, max(row.error, floor)
 
     compared = [row for row in group.rows if group.pass_ == "forward" or row.gradient_rel_l2 is not None]
     for row in compared:
         if row.is_default:
-            axes.plot(row.median_ms, height(row), "o", color="black", markersize=4)
-            axes.plot(row.median_ms, height(row), "o", color="black", markersize=11, fillstyle="none")
-        else:
-            axes.plot(row.median_ms, height(row), "o", color=colors[row.knob], markersize=5)
+            axes.plot(*place(row), "o", color="black", markersize=4)
+            axes.plot(*place(row), "o", color="black", markersize=11, fillstyle="none")
+            continue
+        axes.plot(*place(row), "o", color=colors[row.knob], markersize=5)
+        if row.error != group.default.error:  # those that change nothing but time crowd round the default
             axes.annotate(
-                row.value, (row.median_ms, height(row)), xytext=(4, 3), textcoords="offset points", fontsize=6,
-                color=colors[row.knob],
-            )  # fmt: skip
-    best = non_dominated(compared)
-    axes.plot([row.median_ms for row in best], [height(row) for row in best], color="0.6", linewidth=1, zorder=0)
-    floor = group.default.floor_rel_l2
-    if floor:
-        axes.axhline(floor, color="0.4", linestyle="--", linewidth=0.8)
+                row.value, place(row), xytext=(4, 3), textcoords="offset points", fontsize=6, color=colors[row.knob]
+            )
+    best = [place(row) for row in non_dominated(compared)]
+    axes.plot(*zip(*best, strict=True), color="0.6", linewidth=1, zorder=0)
+    axes.axhline(floor, color="0.4", linestyle="--", linewidth=0.8)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(9, 9)))
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("")
     axes.set_title(f"{group.scene}, {group.pass_}", fontsize=9)
-    axes.set_xlabel("median time [ms]", fontsize=8)
+    axes.set_xlabel("time [ms]", fontsize=8)
     axes.set_ylabel(WORDS[group.pass_], fontsize=8)
     axes.tick_params(which="both", labelsize=7)

@@ -11,7 +11,7 @@ from oasis_warp.bench.rows import Row
 BUDGETS: tuple[tuple[str, float | None], ...] = (("1e-2", 1e-2), ("1e-3", 1e-3), ("1e-4", 1e-4), ("exact", None))
 """Largest error allowed; None: no more than that of the default, whose arithmetic is exact up to rounding."""
 
-WORTHWHILE = 0.03
+WORTHWHILE = 0.05
 """Least share of the time that a setting has to save: less is within what such times differ by."""
 
 
@@ -57,7 +57,7 @@ def fastest(group: Group, budget: float | None) -> Row:
 def non_dominated(rows: Sequence[Row]) -> list[Row]:
     """Rows that no other beats in both time and error, fastest first."""
     best: list[Row] = []
-    for row in sorted(rows, key=lambda row: (row.median_ms, row.error)):
+    for row in sorted(rows, key=lambda row: (row.cost_ms, row.error)):
         if not best or row.error < best[-1].error:
             best.append(row)
     return best
