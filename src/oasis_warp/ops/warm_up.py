@@ -6,11 +6,12 @@ from oasis_warp.ops.blend_weights import blend_weights
 from oasis_warp.ops.face_rotations import face_rotations
 from oasis_warp.ops.mesh_posing import pose_on_mesh
 from oasis_warp.ops.rasterization import rasterization
+from oasis_warp.ops.skinning import skin
 from oasis_warp.ops.visibility import depth_visibility
 
 
 def warm_up(device: torch.device | str = "cpu") -> None:
-    """Run the float32 forward of every operator once on a tetrahedron.
+    """Run the float32 forward of every operator that makes and draws an avatar once, on a tetrahedron.
 
     The first time on a machine this compiles the kernels into the kernel cache, within a minute; afterwards it takes
     milliseconds.
@@ -24,6 +25,7 @@ def warm_up(device: torch.device | str = "cpu") -> None:
     viewmat = torch.eye(4, device=device)
     K = torch.tensor([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]], device=device)
     with torch.no_grad():
+        skin(vertices, None, ones[:, None], viewmat[None])
         turned = face_rotations(vertices, vertices, faces)
         each = torch.arange(4, device=device)
         posed = pose_on_mesh(
