@@ -18,7 +18,7 @@ from oasis_warp.commands.progress import show_progress
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.atomic import output_file, output_folder
 
-TABLE_WIDTH = 140
+TABLE_WIDTH = 160
 """Columns that the widest table takes."""
 
 
