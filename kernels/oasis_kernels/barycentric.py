@@ -17,6 +17,8 @@ from typing import Any
 
 import warp as wp
 
+from oasis_kernels.arrays import row3, row4
+
 wp.set_module_options({"enable_backward": False})
 
 AREA_RATIO_LIMIT = wp.constant(wp.float64(1e4))
@@ -34,16 +36,6 @@ class Mix:
     unit: wp.vec4d
     norm: wp.float64  # of the sum before it was normalised; 0 where the sum vanished
     signs: wp.vec3d
-
-
-@wp.func
-def row3(a: wp.array2d[Any], i: int) -> wp.vec3d:
-    return wp.vec3d(wp.float64(a[i, 0]), wp.float64(a[i, 1]), wp.float64(a[i, 2]))
-
-
-@wp.func
-def row4(a: wp.array2d[Any], i: int) -> wp.vec4d:
-    return wp.vec4d(wp.float64(a[i, 0]), wp.float64(a[i, 1]), wp.float64(a[i, 2]), wp.float64(a[i, 3]))
 
 
 @wp.func

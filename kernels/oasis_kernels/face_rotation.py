@@ -20,6 +20,8 @@ from typing import Any
 
 import warp as wp
 
+from oasis_kernels.arrays import row3, row4
+
 wp.set_module_options({"enable_backward": False})
 
 FLAT = wp.constant(wp.float64(1e-6))
@@ -45,16 +47,11 @@ class Plane:
 
 
 @wp.func
-def corner(vertices: wp.array2d[Any], i: int) -> wp.vec3d:
-    return wp.vec3d(wp.float64(vertices[i, 0]), wp.float64(vertices[i, 1]), wp.float64(vertices[i, 2]))
-
-
-@wp.func
 def plane(f: int, faces: wp.array2d[wp.int32], vertices: wp.array2d[Any]) -> Plane:
-    p = corner(vertices, faces[f, 0])
+    p = row3(vertices, faces[f, 0])
     out = Plane()
-    out.e1 = corner(vertices, faces[f, 1]) - p
-    out.e2 = corner(vertices, faces[f, 2]) - p
+    out.e1 = row3(vertices, faces[f, 1]) - p
+    out.e2 = row3(vertices, faces[f, 2]) - p
     out.longest = wp.max(wp.max(wp.length_sq(out.e1), wp.length_sq(out.e2)), wp.length_sq(out.e2 - out.e1))
     cross = wp.cross(out.e1, out.e2)
     twice = wp.length(cross)
@@ -149,13 +146,6 @@ def face_rotations(
     areas[f, 2] = after.area + DAMPING * before.longest
 
 
-@wp.func
-def unit(quats: wp.array2d[Any], i: int) -> wp.vec4d:
-    return wp.vec4d(
-        wp.float64(quats[i, 0]), wp.float64(quats[i, 1]), wp.float64(quats[i, 2]), wp.float64(quats[i, 3])
-    )
-
-
 @wp.kernel
 def vertex_rotations(
     first: int,
@@ -184,11 +174,11 @@ def vertex_rotations(
     norm = ZERO
     q = wp.vec4d(ONE, ZERO, ZERO, ZERO)
     if best >= 0:
-        ref = unit(face_quats, best)
+        ref = row4(face_quats, best)
         total = wp.vec4d()
         for j in range(offsets[v], offsets[v + 1]):
             f = corners[j] // 3
-            q_face = unit(face_quats, f)
+            q_face = row4(face_quats, f)
             sign = ONE
             if wp.dot(q_face, ref) < ZERO:
                 sign = -ONE
@@ -198,7 +188,7 @@ def vertex_rotations(
         norm = wp.length(total)
         q = total / norm
     elif fallback.shape[0] > 0:
-        q = unit(face_quats, fallback[0])
+        q = row4(face_quats, fallback[0])
     for k in range(4):
         quats[v, k] = quats.dtype(q[k])
     ratio = ONE
@@ -225,8 +215,8 @@ def vertex_rotations_backward(
     rest = wp.float64(sums[1, v])
     g_sum = wp.vec4d()
     if norm > ZERO:
-        q = unit(quats, v)
-        g = unit(grad_quats, v)
+        q = row4(quats, v)
+        g = row4(grad_quats, v)
         g_sum = (g - wp.dot(g, q) * q) / norm
     for k in range(4):
         grad_sums[v, k] = g_sum[k]
@@ -322,8 +312,8 @@ def face_rotations_backward(
     by_damping = by_posed + by_rest
 
     if before.proper and after.proper:
-        q = unit(face_quats, f)
-        g = unit(grad_face_quats, f)
+        q = row4(face_quats, f)
+        g = row4(grad_face_quats, f)
         for k in range(3):
             v = faces[f, k]
             sign = wp.float64(signs[3 * f + k])

@@ -16,88 +16,30 @@ from typing import Any
 
 import warp as wp
 
+from oasis_kernels.arrays import row3, row4
+from oasis_kernels.face_rotation import Plane, plane
+from oasis_kernels.gaussian import rotation, rotation_adjoint
+
 wp.set_module_options({"enable_backward": False})
 
-FLAT = wp.constant(wp.float64(1e-6))
-"""A triangle with |e1 x e2| up to this share of its longest edge squared has no plane worth the name."""
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
 TWO = wp.constant(wp.float64(2.0))
 
 
-@wp.struct
-class Face:
-    """A triangle, seen from its first corner."""
-
-    e1: wp.vec3d
-    e2: wp.vec3d
-    normal: wp.vec3d
-    twice_area: wp.float64
-    proper: wp.bool
-
-
 @wp.func
-def corner(vertices: wp.array2d[Any], i: int) -> wp.vec3d:
-    return wp.vec3d(wp.float64(vertices[i, 0]), wp.float64(vertices[i, 1]), wp.float64(vertices[i, 2]))
-
-
-@wp.func
-def face(f: int, faces: wp.array2d[wp.int32], vertices: wp.array2d[Any]) -> Face:
-    p = corner(vertices, faces[f, 0])
-    out = Face()
-    out.e1 = corner(vertices, faces[f, 1]) - p
-    out.e2 = corner(vertices, faces[f, 2]) - p
-    longest = wp.max(wp.max(wp.length_sq(out.e1), wp.length_sq(out.e2)), wp.length_sq(out.e2 - out.e1))
-    normal = wp.cross(out.e1, out.e2)
-    out.twice_area = wp.length(normal)
-    out.proper = out.twice_area > FLAT * longest
-    if out.proper:
-        out.normal = normal / out.twice_area
-    return out
-
-
-@wp.func
-def inverse(rest: Face) -> wp.mat33d:
+def inverse(rest: Plane) -> wp.mat33d:
     """Of the matrix with columns e1, e2, n."""
-    d1 = wp.cross(rest.e2, rest.normal) / rest.twice_area
-    d2 = wp.cross(rest.normal, rest.e1) / rest.twice_area
+    d1 = wp.cross(rest.e2, rest.normal) / (TWO * rest.area)
+    d2 = wp.cross(rest.normal, rest.e1) / (TWO * rest.area)
     return wp.matrix_from_rows(d1, d2, rest.normal)
 
 
 @wp.func
-def face_map(rest: Face, posed: Face) -> wp.mat33d:
+def face_map(rest: Plane, posed: Plane) -> wp.mat33d:
     if rest.proper and posed.proper:
         return wp.matrix_from_cols(posed.e1, posed.e2, posed.normal) * inverse(rest)
     return wp.identity(n=3, dtype=wp.float64)
-
-
-@wp.func
-def rotation(q: wp.vec4d) -> wp.mat33d:
-    """Of a unit wxyz quaternion."""
-    w = q[0]
-    x = q[1]
-    y = q[2]
-    z = q[3]
-    return wp.mat33d(
-        ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y),
-        TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x),
-        TWO * (x * z - w * y), TWO * (y * z + w * x), ONE - TWO * (x * x + y * y),
-    )  # fmt: skip
-
-
-@wp.func
-def rotation_gradient(q: wp.vec4d, g: wp.mat33d) -> wp.vec4d:
-    """Gradient by `q` of sum g * rotation(q)."""
-    w = q[0]
-    x = q[1]
-    y = q[2]
-    z = q[3]
-    return TWO * wp.vec4d(
-        x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]),
-        w * (g[2, 1] - g[1, 2]) + y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) - TWO * x * (g[1, 1] + g[2, 2]),
-        w * (g[0, 2] - g[2, 0]) + x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) - TWO * y * (g[0, 0] + g[2, 2]),
-        w * (g[1, 0] - g[0, 1]) + x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) - TWO * z * (g[0, 0] + g[1, 1]),
-    )
 
 
 @wp.struct
@@ -110,7 +52,7 @@ class Quaternion:
 
 @wp.func
 def quaternion(quats: wp.array2d[Any], i: int) -> Quaternion:
-    q = wp.vec4d(wp.float64(quats[i, 0]), wp.float64(quats[i, 1]), wp.float64(quats[i, 2]), wp.float64(quats[i, 3]))
+    q = row4(quats, i)
     out = Quaternion()
     out.norm = wp.length(q)
     out.unit = wp.vec4d(ONE, ZERO, ZERO, ZERO)
@@ -136,9 +78,9 @@ def pose(
     f = face_index[i]
     mean = wp.vec3d()
     for k in range(3):
-        mean += wp.float64(barycentrics[i, k]) * corner(posed, faces[f, k])
-    half = face_map(face(f, faces, rest), face(f, faces, posed)) * rotation(quaternion(quats, i).unit)
-    half = half * wp.diag(corner(scales, i))
+        mean += wp.float64(barycentrics[i, k]) * row3(posed, faces[f, k])
+    half = face_map(plane(f, faces, rest), plane(f, faces, posed)) * rotation(quaternion(quats, i).unit)
+    half = half * wp.diag(row3(scales, i))
     covar = half * wp.transpose(half)
     for r in range(3):
         means[i, r] = means.dtype(mean[r])
@@ -155,10 +97,10 @@ class Gradient:
 
 
 @wp.func
-def edge_gradient(by_columns: wp.mat33d, of: Face) -> Gradient:
+def edge_gradient(by_columns: wp.mat33d, of: Plane) -> Gradient:
     """Given the gradient by the columns e1, e2, n."""
     by_normal = wp.vec3d(by_columns[0, 2], by_columns[1, 2], by_columns[2, 2])
-    by_cross = (by_normal - wp.dot(by_normal, of.normal) * of.normal) / of.twice_area
+    by_cross = (by_normal - wp.dot(by_normal, of.normal) * of.normal) / (TWO * of.area)
     out = Gradient()
     out.e1 = wp.vec3d(by_columns[0, 0], by_columns[1, 0], by_columns[2, 0]) + wp.cross(of.e2, by_cross)
     out.e2 = wp.vec3d(by_columns[0, 1], by_columns[1, 1], by_columns[2, 1]) + wp.cross(by_cross, of.e1)
@@ -194,10 +136,10 @@ def pose_backward(
 ):
     i = first + wp.tid()
     f = face_index[i]
-    before = face(f, faces, rest)
-    after = face(f, faces, posed)
-    b = corner(barycentrics, i)
-    g_mean = corner(grad_means, i)
+    before = plane(f, faces, rest)
+    after = plane(f, faces, posed)
+    b = row3(barycentrics, i)
+    g_mean = row3(grad_means, i)
     g = wp.mat33d()
     for r in range(3):
         for c in range(3):
@@ -206,7 +148,7 @@ def pose_backward(
     m = face_map(before, after)
     q = quaternion(quats, i)
     turn = rotation(q.unit)
-    scale = corner(scales, i)
+    scale = row3(scales, i)
     half = turn * wp.diag(scale)
     by_half = g * m * half  # of F half
     by_map = by_half * wp.transpose(half)
@@ -214,7 +156,7 @@ def pose_backward(
 
     if grad_barycentrics.shape[0] > 0:
         for k in range(3):
-            grad_barycentrics[i, k] = grad_barycentrics.dtype(wp.dot(g_mean, corner(posed, faces[f, k])))
+            grad_barycentrics[i, k] = grad_barycentrics.dtype(wp.dot(g_mean, row3(posed, faces[f, k])))
     if grad_scales.shape[0] > 0:
         for k in range(3):
             total = ZERO
@@ -224,7 +166,7 @@ def pose_backward(
     if grad_quats.shape[0] > 0:
         by_quat = wp.vec4d()
         if q.norm > ZERO:
-            by_unit = rotation_gradient(q.unit, by_half * wp.diag(scale))
+            by_unit = rotation_adjoint(q.unit, by_half * wp.diag(scale))
             by_quat = (by_unit - wp.dot(by_unit, q.unit) * q.unit) / q.norm
         for k in range(4):
             grad_quats[i, k] = grad_quats.dtype(by_quat[k])

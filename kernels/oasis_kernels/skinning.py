@@ -18,6 +18,8 @@ from typing import Any
 
 import warp as wp
 
+from oasis_kernels.arrays import row3
+
 wp.set_module_options({"enable_backward": False})
 
 SQUARINGS = wp.constant(40)
@@ -36,11 +38,6 @@ class Blend:
 
     linear: wp.mat33d
     shift: wp.vec3d
-
-
-@wp.func
-def row(a: wp.array2d[Any], i: int) -> wp.vec3d:
-    return wp.vec3d(wp.float64(a[i, 0]), wp.float64(a[i, 1]), wp.float64(a[i, 2]))
 
 
 @wp.func
@@ -126,7 +123,7 @@ def skin(
 ):
     i = first + wp.tid()
     g = blend(i, weights, transforms)
-    mean = g.linear * row(means, i) + g.shift
+    mean = g.linear * row3(means, i) + g.shift
     for c in range(3):
         out_means[i, c] = out_means.dtype(mean[c])
     if covars.shape[0] > 0:
@@ -157,8 +154,8 @@ def skin_backward(
 ):
     i = first + wp.tid()
     g = blend(i, weights, transforms)
-    mean = row(means, i)
-    g_mean = row(grad_out_means, i)
+    mean = row3(means, i)
+    g_mean = row3(grad_out_means, i)
     by_linear = wp.outer(g_mean, mean)
     if grad_out_covars.shape[0] > 0:
         h = g.linear

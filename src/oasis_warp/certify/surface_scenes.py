@@ -83,7 +83,7 @@ def _(draw: Draw, side: int) -> Bend:
 @condition("uniform growth")
 def _(draw: Draw, side: int) -> Bend:
     rest, faces = rumpled(draw, side)
-    return Bend(rest, draw.pick((0.01, 0.5, 2.0, 100.0)) * rest, faces)
+    return Bend(rest, draw.pick((0.02, 0.5, 2.0, 50.0)) * rest, faces)
 
 
 @condition("any unit of length")

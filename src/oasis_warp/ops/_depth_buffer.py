@@ -4,9 +4,7 @@ Everything has a leading batch axis here. A tensor that is the same for the whol
 """
 
 import ctypes
-import os
-import threading
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -17,7 +15,7 @@ from oasis_kernels import depth_buffer_vectors as vectors
 from oasis_kernels.depth_buffer_job import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
 from oasis_warp.core.checks import check_finite, check_index, check_positive
 from oasis_warp.ops._incidence import incidence, sum_at_items
-from oasis_warp.ops._launch import _load_lock, _pool, launch, start, view
+from oasis_warp.ops._launch import launch, run_shared, view
 
 C_TYPES = {torch.float32: "float", torch.float64: "double"}
 MAX_FRACTION_BITS = 22
@@ -194,48 +192,20 @@ def draw_by_vectors(
     return buffer, scores
 
 
-_recorded = threading.local()
-
-
 def _run_all(job: Job, dtype: str) -> None:
     """Run the stages of a forward pass on as many of torch's threads as they have tasks for."""
     if torch.get_num_threads() == 1:
-        _run("all", dtype, ctypes.addressof(job))
+        _run("all", dtype, job, 1)
         return
-    _run_tasks("transform", dtype, job, -(-job.n_vertices // VERTICES_A_TASK))
-    _run_tasks("draw", dtype, job, job.parts)
-    _run_tasks("write", dtype, job, -(-job.height // (4 * QUADS_A_TASK)))
-    _run_tasks("score", dtype, job, -(-job.n_points // POINTS_A_TASK))
+    _run("transform", dtype, job, -(-job.n_vertices // VERTICES_A_TASK))
+    _run("draw", dtype, job, job.parts)
+    _run("write", dtype, job, -(-job.height // (4 * QUADS_A_TASK)))
+    _run("score", dtype, job, -(-job.n_points // POINTS_A_TASK))
 
 
-def _run_tasks(stage: str, dtype: str, job: Job, tasks: int) -> None:
+def _run(stage: str, dtype: str, job: Job, tasks: int) -> None:
     """Run a stage that has a number of tasks for each batch entry."""
-    n_threads = min(torch.get_num_threads(), job.batch * tasks)
-    arguments = stage, dtype, ctypes.addressof(job)
-    if n_threads < 2:
-        _run(*arguments)
-        return
-    pool = _pool(os.getpid(), n_threads)
-    others = [pool.submit(_run, *arguments) for _ in range(n_threads - 1)]
-    try:
-        _run(*arguments)
-    finally:  # they point into the job
-        for other in others:
-            other.result()
-
-
-def _run(stage: str, dtype: str, address: int) -> None:
-    """Run a stage on this thread."""
-    # A recorded launch takes 3 us instead of 19, and belongs to one thread: its arguments are part of it.
-    recorded = getattr(_recorded, stage + dtype, None)
-    if recorded is None:
-        start()
-        with _load_lock:
-            kernel = getattr(vectors.kernels(dtype), stage)
-            recorded: Any = wp.launch(kernel, dim=1, inputs=[address], device="cpu", record_cmd=True)
-        setattr(_recorded, stage + dtype, recorded)
-    recorded.set_param_at_index_from_ctype(0, address)
-    recorded.launch()
+    run_shared(getattr(vectors.kernels(dtype), stage), ctypes.addressof(job), job.batch * tasks)
 
 
 def draw_by_faces(
@@ -340,8 +310,8 @@ def vertex_gradients_by_vectors(
         grad_vertices=grad_vertices.data_ptr(),
     )
     dtype = C_TYPES[slopes.dtype]
-    _run_tasks("transform", dtype, job, -(-n_vertices // VERTICES_A_TASK))
-    _run_tasks("pull", dtype, job, 1)
+    _run("transform", dtype, job, -(-n_vertices // VERTICES_A_TASK))
+    _run("pull", dtype, job, 1)
     return grad_vertices
 
 

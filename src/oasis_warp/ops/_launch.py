@@ -153,14 +153,35 @@ class _Recorded(threading.local):
 _recorded = _Recorded()
 
 
-def _launch_native(native: Native, block: int) -> None:
-    launch: Any = _recorded.launches.get(native.kernel)
+def _replay(kernel: Any, block: int) -> None:
+    launch: Any = _recorded.launches.get(kernel)
     if launch is None:
         with _load_lock:
-            launch = wp.launch(native.kernel, dim=1, inputs=[block], device="cpu", record_cmd=True)
-        _recorded.launches[native.kernel] = launch
+            launch = wp.launch(kernel, dim=1, inputs=[block], device="cpu", record_cmd=True)
+        _recorded.launches[kernel] = launch
     launch.set_param_at_index_from_ctype(0, block)
     launch.launch()
+
+
+def run_shared(kernel: Any, block: int, n_tasks: int) -> None:
+    """Run a CPU kernel of one argument, the address of a parameter block, and return when it is done.
+
+    Up to `n_tasks` of torch's threads run it together, this one among them; the kernel deals out its tasks to them, so
+    that a thread that comes late, or never, costs time only.
+    """
+    start()
+    helpers = min(torch.get_num_threads(), n_tasks) - 1
+    if helpers < 1:
+        _replay(kernel, block)
+        return
+    pool = _pool(os.getpid(), helpers)
+    futures = [pool.submit(_replay, kernel, block) for _ in range(helpers)]
+    try:
+        _replay(kernel, block)
+    finally:  # they point into the block
+        for future in futures:
+            if not future.cancel():
+                future.result()
 
 
 def address(tensor: Tensor, dtype: torch.dtype, size: int) -> int:
@@ -178,29 +199,13 @@ def _give_way() -> int:
 
 
 def run_native(native: Native, words: dict[str, int], n_tasks: int) -> None:
-    """Run a native kernel with the parameter block `words` on the CPU, and return when it is done.
-
-    Up to `n_tasks` of torch's threads work on it together, this one among them; the kernel deals out its tasks, so that
-    one that comes late, or never, costs time only.
+    """Run a native kernel with the parameter block `words` on the CPU: see `run_shared`.
 
     Args:
         native: The kernel.
         words: A number or an `address` for each of its parameters; others are ignored.
         n_tasks: The largest number of tasks in one of its phases.
     """
-    start()
     words = {"give_way": _give_way(), **words}
     block = (ctypes.c_longlong * len(native.parameters))(*[words[name] for name in native.parameters])
-    place = ctypes.addressof(block)
-    helpers = min(torch.get_num_threads(), n_tasks) - 1
-    if helpers < 1:
-        _launch_native(native, place)
-        return
-    pool = _pool(os.getpid(), helpers)
-    futures = [pool.submit(_launch_native, native, place) for _ in range(helpers)]
-    try:
-        _launch_native(native, place)
-    finally:
-        for future in futures:
-            if not future.cancel():
-                future.result()
+    run_shared(native.kernel, ctypes.addressof(block), n_tasks)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels import constants
-from oasis_warp.core.checks import check_choice
+from oasis_warp.core.checks import check_choice, check_finite
 from oasis_warp.ops._scene_checks import check_cameras, check_coefficients, check_colors, check_gaussians
 from oasis_warp.ops.blending import blend
 from oasis_warp.ops.projection import Projection, project
@@ -144,8 +144,10 @@ def rasterization(
     n, n_cameras = len(means), len(viewmats)
     if sh_degree is not None:
         check_coefficients(colors, sh_degree, means, n_cameras)
-        colors = seen_colors(sh_degree, means, colors, viewmats, validate)
+        colors = seen_colors(sh_degree, means, colors, viewmats)
     check_colors(colors, backgrounds, means, n_cameras)
+    if validate and render_mode in ("D", "ED") and not torch.compiler.is_compiling():
+        check_finite(colors=colors, backgrounds=backgrounds)  # nobody draws them, who would see what is wrong
 
     projection = project(
         means, quats, scales, opacities, viewmats, Ks, width, height, near_plane=near_plane, far_plane=far_plane,
@@ -182,16 +184,16 @@ def seen_colors(
     means: Float[Tensor, "N 3"],
     coefficients: Float[Tensor, "N K 3"] | Float[Tensor, "C N K 3"],
     viewmats: Float[Tensor, "C 4 4"],
-    validate: bool,
 ) -> Float[Tensor, "C N 3"]:
     """Colours of the Gaussians as each camera sees them.
 
-    A far camera's centre cancels against the means in float32: their difference is taken in float64.
+    A far camera's centre cancels against the means in float32: their difference is taken in float64. Values are not
+    looked at: bad ones come out as bad colours, which blending refuses by that name.
     """
     pose = viewmats.double()
     centres, _ = torch.linalg.solve_ex(pose[:, :3, :3], -pose[:, :3, 3:])
     directions = (means.double() - centres.mT).to(means.dtype)
-    return (spherical_harmonics(sh_degree, directions, coefficients, validate=validate) + 0.5).clamp_min(0)
+    return (spherical_harmonics(sh_degree, directions, coefficients, validate=False) + 0.5).clamp_min(0)
 
 
 def layers_to_blend(colors: Tensor, depths: Tensor, render_mode: str) -> Tensor:
