@@ -141,7 +141,7 @@ def rasterization(
         quats = scales = None
     check_gaussians(means, quats, scales, covars, opacities)
     check_cameras(viewmats, Ks, means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size)
-    n, n_cameras = len(means), len(viewmats)
+    n_cameras = len(viewmats)
     if sh_degree is not None:
         check_coefficients(colors, sh_degree, means, n_cameras)
         colors = seen_colors(sh_degree, means, colors, viewmats)
@@ -153,8 +153,9 @@ def rasterization(
         means, quats, scales, opacities, viewmats, Ks, width, height, near_plane=near_plane, far_plane=far_plane,
         radius_clip=radius_clip, eps2d=eps2d, covars=covars, validate=validate,
     )  # fmt: skip
-    opacities = opacities.expand(n_cameras, n)
-    channels = layers_to_blend(colors.expand(n_cameras, n, colors.shape[-1]), projection.depths, render_mode)
+    opacities = for_each_camera(opacities, n_cameras)
+    colors = for_each_camera(colors, n_cameras) if colors.dim() == 2 else colors
+    channels = layers_to_blend(colors, projection.depths, render_mode)
     if backgrounds is None or render_mode in ("D", "ED"):
         behind = channels.new_zeros(n_cameras, channels.shape[-1])
     else:
@@ -194,6 +195,11 @@ def seen_colors(
     centres, _ = torch.linalg.solve_ex(pose[:, :3, :3], -pose[:, :3, 3:])
     directions = (means.double() - centres.mT).to(means.dtype)
     return (spherical_harmonics(sh_degree, directions, coefficients, validate=False) + 0.5).clamp_min(0)
+
+
+def for_each_camera(tensor: Tensor, n_cameras: int) -> Tensor:
+    """`tensor` with a leading axis of cameras; for one camera a view, whose gradient is no sum."""
+    return tensor[None] if n_cameras == 1 else tensor.expand(n_cameras, *tensor.shape)
 
 
 def layers_to_blend(colors: Tensor, depths: Tensor, render_mode: str) -> Tensor:
