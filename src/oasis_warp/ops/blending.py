@@ -9,11 +9,11 @@ from torch import Tensor
 
 from oasis_kernels import constants
 from oasis_kernels.rasterize_cuda import INDEX_BITS
-from oasis_warp.core.checks import check_finite
 from oasis_warp.ops import _blend_cuda, _blend_strips, _blend_tiles
 from oasis_warp.ops._launch import has_vectors
 from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
 from oasis_warp.ops._splats import Frame, Splats, Wanted
+from oasis_warp.ops._values import check_finite
 from oasis_warp.ops.projection import Projection
 
 

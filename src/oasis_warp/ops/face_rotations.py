@@ -8,10 +8,11 @@ from torch import Tensor
 
 from oasis_kernels import face_rotation as kernels
 from oasis_kernels import face_rotation_vectors as vector_kernels
-from oasis_warp.core.checks import check_finite, check_float, check_shape
+from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._incidence import Incidence, incidence, sum_at_items
 from oasis_warp.ops._launch import even_cuts, has_vectors, launch_ranges, run_native, view
 from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
+from oasis_warp.ops._values import check_finite
 from oasis_warp.ops._words import place, task_count
 
 

@@ -6,11 +6,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels import barycentric as kernels
-from oasis_warp.core.checks import check_choice, check_finite, check_float, check_shape
+from oasis_warp.core.checks import check_choice, check_float, check_shape
 from oasis_warp.ops._incidence import sum_at_items
 from oasis_warp.ops._launch import even_cuts, has_vectors, launch_ranges, view
 from oasis_warp.ops._registration import adjoint, differentiable, operator
 from oasis_warp.ops._riders import Floats, Riders, find_riders, pose_backward_vectorised, pose_vectorised
+from oasis_warp.ops._values import check_finite
 
 HALF_POWERS = {"sqrt_area": 1, "area": 2, "none": 0}
 """Twice the exponent of the area ratio in each scale law."""

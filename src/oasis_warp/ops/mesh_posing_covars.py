@@ -6,10 +6,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels import face_stretch as kernels
-from oasis_warp.core.checks import check_finite, check_float, check_shape
+from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._incidence import incidence, riders_at_vertices, sum_at_items
 from oasis_warp.ops._launch import even_cuts, launch_ranges, view
 from oasis_warp.ops._registration import adjoint, differentiable, operator
+from oasis_warp.ops._values import check_finite
 
 
 class PosedCovars(NamedTuple):

@@ -7,8 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels import constants
-from oasis_warp.core.checks import check_choice, check_finite
+from oasis_warp.core.checks import check_choice
 from oasis_warp.ops._scene_checks import check_cameras, check_coefficients, check_colors, check_gaussians
+from oasis_warp.ops._values import check_finite
 from oasis_warp.ops.blending import blend
 from oasis_warp.ops.projection import Projection, project
 from oasis_warp.ops.spherical_harmonics import spherical_harmonics

@@ -8,9 +8,10 @@ from torch import Tensor
 
 from oasis_kernels import skinning as kernels
 from oasis_kernels import skinning_vectors as vector_kernels
-from oasis_warp.core.checks import check_finite, check_float, check_shape
+from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._launch import even_cuts, launch_ranges, run_native, view
 from oasis_warp.ops._registration import adjoint, differentiable, operator
+from oasis_warp.ops._values import check_finite
 from oasis_warp.ops._words import place, task_count
 
 SCALAR_NAMES = {torch.float32: "float", torch.float64: "double"}
