@@ -108,10 +108,19 @@ def test_the_command_line_offers_every_operator():
 def test_an_interrupt_ends_the_processes_of_the_grid_and_leaves_no_file(tmp_path):
     command = [sys.executable, "-m", "oasis_warp", "gradcheck", "--scenes", "100000", "--jobs", "2",
                "--json", str(tmp_path / "all.json")]  # fmt: skip
-    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    time.sleep(6)
-    running.send_signal(signal.SIGINT)
-    _, err = running.communicate(timeout=60)
+
+    def heed_interrupts():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a test run in the background ignores them, and so would its child
+
+    running = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts
+    )
+    try:
+        time.sleep(6)
+        running.send_signal(signal.SIGINT)
+        _, err = running.communicate(timeout=60)
+    finally:
+        running.kill()
     assert running.returncode == 130
     assert err.splitlines()[-1] == "oasis: stopped, nothing written." and "Traceback" not in err
     assert not list(tmp_path.iterdir())
