@@ -110,7 +110,7 @@ def test_an_interrupt_ends_the_processes_of_the_grid_and_leaves_no_file(tmp_path
                "--json", str(tmp_path / "all.json")]  # fmt: skip
 
     def heed_interrupts():
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a test run in the background ignores them, and so would its child
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a test run in the background ignores them, and its child would
 
     running = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts
