@@ -153,7 +153,6 @@ BUGS = [
     *_in(
         "depth_buffer_draw", "depth",
         ("farthest in doubt", "if (z > rival ||", "if (z < rival ||"),
-        ("back faces culled", "const F sign = signed_area < 0.f ? (F)(-1.f) : (F)(1.f);", "const F sign = (F)(1.f);"),
     ),
     *_in(
         "depth_buffer_score", "depth",

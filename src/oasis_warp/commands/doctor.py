@@ -24,7 +24,7 @@ PACKAGES = {
     "torch": ("2.6", "2.14"),
     "trimesh": ("4", None),
     "libigl": ("2.6", None),
-    "scipy": ("1.14", None),
+    "scipy": ("1.15", None),
     "opencv-contrib-python-headless": ("5.0.0.93", None),
     "numpy": ("2", None),
     "safetensors": ("0.5", None),
