@@ -58,11 +58,11 @@ def test_a_single_repeat_is_refused():
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells")
 def test_peak_memory_is_what_a_call_holds_at_once():
     def run():
-        first = torch.ones(6 * 2**20)  # 24 MiB
+        first = torch.ones(10 * 2**20)  # 40 MiB: from 32 on the C library gives freed memory back at once
         second = first + 1
         del first
         return second + 1
 
     megabytes = peak_megabytes(run, torch.device("cpu"))
     assert megabytes is not None
-    assert 47 <= megabytes <= 60
+    assert 79 <= megabytes <= 92
