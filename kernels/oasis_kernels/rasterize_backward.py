@@ -148,12 +148,30 @@ def blend_backward(scalar: Any, channels: int, rules: Rules) -> Any:
     return blend_backward
 
 
+Moments = wp.types.vector(length=6, dtype=wp.float64)
+"""The sums of a record, over all pairs of a Gaussian."""
+
+
+@wp.func
+def shape_gradients(w: wp.vec4d, m: Moments):
+    """Gradients by the centre in the image and by the covariance xx, xy, yy; xy stands for both off-diagonal entries.
+
+    sigma = |W d|^2 / 2 with d from the centre to the pixel: dsigma/dcentre = -W^T y, dsigma/dcovariance =
+    -W^T y y^T W / 2, and dL/dsigma = -v.
+    """
+    half = wp.float64(0.5)
+    by_center = wp.vec2d(w[0] * m[1] + w[2] * m[2], w[1] * m[1] + w[3] * m[2])
+    xx = w[0] * (w[0] * m[3] + w[2] * m[4]) + w[2] * (w[0] * m[4] + w[2] * m[5])
+    xy = w[1] * (w[0] * m[3] + w[2] * m[4]) + w[3] * (w[0] * m[4] + w[2] * m[5])
+    yy = w[1] * (w[1] * m[3] + w[3] * m[4]) + w[3] * (w[1] * m[4] + w[3] * m[5])
+    return by_center, wp.vec3d(half * xx, xy, half * yy)
+
+
 @functools.cache
 def gather_shape(scalar: Any) -> Any:
     """Kernel: records -> gradients by means2d, covars2d and opacities; one thread a (camera, Gaussian)."""
     vec2, vec4 = (wp.types.vector(length=n, dtype=scalar) for n in (2, 4))
     moments = wp.types.vector(length=6, dtype=scalar)
-    exact = wp.types.vector(length=6, dtype=wp.float64)
 
     @wp.kernel(enable_backward=False, module="unique")
     def gather_shape(
@@ -168,24 +186,18 @@ def gather_shape(scalar: Any) -> Any:
         g_opacities: wp.array(dtype=scalar),
     ):
         index = first + wp.tid()
-        m = exact()
+        m = Moments()
         start = pair_starts[index]
         for k in range(int(pair_counts[index])):
             record = pair_moments[start + wp.int64(k)]
             for j in range(6):
                 m[j] += wp.float64(record[j])
-        zero, half = wp.float64(0.0), wp.float64(0.5)
-        g_opacity = zero
+        g_opacity = wp.float64(0.0)
         if pair_counts[index] > wp.int64(0):
             g_opacity = m[0] / wp.float64(opacities[index])
-        # sigma = |W d|^2 / 2 with d from the centre to the pixel: dsigma/dcentre = -W^T y, dsigma/dcovariance =
-        # -W^T y y^T W / 2, and dL/dsigma = -v.
-        w = wp.vec4d(whitenings[index])
-        g_means2d[index] = vec2(scalar(w[0] * m[1] + w[2] * m[2]), scalar(w[1] * m[1] + w[3] * m[2]))
-        xx = w[0] * (w[0] * m[3] + w[2] * m[4]) + w[2] * (w[0] * m[4] + w[2] * m[5])
-        xy = w[1] * (w[0] * m[3] + w[2] * m[4]) + w[3] * (w[0] * m[4] + w[2] * m[5])
-        yy = w[1] * (w[1] * m[3] + w[3] * m[4]) + w[3] * (w[1] * m[4] + w[3] * m[5])
-        g_covars2d[index] = wp.vec3d(half * xx, xy, half * yy)  # xy stands for both off-diagonal entries
+        by_center, by_covariance = shape_gradients(wp.vec4d(whitenings[index]), m)
+        g_means2d[index] = vec2(scalar(by_center[0]), scalar(by_center[1]))
+        g_covars2d[index] = by_covariance
         g_opacities[index] = scalar(g_opacity)
 
     return gather_shape

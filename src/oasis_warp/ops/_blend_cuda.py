@@ -7,7 +7,7 @@ from torch import Tensor
 from warp import vec2f, vec3d, vec4f, vec4i
 from warp.types import vector
 
-from oasis_kernels import rasterize_cuda as kernels
+from oasis_kernels import cuda_binning, cuda_draw, cuda_draw_backward
 from oasis_warp.ops._launch import SCALAR, launch, view
 from oasis_warp.ops._registration import hidden, hidden_like_fake, revealed
 from oasis_warp.ops._rules import current_rules
@@ -41,7 +41,7 @@ class Kept(NamedTuple):
 
 def _count_tiles(width: int, height: int) -> tuple[int, int]:
     """Tiles across and down an image."""
-    return -(-width // kernels.TILE), -(-height // kernels.TILE)
+    return -(-width // cuda_binning.TILE), -(-height // cuda_binning.TILE)
 
 
 def _bin(splats: Splats, width: int, height: int) -> tuple[Lists, Tensor, bool]:
@@ -54,7 +54,7 @@ def _bin(splats: Splats, width: int, height: int) -> tuple[Lists, Tensor, bool]:
     pair_starts = torch.empty(n_cameras * n, dtype=torch.int32, device=device)
     boxes = view(splats.boxes.view(-1, 4), vec4i)
     launch(
-        kernels.count_pairs,
+        cuda_binning.count_pairs,
         n_cameras * n,
         [n, boxes, across, down, view(pair_starts), view(counts), view(total)],
         like=counts,
@@ -66,7 +66,7 @@ def _bin(splats: Splats, width: int, height: int) -> tuple[Lists, Tensor, bool]:
     starts = torch.nn.functional.pad(ends, (1, 0)).int()
     keys = torch.empty(n_pairs, dtype=torch.int64, device=device)
     launch(
-        kernels.fill_tiles,
+        cuda_binning.fill_tiles,
         n_cameras * n,
         [
             n, boxes, view(splats.depths.view(-1)), across, down, view(starts), view(cursors), view(keys),
@@ -74,9 +74,9 @@ def _bin(splats: Splats, width: int, height: int) -> tuple[Lists, Tensor, bool]:
         like=keys,
     )  # fmt: skip
     lists = Lists(starts, pair_starts, hidden(n_pairs, torch.int32, device))
-    if longest > kernels.LONGEST:
+    if longest > cuda_draw.LONGEST:
         _sort(keys, counts, across * down, n, revealed(lists.gaussians))
-    return lists, keys, longest > kernels.LONGEST
+    return lists, keys, longest > cuda_draw.LONGEST
 
 
 def _sort(keys: Tensor, counts: Tensor, tiles_a_camera: int, n: int, gaussians: Tensor) -> None:
@@ -84,7 +84,7 @@ def _sort(keys: Tensor, counts: Tensor, tiles_a_camera: int, n: int, gaussians: 
     tiles = torch.repeat_interleave(torch.arange(len(counts), device=keys.device), counts)
     keys, by_depth = torch.sort(keys)
     tiles, by_tile = torch.sort(tiles[by_depth], stable=True)
-    index = keys[by_tile] & ((1 << kernels.INDEX_BITS) - 1)
+    index = keys[by_tile] & ((1 << cuda_binning.INDEX_BITS) - 1)
     gaussians.copy_(tiles // tiles_a_camera * n + index)
 
 
@@ -123,8 +123,8 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
     image, alphas, transmittance = empty(channels), empty(1), empty()
     stops = transmittance.new_empty(transmittance.shape, dtype=torch.int32)
     launch(
-        kernels.blend(channels, current_rules()),
-        (n_cameras * across * down, kernels.BLOCK),
+        cuda_draw.blend(channels, current_rules()),
+        (n_cameras * across * down, cuda_draw.BLOCK),
         [
             n, view(lists.starts), view(keys), int(in_order), view(splats.centers.view(-1, 4), vec4f),
             view(splats.whitenings.view(-1, 4), vec4f), view(splats.opacities.view(-1)),
@@ -133,7 +133,7 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
             view(stops.view(-1)), view(revealed(lists.gaussians)),
         ],
         like=image,
-        block_dim=kernels.BLOCK,
+        block_dim=cuda_draw.BLOCK,
     )  # fmt: skip
     return image, alphas, Kept(transmittance, stops, *lists) if keep else None
 
@@ -159,8 +159,8 @@ def draw_backward(
     boxes, whitenings = view(splats.boxes.view(-1, 4), vec4i), view(splats.whitenings.view(-1, 4), vec4f)
     opacities = view(splats.opacities.view(-1))
     launch(
-        kernels.blend_backward(channels, current_rules()),
-        (n_tiles, kernels.BLOCK),
+        cuda_draw_backward.blend_backward(channels, current_rules()),
+        (n_tiles, cuda_draw.BLOCK),
         [
             view(kept.starts), view(gaussians), view(kept.pair_starts), boxes,
             view(splats.centers.view(-1, 4), vec4f), whitenings, opacities,
@@ -170,7 +170,7 @@ def draw_backward(
             view(tile_backgrounds, color),
         ],
         like=new,
-        block_dim=kernels.BLOCK,
+        block_dim=cuda_draw.BLOCK,
     )  # fmt: skip
     g_means2d = new.new_empty(total if with_shape else 0, 2)
     g_covars2d = new.new_empty(total if with_shape else 0, 3, dtype=torch.float64)
@@ -178,7 +178,7 @@ def draw_backward(
     g_colors = new.new_empty(total if with_colors else 0, channels)
     if with_shape or with_colors:
         launch(
-            kernels.gather(channels),
+            cuda_draw_backward.gather(channels),
             total,
             [
                 boxes, view(kept.pair_starts), view(pair_moments, moments), view(pair_colors, color), whitenings,
