@@ -16,6 +16,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from oasis_kernels.cuda_native import CudaNative
 from oasis_kernels.native import Native
 
 _start_lock = threading.Lock()
@@ -209,3 +210,42 @@ def run_native(native: Native, words: dict[str, int], n_tasks: int) -> None:
     words = {"give_way": _give_way(), **words}
     block = (ctypes.c_longlong * len(native.parameters))(*[words[name] for name in native.parameters])
     run_shared(native.kernel, ctypes.addressof(block), n_tasks)
+
+
+class _CudaLaunches(threading.local):
+    """Launches of CUDA kernels, recorded once a thread."""
+
+    def __init__(self) -> None:
+        self.launches: dict[Any, list[Any]] = {}  # by kernel and device: the launch, and its number of blocks
+
+
+_cuda_launches = _CudaLaunches()
+
+
+def run_cuda(native: CudaNative, words: dict[str, int | float], n_blocks: int, stream: "wp.Stream") -> None:
+    """Launch a CUDA kernel of `n_blocks` blocks on `stream`, which a graph may be capturing; none for no blocks.
+
+    Args:
+        native: The kernel.
+        words: A number or `Tensor.data_ptr()` for each of its parameters, by name; 0 is a null pointer.
+        n_blocks: Of `native.block` threads.
+        stream: Of `device_and_stream`.
+    """
+    if not n_blocks:
+        return
+    block = native.words(**words)
+    key = native.kernel, stream.device
+    recorded = _cuda_launches.launches.get(key)
+    if recorded is None:
+        with _load_lock:
+            launch = wp.launch(
+                native.kernel, dim=native.block, inputs=[native.kernel.adj.args[0].type()], device=stream.device,
+                block_dim=native.block, record_cmd=True,
+            )  # fmt: skip
+        recorded = _cuda_launches.launches[key] = [launch, 1]
+    launch: Any = recorded[0]
+    if recorded[1] != n_blocks:
+        launch.set_dim(n_blocks * native.block)
+        recorded[1] = n_blocks
+    launch.set_param_at_index_from_ctype(0, block)
+    launch.launch(stream)
