@@ -239,7 +239,7 @@ def run_cuda(native: CudaNative, words: dict[str, int | float], n_blocks: int, s
     if not n_blocks:
         return
     block = native.words(**words)
-    key = native.kernel, stream.device
+    key = native.kernel, stream.device.ordinal
     recorded = _cuda_launches.launches.get(key)
     if recorded is None:
         with _load_lock:
