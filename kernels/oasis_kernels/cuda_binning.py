@@ -49,8 +49,14 @@ COUNT = TILE_BOX + """
     if (lane == 31 && sum) base = atomicAdd(counters, (unsigned long long)sum);
     base = __shfl_sync(0xffffffffu, base, 31);
     if (thread < total) pair_starts[thread] = (int)(base + sum - count);
-    for (int y = t.y; y < t.w; y++) for (int x = t.x; x < t.z; x++)
-        atomicAdd(tile_counts + (image + y) * tiles_x + x, 1);
+    // Neighbours in memory are often neighbours in the image: lanes of a warp that count the same tile do it at once.
+    int x = t.x, y = t.y;
+    for (int done = 0; __any_sync(0xffffffffu, done < count); done++) {
+        const long long tile = done < count ? (image + y) * tiles_x + x : -1;
+        const unsigned same = __match_any_sync(0xffffffffu, tile);
+        if (tile >= 0 && lane == __ffs(same) - 1) atomicAdd(tile_counts + tile, __popc(same));
+        if (++x == t.z) { x = t.x; y++; }
+    }
 """
 
 PLACE = """
@@ -108,28 +114,34 @@ PLACE = """
 """
 
 FILL = TILE_BOX + """
-    if (thread >= total) return;
-    const int4 t = tile_box(boxes[thread]);
+    const bool own = thread < total;
+    const int4 t = own ? tile_box(boxes[thread]) : int4{0, 0, 0, 0};
     const int camera = n == total ? 0 : thread / n, index = thread - camera * n;
-    const int across = t.z - t.x, count = across * (t.w - t.y);
-    if (!count) return;
-    long long bits = __double_as_longlong(depths[thread]) - (959ll << 52);
+    const int count = (t.z - t.x) * (t.w - t.y), lane = threadIdx.x & 31;
+    long long bits = count ? __double_as_longlong(depths[thread]) - (959ll << 52) : 0;
     bits = bits < 0 ? 0 : bits;
     const long long key = (bits >> 20) << @INDEX_BITS@ | index;
     const long long image = (long long)camera * tiles_y;
     int x = t.x, y = t.y;
-    for (int done = 0; done < count; done += 4) {  // four at a time, which do not wait for each other
-        long long place[4];
+    for (int done = 0; __any_sync(0xffffffffu, done < count); done += 4) {
+        // Four tiles at a time, whose answers are not waited for; lanes with the same tile ask once.
+        unsigned long long place[4];
+        unsigned same[4];
         #pragma unroll
         for (int k = 0; k < 4; k++) {
-            place[k] = capacity;
-            if (done + k < count) {
-                place[k] = (long long)atomicAdd(cursors + (image + y) * tiles_x + x, 1ull);
-                if (++x == t.z) { x = t.x; y++; }
-            }
+            const long long tile = done + k < count ? (image + y) * tiles_x + x : -1;
+            same[k] = __match_any_sync(0xffffffffu, tile);
+            place[k] = (unsigned long long)capacity;
+            if (tile >= 0 && lane == __ffs(same[k]) - 1)
+                place[k] = atomicAdd(cursors + tile, (unsigned long long)__popc(same[k]));
+            if (++x == t.z) { x = t.x; y++; }
         }
         #pragma unroll
-        for (int k = 0; k < 4; k++) if (place[k] < capacity) keys[place[k]] = key;
+        for (int k = 0; k < 4; k++) {
+            const unsigned long long first = __shfl_sync(0xffffffffu, place[k], __ffs(same[k]) - 1);
+            const long long at = (long long)first + __popc(same[k] & ((1u << lane) - 1u));
+            if (done + k < count && at < capacity) keys[at] = key;
+        }
     }
 """
 

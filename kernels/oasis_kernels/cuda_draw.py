@@ -70,7 +70,7 @@ HEAD = """
 """
 
 SORT = """
-    // Each warp sorts 32 keys at a time in its registers; then every key counts those before it in the other runs.
+    // Each warp sorts 32 keys at a time in its registers; then every key counts those before it in all runs.
     __shared__ long long keys_here[@LONGEST@];
     __shared__ int sorted_here[@LONGEST@];
     if (count <= @LONGEST@) {
@@ -92,9 +92,9 @@ SORT = """
         __syncthreads();
         for (int at = threadIdx.x; at < runs * 32; at += @BLOCK@) {
             const long long key = keys_here[at];
-            int rank = at & 31;
+            int rank = 0;
+            #pragma unroll 4
             for (int run = 0; run < runs; run++) {
-                if (run == at >> 5) continue;
                 const long long* those = keys_here + run * 32;
                 int before = 0;
                 #pragma unroll
@@ -170,34 +170,59 @@ FORWARD = """
                 layer_colors[slot * @PADDED@ + k] =
                     @CHANNELS@ <= 4 ? next_color[k] : colors[(long long)next_index * @CHANNELS@ + k];
         }
-        if (lane >= m && lane < ((m + 3) & ~3)) layers[lane] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, -1e9f, 0};
+        if (lane >= m && lane < ((m + 3) & ~3)) {  // layers that nobody sees
+            layers[lane] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, -1e9f, 0};
+            #pragma unroll
+            for (int k = 0; k < @CHANNELS@; k++) layer_colors[lane * @PADDED@ + k] = 0.f;
+        }
         __syncwarp();
         fetch(first + 32);
-        for (int j = 0; j < m; j += 4) {
-            // Four layers at a time: their alphas do not wait for each other, only the blending does.
-            float alpha[4];
+        // Four layers at a time: their alphas do not wait for each other, and the next four are under way while these
+        // are blended.
+        auto alphas_of = [&](int j, float* alpha) {
             #pragma unroll
             for (int i = 0; i < 4; i++) {
                 const Packed& l = layers[j + i];
                 const float dx = x - l.cx, dy = y - l.cy;
                 const float u = fmaf(l.w0, dx, l.w1 * dy), v = fmaf(l.w2, dx, l.w3 * dy);
-                alpha[i] = fminf(power(fmaf(-v, v, fmaf(-u, u, l.lo))), @ALPHA_MAX@);
+                const float raw = power(fmaf(-v, v, fmaf(-u, u, l.lo)));
+                alpha[i] = raw >= @ALPHA_MIN@ ? fminf(raw, @ALPHA_MAX@) : 0.f;
+            }
+        };
+        float alpha[4], next_alpha[4] = {};
+        if (m) alphas_of(0, alpha);
+        for (int j = 0; j < m; j += 4) {
+            if (j + 4 < m) alphas_of(j + 4, next_alpha);
+            float t[5] = {T};
+            #pragma unroll
+            for (int i = 0; i < 4; i++) t[i + 1] = fmaf(-alpha[i], t[i], t[i]);
+            if (__any_sync(all, t[4] <= @STOP@)) {  // some pixel ends among the four
+                bool ended = false;
+                #pragma unroll
+                for (int i = 0; i < 4; i++) {
+                    if (ended) alpha[i] = 0.f;
+                    t[i + 1] = fmaf(-alpha[i], t[i], t[i]);
+                    if (t[i + 1] <= @STOP@) {
+                        ended = true;
+                        stop = layers[j + i].place;
+                        x = 1e18f;
+                        t[i + 1] = t[i];
+                        alpha[i] = 0.f;
+                    }
+                }
+                #pragma unroll
+                for (int i = 0; i < 4; i++) if (ended) next_alpha[i] = 0.f;
             }
             #pragma unroll
             for (int i = 0; i < 4; i++) {
-                const float after = fmaf(-alpha[i], T, T);
-                const bool seen = alpha[i] >= @ALPHA_MIN@ && x < 1e17f;
-                if (seen && after <= @STOP@) {
-                    stop = layers[j + i].place;
-                    x = 1e18f;
-                } else if (seen) {
-                    const float weight = alpha[i] * T;
-                    #pragma unroll
-                    for (int k = 0; k < @CHANNELS@; k++)
-                        C[k] = fmaf(layer_colors[(j + i) * @PADDED@ + k], weight, C[k]);
-                    T = after;
-                }
+                const float weight = alpha[i] * t[i];
+                #pragma unroll
+                for (int k = 0; k < @CHANNELS@; k++)
+                    C[k] = fmaf(layer_colors[(j + i) * @PADDED@ + k], weight, C[k]);
             }
+            T = t[4];
+            #pragma unroll
+            for (int i = 0; i < 4; i++) alpha[i] = next_alpha[i];
         }
     }
     end_segment();
@@ -256,4 +281,4 @@ def blend(channels: int, rules: Rules) -> CudaNative:
     """Kernel: sort and blend the tiles, a block each."""
     outputs = {"keys": "const long long*", "image": "float*", "alphas": "float*"}
     body = snippet(SORT + FORWARD, channels, rules, BLOCK=BLOCK, WARPS=BLOCK // 32)
-    return cuda_native(f"blend_tiles_{channels}", PARAMETERS | outputs, body, BLOCK, 16 if channels <= 4 else 4)
+    return cuda_native(f"blend_tiles_{channels}", PARAMETERS | outputs, body, BLOCK, 10 if channels <= 4 else 4)

@@ -25,23 +25,29 @@ BACKWARD = """
     float** const layer_records = records_of[warp];
     if (warp >= used && warp > 0) return;
 
-    // Sum over the warp of each of 8 values, by halves: lane l ends with value (l >> 2).
+    // Sums over the warp of each of 32 values, by halves: lane l ends with value l.
+    auto fold = [&](float mine, float other, bool upper, int distance) -> float {
+        return (upper ? other : mine) + __shfl_xor_sync(all, upper ? mine : other, distance);
+    };
     auto scatter_sum = [&](float* v) -> float {
-        const bool upper16 = lane & 16, upper8 = lane & 8, upper4 = lane & 4;
+        const bool upper16 = lane & 16, upper8 = lane & 8, upper4 = lane & 4, upper2 = lane & 2, upper1 = lane & 1;
         #pragma unroll
-        for (int k = 0; k < 4; k++) {
-            const float mine = upper16 ? v[k + 4] : v[k], other = upper16 ? v[k] : v[k + 4];
-            v[k] = mine + __shfl_xor_sync(all, other, 16);
-        }
+        for (int k = 0; k < 16; k++) v[k] = fold(v[k], v[k + 16], upper16, 16);
         #pragma unroll
-        for (int k = 0; k < 2; k++) {
-            const float mine = upper8 ? v[k + 2] : v[k], other = upper8 ? v[k] : v[k + 2];
-            v[k] = mine + __shfl_xor_sync(all, other, 8);
-        }
-        const float mine = upper4 ? v[1] : v[0], other = upper4 ? v[0] : v[1];
-        float sum = mine + __shfl_xor_sync(all, other, 4);
-        sum += __shfl_xor_sync(all, sum, 2);
-        return sum + __shfl_xor_sync(all, sum, 1);
+        for (int k = 0; k < 8; k++) v[k] = fold(v[k], v[k + 8], upper8, 8);
+        #pragma unroll
+        for (int k = 0; k < 4; k++) v[k] = fold(v[k], v[k + 4], upper4, 4);
+        v[0] = fold(v[0], v[2], upper2, 2);
+        v[1] = fold(v[1], v[3], upper2, 2);
+        return fold(v[0], v[1], upper1, 1);
+    };
+    // The same of 4 values: lane l ends with value l >> 3.
+    auto scatter_sum_4 = [&](const float* v) -> float {
+        const bool upper16 = lane & 16, upper8 = lane & 8;
+        float sum = fold(fold(v[0], v[2], upper16, 16), fold(v[1], v[3], upper16, 16), upper8, 8);
+        #pragma unroll
+        for (int offset = 4; offset > 0; offset >>= 1) sum += __shfl_xor_sync(all, sum, offset);
+        return sum;
     };
     auto sum_lanes = [&](float sum) -> float {
         #pragma unroll
@@ -117,11 +123,15 @@ BACKWARD = """
             for (int k = 0; k < @CHANNELS@; k++)
                 layer_colors[slot * @PADDED@ + k] = colors[(long long)g * @CHANNELS@ + k];
         }
-        if (lane >= m && lane < ((m + 3) & ~3)) layers[lane] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, -1e9f, 0};
+        if (lane >= m && lane < ((m + 3) & ~3)) {  // layers that nobody sees
+            layers[lane] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, -1e9f, 0};
+            #pragma unroll
+            for (int k = 0; k < @CHANNELS@; k++) layer_colors[lane * @PADDED@ + k] = 0.f;
+        }
         __syncwarp();
-        // As in the forward pass: four at a time, whose offsets and alphas do not wait for each other.
+        // Four layers at a time: most of what they take does not wait for each other, and their sums share shuffles.
         for (int j = (m - 1) & ~3; j >= 0; j -= 4) {
-            float u[4][2], v[4][2], raw[4][2];
+            float u[4][2], v[4][2], weight[4][2], by_alpha[4][2];
             #pragma unroll
             for (int i = 0; i < 4; i++) {
                 const Packed& l = layers[j + i];
@@ -131,51 +141,53 @@ BACKWARD = """
                     const float dy = y[h] - l.cy;
                     u[i][h] = fmaf(l.w0, dx, l.w1 * dy);
                     v[i][h] = fmaf(l.w2, dx, l.w3 * dy);
-                    raw[i][h] = power(fmaf(-v[i][h], v[i][h], fmaf(-u[i][h], u[i][h], l.lo)));
-                    if (!(raw[i][h] >= @ALPHA_MIN@) || l.place >= stop[h]) raw[i][h] = 0.f;
+                    const float raw = power(fmaf(-v[i][h], v[i][h], fmaf(-u[i][h], u[i][h], l.lo)));
+                    by_alpha[i][h] = raw >= @ALPHA_MIN@ && l.place < stop[h] ? raw : 0.f;
                 }
             }
             #pragma unroll
             for (int i = 3; i >= 0; i--) {
-                if (j + i >= m) continue;
-                float sums[@VALUES@] = {};
                 #pragma unroll
                 for (int h = 0; h < 2; h++) {
-                    const float alpha = fminf(raw[i][h], @ALPHA_MAX@);
+                    const float raw = by_alpha[i][h], alpha = fminf(raw, @ALPHA_MAX@);
                     T[h] = __fdividef(T[h], 1.f - alpha);
-                    const float weight = alpha * T[h];
+                    weight[i][h] = alpha * T[h];
                     float gc = 0.f;
                     #pragma unroll
                     for (int k = 0; k < @CHANNELS@; k++)
                         gc = fmaf(G[h][k], layer_colors[(j + i) * @PADDED@ + k], gc);
                     const float step = gc - S[h];
                     S[h] = fmaf(alpha, step, S[h]);
-                    if (@SHAPE@) {
-                        const float by_alpha = raw[i][h] <= @ALPHA_MAX@ ? weight * step : 0.f;
-                        const float gu = by_alpha * u[i][h], gv = by_alpha * v[i][h];
-                        sums[0] += by_alpha;
-                        sums[1] += gu;
-                        sums[2] += gv;
-                        sums[3] = fmaf(gu, u[i][h], sums[3]);
-                        sums[4] = fmaf(gu, v[i][h], sums[4]);
-                        sums[5] = fmaf(gv, v[i][h], sums[5]);
-                    }
-                    if (@COLORS@) {
-                        #pragma unroll
-                        for (int k = 0; k < @CHANNELS@; k++)
-                            sums[6 * @SHAPE@ + k] = fmaf(G[h][k], weight, sums[6 * @SHAPE@ + k]);
-                    }
+                    by_alpha[i][h] = raw <= @ALPHA_MAX@ ? weight[i][h] * step : 0.f;
                 }
-                float* const record = layer_records[j + i];
+            }
+            auto value = [&](int i, int k) -> float {  // number k of the record of layer i, of this lane's pixels
+                float sum = 0.f;
                 #pragma unroll
-                for (int k = 0; k + 2 <= @VALUES@; k += 8) {  // a single last value is summed by itself
-                    const float sum = scatter_sum(sums + k);
-                    if ((lane & 3) == 0 && k + (lane >> 2) < @RECORD@) record[k + (lane >> 2)] = sum;
+                for (int h = 0; h < 2; h++) {
+                    const float a = u[i][h], b = v[i][h], g = by_alpha[i][h];
+                    if (@SHAPE@ && k < 6) sum += k == 0 ? g : k == 1 ? g * a : k == 2 ? g * b
+                                                 : k == 3 ? g * a * a : k == 4 ? g * a * b : g * b * b;
+                    else if (@COLORS@ && k - 6 * @SHAPE@ < @CHANNELS@) sum += G[h][k - 6 * @SHAPE@] * weight[i][h];
                 }
-                if (@VALUES@ % 8 == 1) {
-                    const float sum = sum_lanes(sums[@VALUES@ - 1]);
-                    if (lane == 0) record[@VALUES@ - 1] = sum;
-                }
+                return sum;
+            };
+            const int mine = j + (lane >> 3);
+            float* const to = mine < m ? layer_records[mine] : nullptr;
+            #pragma unroll
+            for (int first_value = 0; first_value + 2 <= @VALUES@; first_value += 8) {
+                float values[32];
+                #pragma unroll
+                for (int k = 0; k < 32; k++) values[k] = value(k >> 3, first_value + (k & 7));
+                const float sum = scatter_sum(values);
+                if (to && first_value + (lane & 7) < @RECORD@) to[first_value + (lane & 7)] = sum;
+            }
+            if (@VALUES@ % 8 == 1) {
+                float values[4];
+                #pragma unroll
+                for (int k = 0; k < 4; k++) values[k] = value(k, @VALUES@ - 1);
+                const float sum = scatter_sum_4(values);
+                if (to && (lane & 7) == 0) to[@VALUES@ - 1] = sum;
             }
         }
     }
@@ -227,12 +239,9 @@ def record_size(channels: int, shape: bool, colors: bool) -> int:
 @functools.cache
 def blend_backward(channels: int, segments: int, shape: bool, colors: bool, rules: Rules) -> CudaNative:
     """Kernel: gradients by image and alpha -> one record a pair, one background gradient a tile; a block a tile."""
-    values = 6 * shape + channels * colors
-    # Sums of 8 at a time read that many numbers; a single last one is added by itself.
-    padded = values if values % 8 == 1 and values > 1 else max(8, -(-values // 8) * 8)
     body = snippet(
-        TILE_BOX + BACKWARD, channels, rules, WARPS=segments, SHAPE=int(shape), COLORS=int(colors), VALUES=padded,
-        RECORD=record_size(channels, shape, colors),
+        TILE_BOX + BACKWARD, channels, rules, WARPS=segments, SHAPE=int(shape), COLORS=int(colors),
+        VALUES=6 * shape + channels * colors,        RECORD=record_size(channels, shape, colors),
     )  # fmt: skip
     inputs = {
         "pair_starts": "const int*",  # [C * n]
@@ -243,7 +252,7 @@ def blend_backward(channels: int, segments: int, shape: bool, colors: bool, rule
         "tile_backgrounds": "float*",  # [tiles, channels], or null
     }
     name = f"blend_tiles_backward_{channels}"
-    return cuda_native(name, PARAMETERS | inputs, body, 32 * segments, 20 // segments if channels <= 4 else 1)
+    return cuda_native(name, PARAMETERS | inputs, body, 32 * segments, 16 // segments if channels <= 4 else 1)
 
 
 @functools.cache
