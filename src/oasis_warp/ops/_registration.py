@@ -16,6 +16,8 @@ from torch import Tensor
 from torch.autograd.function import Function
 from torch.nn import Parameter
 
+from oasis_warp.core.tracing import is_traced
+
 NAMESPACE = "oasis_warp"
 
 
@@ -40,7 +42,7 @@ class Operator:
         self._differentiated = _function(self._name, self._implementation, backward, save)
 
     def __call__(self, *arguments: Any) -> Any:
-        if torch.compiler.is_compiling() or _is_traced():
+        if is_traced():
             return self._traced(*arguments)
         tracks = torch.is_grad_enabled()
         wanted = False
@@ -52,28 +54,18 @@ class Operator:
                 if tracks and argument.requires_grad:
                     wanted = True
             elif kind is list:
-                if not all(type(t) in _NUMBERS or _is_plain_constant(t, tracks) for t in argument):
-                    return self._traced(*arguments)
+                for item in argument:
+                    if type(item) is Tensor:
+                        if item.is_neg() or (tracks and item.requires_grad):
+                            return self._traced(*arguments)
+                    elif type(item) not in _NUMBERS:
+                        return self._traced(*arguments)
             elif kind not in _NUMBERS:  # a kind of tensor with its own way through ops, such as a fake one
                 return self._traced(*arguments)
         return self._differentiated(*arguments) if wanted else self._implementation(*arguments)
 
 
 _NUMBERS = frozenset({bool, int, float, type(None)})
-
-
-def _is_plain_constant(tensor: Tensor, tracks: bool) -> bool:
-    return type(tensor) is Tensor and not tensor.is_neg() and not (tracks and tensor.requires_grad)
-
-
-def _is_traced() -> bool:
-    """Whether someone follows operators: a dispatch or function mode (fake tensors, make_fx), functorch, a tracer."""
-    return bool(
-        torch._C._len_torch_dispatch_stack()
-        or torch._C._is_torch_function_mode_enabled()
-        or torch._C._are_functorch_transforms_active()
-        or torch._C._is_tracing()
-    )
 
 
 def _function(
@@ -88,11 +80,13 @@ def _function(
 
     def run_backward(ctx: Any, *gradients: Any) -> Any:
         found = backward(ctx, *gradients)
-        # The gradients by a list's tensors, all None here: to a Function the list is one argument that has none.
-        return tuple(None if isinstance(g, list) else g for g in found) if isinstance(found, tuple) else found
+        for gradient in found:
+            if type(gradient) is list:  # those by a list's tensors, all None: to a Function the list is one argument
+                return tuple(None if type(g) is list else g for g in found)
+        return found
 
     function = type(name, (Function,), {"forward": staticmethod(run), "backward": staticmethod(run_backward)})
-    # Below Function.apply, which takes 3 us to look for functorch: `_is_traced` has.
+    # Below Function.apply, which takes 3 us to look for functorch: `is_traced` has.
     return super(Function, function).apply
 
 
