@@ -1,6 +1,7 @@
 """3D Gaussians -> images: the public rasterizer, with gsplat's signature."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from operator import is_
 from typing import Any
 
@@ -11,8 +12,9 @@ from torch import Tensor
 from oasis_kernels import constants
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.checks import check_choice
+from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._scene_checks import check_cameras, check_coefficients, check_colors, check_gaussians
-from oasis_warp.ops._values import check_finite
+from oasis_warp.ops._values import Look, check_finite
 from oasis_warp.ops.blending import blend
 from oasis_warp.ops.projection import project
 from oasis_warp.ops.spherical_harmonics import spherical_harmonics
@@ -128,7 +130,8 @@ def rasterization(
         rolling_shutter: Not supported.
         viewmats_rs: Not supported.
         validate: Look at the values of the tensors: refuse NaN, infinities, magnitudes above 1e15, zero quaternions,
-            opacities outside [0, 1] and zero focal lengths. Waits for a CUDA device; switch it off for trusted inputs.
+            opacities outside [0, 1] and zero focal lengths. Waits for a CUDA device; switch it off for trusted inputs,
+            and while a CUDA graph is being captured.
 
     Returns:
         render: Shape [C, H, W, X], X being D, 1 or D + 1.
@@ -158,10 +161,13 @@ def rasterization(
     if validate and render_mode in ("D", "ED") and not torch.compiler.is_compiling():
         check_finite(colors=colors, backgrounds=backgrounds)  # nobody draws them, who would see what is wrong
 
-    projection = project(
-        means, quats, scales, opacities, viewmats, Ks, width, height, near_plane=near_plane, far_plane=far_plane,
-        radius_clip=radius_clip, eps2d=eps2d, covars=covars, validate=validate,
-    )  # fmt: skip
+    # Projection waits for what it says of its own inputs: a look at the others costs next to nothing meanwhile.
+    looking = validate and render_mode == "RGB" and means.is_cuda and not is_traced()
+    with Look(colors=colors, backgrounds=backgrounds) if looking else nullcontext():
+        projection = project(
+            means, quats, scales, opacities, viewmats, Ks, width, height, near_plane=near_plane, far_plane=far_plane,
+            radius_clip=radius_clip, eps2d=eps2d, covars=covars, validate=validate,
+        )  # fmt: skip
     opacities = for_each_camera(opacities, n_cameras)
     colors = for_each_camera(colors, n_cameras) if colors.dim() == 2 else colors
     channels = layers_to_blend(colors, projection.depths, render_mode)
@@ -170,7 +176,9 @@ def rasterization(
         backgrounds = plain_background((0.0,) * n_channels, n_cameras, like=means)
     elif n_channels > backgrounds.shape[-1]:
         backgrounds = torch.nn.functional.pad(backgrounds, (0, n_channels - backgrounds.shape[-1]))
-    render, alphas = blend(projection, opacities, channels, backgrounds, width, height, tile_size, validate=validate)
+    render, alphas = blend(
+        projection, opacities, channels, backgrounds, width, height, tile_size, validate=validate and not looking
+    )
     if render_mode in ("ED", "RGB+ED"):
         # Over the weights' own sum: alpha, as 1 - T, has lost digits where little was drawn.
         depth, cover = render[..., -2:-1], render[..., -1:]
