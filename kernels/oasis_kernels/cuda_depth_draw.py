@@ -96,10 +96,7 @@ PIXELS = """
         const Key mine = (Key)__float_as_uint(__double2float_rd(z)) << 32 | (unsigned)f;
         const Key old = atomicMin(at, mine);
         if (old >> 32 != mine >> 32) return;
-        auto depth = [&](Key key) -> double {
-            const Triangle t = triangle(camera, mesh, (int)(unsigned)key);
-            return depth_of(t, weigh(t, ray));
-        };
+        auto depth = [&](Key key) { return Exact::depth_of_face(camera, mesh, faces, (int)(unsigned)key, ray); };
         auto is_nearer = [](double za, Key a, double zb, Key b) { return za < zb || (za == zb && a < b); };
         const double old_z = depth(old);
         const bool stays = is_nearer(old_z, old, z, mine);
@@ -117,11 +114,11 @@ PIXELS = """
                           int left, int top, unsigned box_width, int f, unsigned item) {
         const unsigned row = item / box_width;
         const int x = left + (int)(item - row * box_width), y = top + (int)row;
-        const Ray ray = ray_of(camera, x, y);
-        const Weights w = weigh(t, ray);
+        const Ray ray = Exact::ray(camera, x, y);
+        const Weights w = Exact::weigh(t, ray);
         const bool inside = (w.a >= 0.0 && w.b >= 0.0 && w.c >= 0.0) || (w.a <= 0.0 && w.b <= 0.0 && w.c <= 0.0);
         if (!inside || !(fabs(w.sum) > flat)) return;
-        const double z = depth_of(t, w);
+        const double z = Exact::depth(t, w);
         if (z > near_plane) enter(picture + (long long)y * width + x, camera, mesh, ray, f, z);
     };
     const long long plane = (long long)width * height;
@@ -153,7 +150,7 @@ DRAW = """
             entry = b;
         }
         __syncwarp();  // nor the last faces
-        if (has_corner) (&small[lane / 3].triangle.a)[lane % 3] = in_camera(camera, px, py, pz);
+        if (has_corner) (&small[lane / 3].triangle.a)[lane % 3] = Exact::in_camera(camera, px, py, pz);
         __syncwarp();
 
         Box box = {0, 0, 0, 0};
@@ -200,6 +197,7 @@ DRAW = """
 
         Key* picture = keys + b * plane;
         int starts[FACES];
+        #pragma unroll
         for (int k = 1; k < FACES; k++) starts[k] = small[k].start;
         for (int item = lane; item < total; item += 32) {
             int k = 0, start = 0;
@@ -247,7 +245,7 @@ DRAW_LARGE = """
             entry = b;
         }
         const float* mesh = vertices + b * vertices_step;
-        const Triangle t = triangle(camera, mesh, f);
+        const Triangle t = Exact::triangle(camera, mesh, faces, f);
         const Box box = box_of(camera, t);
         const double flat = edge_on(t);
         const long long pixels = (long long)box.width * box.height, last = min((until - start) * @SHARE@, pixels);

@@ -66,9 +66,9 @@ PULL = """
             grad_points[3 * at + axis] = (float)(along * camera.view[8 + axis]);
         if (pixel < 0 || !sums) return;
         const int f = face_ids[(long long)b * width * height + pixel];
-        const Triangle t = triangle(camera, vertices + b * vertices_step, f);
-        const Ray ray = ray_of(camera, pixel % width, pixel / width);
-        const Weights w = weigh(t, ray);
+        const Triangle t = Exact::triangle(camera, vertices + b * vertices_step, faces, f);
+        const Ray ray = Exact::ray(camera, pixel % width, pixel / width);
+        const Weights w = Exact::weigh(t, ray);
         const double ex = t.b.x - t.a.x, ey = t.b.y - t.a.y, ez = t.b.z - t.a.z;
         const double gx = t.c.x - t.a.x, gy = t.c.y - t.a.y, gz = t.c.z - t.a.z;
         const double nx = ey * gz - ez * gy, ny = ez * gx - ex * gz, nz = ex * gy - ey * gx;

@@ -31,7 +31,7 @@ RESOLVE = """
         const float* mesh = vertices + b * vertices_step;
         const Key* picture = keys + b * plane;
         auto shown = [&](int x, int y) -> int { return (int)(unsigned)picture[(long long)y * width + x]; };
-        const Corner p = read_corner(camera, points + b * points_step + 3ll * i);
+        const Corner p = Exact::corner(camera, points + b * points_step + 3ll * i);
         const long long at = (long long)b * n_points + i;
         double seen = 0.0, slope = 0.0;
         int pixel = -1;
@@ -57,9 +57,9 @@ RESOLVE = """
             if (known) {
                 seen = 1.0;
             } else {
-                const Triangle t = triangle(camera, mesh, id);
+                const Triangle t = Exact::triangle(camera, mesh, faces, id);
                 const double per_tau = 1.0 / tau;
-                const double step = (depth_of(t, weigh(t, ray_of(camera, x, y))) - p.z + margin) * per_tau;
+                const double step = (Exact::depth(t, Exact::weigh(t, Exact::ray(camera, x, y))) - p.z + margin) * per_tau;
                 const double e = exp(-fabs(step)), part = 1.0 / (1.0 + e);
                 seen = step >= 0.0 ? part : e * part;
                 slope = -(e * part) * part * per_tau;
@@ -74,9 +74,9 @@ RESOLVE = """
         const int id = (int)(unsigned)keys[b * plane + i];
         double z = __longlong_as_double(0x7ff0000000000000ll), wa = 0.0, wb = 0.0, wc = 0.0;
         if (id >= 0 && (depth || barycentrics)) {
-            const Triangle t = triangle(camera, vertices + b * vertices_step, id);
-            const Weights w = weigh(t, ray_of(camera, (int)(i % width), (int)(i / width)));
-            z = depth_of(t, w);
+            const Triangle t = Exact::triangle(camera, vertices + b * vertices_step, faces, id);
+            const Weights w = Exact::weigh(t, Exact::ray(camera, (int)(i % width), (int)(i / width)));
+            z = Exact::depth(t, w);
             if (barycentrics) { wa = w.a / w.sum; wb = w.b / w.sum; wc = w.c / w.sum; }
         }
         if (depth) depth[b * plane + i] = (float)z;

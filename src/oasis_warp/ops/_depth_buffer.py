@@ -42,10 +42,8 @@ def draw(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> t
     """
     if scene.vertices.device.type == "cpu":
         return draw_by_vectors(scene, query, wanted, validate)
-    if validate:
-        refuse_bad_values(scene, query)
-    method = _depth_cuda.draw if scene.vertices.dtype == torch.float32 else draw_by_faces
-    return method(scene, query, wanted)
+    method = draw_by_keys if scene.vertices.dtype == torch.float32 else draw_by_faces
+    return method(scene, query, wanted, validate)
 
 
 def refuse_bad_values(scene: Scene, query: Query | None) -> None:
@@ -155,8 +153,21 @@ def _run(stage: str, dtype: str, job: Job, tasks: int) -> None:
     run_shared(getattr(vectors.kernels(dtype), stage), ctypes.addressof(job), job.batch * tasks)
 
 
-def draw_by_faces(scene: Scene, query: Query | None, wanted: Wanted) -> tuple[Buffer, Scores | None]:
+def draw_by_keys(
+    scene: Scene, query: Query | None, wanted: Wanted, validate: bool
+) -> tuple[Buffer, Scores | None]:
+    """The way of CUDA in float32."""
+    if validate:
+        refuse_bad_values(scene, query)
+    return _depth_cuda.draw(scene, query, wanted)
+
+
+def draw_by_faces(
+    scene: Scene, query: Query | None, wanted: Wanted, validate: bool
+) -> tuple[Buffer, Scores | None]:
     """The plain way: all faces at once, first for the depths, then for the smallest face at that depth."""
+    if validate:
+        refuse_bad_values(scene, query)
     batch, n_vertices, _ = scene.vertices.shape
     n_faces, width, height = len(scene.faces), scene.width, scene.height
     like = scene.vertices

@@ -103,14 +103,14 @@ def draw(scene: Scene, query: Query | None, wanted: Wanted) -> tuple[Buffer, Sco
             "points_step": points_step,
             "point_vertices": 0 if known is None else known.data_ptr(),
             "vertex_bytes": 0 if known is None else known.element_size(),
-            "n_points": points.shape[1],
+            "n_points": query.points.shape[1],
             "tau": query.tau,
             "margin": query.margin,
             "visibility": scores.visibility.data_ptr(),
             "slopes": scores.slopes.data_ptr() if query.keep else 0,
             "pixels": scores.pixels.data_ptr() if query.keep else 0,
         }
-        blocks += _blocks(points.shape[1])
+        blocks += _blocks(query.points.shape[1])
     run_cuda(cuda_depth_resolve.resolve, words, min(batch * blocks, MOST_BLOCKS), stream)
     return buffer, scores
 
