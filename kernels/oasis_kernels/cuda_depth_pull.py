@@ -4,7 +4,7 @@ Along a ray d = (u, v, 1), a plane with normal n through a corner that moves by 
 farther by w (n e) / (n d). Many points pull at one vertex, and floats added by atomics would round differently each
 time. Whole numbers do not: `pull` runs twice, one thread a point, first for the largest of all numbers that are to be
 added, a block each, then to add multiples of 2^-shift of it in 64 bits, where 2^shift leaves just enough room for
-their sum. `settle`, one thread a vertex, turns the sums into floats. For 10^4 points each number is off by 2^-47 of the largest.
+their sum: for 10^4 points each is off by 2^-47 of the largest. `settle`, one thread a vertex, turns sums into floats.
 """
 
 from oasis_kernels.cuda_depth import ARITHMETIC, BLOCK, CAMERA, SCENE, build
@@ -31,7 +31,8 @@ PULL = """
     __shared__ Camera camera;
     __shared__ Bits highest[@BLOCK@ / 32];
     const unsigned all = 0xffffffffu;
-    const long long step = (long long)gridDim.x * @BLOCK@, thread_index = (long long)block_index * @BLOCK@ + threadIdx.x;
+    const long long step = (long long)gridDim.x * @BLOCK@;
+    const long long thread_index = (long long)block_index * @BLOCK@ + threadIdx.x;
     // The largest over the block, in all of its threads. Bits of doubles that are not negative have their order.
     auto largest_of_block = [&](Bits mine) -> Bits {
         for (int offset = 16; offset > 0; offset >>= 1) {

@@ -59,7 +59,8 @@ RESOLVE = """
             } else {
                 const Triangle t = Exact::triangle(camera, mesh, faces, id);
                 const double per_tau = 1.0 / tau;
-                const double step = (Exact::depth(t, Exact::weigh(t, Exact::ray(camera, x, y))) - p.z + margin) * per_tau;
+                const double z = Exact::depth(t, Exact::weigh(t, Exact::ray(camera, x, y)));
+                const double step = (z - p.z + margin) * per_tau;
                 const double e = exp(-fabs(step)), part = 1.0 / (1.0 + e);
                 seen = step >= 0.0 ? part : e * part;
                 slope = -(e * part) * part * per_tau;
@@ -89,7 +90,8 @@ RESOLVE = """
 
     const bool pictures = depth || face_ids || barycentrics;
     const int point_tasks = (n_points + @BLOCK@ - 1) / @BLOCK@;
-    const long long pixel_tasks = pictures ? (plane + @BLOCK@ - 1) / @BLOCK@ : 0, scored = (long long)batch * point_tasks;
+    const long long scored = (long long)batch * point_tasks;
+    const long long pixel_tasks = pictures ? (plane + @BLOCK@ - 1) / @BLOCK@ : 0;
     int entry = -1;
     for (long long task = block_index; task < scored + batch * pixel_tasks; task += gridDim.x) {
         const bool scores = task < scored;

@@ -1,5 +1,6 @@
-"""Draw meshes into depth buffers and score points against them: on the CPU by vectorised kernels, on CUDA in float32 by
-those of `_depth_cuda`, in float64 by the plain ones.
+"""Draw meshes into depth buffers and score points against them.
+
+On the CPU by vectorised kernels, on CUDA in float32 by those of `_depth_cuda`, in float64 by the plain ones.
 """
 
 import ctypes
@@ -11,7 +12,7 @@ from torch import Tensor
 from oasis_kernels import depth_buffer as kernels
 from oasis_kernels import depth_buffer_vectors as vectors
 from oasis_kernels.depth_buffer_job import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
-from oasis_warp.core.checks import check_finite, check_index, check_positive
+from oasis_warp.core.checks import check_index, check_positive
 from oasis_warp.ops import _depth_cuda
 from oasis_warp.ops._depth_scene import (
     Buffer,
@@ -26,6 +27,7 @@ from oasis_warp.ops._depth_scene import (
 )
 from oasis_warp.ops._incidence import _transposed, sum_at_items
 from oasis_warp.ops._launch import launch, run_shared, view
+from oasis_warp.ops._values import check_finite
 
 C_TYPES = {torch.float32: "float", torch.float64: "double"}
 MAX_FRACTION_BITS = 22
@@ -95,9 +97,7 @@ def _job(scene: Scene, **more: int) -> tuple[Job, list[Tensor]]:
     return job, [vertices, viewmats, Ks]
 
 
-def draw_by_vectors(
-    scene: Scene, query: Query | None, wanted: Wanted, validate: bool
-) -> tuple[Buffer, Scores | None]:
+def draw_by_vectors(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
     """The way of the CPU."""
     batch, n_vertices, _ = scene.vertices.shape
     width, height = scene.width, scene.height
@@ -153,18 +153,14 @@ def _run(stage: str, dtype: str, job: Job, tasks: int) -> None:
     run_shared(getattr(vectors.kernels(dtype), stage), ctypes.addressof(job), job.batch * tasks)
 
 
-def draw_by_keys(
-    scene: Scene, query: Query | None, wanted: Wanted, validate: bool
-) -> tuple[Buffer, Scores | None]:
+def draw_by_keys(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
     """The way of CUDA in float32."""
     if validate:
         refuse_bad_values(scene, query)
     return _depth_cuda.draw(scene, query, wanted)
 
 
-def draw_by_faces(
-    scene: Scene, query: Query | None, wanted: Wanted, validate: bool
-) -> tuple[Buffer, Scores | None]:
+def draw_by_faces(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
     """The plain way: all faces at once, first for the depths, then for the smallest face at that depth."""
     if validate:
         refuse_bad_values(scene, query)
