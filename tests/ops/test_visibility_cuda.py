@@ -1,4 +1,4 @@
-"""The depth buffer in float32, on CUDA above all: the faces of float64 to the last pixel, in any order of the threads."""
+"""The depth buffer in float32, on CUDA above all: the faces of float64, pixel by pixel, in any order of the threads."""
 
 import pytest
 import torch

@@ -38,7 +38,7 @@ def _scene_words(scene: Scene) -> tuple[dict[str, int | float], list[Tensor]]:
     vertices, vertices_step = shared(scene.vertices)
     viewmats, viewmats_step = shared(scene.viewmats)
     Ks, Ks_step = shared(scene.Ks)
-    words = {
+    words: dict[str, int | float] = {
         "vertices": vertices.data_ptr(),
         "viewmats": viewmats.data_ptr(),
         "Ks": Ks.data_ptr(),
