@@ -112,4 +112,4 @@ RESOLVE = """
     }
 """
 
-resolve = build("resolve_keys", PARAMETERS, (CAMERA + ARITHMETIC + RESOLVE).replace("@BLOCK@", str(BLOCK)), 4)
+resolve = build("resolve_keys", PARAMETERS, (CAMERA + ARITHMETIC + RESOLVE).replace("@BLOCK@", str(BLOCK)), 3)
