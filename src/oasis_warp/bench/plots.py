@@ -10,7 +10,7 @@ from oasis_warp.bench.scaling import ScalingRow
 from oasis_warp.bench.speed import SpeedRow
 from oasis_warp.data.atomic import output_file
 
-UNITS = {"gaussians": ("Gaussians", 1e6, "ns"), "pixels": ("pixels", 1e6, "ns"), "views": ("views", 1e3, "us")}
+UNITS = {"gaussians": ("Gaussian", 1e6, "ns"), "pixels": ("pixel", 1e6, "ns"), "views": ("view", 1e3, "us")}
 """Of an axis: what it counts, and how milliseconds for one of them are written."""
 MARKS = {"forward": "o", "forward + backward": "s"}
 DPI = 110
@@ -54,6 +54,7 @@ def plot_speed(rows: Sequence[GpuRow] | Sequence[SpeedRow], path: Path) -> None:
     axes.set_yticks(range(len(bars)), list(bars), fontsize=7)
     axes.invert_yaxis()
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.set_xlabel("time of a call [ms]")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside upper center", ncols=len(series), fontsize=8, frameon=False)
@@ -62,6 +63,8 @@ def plot_speed(rows: Sequence[GpuRow] | Sequence[SpeedRow], path: Path) -> None:
 
 def plot_scaling(rows: Sequence[ScalingRow], path: Path) -> None:
     """A column an axis: the time for one Gaussian, pixel or view above, memory below; lines that rise are cliffs."""
+    from matplotlib.ticker import LogLocator
+
     axes_shown = [axis for axis in UNITS if any(row.axis == axis for row in rows)]
     figure = new_figure(4.6 * len(axes_shown), 7)
     panels = figure.subplots(2, len(axes_shown), squeeze=False)
@@ -83,16 +86,32 @@ def plot_scaling(rows: Sequence[ScalingRow], path: Path) -> None:
             held = [(row.amount, row.peak_mb) for row in line if row.peak_mb]
             if held:
                 below.plot(*zip(*held, strict=True), label=label, **style)
-        above.set_ylabel(f"time [{unit} for each of the {noun}]")
+        above.set_ylabel(f"time [{unit} a {noun}]")
         below.set_ylabel("memory of a call [MiB]")
-        below.set_xlabel(noun)
+        below.set_xlabel(f"{noun}s")
+        amounts = sorted({row.amount for row in rows if row.axis == axis})
         for panel in (above, below):
             panel.set_xscale("log")
             panel.set_yscale("log")
+            panel.set_xticks(amounts, [amount_name(axis, amount) for amount in amounts])
+            panel.set_xticks([], minor=True)
+            panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            panel.yaxis.set_major_formatter("{x:g}")
+            panel.yaxis.set_minor_formatter("")
             panel.grid(True, which="major", color="0.9")
-            panel.tick_params(labelsize=8)
+            panel.tick_params(labelsize=7)
         above.legend(fontsize=6, frameon=False)
     save(figure, path)
+
+
+def amount_name(axis: str, amount: int) -> str:
+    """What stands at an amount on an axis."""
+    if axis == "pixels":
+        return f"{amount**0.5:.0f}²"
+    for suffix, size in (("M", 10**6), ("k", 10**3)):
+        if amount >= size:
+            return f"{amount / size:.2g}{suffix}"
+    return str(amount)
 
 
 def plot_roofline(rows: Sequence[KernelRow], path: Path) -> None:
