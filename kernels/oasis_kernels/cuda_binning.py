@@ -9,6 +9,7 @@ have consecutive numbers, tile after tile.
 """
 
 import functools
+from typing import Any
 
 from oasis_kernels.cuda_native import CudaNative, cuda_native
 
@@ -22,6 +23,10 @@ BLOCK = 128
 COUNTERS = 5
 """64-bit words before the counts of the tiles: pairs numbered; then of `place_tiles` tiles with pairs << 38 | pairs,
 empty tiles, longest list, blocks done. All are zero before `count_pairs` and again after `place_tiles`."""
+SPREAD = 8
+"""Distance of neighbouring tiles' counters in numbers: those that share 32 bytes wait for each other's atomics."""
+MOST_SPREAD = 1 << 16
+"""Tiles beyond which counters stand side by side: there are enough of them not to collide."""
 REPORT = 2
 """64-bit words for the host: pairs, longest list."""
 
@@ -52,7 +57,8 @@ COUNT = TILE_BOX + """
     for (int done = 0; __any_sync(0xffffffffu, done < count); done++) {
         const int tile = done < count ? (int)((image + y) * tiles_x + x) : -1;
         const unsigned same = __match_any_sync(0xffffffffu, tile);
-        if (tile >= 0 && lane == __ffs(same) - 1) atomicAdd((int*)(counters + @COUNTERS@) + tile, __popc(same));
+        if (tile >= 0 && lane == __ffs(same) - 1) 
+            atomicAdd((int*)(counters + @COUNTERS@) + (long long)tile * spread, __popc(same));
         if (++x == t.z) { x = t.x; y++; }
     }
     base = __shfl_sync(0xffffffffu, base, 31);
@@ -68,8 +74,9 @@ PLACE = """
     const bool inside = thread < n_tiles;
     int* const tile_counts = (int*)(counters + @COUNTERS@);
     unsigned long long* const placed = counters + 1;
-    const int count = inside ? tile_counts[thread] : 0;
-    if (inside) tile_counts[thread] = 0;
+    const long long own_counter = (long long)thread * spread;
+    const int count = inside ? tile_counts[own_counter] : 0;
+    if (inside) tile_counts[own_counter] = 0;
     // Prefix sums over the block of pairs and of tiles with pairs, in one word.
     const unsigned long long own = count ? 1ull << 38 | (unsigned long long)count : 0ull;
     unsigned long long sum = own;
@@ -104,7 +111,7 @@ PLACE = """
         const bool fits = start + count <= capacity;
         const int row = thread / tiles_x;
         tiles[rank] = {thread - row * tiles_x, (int)start, fits ? count : 0, row};
-        cursors[thread] = (int)(fits ? start : capacity);
+        cursors[own_counter] = (int)(fits ? start : capacity);
     }
     if (threadIdx.x == 0) {
         __threadfence();
@@ -136,7 +143,8 @@ FILL = TILE_BOX + """
             const int tile = done + k < count ? (int)((image + y) * tiles_x + x) : -1;
             same[k] = __match_any_sync(0xffffffffu, tile);
             place[k] = 0;
-            if (tile >= 0 && lane == __ffs(same[k]) - 1) place[k] = atomicAdd(cursors + tile, __popc(same[k]));
+            if (tile >= 0 && lane == __ffs(same[k]) - 1)
+                place[k] = atomicAdd(cursors + (long long)tile * spread, __popc(same[k]));
             if (++x == t.z) { x = t.x; y++; }
         }
         #pragma unroll
@@ -151,6 +159,11 @@ FILL = TILE_BOX + """
 PLACE_BLOCK = 256
 
 
+def spread_of(n_tiles: Any) -> int:
+    """Distance of the counters of so many tiles."""
+    return SPREAD if n_tiles <= MOST_SPREAD else 1
+
+
 @functools.cache
 def count_pairs() -> CudaNative:
     """Kernel: one thread a (camera, Gaussian)."""
@@ -161,7 +174,8 @@ def count_pairs() -> CudaNative:
         "tiles_x": "int",
         "tiles_y": "int",
         "pair_starts": "int*",  # [total]
-        "counters": "unsigned long long*",  # [COUNTERS], and then [tiles] of int
+        "spread": "int",  # see `spread_of`
+        "counters": "unsigned long long*",  # [COUNTERS], and then [tiles, spread] of int
     }
     return cuda_native("count_pairs", parameters, COUNT.replace("@COUNTERS@", str(COUNTERS)), BLOCK)
 
@@ -175,7 +189,8 @@ def place_tiles() -> CudaNative:
         "capacity": "long long",  # pairs for which there is memory
         "counters": "unsigned long long*",
         "tiles": "int4*",  # column, start and length of the list, row over all cameras; those with pairs come first
-        "cursors": "int*",  # [tiles]: the starts
+        "spread": "int",
+        "cursors": "int*",  # [tiles, spread]: the starts
         "report": "long long*",  # [REPORT]
     }
     body = PLACE
@@ -195,6 +210,7 @@ def fill_tiles() -> CudaNative:
         "tiles_x": "int",
         "tiles_y": "int",
         "capacity": "long long",
+        "spread": "int",
         "cursors": "int*",
         "keys": "long long*",
     }

@@ -30,7 +30,7 @@ class Kept(NamedTuple):
     Gaussian that was not drawn; what happens between the segments of the lists (`checkpoints` of `cuda_draw`)."""
     lists: Tensor
     """int32: [tiles, 4] column, start and length of the list, row over all cameras of a tile, those with any list
-    first; [tiles] cursors, of no further use; [C, N] number of each Gaussian's first pair."""
+    first; [tiles, spread] cursors, of no further use; [C, N] number of each Gaussian's first pair."""
     gaussians: Tensor
     """`hidden` [pairs], int32: the lists, nearest first."""
 
@@ -56,7 +56,7 @@ class Layout(NamedTuple):
 
     def size_of_lists(self) -> Size:
         """Numbers of `Kept.lists`."""
-        return 5 * self.n_tiles + self.n_cameras * self.n
+        return (4 + cuda_binning.spread_of(self.n_tiles)) * self.n_tiles + self.n_cameras * self.n
 
 
 def _layout(colors: Tensor, frame: Frame) -> Layout:
@@ -74,11 +74,12 @@ def _words(splats: Splats, layout: Layout, lists: Tensor, planes: Tensor | None)
     """Parameters of the kernels: sizes, what is drawn, the arrays of `Kept.lists` and `Kept.planes`."""
     first, plane = lists.data_ptr(), 0 if planes is None else planes.data_ptr()
     n_cameras, n, _, tiles_x, tiles_y, width, height, n_tiles, pixels, _ = layout
+    spread = cuda_binning.spread_of(n_tiles)
     return {
         **splats.words(), "opacities": splats.opacities.data_ptr(), "colors": splats.colors.data_ptr(),
         "backgrounds": splats.backgrounds.data_ptr(), "n": n, "n_cameras": n_cameras, "total": n_cameras * n,
         "tiles_x": tiles_x, "tiles_y": tiles_y, "width": width, "height": height, "n_tiles": n_tiles, "tiles": first,
-        "cursors": first + 16 * n_tiles, "pair_starts": first + 20 * n_tiles, "transmittance": plane,
+        "cursors": first + 16 * n_tiles, "pair_starts": first + (16 + 4 * spread) * n_tiles, "spread": spread, "transmittance": plane,
         "stops": plane and plane + 4 * pixels, "checkpoints": plane and plane + 8 * pixels,
     }  # fmt: skip
 

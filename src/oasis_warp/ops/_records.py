@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_kernels.cuda_binning import COUNTERS, TILE
+from oasis_kernels.cuda_binning import COUNTERS, TILE, spread_of
 from oasis_warp.ops._launch import has_cuda_kernels
 
 
@@ -39,7 +39,7 @@ def _starts(total: Size, dtype: torch.dtype) -> tuple[Size, Size, Size, Size, Si
 def counters_size(like: Tensor, n_cameras: Size, width: Size, height: Size) -> Size:
     """Bytes of the counters that follow the tables for images by Gaussians like these."""
     n_tiles = n_cameras * -(-width // TILE) * -(-height // TILE)
-    return 8 * COUNTERS + 4 * n_tiles if has_cuda_kernels(like) else 0
+    return 8 * COUNTERS + 4 * n_tiles * spread_of(n_tiles) if has_cuda_kernels(like) else 0
 
 
 def empty_records(like: Tensor, n_cameras: Size, n: Size, width: Size, height: Size) -> Tensor:
