@@ -56,12 +56,16 @@ HEAD = """
 FORWARD = """
     const T* angle = angles + pose * 3 * (n_joints - 1);
     double* local = locals + pose * @LOCAL@ * n_joints;
-    @EACH_BONE@ if (j > 0) {
+    @EACH_BONE@ {
+        double* to = local + @LOCAL@ * j;
+        if (j == 0) {  // has no transform of its own
+            for (int k = 0; k < @LOCAL@; k++) to[k] = 0.0;
+            continue;
+        }
         const T *a = angle + 3 * (j - 1), *axis = axes + 9 * j;
         const D33 bend = times(about(read3(axis), a[0]), about(read3(axis + 3), a[1]));
         const D33 turn = times(bend, about(read3(axis + 6), a[2]));
         const D3 joint = read3(joints + 3 * j), moved = apply(turn, joint);
-        double* to = local + @LOCAL@ * j;
         for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) to[3 * r + c] = turn.m[r][c];
         to[9] = joint.x - moved.x;
         to[10] = joint.y - moved.y;

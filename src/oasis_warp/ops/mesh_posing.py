@@ -63,7 +63,7 @@ def _pose_on_mesh(
             offsets=offsets,
             vertex_area_ratio=vertex_area_ratio,
         )
-    riders = find_riders(faces, face_index, vertex_index, len(posed_vertices), transposed=False)
+    riders = find_riders(faces, face_index, vertex_index, posed_vertices.shape[-2], transposed=False)
     inputs = Floats(
         posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio
     )
@@ -168,7 +168,7 @@ def _pose_on_mesh_backward(
         return [grad.zero_() for grad in found]
     wanted = Floats(*needs)
     at_vertices = wanted.vertices or wanted.vertex_quats or wanted.vertex_area_ratio
-    riders = find_riders(faces, face_index, vertex_index, len(posed_vertices), transposed=at_vertices)
+    riders = find_riders(faces, face_index, vertex_index, posed_vertices.shape[-2], transposed=at_vertices)
     grads = grad_means, grad_quats, grad_scales
     g = [grad if needed else None for grad, needed in zip(found, needs, strict=True)]
     if on_cuda(quats):

@@ -137,7 +137,7 @@ def _corrected(means: Tensor, displacements: Tensor | None, strengths: Tensor | 
     """Points at rest as a pose corrects them."""
     if displacements is None or strengths is None:
         return means.contiguous()
-    return means + displacements @ strengths
+    return means + displacements.contiguous() @ strengths.contiguous()  # whose layout would change their product's bits
 
 
 def _gradients(
@@ -249,7 +249,7 @@ def _corrective_gradients(
 ) -> list[Tensor]:
     """Gradients of displacements and strengths from those of the corrected points of every pose, [*B, N, 3]."""
     assert displacements is not None and strengths is not None
-    flat, rows = displacements.flatten(0, 1), by_points.flatten(-2)
+    flat, rows, strengths = displacements.contiguous().flatten(0, 1), by_points.flatten(-2), strengths.contiguous()
     by_displacements, by_strengths = unwanted
     if needs[0]:
         # A matrix product also for one pose: the poses are its inner axis.
