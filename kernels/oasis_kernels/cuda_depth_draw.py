@@ -7,7 +7,7 @@ whole queue to all warps of the GPU in equal shares. Those that find the queue f
 many fill the GPU either way.
 
 A key is the depth, rounded down to a float32, above the face's index, so that the smallest key is nearly the answer.
-Where the rounded depths of two faces agree, the exact ones are compared (see `enter`): the face that stays is the
+Where the rounded depths of two faces agree, the exact ones are compared (see `settle`): the face that stays is the
 nearest, of those at one depth the first, whatever the order of the threads.
 """
 
@@ -36,6 +36,8 @@ CLEAR = """
     const long long step = (long long)gridDim.x * @BLOCK@;
     for (long long i = (long long)block_index * @BLOCK@ + threadIdx.x; i < key_pairs; i += step) keys[i] = empty;
     if (block_index == 0 && threadIdx.x == 0) *counter = 0;
+    if (found && block_index == 0) for (int b = threadIdx.x; b < batch; b += @BLOCK@)
+        if (!(Ks[b * Ks_step] > 0.f) || !(Ks[b * Ks_step + 4] > 0.f)) *found = 1;
 """
 
 PIXELS = """
@@ -89,37 +91,48 @@ PIXELS = """
     };
 
     typedef unsigned long long Key;
-    // Enter face f, which the ray hits at depth z. The smallest key wins by atomics alone where rounded depths differ.
-    // Where they agree, that may have been wrong: then the thread that has seen both puts the better one back. Nobody
-    // takes a key out without this duty, and the better one is the same for all threads, so the last word is the best.
-    auto enter = [&](Key* at, const Camera& camera, const float* mesh, Ray ray, int f, double z) {
-        const Key mine = (Key)__float_as_uint(__double2float_rd(z)) << 32 | (unsigned)f;
-        const Key old = atomicMin(at, mine);
-        if (old >> 32 != mine >> 32) return;
-        auto depth = [&](Key key) { return Exact::depth_of_face(camera, mesh, faces, (int)(unsigned)key, ray); };
-        auto is_nearer = [](double za, Key a, double zb, Key b) { return za < zb || (za == zb && a < b); };
-        const double old_z = depth(old);
-        const bool stays = is_nearer(old_z, old, z, mine);
-        const Key best = stays ? old : mine;
-        const double best_z = stays ? old_z : z;
-        for (Key shown = old < mine ? old : mine; shown != best;) {
-            const Key found = atomicCAS(at, shown, best);
-            if (found == shown || found >> 32 < best >> 32) break;
-            if (found != best && is_nearer(depth(found), found, best_z, best)) break;
-            shown = found;
-        }
-    };
+    // A ray that meets a face in front of the camera. `at` is null for one that does not.
+    struct Hit { Key* at; Key key; double z; Ray ray; };
     // Pixel `item` of a box, row by row.
-    auto draw_pixel = [&](const Camera& camera, const float* mesh, Key* picture, const Triangle& t, double flat,
-                          int left, int top, unsigned box_width, int f, unsigned item) {
+    auto meet = [&](const Camera& camera, Key* picture, const Triangle& t, double flat, int left, int top,
+                    unsigned box_width, int f, unsigned item) -> Hit {
         const unsigned row = item / box_width;
         const int x = left + (int)(item - row * box_width), y = top + (int)row;
         const Ray ray = Exact::ray(camera, x, y);
         const Weights w = Exact::weigh(t, ray);
         const bool inside = (w.a >= 0.0 && w.b >= 0.0 && w.c >= 0.0) || (w.a <= 0.0 && w.b <= 0.0 && w.c <= 0.0);
-        if (!inside || !(fabs(w.sum) > flat)) return;
+        if (!inside || !(fabs(w.sum) > flat)) return {nullptr};
         const double z = Exact::depth(t, w);
-        if (z > near_plane) enter(picture + (long long)y * width + x, camera, mesh, ray, f, z);
+        if (!(z > near_plane)) return {nullptr};
+        const Key key = (Key)__float_as_uint(__double2float_rd(z)) << 32 | (unsigned)f;
+        return {picture + (long long)y * width + x, key, z, ray};
+    };
+    // A hit has been entered, by which its key or `old` was lost. The smaller key is the right one where rounded depths
+    // differ. Where they agree, the thread that has seen both puts the better one back if it is not there. Nobody takes
+    // a key out without this duty, and the better one is the same for all threads, so the last word is the best.
+    auto settle = [&](const Hit& hit, Key old, const Camera& camera, const float* mesh) {
+        if (!hit.at || old >> 32 != hit.key >> 32) return;
+        auto depth = [&](Key key) { return Exact::depth_of_face(camera, mesh, faces, (int)(unsigned)key, hit.ray); };
+        auto is_nearer = [](double za, Key a, double zb, Key b) { return za < zb || (za == zb && a < b); };
+        const double old_z = depth(old);
+        const bool stays = is_nearer(old_z, old, hit.z, hit.key);
+        const Key best = stays ? old : hit.key;
+        const double best_z = stays ? old_z : hit.z;
+        for (Key shown = old < hit.key ? old : hit.key; shown != best;) {
+            const Key found = atomicCAS(hit.at, shown, best);
+            if (found == shown || found >> 32 < best >> 32) break;
+            if (found != best && is_nearer(depth(found), found, best_z, best)) break;
+            shown = found;
+        }
+    };
+    // Items from `first` to `end`, dealt out to the lanes; two a lane at a time, for the memory's sake.
+    auto draw_items = [&](const Camera& camera, const float* mesh, unsigned first, unsigned end, auto hit_of) {
+        for (unsigned item = first + (threadIdx.x & 31); item < end; item += 64) {
+            const Hit a = hit_of(item), b = item + 32 < end ? hit_of(item + 32) : Hit{nullptr};
+            const Key old_a = a.at ? atomicMin(a.at, a.key) : 0, old_b = b.at ? atomicMin(b.at, b.key) : 0;
+            settle(a, old_a, camera, mesh);
+            settle(b, old_b, camera, mesh);
+        }
     };
     const long long plane = (long long)width * height;
     const unsigned all = 0xffffffffu;
@@ -199,19 +212,19 @@ DRAW = """
         int starts[FACES];
         #pragma unroll
         for (int k = 1; k < FACES; k++) starts[k] = small[k].start;
-        for (int item = lane; item < total; item += 32) {
+        draw_items(camera, mesh, 0, total, [&](unsigned item) -> Hit {
             int k = 0, start = 0;
             #pragma unroll
-            for (int j = 1; j < FACES; j++) if (item >= starts[j]) { k = j; start = starts[j]; }
+            for (int j = 1; j < FACES; j++) if ((int)item >= starts[j]) { k = j; start = starts[j]; }
             const Small& s = small[k];
-            draw_pixel(camera, mesh, picture, s.triangle, s.flat, s.left, s.top, s.width, first + k, item - start);
-        }
+            return meet(camera, picture, s.triangle, s.flat, s.left, s.top, s.width, first + k, item - start);
+        });
         for (; unqueued; unqueued &= unqueued - 1) {
             const int k = __ffs(unqueued) - 1;
-            const unsigned n = (unsigned)__shfl_sync(all, pixels, k);
             const Small& s = small[k];
-            for (unsigned item = lane; item < n; item += 32)
-                draw_pixel(camera, mesh, picture, s.triangle, s.flat, s.left, s.top, s.width, first + k, item);
+            draw_items(camera, mesh, 0, (unsigned)__shfl_sync(all, pixels, k), [&](unsigned item) -> Hit {
+                return meet(camera, picture, s.triangle, s.flat, s.left, s.top, s.width, first + k, item);
+            });
         }
     }
 """
@@ -249,8 +262,9 @@ DRAW_LARGE = """
         const Box box = box_of(camera, t);
         const double flat = edge_on(t);
         const long long pixels = (long long)box.width * box.height, last = min((until - start) * @SHARE@, pixels);
-        for (long long item = (share - start) * @SHARE@ + lane; item < last; item += 32)
-            draw_pixel(camera, mesh, keys + b * plane, t, flat, box.left, box.top, box.width, f, (unsigned)item);
+        draw_items(camera, mesh, (unsigned)((share - start) * @SHARE@), (unsigned)last, [&](unsigned item) -> Hit {
+            return meet(camera, keys + b * plane, t, flat, box.left, box.top, box.width, f, item);
+        });
         share = until;
     }
 """
@@ -266,8 +280,13 @@ def _filled(text: str) -> str:
     return text
 
 
-clear = build(
-    "clear_keys", {"keys": "ulonglong2*", "key_pairs": "long long", "counter": "unsigned long long*"}, _filled(CLEAR)
-)
+CLEARED = {name: SCENE[name] for name in ("Ks", "Ks_step", "batch")} | {
+    "keys": "ulonglong2*",
+    "key_pairs": "long long",
+    "counter": "unsigned long long*",
+    "found": "volatile long long*",  # set to 1 where a focal length is not positive; or 0
+}
+
+clear = build("clear_keys", CLEARED, _filled(CLEAR))
 draw = build("draw_faces", DRAWN, _filled(CAMERA + ARITHMETIC + PIXELS + DRAW), 3)
 draw_large = build("draw_large_faces", DRAWN, _filled(CAMERA + ARITHMETIC + PIXELS + DRAW_LARGE), 3)

@@ -1,16 +1,22 @@
 """From the keys of `cuda_depth_draw` to scores of points and to pictures: one thread a point, then one a pixel.
 
 Both read the keys alone, so that they are one node. Pictures that nobody asks for are not written, and only the
-pixels that need a depth look at their face again: its float64 depth is not in the key.
+pixels that need a depth look at their face again: its float64 depth is not in the key. A thread of a large picture
+takes several pixels and asks for all of their keys at once.
 """
 
 from oasis_kernels.cuda_depth import ARITHMETIC, BLOCK, CAMERA, SCENE, build
 
+MOST_PIXELS = 4
+"""A thread."""
+
 PARAMETERS = SCENE | {
     "points": "const float*",  # [batch or 1][n_points][3]
     "points_step": "long long",
-    "point_vertices": "const void*",  # [n_points] of 4 or 8 bytes, or 0: points that are vertices of a face in view
+    "point_vertices": "const void*",  # [n_points] of 4 or 8 bytes, or 0: the vertex that a point is, or -1
     "vertex_bytes": "int",
+    "by_identity": "int",  # whether points that are vertices of a face in view are seen by that alone
+    "n_vertices": "int",
     "n_points": "int",
     "tau": "double",
     "margin": "double",
@@ -20,6 +26,8 @@ PARAMETERS = SCENE | {
     "depth": "float*",  # [batch][height][width], or 0
     "face_ids": "int*",  # [batch][height][width], or 0
     "barycentrics": "float*",  # [batch][height][width][3], or 0
+    "pixels_a_thread": "int",  # up to MOST_PIXELS
+    "found": "volatile long long*",  # set to 1 where a point's vertex is none; or 0
 }
 
 RESOLVE = """
@@ -35,14 +43,15 @@ RESOLVE = """
         const long long at = (long long)b * n_points + i;
         double seen = 0.0, slope = 0.0;
         int pixel = -1;
+        long long vertex = -1;
+        if (point_vertices) vertex = vertex_bytes == 8 ? ((const long long*)point_vertices)[i]
+                                                       : (long long)((const int*)point_vertices)[i];
+        if (found && (vertex < -1 || vertex >= n_vertices)) *found = 1;
         const double u = camera.lens[0] * p.x / p.z + camera.lens[1], v = camera.lens[4] * p.y / p.z + camera.lens[5];
         if (p.z > near_plane && u >= 0.0 && v >= 0.0 && u < (double)width && v < (double)height) {
             const int x = (int)u, y = (int)v, id = shown(x, y);
-            long long vertex = -1;
-            if (point_vertices) vertex = vertex_bytes == 8 ? ((const long long*)point_vertices)[i]
-                                                           : (long long)((const int*)point_vertices)[i];
             bool known = id < 0;
-            if (!known && vertex >= 0) {
+            if (!known && by_identity && vertex >= 0) {
                 // All of the 3 x 3 pixels at once, so that the reads do not wait for each other.
                 int ids[9];
                 #pragma unroll
@@ -71,8 +80,7 @@ RESOLVE = """
         if (slopes) { slopes[at] = (float)slope; pixels[at] = pixel; }
     };
 
-    auto show = [&](int b, long long i) {
-        const int id = (int)(unsigned)keys[b * plane + i];
+    auto show = [&](int b, long long i, int id) {
         double z = __longlong_as_double(0x7ff0000000000000ll), wa = 0.0, wb = 0.0, wc = 0.0;
         if (id >= 0 && (depth || barycentrics)) {
             const Triangle t = Exact::triangle(camera, vertices + b * vertices_step, faces, id);
@@ -91,13 +99,20 @@ RESOLVE = """
     const bool pictures = depth || face_ids || barycentrics;
     const int point_tasks = (n_points + @BLOCK@ - 1) / @BLOCK@;
     const long long scored = (long long)batch * point_tasks;
-    const long long pixel_tasks = pictures ? (plane + @BLOCK@ - 1) / @BLOCK@ : 0;
+    const int task_pixels = @BLOCK@ * pixels_a_thread;
+    const long long pixel_tasks = pictures ? (plane + task_pixels - 1) / task_pixels : 0;
     int entry = -1;
     for (long long task = block_index; task < scored + batch * pixel_tasks; task += gridDim.x) {
         const bool scores = task < scored;
         const long long tasks = scores ? point_tasks : pixel_tasks, place = scores ? task : task - scored;
         const int b = (int)(place / tasks);
-        const long long i = (place - b * tasks) * @BLOCK@ + threadIdx.x;
+        const long long first = (place - b * tasks) * (scores ? @BLOCK@ : task_pixels) + threadIdx.x;
+        int ids[@MOST_PIXELS@];
+        #pragma unroll
+        for (int k = 0; k < @MOST_PIXELS@; k++) {
+            const long long i = first + k * @BLOCK@;
+            ids[k] = !scores && k < pixels_a_thread && i < plane ? (int)(unsigned)keys[b * plane + i] : -1;
+        }
         if (b != entry) {
             __syncthreads();  // nobody reads the last camera any more
             read_camera(camera, b, threadIdx.x);
@@ -105,11 +120,18 @@ RESOLVE = """
             entry = b;
         }
         if (scores) {
-            if (i < n_points) score(b, (int)i);
-        } else if (i < plane) {
-            show(b, i);
+            if (first < n_points) score(b, (int)first);
+        } else {
+            #pragma unroll 1
+            for (int k = 0; k < pixels_a_thread; k++) {
+                const long long i = first + k * @BLOCK@;
+                if (i < plane) show(b, i, ids[0]);
+                #pragma unroll
+                for (int j = 1; j < @MOST_PIXELS@; j++) ids[j - 1] = ids[j];  // so that they stay in registers
+            }
         }
     }
 """
 
-resolve = build("resolve_keys", PARAMETERS, (CAMERA + ARITHMETIC + RESOLVE).replace("@BLOCK@", str(BLOCK)), 3)
+TEXT = (CAMERA + ARITHMETIC + RESOLVE).replace("@BLOCK@", str(BLOCK)).replace("@MOST_PIXELS@", str(MOST_PIXELS))
+resolve = build("resolve_keys", PARAMETERS, TEXT, 3)

@@ -1,5 +1,7 @@
 """The depth buffer in float32, on CUDA above all: the faces of float64, pixel by pixel, in any order of the threads."""
 
+import re
+
 import pytest
 import torch
 from test_visibility import some_points
@@ -234,3 +236,32 @@ def test_millions_of_faces_on_a_large_picture_are_those_of_float64():
     got = depth_map(*arguments)
     assert (got.face_ids >= 0).all() and (got.face_ids < 2).any()
     assert_same_picture(got, depth_map(*in_float64(arguments)))
+
+
+@pytest.mark.parametrize("name", ["vertices", "viewmat", "K", "points", "K[0, 0]", "K[1, 1]", "point_vertices"])
+def test_a_bad_value_is_refused_by_name(name, device):
+    points, vertices, _, faces, K, viewmat, *rest = on(device, scoring(1))
+    named = torch.arange(len(points), device=device) % len(vertices)
+    given = {"vertices": vertices, "viewmat": viewmat, "K": K, "points": points}
+    depth_visibility(points, vertices, faces, K, viewmat, *rest, point_vertices=named)
+    if name in given:
+        given[name][1, 1] = torch.nan
+    elif name == "point_vertices":
+        named[7] = len(vertices)
+    else:
+        K[int(name[2]), int(name[2])] = 0
+    for literal in (False, True):
+        with pytest.raises(ValueError, match="^" + re.escape(name) + ": expected"):
+            depth_visibility(points, vertices, faces, K, viewmat, *rest, point_vertices=named, literal=literal)
+
+
+@pytest.mark.gpu
+def test_a_look_at_values_is_refused_in_a_graph():
+    arguments = on("cuda", make(small_faces, 1, 33, 20, torch.float32))
+    depth_map(*arguments)
+    torch.cuda.synchronize()
+    with (
+        pytest.raises(ValueError, match="^validate: expected False while a CUDA graph is being captured"),
+        torch.cuda.graph(torch.cuda.CUDAGraph()),
+    ):
+        depth_map(*arguments)

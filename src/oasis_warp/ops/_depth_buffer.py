@@ -27,7 +27,8 @@ from oasis_warp.ops._depth_scene import (
 )
 from oasis_warp.ops._incidence import _transposed, sum_at_items
 from oasis_warp.ops._launch import launch, run_shared, view
-from oasis_warp.ops._values import check_finite
+from oasis_warp.ops._pair_counts import own_slot
+from oasis_warp.ops._values import Look, check_finite
 
 C_TYPES = {torch.float32: "float", torch.float64: "double"}
 MAX_FRACTION_BITS = 22
@@ -155,9 +156,17 @@ def _run(stage: str, dtype: str, job: Job, tasks: int) -> None:
 
 def draw_by_keys(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
     """The way of CUDA in float32."""
-    if validate:
+    if not validate:
+        return _depth_cuda.draw(scene, query, wanted)
+    points = None if query is None else query.points
+    with Look(vertices=scene.vertices, viewmat=scene.viewmats, K=scene.Ks, points=points):
+        found = own_slot()
+        found[0] = 0
+        drawn = _depth_cuda.draw(scene, query, wanted, found)
+    # Values that are refused do no harm on the way.
+    if found[0]:
         refuse_bad_values(scene, query)
-    return _depth_cuda.draw(scene, query, wanted)
+    return drawn
 
 
 def draw_by_faces(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:

@@ -21,13 +21,13 @@ MOST_BLOCKS = 1 << 22
 """Of a launch: Warp counts threads in 32 bits. Kernels go round until all is done."""
 PAIRS_A_BLOCK = 4 * BLOCK
 """Pairs of keys that a block clears."""
-LARGE_BLOCKS = 3
-"""Blocks a multiprocessor that draw large faces together."""
+BLOCKS_AT_ONCE = 3
+"""Blocks that a multiprocessor holds. So many draw large faces; four times as many share the looking at keys."""
 
 NO_QUERY = dict.fromkeys(
     (
-        "points", "points_step", "point_vertices", "vertex_bytes", "n_points", "tau", "margin", "visibility", "slopes",
-        "pixels",
+        "points", "points_step", "point_vertices", "vertex_bytes", "by_identity", "n_points", "tau", "margin",
+        "visibility", "slopes", "pixels",
     ),
     0,
 )  # fmt: skip
@@ -58,14 +58,25 @@ def _blocks(n: int, a_block: int = BLOCK) -> int:
     return -(-n // a_block)
 
 
-def draw(scene: Scene, query: Query | None, wanted: Wanted) -> tuple[Buffer, Scores | None]:
-    """As `_depth_buffer.draw`, for values that need no look."""
+def draw(
+    scene: Scene, query: Query | None, wanted: Wanted, found: Tensor | None = None
+) -> tuple[Buffer, Scores | None]:
+    """As `_depth_buffer.draw`, without a look at values that costs a launch or a wait of its own.
+
+    Args:
+        scene: Meshes and cameras.
+        query: Points.
+        wanted: What to write.
+        found: Page-locked, int64: its first element becomes 1 if a focal length is not positive or a point's vertex is
+            none, once the device is there.
+    """
     buffer = empty_buffer(scene, wanted)
     scores = None if query is None else empty_scores(scene, query)
     batch, n_faces, plane = len(scene.vertices), len(scene.faces), scene.width * scene.height
     _, stream = device_and_stream(scene.vertices)
     assert stream is not None
 
+    at_once = BLOCKS_AT_ONCE * stream.device.sm_count
     key_pairs = -(-batch * plane // 2)
     capacity = min(batch * n_faces, cuda_depth_draw.QUEUE)
     # One block: keys, the queue's counter, its faces and where they start.
@@ -81,28 +92,37 @@ def draw(scene: Scene, query: Query | None, wanted: Wanted) -> tuple[Buffer, Sco
         "capacity": capacity,
     }
     blocks = min(_blocks(key_pairs, PAIRS_A_BLOCK), MOST_BLOCKS)
-    run_cuda(cuda_depth_draw.clear, {"keys": keys, "key_pairs": key_pairs, "counter": counter}, blocks, stream)
+    found_word = 0 if found is None else found.data_ptr()
+    cleared = {name: scene_words[name] for name in ("Ks", "Ks_step", "batch", "keys")}
+    cleared |= {"key_pairs": key_pairs, "counter": counter, "found": found_word}
+    run_cuda(cuda_depth_draw.clear, cleared, blocks, stream)
     blocks = min(batch * _blocks(n_faces, cuda_depth_draw.FACES_A_BLOCK), MOST_BLOCKS)
     run_cuda(cuda_depth_draw.draw, drawn, blocks, stream)
-    if capacity and plane > cuda_depth_draw.LARGE:
-        run_cuda(cuda_depth_draw.draw_large, drawn, LARGE_BLOCKS * stream.device.sm_count, stream)
+    if capacity:
+        run_cuda(cuda_depth_draw.draw_large, drawn, at_once, stream)
 
+    # A small picture has a pixel for each of the threads that run at once, or not even that.
+    pixels_a_thread = min(max(batch * plane // (2 * BLOCK * at_once), 1), cuda_depth_resolve.MOST_PIXELS)
+    blocks = _blocks(plane, pixels_a_thread * BLOCK) if any(wanted) else 0
     words = scene_words | {
         "depth": buffer.depth.data_ptr() if wanted.depth else 0,
         "face_ids": buffer.face_ids.data_ptr() if wanted.face_ids else 0,
         "barycentrics": buffer.barycentrics.data_ptr() if wanted.barycentrics else 0,
+        "n_vertices": scene.vertices.shape[1],
+        "pixels_a_thread": pixels_a_thread,
+        "found": found_word,
     }
-    blocks = _blocks(plane) if any(wanted) else 0
     if query is None or scores is None:
         words |= NO_QUERY
     else:
         points, points_step = shared(query.points)
-        known = query.point_vertices if query.by_identity else None
+        known = query.point_vertices
         words |= {
             "points": points.data_ptr(),
             "points_step": points_step,
             "point_vertices": 0 if known is None else known.data_ptr(),
             "vertex_bytes": 0 if known is None else known.element_size(),
+            "by_identity": query.by_identity,
             "n_points": query.points.shape[1],
             "tau": query.tau,
             "margin": query.margin,
@@ -111,7 +131,7 @@ def draw(scene: Scene, query: Query | None, wanted: Wanted) -> tuple[Buffer, Sco
             "pixels": scores.pixels.data_ptr() if query.keep else 0,
         }
         blocks += _blocks(query.points.shape[1])
-    run_cuda(cuda_depth_resolve.resolve, words, min(batch * blocks, MOST_BLOCKS), stream)
+    run_cuda(cuda_depth_resolve.resolve, words, min(batch * blocks, 4 * at_once, MOST_BLOCKS), stream)
     return buffer, scores
 
 
