@@ -11,11 +11,11 @@ ABOUT = {"device": "a GPU", "commit": "0123456789", "versions": "oasis_warp 0"}
 GPU = GpuRow(
     case="37k at 512 x 512", pass_="forward + backward", way="warp", gaussians=36_881, faces=None, views=1, width=512,
     height=512, wall_ms=0.25, wall_iqr_ms=0.01, busy_ms=0.1, busy_iqr_ms=0.001, launch_ms=0.11, kernels_ms=0.09,
-    kernels=9, peak_mb=20.5, max_abs=3e-3, most_abs=4e-7, rel_l2=2e-7, gradient_rel_l2=5e-7, bit_equal=True,
+    kernels=9.0, peak_mb=20.5, max_abs=3e-3, most_abs=4e-7, rel_l2=2e-7, gradient_rel_l2=5e-7, bit_equal=True,
     not_captured="", groups=11, calls=40, seed=0, **ABOUT,
 )  # fmt: skip
 PEER = replace(
-    GPU, way="gsplat", wall_ms=0.75, busy_ms=None, busy_iqr_ms=None, launch_ms=None, kernels_ms=0.45, kernels=30,
+    GPU, way="gsplat", wall_ms=0.75, busy_ms=None, busy_iqr_ms=None, launch_ms=None, kernels_ms=0.45, kernels=30.0,
     not_captured="not tried",
 )  # fmt: skip
 FRAME = replace(
@@ -52,7 +52,7 @@ STUDY = [
 ]
 
 KERNEL = KernelRow(
-    case="37k at 512 x 512, forward + backward", kernel="blend_tiles_backward_3", launches=1, us=50.0, bytes=2e7,
+    case="37k at 512 x 512, forward + backward", kernel="blend_tiles_backward_3", launches=1.0, us=50.0, bytes=2e7,
     flops=5e8, gb_s=400.0, gflop_s=10_000.0, floor_us=10.0, bound="flops", ceiling_gb_s=4250.0,
     ceiling_gflop_s=50_000.0, **ABOUT,
 )  # fmt: skip

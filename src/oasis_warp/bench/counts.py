@@ -6,6 +6,7 @@ import torch
 
 from oasis_kernels.constants import EPS2D
 from oasis_kernels.cuda_binning import TILE
+from oasis_warp.bench.avatar_scene import AvatarScene
 from oasis_warp.bench.scenes import MeshScene, Scene
 from oasis_warp.ops.projection import project
 
@@ -76,6 +77,8 @@ class MeshCounts:
     vertices: int
     faces: int
     joints: int
+    correctives: int
+    """Displacements of every vertex."""
     vertex_gaussians: int
     face_gaussians: int
     points: int
@@ -88,8 +91,23 @@ def count_mesh(scene: MeshScene) -> MeshCounts:
         vertices=len(scene.rest_vertices),
         faces=len(scene.faces),
         joints=len(scene.transforms),
+        correctives=0,
         vertex_gaussians=len(scene.vertex_index),
         face_gaussians=len(scene.face_index),
         points=len(scene.points),
         pixels=scene.width * scene.height,
+    )
+
+
+def count_avatar(scene: AvatarScene) -> MeshCounts:
+    """What posing the Gaussians of an avatar takes."""
+    return MeshCounts(
+        vertices=len(scene.hand.template),
+        faces=len(scene.hand.faces),
+        joints=len(scene.hand.parents),
+        correctives=scene.hand.corrective_basis.shape[-1],
+        vertex_gaussians=len(scene.canonical.vertex_index),
+        face_gaussians=len(scene.canonical.face_index),
+        points=0,
+        pixels=0,
     )

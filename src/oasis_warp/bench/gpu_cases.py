@@ -7,7 +7,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_warp.bench.avatar_scene import Learning, avatar_scene, draw, exact_step, make_avatar, pose
+from oasis_warp.bench.avatar_scene import (
+    AvatarScene,
+    Learning,
+    avatar_scene,
+    draw,
+    exact_step,
+    make_avatar,
+    many_poses,
+    pose,
+)
 from oasis_warp.bench.operators import (
     OPERATORS,
     Operator,
@@ -128,31 +137,56 @@ def operator_case(
     )
 
 
-def avatar_case(what: str, name: str, pass_: str, size: int) -> Named:
+def avatar_case(what: str, name: str, pass_: str, size: int = 512, n_poses: int = 1) -> Named:
     """The bundled hand as an avatar: "pose" its Gaussians, draw a "frame", or make a "step" of learning."""
 
     def make(device: torch.device, seed: int, _: Mapping[str, Draw]) -> Case:
         scene = avatar_scene(size, seed, device)
-        wide, canonical = scene.to(dtype=torch.float64), scene.canonical()
-        if what == "step":
-            step = Learning(scene).step
-            way, truth = Way(step, step), exact_step(scene)
-        elif what == "frame":
-            avatar, camera, held = make_avatar(scene)
-            frame = without_gradients(lambda: Results((avatar.render(camera, held, BLACK).image[None],)))
-            plain = without_gradients(lambda: Results(draw(scene, canonical)[:1]))
-            way = Way(frame, plain)
-            truth = without_gradients(lambda: Results(draw(wide, wide.canonical())[:1]))()
-        else:
-            run = without_gradients(lambda: Results(pose(scene, canonical)[:3]))
-            way = Way(run, run)
-            truth = without_gradients(lambda: Results(pose(wide, wide.canonical())[:3]))()
+        if n_poses > 1:
+            scene = replace(scene, held=many_poses(scene.held, n_poses, seed))
+        way, truth = {"pose": posing, "frame": frame, "step": learning}[what](scene)
         return Case(
-            name, pass_, len(scene.quats), len(scene.faces), 1, size, size, seed, {OURS: way}, truth,
-            judged=scene.mask[None] > 0, image=what != "pose",
-        )  # fmt: skip
+            name=name,
+            pass_=pass_,
+            gaussians=n_poses * len(scene.canonical.quats),
+            faces=n_poses * len(scene.hand.faces),
+            views=1,
+            width=size,
+            height=size,
+            seed=seed,
+            ways={OURS: way},
+            truth=truth,
+            judged=scene.mask[None] > 0,
+            image=what != "pose",
+        )
 
     return Named(name, pass_, make)
+
+
+def posing(scene: AvatarScene) -> tuple[Way, Results]:
+    """From joint angles to Gaussians, and what they are."""
+
+    def call(scene: AvatarScene) -> Callable[[], Results]:
+        surface = scene.surface()
+        return without_gradients(lambda: Results(pose(scene, scene.canonical, surface)[:3]))
+
+    return Way(call(scene), call(scene)), call(scene.to(dtype=torch.float64))()
+
+
+def frame(scene: AvatarScene) -> tuple[Way, Results]:
+    """A picture of an avatar as a user asks for it; a graph holds the same without a look at the values."""
+    avatar, surface, wide = make_avatar(scene), scene.surface(), scene.to(dtype=torch.float64)
+    way = Way(
+        without_gradients(lambda: Results((avatar.render(scene.camera, scene.held, BLACK).image[None],))),
+        without_gradients(lambda: Results((draw(scene, scene.canonical, surface),))),
+    )
+    return way, without_gradients(lambda: Results((draw(wide, wide.canonical, wide.surface()),)))()
+
+
+def learning(scene: AvatarScene) -> tuple[Way, Results]:
+    """A whole step."""
+    step = Learning(scene).step
+    return Way(step, step), exact_step(scene)
 
 
 def without_gradients(run: Callable[[], Results]) -> Callable[[], Results]:
@@ -169,10 +203,11 @@ CASES: tuple[Named, ...] = (
         )
         for pass_ in PASSES
     ),
-    avatar_case("pose", "posing 37k", "forward", 512),
+    avatar_case("pose", "posing 37k", "forward"),
+    avatar_case("pose", "1000 poses of 37k", "forward", n_poses=1000),
     *(visibility(448, pass_) for pass_ in PASSES),
-    avatar_case("frame", "avatar at 512 x 512", "pose + draw", 512),
-    avatar_case("step", "learning at 512 x 512", "pose + draw + loss + backward + Adam", 512),
+    avatar_case("frame", "avatar at 512 x 512", "pose + draw"),
+    avatar_case("step", "learning at 512 x 512", "pose + draw + loss + backward + Adam"),
 )  # fmt: skip
 
 

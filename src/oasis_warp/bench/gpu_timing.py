@@ -15,6 +15,7 @@ from typing import Any, Generic, TypeVar
 import torch
 
 from oasis_warp.bench.timing import synchronise
+from oasis_warp.ops._pair_counts import Overflow, watch_overflow
 
 STEPS_A_GRAPH = 10
 """Calls in the graph whose replays give the GPU time of one, so that the launch of the graph hardly counts."""
@@ -141,6 +142,8 @@ class Captured(Generic[Result]):
     steps: int
     results: Result
     """Of the last call, new after every replay."""
+    overflow: Overflow
+    """Whether a replay met more pairs of a Gaussian and a tile than the graph has memory for."""
 
     def probe(self) -> Probe:
         """Its replay, to be timed."""
@@ -168,7 +171,7 @@ def capture(run: Callable[[], Result], steps: int = 1, warm_calls: int = 3) -> C
         torch.cuda.synchronize()
         graph = torch.cuda.CUDAGraph()
         try:
-            with torch.cuda.graph(graph, stream=stream):
+            with watch_overflow() as overflow, torch.cuda.graph(graph, stream=stream):
                 for _ in range(steps - 1):
                     run()
                 results = run()
@@ -177,7 +180,7 @@ def capture(run: Callable[[], Result], steps: int = 1, warm_calls: int = 3) -> C
     torch.cuda.current_stream().wait_stream(stream)
     graph.replay()
     torch.cuda.synchronize()
-    return Captured(graph, steps, results)
+    return Captured(graph, steps, results, overflow)
 
 
 def first_cause(error: BaseException) -> str:

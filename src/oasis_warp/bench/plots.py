@@ -44,7 +44,7 @@ def plot_speed(rows: Sequence[GpuRow] | Sequence[SpeedRow], path: Path) -> None:
             label, found = f"{row.op}\n{row.pass_}", {row.way: row.median_ms}
         bars.setdefault(label, {}).update(found)
     series = list(dict.fromkeys(name for group in bars.values() for name in group))
-    figure = new_figure(9, 0.6 + 0.22 * len(bars) * (len(series) + 1))
+    figure = new_figure(9.0, 0.6 + 0.22 * len(bars) * (len(series) + 1))
     axes = figure.subplots()
     thick = 1 / (len(series) + 1)
     for k, name in enumerate(series):
@@ -66,7 +66,7 @@ def plot_scaling(rows: Sequence[ScalingRow], path: Path) -> None:
     from matplotlib.ticker import LogLocator
 
     axes_shown = [axis for axis in UNITS if any(row.axis == axis for row in rows)]
-    figure = new_figure(4.6 * len(axes_shown), 7)
+    figure = new_figure(4.6 * len(axes_shown), 7.0)
     panels = figure.subplots(2, len(axes_shown), squeeze=False)
     for column, axis in enumerate(axes_shown):
         noun, scale, unit = UNITS[axis]
@@ -110,21 +110,22 @@ def amount_name(axis: str, amount: int) -> str:
         return f"{amount**0.5:.0f}²"
     for suffix, size in (("M", 10**6), ("k", 10**3)):
         if amount >= size:
-            return f"{amount / size:.2g}{suffix}"
+            return f"{amount / size:.3g}{suffix}"
     return str(amount)
 
 
 def plot_roofline(rows: Sequence[KernelRow], path: Path) -> None:
     """Operations a second against operations a byte, below the ceilings; a colour a case."""
     known = [row for row in rows if row.flops and row.bytes and row.gflop_s]
-    figure = new_figure(8, 5)
+    figure = new_figure(8.0, 5.0)
     axes = figure.subplots()
     gb_s, gflop_s = rows[0].ceiling_gb_s, rows[0].ceiling_gflop_s
     intensities = [row.flops / row.bytes for row in known if row.flops and row.bytes]
     ends = [min([0.1, *intensities]) / 2, max([2 * gflop_s / gb_s, *intensities]) * 2]
     corners = [ends[0], gflop_s / gb_s, ends[1]]
     axes.plot(corners, [min(gflop_s, x * gb_s) for x in corners], color="0.3", linewidth=1.5)
-    axes.annotate(f"{gb_s:,.0f} GB/s", (corners[0], corners[0] * gb_s), fontsize=8, rotation=0)
+    foot = corners[0], corners[0] * gb_s
+    axes.annotate(f"{gb_s:,.0f} GB/s", foot, xytext=(0, 14), textcoords="offset points", fontsize=8)
     axes.annotate(f"{gflop_s:,.0f} GFLOP/s", (corners[1], gflop_s), fontsize=8, ha="left", va="bottom")
     for k, case in enumerate(dict.fromkeys(row.case for row in known)):
         for row in known:

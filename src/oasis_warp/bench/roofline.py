@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import torch
 
+from oasis_kernels.cuda_draw_backward import record_size
 from oasis_warp.bench.avatar_scene import avatar_scene, pose
-from oasis_warp.bench.counts import Counts, MeshCounts, count, count_mesh
+from oasis_warp.bench.counts import Counts, MeshCounts, count, count_avatar, count_mesh
 from oasis_warp.bench.gpu_cases import TRUSTED, size_name, without_gradients
 from oasis_warp.bench.gpu_profile import KernelTime, kernel_times
 from oasis_warp.bench.gpu_timing import Probe, device_clock, time_groups
@@ -39,8 +40,8 @@ class Work(NamedTuple):
 GAUSSIAN, GAUSSIAN_GRADIENT = 44, 40
 # What a tile reads of a Gaussian: centre 16, whitening 16, opacity 4, colour 12.
 LAYER = 48
-# What a tile writes of a pair: six moments padded to 32, and the sums by three colours.
-RECORD = 44
+# What a tile writes of a pair: six moments and the sums by three colours, padded.
+RECORD = 4 * record_size(3, True, True)
 
 PICTURE_KERNELS: Mapping[str, Callable[[Counts], Work]] = {
     # Writes means2d 8, covars2d 24, depth 4, conic 12, radii 8, float64 depth 8, centre 16, whitening 16, box 16.
@@ -81,11 +82,15 @@ PICTURE_KERNELS: Mapping[str, Callable[[Counts], Work]] = {
 """By the kernel's name, from what a picture takes."""
 
 MESH_KERNELS: Mapping[str, Callable[[MeshCounts], Work]] = {
-    # Position 12 and weights in, position out. The transforms are blended, 12 multiply-adds a bone, and applied, 9.
-    "skin": lambda c: Work((24 + 4 * c.joints) * c.vertices + 48 * c.joints, (24 * c.joints + 18) * c.vertices),
-    # Three indices; corners at rest and posed, each vertex once; quaternion 16, area ratio 4, row for the vertices 32.
-    # Two frames of 40, with roots and divisions of 10 each, the turn in the plane, a quaternion product 28.
-    "turn_faces": lambda c: Work(24 * c.vertices + (12 + 52) * c.faces, 260 * c.faces),
+    # Position 12, weights and displacements in, position out. The displacements are added, 3 multiply-adds each, the
+    # transforms blended, 12 a bone, and applied, 9.
+    "skin": lambda c: Work(
+        (24 + 4 * c.joints + 12 * c.correctives) * c.vertices + 48 * c.joints,
+        (24 * c.joints + 6 * c.correctives + 18) * c.vertices,
+    ),
+    # Three indices and a row of 48 on the face at rest; posed corners, each vertex once; quaternion 16, area ratio 4,
+    # row for the vertices 32. A frame of 40, roots and divisions of 10 each, the turn in the plane, a product of 28.
+    "turn_faces": lambda c: Work(12 * c.vertices + (60 + 52) * c.faces, 180 * c.faces),
     # Three corners a face: place 4 and row 32; quaternion 16 and area ratio 4 a vertex.
     "turn_vertices": lambda c: Work(3 * 36 * c.faces + 24 * c.vertices, 3 * 18 * c.faces + 40 * c.vertices),
     # On a vertex: index 4, vertex 12, its quaternion 16 and ratio 4, offset 12, quaternion 16, scales 12; on a face:
@@ -232,9 +237,9 @@ def profiled_cases(device: torch.device, seed: int) -> list[Profiled]:
         name = f"{size_name(HAND_GAUSSIANS, size)}, forward + backward"
         cases.append(Profiled(name, run, PICTURE_KERNELS, count(scene)))
     avatar, mesh = avatar_scene(512, seed, device), hand_scenes(448, seed)[1].to(device=device)
-    canonical = avatar.canonical()
-    posing = without_gradients(lambda: Results(pose(avatar, canonical)[:3]))
-    cases.append(Profiled("posing 37k", posing, MESH_KERNELS, count_mesh(mesh)))
+    surface = avatar.surface()
+    posing = without_gradients(lambda: Results(pose(avatar, avatar.canonical, surface)[:3]))
+    cases.append(Profiled("posing 37k", posing, MESH_KERNELS, count_avatar(avatar)))
     seeing = without_gradients(lambda: Results(forward(see.call, mesh, TRUSTED)))
     cases.append(Profiled("visibility at 448 x 448", seeing, MESH_KERNELS, count_mesh(mesh)))
     return cases

@@ -80,13 +80,13 @@ def one_tile(n: int = 100_000, size: int = 512, seed: int = 0) -> Scene:
 
 
 def giants(n: int = 1000, size: int = 512, seed: int = 0) -> Scene:
-    """`n` faint Gaussians wider than the picture, so that every tile lists all of them."""
+    """`n` Gaussians wider than the picture: every tile lists all, and they are too faint for a pixel to end early."""
     generator = torch.Generator().manual_seed(seed)
     pixels = size * torch.rand(n, 2, generator=generator)
     depths = 1 + torch.rand(n, generator=generator)
-    scales = depths[:, None] * (0.7 + 0.3 * torch.rand(n, 3, generator=generator))
-    scales[:, 2] *= 0.01  # across the view: a centre before the near plane is none of the matter
-    opacities = 0.006 + 0.006 * torch.rand(n, generator=generator)
+    scales = depths[:, None] * (1.5 + 0.3 * torch.rand(n, 3, generator=generator))
+    scales[:, 2] *= 0.01  # flat to the view
+    opacities = 0.005 + 0.004 * torch.rand(n, generator=generator)
     level = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(n, 4)
     return frontal(
         "giants", seed, before_pixels(pixels, depths, size), level, scales, opacities,
