@@ -47,16 +47,16 @@ COUNT = TILE_BOX + """
     }
     unsigned long long base = 0;
     if (lane == 31 && sum) base = atomicAdd(counters, (unsigned long long)sum);
-    base = __shfl_sync(0xffffffffu, base, 31);
-    if (thread < total) pair_starts[thread] = (int)(base + sum - count);
     // Neighbours in memory are often neighbours in the image: lanes of a warp that count the same tile do it at once.
     int x = t.x, y = t.y;
     for (int done = 0; __any_sync(0xffffffffu, done < count); done++) {
-        const long long tile = done < count ? (image + y) * tiles_x + x : -1;
+        const int tile = done < count ? (int)((image + y) * tiles_x + x) : -1;
         const unsigned same = __match_any_sync(0xffffffffu, tile);
         if (tile >= 0 && lane == __ffs(same) - 1) atomicAdd(tile_counts + tile, __popc(same));
         if (++x == t.z) { x = t.x; y++; }
     }
+    base = __shfl_sync(0xffffffffu, base, 31);
+    if (thread < total) pair_starts[thread] = (int)(base + sum - count);
 """
 
 PLACE = """
@@ -99,7 +99,8 @@ PLACE = """
                                      : n_tiles - 1 - ((long long)first_empty + (int)threadIdx.x - busy_before);
         // A list that does not fit stays empty; the host learns of it.
         const bool fits = start + count <= capacity;
-        tiles[rank] = {thread, (int)start, fits ? count : 0, 0};
+        const int row = thread / tiles_x;
+        tiles[rank] = {thread - row * tiles_x, (int)start, fits ? count : 0, row};
         cursors[thread] = fits ? start : capacity;
     }
     if (threadIdx.x == 0) {
@@ -129,7 +130,7 @@ FILL = TILE_BOX + """
         unsigned same[4];
         #pragma unroll
         for (int k = 0; k < 4; k++) {
-            const long long tile = done + k < count ? (image + y) * tiles_x + x : -1;
+            const int tile = done + k < count ? (int)((image + y) * tiles_x + x) : -1;
             same[k] = __match_any_sync(0xffffffffu, tile);
             place[k] = (unsigned long long)capacity;
             if (tile >= 0 && lane == __ffs(same[k]) - 1)
@@ -169,10 +170,11 @@ def place_tiles() -> CudaNative:
     """Kernel: one thread a tile."""
     parameters = {
         "n_tiles": "int",
+        "tiles_x": "int",
         "tile_counts": "const int*",
         "capacity": "long long",  # pairs for which there is memory
         "placed": "unsigned long long*",  # the last four counters
-        "tiles": "int4*",  # tile, start and length of its list; those with pairs come first
+        "tiles": "int4*",  # column, start and length of the list, row over all cameras; those with pairs come first
         "cursors": "long long*",  # [tiles]: the starts
         "report": "long long*",  # [REPORT]
     }

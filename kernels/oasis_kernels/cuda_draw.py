@@ -24,31 +24,57 @@ SCALE = 0.8493218183517456
 """sqrt(log2(e) / 2) as a float32: e^(-|y|^2 / 2) = 2^(-|SCALE y|^2)."""
 
 HEAD = """
+    struct Layer { float cx, cy, w0, w1, w2, w3, lo; };
     const unsigned all = 0xffffffffu;
     const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
-    const int4 own = tiles[block_index];  // tile, start and length of its list
-    const int tile = own.x, start = own.y, count = own.z;
-    const int camera = tile / (tiles_x * tiles_y);
-    const int left = (tile % tiles_x) * 8, top = (tile / tiles_x - camera * tiles_y) * 8;
+    const int4 own = tiles[block_index];  // column, start and length of the list, row over all cameras
+    const int start = own.y, count = own.z;
+    const int camera = n_cameras == 1 ? 0 : own.w / tiles_y;
+    const int left = own.x * 8, top = (own.w - camera * tiles_y) * 8;
     const long long first_pixel = ((long long)camera * height + top) * width + left;
     // Segments of the list, of 32 layers or a multiple.
-    const int segment = max(32, ((count + n_segments - 1) / n_segments + 31) & ~31);
-    const int used = (count + segment - 1) / segment;
-    auto power = [](float x) -> float { float r; asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return r; };
+    const int segment = max(32, ((count + @SEGMENTS@ - 1) / @SEGMENTS@ + 31) & ~31);
     // The memory of what is kept of this tile: by boundary between segments, number and pixel.
     float* const boundaries = checkpoints
-        ? checkpoints + (long long)block_index * (n_segments - 1) * (@CHANNELS@ + 1) * 64 : nullptr;
+        ? checkpoints + (long long)block_index * ((@SEGMENTS@ - 1) * (@CHANNELS@ + 1) * 64) : nullptr;
     auto boundary = [&](int b, int k, int pixel) -> float& {
         return boundaries[(b * (@CHANNELS@ + 1) + k) * 64 + pixel];
+    };
+    auto power = [](float x) -> float { float r; asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return r; };
+    auto log2_of = [](float x) -> float { float r; asm("lg2.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return r; };
+    auto inverse = [](float x) -> float { float r; asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return r; };
+
+    // Layers of a warp, @STRIDE@ floats each: centre, W, log2 of the opacity, place in the list, colour.
+    __shared__ __align__(16) float layer_memory[@WARPS@][32 * @STRIDE@];
+    float* const layers = layer_memory[warp];
+    const unsigned layers_at = (unsigned)__cvta_generic_to_shared(layers);
+    auto load4 = [](unsigned at) -> float4 {  // of shared memory, without the arithmetic that a pointer costs
+        float4 v;
+        asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
+                     : "=f"(v.x), "=f"(v.y), "=f"(v.z), "=f"(v.w) : "r"(at));
+        return v;
+    };
+    auto put = [&](int slot, const Layer& l, int place, const float* color) {
+        float* const to = layers + slot * @STRIDE@;
+        *(float4*)to = {l.cx, l.cy, l.w0, l.w1};
+        *(float4*)(to + 4) = {l.w2, l.w3, l.lo, __int_as_float(place)};
+        #pragma unroll
+        for (int k = 0; k < @PADDED@; k += 4)
+            *(float4*)(to + 8 + k) = {color[k], k + 1 < @CHANNELS@ ? color[k + 1] : 0.f,
+                                      k + 2 < @CHANNELS@ ? color[k + 2] : 0.f, k + 3 < @CHANNELS@ ? color[k + 3] : 0.f};
+    };
+    auto put_nothing = [&](int slot) {  // a layer that nobody sees
+        float* const to = layers + slot * @STRIDE@;
+        for (int k = 0; k < @STRIDE@; k++) to[k] = 0.f;
+        to[6] = -1e9f;
     };
 
     // A Gaussian as the tile sees it: centre from the middle of the tile's first pixel, a small, exact number and a
     // remainder; W scaled so that alpha = 2^(lo - |W d|^2).
-    struct Layer { float cx, cy, w0, w1, w2, w3, lo; };
     auto layer = [&](const float4& c, const float4& w, float opacity) -> Layer {
         const float s = @SCALE@;
         return {(c.x - (float)left) + (c.z - 0.5f), (c.y - (float)top) + (c.w - 0.5f), w.x * s, w.y * s, w.z * s,
-                w.w * s, log2f(opacity)};
+                w.w * s, log2_of(opacity)};
     };
     // Whether it can reach a pixel of the columns 0 .. 7 and the rows y_low .. y_high: the least |W d|^2 over the
     // rectangle lies at its middle or on an edge that faces the centre. The slack is larger than what rounding does.
@@ -63,8 +89,8 @@ HEAD = """
         };
         const float xx = l.w0 * l.w0 + l.w2 * l.w2, yy = l.w1 * l.w1 + l.w3 * l.w3, xy = l.w0 * l.w1 + l.w2 * l.w3;
         bool any = dx == 0.f && dy == 0.f;
-        if (dx != 0.f) any |= fits(dx, fminf(fmaxf(__fdividef(-xy * dx, yy), y0), y1));
-        if (dy != 0.f) any |= fits(fminf(fmaxf(__fdividef(-xy * dy, xx), x0), x1), dy);
+        if (dx != 0.f) any |= fits(dx, fminf(fmaxf(-xy * dx * inverse(yy), y0), y1));
+        if (dy != 0.f) any |= fits(fminf(fmaxf(-xy * dy * inverse(xx), x0), x1), dy);
         return any && cut >= 0.f;
     };
 """
@@ -113,18 +139,13 @@ SORT = """
 """
 
 FORWARD = """
-    struct __align__(16) Packed { float cx, cy, w0, w1, w2, w3, lo; int place; };
-    __shared__ Packed layers_of[@WARPS@][32];
-    __shared__ __align__(16) float colors_of[@WARPS@][32 * @PADDED@];
-    Packed* const layers = layers_of[warp];
-    float* const layer_colors = colors_of[warp];
-
+    const int used = (count + segment - 1) / segment;
     const int column = lane & 7, row = 4 * warp + (lane >> 3), pixel_here = row * 8 + column;
     const bool inside = left + column < width && top + row < height;
     // A pixel that has ended moves out of reach of every layer.
     float x = inside ? (float)column : 1e18f;
     const float y = (float)row, y_low = (float)(4 * warp), y_high = y_low + 3.f;
-    float T = 1.f, C[@CHANNELS@] = {}, sums[@CHANNELS@] = {};
+    float T = 1.f, C[@PADDED@] = {}, sums[@CHANNELS@] = {};
     int stop = count, now = 0;  // the segment being drawn
     auto keep = [&](int b, int k, float value) { if (boundaries) boundary(b, k, pixel_here) = value; };
     auto end_segment = [&]() {
@@ -140,7 +161,7 @@ FORWARD = """
 
     // The next 32 layers are on their way while these are drawn.
     float4 next_center, next_whitening;
-    float next_opacity, next_color[@CHANNELS@];
+    float next_opacity, next_color[@PADDED@];
     int next_index;
     auto fetch = [&](int first) {
         if (first + lane < count) {
@@ -163,18 +184,8 @@ FORWARD = """
         const bool hits = first + lane < count && reaches(l, y_low, y_high);
         const unsigned hitting = __ballot_sync(all, hits);
         const int m = __popc(hitting), slot = __popc(hitting & ((1u << lane) - 1u));
-        if (hits) {
-            layers[slot] = {l.cx, l.cy, l.w0, l.w1, l.w2, l.w3, l.lo, first + lane};
-            #pragma unroll
-            for (int k = 0; k < @CHANNELS@; k++)
-                layer_colors[slot * @PADDED@ + k] =
-                    @CHANNELS@ <= 4 ? next_color[k] : colors[(long long)next_index * @CHANNELS@ + k];
-        }
-        if (lane >= m && lane < ((m + 3) & ~3)) {  // layers that nobody sees
-            layers[lane] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, -1e9f, 0};
-            #pragma unroll
-            for (int k = 0; k < @CHANNELS@; k++) layer_colors[lane * @PADDED@ + k] = 0.f;
-        }
+        if (hits) put(slot, l, first + lane, @CHANNELS@ <= 4 ? next_color : colors + (long long)next_index * @CHANNELS@);
+        if (lane >= m && lane < ((m + 3) & ~3)) put_nothing(lane);
         __syncwarp();
         fetch(first + 32);
         // Four layers at a time: their alphas do not wait for each other, and the next four are under way while these
@@ -182,15 +193,17 @@ FORWARD = """
         auto alphas_of = [&](int j, float* alpha) {
             #pragma unroll
             for (int i = 0; i < 4; i++) {
-                const Packed& l = layers[j + i];
-                const float dx = x - l.cx, dy = y - l.cy;
-                const float u = fmaf(l.w0, dx, l.w1 * dy), v = fmaf(l.w2, dx, l.w3 * dy);
-                const float raw = power(fmaf(-v, v, fmaf(-u, u, l.lo)));
+                const unsigned at = layers_at + (j + i) * (4 * @STRIDE@);
+                const float4 a = load4(at), b = load4(at + 16);
+                const float dx = x - a.x, dy = y - a.y;
+                const float u = fmaf(a.z, dx, a.w * dy), v = fmaf(b.x, dx, b.y * dy);
+                const float raw = power(fmaf(-v, v, fmaf(-u, u, b.z)));
                 alpha[i] = raw >= @ALPHA_MIN@ ? fminf(raw, @ALPHA_MAX@) : 0.f;
             }
         };
         float alpha[4], next_alpha[4] = {};
         if (m) alphas_of(0, alpha);
+        #pragma unroll 2
         for (int j = 0; j < m; j += 4) {
             if (j + 4 < m) alphas_of(j + 4, next_alpha);
             float t[5] = {T};
@@ -204,7 +217,7 @@ FORWARD = """
                     t[i + 1] = fmaf(-alpha[i], t[i], t[i]);
                     if (t[i + 1] <= @STOP@) {
                         ended = true;
-                        stop = layers[j + i].place;
+                        stop = __float_as_int(layers[(j + i) * @STRIDE@ + 7]);
                         x = 1e18f;
                         t[i + 1] = t[i];
                         alpha[i] = 0.f;
@@ -217,8 +230,13 @@ FORWARD = """
             for (int i = 0; i < 4; i++) {
                 const float weight = alpha[i] * t[i];
                 #pragma unroll
-                for (int k = 0; k < @CHANNELS@; k++)
-                    C[k] = fmaf(layer_colors[(j + i) * @PADDED@ + k], weight, C[k]);
+                for (int k = 0; k < @CHANNELS@; k += 4) {
+                    const float4 color = load4(layers_at + (j + i) * (4 * @STRIDE@) + 32 + 4 * k);
+                    C[k] = fmaf(color.x, weight, C[k]);
+                    if (k + 1 < @CHANNELS@) C[k + 1] = fmaf(color.y, weight, C[k + 1]);
+                    if (k + 2 < @CHANNELS@) C[k + 2] = fmaf(color.z, weight, C[k + 2]);
+                    if (k + 3 < @CHANNELS@) C[k + 3] = fmaf(color.w, weight, C[k + 3]);
+                }
             }
             T = t[4];
             #pragma unroll
@@ -243,7 +261,7 @@ FORWARD = """
 PARAMETERS = {
     "n": "int",
     "tiles": "const int4*",  # [tiles]: see `place_tiles`
-    "n_segments": "int",
+    "n_cameras": "int",
     "centers": "const float4*",  # [C * n]
     "whitenings": "const float4*",
     "opacities": "const float*",
@@ -256,18 +274,18 @@ PARAMETERS = {
     "tile_gaussians": "int*",  # [pairs]: the lists, nearest first
     "transmittance": "float*",  # [C, H, W], or null
     "stops": "int*",  # [C, H, W]: place in the list of the first layer that was not drawn; or null
-    "checkpoints": "float*",  # [tiles with pairs, n_segments - 1, 1 + channels, 64], or null
+    "checkpoints": "float*",  # [tiles with pairs, segments - 1, 1 + channels, 64], or null
 }
 """Parameters of both directions, and their C++ types."""
 
 
-def snippet(body: str, channels: int, rules: Rules, **numbers: int) -> str:
+def snippet(body: str, channels: int, segments: int, rules: Rules, **numbers: int) -> str:
     """`HEAD` and `body` with the numbers written in, floats as literals that read back to the same number."""
-    text = HEAD + body
+    text, padded = HEAD + body, -(-channels // 4) * 4
     for name, value in {
         "ALPHA_MIN": f"{rules.alpha_min!r}f", "ALPHA_MAX": f"{ALPHA_MAX!r}f", "STOP": f"{rules.transmittance_stop!r}f",
         "CUT": f"({math.log2(rules.alpha_min) - CUT_SLACK!r}f)", "SCALE": f"{SCALE!r}f", "CHANNELS": channels,
-        "PADDED": (channels + 3) // 4 * 4 if channels > 1 else 1, "LONGEST": LONGEST,
+        "PADDED": padded, "STRIDE": 8 + padded, "SEGMENTS": segments, "LONGEST": LONGEST,
         "INDEX_MASK": hex((1 << INDEX_BITS) - 1),
     }.items():  # fmt: skip
         text = text.replace(f"@{name}@", str(value))
@@ -277,8 +295,8 @@ def snippet(body: str, channels: int, rules: Rules, **numbers: int) -> str:
 
 
 @functools.cache
-def blend(channels: int, rules: Rules) -> CudaNative:
+def blend(channels: int, segments: int, rules: Rules) -> CudaNative:
     """Kernel: sort and blend the tiles, a block each."""
     outputs = {"keys": "const long long*", "image": "float*", "alphas": "float*"}
-    body = snippet(SORT + FORWARD, channels, rules, BLOCK=BLOCK, WARPS=BLOCK // 32)
+    body = snippet(SORT + FORWARD, channels, segments, rules, BLOCK=BLOCK, WARPS=BLOCK // 32)
     return cuda_native(f"blend_tiles_{channels}", PARAMETERS | outputs, body, BLOCK, 10 if channels <= 4 else 4)

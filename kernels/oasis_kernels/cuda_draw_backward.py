@@ -16,14 +16,10 @@ from oasis_kernels.cuda_native import CudaNative, cuda_native
 GATHER_BLOCK = 64
 
 BACKWARD = """
-    struct __align__(16) Packed { float cx, cy, w0, w1, w2, w3, lo; int place; };
-    __shared__ Packed layers_of[@WARPS@][32];
-    __shared__ __align__(16) float colors_of[@WARPS@][32 * @PADDED@];
     __shared__ float* records_of[@WARPS@][32];
-    Packed* const layers = layers_of[warp];
-    float* const layer_colors = colors_of[warp];
     float** const layer_records = records_of[warp];
-    if (warp >= used && warp > 0) return;
+    if (warp * segment >= count && (warp > 0 || !tile_backgrounds)) return;
+    const int used = (count + segment - 1) / segment;
 
     // Sums over the warp of each of 32 values, by halves: lane l ends with value l.
     auto fold = [&](float mine, float other, bool upper, int distance) -> float {
@@ -82,14 +78,14 @@ BACKWARD = """
                 #pragma unroll
                 for (int k = 0; k < @CHANNELS@; k++) S[h] += G[h][k] * boundary(b, k + 1, row * 8 + (lane & 7));
             }
-            S[h] = __fdividef(S[h], T[h]);
+            S[h] *= inverse(T[h]);
         }
     }
     if (tile_backgrounds && warp == 0) {
         #pragma unroll
         for (int k = 0; k < @CHANNELS@; k++) {
             const float sum = sum_lanes(by_background[k]);
-            if (lane == 0) tile_backgrounds[(long long)tile * @CHANNELS@ + k] = sum;
+            if (lane == 0) tile_backgrounds[((long long)own.w * tiles_x + own.x) * @CHANNELS@ + k] = sum;
         }
     }
 
@@ -117,45 +113,47 @@ BACKWARD = """
         const unsigned hitting = __ballot_sync(all, hits);
         const int m = __popc(hitting), slot = __popc(hitting & ((1u << lane) - 1u));
         if (hits) {
-            layers[slot] = {l.cx, l.cy, l.w0, l.w1, l.w2, l.w3, l.lo, first + lane};
+            put(slot, l, first + lane, colors + (long long)g * @CHANNELS@);
             layer_records[slot] = record;
-            #pragma unroll
-            for (int k = 0; k < @CHANNELS@; k++)
-                layer_colors[slot * @PADDED@ + k] = colors[(long long)g * @CHANNELS@ + k];
         }
-        if (lane >= m && lane < ((m + 3) & ~3)) {  // layers that nobody sees
-            layers[lane] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, -1e9f, 0};
-            #pragma unroll
-            for (int k = 0; k < @CHANNELS@; k++) layer_colors[lane * @PADDED@ + k] = 0.f;
-        }
+        if (lane >= m && lane < ((m + 3) & ~3)) put_nothing(lane);
         __syncwarp();
         // Four layers at a time: most of what they take does not wait for each other, and their sums share shuffles.
         for (int j = (m - 1) & ~3; j >= 0; j -= 4) {
             float u[4][2], v[4][2], weight[4][2], by_alpha[4][2];
             #pragma unroll
             for (int i = 0; i < 4; i++) {
-                const Packed& l = layers[j + i];
-                const float dx = x - l.cx;
+                const unsigned at = layers_at + (j + i) * (4 * @STRIDE@);
+                const float4 a = load4(at), b = load4(at + 16);
+                const float dx = x - a.x;
                 #pragma unroll
                 for (int h = 0; h < 2; h++) {
-                    const float dy = y[h] - l.cy;
-                    u[i][h] = fmaf(l.w0, dx, l.w1 * dy);
-                    v[i][h] = fmaf(l.w2, dx, l.w3 * dy);
-                    const float raw = power(fmaf(-v[i][h], v[i][h], fmaf(-u[i][h], u[i][h], l.lo)));
-                    by_alpha[i][h] = raw >= @ALPHA_MIN@ && l.place < stop[h] ? raw : 0.f;
+                    const float dy = y[h] - a.y;
+                    u[i][h] = fmaf(a.z, dx, a.w * dy);
+                    v[i][h] = fmaf(b.x, dx, b.y * dy);
+                    const float raw = power(fmaf(-v[i][h], v[i][h], fmaf(-u[i][h], u[i][h], b.z)));
+                    by_alpha[i][h] = raw >= @ALPHA_MIN@ && __float_as_int(b.w) < stop[h] ? raw : 0.f;
                 }
             }
             #pragma unroll
             for (int i = 3; i >= 0; i--) {
+                float color[@PADDED@];
+                #pragma unroll
+                for (int k = 0; k < @PADDED@; k += 4) {
+                    const float4 four = load4(layers_at + (j + i) * (4 * @STRIDE@) + 32 + 4 * k);
+                    color[k] = four.x;
+                    color[k + 1] = four.y;
+                    color[k + 2] = four.z;
+                    color[k + 3] = four.w;
+                }
                 #pragma unroll
                 for (int h = 0; h < 2; h++) {
                     const float raw = by_alpha[i][h], alpha = fminf(raw, @ALPHA_MAX@);
-                    T[h] = __fdividef(T[h], 1.f - alpha);
+                    T[h] *= inverse(1.f - alpha);
                     weight[i][h] = alpha * T[h];
                     float gc = 0.f;
                     #pragma unroll
-                    for (int k = 0; k < @CHANNELS@; k++)
-                        gc = fmaf(G[h][k], layer_colors[(j + i) * @PADDED@ + k], gc);
+                    for (int k = 0; k < @CHANNELS@; k++) gc = fmaf(G[h][k], color[k], gc);
                     const float step = gc - S[h];
                     S[h] = fmaf(alpha, step, S[h]);
                     by_alpha[i][h] = raw <= @ALPHA_MAX@ ? weight[i][h] * step : 0.f;
@@ -240,7 +238,7 @@ def record_size(channels: int, shape: bool, colors: bool) -> int:
 def blend_backward(channels: int, segments: int, shape: bool, colors: bool, rules: Rules) -> CudaNative:
     """Kernel: gradients by image and alpha -> one record a pair, one background gradient a tile; a block a tile."""
     body = snippet(
-        TILE_BOX + BACKWARD, channels, rules, WARPS=segments, SHAPE=int(shape), COLORS=int(colors),
+        TILE_BOX + BACKWARD, channels, segments, rules, WARPS=segments, SHAPE=int(shape), COLORS=int(colors),
         VALUES=6 * shape + channels * colors,        RECORD=record_size(channels, shape, colors),
     )  # fmt: skip
     inputs = {

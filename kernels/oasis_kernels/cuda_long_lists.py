@@ -13,7 +13,7 @@ RUN = 2048
 SORT = """
     __shared__ long long here[@RUN@];
     const int4 own = tiles[block_index];
-    const int tile = own.x, start = own.y, count = own.z;
+    const int start = own.y, count = own.z;
     if (count <= @LONGEST@) return;
     long long *from = keys + start, *to = spare + start;
     for (int first = 0; first < count; first += @RUN@) {
@@ -54,7 +54,7 @@ SORT = """
         from = to;
         to = swapped;
     }
-    const int camera = tile / tiles_a_camera;
+    const int camera = own.w / tiles_y;
     for (int k = threadIdx.x; k < count; k += @BLOCK@)
         tile_gaussians[start + k] = camera * n + (int)(from[k] & @INDEX_MASK@);
 """
@@ -71,7 +71,7 @@ def sort_long_lists() -> CudaNative:
     parameters = {
         "n": "int",
         "tiles": "const int4*",
-        "tiles_a_camera": "int",
+        "tiles_y": "int",
         "keys": "long long*",
         "spare": "long long*",  # as many as keys, or null
         "tile_gaussians": "int*",

@@ -22,7 +22,7 @@ class Lists(NamedTuple):
     """Which Gaussians each tile draws. P pairs of a Gaussian and a tile."""
 
     tiles: Tensor
-    """[tiles, 4], int32: number of a tile, start and length of its list, 0; those that draw anything come first."""
+    """[tiles, 4], int32: column, start and length of the list, row over all cameras; tiles with any list come first."""
     pair_starts: Tensor
     """[M], int32: number of each Gaussian's first pair."""
     gaussians: Tensor
@@ -81,7 +81,7 @@ def _bin(splats: Splats, width: int, height: int) -> tuple[Lists, Tensor]:
     run_cuda(
         cuda_binning.place_tiles(),
         {
-            "n_tiles": n_tiles, "tile_counts": tile_counts, "capacity": capacity.pairs, "placed": counters + 8,
+            "n_tiles": n_tiles, "tiles_x": across, "tile_counts": tile_counts, "capacity": capacity.pairs, "placed": counters + 8,
             "tiles": tiles.data_ptr(), "cursors": cursors.data_ptr(), "report": report.data_ptr(),
         },
         -(-n_tiles // cuda_binning.PLACE_BLOCK),
@@ -109,7 +109,7 @@ def _bin(splats: Splats, width: int, height: int) -> tuple[Lists, Tensor]:
         run_cuda(
             cuda_long_lists.sort_long_lists(),
             {
-                "n": n, "tiles": tiles.data_ptr(), "tiles_a_camera": across * down, "keys": keys.data_ptr(),
+                "n": n, "tiles": tiles.data_ptr(), "tiles_y": down, "keys": keys.data_ptr(),
                 "spare": 0 if spare is None else spare.data_ptr(), "tile_gaussians": lists.gaussians.data_ptr(),
             },
             n_tiles,
@@ -142,7 +142,7 @@ def _scene_words(splats: Splats, frame: Frame) -> tuple[dict[str, int], int]:
     across, down = _count_tiles(frame.width, frame.height)
     n_tiles = n_cameras * across * down
     words = {
-        "n": n, "n_segments": _segments(n_tiles, channels), "centers": splats.centers.data_ptr(),
+        "n": n, "n_cameras": n_cameras, "centers": splats.centers.data_ptr(),
         "whitenings": splats.whitenings.data_ptr(), "opacities": splats.opacities.data_ptr(),
         "colors": splats.colors.data_ptr(), "backgrounds": splats.backgrounds.data_ptr(), "tiles_x": across,
         "tiles_y": down, "width": frame.width, "height": frame.height,
@@ -161,11 +161,12 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
     n_cameras, _, channels = splats.colors.shape
     lists, keys = _bin(splats, width, height)
     words, n_tiles = _scene_words(splats, frame)
+    segments = _segments(n_tiles, channels)
     new = splats.colors
     image, alphas = new.new_empty((n_cameras, height, width, channels)), new.new_empty((n_cameras, height, width, 1))
     kept = None
     if keep:
-        between = words["n_segments"] - 1
+        between = segments - 1
         busy = min(n_tiles, lists.gaussians.untyped_storage().nbytes() // 4)  # no tile draws less than a pair
         kept = Kept(
             new.new_empty((n_cameras, height, width)),
@@ -174,7 +175,7 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
             *lists,
         )
     run_cuda(
-        cuda_draw.blend(channels, current_rules()),
+        cuda_draw.blend(channels, segments, current_rules()),
         {
             **words, "tiles": lists.tiles.data_ptr(), "keys": keys.data_ptr(),
             "tile_gaussians": lists.gaussians.data_ptr(), "image": image.data_ptr(), "alphas": alphas.data_ptr(),
@@ -202,7 +203,7 @@ def draw_backward(
     records = new.new_empty((n_pairs, size))
     tile_backgrounds = new.new_empty((n_cameras, n_tiles // n_cameras, channels)) if with_backgrounds else None
     backward = cuda_draw_backward.blend_backward(
-        channels, words["n_segments"], with_shape, with_colors, current_rules()
+        channels, _segments(n_tiles, channels), with_shape, with_colors, current_rules()
     )
     run_cuda(
         backward,
