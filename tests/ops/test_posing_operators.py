@@ -16,7 +16,6 @@ from oasis_warp.ops import (
     face_rotations,
     pose_on_mesh,
     pose_on_mesh_covars,
-    rest_mesh,
     skin,
 )
 
@@ -64,7 +63,6 @@ def calls(seed=0, n=4, dtype=torch.float32, empty=False, device="cpu"):
         return pose_on_mesh(posed, faces, face_index, barycentrics, vertex_quats, area_ratio, quats, scales, "area")
 
     on_mesh = [posed, barycentrics, unit, normal(n_faces).exp()]
-    still = rest_mesh(rest, faces)
     axes = torch.nn.functional.normalize(normal(5, 3, 3), dim=-1)
 
     def bent(angles, orientation, translation, joints):
@@ -85,7 +83,6 @@ def calls(seed=0, n=4, dtype=torch.float32, empty=False, device="cpu"):
         "bone_transforms poses": (
             bent, [normal(N_POSES, 4, 3), to_matrix(normal(N_POSES, 4)), normal(N_POSES, 3), normal(5, 3)],
         ),
-        "face_rotations of a rest mesh": (lambda posed: face_rotations(still, posed, faces), [posed]),
         "face_rotations poses": (lambda rest, posed: face_rotations(rest, posed, faces), [rest, many_posed]),
         "pose_on_mesh poses": (
             on_both,

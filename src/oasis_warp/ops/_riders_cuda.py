@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from oasis_kernels import cuda_posing_riders as kernels
-from oasis_warp.ops._launch import device_and_stream, run_cuda
+from oasis_warp.ops._launch import current_stream, run_cuda
 from oasis_warp.ops._poses import summed_over_poses
 from oasis_warp.ops._riders import SHARED, Floats, Riders
 from oasis_warp.ops._words import aligned, pointer
@@ -43,7 +43,7 @@ def pose_on_cuda(inputs: Floats, riders: Riders, half_powers: int, posed: Sequen
         "posed_scales": scales,
     }
     blocks = _n_poses(inputs) * (_blocks(riders.p) + _blocks(riders.q))
-    run_cuda(kernels.pose_riders, words, blocks, device_and_stream(inputs.vertices)[1])
+    run_cuda(kernels.pose_riders, words, blocks, current_stream(inputs.vertices.device))
 
 
 def pose_backward_on_cuda(
@@ -79,7 +79,7 @@ def pose_backward_on_cuda(
         "riders": pointer(riders.on_faces.entries),
         **{f"g_{name}": pointer(tensor) for name, tensor in by._asdict().items()},
     }
-    stream = device_and_stream(like)[1]
+    stream = current_stream(like.device)
     run_cuda(kernels.pose_riders_backward, words, n_poses * (_blocks(p) + _blocks(q)), stream)
     blocks = (0 if rows is None else _blocks(riders.n_vertices)) + (
         0 if by.area_ratio is None else _blocks(len(riders.corners.table))

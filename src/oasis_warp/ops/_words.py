@@ -17,11 +17,6 @@ def task_count(*items: int) -> int:
     return -(-max(items) // TASK)
 
 
-def on_cuda(tensor: Tensor) -> bool:
-    """Whether kernels for tensors like this one have a form of their own for CUDA: float32 there."""
-    return tensor.is_cuda and tensor.dtype == torch.float32
-
-
 def pointer(tensor: Tensor | None) -> int:
     """Where the data of a contiguous tensor begin; 0 for none, and for an empty one."""
     return 0 if tensor is None else tensor.data_ptr()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from oasis_kernels import kinematics as kernels
 from oasis_warp.core.checks import check_float, check_shape
-from oasis_warp.ops._launch import device_and_stream, run_cuda, run_native
+from oasis_warp.ops._launch import current_stream, run_cuda, run_native
 from oasis_warp.ops._poses import summed_over_poses
 from oasis_warp.ops._registration import adjoint, differentiable, operator
 from oasis_warp.ops._values import check_finite
@@ -55,7 +55,7 @@ def _run(name: str, tensors: dict[str, Tensor | None], n_poses: int, n_joints: i
     words: dict[str, int] = {"n_joints": n_joints, "n_poses": n_poses}
     if like.is_cuda:
         words |= {key: pointer(tensor) for key, tensor in tensors.items()}
-        run_cuda(getattr(kernels, f"cuda_{name}")(scalar), words, n_poses, device_and_stream(like)[1])
+        run_cuda(getattr(kernels, f"cuda_{name}")(scalar), words, n_poses, current_stream(like.device))
         return
     state = torch.zeros(kernels.STATE, dtype=torch.int64)
     for key, tensor in {**tensors, "state": state}.items():

@@ -12,11 +12,20 @@ from oasis_kernels import face_rotation as kernels
 from oasis_kernels import face_rotation_vectors as vector_kernels
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._incidence import Incidence, incidence, sum_at_items
-from oasis_warp.ops._launch import device_and_stream, even_cuts, has_vectors, launch_ranges, run_cuda, run_native, view
+from oasis_warp.ops._launch import (
+    current_stream,
+    even_cuts,
+    has_cuda_kernels,
+    has_vectors,
+    launch_ranges,
+    run_cuda,
+    run_native,
+    view,
+)
 from oasis_warp.ops._poses import at_pose, pose_by_pose, summed_over_poses
 from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
 from oasis_warp.ops._values import check_finite
-from oasis_warp.ops._words import aligned, on_cuda, place, pointer, task_count
+from oasis_warp.ops._words import aligned, place, pointer, task_count
 from oasis_warp.ops.rest_mesh import RestMesh
 
 
@@ -81,7 +90,7 @@ def _face_rotations(
     rest, posed, triangles = rest.contiguous(), posed.contiguous(), aligned(triangles)
     n_vertices, n_faces = len(rest), len(faces)
     out = _outputs(rest, posed, faces, triangles, keep, validate)
-    if on_cuda(rest):
+    if has_cuda_kernels(rest):
         _turn_on_cuda(rest, posed, corners, triangles, out if keep else (*out[:4], None, None))
         return out
     if posed.ndim == 3:
@@ -162,7 +171,7 @@ def _turn_on_cuda(
         "signs": signs,
         "sums": sums,
     }
-    stream = device_and_stream(rest)[1]
+    stream = current_stream(rest.device)
     run_cuda(cuda_kernels.turn_faces, words, blocks, stream)
     run_cuda(cuda_kernels.turn_vertices, words, n_poses * _blocks(n_vertices), stream)
 
@@ -200,7 +209,7 @@ def _face_rotations_backward(
     n_vertices, n_faces = len(rest), len(faces)
     kept = vertex_quats, face_quats, vertex_area_ratio, signs, sums
     grads = grad_vertex_quats, grad_face_quats, grad_area_ratio, grad_vertex_area_ratio
-    if on_cuda(rest):
+    if has_cuda_kernels(rest):
         return _turn_backward_on_cuda(rest, posed, corners, triangles, kept, grads, needs_rest, needs_posed)
     if posed.ndim == 3:
         found = _gradients(rest, posed, needs_rest, needs_posed)
@@ -307,7 +316,7 @@ def _turn_backward_on_cuda(
         "g_rest": pointer(by_rest),
         "g_posed": pointer(by_posed),
     }
-    stream = device_and_stream(rest)[1]
+    stream = current_stream(rest.device)
     run_cuda(cuda_kernels.turn_faces_backward, words, n_poses * _blocks(n_faces), stream)
     run_cuda(cuda_kernels.gather_edges, words, n_poses * _blocks(n_vertices), stream)
     return rest.new_empty((0, 3)) if by_rest is None else summed_over_poses(by_rest, batched), by_posed

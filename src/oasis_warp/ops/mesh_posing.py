@@ -8,13 +8,12 @@ from torch import Tensor
 from oasis_kernels import barycentric as kernels
 from oasis_warp.core.checks import check_choice, check_float, check_shape
 from oasis_warp.ops._incidence import sum_at_items
-from oasis_warp.ops._launch import even_cuts, has_vectors, launch_ranges, view
+from oasis_warp.ops._launch import even_cuts, has_cuda_kernels, has_vectors, launch_ranges, view
 from oasis_warp.ops._poses import at_pose, pose_by_pose
 from oasis_warp.ops._registration import adjoint, differentiable, operator
 from oasis_warp.ops._riders import SHARED, Floats, Riders, find_riders, pose_backward_vectorised, pose_vectorised
 from oasis_warp.ops._riders_cuda import pose_backward_on_cuda, pose_on_cuda
 from oasis_warp.ops._values import check_finite
-from oasis_warp.ops._words import on_cuda
 
 HALF_POWERS = {"sqrt_area": 1, "area": 2, "none": 0}
 """Twice the exponent of the area ratio in each scale law."""
@@ -68,7 +67,7 @@ def _pose_on_mesh(
         posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio
     )
     posed = _posed_like(posed_vertices, quats)
-    if on_cuda(quats):
+    if has_cuda_kernels(quats):
         pose_on_cuda(inputs, riders, half_powers, posed)
         return posed
     if posed_vertices.ndim == 3:
@@ -171,7 +170,7 @@ def _pose_on_mesh_backward(
     riders = find_riders(faces, face_index, vertex_index, posed_vertices.shape[-2], transposed=at_vertices)
     grads = grad_means, grad_quats, grad_scales
     g = [grad if needed else None for grad, needed in zip(found, needs, strict=True)]
-    if on_cuda(quats):
+    if has_cuda_kernels(quats):
         by_inputs = pose_backward_on_cuda(inputs, riders, half_powers, grads, g)
         return [empty if grad is None else grad for grad, empty in zip(by_inputs, found, strict=True)]
     if posed_vertices.ndim == 3:

@@ -10,10 +10,10 @@ from oasis_kernels import cuda_posing_turn as cuda_kernels
 from oasis_kernels import face_rotation_vectors as vector_kernels
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._incidence import incidence
-from oasis_warp.ops._launch import device_and_stream, has_vectors, run_cuda, run_native
+from oasis_warp.ops._launch import current_stream, has_cuda_kernels, has_vectors, run_cuda, run_native
 from oasis_warp.ops._registration import operator
 from oasis_warp.ops._values import check_finite
-from oasis_warp.ops._words import on_cuda, place, pointer, task_count
+from oasis_warp.ops._words import place, pointer, task_count
 
 
 class RestMesh(NamedTuple):
@@ -45,7 +45,7 @@ def _measure(rest: Tensor, faces: Tensor, validate: bool) -> Tensor:
             "out": place(out, vector_kernels.TRIANGLE * n_faces),
         }
         run_native(vector_kernels.measure, words, task_count(n_faces))
-    elif on_cuda(rest):
+    elif has_cuda_kernels(rest):
         words = {
             "n_vertices": n_vertices,
             "n_faces": n_faces,
@@ -54,7 +54,7 @@ def _measure(rest: Tensor, faces: Tensor, validate: bool) -> Tensor:
             "out": pointer(out),
         }
         blocks = -(-n_faces // cuda_kernels.BLOCK)
-        run_cuda(cuda_kernels.measure_triangles, words, blocks, device_and_stream(rest)[1])
+        run_cuda(cuda_kernels.measure_triangles, words, blocks, current_stream(rest.device))
     return out
 
 

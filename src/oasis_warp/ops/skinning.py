@@ -10,11 +10,19 @@ from oasis_kernels import cuda_posing_skin as cuda_kernels
 from oasis_kernels import skinning as kernels
 from oasis_kernels import skinning_vectors as vector_kernels
 from oasis_warp.core.checks import check_float, check_shape
-from oasis_warp.ops._launch import device_and_stream, even_cuts, launch_ranges, run_cuda, run_native, view
+from oasis_warp.ops._launch import (
+    current_stream,
+    even_cuts,
+    has_cuda_kernels,
+    launch_ranges,
+    run_cuda,
+    run_native,
+    view,
+)
 from oasis_warp.ops._poses import at_pose, pose_by_pose, summed_over_poses
 from oasis_warp.ops._registration import adjoint, differentiable, operator
 from oasis_warp.ops._values import check_finite
-from oasis_warp.ops._words import aligned, on_cuda, place, pointer, task_count
+from oasis_warp.ops._words import aligned, place, pointer, task_count
 
 SCALAR_NAMES = {torch.float32: "float", torch.float64: "double"}
 
@@ -94,7 +102,7 @@ def _skin(
             strengths=strengths,
         )  # fmt: skip
     out_means, out_covars = _outputs(means, covars, weights, transforms)
-    if on_cuda(means) and not rotation_only:
+    if has_cuda_kernels(means) and not rotation_only:
         inputs = _for_cuda(means, covars, weights, transforms, displacements, strengths)
         words = inputs.words() | {
             "n_poses": inputs.n_poses,
@@ -102,7 +110,7 @@ def _skin(
             "out_covars": pointer(out_covars),
         }
         blocks = -(-len(means) // cuda_kernels.POINTS) * -(-inputs.n_poses // cuda_kernels.POSES)
-        run_cuda(cuda_kernels.skin, words, blocks, device_and_stream(means)[1])
+        run_cuda(cuda_kernels.skin, words, blocks, current_stream(means.device))
         return out_means, out_covars
     if transforms.ndim == 4:
 
@@ -176,7 +184,7 @@ def _skin_backward(
     grad_covars: Tensor | None,
     needs: list[bool],
 ) -> list[Tensor]:
-    if on_cuda(means) and not rotation_only:
+    if has_cuda_kernels(means) and not rotation_only:
         inputs = _for_cuda(means, covars, weights, transforms, displacements, strengths)
         return _backward_on_cuda(inputs, grad_means, grad_covars, needs)
     found = _gradients(
@@ -300,7 +308,7 @@ def _backward_on_cuda(
         by_covars.zero_()
     sums = means.new_empty((n_poses, point_blocks, n_joints, 12)) if needs_transforms else None
     by_transforms = transforms.new_empty((len(transforms) if needs_transforms else 0, *transforms.shape[1:]))
-    stream = device_and_stream(means)[1]
+    stream = current_stream(means.device)
     given = [None if grad is None else grad.contiguous() for grad in (grad_means, grad_covars)]
     words = inputs.words() | {
         "g_out_means": pointer(given[0]),
