@@ -165,7 +165,7 @@ def see(degree: int) -> CudaNative:
 
 @functools.cache
 def see_backward(degree: int) -> CudaNative:
-    """Kernel: gradient by the colours -> by means, coefficients and, for each Gaussian, the cameras' centres; or null."""
+    """Kernel: gradient by the colours -> by means, coefficients and, of each Gaussian, cameras' centres; or null."""
     gradients = {
         "n_cameras": "int", "colors": "const float*", "g_colors": "const float*", "g_means": "float*",
         "g_coefficients": "float*", "g_centers": "double*",
