@@ -1,3 +1,5 @@
+import copy
+
 import pytest
 import torch
 from synthetic import PALM_TO_CAMERA, evidence_of
@@ -100,6 +102,11 @@ def test_an_avatar_survives_its_file_bit_for_bit(left, tmp_path):
     assert (loaded.source_camera.width, loaded.source_camera.height) == (64, 64)
 
 
+def test_an_avatar_can_be_copied(left):
+    twin = copy.deepcopy(left)
+    assert torch.equal(twin.pose(left.source_pose).means, left.pose(left.source_pose).means)
+
+
 def test_an_avatar_of_another_hand_model_is_refused(right, tmp_path, monkeypatch):
     path = tmp_path / "a.safetensors"
     written = {}
@@ -147,6 +154,8 @@ def test_a_camera_that_is_none_is_refused(right):
     camera = right.source_camera
     with pytest.raises(ValueError, match="K: expected finite"):
         right.render(camera._replace(K=camera.K * float("nan")), right.source_pose)
+    with pytest.raises(ValueError, match=r"background: expected shape \[3\], got \[4\]"):
+        right.render(camera, right.source_pose, (1.0, 1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match=r"camera\.viewmat: expected shape \[4, 4\], got \[3, 4\]"):
         right.render(camera._replace(viewmat=camera.viewmat[:3]), right.source_pose)
 
@@ -162,6 +171,38 @@ def test_pictures_are_differentiable_in_the_pose(right):
     assert angles.grad is not None
     assert bool(torch.isfinite(angles.grad).all())
     assert float(angles.grad.abs().max()) > 0
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_replayed_pictures_are_the_drawn_ones_at_every_size_and_distance(side, left, right, tmp_path):
+    {"left": left, "right": right}[side].save(tmp_path / "a.safetensors")
+    there = Avatar.load(tmp_path / "a.safetensors", device="cuda")
+    camera = there.source_camera
+    for width, height, distance in [(64, 64, 0), (64, 64, 2), (96, 64, 0), (64, 64, 0), (64, 64, -0.3), (96, 64, 1)]:
+        for name in ("fist", "open"):
+            shift = torch.tensor([0.0, 0, distance]).to(there.device)
+            pose = HandPose(
+                named_pose(there.hand, name).cpu(), there.source_pose.orientation, there.source_pose.translation + shift
+            )
+            seen = camera._replace(width=width, height=height)
+            color = (0.1, 0.2, 0.3)
+            replayed = there.render(seen, pose, color)
+            angles = pose.angles.cuda().requires_grad_()
+            drawn = there.render(seen, pose._replace(angles=angles), color)
+            assert drawn.image.requires_grad and not replayed.image.requires_grad
+            assert replayed.image.shape == (height, width, 3)
+            assert torch.equal(replayed.image, drawn.image) and torch.equal(replayed.alpha, drawn.alpha)
+
+
+@pytest.mark.gpu
+def test_pictures_of_a_gpu_can_be_drawn_in_inference_mode_and_out_of_it(right, tmp_path):
+    right.save(tmp_path / "a.safetensors")
+    there = Avatar.load(tmp_path / "a.safetensors", device="cuda")
+    with torch.inference_mode():
+        inside = there.render(there.source_camera, there.source_pose).image
+    outside = there.render(there.source_camera, there.source_pose).image
+    assert torch.equal(inside, outside)
 
 
 @pytest.mark.gpu

@@ -106,7 +106,7 @@ def main() -> None:
     worst = max(float((a.cpu() - b).abs().max()) for a, b in zip(got, want, strict=True))
     assert worst < 1e-5, worst
     assert all(torch.equal(a, b) for a, b in zip(got, again, strict=True))
-    recording = Recording(lambda *parts: (there.pose(HandPose(*parts), validate=False)[:3], None), fist, there.shape)
+    recording = Recording(lambda *parts: there.pose(HandPose(*parts), validate=False)[:3], fist, there.shape)
     replayed = recording(fist)
     assert replayed is not None and all(torch.equal(a, b) for a, b in zip(got, replayed, strict=True))
     print(f"{len(got[0])} Gaussians, {len(there.hand.template)} vertices; against the CPU {worst:.1e}, the same bits")

@@ -16,6 +16,7 @@ from oasis_warp.hand.skinning import mirror_hand, mirror_points, rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import rest_mesh
 from oasis_warp.render.render import render
+from oasis_warp.render.replay import Recording, Recordings, replayable, replayed
 
 
 class Avatar:
@@ -43,8 +44,7 @@ class Avatar:
         """Shape coefficients of the hand model [standard deviations]."""
         self.surface_offsets = surface_offsets
         """What the photo's outline adds to the rest surface [m]."""
-        self.gaussians = gaussians
-        """Canonical, on the right-handed rest surface."""
+        self._gaussians = gaussians
         self.source_pose = source_pose
         """The pose in the photo, in the frame of `source_camera`."""
         self.source_camera = source_camera
@@ -62,6 +62,13 @@ class Avatar:
         self._rest_mesh = (
             vertices if vertices.requires_grad else rest_mesh(vertices, self.hand.faces, validate=False)
         )
+        self._fixed = (*self._canonical, vertices, self._rest.joints)
+        self._recordings = Recordings()
+
+    @property
+    def gaussians(self) -> CanonicalGaussians:
+        """Canonical, on the right-handed rest surface."""
+        return self._gaussians
 
     @property
     def device(self) -> torch.device:
@@ -104,17 +111,42 @@ class Avatar:
         posed = skin_surface(self._model, self._rest, self._checked(pose, validate))
         return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed)
 
-    def render(self, camera: Camera, pose: HandPose, background: Color = WHITE) -> Render:
+    def render(
+        self, camera: Camera, pose: HandPose, background: Color = WHITE, *, validate: bool = True
+    ) -> Render:
         """A picture of the hand in `pose` over a plain `background`; differentiable in the pose and the camera.
+
+        On CUDA the first picture of a size is recorded, and where no gradient is wanted the next ones replay it.
+
+        Args:
+            camera: What sees the hand.
+            pose: One pose.
+            background: What is seen beside it, and through it.
+            validate: Look at the values of camera and pose too. Waits for a CUDA device if they are there.
 
         Raises:
             ValueError: a part of the pose or the camera has another shape or is not finite.
         """
         check_shape("pose.angles", pose.angles, 15, 3, hint="One pose a picture.")
+        check_shape("pose.orientation", pose.orientation, 3, 3)
+        check_shape("pose.translation", pose.translation, 3)
         check_shape("camera.viewmat", camera.viewmat, 4, 4)
         check_shape("camera.K", camera.K, 3, 3)
-        check_finite(viewmat=camera.viewmat, K=camera.K)
-        return render(self.pose(pose), camera, background=background)
+        color = torch.as_tensor(background, dtype=self.shape.dtype)
+        check_shape("background", color, 3)
+        if validate:
+            check_finite(**pose._asdict(), viewmat=camera.viewmat, K=camera.K)
+        inputs = (*pose, camera.viewmat, camera.K, color)
+        if self.shape.dtype != torch.float32 or not replayable(self.device, (*inputs, *self._fixed)):
+            return render(self.pose(pose, validate=False), camera, background=background)
+
+        def draw(*parts: Tensor) -> tuple[Tensor, ...]:
+            *posed, viewmat, K, color = (part.to(self.shape) for part in parts)
+            seen = Camera(viewmat, K, camera.width, camera.height)
+            return tuple(render(self.pose(HandPose(*posed), validate=False), seen, background=color))
+
+        size = camera.width, camera.height
+        return Render(*replayed(self._recordings, size, lambda: Recording(draw, inputs, self.shape), draw, inputs))
 
     def save(self, path: Path | str) -> None:
         """Write the avatar file (safetensors, versioned; see docs/avatar_file.md)."""

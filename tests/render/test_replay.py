@@ -7,6 +7,7 @@ from synthetic import PALM_TO_CAMERA
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin_surface
+from oasis_warp.ops import rasterization
 from oasis_warp.render.replay import MOST, Recording, Recordings, replayable, replayed
 
 
@@ -86,7 +87,7 @@ def outputs_of(recording, inputs):
 
 
 def squared(matrix, vector):
-    return (matrix @ vector, vector.square()), None
+    return matrix @ vector, vector.square()
 
 
 @pytest.mark.gpu
@@ -102,7 +103,7 @@ def test_a_recording_repeats_its_function_for_inputs_from_anywhere(places, dtype
     recording = Recording(squared, calls[0], like)
     found = [outputs_of(recording, inputs) for inputs in calls]  # none may touch another's memory
     for inputs, outputs in zip(calls, found, strict=True):
-        wanted, _ = squared(*(tensor.to(like) for tensor in inputs))
+        wanted = squared(*(tensor.to(like) for tensor in inputs))
         for got, want in zip(outputs, wanted, strict=True):
             assert got.dtype == dtype and got.is_cuda
             torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
@@ -111,7 +112,7 @@ def test_a_recording_repeats_its_function_for_inputs_from_anywhere(places, dtype
 @pytest.mark.gpu
 def test_calls_on_different_streams_do_not_mix():
     like = torch.empty(0, device="cuda")
-    recording = Recording(lambda x: ((x * 2,), None), [torch.zeros(1000)], like)
+    recording = Recording(lambda x: (x * 2,), [torch.zeros(1000)], like)
     found, streams = [], [torch.cuda.Stream() for _ in range(3)]
     for k in range(30):
         with torch.cuda.stream(streams[k % 3]):
@@ -122,10 +123,26 @@ def test_calls_on_different_streams_do_not_mix():
 
 @pytest.mark.gpu
 def test_a_recording_says_when_its_memory_did_not_suffice():
-    like = torch.empty(0, device="cuda")
-    recording = Recording(lambda x: ((x,), (x.sum() > 10).to(torch.int32)), [torch.zeros(3)], like)
-    assert recording([torch.full((3,), 4.0)]) is None
-    assert (outputs_of(recording, [torch.ones(3)])[0] == 1).all()
+    generator = torch.Generator().manual_seed(0)
+    means = torch.randn(2000, 3, generator=generator).cuda()
+    ones = torch.ones(2000, device="cuda")
+    quats, colors = torch.eye(4)[:1].repeat(2000, 1).cuda(), torch.rand(2000, 3, generator=generator).cuda()
+    K = torch.tensor([[[200.0, 0, 128], [0, 200, 128], [0, 0, 1]]]).cuda()
+
+    def picture(size, distance):
+        viewmat = torch.eye(4, device="cuda")[None]
+        viewmat = torch.cat([viewmat[..., :3], viewmat[..., 3:] + distance * viewmat[..., 2:3]], -1)
+        scales = size * ones[:, None].expand(-1, 3)
+        image, _, _ = rasterization(means, quats, scales, 0.1 * ones, colors, viewmat, K, 256, 256, validate=False)
+        return (image,)
+
+    small, large = ([torch.tensor([size]), torch.tensor([6.0])] for size in (0.01, 0.5))
+    recording = Recording(picture, small, means)
+    assert torch.equal(outputs_of(recording, small)[0], picture(*(part.cuda() for part in small))[0])
+    assert recording(large) is None
+    assert torch.equal(outputs_of(recording, small)[0], picture(*(part.cuda() for part in small))[0])
+    again = Recording(picture, large, means)
+    assert torch.equal(outputs_of(again, large)[0], picture(*(part.cuda() for part in large))[0])
 
 
 @pytest.mark.gpu
@@ -134,7 +151,7 @@ def test_a_replayed_hand_follows_its_pose(hand):
     rest = rest_hand(model, torch.zeros(len(hand.shape_names), device="cuda"))
 
     def surface(*pose):
-        return (skin_surface(model, rest, HandPose(*pose)),), None
+        return (skin_surface(model, rest, HandPose(*pose)),)
 
     poses = [
         HandPose(named_pose(hand, name), PALM_TO_CAMERA, torch.tensor([0.0, 0.1, 0.5]))
@@ -142,4 +159,4 @@ def test_a_replayed_hand_follows_its_pose(hand):
     ]
     recording = Recording(surface, poses[0], rest.vertices)
     for pose in poses:
-        assert torch.equal(outputs_of(recording, pose)[0], surface(*(part.cuda() for part in pose))[0][0])
+        assert torch.equal(outputs_of(recording, pose)[0], surface(*(part.cuda() for part in pose))[0])

@@ -10,11 +10,11 @@ from collections.abc import Callable, Hashable, Sequence
 import torch
 from torch import Tensor
 
+from oasis_warp.ops import watch_overflow
+
 Outputs = tuple[Tensor, ...]
 MOST = 8
-"""Recordings that are kept: each holds the memory of a whole frame."""
-SLOTS = 4
-"""Calls whose inputs may be on their way to the device at once."""
+"""Recordings that are kept: each holds the memory of a whole picture."""
 
 
 def replayable(device: torch.device, inputs: Sequence[Tensor]) -> bool:
@@ -27,31 +27,24 @@ def replayable(device: torch.device, inputs: Sequence[Tensor]) -> bool:
 class Recording:
     """A function as a CUDA graph."""
 
-    def __init__(
-        self, function: Callable[..., tuple[Outputs, Tensor | None]], inputs: Sequence[Tensor], like: Tensor
-    ):
+    def __init__(self, function: Callable[..., Outputs], inputs: Sequence[Tensor], like: Tensor):
         """Run `function` to warm it up, then record it.
 
         Args:
-            function: From tensors of the shapes of `inputs` to its outputs and, where their memory may not suffice, one
-                whole number on the device that is 0 if it did. It waits for nothing and copies nothing from the host,
-                at least from its second call on.
+            function: From tensors of the shapes of `inputs` to its outputs. While it is recorded it waits for nothing
+                and copies nothing from the host.
             inputs: A first set of arguments.
             like: A tensor of the device and precision that `function` gets them in.
         """
-        self._sent = [torch.cuda.Event() for _ in range(SLOTS)]
-        self._next = 0
-        self._read = torch.cuda.Event()
         self._graph = torch.cuda.CUDAGraph()
-        with torch.inference_mode(False), torch.no_grad():  # what is made here is written to in any mode
+        # What is made here is written to in any mode; and a graph belongs to the current device.
+        with torch.cuda.device(like.device), torch.inference_mode(False), torch.no_grad():
             self._allocate(inputs, like)
             self._fill(inputs)
             self._record(function)
-            if self._overflow is not None:
-                self._verdict = torch.zeros(1, dtype=self._overflow.dtype, pin_memory=True)
 
     def _allocate(self, inputs: Sequence[Tensor], like: Tensor) -> None:
-        """One block of memory on the device for all inputs, and several pinned ones that are sent there."""
+        """One block of memory on the device for all inputs, and a page-locked one that is sent there."""
         sizes = [tensor.numel() for tensor in inputs]
 
         def shares(flat: Tensor) -> list[Tensor]:
@@ -59,51 +52,38 @@ class Recording:
 
         self._flat = torch.empty(sum(sizes), dtype=like.dtype, device=like.device)
         self._inputs = shares(self._flat)
-        self._staged = torch.empty(SLOTS, sum(sizes), dtype=like.dtype, pin_memory=True)
-        self._slots = [shares(row) for row in self._staged]
+        self._staged = torch.empty(sum(sizes), dtype=like.dtype, pin_memory=True)
+        self._staged_inputs = shares(self._staged)
 
-    def _record(self, function: Callable[..., tuple[Outputs, Tensor | None]]) -> None:
-        here, aside = torch.cuda.current_stream(self._flat.device), torch.cuda.Stream(self._flat.device)
+    def _record(self, function: Callable[..., Outputs]) -> None:
+        here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
         aside.wait_stream(here)
         with torch.cuda.stream(aside):
-            for _ in range(2):  # loads modules and fills caches; then as it will be recorded
-                function(*self._inputs)
+            function(*self._inputs)  # loads modules, fills caches, counts what a rasterization needs memory for
         here.wait_stream(aside)
-        with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
-            self._outputs, self._overflow = function(*self._inputs)
+        with watch_overflow() as self._overflow:
+            with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+                self._outputs = function(*self._inputs)
 
     def _fill(self, inputs: Sequence[Tensor]) -> None:
         """Put `inputs`, from wherever they are, in their places."""
-        away = [not tensor.is_cuda for tensor in inputs]
-        if any(away):
-            slot, sent = self._next, self._sent[self._next]
-            self._next = (slot + 1) % SLOTS
-            sent.synchronize()  # nothing to wait for, unless the device is `SLOTS` calls behind
-            for place, tensor, here in zip(self._slots[slot], inputs, away, strict=True):
-                if here:
-                    place.copy_(tensor)
-            self._flat.copy_(self._staged[slot], non_blocking=True)
-            sent.record()
-        for place, tensor, here in zip(self._inputs, inputs, away, strict=True):
-            if not here:
+        for place, tensor in zip(self._staged_inputs, inputs, strict=True):
+            if not tensor.is_cuda:
+                place.copy_(tensor)
+        if not all(tensor.is_cuda for tensor in inputs):
+            self._flat.copy_(self._staged, non_blocking=True)
+        for place, tensor in zip(self._inputs, inputs, strict=True):
+            if tensor.is_cuda:
                 place.copy_(tensor)
 
     def __call__(self, inputs: Sequence[Tensor]) -> Outputs | None:
-        """The function's outputs, in fresh memory; None where its own did not suffice."""
-        stream = torch.cuda.current_stream(self._flat.device)
-        stream.wait_event(self._read)  # of the call before, perhaps on another stream
-        with torch.inference_mode(False), torch.no_grad():
+        """The function's outputs, in fresh memory; None where that for its rasterizations did not suffice."""
+        with torch.cuda.device(self._flat.device), torch.inference_mode(False), torch.no_grad():
             self._fill(inputs)
             self._graph.replay()
             outputs = tuple(output.clone() for output in self._outputs)
-            if self._overflow is not None:
-                self._verdict.copy_(self._overflow.view(1), non_blocking=True)
-        self._read.record(stream)
-        if self._overflow is not None:
-            self._read.synchronize()
-            if self._verdict.item():
-                return None
-        return outputs
+            torch.cuda.current_stream().synchronize()  # only then is it known whether the picture is whole
+        return None if self._overflow.happened() else outputs
 
 
 class Recordings:
@@ -114,13 +94,16 @@ class Recordings:
         """Held while one of them is in use: they are one caller's at a time."""
         self._kept: OrderedDict[Hashable, Callable[[Sequence[Tensor]], Outputs | None]] = OrderedDict()
 
+    def __reduce__(self) -> tuple[type["Recordings"], tuple[()]]:
+        return Recordings, ()  # a copy of what they belong to starts without any
+
     def find(
         self, key: Hashable, record: Callable[[], Callable[[Sequence[Tensor]], Outputs | None]]
     ) -> Callable[[Sequence[Tensor]], Outputs | None]:
         """The recording of `key`, made by `record` if there is none; the one unused for longest makes room."""
         if key not in self._kept:
             self._kept[key] = record()
-            while len(self._kept) > MOST:  # only now: recording has waited for the device, which may still have used it
+            while len(self._kept) > MOST:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]
@@ -143,7 +126,7 @@ def replayed(
         recordings: Where recordings are kept.
         key: What the function depends on besides the values of `inputs`: sizes and precision.
         record: Makes a `Recording`, if there is none under `key` or the last one's memory did not suffice.
-        exact: The same function with all the memory that it takes.
+        exact: The function itself.
         inputs: Small tensors, on any device.
     """
     with recordings.lock:
