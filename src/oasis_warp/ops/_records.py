@@ -12,7 +12,6 @@ from torch import Tensor
 from oasis_kernels.cuda_binning import COUNTERS, TILE, spread_of
 from oasis_warp.ops._launch import has_cuda_kernels
 
-
 Size = int | torch.SymInt
 """A size, which is not known yet where torch traces."""
 
