@@ -18,6 +18,8 @@ LARGE = 256
 """Pixels of a box above which a face goes to the queue."""
 SHARE = 512
 """Pixels of a box in the queue that are handed out at once."""
+WORTH_A_LOOK = 8 * SHARE
+"""Pixels of a box above which a share is looked at as a whole first: most may lie beside a long, thin triangle."""
 QUEUE = 1 << 17
 """Faces that the queue holds at the most."""
 START_BITS = 44
@@ -244,6 +246,27 @@ DRAW_LARGE = """
         const long long middle = (slot + beyond) / 2;
         if (queue_starts[middle] <= share) slot = middle; else beyond = middle;
     }
+    // Whether a triangle surely has none of the items from `first` to `last`. On the screen its edge functions are
+    // linear, so they are largest and smallest at the corners of the columns and rows of these items: a lane a corner.
+    auto passes_by = [&](const Camera& camera, const Triangle& t, const Box& box, unsigned first, unsigned last) {
+        const unsigned top = first / box.width, bottom = (last - 1) / box.width;
+        const unsigned left = top == bottom ? first - top * box.width : 0;
+        const unsigned right = top == bottom ? last - 1 - top * box.width : box.width - 1;
+        const Ray ray = Exact::ray(camera, box.left + (int)(lane & 1 ? right : left),
+                                   box.top + (int)(lane & 2 ? bottom : top));
+        const Weights w = Exact::weigh(t, ray);
+        // What rounding may add up to, here or at a pixel, with a margin.
+        auto size_of = [&](const Corner& p) {
+            return fabs(p.x) + fabs(p.y) + (fabs(ray.u) + fabs(ray.v)) * fabs(p.z);
+        };
+        const double a = size_of(t.a), b = size_of(t.b), c = size_of(t.c);
+        const double slack_a = 1e-14 * (b * c), slack_b = 1e-14 * (c * a), slack_c = 1e-14 * (a * b);
+        const bool is_negative = __all_sync(all, w.a < -slack_a) || __all_sync(all, w.b < -slack_b) ||
+                                 __all_sync(all, w.c < -slack_c);
+        const bool is_positive = __all_sync(all, w.a > slack_a) || __all_sync(all, w.b > slack_b) ||
+                                 __all_sync(all, w.c > slack_c);
+        return is_negative && is_positive;
+    };
     __shared__ Camera cameras[@WARPS@];
     Camera& camera = cameras[warp];
     int entry = -1;
@@ -261,11 +284,14 @@ DRAW_LARGE = """
         const Triangle t = Exact::triangle(camera, mesh, faces, f);
         const Box box = box_of(camera, t);
         const double flat = edge_on(t);
-        const long long pixels = (long long)box.width * box.height, last = min((until - start) * @SHARE@, pixels);
-        draw_items(camera, mesh, (unsigned)((share - start) * @SHARE@), (unsigned)last, [&](unsigned item) -> Hit {
-            return meet(camera, keys + b * plane, t, flat, box.left, box.top, box.width, f, item);
-        });
-        share = until;
+        const unsigned pixels = (unsigned)box.width * (unsigned)box.height;
+        for (; share < until; share++) {
+            const unsigned first = (unsigned)(share - start) * @SHARE@, last = min(first + @SHARE@, pixels);
+            if (pixels > @WORTH_A_LOOK@ && passes_by(camera, t, box, first, last)) continue;
+            draw_items(camera, mesh, first, last, [&](unsigned item) -> Hit {
+                return meet(camera, keys + b * plane, t, flat, box.left, box.top, box.width, f, item);
+            });
+        }
     }
 """
 
@@ -273,7 +299,7 @@ DRAW_LARGE = """
 def _filled(text: str) -> str:
     numbers = {
         "BLOCK": BLOCK, "WARPS": BLOCK // 32, "FACES_A_BLOCK": FACES_A_BLOCK, "LARGE": LARGE, "SHARE": SHARE,
-        "START_BITS": START_BITS,
+        "START_BITS": START_BITS, "WORTH_A_LOOK": WORTH_A_LOOK,
     }  # fmt: skip
     for name, value in numbers.items():
         text = text.replace(f"@{name}@", str(value))

@@ -104,7 +104,7 @@ PULL = """
         }
         if (i < n_points) pull(b, i);
     }
-    if (!adds) {
+    if (!adds && sums) {
         __syncthreads();
         peak = largest_of_block(peak);
         if (threadIdx.x == 0) peaks[block_index] = peak;

@@ -1,10 +1,10 @@
 """Float32 posing of Gaussians on CUDA: what `barycentric` computes.
 
 `pose_riders` (one thread a Gaussian; blocks for those on vertices, then blocks for those on faces). Backward:
-`pose_riders_backward` (likewise) writes each Gaussian's row of eight for the vertices it rides on, (by position, by area
-ratio, by rotation), and for each of its corners the weight of the second half; that of the first are its barycentrics.
-Then `gather_riders` (one thread a vertex; blocks for vertices, then blocks for faces) adds up the rows at vertices, and
-the gradients of area ratios at faces.
+`pose_riders_backward` (likewise) writes each Gaussian's row of eight for the vertices it rides on, (by position, by
+area ratio, by rotation), and for each of its corners the weight of the second half; that of the first are its
+barycentrics. Then `gather_riders` (blocks for vertices, then blocks for faces; one thread each) adds up the rows at
+vertices, and the gradients of area ratios at faces.
 """
 
 from oasis_kernels.cuda_native import cuda_native

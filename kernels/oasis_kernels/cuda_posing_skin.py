@@ -1,8 +1,8 @@
 """Float32 skinning on CUDA, what `skinning` computes with H = G, of points at rest that pose correctives move before.
 
 `skin`: four threads a point share its transforms and correctives. `skin_backward` (one thread a point) writes, besides
-the gradients of a point's own inputs, the sums over the block's points of weight times gradient of the blended transform;
-`sum_blocks` (one thread an entry of a transform) adds up the blocks.
+the gradients of a point's own inputs, the sums over the block's points of weight times gradient of the blended
+transform; `sum_blocks` (one thread an entry of a transform) adds up the blocks.
 """
 
 from oasis_kernels.cuda_native import cuda_native
@@ -70,8 +70,8 @@ SKIN = """
         out_means[3 * at + lane] = mine.w * x.x + mine.x * x.y + mine.y * x.z + mine.z;
         if (covars) {
             const float* s = covars + 9ll * i;
-            const V3 half = {mine.w * s[0] + mine.x * s[3] + mine.y * s[6], mine.w * s[1] + mine.x * s[4] + mine.y * s[7],
-                             mine.w * s[2] + mine.x * s[5] + mine.y * s[8]};
+            auto entry = [&](int c) -> float { return mine.w * s[c] + mine.x * s[3 + c] + mine.y * s[6 + c]; };
+            const V3 half = {entry(0), entry(1), entry(2)};
             for (int c = 0; c < 3; c++)
                 out_covars[9 * at + 3 * lane + c] = dot3(half, {rows[c].w, rows[c].x, rows[c].y});
         }
@@ -183,8 +183,8 @@ skin = cuda_native(
     _expanded(SKIN),
     BLOCK,
 )
-"""Kernel: for every `POSES` poses, one block for every `POINTS` points. At multiples of 16 bytes: weights, transforms; of
-8 bytes: displacements."""
+"""Kernel: for every `POSES` poses, one block for every `POINTS` points. At multiples of 16 bytes: weights, transforms;
+of 8 bytes: displacements."""
 
 skin_backward = cuda_native(
     "skin_backward",

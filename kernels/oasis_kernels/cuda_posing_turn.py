@@ -1,8 +1,9 @@
-"""Float32 face and vertex rotations on CUDA: what `face_rotation` computes, by the formulas of `face_rotation_vectors`.
+"""Float32 face and vertex rotations on CUDA: `face_rotation` by the formulas of `face_rotation_vectors`.
 
-`turn_faces` (one thread a face) -> `turn_vertices` (one thread a vertex, over its faces). Backward: `turn_faces_backward`
-(one thread a face, which looks at its three vertices) -> `gather_edges` (one thread a vertex, over its corners). What a
-face is at rest is either worked out on the way or read from a table that `measure_triangles` wrote, one row of 12 a face.
+`turn_faces` (one thread a face) -> `turn_vertices` (one thread a vertex, over its faces). Backward:
+`turn_faces_backward` (one thread a face, which looks at its three vertices) -> `gather_edges` (one thread a vertex,
+over its corners). What a face is at rest is either worked out on the way or read from a table that `measure_triangles`
+wrote, one row of 12 a face, as `face_rotation_vectors` has it.
 """
 
 from oasis_kernels.cuda_native import cuda_native

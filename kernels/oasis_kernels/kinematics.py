@@ -6,8 +6,9 @@ abduction and twist. As a transform of rest points that is A = (L | J - L J), an
     T = T_P A,    T_0 = (orientation | translation).
 
 `transforms` (one pose a task, or a block, whose threads share the bones) keeps every A, in float64, for
-`transforms_backward`. There, with G the gradient by T, parents collect G_P += G A^T from the last bone to the first; then
-the gradient by A is R_P^T G, and a small angle about the axis a in front of the remaining rotations spins L by a.
+`transforms_backward`. There, with G the gradient by T, parents collect G_P += G A^T from the last bone to the first;
+then the gradient by A is R_P^T G, and a small angle about an axis spins L by that axis, as the rotations before it turn
+it.
 
 Pose correctives follow the flexion: two strengths a bone, c and c^2, c = 1 - cos(flexion). Arithmetic is float64
 whatever the arrays hold.
@@ -36,13 +37,8 @@ HEAD = """
         return o;
     };
     auto apply = [](const D33& a, D3 v) -> D3 {
-        return {a.m[0][0] * v.x + a.m[0][1] * v.y + a.m[0][2] * v.z, a.m[1][0] * v.x + a.m[1][1] * v.y + a.m[1][2] * v.z,
-                a.m[2][0] * v.x + a.m[2][1] * v.y + a.m[2][2] * v.z};
-    };
-    auto transposed = [](const D33& a) -> D33 {
-        D33 o;
-        for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) o.m[r][c] = a.m[c][r];
-        return o;
+        auto row = [&](int r) -> double { return a.m[r][0] * v.x + a.m[r][1] * v.y + a.m[r][2] * v.z; };
+        return {row(0), row(1), row(2)};
     };
     auto read3 = [](const T* p) -> D3 { return {(double)p[0], (double)p[1], (double)p[2]}; };
     auto about = [&](D3 a, double angle) -> D33 {  // Rodrigues

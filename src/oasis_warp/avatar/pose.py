@@ -39,7 +39,7 @@ def pose_gaussians(
 
 
 def mirror_canonical(canonical: CanonicalGaussians) -> CanonicalGaussians:
-    """The same Gaussians on the mirror image (x -> -x) of their surface; a quaternion (w, x, y, z) -> (w, x, -y, -z)."""
+    """The same Gaussians on the mirror image (x -> -x) of their surface: a rotation (w, x, y, z) -> (w, x, -y, -z)."""
     offsets, quats = canonical.offsets, canonical.quats
     return canonical._replace(
         offsets=offsets * offsets.new_tensor([-1.0, 1.0, 1.0]), quats=quats * quats.new_tensor([1.0, 1.0, -1.0, -1.0])

@@ -112,8 +112,8 @@ def mirror_pose(pose: HandPose) -> HandPose:
 def mirror_hand(hand: HandModel) -> HandModel:
     """The other hand: posed like `hand` by the same angles, it is the mirror image of `hand` in the mirrored pose.
 
-    Points and displacements are mirrored, axes too, as what angles turn about (a mirror reverses turns). Faces keep their
-    corners, and so wind the other way.
+    Points and displacements are mirrored, axes too, as what angles turn about (a mirror reverses turns). Faces keep
+    their corners, and so wind the other way.
     """
 
     def mirrored(displacements: Tensor) -> Tensor:

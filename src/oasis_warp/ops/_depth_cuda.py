@@ -1,4 +1,8 @@
-"""Depth buffers and scores in float32 on CUDA: four launches, their adjoint in three; nothing waits for the device."""
+"""Depth buffers and scores in float32 on CUDA: four launches, their adjoint in three; nothing waits for the device.
+
+Beside the results they take 8 bytes a pixel and 16 a face, but 2 MiB for all faces at the most; the adjoint takes 32 a
+vertex.
+"""
 
 import torch
 from torch import Tensor

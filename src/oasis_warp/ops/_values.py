@@ -63,7 +63,8 @@ class Look:
         self._found[0] = 0
         stream = device_and_stream(tensors[0])[1]
         for first in range(0, len(tensors), cuda_values.ARRAYS):
-            words: dict[str, int | float] = {"found": self._found.data_ptr(), "largest": checks.FINITE_LIMIT}
+            words: dict[str, int | float] = dict.fromkeys(cuda_values.all_finite().parameters, 0)
+            words |= {"found": self._found.data_ptr(), "largest": checks.FINITE_LIMIT}
             n_blocks = 0
             for k, tensor in enumerate(tensors[first : first + cuda_values.ARRAYS]):
                 words[f"data{k}"] = tensor.data_ptr()

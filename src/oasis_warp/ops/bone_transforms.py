@@ -177,12 +177,12 @@ def bone_transforms(
     with its parent; the first one is carried by `orientation` and `translation`. The strengths of pose correctives that
     come along belong to joints that mostly flex: blend skinning shrinks them by 1 - cos(flexion) to leading order.
 
-    With an axis of poses B before the first three arguments, all poses are worked out in one call, and both outputs have
-    that axis too. Differentiable in angles, orientation, translation and joints.
+    With an axis of poses B before the first three arguments, all poses are worked out in one call, and both outputs
+    have that axis too. Differentiable in angles, orientation, translation and joints.
 
     Args:
-        angles: Flexion, abduction and twist [rad] of the bones but the first, shape [J - 1, 3] or [B, J - 1, 3]; float32
-            or float64.
+        angles: Flexion, abduction and twist [rad] of the bones but the first, shape [J - 1, 3] or [B, J - 1, 3];
+            float32 or float64.
         orientation: Rotation of the first bone, shape [3, 3] or [B, 3, 3].
         translation: Where the origin of the rest frame goes [m], shape [3] or [B, 3].
         joints: Where each bone begins at rest [m], shape [J, 3].

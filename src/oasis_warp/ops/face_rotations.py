@@ -363,8 +363,8 @@ def face_rotations(
     Args:
         rest_vertices: Vertices at rest, any unit of length, shape [V, 3], float32 or float64; or the `rest_mesh` of
             these vertices and faces, where one mesh is posed many times.
-        posed_vertices: The same vertices posed, shape [V, 3]; or B poses of them, shape [B, V, 3]: then every output has
-            that axis too, and is what as many calls give.
+        posed_vertices: The same vertices posed, shape [V, 3]; or B poses of them, shape [B, V, 3]: then every output
+            has that axis too, and is what as many calls give.
         faces: Vertex indices, shape [F, 3]; F may be 0.
         validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
             Shapes and indices are always checked, indices once a tensor.

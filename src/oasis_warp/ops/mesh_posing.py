@@ -178,9 +178,10 @@ def _pose_on_mesh_backward(
 
         def one(k: int) -> list[Tensor]:
             floats = inputs.at_pose(k)
+            of_pose = (at_pose(grad, k) for grad in grads)
             return _pose_on_mesh_backward(
                 floats.vertices, faces, face_index, barycentrics, floats.vertex_quats, floats.area_ratio, quats, scales,
-                vertex_index, offsets, floats.vertex_area_ratio, half_powers, *(at_pose(grad, k) for grad in grads), needs,
+                vertex_index, offsets, floats.vertex_area_ratio, half_powers, *of_pose, needs,
             )  # fmt: skip
 
         pose_by_pose(found, len(posed_vertices), one, SHARED)

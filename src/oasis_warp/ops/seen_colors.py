@@ -6,31 +6,58 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_kernels import cuda_seen_colors as cuda_kernels
 from oasis_kernels import spherical_harmonics as kernels
-from oasis_warp.ops._launch import SCALAR, VEC3, VEC4, even_cuts, launch_ranges, view
+from oasis_warp.ops._launch import (
+    SCALAR,
+    VEC3,
+    VEC4,
+    device_and_stream,
+    even_cuts,
+    has_cuda_kernels,
+    launch_ranges,
+    run_cuda,
+    view,
+)
 from oasis_warp.ops._registration import adjoint, differentiable, operator
 
 
 def _seen(means: Tensor, coefficients: Tensor, viewmats: Tensor, degree: int) -> Tensor:
     colors = _colors_like(means, coefficients, viewmats, degree)
-    dtype = means.dtype
-    if colors.numel():
-        launch_ranges(
-            kernels.see(SCALAR[dtype], degree),
-            even_cuts(colors.shape[0] * colors.shape[1]),
-            [
-                view(means.contiguous(), VEC3[dtype]), _rows(coefficients), view(viewmats.contiguous(), VEC4[dtype]),
-                view(colors.view(-1, 3), VEC3[dtype]),
-            ],
-            like=means,
-        )  # fmt: skip
+    total = colors.shape[0] * colors.shape[1]
+    if not total:
+        return colors
+    means, coefficients, viewmats = means.contiguous(), coefficients.contiguous(), viewmats.contiguous()
+    if has_cuda_kernels(means):
+        words = _cuda_words(means, coefficients, viewmats) | {"total": total, "colors": colors.data_ptr()}
+        n_blocks = -(-total // cuda_kernels.BLOCK)
+        run_cuda(cuda_kernels.see(degree), words, n_blocks, device_and_stream(means)[1])
+        return colors
+    vec3 = VEC3[means.dtype]
+    launch_ranges(
+        kernels.see(SCALAR[means.dtype], degree),
+        even_cuts(total),
+        [
+            view(means, vec3), view(_rows(coefficients), vec3), view(viewmats, VEC4[means.dtype]),
+            view(colors.view(-1, 3), vec3),
+        ],
+        like=means,
+    )  # fmt: skip
     return colors
 
 
-def _rows(coefficients: Tensor) -> Any:
-    """Coefficients [N, K, 3] or [C, N, K, 3] as kernels take them."""
-    flat = coefficients.contiguous().view(-1, *coefficients.shape[-2:])
-    return view(flat, VEC3[coefficients.dtype])
+def _cuda_words(means: Tensor, coefficients: Tensor, viewmats: Tensor) -> dict[str, int | float]:
+    """Parameters of both CUDA kernels."""
+    n_harmonics = coefficients.shape[-2]
+    return {
+        "n": means.shape[0], "rows": coefficients.numel() // (3 * n_harmonics), "n_harmonics": n_harmonics,
+        "means": means.data_ptr(), "coefficients": coefficients.data_ptr(), "poses": viewmats.data_ptr(),
+    }  # fmt: skip
+
+
+def _rows(coefficients: Tensor) -> Tensor:
+    """Coefficients [N, K, 3] or [C, N, K, 3] without an axis of cameras."""
+    return coefficients.view(-1, *coefficients.shape[-2:])
 
 
 def _colors_like(means: Tensor, coefficients: Tensor, viewmats: Tensor, degree: int) -> Tensor:
@@ -49,21 +76,34 @@ def _seen_backward(
     g_means, g_coefficients, g_viewmats = _gradients(
         g_colors, colors, means, coefficients, viewmats, degree, wanted
     )
-    dtype, (n_cameras, n, _) = means.dtype, colors.shape
+    n_cameras, n, _ = colors.shape
     if not colors.numel():
         return g_means.zero_(), g_coefficients.zero_(), g_viewmats.zero_()
+    means, coefficients, viewmats, g_colors = (
+        t.contiguous() for t in (means, coefficients, viewmats, g_colors)
+    )
     g_centers = means.new_empty((n_cameras * n if wanted[2] else 0, 3), dtype=torch.float64)
-    vec3 = VEC3[dtype]
-    launch_ranges(
-        kernels.see_backward(SCALAR[dtype], degree),
-        even_cuts(n),
-        [
-            view(means.contiguous(), vec3), _rows(coefficients), view(viewmats.contiguous(), VEC4[dtype]),
-            view(colors.view(-1, 3), vec3), view(g_colors.contiguous().view(-1, 3), vec3), view(g_means, vec3),
-            _rows(g_coefficients), view(g_centers, VEC3[torch.float64]),
-        ],
-        like=means,
-    )  # fmt: skip
+    if has_cuda_kernels(means):
+        # The address of an empty tensor is null, by which the kernel knows what is not wanted.
+        words = _cuda_words(means, coefficients, viewmats) | {
+            "n_cameras": n_cameras, "colors": colors.data_ptr(), "g_colors": g_colors.data_ptr(),
+            "g_means": g_means.data_ptr(), "g_coefficients": g_coefficients.data_ptr(),
+            "g_centers": g_centers.data_ptr(),
+        }  # fmt: skip
+        n_blocks = -(-n // cuda_kernels.BLOCK)
+        run_cuda(cuda_kernels.see_backward(degree), words, n_blocks, device_and_stream(means)[1])
+    else:
+        vec3 = VEC3[means.dtype]
+        launch_ranges(
+            kernels.see_backward(SCALAR[means.dtype], degree),
+            even_cuts(n),
+            [
+                view(means, vec3), view(_rows(coefficients), vec3), view(viewmats, VEC4[means.dtype]),
+                view(colors.view(-1, 3), vec3), view(g_colors.view(-1, 3), vec3), view(g_means, vec3),
+                view(_rows(g_coefficients), vec3), view(g_centers, VEC3[torch.float64]),
+            ],
+            like=means,
+        )  # fmt: skip
     if wanted[2]:
         _fill_viewmats(g_viewmats, viewmats.detach().double(), g_centers.view(n_cameras, n, 3).sum(1))
     return g_means, g_coefficients, g_viewmats

@@ -254,7 +254,7 @@ def _corrective_gradients(
     if needs[0]:
         # A matrix product also for one pose: the poses are its inner axis.
         each = rows[None] if rows.ndim == 1 else rows
-        by_displacements = (each.T @ strengths.view(len(each), -1)).view_as(displacements)
+        by_displacements = (each.T @ strengths.view(len(each), flat.shape[1])).view_as(displacements)
     if needs[1]:
         by_strengths = rows @ flat
     return [by_displacements, by_strengths]
