@@ -24,13 +24,16 @@ from oasis_warp.bench.rows import json_text, to_record
 from oasis_warp.data.atomic import write_file
 
 PARTS = "kernels", "scaling", "roofline"
-SHARED = "device", "commit", "versions", "seed"
-"""Columns that say the same in every row, and are not printed."""
+SILENT = (
+    "device", "commit", "versions", "seed", "series", "faces", "groups", "calls", "wall_iqr_ms", "busy_iqr_ms",
+    "ceiling_gb_s", "ceiling_gflop_s",
+)  # fmt: skip
+"""Columns that say little about a row, and are not printed."""
 
 
 def line(row: Any) -> str:
     """A row as `name=value` pairs, numbers short."""
-    cells = {key: value for key, value in to_record(row).items() if key not in SHARED and value not in (None, "")}
+    cells = {key: value for key, value in to_record(row).items() if key not in SILENT and value not in (None, "")}
     return " ".join(f"{key}={f'{value:.4g}' if isinstance(value, float) else value}" for key, value in cells.items())
 
 
@@ -66,10 +69,14 @@ def main() -> None:
     wrong = [part for part in options.parts if part not in PARTS]
     if wrong:
         parser.error(f"part: expected {', '.join(PARTS)}, got {wrong[0]}")
+    if options.device == "cuda" and not torch.cuda.is_available():
+        parser.error("--device cuda: torch finds no CUDA device")
     options.out.mkdir(parents=True, exist_ok=True)
     for part in options.parts or PARTS:
         start = time.perf_counter()
         rows = measure(part, torch.device(options.device), options)
+        if not rows:
+            parser.error(f"{part}: nothing to measure; no case holds --only, or the profiler traces no kernels here")
         write_file(options.out / f"{part}.json", json_text(rows).encode())
         print(f"{part}: {time.perf_counter() - start:.1f} s, {rows[0].device}, {rows[0].versions}, {rows[0].commit}")
         for row in rows:

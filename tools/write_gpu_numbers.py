@@ -120,16 +120,17 @@ def point_lines(rows: Sequence[ScalingRow]) -> str:
             continue
         both = backward[key(row)]
         right = "yes" if row.finite and both.finite else "no"
+        overflow = "" if row.overflow is None else "yes" if row.overflow or both.overflow else "no"
         lines.append(
             (
                 row.scene, f"{row.width} x {row.height}", str(row.views), f"{row.pairs:,}", f"{row.longest:,}",
                 short(row.wall_ms), short(row.busy_ms), short(both.wall_ms), short(both.busy_ms), short(row.peak_mb),
-                short(both.peak_mb), right, row.checked, power(row.max_abs), power(row.most_abs),
+                short(both.peak_mb), right, overflow, row.checked, power(row.max_abs), power(row.most_abs),
             )
         )  # fmt: skip
     heading = (
         "scene", "size", "views", "pairs", "longest list", "wall ms", "GPU ms", "with backward: wall ms", "GPU ms",
-        "MiB", "with backward", "finite", "compared", "max error", "of 99.99 %",
+        "MiB", "with backward", "finite", "overflow", "compared", "max error", "of 99.99 %",
     )  # fmt: skip
     return table(heading, lines)
 

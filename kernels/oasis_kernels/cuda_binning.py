@@ -57,7 +57,7 @@ COUNT = TILE_BOX + """
     for (int done = 0; __any_sync(0xffffffffu, done < count); done++) {
         const int tile = done < count ? (int)((image + y) * tiles_x + x) : -1;
         const unsigned same = __match_any_sync(0xffffffffu, tile);
-        if (tile >= 0 && lane == __ffs(same) - 1) 
+        if (tile >= 0 && lane == __ffs(same) - 1)
             atomicAdd((int*)(counters + @COUNTERS@) + (long long)tile * spread, __popc(same));
         if (++x == t.z) { x = t.x; y++; }
     }

@@ -1,16 +1,19 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from oasis_warp.bench import gpu_speed
+from oasis_warp.bench import gpu_speed, gpu_timing
 from oasis_warp.bench.avatar_scene import Learning, avatar_scene, draw, make_avatar, many_poses, pose
 from oasis_warp.bench.errors import same_bits
 from oasis_warp.bench.gpu_cases import CASES, OURS, avatar_case, choose, picture, visibility
 from oasis_warp.bench.gpu_speed import errors, measure, measure_case, most_error
+from oasis_warp.bench.gpu_timing import Captured
 from oasis_warp.bench.operators import OPERATORS, Results
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
+from oasis_warp.ops._pair_counts import Overflow
 
 SMALL = {
     "picture": picture(2_000, 64, 1, "forward"),
@@ -54,16 +57,19 @@ def test_every_case_gives_the_exact_results_and_the_same_bits_again(name, device
     case = SMALL[name].make(device, 0, {})
     found, again = case.ways[OURS].run(), case.ways[OURS].run()
     wrong = errors(case, found)
+    assert wrong["rel_l2"] is not None
     assert wrong["rel_l2"] < LOOSE.get(name, 5e-6)
     assert wrong["max_abs"] is None or wrong["max_abs"] < 2 / 255
     assert (wrong["gradient_rel_l2"] is None) == (len(found.gradients) == 0)
     assert wrong["gradient_rel_l2"] is None or wrong["gradient_rel_l2"] < LOOSE_GRADIENTS.get(name, 5e-5)
-    assert same_bits([*found.values, *found.gradients], [*again.values, *again.gradients])
+    assert same_bits(found.tensors, again.tensors)
 
 
 def test_what_a_graph_holds_of_a_frame_is_what_the_avatar_draws(device):
     case = SMALL["frame"].make(device, 0, {})
-    shown, plain = case.ways[OURS].run(), case.ways[OURS].captured()
+    run, captured = case.ways[OURS]
+    assert captured is not None
+    shown, plain = run(), captured()
     torch.testing.assert_close(plain.values[0], shown.values[0], rtol=0, atol=1e-6)
 
 
@@ -103,6 +109,7 @@ def test_a_row_has_times_and_errors_and_on_the_cpu_no_graph(cpu):
     assert (row.busy_ms, row.launch_ms, row.kernels_ms, row.not_captured) == (None, None, None, "no CUDA device")
     assert row.bit_equal
     assert row.groups == 2
+    assert row.gradient_rel_l2 is not None
     assert row.gradient_rel_l2 < 5e-5
 
 
@@ -118,6 +125,7 @@ def test_a_peer_is_timed_on_the_same_scene_and_its_errors_are_told(cpu):
     assert [row.way for row in rows] == [OURS, "darker"]
     assert rows[1].max_abs == pytest.approx(0.25, abs=1e-4)
     assert rows[1].most_abs == pytest.approx(0.25, abs=1e-4)
+    assert rows[1].gradient_rel_l2 is not None
     assert rows[1].gradient_rel_l2 < 5e-5  # a shift changes no gradient
     assert rows[1].not_captured == "no CUDA device"
     assert len(seen[0].means) == 2_000
@@ -135,6 +143,36 @@ def test_other_bits_in_a_second_call_are_told(cpu):
 
     (row,) = measure_case(replace(case, ways={name: way._replace(run=unsteady)}), cpu, 2)
     assert not row.bit_equal
+
+
+class Lists(Overflow):
+    """Says that lists overflowed, or did not."""
+
+    def __init__(self, full: bool) -> None:
+        super().__init__()
+        self.full = full
+
+    def happened(self) -> bool:
+        return self.full
+
+
+@pytest.mark.parametrize(("full", "shift", "equal"), [(False, 0.0, True), (True, 0.0, False), (False, 1e-7, False)])
+def test_a_graph_is_timed_by_its_steps_and_its_bits_and_lists_are_looked_at(monkeypatch, cpu, full, shift, equal):
+    case = SMALL["picture"].make(cpu, 0, {})
+    monkeypatch.setattr(gpu_timing, "device_clock", lambda run, times: 20.0 * times)
+    replays = []
+
+    def graphs(way, device):
+        results = Results(tuple(value + shift for value in way.run().values))
+        graph = SimpleNamespace(replay=lambda: replays.append(1))
+        return gpu_speed.Graphs(*(Captured(graph, steps, results, Lists(full)) for steps in (1, 10)))
+
+    monkeypatch.setattr(gpu_speed, "make_graphs", graphs)
+    (row,) = measure_case(case, cpu, 2)
+    assert (row.launch_ms, row.busy_ms, row.busy_iqr_ms) == (20.0, 2.0, 0.0)
+    assert row.not_captured == ""
+    assert row.bit_equal == equal
+    assert replays
 
 
 def test_the_error_of_most_pixels_leaves_out_one_in_ten_thousand():
@@ -159,6 +197,7 @@ def test_every_case_is_captured_and_the_graph_gives_the_same_bits(name):
     (row,) = measure([SMALL[name]], torch.device("cuda"), groups=2)
     assert row.not_captured == ""
     assert row.busy_ms is not None
+    assert row.launch_ms is not None
     assert 0 < row.busy_ms <= 2 * row.launch_ms
     assert row.bit_equal
     assert row.kernels is not None

@@ -183,12 +183,7 @@ def test_nothing_lives_longer_than_its_graph(name, backward):
         gc.enable()
 
 
-BLENDS = pytest.mark.xfail(strict=True, reason="blending reads ctx.saved_tensors twice, which checkpoints refuse")
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=BLENDS if "blend" in OPERATORS[name] else ()) for name in NAMES]
-)
+@pytest.mark.parametrize("name", NAMES)
 def test_checkpoints_and_hooks_find_what_they_look_for(name):
     call, inputs = cases()[name]
     leaves = [tensor.clone().requires_grad_() for tensor in inputs]

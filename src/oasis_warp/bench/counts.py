@@ -43,7 +43,7 @@ def count(scene: Scene) -> Counts:
         boxes = project(
             view.means, view.quats, view.scales, view.opacities, view.viewmats, view.Ks, view.width, view.height,
             near_plane=0.01, far_plane=1e10, radius_clip=0.0, eps2d=EPS2D,
-        ).boxes[0]  # fmt: skip
+        ).tables().boxes.view(-1, 4)  # fmt: skip
         boxes = boxes[(boxes[:, 0] < boxes[:, 2]) & (boxes[:, 1] < boxes[:, 3])]
         x0, y0 = (boxes[:, :2] // TILE).unbind(-1)
         x1, y1 = ((boxes[:, 2:] + TILE - 1) // TILE).unbind(-1)

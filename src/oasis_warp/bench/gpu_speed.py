@@ -14,7 +14,7 @@ from oasis_warp.bench.gpu_timing import STEPS_A_GRAPH, Captured, NotCaptured, Pr
 from oasis_warp.bench.operators import Outputs, Results
 from oasis_warp.bench.rows import commit, device_name, versions
 from oasis_warp.bench.scenes import Scene
-from oasis_warp.bench.timing import peak_megabytes
+from oasis_warp.bench.timing import peak_megabytes, synchronise
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 
@@ -151,12 +151,11 @@ def measure_case(case: Case, device: torch.device, groups: int) -> list[GpuRow]:
     for name, way in case.ways.items():
         found, again = way.run(), way.run()
         captured = graphs[name].one
-        equal = same_bits([*found.values, *found.gradients], [*again.values, *again.gradients])
+        equal = same_bits(found.tensors, again.tensors)
         if captured is not None:
             captured.graph.replay()
-            equal = equal and same_bits(
-                [*captured.results.values, *captured.results.gradients], [*found.values, *found.gradients]
-            )
+            synchronise()
+            equal = equal and same_bits(captured.results.tensors, found.tensors) and not captured.overflow.happened()
         times = kernel_times(way.run) if device.type == "cuda" else []
         wall, busy, launch = (samples.get((name, kind)) for kind in ("wall", "busy", "launch"))
         assert wall is not None

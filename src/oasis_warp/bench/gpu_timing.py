@@ -121,13 +121,13 @@ def time_groups(probes: Sequence[Probe], groups: int, seconds: float | None = No
 def warm_up(probe: Probe) -> float:
     """Milliseconds of one of the last calls, after enough of them for the clocks to rise."""
     probe.clock(probe.run, 1)  # compiles or loads kernels
-    done, start = 0, time.perf_counter()
+    done, spent = 0, 0.0
     while True:
-        ms = probe.clock(probe.run, 1 + done) / (1 + done)
-        done += 1 + done
-        spent = time.perf_counter() - start
+        calls = 1 + done
+        ms = probe.clock(probe.run, calls)
+        done, spent = done + calls, spent + 1e-3 * ms
         if spent >= LONGEST_WARM or (done >= WARM_CALLS and spent >= WARM_SECONDS):
-            return ms
+            return ms / calls
 
 
 class NotCaptured(RuntimeError):

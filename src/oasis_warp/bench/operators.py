@@ -31,6 +31,11 @@ class Results(NamedTuple):
     values: Outputs
     gradients: Outputs = ()
 
+    @property
+    def tensors(self) -> Outputs:
+        """Both."""
+        return *self.values, *self.gradients
+
 
 def as_it_is(value: Any) -> Any:
     """The value."""

@@ -52,8 +52,8 @@ PICTURE_KERNELS: Mapping[str, Callable[[Counts], Work]] = {
     "count_pairs": lambda c: Work(20 * c.gaussians + 8 * c.pairs, 10 * c.gaussians + 2 * c.pairs),
     # Counter 4; tile, start and length 16, cursor 8.
     "place_tiles": lambda c: Work(28 * c.tiles, 12 * c.tiles),
-    # Box 16, depth 8; a cursor of 8 is read and written, and a key of 8 written.
-    "fill_tiles": lambda c: Work(24 * c.gaussians + 24 * c.pairs, 10 * c.gaussians + 4 * c.pairs),
+    # Box 16, depth 8; a cursor of 4 is read and written, and a key of 8 written.
+    "fill_tiles": lambda c: Work(24 * c.gaussians + 16 * c.pairs, 10 * c.gaussians + 4 * c.pairs),
     # Key 8, layer, sorted index 4; image 12, alpha, transmittance and stop 4 each; what a tile is 16.
     # A pixel of a box: offset 2, W d 6, |.|^2 3, exponent 2, cap and tests 3, weight and rest 2, colours 6. A pair: the
     # sort compares it log2(length)^2 / 2 times, some 30.

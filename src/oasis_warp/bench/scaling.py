@@ -4,12 +4,14 @@ import itertools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.bench.counts import Counts, count
+from oasis_warp.bench.errors import same_bits
 from oasis_warp.bench.gpu_cases import TRUSTED
 from oasis_warp.bench.gpu_speed import most_error
 from oasis_warp.bench.gpu_timing import STEPS_A_GRAPH, NotCaptured, Probe, capture, time_groups
@@ -18,7 +20,7 @@ from oasis_warp.bench.operators import OPERATORS, Pass, Results, forward, repeat
 from oasis_warp.bench.rows import commit, device_name, versions
 from oasis_warp.bench.scaling_scenes import crop, giants, one_tile, surface
 from oasis_warp.bench.scenes import Scene
-from oasis_warp.bench.timing import peak_megabytes
+from oasis_warp.bench.timing import peak_megabytes, synchronise
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.ops import rasterization
 
@@ -69,6 +71,8 @@ class ScalingRow:
     """Memory beyond what was in use before the call [MiB]."""
     finite: bool
     """All values, and all gradients."""
+    overflow: bool | None
+    """Whether the graph's lists overflowed, or it gave other bits than an eager call; None where there is no graph."""
     checked: str
     """What was compared with the float64 kernels: "all" of the picture, or a "crop" of the first view."""
     max_abs: float
@@ -152,11 +156,11 @@ def measure_point(point: Point, device: torch.device, seconds: float, seed: int)
     for pass_, run in calls.items():
         for _ in range(SETTLED):
             found = run()
-        finite = all(bool(t.isfinite().all()) for t in (*found.values, *found.gradients))
+        finite = all(bool(t.isfinite().all()) for t in found.tensors)
         error = error or picture_errors(scene, found.values[0], work)
         del found
         memory = peak_megabytes(run, device)
-        wall, busy, reason = timed(run, device, seconds / len(calls))
+        times = timed(run, device, seconds / len(calls))
         rows.append(
             ScalingRow(
                 axis=point.axis,
@@ -169,14 +173,15 @@ def measure_point(point: Point, device: torch.device, seconds: float, seed: int)
                 height=scene.height,
                 pairs=work.pairs,
                 longest=work.longest,
-                wall_ms=wall,
-                busy_ms=busy,
+                wall_ms=times.wall_ms,
+                busy_ms=times.busy_ms,
                 peak_mb=memory,
                 finite=finite,
+                overflow=times.overflow,
                 checked=error[0],
                 max_abs=error[1],
                 most_abs=error[2],
-                not_captured=reason,
+                not_captured=times.reason,
                 device=device_name(device),
                 seed=seed,
                 commit=commit(),
@@ -186,21 +191,34 @@ def measure_point(point: Point, device: torch.device, seconds: float, seed: int)
     return rows
 
 
-def timed(run: Callable[[], Results], device: torch.device, seconds: float) -> tuple[float, float | None, str]:
-    """Milliseconds on the host's clock and in a CUDA graph, or why there is no graph."""
-    probes, reason = [Probe(run)], "no CUDA device"
+class Times(NamedTuple):
+    """What `timed` found: see the fields of `ScalingRow`."""
+
+    wall_ms: float
+    busy_ms: float | None
+    overflow: bool | None
+    reason: str
+
+
+def timed(run: Callable[[], Results], device: torch.device, seconds: float) -> Times:
+    """Time a call on the host's clock and, on CUDA, in a graph."""
+    captured, reason = None, "no CUDA device"
     if device.type == "cuda":
         start = time.perf_counter()
         run()
-        torch.cuda.synchronize()
+        synchronise()
         long = time.perf_counter() - start > seconds / (4 * STEPS_A_GRAPH)
         try:
-            probes.append(capture(run, 1 if long else STEPS_A_GRAPH).probe())
-            reason = ""
+            captured, reason = capture(run, 1 if long else STEPS_A_GRAPH), ""
         except NotCaptured as error:
             reason = str(error)
-    wall, *busy = time_groups(probes, GROUPS, seconds)
-    return wall.median_ms, busy[0].median_ms if busy else None, reason
+    if captured is None:
+        (wall,) = time_groups([Probe(run)], GROUPS, seconds)
+        return Times(wall.median_ms, None, None, reason)
+    wall, busy = time_groups([Probe(run), captured.probe()], GROUPS, seconds)
+    same = same_bits(captured.results.tensors, run().tensors)
+    synchronise()
+    return Times(wall.median_ms, busy.median_ms, captured.overflow.happened() or not same, reason)
 
 
 def picture_errors(scene: Scene, image: Float[Tensor, "C H W 3"], work: Counts) -> tuple[str, float, float]:

@@ -101,14 +101,15 @@ def scaling_table(rows: Sequence[ScalingRow]) -> Table:
     table = Table(title_justify="left")
     for heading in ("axis", "scene", "size", "views", "pass"):
         table.add_column(heading, no_wrap=True)
-    for heading in ("pairs", "longest", "wall ms", "GPU ms", "MiB", "finite", "compared", "max", "99.99 %"):
+    for heading in ("pairs", "longest", "wall ms", "GPU ms", "MiB", "finite", "overflow", "compared", "max", "99.99 %"):
         table.add_column(heading, justify="right", no_wrap=True)
     for k, row in enumerate(rows):
         last = k + 1 == len(rows) or (rows[k + 1].axis, rows[k + 1].series) != (row.axis, row.series)
         table.add_row(
             row.axis, row.scene, f"{row.width} x {row.height}", str(row.views), row.pass_, f"{row.pairs:,}",
             f"{row.longest:,}", cell(row.wall_ms), cell(row.busy_ms), cell(row.peak_mb, ".1f"),
-            "yes" if row.finite else "NO", row.checked, number(row.max_abs), number(row.most_abs), end_section=last,
+            "yes" if row.finite else "NO", "" if row.overflow is None else "YES" if row.overflow else "no",
+            row.checked, number(row.max_abs), number(row.most_abs), end_section=last,
         )  # fmt: skip
     return table
 

@@ -79,8 +79,8 @@ def _words(splats: Splats, layout: Layout, lists: Tensor, planes: Tensor | None)
         **splats.words(), "opacities": splats.opacities.data_ptr(), "colors": splats.colors.data_ptr(),
         "backgrounds": splats.backgrounds.data_ptr(), "n": n, "n_cameras": n_cameras, "total": n_cameras * n,
         "tiles_x": tiles_x, "tiles_y": tiles_y, "width": width, "height": height, "n_tiles": n_tiles, "tiles": first,
-        "cursors": first + 16 * n_tiles, "pair_starts": first + (16 + 4 * spread) * n_tiles, "spread": spread, "transmittance": plane,
-        "stops": plane and plane + 4 * pixels, "checkpoints": plane and plane + 8 * pixels,
+        "cursors": first + 16 * n_tiles, "pair_starts": first + (16 + 4 * spread) * n_tiles, "spread": spread,
+        "transmittance": plane, "stops": plane and plane + 4 * pixels, "checkpoints": plane and plane + 8 * pixels,
     }  # fmt: skip
 
 

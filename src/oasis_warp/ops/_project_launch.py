@@ -34,6 +34,7 @@ from oasis_warp.ops._launch import (
 from oasis_warp.ops._pair_counts import own_slot
 from oasis_warp.ops._records import counters_size, empty_records, table_words, tables
 from oasis_warp.ops._rules import current_rules
+from oasis_warp.ops._values import refuse_capture
 
 CAMERA_SUM_BLOCK = 1024
 """Gaussians whose camera gradients one thread of the generic kernel adds up; fixed, so that threads change no sum."""
@@ -83,7 +84,7 @@ def empty_outputs(means: Tensor, viewmats: Tensor, width: int, height: int) -> O
     """Memory for `OUTPUTS` and the records."""
     shape = viewmats.shape[0], means.shape[0]
     means2d, covars2d, depths, conics, radii = (
-        torch.empty((*shape, size) if size else shape, dtype=dtype or means.dtype, device=means.device)
+        means.new_empty((*shape, size) if size else shape, dtype=dtype)
         for _name, size, dtype in OUTPUTS
     )
     return means2d, covars2d, depths, conics, radii, empty_records(means, *shape, width, height)
@@ -105,11 +106,12 @@ def check_arrays(scene: Scene, **others: tuple[Tensor | None, tuple[int, ...], t
     n, c, dtype = means.shape[0], viewmats.shape[0], means.dtype
     if (quats is None or scales is None) if covars is None else not (quats is None and scales is None):
         raise ValueError("covars: expected either covars, or quats and scales, got neither or both.")
-    expected = {
-        "means": (means, (n, 3), dtype), "quats": (quats, (n, 4), dtype), "scales": (scales, (n, 3), dtype),
-        "covars": (covars, (n, 3, 3), dtype), "viewmats": (viewmats, (c, 4, 4), dtype), "Ks": (Ks, (c, 3, 3), dtype),
-    } | others  # fmt: skip
-    for name, (tensor, shape, kind) in expected.items():
+    expected = (
+        ("means", means, (n, 3), dtype), ("quats", quats, (n, 4), dtype), ("scales", scales, (n, 3), dtype),
+        ("covars", covars, (n, 3, 3), dtype), ("viewmats", viewmats, (c, 4, 4), dtype), ("Ks", Ks, (c, 3, 3), dtype),
+        *((name, *other) for name, other in others.items()),
+    )  # fmt: skip
+    for name, tensor, shape, kind in expected:
         if tensor is not None and (tensor.shape != shape or tensor.dtype != kind or tensor.device != means.device):
             raise ValueError(
                 f"{name}: expected shape {list(shape)}, {kind} on {means.device}, "
@@ -164,8 +166,10 @@ def project_cuda(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[
     """
     rules = current_rules()
     stream = current_stream(scene.means.device)
-    bad = own_slot() if validate else None
-    if bad is not None:
+    bad = None
+    if validate:
+        refuse_capture()
+        bad = own_slot()
         bad[0] = 0
     total = len(scene.viewmats) * len(scene.means)
     n_blocks = max(1, -(-total // cuda_projection.BLOCK))  # one clears the counters at least

@@ -9,7 +9,7 @@ from oasis_kernels import cuda_values
 from oasis_kernels.finite import ALL_FINITE
 from oasis_warp.core import checks
 from oasis_warp.ops._launch import device_and_stream, has_vectors, run_cuda, run_native
-from oasis_warp.ops._pair_counts import _slots
+from oasis_warp.ops._pair_counts import slots
 
 
 def check_finite(**tensors: Tensor | None) -> None:
@@ -59,7 +59,7 @@ class Look:
         refuse_capture()
         tensors = list(self._given.values())
         self._device = tensors[0].device
-        self._found = _slots.take()
+        self._found = slots.take()
         self._found[0] = 0
         stream = device_and_stream(tensors[0])[1]
         for first in range(0, len(tensors), cuda_values.ARRAYS):
@@ -76,7 +76,7 @@ class Look:
     def __exit__(self, kind: Any, *_: Any) -> None:
         torch.cuda.current_stream(self._device).synchronize()  # even after an error: the kernel writes to the slot
         bad = bool(self._found[0])
-        _slots.give(self._found)
+        slots.give(self._found)
         if bad and kind is None:
             checks.check_finite(**self._given)
             raise AssertionError("the kernel has met a bad value that is not in its inputs")

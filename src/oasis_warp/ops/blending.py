@@ -9,6 +9,7 @@ from torch import Tensor
 
 from oasis_kernels import constants
 from oasis_kernels.cuda_binning import INDEX_BITS
+from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops import _blend_cuda, _blend_strips, _blend_tiles
 from oasis_warp.ops._launch import has_vectors
 from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
@@ -108,6 +109,7 @@ _adjoint = adjoint("blend_backward", _blend_backward, _blend_backward_fake)
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
     _, _, opacities, colors, backgrounds, records, ctx.frame, _, _ = inputs
     ctx.save_for_backward(records, opacities, colors, backgrounds, *output[2])
+    ctx.bytes = None if is_traced() else [t.untyped_storage().nbytes() for t in output[2]]
     ctx.set_materialize_grads(False)
 
 
@@ -117,6 +119,11 @@ def _back(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, _kept: Any) 
     gradients: Any = (None,) * 5
     if g_image is not None or g_alpha is not None:
         saved = ctx.saved_tensors
+        if ctx.bytes is not None and ctx.bytes != [t.untyped_storage().nbytes() for t in saved[4:]]:
+            raise RuntimeError(
+                "rasterization: expected the tensors that it saved, got copies, which lack what is hidden behind them. "
+                "Draw outside of hooks that move saved tensors, such as torch.autograd.graph.save_on_cpu."
+            )
         gradients = _adjoint(g_image, g_alpha, list(saved[:4]), list(saved[4:]), ctx.frame, wanted)
     return (
         *(g if need else None for g, need in zip(gradients, needs, strict=True)),
