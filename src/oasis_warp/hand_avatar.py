@@ -7,14 +7,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.pose import mirror_canonical, pose_gaussians
-from oasis_warp.core.checks import check_finite, check_shape
+from oasis_warp.core.checks import check_shape
 from oasis_warp.core.config import WHITE, Color
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandPose, PosedHand, Render, Side
 from oasis_warp.data.avatar_file import load_avatar, save_avatar
 from oasis_warp.hand.skinning import mirror_hand, mirror_points, rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.ops import rest_mesh
+from oasis_warp.ops import check_finite, rest_mesh
 from oasis_warp.render.render import render
 from oasis_warp.render.replay import Recording, Recordings, replayable, replayed
 
