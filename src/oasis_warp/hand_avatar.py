@@ -1,5 +1,6 @@
 """`Avatar`: one person's hand, ready to be posed and drawn. No image, network or estimator is needed."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import torch
@@ -7,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.pose import mirror_canonical, pose_gaussians
+from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.checks import check_shape
 from oasis_warp.core.config import WHITE, Color
 from oasis_warp.core.errors import InputError
@@ -14,7 +16,7 @@ from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandPos
 from oasis_warp.data.avatar_file import load_avatar, save_avatar
 from oasis_warp.hand.skinning import mirror_hand, mirror_points, rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.ops import check_finite, rest_mesh
+from oasis_warp.ops import Look, check_finite, rest_mesh
 from oasis_warp.render.render import render
 from oasis_warp.render.replay import Recording, Recordings, replayable, replayed
 
@@ -134,10 +136,13 @@ class Avatar:
         check_shape("camera.K", camera.K, 3, 3)
         color = torch.as_tensor(background, dtype=self.shape.dtype)
         check_shape("background", color, 3)
-        if validate:
-            check_finite(**pose._asdict(), viewmat=camera.viewmat, K=camera.K)
-        inputs = (*pose, camera.viewmat, camera.K, color)
+        if not isinstance(background, Tensor):
+            color = plain_background(tuple(color.tolist()), 1, like=self.shape)[0]
+        named = {**pose._asdict(), "viewmat": camera.viewmat, "K": camera.K}
+        inputs = (*named.values(), color)
         if self.shape.dtype != torch.float32 or not replayable(self.device, (*inputs, *self._fixed)):
+            if validate:
+                check_finite(**named)
             return render(self.pose(pose, validate=False), camera, background=background)
 
         def draw(*parts: Tensor) -> tuple[Tensor, ...]:
@@ -145,8 +150,12 @@ class Avatar:
             seen = Camera(viewmat, K, camera.width, camera.height)
             return tuple(render(self.pose(HandPose(*posed), validate=False), seen, background=color))
 
+        looking = validate and all(tensor.is_cuda for tensor in named.values())  # while the picture is drawn
+        if validate and not looking:
+            check_finite(**named)
         size = camera.width, camera.height
-        return Render(*replayed(self._recordings, size, lambda: Recording(draw, inputs, self.shape), draw, inputs))
+        with Look(**named) if looking else nullcontext():
+            return Render(*replayed(self._recordings, size, lambda: Recording(draw, inputs, self.shape), draw, inputs))
 
     def save(self, path: Path | str) -> None:
         """Write the avatar file (safetensors, versioned; see docs/avatar_file.md)."""

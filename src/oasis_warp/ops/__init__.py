@@ -1,6 +1,7 @@
 """Differentiable operators on torch tensors, computed by Warp kernels on the CPU or a CUDA device."""
 
 from oasis_warp.ops._pair_counts import watch_overflow as watch_overflow
+from oasis_warp.ops._values import Look as Look
 from oasis_warp.ops._values import check_finite as check_finite
 from oasis_warp.ops.blend_weights import BlendWeights as BlendWeights
 from oasis_warp.ops.blend_weights import blend_colors as blend_colors

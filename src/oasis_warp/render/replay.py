@@ -72,9 +72,9 @@ class Recording:
                 place.copy_(tensor)
         if not all(tensor.is_cuda for tensor in inputs):
             self._flat.copy_(self._staged, non_blocking=True)
-        for place, tensor in zip(self._inputs, inputs, strict=True):
-            if tensor.is_cuda:
-                place.copy_(tensor)
+        near = [(place, tensor) for place, tensor in zip(self._inputs, inputs, strict=True) if tensor.is_cuda]
+        if near:
+            torch._foreach_copy_(*map(list, zip(*near, strict=True)))
 
     def __call__(self, inputs: Sequence[Tensor]) -> Outputs | None:
         """The function's outputs, in fresh memory; None where that for its rasterizations did not suffice."""
