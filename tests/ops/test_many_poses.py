@@ -163,7 +163,7 @@ def test_wrong_correctives_are_named_with_what_was_expected(options, message, as
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", [*SHARED, "skin correctives"])
 def test_a_graph_that_was_captured_once_follows_new_inputs_forwards_and_backwards(name):
-    function, inputs = calls(device="cuda")[name]
+    function, inputs = calls(device="cuda", validate=False)[name]
     _, others = calls(seed=3, device="cuda")[name]
     leaves = [tensor.clone().requires_grad_() for tensor in inputs]
     weights = [torch.randn_like(o) for o in function(*leaves)]

@@ -36,7 +36,7 @@ N_POSES = 9
 PARENTS = (-1, 0, 1, 0, 3)
 
 
-def calls(seed=0, n=4, dtype=torch.float32, empty=False, device="cpu"):
+def calls(seed=0, n=4, dtype=torch.float32, empty=False, device="cpu", validate=True):
     """Of each operator: a function of float tensors, and these; `empty`: no points and no riders."""
     generator = torch.Generator().manual_seed(seed)
     rest, posed, faces = (part.to(device) for part in mesh(seed, n, dtype))
@@ -56,7 +56,7 @@ def calls(seed=0, n=4, dtype=torch.float32, empty=False, device="cpu"):
     def on_both(posed, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio):
         return pose_on_mesh(
             posed, faces, face_index, barycentrics, vertex_quats, area_ratio, quats, scales,
-            vertex_index=vertex_index, offsets=offsets, vertex_area_ratio=vertex_area_ratio,
+            vertex_index=vertex_index, offsets=offsets, vertex_area_ratio=vertex_area_ratio, validate=validate,
         )  # fmt: skip
 
     def on_faces(posed, barycentrics, vertex_quats, area_ratio, quats, scales):
@@ -66,13 +66,15 @@ def calls(seed=0, n=4, dtype=torch.float32, empty=False, device="cpu"):
     axes = torch.nn.functional.normalize(normal(5, 3, 3), dim=-1)
 
     def bent(angles, orientation, translation, joints):
-        return bone_transforms(angles, orientation, translation, joints, axes, PARENTS)
+        return bone_transforms(angles, orientation, translation, joints, axes, PARENTS, validate=validate)
 
     def corrected(means, weights, transforms, displacements, strengths):
-        return skin(means, None, weights, transforms, displacements=displacements, strengths=strengths)[:1]
+        correctives = {"displacements": displacements, "strengths": strengths, "validate": validate}
+        return skin(means, None, weights, transforms, **correctives)[:1]
 
     def corrected_with_covars(means, covars, weights, transforms, displacements, strengths):
-        return skin(means, covars, weights, transforms, displacements=displacements, strengths=strengths)
+        correctives = {"displacements": displacements, "strengths": strengths, "validate": validate}
+        return skin(means, covars, weights, transforms, **correctives)
 
     many_posed = posed + 0.1 * normal(N_POSES, n_vertices, 3)
     many_units = torch.nn.functional.normalize(unit + 0.1 * normal(N_POSES, n_vertices, 4), dim=-1)
@@ -83,7 +85,9 @@ def calls(seed=0, n=4, dtype=torch.float32, empty=False, device="cpu"):
         "bone_transforms poses": (
             bent, [normal(N_POSES, 4, 3), to_matrix(normal(N_POSES, 4)), normal(N_POSES, 3), normal(5, 3)],
         ),
-        "face_rotations poses": (lambda rest, posed: face_rotations(rest, posed, faces), [rest, many_posed]),
+        "face_rotations poses": (
+            lambda rest, posed: face_rotations(rest, posed, faces, validate=validate), [rest, many_posed],
+        ),
         "pose_on_mesh poses": (
             on_both,
             [many_posed, barycentrics, many_units, many_ratios[0], normal(p + q, 4), normal(p + q, 3).exp(),
