@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from oasis_kernels import cuda_binning, cuda_draw, cuda_draw_backward, cuda_long_lists
-from oasis_warp.ops._launch import current_stream, run_cuda
+from oasis_warp.ops._launch import current_stream, run_cuda, wait_for
 from oasis_warp.ops._pair_counts import Counts, own_slot, remember, watching
 from oasis_warp.ops._records import Size
 from oasis_warp.ops._registration import hidden, hidden_like_fake
@@ -118,7 +118,7 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
     alphas = new.new_empty((n_cameras, frame.height, frame.width, 1))
     if not capturing:
         # The one moment at which the host waits for the device: only the data knows how much memory it takes.
-        torch.cuda.current_stream(device).synchronize()
+        wait_for(stream)
         counts = Counts(*report.tolist())
         check_pairs(counts.pairs)
         remember(kind, counts)

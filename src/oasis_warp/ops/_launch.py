@@ -84,6 +84,11 @@ def current_stream(device: torch.device) -> "wp.Stream":
     return stream
 
 
+def wait_for(stream: "wp.Stream") -> None:
+    """Wait until the device has done what is on a CUDA stream."""
+    wp.synchronize_stream(stream)
+
+
 def device_and_stream(tensor: Tensor) -> tuple["wp.Device", "wp.Stream | None"]:
     """The Warp device of `tensor` and torch's current stream there; both are needed for graph capture."""
     start()

@@ -30,6 +30,7 @@ from oasis_warp.ops._launch import (
     run_cuda,
     run_native,
     view,
+    wait_for,
 )
 from oasis_warp.ops._pair_counts import own_slot
 from oasis_warp.ops._records import counters_size, empty_records, table_words, tables
@@ -183,7 +184,7 @@ def project_cuda(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[
     run_cuda(cuda_projection.project(), words, n_blocks, stream)
     if bad is None:
         return True
-    torch.cuda.current_stream(scene.means.device).synchronize()
+    wait_for(stream)
     return not bad[0]
 
 
