@@ -66,7 +66,7 @@ class ConvolutionalEncoder(nn.Module):
     def forward(self, image: Float[Tensor, "B S S 3"], mask: Float[Tensor, "B S S"]) -> ImageFeatures:
         """Feature maps of crops (sRGB in [0, 1]) and masks."""
         colors, inside = resampled(image, mask, self.image_size)
-        seen = torch.cat([(colors - MEAN) / SPREAD * inside, inside], dim=1)
+        seen = torch.cat([(colors - MEAN * inside) / SPREAD, inside], dim=1)
         fine = torch.cat([seen, nn.functional.gelu(self.detail(seen))], dim=1)
         x, maps = fine, []
         for reduce, stage in zip(self.reductions, self.stages, strict=True):

@@ -83,7 +83,7 @@ class DinoV2Encoder(nn.Module):
         """Feature maps of crops (sRGB in [0, 1]) and masks."""
         colors, inside = resampled(image, mask, self.image_size)
         mean, spread = (colors.new_tensor(v)[:, None, None] for v in (IMAGENET_MEAN, IMAGENET_SPREAD))
-        x = self.patch((colors - mean) / spread * inside)
+        x = self.patch((colors - mean * inside) / spread)
         grid = x.shape[-2:]
         table = self.position[:, 1:].unflatten(1, (GRID, GRID)).permute(0, 3, 1, 2)
         table = interpolate(table, size=grid, mode="bicubic", align_corners=False)
@@ -107,7 +107,7 @@ class DinoV2Encoder(nn.Module):
             published = load_file(path)
         except SafetensorError as error:
             raise InputError(
-                f"{path}: expected the weights of DINOv2 as safetensors, got another format or a file cut short ({error})."
+                f"{path}: expected the weights of DINOv2, got another format or a file cut short ({error})."
             ) from error
         state = {_our_name(name): tensor.float() for name, tensor in published.items() if "mask_token" not in name}
         own = self.state_dict()

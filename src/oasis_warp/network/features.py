@@ -22,8 +22,11 @@ class ImageFeatures(NamedTuple):
 def resampled(
     image: Float[Tensor, "B S S 3"], mask: Float[Tensor, "B S S"], size: int
 ) -> tuple[Float[Tensor, "B 3 s s"], Float[Tensor, "B 1 s s"]]:
-    """The crop at the encoder's resolution, channels first."""
-    planes = torch.cat([image.permute(0, 3, 1, 2), mask[:, None]], dim=1)
+    """The crop at the encoder's resolution, channels first: colours times mask, and mask.
+
+    Times mask before and not after the resampling, so that the background does not bleed over the hand's outline.
+    """
+    planes = torch.cat([(image * mask[..., None]).permute(0, 3, 1, 2), mask[:, None]], dim=1)
     if planes.shape[-1] != size:
         planes = interpolate(planes, size=(size, size), mode="bilinear", antialias=planes.shape[-1] > size)
     return planes[:, :3], planes[:, 3:]

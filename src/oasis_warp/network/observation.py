@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
-from oasis_warp.avatar.observe import FACING, GRAZING, RIM_PIXELS
+from oasis_warp.avatar.observe import FACING, GRAZING, RIM_PIXELS, VISIBILITY_MARGIN
 from oasis_warp.network.inputs import NetworkInput
 from oasis_warp.network.projection import project_batch, sample
 from oasis_warp.ops import depth_visibility
@@ -43,7 +43,7 @@ def sight(
     vertices, size = inputs.posed, inputs.image.shape[1]
     uv, inside = project_batch(vertices, inputs.viewmat, inputs.K, size)
     visibility = depth_visibility(
-        vertices, vertices, faces, inputs.K, inputs.viewmat, size, size, literal=literal,
+        vertices, vertices, faces, inputs.K, inputs.viewmat, size, size, margin=VISIBILITY_MARGIN, literal=literal,
         point_vertices=None if literal else torch.arange(vertices.shape[1], device=vertices.device), validate=False,
     ).visibility * inside  # fmt: skip
     corners = vertices[:, faces]

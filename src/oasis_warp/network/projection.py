@@ -25,8 +25,11 @@ def project_batch(
 
 
 def sample(planes: Float[Tensor, "B C H W"], uv: Float[Tensor, "B P 2"]) -> Float[Tensor, "B P C"]:
-    """Bilinear reading of `planes` at `uv`, 0 beyond their edge."""
-    read = grid_sample(planes, (2 * uv - 1)[:, None].to(planes.dtype), align_corners=False)
+    """Bilinear reading of `planes` at `uv`, 0 beyond their edge.
+
+    In the precision of `uv`: bfloat16 could not tell one pixel from the next.
+    """
+    read = grid_sample(planes.to(uv.dtype), (2 * uv - 1)[:, None], align_corners=False)
     return read[:, :, 0].transpose(1, 2)
 
 
