@@ -170,13 +170,13 @@ def test_torch_finds_the_operators_well_formed(with_covars, dtype, device):
     scene = ordinary_scene(50, n=N, dtype=dtype, device=device)
     covars = covariances(scene) if with_covars else None
     forward = arguments(scene, covars)
-    torch.library.opcheck(module.project_op, forward)
+    torch.library.opcheck(torch.ops.oasis_warp.project, forward)
     means, quats, scales, covars, _opacities, viewmats, Ks, *_ = arguments(scene, covars, wanted=False)
     out = Projection(*module.project_op(*arguments(scene, covars, wanted=False)))
     given = [torch.ones_like(t) for t in out[:3]]
     wanted = [True, not with_covars, False, with_covars, True]
     torch.library.opcheck(
-        module.project_backward_op,
+        torch.ops.oasis_warp.project_backward,
         (means, quats, scales, covars, viewmats, Ks, scene.width, scene.height, out.radii, *given, wanted),
     )
 

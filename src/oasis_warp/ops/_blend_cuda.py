@@ -4,26 +4,29 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from warp import vec2f, vec3d, vec4f, vec4i
-from warp.types import vector
 
-from oasis_kernels import cuda_binning, cuda_draw, cuda_draw_backward
-from oasis_warp.ops._launch import SCALAR, launch, view
-from oasis_warp.ops._registration import hidden, hidden_like_fake, revealed
+from oasis_kernels import cuda_binning, cuda_draw, cuda_draw_backward, cuda_long_lists
+from oasis_warp.ops._launch import device_and_stream, run_cuda
+from oasis_warp.ops._pair_counts import Counts, own_slot, remember, watching
+from oasis_warp.ops._registration import hidden, hidden_like_fake
 from oasis_warp.ops._rules import current_rules
 from oasis_warp.ops._splats import Frame, Gradients, Splats, Wanted
-from oasis_warp.ops._tiles import check_pairs
+from oasis_warp.ops._tiles import MAX_PAIRS, check_pairs
+
+MOST_CHECKPOINTS = 1 << 16
+"""Tiles times numbers a pixel up to which lists are cut into segments: beyond, there are tiles enough to fill a device,
+and what is kept of the segments would outgrow the pictures."""
 
 
 class Lists(NamedTuple):
     """Which Gaussians each tile draws. P pairs of a Gaussian and a tile."""
 
-    starts: Tensor
-    """[tiles + 1], int32: first place of each tile's list; at the end P."""
+    tiles: Tensor
+    """[tiles, 4], int32: column, start and length of the list, row over all cameras; tiles with any list come first."""
     pair_starts: Tensor
     """[M], int32: number of each Gaussian's first pair."""
     gaussians: Tensor
-    """`hidden` [P], int32: Gaussians, nearest first."""
+    """`hidden` [P], int32: Gaussians, nearest first; filled in where they are kept."""
 
 
 class Kept(NamedTuple):
@@ -33,7 +36,9 @@ class Kept(NamedTuple):
     """[C, H, W], of the end."""
     stops: Tensor
     """[C, H, W], int32: place in the tile's list of the first Gaussian that was not drawn."""
-    starts: Tensor
+    checkpoints: Tensor
+    """`hidden`, of what happens between the segments of a list: see `cuda_draw`."""
+    tiles: Tensor
     """As in `Lists`, like all below."""
     pair_starts: Tensor
     gaussians: Tensor
@@ -44,48 +49,73 @@ def _count_tiles(width: int, height: int) -> tuple[int, int]:
     return -(-width // cuda_binning.TILE), -(-height // cuda_binning.TILE)
 
 
-def _bin(splats: Splats, width: int, height: int) -> tuple[Lists, Tensor, bool]:
-    """Lists of the tiles, sorting keys in their place, and whether the lists are sorted already."""
+def _segments(n_tiles: int, channels: int) -> int:
+    """Parts that the lists are cut into."""
+    return cuda_draw.SEGMENTS if n_tiles * (channels + 1) <= MOST_CHECKPOINTS else 1
+
+
+def _bin(splats: Splats, width: int, height: int) -> tuple[Lists, Tensor]:
+    """Lists of the tiles, and the keys that short ones are to be sorted by."""
     n_cameras, n = splats.depths.shape
     device = splats.depths.device
+    stream = device_and_stream(splats.depths)[1]
     across, down = _count_tiles(width, height)
-    n_tiles = n_cameras * across * down
-    counts, cursors, total = torch.zeros(2 * n_tiles + 1, dtype=torch.int32, device=device).split([n_tiles, n_tiles, 1])
-    pair_starts = torch.empty(n_cameras * n, dtype=torch.int32, device=device)
-    boxes = view(splats.boxes.view(-1, 4), vec4i)
-    launch(
-        cuda_binning.count_pairs,
-        n_cameras * n,
-        [n, boxes, across, down, view(pair_starts), view(counts), view(total)],
-        like=counts,
+    total, n_tiles = n_cameras * n, n_cameras * across * down
+    counts = torch.zeros(2 * cuda_binning.COUNTERS + n_tiles, dtype=torch.int32, device=device)
+    pair_starts = torch.empty(total, dtype=torch.int32, device=device)
+    tiles = torch.empty((n_tiles, 4), dtype=torch.int32, device=device)
+    cursors = torch.empty(n_tiles, dtype=torch.int64, device=device)
+    counters = counts.data_ptr()
+    tile_counts = counters + 8 * cuda_binning.COUNTERS
+    scene = {"n": n, "total": total, "boxes": splats.boxes.data_ptr(), "tiles_x": across, "tiles_y": down}
+    blocks = -(-total // cuda_binning.BLOCK)
+    run_cuda(
+        cuda_binning.count_pairs(),
+        {**scene, "pair_starts": pair_starts.data_ptr(), "tile_counts": tile_counts, "counters": counters},
+        blocks,
+        stream,
     )
-    ends = counts.cumsum(0)
-    # The one moment at which the host waits for the device: only the data knows how much memory it takes.
-    n_pairs, longest = torch.stack([ends[-1], counts.max()]).tolist() if n else (0, 0)
-    check_pairs(n_pairs)
-    starts = torch.nn.functional.pad(ends, (1, 0)).int()
-    keys = torch.empty(n_pairs, dtype=torch.int64, device=device)
-    launch(
-        cuda_binning.fill_tiles,
-        n_cameras * n,
-        [
-            n, boxes, view(splats.depths.view(-1)), across, down, view(starts), view(cursors), view(keys),
-        ],
-        like=keys,
+    kind = device, n_cameras, n, width, height
+    capturing = torch.cuda.is_current_stream_capturing()
+    report, capacity = watching().expect(kind) if capturing else (own_slot(), Counts(MAX_PAIRS, 0))
+    run_cuda(
+        cuda_binning.place_tiles(),
+        {
+            "n_tiles": n_tiles, "tiles_x": across, "tile_counts": tile_counts, "capacity": capacity.pairs, "placed": counters + 8,
+            "tiles": tiles.data_ptr(), "cursors": cursors.data_ptr(), "report": report.data_ptr(),
+        },
+        -(-n_tiles // cuda_binning.PLACE_BLOCK),
+        stream,
     )  # fmt: skip
-    lists = Lists(starts, pair_starts, hidden(n_pairs, torch.int32, device))
-    if longest > cuda_draw.LONGEST:
-        _sort(keys, counts, across * down, n, revealed(lists.gaussians))
-    return lists, keys, longest > cuda_draw.LONGEST
-
-
-def _sort(keys: Tensor, counts: Tensor, tiles_a_camera: int, n: int, gaussians: Tensor) -> None:
-    """Fill in the sorted lists by torch's sort over all pairs, for tiles that a block cannot sort by itself."""
-    tiles = torch.repeat_interleave(torch.arange(len(counts), device=keys.device), counts)
-    keys, by_depth = torch.sort(keys)
-    tiles, by_tile = torch.sort(tiles[by_depth], stable=True)
-    index = keys[by_tile] & ((1 << cuda_binning.INDEX_BITS) - 1)
-    gaussians.copy_(tiles // tiles_a_camera * n + index)
+    if not capturing:
+        # The one moment at which the host waits for the device: only the data knows how much memory it takes.
+        torch.cuda.current_stream(device).synchronize()
+        capacity = Counts(*report[:2].tolist())
+        check_pairs(capacity.pairs)
+        remember(kind, capacity)
+    lists = Lists(tiles, pair_starts, hidden(capacity.pairs, torch.int32, device))
+    keys = torch.empty(capacity.pairs, dtype=torch.int64, device=device)
+    run_cuda(
+        cuda_binning.fill_tiles(),
+        {
+            **scene, "depths": splats.depths.data_ptr(), "capacity": capacity.pairs, "cursors": cursors.data_ptr(),
+            "keys": keys.data_ptr(),
+        },
+        blocks,
+        stream,
+    )  # fmt: skip
+    if capacity.longest > cuda_draw.LONGEST:
+        spare = torch.empty_like(keys) if capacity.longest > cuda_long_lists.RUN else None
+        run_cuda(
+            cuda_long_lists.sort_long_lists(),
+            {
+                "n": n, "tiles": tiles.data_ptr(), "tiles_y": down, "keys": keys.data_ptr(),
+                "spare": 0 if spare is None else spare.data_ptr(), "tile_gaussians": lists.gaussians.data_ptr(),
+            },
+            n_tiles,
+            stream,
+        )  # fmt: skip
+    return lists, keys
 
 
 def kept_like(colors: Tensor, frame: Frame) -> Kept:
@@ -99,10 +129,25 @@ def kept_like(colors: Tensor, frame: Frame) -> Kept:
     return Kept(
         empty(n_cameras, frame.height, frame.width, dtype=torch.float32),
         empty(n_cameras, frame.height, frame.width),
-        empty(n_cameras * across * down + 1),
+        hidden_like_fake(torch.float32, colors.device),
+        empty(n_cameras * across * down, 4),
         empty(n_cameras * n),
         hidden_like_fake(torch.int32, colors.device),
     )
+
+
+def _scene_words(splats: Splats, frame: Frame) -> tuple[dict[str, int], int]:
+    """Parameters of both kernels that draw, and the number of tiles."""
+    n_cameras, n, channels = splats.colors.shape
+    across, down = _count_tiles(frame.width, frame.height)
+    n_tiles = n_cameras * across * down
+    words = {
+        "n": n, "n_cameras": n_cameras, "centers": splats.centers.data_ptr(),
+        "whitenings": splats.whitenings.data_ptr(), "opacities": splats.opacities.data_ptr(),
+        "colors": splats.colors.data_ptr(), "backgrounds": splats.backgrounds.data_ptr(), "tiles_x": across,
+        "tiles_y": down, "width": frame.width, "height": frame.height,
+    }  # fmt: skip
+    return words, n_tiles
 
 
 def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept | None]:
@@ -110,87 +155,87 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
 
     Raises:
         ValueError: more pairs of a Gaussian and a tile than can be numbered.
+        RuntimeError: a graph captures this, and nothing is known of the number of pairs, or nobody watches it.
     """
     width, height, _ = frame
-    n_cameras, n, channels = splats.colors.shape
-    color = vector(channels, SCALAR[torch.float32])
-    across, down = _count_tiles(width, height)
-    lists, keys, in_order = _bin(splats, width, height)
-
-    def empty(*shape: int) -> Tensor:
-        return splats.colors.new_empty(n_cameras, height, width, *shape)
-
-    image, alphas, transmittance = empty(channels), empty(1), empty()
-    stops = transmittance.new_empty(transmittance.shape, dtype=torch.int32)
-    launch(
-        cuda_draw.blend(channels, current_rules()),
-        (n_cameras * across * down, cuda_draw.BLOCK),
-        [
-            n, view(lists.starts), view(keys), int(in_order), view(splats.centers.view(-1, 4), vec4f),
-            view(splats.whitenings.view(-1, 4), vec4f), view(splats.opacities.view(-1)),
-            view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color), across, down, width,
-            height, view(image.view(-1, channels), color), view(alphas.view(-1)), view(transmittance.view(-1)),
-            view(stops.view(-1)), view(revealed(lists.gaussians)),
-        ],
-        like=image,
-        block_dim=cuda_draw.BLOCK,
+    n_cameras, _, channels = splats.colors.shape
+    lists, keys = _bin(splats, width, height)
+    words, n_tiles = _scene_words(splats, frame)
+    segments = _segments(n_tiles, channels)
+    new = splats.colors
+    image, alphas = new.new_empty((n_cameras, height, width, channels)), new.new_empty((n_cameras, height, width, 1))
+    kept = None
+    if keep:
+        between = segments - 1
+        busy = min(n_tiles, lists.gaussians.untyped_storage().nbytes() // 4)  # no tile draws less than a pair
+        kept = Kept(
+            new.new_empty((n_cameras, height, width)),
+            torch.empty((n_cameras, height, width), dtype=torch.int32, device=new.device),
+            hidden(busy * between * (channels + 1) * 64, torch.float32, new.device),
+            *lists,
+        )
+    run_cuda(
+        cuda_draw.blend(channels, segments, current_rules()),
+        {
+            **words, "tiles": lists.tiles.data_ptr(), "keys": keys.data_ptr(),
+            "tile_gaussians": lists.gaussians.data_ptr(), "image": image.data_ptr(), "alphas": alphas.data_ptr(),
+            "transmittance": 0 if kept is None else kept.transmittance.data_ptr(),
+            "stops": 0 if kept is None else kept.stops.data_ptr(),
+            "checkpoints": 0 if kept is None else kept.checkpoints.data_ptr(),
+        },
+        n_tiles,
+        device_and_stream(new)[1],
     )  # fmt: skip
-    return image, alphas, Kept(transmittance, stops, *lists) if keep else None
+    return image, alphas, kept
 
 
 def draw_backward(
     g_image: Tensor | None, g_alpha: Tensor | None, splats: Splats, frame: Frame, kept: Kept, wanted: Wanted
 ) -> Gradients:
     """Gradients from those by image and alpha, None standing for zeros."""
-    width, height, _ = frame
     with_shape, with_colors, with_backgrounds = wanted
     n_cameras, n, channels = splats.colors.shape
-    color, moments = (vector(k, SCALAR[torch.float32]) for k in (channels, 8))
-    across, down = _count_tiles(width, height)
-    pixels, n_tiles = n_cameras * height * width, n_cameras * across * down
-    new = splats.colors
-    of_image = new.new_zeros(pixels, channels) if g_image is None else g_image.view(-1, channels)
-    of_alpha = new.new_zeros(pixels) if g_alpha is None else g_alpha.view(-1)
-    gaussians = revealed(kept.gaussians)
-    n_pairs, total = len(gaussians), n_cameras * n
-    pair_moments = new.new_empty(n_pairs if with_shape else 0, 8)
-    pair_colors = new.new_empty(n_pairs if with_colors else 0, channels)
-    tile_backgrounds = new.new_empty(n_tiles, channels)
-    boxes, whitenings = view(splats.boxes.view(-1, 4), vec4i), view(splats.whitenings.view(-1, 4), vec4f)
-    opacities = view(splats.opacities.view(-1))
-    launch(
-        cuda_draw_backward.blend_backward(channels, current_rules()),
-        (n_tiles, cuda_draw.BLOCK),
-        [
-            view(kept.starts), view(gaussians), view(kept.pair_starts), boxes,
-            view(splats.centers.view(-1, 4), vec4f), whitenings, opacities,
-            view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color), across, down, width,
-            height, view(kept.transmittance.view(-1)), view(kept.stops.view(-1)), view(of_image, color), view(of_alpha),
-            int(with_shape), int(with_colors), view(pair_moments, moments), view(pair_colors, color),
-            view(tile_backgrounds, color),
-        ],
-        like=new,
-        block_dim=cuda_draw.BLOCK,
-    )  # fmt: skip
-    g_means2d = new.new_empty(total if with_shape else 0, 2)
-    g_covars2d = new.new_empty(total if with_shape else 0, 3, dtype=torch.float64)
-    g_opacities = new.new_empty(total if with_shape else 0)
-    g_colors = new.new_empty(total if with_colors else 0, channels)
-    if with_shape or with_colors:
-        launch(
-            cuda_draw_backward.gather(channels),
-            total,
-            [
-                boxes, view(kept.pair_starts), view(pair_moments, moments), view(pair_colors, color), whitenings,
-                opacities, int(with_shape), int(with_colors), view(g_means2d, vec2f), view(g_covars2d, vec3d),
-                view(g_opacities), view(g_colors, color),
-            ],
-            like=new,
-        )  # fmt: skip
-    return Gradients(
-        g_means2d.view(n_cameras, n, 2) if with_shape else None,
-        g_covars2d.view(n_cameras, n, 3) if with_shape else None,
-        g_opacities.view(n_cameras, n) if with_shape else None,
-        g_colors.view(n_cameras, n, channels) if with_colors else None,
-        tile_backgrounds.view(n_cameras, across * down, channels).sum(1) if with_backgrounds else None,
+    new, total = splats.colors, n_cameras * n
+    words, n_tiles = _scene_words(splats, frame)
+    stream = device_and_stream(new)[1]
+    n_pairs = kept.gaussians.untyped_storage().nbytes() // 4 - 1
+    size = cuda_draw_backward.record_size(channels, with_shape, with_colors)
+    records = new.new_empty((n_pairs, size))
+    tile_backgrounds = new.new_empty((n_cameras, n_tiles // n_cameras, channels)) if with_backgrounds else None
+    backward = cuda_draw_backward.blend_backward(
+        channels, _segments(n_tiles, channels), with_shape, with_colors, current_rules()
     )
+    run_cuda(
+        backward,
+        {
+            **words, "tiles": kept.tiles.data_ptr(), "tile_gaussians": kept.gaussians.data_ptr(),
+            "transmittance": kept.transmittance.data_ptr(), "stops": kept.stops.data_ptr(),
+            "checkpoints": kept.checkpoints.data_ptr(), "pair_starts": kept.pair_starts.data_ptr(),
+            "boxes": splats.boxes.data_ptr(), "g_image": 0 if g_image is None else g_image.data_ptr(),
+            "g_alpha": 0 if g_alpha is None else g_alpha.data_ptr(), "records": records.data_ptr(),
+            "tile_backgrounds": 0 if tile_backgrounds is None else tile_backgrounds.data_ptr(),
+        },
+        n_tiles,
+        stream,
+    )  # fmt: skip
+    g_means2d = new.new_empty((n_cameras, n, 2)) if with_shape else None
+    g_covars2d = torch.empty((n_cameras, n, 3), dtype=torch.float64, device=new.device) if with_shape else None
+    g_opacities = new.new_empty((n_cameras, n)) if with_shape else None
+    g_colors = new.new_empty((n_cameras, n, channels)) if with_colors else None
+    if with_shape or with_colors:
+        gradients = {
+            "g_means2d": g_means2d, "g_covars2d": g_covars2d, "g_opacities": g_opacities, "g_colors": g_colors
+        }  # fmt: skip
+        run_cuda(
+            cuda_draw_backward.gather(channels, with_shape, with_colors),
+            {
+                "total": total, "capacity": n_pairs, "boxes": splats.boxes.data_ptr(),
+                "pair_starts": kept.pair_starts.data_ptr(), "records": records.data_ptr(),
+                "whitenings": splats.whitenings.data_ptr(), "opacities": splats.opacities.data_ptr(),
+                **{name: 0 if g is None else g.data_ptr() for name, g in gradients.items()},
+            },
+            -(-total // cuda_draw_backward.GATHER_BLOCK),
+            stream,
+        )  # fmt: skip
+    g_backgrounds = None if tile_backgrounds is None else tile_backgrounds.sum(1)
+    return Gradients(g_means2d, g_covars2d, g_opacities, g_colors, g_backgrounds)

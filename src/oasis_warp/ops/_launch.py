@@ -95,6 +95,11 @@ def has_vectors(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu" and tensor.dtype == torch.float32
 
 
+def has_cuda_kernels(tensor: Tensor) -> bool:
+    """Whether kernels for tensors like this one have a form that is written for CUDA: float32 there."""
+    return tensor.is_cuda and tensor.dtype == torch.float32
+
+
 def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], like: Tensor, block_dim: int = 256) -> None:
     """Launch `kernel` over `dim` threads on the device and current stream of `like`; an empty launch is skipped."""
     if 0 in ([dim] if isinstance(dim, int) else list(dim)):
@@ -234,7 +239,7 @@ def run_cuda(native: CudaNative, words: dict[str, int | float], n_blocks: int, s
     if not n_blocks:
         return
     block = native.words(**words)
-    key = native.kernel, stream.device
+    key = native.kernel, stream.device.ordinal
     recorded = _cuda_launches.launches.get(key)
     if recorded is None:
         with _load_lock:

@@ -11,13 +11,27 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from oasis_kernels import cuda_projection, cuda_projection_backward
 from oasis_kernels import projection as generic
 from oasis_kernels import projection_vectors_backward as vector_backward
 from oasis_kernels import projection_vectors_forward as vector_forward
 from oasis_kernels.native import PHASE_WORDS
 from oasis_kernels.projection_vectors import CHUNK
 from oasis_warp.core.checks import FINITE_LIMIT
-from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, address, even_cuts, launch_ranges, run_native, view
+from oasis_warp.ops._launch import (
+    SCALAR,
+    VEC2,
+    VEC3,
+    VEC4,
+    address,
+    device_and_stream,
+    even_cuts,
+    launch_ranges,
+    run_cuda,
+    run_native,
+    view,
+)
+from oasis_warp.ops._pair_counts import own_slot
 from oasis_warp.ops._rules import current_rules
 
 CAMERA_SUM_BLOCK = 1024
@@ -120,6 +134,60 @@ def project_vectors(scene: Scene, opacities: Tensor, limits: Limits, out: Sequen
     words = _words(scene, opacities=opacities, limits=numbers, state=state, bad=state[PHASE_WORDS:], **outputs)
     run_native(vector_forward.project(), words, -(-len(scene.means) // CHUNK))
     return not state[PHASE_WORDS]
+
+
+def _cuda_words(scene: Scene, **others: Tensor | None) -> dict[str, int | float]:
+    """Parameters of a CUDA kernel: the scene, and other tensors by name."""
+    words: dict[str, int | float] = {
+        name: 0 if tensor is None else tensor.data_ptr()
+        for name, tensor in {
+            "means": scene.means, "quats": scene.quats, "scales": scene.scales, "covars": scene.covars,
+            "viewmats": scene.viewmats, "Ks": scene.Ks, **others,
+        }.items()
+    }  # fmt: skip
+    sizes = {"n": len(scene.means), "n_cameras": len(scene.viewmats), "width": scene.width, "height": scene.height}
+    return words | sizes
+
+
+def project_cuda(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[Tensor], validate: bool) -> bool:
+    """Fill `out` by the float32 CUDA kernel; where it is to `validate`, wait for what it says of the inputs.
+
+    Returns:
+        False where an input was found not finite or outside its range.
+    """
+    rules = current_rules()
+    stream = device_and_stream(scene.means)[1]
+    bad = own_slot() if validate else None
+    if bad is not None:
+        bad[0] = 0
+    outputs = {name: tensor for (name, *_), tensor in zip(OUTPUTS, out, strict=True)}
+    words = _cuda_words(scene, opacities=opacities, bad=bad, **outputs) | {
+        "near": as_float32(limits.near_plane), "far": as_float32(limits.far_plane), "radius_clip": limits.radius_clip,
+        "eps2d": as_float32(limits.eps2d), "alpha_min": as_float32(rules.alpha_min),
+        "extent_sigmas": rules.extent_sigmas, "largest": FINITE_LIMIT,
+    }  # fmt: skip
+    total = len(scene.viewmats) * len(scene.means)
+    run_cuda(cuda_projection.project(), words, -(-total // cuda_projection.BLOCK), stream)
+    if bad is None:
+        return True
+    torch.cuda.current_stream(scene.means.device).synchronize()
+    return not bad[0]
+
+
+def backward_cuda(scene: Scene, radii: Tensor, incoming: "Incoming", out: Mapping[str, Tensor]) -> None:
+    """Fill the gradients `out`, by name, by the float32 CUDA kernel."""
+    n, n_cameras, g_viewmats = len(scene.means), len(scene.viewmats), out.get("viewmats")
+    sums = None if g_viewmats is None else radii.new_empty((n_cameras * n, 12), dtype=torch.float64)
+    words = _cuda_words(
+        scene, radii=radii, g_means2d=incoming.means2d, g_covars2d=incoming.covars2d, g_depths=incoming.depths,
+        g_cameras=sums, **{f"g_{name}": out.get(name) for name in ("means", "quats", "scales", "covars")},
+    )  # fmt: skip
+    run_cuda(
+        cuda_projection_backward.project_backward(), words, -(-n // cuda_projection.BLOCK),
+        device_and_stream(radii)[1],
+    )  # fmt: skip
+    if g_viewmats is not None and sums is not None:
+        _fill_viewmats(g_viewmats, _sum_rows(sums, n, CAMERA_SUM_BLOCK))
 
 
 def project_generic(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[Tensor]) -> None:

@@ -10,16 +10,18 @@ from jaxtyping import Float, Float64, Int32
 from torch import Tensor
 
 from oasis_warp.core.checks import check_finite
-from oasis_warp.ops._launch import has_vectors
+from oasis_warp.ops._launch import has_cuda_kernels, has_vectors
 from oasis_warp.ops._project_launch import (
     Incoming,
     Limits,
     Outputs,
     Scene,
+    backward_cuda,
     backward_generic,
     backward_vectors,
     check_arrays,
     empty_outputs,
+    project_cuda,
     project_generic,
     project_vectors,
 )
@@ -108,9 +110,13 @@ def _project(
     scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
     check_arrays(scene, opacities=(opacities, means.shape[:1], means.dtype))
     out = empty_outputs(means, viewmats)
-    if len(means) and len(viewmats) and has_vectors(means):
+    if len(means) and len(viewmats) and (has_vectors(means) or has_cuda_kernels(means)):
         # The kernel looks at the values as it reads them; what is wrong with them is for the slow checks to say.
-        sound = project_vectors(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
+        scene, opacities = scene.contiguous(), opacities.contiguous()
+        if means.is_cuda:
+            sound = project_cuda(scene, opacities, Limits(*limits), out, validate)
+        else:
+            sound = project_vectors(scene, opacities, Limits(*limits), out)
         if validate and not sound:
             check_values(means, quats, scales, covars, opacities, viewmats, Ks)
             raise AssertionError("the kernel has met a bad value that is not in its inputs")
@@ -164,7 +170,7 @@ def _project_backward(
             gradient.zero_()
         return out
     incoming = Incoming(g_means2d, g_covars2d, g_depths).contiguous()
-    run = backward_vectors if has_vectors(means) else backward_generic
+    run = backward_vectors if has_vectors(means) else backward_cuda if has_cuda_kernels(means) else backward_generic
     named = {name: g for name, g, asked in zip(INPUTS, out, wanted, strict=True) if asked}
     run(scene.contiguous(), radii.contiguous(), incoming, named)
     return out
