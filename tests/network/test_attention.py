@@ -72,7 +72,7 @@ def test_an_adaptive_norm_starts_plain_and_open_and_follows_its_context(random):
     assert not torch.allclose(out, other)
     assert not torch.allclose(gate, other_gate)
     out.sum().backward()
-    assert norm.modulation.weight.grad.any()
+    assert norm.modulation.weight.grad is not None and norm.modulation.weight.grad.any()
 
 
 def test_a_block_treats_tokens_alike_wherever_they_stand(random):

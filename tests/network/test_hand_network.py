@@ -60,7 +60,7 @@ WEIGHTS_THAT_CHANGE = {
     ("visibility", "literal"): set(),
     ("refine", "off"): {"refinement"},
     ("fom", "off"): {"feature_on_mesh", "face_head"},
-    ("point_evidence", "off"): {"point_evidence", "global_token"},
+    ("point_evidence", "off"): {"point_evidence", "global_token", "vertex_head", "face_head"},
 }
 
 

@@ -58,6 +58,7 @@ def test_at_visibility_one_half_the_bias_is_nothing(tokens):
 def test_attention_is_the_softmax_of_equation_6(tokens):
     module, (points, local, context, visibility) = attention(), tokens
     q, k, v, gate = module._project(points, local, context)
+    assert module.log_beta is not None
     s, beta = 2 * visibility - 1, module.log_beta.exp()
     bias = torch.cat([(beta / 2 * s)[..., None].expand(-1, -1, N_LOCAL), (-beta / 2 * s)[..., None]], dim=-1)
     weights = (q @ k.transpose(-1, -2) / 8**0.5 + bias[:, None]).softmax(-1)

@@ -151,9 +151,9 @@ class Render(NamedTuple):
 class TrainingBatch(NamedTuple):
     """B hands, each as one photo shows it and as T pictures must come out: what a prior is trained on.
 
-    Right hands (left ones mirrored), all pictures square; vertices are those of one hand model. `posed` and `viewmat` of
-    the photo may be off by an estimator's error; `rest` and the targets are true, so that what is learned lands where
-    it belongs.
+    Right hands (left ones mirrored), all pictures square; vertices are those of one hand model. `posed` and `viewmat`
+    of the photo may be off by an estimator's error; `rest` and the targets are true, so that what is learned lands
+    where it belongs.
     """
 
     image: Float[Tensor, "B S S 3"]

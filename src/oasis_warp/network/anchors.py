@@ -25,7 +25,7 @@ class BatchAnchors(NamedTuple):
     quats: Float[Tensor, "B N 4"]
     scales: Float[Tensor, "B N 3"]
     fade: Float[Tensor, "B N"]
-    """1, falling to 0 at the open wrist: the share of its opacity that a Gaussian may have."""
+    """As `rim_fade`."""
 
 
 def faces_of_vertices(faces: Int[Tensor, "F 3"], n_vertices: int) -> Int[Tensor, "V M"]:
@@ -37,6 +37,12 @@ def faces_of_vertices(faces: Int[Tensor, "F 3"], n_vertices: int) -> Int[Tensor,
     table = torch.full((n_vertices, int(count.max())), len(faces), dtype=torch.int64, device=faces.device)
     table[owner, place] = face
     return table
+
+
+def rim_fade(rest: Float[Tensor, "B V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor, "B V"]:
+    """0 at the open wrist, 1 from `RIM_FADE` on: the share of its opacity that a vertex's Gaussian may have."""
+    fade = (torch.cdist(rest, rest[:, rim]).amin(2) / RIM_FADE).clamp(0, 1)
+    return fade * fade * (3 - 2 * fade)
 
 
 @torch.no_grad()
@@ -59,8 +65,7 @@ def batch_anchors(
     normals = normalize(cross, dim=-1, eps=1e-30)
     vertex_quats, vertex_scales = _vertex_shapes(cross, vertex_faces)
     face_quats, face_scales = _face_shapes(corners, normals)
-    fade = (torch.cdist(rest, rest[:, rim]).amin(2) / RIM_FADE).clamp(0, 1)
-    fade = fade * fade * (3 - 2 * fade)
+    fade = rim_fade(rest, rim)
     return BatchAnchors(
         torch.cat([vertex_quats, face_quats], dim=1),
         torch.cat([vertex_scales, face_scales], dim=1),

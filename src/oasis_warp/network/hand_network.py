@@ -13,11 +13,11 @@ from oasis_warp.network.dinov2 import DinoV2Encoder
 from oasis_warp.network.encoding import encode
 from oasis_warp.network.feature_on_mesh import FeatureOnMesh
 from oasis_warp.network.features import ImageFeatures
-from oasis_warp.network.heads import FACE_OUTPUTS, VERTEX_OUTPUTS, GaussianHead, decode, decode_offsets
+from oasis_warp.network.heads import FACE_OUTPUTS, TRUST, VERTEX_OUTPUTS, GaussianHead, decode, decode_offsets
 from oasis_warp.network.inputs import NetworkInput, Prediction
 from oasis_warp.network.mean_hand import MeanHand, MeanHands
 from oasis_warp.network.observation import Sighting, sight
-from oasis_warp.network.point_features import PointEvidence, PointFeatures
+from oasis_warp.network.point_features import PointEvidence, PointFeatures, seen_difference
 from oasis_warp.network.refinement import CoarseLevel, Refinement
 from oasis_warp.network.tokenizer import PlaceEncoding, Tokenizer, VisualTokens, grid_places
 from oasis_warp.network.vpia import JointAttention, VisibilityAttention
@@ -72,10 +72,11 @@ class HandNetwork(nn.Module):
         else:
             self.fusion = VisibilityAttention(width, heads, config.n_tokens, config.vpia == "on")
         self.refinement = Refinement(width, heads, config.refine_layers) if config.refine == "on" else None
-        self.vertex_head = GaussianHead(width, config.head_width, VERTEX_OUTPUTS)
+        more = TRUST if direct else {}
+        self.vertex_head = GaussianHead(width, config.head_width, VERTEX_OUTPUTS | more)
         if config.fom == "on":
             self.feature_on_mesh = FeatureOnMesh(len(hand.faces))
-            self.face_head = GaussianHead(width, config.head_width, FACE_OUTPUTS)
+            self.face_head = GaussianHead(width, config.head_width, FACE_OUTPUTS | more)
 
     def _remember(self, hand: HandModel) -> None:
         """Keep what never changes of the hand; it is not saved with the weights."""
@@ -92,20 +93,21 @@ class HandNetwork(nn.Module):
         with torch.autocast(inputs.image.device.type, enabled=False):
             sighting = sight(inputs, self.faces, self.vertex_faces, self.config.visibility == "literal")
             mean = self.mean_hands(sighting.colors, sighting.confidence)
-        points, local, context = self.tokens(inputs, sighting, mean)
+            seen = None if self.point_evidence is None else seen_difference(sighting, mean)
+        points, local, context = self.tokens(inputs, sighting, mean, seen)
         features = self.fuse(points, local, context, sighting.visibility)
         if self.refinement is not None:
             features = self.refinement(features, self.level)
-        return self.decode(features, mean, inputs.rest)
+        return self.decode(features, mean.colors, seen, inputs.rest)
 
     def tokens(
-        self, inputs: NetworkInput, sighting: Sighting, mean: MeanHand
+        self, inputs: NetworkInput, sighting: Sighting, mean: MeanHand, seen: Float[Tensor, "B V 3"] | None
     ) -> tuple[Float[Tensor, "B V C"], Float[Tensor, "B M C"], Float[Tensor, "B C"]]:
-        """Geometric tokens, local image tokens and the global token."""
+        """Geometric tokens, local image tokens and the global token; `seen` comes with point evidence."""
         features = self.encoder(inputs.image, inputs.mask)
         geometric = self.geometry(self.template_encoding).expand(len(inputs.image), -1, -1)
         pooled = features.deep.amax((2, 3))
-        if self.point_evidence is None:
+        if self.point_evidence is None or seen is None:
             context = self.global_token(pooled)
             aligned = self._aligned(features, sighting) if self.config.vet != "off" else None
             points, visual = geometric, self._visual(features, aligned, None, sighting)
@@ -114,7 +116,7 @@ class HandNetwork(nn.Module):
             context = self.global_token(torch.cat([pooled, tone.to(pooled.dtype)], dim=1))
             aligned = self._aligned(features, sighting)
             visual = self._visual(features, aligned, geometric, sighting)
-            points = geometric + self.point_evidence(aligned, sighting, mean)
+            points = geometric + self.point_evidence(aligned, seen, sighting, mean)
             points = points + self.place(sighting.uv) * sighting.inside[..., None]
         return points, visual.tokens + self.place(visual.centers), context
 
@@ -134,11 +136,14 @@ class HandNetwork(nn.Module):
         return points + self.level.up(self.fusion(coarse, local, context) - coarse)
 
     def decode(
-        self, features: Float[Tensor, "B V C"], mean: MeanHand, rest: Float[Tensor, "B V 3"]
+        self,
+        features: Float[Tensor, "B V C"],
+        colors: Float[Tensor, "B V 3"],
+        seen: Float[Tensor, "B V 3"] | None,
+        rest: Float[Tensor, "B V 3"],
     ) -> Prediction:
-        """Both heads, applied to the anchors on `rest` and the mean colours."""
+        """Both heads, applied to the anchors on `rest`, the mean colours, and what the photo shows instead of them."""
         raw = self.vertex_head(features)
-        colors = mean.colors
         barycentrics = features.new_zeros((len(features), 0, 3), dtype=torch.float32)
         with torch.autocast(features.device.type, enabled=False):
             anchors = batch_anchors(rest, self.faces, self.vertex_faces, self.rim)
@@ -148,12 +153,13 @@ class HandNetwork(nn.Module):
             barycentrics = on_faces.pop("barycentrics").softmax(-1)
             raw = {name: torch.cat([raw[name], values], dim=1) for name, values in on_faces.items()}
             colors = torch.cat([colors, colors[:, self.faces].mean(2)], dim=1)
+            seen = None if seen is None else torch.cat([seen, seen[:, self.faces].mean(2)], dim=1)
         count = colors.shape[1]
         with torch.autocast(features.device.type, enabled=False):
             attributes = decode(
-                raw, anchors.quats[:, :count], anchors.scales[:, :count], anchors.fade[:, :count], colors
+                raw, anchors.quats[:, :count], anchors.scales[:, :count], anchors.fade[:, :count], colors, seen
             )
-        return Prediction(offsets, barycentrics, *attributes)
+        return Prediction(offsets, barycentrics, *attributes, anchors.scales[:, :count])
 
     def _aligned(self, features: ImageFeatures, sighting: Sighting) -> Tensor:
         return self.point_features(features, sighting.uv, sighting.inside)

@@ -23,6 +23,8 @@ COLOR_MARGIN = 1e-3
 SHARED = {"quats": 4, "scales": 3, "opacities": 1, "colors": 3}
 VERTEX_OUTPUTS = {**SHARED, "offsets": 3}
 FACE_OUTPUTS = {**SHARED, "barycentrics": 3}
+TRUST = {"trust": 1}
+"""Further output where points are told what the photo shows of them: how much of it to take over."""
 
 
 class GaussianHead(nn.Module):
@@ -58,22 +60,22 @@ def decode(
     scales: Float[Tensor, "B N 3"],
     fade: Float[Tensor, "B N"],
     colors: Float[Tensor, "B N 3"],
+    seen: Float[Tensor, "B N 3"] | None,
 ) -> Attributes:
     """Apply raw outputs to anchors and mean colours; raw zeros return them.
 
     A rotation turns in the anchor's own frame, a scale grows by exp of a bounded number, opacity moves in logits below
-    what the wrist's fade allows, colour moves in logits.
+    what the wrist's fade allows, colour moves in logits, and with `seen`, the photo's difference from `colors` in
+    logits, by the share of it that the head trusts.
     """
     identity = raw["quats"].new_tensor([1.0, 0, 0, 0])
     turn = normalize(raw["quats"] + identity, dim=-1, eps=1e-6)
     grow = (MAX_LOG_SCALE * torch.tanh(raw["scales"] / MAX_LOG_SCALE)).exp()
     opacity = torch.sigmoid(raw["opacities"][..., 0] + math.log(OPACITY / (1 - OPACITY)))
-    return Attributes(
-        rotation.multiply(quats, turn),
-        scales * grow,
-        fade * opacity,
-        torch.sigmoid(raw["colors"] + torch.logit(colors, COLOR_MARGIN)),
-    )
+    color = raw["colors"] + torch.logit(colors, COLOR_MARGIN)
+    if seen is not None:
+        color = color + raw["trust"] * seen
+    return Attributes(rotation.multiply(quats, turn), scales * grow, fade * opacity, torch.sigmoid(color))
 
 
 def decode_offsets(raw: dict[str, Tensor]) -> Float[Tensor, "B V 3"]:

@@ -31,6 +31,8 @@ class Prediction(NamedTuple):
     scales: Float[Tensor, "B N 3"]
     opacities: Float[Tensor, "B N"]
     colors: Float[Tensor, "B N 3"]
+    anchor_scales: Float[Tensor, "B N 3"]
+    """What `scales` started from."""
 
 
 def input_of_evidence(evidence: Evidence) -> NetworkInput:

@@ -33,6 +33,12 @@ class PointFeatures(nn.Module):
         return self.project(read) * inside[..., None]
 
 
+def seen_difference(sighting: Sighting, mean: MeanHand) -> Float[Tensor, "B V 3"]:
+    """How the photo differs from the mean colours at each vertex, in logits; 0 where it does not show the vertex."""
+    difference = torch.logit(sighting.colors, COLOR_MARGIN) - torch.logit(mean.colors, COLOR_MARGIN)
+    return difference * sighting.confidence[..., None]
+
+
 class PointEvidence(nn.Module):
     """Tell a point what the photo shows of it: its aligned feature times its visibility, and how far off the mean.
 
@@ -46,10 +52,9 @@ class PointEvidence(nn.Module):
         self.known = nn.Linear(8, width)
 
     def forward(
-        self, aligned: Float[Tensor, "B V C"], sighting: Sighting, mean: MeanHand
+        self, aligned: Float[Tensor, "B V C"], seen: Float[Tensor, "B V 3"], sighting: Sighting, mean: MeanHand
     ) -> Float[Tensor, "B V C"]:
-        """To be added to the geometric tokens."""
+        """To be added to the geometric tokens; `seen` is what `seen_difference` says."""
         base = torch.logit(mean.colors, COLOR_MARGIN)
-        difference = (torch.logit(sighting.colors, COLOR_MARGIN) - base) * sighting.confidence[..., None]
-        known = torch.cat([base, difference, sighting.visibility[..., None], sighting.confidence[..., None]], dim=-1)
+        known = torch.cat([base, seen, sighting.visibility[..., None], sighting.confidence[..., None]], dim=-1)
         return self.seen(aligned * sighting.visibility[..., None]) + self.known(known)
