@@ -62,7 +62,7 @@ def test_those_that_place_anchors_leaves_out_are_too_faint_to_be_drawn(hand, han
 
 
 def test_visibility_and_colours_are_those_of_observe(network, evidences, batch, hand):
-    sighting = sight(batch, network.faces, network.vertex_faces, literal=False)
+    sighting = sight(batch, network.faces, network.vertex_faces, network.vertex_index)
     for k, evidence in enumerate(evidences):
         seen = observe(hand, evidence)
         torch.testing.assert_close(sighting.colors[k], seen.colors, atol=1e-5, rtol=0)
@@ -70,7 +70,7 @@ def test_visibility_and_colours_are_those_of_observe(network, evidences, batch, 
 
 
 def test_tones_are_those_of_the_mean_prior(hand, batch, evidences, network):
-    sighting = sight(batch, network.faces, network.vertex_faces, literal=False)
+    sighting = sight(batch, network.faces, network.vertex_faces, network.vertex_index)
     mean = MeanHands(hand)(sighting.colors, sighting.confidence)
     regions = label_regions(hand)
     for k, evidence in enumerate(evidences):

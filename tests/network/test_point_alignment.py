@@ -94,7 +94,7 @@ def test_what_lies_outside_the_frame_gets_no_feature(random):
 
 def test_a_coloured_dot_speaks_to_the_points_that_project_onto_it(network, evidences):
     inputs = input_of_evidence(evidences[0])
-    sighting = sight(inputs, network.faces, network.vertex_faces, literal=False)
+    sighting = sight(inputs, network.faces, network.vertex_faces, network.vertex_index)
     target = int(sighting.confidence[0].argmax())
     place = (sighting.uv[0, target] * 64).long()
     dotted = inputs.image.clone()

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import torch
 
-from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
+from oasis_warp.avatar.anchors import OPACITY, place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.types import HandPose, TrainingBatch
@@ -48,6 +48,7 @@ class PaintedHands:
         )
         anchors = place_anchors(hand, rest)
         truth = anchors.with_colors(vertex_to_gaussians((colors + 0.05 * paint).clamp(0, 1), hand.faces, anchors))
+        truth = truth._replace(opacities=torch.full_like(truth.opacities, OPACITY))  # a hand does not end at the wrist
         pictures = [self._picture(random, rest, truth) for _ in range(1 + self.targets)]
         image, mask, posed, viewmat, K = pictures[0]
         targets = [torch.stack(parts) for parts in zip(*pictures[1:], strict=True)]

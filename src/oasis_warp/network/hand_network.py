@@ -37,6 +37,9 @@ class HandNetwork(nn.Module):
     faces: Tensor
     rim: Tensor
     vertex_faces: Tensor
+    vertex_index: Tensor
+    face_index: Tensor
+    """All vertices, and all faces that carry a Gaussian: always these tensors, as operators check indices once each."""
     template_encoding: Tensor
 
     def __init__(self, config: NetworkConfig, hand: HandModel):
@@ -84,6 +87,8 @@ class HandNetwork(nn.Module):
             "faces": hand.faces,
             "rim": hand.rim,
             "vertex_faces": faces_of_vertices(hand.faces, len(hand.template)),
+            "vertex_index": torch.arange(len(hand.template)),
+            "face_index": torch.arange(len(hand.faces) if self.config.fom == "on" else 0),
             "template_encoding": encode(hand.template / HAND_LENGTH, self.config.frequencies),
         }.items():
             self.register_buffer(name, tensor, persistent=False)
@@ -91,7 +96,7 @@ class HandNetwork(nn.Module):
     def forward(self, inputs: NetworkInput) -> Prediction:
         """Canonical Gaussians of every hand of the batch."""
         with torch.autocast(inputs.image.device.type, enabled=False):
-            sighting = sight(inputs, self.faces, self.vertex_faces, self.config.visibility == "literal")
+            sighting = self.look(inputs)
             mean = self.mean_hands(sighting.colors, sighting.confidence)
             seen = None if self.point_evidence is None else seen_difference(sighting, mean)
         points, local, context = self.tokens(inputs, sighting, mean, seen)
@@ -99,6 +104,11 @@ class HandNetwork(nn.Module):
         if self.refinement is not None:
             features = self.refinement(features, self.level)
         return self.decode(features, mean.colors, seen, inputs.rest)
+
+    def look(self, inputs: NetworkInput) -> Sighting:
+        """What each photo shows of each vertex."""
+        identity = None if self.config.visibility == "literal" else self.vertex_index
+        return sight(inputs, self.faces, self.vertex_faces, identity)
 
     def tokens(
         self, inputs: NetworkInput, sighting: Sighting, mean: MeanHand, seen: Float[Tensor, "B V 3"] | None

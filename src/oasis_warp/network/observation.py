@@ -30,7 +30,10 @@ class Sighting(NamedTuple):
 
 @torch.no_grad()
 def sight(
-    inputs: NetworkInput, faces: Int[Tensor, "F 3"], vertex_faces: Int[Tensor, "V M"], literal: bool
+    inputs: NetworkInput,
+    faces: Int[Tensor, "F 3"],
+    vertex_faces: Int[Tensor, "V M"],
+    vertex_index: Int[Tensor, "V"] | None,
 ) -> Sighting:
     """Look at every vertex; `avatar.observe.observe` in batches.
 
@@ -38,13 +41,14 @@ def sight(
         inputs: Photos and posed surfaces.
         faces: Corners.
         vertex_faces: From `anchors.faces_of_vertices`.
-        literal: Visibility as equation 4 is printed, without margin or identity.
+        vertex_index: Numbers of the vertices: one on a face that is seen is seen itself. With None visibility is
+            equation 4 as printed, without margin or identity.
     """
     vertices, size = inputs.posed, inputs.image.shape[1]
     uv, inside = project_batch(vertices, inputs.viewmat, inputs.K, size)
     visibility = depth_visibility(
-        vertices, vertices, faces, inputs.K, inputs.viewmat, size, size, margin=VISIBILITY_MARGIN, literal=literal,
-        point_vertices=None if literal else torch.arange(vertices.shape[1], device=vertices.device), validate=False,
+        vertices, vertices, faces, inputs.K, inputs.viewmat, size, size, margin=VISIBILITY_MARGIN,
+        literal=vertex_index is None, point_vertices=vertex_index, validate=False,
     ).visibility * inside  # fmt: skip
     corners = vertices[:, faces]
     cross = torch.linalg.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])

@@ -24,7 +24,7 @@ from oasis_warp.network.weights_file import save_network
 from oasis_warp.training.checkpoint import load_checkpoint, save_checkpoint
 from oasis_warp.training.distributed import Place, mean_over_processes
 from oasis_warp.training.losses import LossConfig, Perceptual, objective, picture_psnr
-from oasis_warp.training.targets import Pictures, draw_targets, riders_of, true_pictures
+from oasis_warp.training.targets import Pictures, draw_targets, true_pictures
 
 CHECKPOINT, WEIGHTS, METRICS, SHEET = "checkpoint.safetensors", "network.safetensors", "metrics.jsonl", "pictures.png"
 """What training leaves in its folder."""
@@ -94,7 +94,6 @@ class Trainer:
         self.config, self.place, self.perceptual = config, place, perceptual
         self.trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
         self.optimizer = torch.optim.Adam(self.trained, lr=config.learning_rate, fused=place.device.type == "cuda")
-        self.riders = riders_of(network)
         self.model: torch.nn.Module = network
         if place.world > 1:
             devices = [place.device.index] if place.device.type == "cuda" else None
@@ -118,7 +117,7 @@ class Trainer:
         half = self.config.precision == "bfloat16"
         with torch.autocast(self.place.device.type, torch.bfloat16, enabled=half):
             prediction = self.model(input_of_batch(batch))
-        drawn = draw_targets(prediction, batch, self.network.faces, self.riders)
+        drawn = draw_targets(prediction, batch, self.network)
         true = true_pictures(batch, self.network.faces, self.network.rim)
         loss, terms = objective(prediction, drawn, true, self.config.losses, self.perceptual)
         return StepResult(loss, terms, picture_psnr(drawn, true), drawn, true)

@@ -22,32 +22,14 @@ class Pictures(NamedTuple):
     alphas: Float[Tensor, "N H H"]
 
 
-class Riders(NamedTuple):
-    """Numbers of all vertices and faces: the same tensors every time, so that operators look at them once."""
-
-    vertex_index: Int[Tensor, "V"]
-    face_index: Int[Tensor, "F"]
-
-
-def riders_of(network: HandNetwork) -> Riders:
-    """Of the Gaussians that `network` predicts."""
-    device = network.faces.device
-    n_faces = len(network.faces) if network.config.fom == "on" else 0
-    return Riders(
-        torch.arange(len(network.template_encoding), device=device), torch.arange(n_faces, device=device)
-    )
-
-
-def draw_targets(
-    prediction: Prediction, batch: TrainingBatch, faces: Int[Tensor, "F 3"], riders: Riders
-) -> Pictures:
+def draw_targets(prediction: Prediction, batch: TrainingBatch, network: HandNetwork) -> Pictures:
     """Pose and draw the Gaussians of every hand in the pose and camera of each of its targets."""
     size = batch.target_images.shape[2]
     images, alphas = [], []
     for hand in range(len(batch.rest)):
-        canonical = all_gaussians(prediction, hand, *riders)
+        canonical = all_gaussians(prediction, hand, network.vertex_index, network.face_index)
         for target in range(batch.target_posed.shape[1]):
-            posed = pose_gaussians(canonical, faces, batch.rest[hand], batch.target_posed[hand, target])
+            posed = pose_gaussians(canonical, network.faces, batch.rest[hand], batch.target_posed[hand, target])
             image, alpha, _ = rasterization(
                 *posed, batch.target_viewmats[hand, target][None], batch.target_Ks[hand, target][None], size, size,
                 validate=False,
