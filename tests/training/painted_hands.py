@@ -52,7 +52,8 @@ class PaintedHands:
         pictures = [self._picture(random, rest, truth) for _ in range(1 + self.targets)]
         image, mask, posed, viewmat, K = pictures[0]
         targets = [torch.stack(parts) for parts in zip(*pictures[1:], strict=True)]
-        return image, mask, posed, viewmat, K, rest.vertices, *targets
+        images, masks, *poses = targets
+        return image, mask, posed, viewmat, K, rest.vertices, images, masks, torch.ones_like(masks), *poses
 
     def _picture(self, random, rest, truth):
         name = POSES[int(torch.randint(len(POSES), (), generator=random))]

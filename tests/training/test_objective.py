@@ -1,15 +1,19 @@
 """The training objective, and the pictures it compares."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from painted_hands import PaintedHands
 
 from oasis_warp.core.types import Camera
 from oasis_warp.losses.image import masked_dssim, masked_l1
-from oasis_warp.network.inputs import Prediction
+from oasis_warp.network.config import COMPACT
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.inputs import Prediction, input_of_batch
 from oasis_warp.render.render import render
 from oasis_warp.training.losses import LossConfig, objective, picture_psnr, position_loss, scaling_loss
-from oasis_warp.training.targets import Pictures, true_pictures
+from oasis_warp.training.targets import Pictures, draw_targets, true_pictures
 
 
 def prediction(**changed):
@@ -19,6 +23,21 @@ def prediction(**changed):
         anchor_scales=torch.full((1, 6, 3), 1e-3),
     )  # fmt: skip
     return still._replace(**changed)
+
+
+@pytest.fixture
+def network_of(hand):
+    """Draw the targets of a batch by an untrained network."""
+    config = replace(
+        COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8
+    )
+
+    def draw(batch):
+        network = HandNetwork(config, hand)
+        with torch.no_grad():
+            return draw_targets(network(input_of_batch(batch)), batch, network)
+
+    return draw
 
 
 @pytest.fixture
@@ -122,3 +141,15 @@ def test_what_was_drawn_by_the_truth_costs_nearly_nothing(hand):
     true = true_pictures(solid, hand.faces, hand.rim)
     inner = -torch.nn.functional.max_pool2d(-(drawn.alpha > 0.02).float()[None], 3, 1, 1)[0] > 0
     assert float((true.images[0] - drawn.image).abs().mean(-1)[inner].mean()) < 0.03
+
+
+def test_what_a_sleeve_hides_is_neither_asked_for_nor_forbidden(hand, network_of):
+    batch = PaintedHands(hand, hands=1, targets=1, size=32).batch(0)
+    known = torch.ones_like(batch.target_known)
+    known[..., :16] = 0
+    half = batch._replace(target_known=known)
+    true = true_pictures(half, hand.faces, hand.rim)
+    assert not true.images[:, :, :16].any() and not true.alphas[:, :, :16].any()
+    drawn = network_of(half)
+    assert not drawn.images[:, :, :16].any() and not drawn.alphas[:, :, :16].any()
+    assert drawn.alphas[:, :, 16:].any()

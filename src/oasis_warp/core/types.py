@@ -171,6 +171,9 @@ class TrainingBatch(NamedTuple):
     target_images: Float[Tensor, "B T H H 3"]
     """Over black: what is not hand is 0."""
     target_masks: Float[Tensor, "B T H H"]
+    """Share of each pixel that is hand."""
+    target_known: Float[Tensor, "B T H H"]
+    """Share that says whether there is hand; less than 1 where an arm or clothes may hide it."""
     target_posed: Float[Tensor, "B T V 3"]
     """The surface in each target's pose [m]."""
     target_viewmats: Float[Tensor, "B T 4 4"]

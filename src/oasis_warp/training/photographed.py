@@ -74,13 +74,13 @@ class Photographed(Protocol):
 class EstimatorNoise:
     """How far an estimated pose is off, as standard deviations; about the errors that docs/estimator.md measures."""
 
-    angles: float = 0.06
+    angles: float = 0.03
     """Of every joint angle [rad]."""
-    turn: float = 0.03
+    turn: float = 0.015
     """Of the hand as a whole, about each axis [rad]."""
     shift: float = 0.001
     """Of its place across the view [m]."""
-    shape: float = 0.3
+    shape: float = 0.15
     """Of shape coefficients."""
     crop: float = 0.02
     """Of the crop's place, over its side."""
@@ -221,7 +221,9 @@ def training_batch(
     image, alpha, mask, orientation, translation, K = _as_right_hands(targets)
     goal = pose_hands(hand, targets.shape, targets.angles, orientation, translation)
     alone = image * (mask / alpha.clamp_min(1e-3)).clamp(0, 1)[..., None]  # the picture is over black already
-    cut = crop_to_mask(torch.cat([alone, mask[..., None]], dim=-1), mask, K, size, K.new_zeros(len(K), 3))
+    hidden = (alpha - mask).clamp(0, 1)
+    planes = torch.cat([alone, mask[..., None], hidden[..., None]], dim=-1)
+    cut = crop_to_mask(planes, mask, K, size, K.new_zeros(len(K), 3))
     still = torch.eye(4, dtype=like.dtype, device=like.device)
 
     def by_hand(tensor: Tensor) -> Tensor:
@@ -236,6 +238,7 @@ def training_batch(
         rest=true.rest,
         target_images=by_hand(cut.planes[..., :3].clamp(0, 1)),
         target_masks=by_hand(cut.planes[..., 3].clamp(0, 1)),
+        target_known=by_hand(1 - cut.planes[..., 4].clamp(0, 1)),
         target_posed=by_hand(goal.posed),
         target_viewmats=still.expand(count, views, -1, -1),
         target_Ks=by_hand(cut.K),

@@ -16,7 +16,7 @@ from oasis_warp.ops import depth_map, rasterization
 
 
 class Pictures(NamedTuple):
-    """N = B T pictures over black."""
+    """N = B T pictures over black; what their targets say nothing about is black, too."""
 
     images: Float[Tensor, "N H H 3"]
     alphas: Float[Tensor, "N H H"]
@@ -36,7 +36,8 @@ def draw_targets(prediction: Prediction, batch: TrainingBatch, network: HandNetw
             )  # fmt: skip
             images.append(image[0])
             alphas.append(alpha[0, ..., 0])
-    return Pictures(torch.stack(images), torch.stack(alphas))
+    known = batch.target_known.flatten(0, 1)
+    return Pictures(torch.stack(images) * known[..., None], torch.stack(alphas) * known)
 
 
 @torch.no_grad()
@@ -51,6 +52,5 @@ def true_pictures(batch: TrainingBatch, faces: Int[Tensor, "F 3"], rim: Int[Tens
     corners = faces[seen.face_ids.clamp_min(0).long()]
     at_corners = at_vertices.gather(1, corners.flatten(1)).view(corners.shape)
     fade = torch.where(seen.face_ids >= 0, (at_corners * seen.barycentrics).sum(-1), 1)
-    return Pictures(
-        batch.target_images.flatten(0, 1) * fade[..., None], batch.target_masks.flatten(0, 1) * fade
-    )
+    share = fade * batch.target_known.flatten(0, 1)
+    return Pictures(batch.target_images.flatten(0, 1) * share[..., None], batch.target_masks.flatten(0, 1) * share)
