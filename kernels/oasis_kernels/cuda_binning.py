@@ -9,6 +9,7 @@ have consecutive numbers, tile after tile.
 """
 
 import functools
+from typing import Any
 
 from oasis_kernels.cuda_native import CudaNative, cuda_native
 
@@ -20,10 +21,14 @@ to 2^63, and 32 of mantissa."""
 BLOCK = 128
 
 COUNTERS = 5
-"""64-bit words, zero on entry: pairs numbered; then of `place_tiles` tiles with pairs << 38 | pairs, empty tiles,
-longest list, blocks done."""
-REPORT = 3
-"""64-bit words for the host: pairs, longest list, tiles with pairs."""
+"""64-bit words before the counts of the tiles: pairs numbered; then of `place_tiles` tiles with pairs << 38 | pairs,
+empty tiles, longest list, blocks done. All are zero before `count_pairs` and again after `place_tiles`."""
+SPREAD = 8
+"""Distance of neighbouring tiles' counters in numbers: those that share 32 bytes wait for each other's atomics."""
+MOST_SPREAD = 1 << 16
+"""Tiles beyond which counters stand side by side: there are enough of them not to collide."""
+REPORT = 2
+"""64-bit words for the host: pairs, longest list."""
 
 TILE_BOX = """
     // Tiles x0, y0, x1, y1 (past the end) that a box of pixels touches; empty boxes touch none.
@@ -52,7 +57,8 @@ COUNT = TILE_BOX + """
     for (int done = 0; __any_sync(0xffffffffu, done < count); done++) {
         const int tile = done < count ? (int)((image + y) * tiles_x + x) : -1;
         const unsigned same = __match_any_sync(0xffffffffu, tile);
-        if (tile >= 0 && lane == __ffs(same) - 1) atomicAdd(tile_counts + tile, __popc(same));
+        if (tile >= 0 && lane == __ffs(same) - 1)
+            atomicAdd((int*)(counters + @COUNTERS@) + (long long)tile * spread, __popc(same));
         if (++x == t.z) { x = t.x; y++; }
     }
     base = __shfl_sync(0xffffffffu, base, 31);
@@ -66,7 +72,11 @@ PLACE = """
     __shared__ int warp_longest[@WARPS@];
     const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
     const bool inside = thread < n_tiles;
-    const int count = inside ? tile_counts[thread] : 0;
+    int* const tile_counts = (int*)(counters + @COUNTERS@);
+    unsigned long long* const placed = counters + 1;
+    const long long own_counter = (long long)thread * spread;
+    const int count = inside ? tile_counts[own_counter] : 0;
+    if (inside) tile_counts[own_counter] = 0;
     // Prefix sums over the block of pairs and of tiles with pairs, in one word.
     const unsigned long long own = count ? 1ull << 38 | (unsigned long long)count : 0ull;
     unsigned long long sum = own;
@@ -101,7 +111,7 @@ PLACE = """
         const bool fits = start + count <= capacity;
         const int row = thread / tiles_x;
         tiles[rank] = {thread - row * tiles_x, (int)start, fits ? count : 0, row};
-        cursors[thread] = fits ? start : capacity;
+        cursors[own_counter] = (int)(fits ? start : capacity);
     }
     if (threadIdx.x == 0) {
         __threadfence();
@@ -109,7 +119,7 @@ PLACE = """
             const unsigned long long total = atomicAdd(placed, 0ull);
             report[0] = (long long)(total & ((1ull << 38) - 1));
             report[1] = atomicMax((long long*)placed + 2, 0ll);
-            report[2] = (long long)(total >> 38);
+            for (int k = 0; k < @COUNTERS@; k++) counters[k] = 0;
         }
     }
 """
@@ -119,34 +129,39 @@ FILL = TILE_BOX + """
     const int4 t = own ? tile_box(boxes[thread]) : int4{0, 0, 0, 0};
     const int camera = n == total ? 0 : thread / n, index = thread - camera * n;
     const int count = (t.z - t.x) * (t.w - t.y), lane = threadIdx.x & 31;
-    long long bits = count ? __double_as_longlong(depths[thread]) - (959ll << 52) : 0;
+    long long bits = count ? __double_as_longlong(sort_depths[thread]) - (959ll << 52) : 0;
     bits = bits < 0 ? 0 : bits;
     const long long key = (bits >> 20) << @INDEX_BITS@ | index;
     const long long image = (long long)camera * tiles_y;
     int x = t.x, y = t.y;
     for (int done = 0; __any_sync(0xffffffffu, done < count); done += 4) {
         // Four tiles at a time, whose answers are not waited for; lanes with the same tile ask once.
-        unsigned long long place[4];
+        int place[4];
         unsigned same[4];
         #pragma unroll
         for (int k = 0; k < 4; k++) {
             const int tile = done + k < count ? (int)((image + y) * tiles_x + x) : -1;
             same[k] = __match_any_sync(0xffffffffu, tile);
-            place[k] = (unsigned long long)capacity;
+            place[k] = 0;
             if (tile >= 0 && lane == __ffs(same[k]) - 1)
-                place[k] = atomicAdd(cursors + tile, (unsigned long long)__popc(same[k]));
+                place[k] = atomicAdd(cursors + (long long)tile * spread, __popc(same[k]));
             if (++x == t.z) { x = t.x; y++; }
         }
         #pragma unroll
         for (int k = 0; k < 4; k++) {
-            const unsigned long long first = __shfl_sync(0xffffffffu, place[k], __ffs(same[k]) - 1);
-            const long long at = (long long)first + __popc(same[k] & ((1u << lane) - 1u));
-            if (done + k < count && at < capacity) keys[at] = key;
+            const unsigned at = (unsigned)__shfl_sync(0xffffffffu, place[k], __ffs(same[k]) - 1)
+                + (unsigned)__popc(same[k] & ((1u << lane) - 1u));
+            if (done + k < count && at < (unsigned)capacity) keys[at] = key;
         }
     }
 """
 
 PLACE_BLOCK = 256
+
+
+def spread_of(n_tiles: Any) -> int:
+    """Distance of the counters of so many tiles."""
+    return SPREAD if n_tiles <= MOST_SPREAD else 1
 
 
 @functools.cache
@@ -159,10 +174,10 @@ def count_pairs() -> CudaNative:
         "tiles_x": "int",
         "tiles_y": "int",
         "pair_starts": "int*",  # [total]
-        "tile_counts": "int*",  # [tiles], zero on entry
-        "counters": "unsigned long long*",  # the first one
+        "spread": "int",  # see `spread_of`
+        "counters": "unsigned long long*",  # [COUNTERS], and then [tiles, spread] of int
     }
-    return cuda_native("count_pairs", parameters, COUNT, BLOCK)
+    return cuda_native("count_pairs", parameters, COUNT.replace("@COUNTERS@", str(COUNTERS)), BLOCK)
 
 
 @functools.cache
@@ -171,14 +186,16 @@ def place_tiles() -> CudaNative:
     parameters = {
         "n_tiles": "int",
         "tiles_x": "int",
-        "tile_counts": "const int*",
         "capacity": "long long",  # pairs for which there is memory
-        "placed": "unsigned long long*",  # the last four counters
+        "counters": "unsigned long long*",
         "tiles": "int4*",  # column, start and length of the list, row over all cameras; those with pairs come first
-        "cursors": "long long*",  # [tiles]: the starts
+        "spread": "int",
+        "cursors": "int*",  # [tiles, spread]: the starts
         "report": "long long*",  # [REPORT]
     }
-    body = PLACE.replace("@BLOCK@", str(PLACE_BLOCK)).replace("@WARPS@", str(PLACE_BLOCK // 32))
+    body = PLACE
+    for name, number in {"BLOCK": PLACE_BLOCK, "WARPS": PLACE_BLOCK // 32, "COUNTERS": COUNTERS}.items():
+        body = body.replace(f"@{name}@", str(number))
     return cuda_native("place_tiles", parameters, body, PLACE_BLOCK)
 
 
@@ -189,11 +206,12 @@ def fill_tiles() -> CudaNative:
         "n": "int",
         "total": "int",
         "boxes": "const int4*",
-        "depths": "const double*",
+        "sort_depths": "const double*",
         "tiles_x": "int",
         "tiles_y": "int",
         "capacity": "long long",
-        "cursors": "unsigned long long*",
+        "spread": "int",
+        "cursors": "int*",
         "keys": "long long*",
     }
     return cuda_native("fill_tiles", parameters, FILL.replace("@INDEX_BITS@", str(INDEX_BITS)), BLOCK)

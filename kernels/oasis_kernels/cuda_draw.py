@@ -130,7 +130,7 @@ SORT = """
             if (at < count) {
                 const int g = camera * n + (int)(key & @INDEX_MASK@);
                 sorted_here[rank] = g;
-                if (checkpoints || stops) tile_gaussians[start + rank] = g;
+                if (stops) tile_gaussians[start + rank] = g;
             }
         }
         __syncthreads();
@@ -184,7 +184,8 @@ FORWARD = """
         const bool hits = first + lane < count && reaches(l, y_low, y_high);
         const unsigned hitting = __ballot_sync(all, hits);
         const int m = __popc(hitting), slot = __popc(hitting & ((1u << lane) - 1u));
-        if (hits) put(slot, l, first + lane, @CHANNELS@ <= 4 ? next_color : colors + (long long)next_index * @CHANNELS@);
+        const float* const color = @CHANNELS@ <= 4 ? next_color : colors + (long long)next_index * @CHANNELS@;
+        if (hits) put(slot, l, first + lane, color);
         if (lane >= m && lane < ((m + 3) & ~3)) put_nothing(lane);
         __syncwarp();
         fetch(first + 32);
@@ -271,7 +272,7 @@ PARAMETERS = {
     "tiles_y": "int",
     "width": "int",
     "height": "int",
-    "tile_gaussians": "int*",  # [pairs]: the lists, nearest first
+    "tile_gaussians": "int*",  # [pairs]: the lists, nearest first; or null
     "transmittance": "float*",  # [C, H, W], or null
     "stops": "int*",  # [C, H, W]: place in the list of the first layer that was not drawn; or null
     "checkpoints": "float*",  # [tiles with pairs, segments - 1, 1 + channels, 64], or null

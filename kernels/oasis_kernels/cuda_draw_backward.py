@@ -102,7 +102,7 @@ BACKWARD = """
             g = list[first + lane];
             const int4 t = tile_box(boxes[g]);
             const int number = pair_starts[g] + (top / 8 - t.y) * (t.z - t.x) + left / 8 - t.x;
-            record = records + (long long)number * @RECORD@;
+            record = pair_records + (long long)number * @RECORD@;
             l = layer(centers[g], whitenings[g], opacities[g]);
             hits = first + lane < last && reaches(l, 0.f, 7.f);
             if (!hits) {
@@ -198,7 +198,7 @@ GATHER = """
     const long long start = pair_starts[thread];
     float sums[@RECORD@] = {};
     if (start + count <= capacity) for (int pair = 0; pair < count; pair++) {
-        const float4* record = (const float4*)(records + (start + pair) * @RECORD@);
+        const float4* record = (const float4*)(pair_records + (start + pair) * @RECORD@);
         #pragma unroll
         for (int k = 0; k < @RECORD@ / 4; k++) {
             const float4 four = record[k];
@@ -246,7 +246,7 @@ def blend_backward(channels: int, segments: int, shape: bool, colors: bool, rule
         "boxes": "const int4*",
         "g_image": "const float*",  # [C, H, W, channels], or null for zeros
         "g_alpha": "const float*",  # [C, H, W], or null for zeros
-        "records": "float*",  # [pairs, record size]
+        "pair_records": "float*",  # [pairs, record size]
         "tile_backgrounds": "float*",  # [tiles, channels], or null
     }
     name = f"blend_tiles_backward_{channels}"
@@ -267,7 +267,7 @@ def gather(channels: int, shape: bool, colors: bool) -> CudaNative:
         "capacity": "long long",  # pairs for which there are records
         "boxes": "const int4*",
         "pair_starts": "const int*",
-        "records": "const float*",
+        "pair_records": "const float*",
         "whitenings": "const float4*",
         "opacities": "const float*",
         "g_means2d": "float2*",

@@ -43,6 +43,9 @@ FORWARD_PARAMETERS = SCENE | {
     "centers": "float4*",  # [C, n]
     "whitenings": "float4*",  # [C, n]
     "boxes": "int4*",  # [C, n]
+    "counters": "int*",  # of the tiles, to be cleared
+    "n_counters": "int",
+    "n_threads": "int",
     "bad": "long long*",  # made 1 where an input is not finite, too large or outside its range; or null
 }
 
@@ -110,6 +113,7 @@ HEAD = """
 """
 
 FORWARD = """
+    for (int k = thread; k < n_counters; k += n_threads) counters[k] = 0;
     if (thread >= n * n_cameras) return;
     const int c = n_cameras == 1 ? 0 : thread / n, i = thread - c * n;
     bool flaw = false;

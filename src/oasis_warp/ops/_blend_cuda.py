@@ -1,4 +1,7 @@
-"""Blend float32 Gaussians on CUDA, a block of warps a tile."""
+"""Blend float32 Gaussians on CUDA, a block of warps a tile.
+
+Torch takes its time for every tensor, longer than some kernels run: tensors here hold several arrays each.
+"""
 
 from typing import NamedTuple
 
@@ -6,8 +9,9 @@ import torch
 from torch import Tensor
 
 from oasis_kernels import cuda_binning, cuda_draw, cuda_draw_backward, cuda_long_lists
-from oasis_warp.ops._launch import device_and_stream, run_cuda
+from oasis_warp.ops._launch import current_stream, run_cuda
 from oasis_warp.ops._pair_counts import Counts, own_slot, remember, watching
+from oasis_warp.ops._records import Size
 from oasis_warp.ops._registration import hidden, hidden_like_fake
 from oasis_warp.ops._rules import current_rules
 from oasis_warp.ops._splats import Frame, Gradients, Splats, Wanted
@@ -18,136 +22,76 @@ MOST_CHECKPOINTS = 1 << 16
 and what is kept of the segments would outgrow the pictures."""
 
 
-class Lists(NamedTuple):
-    """Which Gaussians each tile draws. P pairs of a Gaussian and a tile."""
-
-    tiles: Tensor
-    """[tiles, 4], int32: column, start and length of the list, row over all cameras; tiles with any list come first."""
-    pair_starts: Tensor
-    """[M], int32: number of each Gaussian's first pair."""
-    gaussians: Tensor
-    """`hidden` [P], int32: Gaussians, nearest first; filled in where they are kept."""
-
-
 class Kept(NamedTuple):
     """What the adjoint needs."""
 
-    transmittance: Tensor
-    """[C, H, W], of the end."""
-    stops: Tensor
-    """[C, H, W], int32: place in the tile's list of the first Gaussian that was not drawn."""
-    checkpoints: Tensor
-    """`hidden`, of what happens between the segments of a list: see `cuda_draw`."""
-    tiles: Tensor
-    """As in `Lists`, like all below."""
-    pair_starts: Tensor
+    planes: Tensor
+    """float32: [C, H, W] transmittance at the end; [C, H, W] bits of int32, place in the tile's list of the first
+    Gaussian that was not drawn; what happens between the segments of the lists (`checkpoints` of `cuda_draw`)."""
+    lists: Tensor
+    """int32: [tiles, 4] column, start and length of the list, row over all cameras of a tile, those with any list
+    first; [tiles, spread] cursors, of no further use; [C, N] number of each Gaussian's first pair."""
     gaussians: Tensor
+    """`hidden` [pairs], int32: the lists, nearest first."""
 
 
-def _count_tiles(width: int, height: int) -> tuple[int, int]:
-    """Tiles across and down an image."""
-    return -(-width // cuda_binning.TILE), -(-height // cuda_binning.TILE)
+class Layout(NamedTuple):
+    """Sizes of one call."""
 
-
-def _segments(n_tiles: int, channels: int) -> int:
+    n_cameras: int
+    n: int
+    channels: int
+    tiles_x: int
+    tiles_y: int
+    width: int
+    height: int
+    n_tiles: int
+    pixels: int
+    segments: int
     """Parts that the lists are cut into."""
-    return cuda_draw.SEGMENTS if n_tiles * (channels + 1) <= MOST_CHECKPOINTS else 1
+
+    def size_of_planes(self) -> Size:
+        """Numbers of `Kept.planes`."""
+        return 2 * self.pixels + self.n_tiles * (self.segments - 1) * (self.channels + 1) * 64
+
+    def size_of_lists(self) -> Size:
+        """Numbers of `Kept.lists`."""
+        return (4 + cuda_binning.spread_of(self.n_tiles)) * self.n_tiles + self.n_cameras * self.n
 
 
-def _bin(splats: Splats, width: int, height: int) -> tuple[Lists, Tensor]:
-    """Lists of the tiles, and the keys that short ones are to be sorted by."""
-    n_cameras, n = splats.depths.shape
-    device = splats.depths.device
-    stream = device_and_stream(splats.depths)[1]
-    across, down = _count_tiles(width, height)
-    total, n_tiles = n_cameras * n, n_cameras * across * down
-    counts = torch.zeros(2 * cuda_binning.COUNTERS + n_tiles, dtype=torch.int32, device=device)
-    pair_starts = torch.empty(total, dtype=torch.int32, device=device)
-    tiles = torch.empty((n_tiles, 4), dtype=torch.int32, device=device)
-    cursors = torch.empty(n_tiles, dtype=torch.int64, device=device)
-    counters = counts.data_ptr()
-    tile_counts = counters + 8 * cuda_binning.COUNTERS
-    scene = {"n": n, "total": total, "boxes": splats.boxes.data_ptr(), "tiles_x": across, "tiles_y": down}
-    blocks = -(-total // cuda_binning.BLOCK)
-    run_cuda(
-        cuda_binning.count_pairs(),
-        {**scene, "pair_starts": pair_starts.data_ptr(), "tile_counts": tile_counts, "counters": counters},
-        blocks,
-        stream,
+def _layout(colors: Tensor, frame: Frame) -> Layout:
+    n_cameras, n, channels = colors.shape
+    width, height, _ = frame
+    across, down = -(-width // cuda_binning.TILE), -(-height // cuda_binning.TILE)
+    n_tiles = n_cameras * across * down
+    segments = cuda_draw.SEGMENTS if n_tiles * (channels + 1) <= MOST_CHECKPOINTS else 1
+    return Layout(
+        n_cameras, n, channels, across, down, width, height, n_tiles, n_cameras * height * width, segments
     )
-    kind = device, n_cameras, n, width, height
-    capturing = torch.cuda.is_current_stream_capturing()
-    report, capacity = watching().expect(kind) if capturing else (own_slot(), Counts(MAX_PAIRS, 0))
-    run_cuda(
-        cuda_binning.place_tiles(),
-        {
-            "n_tiles": n_tiles, "tiles_x": across, "tile_counts": tile_counts, "capacity": capacity.pairs, "placed": counters + 8,
-            "tiles": tiles.data_ptr(), "cursors": cursors.data_ptr(), "report": report.data_ptr(),
-        },
-        -(-n_tiles // cuda_binning.PLACE_BLOCK),
-        stream,
-    )  # fmt: skip
-    if not capturing:
-        # The one moment at which the host waits for the device: only the data knows how much memory it takes.
-        torch.cuda.current_stream(device).synchronize()
-        capacity = Counts(*report[:2].tolist())
-        check_pairs(capacity.pairs)
-        remember(kind, capacity)
-    lists = Lists(tiles, pair_starts, hidden(capacity.pairs, torch.int32, device))
-    keys = torch.empty(capacity.pairs, dtype=torch.int64, device=device)
-    run_cuda(
-        cuda_binning.fill_tiles(),
-        {
-            **scene, "depths": splats.depths.data_ptr(), "capacity": capacity.pairs, "cursors": cursors.data_ptr(),
-            "keys": keys.data_ptr(),
-        },
-        blocks,
-        stream,
-    )  # fmt: skip
-    if capacity.longest > cuda_draw.LONGEST:
-        spare = torch.empty_like(keys) if capacity.longest > cuda_long_lists.RUN else None
-        run_cuda(
-            cuda_long_lists.sort_long_lists(),
-            {
-                "n": n, "tiles": tiles.data_ptr(), "tiles_y": down, "keys": keys.data_ptr(),
-                "spare": 0 if spare is None else spare.data_ptr(), "tile_gaussians": lists.gaussians.data_ptr(),
-            },
-            n_tiles,
-            stream,
-        )  # fmt: skip
-    return lists, keys
+
+
+def _words(splats: Splats, layout: Layout, lists: Tensor, planes: Tensor | None) -> dict[str, int]:
+    """Parameters of the kernels: sizes, what is drawn, the arrays of `Kept.lists` and `Kept.planes`."""
+    first, plane = lists.data_ptr(), 0 if planes is None else planes.data_ptr()
+    n_cameras, n, _, tiles_x, tiles_y, width, height, n_tiles, pixels, _ = layout
+    spread = cuda_binning.spread_of(n_tiles)
+    return {
+        **splats.words(), "opacities": splats.opacities.data_ptr(), "colors": splats.colors.data_ptr(),
+        "backgrounds": splats.backgrounds.data_ptr(), "n": n, "n_cameras": n_cameras, "total": n_cameras * n,
+        "tiles_x": tiles_x, "tiles_y": tiles_y, "width": width, "height": height, "n_tiles": n_tiles, "tiles": first,
+        "cursors": first + 16 * n_tiles, "pair_starts": first + (16 + 4 * spread) * n_tiles, "spread": spread,
+        "transmittance": plane, "stops": plane and plane + 4 * pixels, "checkpoints": plane and plane + 8 * pixels,
+    }  # fmt: skip
 
 
 def kept_like(colors: Tensor, frame: Frame) -> Kept:
     """Empty tensors of the shapes that `draw` keeps."""
-    n_cameras, n, _ = colors.shape
-    across, down = _count_tiles(frame.width, frame.height)
-
-    def empty(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
-        return colors.new_empty(shape, dtype=dtype)
-
+    layout = _layout(colors, frame)
     return Kept(
-        empty(n_cameras, frame.height, frame.width, dtype=torch.float32),
-        empty(n_cameras, frame.height, frame.width),
-        hidden_like_fake(torch.float32, colors.device),
-        empty(n_cameras * across * down, 4),
-        empty(n_cameras * n),
+        colors.new_empty(layout.size_of_planes()),
+        colors.new_empty(layout.size_of_lists(), dtype=torch.int32),
         hidden_like_fake(torch.int32, colors.device),
     )
-
-
-def _scene_words(splats: Splats, frame: Frame) -> tuple[dict[str, int], int]:
-    """Parameters of both kernels that draw, and the number of tiles."""
-    n_cameras, n, channels = splats.colors.shape
-    across, down = _count_tiles(frame.width, frame.height)
-    n_tiles = n_cameras * across * down
-    words = {
-        "n": n, "n_cameras": n_cameras, "centers": splats.centers.data_ptr(),
-        "whitenings": splats.whitenings.data_ptr(), "opacities": splats.opacities.data_ptr(),
-        "colors": splats.colors.data_ptr(), "backgrounds": splats.backgrounds.data_ptr(), "tiles_x": across,
-        "tiles_y": down, "width": frame.width, "height": frame.height,
-    }  # fmt: skip
-    return words, n_tiles
 
 
 def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept | None]:
@@ -157,36 +101,41 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
         ValueError: more pairs of a Gaussian and a tile than can be numbered.
         RuntimeError: a graph captures this, and nothing is known of the number of pairs, or nobody watches it.
     """
-    width, height, _ = frame
-    n_cameras, _, channels = splats.colors.shape
-    lists, keys = _bin(splats, width, height)
-    words, n_tiles = _scene_words(splats, frame)
-    segments = _segments(n_tiles, channels)
-    new = splats.colors
-    image, alphas = new.new_empty((n_cameras, height, width, channels)), new.new_empty((n_cameras, height, width, 1))
-    kept = None
-    if keep:
-        between = segments - 1
-        busy = min(n_tiles, lists.gaussians.untyped_storage().nbytes() // 4)  # no tile draws less than a pair
-        kept = Kept(
-            new.new_empty((n_cameras, height, width)),
-            torch.empty((n_cameras, height, width), dtype=torch.int32, device=new.device),
-            hidden(busy * between * (channels + 1) * 64, torch.float32, new.device),
-            *lists,
-        )
-    run_cuda(
-        cuda_draw.blend(channels, segments, current_rules()),
-        {
-            **words, "tiles": lists.tiles.data_ptr(), "keys": keys.data_ptr(),
-            "tile_gaussians": lists.gaussians.data_ptr(), "image": image.data_ptr(), "alphas": alphas.data_ptr(),
-            "transmittance": 0 if kept is None else kept.transmittance.data_ptr(),
-            "stops": 0 if kept is None else kept.stops.data_ptr(),
-            "checkpoints": 0 if kept is None else kept.checkpoints.data_ptr(),
-        },
-        n_tiles,
-        device_and_stream(new)[1],
-    )  # fmt: skip
-    return image, alphas, kept
+    layout, new = _layout(splats.colors, frame), splats.colors
+    n_cameras, n, channels = new.shape
+    device, stream = new.device, current_stream(new.device)
+    lists = torch.empty(layout.size_of_lists(), dtype=torch.int32, device=device)
+    planes = new.new_empty(layout.size_of_planes()) if keep else None
+    words = _words(splats, layout, lists, planes)
+    kind = device, n_cameras, n, frame.width, frame.height
+    capturing = torch.cuda.is_current_stream_capturing()
+    report, counts = watching().expect(kind) if capturing else (own_slot(), Counts(MAX_PAIRS, 0))
+    words |= {"capacity": counts.pairs, "report": report.data_ptr()}
+    blocks = -(-n_cameras * n // cuda_binning.BLOCK)
+    run_cuda(cuda_binning.count_pairs(), words, blocks, stream)
+    run_cuda(cuda_binning.place_tiles(), words, -(-layout.n_tiles // cuda_binning.PLACE_BLOCK), stream)
+    image = new.new_empty((n_cameras, frame.height, frame.width, channels))
+    alphas = new.new_empty((n_cameras, frame.height, frame.width, 1))
+    if not capturing:
+        # The one moment at which the host waits for the device: only the data knows how much memory it takes.
+        torch.cuda.current_stream(device).synchronize()
+        counts = Counts(*report.tolist())
+        check_pairs(counts.pairs)
+        remember(kind, counts)
+    long = counts.longest > cuda_draw.LONGEST
+    gaussians = hidden(counts.pairs, torch.int32, device) if keep or long else None
+    keys = torch.empty(counts.pairs, dtype=torch.int64, device=device)
+    words |= {
+        "capacity": counts.pairs, "keys": keys.data_ptr(), "image": image.data_ptr(), "alphas": alphas.data_ptr(),
+        "tile_gaussians": 0 if gaussians is None else gaussians.data_ptr(),
+    }  # fmt: skip
+    run_cuda(cuda_binning.fill_tiles(), words, blocks, stream)
+    if long:
+        spare = torch.empty_like(keys) if counts.longest > cuda_long_lists.RUN else None
+        words["spare"] = 0 if spare is None else spare.data_ptr()
+        run_cuda(cuda_long_lists.sort_long_lists(), words, layout.n_tiles, stream)
+    run_cuda(cuda_draw.blend(channels, layout.segments, current_rules()), words, layout.n_tiles, stream)
+    return image, alphas, None if planes is None or gaussians is None else Kept(planes, lists, gaussians)
 
 
 def draw_backward(
@@ -194,48 +143,30 @@ def draw_backward(
 ) -> Gradients:
     """Gradients from those by image and alpha, None standing for zeros."""
     with_shape, with_colors, with_backgrounds = wanted
-    n_cameras, n, channels = splats.colors.shape
-    new, total = splats.colors, n_cameras * n
-    words, n_tiles = _scene_words(splats, frame)
-    stream = device_and_stream(new)[1]
-    n_pairs = kept.gaussians.untyped_storage().nbytes() // 4 - 1
+    layout, new = _layout(splats.colors, frame), splats.colors
+    n_cameras, n, channels = new.shape
+    stream = current_stream(new.device)
+    capacity = kept.gaussians.untyped_storage().nbytes() // 4 - 1
     size = cuda_draw_backward.record_size(channels, with_shape, with_colors)
-    records = new.new_empty((n_pairs, size))
-    tile_backgrounds = new.new_empty((n_cameras, n_tiles // n_cameras, channels)) if with_backgrounds else None
-    backward = cuda_draw_backward.blend_backward(
-        channels, _segments(n_tiles, channels), with_shape, with_colors, current_rules()
-    )
-    run_cuda(
-        backward,
-        {
-            **words, "tiles": kept.tiles.data_ptr(), "tile_gaussians": kept.gaussians.data_ptr(),
-            "transmittance": kept.transmittance.data_ptr(), "stops": kept.stops.data_ptr(),
-            "checkpoints": kept.checkpoints.data_ptr(), "pair_starts": kept.pair_starts.data_ptr(),
-            "boxes": splats.boxes.data_ptr(), "g_image": 0 if g_image is None else g_image.data_ptr(),
-            "g_alpha": 0 if g_alpha is None else g_alpha.data_ptr(), "records": records.data_ptr(),
-            "tile_backgrounds": 0 if tile_backgrounds is None else tile_backgrounds.data_ptr(),
-        },
-        n_tiles,
-        stream,
-    )  # fmt: skip
+    pair_records = new.new_empty(capacity * size)
+    tile_backgrounds = new.new_empty((n_cameras, layout.n_tiles // n_cameras, channels)) if with_backgrounds else None
     g_means2d = new.new_empty((n_cameras, n, 2)) if with_shape else None
     g_covars2d = torch.empty((n_cameras, n, 3), dtype=torch.float64, device=new.device) if with_shape else None
     g_opacities = new.new_empty((n_cameras, n)) if with_shape else None
     g_colors = new.new_empty((n_cameras, n, channels)) if with_colors else None
+    arrays = {
+        "g_image": g_image, "g_alpha": g_alpha, "tile_backgrounds": tile_backgrounds, "g_means2d": g_means2d,
+        "g_covars2d": g_covars2d, "g_opacities": g_opacities, "g_colors": g_colors,
+    }  # fmt: skip
+    words = _words(splats, layout, kept.lists, kept.planes) | {
+        "capacity": capacity, "tile_gaussians": kept.gaussians.data_ptr(), "pair_records": pair_records.data_ptr(),
+        **{name: 0 if array is None else array.data_ptr() for name, array in arrays.items()},
+    }  # fmt: skip
+    rules = current_rules()
+    backward = cuda_draw_backward.blend_backward(channels, layout.segments, with_shape, with_colors, rules)
+    run_cuda(backward, words, layout.n_tiles, stream)
     if with_shape or with_colors:
-        gradients = {
-            "g_means2d": g_means2d, "g_covars2d": g_covars2d, "g_opacities": g_opacities, "g_colors": g_colors
-        }  # fmt: skip
-        run_cuda(
-            cuda_draw_backward.gather(channels, with_shape, with_colors),
-            {
-                "total": total, "capacity": n_pairs, "boxes": splats.boxes.data_ptr(),
-                "pair_starts": kept.pair_starts.data_ptr(), "records": records.data_ptr(),
-                "whitenings": splats.whitenings.data_ptr(), "opacities": splats.opacities.data_ptr(),
-                **{name: 0 if g is None else g.data_ptr() for name, g in gradients.items()},
-            },
-            -(-total // cuda_draw_backward.GATHER_BLOCK),
-            stream,
-        )  # fmt: skip
+        blocks = -(-n_cameras * n // cuda_draw_backward.GATHER_BLOCK)
+        run_cuda(cuda_draw_backward.gather(channels, with_shape, with_colors), words, blocks, stream)
     g_backgrounds = None if tile_backgrounds is None else tile_backgrounds.sum(1)
     return Gradients(g_means2d, g_covars2d, g_opacities, g_colors, g_backgrounds)

@@ -55,15 +55,16 @@ class _Slots:
             self.free.append(slot)
 
 
-_slots = _Slots()
+slots = _Slots()
+"""For kernels that tell the host a few numbers."""
 
 
 class _Own(threading.local):
     """A slot a thread, for calls that wait."""
 
     def __init__(self) -> None:
-        self.slot = _slots.take()
-        weakref.finalize(threading.current_thread(), _slots.give, self.slot)
+        self.slot = slots.take()
+        weakref.finalize(threading.current_thread(), slots.give, self.slot)
 
 
 _own: _Own | None = None
@@ -87,9 +88,9 @@ class Overflow:
 
     def expect(self, kind: Kind) -> tuple[Tensor, Counts]:
         """A report's memory and the capacity for a call of this `kind`."""
-        slot, capacity = _slots.take().zero_(), capacity_of(kind)
+        slot, capacity = slots.take().zero_(), capacity_of(kind)
         self._reports.append((slot, capacity))
-        weakref.finalize(self, _slots.give, slot)
+        weakref.finalize(self, slots.give, slot)
         return slot, capacity
 
     def happened(self) -> bool:

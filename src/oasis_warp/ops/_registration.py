@@ -136,13 +136,12 @@ def hidden(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
     The one element lies at the start of a longer storage: shapes stay known, the storage travels along.
     """
-    return torch.empty(size + 1, dtype=dtype, device=device)[:1]
+    return torch.empty(size + 1, dtype=dtype, device=device).resize_(1)
 
 
 def revealed(buffer: Tensor) -> Tensor:
     """All elements of a `hidden` buffer."""
-    whole = torch.empty(0, dtype=buffer.dtype, device=buffer.device).set_(buffer.untyped_storage())
-    return whole[:-1]
+    return buffer.as_strided((buffer.untyped_storage().nbytes() // buffer.element_size() - 1,), (1,))
 
 
 def hidden_like_fake(dtype: torch.dtype, device: torch.device) -> Tensor:

@@ -9,7 +9,7 @@ from oasis_kernels import cuda_values
 from oasis_kernels.finite import ALL_FINITE
 from oasis_warp.core import checks
 from oasis_warp.ops._launch import device_and_stream, has_vectors, run_cuda, run_native
-from oasis_warp.ops._pair_counts import _slots
+from oasis_warp.ops._pair_counts import slots
 
 
 def check_finite(**tensors: Tensor | None) -> None:
@@ -59,11 +59,12 @@ class Look:
         refuse_capture()
         tensors = list(self._given.values())
         self._device = tensors[0].device
-        self._found = _slots.take()
+        self._found = slots.take()
         self._found[0] = 0
         stream = device_and_stream(tensors[0])[1]
         for first in range(0, len(tensors), cuda_values.ARRAYS):
-            words: dict[str, int | float] = {"found": self._found.data_ptr(), "largest": checks.FINITE_LIMIT}
+            words: dict[str, int | float] = dict.fromkeys(cuda_values.all_finite().parameters, 0)
+            words |= {"found": self._found.data_ptr(), "largest": checks.FINITE_LIMIT}
             n_blocks = 0
             for k, tensor in enumerate(tensors[first : first + cuda_values.ARRAYS]):
                 words[f"data{k}"] = tensor.data_ptr()
@@ -75,7 +76,7 @@ class Look:
     def __exit__(self, kind: Any, *_: Any) -> None:
         torch.cuda.current_stream(self._device).synchronize()  # even after an error: the kernel writes to the slot
         bad = bool(self._found[0])
-        _slots.give(self._found)
+        slots.give(self._found)
         if bad and kind is None:
             checks.check_finite(**self._given)
             raise AssertionError("the kernel has met a bad value that is not in its inputs")

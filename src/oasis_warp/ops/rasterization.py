@@ -17,7 +17,7 @@ from oasis_warp.ops._scene_checks import check_cameras, check_coefficients, chec
 from oasis_warp.ops._values import Look, check_finite
 from oasis_warp.ops.blending import blend
 from oasis_warp.ops.projection import project
-from oasis_warp.ops.spherical_harmonics import spherical_harmonics
+from oasis_warp.ops.seen_colors import seen_colors
 
 UNSUPPORTED: dict[str, tuple[Any, str]] = {
     "sparse_grad": (False, "Gradients are dense."),
@@ -219,23 +219,6 @@ def refuse_unless_default(name: str, value: Any, default: Any, hint: str) -> Non
         return
     got = repr(value) if isinstance(value, bool | int | str) else type(value).__name__
     raise ValueError(f"{name}: expected {default!r}, got {got}. Not supported in this version. {hint}")
-
-
-def seen_colors(
-    sh_degree: int,
-    means: Float[Tensor, "N 3"],
-    coefficients: Float[Tensor, "N K 3"] | Float[Tensor, "C N K 3"],
-    viewmats: Float[Tensor, "C 4 4"],
-) -> Float[Tensor, "C N 3"]:
-    """Colours of the Gaussians as each camera sees them.
-
-    A far camera's centre cancels against the means in float32: their difference is taken in float64. Values are not
-    looked at: bad ones come out as bad colours, which blending refuses by that name.
-    """
-    pose = viewmats.double()
-    centres, _ = torch.linalg.solve_ex(pose[:, :3, :3], -pose[:, :3, 3:])
-    directions = (means.double() - centres.mT).to(means.dtype)
-    return (spherical_harmonics(sh_degree, directions, coefficients, validate=False) + 0.5).clamp_min(0)
 
 
 def for_each_camera(tensor: Tensor, n_cameras: int) -> Tensor:
