@@ -93,7 +93,8 @@ def test_an_ablation_draws_something_else(ablated, network, batch):
     if ablated.switch == "fom":  # the vertices know nothing of it
         n = a.offsets.shape[1]
         assert torch.equal(a.offsets, b.offsets)
-        assert all(torch.equal(x[:, :n], y) for x, y in zip(a[2:], b[2:], strict=True))
+        for x, y in zip(a[2:], b[2:], strict=True):
+            torch.testing.assert_close(x[:, :n], y, atol=1e-6, rtol=0)  # the last few of a vector loop round apart
     else:
         assert float((a.colors - b.colors).abs().mean()) > 1e-6
 
