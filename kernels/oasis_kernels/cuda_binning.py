@@ -108,7 +108,7 @@ PLACE = """
         const long long rank = count ? (long long)(at >> 38)
                                      : n_tiles - 1 - ((long long)first_empty + (int)threadIdx.x - busy_before);
         // A list that does not fit stays empty; the host learns of it.
-        const bool fits = start + count <= capacity;
+        const bool fits = start + count <= capacity && count <= longest_sorted;
         const int row = thread / tiles_x;
         tiles[rank] = {thread - row * tiles_x, (int)start, fits ? count : 0, row};
         cursors[own_counter] = (int)(fits ? start : capacity);
@@ -187,6 +187,7 @@ def place_tiles() -> CudaNative:
         "n_tiles": "int",
         "tiles_x": "int",
         "capacity": "long long",  # pairs for which there is memory
+        "longest_sorted": "int",  # list that will be sorted
         "counters": "unsigned long long*",
         "tiles": "int4*",  # column, start and length of the list, row over all cameras; those with pairs come first
         "spread": "int",

@@ -109,8 +109,8 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
     words = _words(splats, layout, lists, planes)
     kind = device, n_cameras, n, frame.width, frame.height
     capturing = torch.cuda.is_current_stream_capturing()
-    report, counts = watching().expect(kind) if capturing else (own_slot(), Counts(MAX_PAIRS, 0))
-    words |= {"capacity": counts.pairs, "report": report.data_ptr()}
+    report, counts = watching().expect(kind) if capturing else (own_slot(), Counts(MAX_PAIRS, MAX_PAIRS))
+    words |= {"capacity": counts.pairs, "longest_sorted": counts.longest, "report": report.data_ptr()}
     blocks = -(-n_cameras * n // cuda_binning.BLOCK)
     run_cuda(cuda_binning.count_pairs(), words, blocks, stream)
     run_cuda(cuda_binning.place_tiles(), words, -(-layout.n_tiles // cuda_binning.PLACE_BLOCK), stream)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from oasis_kernels import cuda_draw, cuda_long_lists
 from oasis_kernels.cuda_binning import REPORT
 from oasis_warp.ops._tiles import MAX_PAIRS
 
@@ -28,7 +29,7 @@ class Counts(NamedTuple):
 
     pairs: int
     longest: int
-    """Length of the longest list of a tile."""
+    """Length of the longest list of a tile, or of the longest that can be sorted."""
 
 
 Kind = tuple[torch.device, int, int, int, int]
@@ -136,7 +137,9 @@ def capacity_of(kind: Kind) -> Counts:
             f"cameras of {width} x {height} px and {n} Gaussians on {device}. Warm up with the same sizes."
         )
     last = _last[kind]
-    return Counts(min(int(SLACK * last.pairs) + 4096, MAX_PAIRS), int(SLACK * last.longest) + 32)
+    longest = int(SLACK * last.longest)
+    sorted_ = next(limit for limit in (cuda_draw.LONGEST, cuda_long_lists.RUN, MAX_PAIRS) if limit >= longest)
+    return Counts(min(int(SLACK * last.pairs) + 4096, MAX_PAIRS), sorted_)
 
 
 def watching() -> Overflow:
