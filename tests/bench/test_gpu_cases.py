@@ -36,6 +36,8 @@ def test_the_cases_are_those_that_the_page_promises():
         *((name, pass_)
           for name in ("37k at 512 x 512", "12k at 256 x 256", "37k at 256 x 256", "8 views of 37k at 512 x 512")
           for pass_ in ("forward", "forward + backward")),
+        *((f"{name}, recorded", pass_) for name in ("37k at 512 x 512", "12k at 256 x 256")
+          for pass_ in ("forward", "forward + backward")),
         ("posing 37k", "forward"), ("1000 poses of 37k", "forward"), ("visibility at 448 x 448", "forward"),
         ("visibility at 448 x 448", "forward + backward"), ("avatar at 512 x 512", "pose + draw"),
         ("learning at 512 x 512", "pose + draw + loss + backward + Adam"),

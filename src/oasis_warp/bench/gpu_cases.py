@@ -29,6 +29,7 @@ from oasis_warp.bench.operators import (
 )
 from oasis_warp.bench.scenes import HAND_GAUSSIANS, MeshScene, Scene, hand_scenes, surfels
 from oasis_warp.core.config import BLACK
+from oasis_warp.ops import RecordedRasterization
 
 OURS = "warp"
 TRUSTED = {"validate": False}
@@ -96,6 +97,26 @@ def picture(gaussians: int, size: int, n_views: int, pass_: Pass) -> Named:
     return Named(name, pass_, make)
 
 
+def recorded_picture(gaussians: int, size: int, pass_: Pass) -> Named:
+    """The same by a `RecordedRasterization`, under torch's autograd."""
+
+    def make(device: torch.device, seed: int, _: Mapping[str, Draw]) -> Case:
+        scene = hand_scenes(size, seed)[0] if gaussians == HAND_GAUSSIANS else surfels(gaussians, size, seed)
+        draw_recorded = RecordedRasterization(size, size)
+
+        def call(scene: Scene) -> Outputs:
+            return draw_recorded(
+                scene.means, scene.quats, scene.scales, scene.opacities, scene.colors, scene.viewmats, scene.Ks,
+                scene.backgrounds,
+            )  # fmt: skip
+
+        operator = replace(OPERATORS["rasterization"], graded=1)
+        return operator_case(name, operator, scene.to(device=device), pass_, {}, call)
+
+    name = f"{size_name(gaussians, size)}, recorded"
+    return Named(name, pass_, make)
+
+
 def visibility(size: int, pass_: Pass) -> Named:
     """The hand's vertices, moved about, past its own surface."""
 
@@ -108,9 +129,14 @@ def visibility(size: int, pass_: Pass) -> Named:
 
 
 def operator_case(
-    name: str, operator: Operator, scene: Scene | MeshScene, pass_: Pass, peers: Mapping[str, Draw]
+    name: str,
+    operator: Operator,
+    scene: Scene | MeshScene,
+    pass_: Pass,
+    peers: Mapping[str, Draw],
+    recorded: Callable[..., Outputs] | None = None,
 ) -> Case:
-    """A pass of an operator on a scene; `peers` are other calls that do the same."""
+    """A pass of an operator on a scene; `peers` do the same, and so does `recorded`, which is timed in its place."""
     truth = exact(operator, scene)
     weights = tuple(w.to(torch.float32) for w in truth.weights)
 
@@ -120,6 +146,7 @@ def operator_case(
         return repeated_gradients(operator, call, scene, options, weights)
 
     ours = call_of(operator.call, TRUSTED)
+    way = Way(ours, ours) if recorded is None else Way(call_of(recorded, {}), None)
     others = {peer: Way(call_of(call, {}), None) for peer, call in peers.items()}
     return Case(
         name=name,
@@ -130,7 +157,7 @@ def operator_case(
         width=scene.width,
         height=scene.height,
         seed=scene.seed,
-        ways={OURS: Way(ours, ours), **others},
+        ways={OURS: way, **others},
         truth=Results(truth.outputs, truth.gradients if pass_ != "forward" else ()),
         judged=truth.judged,
         image=operator.image,
@@ -202,6 +229,10 @@ CASES: tuple[Named, ...] = (
             (HAND_GAUSSIANS, 512, 1), (12_000, 256, 1), (HAND_GAUSSIANS, 256, 1), (HAND_GAUSSIANS, 512, 8),
         )
         for pass_ in PASSES
+    ),
+    *(
+        recorded_picture(gaussians, size, pass_)
+        for gaussians, size in ((HAND_GAUSSIANS, 512), (12_000, 256)) for pass_ in PASSES
     ),
     avatar_case("pose", "posing 37k", "forward"),
     avatar_case("pose", "1000 poses of 37k", "forward", n_poses=1000),

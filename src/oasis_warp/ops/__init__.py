@@ -17,6 +17,7 @@ from oasis_warp.ops.mesh_posing import pose_on_mesh as pose_on_mesh
 from oasis_warp.ops.mesh_posing_covars import PosedCovars as PosedCovars
 from oasis_warp.ops.mesh_posing_covars import pose_on_mesh_covars as pose_on_mesh_covars
 from oasis_warp.ops.rasterization import rasterization as rasterization
+from oasis_warp.ops.recorded import RecordedRasterization as RecordedRasterization
 from oasis_warp.ops.rest_mesh import RestMesh as RestMesh
 from oasis_warp.ops.rest_mesh import rest_mesh as rest_mesh
 from oasis_warp.ops.skinning import Skinned as Skinned

@@ -42,6 +42,7 @@ class _Recording:
                 for _ in range(WARM_UPS):
                     outputs = draw()
                     self.incoming = [torch.zeros_like(output) for output in outputs]
+                    self._zero = [True for _ in outputs]
                     if self._leaves:
                         back(outputs)
             torch.cuda.current_stream().wait_stream(aside)
@@ -72,11 +73,12 @@ class _Recording:
 
     def back(self, incoming: tuple[Tensor | None, Tensor | None]) -> list[Tensor | None]:
         """Replay the backward graph: gradients by those of the arguments that need one."""
-        for place, gradient in zip(self.incoming, incoming, strict=True):
-            if gradient is None:
-                place.zero_()
-            else:
-                place.copy_(gradient)
+        for k, gradient in enumerate(incoming):
+            if gradient is not None:
+                self.incoming[k].copy_(gradient)
+            elif not self._zero[k]:
+                self.incoming[k].zero_()
+            self._zero[k] = gradient is None
         self._backward.replay()
         gradients = iter(self._gradients)
         found = [next(gradients) if needs else None for needs in self.needs]
