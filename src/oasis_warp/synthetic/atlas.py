@@ -16,7 +16,7 @@ from torch import Tensor
 from oasis_warp.ops import depth_map
 from oasis_warp.synthetic.body import Body, bundled_body
 
-WIDTH, HEIGHT = 1024, 1280
+WIDTH, HEIGHT = 1024, 1408
 """Texels of the atlas: .34 mm each on the hand, enough for a hand that fills 512 pixels."""
 
 

@@ -25,8 +25,10 @@ ARM_ROWS, ARM_LENGTH = 20, 0.30
 """Rings of the forearm, and its length [m]."""
 SLEEVE_ROWS, BAND_ROWS = 28, 7
 RING_COLUMNS, RING_ROWS = 48, 8
-ATLAS_HAND_SHARE = 0.8
+ATLAS_HAND_SHARE = 1024 / 1408
 """Share of the atlas's height that the hand's texture coordinates fill; the forearm lies above."""
+ATLAS_ARM_BIAS = 0.7
+"""The forearm's rows are denser at the wrist by 1 + this, sparser at the elbow by 1 - this."""
 
 SKIN, SLEEVE, BAND, RING = range(4)
 """Materials of faces."""
@@ -139,7 +141,9 @@ def bundled_body() -> Body:
     a, b = grid[:-1], grid[1:]
     quad = np.stack([a[:, :-1], b[:, :-1], b[:, 1:], a[:, 1:]], -1).reshape(-1, 4)
     arm_uv_faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]], 1).reshape(-1, 3)
-    u, v = np.meshgrid(np.linspace(0.01, 0.99, columns + 1), ATLAS_HAND_SHARE + np.linspace(0.006, 0.194, ARM_ROWS + 1))
+    s = np.linspace(0, 1, ARM_ROWS + 1)
+    rise = 0.006 + (1 - ATLAS_HAND_SHARE - 0.012) * (s + ATLAS_ARM_BIAS * s * (1 - s))
+    u, v = np.meshgrid(np.linspace(0.01, 0.99, columns + 1), ATLAS_HAND_SHARE + rise)
     uv = np.concatenate([hand.uv.numpy() * [1, ATLAS_HAND_SHARE], np.stack([u, v], -1).reshape(-1, 2)])
 
     still = torch.eye(3).expand(1, ARM_ROWS, 3, 3)

@@ -107,7 +107,7 @@ def draw_back(atlas: Atlas, strokes: Strokes, identity: Identity) -> None:
         middle, half = np.array([rng.uniform(-85, 0), 0, rng.uniform(-36, 26)]), rng.uniform(2, 8)
         slope = rng.normal(0, 0.5)
         t = np.linspace(-half, half, 10)[:, None]
-        strokes.add("fold", atlas.snap(middle + t * [slope, 0, 1], "back"), 0.5, rng.uniform(0.1, 0.45), taper=0.5)
+        strokes.add("fold", atlas.snap(middle + t * [slope, 0, 1], "back"), 0.5, rng.uniform(0.06, 0.28), taper=0.5)
     _hairs(atlas, strokes, identity, knuckles)
 
 
@@ -128,4 +128,4 @@ def _hairs(atlas: Atlas, strokes: Strokes, identity: Identity, knuckles: np.ndar
     lines = atlas.snap((roots[:, None] + np.cumsum(steps, 1)).reshape(-1, 3), "back").reshape(n, 9, 3)
     for line, root in zip(lines, roots, strict=True):
         if np.abs(line[0] - root)[[0, 2]].max() < 4:  # not one that fell beside the arm
-            strokes.add("hair", line, 0.15, 0.9, taper=0.3, wobble=0.08)
+            strokes.add("hair", line, 0.27, rng.uniform(0.35, 0.75), taper=0.4, wobble=0.08)

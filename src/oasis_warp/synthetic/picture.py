@@ -12,6 +12,7 @@ from torch import Tensor
 
 from oasis_warp.core.types import Side
 from oasis_warp.ops import depth_map
+from oasis_warp.ops.room_tracing import trace_rooms
 from oasis_warp.ops.skin_shading import Texture, Worn, shade_skin, smooth_over_faces, surface_state
 from oasis_warp.synthetic.atlas import HEIGHT, WIDTH
 from oasis_warp.synthetic.body import RING, Body, bundled_body
@@ -21,6 +22,7 @@ from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.illumination import light_lamps, see_sky
 from oasis_warp.synthetic.people import Person, person
 from oasis_warp.synthetic.posing import pose_people
+from oasis_warp.synthetic.rooms import Room, sample_room
 from oasis_warp.synthetic.sensor import Sensor, expose, sample_sensor, srgb
 from oasis_warp.synthetic.stage import Light, Look, View, sample_light, sample_view
 from oasis_warp.synthetic.wardrobe import SKIN_LOOK, Clothes, sample_clothes
@@ -33,6 +35,8 @@ SAMPLES = 2
 TEXEL = 0.34e-3
 """Size of a texel on the hand [m]."""
 STRETCH_PASSES = 2
+HAND_REACH = 0.11
+"""Of a hand beyond its middle, roughly: rooms begin behind it [m]."""
 
 
 class Shot(NamedTuple):
@@ -48,6 +52,7 @@ class Shot(NamedTuple):
     view: View
     light: Light
     clothes: Clothes
+    room: Room
     sensor: Sensor
     seed: int
     """Of whatever is drawn a pixel at a time."""
@@ -88,6 +93,7 @@ def sample_shot(seed: int, index: int, look: Look = "photo") -> Shot:
     name, angles = sample_gesture(rng, bundled_body().hand)
     bend = np.array([0.0, rng.normal(0, 0.15), rng.normal(0, 0.30)])
     number = index // PICTURES_EACH
+    view = sample_view(rng, look)
     return Shot(
         index=index,
         person=number,
@@ -95,9 +101,10 @@ def sample_shot(seed: int, index: int, look: Look = "photo") -> Shot:
         gesture=name,
         angles=angles,
         bend=bend,
-        view=sample_view(rng, look),
+        view=view,
         light=sample_light(rng, look),
         clothes=sample_clothes(rng, bare=look == "even"),
+        room=sample_room(rng, view.distance, HAND_REACH),
         sensor=sample_sensor(rng),
         seed=int(rng.integers(1 << 31)),
     )
@@ -143,7 +150,7 @@ def render_batch(
     seen = depth_map(posed.vertices, body.faces, still, K, fine, fine, validate=False)
     state = surface_state(posed.vertices, body.faces)
     lights = [s.light for s in shots]
-    distance = torch.tensor([s.view.distance for s in shots], device=device)
+    distance = torch.tensor([s.view.distance for s in shots], device=device, dtype=torch.float32)
     sky = torch.from_numpy(np.stack([light.sky for light in lights])).float().to(device)
     lamps = light_lamps(body, posed, lights)
     shaded = shade_skin(
@@ -155,8 +162,12 @@ def render_batch(
     if look == "even":
         image = srgb(shaded.color.clamp(0, 1))
     else:
-        behind = 0.35 * (0.2820948 * sky[:, 0] + 0.3)
-        light = shaded.color + (1 - shaded.alpha[..., None]) * behind[:, None, None]
+        solids = torch.from_numpy(np.stack([s.room.solids for s in shots])).to(device)
+        apertures = torch.tensor([s.room.aperture for s in shots], device=device)
+        behind = trace_rooms(
+            solids, posed.focal * size, sky, lamps, shaded.alpha, seeds, distance, apertures
+        )
+        light = shaded.color + (1 - shaded.alpha[..., None]) * behind
         white = torch.from_numpy(np.stack([s.light.white for s in shots])).float().to(device)
         image = expose(light, shaded.alpha, [s.sensor for s in shots], white, seeds)
     K = K / torch.tensor([SAMPLES, SAMPLES, 1.0], device=device)[:, None]

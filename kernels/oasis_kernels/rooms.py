@@ -1,0 +1,395 @@
+"""Rooms of boxes, balls and cylinders behind a hand, traced one ray a pixel, and the blur of what is out of focus.
+
+`trace`: one thread a pixel; everything in the camera's frame, the camera at the origin. A solid is a row of
+SOLID_WORDS numbers: shape, pattern, pattern size [m], gloss, glow, seed; centre; half sizes; the rotation from the
+camera's frame to its own (rows); two colours. Light is the sky by its harmonics, darkened near other solids by their
+distance fields (Evans 2006), and the lamps with the hand's soft shadow and a marched one of the solids.
+"""
+
+import warp as wp
+
+from oasis_kernels.sky import blurred, cosine_lobe, disc, harmonics, light_along, lit_share
+
+wp.set_module_options({"enable_backward": False})
+
+SOLID_WORDS = wp.constant(27)
+SHAPE, PATTERN, CELL, GLOSS, GLOW, SEED = (wp.constant(k) for k in range(6))
+CENTER, HALF, TURN, FIRST, SECOND = (wp.constant(k) for k in (6, 9, 12, 21, 24))
+
+NOTHING, BOX, BALL, CYLINDER = (wp.constant(k) for k in range(4))
+PAINT, PLANKS, TILES, CLOTH, SPECKS, STRIPES, BOOKS, KEYS, TEXT, PICTURE, PANES, LEAVES, PANELS, CARPET = (
+    wp.constant(k) for k in range(14)
+)
+FAR = wp.constant(60.0)
+BLUR_TAPS = wp.constant(24)
+
+
+@wp.func
+def vector_at(solids: wp.array3d[wp.float32], b: int, k: int, at: int) -> wp.vec3f:
+    return wp.vec3f(solids[b, k, at], solids[b, k, at + 1], solids[b, k, at + 2])
+
+
+@wp.func
+def turned(solids: wp.array3d[wp.float32], b: int, k: int, v: wp.vec3f) -> wp.vec3f:
+    return wp.vec3f(
+        wp.dot(vector_at(solids, b, k, TURN), v),
+        wp.dot(vector_at(solids, b, k, TURN + 3), v),
+        wp.dot(vector_at(solids, b, k, TURN + 6), v),
+    )
+
+
+@wp.func
+def turned_back(solids: wp.array3d[wp.float32], b: int, k: int, v: wp.vec3f) -> wp.vec3f:
+    return (
+        v[0] * vector_at(solids, b, k, TURN)
+        + v[1] * vector_at(solids, b, k, TURN + 3)
+        + v[2] * vector_at(solids, b, k, TURN + 6)
+    )
+
+
+@wp.func
+def entry(shape: int, half: wp.vec3f, o: wp.vec3f, d: wp.vec3f) -> float:
+    """Distance along the ray to the solid, FAR where it misses or starts inside."""
+    t = float(FAR)
+    if shape == BOX:
+        near = float(-FAR)
+        away = float(FAR)
+        for c in range(3):
+            inv = 1.0 / (d[c] if wp.abs(d[c]) > 1.0e-9 else 1.0e-9)
+            a = (-half[c] - o[c]) * inv
+            e = (half[c] - o[c]) * inv
+            near = wp.max(near, wp.min(a, e))
+            away = wp.min(away, wp.max(a, e))
+        if near < away and near > 1.0e-4:
+            t = near
+    elif shape == BALL:
+        p = wp.cw_div(o, half)
+        q = wp.cw_div(d, half)
+        a = wp.dot(q, q)
+        h = wp.dot(p, q)
+        r = wp.dot(p, p) - 1.0
+        root = h * h - a * r
+        if root > 0.0:
+            s = (-h - wp.sqrt(root)) / a
+            if s > 1.0e-4:
+                t = s
+    else:  # upright: along its second axis
+        a = d[0] * d[0] + d[2] * d[2]
+        h = o[0] * d[0] + o[2] * d[2]
+        r = o[0] * o[0] + o[2] * o[2] - half[0] * half[0]
+        root = h * h - a * r
+        if root > 0.0 and a > 1.0e-9:
+            s = (-h - wp.sqrt(root)) / a
+            if s > 1.0e-4 and wp.abs(o[1] + s * d[1]) <= half[1]:
+                t = s
+        if wp.abs(d[1]) > 1.0e-9:
+            s = (-wp.sign(d[1]) * half[1] - o[1]) / d[1]
+            x, z = o[0] + s * d[0], o[2] + s * d[2]
+            if s > 1.0e-4 and x * x + z * z <= half[0] * half[0]:
+                t = wp.min(t, s)
+    return t
+
+
+@wp.func
+def clearance(solids: wp.array3d[wp.float32], b: int, p: wp.vec3f) -> float:
+    """Distance to the nearest solid, negative inside one."""
+    least = float(FAR)
+    for k in range(solids.shape[1]):
+        shape = int(solids[b, k, SHAPE])
+        if shape != NOTHING:
+            q = p - vector_at(solids, b, k, CENTER)
+            half = vector_at(solids, b, k, HALF)
+            if wp.length(q) < wp.length(half) + least:
+                q = turned(solids, b, k, q)
+                if shape == BOX:
+                    e = wp.vec3f(wp.abs(q[0]) - half[0], wp.abs(q[1]) - half[1], wp.abs(q[2]) - half[2])
+                    out = wp.vec3f(wp.max(e[0], 0.0), wp.max(e[1], 0.0), wp.max(e[2], 0.0))
+                    least = wp.min(least, wp.length(out) + wp.min(wp.max(e[0], wp.max(e[1], e[2])), 0.0))
+                elif shape == BALL:
+                    least = wp.min(least, (wp.length(wp.cw_div(q, half)) - 1.0) * wp.min(half[0], wp.min(half[1], half[2])))
+                else:
+                    r = wp.sqrt(q[0] * q[0] + q[2] * q[2]) - half[0]
+                    y = wp.abs(q[1]) - half[1]
+                    out2 = wp.vec2f(wp.max(r, 0.0), wp.max(y, 0.0))
+                    least = wp.min(least, wp.length(out2) + wp.min(wp.max(r, y), 0.0))
+    return least
+
+
+@wp.func
+def hashed(i: int, j: int, seed: int) -> float:
+    """Uniform in [0, 1)."""
+    return wp.randf(wp.rand_init(seed + 7919 * i, j))
+
+
+@wp.func
+def rough_noise(p: wp.vec3f, seed: int, octaves: int) -> float:
+    total = float(0.0)
+    gain = float(1.0)
+    q = p + wp.vec3f(31.4, 17.9, 5.3)
+    for k in range(octaves):
+        total += gain * wp.noise(wp.rand_init(seed + k), q)
+        q = 2.03 * q
+        gain *= 0.5
+    return 1.5 * total
+
+
+@wp.func
+def groove(x: float, width: float) -> float:
+    """1 on lines at whole numbers, 0 off them."""
+    away = wp.abs(x - wp.floor(x + 0.5))
+    return wp.exp(-(away * away) / (width * width))
+
+
+@wp.func
+def painted(pattern: int, u: float, v: float, cell: float, seed: int, p: wp.vec3f, a: wp.vec3f, e: wp.vec3f) -> wp.vec3f:
+    """Reflectance at (u, v) [m] of a face, `p` the point in the solid's own frame."""
+    c = a
+    x, y = u / cell, v / cell
+    if pattern == PAINT:
+        c = a * (1.0 + 0.05 * rough_noise(p / 0.5, seed, 2) + 0.02 * rough_noise(p / 0.01, seed + 5, 1))
+    elif pattern == PLANKS:
+        row = int(wp.floor(y))
+        shift = 7.0 * hashed(row, 1, seed)
+        length = 11.0
+        board = int(wp.floor(x / length + shift))
+        tone = hashed(row, board, seed + 3)
+        g = rough_noise(wp.vec3f(0.35 * x + 40.0 * tone, 5.0 * y, 9.0 * tone), seed, 3)
+        fine = rough_noise(wp.vec3f(1.2 * x, 26.0 * y, 3.0 * tone), seed + 9, 1)
+        c = (a + (e - a) * tone) * (0.88 + 0.22 * g + 0.09 * fine)
+        line = wp.max(groove(y, 0.018), groove(x / length + shift, 0.0016))
+        c = c * (1.0 - 0.7 * line)
+    elif pattern == TILES:
+        i, j = int(wp.floor(x)), int(wp.floor(y))
+        tone = hashed(i, j, seed)
+        c = a * (0.9 + 0.2 * tone + 0.06 * rough_noise(4.0 * wp.vec3f(x, y, tone), seed, 3))
+        line = wp.max(groove(x, 0.015), groove(y, 0.015))
+        c = c + (e - c) * line
+    elif pattern == CLOTH:
+        weave = wp.sin(6.2832 * u / 0.0035) * wp.sin(6.2832 * v / 0.0035)
+        c = a * (1.0 + 0.12 * weave + 0.2 * rough_noise(p / 0.07, seed, 3))
+        c = c + (e - c) * 0.6 * wp.clamp(groove(x, 0.06) + groove(y, 0.06), 0.0, 1.0)
+    elif pattern == SPECKS:
+        n = rough_noise(p / cell, seed, 3)
+        f = rough_noise(p / (0.12 * cell), seed + 11, 2)
+        c = a + (e - a) * wp.clamp(0.5 + 1.6 * n, 0.0, 1.0)
+        c = c * (1.0 + 0.35 * f)
+    elif pattern == STRIPES:
+        wave = 0.5 + 0.5 * wp.sin(6.2832 * (x + 0.25 * rough_noise(wp.vec3f(0.3 * x, 0.0, 0.2 * y), seed, 1)))
+        c = a + (e - a) * wave
+    elif pattern == BOOKS:
+        shelf = int(wp.floor(y / 7.0))
+        rise = y / 7.0 - wp.floor(y / 7.0)
+        slot = int(wp.floor(x + 0.35 * hashed(int(wp.floor(x)), shelf, seed)))
+        tall = 0.55 + 0.35 * hashed(slot, shelf, seed + 1)
+        hue = wp.vec3f(hashed(slot, shelf, seed + 2), hashed(slot, shelf, seed + 3), hashed(slot, shelf, seed + 4))
+        grey = (hue[0] + hue[1] + hue[2]) / 3.0
+        book = 0.02 + 0.75 * grey * grey
+        c = book * (wp.vec3f(0.6, 0.6, 0.6) + 0.8 * hue) * (1.0 - 0.5 * groove(x, 0.08))
+        c = c * (1.0 + 0.6 * groove(3.0 * rise + hashed(slot, shelf, seed + 5), 0.12))
+        if rise > tall:
+            c = 0.06 * a
+        if rise < 0.07:
+            c = a
+    elif pattern == KEYS:
+        i, j = int(wp.floor(x)), int(wp.floor(y))
+        fx, fy = x - wp.floor(x), y - wp.floor(y)
+        c = e
+        if fx > 0.1 and fx < 0.9 and fy > 0.1 and fy < 0.9:
+            c = a
+            if wp.abs(fx - 0.4) < 0.12 and wp.abs(fy - 0.4) < 0.15 and hashed(i, j, seed) > 0.1:
+                c = a + 0.5 * (wp.vec3f(0.8, 0.8, 0.8) - a)
+    elif pattern == TEXT:
+        j = int(wp.floor(y))
+        fy = y - wp.floor(y)
+        word = rough_noise(wp.vec3f(1.1 * x, 3.7 * float(j), 0.0), seed, 1)
+        c = a
+        if fy > 0.3 and fy < 0.75 and word > -0.35 and hashed(j, 3, seed) > 0.12:
+            c = a + (e - a) * (0.55 + 0.3 * hashed(int(wp.floor(6.0 * x)), j, seed))
+    elif pattern == PICTURE:
+        n = rough_noise(p / cell, seed, 4)
+        m = rough_noise(p / (0.7 * cell) + wp.vec3f(9.0, 0.0, 0.0), seed + 21, 3)
+        c = a + (e - a) * wp.clamp(0.5 + 1.4 * n, 0.0, 1.0)
+        c = c * wp.clamp(0.8 + 0.9 * m, 0.1, 1.7)
+        if m > 0.35:
+            c = wp.vec3f(e[2], a[0], e[1])
+    elif pattern == PANES:
+        c = a * (0.75 + 0.5 * rough_noise(p / (1.7 * cell), seed, 3))
+        if v > 0.0:
+            c = wp.cw_mul(c, wp.vec3f(0.55, 0.62, 0.5))
+        line = wp.max(groove(x, 0.05), groove(y, 0.04))
+        c = c + (0.2 * e - c) * wp.clamp(1.6 * line, 0.0, 1.0)
+    elif pattern == LEAVES:
+        n = rough_noise(p / cell, seed, 4)
+        m = rough_noise(p / (0.35 * cell), seed + 3, 2)
+        c = a * wp.clamp(0.55 + 1.5 * m, 0.03, 2.0)
+        if n + 0.4 * m > 0.25:
+            c = e * wp.clamp(0.8 + m, 0.1, 1.8)
+    elif pattern == PANELS:  # doors and cupboards
+        line = wp.max(groove(x, 0.012), groove(y / 1.9, 0.008))
+        inset = wp.max(groove(x + 0.16, 0.012), groove(x - 0.16, 0.012))
+        c = a * (1.0 - 0.75 * line - 0.22 * inset + 0.10 * rough_noise(wp.vec3f(30.0 * u, 1.5 * v, 0.0), seed, 2))
+    elif pattern == CARPET:
+        fibre = rough_noise(p / 0.006, seed, 2)
+        c = a * (1.0 + 0.35 * fibre + 0.12 * rough_noise(p / 0.15, seed + 4, 2))
+        ring = wp.sin(6.2832 * (wp.abs(x) + wp.abs(y)))
+        if ring > 0.55:
+            c = e * (1.0 + 0.35 * fibre)
+    return wp.vec3f(wp.clamp(c[0], 0.004, 0.95), wp.clamp(c[1], 0.004, 0.95), wp.clamp(c[2], 0.004, 0.95))
+
+
+@wp.kernel
+def trace(
+    first: int,
+    solids: wp.array3d[wp.float32],
+    focals: wp.array[wp.float32],
+    sky: wp.array2d[wp.vec3f],
+    lamps: wp.array2d[wp.vec3f],
+    lamp_colors: wp.array2d[wp.vec3f],
+    lamp_ranges: wp.array2d[wp.float32],
+    lamp_spreads: wp.array2d[wp.float32],
+    lamp_views: wp.array2d[wp.mat44f],
+    lamp_focals: wp.array2d[wp.float32],
+    lamp_depths: wp.array3d[wp.float32],
+    hidden: wp.array3d[wp.float32],  # where this is 1 the hand covers the pixel and nothing is traced
+    seeds: wp.array[wp.int32],
+    light: wp.array3d[wp.vec3f],
+    depth: wp.array3d[wp.float32],
+):
+    i = first + wp.tid()
+    rows, columns = light.shape[1], light.shape[2]
+    b = i // (rows * columns)
+    y = (i - b * rows * columns) // columns
+    x = i - (b * rows + y) * columns
+    state = wp.rand_init(seeds[b], y * columns + x)
+    jitter_x, jitter_y = wp.randf(state), wp.randf(state)
+    turn = 6.2832 * wp.randf(state)
+    depth[b, y, x] = FAR
+    if hidden[b, y, x] > 0.999:
+        light[b, y, x] = wp.vec3f()
+        return
+    d = wp.normalize(
+        wp.vec3f(
+            (float(x) + 0.25 + 0.5 * jitter_x - 0.5 * float(columns)) / focals[b],
+            (float(y) + 0.25 + 0.5 * jitter_y - 0.5 * float(rows)) / focals[b],
+            1.0,
+        )
+    )
+    t = float(FAR)
+    hit = int(-1)
+    for k in range(solids.shape[1]):
+        shape = int(solids[b, k, SHAPE])
+        if shape != NOTHING:
+            o = turned(solids, b, k, -vector_at(solids, b, k, CENTER))
+            s = entry(shape, vector_at(solids, b, k, HALF), o, turned(solids, b, k, d))
+            if s < t:
+                t = s
+                hit = k
+    if hit < 0:
+        light[b, y, x] = light_along(sky, b, blurred(harmonics(d), 0.8)) * 2.0
+        return
+    p = t * d
+    depth[b, y, x] = p[2]
+    shape = int(solids[b, hit, SHAPE])
+    half = vector_at(solids, b, hit, HALF)
+    q = turned(solids, b, hit, p - vector_at(solids, b, hit, CENTER))
+    n = wp.vec3f(0.0, 1.0, 0.0)
+    u, v = q[0], q[2]
+    if shape == BOX:
+        e = wp.vec3f(wp.abs(q[0]) / half[0], wp.abs(q[1]) / half[1], wp.abs(q[2]) / half[2])
+        if e[0] > e[1] and e[0] > e[2]:
+            n = wp.vec3f(wp.sign(q[0]), 0.0, 0.0)
+            u, v = q[2], q[1]
+        elif e[1] > e[2]:
+            n = wp.vec3f(0.0, wp.sign(q[1]), 0.0)
+        else:
+            n = wp.vec3f(0.0, 0.0, wp.sign(q[2]))
+            u, v = q[0], q[1]
+    elif shape == BALL:
+        n = wp.normalize(wp.cw_div(q, wp.cw_mul(half, half)))
+        u, v = wp.atan2(q[2], q[0]) * half[0], q[1]
+    else:
+        if wp.abs(q[1]) < 0.999 * half[1]:
+            n = wp.normalize(wp.vec3f(q[0], 0.0, q[2]))
+            u, v = wp.atan2(q[2], q[0]) * half[0], q[1]
+        else:
+            n = wp.vec3f(0.0, wp.sign(q[1]), 0.0)
+    seed = int(solids[b, hit, SEED])
+    base = painted(
+        int(solids[b, hit, PATTERN]), u, v, solids[b, hit, CELL], seed, q,
+        vector_at(solids, b, hit, FIRST), vector_at(solids, b, hit, SECOND),
+    )
+    n = turned_back(solids, b, hit, n)
+    glow = solids[b, hit, GLOW]
+    gloss = solids[b, hit, GLOSS]
+    open_ = float(1.0)
+    size = wp.clamp(0.12 * p[2], 0.02, 0.3)
+    for k in range(1, 4):
+        reach = size * float(k * k) / 9.0
+        open_ -= wp.max(reach - clearance(solids, b, p + reach * n), 0.0) / reach * 0.24
+    open_ = wp.max(open_, 0.12)
+    total = light_along(sky, b, cosine_lobe(n)) * open_
+    for l in range(lamps.shape[1]):
+        color = lamp_colors[b, l]
+        if color[0] + color[1] + color[2] > 0.0:
+            to = lamps[b, l] - p
+            distance = wp.length(to)
+            w = to / distance
+            facing = wp.dot(n, w)
+            if facing > 0.0:
+                fall = lamp_ranges[b, l] / distance
+                share = lit_share(
+                    lamp_depths, b * lamps.shape[1] + l, lamp_views[b, l], lamp_focals[b, l], lamp_spreads[b, l], p, n,
+                    turn, 0.002,
+                )
+                if share > 0.0 and l == 0:  # the first lamp's shadows of the solids themselves
+                    s = 0.015 + 0.01 * jitter_x
+                    soft = 1.0 / wp.max(lamp_spreads[b, l], 0.05)
+                    for _k in range(7):
+                        near = clearance(solids, b, p + 0.004 * n + s * w)
+                        share = wp.min(share, wp.clamp(0.5 + 0.5 * soft * near / s, 0.0, 1.0))
+                        s += wp.clamp(near, 0.02, 0.25)
+                total += color * (fall * fall * facing * share)
+    back = d - 2.0 * wp.dot(d, n) * n
+    facing_view = wp.clamp(-wp.dot(d, n), 0.0, 1.0)
+    mirror = gloss * (0.04 + 0.6 * wp.pow(1.0 - facing_view, 5.0))
+    shown = wp.cw_mul(base, total) + mirror * open_ * light_along(sky, b, blurred(harmonics(back), 0.85))
+    light[b, y, x] = shown + glow * base
+
+
+@wp.kernel
+def defocus(
+    first: int,
+    depth: wp.array3d[wp.float32],
+    hidden: wp.array3d[wp.float32],
+    focus: wp.array[wp.float32],  # depth that is sharp
+    apertures: wp.array[wp.float32],  # radius of blur far off over the width of the picture
+    seeds: wp.array[wp.int32],
+    light: wp.array3d[wp.vec3f],
+    out: wp.array3d[wp.vec3f],
+):
+    """Gathers over a disc as large as the pixel's own circle of confusion; what the hand hides does not count."""
+    i = first + wp.tid()
+    rows, columns = light.shape[1], light.shape[2]
+    b = i // (rows * columns)
+    y = (i - b * rows * columns) // columns
+    x = i - (b * rows + y) * columns
+    if hidden[b, y, x] > 0.999:
+        out[b, y, x] = light[b, y, x]
+        return
+    radius = apertures[b] * float(columns) * wp.abs(1.0 - focus[b] / depth[b, y, x])
+    radius = wp.max(radius, 0.7)
+    turn = 6.2832 * wp.randf(wp.rand_init(seeds[b], y * columns + x))
+    total = light[b, y, x] * 0.5
+    weight = float(0.5)
+    for k in range(BLUR_TAPS):
+        o = radius * disc(k, BLUR_TAPS, turn)
+        u = wp.clamp(int(wp.floor(float(x) + 0.5 + o[0])), 0, columns - 1)
+        v = wp.clamp(int(wp.floor(float(y) + 0.5 + o[1])), 0, rows - 1)
+        if hidden[b, v, u] < 0.999:
+            own = apertures[b] * float(columns) * wp.abs(1.0 - focus[b] / depth[b, v, u])
+            w = float(1.0)
+            if depth[b, v, u] < depth[b, y, x] and wp.max(own, 0.7) < wp.length(o):
+                w = 0.15  # what is sharp does not smear into what lies behind it
+            total += w * light[b, v, u]
+            weight += w
+    out[b, y, x] = total / weight
