@@ -1,4 +1,4 @@
-"""Rooms of boxes, balls and cylinders behind a hand, traced one ray a pixel, and the blur of what is out of focus.
+"""Rooms of boxes, balls and cylinders behind a hand, traced a few rays a pixel, and the blur of what is out of focus.
 
 `trace`: one thread a pixel; everything in the camera's frame, the camera at the origin. A solid is a row of
 SOLID_WORDS numbers: shape, pattern, pattern size [m], gloss, glow, seed; centre; half sizes; the rotation from the
@@ -22,6 +22,8 @@ PAINT, PLANKS, TILES, CLOTH, SPECKS, STRIPES, BOOKS, KEYS, TEXT, PICTURE, PANES,
 )
 FAR = wp.constant(60.0)
 BLUR_TAPS = wp.constant(24)
+RAYS = wp.constant(2)
+"""A pixel."""
 
 
 @wp.func
@@ -184,7 +186,8 @@ def painted(pattern: int, u: float, v: float, cell: float, seed: int, p: wp.vec3
         hue = wp.vec3f(hashed(slot, shelf, seed + 2), hashed(slot, shelf, seed + 3), hashed(slot, shelf, seed + 4))
         grey = (hue[0] + hue[1] + hue[2]) / 3.0
         book = 0.02 + 0.75 * grey * grey
-        c = book * (wp.vec3f(0.6, 0.6, 0.6) + 0.8 * hue) * (1.0 - 0.5 * groove(x, 0.08))
+        c = book * (wp.vec3f(0.8, 0.78, 0.74) + 0.5 * (hue - wp.vec3f(grey, grey, grey)))
+        c = c * (1.0 - 0.5 * groove(x, 0.08))
         c = c * (1.0 + 0.6 * groove(3.0 * rise + hashed(slot, shelf, seed + 5), 0.12))
         if rise > tall:
             c = 0.06 * a
@@ -211,7 +214,7 @@ def painted(pattern: int, u: float, v: float, cell: float, seed: int, p: wp.vec3
         c = a + (e - a) * wp.clamp(0.5 + 1.4 * n, 0.0, 1.0)
         c = c * wp.clamp(0.8 + 0.9 * m, 0.1, 1.7)
         if m > 0.35:
-            c = wp.vec3f(e[2], a[0], e[1])
+            c = 0.5 * (a + e) * wp.clamp(1.0 - 1.5 * n, 0.2, 1.5)
     elif pattern == PANES:
         c = a * (0.75 + 0.5 * rough_noise(p / (1.7 * cell), seed, 3))
         if v > 0.0:
@@ -237,11 +240,12 @@ def painted(pattern: int, u: float, v: float, cell: float, seed: int, p: wp.vec3
     return wp.vec3f(wp.clamp(c[0], 0.004, 0.95), wp.clamp(c[1], 0.004, 0.95), wp.clamp(c[2], 0.004, 0.95))
 
 
-@wp.kernel
-def trace(
-    first: int,
+@wp.func
+def sight(
+    b: int,
+    d: wp.vec3f,
+    turn: float,
     solids: wp.array3d[wp.float32],
-    focals: wp.array[wp.float32],
     sky: wp.array2d[wp.vec3f],
     lamps: wp.array2d[wp.vec3f],
     lamp_colors: wp.array2d[wp.vec3f],
@@ -250,30 +254,8 @@ def trace(
     lamp_views: wp.array2d[wp.mat44f],
     lamp_focals: wp.array2d[wp.float32],
     lamp_depths: wp.array3d[wp.float32],
-    hidden: wp.array3d[wp.float32],  # where this is 1 the hand covers the pixel and nothing is traced
-    seeds: wp.array[wp.int32],
-    light: wp.array3d[wp.vec3f],
-    depth: wp.array3d[wp.float32],
-):
-    i = first + wp.tid()
-    rows, columns = light.shape[1], light.shape[2]
-    b = i // (rows * columns)
-    y = (i - b * rows * columns) // columns
-    x = i - (b * rows + y) * columns
-    state = wp.rand_init(seeds[b], y * columns + x)
-    jitter_x, jitter_y = wp.randf(state), wp.randf(state)
-    turn = 6.2832 * wp.randf(state)
-    depth[b, y, x] = FAR
-    if hidden[b, y, x] > 0.999:
-        light[b, y, x] = wp.vec3f()
-        return
-    d = wp.normalize(
-        wp.vec3f(
-            (float(x) + 0.25 + 0.5 * jitter_x - 0.5 * float(columns)) / focals[b],
-            (float(y) + 0.25 + 0.5 * jitter_y - 0.5 * float(rows)) / focals[b],
-            1.0,
-        )
-    )
+) -> wp.vec4f:
+    """Light and depth along the ray `d` from the camera."""
     t = float(FAR)
     hit = int(-1)
     for k in range(solids.shape[1]):
@@ -285,10 +267,9 @@ def trace(
                 t = s
                 hit = k
     if hit < 0:
-        light[b, y, x] = light_along(sky, b, blurred(harmonics(d), 0.8)) * 2.0
-        return
+        sky_light = 2.0 * light_along(sky, b, blurred(harmonics(d), 0.8))
+        return wp.vec4f(sky_light[0], sky_light[1], sky_light[2], FAR)
     p = t * d
-    depth[b, y, x] = p[2]
     shape = int(solids[b, hit, SHAPE])
     half = vector_at(solids, b, hit, HALF)
     q = turned(solids, b, hit, p - vector_at(solids, b, hit, CENTER))
@@ -342,7 +323,7 @@ def trace(
                     turn, 0.002,
                 )
                 if share > 0.0 and l == 0:  # the first lamp's shadows of the solids themselves
-                    s = 0.015 + 0.01 * jitter_x
+                    s = 0.015 + 0.0016 * turn
                     soft = 1.0 / wp.max(lamp_spreads[b, l], 0.05)
                     for _k in range(7):
                         near = clearance(solids, b, p + 0.004 * n + s * w)
@@ -353,7 +334,51 @@ def trace(
     facing_view = wp.clamp(-wp.dot(d, n), 0.0, 1.0)
     mirror = gloss * (0.04 + 0.6 * wp.pow(1.0 - facing_view, 5.0))
     shown = wp.cw_mul(base, total) + mirror * open_ * light_along(sky, b, blurred(harmonics(back), 0.85))
-    light[b, y, x] = shown + glow * base
+    shown = shown + glow * base
+    return wp.vec4f(shown[0], shown[1], shown[2], p[2])
+
+
+
+
+@wp.kernel
+def trace(
+    first: int,
+    solids: wp.array3d[wp.float32],
+    focals: wp.array[wp.float32],
+    sky: wp.array2d[wp.vec3f],
+    lamps: wp.array2d[wp.vec3f],
+    lamp_colors: wp.array2d[wp.vec3f],
+    lamp_ranges: wp.array2d[wp.float32],
+    lamp_spreads: wp.array2d[wp.float32],
+    lamp_views: wp.array2d[wp.mat44f],
+    lamp_focals: wp.array2d[wp.float32],
+    lamp_depths: wp.array3d[wp.float32],
+    hidden: wp.array3d[wp.float32],  # where this is 1 the hand covers the pixel and nothing is traced
+    seeds: wp.array[wp.int32],
+    light: wp.array3d[wp.vec3f],
+    depth: wp.array3d[wp.float32],
+):
+    i = first + wp.tid()
+    rows, columns = light.shape[1], light.shape[2]
+    b = i // (rows * columns)
+    y = (i - b * rows * columns) // columns
+    x = i - (b * rows + y) * columns
+    total = wp.vec3f()
+    nearest = float(FAR)
+    if hidden[b, y, x] <= 0.999:
+        turn = 6.2832 * wp.randf(wp.rand_init(seeds[b], y * columns + x))
+        for k in range(RAYS):
+            right = float(x) + (float(k) + 0.5) / float(RAYS) - 0.5 * float(columns)
+            down = float(y) + (0.3 if k % 2 == 0 else 0.7) - 0.5 * float(rows)
+            d = wp.normalize(wp.vec3f(right / focals[b], down / focals[b], 1.0))
+            s = sight(
+                b, d, turn + 1.2 * float(k), solids, sky, lamps, lamp_colors, lamp_ranges, lamp_spreads, lamp_views,
+                lamp_focals, lamp_depths,
+            )
+            total += wp.vec3f(s[0], s[1], s[2]) / float(RAYS)
+            nearest = wp.min(nearest, s[3])
+    light[b, y, x] = total
+    depth[b, y, x] = nearest
 
 
 @wp.kernel
@@ -377,7 +402,7 @@ def defocus(
         out[b, y, x] = light[b, y, x]
         return
     radius = apertures[b] * float(columns) * wp.abs(1.0 - focus[b] / depth[b, y, x])
-    radius = wp.max(radius, 0.7)
+    radius = wp.max(radius, 0.85)
     turn = 6.2832 * wp.randf(wp.rand_init(seeds[b], y * columns + x))
     total = light[b, y, x] * 0.5
     weight = float(0.5)

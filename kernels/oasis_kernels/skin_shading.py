@@ -233,9 +233,9 @@ def shade(
         diffuse[c] = diffuse[c] + hidden * own * plain[c] * 0.55 / (1.0 - hidden * own)
     back = 2.0 * wp.dot(m, view) * m - view
     ahead = light_along(sky, b, blurred(harmonics(back), 1.0 - 0.55 * rough))
-    grazing = wp.pow(1.0 - nv, 5.0) * wp.max(0.24 * (1.0 - rough), 0.0)
+    grazing = wp.pow(1.0 - nv, 5.0) * wp.max(0.20 * (1.0 - rough), 0.0)
     for c in range(3):
-        gloss[c] = gloss[c] + (0.55 * f0[c] * (1.0 + 1.2 * metal) + (1.0 - f0[c]) * grazing) * ahead[c] * seen * seen * cavity
+        gloss[c] = gloss[c] + (0.3 * f0[c] * (1.0 + 3.0 * metal) + (1.0 - f0[c]) * grazing) * ahead[c] * seen * seen * cavity
     light[b, y, x] = diffuse
     tone[b, y, x] = base * (1.0 - metal)
     mirrored[b, y, x] = gloss

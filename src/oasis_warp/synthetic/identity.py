@@ -26,7 +26,7 @@ class Population:
     tattoo: float = 0.06
     ring: float = 0.14
     plaster: float = 0.04
-    melanin: tuple[float, float] = (0.006, 0.45)
+    melanin: tuple[float, float] = (0.006, 0.34)
     """Lightest and darkest skin: volume shares of melanosomes, log-uniform between."""
 
 

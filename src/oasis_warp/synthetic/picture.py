@@ -2,7 +2,8 @@
 
 import functools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from oasis_warp.ops import depth_map
 from oasis_warp.ops.room_tracing import trace_rooms
 from oasis_warp.ops.skin_shading import Texture, Worn, shade_skin, smooth_over_faces, surface_state
 from oasis_warp.synthetic.atlas import HEIGHT, WIDTH
+from oasis_warp.synthetic.backgrounds import cut_background
 from oasis_warp.synthetic.body import RING, Body, bundled_body
 from oasis_warp.synthetic.contact import separate
 from oasis_warp.synthetic.gestures import sample_gesture
@@ -37,6 +39,19 @@ TEXEL = 0.34e-3
 STRETCH_PASSES = 2
 HAND_REACH = 0.11
 """Of a hand beyond its middle, roughly: rooms begin behind it [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenery:
+    """What pictures show, besides what the seed decides."""
+
+    look: Look = "photo"
+    population: Population = Population()
+    backgrounds: tuple[Path, ...] = ()
+    """Pictures to stand behind the hands (see `backgrounds.list_backgrounds`); rooms when empty."""
+
+
+PHOTOS = Scenery()
 
 
 class Shot(NamedTuple):
@@ -124,17 +139,17 @@ def render_batch(
     size: int = 256,
     device: torch.device | str = "cpu",
     *,
-    look: Look = "photo",
-    population: Population = Population(),  # noqa: B008  (frozen)
+    scenery: Scenery = PHOTOS,
 ) -> SyntheticBatch:
     """Pictures `indices` of the world `seed`, each `size` pixels wide and high.
 
-    A picture depends on seed, index, size, look and population alone: not on its batch, nor on the device, up to
+    A picture depends on seed, index, size and scenery alone: not on its batch, nor on the device, up to
     rounding. Indices 8 n to 8 n + 7 show person n, whose texture is baked when first met (seconds) and kept.
     """
+    look = scenery.look
     body = _body(str(device))
     shots = [sample_shot(seed, int(index), look) for index in indices]
-    people = [person(seed, shot.person, population, str(device)) for shot in shots]
+    people = [person(seed, shot.person, scenery.population, str(device)) for shot in shots]
     joints = np.stack([p.joints.double().cpu().numpy() for p in people]) * 1e3
     angles, _ = separate(np.stack([shot.angles for shot in shots]), joints)
     posed = pose_people(
@@ -164,12 +179,15 @@ def render_batch(
     else:
         solids = torch.from_numpy(np.stack([s.room.solids for s in shots])).to(device)
         apertures = torch.tensor([s.room.aperture for s in shots], device=device)
-        behind = trace_rooms(
-            solids, posed.focal * size, sky, lamps, shaded.alpha, seeds, distance, apertures
-        )
+        if scenery.backgrounds:
+            behind = torch.stack([_cut(scenery, shot, size) for shot in shots]).to(device)
+        else:
+            behind = trace_rooms(
+                solids, posed.focal * size, sky, lamps, shaded.alpha, seeds, distance, apertures
+            )
         light = shaded.color + (1 - shaded.alpha[..., None]) * behind
-        white = torch.from_numpy(np.stack([s.light.white for s in shots])).float().to(device)
-        image = expose(light, shaded.alpha, [s.sensor for s in shots], white, seeds)
+        incident = torch.from_numpy(np.stack([s.light.incident for s in shots])).float().to(device)
+        image = expose(light, shaded.alpha, [s.sensor for s in shots], incident, seeds)
     K = K / torch.tensor([SAMPLES, SAMPLES, 1.0], device=device)[:, None]
     marks = posed.landmarks @ K.transpose(1, 2)
     batch = SyntheticBatch(
@@ -190,6 +208,12 @@ def render_batch(
         gestures=tuple(s.gesture for s in shots),
     )
     return _mirror_left(batch, size)
+
+
+def _cut(scenery: Scenery, shot: Shot, size: int) -> Tensor:
+    """A picture of the folder as bright as the light on the hand."""
+    cut = cut_background(scenery.backgrounds, np.random.default_rng([shot.seed]), size, shot.room.aperture * size)
+    return cut * float(shot.light.incident.mean())
 
 
 def _mirror_left(batch: SyntheticBatch, size: int) -> SyntheticBatch:

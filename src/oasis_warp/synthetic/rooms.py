@@ -56,8 +56,8 @@ class _Builder:
         u, rng = self.rng.uniform, self.rng
         level = np.exp(u(np.log(low), np.log(high)))
         tint = np.exp(rng.normal([0.05, 0.0, -0.08], [0.10, 0.04, 0.14]))
-        if rng.random() < 0.14:
-            tint = np.exp(rng.normal(0, 0.6, 3))
+        if rng.random() < 0.12:
+            tint = np.exp(rng.normal(0, 0.42, 3))
         return np.clip(level * tint, 0.008, 0.88)
 
     def wood(self) -> np.ndarray:
@@ -70,7 +70,7 @@ class _Builder:
         u, rng = self.rng.uniform, self.rng
         base = u(0.35, 0.85) * np.array([1.0, u(0.9, 1.0), u(0.72, 1.0)])
         if rng.random() < 0.3:
-            base = np.clip(np.exp(rng.normal(np.log(0.3), 0.6)) * np.exp(rng.normal(0, 0.35, 3)), 0.02, 0.85)
+            base = np.clip(np.exp(rng.normal(np.log(0.3), 0.6)) * np.exp(rng.normal(0, 0.22, 3)), 0.02, 0.85)
         return base
 
     def surface(self) -> tuple[str, np.ndarray, np.ndarray, float]:
@@ -111,7 +111,7 @@ def sample_room(rng: np.random.Generator, distance: float, reach: float) -> Room
     back = distance + reach
     {"wall": _wall, "desk": _desk, "floor": _floor, "room": _room, "cloth": _cloth, "garden": _garden,
      "studio": _studio}[kind](build, back)  # fmt: skip
-    aperture = float(np.exp(u(np.log(0.0015), np.log(0.035)))) * (1.4 if kind in ("room", "garden") else 1.0)
+    aperture = float(np.exp(u(np.log(0.0015), np.log(0.035)))) * {"room": 1.6, "garden": 3.0}.get(kind, 1.0)
     return Room(kind, build.matrix(), aperture)
 
 
@@ -146,7 +146,7 @@ def _on_wall(build: _Builder, z: float, floor: float, spread: float) -> None:
                       cell=u(0.05, 0.12))  # fmt: skip
         case "shelf":
             w, h = u(0.25, 0.6), u(0.2, 0.7)
-            build.add("box", "books", [x + np.sign(x) * 0.15, y, z - 0.12], [w, h, 0.12], build.wood(), cell=u(0.022, 0.045))
+            build.add("box", "books", [x + np.sign(x) * 0.15, y, z - 0.12], [w, h, 0.12], build.wood(), cell=u(0.014, 0.03))
         case "window":
             build.add("box", "panes", [x, y - 0.2, z - 0.01], [u(0.3, 0.6), u(0.35, 0.7), 0.02],
                       np.array([0.7, 0.8, 0.95]), white, cell=u(0.25, 0.5), glow=u(0.5, 3.0))  # fmt: skip
@@ -343,7 +343,7 @@ def _room(build: _Builder, back: float) -> None:
                 build.add("ball", "leaves", [x, floor - 0.7, at], [0.3, 0.45, 0.3], np.array([0.05, 0.14, 0.03]),
                           np.array([0.015, 0.035, 0.01]), cell=0.12)  # fmt: skip
             case "shelf":
-                build.add("box", "books", [x, floor - 0.9, at], [0.4, 0.9, 0.15], build.wood(), cell=u(0.025, 0.045))
+                build.add("box", "books", [x, floor - 0.9, at], [0.4, 0.9, 0.15], build.wood(), cell=u(0.018, 0.035))
 
 
 def _cloth(build: _Builder, back: float) -> None:
@@ -368,7 +368,7 @@ def _garden(build: _Builder, back: float) -> None:
     rng, u = build.rng, build.rng.uniform
     z, ground = back + u(3, 12), u(1.0, 1.5)
     build.add("box", "paint", [0, -10, z + 20], [60, 40, 0.1], np.array([0.5, 0.65, 0.9]), glow=u(0.6, 1.4))
-    leaf, dark = np.array([u(0.05, 0.16), u(0.13, 0.25), u(0.02, 0.06)]), np.array([0.015, 0.03, 0.008])
+    leaf, dark = u(0.5, 1.2) * np.array([u(0.07, 0.16), u(0.11, 0.17), u(0.03, 0.07)]), np.array([0.018, 0.028, 0.012])
     path = rng.random() < 0.4
     build.add("box", "specks" if path else "leaves", [0, ground + 0.05, z], [40, 0.05, 30], build.neutral() if path else leaf,
               build.neutral(0.05, 0.4) if path else dark, cell=u(0.03, 0.15))  # fmt: skip
@@ -388,8 +388,8 @@ def _garden(build: _Builder, back: float) -> None:
 def _studio(build: _Builder, back: float) -> None:
     """A plain ground close behind."""
     rng, u = build.rng, build.rng.uniform
-    color = (np.full(3, u(0.5, 0.88)), np.full(3, u(0.01, 0.1)), build.neutral(), np.clip(rng.uniform(0.02, 0.6, 3), 0, 1))[
-        rng.choice(4, p=[0.35, 0.2, 0.25, 0.2])
+    color = (np.full(3, u(0.5, 0.88)), np.full(3, u(0.01, 0.1)), build.neutral(), np.clip(u(0.1, 0.5) * np.exp(rng.normal(0, 0.45, 3)), 0.01, 0.8))[
+        rng.choice(4, p=[0.4, 0.2, 0.28, 0.12])
     ]
     z = build.axis_point(back + np.exp(u(np.log(0.02), np.log(0.8))))[2]
     build.add("box", "paint", [0, 0, z + 0.05], [8, 8, 0.05], color, gloss=0.1)

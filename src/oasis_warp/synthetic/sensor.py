@@ -32,7 +32,9 @@ class Sensor(NamedTuple):
     """One camera and its mood."""
 
     exposure: float
-    """Mean of the exposed picture in linear light."""
+    """Exposed value of a grey card of 18 % in mean light."""
+    metering: float
+    """0: for the light that falls in, 1: for what the picture throws back, which turns pale and dark hands grey."""
     balance: float
     """Share of the light's colour that white balance takes out."""
     tint: np.ndarray
@@ -55,7 +57,8 @@ def sample_sensor(rng: np.random.Generator) -> Sensor:
     """Phones mostly: near daylight balance, some contrast, some sharpening, JPEG 60 to 95."""
     u = rng.uniform
     return Sensor(
-        exposure=float(np.exp(rng.normal(-1.5, 0.32))),
+        exposure=float(np.exp(rng.normal(-1.62, 0.34))),
+        metering=u(0.1, 0.6),
         balance=u(0.35, 1.0),
         tint=np.exp(rng.normal(0, [0.045, 0.02, 0.06])),
         vignette=u(0, 0.18),
@@ -126,16 +129,16 @@ def srgb(linear: Tensor) -> Tensor:
 
 
 def expose(
-    light: Float[Tensor, "B H W 3"], alpha: Float[Tensor, "B H W"], sensors: list[Sensor], white: Float[Tensor, "B 3"],
+    light: Float[Tensor, "B H W 3"], alpha: Float[Tensor, "B H W"], sensors: list[Sensor], incident: Float[Tensor, "B 3"],
     seeds: Int[Tensor, "B"],
 ) -> Float[Tensor, "B H W 3"]:  # fmt: skip
     """Photos in [0, 1], sRGB, of linear light.
 
     Args:
         light: Of the scene.
-        alpha: Where the hand is: it is metered with a weight of 70 %.
+        alpha: Where the hand is: it is metered first.
         sensors: One an image.
-        white: Colour of the illumination.
+        incident: Irradiance over pi on the hand, linear RGB.
         seeds: Of the noise.
     """
     device, size = light.device, light.shape[2]
@@ -148,9 +151,12 @@ def expose(
 
     x = light.permute(0, 3, 1, 2)
     luma = torch.tensor(_LUMA, device=device)[:, None, None]
-    weight = alpha * 0.7 + 0.18
-    key = ((x * luma).sum(1) * weight).sum((1, 2)) / weight.sum((1, 2))
-    gain = column("exposure") / key.clamp_min(1e-4)
+    weight = alpha * 0.7 + 0.25
+    mirrored = ((x * luma).sum(1).clamp(max=2.0) * weight).sum((1, 2)) / weight.sum((1, 2))
+    falling = 0.18 * (incident * luma[:, 0, 0]).sum(1)
+    share = column("metering")
+    gain = column("exposure") / (falling.clamp_min(1e-3) ** (1 - share) * mirrored.clamp_min(1e-3) ** share)
+    white = incident / incident.mean(1, keepdim=True)
     balance = column("tint") / white ** column("balance")[:, None]
     x = x * gain[:, None, None, None] * balance[:, :, None, None]
     at = (torch.arange(size, device=device) + 0.5) / size * 2 - 1

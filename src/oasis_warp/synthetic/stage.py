@@ -36,8 +36,8 @@ class Light(NamedTuple):
     """Irradiance over pi at the hand, [L, 3]; black where there is no lamp."""
     spreads: np.ndarray
     """Radius over distance, [L]."""
-    white: np.ndarray
-    """Colour of all light together: what a camera balances against, mean 1."""
+    incident: np.ndarray
+    """Irradiance over pi on the hand, roughly, [3]: what a camera is balanced and exposed for."""
 
 
 class View(NamedTuple):
@@ -151,5 +151,4 @@ def sample_light(rng: np.random.Generator, look: Look) -> Light:
             spread, distance = float(np.exp(u(np.log(0.04), np.log(0.42)))), float(np.exp(u(np.log(0.5), np.log(4.0))))
         directions[k], distances[k], spreads[k] = way / np.linalg.norm(way), distance, spread
         colors[k] = u(0.5, 1.9) / (1 + k) * warmth(mood + rng.normal(0.03, 0.2))
-    white = sky[0] * 0.2 + colors.sum(0) * 0.6
-    return Light(sky, directions, distances, colors, spreads, white / white.mean())
+    return Light(sky, directions, distances, colors, spreads, 0.2820948 * sky[0] + 0.5 * colors.sum(0))
