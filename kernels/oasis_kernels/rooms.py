@@ -299,6 +299,14 @@ def sight(
         int(solids[b, hit, PATTERN]), u, v, solids[b, hit, CELL], seed, q,
         vector_at(solids, b, hit, FIRST), vector_at(solids, b, hit, SECOND),
     )
+    if int(solids[b, hit, PATTERN]) == CLOTH:  # wrinkles
+        g = rough_noise(q / 0.09, seed + 50, 2)
+        n = n + 1.1 * wp.vec3f(
+            rough_noise((q + wp.vec3f(0.008, 0.0, 0.0)) / 0.09, seed + 50, 2) - g,
+            rough_noise((q + wp.vec3f(0.0, 0.008, 0.0)) / 0.09, seed + 50, 2) - g,
+            rough_noise((q + wp.vec3f(0.0, 0.0, 0.008)) / 0.09, seed + 50, 2) - g,
+        )
+        n = wp.normalize(n)
     n = turned_back(solids, b, hit, n)
     glow = solids[b, hit, GLOW]
     gloss = solids[b, hit, GLOSS]

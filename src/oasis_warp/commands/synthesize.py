@@ -13,7 +13,8 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, to_uint8, write_picture
 from oasis_warp.synthetic.backgrounds import list_backgrounds
-from oasis_warp.synthetic.picture import PICTURES_EACH, Scenery, render_batch
+from oasis_warp.synthetic.picture import render_batch
+from oasis_warp.synthetic.plan import PICTURES_EACH, Scenery
 from oasis_warp.synthetic.sheet import contact_sheet
 from oasis_warp.synthetic.shards import write_shards
 

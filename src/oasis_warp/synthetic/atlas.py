@@ -38,15 +38,10 @@ class Atlas:
         seen = depth_map(flat, body.uv_faces, torch.eye(4), torch.eye(3), WIDTH, HEIGHT)
         shown = seen.face_ids >= 0
         corners = body.faces[seen.face_ids[shown].long()]
-        weights = seen.barycentrics[shown][..., None]
-
-        def spread(values: Tensor) -> Tensor:
-            return (values[corners] * weights).sum(1)
-
-        self.body = body
-        self.points, self.palm = spread(body.rest), spread(body.palm[:, None])[:, 0]
-        self.normals = torch.nn.functional.normalize(spread(body.normals), dim=-1)
-        share = spread(body.finger_weights)
+        self.body, self._corners, self._weights = body, corners, seen.barycentrics[shown][..., None]
+        self.points, self.palm = self.spread(body.rest), self.spread(body.palm[:, None])[:, 0]
+        self.normals = torch.nn.functional.normalize(self.spread(body.normals), dim=-1)
+        share = self.spread(body.finger_weights)
         self.finger_weight, best = share.max(1)
         self.finger = torch.where(self.finger_weight > 0.5, best, -1)
         self._positions = self.points.double().numpy()
@@ -62,6 +57,10 @@ class Atlas:
         self._fill = number[torch.from_numpy(nearest[0]).long(), torch.from_numpy(nearest[1]).long()]
         """Texel shown at each place; beyond the islands the nearest, so that interpolation does not bleed."""
         self._trees: dict[str, tuple[np.ndarray, cKDTree, tuple[int, ...]]] = {}
+
+    def spread(self, values: Float[Tensor, "K C"]) -> Float[Tensor, "N C"]:
+        """Values of the vertices of hand and forearm, interpolated at the texels."""
+        return (values[self._corners] * self._weights).sum(1)
 
     def image(self, values: Float[Tensor, "N C"]) -> Float[Tensor, "H W C"]:
         """Values of the texels as a picture of the atlas."""

@@ -20,12 +20,15 @@ CHANNELS = ("red", "green", "blue", "height", "fold", "wrinkle", "roughness", "o
 """Of the texture: linear reflectance; relief, folds (negative: grooves) that flatten when stretched, wrinkles that
 appear when squeezed [mm]; GGX roughness; strength of the specular reflection."""
 
-NOISES = {
-    "palm_edge": (7.0, 2), "wrist_edge": (8.0, 1), "blotch": (14.0, 3), "grain": (2.2, 2), "flush": (11.0, 3),
-    "palm_flush": (3.2, 2), "lumps": (11.0, 3), "dry": (2.5, 2), "palm_lumps": (16.0, 2), "gloss": (6.0, 2),
-    "lattice_a": (1.5, 1), "lattice_b": (0.95, 1), "ridge": (0.8, 1), "tattoo": (9.0, 2),
+COARSE_NOISES = {
+    "palm_edge": (7.0, 2), "wrist_edge": (8.0, 1), "blotch": (14.0, 3), "flush": (11.0, 3), "lumps": (11.0, 3),
+    "palm_lumps": (16.0, 2), "gloss": (6.0, 2),
 }  # fmt: skip
-"""Cell of the largest octave [mm], and octaves."""
+FINE_NOISES = {
+    "grain": (2.2, 2), "palm_flush": (3.2, 2), "dry": (2.5, 1), "lattice_a": (1.5, 1), "lattice_b": (0.95, 1),
+    "ridge": (0.8, 1), "tattoo": (9.0, 2),
+}  # fmt: skip
+"""Cell of the largest octave [mm], and octaves. Coarse ones are evaluated at the vertices, 2 mm apart."""
 
 
 class Regions(NamedTuple):
@@ -52,9 +55,14 @@ class Nails(NamedTuple):
     """-1 to 1 over the plate."""
 
 
-def _noises(points: Tensor, seed: int) -> dict[str, Tensor]:
-    fields = [NoiseField(cell, seed + 97 * k, octaves) for k, (cell, octaves) in enumerate(NOISES.values())]
-    return dict(zip(NOISES, surface_noise(points, fields).unbind(1), strict=True))
+def _noises(atlas: Atlas, identity: Identity) -> dict[str, Tensor]:
+    def fields(table: dict[str, tuple[float, int]], seed: int) -> list[NoiseField]:
+        return [NoiseField(cell, seed + 97 * k, octaves) for k, (cell, octaves) in enumerate(table.values())]
+
+    fine = {name: how for name, how in FINE_NOISES.items() if name != "tattoo" or identity.tattoo}
+    coarse = atlas.spread(surface_noise(atlas.body.rest, fields(COARSE_NOISES, identity.seed)))
+    values = torch.cat([coarse, surface_noise(atlas.points, fields(fine, identity.seed + 5000))], 1)
+    return dict(zip((*COARSE_NOISES, *fine), values.unbind(1), strict=True))
 
 
 def _regions(atlas: Atlas, noise: dict[str, Tensor]) -> Regions:
@@ -136,7 +144,7 @@ def _spots(atlas: Atlas, identity: Identity, rng: np.random.Generator) -> Tensor
 def bake(atlas: Atlas, identity: Identity) -> Float[Tensor, "H W 8"]:
     """The texture of one person, `CHANNELS`, float16."""
     rng = np.random.default_rng([identity.seed])
-    noise = _noises(atlas.points, identity.seed)
+    noise = _noises(atlas, identity)
     strokes = Strokes(rng)
     draw_fingers(atlas, strokes, identity)
     Palm(atlas, strokes, identity).draw()
@@ -202,7 +210,7 @@ def _color(identity: Identity, region: Regions, nails: Nails, line: dict[str, Te
     bed = bed + (pale - bed) * (0.35 * nails.lunula)[:, None]
     bed = bed + (color.new_tensor([0.74, 0.68, 0.56]) - bed) * (0.55 * nails.free)[:, None]
     color = color + (bed - color) * nails.plate[:, None]
-    dark = 0.26 * line["crease"] + 0.26 * line["main"] + 0.15 * line["minor"]
+    dark = 0.40 * line["crease"] + 0.40 * line["main"] + 0.22 * line["minor"]
     return color * torch.exp(-dark)[:, None] ** color.new_tensor([0.75, 1.1, 1.15])  # cavities: dark and warm
 
 
@@ -262,7 +270,7 @@ def _relief(identity: Identity, region: Regions, nails: Nails, line: dict[str, T
     bare = 1 - plate
     lattice = (noise["lattice_a"].abs() + 0.7 * noise["lattice_b"].abs()).clamp(0, 1)
     texture = back * (0.05 + 0.05 * identity.age) * lattice * bare + palm * 0.02 * noise["ridge"]
-    height = -(0.42 * line["crease"] + 0.40 * line["main"] + 0.24 * line["minor"]) - 0.25 * line["halo"]
+    height = -(0.50 * line["crease"] + 0.48 * line["main"] + 0.28 * line["minor"]) - 0.28 * line["halo"]
     height = height + texture + 0.13 * noise["lumps"] * (1 - 0.6 * plate)
     height = height + (0.03 + 0.04 * identity.dryness) * noise["dry"] * bare
     toward_wrist = 0.25 + 0.75 * (region.on_finger < 0.5)

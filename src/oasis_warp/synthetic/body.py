@@ -32,6 +32,8 @@ ATLAS_ARM_BIAS = 0.7
 
 SKIN, SLEEVE, BAND, RING = range(4)
 """Materials of faces."""
+KNUCKLE_RISE = (2.0, 1.7, 0.8)
+"""How far a knuckle stands out of a finger bent by 90 degrees, from the hand outwards [mm]."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,21 @@ def _bone(hand: HandModel, finger: int, place: int) -> Bone:
     back = back - along * (back @ along)
     back /= np.linalg.norm(back)
     return Bone(start, along, back, np.cross(back, along), length)
+
+
+def _knuckle_rise(points: np.ndarray, normals: np.ndarray, bones: tuple[tuple[Bone, ...], ...]) -> Tensor:
+    """Blend skinning rounds a bent joint off; bone does not. Arguments in millimetres; [V, 15] in metres."""
+    out = np.zeros((len(points), 15))
+    for finger, of_finger in enumerate(bones):
+        for place, bone in enumerate(of_finger):
+            if FINGERS[finger] == "thumb" and place == 0:  # lies deep in the hand
+                continue
+            along, side, back = bone.local(points).T
+            t = np.clip((normals @ bone.back - 0.15) / 0.65, 0, 1)
+            width, length = (7.5, 7.0) if place == 0 else (6.0, 5.0)
+            shape = np.exp(-((side / width) ** 2) - ((along - 0.5) / length) ** 2) * (np.abs(side) < 14) * (back > 0)
+            out[:, 3 * finger + place] = KNUCKLE_RISE[place] * t * t * (3 - 2 * t) * shape
+    return torch.from_numpy(out * 1e-3).float()
 
 
 def _tube_faces(rows: np.ndarray) -> np.ndarray:
@@ -93,6 +110,8 @@ class Body:
     """Share of each finger's joints in the skinning."""
     bones: tuple[tuple[Bone, ...], ...]
     """[finger][place]."""
+    knuckle_rise: Float[Tensor, "V 15"]
+    """Displacement of the hand's vertices along their normals, for each joint of a finger bent by 90 degrees [m]."""
 
     @property
     def n_hand(self) -> int:
@@ -172,6 +191,7 @@ def bundled_body() -> Body:
     toward = torch.cat([0.5 - 0.5 * torch.cos(hand.bone_theta), 0.5 - 0.5 * normals[n:, 1]])
     palm = surface.smooth_over_mesh(toward[:, None], edges, 5)[:, 0]
     weights = torch.cat([hand.weights, torch.eye(16)[:1].expand(len(rest) - n, 16)])
+    bones = tuple(tuple(_bone(hand, finger, place) for place in range(3)) for finger in range(5))
     by_finger = torch.stack([weights[:, 3 * k + 1 : 3 * k + 4].sum(1) for k in range(5)], 1)
     return Body(
         hand=hand,
@@ -185,5 +205,6 @@ def bundled_body() -> Body:
         normals=normals,
         palm=palm,
         finger_weights=by_finger,
-        bones=tuple(tuple(_bone(hand, finger, place) for place in range(3)) for finger in range(5)),
+        bones=bones,
+        knuckle_rise=_knuckle_rise(rest[:n].double().numpy() * 1e3, normals[:n].double().numpy(), bones),
     )

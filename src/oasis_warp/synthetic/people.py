@@ -1,6 +1,6 @@
 """People of a world, baked once and kept: texture, resting surface and what goes with them."""
 
-import functools
+from collections import OrderedDict
 from typing import NamedTuple
 
 import torch
@@ -15,8 +15,8 @@ from oasis_warp.synthetic.identity import Identity, Population, sample_identity
 from oasis_warp.synthetic.relief import relief
 from oasis_warp.synthetic.wardrobe import ring_at_rest, ring_look
 
-KEPT = 48
-"""People kept, 21 MB each."""
+KEPT = {"cpu": 48, "cuda": 1024}
+"""People kept on a device, 23 MB each."""
 
 
 class Person(NamedTuple):
@@ -37,9 +37,23 @@ class Person(NamedTuple):
     ring_look: tuple[float, ...]
 
 
-@functools.lru_cache(KEPT)
+_known: OrderedDict[tuple[int, int, Population, str], Person] = OrderedDict()
+
+
 def person(seed: int, number: int, population: Population, device: str) -> Person:
-    """Person `number` of the world `seed`; a few seconds the first time."""
+    """Person `number` of the world `seed`; a few seconds the first time, then kept until many others have come."""
+    key = (seed, number, population, device)
+    if key in _known:
+        _known.move_to_end(key)
+        return _known[key]
+    found = _born(seed, number, population, device)
+    _known[key] = found
+    if len(_known) > KEPT[torch.device(device).type]:
+        _known.popitem(last=False)
+    return found
+
+
+def _born(seed: int, number: int, population: Population, device: str) -> Person:
     body, atlas = bundled_body(), bundled_atlas()
     hand = body.hand
     identity = sample_identity(hand, seed, number, population)

@@ -1,9 +1,9 @@
 """Pictures of synthetic hands. Any one is a function of (seed, index), whatever the batch it is made in."""
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,66 +11,24 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_warp.core.types import Side
 from oasis_warp.ops import depth_map
 from oasis_warp.ops.room_tracing import trace_rooms
 from oasis_warp.ops.skin_shading import Texture, Worn, shade_skin, smooth_over_faces, surface_state
 from oasis_warp.synthetic.atlas import HEIGHT, WIDTH
 from oasis_warp.synthetic.backgrounds import cut_background
 from oasis_warp.synthetic.body import RING, Body, bundled_body
-from oasis_warp.synthetic.contact import separate
-from oasis_warp.synthetic.gestures import sample_gesture
-from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.illumination import light_lamps, see_sky
 from oasis_warp.synthetic.people import Person, person
+from oasis_warp.synthetic.plan import PHOTOS, Scenery, Shot, plan_ahead, plan_shots
 from oasis_warp.synthetic.posing import pose_people
-from oasis_warp.synthetic.rooms import Room, sample_room
-from oasis_warp.synthetic.sensor import Sensor, expose, sample_sensor, srgb
-from oasis_warp.synthetic.stage import Light, Look, View, sample_light, sample_view
-from oasis_warp.synthetic.wardrobe import SKIN_LOOK, Clothes, sample_clothes
+from oasis_warp.synthetic.sensor import expose, srgb
+from oasis_warp.synthetic.wardrobe import SKIN_LOOK
 
-PICTURES_EACH = 8
-"""Consecutive indices that show one person: a texture is baked once for so many."""
-PICTURE_STREAM = 2
 SAMPLES = 2
 """Sub-pixels along a pixel's side."""
 TEXEL = 0.34e-3
 """Size of a texel on the hand [m]."""
 STRETCH_PASSES = 2
-HAND_REACH = 0.11
-"""Of a hand beyond its middle, roughly: rooms begin behind it [m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scenery:
-    """What pictures show, besides what the seed decides."""
-
-    look: Look = "photo"
-    population: Population = Population()
-    backgrounds: tuple[Path, ...] = ()
-    """Pictures to stand behind the hands (see `backgrounds.list_backgrounds`); rooms when empty."""
-
-
-PHOTOS = Scenery()
-
-
-class Shot(NamedTuple):
-    """All that is drawn for one picture, before anything is rendered."""
-
-    index: int
-    person: int
-    side: Side
-    gesture: str
-    angles: np.ndarray
-    """Before fingers are kept apart, [16, 3] [rad]."""
-    bend: np.ndarray
-    view: View
-    light: Light
-    clothes: Clothes
-    room: Room
-    sensor: Sensor
-    seed: int
-    """Of whatever is drawn a pixel at a time."""
 
 
 class SyntheticBatch(NamedTuple):
@@ -102,37 +60,13 @@ class SyntheticBatch(NamedTuple):
     gestures: tuple[str, ...]
 
 
-def sample_shot(seed: int, index: int, look: Look = "photo") -> Shot:
-    """Draw picture `index` of the world `seed`."""
-    rng = np.random.default_rng([seed, PICTURE_STREAM, index, look == "even"])
-    name, angles = sample_gesture(rng, bundled_body().hand)
-    bend = np.array([0.0, rng.normal(0, 0.15), rng.normal(0, 0.30)])
-    number = index // PICTURES_EACH
-    view = sample_view(rng, look)
-    return Shot(
-        index=index,
-        person=number,
-        side="left" if np.random.default_rng([seed, PICTURE_STREAM, number]).random() < 0.5 else "right",
-        gesture=name,
-        angles=angles,
-        bend=bend,
-        view=view,
-        light=sample_light(rng, look),
-        clothes=sample_clothes(rng, bare=look == "even"),
-        room=sample_room(rng, view.distance, HAND_REACH),
-        sensor=sample_sensor(rng),
-        seed=int(rng.integers(1 << 31)),
-    )
-
-
 @functools.cache
 def _body(device: str) -> Body:
     body = bundled_body()
-    moved = {name: getattr(body, name).to(device) for name in ("faces", "materials", "uv", "uv_faces")}
+    moved = {name: getattr(body, name).to(device) for name in ("faces", "materials", "uv", "uv_faces", "normals", "knuckle_rise")}
     return replace(body, hand=body.hand.to(device), **moved)
 
 
-@torch.no_grad()
 def render_batch(
     seed: int,
     indices: Sequence[int],
@@ -144,14 +78,20 @@ def render_batch(
     """Pictures `indices` of the world `seed`, each `size` pixels wide and high.
 
     A picture depends on seed, index, size and scenery alone: not on its batch, nor on the device, up to
-    rounding. Indices 8 n to 8 n + 7 show person n, whose texture is baked when first met (seconds) and kept.
+    rounding. Indices 8 n to 8 n + 7 show one person, whose texture is baked when first met (seconds) and kept.
     """
-    look = scenery.look
-    body = _body(str(device))
-    shots = [sample_shot(seed, int(index), look) for index in indices]
-    people = [person(seed, shot.person, scenery.population, str(device)) for shot in shots]
-    joints = np.stack([p.joints.double().cpu().numpy() for p in people]) * 1e3
-    angles, _ = separate(np.stack([shot.angles for shot in shots]), joints)
+    return render_shots(seed, plan_shots(seed, indices, scenery), size, device, scenery=scenery)
+
+
+@torch.no_grad()
+def render_shots(
+    seed: int, shots: Sequence[Shot], size: int, device: torch.device | str, *, scenery: Scenery
+) -> SyntheticBatch:
+    """The second half of `render_batch`: pictures of shots that `plan_shots` has drawn for the same seed and scenery."""
+    device, look = str(device), scenery.look
+    body = _body(device)
+    people = [person(seed, shot.person, scenery.population, device) for shot in shots]
+    angles = np.stack([shot.angles for shot in shots])
     posed = pose_people(
         body, people, angles, np.stack([s.bend for s in shots]), [s.view for s in shots], [s.clothes for s in shots]
     )
@@ -210,6 +150,19 @@ def render_batch(
     return _mirror_left(batch, size)
 
 
+def stream(
+    seed: int, batch: int, size: int = 256, device: torch.device | str = "cpu", *, start: int = 0,
+    scenery: Scenery = PHOTOS, workers: int = 0,
+) -> Iterator[SyntheticBatch]:  # fmt: skip
+    """Pictures from `start` on in batches, without end: `render_batch`, for training on the fly.
+
+    Drawing a shot takes a CPU some milliseconds; with `workers`, so many processes draw ahead while a GPU renders.
+    """
+    blocks = (range(first, first + batch) for first in itertools.count(start, batch))
+    for shots in plan_ahead(seed, blocks, scenery, workers):
+        yield render_shots(seed, shots, size, device, scenery=scenery)
+
+
 def _cut(scenery: Scenery, shot: Shot, size: int) -> Tensor:
     """A picture of the folder as bright as the light on the hand."""
     cut = cut_background(scenery.backgrounds, np.random.default_rng([shot.seed]), size, shot.room.aperture * size)
@@ -257,7 +210,7 @@ def _textures(body: Body, people: list[Person]) -> Texture:
     pages = {slots[id(p)]: p.texture for p in people}
     device = people[0].texture.device
     return Texture(
-        torch.stack([pages[k] for k in range(len(pages))]),
+        pages[0][None] if len(pages) == 1 else torch.stack([pages[k] for k in range(len(pages))]),
         torch.tensor(numbers, device=device, dtype=torch.int32),
         body.uv * torch.tensor([WIDTH, HEIGHT], device=device),
         body.uv_faces,

@@ -11,7 +11,7 @@ from oasis_warp.hand.correctives import corrective_coefficients
 from oasis_warp.synthetic.body import ARM_LENGTH, ARM_ROWS, Body, arm_rows
 from oasis_warp.synthetic.contact import bundled_skeleton
 from oasis_warp.synthetic.people import Person
-from oasis_warp.synthetic.stage import View, rotation_about
+from oasis_warp.synthetic.stage import View
 from oasis_warp.synthetic.wardrobe import AWAY, Clothes, bands, sleeves
 
 ARM_BEND = 0.15
@@ -40,8 +40,11 @@ def arm_turns(bends: np.ndarray) -> np.ndarray:
     """Rotations of the arm's rings, [B, R, 3, 3], for bends at the wrist about axes with lengths [rad], [B, 3]."""
     share = np.minimum(1.0, np.linspace(0, 1, ARM_ROWS + 1)[1:] / ARM_BEND)
     lengths = np.linalg.norm(bends, axis=1)
-    return np.stack([[rotation_about(axis, length * s) for s in share]
-                     for axis, length in zip(bends, lengths, strict=True)])  # fmt: skip
+    x, y, z = (bends / np.maximum(lengths, 1e-12)[:, None]).T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 1, 3, 3)
+    angles = (lengths[:, None] * share)[..., None, None]
+    return np.eye(3) + np.sin(angles) * cross + (1 - np.cos(angles)) * cross @ cross
 
 
 def pose_people(
@@ -65,6 +68,10 @@ def pose_people(
     coefficients = torch.stack([corrective_coefficients(hand, on_device(a[1:])) for a in angles])
     rest = torch.stack([p.rest for p in people])
     rest = rest + (coefficients @ hand.corrective_basis.flatten(0, 1).T).unflatten(1, (-1, 3))
+    bony = torch.tensor([0.4 + 0.9 * p.identity.bony for p in people], device=device)
+    bent = on_device(1 - np.cos(np.maximum(angles[:, 1:, 0] + hand.rest_bend[1:].cpu().numpy(), 0)))
+    rise = (bent * bony[:, None]) @ body.knuckle_rise.T
+    rest = rest + body.normals[: body.n_hand] * rise[..., None]
     blended = hand.weights @ torch.cat([rotation.flatten(2), shift], 2)  # B V 12
     skinned = (blended[..., :9].unflatten(2, (3, 3)) * rest[:, :, None]).sum(-1) + blended[..., 9:]
 

@@ -111,7 +111,9 @@ def sample_room(rng: np.random.Generator, distance: float, reach: float) -> Room
     back = distance + reach
     {"wall": _wall, "desk": _desk, "floor": _floor, "room": _room, "cloth": _cloth, "garden": _garden,
      "studio": _studio}[kind](build, back)  # fmt: skip
-    aperture = float(np.exp(u(np.log(0.0015), np.log(0.035)))) * {"room": 1.6, "garden": 3.0}.get(kind, 1.0)
+    aperture = float(np.exp(u(np.log(0.0015), np.log(0.035)))) * {"room": 1.6}.get(kind, 1.0)
+    if kind == "garden":
+        aperture = u(0.02, 0.07)
     return Room(kind, build.matrix(), aperture)
 
 
@@ -354,12 +356,12 @@ def _cloth(build: _Builder, back: float) -> None:
     a = build.neutral(0.015, 0.7)
     build.add("box", "cloth", [gaze[0], y + 0.15, gaze[2]], [1.5, 0.15, 1.2], a, np.clip(a * np.exp(rng.normal(0, 0.6)), 0.01, 0.8),
               cell=np.exp(u(np.log(0.02), np.log(0.6))))  # fmt: skip
-    for _ in range(rng.integers(3, 9)):  # heaps and folds
-        build.add("ball", "cloth", [gaze[0] + rng.normal(0, 0.35), y + 0.02, gaze[2] + rng.normal(0, 0.3)],
-                  u([0.08, 0.03, 0.04], [0.4, 0.10, 0.12]), a * u(0.9, 1.1), a, cell=0.3, yaw=u(-3, 3))  # fmt: skip
+    for _ in range(rng.integers(1, 4)):  # folds
+        build.add("ball", "cloth", [gaze[0] + rng.normal(0, 0.4), y + 0.03, gaze[2] + rng.normal(0, 0.3)],
+                  u([0.2, 0.03, 0.02], [0.6, 0.06, 0.07]), a, a, cell=0.3, yaw=u(-3, 3))  # fmt: skip
     for _ in range(rng.integers(0, 4)):
         c = build.neutral()
-        build.add("ball", "cloth", [gaze[0] + rng.normal(0, 0.5), y - 0.06, gaze[2] + u(0.1, 0.7)], [0.25, 0.11, 0.2], c,
+        build.add("ball", "cloth", [gaze[0] + rng.normal(0, 0.5), y - 0.04, gaze[2] + u(0.25, 0.8)], [0.3, 0.13, 0.22], c,
                   build.neutral(), cell=u(0.03, 0.3), yaw=u(-3, 3))  # fmt: skip
     build.add("box", "paint", [0, 0, gaze[2] + u(0.8, 2.5)], [6, 3, 0.05], build.wall_paint())
 

@@ -57,8 +57,8 @@ def sample_sensor(rng: np.random.Generator) -> Sensor:
     """Phones mostly: near daylight balance, some contrast, some sharpening, JPEG 60 to 95."""
     u = rng.uniform
     return Sensor(
-        exposure=float(np.exp(rng.normal(-1.62, 0.34))),
-        metering=u(0.1, 0.6),
+        exposure=float(np.exp(rng.normal(-1.72, 0.30))),
+        metering=u(0.2, 0.65),
         balance=u(0.35, 1.0),
         tint=np.exp(rng.normal(0, [0.045, 0.02, 0.06])),
         vignette=u(0, 0.18),

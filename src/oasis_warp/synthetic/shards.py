@@ -17,7 +17,8 @@ import torch
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.data.atomic import output_file, write_file
-from oasis_warp.synthetic.picture import Scenery, SyntheticBatch, render_batch
+from oasis_warp.synthetic.picture import SyntheticBatch, render_batch
+from oasis_warp.synthetic.plan import Scenery
 
 SHARD = 64
 """Pictures a file: a whole number of people."""

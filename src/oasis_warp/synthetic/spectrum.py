@@ -2,8 +2,9 @@
 
 Melanin absorbs in the epidermis, crossed twice along uneven paths; haemoglobin in the dermis, whose diffuse
 reflectance is a dipole (Jacques 2013; Prahl's haemoglobin spectra); CIE 1931 by the fits of Wyman et al. 2013, under
-D65. Four free constants (the spread of paths, the slope of melanin, what returns from above it, and the gain of the
-dermis) are fitted to measured skin colours from CIELAB L 72 to L 30.
+D65. Three free constants (the spread of paths, the slope of melanin, the gain of the dermis) are fitted to measured
+skin colours from CIELAB L 72 to L 30. Those were measured with the mirrored light in, 4 % of it above the melanin; here
+half of that is left to the gloss, which is rendered for itself: with both, dark skin would be chalky.
 """
 
 import numpy as np
@@ -29,6 +30,8 @@ _D65 = np.array([
 _XYZ_TO_RGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 _WHITE = np.array([0.9505, 1.0, 1.089])
 
+ABOVE_MELANIN = 0.018
+"""Share of light that comes back before it meets melanin, mirrored light left out."""
 MELANIN_RANGE = (0.002, 0.8)
 BLOOD_RANGE = (0.001, 0.15)
 _TABLE = (48, 40)
@@ -69,7 +72,7 @@ def skin_reflectance(
     depth = np.sqrt(3 * (1 - albedo))
     dermis = albedo / 2 * (1 + np.exp(-4 / 3 * 3.25 * depth)) * np.exp(-depth) * 1.12
     crossed = (melanin * 494 * (_NM / 550) ** -2.36 + bloodless) * epidermis * 1e-4 * 3.2
-    returned = 0.04 + 0.96 * (1 + crossed / 4.75) ** -4.75 * dermis
+    returned = ABOVE_MELANIN + (1 - ABOVE_MELANIN) * (1 + crossed / 4.75) ** -4.75 * dermis
     return np.clip(returned @ _matching().T @ _XYZ_TO_RGB.T, 0.002, 0.95)
 
 

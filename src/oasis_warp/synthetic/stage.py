@@ -151,4 +151,4 @@ def sample_light(rng: np.random.Generator, look: Look) -> Light:
             spread, distance = float(np.exp(u(np.log(0.04), np.log(0.42)))), float(np.exp(u(np.log(0.5), np.log(4.0))))
         directions[k], distances[k], spreads[k] = way / np.linalg.norm(way), distance, spread
         colors[k] = u(0.5, 1.9) / (1 + k) * warmth(mood + rng.normal(0.03, 0.2))
-    return Light(sky, directions, distances, colors, spreads, 0.2820948 * sky[0] + 0.5 * colors.sum(0))
+    return Light(sky, directions, distances, colors, spreads, 0.2820948 * sky[0] + 0.65 * colors.sum(0))
