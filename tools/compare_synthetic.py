@@ -143,7 +143,9 @@ def report(name: str, rows: list[Row]) -> None:
     for label, colors in (("palm", [r.palm for r in rows]), ("back", [r.back for r in rows])):
         colors = np.array([c for c in colors if np.isfinite(c).all()])
         if len(colors):
-            words = ", ".join(f"{axis} {m:.0f} +-{s:.0f}" for axis, m, s in zip("Lab", colors.mean(0), colors.std(0), strict=True))
+            words = ", ".join(
+                f"{axis} {m:.0f} +-{s:.0f}" for axis, m, s in zip("Lab", colors.mean(0), colors.std(0), strict=True)
+            )
             print(f"  {label} ({len(colors)}): {words}")
 
 

@@ -8,7 +8,7 @@ distance fields (Evans 2006), and the lamps with the hand's soft shadow and a ma
 
 import warp as wp
 
-from oasis_kernels.sky import blurred, cosine_lobe, disc, harmonics, light_along, lit_share
+from oasis_kernels.sky import blurred, cosine_lobe, disc, dither, harmonics, light_along, lit_share
 
 wp.set_module_options({"enable_backward": False})
 
@@ -108,7 +108,9 @@ def clearance(solids: wp.array3d[wp.float32], b: int, p: wp.vec3f) -> float:
                     out = wp.vec3f(wp.max(e[0], 0.0), wp.max(e[1], 0.0), wp.max(e[2], 0.0))
                     least = wp.min(least, wp.length(out) + wp.min(wp.max(e[0], wp.max(e[1], e[2])), 0.0))
                 elif shape == BALL:
-                    least = wp.min(least, (wp.length(wp.cw_div(q, half)) - 1.0) * wp.min(half[0], wp.min(half[1], half[2])))
+                    least = wp.min(
+                        least, (wp.length(wp.cw_div(q, half)) - 1.0) * wp.min(half[0], wp.min(half[1], half[2]))
+                    )
                 else:
                     r = wp.sqrt(q[0] * q[0] + q[2] * q[2]) - half[0]
                     y = wp.abs(q[1]) - half[1]
@@ -125,8 +127,8 @@ def hashed(i: int, j: int, seed: int) -> float:
 
 @wp.func
 def rough_noise(p: wp.vec3f, seed: int, octaves: int) -> float:
-    total = float(0.0)
-    gain = float(1.0)
+    total = wp.float32(0.0)
+    gain = wp.float32(1.0)
     q = p + wp.vec3f(31.4, 17.9, 5.3)
     for k in range(octaves):
         total += gain * wp.noise(wp.rand_init(seed + k), q)
@@ -143,7 +145,9 @@ def groove(x: float, width: float) -> float:
 
 
 @wp.func
-def painted(pattern: int, u: float, v: float, cell: float, seed: int, p: wp.vec3f, a: wp.vec3f, e: wp.vec3f) -> wp.vec3f:
+def painted(
+    pattern: int, u: float, v: float, cell: float, seed: int, p: wp.vec3f, a: wp.vec3f, e: wp.vec3f
+) -> wp.vec3f:
     """Reflectance at (u, v) [m] of a face, `p` the point in the solid's own frame."""
     c = a
     x, y = u / cell, v / cell
@@ -152,7 +156,7 @@ def painted(pattern: int, u: float, v: float, cell: float, seed: int, p: wp.vec3
     elif pattern == PLANKS:
         row = int(wp.floor(y))
         shift = 7.0 * hashed(row, 1, seed)
-        length = 11.0
+        length = wp.float32(11.0)
         board = int(wp.floor(x / length + shift))
         tone = hashed(row, board, seed + 3)
         g = rough_noise(wp.vec3f(0.35 * x + 40.0 * tone, 5.0 * y, 9.0 * tone), seed, 3)
@@ -257,7 +261,7 @@ def sight(
 ) -> wp.vec4f:
     """Light and depth along the ray `d` from the camera."""
     t = float(FAR)
-    hit = int(-1)
+    hit = wp.int32(-1)
     for k in range(solids.shape[1]):
         shape = int(solids[b, k, SHAPE])
         if shape != NOTHING:
@@ -296,8 +300,14 @@ def sight(
             n = wp.vec3f(0.0, wp.sign(q[1]), 0.0)
     seed = int(solids[b, hit, SEED])
     base = painted(
-        int(solids[b, hit, PATTERN]), u, v, solids[b, hit, CELL], seed, q,
-        vector_at(solids, b, hit, FIRST), vector_at(solids, b, hit, SECOND),
+        int(solids[b, hit, PATTERN]),
+        u,
+        v,
+        solids[b, hit, CELL],
+        seed,
+        q,
+        vector_at(solids, b, hit, FIRST),
+        vector_at(solids, b, hit, SECOND),
     )
     if int(solids[b, hit, PATTERN]) == CLOTH:  # wrinkles
         g = rough_noise(q / 0.09, seed + 50, 2)
@@ -310,29 +320,36 @@ def sight(
     n = turned_back(solids, b, hit, n)
     glow = solids[b, hit, GLOW]
     gloss = solids[b, hit, GLOSS]
-    open_ = float(1.0)
+    open_ = wp.float32(1.0)
     size = wp.clamp(0.12 * p[2], 0.02, 0.3)
     for k in range(1, 4):
         reach = size * float(k * k) / 9.0
         open_ -= wp.max(reach - clearance(solids, b, p + reach * n), 0.0) / reach * 0.24
     open_ = wp.max(open_, 0.12)
     total = light_along(sky, b, cosine_lobe(n)) * open_
-    for l in range(lamps.shape[1]):
-        color = lamp_colors[b, l]
+    for lamp in range(lamps.shape[1]):
+        color = lamp_colors[b, lamp]
         if color[0] + color[1] + color[2] > 0.0:
-            to = lamps[b, l] - p
+            to = lamps[b, lamp] - p
             distance = wp.length(to)
             w = to / distance
             facing = wp.dot(n, w)
             if facing > 0.0:
-                fall = lamp_ranges[b, l] / distance
+                fall = lamp_ranges[b, lamp] / distance
                 share = lit_share(
-                    lamp_depths, b * lamps.shape[1] + l, lamp_views[b, l], lamp_focals[b, l], lamp_spreads[b, l], p, n,
-                    turn, 0.002,
+                    lamp_depths,
+                    b * lamps.shape[1] + lamp,
+                    lamp_views[b, lamp],
+                    lamp_focals[b, lamp],
+                    lamp_spreads[b, lamp],
+                    p,
+                    n,
+                    turn,
+                    0.002,
                 )
-                if share > 0.0 and l == 0:  # the first lamp's shadows of the solids themselves
+                if share > 0.0 and lamp == 0:  # the first lamp's shadows of the solids themselves
                     s = 0.015 + 0.0016 * turn
-                    soft = 1.0 / wp.max(lamp_spreads[b, l], 0.05)
+                    soft = 1.0 / wp.max(lamp_spreads[b, lamp], 0.05)
                     for _k in range(7):
                         near = clearance(solids, b, p + 0.004 * n + s * w)
                         share = wp.min(share, wp.clamp(0.5 + 0.5 * soft * near / s, 0.0, 1.0))
@@ -344,8 +361,6 @@ def sight(
     shown = wp.cw_mul(base, total) + mirror * open_ * light_along(sky, b, blurred(harmonics(back), 0.85))
     shown = shown + glow * base
     return wp.vec4f(shown[0], shown[1], shown[2], p[2])
-
-
 
 
 @wp.kernel
@@ -362,7 +377,6 @@ def trace(
     lamp_focals: wp.array2d[wp.float32],
     lamp_depths: wp.array3d[wp.float32],
     hidden: wp.array3d[wp.float32],  # where this is 1 the hand covers the pixel and nothing is traced
-    seeds: wp.array[wp.int32],
     light: wp.array3d[wp.vec3f],
     depth: wp.array3d[wp.float32],
 ):
@@ -374,14 +388,24 @@ def trace(
     total = wp.vec3f()
     nearest = float(FAR)
     if hidden[b, y, x] <= 0.999:
-        turn = 6.2832 * wp.randf(wp.rand_init(seeds[b], y * columns + x))
+        turn = dither(x, y)
         for k in range(RAYS):
             right = float(x) + (float(k) + 0.5) / float(RAYS) - 0.5 * float(columns)
             down = float(y) + (0.3 if k % 2 == 0 else 0.7) - 0.5 * float(rows)
             d = wp.normalize(wp.vec3f(right / focals[b], down / focals[b], 1.0))
             s = sight(
-                b, d, turn + 1.2 * float(k), solids, sky, lamps, lamp_colors, lamp_ranges, lamp_spreads, lamp_views,
-                lamp_focals, lamp_depths,
+                b,
+                d,
+                turn + 1.2 * float(k),
+                solids,
+                sky,
+                lamps,
+                lamp_colors,
+                lamp_ranges,
+                lamp_spreads,
+                lamp_views,
+                lamp_focals,
+                lamp_depths,
             )
             total += wp.vec3f(s[0], s[1], s[2]) / float(RAYS)
             nearest = wp.min(nearest, s[3])
@@ -396,7 +420,6 @@ def defocus(
     hidden: wp.array3d[wp.float32],
     focus: wp.array[wp.float32],  # depth that is sharp
     apertures: wp.array[wp.float32],  # radius of blur far off over the width of the picture
-    seeds: wp.array[wp.int32],
     light: wp.array3d[wp.vec3f],
     out: wp.array3d[wp.vec3f],
 ):
@@ -411,16 +434,16 @@ def defocus(
         return
     radius = apertures[b] * float(columns) * wp.abs(1.0 - focus[b] / depth[b, y, x])
     radius = wp.max(radius, 0.85)
-    turn = 6.2832 * wp.randf(wp.rand_init(seeds[b], y * columns + x))
+    turn = dither(x, y)
     total = light[b, y, x] * 0.5
-    weight = float(0.5)
+    weight = wp.float32(0.5)
     for k in range(BLUR_TAPS):
         o = radius * disc(k, BLUR_TAPS, turn)
         u = wp.clamp(int(wp.floor(float(x) + 0.5 + o[0])), 0, columns - 1)
         v = wp.clamp(int(wp.floor(float(y) + 0.5 + o[1])), 0, rows - 1)
         if hidden[b, v, u] < 0.999:
             own = apertures[b] * float(columns) * wp.abs(1.0 - focus[b] / depth[b, v, u])
-            w = float(1.0)
+            w = wp.float32(1.0)
             if depth[b, v, u] < depth[b, y, x] and wp.max(own, 0.7) < wp.length(o):
                 w = 0.15  # what is sharp does not smear into what lies behind it
             total += w * light[b, v, u]

@@ -31,7 +31,7 @@ def surface_state(
     b = i // n_vertices
     v = i - b * n_vertices
     total = wp.vec3f()
-    area = float(0.0)
+    area = wp.float32(0.0)
     for e in range(offsets[v], offsets[v + 1]):
         f = entries[e] // 3
         a = vertices[b, faces[f, 0]]
@@ -58,7 +58,7 @@ def smooth(
     begin, end = offsets[v], offsets[v + 1]
     share = 1.0 / (3.0 * float(wp.max(end - begin, 1)))
     for c in range(values.shape[2]):
-        total = float(0.0)
+        total = wp.float32(0.0)
         for e in range(begin, end):
             f = entries[e] // 3
             for k in range(3):
@@ -90,7 +90,7 @@ def sky_transfer(
     size = depths.shape[2]
     half = 0.5 * float(size)
     weight = 4.0 / float(directions.shape[0])
-    seen = float(1.0)
+    seen = wp.float32(1.0)
     for k in range(directions.shape[0]):
         d = directions[k]
         cosine = wp.dot(n, d)

@@ -11,7 +11,7 @@ lobes for lamps, low-order harmonics of the sky along the mirrored ray.
 
 import warp as wp
 
-from oasis_kernels.sky import blurred, cosine_lobe, harmonics, light_along, lit_share, vec9
+from oasis_kernels.sky import blurred, cosine_lobe, dither, harmonics, light_along, lit_share, vec9
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,7 +48,7 @@ def height(atlas: wp.array4d[wp.float16], slot: int, x: float, y: float, fold: f
     u, v = wp.clamp(x - 0.5, 0.0, float(atlas.shape[2]) - 1.001), wp.clamp(y - 0.5, 0.0, float(atlas.shape[1]) - 1.001)
     i, j = int(u), int(v)
     a, b = u - float(i), v - float(j)
-    total = float(0.0)
+    total = wp.float32(0.0)
     for dj in range(2):
         for di in range(2):
             w = (a if di == 1 else 1.0 - a) * (b if dj == 1 else 1.0 - b)
@@ -121,10 +121,10 @@ def shade(
     seen = wp.clamp(w[0] * transfer[b, a0, 9] + w[1] * transfer[b, a1, 9] + w[2] * transfer[b, a2, 9], 0.0, 1.0)
     material = materials[f]
     base = wp.vec3f()
-    rough = float(0.5)
-    shine = float(1.0)
-    metal = float(0.0)
-    cavity = float(1.0)
+    rough = wp.float32(0.5)
+    shine = wp.float32(1.0)
+    metal = wp.float32(0.0)
+    cavity = wp.float32(1.0)
     m = n
     if material == SKIN:
         slot = slots[b]
@@ -132,7 +132,7 @@ def shade(
         t = w[0] * t0 + w[1] * t1 + w[2] * t2
         area = w[0] * stretch[b, a0, 0] + w[1] * stretch[b, a1, 0] + w[2] * stretch[b, a2, 0]
         fold = wp.clamp(2.2 - 1.3 * area, 0.15, 1.8)
-        wrinkle = wp.clamp(0.22 + 5.0 * (0.98 - area), 0.1, 1.5)
+        wrinkle = wp.clamp(0.32 + 5.0 * (0.98 - area), 0.12, 1.5)
         s = texel(atlas, slot, t[0], t[1])
         base = wp.vec3f(s[0], s[1], s[2])
         # Stretched skin pales, squeezed skin reddens; grooves are dark and warm.
@@ -155,8 +155,12 @@ def shade(
             volume = wp.dot(pu, r1)
             if wp.abs(volume) > 1.0e-14:
                 o = wp.max(0.75, 0.5 * texels_a_pixel[b])
-                hu = height(atlas, slot, t[0] + o, t[1], fold, wrinkle) - height(atlas, slot, t[0] - o, t[1], fold, wrinkle)
-                hv = height(atlas, slot, t[0], t[1] + o, fold, wrinkle) - height(atlas, slot, t[0], t[1] - o, fold, wrinkle)
+                hu = height(atlas, slot, t[0] + o, t[1], fold, wrinkle) - height(
+                    atlas, slot, t[0] - o, t[1], fold, wrinkle
+                )
+                hv = height(atlas, slot, t[0], t[1] + o, fold, wrinkle) - height(
+                    atlas, slot, t[0], t[1] - o, fold, wrinkle
+                )
                 gradient = (hu * r1 + hv * r2) / (2.0 * o * volume)
                 steep = wp.length(gradient)
                 gradient = gradient / (1.0 + 0.5 * steep)
@@ -178,9 +182,11 @@ def shade(
                 wp.noise(state, (p + wp.vec3f(0.0, 0.002, 0.0)) / 0.012) - crease,
                 wp.noise(state, (p + wp.vec3f(0.0, 0.0, 0.002)) / 0.012) - crease,
             )
-            m = wp.normalize(n + 0.7 * g + 0.25 * wp.vec3f(fibre, wp.noise(state, p / CLOTH_CELL + wp.vec3f(9.0, 0.0, 0.0)), 0.0))
+            m = wp.normalize(
+                n + 0.7 * g + 0.25 * wp.vec3f(fibre, wp.noise(state, p / CLOTH_CELL + wp.vec3f(9.0, 0.0, 0.0)), 0.0)
+            )
             base = base * (1.0 + 0.25 * fibre)
-            shine = 0.3
+            shine = wp.float32(0.3)
     nv = wp.max(wp.dot(m, view), 0.05)
     flat = cosine_lobe(n)
     bumped = cosine_lobe(m)
@@ -193,23 +199,29 @@ def shade(
     straight = SHEEN * shine * (1.0 - metal)
     f0 = wp.vec3f(straight, straight, straight) + metal * base
     gloss = wp.vec3f()
-    state = wp.rand_init(seeds[b], y * columns + x)
-    turn = 2.0 * PI * wp.randf(state)
-    for l in range(lamps.shape[1]):
-        color = lamp_colors[b, l]
+    turn = dither(x, y)
+    for lamp in range(lamps.shape[1]):
+        color = lamp_colors[b, lamp]
         if color[0] + color[1] + color[2] > 0.0:
-            to = lamps[b, l] - p
+            to = lamps[b, lamp] - p
             distance = wp.length(to)
             d = to / distance
-            fall = lamp_ranges[b, l] / distance
+            fall = lamp_ranges[b, lamp] / distance
             color = color * (fall * fall)
-            spread = lamp_spreads[b, l]
+            spread = lamp_spreads[b, lamp]
             facing = wp.dot(n, d)
-            share = float(0.0)
+            share = wp.float32(0.0)
             if facing > -0.25:
                 share = lit_share(
-                    lamp_depths, b * lamps.shape[1] + l, lamp_views[b, l], lamp_focals[b, l], spread, p + 0.0012 * n,
-                    n, turn, 0.0012,
+                    lamp_depths,
+                    b * lamps.shape[1] + lamp,
+                    lamp_views[b, lamp],
+                    lamp_focals[b, lamp],
+                    spread,
+                    p + 0.0012 * n,
+                    n,
+                    turn,
+                    0.0012,
                 )
             if share > 0.0:
                 nl = wp.dot(m, d)
@@ -220,22 +232,31 @@ def shade(
                     middle = wp.normalize(view + d)
                     nh, vh = wp.clamp(wp.dot(m, middle), 0.0, 1.0), wp.clamp(wp.dot(view, middle), 0.0, 1.0)
                     edge = wp.pow(1.0 - vh, 5.0) * wp.max(0.28 - 0.2 * rough, 0.0)
-                    lobes = float(0.0)
+                    lobes = wp.float32(0.0)
                     for k in range(2):
                         r = rough if k == 0 else 0.55 * rough
                         wide = r + 0.35 * spread
-                        lobes += (0.7 if k == 0 else 0.3) * ggx(wide * wide, nh, nv, wp.max(nl, 0.02)) * (r / wide) * (r / wide)
+                        lobes += (
+                            (0.7 if k == 0 else 0.3)
+                            * ggx(wide * wide, nh, nv, wp.max(nl, 0.02))
+                            * (r / wide)
+                            * (r / wide)
+                        )
                     for c in range(3):
-                        gloss[c] = gloss[c] + share * color[c] * PI * lobes * nl * (f0[c] + (1.0 - f0[c]) * edge) * cavity
+                        gloss[c] = (
+                            gloss[c] + share * color[c] * PI * lobes * nl * (f0[c] + (1.0 - f0[c]) * edge) * cavity
+                        )
     hidden = 1.0 - seen
     for c in range(3):  # one more bounce off skin: gaps between fingers are warm, not black
         own = tones[b][c]
-        diffuse[c] = diffuse[c] + hidden * own * plain[c] * 0.55 / (1.0 - hidden * own)
+        diffuse[c] = diffuse[c] + hidden * own * plain[c] * 0.4 / (1.0 - hidden * own)
     back = 2.0 * wp.dot(m, view) * m - view
     ahead = light_along(sky, b, blurred(harmonics(back), 1.0 - 0.55 * rough))
     grazing = wp.pow(1.0 - nv, 5.0) * wp.max(0.20 * (1.0 - rough), 0.0)
     for c in range(3):
-        gloss[c] = gloss[c] + (0.3 * f0[c] * (1.0 + 3.0 * metal) + (1.0 - f0[c]) * grazing) * ahead[c] * seen * seen * cavity
+        gloss[c] = (
+            gloss[c] + (0.3 * f0[c] * (1.0 + 3.0 * metal) + (1.0 - f0[c]) * grazing) * ahead[c] * seen * seen * cavity
+        )
     light[b, y, x] = diffuse
     tone[b, y, x] = base * (1.0 - metal)
     mirrored[b, y, x] = gloss
@@ -313,8 +334,8 @@ def resolve(
     x = i - (b * rows + y) * columns
     n = face_ids.shape[1] // rows
     total = wp.vec3f()
-    covered = float(0.0)
-    hand = float(0.0)
+    covered = wp.float32(0.0)
+    hand = wp.float32(0.0)
     nearest = float(wp.inf)
     for v in range(y * n, y * n + n):
         for u in range(x * n, x * n + n):

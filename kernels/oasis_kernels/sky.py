@@ -7,7 +7,7 @@ import warp as wp
 
 vec9 = wp.types.vector(length=9, dtype=wp.float32)
 
-TAPS = wp.constant(10)
+TAPS = wp.constant(12)
 BLOCKERS = wp.constant(6)
 GOLDEN_ANGLE = wp.constant(2.3999632)
 
@@ -65,6 +65,14 @@ def disc(k: int, n: int, turn: float) -> wp.vec2f:
 
 
 @wp.func
+def dither(x: int, y: int) -> float:
+    """An angle for each pixel, in [0, 2 pi): even over any few neighbours (interleaved gradient noise, Jimenez 2014)."""
+    inner = 0.06711056 * float(x) + 0.00583715 * float(y)
+    outer = 52.9829189 * (inner - wp.floor(inner))
+    return 6.2831853 * (outer - wp.floor(outer))
+
+
+@wp.func
 def lit_share(
     depths: wp.array3d[wp.float32],  # [lamp, row, column]: the lamp's own depth buffer
     lamp: int,
@@ -87,8 +95,8 @@ def lit_share(
     steep = wp.min(m[2], -0.18)  # towards the lamp is negative
     slope = wp.vec2f(-m[0] / steep, -m[1] / steep)  # of the surface's depth
     search = wp.clamp(spread * 0.10, 0.001, 0.05)
-    depth = float(0.0)
-    found = float(0.0)
+    depth = wp.float32(0.0)
+    found = wp.float32(0.0)
     for k in range(BLOCKERS):
         o = search * disc(k, BLOCKERS, turn)
         x = int(wp.floor((q[0] + o[0]) * scale + half))
@@ -104,14 +112,14 @@ def lit_share(
     else:
         radius = wp.max(radius, 0.0015)
     radius = wp.min(radius, 0.06)
-    seen = float(0.0)
+    seen = wp.float32(0.0)
     for k in range(TAPS):
         o = radius * disc(k, TAPS, turn)
         x = int(wp.floor((q[0] + o[0]) * scale + half))
         y = int(wp.floor((q[1] + o[1]) * scale + half))
-        lit = float(1.0)
+        lit = wp.float32(1.0)
         if x >= 0 and x < size and y >= 0 and y < size:
             if depths[lamp, y, x] < q[2] + wp.clamp(slope[0] * o[0] + slope[1] * o[1], -radius, radius) - bias:
-                lit = 0.0
+                lit = wp.float32(0.0)
         seen += lit
     return seen / float(TAPS)

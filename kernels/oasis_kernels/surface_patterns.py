@@ -23,9 +23,9 @@ def noise(
     i = first + wp.tid()
     shift = wp.vec3f(61.3, 47.9, 83.1)  # the lattice's planes, where noise is zero, do not pass through the origin
     for k in range(cells.shape[0]):
-        total = float(0.0)
+        total = wp.float32(0.0)
         cell = cells[k]
-        gain = float(1.0)
+        gain = wp.float32(1.0)
         for octave in range(octaves[k]):
             total += gain * wp.noise(wp.rand_init(seeds[k] + 31 * octave), points[i] / cell + shift)
             cell *= 0.5

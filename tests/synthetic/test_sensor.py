@@ -16,7 +16,12 @@ def test_our_jpeg_loses_what_a_real_one_loses():
     for quality in (60, 80, 95):
         ours = jpeg(image.permute(2, 0, 1)[None], [quality])[0].permute(1, 2, 0).numpy()
         pixels = (image.numpy() * 255).round().astype(np.uint8)
-        flags = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+        flags = [
+            cv2.IMWRITE_JPEG_QUALITY,
+            quality,
+            cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+            cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
+        ]
         _, file = cv2.imencode(".jpg", pixels[..., ::-1], flags)
         real = cv2.imdecode(file, cv2.IMREAD_COLOR)[..., ::-1] / 255
         lost = np.abs(real - image.numpy()).mean()
@@ -34,7 +39,9 @@ def test_more_light_gives_a_brighter_photo_of_the_same_scene():
     sensor = sample_sensor(np.random.default_rng(1))
     scene = _photo()[None] * 0.5
     alpha, incident, seeds = torch.ones(1, 48, 48), torch.ones(1, 3), torch.tensor([1], dtype=torch.int32)
-    means = [float(expose(scene, alpha, [sensor._replace(exposure=e)], incident, seeds).mean()) for e in (0.1, 0.2, 0.4)]
+    means = [
+        float(expose(scene, alpha, [sensor._replace(exposure=e)], incident, seeds).mean()) for e in (0.1, 0.2, 0.4)
+    ]
     assert means[0] < means[1] < means[2]
 
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from oasis_warp.synthetic.identity import Population, sample_identity
 from oasis_warp.synthetic.body import bundled_body
+from oasis_warp.synthetic.identity import Population, sample_identity
 from oasis_warp.synthetic.spectrum import SkinColor, linear_to_lab, skin_reflectance
 
 

@@ -15,8 +15,8 @@ from oasis_warp.synthetic import shards
 from oasis_warp.synthetic.backgrounds import cut_background, list_backgrounds
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.plan import PHOTOS, Scenery
-from oasis_warp.synthetic.sheet import contact_sheet
 from oasis_warp.synthetic.shards import write_shards
+from oasis_warp.synthetic.sheet import contact_sheet
 
 SIZE = 32
 JOB = {"count": 5, "seed": 11, "size": SIZE, "device": "cpu", "scenery": PHOTOS, "settings": {}, "batch": 2}
@@ -48,7 +48,9 @@ def test_shards_hold_every_picture_once_and_the_truth_beside_it(whole):
         names = tar.getnames()
         truth = json.load(tar.extractfile("00000002.json"))
         mask = cv2.imdecode(np.frombuffer(tar.extractfile("00000002.mask.png").read(), np.uint8), cv2.IMREAD_UNCHANGED)
-        depth = cv2.imdecode(np.frombuffer(tar.extractfile("00000002.depth.png").read(), np.uint8), cv2.IMREAD_UNCHANGED)
+        depth = cv2.imdecode(
+            np.frombuffer(tar.extractfile("00000002.depth.png").read(), np.uint8), cv2.IMREAD_UNCHANGED
+        )
     assert names == [f"{k:08d}.{end}" for k in (2, 3) for end in ("jpg", "mask.png", "depth.png", "json")]
     batch = render_batch(11, [2], SIZE)
     np.testing.assert_allclose(truth["landmarks"], batch.landmarks[0], atol=1e-3)

@@ -15,8 +15,8 @@ from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, to_uint8, w
 from oasis_warp.synthetic.backgrounds import list_backgrounds
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.plan import PICTURES_EACH, Scenery
-from oasis_warp.synthetic.sheet import contact_sheet
 from oasis_warp.synthetic.shards import write_shards
+from oasis_warp.synthetic.sheet import contact_sheet
 
 SHEET_COLUMNS = 8
 BATCH = {"cpu": 4, "cuda": 64}

@@ -2,7 +2,7 @@
 
 import torch
 import warp as wp
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels import rooms as kernels
@@ -26,12 +26,12 @@ def _vec3(tensor: Tensor) -> object:
 def _trace(
     solids: Tensor, focals: Tensor, sky: Tensor, lamp_positions: Tensor, lamp_colors: Tensor, lamp_ranges: Tensor,
     lamp_spreads: Tensor, lamp_viewmats: Tensor, lamp_focals: Tensor, lamp_depths: Tensor, hidden: Tensor,
-    seeds: Tensor, focus: Tensor, apertures: Tensor,
+    focus: Tensor, apertures: Tensor,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     sharp, out = hidden.new_empty((*hidden.shape, 3)), hidden.new_empty((*hidden.shape, 3))
     depth = torch.empty_like(hidden)
     cuts = even_cuts(hidden.numel())
-    covered, dice = view(hidden.contiguous()), view(seeds.to(torch.int32).contiguous())
+    covered = view(hidden.contiguous())
     launch_ranges(
         kernels.trace,
         cuts,
@@ -39,11 +39,11 @@ def _trace(
             view(solids.contiguous()), view(focals.contiguous()), _vec3(sky), _vec3(lamp_positions), _vec3(lamp_colors),
             view(lamp_ranges.contiguous()), view(lamp_spreads.contiguous()),
             view(lamp_viewmats.contiguous(), wp.mat44f), view(lamp_focals.contiguous()),
-            view(lamp_depths.flatten(0, 1).contiguous()), covered, dice, view(sharp, wp.vec3f), view(depth),
+            view(lamp_depths.flatten(0, 1).contiguous()), covered, view(sharp, wp.vec3f), view(depth),
         ],
         like=hidden,
     )  # fmt: skip
-    inputs = [view(depth), covered, view(focus.contiguous()), view(apertures.contiguous()), dice,
+    inputs = [view(depth), covered, view(focus.contiguous()), view(apertures.contiguous()),
               view(sharp, wp.vec3f), view(out, wp.vec3f)]  # fmt: skip
     launch_ranges(kernels.defocus, cuts, inputs, like=hidden)
     return out, depth
@@ -64,7 +64,6 @@ def trace_rooms(
     sky: Float[Tensor, "B 9 3"],
     lamps: Lamps,
     hidden: Float[Tensor, "B H W"],
-    seeds: Int[Tensor, "B"],
     focus: Float[Tensor, "B"],
     apertures: Float[Tensor, "B"],
 ) -> Float[Tensor, "B H W 3"]:
@@ -77,7 +76,6 @@ def trace_rooms(
         sky: Coefficients of the light from all around.
         lamps: With what they see of the hand.
         hidden: Share of each pixel that the hand covers; covered ones are left black.
-        seeds: int32, of the jitter of rays and shadows.
         focus: Depth that is sharp [m].
         apertures: Radius of the blur of things far off, over the width of the picture.
 
@@ -89,7 +87,7 @@ def trace_rooms(
     check_shape("focals", focals, "B", sizes=sizes)
     check_shape("sky", sky, "B", 9, 3, sizes=sizes)
     check_shape("hidden", hidden, "B", "H", "W", sizes=sizes)
-    for name, tensor in (("seeds", seeds), ("focus", focus), ("apertures", apertures)):
+    for name, tensor in (("focus", focus), ("apertures", apertures)):
         check_shape(name, tensor, "B", sizes=sizes)
-    light, _ = _op(solids, focals, sky, *lamps, hidden, seeds, focus, apertures)
+    light, _ = _op(solids, focals, sky, *lamps, hidden, focus, apertures)
     return light

@@ -298,7 +298,7 @@ def shade_skin(
         texels_a_pixel: Size of a sub-pixel on the hand: relief finer than that is left out.
         sky: Coefficients of the light from all around.
         lamps: The lamps.
-        seeds: int32, of the dither of shadows and of the weave of cloth.
+        seeds: int32, of the weave of cloth.
         n_hand_faces: The first so many faces are the hand's.
         ring: Material that counts as hand in the mask.
 

@@ -29,7 +29,9 @@ def list_backgrounds(folder: Path) -> tuple[Path, ...]:
         raise InputError(f"{folder}: expected a folder of pictures, found none; give one that exists.")
     paths = tuple(sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")))
     if not paths:
-        raise InputError(f"{folder}: expected pictures ({', '.join(SUFFIXES[:4])} ...), found none; choose another folder.")
+        raise InputError(
+            f"{folder}: expected pictures ({', '.join(SUFFIXES[:4])} ...), found none; choose another folder."
+        )
     for path in paths:
         read_photo(path, max_pixels=MAX_PIXELS)
     return paths

@@ -67,7 +67,7 @@ def _noises(atlas: Atlas, identity: Identity) -> dict[str, Tensor]:
 
 def _regions(atlas: Atlas, noise: dict[str, Tensor]) -> Regions:
     x = atlas.points[:, 0]
-    palm = smoothstep(0.36, 0.74, atlas.palm + 0.08 * noise["palm_edge"])
+    palm = smoothstep(0.28, 0.80, atlas.palm + 0.08 * noise["palm_edge"])
     palm = palm * smoothstep(9.0, -9.0, x + 3 * noise["wrist_edge"])
     tip, knuckle = torch.zeros_like(x), torch.zeros_like(x)
     for finger in range(len(FINGERS)):
@@ -179,8 +179,8 @@ def _color(identity: Identity, region: Regions, nails: Nails, line: dict[str, Te
     palm_melanin = min(0.6 * m, 0.006 + 0.33 * m)
     melanin = m * (1 + (identity.tan - 1) * back) * back + palm_melanin * palm
     lattice = (noise["lattice_a"].abs() + noise["lattice_b"].abs()).clamp(0, 1)
-    melanin = melanin * (1 + 0.09 * back * (0.5 - lattice))
-    melanin = melanin * (1 + 0.18 * noise["blotch"] + 0.14 * noise["grain"])
+    melanin = melanin * (1 + (0.10 * back + 0.06 * palm) * (0.5 - lattice))
+    melanin = melanin * (1 + 0.21 * noise["blotch"] + 0.19 * noise["grain"])
     melanin = melanin * (1 + (0.35 + 0.18 * identity.knuckles) * region.knuckle * back + 0.25 * line["fold"])
     pigmented = line["main"] + line["crease"] + 0.6 * line["minor"]  # dark palms have darker lines
     melanin = melanin + palm * pigmented * (0.05 * m + 0.35 * max(0.0, m - 0.06))
@@ -191,7 +191,7 @@ def _color(identity: Identity, region: Regions, nails: Nails, line: dict[str, Te
         1 + 0.55 * palm + 1.1 * region.tip * (0.5 + 0.5 * palm) + 0.9 * region.knuckle * back + 0.35 * region.on_finger
     )
     pad = palm * (1 - region.on_finger)
-    blood = blood * (1 + identity.mottle * (0.38 * noise["flush"] + 0.3 * palm * noise["palm_flush"]) + 0.15 * pad)
+    blood = blood * (1 + identity.mottle * (0.42 * noise["flush"] + 0.45 * palm * noise["palm_flush"]) + 0.15 * pad)
     vein = line["vein"] * identity.veins
     blood = blood * (1 + 0.55 * groove.clamp(max=1.2) * (0.8 * palm + 0.2) + 0.2 * line["halo"]) * (1 - 0.25 * vein)
     blood = blood.clamp_min(0.002)
@@ -204,13 +204,13 @@ def _color(identity: Identity, region: Regions, nails: Nails, line: dict[str, Te
     color = color + (person(identity.oxygen, horn)(melanin, blood) - color) * palm[:, None]
     deep = person(0.15, 0.5 * identity.carotene)(melanin, 0.9 * blood) * color.new_tensor([0.8, 0.95, 1.05])
     color = color + (deep - color) * (0.5 * vein * back).clamp(0, 1)[:, None]
-    bed = person(identity.oxygen, 0.0)(0.5 * m + 0.004 + 0 * melanin, identity.blood * (1.7 + 0.3 * noise["dry"]))
+    bed = person(identity.oxygen, 0.0)(0.62 * m + 0.004 + 0 * melanin, identity.blood * (1.6 + 0.3 * noise["dry"]))
     bed = 0.94 * bed + 0.05 * color.new_tensor([0.75, 0.62, 0.52])
     pale = color.new_tensor([0.72, 0.60, 0.53]) * (0.75 + 0.25 * (m < 0.1))
     bed = bed + (pale - bed) * (0.35 * nails.lunula)[:, None]
     bed = bed + (color.new_tensor([0.74, 0.68, 0.56]) - bed) * (0.55 * nails.free)[:, None]
     color = color + (bed - color) * nails.plate[:, None]
-    dark = 0.40 * line["crease"] + 0.40 * line["main"] + 0.22 * line["minor"]
+    dark = 0.40 * line["crease"] + 0.38 * line["main"] + 0.20 * line["minor"] + 0.09 * line["halo"]
     return color * torch.exp(-dark)[:, None] ** color.new_tensor([0.75, 1.1, 1.15])  # cavities: dark and warm
 
 
@@ -269,12 +269,14 @@ def _relief(identity: Identity, region: Regions, nails: Nails, line: dict[str, T
     palm, back, plate = region.palm, 1 - region.palm, nails.plate
     bare = 1 - plate
     lattice = (noise["lattice_a"].abs() + 0.7 * noise["lattice_b"].abs()).clamp(0, 1)
-    texture = back * (0.05 + 0.05 * identity.age) * lattice * bare + palm * 0.02 * noise["ridge"]
+    texture = back * (0.08 + 0.06 * identity.age) * lattice * bare + palm * (0.03 * noise["ridge"] + 0.05 * lattice)
     height = -(0.50 * line["crease"] + 0.48 * line["main"] + 0.28 * line["minor"]) - 0.28 * line["halo"]
     height = height + texture + 0.13 * noise["lumps"] * (1 - 0.6 * plate)
     height = height + (0.03 + 0.04 * identity.dryness) * noise["dry"] * bare
     toward_wrist = 0.25 + 0.75 * (region.on_finger < 0.5)
-    height = height + back * toward_wrist * (0.25 * identity.tendons * line["tendon"] + 0.6 * identity.veins * line["vein"])
+    height = height + back * toward_wrist * (
+        0.25 * identity.tendons * line["tendon"] + 0.6 * identity.veins * line["vein"]
+    )
     height = height + 0.35 * palm * noise["palm_lumps"] + 0.05 * line["hair"]
     rim = torch.exp(-(((nails.distance - 0.15) / 0.3) ** 2)) * (nails.distance < 2)
     height = height + plate * (0.25 - 0.2 * nails.free - 0.35 * nails.across**2) - 0.22 * rim

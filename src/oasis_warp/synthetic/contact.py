@@ -5,6 +5,7 @@ touch, as flesh does. Everything is elementwise over a batch, so a pose does not
 """
 
 import functools
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -55,7 +56,7 @@ def bundled_balls() -> Balls:
             c = knuckle * share
             near = body.rest[: body.n_hand].double().numpy() - c
             off = np.hypot(near[:, 0], near[:, 2]) < 5
-            c = c + [0, (near[off, 1].max() + near[off, 1].min()) / 2, 0]
+            c = c + np.array([0, (near[off, 1].max() + near[off, 1].min()) / 2, 0])
             thick = np.ptp(near[off, 1]) / 2
             joint.append(0), center.append(c), radius.append(min(thick, 13.0)), group.append(PALM)
     joint, group, radius = np.array(joint), np.array(group), np.array(radius)
@@ -82,7 +83,9 @@ def _sections(body: Body, finger: int, place: int) -> list[tuple[np.ndarray, flo
         near = local[np.argsort(np.abs(local[:, 0] - share * bone.length))[:40]]
         side, back = ((near[:, k].max() + near[:, k].min()) / 2 for k in (1, 2))
         radius = min(np.ptp(near[:, 1]), np.ptp(near[:, 2])) / 2
-        out.append((bone.origin + bone.along * share * bone.length + bone.side * side + bone.back * back, min(radius, 12.0)))
+        out.append(
+            (bone.origin + bone.along * share * bone.length + bone.side * side + bone.back * back, min(radius, 12.0))
+        )
     return out
 
 
@@ -162,7 +165,7 @@ def separate(angles: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, np.nda
             of_pair = ((first == a) & (second == b)) | ((first == b) & (second == a))
             return depth[:, of_pair].max(1) if of_pair.any() else np.zeros(len(depth))
 
-        for a, b in zip(_ORDER[:-1], _ORDER[1:], strict=True):
+        for a, b in itertools.pairwise(_ORDER):
             push = np.radians(np.minimum(0.6 * worst(FINGERS.index(a), FINGERS.index(b)), 2.0))
             angles[:, 3 * FINGERS.index(a) + 1, 1] += push
             angles[:, 3 * FINGERS.index(b) + 1, 1] -= push

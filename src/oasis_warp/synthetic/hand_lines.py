@@ -118,8 +118,8 @@ def _hairs(atlas: Atlas, strokes: Strokes, identity: Identity, knuckles: np.ndar
         return
     on_finger = rng.random(n) > 0.86
     roots = np.c_[rng.uniform(-72, 260, n), np.zeros(n), rng.normal(-8, 24, n)]
-    roots[on_finger] = knuckles[rng.integers(4, size=on_finger.sum())] + [-20, 0, 0] + rng.normal(
-        0, 3, (on_finger.sum(), 3)
+    roots[on_finger] = (
+        knuckles[rng.integers(4, size=on_finger.sum())] + [-20, 0, 0] + rng.normal(0, 3, (on_finger.sum(), 3))
     )
     lean, curl, length = rng.normal(-1.0, 0.35, n), rng.normal(0, 0.12, n), rng.uniform(3, 11, n)
     t = np.linspace(0, 1, 9)

@@ -47,7 +47,9 @@ def _depths(posed: Posed, faces: Tensor, viewmats: Tensor, focals: Tensor, size:
     batch, n = focals.shape
     vertices = posed.vertices[:, None].expand(-1, n, -1, -1).flatten(0, 1)
     K = _intrinsics(focals.flatten(), size)
-    return depth_map(vertices, faces, viewmats.flatten(0, 1), K, size, size, validate=False).depth.unflatten(0, (batch, n))
+    return depth_map(vertices, faces, viewmats.flatten(0, 1), K, size, size, validate=False).depth.unflatten(
+        0, (batch, n)
+    )
 
 
 @functools.cache

@@ -68,7 +68,7 @@ class Palm:
         belly, end = u(0.24, 0.52), u(-0.02, 0.34)
         life = self.line(
             "main", jitter([start, (belly * 0.55, u(0.70, 0.84)), (belly, u(0.40, 0.6)), (u(0.22, 0.48), end)]),
-            u(0.7, 1.0), depth * u(0.75, 1.15), branches=n_branches(), gap=0.2,
+            u(0.8, 1.15), depth * u(0.8, 1.2), branches=n_branches(), gap=0.2,
         )  # fmt: skip
         self.strokes.add("halo", self.place(life), 2.6, depth)
         if rng.random() < SINGLE_CREASE:
@@ -82,13 +82,13 @@ class Palm:
             head = self.line(
                 "main", jitter([head_start, (0.12, 0.9 - 0.2 * drop), (0.5 * reach + 0.1, 0.86 - 0.5 * drop),
                                 (reach, 0.82 - drop * u(0.8, 1.2))]),
-                u(0.65, 0.95), depth * u(0.65, 1.1), branches=n_branches(), gap=0.25,
+                u(0.75, 1.1), depth * u(0.7, 1.15), branches=n_branches(), gap=0.25,
             )  # fmt: skip
             rise, finish = u(-0.02, 0.2), u(-0.02, 0.42)
             heart = self.line(
                 "main", jitter([(u(1.15, 1.25), u(0.72, 0.84)), (0.9, 0.86 + 0.3 * rise), (0.6, 0.93 + 0.25 * rise),
                                 (finish, 0.95 + rise)]),
-                u(0.65, 0.95), depth * u(0.7, 1.15), branches=n_branches() + 1, gap=0.2,
+                u(0.75, 1.1), depth * u(0.75, 1.2), branches=n_branches() + 1, gap=0.2,
             )  # fmt: skip
             for curve in (head, heart):
                 self.strokes.add("halo", self.place(curve), 2.6, depth * 0.9)
@@ -114,9 +114,12 @@ class Palm:
             toward = u(0.08, 0.85)
             i = rng.integers(2, 26)
             part = life[i : i + rng.integers(9, 22)]
-            bent = part + (root - part) * toward + rng.normal(0, 0.012, (1, 2)) + np.linspace(-1, 1, len(part))[
-                :, None
-            ] * rng.normal(0, 0.03, 2)
+            bent = (
+                part
+                + (root - part) * toward
+                + rng.normal(0, 0.012, (1, 2))
+                + np.linspace(-1, 1, len(part))[:, None] * rng.normal(0, 0.03, 2)
+            )
             self.strokes.add("wrinkle", self.place(bent), u(0.55, 0.9), u(0.4, 1.0), taper=0.4, wobble=0.5)
             if rng.random() < 0.35 + 0.4 * age:
                 self.strokes.add("minor", self.place(bent), u(0.35, 0.5), u(0.2, 0.5), taper=0.5, wobble=0.4)
@@ -127,22 +130,29 @@ class Palm:
             self.strokes.add("wrinkle", self.place(c), u(0.4, 0.7), u(0.25, 0.6), taper=0.5, wobble=0.6)
         web = np.array([-0.33, 0.86])
         for _ in range(rng.integers(4, 9)):  # the web between thumb and index
-            c = web + rng.normal(0, [0.05, 0.05], 2) + np.linspace(-1, 1, 12)[:, None] * np.array([u(0.05, 0.16), u(-0.1, 0.04)])
+            c = (
+                web
+                + rng.normal(0, [0.05, 0.05], 2)
+                + np.linspace(-1, 1, 12)[:, None] * np.array([u(0.05, 0.16), u(-0.1, 0.04)])
+            )
             self.strokes.add("wrinkle", self.place(c), u(0.45, 0.7), u(0.4, 0.9), taper=0.5, wobble=0.4)
         for _ in range(rng.integers(4, 10)):  # the ball below the little finger
-            c = np.array([u(0.75, 1.15), u(0.12, 0.6)]) + np.linspace(-1, 1, 12)[:, None] * [u(0.05, 0.16), u(-0.05, 0.06)]
+            c = np.array([u(0.75, 1.15), u(0.12, 0.6)]) + np.linspace(-1, 1, 12)[:, None] * [
+                u(0.05, 0.16),
+                u(-0.05, 0.06),
+            ]
             self.strokes.add("wrinkle", self.place(c), u(0.4, 0.7), u(0.3, 0.7), taper=0.5, wobble=0.5)
 
     def _fine_lines(self) -> None:
         rng, identity = self.rng, self.identity
         favourite = rng.uniform(0, np.pi, 4)
-        for _ in range(int(14 + 62 * identity.line_wealth + 20 * identity.age)):
+        for _ in range(int(45 + 120 * identity.line_wealth + 40 * identity.age)):
             middle, angle = rng.uniform([-0.25, 0.05], [1.15, 1.06]), rng.choice(favourite) + rng.normal(0, 0.3)
             length = rng.uniform(0.06, 0.34)
             step = np.array([np.cos(angle), np.sin(angle)]) * length
             controls = middle + np.linspace(-0.5, 0.5, 4)[:, None] * step + rng.normal(0, 0.012, (4, 2))
             self.strokes.add("minor", self.place(through(controls, 16)), rng.uniform(0.3, 0.6),
-                             rng.uniform(0.15, 0.65) * identity.line_depth, taper=0.5, wobble=0.4)  # fmt: skip
+                             rng.uniform(0.12, 0.6) * identity.line_depth, taper=0.5, wobble=0.5)  # fmt: skip
 
     def _finger_roots(self) -> None:
         """Short lines that run from the fingers' roots into the palm."""
@@ -150,5 +160,8 @@ class Palm:
         for middle in (0.0, 0.33, 0.67, 1.0):
             for _ in range(rng.integers(0, 4)):
                 u = middle + rng.normal(0, 0.06)
-                c = np.array([u, rng.uniform(1.02, 1.14)]) + np.linspace(0, 1, 10)[:, None] * [rng.normal(0, 0.03), -rng.uniform(0.05, 0.16)]
+                c = np.array([u, rng.uniform(1.02, 1.14)]) + np.linspace(0, 1, 10)[:, None] * [
+                    rng.normal(0, 0.03),
+                    -rng.uniform(0.05, 0.16),
+                ]
                 self.strokes.add("minor", self.place(c), 0.4, rng.uniform(0.2, 0.5), taper=0.5)

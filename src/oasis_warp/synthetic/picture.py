@@ -63,7 +63,10 @@ class SyntheticBatch(NamedTuple):
 @functools.cache
 def _body(device: str) -> Body:
     body = bundled_body()
-    moved = {name: getattr(body, name).to(device) for name in ("faces", "materials", "uv", "uv_faces", "normals", "knuckle_rise")}
+    moved = {
+        name: getattr(body, name).to(device)
+        for name in ("faces", "materials", "uv", "uv_faces", "normals", "knuckle_rise")
+    }
     return replace(body, hand=body.hand.to(device), **moved)
 
 
@@ -122,9 +125,7 @@ def render_shots(
         if scenery.backgrounds:
             behind = torch.stack([_cut(scenery, shot, size) for shot in shots]).to(device)
         else:
-            behind = trace_rooms(
-                solids, posed.focal * size, sky, lamps, shaded.alpha, seeds, distance, apertures
-            )
+            behind = trace_rooms(solids, posed.focal * size, sky, lamps, shaded.alpha, distance, apertures)
         light = shaded.color + (1 - shaded.alpha[..., None]) * behind
         incident = torch.from_numpy(np.stack([s.light.incident for s in shots])).float().to(device)
         image = expose(light, shaded.alpha, [s.sensor for s in shots], incident, seeds)

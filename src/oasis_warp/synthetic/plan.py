@@ -1,4 +1,4 @@
-"""Plan pictures: everything that is drawn at random, before anything is rendered. On the CPU, a few milliseconds each."""
+"""Plan pictures: all that is drawn at random, before anything is rendered. On the CPU, a few milliseconds each."""
 
 import functools
 import multiprocessing
@@ -29,6 +29,7 @@ HAND_REACH = 0.11
 """Of a hand beyond its middle, roughly: rooms begin behind it [m]."""
 AHEAD = 3
 """Batches a worker that are planned ahead."""
+EVERYBODY = Population()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,7 @@ class Scenery:
     """What pictures show, besides what the seed decides."""
 
     look: Look = "photo"
-    population: Population = Population()
+    population: Population = EVERYBODY
     people: int | None = None
     """How many people there are: then the first comes again, in other pictures. No end when None."""
     backgrounds: tuple[Path, ...] = ()
@@ -107,9 +108,7 @@ def plan_shots(seed: int, indices: Sequence[int], scenery: Scenery = PHOTOS) -> 
     return [shot._replace(angles=a) for shot, a in zip(shots, angles, strict=True)]
 
 
-def plan_ahead(
-    seed: int, blocks: Iterable[Sequence[int]], scenery: Scenery, workers: int
-) -> Iterator[list[Shot]]:
+def plan_ahead(seed: int, blocks: Iterable[Sequence[int]], scenery: Scenery, workers: int) -> Iterator[list[Shot]]:
     """`plan_shots` of each of `blocks` in turn, drawn ahead by `workers` processes where there are any."""
     if workers < 1:
         for block in blocks:

@@ -9,6 +9,7 @@ from oasis_warp.ops.surface_patterns import NoiseField, surface_noise
 from oasis_warp.synthetic.body import Body
 from oasis_warp.synthetic.identity import Identity
 
+_UP, _PAD, _BACK_OF_KNUCKLE = np.array([0.0, 8, 0]), np.array([-5.0, -12, 0]), np.array([1.5, 0, 0])
 _ACROSS = (1, 4, 10, 7)
 """First joints of index, middle, ring, little: as they lie side by side."""
 
@@ -46,16 +47,16 @@ def relief(body: Body, identity: Identity) -> Float[Tensor, "V"]:
     knuckles = joints[list(_ACROSS)]
     for i, knuckle in enumerate(knuckles):
         up = body.hand.pose_axes[_ACROSS[i], 1].double().numpy()
-        height += back * 1.7 * bony * blob(knuckle + up * 9 + [1.5, 0, 0], 8.5)
+        height += back * 1.7 * bony * blob(knuckle + up * 9 + _BACK_OF_KNUCKLE, 8.5)
         s = np.clip((points - knuckle) @ -knuckle / (knuckle @ knuckle), 0, 1)
         off = np.linalg.norm((points - knuckle * (1 - s)[:, None])[:, [0, 2]], axis=1)
         tendon = identity.tendons * (0.3 + 0.9 * bony) * 1.2 * np.exp(-((off / 2.6) ** 2))
         height += back * _step(1, 0.75, s) * tendon
         if i < 3:
             between = (knuckle + knuckles[i + 1]) / 2
-            hollow = blob(between + [0, 8, 0], 6.5) + 0.55 * blob(between * 0.72 + [0, 8, 0], [18, 15, 4.0])
+            hollow = blob(between + _UP, 6.5) + 0.55 * blob(between * 0.72 + _UP, [18, 15, 4.0])
             height -= back * (0.4 + 1.5 * bony) * hollow
-        height += palm * 0.7 * blob(knuckle + [-5, -12, 0], 8)
+        height += palm * 0.7 * blob(knuckle + _PAD, 8)
     height += palm * (
         1.6 * blob(np.array([-42, -22, 24]), [22, 20, 13])
         + 1.3 * blob(np.array([-35, -18, -26]), [26, 20, 11])

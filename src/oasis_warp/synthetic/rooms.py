@@ -29,7 +29,9 @@ class _Builder:
 
     def __init__(self, rng: np.random.Generator, yaw: float, pitch: float, roll: float):
         self.rng = rng
-        self.to_camera = rotation_about([0, 0, 1], roll) @ rotation_about([1, 0, 0], pitch) @ rotation_about([0, 1, 0], yaw)
+        self.to_camera = (
+            rotation_about([0, 0, 1], roll) @ rotation_about([1, 0, 0], pitch) @ rotation_about([0, 1, 0], yaw)
+        )
         self.rows: list[np.ndarray] = []
 
     def axis_point(self, distance: float) -> np.ndarray:
@@ -138,7 +140,9 @@ def _on_wall(build: _Builder, z: float, floor: float, spread: float) -> None:
         case "door":
             color = build.wood() if rng.random() < 0.6 else white
             x = x + np.sign(x) * 0.2
-            build.add("box", "panels", [x, floor - 1.0, z - 0.02], [0.42, 1.0, 0.02], color, cell=u(0.5, 0.85), gloss=0.3)
+            build.add(
+                "box", "panels", [x, floor - 1.0, z - 0.02], [0.42, 1.0, 0.02], color, cell=u(0.5, 0.85), gloss=0.3
+            )
             build.add("box", "paint", [x, floor - 2.05, z - 0.03], [0.5, 0.05, 0.03], color * 0.8)
             build.add("box", "paint", [x - 0.47, floor - 1.0, z - 0.03], [0.05, 1.05, 0.03], color * 0.85)
             build.add("ball", "paint", [x + 0.34, floor - 1.0, z - 0.07], [0.028] * 3, np.full(3, 0.55), gloss=2.0)
@@ -148,7 +152,9 @@ def _on_wall(build: _Builder, z: float, floor: float, spread: float) -> None:
                       cell=u(0.05, 0.12))  # fmt: skip
         case "shelf":
             w, h = u(0.25, 0.6), u(0.2, 0.7)
-            build.add("box", "books", [x + np.sign(x) * 0.15, y, z - 0.12], [w, h, 0.12], build.wood(), cell=u(0.014, 0.03))
+            build.add(
+                "box", "books", [x + np.sign(x) * 0.15, y, z - 0.12], [w, h, 0.12], build.wood(), cell=u(0.014, 0.03)
+            )
         case "window":
             build.add("box", "panes", [x, y - 0.2, z - 0.01], [u(0.3, 0.6), u(0.35, 0.7), 0.02],
                       np.array([0.7, 0.8, 0.95]), white, cell=u(0.25, 0.5), glow=u(0.5, 3.0))  # fmt: skip
@@ -159,7 +165,9 @@ def _on_wall(build: _Builder, z: float, floor: float, spread: float) -> None:
         case "lamp":
             build.add("ball", "paint", [x, y - 0.3, z - 0.25], [u(0.06, 0.12)] * 3, np.array([1, 0.85, 0.6]) * 0.8,
                       glow=u(1.5, 4))  # fmt: skip
-            build.add("cylinder", "paint", [x, y + 0.5, z - 0.25], [0.012, 0.7, 0.012], build.neutral(0.02, 0.5), gloss=1.0)
+            build.add(
+                "cylinder", "paint", [x, y + 0.5, z - 0.25], [0.012, 0.7, 0.012], build.neutral(0.02, 0.5), gloss=1.0
+            )
 
 
 def _wall(build: _Builder, back: float) -> None:
@@ -224,7 +232,15 @@ def _small_thing(build: _Builder, x: float, y: float, z: float) -> None:
         case "plate":
             r = u(0.07, 0.13)
             build.add("cylinder", "paint", [x, y - 0.008, z], [r, 0.008, r], np.full(3, u(0.5, 0.8)), gloss=1.2)
-            build.add("ball", "specks", [x, y - 0.02, z], [0.5 * r, 0.018, 0.5 * r], build.neutral(), build.neutral(), cell=0.02)
+            build.add(
+                "ball",
+                "specks",
+                [x, y - 0.02, z],
+                [0.5 * r, 0.018, 0.5 * r],
+                build.neutral(),
+                build.neutral(),
+                cell=0.02,
+            )
         case "bottle":
             r = u(0.028, 0.042)
             build.add("cylinder", "paint", [x, y - 0.09, z], [r, 0.09, r], color, gloss=2.0)
@@ -237,7 +253,15 @@ def _small_thing(build: _Builder, x: float, y: float, z: float) -> None:
                 build.add("box", "paint", [x + 0.11 * k, y - 0.003, z + 0.05 * np.sin(2 * k)], [0.07, 0.003, 0.003],
                           np.full(3, 0.03), yaw=0.7 * np.sin(2 * k + yaw))  # fmt: skip
         case "cloth":
-            build.add("ball", "cloth", [x, y - 0.01, z], [u(0.07, 0.16), 0.03, u(0.07, 0.16)], color, build.neutral(), cell=0.05)
+            build.add(
+                "ball",
+                "cloth",
+                [x, y - 0.01, z],
+                [u(0.07, 0.16), 0.03, u(0.07, 0.16)],
+                color,
+                build.neutral(),
+                cell=0.05,
+            )
 
 
 def _laptop(build: _Builder, x: float, y: float, z: float) -> None:
@@ -258,7 +282,9 @@ def _desk(build: _Builder, back: float) -> None:
     gaze = build.axis_point(back + np.exp(u(np.log(0.03), np.log(0.4))))
     y = max(gaze[1], 0.05)
     kind, a, b, cell = build.surface()
-    build.add("box", kind, [gaze[0], y + 0.015, gaze[2]], [0.9, 0.015, u(0.35, 0.6)], a, b, cell=cell, gloss=u(0.1, 1.2))
+    build.add(
+        "box", kind, [gaze[0], y + 0.015, gaze[2]], [0.9, 0.015, u(0.35, 0.6)], a, b, cell=cell, gloss=u(0.1, 1.2)
+    )
     floor_kind, c, d, size = build.surface()
     build.add("box", floor_kind, [0, y + 0.75, gaze[2]], [5, 0.02, 5], c, d, cell=size, gloss=0.4)
     build.add("box", "paint", [0, 0, gaze[2] + u(0.6, 2.0)], [5, 3, 0.05], build.wall_paint())
@@ -284,7 +310,14 @@ def _floor(build: _Builder, back: float) -> None:
         x, z = gaze[0] + rng.normal(0, 0.5), gaze[2] + rng.normal(0.1, 0.5)
         match rng.choice(["leg", "shoe", "furniture", "bag", "stand", "small"], p=[0.2, 0.2, 0.25, 0.12, 0.08, 0.15]):
             case "leg":
-                build.add("cylinder", "paint", [x, y - 0.4, z], [u(0.015, 0.04), 0.4, 0.03], build.neutral(0.01, 0.5), gloss=0.8)
+                build.add(
+                    "cylinder",
+                    "paint",
+                    [x, y - 0.4, z],
+                    [u(0.015, 0.04), 0.4, 0.03],
+                    build.neutral(0.01, 0.5),
+                    gloss=0.8,
+                )
             case "shoe":
                 color, yaw = build.neutral(0.01, 0.5), u(-3, 3)
                 for side in (-0.06, 0.06):
@@ -334,7 +367,14 @@ def _room(build: _Builder, back: float) -> None:
                     build.add("box", "paint", [x + side, floor - 0.36, at], [0.025, 0.36, 0.025], c * 0.8)
                 _small_thing(build, x, floor - 0.75, at)
             case "cabinet":
-                build.add("box", "panels", [x, floor - 0.45, at], [u(0.3, 0.6), u(0.35, 0.9), 0.25], build.wood(), cell=u(0.3, 0.6))
+                build.add(
+                    "box",
+                    "panels",
+                    [x, floor - 0.45, at],
+                    [u(0.3, 0.6), u(0.35, 0.9), 0.25],
+                    build.wood(),
+                    cell=u(0.3, 0.6),
+                )
             case "chair":
                 c = build.neutral(0.01, 0.5)
                 build.add("box", "cloth", [x, floor - 0.45, at], [0.22, 0.03, 0.22], c, c, cell=0.3)
@@ -342,8 +382,8 @@ def _room(build: _Builder, back: float) -> None:
                 build.add("cylinder", "paint", [x, floor - 0.22, at], [0.03, 0.22, 0.03], np.full(3, 0.1), gloss=1.0)
             case "plant":
                 build.add("cylinder", "paint", [x, floor - 0.15, at], [0.14, 0.15, 0.14], build.neutral())
-                build.add("ball", "leaves", [x, floor - 0.7, at], [0.3, 0.45, 0.3], np.array([0.05, 0.14, 0.03]),
-                          np.array([0.015, 0.035, 0.01]), cell=0.12)  # fmt: skip
+                build.add("ball", "leaves", [x, floor - 0.7, at], [0.3, 0.45, 0.3], np.array([0.06, 0.10, 0.04]),
+                          np.array([0.015, 0.025, 0.012]), cell=0.12)  # fmt: skip
             case "shelf":
                 build.add("box", "books", [x, floor - 0.9, at], [0.4, 0.9, 0.15], build.wood(), cell=u(0.018, 0.035))
 
@@ -384,14 +424,25 @@ def _garden(build: _Builder, back: float) -> None:
                 build.add("cylinder", "specks", [x, ground - 2, at], [u(0.05, 0.25), 2.2, 0.2], np.array([0.1, 0.07, 0.05]),
                           np.array([0.03, 0.02, 0.015]), cell=0.1)  # fmt: skip
             case "house":
-                build.add("box", "tiles", [x, ground - 2.5, z + 3], [u(2, 5), 2.5, 2], build.wall_paint(), np.full(3, 0.05), cell=u(0.8, 1.6))
+                build.add(
+                    "box",
+                    "tiles",
+                    [x, ground - 2.5, z + 3],
+                    [u(2, 5), 2.5, 2],
+                    build.wall_paint(),
+                    np.full(3, 0.05),
+                    cell=u(0.8, 1.6),
+                )
 
 
 def _studio(build: _Builder, back: float) -> None:
     """A plain ground close behind."""
     rng, u = build.rng, build.rng.uniform
-    color = (np.full(3, u(0.5, 0.88)), np.full(3, u(0.01, 0.1)), build.neutral(), np.clip(u(0.1, 0.5) * np.exp(rng.normal(0, 0.45, 3)), 0.01, 0.8))[
-        rng.choice(4, p=[0.4, 0.2, 0.28, 0.12])
-    ]
+    color = (
+        np.full(3, u(0.5, 0.88)),
+        np.full(3, u(0.01, 0.1)),
+        build.neutral(),
+        np.clip(u(0.1, 0.5) * np.exp(rng.normal(0, 0.45, 3)), 0.01, 0.8),
+    )[rng.choice(4, p=[0.4, 0.2, 0.28, 0.12])]
     z = build.axis_point(back + np.exp(u(np.log(0.02), np.log(0.8))))[2]
     build.add("box", "paint", [0, 0, z + 0.05], [8, 8, 0.05], color, gloss=0.1)

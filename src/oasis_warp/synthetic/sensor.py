@@ -67,7 +67,7 @@ def sample_sensor(rng: np.random.Generator) -> Sensor:
         grain=u(0.3, 0.9),
         filmic=bool(rng.random() < 0.35),
         contrast=u(0.2, 0.85),
-        saturation=u(0.92, 1.22),
+        saturation=u(0.88, 1.12),
         sharpening=u(0, 0.45),
         quality=int(rng.integers(60, 96)),
     )
@@ -124,7 +124,7 @@ def jpeg(images: Float[Tensor, "B 3 H W"], qualities: list[int]) -> Float[Tensor
 
 
 def srgb(linear: Tensor) -> Tensor:
-    """sRGB of linear light."""
+    """SRGB of linear light."""
     return torch.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(1e-8) ** (1 / 2.4) - 0.055)
 
 

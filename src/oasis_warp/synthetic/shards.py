@@ -96,7 +96,9 @@ def _claim(folder: Path, described: dict[str, Any]) -> None:
     text = json.dumps(described, indent=1, sort_keys=True) + "\n"
     if file.exists():
         if file.read_text() != text:
-            raise InputError(f"{folder}: holds pictures made with other settings (see {DESCRIPTION}); choose another folder.")
+            raise InputError(
+                f"{folder}: holds pictures made with other settings (see {DESCRIPTION}); choose another folder."
+            )
     else:
         write_file(file, text.encode())
 

@@ -19,6 +19,7 @@ _FACING = {
 }
 """Rotations from the hand's frame to a camera that sees this side, fingers up."""
 _VIEW_SHARES = {"palm": 0.40, "back": 0.32, "thumb": 0.11, "little": 0.03, "any": 0.14}
+_TO_CAMERA = np.array([0.0, 0.0, -1.0])
 DIRECTIONS = 400
 """Of the sky, when its harmonics are summed."""
 
@@ -101,7 +102,7 @@ def _harmonics(d: np.ndarray) -> np.ndarray:
 
 
 def sphere(n: int) -> np.ndarray:
-    """n unit vectors spread evenly (Fibonacci's spiral), [n, 3]."""
+    """N unit vectors spread evenly (Fibonacci's spiral), [n, 3]."""
     k = np.arange(n) + 0.5
     z, turn = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
     r = np.sqrt(1 - z * z)
@@ -119,7 +120,7 @@ def sample_light(rng: np.random.Generator, look: Look) -> Light:
         level = 0.9 * np.ones((DIRECTIONS, 1)) - 0.12 * d[:, 1:2] - 0.18 * d[:, 2:3]
         sky = _SPHERE_HARMONICS.T @ (level * np.ones(3))
         none = np.zeros((N_LAMPS, 3))
-        return Light(sky, none + [0, 0, -1.0], np.ones(N_LAMPS), none, np.full(N_LAMPS, 0.1), np.ones(3))
+        return Light(sky, none + _TO_CAMERA, np.ones(N_LAMPS), none, np.full(N_LAMPS, 0.1), np.ones(3))
     u, d = rng.uniform, _SPHERE
     up = np.array([rng.normal(0, 0.3), -1, rng.normal(0, 0.3)])
     up /= np.linalg.norm(up)
@@ -140,7 +141,7 @@ def sample_light(rng: np.random.Generator, look: Look) -> Light:
     sky = _SPHERE_HARMONICS.T @ level
 
     n = int(rng.choice([1, 2, 3], p=[0.55, 0.33, 0.12]))
-    directions, colors = np.zeros((N_LAMPS, 3)) + [0, 0, -1.0], np.zeros((N_LAMPS, 3))
+    directions, colors = np.zeros((N_LAMPS, 3)) + _TO_CAMERA, np.zeros((N_LAMPS, 3))
     distances, spreads = np.ones(N_LAMPS), np.full(N_LAMPS, 0.1)
     for k in range(n):
         if k == 0 and rng.random() < 0.13:  # the camera's own flash

@@ -12,7 +12,8 @@ KINDS = ("crease", "main", "minor", "fold", "wrinkle", "vein", "tendon", "hair",
 wrinkles; vessels; tendons; hairs; the soft valley along main lines."""
 _WIDE = ("vein", "tendon", "halo")
 """Drawn apart: the widest line sets the search's cells."""
-_SPACING = 0.32
+_LONG = ("crease", "main", "halo")
+_SPACING = 0.25
 """Between samples of one line, and of hairs [mm]."""
 _HAIR_SPACING = 0.14
 
@@ -32,7 +33,7 @@ class Strokes:
             kind: One of `KINDS`.
             points: On the surface, in order.
             width: Of the Gaussian profile.
-            strength: In the middle; it wanders by up to 45 %.
+            strength: In the middle; it wanders by up to a quarter, that of fine lines by twice as much.
             taper: Share of the length over which either end fades.
             wobble: Amplitude of the line's own wander.
         """
@@ -48,11 +49,11 @@ class Strokes:
             knots = np.arange(-1, length / cell + 2) * cell
             return np.interp(t, knots, self.rng.uniform(-1, 1, len(knots)))
 
-        line += wobble * np.stack([walk(3.5) for _ in range(3)], 1)
+        line += wobble * np.stack([walk(5.0) for _ in range(3)], 1)
         u = t / length
         fade = np.clip(np.minimum(u, 1 - u) / max(taper, 1e-3), 0, 1) ** 0.7
-        amplitude = strength * fade * (1 + 0.45 * walk(3.0))
-        widths = width * (1 + 0.25 * walk(4.0))
+        amplitude = strength * fade * (1 + (0.25 if kind in _LONG else 0.5) * walk(4.0))
+        widths = width * (1 + 0.2 * walk(5.0))
         self._rows.append(np.c_[line, widths, amplitude, np.full(len(t), KINDS.index(kind))])
 
     def draw(self, points: Float[Tensor, "N 3"]) -> dict[str, Float[Tensor, "N"]]:

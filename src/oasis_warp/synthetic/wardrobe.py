@@ -48,7 +48,7 @@ def sample_clothes(rng: np.random.Generator, bare: bool) -> Clothes:
     start = u(0.008, 0.13)
     look = (*cloth_color(), 0.85, 0.0, 1.0)
     metal = float(rng.random() < 0.35)
-    strap = ((0.75, 0.74, 0.72) if metal else cloth_color())
+    strap = (0.75, 0.74, 0.72) if metal else cloth_color()
     return Clothes(
         sleeve_start=start if sleeve else 2 * ARM_LENGTH,
         sleeve_gap=u(0.002, 0.009),
@@ -119,7 +119,12 @@ def ring_at_rest(body: Body, rest: Float[Tensor, "V 3"], joints: Float[Tensor, "
     points = rest.double().numpy() * 1e3 - (joints[joint].double().numpy() * 1e3)
     axes = np.stack([bone.along, bone.side, bone.back], 1)
     local = points @ axes
-    place = identity.ring_place * bone.length * np.linalg.norm((joints[joint + 1] - joints[joint]).numpy() * 1e3) / bone.length
+    place = (
+        identity.ring_place
+        * bone.length
+        * np.linalg.norm((joints[joint + 1] - joints[joint]).numpy() * 1e3)
+        / bone.length
+    )
     on_finger = body.finger_weights[: body.n_hand, finger].numpy() > 0.6
     near = local[on_finger & (np.abs(local[:, 0] - place) < 3.5)][:, 1:]
     middle = (near.max(0) + near.min(0)) / 2
