@@ -187,7 +187,8 @@ def shade(
             )
             base = base * (1.0 + 0.25 * fibre)
             shine = wp.float32(0.3)
-    nv = wp.max(wp.dot(m, view), 0.05)
+    film = wp.normalize(0.5 * n + 0.5 * m)  # the film of oil lies smoother than the skin
+    nv = wp.max(wp.dot(film, view), 0.05)
     flat = cosine_lobe(n)
     bumped = cosine_lobe(m)
     diffuse = wp.vec3f()
@@ -230,7 +231,7 @@ def shade(
                     diffuse[c] = diffuse[c] + share * color[c] * wp.max((nl + wrap) / (1.0 + wrap), 0.0)
                 if nl > 0.0:
                     middle = wp.normalize(view + d)
-                    nh, vh = wp.clamp(wp.dot(m, middle), 0.0, 1.0), wp.clamp(wp.dot(view, middle), 0.0, 1.0)
+                    nh, vh = wp.clamp(wp.dot(film, middle), 0.0, 1.0), wp.clamp(wp.dot(view, middle), 0.0, 1.0)
                     edge = wp.pow(1.0 - vh, 5.0) * wp.max(0.28 - 0.2 * rough, 0.0)
                     lobes = wp.float32(0.0)
                     for k in range(2):
@@ -250,7 +251,7 @@ def shade(
     for c in range(3):  # one more bounce off skin: gaps between fingers are warm, not black
         own = tones[b][c]
         diffuse[c] = diffuse[c] + hidden * own * plain[c] * 0.4 / (1.0 - hidden * own)
-    back = 2.0 * wp.dot(m, view) * m - view
+    back = 2.0 * wp.dot(film, view) * film - view
     ahead = light_along(sky, b, blurred(harmonics(back), 1.0 - 0.55 * rough))
     grazing = wp.pow(1.0 - nv, 5.0) * wp.max(0.20 * (1.0 - rough), 0.0)
     for c in range(3):

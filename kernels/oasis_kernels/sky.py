@@ -29,7 +29,7 @@ def harmonics(d: wp.vec3f) -> vec9:
 
 @wp.func
 def cosine_lobe(n: wp.vec3f) -> vec9:
-    """Harmonics of max(0, n . d) / pi: times the light's coefficients it is the irradiance over pi (Ramamoorthi 2001)."""
+    """Harmonics of max(0, n . d) / pi: times a light's coefficients, its irradiance over pi (Ramamoorthi 2001)."""
     b = harmonics(n)
     for k in range(1, 4):
         b[k] = b[k] * (2.0 / 3.0)
@@ -66,7 +66,7 @@ def disc(k: int, n: int, turn: float) -> wp.vec2f:
 
 @wp.func
 def dither(x: int, y: int) -> float:
-    """An angle for each pixel, in [0, 2 pi): even over any few neighbours (interleaved gradient noise, Jimenez 2014)."""
+    """An angle for each pixel in [0, 2 pi), even over neighbours (interleaved gradient noise, Jimenez 2014)."""
     inner = 0.06711056 * float(x) + 0.00583715 * float(y)
     outer = 52.9829189 * (inner - wp.floor(inner))
     return 6.2831853 * (outer - wp.floor(outer))

@@ -11,14 +11,19 @@ from oasis_warp.synthetic.picture import render_batch, stream
 from oasis_warp.synthetic.plan import PICTURES_EACH, Scenery, plan_ahead, plan_shots, sample_shot
 
 SIZE = 64
-SEED = 11
+SEED = 13
 INDICES = (0, 1, 2, 3, PICTURES_EACH, PICTURES_EACH + 1)
 
 
 @pytest.fixture(scope="module")
 def batch(hand):
-    """Photos of two people of world 11: one shows a left hand, the other a right one."""
+    """Photos of two people of world 13: one shows a left hand, the other a right one."""
     return render_batch(SEED, INDICES, SIZE)
+
+
+def _grown(mask):
+    """A mask and its neighbours."""
+    return torch.nn.functional.max_pool2d(mask[None].float(), 3, 1, 1)[0] > 0
 
 
 def _same(a, b, share=0.999, tolerance=1e-4):
@@ -73,8 +78,9 @@ def test_pose_shape_and_camera_explain_mask_depth_and_landmarks(batch, hand):
         torch.testing.assert_close(project(camera, marks)[0], batch.landmarks[k], atol=0.02, rtol=0)
         seen = depth_map(points, hand.faces, camera.viewmat, camera.K, SIZE, SIZE)
         inside, shown = seen.face_ids >= 0, batch.mask[k] > 0.5
-        # Relief (up to 3 mm) and clothes are not the model's.
-        assert float((inside & shown).sum() / (inside | shown).sum()) > 0.86
+        # Relief, of up to 3 mm, is not the model's, and a sleeve may cover some of the wrist.
+        assert float((shown & ~_grown(inside)).sum()) <= 0.02 * float(shown.sum())
+        assert float((inside & ~_grown(shown)).sum()) <= 0.06 * float(inside.sum())
         both = inside & (batch.mask[k] > 0.99)
         off = (seen.depth[both] - batch.depth[k][both]).abs()
         assert float(off.median()) < 0.003

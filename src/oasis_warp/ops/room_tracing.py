@@ -59,7 +59,7 @@ _op = operator("trace_rooms", _trace, _trace_fake)
 
 @torch.no_grad()
 def trace_rooms(
-    solids: Float[Tensor, "B N W"],
+    solids: Float[Tensor, "B N 27"],
     focals: Float[Tensor, "B"],
     sky: Float[Tensor, "B 9 3"],
     lamps: Lamps,

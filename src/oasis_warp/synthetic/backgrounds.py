@@ -45,7 +45,7 @@ def _picture(path: Path) -> np.ndarray:
 
 
 def cut_background(paths: tuple[Path, ...], rng: np.random.Generator, size: int, blur: float) -> Float[Tensor, "H W 3"]:
-    """A square cut from one of the pictures, mirrored or not, in linear light of mean .3, out of focus by `blur` [px]."""
+    """A square cut from one of the pictures, mirrored or not, in linear light of mean .3; `blur` is in pixels."""
     picture = _picture(paths[rng.integers(len(paths))])
     height, width = picture.shape[:2]
     side = max(1, int(min(height, width) * rng.uniform(0.5, 1.0)))

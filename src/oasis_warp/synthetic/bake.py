@@ -180,7 +180,7 @@ def _color(identity: Identity, region: Regions, nails: Nails, line: dict[str, Te
     melanin = m * (1 + (identity.tan - 1) * back) * back + palm_melanin * palm
     lattice = (noise["lattice_a"].abs() + noise["lattice_b"].abs()).clamp(0, 1)
     melanin = melanin * (1 + (0.10 * back + 0.06 * palm) * (0.5 - lattice))
-    melanin = melanin * (1 + 0.21 * noise["blotch"] + 0.19 * noise["grain"])
+    melanin = melanin * (1 + 0.18 * noise["blotch"] + 0.15 * noise["grain"])
     melanin = melanin * (1 + (0.35 + 0.18 * identity.knuckles) * region.knuckle * back + 0.25 * line["fold"])
     pigmented = line["main"] + line["crease"] + 0.6 * line["minor"]  # dark palms have darker lines
     melanin = melanin + palm * pigmented * (0.05 * m + 0.35 * max(0.0, m - 0.06))
@@ -264,7 +264,9 @@ def _tattoo(points: Tensor, pattern: int, rng: np.random.Generator, noise: Tenso
     return (ink.clamp(0, 1) * rng.uniform(0.6, 0.92)).clamp(0, 1)
 
 
-def _relief(identity: Identity, region: Regions, nails: Nails, line: dict[str, Tensor], noise: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+def _relief(
+    identity: Identity, region: Regions, nails: Nails, line: dict[str, Tensor], noise: dict[str, Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
     """Heights [mm]: what stays, what flattens under stretch, what rises when squeezed."""
     palm, back, plate = region.palm, 1 - region.palm, nails.plate
     bare = 1 - plate

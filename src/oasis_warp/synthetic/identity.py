@@ -100,6 +100,8 @@ def sample_identity(hand: HandModel, seed: int, number: int, population: Populat
     has = {name: rng.random() < getattr(population, name)
            for name in ("freckles", "hair", "polish", "tattoo", "ring", "plaster")}  # fmt: skip
     freckles = int(rng.choice([rng.poisson(14), rng.poisson(130)], p=[0.7, 0.3]))
+    hairs, tattoo = int(u(60, 600)), int(rng.integers(1, 5))
+    ring_finger = int(rng.choice([0, 1, 3, 3, 3, 2]))
     return Identity(
         shape=shape,
         arm_girth=u(0.2, 0.6),
@@ -118,11 +120,11 @@ def sample_identity(hand: HandModel, seed: int, number: int, population: Populat
         line_wealth=float(np.clip(rng.beta(1.5, 1.8) * 0.7 + 0.3 * age, 0, 1)),
         knuckles=u(0.5, 1.5),
         dryness=u(0, 1),
-        oil=u(0.25, 0.85),
-        roughness=u(0.40, 0.58),
+        oil=u(0.2, 0.7),
+        roughness=u(0.46, 0.66),
         freckles=freckles * has["freckles"],
         moles=int(rng.integers(0, 5)),
-        hairs=int(u(60, 600)) * has["hair"],
+        hairs=hairs * has["hair"],
         hair_melanin=float(np.clip(hue + (melanin > 0.06), 0, 1)),
         nail_length=float(rng.choice([u(-0.6, 0.6), u(0.6, 3.0)], p=[0.7, 0.3])),
         nail_width=u(0.8, 1.7),
@@ -130,9 +132,9 @@ def sample_identity(hand: HandModel, seed: int, number: int, population: Populat
         lunula=u(0, 1),
         polish=polish if has["polish"] else None,
         gloss=u(0, 1),
-        tattoo=int(rng.integers(1, 5)) * has["tattoo"],
+        tattoo=tattoo * has["tattoo"],
         plaster=bool(has["plaster"]),
-        ring_finger=int(rng.choice([0, 1, 3, 3, 3, 2])) if has["ring"] else -1,
+        ring_finger=ring_finger if has["ring"] else -1,
         ring_place=u(0.5, 0.66),
         ring_width=u(1.8, 5.5),
         ring_metal=tuple(np.array([[0.9, 0.65, 0.25], [0.85, 0.82, 0.78], [0.8, 0.5, 0.4]])[rng.integers(3)]),

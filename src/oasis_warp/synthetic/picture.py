@@ -90,7 +90,7 @@ def render_batch(
 def render_shots(
     seed: int, shots: Sequence[Shot], size: int, device: torch.device | str, *, scenery: Scenery
 ) -> SyntheticBatch:
-    """The second half of `render_batch`: pictures of shots that `plan_shots` has drawn for the same seed and scenery."""
+    """The second half of `render_batch`: pictures of what `plan_shots` has drawn for the same seed and scenery."""
     device, look = str(device), scenery.look
     body = _body(device)
     people = [person(seed, shot.person, scenery.population, device) for shot in shots]

@@ -75,7 +75,7 @@ def sample_shot(seed: int, index: int, scenery: Scenery = PHOTOS) -> Shot:
     number = index // PICTURES_EACH
     if scenery.people is not None:
         number %= scenery.people
-    view = sample_view(rng, look)
+    view = sample_view(rng, look, closed=bool((angles[[1, 4, 7, 10], 0] > 0.9).sum() >= 3))
     return Shot(
         index=index,
         person=number,

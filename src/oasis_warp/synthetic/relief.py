@@ -27,7 +27,7 @@ def relief(body: Body, identity: Identity) -> Float[Tensor, "V"]:
     bony, height = identity.bony, np.zeros(n)
     back, palm = _step(0.1, 0.7, normals[:, 1]), _step(0.1, 0.7, -normals[:, 1])
 
-    def blob(center: np.ndarray, radius: float | list[float]) -> np.ndarray:
+    def blob(center: np.ndarray, radius: float | list[float | int]) -> np.ndarray:
         return np.exp(-(((points - center) / radius) ** 2).sum(1))
 
     for finger, bones in enumerate(body.bones):
@@ -51,12 +51,12 @@ def relief(body: Body, identity: Identity) -> Float[Tensor, "V"]:
         s = np.clip((points - knuckle) @ -knuckle / (knuckle @ knuckle), 0, 1)
         off = np.linalg.norm((points - knuckle * (1 - s)[:, None])[:, [0, 2]], axis=1)
         tendon = identity.tendons * (0.3 + 0.9 * bony) * 1.2 * np.exp(-((off / 2.6) ** 2))
-        height += back * _step(1, 0.75, s) * tendon
+        height += back * _step(1.0, 0.75, s) * tendon
         if i < 3:
             between = (knuckle + knuckles[i + 1]) / 2
             hollow = blob(between + _UP, 6.5) + 0.55 * blob(between * 0.72 + _UP, [18, 15, 4.0])
             height -= back * (0.4 + 1.5 * bony) * hollow
-        height += palm * 0.7 * blob(knuckle + _PAD, 8)
+        height += palm * 0.7 * blob(knuckle + _PAD, 8.0)
     height += palm * (
         1.6 * blob(np.array([-42, -22, 24]), [22, 20, 13])
         + 1.3 * blob(np.array([-35, -18, -26]), [26, 20, 11])

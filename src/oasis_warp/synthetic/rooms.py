@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from oasis_warp.ops.room_tracing import PATTERNS, SHAPES, SOLID_WORDS
-from oasis_warp.synthetic.stage import rotation_about
+from oasis_warp.synthetic.furniture import hang_on_wall, put_laptop, put_thing
+from oasis_warp.synthetic.solids import Builder
 
-MAX_SOLIDS = 26
 _KINDS = {"wall": 0.24, "desk": 0.24, "floor": 0.13, "room": 0.20, "cloth": 0.08, "garden": 0.05, "studio": 0.06}
 
 
@@ -19,82 +18,9 @@ class Room(NamedTuple):
 
     kind: str
     solids: np.ndarray
-    """Rows for `ops.room_tracing.trace_rooms`, in the camera's frame, [MAX_SOLIDS, SOLID_WORDS]."""
+    """Rows for `ops.room_tracing.trace_rooms`, in the camera's frame (`solids.Builder.matrix`)."""
     aperture: float
     """Radius of the blur of things far off, over the width of the picture."""
-
-
-class _Builder:
-    """Collects solids in the room's frame."""
-
-    def __init__(self, rng: np.random.Generator, yaw: float, pitch: float, roll: float):
-        self.rng = rng
-        self.to_camera = (
-            rotation_about([0, 0, 1], roll) @ rotation_about([1, 0, 0], pitch) @ rotation_about([0, 1, 0], yaw)
-        )
-        self.rows: list[np.ndarray] = []
-
-    def axis_point(self, distance: float) -> np.ndarray:
-        """The point of the camera's axis at a distance, in the room's frame."""
-        return self.to_camera.T @ np.array([0.0, 0.0, distance])
-
-    def add(self, shape: str, pattern: str, center: np.ndarray | list[float], half: np.ndarray | list[float],
-            first: np.ndarray, second: np.ndarray | None = None, *, cell: float = 0.1, gloss: float = 0.0,
-            glow: float = 0.0, yaw: float = 0.0, tilt: float = 0.0) -> None:  # fmt: skip
-        """One solid; `yaw` turns it about the vertical, `tilt` then about its own first axis."""
-        if len(self.rows) >= MAX_SOLIDS:
-            return
-        own = rotation_about([0, 1, 0], yaw) @ rotation_about([1, 0, 0], tilt)
-        turn = own.T @ self.to_camera.T
-        seed = float(self.rng.integers(1 << 20))
-        head = [SHAPES.index(shape), PATTERNS.index(pattern), cell, gloss, glow, seed]
-        second = first if second is None else second
-        place = self.to_camera @ np.asarray(center, float)
-        self.rows.append(np.concatenate([head, place, half, turn.ravel(), first, second]))
-
-    # Colours, linear.
-    def neutral(self, low: float = 0.03, high: float = 0.75) -> np.ndarray:
-        """A grey, beige, brown or bluish tone; some are vivid."""
-        u, rng = self.rng.uniform, self.rng
-        level = np.exp(u(np.log(low), np.log(high)))
-        tint = np.exp(rng.normal([0.05, 0.0, -0.08], [0.10, 0.04, 0.14]))
-        if rng.random() < 0.12:
-            tint = np.exp(rng.normal(0, 0.42, 3))
-        return np.clip(level * tint, 0.008, 0.88)
-
-    def wood(self) -> np.ndarray:
-        """Pale ash to dark walnut."""
-        u = self.rng.uniform
-        return np.exp(u(np.log(0.05), np.log(0.5))) * np.array([1.0, u(0.5, 0.74), u(0.22, 0.5)])
-
-    def wall_paint(self) -> np.ndarray:
-        """Mostly off-white, some coloured."""
-        u, rng = self.rng.uniform, self.rng
-        base = u(0.35, 0.85) * np.array([1.0, u(0.9, 1.0), u(0.72, 1.0)])
-        if rng.random() < 0.3:
-            base = np.clip(np.exp(rng.normal(np.log(0.3), 0.6)) * np.exp(rng.normal(0, 0.22, 3)), 0.02, 0.85)
-        return base
-
-    def surface(self) -> tuple[str, np.ndarray, np.ndarray, float]:
-        """Pattern, colours and cell of a table or floor."""
-        u, rng = self.rng.uniform, self.rng
-        kind = rng.choice(["planks", "tiles", "specks", "paint", "carpet"], p=[0.5, 0.13, 0.14, 0.15, 0.08])
-        if kind == "planks":
-            a = self.wood()
-            return kind, a, a * u(0.65, 1.5), u(0.05, 0.13)
-        if kind == "tiles":
-            return kind, self.neutral(0.1), self.neutral(0.05, 0.4), u(0.1, 0.45)
-        if kind == "specks":
-            a = self.neutral()
-            return kind, a, np.clip(a * np.exp(rng.normal(0, 0.7)), 0.01, 0.85), np.exp(u(np.log(0.008), np.log(0.1)))
-        return kind, self.neutral(), self.neutral(), u(0.05, 0.3)
-
-    def matrix(self) -> np.ndarray:
-        """All rows, padded."""
-        out = np.zeros((MAX_SOLIDS, SOLID_WORDS), np.float32)
-        if self.rows:
-            out[: len(self.rows)] = self.rows
-        return out
 
 
 def sample_room(rng: np.random.Generator, distance: float, reach: float) -> Room:
@@ -109,68 +35,24 @@ def sample_room(rng: np.random.Generator, distance: float, reach: float) -> Room
     u = rng.uniform
     down = {"desk": u(0.3, 1.3), "floor": u(0.7, 1.45), "cloth": u(0.1, 1.4), "garden": u(-0.1, 0.35)}
     pitch = down.get(kind, rng.normal(0.05, 0.10))
-    build = _Builder(rng, rng.normal(0, 0.45), pitch, rng.normal(0, 0.07))
+    build = Builder(rng, rng.normal(0, 0.45), pitch, rng.normal(0, 0.07))
     back = distance + reach
-    {"wall": _wall, "desk": _desk, "floor": _floor, "room": _room, "cloth": _cloth, "garden": _garden,
-     "studio": _studio}[kind](build, back)  # fmt: skip
+    {
+        "wall": _wall,
+        "desk": _desk,
+        "floor": _floor,
+        "room": _room,
+        "cloth": _cloth,
+        "garden": _garden,
+        "studio": _studio,
+    }[kind](build, back)
     aperture = float(np.exp(u(np.log(0.0015), np.log(0.035)))) * {"room": 1.6}.get(kind, 1.0)
     if kind == "garden":
         aperture = u(0.02, 0.07)
     return Room(kind, build.matrix(), aperture)
 
 
-def _on_wall(build: _Builder, z: float, floor: float, spread: float) -> None:
-    """Something that hangs on or leans against the wall at depth `z`."""
-    rng, u = build.rng, build.rng.uniform
-    x, y = u(-spread, spread), u(-0.6 * spread, 0.6 * spread)
-    white = np.full(3, u(0.5, 0.8))
-    match rng.choice(["switch", "socket", "picture", "door", "curtain", "shelf", "poster", "window", "coat", "lamp"],
-                     p=[0.12, 0.08, 0.16, 0.14, 0.1, 0.14, 0.08, 0.08, 0.06, 0.04]):  # fmt: skip
-        case "switch":
-            build.add("box", "paint", [x, y, z - 0.006], [0.04, 0.06, 0.006], white, gloss=0.6)
-            build.add("box", "paint", [x, y, z - 0.013], [0.017, 0.032, 0.004], white * 0.95, gloss=0.6)
-        case "socket":
-            build.add("box", "tiles", [x, y, z - 0.006], [0.04, 0.04, 0.006], white, white * 0.2, cell=0.03, gloss=0.5)
-        case "picture" | "poster":
-            w, h = u(0.08, 0.35), u(0.08, 0.35)
-            frame = build.neutral()
-            build.add("box", "paint", [x, y, z - 0.01], [w + 0.02, h + 0.02, 0.01], frame, gloss=0.4)
-            build.add("box", "picture", [x, y, z - 0.022], [w, h, 0.003], build.neutral(), build.neutral(),
-                      cell=u(0.05, 0.3), gloss=0.3)  # fmt: skip
-        case "door":
-            color = build.wood() if rng.random() < 0.6 else white
-            x = x + np.sign(x) * 0.2
-            build.add(
-                "box", "panels", [x, floor - 1.0, z - 0.02], [0.42, 1.0, 0.02], color, cell=u(0.5, 0.85), gloss=0.3
-            )
-            build.add("box", "paint", [x, floor - 2.05, z - 0.03], [0.5, 0.05, 0.03], color * 0.8)
-            build.add("box", "paint", [x - 0.47, floor - 1.0, z - 0.03], [0.05, 1.05, 0.03], color * 0.85)
-            build.add("ball", "paint", [x + 0.34, floor - 1.0, z - 0.07], [0.028] * 3, np.full(3, 0.55), gloss=2.0)
-        case "curtain":
-            a = build.neutral()
-            build.add("box", "stripes", [x + np.sign(x) * 0.3, 0, z - 0.05], [u(0.2, 0.5), 1.4, 0.03], a, a * u(0.35, 0.7),
-                      cell=u(0.05, 0.12))  # fmt: skip
-        case "shelf":
-            w, h = u(0.25, 0.6), u(0.2, 0.7)
-            build.add(
-                "box", "books", [x + np.sign(x) * 0.15, y, z - 0.12], [w, h, 0.12], build.wood(), cell=u(0.014, 0.03)
-            )
-        case "window":
-            build.add("box", "panes", [x, y - 0.2, z - 0.01], [u(0.3, 0.6), u(0.35, 0.7), 0.02],
-                      np.array([0.7, 0.8, 0.95]), white, cell=u(0.25, 0.5), glow=u(0.5, 3.0))  # fmt: skip
-        case "coat":
-            for _ in range(rng.integers(2, 5)):
-                build.add("ball", "cloth", [x + u(-0.15, 0.15), y + u(0, 0.3), z - 0.08], [u(0.06, 0.13), u(0.2, 0.45), 0.07],
-                          build.neutral(0.01, 0.5), build.neutral(), cell=u(0.03, 0.3))  # fmt: skip
-        case "lamp":
-            build.add("ball", "paint", [x, y - 0.3, z - 0.25], [u(0.06, 0.12)] * 3, np.array([1, 0.85, 0.6]) * 0.8,
-                      glow=u(1.5, 4))  # fmt: skip
-            build.add(
-                "cylinder", "paint", [x, y + 0.5, z - 0.25], [0.012, 0.7, 0.012], build.neutral(0.02, 0.5), gloss=1.0
-            )
-
-
-def _wall(build: _Builder, back: float) -> None:
+def _wall(build: Builder, back: float) -> None:
     rng, u = build.rng, build.rng.uniform
     z = build.axis_point(back + np.exp(u(np.log(0.03), np.log(1.3))))[2]
     floor = u(0.7, 1.5)
@@ -190,94 +72,10 @@ def _wall(build: _Builder, back: float) -> None:
         side = rng.choice([-1, 1])
         build.add("box", "paint", [side * u(0.25, 1.2) + side * 0.05, 0, z - 1], [0.05, 3, 1.0], paint * u(0.7, 1.0))
     for _ in range(rng.integers(0, 5)):
-        _on_wall(build, z, floor, u(0.1, 0.6) * (0.3 + z))
+        hang_on_wall(build, z, floor, u(0.1, 0.6) * (0.3 + z))
 
 
-def _small_thing(build: _Builder, x: float, y: float, z: float) -> None:
-    """Something that stands or lies at (x, z) on a surface of height `y`."""
-    rng, u = build.rng, build.rng.uniform
-    yaw = u(-np.pi, np.pi)
-    color = build.neutral()
-    match rng.choice(["mug", "paper", "book", "phone", "pen", "box", "ball", "plate", "bottle", "keyboard", "cable", "cloth"],
-                     p=[0.12, 0.14, 0.13, 0.1, 0.1, 0.1, 0.05, 0.06, 0.07, 0.06, 0.03, 0.04]):  # fmt: skip
-        case "mug":
-            r = u(0.035, 0.045)
-            build.add("cylinder", "paint", [x, y - 0.048, z], [r, 0.048, r], color, gloss=1.2)
-            build.add("cylinder", "paint", [x, y - 0.0965, z], [0.85 * r, 0.001, r], np.array([0.03, 0.015, 0.01]))
-            build.add("ball", "paint", [x + 1.2 * r * np.cos(yaw), y - 0.05, z + 1.2 * r * np.sin(yaw)], [0.02, 0.027, 0.008],
-                      color, gloss=1.0, yaw=-yaw)  # fmt: skip
-        case "paper":
-            for k in range(rng.integers(1, 4)):
-                build.add("box", "text", [x + u(-0.06, 0.06), y - 0.001 * (k + 1), z + u(-0.06, 0.06)],
-                          [0.105, 0.001, 0.148], np.full(3, u(0.65, 0.85)), np.full(3, 0.05), cell=u(0.006, 0.014), yaw=yaw + u(-0.4, 0.4))  # fmt: skip
-        case "book":
-            h = 0.0
-            for _ in range(rng.integers(1, 4)):
-                t = u(0.006, 0.02)
-                build.add("box", str(rng.choice(["paint", "picture", "stripes"])), [x, y - h - t, z],
-                          [u(0.06, 0.12), t, u(0.08, 0.15)], build.neutral(), build.neutral(), cell=u(0.02, 0.1), gloss=0.6,
-                          yaw=yaw + u(-0.3, 0.3))  # fmt: skip
-                h += 2 * t
-        case "phone":
-            build.add("box", "paint", [x, y - 0.004, z], [0.036, 0.004, 0.075], np.full(3, 0.015), gloss=3.0, yaw=yaw)
-        case "pen":
-            build.add("box", "paint", [x, y - 0.004, z], [0.07, 0.004, 0.004], color, gloss=0.8, yaw=yaw)
-        case "box":
-            s = np.exp(u(np.log(0.02), np.log(0.12), 3))
-            build.add("box", str(rng.choice(["paint", "picture", "text"])), [x, y - s[1], z], s, color, build.neutral(),
-                      cell=u(0.01, 0.08), gloss=u(0, 0.8), yaw=yaw)  # fmt: skip
-        case "ball":
-            r = u(0.02, 0.05)
-            build.add("ball", "paint", [x, y - r, z], [r] * 3, color, gloss=u(0, 1.5))
-        case "plate":
-            r = u(0.07, 0.13)
-            build.add("cylinder", "paint", [x, y - 0.008, z], [r, 0.008, r], np.full(3, u(0.5, 0.8)), gloss=1.2)
-            build.add(
-                "ball",
-                "specks",
-                [x, y - 0.02, z],
-                [0.5 * r, 0.018, 0.5 * r],
-                build.neutral(),
-                build.neutral(),
-                cell=0.02,
-            )
-        case "bottle":
-            r = u(0.028, 0.042)
-            build.add("cylinder", "paint", [x, y - 0.09, z], [r, 0.09, r], color, gloss=2.0)
-            build.add("cylinder", "paint", [x, y - 0.2, z], [0.4 * r, 0.03, r], build.neutral(), gloss=1.0)
-        case "keyboard":
-            build.add("box", "keys", [x, y - 0.008, z], [0.2, 0.008, 0.065], np.full(3, u(0.01, 0.5)), build.neutral(),
-                      cell=0.019, gloss=0.3, yaw=u(-0.3, 0.3))  # fmt: skip
-        case "cable":
-            for k in range(3):
-                build.add("box", "paint", [x + 0.11 * k, y - 0.003, z + 0.05 * np.sin(2 * k)], [0.07, 0.003, 0.003],
-                          np.full(3, 0.03), yaw=0.7 * np.sin(2 * k + yaw))  # fmt: skip
-        case "cloth":
-            build.add(
-                "ball",
-                "cloth",
-                [x, y - 0.01, z],
-                [u(0.07, 0.16), 0.03, u(0.07, 0.16)],
-                color,
-                build.neutral(),
-                cell=0.05,
-            )
-
-
-def _laptop(build: _Builder, x: float, y: float, z: float) -> None:
-    """Keyboard below, screen behind, as one sits before it."""
-    rng, u = build.rng, build.rng.uniform
-    body = np.full(3, float(rng.choice([0.02, 0.35, 0.5])))
-    yaw = u(-0.4, 0.4)
-    build.add("box", "paint", [x, y - 0.008, z], [0.16, 0.008, 0.11], body, gloss=0.8, yaw=yaw)
-    build.add("box", "keys", [x - 0.03 * np.sin(yaw), y - 0.0165, z + 0.03], [0.145, 0.001, 0.055], np.full(3, 0.012), body,
-              cell=0.019, yaw=yaw)  # fmt: skip
-    build.add("box", str(rng.choice(["picture", "text"])), [x + 0.12 * np.sin(yaw), y - 0.115, z + 0.12 * np.cos(yaw) + 0.03],
-              [0.155, 0.1, 0.004], np.full(3, 0.85) if rng.random() < 0.5 else build.neutral(), build.neutral(),
-              cell=u(0.006, 0.08), glow=u(0.2, 1.2), gloss=0.8, yaw=yaw, tilt=0.25)  # fmt: skip
-
-
-def _desk(build: _Builder, back: float) -> None:
+def _desk(build: Builder, back: float) -> None:
     rng, u = build.rng, build.rng.uniform
     gaze = build.axis_point(back + np.exp(u(np.log(0.03), np.log(0.4))))
     y = max(gaze[1], 0.05)
@@ -289,22 +87,30 @@ def _desk(build: _Builder, back: float) -> None:
     build.add("box", floor_kind, [0, y + 0.75, gaze[2]], [5, 0.02, 5], c, d, cell=size, gloss=0.4)
     build.add("box", "paint", [0, 0, gaze[2] + u(0.6, 2.0)], [5, 3, 0.05], build.wall_paint())
     if rng.random() < 0.4:
-        _laptop(build, gaze[0] + u(-0.25, 0.25), y, gaze[2] + u(0.0, 0.25))
+        put_laptop(build, gaze[0] + u(-0.25, 0.25), y, gaze[2] + u(0.0, 0.25))
     for _ in range(rng.integers(2, 9)):
-        _small_thing(build, gaze[0] + rng.normal(0, 0.22), y, gaze[2] + rng.normal(0.04, 0.2))
+        put_thing(build, gaze[0] + rng.normal(0, 0.22), y, gaze[2] + rng.normal(0.04, 0.2))
     if rng.random() < 0.3:
-        _on_wall(build, gaze[2] + 0.6, y + 0.7, 0.8)
+        hang_on_wall(build, gaze[2] + 0.6, y + 0.7, 0.8)
 
 
-def _floor(build: _Builder, back: float) -> None:
+def _floor(build: Builder, back: float) -> None:
     rng, u = build.rng, build.rng.uniform
     gaze = build.axis_point(back + u(0.35, 1.3))
     y = max(gaze[1], 0.4)
     kind, a, b, cell = build.surface()
     build.add("box", kind, [0, y + 0.05, gaze[2]], [6, 0.05, 6], a, b, cell=cell, gloss=u(0.2, 1.2))
     if rng.random() < 0.35:
-        build.add("box", "carpet", [gaze[0] + u(-0.8, 0.8), y - 0.004, gaze[2] + u(-0.8, 0.8)], [u(0.4, 1.0), 0.005, u(0.4, 1.2)],
-                  build.neutral(), build.neutral(), cell=u(0.15, 0.6), yaw=u(-0.5, 0.5))  # fmt: skip
+        build.add(
+            "box",
+            "carpet",
+            [gaze[0] + u(-0.8, 0.8), y - 0.004, gaze[2] + u(-0.8, 0.8)],
+            [u(0.4, 1.0), 0.005, u(0.4, 1.2)],
+            build.neutral(),
+            build.neutral(),
+            cell=u(0.15, 0.6),
+            yaw=u(-0.5, 0.5),
+        )
     build.add("box", "paint", [0, y - 1.5, gaze[2] + u(0.5, 2.5)], [6, 1.5, 0.05], build.wall_paint())
     for _ in range(rng.integers(1, 6)):
         x, z = gaze[0] + rng.normal(0, 0.5), gaze[2] + rng.normal(0.1, 0.5)
@@ -321,23 +127,45 @@ def _floor(build: _Builder, back: float) -> None:
             case "shoe":
                 color, yaw = build.neutral(0.01, 0.5), u(-3, 3)
                 for side in (-0.06, 0.06):
-                    build.add("ball", "paint", [x + side * np.cos(yaw), y - 0.035, z - side * np.sin(yaw)], [0.047, 0.045, 0.14],
-                              color, gloss=0.5, yaw=yaw)  # fmt: skip
+                    build.add(
+                        "ball",
+                        "paint",
+                        [x + side * np.cos(yaw), y - 0.035, z - side * np.sin(yaw)],
+                        [0.047, 0.045, 0.14],
+                        color,
+                        gloss=0.5,
+                        yaw=yaw,
+                    )
             case "furniture":
                 s = u([0.15, 0.15, 0.15], [0.6, 0.45, 0.5])
-                build.add("box", str(rng.choice(["panels", "cloth", "paint"])), [x + np.sign(x) * 0.3, y - s[1], z], s,
-                          build.wood() if rng.random() < 0.5 else build.neutral(), build.neutral(), cell=u(0.1, 0.5), yaw=u(-0.4, 0.4))  # fmt: skip
+                build.add(
+                    "box",
+                    str(rng.choice(["panels", "cloth", "paint"])),
+                    [x + np.sign(x) * 0.3, y - s[1], z],
+                    s,
+                    build.wood() if rng.random() < 0.5 else build.neutral(),
+                    build.neutral(),
+                    cell=u(0.1, 0.5),
+                    yaw=u(-0.4, 0.4),
+                )
             case "bag":
-                build.add("ball", "cloth", [x, y - 0.1, z], u([0.1, 0.08, 0.1], [0.25, 0.18, 0.25]), build.neutral(0.01, 0.4),
-                          build.neutral(), cell=0.2)  # fmt: skip
+                build.add(
+                    "ball",
+                    "cloth",
+                    [x, y - 0.1, z],
+                    u([0.1, 0.08, 0.1], [0.25, 0.18, 0.25]),
+                    build.neutral(0.01, 0.4),
+                    build.neutral(),
+                    cell=0.2,
+                )
             case "stand":
                 build.add("cylinder", "paint", [x, y - 0.012, z], [0.14, 0.012, 0.14], np.full(3, 0.4), gloss=2.0)
                 build.add("cylinder", "paint", [x, y - 0.7, z], [0.011, 0.7, 0.011], np.full(3, 0.35), gloss=2.0)
             case "small":
-                _small_thing(build, x, y, z)
+                put_thing(build, x, y, z)
 
 
-def _room(build: _Builder, back: float) -> None:
+def _room(build: Builder, back: float) -> None:
     rng, u = build.rng, build.rng.uniform
     z, floor = back + u(1.2, 4.0), u(0.6, 1.45)
     left, right = -u(0.8, 3.0), u(0.8, 3.0)
@@ -350,7 +178,7 @@ def _room(build: _Builder, back: float) -> None:
         if rng.random() < 0.7:
             build.add("box", "paint", [x + np.sign(x) * 0.05, 0, z / 2], [0.05, 4, 6], paint * u(0.75, 1.0))
     for _ in range(rng.integers(1, 4)):
-        _on_wall(build, z, floor, 1.6)
+        hang_on_wall(build, z, floor, 1.6)
     for _ in range(rng.integers(2, 6)):
         x, at = u(left, right), u(0.45, 0.95) * z
         match rng.choice(["sofa", "table", "cabinet", "chair", "plant", "shelf"], p=[0.2, 0.2, 0.2, 0.15, 0.1, 0.15]):
@@ -358,14 +186,22 @@ def _room(build: _Builder, back: float) -> None:
                 c = build.neutral(0.02, 0.6)
                 build.add("box", "cloth", [x, floor - 0.22, at], [0.8, 0.22, 0.4], c, c, cell=0.6)
                 build.add("box", "cloth", [x, floor - 0.55, at + 0.32], [0.8, 0.35, 0.1], c, c, cell=0.6)
-                build.add("ball", "cloth", [x + u(-0.6, 0.6), floor - 0.55, at + 0.1], [0.22, 0.2, 0.1], build.neutral(),
-                          build.neutral(), cell=0.1, yaw=u(-0.5, 0.5))  # fmt: skip
+                build.add(
+                    "ball",
+                    "cloth",
+                    [x + u(-0.6, 0.6), floor - 0.55, at + 0.1],
+                    [0.22, 0.2, 0.1],
+                    build.neutral(),
+                    build.neutral(),
+                    cell=0.1,
+                    yaw=u(-0.5, 0.5),
+                )
             case "table":
                 c = build.wood()
                 build.add("box", "planks", [x, floor - 0.73, at], [u(0.3, 0.7), 0.02, 0.4], c, c, cell=0.1, gloss=0.6)
                 for side in (-0.28, 0.28):
                     build.add("box", "paint", [x + side, floor - 0.36, at], [0.025, 0.36, 0.025], c * 0.8)
-                _small_thing(build, x, floor - 0.75, at)
+                put_thing(build, x, floor - 0.75, at)
             case "cabinet":
                 build.add(
                     "box",
@@ -382,38 +218,75 @@ def _room(build: _Builder, back: float) -> None:
                 build.add("cylinder", "paint", [x, floor - 0.22, at], [0.03, 0.22, 0.03], np.full(3, 0.1), gloss=1.0)
             case "plant":
                 build.add("cylinder", "paint", [x, floor - 0.15, at], [0.14, 0.15, 0.14], build.neutral())
-                build.add("ball", "leaves", [x, floor - 0.7, at], [0.3, 0.45, 0.3], np.array([0.06, 0.10, 0.04]),
-                          np.array([0.015, 0.025, 0.012]), cell=0.12)  # fmt: skip
+                build.add(
+                    "ball",
+                    "leaves",
+                    [x, floor - 0.7, at],
+                    [0.3, 0.45, 0.3],
+                    np.array([0.06, 0.10, 0.04]),
+                    np.array([0.015, 0.025, 0.012]),
+                    cell=0.12,
+                )
             case "shelf":
                 build.add("box", "books", [x, floor - 0.9, at], [0.4, 0.9, 0.15], build.wood(), cell=u(0.018, 0.035))
 
 
-def _cloth(build: _Builder, back: float) -> None:
+def _cloth(build: Builder, back: float) -> None:
     """A bed, a sofa, a lap."""
     rng, u = build.rng, build.rng.uniform
     gaze = build.axis_point(back + u(0.02, 0.25))
     y = max(gaze[1], 0.03)
     a = build.neutral(0.015, 0.7)
-    build.add("box", "cloth", [gaze[0], y + 0.15, gaze[2]], [1.5, 0.15, 1.2], a, np.clip(a * np.exp(rng.normal(0, 0.6)), 0.01, 0.8),
-              cell=np.exp(u(np.log(0.02), np.log(0.6))))  # fmt: skip
+    build.add(
+        "box",
+        "cloth",
+        [gaze[0], y + 0.15, gaze[2]],
+        [1.5, 0.15, 1.2],
+        a,
+        np.clip(a * np.exp(rng.normal(0, 0.6)), 0.01, 0.8),
+        cell=np.exp(u(np.log(0.02), np.log(0.6))),
+    )
     for _ in range(rng.integers(1, 4)):  # folds
-        build.add("ball", "cloth", [gaze[0] + rng.normal(0, 0.4), y + 0.03, gaze[2] + rng.normal(0, 0.3)],
-                  u([0.2, 0.03, 0.02], [0.6, 0.06, 0.07]), a, a, cell=0.3, yaw=u(-3, 3))  # fmt: skip
+        build.add(
+            "ball",
+            "cloth",
+            [gaze[0] + rng.normal(0, 0.4), y + 0.03, gaze[2] + rng.normal(0, 0.3)],
+            u([0.2, 0.03, 0.02], [0.6, 0.06, 0.07]),
+            a,
+            a,
+            cell=0.3,
+            yaw=u(-3, 3),
+        )
     for _ in range(rng.integers(0, 4)):
         c = build.neutral()
-        build.add("ball", "cloth", [gaze[0] + rng.normal(0, 0.5), y - 0.04, gaze[2] + u(0.25, 0.8)], [0.3, 0.13, 0.22], c,
-                  build.neutral(), cell=u(0.03, 0.3), yaw=u(-3, 3))  # fmt: skip
+        build.add(
+            "ball",
+            "cloth",
+            [gaze[0] + rng.normal(0, 0.5), y - 0.04, gaze[2] + u(0.25, 0.8)],
+            [0.3, 0.13, 0.22],
+            c,
+            build.neutral(),
+            cell=u(0.03, 0.3),
+            yaw=u(-3, 3),
+        )
     build.add("box", "paint", [0, 0, gaze[2] + u(0.8, 2.5)], [6, 3, 0.05], build.wall_paint())
 
 
-def _garden(build: _Builder, back: float) -> None:
+def _garden(build: Builder, back: float) -> None:
     rng, u = build.rng, build.rng.uniform
     z, ground = back + u(3, 12), u(1.0, 1.5)
     build.add("box", "paint", [0, -10, z + 20], [60, 40, 0.1], np.array([0.5, 0.65, 0.9]), glow=u(0.6, 1.4))
     leaf, dark = u(0.5, 1.2) * np.array([u(0.07, 0.16), u(0.11, 0.17), u(0.03, 0.07)]), np.array([0.018, 0.028, 0.012])
     path = rng.random() < 0.4
-    build.add("box", "specks" if path else "leaves", [0, ground + 0.05, z], [40, 0.05, 30], build.neutral() if path else leaf,
-              build.neutral(0.05, 0.4) if path else dark, cell=u(0.03, 0.15))  # fmt: skip
+    build.add(
+        "box",
+        "specks" if path else "leaves",
+        [0, ground + 0.05, z],
+        [40, 0.05, 30],
+        build.neutral() if path else leaf,
+        build.neutral(0.05, 0.4) if path else dark,
+        cell=u(0.03, 0.15),
+    )
     for _ in range(rng.integers(3, 9)):
         x, at = rng.normal(0, 0.45) * z, u(0.4, 1.0) * z
         match rng.choice(["bush", "trunk", "house"], p=[0.6, 0.2, 0.2]):
@@ -421,8 +294,15 @@ def _garden(build: _Builder, back: float) -> None:
                 s = u([0.4, 0.4, 0.4], [2.2, 1.8, 1.5])
                 build.add("ball", "leaves", [x, ground - 0.7 * s[1], at], s, leaf * u(0.6, 1.4), dark, cell=u(0.1, 0.4))
             case "trunk":
-                build.add("cylinder", "specks", [x, ground - 2, at], [u(0.05, 0.25), 2.2, 0.2], np.array([0.1, 0.07, 0.05]),
-                          np.array([0.03, 0.02, 0.015]), cell=0.1)  # fmt: skip
+                build.add(
+                    "cylinder",
+                    "specks",
+                    [x, ground - 2, at],
+                    [u(0.05, 0.25), 2.2, 0.2],
+                    np.array([0.1, 0.07, 0.05]),
+                    np.array([0.03, 0.02, 0.015]),
+                    cell=0.1,
+                )
             case "house":
                 build.add(
                     "box",
@@ -435,14 +315,14 @@ def _garden(build: _Builder, back: float) -> None:
                 )
 
 
-def _studio(build: _Builder, back: float) -> None:
+def _studio(build: Builder, back: float) -> None:
     """A plain ground close behind."""
     rng, u = build.rng, build.rng.uniform
     color = (
         np.full(3, u(0.5, 0.88)),
         np.full(3, u(0.01, 0.1)),
         build.neutral(),
-        np.clip(u(0.1, 0.5) * np.exp(rng.normal(0, 0.45, 3)), 0.01, 0.8),
+        build.vivid(),
     )[rng.choice(4, p=[0.4, 0.2, 0.28, 0.12])]
     z = build.axis_point(back + np.exp(u(np.log(0.02), np.log(0.8))))[2]
     build.add("box", "paint", [0, 0, z + 0.05], [8, 8, 0.05], color, gloss=0.1)

@@ -129,9 +129,12 @@ def srgb(linear: Tensor) -> Tensor:
 
 
 def expose(
-    light: Float[Tensor, "B H W 3"], alpha: Float[Tensor, "B H W"], sensors: list[Sensor], incident: Float[Tensor, "B 3"],
+    light: Float[Tensor, "B H W 3"],
+    alpha: Float[Tensor, "B H W"],
+    sensors: list[Sensor],
+    incident: Float[Tensor, "B 3"],
     seeds: Int[Tensor, "B"],
-) -> Float[Tensor, "B H W 3"]:  # fmt: skip
+) -> Float[Tensor, "B H W 3"]:
     """Photos in [0, 1], sRGB, of linear light.
 
     Args:

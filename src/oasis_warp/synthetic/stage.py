@@ -3,11 +3,13 @@
 The camera looks along +z, x right, y down, metres; colours are linear RGB.
 """
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 N_LAMPS = 3
+Vector = np.ndarray | Sequence[float | int]
 Look = Literal["photo", "even"]
 """A photo with everything, or the hand alone in even light, as training wants its targets."""
 
@@ -54,21 +56,26 @@ class View(NamedTuple):
     """Of the box's middle, in sides of the picture, [2]."""
 
 
-def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
+def rotation_about(axis: Vector, angle: float) -> np.ndarray:
     """Rotation matrix (Rodrigues)."""
     x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def sample_view(rng: np.random.Generator, look: Look) -> View:
-    """A camera: palms and backs mostly, upright mostly, any side sometimes; even looks come from all around."""
+def sample_view(rng: np.random.Generator, look: Look, closed: bool) -> View:
+    """A camera: palms and backs mostly, upright mostly, any side sometimes; even looks come from all around.
+
+    A `closed` hand shows its fingers rather than its back, as people hold fists up.
+    """
     u = rng.uniform
     side = rng.choice(list(_VIEW_SHARES), p=list(_VIEW_SHARES.values()))
     turn = rng.normal(size=4)
     turn /= np.linalg.norm(turn)
     tilts = rng.normal(0, [0.42, 0.30, 0.36])
     sideways = rng.random()
+    if closed and side == "back" and rng.random() < 0.65:
+        side = "palm" if sideways < 0.4 else "thumb"
     if side == "any" or look == "even":
         w, x, y, z = turn
         rotation = np.array([

@@ -111,7 +111,9 @@ def bands(rows: Float[Tensor, "B R C 3"], clothes: list[Clothes]) -> Float[Tenso
     return rings + _outward(rings) * lift[..., None, None]
 
 
-def ring_at_rest(body: Body, rest: Float[Tensor, "V 3"], joints: Float[Tensor, "16 3"], identity: Identity) -> Float[Tensor, "K 3"]:  # fmt: skip
+def ring_at_rest(
+    body: Body, rest: Float[Tensor, "V 3"], joints: Float[Tensor, "16 3"], identity: Identity
+) -> Float[Tensor, "K 3"]:
     """A band that fits the identity's finger, in the hand's frame at rest [m]; nothing to be used if it has none."""
     finger = max(identity.ring_finger, 0)
     bone = body.bones[finger][0]
