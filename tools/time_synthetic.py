@@ -1,6 +1,6 @@
 """How fast synthetic pictures are made, by stage, with everything on and the people baked.
 
-    python tools/time_synthetic.py --device cuda --batch 64
+python tools/time_synthetic.py --device cuda --batch 64
 """
 
 import time

@@ -9,6 +9,8 @@ vec9 = wp.types.vector(length=9, dtype=wp.float32)
 
 TAPS = wp.constant(12)
 BLOCKERS = wp.constant(6)
+WIDEST = wp.constant(0.06)
+"""Of half shadows [m]."""
 GOLDEN_ANGLE = wp.constant(2.3999632)
 
 
@@ -92,9 +94,12 @@ def lit_share(
     if q[2] < 0.01:
         return 1.0
     scale = focal / q[2]
+    edge = half + WIDEST * scale
+    if wp.abs(q[0]) * scale > edge or wp.abs(q[1]) * scale > edge:
+        return 1.0  # the lamp's buffer shows all that casts shadows
     steep = wp.min(m[2], -0.18)  # towards the lamp is negative
     slope = wp.vec2f(-m[0] / steep, -m[1] / steep)  # of the surface's depth
-    search = wp.clamp(spread * 0.10, 0.001, 0.05)
+    search = wp.clamp(spread * 0.10, 0.001, WIDEST)
     depth = wp.float32(0.0)
     found = wp.float32(0.0)
     for k in range(BLOCKERS):
@@ -111,7 +116,7 @@ def lit_share(
         radius = wp.max(radius, spread * (q[2] - depth / found))
     else:
         radius = wp.max(radius, 0.0015)
-    radius = wp.min(radius, 0.06)
+    radius = wp.min(radius, WIDEST)
     seen = wp.float32(0.0)
     for k in range(TAPS):
         o = radius * disc(k, TAPS, turn)

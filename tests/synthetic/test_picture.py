@@ -6,9 +6,10 @@ from oasis_warp.core.camera import project
 from oasis_warp.core.types import Camera, HandPose
 from oasis_warp.hand.skinning import hand21, mirror_points, mirror_pose, rest_hand, skin
 from oasis_warp.ops import depth_map
+from oasis_warp.synthetic import people
 from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.picture import render_batch, stream
-from oasis_warp.synthetic.plan import PICTURES_EACH, Scenery, plan_ahead, plan_shots, sample_shot
+from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, plan_ahead, plan_shots, sample_shot
 
 SIZE = 64
 SEED = 13
@@ -78,9 +79,10 @@ def test_pose_shape_and_camera_explain_mask_depth_and_landmarks(batch, hand):
         torch.testing.assert_close(project(camera, marks)[0], batch.landmarks[k], atol=0.02, rtol=0)
         seen = depth_map(points, hand.faces, camera.viewmat, camera.K, SIZE, SIZE)
         inside, shown = seen.face_ids >= 0, batch.mask[k] > 0.5
-        # Relief, of up to 3 mm, is not the model's, and a sleeve may cover some of the wrist.
+        # Relief, of up to 3 mm, is not the model's; arm and clothes may stand before the hand.
         assert float((shown & ~_grown(inside)).sum()) <= 0.02 * float(shown.sum())
-        assert float((inside & ~_grown(shown)).sum()) <= 0.06 * float(inside.sum())
+        assert float((inside & ~_grown(batch.alpha[k] > 0.5)).sum()) <= 0.02 * float(inside.sum())
+        assert float((inside & shown).sum()) > 0.7 * float(inside.sum())
         both = inside & (batch.mask[k] > 0.99)
         off = (seen.depth[both] - batch.depth[k][both]).abs()
         assert float(off.median()) < 0.003
@@ -151,3 +153,18 @@ def test_processes_that_plan_ahead_plan_the_same():
             assert one.seed == other.seed
             np.testing.assert_array_equal(one.angles, other.angles)
             np.testing.assert_array_equal(one.room.solids, other.room.solids)
+
+
+@pytest.mark.slow
+def test_people_baked_by_other_processes_are_the_same(monkeypatch):
+    here = people.person(SEED, 0, EVERYBODY, "cpu")
+    monkeypatch.setattr(people, "_known", people.OrderedDict())
+    people.bake_people(SEED, [0], EVERYBODY, "cpu", jobs=1)
+    ((_, there),) = people._known.items()
+    for name in ("texture", "rest", "areas", "ring"):
+        assert torch.equal(getattr(there, name), getattr(here, name))
+
+
+def test_too_many_people_are_refused():
+    with pytest.raises(ValueError, match="at most 48 people"):
+        people.bake_people(SEED, range(49), EVERYBODY, "cpu", jobs=1)

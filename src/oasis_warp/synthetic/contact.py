@@ -34,7 +34,11 @@ class Balls(NamedTuple):
     group: np.ndarray
     """Finger, or PALM."""
     pairs: np.ndarray
-    """Which two may meet, [P, 2]."""
+    """Which two may meet, [P, 2]; sorted by their groups."""
+    starts: np.ndarray
+    """First pair of each two groups."""
+    column: np.ndarray
+    """Place in `starts` of two groups, [6, 6]."""
     allowed: np.ndarray
     """Depth that each pair overlaps at rest, and flesh, [P]."""
 
@@ -68,8 +72,13 @@ def bundled_balls() -> Balls:
     meet &= ~palm_pair | (outer(i) & outer(j))
     pairs = np.stack([i[meet], j[meet]], 1)
     gap = np.linalg.norm(center[pairs[:, 0]] - center[pairs[:, 1]], axis=1) - radius[pairs].sum(1)
-    near = gap < 120
-    return Balls(joint, center, radius, group, pairs[near], np.maximum(-gap[near], 0) + FLESH)
+    groups = np.sort(group[pairs], 1)
+    order = np.lexsort((groups[:, 1], groups[:, 0]))
+    kinds, starts = np.unique(groups[order], axis=0, return_index=True)
+    column = np.zeros((6, 6), int)
+    column[kinds[:, 0], kinds[:, 1]] = column[kinds[:, 1], kinds[:, 0]] = np.arange(len(kinds))
+    allowed = np.maximum(-gap, 0) + FLESH
+    return Balls(joint, center, radius, group, pairs[order], starts, column, allowed[order])
 
 
 def _sections(body: Body, finger: int, place: int) -> list[tuple[np.ndarray, float]]:
@@ -148,36 +157,42 @@ def separate(angles: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, np.nda
         angles: Within the joints' limits [rad], [B, 16, 3].
         joints: At rest [mm], [B, 16, 3].
     """
-    balls = bundled_balls()
-    hand = bundled_body().hand
-    low, high = hand.pose_limits.double().numpy().transpose(2, 0, 1)
-    rest_bend = hand.rest_bend.double().numpy()
-    first, second = balls.group[balls.pairs].T
-    angles = angles.copy()
     best, best_depth = angles.copy(), np.full(len(angles), np.inf)
+    active, current = np.arange(len(angles)), angles
     for _ in range(ROUNDS + 1):
-        depth = overlaps(angles, joints)
+        depth = overlaps(current, joints[active])
         deepest = depth.max(1)
-        better = deepest < best_depth
-        best[better], best_depth[better] = angles[better], deepest[better]
-
-        def worst(a: int, b: int, depth: np.ndarray = depth) -> np.ndarray:
-            of_pair = ((first == a) & (second == b)) | ((first == b) & (second == a))
-            return depth[:, of_pair].max(1) if of_pair.any() else np.zeros(len(depth))
-
-        for a, b in itertools.pairwise(_ORDER):
-            push = np.radians(np.minimum(0.6 * worst(FINGERS.index(a), FINGERS.index(b)), 2.0))
-            angles[:, 3 * FINGERS.index(a) + 1, 1] += push
-            angles[:, 3 * FINGERS.index(b) + 1, 1] -= push
-        for name in _ORDER:
-            finger = FINGERS.index(name)
-            ease = np.minimum(0.012 * worst(finger, PALM), 0.06)[:, None]
-            rows = slice(3 * finger + 1, 3 * finger + 4)
-            flexion = angles[:, rows, 0] + rest_bend[rows]
-            angles[:, rows, 0] -= ease * np.maximum(flexion, 0)
-        blocked = np.max([worst(THUMB, k) for k in (0, 1, 2, 3, PALM)], 0)
-        back = np.minimum(0.022 * blocked, 0.10)[:, None]
-        angles[:, 13] += back * (_OPEN_THUMB - angles[:, 13])
-        angles[:, 14:16, 0] -= back * np.maximum(angles[:, 14:16, 0], 0)
-        angles = np.clip(angles, low, high)
+        better = deepest < best_depth[active]
+        best[active[better]], best_depth[active[better]] = current[better], deepest[better]
+        on = deepest > 0
+        if not on.any():
+            break
+        active, current = active[on], _eased(current[on], depth[on])
     return best, best_depth
+
+
+def _eased(angles: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """One step away from the overlaps: neighbours spread, fingers open, the thumb draws back."""
+    balls, hand = bundled_balls(), bundled_body().hand
+    rest_bend = hand.rest_bend.double().numpy()
+    angles, between = angles.copy(), np.maximum.reduceat(depth, balls.starts, axis=1)
+
+    def worst(a: int, b: int) -> np.ndarray:
+        return between[:, balls.column[a, b]]
+
+    for a, b in itertools.pairwise(_ORDER):
+        push = np.radians(np.minimum(0.6 * worst(FINGERS.index(a), FINGERS.index(b)), 2.0))
+        angles[:, 3 * FINGERS.index(a) + 1, 1] += push
+        angles[:, 3 * FINGERS.index(b) + 1, 1] -= push
+    for name in _ORDER:
+        finger = FINGERS.index(name)
+        ease = np.minimum(0.012 * worst(finger, PALM), 0.06)[:, None]
+        rows = slice(3 * finger + 1, 3 * finger + 4)
+        flexion = angles[:, rows, 0] + rest_bend[rows]
+        angles[:, rows, 0] -= ease * np.maximum(flexion, 0)
+    blocked = np.max([worst(THUMB, k) for k in (0, 1, 2, 3, PALM)], 0)
+    back = np.minimum(0.022 * blocked, 0.10)[:, None]
+    angles[:, 13] += back * (_OPEN_THUMB - angles[:, 13])
+    angles[:, 14:16, 0] -= back * np.maximum(angles[:, 14:16, 0], 0)
+    low, high = hand.pose_limits.double().numpy().transpose(2, 0, 1)
+    return np.clip(angles, low, high)

@@ -75,7 +75,9 @@ def _folds(atlas: Atlas, strokes: Strokes, identity: Identity, name: str, place:
         strokes.add("fold", line, u(0.45, 0.75), u(0.7, 1.6) * depth, taper=0.4, wobble=0.4)
     for _ in range(int(3 + 8 * identity.age)):
         middle, half = rng.normal(0, 0.4), u(0.15, 0.4)
-        line = _arc(atlas, name, bone, rng.normal(0, reach * 0.8), np.linspace(middle - half, middle + half, 10), 8.0, 0.0)
+        line = _arc(
+            atlas, name, bone, rng.normal(0, reach * 0.8), np.linspace(middle - half, middle + half, 10), 8.0, 0.0
+        )
         strokes.add("fold", line, u(0.35, 0.5), u(0.3, 0.8) * depth, taper=0.5, wobble=0.5)
 
 

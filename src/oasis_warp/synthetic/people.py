@@ -1,12 +1,16 @@
 """People of a world, baked once and kept: texture, resting surface and what goes with them."""
 
+import multiprocessing
 from collections import OrderedDict
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.core.logging import Progress, silent
 from oasis_warp.ops.skin_shading import surface_state
 from oasis_warp.synthetic.atlas import bundled_atlas
 from oasis_warp.synthetic.bake import bake
@@ -46,14 +50,44 @@ def person(seed: int, number: int, population: Population, device: str) -> Perso
     if key in _known:
         _known.move_to_end(key)
         return _known[key]
-    found = _born(seed, number, population, device)
+    return _keep(key, _born(seed, number, population))
+
+
+def bake_people(
+    seed: int, numbers: Sequence[int], population: Population, device: str, *, jobs: int, progress: Progress = silent
+) -> None:
+    """Make `person` ready for each of `numbers`, in `jobs` processes: before training, so that it never waits.
+
+    Raises:
+        ValueError: more people than are kept on the device.
+    """
+    most = KEPT[torch.device(device).type]
+    if len(numbers) > most:
+        raise ValueError(
+            f"numbers: expected at most {most} people on {device}, got {len(numbers)}. Others are forgotten."
+        )
+    missing = [n for n in numbers if (seed, n, population, device) not in _known]
+    # A forked child of a process with a CUDA context or threads may hang, a spawned one does not.
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        born = pool.map(_born, [seed] * len(missing), missing, [population] * len(missing))
+        for k, (number, found) in enumerate(zip(missing, born, strict=True)):
+            _keep((seed, number, population, device), found)
+            progress("people", k + 1, len(missing))
+
+
+def _keep(key: tuple[int, int, Population, str], found: Person) -> Person:
+    """Move a person to the key's device and remember it, and forget the one that was not met for longest."""
+    device = key[3]
+    moved = {name: value.to(device) for name, value in found._asdict().items() if isinstance(value, Tensor)}
+    found = found._replace(**moved)
     _known[key] = found
-    if len(_known) > KEPT[torch.device(device).type]:
-        _known.popitem(last=False)
+    if sum(k[3] == device for k in _known) > KEPT[torch.device(device).type]:
+        del _known[next(k for k in _known if k[3] == device)]
     return found
 
 
-def _born(seed: int, number: int, population: Population, device: str) -> Person:
+def _born(seed: int, number: int, population: Population) -> Person:
+    """On the CPU."""
     body, atlas = bundled_body(), bundled_atlas()
     hand = body.hand
     identity = sample_identity(hand, seed, number, population)
@@ -69,12 +103,12 @@ def _born(seed: int, number: int, population: Population, device: str) -> Person
     areas = surface_state(whole, body.faces[:n_skin]).areas[0]
     return Person(
         identity,
-        texture.to(device),
-        rest.to(device),
-        joints.to(device),
-        tips.to(device),
-        areas.to(device),
-        texture[..., :3].float().mean((0, 1)).to(device),
-        ring_at_rest(body, rest, joints, identity).to(device),
+        texture,
+        rest,
+        joints,
+        tips,
+        areas,
+        texture[..., :3].float().mean((0, 1)),
+        ring_at_rest(body, rest, joints, identity),
         ring_look(identity),
     )
