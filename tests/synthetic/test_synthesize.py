@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from oasis_warp import cli
-from oasis_warp.commands.exit_codes import BAD_INPUT
+from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.synthetic import shards
@@ -151,3 +151,12 @@ def test_a_sheet_places_pictures_in_rows():
     sheet = contact_sheet(images, 2, gap=1)
     assert sheet.shape == (9, 11, 3)
     assert float(sheet[0, 6, 0]) == 0.25 and float(sheet[5, 0, 0]) == 0.5 and float(sheet[8, 10, 0]) == 1
+
+
+def test_ctrl_c_keeps_what_is_whole_and_says_so(tmp_path, monkeypatch, capsys):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("oasis_warp.commands.synthesize.write_shards", stopped)
+    assert cli.main(["synthesize", str(tmp_path / "out")]) == INTERRUPTED
+    assert "the same command goes on" in capsys.readouterr().err

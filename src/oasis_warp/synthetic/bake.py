@@ -277,7 +277,7 @@ def _relief(
     height = height + (0.03 + 0.04 * identity.dryness) * noise["dry"] * bare
     toward_wrist = 0.25 + 0.75 * (region.on_finger < 0.5)
     height = height + back * toward_wrist * (
-        0.25 * identity.tendons * line["tendon"] + 0.6 * identity.veins * line["vein"]
+        0.15 * identity.tendons * line["tendon"] + 0.6 * identity.veins * line["vein"]
     )
     height = height + 0.35 * palm * noise["palm_lumps"] + 0.05 * line["hair"]
     rim = torch.exp(-(((nails.distance - 0.15) / 0.3) ** 2)) * (nails.distance < 2)

@@ -80,8 +80,9 @@ def _blur(images: Tensor, sigmas: Tensor) -> Tensor:
     kernel = torch.exp(-0.5 * (at / sigmas[:, None].clamp_min(0.05)) ** 2)
     kernel = (kernel / kernel.sum(1, keepdim=True)).repeat_interleave(channels, 0)[:, None]
     flat = images.reshape(1, batch * channels, *images.shape[2:])
-    flat = conv2d(pad(flat, (_TAPS, _TAPS, 0, 0), mode="replicate"), kernel[:, :, None], groups=batch * channels)
-    flat = conv2d(pad(flat, (0, 0, _TAPS, _TAPS), mode="replicate"), kernel[..., None], groups=batch * channels)
+    with torch.backends.cudnn.flags(deterministic=True, allow_tf32=False):  # the same picture as on the CPU
+        flat = conv2d(pad(flat, (_TAPS, _TAPS, 0, 0), mode="replicate"), kernel[:, :, None], groups=batch * channels)
+        flat = conv2d(pad(flat, (0, 0, _TAPS, _TAPS), mode="replicate"), kernel[..., None], groups=batch * channels)
     return flat.view_as(images)
 
 
