@@ -1,4 +1,3 @@
-import io
 import json
 import tarfile
 
@@ -42,15 +41,21 @@ def _files(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+def _member(tar, name):
+    with tar.extractfile(name) as file:
+        return file.read()
+
+
+def _decoded(data):
+    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
+
+
 def test_shards_hold_every_picture_once_and_the_truth_beside_it(whole):
     assert sorted(_files(whole)) == ["dataset.json", *(f"hands-{k:06d}.tar" for k in range(3))]
     with tarfile.open(whole / "hands-000001.tar") as tar:
         names = tar.getnames()
-        truth = json.load(tar.extractfile("00000002.json"))
-        mask = cv2.imdecode(np.frombuffer(tar.extractfile("00000002.mask.png").read(), np.uint8), cv2.IMREAD_UNCHANGED)
-        depth = cv2.imdecode(
-            np.frombuffer(tar.extractfile("00000002.depth.png").read(), np.uint8), cv2.IMREAD_UNCHANGED
-        )
+        truth = json.loads(_member(tar, "00000002.json"))
+        mask, depth = (_decoded(_member(tar, f"00000002.{kind}.png")) for kind in ("mask", "depth"))
     assert names == [f"{k:08d}.{end}" for k in (2, 3) for end in ("jpg", "mask.png", "depth.png", "json")]
     batch = render_batch(13, [2], SIZE)
     np.testing.assert_allclose(truth["landmarks"], batch.landmarks[0], atol=1e-3)
@@ -143,7 +148,7 @@ def test_an_empty_folder_of_backgrounds_is_refused(tmp_path):
 def test_the_command_writes_a_sheet(tmp_path):
     out = tmp_path / "sheet.png"
     assert cli.main(["synthesize", str(out), "--sheet", "--count", "2", "--size", "32", "--seed", "13"]) == 0
-    assert cv2.imdecode(np.frombuffer(io.BytesIO(out.read_bytes()).read(), np.uint8), 1).shape == (32, 66, 3)
+    assert _decoded(out.read_bytes()).shape == (32, 66, 3)
 
 
 def test_a_sheet_places_pictures_in_rows():

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from oasis_warp.ops import depth_map
-from oasis_warp.synthetic.body import Body, bundled_body
+from oasis_warp.synthetic.body import FINGERS, Body, bundled_body
 
 WIDTH, HEIGHT = 1024, 1408
 """Texels of the atlas: .34 mm each on the hand, enough for a hand that fills 512 pixels."""
@@ -51,7 +51,7 @@ class Atlas:
             for place, bone in enumerate(bones):
                 local[here, place] = bone.local(self._positions[here])
         self.local = torch.from_numpy(local)
-        nearest = distance_transform_edt(~shown.numpy(), return_distances=False, return_indices=True)
+        nearest = np.asarray(distance_transform_edt(~shown.numpy(), return_distances=False, return_indices=True))
         number = torch.full((HEIGHT, WIDTH), -1, dtype=torch.int64)
         number[shown] = torch.arange(int(shown.sum()))
         self._fill = number[torch.from_numpy(nearest[0]).long(), torch.from_numpy(nearest[1]).long()]
@@ -79,8 +79,6 @@ class Atlas:
         return self._positions[index[tree.query(np.asarray(points)[:, axes])[1]]]
 
     def _region(self, region: str) -> tuple[np.ndarray, tuple[int, ...]]:
-        from oasis_warp.synthetic.body import FINGERS
-
         if region in FINGERS:
             return (self.finger == FINGERS.index(region)).numpy(), (0, 1, 2)
         n, x = self.normals[:, 1].numpy(), self._positions[:, 0]

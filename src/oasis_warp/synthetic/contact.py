@@ -47,13 +47,13 @@ class Balls(NamedTuple):
 def bundled_balls() -> Balls:
     """Of the mean hand."""
     body = bundled_body()
-    joint, center, radius, group = [], [], [], []
+    rows = []
     for finger in range(5):
         for place in range(3):
             for share, (c, r) in zip(_PLACES, _sections(body, finger, place), strict=True):
                 if place == 2 and share == _PLACES[-1]:
                     r = 0.9 * r
-                joint.append(3 * finger + 1 + place), center.append(c), radius.append(r), group.append(finger)
+                rows.append((3 * finger + 1 + place, c, r, finger))
     knuckles = body.hand.joints[[1, 4, 10, 7]].double().numpy() * 1e3
     for knuckle in knuckles:
         for share in (0.25, 0.45, 0.65, 0.85):
@@ -62,9 +62,8 @@ def bundled_balls() -> Balls:
             off = np.hypot(near[:, 0], near[:, 2]) < 5
             c = c + np.array([0, (near[off, 1].max() + near[off, 1].min()) / 2, 0])
             thick = np.ptp(near[off, 1]) / 2
-            joint.append(0), center.append(c), radius.append(min(thick, 13.0)), group.append(PALM)
-    joint, group, radius = np.array(joint), np.array(group), np.array(radius)
-    center = np.stack(center)
+            rows.append((0, c, min(thick, 13.0), PALM))
+    joint, center, radius, group = (np.array(column) for column in zip(*rows, strict=True))
     i, j = np.triu_indices(len(joint), 1)
     outer = lambda k: (joint[k] == 0) | ((joint[k] - 1) % 3 > 0)  # noqa: E731  (first phalanges touch at their roots)
     palm_pair = (group[i] == PALM) ^ (group[j] == PALM)

@@ -152,4 +152,5 @@ def _polish(rng: np.random.Generator) -> tuple[float, float, float]:
         0.01 + 0.07 * value,
         value**1.6,
     ][kind]
-    return tuple(float(c) for c in np.clip(color, 0.01, 0.85))
+    red, green, blue = (float(c) for c in np.clip(color, 0.01, 0.85))
+    return red, green, blue
