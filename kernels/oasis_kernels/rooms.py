@@ -195,9 +195,9 @@ def sight(
     gloss = solids[b, hit, GLOSS]
     open_ = wp.float32(1.0)
     size = wp.clamp(0.12 * p[2], 0.02, 0.3)
-    for k in range(1, 4):
-        reach = size * float(k * k) / 9.0
-        open_ -= wp.max(reach - clearance(solids, b, p + reach * n), 0.0) / reach * 0.24
+    for k in range(2):
+        reach = size * (0.2 + 0.8 * float(k))
+        open_ -= wp.max(reach - clearance(solids, b, p + reach * n), 0.0) / reach * 0.36
     open_ = wp.max(open_, 0.12)
     total = light_along(sky, b, cosine_lobe(n)) * open_
     for lamp in range(lamps.shape[1]):
@@ -223,10 +223,10 @@ def sight(
                 if share > 0.0 and lamp == 0:  # the first lamp's shadows of the solids themselves
                     s = 0.015 + 0.0016 * turn
                     soft = 1.0 / wp.max(lamp_spreads[b, lamp], 0.05)
-                    for _k in range(7):
+                    for _k in range(5):
                         near = clearance(solids, b, p + 0.004 * n + s * w)
                         share = wp.min(share, wp.clamp(0.5 + 0.5 * soft * near / s, 0.0, 1.0))
-                        s += wp.clamp(near, 0.02, 0.25)
+                        s += wp.clamp(near, 0.03, 0.3)
                 total += color * (fall * fall * facing * share)
     back = d - 2.0 * wp.dot(d, n) * n
     facing_view = wp.clamp(-wp.dot(d, n), 0.0, 1.0)

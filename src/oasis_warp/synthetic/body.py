@@ -7,6 +7,7 @@ Vertices are those of the hand, then of the rows of the forearm (towards the elb
 import functools
 from dataclasses import dataclass
 
+import igl
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -32,6 +33,7 @@ ATLAS_ARM_BIAS = 0.7
 
 SKIN, SLEEVE, BAND, RING = range(4)
 """Materials of faces."""
+COARSE_FACES = 4000
 KNUCKLE_RISE = (2.0, 1.7, 0.8)
 """How far a knuckle stands out of a finger bent by 90 degrees, from the hand outwards [mm]."""
 
@@ -110,6 +112,9 @@ class Body:
     """Share of each finger's joints in the skinning."""
     bones: tuple[tuple[Bone, ...], ...]
     """[finger][place]."""
+    coarse_vertices: Int[Tensor, "C"]
+    """Some vertices of hand and forearm, and the faces between them: what hides the sky from others."""
+    coarse_faces: Int[Tensor, "G 3"]
     knuckle_rise: Float[Tensor, "V 15"]
     """Displacement of the hand's vertices along their normals, for each joint of a finger bent by 90 degrees [m]."""
 
@@ -145,6 +150,12 @@ def smoothstep(low: float, high: float, x: Tensor) -> Tensor:
     """0 at `low`, 1 at `high`, which may be the smaller one; flat at both ends."""
     t = ((x - low) / (high - low)).clamp(0, 1)
     return t * t * (3 - 2 * t)
+
+
+def _coarse(rest: Tensor, faces: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Vertices that are kept when edges are collapsed, and the faces that are left."""
+    _, left, _, kept = igl.decimate(rest.double().numpy(), np.ascontiguousarray(faces, np.int64), COARSE_FACES, False)
+    return torch.from_numpy(np.asarray(kept, np.int64)), torch.from_numpy(np.ascontiguousarray(left, np.int64))
 
 
 @functools.cache
@@ -193,8 +204,11 @@ def bundled_body() -> Body:
     weights = torch.cat([hand.weights, torch.eye(16)[:1].expand(len(rest) - n, 16)])
     bones = tuple(tuple(_bone(hand, finger, place) for place in range(3)) for finger in range(5))
     by_finger = torch.stack([weights[:, 3 * k + 1 : 3 * k + 4].sum(1) for k in range(5)], 1)
+    coarse_vertices, coarse_faces = _coarse(rest, skin_faces)
     return Body(
         hand=hand,
+        coarse_vertices=coarse_vertices,
+        coarse_faces=coarse_faces,
         faces=torch.from_numpy(np.concatenate([skin_faces, *worn])),
         materials=torch.from_numpy(np.concatenate(materials)).to(torch.int32),
         uv=torch.from_numpy(uv).float(),

@@ -42,10 +42,10 @@ def _intrinsics(focal: Tensor, size: int) -> Tensor:
     return K
 
 
-def _depths(posed: Posed, faces: Tensor, viewmats: Tensor, focals: Tensor, size: int) -> Tensor:
+def _depths(vertices: Tensor, faces: Tensor, viewmats: Tensor, focals: Tensor, size: int) -> Tensor:
     """Depth buffers of each image's mesh from each of its [B, N] cameras, [B, N, size, size]."""
     batch, n = focals.shape
-    vertices = posed.vertices[:, None].expand(-1, n, -1, -1).flatten(0, 1)
+    vertices = vertices[:, None].expand(-1, n, -1, -1).flatten(0, 1)
     K = _intrinsics(focals.flatten(), size)
     return depth_map(vertices, faces, viewmats.flatten(0, 1), K, size, size, validate=False).depth.unflatten(
         0, (batch, n)
@@ -64,7 +64,9 @@ def see_sky(body: Body, posed: Posed, normals: Tensor) -> Float[Tensor, "B V 10"
     away = posed.center[:, None] + directions * (SKY_DISTANCE * radius)[:, None, None]
     viewmats = look_at(away, posed.center[:, None].expand_as(away))
     focals = SKY_DISTANCE * SKY_SIZE / 2 * torch.ones_like(radius)
-    depths = _depths(posed, body.faces, viewmats, focals[:, None].expand(-1, len(directions)).contiguous(), SKY_SIZE)
+    coarse = posed.vertices[:, body.coarse_vertices]
+    each = focals[:, None].expand(-1, len(directions)).contiguous()
+    depths = _depths(coarse, body.coarse_faces, viewmats, each, SKY_SIZE)
     transfer = sky_transfer(posed.vertices, normals, directions, viewmats, focals, depths)
     return smooth_over_faces(transfer, body.faces)
 
@@ -78,5 +80,5 @@ def light_lamps(body: Body, posed: Posed, lights: list[Light]) -> Lamps:
     positions = center + directions * distances[..., None]
     viewmats = look_at(positions, center)
     focals = LAMP_SIZE / 2 * distances / (LAMP_MARGIN * posed.radius)[:, None]
-    depths = _depths(posed, body.faces, viewmats, focals, LAMP_SIZE)
+    depths = _depths(posed.vertices, body.faces, viewmats, focals, LAMP_SIZE)
     return Lamps(positions, on_device("colors"), distances, on_device("spreads"), viewmats, focals, depths)

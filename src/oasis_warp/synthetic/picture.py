@@ -65,7 +65,7 @@ def _body(device: str) -> Body:
     body = bundled_body()
     moved = {
         name: getattr(body, name).to(device)
-        for name in ("faces", "materials", "uv", "uv_faces", "normals", "knuckle_rise")
+        for name in ("faces", "materials", "uv", "uv_faces", "normals", "knuckle_rise", "coarse_vertices", "coarse_faces")
     }
     return replace(body, hand=body.hand.to(device), **moved)
 
