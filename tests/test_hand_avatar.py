@@ -1,15 +1,18 @@
+import copy
+
 import pytest
 import torch
 from synthetic import PALM_TO_CAMERA, evidence_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.pose import mirror_gaussians
+from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.core import rotation
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians, HandPose
 from oasis_warp.data.avatar_file import save_avatar
 from oasis_warp.evaluation import coverage
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.skinning import mirror_pose
+from oasis_warp.hand.skinning import mirror_points, mirror_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.render.cameras import mirrored_camera
 
@@ -40,9 +43,13 @@ def left(right):
 
 
 def test_a_left_hand_is_the_mirror_image_of_a_right_hand(left, right):
-    mirrored = mirror_gaussians(right.pose(right.source_pose))
-    for ours, theirs in zip(left.pose(left.source_pose), mirrored, strict=True):
-        torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=0)
+    ours, theirs = left.pose(left.source_pose), right.pose(right.source_pose)
+    torch.testing.assert_close(ours.means, mirror_points(theirs.means), atol=1e-6, rtol=0)
+    flip = torch.tensor([-1.0, 1.0, 1.0])
+    turns, mirrored = rotation.to_matrix(ours.quats), rotation.to_matrix(theirs.quats) * flip * flip[:, None]
+    torch.testing.assert_close(turns, mirrored, atol=2e-5, rtol=0)
+    torch.testing.assert_close(ours.scales, theirs.scales, atol=1e-8, rtol=1e-5)
+    torch.testing.assert_close(left.mesh(left.source_pose).tips, mirror_points(right.mesh(right.source_pose).tips))
     pictures = [a.render(a.source_camera, a.source_pose).image for a in (left, right)]
     difference = (pictures[0].flip(1) - pictures[1]).abs().amax(-1)
     # A layer at the cut of 1/255 may be drawn in one picture and left out of the other.
@@ -55,6 +62,36 @@ def test_the_mesh_carries_the_gaussians(left):
     torch.testing.assert_close(means[:100], vertices[left.gaussians.vertex_index[:100]])
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_many_poses_are_what_as_many_calls_give(side, left, right):
+    avatar = {"left": left, "right": right}[side]
+    angles = [named_pose(avatar.hand, name) for name in ("fist", "pinch", "open")]
+    shifts = torch.rand(3, 3, generator=torch.Generator().manual_seed(0))
+    poses = [HandPose(a, PALM_TO_CAMERA, t) for a, t in zip(angles, shifts, strict=True)]
+    together = HandPose(*map(torch.stack, zip(*poses, strict=True)))
+    gaussians, surfaces = avatar.pose(together), avatar.mesh(together)
+    for k, pose in enumerate(poses):
+        alone = avatar.pose(pose)
+        assert all(torch.equal(a[k], b) for a, b in zip(gaussians[:3], alone[:3], strict=True))
+        assert torch.equal(surfaces.vertices[k], avatar.mesh(pose).vertices)
+    assert gaussians.opacities is avatar.gaussians.opacities and gaussians.colors is avatar.gaussians.colors
+
+
+def test_a_shape_that_needs_a_gradient_gets_one_through_the_surface_at_rest_too(right):
+    shape = right.shape.clone().requires_grad_()
+    avatar = Avatar(
+        side="right", shape=shape, surface_offsets=right.surface_offsets, gaussians=right.gaussians,
+        source_pose=right.source_pose, source_camera=right.source_camera,
+    )  # fmt: skip
+    flat = avatar.source_pose._replace(angles=torch.zeros(15, 3))
+    (both,) = torch.autograd.grad(avatar.pose(flat).scales.sum(), shape, retain_graph=True)
+    posed = avatar.mesh(flat).vertices
+    alone = pose_gaussians(avatar.gaussians, avatar.hand.faces, avatar.rest.vertices.detach(), posed).scales.sum()
+    (left_behind,) = torch.autograd.grad(alone, shape)
+    # An unbent hand grows as much posed as at rest.
+    assert both.norm() < 1e-3 * left_behind.norm()
+
+
 def test_an_avatar_survives_its_file_bit_for_bit(left, tmp_path):
     left.save(tmp_path / "a.safetensors")
     loaded = Avatar.load(tmp_path / "a.safetensors")
@@ -63,6 +100,11 @@ def test_an_avatar_survives_its_file_bit_for_bit(left, tmp_path):
     for ours, theirs in zip(loaded.pose(pose), left.pose(pose), strict=True):
         assert torch.equal(ours, theirs)
     assert (loaded.source_camera.width, loaded.source_camera.height) == (64, 64)
+
+
+def test_an_avatar_can_be_copied(left):
+    twin = copy.deepcopy(left)
+    assert torch.equal(twin.pose(left.source_pose).means, left.pose(left.source_pose).means)
 
 
 def test_an_avatar_of_another_hand_model_is_refused(right, tmp_path, monkeypatch):
@@ -86,6 +128,7 @@ def test_an_avatar_of_another_hand_model_is_refused(right, tmp_path, monkeypatch
         ({"angles": torch.zeros(14, 3)}, r"pose\.angles: expected shape \[15, 3\], got \[14, 3\]"),
         ({"orientation": torch.eye(4)}, r"pose\.orientation: expected shape \[3, 3\]"),
         ({"translation": torch.tensor([0.0, float("nan"), 0])}, "translation: expected finite"),
+        ({"angles": torch.zeros(2, 15, 3)}, r"pose\.orientation: expected shape \[2, 3, 3\]"),
     ],
 )
 def test_a_pose_that_is_none_is_refused(right, change, message):
@@ -94,10 +137,25 @@ def test_a_pose_that_is_none_is_refused(right, change, message):
 
 
 @pytest.mark.usefixtures("as_shipped")
+def test_many_poses_are_no_picture(right):
+    many = HandPose(*(part[None] for part in right.source_pose))
+    with pytest.raises(ValueError, match=r"pose\.angles: expected shape \[15, 3\], got \[1, 15, 3\]. One pose a"):
+        right.render(right.source_camera, many)
+
+
+def test_an_unchecked_pose_is_posed_whatever_it_holds(right):
+    broken = right.source_pose._replace(translation=torch.full((3,), torch.nan))
+    assert right.pose(broken, validate=False).means.isnan().all()
+    assert right.mesh(broken, validate=False).vertices.isnan().all()
+
+
+@pytest.mark.usefixtures("as_shipped")
 def test_a_camera_that_is_none_is_refused(right):
     camera = right.source_camera
     with pytest.raises(ValueError, match="K: expected finite"):
         right.render(camera._replace(K=camera.K * float("nan")), right.source_pose)
+    with pytest.raises(ValueError, match=r"background: expected shape \[3\], got \[4\]"):
+        right.render(camera, right.source_pose, (1.0, 1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match=r"camera\.viewmat: expected shape \[4, 4\], got \[3, 4\]"):
         right.render(camera._replace(viewmat=camera.viewmat[:3]), right.source_pose)
 
@@ -116,6 +174,38 @@ def test_pictures_are_differentiable_in_the_pose(right):
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_replayed_pictures_are_the_drawn_ones_at_every_size_and_distance(side, left, right, tmp_path):
+    {"left": left, "right": right}[side].save(tmp_path / "a.safetensors")
+    there = Avatar.load(tmp_path / "a.safetensors", device="cuda")
+    camera = there.source_camera
+    for width, height, distance in [(64, 64, 0), (64, 64, 2), (96, 64, 0), (64, 64, 0), (64, 64, -0.3), (96, 64, 1)]:
+        for name in ("fist", "open"):
+            shift = torch.tensor([0.0, 0, distance]).to(there.device)
+            pose = HandPose(
+                named_pose(there.hand, name).cpu(), there.source_pose.orientation, there.source_pose.translation + shift
+            )
+            seen = camera._replace(width=width, height=height)
+            color = (0.1, 0.2, 0.3)
+            replayed = there.render(seen, pose, color)
+            angles = pose.angles.cuda().requires_grad_()
+            drawn = there.render(seen, pose._replace(angles=angles), color)
+            assert drawn.image.requires_grad and not replayed.image.requires_grad
+            assert replayed.image.shape == (height, width, 3)
+            assert torch.equal(replayed.image, drawn.image) and torch.equal(replayed.alpha, drawn.alpha)
+
+
+@pytest.mark.gpu
+def test_pictures_of_a_gpu_can_be_drawn_in_inference_mode_and_out_of_it(right, tmp_path):
+    right.save(tmp_path / "a.safetensors")
+    there = Avatar.load(tmp_path / "a.safetensors", device="cuda")
+    with torch.inference_mode():
+        inside = there.render(there.source_camera, there.source_pose).image
+    outside = there.render(there.source_camera, there.source_pose).image
+    assert torch.equal(inside, outside)
+
+
+@pytest.mark.gpu
 def test_a_gpu_draws_what_the_cpu_draws(right, tmp_path):
     right.save(tmp_path / "a.safetensors")
     there = Avatar.load(tmp_path / "a.safetensors", device="cuda")
@@ -124,6 +214,28 @@ def test_a_gpu_draws_what_the_cpu_draws(right, tmp_path):
     torch.testing.assert_close(
         picture.cpu(), right.render(right.source_camera, right.source_pose).image, atol=2e-3, rtol=0
     )
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_gpu_poses_what_the_cpu_poses_in_a_graph_too(side, left, right, tmp_path):
+    here = {"left": left, "right": right}[side]
+    here.save(tmp_path / "a.safetensors")
+    there = Avatar.load(tmp_path / "a.safetensors", device="cuda")
+    static = HandPose(*(part.cuda() for part in here.source_pose))
+    there.pose(static, validate=False)  # loads the kernels, looks at the indices
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = there.pose(static, validate=False)
+    pose = HandPose(named_pose(here.hand, "fist"), PALM_TO_CAMERA, torch.tensor([0.1, 0.2, 0.5]))
+    for part, new in zip(static, pose, strict=True):
+        part.copy_(new)
+    graph.replay()
+    want, eager = here.pose(pose), there.pose(pose)
+    for ours, again, theirs in zip(captured[:3], eager[:3], want[:3], strict=True):
+        assert torch.equal(ours, again)
+        torch.testing.assert_close(ours.cpu(), theirs, atol=1e-5, rtol=0)
 
 
 def test_fewer_gaussians_make_a_smaller_file_and_still_an_avatar(right):

@@ -1,269 +1,303 @@
-"""Float32 blending on CUDA: a block of warps sorts and draws a tile of 8 x 8 pixels, two pixels a lane.
+"""Float32 blending on CUDA: two warps sort and draw a tile of 8 x 8 pixels, one pixel a lane.
 
-The longest lists decide the time, so a list is cut into segments, one a warp, by its length alone. A first pass over
-its segment tells each warp how much light the segment lets through; products over the segments in front give the
-transmittance that the second pass starts with. A pixel that ends in one segment is not entered by the next.
+A warp goes through the tile's list 32 layers at a time: each lane fetches one and tests it against the warp's 8 x 4
+pixels; those that can reach a pixel are packed together in shared memory, where all lanes read them in turn.
+
+For the backward pass the list is cut into segments by its length alone. What each segment but the first adds to a
+pixel, and the transmittance at the end of each but the last, are kept, so that the segments can be replayed at once.
 """
 
 import functools
-from typing import Any
+import math
 
-import warp as wp
-
-from oasis_kernels.constants import ALPHA_MAX, Rules
+from oasis_kernels.constants import ALPHA_MAX, CUT_SLACK, Rules
 from oasis_kernels.cuda_binning import INDEX_BITS
+from oasis_kernels.cuda_native import CudaNative, cuda_native
 
-WARPS = 4
-"""Warps that share a tile, at most: each takes a segment of the list, of 32 layers or more."""
-BLOCK = 32 * WARPS
+BLOCK = 64
 """Threads a tile."""
-LONGEST = 2048
-"""Longest list that is sorted in shared memory; longer ones come in sorted."""
+LONGEST = 512
+"""Longest list that is sorted here; longer ones come in sorted, by `cuda_long_lists`."""
+SEGMENTS = 4
+"""Most parts of a list."""
 SCALE = 0.8493218183517456
 """sqrt(log2(e) / 2) as a float32: e^(-|y|^2 / 2) = 2^(-|SCALE y|^2)."""
 
 HEAD = """
-#if defined(__CUDA_ARCH__)
-    const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
+    struct Layer { float cx, cy, w0, w1, w2, w3, lo; };
     const unsigned all = 0xffffffffu;
-    const int camera = tile / (tiles_x * tiles_y);
-    const int left = (tile % tiles_x) * 8, top = (tile / tiles_x - camera * tiles_y) * 8;
-    const int start = tile_starts.data[tile], count = tile_starts.data[tile + 1] - start;
-    const int px = left + (lane & 7), py0 = top + (lane >> 3), py1 = py0 + 4;
-    const bool in0 = px < width && py0 < height, in1 = px < width && py1 < height;
-    const long long row = (long long)camera * height;
-    const long long pixel0 = (row + py0) * width + px, pixel1 = (row + py1) * width + px;
-    // The list is cut into equal segments, one a warp, each of 32 layers or more.
-    int segments = @WARPS@;
-    while (segments > 1 && count <= 32 * (segments / 2)) segments >>= 1;
-    const int segment = ((count + segments - 1) / segments + 3) & ~3;
-    const int from = min(warp * segment, count), to = min(from + segment, count);
-
-    // Offsets of the pixels' centres from the tile's corner: small, exact numbers.
-    const float x = (float)(lane & 7), y0 = (float)(lane >> 3), y1 = y0 + 4.f;
-
-    // A Gaussian as the tile sees it: centre from the tile's corner, half a pixel taken off; W scaled so that
-    // alpha = 2^(lo - |W d|^2).
-    struct __align__(16) Layer { float cx, cy, w0, w1, w2, w3, lo, pad; };
-    auto layer = [&](int g) -> Layer {
-        const float4 c = *(const float4*)(centers.data + g);
-        const float4 w = *(const float4*)(whitenings.data + g);
-        const float s = @SCALE@;
-        return {(c.x - (float)left) + (c.z - 0.5f), (c.y - (float)top) + (c.w - 0.5f), w.x * s, w.y * s, w.z * s,
-                w.w * s, log2f(opacities.data[g]), 0.f};
+    const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
+    const int4 own = tiles[block_index];  // column, start and length of the list, row over all cameras
+    const int start = own.y, count = own.z;
+    const int camera = n_cameras == 1 ? 0 : own.w / tiles_y;
+    const int left = own.x * 8, top = (own.w - camera * tiles_y) * 8;
+    const long long first_pixel = ((long long)camera * height + top) * width + left;
+    // Segments of the list, of 32 layers or a multiple.
+    const int segment = max(32, ((count + @SEGMENTS@ - 1) / @SEGMENTS@ + 31) & ~31);
+    // The memory of what is kept of this tile: by boundary between segments, number and pixel.
+    float* const boundaries = checkpoints
+        ? checkpoints + (long long)block_index * ((@SEGMENTS@ - 1) * (@CHANNELS@ + 1) * 64) : nullptr;
+    auto boundary = [&](int b, int k, int pixel) -> float& {
+        return boundaries[(b * (@CHANNELS@ + 1) + k) * 64 + pixel];
     };
     auto power = [](float x) -> float { float r; asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return r; };
+    auto log2_of = [](float x) -> float { float r; asm("lg2.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return r; };
+    auto inverse = [](float x) -> float { float r; asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return r; };
+
+    // Layers of a warp, @STRIDE@ floats each: centre, W, log2 of the opacity, place in the list, colour.
+    __shared__ __align__(16) float layer_memory[@WARPS@][32 * @STRIDE@];
+    float* const layers = layer_memory[warp];
+    const unsigned layers_at = (unsigned)__cvta_generic_to_shared(layers);
+    auto load4 = [](unsigned at) -> float4 {  // of shared memory, without the arithmetic that a pointer costs
+        float4 v;
+        asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
+                     : "=f"(v.x), "=f"(v.y), "=f"(v.z), "=f"(v.w) : "r"(at));
+        return v;
+    };
+    auto put = [&](int slot, const Layer& l, int place, const float* color) {
+        float* const to = layers + slot * @STRIDE@;
+        *(float4*)to = {l.cx, l.cy, l.w0, l.w1};
+        *(float4*)(to + 4) = {l.w2, l.w3, l.lo, __int_as_float(place)};
+        #pragma unroll
+        for (int k = 0; k < @PADDED@; k += 4)
+            *(float4*)(to + 8 + k) = {color[k], k + 1 < @CHANNELS@ ? color[k + 1] : 0.f,
+                                      k + 2 < @CHANNELS@ ? color[k + 2] : 0.f, k + 3 < @CHANNELS@ ? color[k + 3] : 0.f};
+    };
+    auto put_nothing = [&](int slot) {  // a layer that nobody sees
+        float* const to = layers + slot * @STRIDE@;
+        for (int k = 0; k < @STRIDE@; k++) to[k] = 0.f;
+        to[6] = -1e9f;
+    };
+
+    // A Gaussian as the tile sees it: centre from the middle of the tile's first pixel, a small, exact number and a
+    // remainder; W scaled so that alpha = 2^(lo - |W d|^2).
+    auto layer = [&](const float4& c, const float4& w, float opacity) -> Layer {
+        const float s = @SCALE@;
+        return {(c.x - (float)left) + (c.z - 0.5f), (c.y - (float)top) + (c.w - 0.5f), w.x * s, w.y * s, w.z * s,
+                w.w * s, log2_of(opacity)};
+    };
+    // Whether it can reach a pixel of the columns 0 .. 7 and the rows y_low .. y_high: the least |W d|^2 over the
+    // rectangle lies at its middle or on an edge that faces the centre. The slack is larger than what rounding does.
+    auto reaches = [&](const Layer& l, float y_low, float y_high) -> bool {
+        const float cut = l.lo - @CUT@;
+        const float x0 = -l.cx, x1 = 7.f - l.cx, y0 = y_low - l.cy, y1 = y_high - l.cy;
+        const float dx = fminf(fmaxf(0.f, x0), x1), dy = fminf(fmaxf(0.f, y0), y1);
+        auto fits = [&](float ex, float ey) -> bool {
+            const float u = l.w0 * ex + l.w1 * ey, p = l.w2 * ex, q = l.w3 * ey;
+            const float v = fmaxf(fabsf(p + q) - 1e-6f * (fabsf(p) + fabsf(q)), 0.f);
+            return u * u + v * v <= cut;
+        };
+        const float xx = l.w0 * l.w0 + l.w2 * l.w2, yy = l.w1 * l.w1 + l.w3 * l.w3, xy = l.w0 * l.w1 + l.w2 * l.w3;
+        bool any = dx == 0.f && dy == 0.f;
+        if (dx != 0.f) any |= fits(dx, fminf(fmaxf(-xy * dx * inverse(yy), y0), y1));
+        if (dy != 0.f) any |= fits(fminf(fmaxf(-xy * dy * inverse(xx), x0), x1), dy);
+        return any && cut >= 0.f;
+    };
+"""
+
+SORT = """
+    // Each warp sorts 32 keys at a time in its registers; then every key counts those before it in all runs.
+    __shared__ long long keys_here[@LONGEST@];
+    __shared__ int sorted_here[@LONGEST@];
+    if (count <= @LONGEST@) {
+        const int runs = (count + 31) >> 5;
+        for (int run = warp; run < runs; run += @WARPS@) {
+            const int at = run * 32 + lane;
+            long long key = at < count ? keys[start + at] : 0x7fffffffffffffffll;
+            #pragma unroll
+            for (int size = 2; size <= 32; size <<= 1) {
+                #pragma unroll
+                for (int step = size >> 1; step > 0; step >>= 1) {
+                    const long long other = __shfl_xor_sync(all, key, step);
+                    const bool smaller = ((lane & size) == 0 || size == 32) == ((lane & step) == 0);
+                    if ((other < key) == smaller) key = other;
+                }
+            }
+            keys_here[at] = key;
+        }
+        __syncthreads();
+        for (int at = threadIdx.x; at < runs * 32; at += @BLOCK@) {
+            const long long key = keys_here[at];
+            int rank = 0;
+            #pragma unroll 4
+            for (int run = 0; run < runs; run++) {
+                const long long* those = keys_here + run * 32;
+                int before = 0;
+                #pragma unroll
+                for (int step = 16; step > 0; step >>= 1) if (those[before + step - 1] < key) before += step;
+                rank += before + (those[before] < key);
+            }
+            if (at < count) {
+                const int g = camera * n + (int)(key & @INDEX_MASK@);
+                sorted_here[rank] = g;
+                if (stops) tile_gaussians[start + rank] = g;
+            }
+        }
+        __syncthreads();
+    }
+    const int* const list = count <= @LONGEST@ ? sorted_here : tile_gaussians + start;
 """
 
 FORWARD = """
-    // One after the other, this memory holds the keys, batches of layers, and what the segments add.
-    __shared__ __align__(16) float pool[@POOL@];
-    __shared__ float passes[@WARPS@][64];
-    Layer* batch = (Layer*)pool + 32 * warp;
-    float* batch_colors = pool + 256 * @WARPS@ + 32 * @CHANNELS@ * warp;
-    if (!sorted) {
-        long long* sorting = (long long*)pool;  // a bitonic network
-        int size = 32;
-        while (size < count) size <<= 1;
-        for (int k = threadIdx.x; k < size; k += blockDim.x)
-            sorting[k] = k < count ? keys.data[start + k] : 0x7fffffffffffffffll;
-        __syncthreads();
-        for (int block = 2; block <= size; block <<= 1) for (int step = block >> 1; step > 0; step >>= 1) {
-            for (int k = threadIdx.x; k < size / 2; k += blockDim.x) {
-                const int a = ((k & ~(step - 1)) << 1) | (k & (step - 1)), b = a + step;
-                const long long u = sorting[a], v = sorting[b];
-                if ((u > v) == ((a & block) == 0)) { sorting[a] = v; sorting[b] = u; }
-            }
-            __syncthreads();
+    const int used = (count + segment - 1) / segment;
+    const int column = lane & 7, row = 4 * warp + (lane >> 3), pixel_here = row * 8 + column;
+    const bool inside = left + column < width && top + row < height;
+    // A pixel that has ended moves out of reach of every layer.
+    float x = inside ? (float)column : 1e18f;
+    const float y = (float)row, y_low = (float)(4 * warp), y_high = y_low + 3.f;
+    float T = 1.f, C[@PADDED@] = {}, sums[@CHANNELS@] = {};
+    int stop = count, now = 0;  // the segment being drawn
+    auto keep = [&](int b, int k, float value) { if (boundaries) boundary(b, k, pixel_here) = value; };
+    auto end_segment = [&]() {
+        #pragma unroll
+        for (int k = 0; k < @CHANNELS@; k++) {
+            if (now > 0) keep(now - 1, k + 1, C[k]);
+            sums[k] += C[k];
+            C[k] = 0.f;
         }
-        for (int k = threadIdx.x; k < count; k += blockDim.x)
-            tile_gaussians.data[start + k] = camera * n + (int)(sorting[k] & @INDEX_MASK@);
-        __syncthreads();
-    }
-    auto load = [&](int first, bool with_colors) {
-        __syncwarp();
-        const int k = first + lane;
-        if (k < to) {
-            const int g = tile_gaussians.data[start + k];
-            batch[lane] = layer(g);
-            const float* rgb = (const float*)(colors.data + g);
-            if (with_colors) for (int c = 0; c < @CHANNELS@; c++) batch_colors[lane * @CHANNELS@ + c] = rgb[c];
-        } else {
-            batch[lane] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, -1e9f, 0.f};  // fainter than any cut-off
-            for (int c = 0; c < @CHANNELS@; c++) batch_colors[lane * @CHANNELS@ + c] = 0.f;
-        }
-        __syncwarp();
-    };
-    auto alphas_of = [&](const Layer& l, float& alpha0, float& alpha1) {
-        const float dx = x - l.cx, d0 = y0 - l.cy, d1 = y1 - l.cy;
-        const float u0 = l.w0 * dx + l.w1 * d0, v0 = l.w2 * dx + l.w3 * d0;
-        const float u1 = l.w0 * dx + l.w1 * d1, v1 = l.w2 * dx + l.w3 * d1;
-        alpha0 = fminf(power(l.lo - (u0 * u0 + v0 * v0)), @ALPHA_MAX@);
-        alpha1 = fminf(power(l.lo - (u1 * u1 + v1 * v1)), @ALPHA_MAX@);
+        if (now < used - 1) keep(now, 0, T);
+        now++;
     };
 
-    // First how much each segment lets through, whatever lies in front of it; then every segment knows the
-    // transmittance that it starts with.
-    float P0 = 1.f, P1 = 1.f;
-    if (warp < segments - 1) for (int first = from; first < to; first += 32) {
-        load(first, false);
-        const int m = min(32, to - first);
-        for (int j = 0; j < m; j += 4) {
-            #pragma unroll
-            for (int i = 0; i < 4; i++) {
-                float alpha0, alpha1;
-                alphas_of(batch[j + i], alpha0, alpha1);
-                P0 *= alpha0 >= @ALPHA_MIN@ ? 1.f - alpha0 : 1.f;
-                P1 *= alpha1 >= @ALPHA_MIN@ ? 1.f - alpha1 : 1.f;
+    // The next 32 layers are on their way while these are drawn.
+    float4 next_center, next_whitening;
+    float next_opacity, next_color[@PADDED@];
+    int next_index;
+    auto fetch = [&](int first) {
+        if (first + lane < count) {
+            next_index = list[first + lane];
+            next_center = centers[next_index];
+            next_whitening = whitenings[next_index];
+            next_opacity = opacities[next_index];
+            if (@CHANNELS@ <= 4) {
+                #pragma unroll
+                for (int k = 0; k < @CHANNELS@; k++) next_color[k] = colors[(long long)next_index * @CHANNELS@ + k];
             }
         }
-    }
-    passes[warp][lane] = P0;
-    passes[warp][lane + 32] = P1;
-    __syncthreads();
-    float T0 = 1.f, T1 = 1.f, A0 = 0.f, A1 = 0.f, C0[@CHANNELS@] = {}, C1[@CHANNELS@] = {};
-    for (int k = 0; k < warp && k < segments; k++) {
-        T0 *= passes[k][lane];
-        T1 *= passes[k][lane + 32];
-    }
-    int stop0 = count, stop1 = count;
-    bool open0 = in0 && T0 > @STOP@, open1 = in1 && T1 > @STOP@;
-    if (!open0) stop0 = from;
-    if (!open1) stop1 = from;
-    auto draw = [&](float alpha, int place, const float* rgb, bool& open, float& T, float& A, float* C, int& stop) {
-        const bool seen = open && alpha >= @ALPHA_MIN@;
-        const float after = T * (1.f - alpha);
-        const bool ends = seen && after <= @STOP@, drawn = seen && !ends;
-        const float weight = drawn ? alpha * T : 0.f;
-        open = open && !ends;
-        stop = ends ? place : stop;
-        T = drawn ? after : T;
-        A += weight;
-        for (int k = 0; k < @CHANNELS@; k++) C[k] += rgb[k] * weight;
     };
-    if (warp < segments) for (int first = from; first < to && __any_sync(all, open0 || open1); first += 32) {
-        load(first, true);
-        // Four layers at a time: their alphas do not wait for each other, only the blending does.
-        const int m = min(32, to - first);
+    fetch(0);
+    for (int first = 0; first < count; first += 32) {
+        if (first == (now + 1) * segment) end_segment();
+        if (!__any_sync(all, x < 1e17f)) break;
+        __syncwarp();
+        const Layer l = layer(next_center, next_whitening, next_opacity);
+        const bool hits = first + lane < count && reaches(l, y_low, y_high);
+        const unsigned hitting = __ballot_sync(all, hits);
+        const int m = __popc(hitting), slot = __popc(hitting & ((1u << lane) - 1u));
+        const float* const color = @CHANNELS@ <= 4 ? next_color : colors + (long long)next_index * @CHANNELS@;
+        if (hits) put(slot, l, first + lane, color);
+        if (lane >= m && lane < ((m + 3) & ~3)) put_nothing(lane);
+        __syncwarp();
+        fetch(first + 32);
+        // Four layers at a time: their alphas do not wait for each other, and the next four are under way while these
+        // are blended.
+        auto alphas_of = [&](int j, float* alpha) {
+            #pragma unroll
+            for (int i = 0; i < 4; i++) {
+                const unsigned at = layers_at + (j + i) * (4 * @STRIDE@);
+                const float4 a = load4(at), b = load4(at + 16);
+                const float dx = x - a.x, dy = y - a.y;
+                const float u = fmaf(a.z, dx, a.w * dy), v = fmaf(b.x, dx, b.y * dy);
+                const float raw = power(fmaf(-v, v, fmaf(-u, u, b.z)));
+                alpha[i] = raw >= @ALPHA_MIN@ ? fminf(raw, @ALPHA_MAX@) : 0.f;
+            }
+        };
+        float alpha[4], next_alpha[4] = {};
+        if (m) alphas_of(0, alpha);
+        #pragma unroll 2
         for (int j = 0; j < m; j += 4) {
-            float alpha0[4], alpha1[4];
-            bool any = false;
+            if (j + 4 < m) alphas_of(j + 4, next_alpha);
+            float t[5] = {T};
+            #pragma unroll
+            for (int i = 0; i < 4; i++) t[i + 1] = fmaf(-alpha[i], t[i], t[i]);
+            if (__any_sync(all, t[4] <= @STOP@)) {  // some pixel ends among the four
+                bool ended = false;
+                #pragma unroll
+                for (int i = 0; i < 4; i++) {
+                    if (ended) alpha[i] = 0.f;
+                    t[i + 1] = fmaf(-alpha[i], t[i], t[i]);
+                    if (t[i + 1] <= @STOP@) {
+                        ended = true;
+                        stop = __float_as_int(layers[(j + i) * @STRIDE@ + 7]);
+                        x = 1e18f;
+                        t[i + 1] = t[i];
+                        alpha[i] = 0.f;
+                    }
+                }
+                #pragma unroll
+                for (int i = 0; i < 4; i++) if (ended) next_alpha[i] = 0.f;
+            }
             #pragma unroll
             for (int i = 0; i < 4; i++) {
-                alphas_of(batch[j + i], alpha0[i], alpha1[i]);
-                any = any || (open0 && alpha0[i] >= @ALPHA_MIN@) || (open1 && alpha1[i] >= @ALPHA_MIN@);
+                const float weight = alpha[i] * t[i];
+                #pragma unroll
+                for (int k = 0; k < @CHANNELS@; k += 4) {
+                    const float4 color = load4(layers_at + (j + i) * (4 * @STRIDE@) + 32 + 4 * k);
+                    C[k] = fmaf(color.x, weight, C[k]);
+                    if (k + 1 < @CHANNELS@) C[k + 1] = fmaf(color.y, weight, C[k + 1]);
+                    if (k + 2 < @CHANNELS@) C[k + 2] = fmaf(color.z, weight, C[k + 2]);
+                    if (k + 3 < @CHANNELS@) C[k + 3] = fmaf(color.w, weight, C[k + 3]);
+                }
             }
-            if (!__any_sync(all, any)) continue;
+            T = t[4];
             #pragma unroll
-            for (int i = 0; i < 4; i++) {
-                const float* rgb = batch_colors + (j + i) * @CHANNELS@;
-                draw(alpha0[i], first + j + i, rgb, open0, T0, A0, C0, stop0);
-                draw(alpha1[i], first + j + i, rgb, open1, T1, A1, C1, stop1);
-            }
+            for (int i = 0; i < 4; i++) alpha[i] = next_alpha[i];
         }
     }
-
-    // What the segments add, front to back. A pixel ends where the first of them says so.
-    __syncthreads();  // the batches have been read
-    auto sums = [&](int k, int c, int p) -> float& { return pool[(k * (@CHANNELS@ + 2) + c) * 64 + p]; };
-    __shared__ int ends[@WARPS@][64];
-    if (warp < segments) {
-        for (int k = 0; k < @CHANNELS@; k++) { sums(warp, k, lane) = C0[k]; sums(warp, k, lane + 32) = C1[k]; }
-        sums(warp, @CHANNELS@, lane) = A0; sums(warp, @CHANNELS@, lane + 32) = A1;
-        sums(warp, @CHANNELS@ + 1, lane) = T0; sums(warp, @CHANNELS@ + 1, lane + 32) = T1;
-        ends[warp][lane] = stop0; ends[warp][lane + 32] = stop1;
+    end_segment();
+    for (; now < used; now++) {  // segments that no pixel needed
+        for (int k = 0; k < @CHANNELS@; k++) keep(now - 1, k + 1, 0.f);
+        if (now < used - 1) keep(now, 0, T);
     }
-    __syncthreads();
-    if (warp >= 2) return;
-    const int p = lane + 32 * warp;
-    if (!(warp ? in1 : in0)) return;
-    float A = 0.f, T = 1.f, C[@CHANNELS@] = {};
-    int stop = count;
-    for (int k = 0; k < segments; k++) {
-        A += sums(k, @CHANNELS@, p);
-        for (int c = 0; c < @CHANNELS@; c++) C[c] += sums(k, c, p);
-        // A segment that was not entered (it stops where it starts) leaves the transmittance of the one before.
-        if (ends[k][p] > k * segment || k == 0) T = sums(k, @CHANNELS@ + 1, p);
-        if (ends[k][p] < count) { stop = ends[k][p]; break; }
-    }
-    const long long pixel = warp ? pixel1 : pixel0;
-    const float* background = (const float*)(backgrounds.data + camera);
-    transmittance.data[pixel] = T;
-    alphas.data[pixel] = A;
-    stops.data[pixel] = stop;
-    float* out = (float*)(image.data + pixel);
-    for (int k = 0; k < @CHANNELS@; k++) out[k] = C[k] + background[k] * T;
-#endif
+    if (!inside) return;
+    const long long pixel = first_pixel + (long long)row * width + column;
+    alphas[pixel] = 1.f - T;
+    if (transmittance) transmittance[pixel] = T;
+    if (stops) stops[pixel] = stop;
+    #pragma unroll
+    for (int k = 0; k < @CHANNELS@; k++)
+        image[pixel * @CHANNELS@ + k] = sums[k] + (backgrounds ? backgrounds[camera * @CHANNELS@ + k] * T : 0.f);
 """
 
+PARAMETERS = {
+    "n": "int",
+    "tiles": "const int4*",  # [tiles]: see `place_tiles`
+    "n_cameras": "int",
+    "centers": "const float4*",  # [C * n]
+    "whitenings": "const float4*",
+    "opacities": "const float*",
+    "colors": "const float*",  # [C * n, channels]
+    "backgrounds": "const float*",  # [C, channels], or null for black
+    "tiles_x": "int",
+    "tiles_y": "int",
+    "width": "int",
+    "height": "int",
+    "tile_gaussians": "int*",  # [pairs]: the lists, nearest first; or null
+    "transmittance": "float*",  # [C, H, W], or null
+    "stops": "int*",  # [C, H, W]: place in the list of the first layer that was not drawn; or null
+    "checkpoints": "float*",  # [tiles with pairs, segments - 1, 1 + channels, 64], or null
+}
+"""Parameters of both directions, and their C++ types."""
 
-def snippet(body: str, channels: int, rules: Rules) -> str:
-    """C++ of one block with the numbers written in, floats as literals that read back to the same number."""
-    text = HEAD + body
-    pool = max(2 * LONGEST, WARPS * max(256 + 32 * channels, 64 * (channels + 2)))
+
+def snippet(body: str, channels: int, segments: int, rules: Rules, **numbers: int) -> str:
+    """`HEAD` and `body` with the numbers written in, floats as literals that read back to the same number."""
+    text, padded = HEAD + body, -(-channels // 4) * 4
     for name, value in {
         "ALPHA_MIN": f"{rules.alpha_min!r}f", "ALPHA_MAX": f"{ALPHA_MAX!r}f", "STOP": f"{rules.transmittance_stop!r}f",
-        "SCALE": f"{SCALE!r}f", "CHANNELS": channels, "WARPS": WARPS, "POOL": pool,
+        "CUT": f"({math.log2(rules.alpha_min) - CUT_SLACK!r}f)", "SCALE": f"{SCALE!r}f", "CHANNELS": channels,
+        "PADDED": padded, "STRIDE": 8 + padded, "SEGMENTS": segments, "LONGEST": LONGEST,
         "INDEX_MASK": hex((1 << INDEX_BITS) - 1),
     }.items():  # fmt: skip
         text = text.replace(f"@{name}@", str(value))
+    for name, number in numbers.items():
+        text = text.replace(f"@{name}@", str(number))
     return text
 
 
 @functools.cache
-def blend(channels: int, rules: Rules) -> Any:
-    """Kernel: sort and blend the tiles; launched with (tiles, BLOCK) threads in blocks of BLOCK."""
-    vec4 = wp.types.vector(length=4, dtype=wp.float32)
-    color = wp.types.vector(length=channels, dtype=wp.float32)
-
-    @wp.func_native(snippet(FORWARD, channels, rules))
-    def blend_tile(
-        tile: int,
-        n: int,
-        tile_starts: wp.array(dtype=wp.int32),
-        keys: wp.array(dtype=wp.int64),
-        sorted: int,  # 1: `tile_gaussians` comes in filled
-        centers: wp.array(dtype=vec4),
-        whitenings: wp.array(dtype=vec4),
-        opacities: wp.array(dtype=wp.float32),
-        colors: wp.array(dtype=color),
-        backgrounds: wp.array(dtype=color),
-        tiles_x: int,
-        tiles_y: int,
-        width: int,
-        height: int,
-        image: wp.array(dtype=color),
-        alphas: wp.array(dtype=wp.float32),
-        transmittance: wp.array(dtype=wp.float32),
-        stops: wp.array(dtype=wp.int32),
-        tile_gaussians: wp.array(dtype=wp.int32),
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def blend(
-        n: int,
-        tile_starts: wp.array(dtype=wp.int32),
-        keys: wp.array(dtype=wp.int64),
-        sorted: int,  # 1: `tile_gaussians` comes in filled
-        centers: wp.array(dtype=vec4),
-        whitenings: wp.array(dtype=vec4),
-        opacities: wp.array(dtype=wp.float32),
-        colors: wp.array(dtype=color),
-        backgrounds: wp.array(dtype=color),
-        tiles_x: int,
-        tiles_y: int,
-        width: int,
-        height: int,
-        image: wp.array(dtype=color),
-        alphas: wp.array(dtype=wp.float32),
-        transmittance: wp.array(dtype=wp.float32),
-        stops: wp.array(dtype=wp.int32),
-        tile_gaussians: wp.array(dtype=wp.int32),
-    ):
-        tile, _lane = wp.tid()
-        blend_tile(
-            tile, n, tile_starts, keys, sorted, centers, whitenings, opacities, colors, backgrounds, tiles_x, tiles_y,
-            width, height, image, alphas, transmittance, stops, tile_gaussians,
-        )  # fmt: skip
-
-    return blend
+def blend(channels: int, segments: int, rules: Rules) -> CudaNative:
+    """Kernel: sort and blend the tiles, a block each."""
+    outputs = {"keys": "const long long*", "image": "float*", "alphas": "float*"}
+    body = snippet(SORT + FORWARD, channels, segments, rules, BLOCK=BLOCK, WARPS=BLOCK // 32)
+    return cuda_native(f"blend_tiles_{channels}", PARAMETERS | outputs, body, BLOCK, 10 if channels <= 4 else 4)

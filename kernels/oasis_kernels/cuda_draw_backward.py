@@ -1,319 +1,278 @@
 """Adjoint of the CUDA blending: `blend_backward` replays each tile back to front, `gather` adds up its records.
 
-Segments as in the forward pass: a first pass tells each warp how much light its segment lets through and what it shows,
-products and sums over the other segments give the transmittance at its end and what is seen behind it. One record a
-pair, at the pair's number; a Gaussian adds its own in order.
+A warp replays a segment of the list for all 64 pixels, two a lane. What the forward pass kept tells it the
+transmittance at the segment's end and what the later segments add, and so what is seen behind it. One record a pair, at
+the pair's number; a Gaussian adds its own in order. Records hold sums over the tile's pixels as in
+`rasterize_backward`, of the scaled offset y = SCALE W d: six by the shape, then one a channel.
 """
 
 import functools
-from typing import Any
-
-import warp as wp
 
 from oasis_kernels.constants import Rules
-from oasis_kernels.cuda_binning import TILE
-from oasis_kernels.cuda_draw import SCALE, snippet
-from oasis_kernels.rasterize_backward import Moments, shape_gradients
-from oasis_kernels.tiles import tile_box
+from oasis_kernels.cuda_binning import TILE_BOX
+from oasis_kernels.cuda_draw import PARAMETERS, SCALE, snippet
+from oasis_kernels.cuda_native import CudaNative, cuda_native
+
+GATHER_BLOCK = 64
 
 BACKWARD = """
-    __shared__ Layer batches[@WARPS@][32];
-    __shared__ float batch_colors_of[@WARPS@][32 * @CHANNELS@];
-    __shared__ int batch_pairs_of[@WARPS@][32];
-    Layer* batch = batches[warp];
-    float* batch_colors = batch_colors_of[warp];
-    int* batch_pairs = batch_pairs_of[warp];
-    auto pair_of = [&](int g) -> int {
-        const int* box = (const int*)(boxes.data + g);
-        const int x0 = box[0] / 8, y0 = box[1] / 8, x1 = (box[2] - 1) / 8 + 1;
-        return pair_starts.data[g] + (top / 8 - y0) * (x1 - x0) + (left / 8 - x0);
+    __shared__ float* records_of[@WARPS@][32];
+    float** const layer_records = records_of[warp];
+    if (warp * segment >= count && (warp > 0 || !tile_backgrounds)) return;
+    const int used = (count + segment - 1) / segment;
+
+    // Sums over the warp of each of 32 values, by halves: lane l ends with value l.
+    auto fold = [&](float mine, float other, bool upper, int distance) -> float {
+        return (upper ? other : mine) + __shfl_xor_sync(all, upper ? mine : other, distance);
     };
-    // Sum of each of 8 values over the warp, by halves: lane l ends with value (l >> 2).
     auto scatter_sum = [&](float* v) -> float {
-        const bool upper16 = lane & 16, upper8 = lane & 8, upper4 = lane & 4;
-        for (int k = 0; k < 4; k++) {
-            const float mine = upper16 ? v[k + 4] : v[k], other = upper16 ? v[k] : v[k + 4];
-            v[k] = mine + __shfl_xor_sync(all, other, 16);
-        }
-        for (int k = 0; k < 2; k++) {
-            const float mine = upper8 ? v[k + 2] : v[k], other = upper8 ? v[k] : v[k + 2];
-            v[k] = mine + __shfl_xor_sync(all, other, 8);
-        }
-        const float mine = upper4 ? v[1] : v[0], other = upper4 ? v[0] : v[1];
-        float sum = mine + __shfl_xor_sync(all, other, 4);
-        sum += __shfl_xor_sync(all, sum, 2);
-        return sum + __shfl_xor_sync(all, sum, 1);
+        const bool upper16 = lane & 16, upper8 = lane & 8, upper4 = lane & 4, upper2 = lane & 2, upper1 = lane & 1;
+        #pragma unroll
+        for (int k = 0; k < 16; k++) v[k] = fold(v[k], v[k + 16], upper16, 16);
+        #pragma unroll
+        for (int k = 0; k < 8; k++) v[k] = fold(v[k], v[k + 8], upper8, 8);
+        #pragma unroll
+        for (int k = 0; k < 4; k++) v[k] = fold(v[k], v[k + 4], upper4, 4);
+        v[0] = fold(v[0], v[2], upper2, 2);
+        v[1] = fold(v[1], v[3], upper2, 2);
+        return fold(v[0], v[1], upper1, 1);
     };
-    float T0 = 0.f, T1 = 0.f, S0 = 0.f, S1 = 0.f, G0[@CHANNELS@] = {}, G1[@CHANNELS@] = {};
-    int stop0 = 0, stop1 = 0;
-    const float* background = (const float*)(backgrounds.data + camera);
-    float by_background[@CHANNELS@] = {};
-    auto open_pixel = [&](bool inside, long long pixel, float& T, float& S, float* G, int& stop) {
-        if (!inside) return;
-        T = transmittance.data[pixel];
-        stop = stops.data[pixel];
-        S = -g_alpha.data[pixel];
-        const float* g = (const float*)(g_image.data + pixel);
-        for (int k = 0; k < @CHANNELS@; k++) {
-            G[k] = g[k];
-            S += g[k] * background[k];
-            by_background[k] += g[k] * T;
-        }
+    // The same of 4 values: lane l ends with value l >> 3.
+    auto scatter_sum_4 = [&](const float* v) -> float {
+        const bool upper16 = lane & 16, upper8 = lane & 8;
+        float sum = fold(fold(v[0], v[2], upper16, 16), fold(v[1], v[3], upper16, 16), upper8, 8);
+        #pragma unroll
+        for (int offset = 4; offset > 0; offset >>= 1) sum += __shfl_xor_sync(all, sum, offset);
+        return sum;
     };
-    open_pixel(in0, pixel0, T0, S0, G0, stop0);
-    open_pixel(in1, pixel1, T1, S1, G1, stop1);
-    if (warp == 0) for (int k = 0; k < @CHANNELS@; k++) {
-        float sum = by_background[k];
+    auto sum_lanes = [&](float sum) -> float {
+        #pragma unroll
         for (int offset = 16; offset > 0; offset >>= 1) sum += __shfl_xor_sync(all, sum, offset);
-        if (lane == 0) ((float*)(tile_backgrounds.data + tile))[k] = sum;
-    }
-    auto load = [&](int first) {
-        __syncwarp();
-        if (first + lane < to) {
-            const int g = tile_gaussians.data[start + first + lane];
-            batch[lane] = layer(g);
-            batch_pairs[lane] = pair_of(g);
-            const float* rgb = (const float*)(colors.data + g);
-            for (int k = 0; k < @CHANNELS@; k++) batch_colors[lane * @CHANNELS@ + k] = rgb[k];
-        } else {
-            batch[lane] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, -1e9f, 0.f};
-            for (int k = 0; k < @CHANNELS@; k++) batch_colors[lane * @CHANNELS@ + k] = 0.f;
-        }
-        __syncwarp();
+        return sum;
     };
 
-    // First what each segment lets through and shows by itself; then every segment knows the transmittance at its end
-    // and what is seen behind it.
-    __shared__ float passes[@WARPS@][64], shows[@WARPS@][64];
-    float P0 = 1.f, P1 = 1.f, c0 = 0.f, c1 = 0.f;
-    for (int first = from; first < to; first += 32) {
-        load(first);
-        const int m = min(32, to - first);
-        for (int j = 0; j < m; j += 4) {
-            #pragma unroll
-            for (int i = 0; i < 4; i++) {
-                const Layer l = batch[j + i];
-                const float* rgb = batch_colors + (j + i) * @CHANNELS@;
-                const float dx = x - l.cx;
-                auto pass = [&](float dy, int stop, const float* G, float& P, float& c) {
-                    const float u = l.w0 * dx + l.w1 * dy, v = l.w2 * dx + l.w3 * dy;
-                    const float alpha = fminf(power(l.lo - (u * u + v * v)), @ALPHA_MAX@);
-                    const float a = alpha >= @ALPHA_MIN@ && first + j + i < stop ? alpha : 0.f;
-                    float gc = 0.f;
-                    #pragma unroll
-                    for (int k = 0; k < @CHANNELS@; k++) gc += G[k] * rgb[k];
-                    c += P * a * gc;
-                    P *= 1.f - a;
-                };
-                pass(y0 - l.cy, stop0, G0, P0, c0);
-                pass(y1 - l.cy, stop1, G1, P1, c1);
+    const float x = (float)(lane & 7), y[2] = {(float)(lane >> 3), (float)(lane >> 3) + 4.f};
+    float T[2] = {1.f, 1.f}, S[2] = {}, G[2][@CHANNELS@] = {};  // S: what is seen behind, times G
+    int stop[2] = {};
+    float by_background[@CHANNELS@] = {};
+    #pragma unroll
+    for (int h = 0; h < 2; h++) {
+        const int row = (lane >> 3) + 4 * h;
+        if (left + (lane & 7) >= width || top + row >= height) continue;
+        const long long pixel = first_pixel + (long long)row * width + (lane & 7);
+        const float final_T = transmittance[pixel];
+        stop[h] = stops[pixel];
+        float behind = g_alpha ? -g_alpha[pixel] : 0.f;
+        #pragma unroll
+        for (int k = 0; k < @CHANNELS@; k++) {
+            G[h][k] = g_image ? g_image[pixel * @CHANNELS@ + k] : 0.f;
+            if (backgrounds) behind += G[h][k] * backgrounds[camera * @CHANNELS@ + k];
+            by_background[k] += G[h][k] * final_T;
+        }
+        T[h] = final_T;
+        S[h] = behind;
+        if (warp < used - 1) {
+            T[h] = boundary(warp, 0, row * 8 + (lane & 7));
+            S[h] *= final_T;
+            for (int b = used - 2; b >= warp; b--) {
+                #pragma unroll
+                for (int k = 0; k < @CHANNELS@; k++) S[h] += G[h][k] * boundary(b, k + 1, row * 8 + (lane & 7));
             }
+            S[h] *= inverse(T[h]);
         }
     }
-    passes[warp][lane] = P0; passes[warp][lane + 32] = P1;
-    shows[warp][lane] = c0; shows[warp][lane + 32] = c1;
-    __syncthreads();
-    if (warp >= segments) return;
-    T0 = 1.f, T1 = 1.f;
-    for (int k = 0; k <= warp; k++) { T0 *= passes[k][lane]; T1 *= passes[k][lane + 32]; }
-    for (int k = segments - 1; k > warp; k--) {
-        S0 = shows[k][lane] + passes[k][lane] * S0;
-        S1 = shows[k][lane + 32] + passes[k][lane + 32] * S1;
+    if (tile_backgrounds && warp == 0) {
+        #pragma unroll
+        for (int k = 0; k < @CHANNELS@; k++) {
+            const float sum = sum_lanes(by_background[k]);
+            if (lane == 0) tile_backgrounds[((long long)own.w * tiles_x + own.x) * @CHANNELS@ + k] = sum;
+        }
     }
-    const int last = max(from, min(to, __reduce_max_sync(all, max(stop0, stop1))));
-    for (int place = last + lane; place < to; place += 32) {  // behind every pixel's end
-        const long long pair = pair_of(tile_gaussians.data[start + place]);
-        if (with_colors) for (int k = 0; k < @CHANNELS@; k++) ((float*)(pair_colors.data + pair))[k] = 0.f;
-        if (with_shape) for (int k = 0; k < 8; k++) ((float*)(pair_moments.data + pair))[k] = 0.f;
-    }
-    for (int first = from + ((last - from - 1) & ~31); first >= from && last > from; first -= 32) {
-        load(first);
-        // As in the forward pass: four at a time, whose offsets and alphas do not wait for each other.
-        for (int j = (min(32, last - first) - 1) & ~3; j >= 0; j -= 4) {
-            float u[4][2], v[4][2], raw[4][2];
-            bool drawn[4][2];
+
+    const int* const list = tile_gaussians + start;
+    const int from = warp * segment, to = min(from + segment, count);
+    const int last = __reduce_max_sync(all, max(stop[0], stop[1]));
+    if (@RECORD@) for (int first = from + ((to - from - 1) & ~31); first >= from; first -= 32) {
+        __syncwarp();
+        Layer l;
+        int g;
+        float* record = nullptr;
+        bool hits = false;
+        if (first + lane < to) {
+            g = list[first + lane];
+            const int4 t = tile_box(boxes[g]);
+            const int number = pair_starts[g] + (top / 8 - t.y) * (t.z - t.x) + left / 8 - t.x;
+            record = pair_records + (long long)number * @RECORD@;
+            l = layer(centers[g], whitenings[g], opacities[g]);
+            hits = first + lane < last && reaches(l, 0.f, 7.f);
+            if (!hits) {
+                #pragma unroll
+                for (int k = 0; k < @RECORD@; k += 4) *(float4*)(record + k) = {0.f, 0.f, 0.f, 0.f};
+            }
+        }
+        const unsigned hitting = __ballot_sync(all, hits);
+        const int m = __popc(hitting), slot = __popc(hitting & ((1u << lane) - 1u));
+        if (hits) {
+            put(slot, l, first + lane, colors + (long long)g * @CHANNELS@);
+            layer_records[slot] = record;
+        }
+        if (lane >= m && lane < ((m + 3) & ~3)) put_nothing(lane);
+        __syncwarp();
+        // Four layers at a time: most of what they take does not wait for each other, and their sums share shuffles.
+        for (int j = (m - 1) & ~3; j >= 0; j -= 4) {
+            float u[4][2], v[4][2], weight[4][2], by_alpha[4][2];
             #pragma unroll
             for (int i = 0; i < 4; i++) {
-                const Layer l = batch[j + i];
-                const float dx = x - l.cx;
+                const unsigned at = layers_at + (j + i) * (4 * @STRIDE@);
+                const float4 a = load4(at), b = load4(at + 16);
+                const float dx = x - a.x;
                 #pragma unroll
                 for (int h = 0; h < 2; h++) {
-                    const float dy = (h ? y1 : y0) - l.cy;
-                    u[i][h] = l.w0 * dx + l.w1 * dy;
-                    v[i][h] = l.w2 * dx + l.w3 * dy;
-                    raw[i][h] = power(l.lo - (u[i][h] * u[i][h] + v[i][h] * v[i][h]));
-                    drawn[i][h] = raw[i][h] >= @ALPHA_MIN@ && first + j + i < (h ? stop1 : stop0);
+                    const float dy = y[h] - a.y;
+                    u[i][h] = fmaf(a.z, dx, a.w * dy);
+                    v[i][h] = fmaf(b.x, dx, b.y * dy);
+                    const float raw = power(fmaf(-v[i][h], v[i][h], fmaf(-u[i][h], u[i][h], b.z)));
+                    by_alpha[i][h] = raw >= @ALPHA_MIN@ && __float_as_int(b.w) < stop[h] ? raw : 0.f;
                 }
             }
             #pragma unroll
             for (int i = 3; i >= 0; i--) {
-                if (first + j + i >= last) continue;
-                const float* rgb = batch_colors + (j + i) * @CHANNELS@;
-                const long long pair = batch_pairs[j + i];
-                const bool any = __any_sync(all, drawn[i][0] || drawn[i][1]);
-                float m[8] = {}, by_color[(@CHANNELS@ + 7) / 8 * 8] = {};
-                auto undraw = [&](int h, float& T, float& S, const float* G) {
-                    const float alpha = drawn[i][h] ? fminf(raw[i][h], @ALPHA_MAX@) : 0.f;
-                    T = __fdividef(T, 1.f - alpha);
-                    const float weight = alpha * T;
+                float color[@PADDED@];
+                #pragma unroll
+                for (int k = 0; k < @PADDED@; k += 4) {
+                    const float4 four = load4(layers_at + (j + i) * (4 * @STRIDE@) + 32 + 4 * k);
+                    color[k] = four.x;
+                    color[k + 1] = four.y;
+                    color[k + 2] = four.z;
+                    color[k + 3] = four.w;
+                }
+                #pragma unroll
+                for (int h = 0; h < 2; h++) {
+                    const float raw = by_alpha[i][h], alpha = fminf(raw, @ALPHA_MAX@);
+                    T[h] *= inverse(1.f - alpha);
+                    weight[i][h] = alpha * T[h];
                     float gc = 0.f;
                     #pragma unroll
-                    for (int k = 0; k < @CHANNELS@; k++) {
-                        by_color[k] += G[k] * weight;
-                        gc += G[k] * rgb[k];
-                    }
-                    const float step = gc - S;
-                    S += alpha * step;
-                    const float g = raw[i][h] <= @ALPHA_MAX@ ? weight * step : 0.f;
-                    const float gu = drawn[i][h] ? g * u[i][h] : 0.f, gv = drawn[i][h] ? g * v[i][h] : 0.f;
-                    m[0] += g;
-                    m[1] += gu;
-                    m[2] += gv;
-                    m[3] += gu * u[i][h];
-                    m[4] += gu * v[i][h];
-                    m[5] += gv * v[i][h];
-                };
-                if (any) {
-                    undraw(0, T0, S0, G0);
-                    undraw(1, T1, S1, G1);
+                    for (int k = 0; k < @CHANNELS@; k++) gc = fmaf(G[h][k], color[k], gc);
+                    const float step = gc - S[h];
+                    S[h] = fmaf(alpha, step, S[h]);
+                    by_alpha[i][h] = raw <= @ALPHA_MAX@ ? weight[i][h] * step : 0.f;
                 }
-                if (with_shape) {
-                    const float sum = any ? scatter_sum(m) : 0.f;
-                    if ((lane & 3) == 0) ((float*)(pair_moments.data + pair))[lane >> 2] = sum;
+            }
+            auto value = [&](int i, int k) -> float {  // number k of the record of layer i, of this lane's pixels
+                float sum = 0.f;
+                #pragma unroll
+                for (int h = 0; h < 2; h++) {
+                    const float a = u[i][h], b = v[i][h], g = by_alpha[i][h];
+                    if (@SHAPE@ && k < 6) sum += k == 0 ? g : k == 1 ? g * a : k == 2 ? g * b
+                                                 : k == 3 ? g * a * a : k == 4 ? g * a * b : g * b * b;
+                    else if (@COLORS@ && k - 6 * @SHAPE@ < @CHANNELS@) sum += G[h][k - 6 * @SHAPE@] * weight[i][h];
                 }
-                if (with_colors) {
-                    #pragma unroll
-                    for (int k = 0; k < @CHANNELS@; k += 8) {
-                        const float sum = any ? scatter_sum(by_color + k) : 0.f;
-                        if ((lane & 3) == 0 && k + (lane >> 2) < @CHANNELS@)
-                            ((float*)(pair_colors.data + pair))[k + (lane >> 2)] = sum;
-                    }
-                }
+                return sum;
+            };
+            const int mine = j + (lane >> 3);
+            float* const to = mine < m ? layer_records[mine] : nullptr;
+            #pragma unroll
+            for (int first_value = 0; first_value + 2 <= @VALUES@; first_value += 8) {
+                float values[32];
+                #pragma unroll
+                for (int k = 0; k < 32; k++) values[k] = value(k >> 3, first_value + (k & 7));
+                const float sum = scatter_sum(values);
+                if (to && first_value + (lane & 7) < @RECORD@) to[first_value + (lane & 7)] = sum;
+            }
+            if (@VALUES@ % 8 == 1) {
+                float values[4];
+                #pragma unroll
+                for (int k = 0; k < 4; k++) values[k] = value(k, @VALUES@ - 1);
+                const float sum = scatter_sum_4(values);
+                if (to && (lane & 7) == 0) to[@VALUES@ - 1] = sum;
             }
         }
     }
-#endif
+"""
+
+GATHER = """
+    if (thread >= total) return;
+    const int4 t = tile_box(boxes[thread]);
+    const int count = (t.z - t.x) * (t.w - t.y);
+    const long long start = pair_starts[thread];
+    float sums[@RECORD@] = {};
+    if (start + count <= capacity) for (int pair = 0; pair < count; pair++) {
+        const float4* record = (const float4*)(pair_records + (start + pair) * @RECORD@);
+        #pragma unroll
+        for (int k = 0; k < @RECORD@ / 4; k++) {
+            const float4 four = record[k];
+            sums[4 * k] += four.x;
+            sums[4 * k + 1] += four.y;
+            sums[4 * k + 2] += four.z;
+            sums[4 * k + 3] += four.w;
+        }
+    }
+    if (@COLORS@) {
+        #pragma unroll
+        for (int k = 0; k < @CHANNELS@; k++)
+            g_colors[(long long)thread * @CHANNELS@ + k] = sums[6 * @SHAPE@ + k];
+    }
+    if (@SHAPE@) {
+        const float4 whitening = whitenings[thread];
+        const double w0 = whitening.x, w1 = whitening.y, w2 = whitening.z, w3 = whitening.w;
+        const double once = 1.0 / @SCALE@, twice = once * once;
+        const double m1 = once * sums[1], m2 = once * sums[2];
+        const double m3 = twice * sums[3], m4 = twice * sums[4], m5 = twice * sums[5];
+        g_means2d[thread] = {(float)(w0 * m1 + w2 * m2), (float)(w1 * m1 + w3 * m2)};
+        double* const by_covariance = g_covars2d + 3 * (long long)thread;
+        by_covariance[0] = 0.5 * (w0 * (w0 * m3 + w2 * m4) + w2 * (w0 * m4 + w2 * m5));
+        by_covariance[1] = w1 * (w0 * m3 + w2 * m4) + w3 * (w0 * m4 + w2 * m5);
+        by_covariance[2] = 0.5 * (w1 * (w1 * m3 + w3 * m4) + w3 * (w1 * m4 + w3 * m5));
+        g_opacities[thread] = count ? sums[0] / opacities[thread] : 0.f;
+    }
 """
 
 
-@functools.cache
-def blend_backward(channels: int, rules: Rules) -> Any:
-    """Kernel: gradients by image and alpha -> one record a pair, one background gradient a tile; launched as `blend`.
-
-    A record holds sums over the tile's pixels as in `rasterize_backward`, of the scaled offset y = SCALE W d.
-    """
-    vec4 = wp.types.vector(length=4, dtype=wp.float32)
-    moments = wp.types.vector(length=8, dtype=wp.float32)  # of the scaled offsets; the last two are zero
-    color = wp.types.vector(length=channels, dtype=wp.float32)
-
-    @wp.func_native(snippet(BACKWARD, channels, rules))
-    def blend_tile_backward(
-        tile: int,
-        tile_starts: wp.array(dtype=wp.int32),
-        tile_gaussians: wp.array(dtype=wp.int32),
-        pair_starts: wp.array(dtype=wp.int32),
-        boxes: wp.array(dtype=wp.vec4i),
-        centers: wp.array(dtype=vec4),
-        whitenings: wp.array(dtype=vec4),
-        opacities: wp.array(dtype=wp.float32),
-        colors: wp.array(dtype=color),
-        backgrounds: wp.array(dtype=color),
-        tiles_x: int,
-        tiles_y: int,
-        width: int,
-        height: int,
-        transmittance: wp.array(dtype=wp.float32),
-        stops: wp.array(dtype=wp.int32),
-        g_image: wp.array(dtype=color),
-        g_alpha: wp.array(dtype=wp.float32),
-        with_shape: int,
-        with_colors: int,
-        pair_moments: wp.array(dtype=moments),
-        pair_colors: wp.array(dtype=color),
-        tile_backgrounds: wp.array(dtype=color),
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def blend_backward(
-        tile_starts: wp.array(dtype=wp.int32),
-        tile_gaussians: wp.array(dtype=wp.int32),
-        pair_starts: wp.array(dtype=wp.int32),
-        boxes: wp.array(dtype=wp.vec4i),
-        centers: wp.array(dtype=vec4),
-        whitenings: wp.array(dtype=vec4),
-        opacities: wp.array(dtype=wp.float32),
-        colors: wp.array(dtype=color),
-        backgrounds: wp.array(dtype=color),
-        tiles_x: int,
-        tiles_y: int,
-        width: int,
-        height: int,
-        transmittance: wp.array(dtype=wp.float32),
-        stops: wp.array(dtype=wp.int32),
-        g_image: wp.array(dtype=color),
-        g_alpha: wp.array(dtype=wp.float32),
-        with_shape: int,
-        with_colors: int,
-        pair_moments: wp.array(dtype=moments),
-        pair_colors: wp.array(dtype=color),
-        tile_backgrounds: wp.array(dtype=color),
-    ):
-        tile, _lane = wp.tid()
-        blend_tile_backward(
-            tile, tile_starts, tile_gaussians, pair_starts, boxes, centers, whitenings, opacities, colors,
-            backgrounds, tiles_x, tiles_y, width, height, transmittance, stops, g_image, g_alpha, with_shape,
-            with_colors, pair_moments, pair_colors, tile_backgrounds,
-        )  # fmt: skip
-
-    return blend_backward
+def record_size(channels: int, shape: bool, colors: bool) -> int:
+    """Numbers of a record, a multiple of 4."""
+    return -(-(6 * shape + channels * colors) // 4) * 4
 
 
 @functools.cache
-def gather(channels: int) -> Any:
+def blend_backward(channels: int, segments: int, shape: bool, colors: bool, rules: Rules) -> CudaNative:
+    """Kernel: gradients by image and alpha -> one record a pair, one background gradient a tile; a block a tile."""
+    body = snippet(
+        TILE_BOX + BACKWARD, channels, segments, rules, WARPS=segments, SHAPE=int(shape), COLORS=int(colors),
+        VALUES=6 * shape + channels * colors,        RECORD=record_size(channels, shape, colors),
+    )  # fmt: skip
+    inputs = {
+        "pair_starts": "const int*",  # [C * n]
+        "boxes": "const int4*",
+        "g_image": "const float*",  # [C, H, W, channels], or null for zeros
+        "g_alpha": "const float*",  # [C, H, W], or null for zeros
+        "pair_records": "float*",  # [pairs, record size]
+        "tile_backgrounds": "float*",  # [tiles, channels], or null
+    }
+    name = f"blend_tiles_backward_{channels}"
+    return cuda_native(name, PARAMETERS | inputs, body, 32 * segments, 16 // segments if channels <= 4 else 1)
+
+
+@functools.cache
+def gather(channels: int, shape: bool, colors: bool) -> CudaNative:
     """Kernel: records -> gradients by means2d, covars2d, opacities and colours; one thread a (camera, Gaussian)."""
-    moments = wp.types.vector(length=8, dtype=wp.float32)
-    color = wp.types.vector(length=channels, dtype=wp.float32)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def gather(
-        boxes: wp.array(dtype=wp.vec4i),
-        pair_starts: wp.array(dtype=wp.int32),
-        pair_moments: wp.array(dtype=moments),
-        pair_colors: wp.array(dtype=color),
-        whitenings: wp.array(dtype=wp.vec4),
-        opacities: wp.array(dtype=wp.float32),
-        with_shape: int,
-        with_colors: int,
-        g_means2d: wp.array(dtype=wp.vec2),
-        g_covars2d: wp.array(dtype=wp.vec3d),
-        g_opacities: wp.array(dtype=wp.float32),
-        g_colors: wp.array(dtype=color),
-    ):
-        index = wp.tid()
-        t = tile_box(boxes[index], TILE)
-        count = (t[2] - t[0]) * (t[3] - t[1])
-        start = pair_starts[index]
-        if with_colors != 0:
-            total = color()
-            for k in range(count):
-                total += pair_colors[start + k]
-            g_colors[index] = total
-        if with_shape != 0:
-            m = moments()
-            for k in range(count):
-                m += pair_moments[start + k]
-            g_opacity = wp.float32(0.0)
-            if count > 0:
-                g_opacity = m[0] / opacities[index]
-            once = wp.float64(1.0) / wp.float64(SCALE)
-            twice = once * once
-            sums = Moments(
-                wp.float64(m[0]), once * wp.float64(m[1]), once * wp.float64(m[2]),
-                twice * wp.float64(m[3]), twice * wp.float64(m[4]), twice * wp.float64(m[5]),
-            )  # fmt: skip
-            by_center, by_covariance = shape_gradients(wp.vec4d(whitenings[index]), sums)
-            g_means2d[index] = wp.vec2(wp.float32(by_center[0]), wp.float32(by_center[1]))
-            g_covars2d[index] = by_covariance
-            g_opacities[index] = g_opacity
-
-    return gather
+    body = TILE_BOX + GATHER
+    for name, number in {
+        "CHANNELS": channels, "SHAPE": int(shape), "COLORS": int(colors), "SCALE": SCALE,
+        "RECORD": record_size(channels, shape, colors),
+    }.items():  # fmt: skip
+        body = body.replace(f"@{name}@", str(number))
+    parameters = {
+        "total": "int",
+        "capacity": "long long",  # pairs for which there are records
+        "boxes": "const int4*",
+        "pair_starts": "const int*",
+        "pair_records": "const float*",
+        "whitenings": "const float4*",
+        "opacities": "const float*",
+        "g_means2d": "float2*",
+        "g_covars2d": "double*",
+        "g_opacities": "float*",
+        "g_colors": "float*",
+    }
+    return cuda_native(f"gather_records_{channels}", parameters, body, GATHER_BLOCK)

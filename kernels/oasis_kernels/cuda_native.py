@@ -19,7 +19,9 @@ class CudaNative:
 
     kernel: Any
     words: Any
-    """Its parameters, a ctypes structure that is made from their names."""
+    """A ctypes structure of its parameters."""
+    parameters: tuple[str, ...]
+    """Their names, in order."""
     block: int
     """Threads a block."""
 
@@ -61,4 +63,5 @@ def cuda_native(
         launch, enable_backward=False, module="unique", launch_bounds=(block, blocks_a_multiprocessor)
     )
     fields = [(p, ctypes.c_double if kind in reads else ctypes.c_longlong) for p, kind in parameters.items()]
-    return CudaNative(kernel, type(f"{name}_words", (ctypes.Structure,), {"_fields_": fields}), block)
+    words = type(f"{name}_words", (ctypes.Structure,), {"_fields_": fields})
+    return CudaNative(kernel, words, tuple(parameters), block)

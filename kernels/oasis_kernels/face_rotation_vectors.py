@@ -13,6 +13,9 @@ the angle: all that `face_rotation.turn_gradient` needs is at hand in the two fr
 from oasis_kernels.native import PHASE_WORDS, native
 from oasis_kernels.posing_vectors import HEAD, fused
 
+TRIANGLE = 12
+"""Numbers of a face at rest in the table of `measure`."""
+
 GEOMETRY = """
     struct Triangle { V3 t, b, n; V l, x, y, longest, scale, unit; I flat, point; };
     const I mantissa_off = (I)(0x7f800000), inverse = (I)(0x7f000000);
@@ -40,32 +43,57 @@ GEOMETRY = """
         const I a = (la >= lb) & (la >= lc);
         return {a, ~a & (lb >= lc)};
     };
+    auto completed = [&](Triangle o) -> Triangle {
+        o.point = !(o.longest > 0.f);
+        o.n = cross(o.t, o.b);
+        o.flat = !(o.l * o.y > @FLAT@ * o.longest);
+        return o;
+    };
     auto triangle = [&](const Edges& e, const Start& from) -> Triangle {
         Triangle o;
         const V3 e1 = choose(from.a, e.a, choose(from.b, e.b, e.c));
         const V3 e3 = choose(from.a, e.c, choose(from.b, e.a, e.b));  // comes back to the corner
         const V3 e2 = scaled((V)(-1.f), e3);
         o.longest = largest(dot3(e.a, e.a), largest(dot3(e.b, e.b), dot3(e.c, e.c)));
-        o.point = !(o.longest > 0.f);
         o.l = root(dot3(e1, e1));
         o.t = scaled(o.l > 0.f ? 1.f / o.l : zero, e1);
         o.x = dot3(e2, o.t);
         const V3 height = minus(e2, scaled(o.x, o.t));
         o.y = root(dot3(height, height));
         o.b = scaled(o.y > 0.f ? 1.f / o.y : zero, height);
-        o.n = cross(o.t, o.b);
-        o.flat = !(o.l * o.y > @FLAT@ * o.longest);
         o.scale = e.scale;
         o.unit = e.unit;
-        return o;
+        return completed(o);
+    };
+    auto at_rest = [&](const Table& vertices, int first, int count, const int* corners, Start& from) -> Triangle {
+        if (!triangles) {
+            const Edges e = edges(vertices, corners);
+            from = start(e);
+            return triangle(e, from);
+        }
+        auto part = [&](int k) -> V4 {
+            return rows([&](int lane) -> Q {
+                return load_row(triangles + @TRIANGLE@ll * (first + wp::min(lane, count - 1)) + 4 * k);
+            });
+        };
+        const V4 p = part(0), q = part(1), r = part(2);
+        Triangle o;
+        o.t = {p.w, p.x, p.y};
+        o.l = p.z;
+        o.b = {q.w, q.x, q.y};
+        o.x = q.z;
+        o.y = r.w;
+        o.longest = r.x;
+        o.unit = r.y;
+        o.scale = __builtin_bit_cast(V, inverse - __builtin_bit_cast(I, o.unit));
+        from = {r.z == 0.f, r.z == 1.f};
+        return completed(o);
     };
     struct Pair { Triangle rest, posed; Start from; I proper; V weight, damped, ratio, c, s, h; V3 t, b; };
-    auto pair = [&](const Table& rest_table, const Table& posed_table, const int* corners) -> Pair {
+    auto pair = [&](const Table& before, const Table& after, int first, int count, const int* corners) -> Pair {
         Pair o;
-        const Edges before = edges(rest_table, corners), after = edges(posed_table, corners);
-        const Start from = start(before);
-        const Triangle rest = triangle(before, from), posed = triangle(after, from);
-        o.from = from;
+        const Triangle rest = at_rest(before, first, count, corners, o.from);
+        const Triangle posed = triangle(edges(after, corners), o.from);
         o.rest = rest;
         o.posed = posed;
         o.weight = 0.5f * rest.l * rest.y * rest.unit * rest.unit;
@@ -98,13 +126,31 @@ GEOMETRY = """
     };
 """
 
+MEASURE = """
+    const float* triangles = nullptr;
+""" + GEOMETRY + """
+    const Table vertices = table3(rest_vertices, n_vertices);
+    ranges(state, n_faces, [&](int first, int end) {
+        for (int i = first; i < end; i += 16) {
+            const int count = wp::min(16, end - i);
+            Start from;
+            const Triangle o = at_rest(vertices, i, count, corners_of(faces, i, count), from);
+            const V begins = from.a ? zero : from.b ? one : (V)(2.f);
+            float* row = out + @TRIANGLE@ll * i;
+            put4(row, count, {o.t.x, o.t.y, o.t.z, o.l}, @TRIANGLE@);
+            put4(row + 4, count, {o.b.x, o.b.y, o.b.z, o.x}, @TRIANGLE@);
+            put4(row + 8, count, {o.y, o.longest, o.unit, begins}, @TRIANGLE@);
+        }
+    });
+"""
+
 TURN = """
     const Table before = table3(rest_vertices, n_vertices), after = table3(posed_vertices, n_vertices);
     long long* found_flat = state + @FLAT_WORD@;
     ranges(state, n_faces, [&](int first, int end) {
         for (int i = first; i < end; i += 16) {
             const int count = wp::min(16, end - i);
-            const Pair p = pair(before, after, corners_of(faces, i, count));
+            const Pair p = pair(before, after, i, count, corners_of(faces, i, count));
             const V3 t = p.rest.t, b = p.rest.b, n = p.rest.n, n1 = p.posed.n;
             auto entry = [&](V u, V v, V w, V x, V y, V z) -> V { return u * x + v * y + w * z; };
             const V m00 = entry(p.t.x, p.b.x, n1.x, t.x, b.x, n.x), m01 = entry(p.t.x, p.b.x, n1.x, t.y, b.y, n.y);
@@ -238,7 +284,7 @@ TURN_BACKWARD = """
         for (int i = first; i < end; i += 16) {
             const int count = wp::min(16, end - i);
             const int* corners = corners_of(faces, i, count);
-            const Pair p = pair(before, after, corners);
+            const Pair p = pair(before, after, i, count, corners);
             const Triangle &r = p.rest, &o = p.posed;
 
             const V4 q = get4(face_quats + 4ll * i, count);
@@ -329,15 +375,18 @@ TURN_BACKWARD = """
     gather(state + 3 * @PHASE_WORDS@, posed_edges, g_posed);
 """
 
-MESHES = {
+FACES = {
     "n_vertices": "int",
     "n_faces": "int",
     "rest_vertices": "const float*",  # [V, 3]
-    "posed_vertices": "const float*",  # [V, 3]
     "faces": "const int*",  # [F, 3]
+    "state": "long long*",  # `STATE` words of zeros
+}
+MESHES = FACES | {
+    "triangles": "const float*",  # [F, TRIANGLE], from `measure`, or 0
+    "posed_vertices": "const float*",  # [V, 3]
     "offsets": "const int*",  # [V + 1]; corners of vertex v are corners[offsets[v] .. offsets[v + 1] - 1]
     "corners": "const int*",  # [3 F]; 3 face + corner
-    "state": "long long*",  # `STATE` words of zeros
 }
 STATE = 4 * PHASE_WORDS
 """Words that threads share."""
@@ -345,11 +394,13 @@ STATE = 4 * PHASE_WORDS
 
 def _expanded(body: str) -> str:
     names = {"FLAT": "1e-6f", "DAMPING": "0.5e-6f", "PHASE_WORDS": PHASE_WORDS, "FLAT_WORD": 3 * PHASE_WORDS}
+    names["TRIANGLE"] = TRIANGLE
     for name, value in names.items():
         body = body.replace(f"@{name}@", str(value))
     return fused(HEAD + body)
 
 
+measure = native("measure", FACES | {"out": "float*"}, _expanded(MEASURE))  # [F, TRIANGLE]
 turn = native(
     "turn",
     MESHES

@@ -1,4 +1,7 @@
-"""View-dependent colour: real spherical harmonics up to degree 3, and their adjoint. One thread a direction.
+"""View-dependent colour: real spherical harmonics up to degree 3, and their adjoint.
+
+`evaluate` takes directions, one thread each; `see` takes Gaussians and cameras, one thread for each pair of them, and
+its adjoint one for each Gaussian, which goes through the cameras in order.
 
 The basis is that of 3DGS (Kerbl et al. 2023): orthonormal, with the Condon-Shortley sign, m from -l to l. It is written
 as polynomials of the unit direction (x, y, z); directions come in at any length. A degree is a kernel of its own.
@@ -81,7 +84,7 @@ def _basis_adjoint(scalar: Any, degree: int) -> Any:
             two = scalar(2.0)
             out += scalar(L2_XY) * vec3(g[4] * y - g[7] * z, g[4] * x - g[5] * z, -g[5] * y - g[7] * x)
             out += two * scalar(L2_XX) * g[8] * vec3(x, -y, scalar(0.0))
-            out[2] = out[2] + scalar(6.0 * L2_ZZ) * g[6] * z
+            out[2] = out[2] + scalar(6.0) * scalar(L2_ZZ) * g[6] * z
         if wp.static(degree > 2):
             three, five, six, ten = scalar(3.0), scalar(5.0), scalar(6.0), scalar(10.0)
             xx, yy, zz = x * x, y * y, z * z
@@ -174,3 +177,118 @@ def evaluate_backward(scalar: Any, degree: int) -> Any:
             g_directions[i] = g_direction
 
     return evaluate_backward
+
+
+@wp.func
+def camera_center(r0: wp.vec4d, r1: wp.vec4d, r2: wp.vec4d):
+    """Where a camera is, whose pose has these rows: minus the inverse of their first columns times the last."""
+    a, b, c = wp.vec3d(r0[0], r0[1], r0[2]), wp.vec3d(r1[0], r1[1], r1[2]), wp.vec3d(r2[0], r2[1], r2[2])
+    bc, ca, ab = wp.cross(b, c), wp.cross(c, a), wp.cross(a, b)
+    return -(r0[3] * bc + r1[3] * ca + r2[3] * ab) / wp.dot(a, bc)
+
+
+@functools.cache
+def _direction(scalar: Any) -> Any:
+    """Function: centre of a Gaussian, rows of a pose -> from the camera to the Gaussian.
+
+    A far camera's centre cancels against the Gaussian's in float32: their difference is taken in float64.
+    """
+    vec3, vec4 = (wp.types.vector(length=k, dtype=scalar) for k in (3, 4))
+
+    @wp.func
+    def direction(mean: vec3, r0: vec4, r1: vec4, r2: vec4):
+        center = camera_center(wp.vec4d(r0), wp.vec4d(r1), wp.vec4d(r2))
+        return vec3(wp.vec3d(mean) - center)
+
+    return direction
+
+
+@functools.cache
+def see(scalar: Any, degree: int) -> Any:
+    """Kernel: Gaussians, coefficients, poses -> colours max(0, 0.5 + harmonics), as each camera sees them."""
+    vec3, vec4 = (wp.types.vector(length=k, dtype=scalar) for k in (3, 4))
+    basis, unit, direction = _basis(scalar, degree), _unit(scalar), _direction(scalar)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def see(
+        first: int,
+        means: wp.array(dtype=vec3),
+        coefficients: wp.array2d(dtype=vec3),  # rows of all cameras, one after the other, or those they share
+        poses: wp.array2d(dtype=vec4),
+        colors: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        n = means.shape[0]
+        camera, row = i // n, i % coefficients.shape[0]
+        d, _norm = unit(direction(means[i % n], poses[camera, 0], poses[camera, 1], poses[camera, 2]))
+        b = basis(d)
+        total = vec3()
+        for k in range(wp.static((degree + 1) ** 2)):
+            total += b[k] * coefficients[row, k]
+        for k in range(3):
+            color = total[k] + scalar(0.5)
+            total[k] = wp.where(color < scalar(0.0), scalar(0.0), color)  # NaN stays
+        colors[i] = total
+
+    return see
+
+
+@functools.cache
+def see_backward(scalar: Any, degree: int) -> Any:
+    """Kernel: gradient by the colours -> by means, coefficients, and the cameras' centres for each Gaussian.
+
+    An array is empty where it is not wanted.
+    """
+    values = wp.types.vector(length=(degree + 1) ** 2, dtype=scalar)
+    vec3, vec4 = (wp.types.vector(length=k, dtype=scalar) for k in (3, 4))
+    basis, basis_adjoint, unit = _basis(scalar, degree), _basis_adjoint(scalar, degree), _unit(scalar)
+    direction = _direction(scalar)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def see_backward(
+        first: int,
+        means: wp.array(dtype=vec3),
+        coefficients: wp.array2d(dtype=vec3),
+        poses: wp.array2d(dtype=vec4),
+        colors: wp.array(dtype=vec3),
+        g_colors: wp.array(dtype=vec3),
+        g_means: wp.array(dtype=vec3),
+        g_coefficients: wp.array2d(dtype=vec3),
+        g_centers: wp.array(dtype=wp.vec3d),
+    ):
+        gaussian = first + wp.tid()
+        n = means.shape[0]
+        g_mean = wp.vec3d()
+        for camera in range(poses.shape[0]):
+            i = camera * n + gaussian
+            row = i % coefficients.shape[0]
+            d, norm = unit(direction(means[gaussian], poses[camera, 0], poses[camera, 1], poses[camera, 2]))
+            g = g_colors[i]
+            for k in range(3):
+                if not colors[i][k] > scalar(0.0):
+                    g[k] = scalar(0.0)
+            if g_coefficients.shape[0] > 0:
+                b = basis(d)
+                for k in range(wp.static((degree + 1) ** 2)):
+                    if row == i:
+                        g_coefficients[row, k] = b[k] * g
+                    else:
+                        g_coefficients[row, k] += b[k] * g
+                if row == i:
+                    for k in range(wp.static((degree + 1) ** 2), coefficients.shape[1]):
+                        g_coefficients[row, k] = vec3()
+            if g_means.shape[0] > 0 or g_centers.shape[0] > 0:
+                by_harmonic = values()
+                for k in range(wp.static((degree + 1) ** 2)):
+                    by_harmonic[k] = wp.dot(coefficients[row, k], g)
+                g_unit = basis_adjoint(d, by_harmonic)
+                g_direction = vec3()
+                if norm > scalar(0.0):
+                    g_direction = (g_unit - wp.dot(g_unit, d) * d) / norm
+                g_mean += wp.vec3d(g_direction)
+                if g_centers.shape[0] > 0:
+                    g_centers[i] = -wp.vec3d(g_direction)
+        if g_means.shape[0] > 0:
+            g_means[gaussian] = vec3(g_mean)
+
+    return see_backward

@@ -38,7 +38,7 @@ GRID = {
 """Parameters that every kernel over strips begins with."""
 
 BINNING = GRID | {
-    "depths": "const long long*",  # [n], the bits of float64
+    "sort_depths": "const long long*",  # [n], the bits of float64
     "counts": "int*",  # [n_chunks, n_strips]: entries, then place of the first within the strip's list
     "chunk_pairs": "long long*",  # [n_chunks]: pairs, then number of the first
     "totals": "long long*",  # pairs; the least depth bits; bits to drop from their differences
@@ -96,8 +96,8 @@ COLLECT = """
             if (!is_drawn(box)) continue;
             const Span s = span_of(box);
             pairs += each_strip(s, [&](long long strip) { of_camera[strip]++; });
-            low = depths[i] < low ? depths[i] : low;
-            high = depths[i] > high ? depths[i] : high;
+            low = sort_depths[i] < low ? sort_depths[i] : low;
+            high = sort_depths[i] > high ? sort_depths[i] : high;
             float* r = records + 16 * i;
             const float *center = centers + 4 * i, *w = whitenings + 4 * i;
             r[0] = center[0]; r[1] = center[1]; r[2] = 0.5f - center[2]; r[3] = 0.5f - center[3];
@@ -160,7 +160,7 @@ FILL = """
             const int* box = boxes + 4 * i;
             pair_starts[i] += base;
             if (!is_drawn(box)) continue;
-            const long long item = ((depths[i] - low) >> drop) << 31 | i;
+            const long long item = ((sort_depths[i] - low) >> drop) << 31 | i;
             const Span s = span_of(box);
             each_strip(s, [&](long long strip) { items[starts[strip0 + strip] + place[strip0 + strip]++] = item; });
         }

@@ -1,27 +1,34 @@
 """`Avatar`: one person's hand, ready to be posed and drawn. No image, network or estimator is needed."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.pose import mirror_gaussians, pose_gaussians
-from oasis_warp.core.checks import check_finite, check_shape
+from oasis_warp.avatar.pose import mirror_canonical, pose_gaussians
+from oasis_warp.core.backgrounds import plain_background
+from oasis_warp.core.checks import check_shape
 from oasis_warp.core.config import WHITE, Color
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandPose, PosedHand, Render, Side
 from oasis_warp.data.avatar_file import load_avatar, save_avatar
-from oasis_warp.hand.skinning import mirror_points, mirror_pose, rest_hand, skin
+from oasis_warp.hand.skinning import mirror_hand, mirror_points, rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand
+from oasis_warp.ops import Look, check_finite, rest_mesh
 from oasis_warp.render.render import render
+from oasis_warp.render.replay import Recording, Recordings, replayable, replayed
 
 
 class Avatar:
     """A hand made from a photo; see `oasis_warp.reconstruct`.
 
-    A left hand is stored as its mirror image (x -> -x) and mirrored after posing, so a pose means the same on both
-    sides: positive flexion closes, positive abduction goes to the thumb.
+    A left hand is stored as its mirror image (x -> -x), a right one; its mirror image is what is posed. So a pose means
+    the same on both sides: positive flexion closes, positive abduction goes to the thumb.
+
+    `mesh` and `pose` take many poses at once: with an axis of size B before every part of the pose, their results have
+    that axis too.
     """
 
     def __init__(
@@ -39,8 +46,7 @@ class Avatar:
         """Shape coefficients of the hand model [standard deviations]."""
         self.surface_offsets = surface_offsets
         """What the photo's outline adds to the rest surface [m]."""
-        self.gaussians = gaussians
-        """Canonical, on the right-handed rest surface."""
+        self._gaussians = gaussians
         self.source_pose = source_pose
         """The pose in the photo, in the frame of `source_camera`."""
         self.source_camera = source_camera
@@ -50,48 +56,106 @@ class Avatar:
         self.rest = plain._replace(vertices=plain.vertices + surface_offsets)
         """The right-handed surface at rest [m]."""
 
+        left = side == "left"
+        self._model = mirror_hand(self.hand) if left else self.hand
+        self._rest = PosedHand(*map(mirror_points, self.rest)) if left else self.rest
+        self._canonical = mirror_canonical(gaussians) if left else gaussians
+        vertices = self._rest.vertices
+        self._rest_mesh = (
+            vertices if vertices.requires_grad else rest_mesh(vertices, self.hand.faces, validate=False)
+        )
+        self._fixed = (*self._canonical, vertices, self._rest.joints)
+        self._recordings = Recordings()
+
+    @property
+    def gaussians(self) -> CanonicalGaussians:
+        """Canonical, on the right-handed rest surface."""
+        return self._gaussians
+
     @property
     def device(self) -> torch.device:
         """Where the avatar's tensors are."""
         return self.gaussians.colors.device
 
-    def _skin_right(self, pose: HandPose) -> PosedHand:
-        check_shape("pose.angles", pose.angles, 15, 3, hint="One row for each joint but the wrist.")
-        check_shape("pose.orientation", pose.orientation, 3, 3)
-        check_shape("pose.translation", pose.translation, 3)
-        check_finite(angles=pose.angles, orientation=pose.orientation, translation=pose.translation)
-        pose = HandPose(*(part.to(self.shape) for part in pose))
-        return skin(self.hand, self.rest, mirror_pose(pose) if self.side == "left" else pose)
+    def _checked(self, pose: HandPose, validate: bool) -> HandPose:
+        """The pose in the avatar's precision and place."""
+        batch, sizes = ("B",) if pose.angles.ndim == 3 else (), {}
+        hint = "One row for each joint but the wrist."
+        check_shape("pose.angles", pose.angles, *batch, 15, 3, sizes=sizes, hint=hint)
+        check_shape("pose.orientation", pose.orientation, *batch, 3, 3, sizes=sizes)
+        check_shape("pose.translation", pose.translation, *batch, 3, sizes=sizes)
+        if validate:
+            check_finite(angles=pose.angles, orientation=pose.orientation, translation=pose.translation)
+        return HandPose(*(part.to(self.shape) for part in pose))
 
-    def mesh(self, pose: HandPose) -> PosedHand:
+    def mesh(self, pose: HandPose, *, validate: bool = True) -> PosedHand:
         """The surface in `pose` [m]; the faces of a left hand wind the other way.
 
+        Args:
+            pose: One, or with an axis in front of every part many.
+            validate: Look at the pose's values too. Waits for a CUDA device if they are there.
+
         Raises:
             ValueError: a part of the pose has another shape or is not finite.
         """
-        posed = self._skin_right(pose)
-        return PosedHand(*map(mirror_points, posed)) if self.side == "left" else posed
+        return skin(self._model, self._rest, self._checked(pose, validate))
 
-    def pose(self, pose: HandPose) -> Gaussians:
+    def pose(self, pose: HandPose, *, validate: bool = True) -> Gaussians:
         """The Gaussians in `pose`, in the world of its orientation and translation.
 
+        Args:
+            pose: One, or with an axis in front of every part many.
+            validate: Look at the pose's values too. Waits for a CUDA device if they are there.
+
         Raises:
             ValueError: a part of the pose has another shape or is not finite.
         """
-        posed = self._skin_right(pose)
-        gaussians = pose_gaussians(self.gaussians, self.hand.faces, self.rest.vertices, posed.vertices)
-        return mirror_gaussians(gaussians) if self.side == "left" else gaussians
+        posed = skin_surface(self._model, self._rest, self._checked(pose, validate))
+        return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed)
 
-    def render(self, camera: Camera, pose: HandPose, background: Color = WHITE) -> Render:
+    def render(
+        self, camera: Camera, pose: HandPose, background: Color = WHITE, *, validate: bool = True
+    ) -> Render:
         """A picture of the hand in `pose` over a plain `background`; differentiable in the pose and the camera.
+
+        On CUDA the first picture of a size is recorded, and where no gradient is wanted the next ones replay it.
+
+        Args:
+            camera: What sees the hand.
+            pose: One pose.
+            background: What is seen beside it, and through it.
+            validate: Look at the values of camera and pose too. Waits for a CUDA device if they are there.
 
         Raises:
             ValueError: a part of the pose or the camera has another shape or is not finite.
         """
+        check_shape("pose.angles", pose.angles, 15, 3, hint="One pose a picture.")
+        check_shape("pose.orientation", pose.orientation, 3, 3)
+        check_shape("pose.translation", pose.translation, 3)
         check_shape("camera.viewmat", camera.viewmat, 4, 4)
         check_shape("camera.K", camera.K, 3, 3)
-        check_finite(viewmat=camera.viewmat, K=camera.K)
-        return render(self.pose(pose), camera, background=background)
+        color = torch.as_tensor(background, dtype=self.shape.dtype)
+        check_shape("background", color, 3)
+        if not isinstance(background, Tensor):
+            color = plain_background(tuple(color.tolist()), 1, like=self.shape)[0]
+        named = {**pose._asdict(), "viewmat": camera.viewmat, "K": camera.K}
+        inputs = (*named.values(), color)
+        if self.shape.dtype != torch.float32 or not replayable(self.device, (*inputs, *self._fixed)):
+            if validate:
+                check_finite(**named)
+            return render(self.pose(pose, validate=False), camera, background=background)
+
+        def draw(*parts: Tensor) -> tuple[Tensor, ...]:
+            *posed, viewmat, K, color = (part.to(self.shape) for part in parts)
+            seen = Camera(viewmat, K, camera.width, camera.height)
+            return tuple(render(self.pose(HandPose(*posed), validate=False), seen, background=color))
+
+        looking = validate and all(tensor.is_cuda for tensor in named.values())  # while the picture is drawn
+        if validate and not looking:
+            check_finite(**named)
+        size = camera.width, camera.height
+        with Look(**named) if looking else nullcontext():
+            return Render(*replayed(self._recordings, size, lambda: Recording(draw, inputs, self.shape), draw, inputs))
 
     def save(self, path: Path | str) -> None:
         """Write the avatar file (safetensors, versioned; see docs/avatar_file.md)."""

@@ -2,8 +2,10 @@ import torch
 from synthetic import PALM_TO_CAMERA, posed_hand
 
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
-from oasis_warp.avatar.pose import mirror_gaussians, pose_gaussians
+from oasis_warp.avatar.pose import mirror_canonical, pose_gaussians
 from oasis_warp.core import rotation
+from oasis_warp.hand.skinning import mirror_points
+from oasis_warp.ops import rest_mesh
 
 
 def canonical_and_rest(hand):
@@ -47,11 +49,25 @@ def test_offsets_turn_with_the_surface(hand):
     torch.testing.assert_close(posed.means[:n], expected, atol=1e-6, rtol=0)
 
 
-def test_mirroring_mirrors_every_covariance_and_twice_is_nothing(hand):
+def test_the_mirrored_gaussians_on_the_mirrored_surface_are_the_mirror_image(hand):
     canonical, rest = canonical_and_rest(hand)
-    posed = pose_gaussians(canonical, hand.faces, rest.vertices, posed_hand(hand, "fist")[2].vertices)
-    mirrored = mirror_gaussians(posed)
+    generator = torch.Generator().manual_seed(0)
+    canonical = canonical._replace(offsets=0.001 * torch.randn(canonical.offsets.shape, generator=generator))
+    fist = posed_hand(hand, "fist")[2].vertices
+    posed = pose_gaussians(canonical, hand.faces, rest.vertices, fist)
+    mirrored = mirror_canonical(canonical)
+    left = pose_gaussians(mirrored, hand.faces, mirror_points(rest.vertices), mirror_points(fist))
     flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))
-    torch.testing.assert_close(mirrored.means, posed.means @ flip)
-    torch.testing.assert_close(covariances(mirrored), flip @ covariances(posed) @ flip, atol=1e-12, rtol=1e-4)
-    assert all(torch.equal(a, b) for a, b in zip(mirror_gaussians(mirrored), posed, strict=True))
+    torch.testing.assert_close(left.means, posed.means @ flip, atol=1e-7, rtol=0)
+    torch.testing.assert_close(covariances(left), flip @ covariances(posed) @ flip, atol=1e-12, rtol=1e-4)
+    assert all(torch.equal(a, b) for a, b in zip(mirror_canonical(mirrored), canonical, strict=True))
+
+
+def test_many_poses_are_what_as_many_calls_give_and_a_measured_surface_poses_as_its_vertices(hand):
+    canonical, rest = canonical_and_rest(hand)
+    surfaces = [posed_hand(hand, name)[2].vertices for name in ("fist", "pinch")]
+    still = rest_mesh(rest.vertices, hand.faces)
+    together = pose_gaussians(canonical, hand.faces, still, torch.stack(surfaces))
+    for k, surface in enumerate(surfaces):
+        alone = pose_gaussians(canonical, hand.faces, rest.vertices, surface)
+        assert all(torch.equal(a[k], b) for a, b in zip(together[:3], alone[:3], strict=True))

@@ -3,9 +3,10 @@ import json
 from functools import partial
 
 import pytest
+import torch
+from gpu_rows import FRAME, GPU, KERNELS, SPEED, STUDY
 
-from oasis_warp.bench import error_time, knobs, pareto, speed
-from oasis_warp.bench.operators import OPERATORS
+from oasis_warp.bench import error_time, gpu_speed, knobs, pareto, roofline, scaling, speed
 from oasis_warp.bench.rows import KEYS
 from oasis_warp.bench.scenes import layered
 from oasis_warp.cli import main
@@ -50,13 +51,15 @@ def test_an_interrupted_measurement_leaves_nothing(short, monkeypatch, tmp_path,
 
 
 def test_kernels_prints_a_table_and_writes_json(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(speed, "OPERATORS", {"rasterization": OPERATORS["rasterization"]})
     monkeypatch.setattr(speed, "surfels", lambda n, size, seed: layered(n=n, size=size, seed=seed))
     file = tmp_path / "speed.json"
-    arguments = ["--repeats", "2", "--size", "16", "--gaussians", "200", "--json", str(file)]
+    table = tmp_path / "speed.csv"
+    arguments = ["--repeats", "2", "--size", "16", "--gaussians", "200", "--only", "rasterization"]
+    arguments += ["--json", str(file), "--csv", str(table)]
     assert main(["bench", "kernels", *arguments]) == 0
     records = json.loads(file.read_text())
     assert [(r["way"], r["gaussians"]) for r in records] == [("warp", 200), ("scalar", 200), ("torch", 200)] * 2
+    assert [r["way"] for r in csv.DictReader(table.read_text().splitlines())] == [r["way"] for r in records]
     out = capsys.readouterr().out
     assert "/ yardstick" in out
     assert "torch" in out
@@ -72,7 +75,13 @@ def test_kernels_prints_a_table_and_writes_json(monkeypatch, tmp_path, capsys):
         (["kernels", "--size", "5000"], "--size: expected 16 to 4096"),
         (["kernels", "--gaussians", "40000"], "--gaussians: expected 1 to 36881, as many as the hand has, got 40000"),
         (["kernels", "--json", "{}/no/k.json"], "expected the folder"),
-        (["kernels", "--peer", "gsplat"], "--peer gsplat: "),
+        (["kernels", "--csv", "{}/no/k.csv"], "expected the folder"),
+        (["kernels", "--plot", "{}/k.jpeg"], "k.jpeg: expected a name that ends in .png or .svg."),
+        (["kernels", "--peer", "gsplat"], "--peer gsplat: it draws on CUDA devices only; add --device cuda."),
+        (["kernels", "--only", "nothing"], "--only nothing: expected part of one of rasterization, blend_weights"),
+        (["scaling", "-o", "{}/no/folder"], "expected the folder"),
+        (["scaling", "-o", "{}/o", "--seconds", "0"], "--seconds: expected more than 0, got 0."),
+        (["scaling", "-o", "{}/o", "--threads", "0"], "--threads: expected 1 to"),
     ],
 )
 def test_what_cannot_be_measured_is_refused_in_one_sentence(arguments, sentence, tmp_path, capsys):
@@ -82,3 +91,116 @@ def test_what_cannot_be_measured_is_refused_in_one_sentence(arguments, sentence,
     assert captured.err.splitlines()[-1].startswith("oasis: ")
     assert captured.out == ""
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("what", [["kernels"], ["scaling", "-o", "{}/o"], ["roofline"], ["error-time", "-o", "{}/o"]])
+def test_a_gpu_that_is_not_there_is_told_in_one_sentence(monkeypatch, tmp_path, capsys, what):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert main(["bench", *(a.format(tmp_path) for a in what), "--device", "cuda"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err == (
+        "oasis: --device cuda: torch finds no CUDA device; use --device cpu, or see `oasis doctor`.\n"
+    )
+    assert captured.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    """A machine that says it has a GPU, where nothing is measured."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    asked = {}
+
+    def measure(cases, device, **options):
+        asked.update(options, cases=cases, device=device)
+        return SPEED
+
+    monkeypatch.setattr(gpu_speed, "measure", measure)
+    monkeypatch.setattr(roofline, "measure", lambda *_: KERNELS)
+    return asked
+
+
+def test_kernels_on_a_gpu_are_its_own_cases_on_both_clocks(gpu, tmp_path, capsys):
+    files = [tmp_path / name for name in ("k.json", "k.csv")]
+    arguments = ["--device", "cuda", "--only", "12k", "--repeats", "9", "--json", str(files[0]), "--csv", str(files[1])]
+    assert main(["bench", "kernels", *arguments]) == 0
+    assert [case.name for case in gpu["cases"]] == ["12k at 256 x 256"] * 2
+    assert (gpu["groups"], gpu["device"].type, gpu["peers"]) == (9, "cuda", {})
+    records = json.loads(files[0].read_text())
+    assert [r["way"] for r in records] == ["warp", "gsplat", "warp"]
+    assert records[0]["busy_ms"] == GPU.busy_ms
+    assert records[1]["busy_ms"] is None
+    assert len(files[1].read_text().splitlines()) == 4
+    captured = capsys.readouterr()
+    assert "37k at 512 x 512" in captured.out
+    assert "avatar at 512 x 512, pose + draw: no graph could hold it: operation not permitted" in captured.err
+    assert captured.err.count("no graph could hold it") == 1  # nobody tried gsplat
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--size", "512"], "--size: with --device cuda every case has its own; leave it out, or see --only."),
+        (["--gaussians", "100"], "--gaussians: with --device cuda every case has its own"),
+        (["--only", "nothing"], "--only nothing: expected part of one of 37k at 512 x 512, 12k at 256 x 256"),
+        (["--repeats", "1"], "--repeats: expected 2 or more, got 1"),
+        (["--peer", "gsplat"], "--peer gsplat: the package is not installed; `pip install gsplat` brings it."),
+        (["--json", "{}/no/k.json"], "expected the folder"),
+    ],
+)
+def test_what_cannot_be_measured_on_a_gpu_is_refused_in_one_sentence(
+    gpu, monkeypatch, arguments, sentence, tmp_path, capsys
+):
+    monkeypatch.setattr(gpu_speed, "find_spec", lambda name: None)
+    assert main(["bench", "kernels", "--device", "cuda", *(a.format(tmp_path) for a in arguments)]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("oasis: ")
+    assert sentence in captured.err
+    assert captured.out == ""
+    assert gpu == {}
+
+
+def test_a_plot_without_matplotlib_is_refused_before_anything_is_measured(gpu, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(pareto, "find_spec", lambda name: None)
+    assert main(["bench", "roofline", "--plot", str(tmp_path / "r.png")]) == 2
+    assert capsys.readouterr().err.startswith("oasis: --plot: matplotlib is not installed")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_roofline_is_told_for_every_kernel(gpu, tmp_path, capsys):
+    assert main(["bench", "roofline", "--json", str(tmp_path / "r.json")]) == 0
+    out = capsys.readouterr().out
+    assert "Ceilings measured: 4,250 GB/s, 50,000 GFLOP/s" in out
+    assert "blend_tiles_backward_3" in out
+    assert "20%" in out
+    assert len(json.loads((tmp_path / "r.json").read_text())) == len(KERNELS)
+
+
+def test_a_profiler_that_sees_nothing_is_told_in_one_sentence(gpu, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(roofline, "measure", lambda *_: [])
+    assert main(["bench", "roofline", "--json", str(tmp_path / "r.json")]) == 2
+    assert "torch's profiler traces no kernels here" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_scaling_writes_its_tables_and_tells_the_steepest_steps(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(pareto, "find_spec", lambda name: None)
+    asked = {}
+    monkeypatch.setattr(scaling, "measure", lambda points, device, **options: asked.update(options) or STUDY)
+    assert main(["bench", "scaling", "--quick", "-o", str(tmp_path / "out"), "--seed", "3"]) == 0
+    assert (asked["seconds"], asked["seed"]) == (1.0, 3)
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"scaling.csv", "scaling.json"}
+    captured = capsys.readouterr()
+    assert "(cliff)" in captured.out
+    assert "matplotlib is not installed" in captured.err
+
+
+def test_scaling_and_kernels_draw_what_they_measured(gpu, monkeypatch, tmp_path):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(scaling, "measure", lambda points, device, **options: STUDY)
+    assert main(["bench", "scaling", "-o", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "scaling.png").exists()
+    for what in ("kernels", "roofline"):
+        assert main(["bench", what, "--device", "cuda", "--plot", str(tmp_path / f"{what}.svg")]) == 0
+    assert FRAME.case in (tmp_path / "kernels.svg").read_text()
+    assert {p.name for p in tmp_path.iterdir()} == {"out", "kernels.svg", "roofline.svg"}

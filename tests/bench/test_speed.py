@@ -9,7 +9,6 @@ from oasis_warp.bench.operators import OPERATORS, forward
 from oasis_warp.bench.rows import json_text
 from oasis_warp.bench.scalar import generic_kernels
 from oasis_warp.bench.scenes import hand_scenes
-from oasis_warp.core.errors import InputError
 
 WAYS = {"warp": speed.WARP, "scalar": speed.SCALAR, "torch": speed.TORCH}
 
@@ -61,12 +60,3 @@ def test_rows_are_plain_json(small, cpu):
     records = json.loads(json_text(rows))
     assert [r["way"] for r in records] == ["warp", "torch"] * 2  # sparse products are torch's: nothing to vectorise
     assert {r["pass"] for r in records} == {"forward", "forward + backward"}
-
-
-def test_a_peer_that_is_not_there_is_told_in_one_sentence(monkeypatch, cpu):
-    monkeypatch.setattr(speed, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"--peer gsplat: the package is not installed; `pip install gsplat`"):
-        speed.gsplat_way(cpu)
-    monkeypatch.setattr(speed, "find_spec", lambda name: object())
-    with pytest.raises(InputError, match=r"--peer gsplat: it draws on CUDA devices only; add --device cuda\."):
-        speed.gsplat_way(cpu)

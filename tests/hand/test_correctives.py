@@ -7,9 +7,9 @@ import torch
 from hand_build.quality import closed, self_crossings, signed_volume
 
 from oasis_warp.core.types import HandPose
-from oasis_warp.hand.correctives import corrected_rest, corrective_coefficients
+from oasis_warp.hand.correctives import corrective_coefficients
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.skinning import rest_hand, skin
+from oasis_warp.hand.skinning import bone_transforms, rest_hand, skin
 
 HINGES = [2, 3, 5, 6, 8, 9, 11, 12, 14, 15]
 
@@ -59,13 +59,20 @@ def test_strengths_are_those_that_the_shapes_were_fitted_to(hand):
 def test_a_hand_without_correctives_keeps_its_rest_surface(plain):
     angles = torch.full((15, 3), 0.3)
     assert corrective_coefficients(plain, angles).shape == (0,)
-    assert corrected_rest(plain, plain.template, angles) is plain.template
+    rest = rest_hand(plain, torch.zeros(40))
+    pose = HandPose(angles, torch.eye(3), torch.zeros(3))
+    rotation, translation = bone_transforms(plain, rest.joints, pose)
+    moved = (rotation @ rest.vertices[:, None, :, None])[..., 0] + translation
+    alone = (plain.weights[..., None] * moved).sum(1)
+    torch.testing.assert_close(skin(plain, rest, pose).vertices, alone, rtol=0, atol=1e-6)
 
 
 def test_a_hand_with_other_correctives_is_refused(hand):
     odd = dataclasses.replace(hand, corrective_basis=hand.corrective_basis[..., :7])
     with pytest.raises(ValueError, match="hand: expected 0 or 30 pose correctives, got 7"):
         corrective_coefficients(odd, torch.zeros(15, 3))
+    with pytest.raises(ValueError, match="hand: expected 0 or 30 pose correctives, got 7"):
+        surface(odd, torch.zeros(15, 3))
 
 
 def test_each_joint_corrects_its_own_neighbourhood(hand):

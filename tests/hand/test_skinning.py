@@ -14,11 +14,12 @@ from oasis_warp.hand.skinning import (
     bone_transforms,
     clamp_angles,
     hand21,
-    joint_rotations,
+    mirror_hand,
     mirror_points,
     mirror_pose,
     rest_hand,
     skin,
+    skin_surface,
 )
 
 F64 = torch.float64
@@ -121,12 +122,14 @@ def test_bones_keep_their_lengths(exact):
     torch.testing.assert_close(length(posed.joints), length(rest.joints), rtol=0, atol=1e-7)
 
 
-def test_joint_rotations_are_rotations_and_leave_the_wrist(exact):
-    local = joint_rotations(exact, random_angles(exact, 7))
+def test_bones_turn_by_rotations_and_the_wrist_by_the_orientation(exact):
+    orientation = random_rotation(7)
+    pose = at_origin(random_angles(exact, 7))._replace(orientation=orientation)
+    turn, shift = bone_transforms(exact, exact.joints, pose)
     eye = torch.eye(3, dtype=F64)
-    torch.testing.assert_close(local @ local.mT, eye.expand(16, 3, 3), rtol=0, atol=2e-7)
-    assert torch.linalg.det(local).gt(0).all()
-    assert torch.equal(local[0], eye)
+    torch.testing.assert_close(turn @ turn.mT, eye.expand(16, 3, 3), rtol=0, atol=1e-6)  # the axes are float32
+    assert torch.linalg.det(turn).gt(0).all()
+    assert torch.equal(turn[0], orientation) and not shift[0].any()
 
 
 def test_each_bone_carries_its_own_joint_to_the_posed_joint(exact):
@@ -170,17 +173,32 @@ def test_rest_lies_within_the_limits(hand):
 def test_a_mirrored_pose_of_the_mirrored_hand_is_the_mirror_image(exact):
     pose = HandPose(random_angles(exact, 10), random_rotation(10), torch.tensor([0.1, -0.3, 0.6], dtype=F64))
     right = skin(exact, rest_hand(exact, random_shape(10)), pose)
-    # The left hand built by hand: mirrored model, axes of rotation mirrored as pseudovectors (M a, angle -> -angle).
-    flip = mirror_points
-    left_model = dataclasses.replace(
-        exact, template=flip(exact.template), joints=flip(exact.joints), tips=flip(exact.tips),
-        shape_basis=flip(exact.shape_basis.mT).mT, joint_basis=flip(exact.joint_basis.mT).mT,
-        tip_basis=flip(exact.tip_basis.mT).mT, corrective_basis=flip(exact.corrective_basis.mT).mT,
-        pose_axes=-flip(exact.pose_axes),
-    )  # fmt: skip
+    left_model = mirror_hand(exact)
     left = skin(left_model, rest_hand(left_model, random_shape(10)), mirror_pose(pose))
     for got, want in zip(left, right, strict=True):
-        torch.testing.assert_close(got, flip(want), rtol=0, atol=1e-12)
+        torch.testing.assert_close(got, mirror_points(want), rtol=0, atol=1e-12)
+
+
+def test_a_hand_mirrored_twice_is_the_hand(hand):
+    for name, value in vars(mirror_hand(mirror_hand(hand))).items():
+        before = getattr(hand, name)
+        assert value is before or torch.equal(value, before), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_many_poses_are_what_as_many_calls_give(hand, dtype, device):
+    model = hand.to(device=device, dtype=dtype)
+    rest = rest_hand(model, random_shape(13).to(device, dtype))
+    angles = torch.stack([random_angles(hand, seed) for seed in range(3)])
+    turns = torch.stack([random_rotation(seed) for seed in range(3)])
+    poses = HandPose(*(part.to(device, dtype) for part in (angles, turns, torch.randn(3, 3))))
+    together = skin(model, rest, poses)
+    for k in range(3):
+        alone = skin(model, rest, HandPose(*(part[k] for part in poses)))
+        assert torch.equal(together.vertices[k], alone.vertices)
+        torch.testing.assert_close(together.joints[k], alone.joints)
+        torch.testing.assert_close(together.tips[k], alone.tips)
+    assert torch.equal(skin_surface(model, rest, poses), together.vertices)
 
 
 def test_mirroring_twice_changes_nothing(exact):

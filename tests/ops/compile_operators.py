@@ -40,7 +40,8 @@ def rasterization():
         )  # fmt: skip
         return image, alphas, meta["means2d"]
 
-    return draw, [*gaussians(), torch.rand(6, 3), torch.rand(1, 3), viewmat[None]]
+    g = torch.Generator().manual_seed(2)
+    return draw, [*gaussians(), torch.rand(6, 3, generator=g), torch.rand(1, 3, generator=g), viewmat[None]]
 
 
 def rasterization_of_harmonics_and_covariances():
@@ -54,7 +55,8 @@ def rasterization_of_harmonics_and_covariances():
         )
         return image, alphas
 
-    return draw, [means, scales.square(), opacities, torch.rand(6, 4, 3)]
+    coefficients = torch.rand(6, 4, 3, generator=torch.Generator().manual_seed(3))
+    return draw, [means, scales.square(), opacities, coefficients]
 
 
 CASES = [spherical_harmonics, rasterization, rasterization_of_harmonics_and_covariances]

@@ -8,7 +8,16 @@ import sys
 import pytest
 import torch
 
-from oasis_warp.ops import _launch, _words, face_rotations, pose_on_mesh, pose_on_mesh_covars, skin
+from oasis_warp.core.rotation import to_matrix
+from oasis_warp.ops import (
+    _launch,
+    _words,
+    bone_transforms,
+    face_rotations,
+    pose_on_mesh,
+    pose_on_mesh_covars,
+    skin,
+)
 
 
 def mesh(seed, n, dtype):
@@ -23,17 +32,21 @@ def mesh(seed, n, dtype):
     return rest.to(dtype), posed.to(dtype), faces
 
 
-def calls(seed=0, n=4, dtype=torch.float32, empty=False):
+N_POSES = 9
+PARENTS = (-1, 0, 1, 0, 3)
+
+
+def calls(seed=0, n=4, dtype=torch.float32, empty=False, device="cpu", validate=True):
     """Of each operator: a function of float tensors, and these; `empty`: no points and no riders."""
     generator = torch.Generator().manual_seed(seed)
-    rest, posed, faces = mesh(seed, n, dtype)
+    rest, posed, faces = (part.to(device) for part in mesh(seed, n, dtype))
     n_vertices, n_faces = len(rest), len(faces)
 
     def normal(*shape):
-        return torch.randn(*shape, generator=generator).to(dtype)
+        return torch.randn(*shape, generator=generator).to(device, dtype)
 
-    face_index = torch.randint(n_faces, (n_faces + 3,), generator=generator)
-    vertex_index = torch.randint(n_vertices, (n_vertices // 2,), generator=generator)
+    face_index = torch.randint(n_faces, (n_faces + 3,), generator=generator).to(device)
+    vertex_index = torch.randint(n_vertices, (n_vertices // 2,), generator=generator).to(device)
     if empty:
         face_index, vertex_index = face_index[:0], vertex_index[:0]
     q, p, k = len(face_index), len(vertex_index), 0 if empty else 37
@@ -43,14 +56,49 @@ def calls(seed=0, n=4, dtype=torch.float32, empty=False):
     def on_both(posed, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio):
         return pose_on_mesh(
             posed, faces, face_index, barycentrics, vertex_quats, area_ratio, quats, scales,
-            vertex_index=vertex_index, offsets=offsets, vertex_area_ratio=vertex_area_ratio,
+            vertex_index=vertex_index, offsets=offsets, vertex_area_ratio=vertex_area_ratio, validate=validate,
         )  # fmt: skip
 
     def on_faces(posed, barycentrics, vertex_quats, area_ratio, quats, scales):
         return pose_on_mesh(posed, faces, face_index, barycentrics, vertex_quats, area_ratio, quats, scales, "area")
 
     on_mesh = [posed, barycentrics, unit, normal(n_faces).exp()]
+    axes = torch.nn.functional.normalize(normal(5, 3, 3), dim=-1)
+
+    def bent(angles, orientation, translation, joints):
+        return bone_transforms(angles, orientation, translation, joints, axes, PARENTS, validate=validate)
+
+    def corrected(means, weights, transforms, displacements, strengths):
+        correctives = {"displacements": displacements, "strengths": strengths, "validate": validate}
+        return skin(means, None, weights, transforms, **correctives)[:1]
+
+    def corrected_with_covars(means, covars, weights, transforms, displacements, strengths):
+        correctives = {"displacements": displacements, "strengths": strengths, "validate": validate}
+        return skin(means, covars, weights, transforms, **correctives)
+
+    many_posed = posed + 0.1 * normal(N_POSES, n_vertices, 3)
+    many_units = torch.nn.functional.normalize(unit + 0.1 * normal(N_POSES, n_vertices, 4), dim=-1)
+    many_ratios = normal(N_POSES, n_faces).exp(), normal(N_POSES, n_vertices).exp()
+    skinned = [normal(k, 3), normal(k, 3, 3), normal(k, 5).softmax(-1)]
     return {
+        "bone_transforms": (bent, [normal(4, 3), to_matrix(normal(4)), normal(3), normal(5, 3)]),
+        "bone_transforms poses": (
+            bent, [normal(N_POSES, 4, 3), to_matrix(normal(N_POSES, 4)), normal(N_POSES, 3), normal(5, 3)],
+        ),
+        "face_rotations poses": (
+            lambda rest, posed: face_rotations(rest, posed, faces, validate=validate), [rest, many_posed],
+        ),
+        "pose_on_mesh poses": (
+            on_both,
+            [many_posed, barycentrics, many_units, many_ratios[0], normal(p + q, 4), normal(p + q, 3).exp(),
+             normal(p, 3), many_ratios[1]],
+        ),
+        "skin correctives": (
+            corrected, [skinned[0], skinned[2], normal(5, 3, 4), normal(k, 3, 6), normal(6)],
+        ),
+        "skin poses": (
+            corrected_with_covars, [*skinned, normal(N_POSES, 5, 4, 4), normal(k, 3, 7), normal(N_POSES, 7)],
+        ),
         "face_rotations": (lambda rest, posed: face_rotations(rest, posed, faces), [rest, posed]),
         "pose_on_mesh": (
             on_both,
@@ -98,13 +146,14 @@ def test_an_operator_compiles_into_one_graph_with_its_gradient(name, as_shipped)
     assert all(torch.equal(a, b) for a, b in zip(results(name), results(name, compiled), strict=True))
 
 
-@pytest.mark.parametrize("name", ["face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "skin"])
+@pytest.mark.parametrize("name", [name for name in NAMES if "faces" not in name and "points" not in name])
 @pytest.mark.parametrize("backward", [False, True])
 def test_what_torch_is_told_of_an_operator_is_true(name, backward):
     # Each custom op is called once by the public function: take its arguments from there.
     function, inputs = calls()[name]
     seen = []
-    op = getattr(torch.ops.oasis_warp, name + ("_backward" if backward else "")).default
+    op = getattr(torch.ops.oasis_warp, name.split()[0] + ("_backward" if backward else "")).default
+
     class Spy(torch.utils._python_dispatch.TorchDispatchMode):
         def __torch_dispatch__(self, func, types, args=(), kwargs=None):
             if func is op:
@@ -123,13 +172,13 @@ def test_what_torch_is_told_of_an_operator_is_true(name, backward):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_memory_of_any_layout_gives_the_same_bits(name):
+def test_memory_of_any_layout_gives_the_same_bits(name, device):
     def spread(tensor):
-        wide = torch.full((*tensor.shape[:-1], 2 * tensor.shape[-1] + 1), torch.nan, dtype=tensor.dtype)
+        wide = tensor.new_full((*tensor.shape[:-1], 2 * tensor.shape[-1] + 1), torch.nan)
         wide[..., 1::2] = tensor
         return wide[..., 1::2]
 
-    function, inputs = calls()[name]
+    function, inputs = calls(device=device)[name]
     leaves = [spread(tensor.detach()).requires_grad_() for tensor in inputs]
     assert not any(leaf.is_contiguous() for leaf in leaves if leaf.ndim > 1)
     out = function(*leaves)
@@ -138,13 +187,29 @@ def test_memory_of_any_layout_gives_the_same_bits(name):
     weights = [torch.randn(o.shape, generator=generator).to(o) for o in out]
     weights = [w.mT.contiguous().mT if w.ndim > 1 else w for w in weights]
     grads = torch.autograd.grad(list(out), leaves, weights)
-    for a, b in zip([*out, *grads], results(name), strict=True):
+    for a, b in zip([*out, *grads], results(name, device=device), strict=True):
         assert torch.equal(a, b)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_broadcast_inputs_and_gradients_are_read_as_what_they_stand_for(name):
-    function, inputs = calls()[name]
+def test_memory_that_begins_anywhere_gives_the_same_results(name, device):
+    function, inputs = calls(device=device)[name]
+    # Torch multiplies correctives by strengths on the CPU, and rounds as its vectors happen to lie.
+    tolerance = {"rtol": 1e-5, "atol": 1e-6} if name in ("skin correctives", "skin poses") else {"rtol": 0, "atol": 0}
+    for shift in (1, 2, 3):
+        yards = [tensor.new_full((tensor.numel() + shift,), torch.nan) for tensor in inputs]
+        leaves = [
+            yard[shift:].view_as(tensor).copy_(tensor).detach().requires_grad_()
+            for yard, tensor in zip(yards, inputs, strict=True)
+        ]
+        out = function(*leaves)
+        for a, b in zip([*out, *weighted_gradients(out, leaves)], results(name, device=device), strict=True):
+            torch.testing.assert_close(a, b, **tolerance)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_broadcast_inputs_and_gradients_are_read_as_what_they_stand_for(name, device):
+    function, inputs = calls(device=device)[name]
     repeated = [tensor[:1].expand_as(tensor) for tensor in inputs]
     full = [tensor.contiguous() for tensor in repeated]
     for leaves in (repeated, full):
@@ -163,20 +228,18 @@ def test_broadcast_inputs_and_gradients_are_read_as_what_they_stand_for(name):
 
 @pytest.mark.parametrize("n", [1, 2, 3, 17])
 @pytest.mark.parametrize("name", NAMES)
-def test_float32_agrees_with_the_generic_kernels_in_float64(name, n):
-    _, inputs = calls(1, n)[name]
-    wide = calls(1, n, torch.float64)[name][1]
+def test_float32_agrees_with_the_generic_kernels_in_float64(name, n, device):
+    function, inputs = calls(1, n, device=device)[name]
+    exact, wide = calls(1, n, torch.float64)[name]
     for a, b in zip(inputs, wide, strict=True):
         b.copy_(a)
-    function, _ = calls(1, n)[name]
-    exact, _ = calls(1, n, torch.float64)[name]
     leaves, wide = ([t.clone().requires_grad_() for t in tensors] for tensors in (inputs, wide))
     out, want = function(*leaves), exact(*wide)
     for a, b in zip(out, want, strict=True):
         # A quaternion and its opposite are one rotation; signs may differ where two faces are equally large.
-        assert (a.double() - b).norm() <= 5e-6 * b.norm()
+        assert (a.double().cpu() - b).norm() <= 5e-6 * b.norm()
     for a, b in zip(weighted_gradients(out, leaves), weighted_gradients(want, wide), strict=True):
-        assert (a.double() - b).norm() <= 5e-5 * b.norm()
+        assert (a.double().cpu() - b).norm() <= 5e-5 * b.norm()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -186,12 +249,12 @@ def test_any_number_of_threads_gives_the_same_bits(name, with_threads):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_gradient_is_worked_out_that_nobody_wants(name):
-    function, inputs = calls()[name]
+def test_no_gradient_is_worked_out_that_nobody_wants(name, device):
+    function, inputs = calls(device=device)[name]
     with torch.no_grad():
         plain = function(*[tensor.clone().requires_grad_() for tensor in inputs])
     assert not any(out.requires_grad for out in plain)
-    whole = results(name)[len(plain) :]
+    whole = results(name, device=device)[len(plain) :]
     for k, tensor in enumerate(inputs):
         leaves = [t.clone().requires_grad_(j == k) for j, t in enumerate(inputs)]
         (grad,) = weighted_gradients(function(*leaves), [leaves[k]])
@@ -201,12 +264,12 @@ def test_no_gradient_is_worked_out_that_nobody_wants(name):
 @pytest.mark.parametrize("empty", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", NAMES)
-def test_nothing_comes_out_that_nobody_wrote(name, dtype, empty):
-    plain = results(name, dtype=dtype, empty=empty)
+def test_nothing_comes_out_that_nobody_wrote(name, dtype, empty, device):
+    plain = results(name, dtype=dtype, empty=empty, device=device)
     torch.use_deterministic_algorithms(True)  # new memory is full of NaN
     try:
         assert torch.empty(1).isnan()
-        filled = results(name, dtype=dtype, empty=empty)
+        filled = results(name, dtype=dtype, empty=empty, device=device)
     finally:
         torch.use_deterministic_algorithms(False)
     for a, b in zip(plain, filled, strict=True):
@@ -243,7 +306,7 @@ def test_kernels_stay_inside_their_memory(monkeypatch):
     cases = [(name, {"n": n, "empty": empty}) for name in NAMES for n in (1, 2, 5) for empty in (False, True)]
     plain = [results(name, **which) for name, which in cases]
     monkeypatch.setattr(_words, "address", guarded_address)
-    for module in ("_riders", "face_rotations", "skinning"):
+    for module in ("_riders", "bone_transforms", "face_rotations", "rest_mesh", "skinning"):
         monkeypatch.setattr(sys.modules[f"oasis_warp.ops.{module}"], "run_native", guarded_run)
     for (name, which), want in zip(cases, plain, strict=True):
         for a, b in zip(results(name, **which), want, strict=True):

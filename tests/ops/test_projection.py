@@ -14,6 +14,7 @@ from test_rasterization_stiff import CASES
 
 from oasis_kernels.constants import Rules
 from oasis_warp.ops import projection as module
+from oasis_warp.ops._records import Tables
 from oasis_warp.ops._rules import using
 from oasis_warp.ops.projection import Projection, project
 
@@ -22,10 +23,13 @@ ROUNDING = 2e-7
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 
 
+NAMES = (*Projection._fields[:-1], *Tables._fields)
+
+
 def assert_same(vectors, generic):
     """A float32 projection and its gradients against float64 ones: values one by one, gradients by rel-L2."""
     (got, g_got), (want, g_want) = vectors, generic
-    for name, a, b in zip(Projection._fields, got, want, strict=True):
+    for name, a, b in zip(NAMES, (*got[:-1], *got.tables()), (*want[:-1], *want.tables()), strict=True):
         if a.dtype == torch.int32:
             assert torch.equal(a, b), name
             continue
@@ -84,7 +88,8 @@ def test_vectors_bear_needles_whose_determinant_would_cancel_in_float64():
     xx, xy, yy = generic.covars2d.unbind(-1)
     det = generic.conics[..., 0] * generic.conics[..., 2] - generic.conics[..., 1] ** 2
     assert (generic.radii > 0).any() and not torch.allclose((xx * yy - xy * xy) * det, torch.ones_like(det))
-    torch.testing.assert_close(vectors.whitenings.double(), generic.whitenings, rtol=ROUNDING, atol=0.0)
+    got, want = vectors.tables().whitenings, generic.tables().whitenings
+    torch.testing.assert_close(got.double(), want, rtol=ROUNDING, atol=0.0)
 
 
 def test_vectors_bear_cameras_far_from_the_origin():
@@ -108,7 +113,8 @@ def test_the_first_gaussians_do_not_depend_on_how_many_follow(n, dtype):
         out = project(*inputs.values(), s.opacities, s.viewmats, *arguments, **OPTIONS)
         given = [g[:, : len(s.means)] for g in incoming_like(scene, out)]
         gradients = torch.autograd.grad(out[:3], list(inputs.values()), given)
-        results.append([*(t.detach()[:, :n] for t in out), *(g[:n] for g in gradients)])
+        values = (*out[:-1], *out.tables())
+        results.append([*(t.detach()[:, :n] for t in values), *(g[:n] for g in gradients)])
     for a, b in zip(*results, strict=True):
         assert torch.equal(a, b)
 
@@ -195,7 +201,7 @@ def test_gaussians_that_are_not_drawn_pass_on_the_gradient_of_depth_only(dtype, 
         *inputs, scene.opacities, scene.viewmats, scene.Ks, scene.width, scene.height,
         **(OPTIONS | {"near_plane": 100.0, "far_plane": 200.0}),
     )  # fmt: skip
-    assert not out.radii.any() and not any(t.any() for t in (out.means2d, out.covars2d, out.conics, out.boxes))
+    assert not out.radii.any() and not any(t.any() for t in (out.means2d, out.covars2d, out.conics, out.tables().boxes))
     g_means, g_quats, g_scales = torch.autograd.grad(out[:3], inputs, incoming(out))
     towards = scene.viewmats[:, None, 2, :3] * incoming(out)[2][..., None]
     torch.testing.assert_close(g_means, towards.sum(0))
@@ -258,7 +264,7 @@ def test_nothing_is_read_or_written_beside_the_arrays(n, with_covars, monkeypatc
     scene = scene.with_(**{k: amid_nan(v) for k, v in scene.tensors.items()})
     # What lies around the inputs is NaN: to read it would fail the check of values or change a result.
     assert_equal_bits(run(scene, amid_nan(covars) if with_covars else None, validate=True), plain)
-    assert len(wholes) == 2 * (9 + 5)
+    assert len(wholes) == 2 * (6 + 5)
     for whole in wholes:
         assert (whole[:GUARD] == 77).all() and (whole[-GUARD:] == 77).all()
 

@@ -7,6 +7,7 @@ from rasterization_scenes import ordinary_scene
 from test_projection import DTYPES
 
 from oasis_warp.ops import projection as module
+from oasis_warp.ops._records import Tables
 from oasis_warp.ops.projection import Projection, project
 
 N = 19
@@ -104,9 +105,10 @@ def test_unchecked_a_bad_gaussian_is_not_drawn_and_harms_no_other(name, value, d
     names = "means", "quats", "scales"
     got, want = run(scene.with_(**{name: bad}), by=names), run(scene, by=names)
     assert all(torch.isfinite(g).all() for g in got[1].values())
-    assert not got[0].radii[:, 5].any() and not got[0].boxes[:, 5].any()
+    assert not got[0].radii[:, 5].any() and not got[0].tables().boxes[:, 5].any()
     others = torch.arange(N, device=device) != 5
-    for field, a, b in zip(Projection._fields, got[0], want[0], strict=True):
+    fields = (*Projection._fields[:-1], *Tables._fields)
+    for field, a, b in zip(fields, *((*p[:-1], *p.tables()) for p in (got[0], want[0])), strict=True):
         assert torch.equal(a[:, others], b[:, others]), field
     for key in names:
         assert torch.equal(got[1][key][others], want[1][key][others]), key
@@ -170,13 +172,13 @@ def test_torch_finds_the_operators_well_formed(with_covars, dtype, device):
     scene = ordinary_scene(50, n=N, dtype=dtype, device=device)
     covars = covariances(scene) if with_covars else None
     forward = arguments(scene, covars)
-    torch.library.opcheck(module.project_op, forward)
+    torch.library.opcheck(torch.ops.oasis_warp.project, forward)
     means, quats, scales, covars, _opacities, viewmats, Ks, *_ = arguments(scene, covars, wanted=False)
     out = Projection(*module.project_op(*arguments(scene, covars, wanted=False)))
     given = [torch.ones_like(t) for t in out[:3]]
     wanted = [True, not with_covars, False, with_covars, True]
     torch.library.opcheck(
-        module.project_backward_op,
+        torch.ops.oasis_warp.project_backward,
         (means, quats, scales, covars, viewmats, Ks, scene.width, scene.height, out.radii, *given, wanted),
     )
 

@@ -81,7 +81,7 @@ def test_covariances_are_projected_as_their_quaternions_and_scales(dtype, device
     scene = scene.to(device, dtype)
     (got, g_got), (want, g_want) = run(scene, covars), run(scene)
     error = 1e-6 if dtype == torch.float32 else 1e-12
-    assert torch.equal(got.boxes, want.boxes)
+    assert torch.equal(got.tables().boxes, want.tables().boxes)
     for name in ("means2d", "covars2d", "conics", "depths"):
         torch.testing.assert_close(getattr(got, name), getattr(want, name), rtol=10 * error, atol=error)
     for name in ("means", "viewmats"):
@@ -108,7 +108,7 @@ def test_only_the_symmetric_part_counts_and_gradients_are_symmetric(dtype, devic
     covars = 0.5 * (covars + covars.mT)
     lopsided = torch.triu(covars, 1) * 2 + torch.diag_embed(covars.diagonal(dim1=-2, dim2=-1))
     (got, g_got), (want, g_want) = run(scene, lopsided), run(scene, covars)
-    assert torch.equal(got.covars2d, want.covars2d) and torch.equal(got.whitenings, want.whitenings)
+    assert torch.equal(got.covars2d, want.covars2d) and torch.equal(got.tables().whitenings, want.tables().whitenings)
     assert torch.equal(g_got["covars"], g_want["covars"])
     error = 1e-6 if dtype == torch.float32 else 1e-12
     g = g_got["covars"]
@@ -149,5 +149,7 @@ def test_vectors_of_quaternions_and_of_covariances_share_means_and_depths():
     scene = ordinary_scene(38)
     (quats, _), _ = both(scene)
     covars, _ = run(scene, covariances(scene))
-    for name in ("means2d", "depths", "sort_depths", "centers"):
+    for name in ("means2d", "depths"):
         assert torch.equal(getattr(quats, name), getattr(covars, name)), name
+    for name in ("sort_depths", "centers"):
+        assert torch.equal(getattr(quats.tables(), name), getattr(covars.tables(), name)), name

@@ -149,3 +149,11 @@ def test_blend_weights_refuses_what_the_rasterizer_refuses(call):
     opacities = a["opacities"] + 1
     with pytest.raises(ValueError, match=r"^opacities: expected values in \[0, 1\]"):
         blend_weights(a["means"], a["quats"], a["scales"], opacities, a["viewmats"][0], a["Ks"][0], 37, 29)
+
+
+def test_saved_tensors_that_were_copied_are_refused(call):
+    means = call.arguments["means"].clone().requires_grad_()
+    with torch.autograd.graph.saved_tensors_hooks(torch.clone, lambda tensor: tensor):
+        image, _, _ = call(means=means)
+    with pytest.raises(RuntimeError, match="rasterization: expected the tensors that it saved, got copies"):
+        image.sum().backward()

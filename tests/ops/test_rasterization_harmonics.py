@@ -6,7 +6,7 @@ from rasterization_scenes import ordinary_scene
 
 from oasis_warp.certify.twins.harmonics import seen_colors as expected_colors
 from oasis_warp.ops import rasterization
-from oasis_warp.ops.rasterization import seen_colors
+from oasis_warp.ops.seen_colors import seen_colors
 
 
 def scene_and_coefficients(degree=3, cameras=2, dtype=torch.float64, per_camera=False):
@@ -82,3 +82,41 @@ def test_a_wrong_degree_or_shape_is_refused_by_name(degree, shape, words):
     scene, _ = scene_and_coefficients(dtype=torch.float32)
     with pytest.raises(ValueError, match=words):
         draw(scene, torch.zeros(shape), sh_degree=degree)
+
+
+@pytest.mark.parametrize("wanted", [(1, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
+@pytest.mark.parametrize("per_camera", [False, True])
+@pytest.mark.parametrize("degree", range(4))
+def test_colours_and_their_gradients_are_those_of_the_twin(degree, per_camera, wanted, device):
+    scene, coefficients = scene_and_coefficients(cameras=3, per_camera=per_camera)  # more than the degree's
+    inputs = [
+        t.to(device).clone().requires_grad_(bool(asked))
+        for t, asked in zip((scene.means, coefficients, scene.viewmats), wanted, strict=True)
+    ]
+    leaves = [t for t in inputs if t.requires_grad]
+    got, expected = seen_colors(degree, *inputs), expected_colors(degree, *inputs)
+    assert (expected == 0).any() and (expected > 0).any()
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-13)
+    incoming = torch.randn(got.shape, generator=torch.Generator().manual_seed(3), dtype=got.dtype).to(device)
+    expected = expected + 0 * sum(leaf.sum() for leaf in leaves)  # degree 0 depends on the coefficients alone
+    for a, b in zip(
+        torch.autograd.grad(got, leaves, incoming), torch.autograd.grad(expected, leaves, incoming), strict=True
+    ):
+        assert (a - b).norm() <= 1e-12 * b.norm()
+
+
+def test_nothing_to_see_has_no_colours_and_gradients_of_zero(device):
+    scene, coefficients = scene_and_coefficients()
+    none = scene.means[:0].to(device), coefficients[:0].to(device), scene.viewmats.to(device)
+    inputs = [t.clone().requires_grad_() for t in none]
+    colors = seen_colors(3, *inputs)
+    assert colors.shape == (2, 0, 3)
+    gradients = torch.autograd.grad(colors.sum(), inputs)
+    assert [g.shape for g in gradients] == [t.shape for t in inputs] and not gradients[2].any()
+
+
+def test_colours_that_are_no_numbers_stay_so(device):
+    scene, coefficients = scene_and_coefficients(dtype=torch.float32)
+    coefficients[3, 0, 1] = float("nan")
+    colors = seen_colors(3, scene.means.to(device), coefficients.to(device), scene.viewmats.to(device))
+    assert colors[:, 3, 1].isnan().all() and colors.isnan().sum() == 2

@@ -161,7 +161,7 @@ def test_more_pairs_than_can_be_counted_are_refused_with_their_number():
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
     projection = project(means, quats, torch.full((n, 3), 9.0), torch.full((n,), 0.5), eye, K, size, size, **options)
     with pytest.raises(ValueError, match=f"at most {MAX_PAIRS} pairs of a Gaussian and a tile, got {n * 4096}"):
-        bin_to_tiles(projection.boxes, projection.sort_depths, size, size, 1)
+        bin_to_tiles(projection.tables().boxes, projection.tables().sort_depths, size, size, 1)
 
 
 @pytest.mark.parametrize("name", ["larger than the image", "3000 faint layers", "partly behind the camera"])
@@ -172,7 +172,8 @@ def test_dealing_and_sorting_fill_the_same_lists(name):
     options = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3}
     cameras, Ks = scene.viewmats.repeat(2, 1, 1), scene.Ks.repeat(2, 1, 1)
     projection = project(scene.means, *twice, cameras, Ks, scene.width, scene.height, **options)
-    dealt, sorted_ = (f(projection.boxes, projection.sort_depths, 7, 10, 10) for f in (bin_by_dealing, bin_by_sorting))
+    records = projection.tables()
+    dealt, sorted_ = (f(records.boxes, records.sort_depths, 7, 10, 10) for f in (bin_by_dealing, bin_by_sorting))
     assert torch.equal(dealt.starts, sorted_.starts)
     assert torch.equal(revealed(dealt.gaussians), revealed(sorted_.gaussians))
     assert torch.equal(dealt.pair_counts, sorted_.pair_counts)

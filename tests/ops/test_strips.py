@@ -168,13 +168,13 @@ def test_lists_hold_each_strips_gaussians_by_depth_and_then_by_index(n, distinct
     p = projected(scene)
     cut = _blend_strips.cut_strips(2, n, 80, 70, 8)
     splats = Splats(
-        p.sort_depths, p.centers, p.whitenings, p.boxes, scene.opacities.expand(2, n).contiguous(),
-        scene.colors.expand(2, n, 3).contiguous(), scene.backgrounds,
+        p.records, scene.opacities.expand(2, n).contiguous(), scene.colors.expand(2, n, 3).contiguous(),
+        scene.backgrounds,
     )  # fmt: skip
     _, _, lists = _blend_strips.draw(splats, Frame(80, 70, 8), True)
     assert lists is not None
     ids = revealed(lists.ids)
-    boxes, depths = p.boxes.view(-1, 4), p.sort_depths.view(-1)
+    boxes, depths = p.tables().boxes.view(-1, 4), p.tables().sort_depths.view(-1)
     x0, y0, x1, y1 = boxes.unbind(1)
     for s in range(cut.n_strips):
         camera, rest = divmod(s, cut.across * cut.down)
@@ -259,7 +259,7 @@ def test_nothing_is_written_past_a_buffer_nor_read_from_there(name, channels, ti
 
     def run(copy):
         splats = Splats(
-            *map(copy, (p.sort_depths, p.centers, p.whitenings, p.boxes, opacities, colors, backgrounds))
+            *map(copy, (p.records, opacities, colors, backgrounds))
         )
         *plain, nothing = _blend_strips.draw(splats, frame, False)
         *drawn, kept = _blend_strips.draw(splats, frame, True)

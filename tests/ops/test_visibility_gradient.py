@@ -231,9 +231,10 @@ def test_torch_compiles_both_functions_without_a_break(as_shipped):
 def test_the_ops_keep_the_contract_of_custom_ops(dtype):
     vertices, faces, viewmats, Ks, points = batch(2, dtype)
     ops = torch.ops.oasis_warp
-    torch.library.opcheck(ops.depth_map, (vertices, faces, viewmats, Ks, WIDTH, HEIGHT, 0.01, True))
+    for outputs in ((True, True, True), (False, True, False)):
+        torch.library.opcheck(ops.depth_map, (vertices, faces, viewmats, Ks, WIDTH, HEIGHT, 0.01, *outputs, True))
     leaves = (points.requires_grad_(), vertices.requires_grad_())
-    for keep, known in ((True, torch.arange(37)), (False, None)):
-        rest = (faces, viewmats, Ks, known, known is not None, WIDTH, HEIGHT, 0.01, TAU, 3 * TAU, keep, True)
+    for keep, maps, known in ((True, True, torch.arange(37)), (True, False, None), (False, False, None)):
+        rest = (faces, viewmats, Ks, known, known is not None, WIDTH, HEIGHT, 0.01, TAU, 3 * TAU, maps, keep, True)
         inputs = leaves if keep else [t.detach() for t in leaves]
         torch.library.opcheck(ops.depth_visibility, (*inputs, *rest))

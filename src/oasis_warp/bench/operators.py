@@ -25,6 +25,18 @@ Outputs = tuple[Tensor, ...]
 Pass = Literal["forward", "forward + backward"]
 
 
+class Results(NamedTuple):
+    """What a call gave: its outputs, and in passes with one the gradients."""
+
+    values: Outputs
+    gradients: Outputs = ()
+
+    @property
+    def tensors(self) -> Outputs:
+        """Both."""
+        return *self.values, *self.gradients
+
+
 def as_it_is(value: Any) -> Any:
     """The value."""
     return value
@@ -211,6 +223,21 @@ def gradients(
     return torch.autograd.grad(outputs, tuple(leaves.values()), weights)
 
 
+def repeated_gradients(
+    operator: Operator, call: Callable[..., Outputs], scene: Any, options: Mapping[str, Any], weights: Outputs
+) -> Callable[[], Results]:
+    """`gradients` as a call to be made often, with the outputs: what a call need not do again is done before."""
+    leaves = {name: getattr(scene, name).detach().requires_grad_(True) for name in operator.leaves}
+    live, inputs = replace(scene, **leaves), tuple(leaves.values())
+
+    def run() -> Results:
+        outputs = call(live, **options)
+        taken = torch.autograd.grad(outputs[: len(weights)], inputs, weights)
+        return Results(tuple(output.detach() for output in outputs), taken)
+
+    return run
+
+
 class Exact(NamedTuple):
     """What results are compared with: the float64 kernels on the same float32 numbers, with gsplat's rules."""
 
@@ -233,7 +260,7 @@ def exact(operator: Operator, scene: Any) -> Exact:
     judged = None
     if isinstance(scene, Scene):
         with torch.no_grad():
-            judged = ~torch_rasterizer.draw(wide).fragile[None]
+            judged = ~torch.stack([torch_rasterizer.draw(view).fragile for view in wide.views()])
     wide = operator.prepare(wide)
     outputs = forward(operator.call, wide, {})
     generator = torch.Generator().manual_seed(scene.seed)

@@ -10,13 +10,15 @@ import subprocess
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import torch
 
 from oasis_warp import __version__
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.atomic import write_file
+
+Kind = TypeVar("Kind")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,15 +102,15 @@ def to_record(row: Any) -> dict[str, Any]:
     return {name.rstrip("_"): clean(value) for name, value in asdict(row).items()}
 
 
-def csv_text(rows: Sequence[Row]) -> str:
-    """Rows as CSV with a heading."""
+def csv_text(rows: Sequence[Any]) -> str:
+    """Rows, one or more of one kind, as CSV with a heading."""
     out = io.StringIO()
-    writer = csv.DictWriter(out, KEYS, lineterminator="\n")
+    writer = csv.DictWriter(out, [field.name.rstrip("_") for field in fields(rows[0])], lineterminator="\n")
     writer.writeheader()
+    words = {True: "yes", False: "no"}
     for row in rows:
         record = to_record(row)
-        record["bit_equal"] = "yes" if row.bit_equal else "no"
-        writer.writerow(record)
+        writer.writerow({key: words[v] if isinstance(v, bool) else v for key, v in record.items()})
     return out.getvalue()
 
 
@@ -117,7 +119,7 @@ def json_text(rows: Sequence[Any]) -> str:
     return json.dumps([to_record(row) for row in rows], indent=1, allow_nan=False) + "\n"
 
 
-def write_rows(rows: Sequence[Row], csv_path: Path, json_path: Path) -> None:
+def write_rows(rows: Sequence[Any], csv_path: Path, json_path: Path) -> None:
     """Write both files, each whole or not at all.
 
     Raises:
@@ -125,6 +127,29 @@ def write_rows(rows: Sequence[Row], csv_path: Path, json_path: Path) -> None:
     """
     write_file(csv_path, csv_text(rows).encode())
     write_file(json_path, json_text(rows).encode())
+
+
+def from_record(kind: type[Kind], record: dict[str, Any]) -> Kind:
+    """The row that `to_record` made `record` from; a number that was not finite comes back as infinity."""
+    values = {}
+    for field in fields(kind):
+        value, kinds = record[field.name.rstrip("_")], get_args(field.type) or (field.type,)
+        values[field.name] = math.inf if value is None and type(None) not in kinds else value
+    return kind(**values)
+
+
+def read_json(kind: type[Kind], path: Path) -> list[Kind]:
+    """The rows of a file of `write_rows` or `json_text`.
+
+    Raises:
+        InputError: no such file, or rows of another kind.
+    """
+    try:
+        return [from_record(kind, record) for record in json.loads(path.read_text())]
+    except OSError as error:
+        raise InputError(f"{path}: expected a JSON file of `oasis bench`, got {error.strerror}.") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: expected the rows of a {kind.__name__}, found something else.") from error
 
 
 def read_csv(path: Path) -> list[Row]:

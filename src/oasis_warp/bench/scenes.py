@@ -5,7 +5,7 @@ Every number is a float32 number, so that both precisions see the same scene. A 
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -15,7 +15,8 @@ from torch.nn.functional import normalize
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
-from oasis_warp.core.types import HandPose
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import Camera, CanonicalGaussians, HandPose, PosedHand
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import bone_transforms, rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
@@ -56,7 +57,7 @@ class _Tensors:
 
 @dataclass(frozen=True)
 class Scene(_Tensors):
-    """Gaussians before one camera, as `rasterization` takes them."""
+    """Gaussians before C cameras, as `rasterization` takes them."""
 
     name: str
     seed: int
@@ -65,11 +66,18 @@ class Scene(_Tensors):
     scales: Float[Tensor, "N 3"]
     opacities: Float[Tensor, "N"]
     colors: Float[Tensor, "N 3"]
-    viewmats: Float[Tensor, "1 4 4"]
-    Ks: Float[Tensor, "1 3 3"]
-    backgrounds: Float[Tensor, "1 3"]
+    viewmats: Float[Tensor, "C 4 4"]
+    Ks: Float[Tensor, "C 3 3"]
+    backgrounds: Float[Tensor, "C 3"]
     width: int
     height: int
+
+    def views(self) -> "list[Scene]":
+        """A scene for each camera."""
+        return [
+            replace(self, viewmats=viewmat[None], Ks=K[None], backgrounds=background[None])
+            for viewmat, K, background in zip(self.viewmats, self.Ks, self.backgrounds, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -104,33 +112,53 @@ class MeshScene(_Tensors):
     height: int
 
 
-def hand_scenes(size: int = 256, seed: int = 0) -> tuple[Scene, MeshScene]:
-    """The bundled hand, open, palm to the camera: 36,881 Gaussians over black, and its mesh of 24,608 faces."""
-    generator = torch.Generator().manual_seed(seed)
+class HandParts(NamedTuple):
+    """The bundled hand, open, palm to the camera, and what is needed to pose it."""
+
+    hand: HandModel
+    rest: PosedHand
+    pose: HandPose
+    posed: Float[Tensor, "V 3"]
+    """Its vertices in the pose [m]."""
+    canonical: CanonicalGaussians
+
+
+def hand_parts(generator: torch.Generator) -> HandParts:
+    """The bundled hand with 36,881 Gaussians; the generator makes the noise on their colours."""
     hand = bundled_hand()
     rest = rest_hand(hand, torch.zeros(len(hand.shape_names)))
     pose = HandPose(named_pose(hand, "open"), torch.tensor(PALM_TO_CAMERA), torch.tensor([0.0, 0.0, 0.5]))
-    posed = skin(hand, rest, pose).vertices
     anchors = place_anchors(hand, rest)
     skin_colors = region_colors(label_regions(hand), MELANIN).to(torch.float32)
     skin_colors = (skin_colors + TEXTURE * torch.randn(skin_colors.shape, generator=generator)).clamp(0, 1)
     canonical = anchors.with_colors(vertex_to_gaussians(skin_colors, hand.faces, anchors))
+    return HandParts(hand, rest, pose, skin(hand, rest, pose).vertices, canonical)
+
+
+def hand_scenes(size: int = 256, seed: int = 0, n_views: int = 1) -> tuple[Scene, MeshScene]:
+    """The bundled hand: 36,881 Gaussians over black, seen from `n_views` sides, and its mesh of 24,608 faces."""
+    generator = torch.Generator().manual_seed(seed)
+    hand, rest, pose, posed, canonical = hand_parts(generator)
     gaussians = pose_gaussians(canonical, hand.faces, rest.vertices, posed)
-    camera = orbit_camera(posed, 0.0, size=size)
-    drawn = Scene(
-        "hand", seed, *gaussians, camera.viewmat[None], camera.K[None], torch.zeros(1, 3), size, size
-    )  # fmt: skip
+    cameras = cameras_around(posed, size, n_views)
+    viewmats, Ks = (torch.stack([getattr(camera, name) for camera in cameras]) for name in ("viewmat", "K"))
+    drawn = Scene("hand", seed, *gaussians, viewmats, Ks, torch.zeros(n_views, 3), size, size)
     points = posed + POINT_NOISE * torch.randn(posed.shape, generator=generator)
-    offsets = OFFSET * torch.randn(len(anchors.vertex_index), 3, generator=generator)
+    offsets = OFFSET * torch.randn(len(canonical.vertex_index), 3, generator=generator)
     axes = VERTEX_GAUSSIAN * torch.randn(len(posed), 3, 3, generator=generator)
     rotations, translations = bone_transforms(hand, rest.joints, pose)
     mesh = MeshScene(
         "hand", seed, rest.vertices, posed, hand.faces, *turns(rest.vertices, posed, hand.faces),
         axes @ axes.transpose(1, 2), hand.weights, torch.cat([rotations, translations[..., None]], -1), points,
-        anchors.vertex_index, offsets, anchors.face_index, anchors.barycentrics, anchors.quats, anchors.scales,
-        camera.viewmat, camera.K, size, size,
+        canonical.vertex_index, offsets, canonical.face_index, canonical.barycentrics, canonical.quats,
+        canonical.scales, viewmats[0], Ks[0], size, size,
     )  # fmt: skip
     return drawn, mesh
+
+
+def cameras_around(vertices: Float[Tensor, "V 3"], size: int, n: int) -> list[Camera]:
+    """`n` cameras all round, the first before the palm."""
+    return [orbit_camera(vertices, 2 * math.pi * k / n, size=size) for k in range(n)]
 
 
 def turns(rest_vertices: Tensor, posed_vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:

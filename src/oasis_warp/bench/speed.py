@@ -1,20 +1,18 @@
-"""How fast every operator is: beside a yardstick, the same in torch, and other rasterizers, in one run."""
+"""How fast every operator is: beside a yardstick and the same in torch, in one run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import torch
 
 from oasis_warp.bench.errors import relative_error
-from oasis_warp.bench.operators import OPERATORS, Exact, Operator, Outputs, Pass, exact, forward, gradients
+from oasis_warp.bench.operators import Exact, Operator, Outputs, Pass, exact, forward, gradients
 from oasis_warp.bench.rows import commit, device_name, versions
 from oasis_warp.bench.scalar import generic_kernels
 from oasis_warp.bench.scenes import MeshScene, Scene, hand_scenes, surfels
 from oasis_warp.bench.timing import Timed, peak_megabytes, time_together
 from oasis_warp.bench.yardstick import make_yardstick
-from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 
 
@@ -30,7 +28,7 @@ class SpeedRow:
     pass_: str
     """Called `pass` in files."""
     way: str
-    """"warp" is ours, "scalar" our generic kernels in float32 on the CPU, "torch" the same in torch; or a peer."""
+    """"warp" is ours, "scalar" our generic kernels in float32 on the CPU, "torch" the same in torch."""
     scene: str
     gaussians: int
     """In the scene."""
@@ -75,29 +73,8 @@ SCALAR = Way(lambda operator: operator.call if operator.vectorised else None, ge
 TORCH = Way(lambda operator: operator.torch_peer)
 
 
-def gsplat_way(device: torch.device) -> Way:
-    """The rasterizer of gsplat.
-
-    Raises:
-        InputError: it is not installed, or cannot draw on the device.
-    """
-    if find_spec("gsplat") is None:
-        raise InputError("--peer gsplat: the package is not installed; `pip install gsplat` brings it.")
-    if device.type != "cuda":
-        raise InputError("--peer gsplat: it draws on CUDA devices only; add --device cuda.")
-    import gsplat
-
-    def draw(scene: Scene) -> Outputs:
-        image, alphas, _ = gsplat.rasterization(
-            scene.means, scene.quats, scene.scales, scene.opacities, scene.colors, scene.viewmats, scene.Ks,
-            scene.width, scene.height, backgrounds=scene.backgrounds, packed=False,
-        )  # fmt: skip
-        return image, alphas
-
-    return Way(lambda operator: draw if operator.name == "rasterization" else None)
-
-
 def measure(
+    operators: Sequence[Operator],
     *,
     device: torch.device,
     gaussians: int,
@@ -105,28 +82,27 @@ def measure(
     threads: int,
     repeats: int,
     seed: int = 0,
-    peers: dict[str, Way] | None = None,
     progress: Progress = silent,
 ) -> list[SpeedRow]:
-    """Rows of every way to compute every operator, each operator's timed in turns.
+    """Rows of every way to compute the `operators`, each operator's timed in turns.
 
     Args:
+        operators: Of `OPERATORS`.
         device: Where to compute.
         gaussians: Of the hand, to be drawn.
         size: Side of the picture [px].
         threads: CPU threads.
         repeats: Timed calls of each.
         seed: Of the scene.
-        peers: More ways, by name.
         progress: Told after every round.
     """
     drawn, mesh = surfels(gaussians, size, seed), hand_scenes(size, seed)[1]
-    ways = {"warp": WARP, **({"scalar": SCALAR} if device.type == "cpu" else {}), "torch": TORCH, **(peers or {})}
+    ways = {"warp": WARP, **({"scalar": SCALAR} if device.type == "cpu" else {}), "torch": TORCH}
     rows: list[SpeedRow] = []
-    for place, operator in enumerate(OPERATORS.values()):
+    for place, operator in enumerate(operators):
 
         def after_round(n: int, done: int = place * repeats) -> None:
-            progress("speed", done + n, len(OPERATORS) * repeats)
+            progress("speed", done + n, len(operators) * repeats)
 
         scene = (drawn if operator.scene is Scene else mesh).to(device=device)
         rows += measure_operator(operator, scene, ways, device, threads, repeats, after_round)

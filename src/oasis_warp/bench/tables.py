@@ -5,7 +5,10 @@ from collections.abc import Sequence
 
 from rich.table import Table
 
+from oasis_warp.bench.gpu_speed import GpuRow
+from oasis_warp.bench.roofline import KernelRow
 from oasis_warp.bench.rows import Row
+from oasis_warp.bench.scaling import ScalingRow, steepest
 from oasis_warp.bench.speed import SpeedRow
 from oasis_warp.bench.summary import BUDGETS, Group, fastest, groups
 
@@ -62,5 +65,82 @@ def speed_table(rows: Sequence[SpeedRow]) -> Table:
             "" if row.cpu_ms is None else f"{row.cpu_ms:.2f}", f"{row.over_yardstick:.3f}", f"{row.over_warp:.1f}",
             "" if row.peak_mb is None else f"{row.peak_mb:.1f}",
             number(row.rel_l2), number(row.gradient_rel_l2), end_section=last,
+        )  # fmt: skip
+    return table
+
+
+def cell(value: float | None, form: str = ".3g") -> str:
+    """A number, or nothing where there is none."""
+    return "" if value is None else format(value, form)
+
+
+def gpu_table(rows: Sequence[GpuRow]) -> Table:
+    """Times on both clocks and errors of every way to compute every case."""
+    table = Table(title_justify="left")
+    for heading in ("case", "pass", "way"):
+        table.add_column(heading)
+    for heading in (
+        "wall ms", "quartiles", "a second", "GPU ms", "quartiles", "launched", "kernels ms", "kernels", "MiB", "max",
+        "99.99 %", "rel-L2", "gradient", "same bits",
+    ):  # fmt: skip
+        table.add_column(heading, justify="right", no_wrap=True)
+    for k, row in enumerate(rows):
+        last = k + 1 == len(rows) or rows[k + 1].case != row.case
+        table.add_row(
+            row.case, row.pass_, row.way, cell(row.wall_ms), cell(row.wall_iqr_ms, ".2g"),
+            f"{1e3 * row.views / row.wall_ms:,.0f}", cell(row.busy_ms), cell(row.busy_iqr_ms, ".2g"),
+            cell(row.launch_ms), cell(row.kernels_ms), cell(row.kernels, ".0f"), cell(row.peak_mb, ".1f"),
+            number(row.max_abs), number(row.most_abs), number(row.rel_l2), number(row.gradient_rel_l2),
+            "yes" if row.bit_equal else "no", end_section=last,
+        )  # fmt: skip
+    return table
+
+
+def scaling_table(rows: Sequence[ScalingRow]) -> Table:
+    """Every point of the study."""
+    table = Table(title_justify="left")
+    for heading in ("axis", "scene", "size", "views", "pass"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("pairs", "longest", "wall ms", "GPU ms", "MiB", "finite", "overflow", "compared", "max", "99.99 %"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for k, row in enumerate(rows):
+        last = k + 1 == len(rows) or (rows[k + 1].axis, rows[k + 1].series) != (row.axis, row.series)
+        table.add_row(
+            row.axis, row.scene, f"{row.width} x {row.height}", str(row.views), row.pass_, f"{row.pairs:,}",
+            f"{row.longest:,}", cell(row.wall_ms), cell(row.busy_ms), cell(row.peak_mb, ".1f"),
+            "yes" if row.finite else "NO", "" if row.overflow is None else "YES" if row.overflow else "no",
+            row.checked, number(row.max_abs), number(row.most_abs), end_section=last,
+        )  # fmt: skip
+    return table
+
+
+def growth_table(rows: Sequence[ScalingRow]) -> Table:
+    """The steepest step along every line of the study."""
+    table = Table(title="Largest growth of time over growth of work", title_justify="left")
+    for heading in ("axis", "of", "pass", "ratio", "between"):
+        table.add_column(heading)
+    for step in steepest(rows):
+        table.add_row(
+            step.axis, step.series, step.pass_, f"{step.ratio:.2f}{' (cliff)' if step.cliff else ''}",
+            f"{step.before:,} and {step.after:,}",
+        )  # fmt: skip
+    return table
+
+
+def roofline_table(rows: Sequence[KernelRow]) -> Table:
+    """Every kernel's time, what it moved and did, and its share of the nearer ceiling."""
+    ceilings = f"{rows[0].ceiling_gb_s:,.0f} GB/s, {rows[0].ceiling_gflop_s:,.0f} GFLOP/s"
+    table = Table(title=f"Ceilings measured: {ceilings}", title_justify="left")
+    for heading in ("case", "kernel"):
+        table.add_column(heading)
+    for heading in ("launches", "us", "MB", "GB/s", "MFLOP", "GFLOP/s", "floor us", "share", "of"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for k, row in enumerate(rows):
+        last = k + 1 == len(rows) or rows[k + 1].case != row.case
+        table.add_row(
+            row.case, row.kernel, f"{row.launches:g}", f"{row.us:.2f}",
+            "" if row.bytes is None else f"{1e-6 * row.bytes:.2f}", cell(row.gb_s, ",.0f"),
+            "" if row.flops is None else f"{1e-6 * row.flops:.1f}", cell(row.gflop_s, ",.0f"),
+            cell(row.floor_us, ".2f"), cell(row.share, ".0%"), row.bound, end_section=last,
         )  # fmt: skip
     return table

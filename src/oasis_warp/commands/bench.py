@@ -1,25 +1,40 @@
 """`oasis bench`: measure the operators on this machine."""
 
 import os
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
+from rich.table import Table
 
-from oasis_warp.bench import error_time, pareto, speed
-from oasis_warp.bench.rows import json_text, write_rows
+from oasis_warp.bench import error_time, gpu_cases, gpu_speed, pareto, plots, roofline, scaling, speed
+from oasis_warp.bench.operators import OPERATORS
+from oasis_warp.bench.rows import csv_text, json_text, write_rows
 from oasis_warp.bench.scenes import HAND_GAUSSIANS
 from oasis_warp.bench.summary import groups
-from oasis_warp.bench.tables import budget_table, setting_table, speed_table
+from oasis_warp.bench.tables import (
+    budget_table,
+    gpu_table,
+    growth_table,
+    roofline_table,
+    scaling_table,
+    setting_table,
+    speed_table,
+)
 from oasis_warp.bench.timing import using_threads
 from oasis_warp.commands.look import check_device
-from oasis_warp.commands.options import Bench, ErrorTime, Kernels
+from oasis_warp.commands.options import Bench, ErrorTime, Kernels, Roofline, Scaling
 from oasis_warp.commands.progress import show_progress
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.atomic import output_file, output_folder
 
-TABLE_WIDTH = 160
+TABLE_WIDTH = 200
 """Columns that the widest table takes."""
+REPEATS, GPU_GROUPS = 30, 11
+SIZE, GAUSSIANS = 256, 20_000
 
 
 def run(options: Bench) -> int:
@@ -30,41 +45,57 @@ def run(options: Bench) -> int:
     """
     chosen = options.what
     check_device(chosen.device)
-    check_numbers(chosen)
-    if isinstance(chosen, ErrorTime):
-        measure_error_time(chosen)
-    else:
-        measure_kernels(chosen)
+    match chosen:
+        case ErrorTime():
+            measure_error_time(chosen)
+        case Kernels(device="cuda"):
+            measure_gpu(chosen)
+        case Kernels():
+            measure_kernels(chosen)
+        case Scaling():
+            measure_scaling(chosen)
+        case Roofline():
+            measure_roofline(chosen)
     return 0
 
 
-def check_numbers(options: ErrorTime | Kernels) -> None:
-    """Refuse numbers that nothing can be measured with.
+def check_repeats(repeats: int | None) -> None:
+    """Refuse too few."""
+    if repeats is not None and repeats < 2:
+        raise InputError(f"--repeats: expected 2 or more, got {repeats}; quartiles need some.")
 
-    Raises:
-        InputError: names the option.
-    """
-    if options.repeats is not None and options.repeats < 2:
-        raise InputError(f"--repeats: expected 2 or more, got {options.repeats}; quartiles need some.")
+
+def check_threads(threads: int) -> None:
+    """Refuse more than there are."""
     cores = os.cpu_count() or 1
-    if not 1 <= options.threads <= cores:
-        raise InputError(f"--threads: expected 1 to {cores}, the cores of this machine, got {options.threads}.")
-    multiple = 4 if isinstance(options, ErrorTime) else 1
-    if isinstance(options, Kernels) and not 1 <= options.gaussians <= HAND_GAUSSIANS:
-        raise InputError(
-            f"--gaussians: expected 1 to {HAND_GAUSSIANS}, as many as the hand has, got {options.gaussians}."
-        )
-    if not 16 <= options.size <= 4096 or options.size % multiple:
-        wanted = "a multiple of 4 from 16 to 4096" if multiple == 4 else "16 to 4096"
-        raise InputError(f"--size: expected {wanted} pixels, got {options.size}.")
+    if not 1 <= threads <= cores:
+        raise InputError(f"--threads: expected 1 to {cores}, the cores of this machine, got {threads}.")
+
+
+def check_size(size: int, multiple: int = 1) -> None:
+    """Refuse a picture that cannot be drawn."""
+    if not 16 <= size <= 4096 or size % multiple:
+        wanted = f"a multiple of {multiple} from 16 to 4096" if multiple > 1 else "16 to 4096"
+        raise InputError(f"--size: expected {wanted} pixels, got {size}.")
+
+
+def check_plot(plot: Path | None) -> None:
+    """Refuse a picture that cannot be made, before anything is measured."""
+    if plot is None:
+        return
+    if plot.suffix not in (".png", ".svg"):
+        raise InputError(f"--plot {plot}: expected a name that ends in .png or .svg.")
+    if not pareto.can_plot():
+        raise InputError(f"--plot: {pareto.MISSING}")
 
 
 def measure_error_time(options: ErrorTime) -> None:
     """`oasis bench error-time`."""
+    check_repeats(options.repeats)
+    check_threads(options.threads)
+    check_size(options.size, 4)
     notes = Console(stderr=True)
-    with_plots = pareto.can_plot()
-    if not with_plots:
-        notes.print(f"oasis: {pareto.MISSING}", highlight=False, soft_wrap=True, markup=False)
+    with_plots = can_plot(notes)
     device = torch.device(options.device)
     with output_folder(options.out) as folder:
         with show_progress(notes) as progress, using_threads(options.threads):
@@ -82,28 +113,126 @@ def measure_error_time(options: ErrorTime) -> None:
         if with_plots:
             for op in dict.fromkeys(row.op for row in rows):
                 pareto.plot_operator(rows, op, folder / f"{op}.png")
-    console = table_console()
-    for group in groups(rows):
-        console.print(setting_table(group))
-    console.print(budget_table(rows))
+    show(*(setting_table(group) for group in groups(rows)), budget_table(rows))
 
 
 def measure_kernels(options: Kernels) -> None:
-    """`oasis bench kernels`."""
-    device = torch.device(options.device)
-    peers = {"gsplat": speed.gsplat_way(device)} if options.peer else {}
-    with nullcontext() if options.json is None else output_file(options.json) as part:
+    """`oasis bench kernels` on the CPU."""
+    check_repeats(options.repeats)
+    check_threads(options.threads)
+    size, gaussians = options.size or SIZE, options.gaussians or GAUSSIANS
+    check_size(size)
+    if not 1 <= gaussians <= HAND_GAUSSIANS:
+        raise InputError(f"--gaussians: expected 1 to {HAND_GAUSSIANS}, as many as the hand has, got {gaussians}.")
+    if options.peer:
+        raise InputError(f"--peer {options.peer}: it draws on CUDA devices only; add --device cuda.")
+    operators = [operator for name, operator in OPERATORS.items() if options.only in name]
+    if not operators:
+        raise InputError(f"--only {options.only}: expected part of one of {', '.join(OPERATORS)}.")
+    with results(options, plots.plot_speed) as write:
         with show_progress(Console(stderr=True)) as progress, using_threads(options.threads):
             rows = speed.measure(
-                device=device, gaussians=options.gaussians, size=options.size, threads=options.threads,
-                repeats=options.repeats, peers=peers, progress=progress,
+                operators, device=torch.device("cpu"), gaussians=gaussians, size=size, threads=options.threads,
+                repeats=options.repeats or REPEATS, progress=progress,
             )  # fmt: skip
-        if part is not None:
-            part.write_text(json_text(rows))
-    table_console().print(speed_table(rows))
+        write(rows)
+    show(speed_table(rows))
 
 
-def table_console() -> Console:
-    """The console, wide enough for our tables: a file has no width, and cut numbers say nothing."""
+def measure_gpu(options: Kernels) -> None:
+    """`oasis bench kernels --device cuda`."""
+    check_repeats(options.repeats)
+    for name, value in (("size", options.size), ("gaussians", options.gaussians)):
+        if value is not None:
+            raise InputError(f"--{name}: with --device cuda every case has its own; leave it out, or see --only.")
+    cases = gpu_cases.choose(options.only)
+    if not cases:
+        names = ", ".join(dict.fromkeys(case.name for case in gpu_cases.CASES))
+        raise InputError(f"--only {options.only}: expected part of one of {names}.")
+    peers = {"gsplat": gpu_speed.gsplat_draw()} if options.peer else {}
+    notes = Console(stderr=True)
+    with results(options, plots.plot_speed) as write:
+        with show_progress(notes) as progress, using_threads(options.threads):
+            rows = gpu_speed.measure(
+                cases, torch.device("cuda"), groups=options.repeats or GPU_GROUPS, peers=peers, progress=progress
+            )
+        write(rows)
+    show(gpu_table(rows))
+    for row in rows:
+        if row.not_captured and row.way == gpu_cases.OURS:
+            notes.print(f"oasis: {row.case}, {row.pass_}: no graph could hold it: {row.not_captured}", soft_wrap=True)
+
+
+def measure_scaling(options: Scaling) -> None:
+    """`oasis bench scaling`."""
+    check_threads(options.threads)
+    seconds = options.seconds if options.seconds is not None else 1.0 if options.quick else 2.0
+    if not seconds > 0:
+        raise InputError(f"--seconds: expected more than 0, got {seconds:g}.")
+    notes = Console(stderr=True)
+    with_plot = can_plot(notes)
+    with output_folder(options.out) as folder:
+        with show_progress(notes) as progress, using_threads(options.threads):
+            rows = scaling.measure(
+                scaling.points(options.quick), torch.device(options.device), seconds=seconds, seed=options.seed,
+                progress=progress,
+            )  # fmt: skip
+        write_rows(rows, folder / "scaling.csv", folder / "scaling.json")
+        if with_plot:
+            plots.plot_scaling(rows, folder / "scaling.png")
+    show(scaling_table(rows), growth_table(rows))
+
+
+def measure_roofline(options: Roofline) -> None:
+    """`oasis bench roofline`."""
+    with results(options, plots.plot_roofline) as write:
+        with show_progress(Console(stderr=True)) as progress:
+            rows = roofline.measure(torch.device(options.device), options.seed, progress)
+        if not rows:
+            raise InputError("--device cuda: torch's profiler traces no kernels here; check the driver's permissions.")
+        write(rows)
+    show(roofline_table(rows))
+
+
+@contextmanager
+def results(
+    options: Kernels | Roofline, plot: Callable[[Sequence[Any], Path], None]
+) -> Iterator[Callable[[Sequence[Any]], None]]:
+    """The files that `options` name, all opened now: what cannot be written shows before minutes of work, not after.
+
+    Raises:
+        InputError: one of them cannot be written.
+    """
+    check_plot(options.plot)
+    with ExitStack() as files:
+        parts = {
+            path: files.enter_context(output_file(path))
+            for path in (options.json, options.csv, options.plot)
+            if path is not None
+        }
+
+        def write(rows: Sequence[Any]) -> None:
+            if options.json is not None:
+                parts[options.json].write_text(json_text(rows))
+            if options.csv is not None:
+                parts[options.csv].write_text(csv_text(rows))
+            if options.plot is not None:
+                plot(rows, parts[options.plot])
+
+        yield write
+
+
+def can_plot(notes: Console) -> bool:
+    """Whether pictures can be drawn; says so where they cannot."""
+    if not pareto.can_plot():
+        notes.print(f"oasis: {pareto.MISSING}", highlight=False, soft_wrap=True, markup=False)
+        return False
+    return True
+
+
+def show(*tables: Table) -> None:
+    """Print tables on a console that is wide enough: a file has no width, and cut numbers say nothing."""
     console = Console()
-    return console if console.width >= TABLE_WIDTH else Console(width=TABLE_WIDTH)
+    console = console if console.width >= TABLE_WIDTH else Console(width=TABLE_WIDTH)
+    for table in tables:
+        console.print(table)

@@ -142,29 +142,82 @@ class ErrorTime:
 
 @dataclass(frozen=True, kw_only=True)
 class Kernels:
-    """How fast every operator is, and how exact, beside the same in torch and a scalar kernel, in one run."""
+    """How fast everything is, and how exact, in one run.
+
+    On the CPU every operator, beside the same in torch and a scalar kernel. On CUDA pictures of several sizes, posing,
+    visibility, an avatar's frame and a step of learning, on the host's clock and in CUDA graphs.
+    """
 
     json: Path | None = None
     """File to write the numbers to as well."""
-    repeats: int = 30
-    """Timed calls of each."""
-    size: int = 256
-    """Side of the picture [px]."""
-    gaussians: int = 20_000
-    """Gaussians that are drawn, of the bundled hand's 36,881; fewer are larger."""
+    csv: Path | None = None
+    """The same as a table."""
+    plot: Path | None = None
+    """Picture of the times: .png or .svg; needs matplotlib."""
+    only: str = ""
+    """Measure only what holds this text in its name: an operator on the CPU, a case or pass on CUDA."""
+    repeats: int | None = None
+    """Timed calls of each on the CPU, 30 when not given; on CUDA groups of calls, 11 when not given."""
+    size: int | None = None
+    """Side of the picture [px], 256 when not given; on CUDA every case has its own."""
+    gaussians: int | None = None
+    """Gaussians drawn of the bundled hand's 36,881, 20,000 when not given; on CUDA every case has its own."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
     threads: int = 1
     """CPU threads."""
     peer: Literal["gsplat"] | None = None
-    """Time another rasterizer too, on the same scene."""
+    """Time another rasterizer too, in turns with ours; on CUDA only."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scaling:
+    """How time and memory grow with Gaussians, pixels and views: scaling.csv, .json and a plot.
+
+    1,000 to 10 million Gaussians, 128 to 4096 pixels a side, 1 to 64 views, and two scenes that load a rasterizer most.
+    Every picture is compared with the float64 kernels, all of it or, where that would take long, a part.
+    """
+
+    out: Output
+    """Folder for the results; its parent must exist."""
+    quick: FlagCreatePairsOff[bool] = False
+    """Small scenes only, in a minute on a CPU."""
+    seconds: float | None = None
+    """For timing each point: 2 when not given, 1 with --quick."""
+    seed: int = 0
+    """Of the scenes."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""
+    threads: int = 1
+    """CPU threads."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Roofline:
+    """How near each CUDA kernel comes to what the GPU can do, which is measured first."""
+
+    json: Path | None = None
+    """File to write the numbers to as well."""
+    csv: Path | None = None
+    """The same as a table."""
+    plot: Path | None = None
+    """Picture: .png or .svg; needs matplotlib."""
+    seed: int = 0
+    """Of the scenes."""
+    device: Literal["cuda"] = "cuda"
+    """Where to compute."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Measure the operators on this machine: error against run time, or speed."""
+    """Measure the operators on this machine: speed, error against run time, growth, or share of what is possible."""
 
-    what: Annotated[ErrorTime, subcommand("error-time")] | Annotated[Kernels, subcommand("kernels")]
+    what: (
+        Annotated[Kernels, subcommand("kernels")]
+        | Annotated[ErrorTime, subcommand("error-time")]
+        | Annotated[Scaling, subcommand("scaling")]
+        | Annotated[Roofline, subcommand("roofline")]
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

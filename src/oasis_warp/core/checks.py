@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+FLOATS = torch.float32, torch.float64
 FINITE_LIMIT = 1e15
 """Magnitude above which a finite number is refused as absurd: squares of it still fit in float32."""
 
@@ -25,13 +26,18 @@ def check_shape(
     if not isinstance(tensor, Tensor):
         raise TypeError(_sentence(name, "a torch.Tensor", type(tensor).__name__, hint))
     sizes = {} if sizes is None else sizes
-    want = [sizes.get(s, s) if isinstance(s, str) else s for s in shape]
-    got = list(tensor.shape)
-    if len(want) != len(got) or any(isinstance(w, int) and w != g for w, g in zip(want, got, strict=True)):
-        raise ValueError(_sentence(name, f"shape [{', '.join(map(str, want))}]", f"{got}", hint))
-    for letter, size in zip(shape, got, strict=True):
-        if isinstance(letter, str):
-            sizes[letter] = size
+    got = tensor.shape
+    fits = len(shape) == len(got)
+    if fits:
+        for want, size in zip(shape, got, strict=True):
+            if size != (sizes.get(want, size) if isinstance(want, str) else want):
+                fits = False
+    if not fits:
+        known = ", ".join(str(sizes.get(s, s) if isinstance(s, str) else s) for s in shape)
+        raise ValueError(_sentence(name, f"shape [{known}]", f"{list(got)}", hint))
+    for want, size in zip(shape, got, strict=True):
+        if isinstance(want, str):
+            sizes[want] = size
 
 
 def check_float(name: str, tensor: Tensor, like: Tensor | None = None) -> None:
@@ -40,13 +46,27 @@ def check_float(name: str, tensor: Tensor, like: Tensor | None = None) -> None:
     Raises:
         ValueError: another dtype or device.
     """
-    if tensor.dtype not in (torch.float32, torch.float64):
+    if tensor.dtype not in FLOATS:
         raise ValueError(_sentence(name, "float32 or float64", str(tensor.dtype).removeprefix("torch."), ""))
     if like is not None and (tensor.dtype != like.dtype or tensor.device != like.device):
         raise ValueError(
             _sentence(name, f"{like.dtype} on {like.device}", f"{tensor.dtype} on {tensor.device}",
                       "All arguments of one call share them.")
         )
+
+
+def check_like(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor, hint: str = "") -> None:
+    """`check_shape` and `check_float` in one look, for sizes that are known; `like` is a checked tensor.
+
+    Raises:
+        TypeError: `tensor` is no tensor.
+        ValueError: another shape, dtype or device.
+    """
+    if isinstance(tensor, Tensor) and tensor.shape == shape:
+        if tensor.dtype != like.dtype or tensor.device != like.device:
+            check_float(name, tensor, like)
+    else:
+        check_shape(name, tensor, *shape, hint=hint)
 
 
 def check_finite(**tensors: Tensor | None) -> None:

@@ -146,3 +146,35 @@ class Render(NamedTuple):
 
     image: Float[Tensor, "H W 3"]
     alpha: Float[Tensor, "H W"]
+
+
+class TrainingBatch(NamedTuple):
+    """B hands, each as one photo shows it and as T pictures must come out: what a prior is trained on.
+
+    Right hands (left ones mirrored), all pictures square; vertices are those of one hand model. `posed` and `viewmat`
+    of the photo may be off by an estimator's error; `rest` and the targets are true, so that what is learned lands
+    where it belongs.
+    """
+
+    image: Float[Tensor, "B S S 3"]
+    """Of the photo: a crop around the hand, its background included."""
+    mask: Float[Tensor, "B S S"]
+    """Share of each of its pixels that is hand."""
+    posed: Float[Tensor, "B V 3"]
+    """The surface in the photo's pose [m]."""
+    viewmat: Float[Tensor, "B 4 4"]
+    """Of the photo, world to camera."""
+    K: Float[Tensor, "B 3 3"]
+    """Of the photo [px]."""
+    rest: Float[Tensor, "B V 3"]
+    """The surface at rest [m]."""
+    target_images: Float[Tensor, "B T H H 3"]
+    """Over black: what is not hand is 0."""
+    target_masks: Float[Tensor, "B T H H"]
+    """Share of each pixel that is hand."""
+    target_known: Float[Tensor, "B T H H"]
+    """Share that says whether there is hand; less than 1 where an arm or clothes may hide it."""
+    target_posed: Float[Tensor, "B T V 3"]
+    """The surface in each target's pose [m]."""
+    target_viewmats: Float[Tensor, "B T 4 4"]
+    target_Ks: Float[Tensor, "B T 3 3"]

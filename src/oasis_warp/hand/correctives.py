@@ -7,31 +7,28 @@ from torch import Tensor
 from oasis_warp.core.hand_model import HandModel
 
 
+def has_correctives(hand: HandModel) -> bool:
+    """Whether `hand` changes its rest surface with its pose.
+
+    Raises:
+        ValueError: it does, but with other than two correctives a joint.
+    """
+    size, expected = hand.corrective_basis.shape[-1], 2 * (len(hand.parents) - 1)
+    if size not in (0, expected):
+        raise ValueError(f"hand: expected 0 or {expected} pose correctives, got {size}. Two for each joint.")
+    return size > 0
+
+
 def corrective_coefficients(hand: HandModel, angles: Float[Tensor, "15 3"]) -> Float[Tensor, "C"]:
     """Strengths of the displacements in `hand.corrective_basis` at joint `angles` [rad]; empty if the hand has none.
 
     Two for each joint, from its flexion: c and c^2 with c = 1 - cos(flexion). Blend skinning shrinks a joint by c to
-    leading order; both vanish with their slopes at rest.
+    leading order; both vanish with their slopes at rest. `ops.bone_transforms` works out the same for many poses.
 
     Raises:
         ValueError: `hand` has correctives, but not two a joint.
     """
-    size = hand.corrective_basis.shape[-1]
-    if size == 0:
+    if not has_correctives(hand):
         return angles.new_zeros(0)
-    if size != 2 * len(angles):
-        raise ValueError(f"hand: expected 0 or {2 * len(angles)} pose correctives, got {size}. Two for each joint.")
     c = 1 - torch.cos(angles[:, 0])
     return torch.stack([c, c * c], -1).flatten()
-
-
-def corrected_rest(
-    hand: HandModel, vertices: Float[Tensor, "V 3"], angles: Float[Tensor, "15 3"]
-) -> Float[Tensor, "V 3"]:
-    """The rest surface `vertices` [m] changed so that blend skinning by `angles` [rad] bends it like flesh.
-
-    The displacements are those of the mean hand, whatever the shape of `vertices`.
-    """
-    if hand.corrective_basis.shape[-1] == 0:
-        return vertices
-    return vertices + hand.corrective_basis @ corrective_coefficients(hand, angles)

@@ -1,14 +1,20 @@
 """Pose the hand: shape and joint angles -> surface, joints and finger tips; clamp and mirror poses."""
 
+import dataclasses
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp import ops
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.core.types import HandPose, PosedHand
-from oasis_warp.hand.correctives import corrected_rest
-from oasis_warp.ops import skin as blend_skin
+from oasis_warp.hand.correctives import has_correctives
+from oasis_warp.ops import BoneTransforms
+
+TIP_BONES = (15, 3, 6, 12, 9)
+"""Whose ends the tips are: thumb, index, middle, ring, little."""
 
 
 def rest_hand(hand: HandModel, shape: Float[Tensor, "S"]) -> PosedHand:
@@ -20,41 +26,57 @@ def rest_hand(hand: HandModel, shape: Float[Tensor, "S"]) -> PosedHand:
     )
 
 
-def joint_rotations(hand: HandModel, angles: Float[Tensor, "15 3"]) -> Float[Tensor, "16 3 3"]:
-    """Local rotations of all joints, the wrist's the identity: the matrix product flexion @ abduction @ twist."""
-    axes = hand.pose_axes[1:]
-    flexion, abduction, twist = (from_axis_angle(axes[:, k], angles[:, k]) for k in range(3))
-    wrist = torch.eye(3, dtype=angles.dtype, device=angles.device)[None]
-    return torch.cat([wrist, flexion @ abduction @ twist])
-
-
 def bone_transforms(
     hand: HandModel, joints: Float[Tensor, "16 3"], pose: HandPose
-) -> tuple[Float[Tensor, "16 3 3"], Float[Tensor, "16 3"]]:
+) -> tuple[Float[Tensor, "*B 16 3 3"], Float[Tensor, "*B 16 3"]]:
     """Rotation and translation [m] that carry each bone's rest points into the world."""
-    local = joint_rotations(hand, pose.angles)
-    rotations, origins = [pose.orientation], [pose.orientation @ joints[0] + pose.translation]
-    for j in range(1, len(hand.parents)):
-        parent = hand.parents[j]
-        rotations.append(rotations[parent] @ local[j])
-        origins.append(rotations[parent] @ (joints[j] - joints[parent]) + origins[parent])
-    rotation = torch.stack(rotations)
-    return rotation, torch.stack(origins) - (rotation @ joints[..., None])[..., 0]
+    transforms = _bones(hand, joints, pose).transforms
+    return transforms[..., :3], transforms[..., 3]
+
+
+def _bones(hand: HandModel, joints: Tensor, pose: HandPose) -> BoneTransforms:
+    return ops.bone_transforms(*pose, joints, hand.pose_axes, hand.parents, validate=False)
+
+
+def skin_surface(hand: HandModel, rest: PosedHand, pose: HandPose) -> Float[Tensor, "*B V 3"]:
+    """The vertices of `skin` alone."""
+    return _surface(hand, rest, _bones(hand, rest.joints, pose))
+
+
+def _surface(hand: HandModel, rest: PosedHand, bones: BoneTransforms) -> Tensor:
+    corrected = has_correctives(hand)
+    return ops.skin(
+        rest.vertices,
+        None,
+        hand.weights,
+        bones.transforms,
+        displacements=hand.corrective_basis if corrected else None,
+        strengths=bones.bends if corrected else None,
+        validate=False,
+    ).means
 
 
 def skin(hand: HandModel, rest: PosedHand, pose: HandPose) -> PosedHand:
     """`rest` (from `rest_hand`) in `pose`: pose correctives, then linear blend skinning.
 
-    Differentiable in shape and pose. `hand`, `rest` and `pose` share one dtype and device (`HandModel.to`).
+    Differentiable in shape and pose. `hand`, `rest` and `pose` share one dtype and device (`HandModel.to`). The
+    correctives are those of the mean hand, whatever the shape. With an axis of poses before all parts of `pose`, the
+    result has it too.
     """
-    rotation, translation = bone_transforms(hand, rest.joints, pose)
-    surface = corrected_rest(hand, rest.vertices, pose.angles)
-    transforms = torch.cat([rotation, translation[..., None]], -1)
-    vertices = blend_skin(surface, None, hand.weights, transforms, validate=False).means
-    joints = (rotation @ rest.joints[..., None])[..., 0] + translation
-    last = torch.tensor([15, 3, 6, 12, 9], device=rotation.device)  # thumb, index, middle, ring, little
-    tips = (rotation[last] @ rest.tips[..., None])[..., 0] + translation[last]
-    return PosedHand(vertices, joints, tips)
+    bones = _bones(hand, rest.joints, pose)
+    every_bone = range(len(hand.parents))
+    return PosedHand(
+        vertices=_surface(hand, rest, bones),
+        joints=_carried(bones.transforms, every_bone, rest.joints),
+        tips=_carried(bones.transforms, TIP_BONES, rest.tips),
+    )
+
+
+def _carried(transforms: Tensor, bones: Sequence[int], points: Tensor) -> Tensor:
+    """Points, one for each of `bones`, moved with them."""
+    # Taken one by one: an index list would be copied to the device at every call.
+    of_points = torch.stack([transforms[..., bone, :, :] for bone in bones], -3)
+    return (of_points[..., :3] @ points[..., None])[..., 0] + of_points[..., 3]
 
 
 def hand21(posed: PosedHand, hand: HandModel) -> Float[Tensor, "21 3"]:
@@ -84,4 +106,27 @@ def mirror_pose(pose: HandPose) -> HandPose:
         angles=pose.angles,
         orientation=mirror[:, None] * pose.orientation * mirror,
         translation=mirror * pose.translation,
+    )
+
+
+def mirror_hand(hand: HandModel) -> HandModel:
+    """The other hand: posed like `hand` by the same angles, it is the mirror image of `hand` in the mirrored pose.
+
+    Points and displacements are mirrored, axes too, as what angles turn about (a mirror reverses turns). Faces keep
+    their corners, and so wind the other way.
+    """
+
+    def mirrored(displacements: Tensor) -> Tensor:
+        return mirror_points(displacements.mT).mT.contiguous()
+
+    return dataclasses.replace(
+        hand,
+        template=mirror_points(hand.template),
+        shape_basis=mirrored(hand.shape_basis),
+        joints=mirror_points(hand.joints),
+        joint_basis=mirrored(hand.joint_basis),
+        tips=mirror_points(hand.tips),
+        tip_basis=mirrored(hand.tip_basis),
+        pose_axes=-mirror_points(hand.pose_axes),
+        corrective_basis=mirrored(hand.corrective_basis),
     )

@@ -1,106 +1,95 @@
-"""Blend float32 Gaussians on CUDA, a block of warps a tile."""
+"""Blend float32 Gaussians on CUDA, a block of warps a tile.
+
+Torch takes its time for every tensor, longer than some kernels run: tensors here hold several arrays each.
+"""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from warp import vec2f, vec3d, vec4f, vec4i
-from warp.types import vector
 
-from oasis_kernels import cuda_binning, cuda_draw, cuda_draw_backward
-from oasis_warp.ops._launch import SCALAR, launch, view
-from oasis_warp.ops._registration import hidden, hidden_like_fake, revealed
+from oasis_kernels import cuda_binning, cuda_draw, cuda_draw_backward, cuda_long_lists
+from oasis_warp.ops._launch import current_stream, run_cuda, wait_for
+from oasis_warp.ops._pair_counts import Counts, own_slot, remember, watching
+from oasis_warp.ops._records import Size
+from oasis_warp.ops._registration import hidden, hidden_like_fake
 from oasis_warp.ops._rules import current_rules
 from oasis_warp.ops._splats import Frame, Gradients, Splats, Wanted
-from oasis_warp.ops._tiles import check_pairs
+from oasis_warp.ops._tiles import MAX_PAIRS, check_pairs
 
-
-class Lists(NamedTuple):
-    """Which Gaussians each tile draws. P pairs of a Gaussian and a tile."""
-
-    starts: Tensor
-    """[tiles + 1], int32: first place of each tile's list; at the end P."""
-    pair_starts: Tensor
-    """[M], int32: number of each Gaussian's first pair."""
-    gaussians: Tensor
-    """`hidden` [P], int32: Gaussians, nearest first."""
+MOST_CHECKPOINTS = 1 << 16
+"""Tiles times numbers a pixel up to which lists are cut into segments: beyond, there are tiles enough to fill a device,
+and what is kept of the segments would outgrow the pictures."""
 
 
 class Kept(NamedTuple):
     """What the adjoint needs."""
 
-    transmittance: Tensor
-    """[C, H, W], of the end."""
-    stops: Tensor
-    """[C, H, W], int32: place in the tile's list of the first Gaussian that was not drawn."""
-    starts: Tensor
-    """As in `Lists`, like all below."""
-    pair_starts: Tensor
+    planes: Tensor
+    """float32: [C, H, W] transmittance at the end; [C, H, W] bits of int32, place in the tile's list of the first
+    Gaussian that was not drawn; what happens between the segments of the lists (`checkpoints` of `cuda_draw`)."""
+    lists: Tensor
+    """int32: [tiles, 4] column, start and length of the list, row over all cameras of a tile, those with any list
+    first; [tiles, spread] cursors, of no further use; [C, N] number of each Gaussian's first pair."""
     gaussians: Tensor
+    """`hidden` [pairs], int32: the lists, nearest first."""
 
 
-def _count_tiles(width: int, height: int) -> tuple[int, int]:
-    """Tiles across and down an image."""
-    return -(-width // cuda_binning.TILE), -(-height // cuda_binning.TILE)
+class Layout(NamedTuple):
+    """Sizes of one call."""
+
+    n_cameras: int
+    n: int
+    channels: int
+    tiles_x: int
+    tiles_y: int
+    width: int
+    height: int
+    n_tiles: int
+    pixels: int
+    segments: int
+    """Parts that the lists are cut into."""
+
+    def size_of_planes(self) -> Size:
+        """Numbers of `Kept.planes`."""
+        return 2 * self.pixels + self.n_tiles * (self.segments - 1) * (self.channels + 1) * 64
+
+    def size_of_lists(self) -> Size:
+        """Numbers of `Kept.lists`."""
+        return (4 + cuda_binning.spread_of(self.n_tiles)) * self.n_tiles + self.n_cameras * self.n
 
 
-def _bin(splats: Splats, width: int, height: int) -> tuple[Lists, Tensor, bool]:
-    """Lists of the tiles, sorting keys in their place, and whether the lists are sorted already."""
-    n_cameras, n = splats.depths.shape
-    device = splats.depths.device
-    across, down = _count_tiles(width, height)
+def _layout(colors: Tensor, frame: Frame) -> Layout:
+    n_cameras, n, channels = colors.shape
+    width, height, _ = frame
+    across, down = -(-width // cuda_binning.TILE), -(-height // cuda_binning.TILE)
     n_tiles = n_cameras * across * down
-    counts, cursors, total = torch.zeros(2 * n_tiles + 1, dtype=torch.int32, device=device).split([n_tiles, n_tiles, 1])
-    pair_starts = torch.empty(n_cameras * n, dtype=torch.int32, device=device)
-    boxes = view(splats.boxes.view(-1, 4), vec4i)
-    launch(
-        cuda_binning.count_pairs,
-        n_cameras * n,
-        [n, boxes, across, down, view(pair_starts), view(counts), view(total)],
-        like=counts,
+    segments = cuda_draw.SEGMENTS if n_tiles * (channels + 1) <= MOST_CHECKPOINTS else 1
+    return Layout(
+        n_cameras, n, channels, across, down, width, height, n_tiles, n_cameras * height * width, segments
     )
-    ends = counts.cumsum(0)
-    # The one moment at which the host waits for the device: only the data knows how much memory it takes.
-    n_pairs, longest = torch.stack([ends[-1], counts.max()]).tolist() if n else (0, 0)
-    check_pairs(n_pairs)
-    starts = torch.nn.functional.pad(ends, (1, 0)).int()
-    keys = torch.empty(n_pairs, dtype=torch.int64, device=device)
-    launch(
-        cuda_binning.fill_tiles,
-        n_cameras * n,
-        [
-            n, boxes, view(splats.depths.view(-1)), across, down, view(starts), view(cursors), view(keys),
-        ],
-        like=keys,
-    )  # fmt: skip
-    lists = Lists(starts, pair_starts, hidden(n_pairs, torch.int32, device))
-    if longest > cuda_draw.LONGEST:
-        _sort(keys, counts, across * down, n, revealed(lists.gaussians))
-    return lists, keys, longest > cuda_draw.LONGEST
 
 
-def _sort(keys: Tensor, counts: Tensor, tiles_a_camera: int, n: int, gaussians: Tensor) -> None:
-    """Fill in the sorted lists by torch's sort over all pairs, for tiles that a block cannot sort by itself."""
-    tiles = torch.repeat_interleave(torch.arange(len(counts), device=keys.device), counts)
-    keys, by_depth = torch.sort(keys)
-    tiles, by_tile = torch.sort(tiles[by_depth], stable=True)
-    index = keys[by_tile] & ((1 << cuda_binning.INDEX_BITS) - 1)
-    gaussians.copy_(tiles // tiles_a_camera * n + index)
+def _words(splats: Splats, layout: Layout, lists: Tensor, planes: Tensor | None) -> dict[str, int]:
+    """Parameters of the kernels: sizes, what is drawn, the arrays of `Kept.lists` and `Kept.planes`."""
+    first, plane = lists.data_ptr(), 0 if planes is None else planes.data_ptr()
+    n_cameras, n, _, tiles_x, tiles_y, width, height, n_tiles, pixels, _ = layout
+    spread = cuda_binning.spread_of(n_tiles)
+    return {
+        **splats.words(), "opacities": splats.opacities.data_ptr(), "colors": splats.colors.data_ptr(),
+        "backgrounds": splats.backgrounds.data_ptr(), "n": n, "n_cameras": n_cameras, "total": n_cameras * n,
+        "tiles_x": tiles_x, "tiles_y": tiles_y, "width": width, "height": height, "n_tiles": n_tiles, "tiles": first,
+        "cursors": first + 16 * n_tiles, "pair_starts": first + (16 + 4 * spread) * n_tiles, "spread": spread,
+        "transmittance": plane, "stops": plane and plane + 4 * pixels, "checkpoints": plane and plane + 8 * pixels,
+    }  # fmt: skip
 
 
 def kept_like(colors: Tensor, frame: Frame) -> Kept:
     """Empty tensors of the shapes that `draw` keeps."""
-    n_cameras, n, _ = colors.shape
-    across, down = _count_tiles(frame.width, frame.height)
-
-    def empty(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
-        return colors.new_empty(shape, dtype=dtype)
-
+    layout = _layout(colors, frame)
     return Kept(
-        empty(n_cameras, frame.height, frame.width, dtype=torch.float32),
-        empty(n_cameras, frame.height, frame.width),
-        empty(n_cameras * across * down + 1),
-        empty(n_cameras * n),
+        colors.new_empty(layout.size_of_planes()),
+        colors.new_empty(layout.size_of_lists(), dtype=torch.int32),
         hidden_like_fake(torch.int32, colors.device),
     )
 
@@ -110,87 +99,74 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
 
     Raises:
         ValueError: more pairs of a Gaussian and a tile than can be numbered.
+        RuntimeError: a graph captures this, and nothing is known of the number of pairs, or nobody watches it.
     """
-    width, height, _ = frame
-    n_cameras, n, channels = splats.colors.shape
-    color = vector(channels, SCALAR[torch.float32])
-    across, down = _count_tiles(width, height)
-    lists, keys, in_order = _bin(splats, width, height)
-
-    def empty(*shape: int) -> Tensor:
-        return splats.colors.new_empty(n_cameras, height, width, *shape)
-
-    image, alphas, transmittance = empty(channels), empty(1), empty()
-    stops = transmittance.new_empty(transmittance.shape, dtype=torch.int32)
-    launch(
-        cuda_draw.blend(channels, current_rules()),
-        (n_cameras * across * down, cuda_draw.BLOCK),
-        [
-            n, view(lists.starts), view(keys), int(in_order), view(splats.centers.view(-1, 4), vec4f),
-            view(splats.whitenings.view(-1, 4), vec4f), view(splats.opacities.view(-1)),
-            view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color), across, down, width,
-            height, view(image.view(-1, channels), color), view(alphas.view(-1)), view(transmittance.view(-1)),
-            view(stops.view(-1)), view(revealed(lists.gaussians)),
-        ],
-        like=image,
-        block_dim=cuda_draw.BLOCK,
-    )  # fmt: skip
-    return image, alphas, Kept(transmittance, stops, *lists) if keep else None
+    layout, new = _layout(splats.colors, frame), splats.colors
+    n_cameras, n, channels = new.shape
+    device, stream = new.device, current_stream(new.device)
+    lists = torch.empty(layout.size_of_lists(), dtype=torch.int32, device=device)
+    planes = new.new_empty(layout.size_of_planes()) if keep else None
+    words = _words(splats, layout, lists, planes)
+    kind = device, n_cameras, n, frame.width, frame.height
+    capturing = torch.cuda.is_current_stream_capturing()
+    report, counts = watching().expect(kind) if capturing else (own_slot(), Counts(MAX_PAIRS, 0))
+    words |= {"capacity": counts.pairs, "report": report.data_ptr()}
+    blocks = -(-n_cameras * n // cuda_binning.BLOCK)
+    run_cuda(cuda_binning.count_pairs(), words, blocks, stream)
+    run_cuda(cuda_binning.place_tiles(), words, -(-layout.n_tiles // cuda_binning.PLACE_BLOCK), stream)
+    image = new.new_empty((n_cameras, frame.height, frame.width, channels))
+    alphas = new.new_empty((n_cameras, frame.height, frame.width, 1))
+    if not capturing:
+        # The one moment at which the host waits for the device: only the data knows how much memory it takes.
+        wait_for(stream)
+        counts = Counts(*report.tolist())
+        check_pairs(counts.pairs)
+        remember(kind, counts)
+    long = counts.longest > cuda_draw.LONGEST
+    gaussians = hidden(counts.pairs, torch.int32, device) if keep or long else None
+    keys = torch.empty(counts.pairs, dtype=torch.int64, device=device)
+    words |= {
+        "capacity": counts.pairs, "keys": keys.data_ptr(), "image": image.data_ptr(), "alphas": alphas.data_ptr(),
+        "tile_gaussians": 0 if gaussians is None else gaussians.data_ptr(),
+    }  # fmt: skip
+    run_cuda(cuda_binning.fill_tiles(), words, blocks, stream)
+    if long:
+        spare = torch.empty_like(keys) if counts.longest > cuda_long_lists.RUN else None
+        words["spare"] = 0 if spare is None else spare.data_ptr()
+        run_cuda(cuda_long_lists.sort_long_lists(), words, layout.n_tiles, stream)
+    run_cuda(cuda_draw.blend(channels, layout.segments, current_rules()), words, layout.n_tiles, stream)
+    return image, alphas, None if planes is None or gaussians is None else Kept(planes, lists, gaussians)
 
 
 def draw_backward(
     g_image: Tensor | None, g_alpha: Tensor | None, splats: Splats, frame: Frame, kept: Kept, wanted: Wanted
 ) -> Gradients:
     """Gradients from those by image and alpha, None standing for zeros."""
-    width, height, _ = frame
     with_shape, with_colors, with_backgrounds = wanted
-    n_cameras, n, channels = splats.colors.shape
-    color, moments = (vector(k, SCALAR[torch.float32]) for k in (channels, 8))
-    across, down = _count_tiles(width, height)
-    pixels, n_tiles = n_cameras * height * width, n_cameras * across * down
-    new = splats.colors
-    of_image = new.new_zeros(pixels, channels) if g_image is None else g_image.view(-1, channels)
-    of_alpha = new.new_zeros(pixels) if g_alpha is None else g_alpha.view(-1)
-    gaussians = revealed(kept.gaussians)
-    n_pairs, total = len(gaussians), n_cameras * n
-    pair_moments = new.new_empty(n_pairs if with_shape else 0, 8)
-    pair_colors = new.new_empty(n_pairs if with_colors else 0, channels)
-    tile_backgrounds = new.new_empty(n_tiles, channels)
-    boxes, whitenings = view(splats.boxes.view(-1, 4), vec4i), view(splats.whitenings.view(-1, 4), vec4f)
-    opacities = view(splats.opacities.view(-1))
-    launch(
-        cuda_draw_backward.blend_backward(channels, current_rules()),
-        (n_tiles, cuda_draw.BLOCK),
-        [
-            view(kept.starts), view(gaussians), view(kept.pair_starts), boxes,
-            view(splats.centers.view(-1, 4), vec4f), whitenings, opacities,
-            view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color), across, down, width,
-            height, view(kept.transmittance.view(-1)), view(kept.stops.view(-1)), view(of_image, color), view(of_alpha),
-            int(with_shape), int(with_colors), view(pair_moments, moments), view(pair_colors, color),
-            view(tile_backgrounds, color),
-        ],
-        like=new,
-        block_dim=cuda_draw.BLOCK,
-    )  # fmt: skip
-    g_means2d = new.new_empty(total if with_shape else 0, 2)
-    g_covars2d = new.new_empty(total if with_shape else 0, 3, dtype=torch.float64)
-    g_opacities = new.new_empty(total if with_shape else 0)
-    g_colors = new.new_empty(total if with_colors else 0, channels)
+    layout, new = _layout(splats.colors, frame), splats.colors
+    n_cameras, n, channels = new.shape
+    stream = current_stream(new.device)
+    capacity = kept.gaussians.untyped_storage().nbytes() // 4 - 1
+    size = cuda_draw_backward.record_size(channels, with_shape, with_colors)
+    pair_records = new.new_empty(capacity * size)
+    tile_backgrounds = new.new_empty((n_cameras, layout.n_tiles // n_cameras, channels)) if with_backgrounds else None
+    g_means2d = new.new_empty((n_cameras, n, 2)) if with_shape else None
+    g_covars2d = torch.empty((n_cameras, n, 3), dtype=torch.float64, device=new.device) if with_shape else None
+    g_opacities = new.new_empty((n_cameras, n)) if with_shape else None
+    g_colors = new.new_empty((n_cameras, n, channels)) if with_colors else None
+    arrays = {
+        "g_image": g_image, "g_alpha": g_alpha, "tile_backgrounds": tile_backgrounds, "g_means2d": g_means2d,
+        "g_covars2d": g_covars2d, "g_opacities": g_opacities, "g_colors": g_colors,
+    }  # fmt: skip
+    words = _words(splats, layout, kept.lists, kept.planes) | {
+        "capacity": capacity, "tile_gaussians": kept.gaussians.data_ptr(), "pair_records": pair_records.data_ptr(),
+        **{name: 0 if array is None else array.data_ptr() for name, array in arrays.items()},
+    }  # fmt: skip
+    rules = current_rules()
+    backward = cuda_draw_backward.blend_backward(channels, layout.segments, with_shape, with_colors, rules)
+    run_cuda(backward, words, layout.n_tiles, stream)
     if with_shape or with_colors:
-        launch(
-            cuda_draw_backward.gather(channels),
-            total,
-            [
-                boxes, view(kept.pair_starts), view(pair_moments, moments), view(pair_colors, color), whitenings,
-                opacities, int(with_shape), int(with_colors), view(g_means2d, vec2f), view(g_covars2d, vec3d),
-                view(g_opacities), view(g_colors, color),
-            ],
-            like=new,
-        )  # fmt: skip
-    return Gradients(
-        g_means2d.view(n_cameras, n, 2) if with_shape else None,
-        g_covars2d.view(n_cameras, n, 3) if with_shape else None,
-        g_opacities.view(n_cameras, n) if with_shape else None,
-        g_colors.view(n_cameras, n, channels) if with_colors else None,
-        tile_backgrounds.view(n_cameras, across * down, channels).sum(1) if with_backgrounds else None,
-    )
+        blocks = -(-n_cameras * n // cuda_draw_backward.GATHER_BLOCK)
+        run_cuda(cuda_draw_backward.gather(channels, with_shape, with_colors), words, blocks, stream)
+    g_backgrounds = None if tile_backgrounds is None else tile_backgrounds.sum(1)
+    return Gradients(g_means2d, g_covars2d, g_opacities, g_colors, g_backgrounds)

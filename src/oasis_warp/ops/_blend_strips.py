@@ -103,21 +103,17 @@ def count(splats: Splats, s: Strips) -> Counted:
     by_chunk = torch.empty(3, s.n_chunks, dtype=torch.int64)
     totals = torch.empty(3, dtype=torch.int64)
     state = torch.zeros(strips_binning.COLLECT_STATE, dtype=torch.int64)
-    words = s.words | {
-        "boxes": address(splats.boxes, torch.int32, 4 * total),
+    words = s.words | splats.words() | {
         "records": address(records, torch.float32, strips.RECORD * total),
         "starts": address(starts, torch.int64, s.n_strips + 1),
         "pair_starts": address(pair_starts, torch.int32, total),
         "order": address(order, torch.int32, s.n_strips),
         "state": address(state, torch.int64, strips_binning.COLLECT_STATE),
-        "depths": address(splats.depths, torch.float64, total),
         "counts": address(counts, torch.int32, s.n_chunks * s.n_strips),
         "chunk_pairs": address(by_chunk, torch.int64, 3 * s.n_chunks),
         "lows": by_chunk.data_ptr() + 8 * s.n_chunks,
         "highs": by_chunk.data_ptr() + 16 * s.n_chunks,
         "totals": address(totals, torch.int64, 3),
-        "centers": address(splats.centers, torch.float32, 4 * total),
-        "whitenings": address(splats.whitenings, torch.float32, 4 * total),
         "opacities": address(splats.opacities, torch.float32, total),
         "colors": address(splats.colors, torch.float32, channels * total),
     }
@@ -218,14 +214,12 @@ def draw_backward(
     opacities = torch.empty(s.n_cameras, s.n if with_shape else 0)
     colors = torch.empty(s.n_cameras, s.n if summed.color else 0, channels)
     state = torch.zeros(strips_backward.BACKWARD_STATE, dtype=torch.int64)
-    words = s.words | {
-        "boxes": address(splats.boxes, torch.int32, 4 * total),
+    words = s.words | splats.words() | {
         "records": address(kept.records, torch.float32, strips.RECORD * total),
         "starts": address(kept.starts, torch.int64, s.n_strips + 1),
         "pair_starts": address(kept.pair_starts, torch.int32, total),
         "order": address(kept.order, torch.int32, s.n_strips),
         "state": address(state, torch.int64, strips_backward.BACKWARD_STATE),
-        "whitenings": address(splats.whitenings, torch.float32, 4 * total),
         "opacities": address(splats.opacities, torch.float32, total),
         "colors": address(splats.colors, torch.float32, total * channels),
         "backgrounds": address(splats.backgrounds, torch.float32, s.n_cameras * channels),

@@ -72,7 +72,8 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
     dtype, device = splats.colors.dtype, splats.colors.device
     start()
     color, vec4 = vector(channels, SCALAR[dtype]), VEC4[dtype]
-    tiles = bin_to_tiles(splats.boxes, splats.depths, width, height, tile_size)
+    records = splats.tables()
+    tiles = bin_to_tiles(records.boxes, records.sort_depths, width, height, tile_size)
     image = torch.empty(n_cameras, height, width, channels, dtype=dtype, device=device)
     alphas = torch.empty(n_cameras, height, width, 1, dtype=dtype, device=device)
     transmittance = torch.empty(n_cameras, height, width, dtype=dtype, device=device)
@@ -82,8 +83,8 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
         forward_kernels.blend(SCALAR[dtype], channels, current_rules()),
         even_work(tiles.starts),
         [
-            view(tiles.starts), view(revealed(tiles.gaussians)), view(splats.boxes.view(-1, 4), vec4i),
-            view(splats.centers.view(-1, 4), vec4), view(splats.whitenings.view(-1, 4), vec4),
+            view(tiles.starts), view(revealed(tiles.gaussians)), view(records.boxes.view(-1, 4), vec4i),
+            view(records.centers.view(-1, 4), vec4), view(records.whitenings.view(-1, 4), vec4),
             view(splats.opacities.view(-1)), view(splats.colors.view(-1, channels), color),
             view(splats.backgrounds, color), tile_size, lane_width, lane_height, tiles.across, tiles.down, width,
             height, view(image.view(-1, channels), color), view(alphas.view(-1)), view(transmittance.view(-1)),
@@ -110,7 +111,7 @@ def draw_backward(
     with_shape, with_colors, with_backgrounds = wanted
     dtype, device = splats.colors.dtype, splats.colors.device
     start()
-    scalar, vec4 = SCALAR[dtype], VEC4[dtype]
+    scalar, vec4, records = SCALAR[dtype], VEC4[dtype], splats.tables()
     color, moments = vector(channels, scalar), vector(6, scalar)
     pixels = n_cameras * height * width
 
@@ -129,8 +130,8 @@ def draw_backward(
         even_work(tiles.starts),
         [
             view(tiles.starts), view(revealed(tiles.gaussians)), view(pair_numbers),
-            view(splats.boxes.view(-1, 4), vec4i), view(splats.centers.view(-1, 4), vec4),
-            view(splats.whitenings.view(-1, 4), vec4), view(splats.opacities.view(-1)),
+            view(records.boxes.view(-1, 4), vec4i), view(records.centers.view(-1, 4), vec4),
+            view(records.whitenings.view(-1, 4), vec4), view(splats.opacities.view(-1)),
             view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color),
             view(stops.view(-1)), view(of_image, color), view(of_alpha), tiles.size, lane_width,
             lane_height, tiles.across, tiles.down, width, height, int(with_shape),
@@ -152,7 +153,7 @@ def draw_backward(
             backward_kernels.gather_shape(scalar),
             cuts,
             [
-                *spans, view(pair_moments, moments), view(splats.whitenings.view(-1, 4), vec4),
+                *spans, view(pair_moments, moments), view(records.whitenings.view(-1, 4), vec4),
                 view(splats.opacities.view(-1)), view(g_means2d.view(-1, 2), VEC2[dtype]),
                 view(g_covars2d.view(-1, 3), VEC3[torch.float64]), view(g_opacities.view(-1)),
             ],

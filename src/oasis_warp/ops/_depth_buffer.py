@@ -1,10 +1,9 @@
-"""Draw meshes into depth buffers and score points against them: the vectorised kernels on the CPU, else the plain ones.
+"""Draw meshes into depth buffers and score points against them.
 
-Everything has a leading batch axis here. A tensor that is the same for the whole batch may come expanded.
+On the CPU by vectorised kernels, on CUDA in float32 by those of `_depth_cuda`, in float64 by the plain ones.
 """
 
 import ctypes
-from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -13,9 +12,23 @@ from torch import Tensor
 from oasis_kernels import depth_buffer as kernels
 from oasis_kernels import depth_buffer_vectors as vectors
 from oasis_kernels.depth_buffer_job import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
-from oasis_warp.core.checks import check_finite, check_index, check_positive
-from oasis_warp.ops._incidence import incidence, sum_at_items
+from oasis_warp.core.checks import check_index, check_positive
+from oasis_warp.ops import _depth_cuda
+from oasis_warp.ops._depth_scene import (
+    Buffer,
+    Query,
+    Scene,
+    Scores,
+    Wanted,
+    empty_buffer,
+    empty_scores,
+    only,
+    shared,
+)
+from oasis_warp.ops._incidence import _transposed, sum_at_items
 from oasis_warp.ops._launch import launch, run_shared, view
+from oasis_warp.ops._pair_counts import own_slot
+from oasis_warp.ops._values import Look, check_finite
 
 C_TYPES = {torch.float32: "float", torch.float64: "double"}
 MAX_FRACTION_BITS = 22
@@ -23,72 +36,17 @@ FACES_A_PART = 4096
 """A mesh is drawn in parts, one a thread, of no fewer faces than this."""
 
 
-class Scene(NamedTuple):
-    """Meshes and cameras. B batch entries, V vertices, F faces."""
-
-    vertices: Tensor
-    """[B, V, 3]."""
-    faces: Tensor
-    """int32 [F, 3], contiguous, every index in [0, V)."""
-    viewmats: Tensor
-    """[B, 4, 4]."""
-    Ks: Tensor
-    """[B, 3, 3]."""
-    width: int
-    height: int
-    near_plane: float
-
-    def room(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
-        """An empty tensor of `shape` for each batch entry, of the vertices' type unless told."""
-        return self.vertices.new_empty((self.vertices.shape[0], *shape), dtype=dtype)
-
-
-class Query(NamedTuple):
-    """Points to be scored."""
-
-    points: Tensor
-    """[B, P, 3]."""
-    point_vertices: Tensor | None
-    """int32 [P], contiguous: the vertex that each point is, or -1."""
-    by_identity: bool
-    """Whether points that are vertices of a face in view are seen by that alone."""
-    tau: float
-    margin: float
-    keep: bool
-    """Whether `Scores.slopes` and `pixels` are wanted."""
-
-
-class Buffer(NamedTuple):
-    """What the cameras see."""
-
-    depth: Tensor
-    """[B, H, W]."""
-    face_ids: Tensor
-    """int32 [B, H, W]."""
-    barycentrics: Tensor | None
-    """[B, H, W, 3]."""
-
-
-class Scores(NamedTuple):
-    """Visibility of the points of a `Query`, and what its adjoint needs."""
-
-    visibility: Tensor
-    """[B, P]."""
-    slopes: Tensor
-    """Derivative with respect to the point's depth, [B, P]; [B, 0] unless kept."""
-    pixels: Tensor
-    """int32: row * width + column where the score is soft, else -1; as `slopes`."""
-
-
-def draw(scene: Scene, query: Query | None, barycentrics: bool, validate: bool) -> tuple[Buffer, Scores | None]:
+def draw(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
     """Fill the depth buffers and score the points, if any.
 
     Raises:
         ValueError: with `validate`, a value that is not finite, a focal length that is not positive, or a point's
             vertex that is none.
     """
-    method = draw_by_vectors if scene.vertices.device.type == "cpu" else draw_by_faces
-    return method(scene, query, barycentrics, validate)
+    if scene.vertices.device.type == "cpu":
+        return draw_by_vectors(scene, query, wanted, validate)
+    method = draw_by_keys if scene.vertices.dtype == torch.float32 else draw_by_faces
+    return method(scene, query, wanted, validate)
 
 
 def refuse_bad_values(scene: Scene, query: Query | None) -> None:
@@ -110,13 +68,6 @@ def plane_size(width: int, height: int) -> int:
     return -(-height // 4) * 4 * columns
 
 
-def _shared(tensor: Tensor) -> tuple[Tensor, int]:
-    """A contiguous tensor and the step from one batch entry to the next: 0 where they are the same."""
-    if tensor.shape[0] == 1 or (tensor.stride(0) == 0 and tensor.shape[0] > 1):
-        return tensor[0].contiguous(), 0
-    return tensor.contiguous(), tensor[:1].numel()
-
-
 def _fraction_bits(width: int, height: int) -> int:
     """Bits after the point of coordinates on the screen that reach half a picture beyond its borders in 31 bits."""
     return min(MAX_FRACTION_BITS, 30 - (max(width, height) - 1).bit_length())
@@ -124,9 +75,9 @@ def _fraction_bits(width: int, height: int) -> int:
 
 def _job(scene: Scene, **more: int) -> tuple[Job, list[Tensor]]:
     """A job for `scene`, and the tensors it points to, which must outlive it; `more` are further fields."""
-    vertices, vertices_step = _shared(scene.vertices)
-    viewmats, viewmats_step = _shared(scene.viewmats)
-    Ks, Ks_step = _shared(scene.Ks)
+    vertices, vertices_step = shared(scene.vertices)
+    viewmats, viewmats_step = shared(scene.viewmats)
+    Ks, Ks_step = shared(scene.Ks)
     job = Job(
         vertices=vertices.data_ptr(),
         viewmats=viewmats.data_ptr(),
@@ -147,18 +98,13 @@ def _job(scene: Scene, **more: int) -> tuple[Job, list[Tensor]]:
     return job, [vertices, viewmats, Ks]
 
 
-def draw_by_vectors(
-    scene: Scene, query: Query | None, barycentrics: bool, validate: bool
-) -> tuple[Buffer, Scores | None]:
+def draw_by_vectors(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
     """The way of the CPU."""
     batch, n_vertices, _ = scene.vertices.shape
     width, height = scene.width, scene.height
     parts = max(1, min(-(-torch.get_num_threads() // max(batch, 1)), scene.faces.shape[0] // FACES_A_PART))
-    buffer = Buffer(
-        scene.room(height, width),
-        scene.room(height, width, dtype=torch.int32),
-        scene.room(height, width, 3) if barycentrics else None,
-    )
+    drawn = wanted._replace(depth=True, face_ids=True)
+    buffer = empty_buffer(scene, drawn)
     # One block: camera_vertices, screen_vertices and planes, in numbers of 4 bytes.
     room = scene.room(12 * n_vertices + 2 * parts * plane_size(width, height), dtype=torch.float32)
     first = room.data_ptr()
@@ -170,16 +116,16 @@ def draw_by_vectors(
         parts=parts,
         depth=buffer.depth.data_ptr(),
         face_ids=buffer.face_ids.data_ptr(),
-        barycentrics=0 if buffer.barycentrics is None else buffer.barycentrics.data_ptr(),
+        barycentrics=buffer.barycentrics.data_ptr() if wanted.barycentrics else 0,
     )
     scores = None
     if query is not None:
-        points, job.points_step = _shared(query.points)
-        n_points = job.n_points = query.points.shape[1]
-        kept = n_points if query.keep else 0
-        scores = Scores(scene.room(n_points), scene.room(kept), scene.room(kept, dtype=torch.int32))
+        points, job.points_step = shared(query.points)
+        job.n_points = query.points.shape[1]
+        scores = empty_scores(scene, query)
+        named = None if query.point_vertices is None else query.point_vertices.to(torch.int32)
         job.points = points.data_ptr()
-        job.point_vertices = 0 if query.point_vertices is None else query.point_vertices.data_ptr()
+        job.point_vertices = 0 if named is None else named.data_ptr()
         job.identity = query.by_identity
         job.tau, job.margin = query.tau, query.margin
         job.visibility = scores.visibility.data_ptr()
@@ -189,7 +135,7 @@ def draw_by_vectors(
     # Values that are refused do no harm on the way.
     if validate and job.found:
         refuse_bad_values(scene, query)
-    return buffer, scores
+    return (buffer if drawn == wanted else only(buffer, wanted)), scores
 
 
 def _run_all(job: Job, dtype: str) -> None:
@@ -208,10 +154,23 @@ def _run(stage: str, dtype: str, job: Job, tasks: int) -> None:
     run_shared(getattr(vectors.kernels(dtype), stage), ctypes.addressof(job), job.batch * tasks)
 
 
-def draw_by_faces(
-    scene: Scene, query: Query | None, barycentrics: bool, validate: bool
-) -> tuple[Buffer, Scores | None]:
-    """The way of CUDA: all faces at once, first for the depths, then for the smallest face at that depth."""
+def draw_by_keys(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
+    """The way of CUDA in float32."""
+    if not validate:
+        return _depth_cuda.draw(scene, query, wanted)
+    points = None if query is None else query.points
+    with Look(vertices=scene.vertices, viewmat=scene.viewmats, K=scene.Ks, points=points):
+        found = own_slot()
+        found[0] = 0
+        drawn = _depth_cuda.draw(scene, query, wanted, found)
+    # Values that are refused do no harm on the way.
+    if found[0]:
+        refuse_bad_values(scene, query)
+    return drawn
+
+
+def draw_by_faces(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
+    """The plain way: all faces at once, first for the depths, then for the smallest face at that depth."""
     if validate:
         refuse_bad_values(scene, query)
     batch, n_vertices, _ = scene.vertices.shape
@@ -240,31 +199,30 @@ def draw_by_faces(
             [stage, vertices, faces, view(boxes, wp.vec4i), Ks, near, view(depth), view(face_ids, wp.uint32)],
             like=like,
         )
-    weights = None
-    if barycentrics:
-        weights = scene.room(height, width, 3).zero_()
+    weights = scene.room(height, width, 3).zero_()
+    if wanted.barycentrics:
         launch(
             kernels.interpolate,
             (batch, height, width),
             [vertices, faces, Ks, view(face_ids), view(weights)],
             like=like,
         )
-    buffer = Buffer(depth.to(like.dtype), face_ids, weights)
+    buffer = only(Buffer(depth.to(like.dtype), face_ids, weights), wanted)
     if query is None:
         return buffer, None
 
     n_points = query.points.shape[1]
-    kept = n_points if query.keep else 0
     known = query.point_vertices if query.by_identity else None
-    scores = Scores(
-        scene.room(n_points).zero_(), scene.room(kept).zero_(), scene.room(kept, dtype=torch.int32).fill_(-1)
-    )
+    scores = empty_scores(scene, query)
+    scores.visibility.zero_()
+    scores.slopes.zero_()
+    scores.pixels.fill_(-1)
     launch(
         kernels.visibility,
         (batch, n_points),
         [
             view(query.points.contiguous()),
-            view(face_ids.new_empty(0) if known is None else known),
+            view(face_ids.new_empty(0) if known is None else known.to(torch.int32)),
             faces,
             viewmats,
             Ks,
@@ -280,12 +238,30 @@ def draw_by_faces(
     return buffer, scores
 
 
-def vertex_gradients(
-    scene: Scene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
-) -> Tensor:
-    """Gradient of scores by the vertices of the faces in their pixels, [B, V, 3]; its sums have a fixed order."""
-    method = vertex_gradients_by_vectors if slopes.device.type == "cpu" else vertex_gradients_by_points
-    return method(scene, face_ids, grad_visibility.contiguous(), slopes, pixels)
+def gradients(
+    scene: Scene,
+    face_ids: Tensor,
+    grad_visibility: Tensor,
+    slopes: Tensor,
+    pixels: Tensor,
+    needs_points: bool,
+    needs_vertices: bool,
+) -> tuple[Tensor, Tensor]:
+    """Gradients of scores by the points, [B, P, 3], and by the vertices of the faces in their pixels, [B, V, 3].
+
+    Sums have a fixed order, or none. What is not needed has no elements.
+    """
+    on_cuda = slopes.device.type != "cpu"
+    if on_cuda and slopes.dtype == torch.float32:
+        return _depth_cuda.gradients(scene, face_ids, grad_visibility, slopes, pixels, needs_points, needs_vertices)
+    by_points, by_vertices = slopes.new_empty(0), slopes.new_empty(0)
+    if needs_points:
+        # The point's depth is the third row of the view.
+        by_points = (grad_visibility * slopes)[..., None] * scene.viewmats[:, None, 2, :3]
+    if needs_vertices:
+        method = vertex_gradients_by_points if on_cuda else vertex_gradients_by_vectors
+        by_vertices = method(scene, face_ids, grad_visibility.contiguous(), slopes, pixels)
+    return by_points, by_vertices
 
 
 def vertex_gradients_by_vectors(
@@ -318,7 +294,7 @@ def vertex_gradients_by_vectors(
 def vertex_gradients_by_points(
     scene: Scene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
 ) -> Tensor:
-    """The way of CUDA: all points at once, then for each vertex the sum over the points that name it."""
+    """The plain way: all points at once, then for each vertex the sum over the points that name it."""
     batch, n_points = slopes.shape
     n_vertices = scene.vertices.shape[1]
     rows = scene.room(n_points, 3, 3)
@@ -330,5 +306,5 @@ def vertex_gradients_by_points(
     seen = face_ids.flatten(1).gather(1, pixels.clamp_min(0).long()).where(pixels >= 0, 0)
     corners = scene.faces[seen.long()] if len(scene.faces) else scene.faces.new_zeros((batch, n_points, 3))
     corners = corners + n_vertices * torch.arange(batch, device=corners.device, dtype=torch.int32)[:, None, None]
-    index = incidence("corners", corners.view(-1, 3), batch * n_vertices, "vertices")
-    return sum_at_items(rows.view(-1, 3), index).view_as(scene.vertices)
+    # Not `incidence`, which would look at the indices and so wait for the device.
+    return sum_at_items(rows.view(-1, 3), _transposed(corners, batch * n_vertices)).view_as(scene.vertices)

@@ -67,11 +67,26 @@ def start() -> None:
         _started = True
 
 
-@functools.cache
-def _warp_stream(stream: torch.cuda.Stream) -> "wp.Stream":
-    # Kept for the life of the process: making one costs 5 us, and torch's pool of streams is small. The stream comes as
-    # the object: rebuilt from its handle, the default stream (handle 0) would become another one, out of order.
-    return wp.stream_from_torch(stream)
+_warp_streams: dict[tuple[int, int], "wp.Stream"] = {}  # by device and handle
+
+
+def current_stream(device: torch.device) -> "wp.Stream":
+    """Torch's current stream on a CUDA device, for a launch that a graph may be capturing."""
+    index = torch.cuda.current_device() if device.index is None else device.index
+    # What torch.cuda.current_stream does, in a tenth of its time.
+    key = index, torch._C._cuda_getCurrentRawStream(index)
+    stream = _warp_streams.get(key)
+    if stream is None:
+        start()
+        # Kept for the life of the process: making one costs 5 us, and torch's pool of streams is small. It is made from
+        # the object: rebuilt from its handle, the default stream (handle 0) would become another one, out of order.
+        stream = _warp_streams[key] = wp.stream_from_torch(torch.cuda.current_stream(index))
+    return stream
+
+
+def wait_for(stream: "wp.Stream") -> None:
+    """Wait until the device has done what is on a CUDA stream."""
+    wp.synchronize_stream(stream)
 
 
 def device_and_stream(tensor: Tensor) -> tuple["wp.Device", "wp.Stream | None"]:
@@ -79,8 +94,8 @@ def device_and_stream(tensor: Tensor) -> tuple["wp.Device", "wp.Stream | None"]:
     start()
     if tensor.device.type == "cpu":
         return wp.get_device("cpu"), None
-    current = torch.cuda.current_stream(tensor.device)
-    return wp.device_from_torch(tensor.device), _warp_stream(current)
+    stream = current_stream(tensor.device)
+    return stream.device, stream
 
 
 def view(tensor: Tensor, dtype: Any = None) -> Any:
@@ -93,6 +108,11 @@ def view(tensor: Tensor, dtype: Any = None) -> Any:
 def has_vectors(tensor: Tensor) -> bool:
     """Whether kernels for tensors like this one have a vectorised form: float32 on the CPU."""
     return tensor.device.type == "cpu" and tensor.dtype == torch.float32
+
+
+def has_cuda_kernels(tensor: Tensor) -> bool:
+    """Whether kernels for tensors like this one have a form that is written for CUDA: float32 there."""
+    return tensor.is_cuda and tensor.dtype == torch.float32
 
 
 def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], like: Tensor, block_dim: int = 256) -> None:
@@ -227,14 +247,15 @@ def run_cuda(native: CudaNative, words: dict[str, int | float], n_blocks: int, s
 
     Args:
         native: The kernel.
-        words: A number or `Tensor.data_ptr()` for each of its parameters, by name; 0 is a null pointer.
+        words: A number or `Tensor.data_ptr()` for each of its parameters, by name; 0 is a null pointer. Others are
+            ignored.
         n_blocks: Of `native.block` threads.
-        stream: Of `device_and_stream`.
+        stream: A `current_stream`.
     """
     if not n_blocks:
         return
-    block = native.words(**words)
-    key = native.kernel, stream.device
+    block = native.words(*[words[name] for name in native.parameters])
+    key = native.kernel, stream.device.ordinal
     recorded = _cuda_launches.launches.get(key)
     if recorded is None:
         with _load_lock:

@@ -11,24 +11,41 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from oasis_kernels import cuda_projection, cuda_projection_backward
 from oasis_kernels import projection as generic
 from oasis_kernels import projection_vectors_backward as vector_backward
 from oasis_kernels import projection_vectors_forward as vector_forward
 from oasis_kernels.native import PHASE_WORDS
 from oasis_kernels.projection_vectors import CHUNK
 from oasis_warp.core.checks import FINITE_LIMIT
-from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, address, even_cuts, launch_ranges, run_native, view
+from oasis_warp.ops._launch import (
+    SCALAR,
+    VEC2,
+    VEC3,
+    VEC4,
+    address,
+    current_stream,
+    even_cuts,
+    launch_ranges,
+    run_cuda,
+    run_native,
+    view,
+    wait_for,
+)
+from oasis_warp.ops._pair_counts import own_slot
+from oasis_warp.ops._records import counters_size, empty_records, table_words, tables
 from oasis_warp.ops._rules import current_rules
+from oasis_warp.ops._values import refuse_capture
 
 CAMERA_SUM_BLOCK = 1024
 """Gaussians whose camera gradients one thread of the generic kernel adds up; fixed, so that threads change no sum."""
 OUTPUTS = (
     ("means2d", 2, None), ("covars2d", 3, torch.float64), ("depths", 0, None), ("conics", 3, None),
-    ("radii", 2, torch.int32), ("sort_depths", 0, torch.float64), ("centers", 4, None), ("whitenings", 4, None),
-    ("boxes", 4, torch.int32),
+    ("radii", 2, torch.int32),
 )  # fmt: skip
-"""Name, numbers a Gaussian (0: no axis for them) and type (None: that of the inputs) of what projection writes."""
-Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Name, numbers a Gaussian (0: no axis for them) and type (None: that of the inputs) of what projection writes, besides
+the records."""
+Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 VECTORS = {dtype: {2: VEC2[dtype], 3: VEC3[dtype], 4: VEC4[dtype]} for dtype in (torch.float32, torch.float64)}
 VECTORS[torch.int32] = {2: wp.vec2i, 4: wp.vec4i}
 
@@ -64,14 +81,20 @@ def as_float32(value: float) -> float:
     return ctypes.c_float(value).value
 
 
-def empty_outputs(means: Tensor, viewmats: Tensor) -> Outputs:
-    """Memory for `OUTPUTS`."""
+def empty_outputs(means: Tensor, viewmats: Tensor, width: int, height: int) -> Outputs:
+    """Memory for `OUTPUTS` and the records."""
     shape = viewmats.shape[0], means.shape[0]
-    means2d, covars2d, depths, conics, radii, sort_depths, centers, whitenings, boxes = (
-        torch.empty((*shape, size) if size else shape, dtype=dtype or means.dtype, device=means.device)
+    means2d, covars2d, depths, conics, radii = (
+        means.new_empty((*shape, size) if size else shape, dtype=dtype)
         for _name, size, dtype in OUTPUTS
     )
-    return means2d, covars2d, depths, conics, radii, sort_depths, centers, whitenings, boxes
+    return means2d, covars2d, depths, conics, radii, empty_records(means, *shape, width, height)
+
+
+def _output_words(scene: Scene, out: Sequence[Tensor]) -> dict[str, int]:
+    """Addresses of everything that projection writes."""
+    words = {name: tensor.data_ptr() for (name, *_), tensor in zip(OUTPUTS, out, strict=False)}
+    return words | table_words(out[-1], len(scene.viewmats) * len(scene.means), scene.means.dtype)
 
 
 def check_arrays(scene: Scene, **others: tuple[Tensor | None, tuple[int, ...], torch.dtype]) -> None:
@@ -84,11 +107,12 @@ def check_arrays(scene: Scene, **others: tuple[Tensor | None, tuple[int, ...], t
     n, c, dtype = means.shape[0], viewmats.shape[0], means.dtype
     if (quats is None or scales is None) if covars is None else not (quats is None and scales is None):
         raise ValueError("covars: expected either covars, or quats and scales, got neither or both.")
-    expected = {
-        "means": (means, (n, 3), dtype), "quats": (quats, (n, 4), dtype), "scales": (scales, (n, 3), dtype),
-        "covars": (covars, (n, 3, 3), dtype), "viewmats": (viewmats, (c, 4, 4), dtype), "Ks": (Ks, (c, 3, 3), dtype),
-    } | others  # fmt: skip
-    for name, (tensor, shape, kind) in expected.items():
+    expected = (
+        ("means", means, (n, 3), dtype), ("quats", quats, (n, 4), dtype), ("scales", scales, (n, 3), dtype),
+        ("covars", covars, (n, 3, 3), dtype), ("viewmats", viewmats, (c, 4, 4), dtype), ("Ks", Ks, (c, 3, 3), dtype),
+        *((name, *other) for name, other in others.items()),
+    )  # fmt: skip
+    for name, tensor, shape, kind in expected:
         if tensor is not None and (tensor.shape != shape or tensor.dtype != kind or tensor.device != means.device):
             raise ValueError(
                 f"{name}: expected shape {list(shape)}, {kind} on {means.device}, "
@@ -116,15 +140,74 @@ def project_vectors(scene: Scene, opacities: Tensor, limits: Limits, out: Sequen
         dtype=torch.float64,
     )  # fmt: skip
     state = torch.zeros(PHASE_WORDS + 1, dtype=torch.int64)
-    outputs = {name: tensor for (name, *_), tensor in zip(OUTPUTS, out, strict=True)}
-    words = _words(scene, opacities=opacities, limits=numbers, state=state, bad=state[PHASE_WORDS:], **outputs)
+    words = _words(scene, opacities=opacities, limits=numbers, state=state, bad=state[PHASE_WORDS:])
+    words |= _output_words(scene, out)
     run_native(vector_forward.project(), words, -(-len(scene.means) // CHUNK))
     return not state[PHASE_WORDS]
+
+
+def _cuda_words(scene: Scene, **others: Tensor | None) -> dict[str, int | float]:
+    """Parameters of a CUDA kernel: the scene, and other tensors by name."""
+    words: dict[str, int | float] = {
+        name: 0 if tensor is None else tensor.data_ptr()
+        for name, tensor in {
+            "means": scene.means, "quats": scene.quats, "scales": scene.scales, "covars": scene.covars,
+            "viewmats": scene.viewmats, "Ks": scene.Ks, **others,
+        }.items()
+    }  # fmt: skip
+    sizes = {"n": len(scene.means), "n_cameras": len(scene.viewmats), "width": scene.width, "height": scene.height}
+    return words | sizes
+
+
+def project_cuda(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[Tensor], validate: bool) -> bool:
+    """Fill `out` by the float32 CUDA kernel; where it is to `validate`, wait for what it says of the inputs.
+
+    Returns:
+        False where an input was found not finite or outside its range.
+    """
+    rules = current_rules()
+    stream = current_stream(scene.means.device)
+    bad = None
+    if validate:
+        refuse_capture()
+        bad = own_slot()
+        bad[0] = 0
+    total = len(scene.viewmats) * len(scene.means)
+    n_blocks = max(1, -(-total // cuda_projection.BLOCK))  # one clears the counters at least
+    n_counters = counters_size(scene.means, len(scene.viewmats), scene.width, scene.height) // 4
+    words = _cuda_words(scene, opacities=opacities, bad=bad) | _output_words(scene, out) | {
+        "n_threads": n_blocks * cuda_projection.BLOCK, "n_counters": n_counters,
+        "near": as_float32(limits.near_plane), "far": as_float32(limits.far_plane), "radius_clip": limits.radius_clip,
+        "eps2d": as_float32(limits.eps2d), "alpha_min": as_float32(rules.alpha_min),
+        "extent_sigmas": rules.extent_sigmas, "largest": FINITE_LIMIT,
+    }  # fmt: skip
+    run_cuda(cuda_projection.project(), words, n_blocks, stream)
+    if bad is None:
+        return True
+    wait_for(stream)
+    return not bad[0]
+
+
+def backward_cuda(scene: Scene, radii: Tensor, incoming: "Incoming", out: Mapping[str, Tensor]) -> None:
+    """Fill the gradients `out`, by name, by the float32 CUDA kernel."""
+    n, n_cameras, g_viewmats = len(scene.means), len(scene.viewmats), out.get("viewmats")
+    sums = None if g_viewmats is None else radii.new_empty((n_cameras * n, 12), dtype=torch.float64)
+    words = _cuda_words(
+        scene, radii=radii, g_means2d=incoming.means2d, g_covars2d=incoming.covars2d, g_depths=incoming.depths,
+        g_cameras=sums, **{f"g_{name}": out.get(name) for name in ("means", "quats", "scales", "covars")},
+    )  # fmt: skip
+    run_cuda(
+        cuda_projection_backward.project_backward(), words, -(-n // cuda_projection.BLOCK),
+        current_stream(radii.device),
+    )  # fmt: skip
+    if g_viewmats is not None and sums is not None:
+        _fill_viewmats(g_viewmats, _sum_rows(sums, n, CAMERA_SUM_BLOCK))
 
 
 def project_generic(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[Tensor]) -> None:
     """Fill `out` by the generic kernel."""
     rules = current_rules()
+    records = tables(out[-1], len(scene.viewmats), len(scene.means), scene.means.dtype)
     launch_ranges(
         generic.project(SCALAR[scene.means.dtype]),
         even_cuts(len(scene.viewmats) * len(scene.means)),
@@ -132,7 +215,9 @@ def project_generic(scene: Scene, opacities: Tensor, limits: Limits, out: Sequen
             len(scene.means), *_gaussian_views(scene), view(opacities), view(scene.viewmats), view(scene.Ks),
             scene.width, scene.height, as_float32(limits.near_plane), as_float32(limits.far_plane),
             as_float32(limits.eps2d), limits.radius_clip, as_float32(rules.alpha_min), rules.extent_sigmas,
-            *(_rows(tensor, size) for (_name, size, _dtype), tensor in zip(OUTPUTS, out, strict=True)),
+            *(_rows(tensor, size) for (_name, size, _dtype), tensor in zip(OUTPUTS, out, strict=False)),
+            _rows(records.sort_depths, 0), _rows(records.centers, 4), _rows(records.whitenings, 4),
+            _rows(records.boxes, 4),
         ],
         like=scene.means,
     )  # fmt: skip

@@ -9,11 +9,12 @@ from torch import Tensor
 from oasis_kernels import barycentric_vectors as kernels
 from oasis_warp.ops._incidence import Incidence, incidence, riders_at_vertices
 from oasis_warp.ops._launch import run_native
+from oasis_warp.ops._poses import at_pose
 from oasis_warp.ops._words import place, task_count
 
 
 class Floats(NamedTuple):
-    """The float inputs, contiguous, or gradients by them; the last two are None where nothing rides on vertices."""
+    """The float inputs, or gradients by them; the last two are None where nothing rides on vertices."""
 
     vertices: Tensor
     barycentrics: Tensor
@@ -23,6 +24,17 @@ class Floats(NamedTuple):
     scales: Tensor
     offsets: Tensor | None
     vertex_area_ratio: Tensor | None
+
+    def contiguous(self) -> "Floats":
+        return Floats(*(None if tensor is None else tensor.contiguous() for tensor in self))
+
+    def at_pose(self, k: int) -> "Floats":
+        """Those of one of several poses."""
+        return Floats(*(t if shared else at_pose(t, k) for t, shared in zip(self, SHARED, strict=True)))
+
+
+SHARED = (False, True, False, False, True, True, True, False)
+"""Which of `Floats` all poses share; the others have an axis of poses in front where there are several."""
 
 
 class Riders(NamedTuple):

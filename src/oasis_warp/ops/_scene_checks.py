@@ -3,11 +3,12 @@
 import torch
 from torch import Tensor
 
-from oasis_warp.core.checks import check_float, check_positive, check_shape
+from oasis_warp.core.checks import check_float, check_like, check_positive, check_shape
 from oasis_warp.ops.spherical_harmonics import check_degree
 
 MAX_CHANNELS = 32
 MAX_PIXELS = 2**31 - 1
+WHOLE = int, torch.SymInt
 
 
 def check_gaussians(
@@ -18,23 +19,18 @@ def check_gaussians(
     Raises:
         ValueError: names the argument.
     """
-    sizes: dict[str, int] = {}
-    check_shape("means", means, "N", 3, sizes=sizes)
+    check_shape("means", means, "N", 3)
     check_float("means", means)
-    tensors = {"opacities": opacities}
-    check_shape("opacities", opacities, "N", sizes=sizes, hint="One number for each centre.")
+    n = means.shape[0]
+    check_like("opacities", opacities, (n,), means, "One number for each centre.")
     if covars is not None:
-        check_shape("covars", covars, "N", 3, 3, sizes=sizes, hint="One matrix for each centre.")
-        tensors["covars"] = covars
+        check_like("covars", covars, (n, 3, 3), means, "One matrix for each centre.")
     elif quats is None or scales is None:
         name = "quats" if quats is None else "scales"
         raise ValueError(f"{name}: expected a tensor, got None. Shapes are quats with scales, or covars.")
     else:
-        check_shape("quats", quats, "N", 4, sizes=sizes, hint="One wxyz row for each centre.")
-        check_shape("scales", scales, "N", 3, sizes=sizes, hint="One row for each centre.")
-        tensors |= {"quats": quats, "scales": scales}
-    for name, tensor in tensors.items():
-        check_float(name, tensor, like=means)
+        check_like("quats", quats, (n, 4), means, "One wxyz row for each centre.")
+        check_like("scales", scales, (n, 3), means, "One row for each centre.")
 
 
 def check_cameras(
@@ -54,17 +50,16 @@ def check_cameras(
     Raises:
         ValueError: names the argument.
     """
-    sizes: dict[str, int] = {}
-    check_shape("viewmats", viewmats, "C", 4, 4, sizes=sizes, hint="A single camera is viewmat[None].")
-    check_shape("Ks", Ks, "C", 3, 3, sizes=sizes, hint="One matrix for each viewmat.")
+    check_shape("viewmats", viewmats, "C", 4, 4, hint="A single camera is viewmat[None].")
     check_float("viewmats", viewmats, like=means)
-    check_float("Ks", Ks, like=means)
-    for name, value in {"width": width, "height": height, "tile_size": tile_size}.items():
-        if not isinstance(value, int | torch.SymInt) or isinstance(value, bool) or value < 1:
+    n_cameras = viewmats.shape[0]
+    check_like("Ks", Ks, (n_cameras, 3, 3), means, "One matrix for each viewmat.")
+    for name, value in (("width", width), ("height", height), ("tile_size", tile_size)):
+        if not isinstance(value, WHOLE) or isinstance(value, bool) or value < 1:
             raise ValueError(f"{name}: expected a whole number of pixels, at least 1, got {value!r}.")
-    if sizes["C"] * width * height > MAX_PIXELS:
+    if n_cameras * width * height > MAX_PIXELS:
         raise ValueError(
-            f"width: expected at most {MAX_PIXELS} pixels in all images, got {sizes['C']} x {height} x {width}. "
+            f"width: expected at most {MAX_PIXELS} pixels in all images, got {n_cameras} x {height} x {width}. "
             "Draw fewer cameras a call."
         )
     check_positive("near_plane", near_plane)
@@ -82,7 +77,7 @@ def check_coefficients(coefficients: Tensor, sh_degree: int, means: Tensor, n_ca
     Raises:
         ValueError: names the argument.
     """
-    sizes = {"N": len(means), "C": n_cameras}
+    sizes = {"N": means.shape[0], "C": n_cameras}
     if isinstance(coefficients, Tensor) and coefficients.dim() == 4:
         check_shape("colors", coefficients, "C", "N", "K", 3, sizes=sizes, hint="Or [N, K, 3].")
     else:
@@ -98,7 +93,7 @@ def check_colors(colors: Tensor, backgrounds: Tensor | None, means: Tensor, n_ca
     Raises:
         ValueError: names the argument.
     """
-    sizes = {"N": len(means), "C": n_cameras}
+    sizes = {"N": means.shape[0], "C": n_cameras}
     if isinstance(colors, Tensor) and colors.dim() == 2:
         check_shape("colors", colors, "N", "D", sizes=sizes, hint="One row for each centre.")
     else:
@@ -107,5 +102,4 @@ def check_colors(colors: Tensor, backgrounds: Tensor | None, means: Tensor, n_ca
     if not 1 <= colors.shape[-1] <= MAX_CHANNELS:
         raise ValueError(f"colors: expected 1 to {MAX_CHANNELS} channels, got {colors.shape[-1]}. Draw the rest apart.")
     if backgrounds is not None:
-        check_shape("backgrounds", backgrounds, "C", "D", sizes=sizes, hint="One row for each camera.")
-        check_float("backgrounds", backgrounds, like=means)
+        check_like("backgrounds", backgrounds, (n_cameras, colors.shape[-1]), means, "One row for each camera.")

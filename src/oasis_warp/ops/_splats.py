@@ -4,17 +4,28 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from oasis_warp.ops._records import Tables, table_words, tables
+
 
 class Splats(NamedTuple):
-    """What is drawn, as the projection made it: see `Projection`. M = cameras * Gaussians."""
+    """What is drawn by C cameras, contiguous."""
 
-    depths: Tensor
-    centers: Tensor
-    whitenings: Tensor
-    boxes: Tensor
+    records: Tensor
+    """Of the projection: see `_records`."""
     opacities: Tensor
+    """[C, N]."""
     colors: Tensor
+    """[C, N, D]."""
     backgrounds: Tensor
+    """[C, D]."""
+
+    def tables(self) -> Tables:
+        """Where and how the Gaussians are drawn."""
+        return tables(self.records, *self.opacities.shape, self.opacities.dtype)
+
+    def words(self) -> dict[str, int]:
+        """Addresses of the tables, by name."""
+        return table_words(self.records, self.opacities.numel(), self.opacities.dtype)
 
 
 class Frame(NamedTuple):

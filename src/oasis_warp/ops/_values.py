@@ -1,11 +1,15 @@
 """`core.checks.check_finite` for the operators' implementations, where it is part of every call."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
+from oasis_kernels import cuda_values
 from oasis_kernels.finite import ALL_FINITE
 from oasis_warp.core import checks
-from oasis_warp.ops._launch import has_vectors, run_native
+from oasis_warp.ops._launch import device_and_stream, has_vectors, run_cuda, run_native
+from oasis_warp.ops._pair_counts import slots
 
 
 def check_finite(**tensors: Tensor | None) -> None:
@@ -15,6 +19,9 @@ def check_finite(**tensors: Tensor | None) -> None:
         ValueError: names the argument and how many of its values are bad.
     """
     given = {name: tensor.detach() for name, tensor in tensors.items() if tensor is not None}
+    if given and all(t.is_cuda for t in given.values()):
+        with Look(**given):
+            return
     quick = [t for t in given.values() if has_vectors(t) and t.is_contiguous()]
     if quick:
         arrays = torch.tensor([(t.data_ptr(), t.numel()) for t in quick])
@@ -25,3 +32,51 @@ def check_finite(**tensors: Tensor | None) -> None:
         if not found[0]:
             given = {name: t for name, t in given.items() if not any(t is known for known in quick)}
     checks.check_finite(**given)  # also for the words, where something was found
+
+
+def refuse_capture() -> None:
+    """Refuse to look at values while a CUDA graph captures the call: nobody knows them yet.
+
+    Raises:
+        ValueError: it is being captured.
+    """
+    if torch.cuda.is_current_stream_capturing():
+        raise ValueError(
+            "validate: expected False while a CUDA graph is being captured, got True. Values exist only once it runs."
+        )
+
+
+class Look:
+    """A look at CUDA tensors that the device takes while the host goes on to what stands in the `with` block.
+
+    At the end of the block it waits for the device, and refuses as `check_finite` does.
+    """
+
+    def __init__(self, **tensors: Tensor | None) -> None:
+        self._given = {name: tensor.contiguous() for name, tensor in tensors.items() if tensor is not None}
+
+    def __enter__(self) -> None:
+        refuse_capture()
+        tensors = list(self._given.values())
+        self._device = tensors[0].device
+        self._found = slots.take()
+        self._found[0] = 0
+        stream = device_and_stream(tensors[0])[1]
+        for first in range(0, len(tensors), cuda_values.ARRAYS):
+            words: dict[str, int | float] = dict.fromkeys(cuda_values.all_finite().parameters, 0)
+            words |= {"found": self._found.data_ptr(), "largest": checks.FINITE_LIMIT}
+            n_blocks = 0
+            for k, tensor in enumerate(tensors[first : first + cuda_values.ARRAYS]):
+                words[f"data{k}"] = tensor.data_ptr()
+                words[f"count{k}"] = tensor.numel()
+                words[f"wide{k}"] = tensor.dtype == torch.float64
+                n_blocks += -(-tensor.numel() // cuda_values.CHUNK)
+            run_cuda(cuda_values.all_finite(), words, n_blocks, stream)
+
+    def __exit__(self, kind: Any, *_: Any) -> None:
+        torch.cuda.current_stream(self._device).synchronize()  # even after an error: the kernel writes to the slot
+        bad = bool(self._found[0])
+        slots.give(self._found)
+        if bad and kind is None:
+            checks.check_finite(**self._given)
+            raise AssertionError("the kernel has met a bad value that is not in its inputs")

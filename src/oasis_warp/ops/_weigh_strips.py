@@ -18,7 +18,7 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
     Raises:
         ValueError: more weights than int32 can count.
     """
-    n, n_pixels = splats.depths.shape[1], width * height
+    n, n_pixels = splats.opacities.shape[1], width * height
     s = cut_strips(1, n, width, height, tile_size, tiles_across=-(-width // tile_size))
     assert s.across == 1
     counted = count(splats, s)

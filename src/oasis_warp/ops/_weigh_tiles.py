@@ -42,9 +42,9 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
     Raises:
         ValueError: more weights than int32 can count.
     """
-    n, n_pixels = splats.depths.shape[1], width * height
+    n, n_pixels, records = splats.opacities.shape[1], width * height, splats.tables()
     dtype, device = splats.opacities.dtype, splats.opacities.device
-    tiles = bin_to_tiles(splats.boxes, splats.depths, width, height, tile_size)
+    tiles = bin_to_tiles(records.boxes, records.sort_depths, width, height, tile_size)
     scratch = torch.empty(n_pixels, dtype=dtype, device=device)
     counts = torch.empty(n_pixels, dtype=torch.int32, device=device)
     lanes, lane_width, lane_height = lane_grid(tile_size, device, CUDA_LANES)
@@ -54,8 +54,8 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
             kernels.weigh(SCALAR[dtype], current_rules()),
             even_work(tiles.starts),
             [
-                view(tiles.starts), view(revealed(tiles.gaussians)), view(splats.boxes.view(-1, 4), vec4i),
-                view(splats.centers.view(-1, 4), VEC4[dtype]), view(splats.whitenings.view(-1, 4), VEC4[dtype]),
+                view(tiles.starts), view(revealed(tiles.gaussians)), view(records.boxes.view(-1, 4), vec4i),
+                view(records.centers.view(-1, 4), VEC4[dtype]), view(records.whitenings.view(-1, 4), VEC4[dtype]),
                 view(splats.opacities.view(-1)), tiles.size, lane_width, lane_height, tiles.across, tiles.down, width,
                 height, int(write), view(starts), view(scratch), view(counts), view(columns), view(values),
             ],

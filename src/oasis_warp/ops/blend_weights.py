@@ -83,9 +83,8 @@ def blend_weights(
             near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d, validate=validate,
         )  # fmt: skip
         splats = Splats(
-            projection.sort_depths, projection.centers, projection.whitenings, projection.boxes,
-            opacities[None].contiguous(), means.new_empty(1, n, 0), means.new_empty(1, 0),
-        )  # fmt: skip
+            projection.records, opacities[None].contiguous(), means.new_empty(1, n, 0), means.new_empty(1, 0)
+        )
         weigh = weigh_strips if has_vectors(means) else weigh_tiles
         w = weigh(splats, width, height, tile_size)
         matrix = _csr(w.pixel_starts, w.gaussians, w.by_pixel, (pixels, n))

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from oasis_kernels import constants
 from oasis_kernels.cuda_binning import INDEX_BITS
+from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops import _blend_cuda, _blend_strips, _blend_tiles
 from oasis_warp.ops._launch import has_vectors
 from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
@@ -26,14 +27,14 @@ def _way(colors: Tensor) -> ModuleType:
     return _blend_tiles
 
 
-# The projection's other outputs, sizes and flags come in lists: torch takes time for every argument of an op.
+# Sizes and flags come in lists: torch takes time for every argument of an op.
 def _blend(
     means2d: Tensor,
     covars2d: Tensor,
     opacities: Tensor,
     colors: Tensor,
     backgrounds: Tensor,
-    projected: list[Tensor],
+    records: Tensor,
     frame: list[int],
     keep: bool,
     validate: bool,
@@ -41,7 +42,7 @@ def _blend(
     if validate:
         shared = colors.stride(0) == 0  # by the cameras: each value counts once
         check_finite(colors=colors[:1] if shared else colors, backgrounds=backgrounds)
-    splats = Splats(*(t.contiguous() for t in (*projected, opacities, colors, backgrounds)))
+    splats = Splats(records, opacities.contiguous(), colors.contiguous(), backgrounds.contiguous())
     image, alphas, kept = _way(colors).draw(splats, Frame(*frame), keep)
     return image, alphas, [] if kept is None else list(kept)
 
@@ -52,7 +53,7 @@ def _blend_fake(
     opacities: Tensor,
     colors: Tensor,
     backgrounds: Tensor,
-    projected: list[Tensor],
+    records: Tensor,
     frame: list[int],
     keep: bool,
     validate: bool,
@@ -106,9 +107,9 @@ _adjoint = adjoint("blend_backward", _blend_backward, _blend_backward_fake)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
-    _, _, opacities, colors, backgrounds, projected, ctx.frame, _, _ = inputs
-    ctx.n_splats = len(projected) + 3
-    ctx.save_for_backward(*projected, opacities, colors, backgrounds, *output[2])
+    _, _, opacities, colors, backgrounds, records, ctx.frame, _, _ = inputs
+    ctx.save_for_backward(records, opacities, colors, backgrounds, *output[2])
+    ctx.bytes = None if is_traced() else [t.untyped_storage().nbytes() for t in output[2]]
     ctx.set_materialize_grads(False)
 
 
@@ -117,11 +118,16 @@ def _back(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, _kept: Any) 
     wanted = [by_means2d or by_covars2d or by_opacities, by_colors, by_backgrounds]
     gradients: Any = (None,) * 5
     if g_image is not None or g_alpha is not None:
-        splats, kept = list(ctx.saved_tensors[: ctx.n_splats]), list(ctx.saved_tensors[ctx.n_splats :])
-        gradients = _adjoint(g_image, g_alpha, splats, kept, ctx.frame, wanted)
+        saved = ctx.saved_tensors
+        if ctx.bytes is not None and ctx.bytes != [t.untyped_storage().nbytes() for t in saved[4:]]:
+            raise RuntimeError(
+                "rasterization: expected the tensors that it saved, got copies, which lack what is hidden behind them. "
+                "Draw outside of hooks that move saved tensors, such as torch.autograd.graph.save_on_cpu."
+            )
+        gradients = _adjoint(g_image, g_alpha, list(saved[:4]), list(saved[4:]), ctx.frame, wanted)
     return (
         *(g if need else None for g, need in zip(gradients, needs, strict=True)),
-        [None] * (ctx.n_splats - 3),  # projected
+        None,  # records
         None,  # frame
         None,  # keep
         None,  # validate
@@ -156,8 +162,7 @@ def blend(
         backgrounds = torch.nn.functional.pad(backgrounds, (0, padding))
     means2d, covars2d = projection.means2d, projection.covars2d
     image, alphas, _ = _forward(
-        means2d, covars2d, opacities, colors, backgrounds,
-        [projection.sort_depths, projection.centers, projection.whitenings, projection.boxes],
-        [width, height, tile_size], needs_gradient(means2d, covars2d, opacities, colors, backgrounds), validate,
+        means2d, covars2d, opacities, colors, backgrounds, projection.records, [width, height, tile_size],
+        needs_gradient(means2d, covars2d, opacities, colors, backgrounds), validate,
     )  # fmt: skip
     return (image[..., :channels] if padding else image), alphas

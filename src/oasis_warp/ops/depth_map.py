@@ -1,19 +1,24 @@
 """What a camera sees of a mesh: depths, face ids and barycentrics, a pixel each."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_warp.core.checks import check_float, check_positive, check_shape
-from oasis_warp.ops._depth_buffer import Scene, draw, plane_size
+from oasis_warp.core.checks import check_choice, check_float, check_positive, check_shape
+from oasis_warp.ops._depth_buffer import draw, plane_size
+from oasis_warp.ops._depth_scene import Scene, Wanted
 from oasis_warp.ops._incidence import incidence
 from oasis_warp.ops._registration import operator
 
 
 class DepthMap(NamedTuple):
-    """The nearest surface of each pixel. The batch axis B is there if an argument has one."""
+    """The nearest surface of each pixel. The batch axis B is there if an argument has one.
+
+    Fields that were not among the `outputs` asked for have no rows and no columns.
+    """
 
     depth: Float[Tensor, "H W"] | Float[Tensor, "B H W"]
     """Depth along the camera's z axis [m], +inf where there is no surface."""
@@ -65,21 +70,25 @@ def _depth_map(
     width: int,
     height: int,
     near_plane: float,
+    depth: bool,
+    face_ids: bool,
+    barycentrics: bool,
     validate: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     table = incidence("faces", faces, vertices.shape[1], "vertices").table
     scene = Scene(vertices, table, viewmats, Ks, width, height, near_plane)
-    (depth, face_ids, barycentrics), _ = draw(scene, None, True, validate)
-    assert barycentrics is not None
-    return depth, face_ids, barycentrics
+    buffer, _ = draw(scene, None, Wanted(depth, face_ids, barycentrics), validate)
+    return buffer.depth, buffer.face_ids, buffer.barycentrics
 
 
-def _depth_map_fake(vertices, faces, viewmats, Ks, width, height, near_plane, validate):
-    shape = (len(vertices), height, width)
+def _depth_map_fake(
+    vertices, faces, viewmats, Ks, width, height, near_plane, depth, face_ids, barycentrics, validate
+):  # fmt: skip
+    size, nothing = (len(vertices), height, width), (len(vertices), 0, 0)
     return (
-        vertices.new_empty(shape),
-        vertices.new_empty(shape, dtype=torch.int32),
-        vertices.new_empty((*shape, 3)),
+        vertices.new_empty(size if depth else nothing),
+        vertices.new_empty(size if face_ids else nothing, dtype=torch.int32),
+        vertices.new_empty((*(size if barycentrics else nothing), 3)),
     )
 
 
@@ -96,6 +105,7 @@ def depth_map(
     height: int,
     near_plane: float = 0.01,
     *,
+    outputs: Sequence[Literal["depth", "face_ids", "barycentrics"]] = DepthMap._fields,
     validate: bool = True,
 ) -> DepthMap:
     """The nearest surface behind each pixel's centre, from either side; nothing here carries a gradient.
@@ -117,6 +127,8 @@ def depth_map(
         width: Columns of the image.
         height: Rows of the image.
         near_plane: Depth up to which surfaces are not seen [m].
+        outputs: Fields to compute. Barycentrics cost most, ids nearly nothing; depths are float64 rounded to the
+            vertices' type only in company of barycentrics or on CUDA, else within 5e-6 in float32.
         validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
             Shapes and indices are always checked, indices once a tensor.
 
@@ -125,9 +137,11 @@ def depth_map(
             positive.
     """
     sizes = check_scene(vertices, faces, viewmat, K, width, height, near_plane)
+    for name in outputs:
+        check_choice("outputs", name, DepthMap._fields)
     batch = sizes.get("B", 1)
     out = _op(
         batched(vertices, batch, 2), faces, batched(viewmat, batch, 2), batched(K, batch, 2), width, height,
-        near_plane, validate,
+        near_plane, *(name in outputs for name in DepthMap._fields), validate,
     )  # fmt: skip
     return DepthMap(*(out if "B" in sizes else (t[0] for t in out)))

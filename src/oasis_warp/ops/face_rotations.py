@@ -1,49 +1,66 @@
 """Rotations and area ratios of faces and vertices between a rest mesh and a posed one."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from oasis_kernels import cuda_posing_turn as cuda_kernels
 from oasis_kernels import face_rotation as kernels
 from oasis_kernels import face_rotation_vectors as vector_kernels
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._incidence import Incidence, incidence, sum_at_items
-from oasis_warp.ops._launch import even_cuts, has_vectors, launch_ranges, run_native, view
+from oasis_warp.ops._launch import (
+    current_stream,
+    even_cuts,
+    has_cuda_kernels,
+    has_vectors,
+    launch_ranges,
+    run_cuda,
+    run_native,
+    view,
+)
+from oasis_warp.ops._poses import at_pose, pose_by_pose, summed_over_poses
 from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
 from oasis_warp.ops._values import check_finite
-from oasis_warp.ops._words import place, task_count
+from oasis_warp.ops._words import aligned, place, pointer, task_count
+from oasis_warp.ops.rest_mesh import RestMesh
 
 
 class FaceRotations(NamedTuple):
     """How the surface turned and grew. Quaternions are unit, wxyz, rest to posed."""
 
-    vertex_quats: Float[Tensor, "V 4"]
-    face_quats: Float[Tensor, "F 4"]
-    area_ratio: Float[Tensor, "F"]
+    vertex_quats: Float[Tensor, "*B V 4"]
+    face_quats: Float[Tensor, "*B F 4"]
+    area_ratio: Float[Tensor, "*B F"]
     """Posed area over rest area."""
-    vertex_area_ratio: Float[Tensor, "V"]
+    vertex_area_ratio: Float[Tensor, "*B V"]
     """The same of all faces round a vertex together; 1 where there is none."""
 
 
 Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
-def _outputs(rest: Tensor, posed: Tensor, faces: Tensor, keep: bool, validate: bool) -> Outputs:
+def _outputs(
+    rest: Tensor, posed: Tensor, faces: Tensor, triangles: Tensor | None, keep: bool, validate: bool
+) -> Outputs:
     """Empty tensors for the results and for what the adjoint needs: signs of corners, sums at vertices."""
-    n_vertices, n_faces = len(rest), len(faces)
+    batch, n_vertices, n_faces = posed.shape[:-2], len(rest), len(faces)
     return (
-        rest.new_empty((n_vertices, 4)),
-        rest.new_empty((n_faces, 4)),
-        rest.new_empty(n_faces),
-        rest.new_empty(n_vertices),
-        rest.new_empty(3 * n_faces if keep else 0),
-        rest.new_empty((2 if keep else 0, n_vertices)),
+        rest.new_empty((*batch, n_vertices, 4)),
+        rest.new_empty((*batch, n_faces, 4)),
+        rest.new_empty((*batch, n_faces)),
+        rest.new_empty((*batch, n_vertices)),
+        rest.new_empty((*batch, 3 * n_faces if keep else 0)),
+        rest.new_empty((*batch, 2 if keep else 0, n_vertices)),
     )
 
 
-def _mesh_words(rest: Tensor, posed: Tensor, corners: Incidence, state: Tensor) -> dict[str, int]:
+def _mesh_words(
+    rest: Tensor, posed: Tensor, corners: Incidence, triangles: Tensor | None, state: Tensor
+) -> dict[str, int]:
     """What the vectorised kernels are told of the two meshes."""
     n_vertices, n_faces = len(rest), len(corners.table)
     return {
@@ -52,26 +69,41 @@ def _mesh_words(rest: Tensor, posed: Tensor, corners: Incidence, state: Tensor) 
         "rest_vertices": place(rest, 3 * n_vertices),
         "posed_vertices": place(posed, 3 * n_vertices),
         "faces": place(corners.table, 3 * n_faces, torch.int32),
+        "triangles": place(triangles, vector_kernels.TRIANGLE * n_faces),
         "offsets": place(corners.offsets, n_vertices + 1, torch.int32),
         "corners": place(corners.entries, 3 * n_faces, torch.int32),
         "state": place(state, vector_kernels.STATE, torch.int64),
     }
 
 
+def _blocks(n: int) -> int:
+    """Of a CUDA kernel, for so many faces or vertices."""
+    return -(-n // cuda_kernels.BLOCK)
+
+
 def _face_rotations(
-    rest: Tensor, posed: Tensor, faces: Tensor, keep: bool, validate: bool
+    rest: Tensor, posed: Tensor, faces: Tensor, triangles: Tensor | None, keep: bool, validate: bool
 ) -> Outputs:
     if validate:
         check_finite(rest_vertices=rest, posed_vertices=posed)
     corners = incidence("faces", faces, len(rest), "vertices")
-    rest, posed = rest.contiguous(), posed.contiguous()
+    rest, posed, triangles = rest.contiguous(), posed.contiguous(), aligned(triangles)
     n_vertices, n_faces = len(rest), len(faces)
-    out = _outputs(rest, posed, faces, keep, validate)
+    out = _outputs(rest, posed, faces, triangles, keep, validate)
+    if has_cuda_kernels(rest):
+        _turn_on_cuda(rest, posed, corners, triangles, out if keep else (*out[:4], None, None))
+        return out
+    if posed.ndim == 3:
+        pose_by_pose(
+            out, len(posed), lambda k: _face_rotations(rest, posed[k], faces, triangles, keep, validate=False)
+        )
+        return out
+
     vertex_quats, face_quats, area_ratio, vertex_area_ratio, signs, sums = out
     if has_vectors(rest):
         rows_of_faces = rest.new_empty((n_faces, 8))
         state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
-        words = _mesh_words(rest, posed, corners, state) | {
+        words = _mesh_words(rest, posed, corners, triangles, state) | {
             "rows_of_faces": place(rows_of_faces, 8 * n_faces),
             "vertex_quats": place(vertex_quats, 4 * n_vertices),
             "face_quats": place(face_quats, 4 * n_faces),
@@ -106,10 +138,48 @@ def _face_rotations(
     return out
 
 
+def _cuda_words(rest: Tensor, posed: Tensor, corners: Incidence, triangles: Tensor | None) -> dict[str, int]:
+    """What the CUDA kernels are told of the two meshes."""
+    return {
+        "n_vertices": len(rest),
+        "n_faces": len(corners.table),
+        "rest_vertices": pointer(rest),
+        "posed_vertices": pointer(posed),
+        "faces": pointer(corners.table),
+        "triangles": pointer(triangles),
+        "offsets": pointer(corners.offsets),
+        "corners": pointer(corners.entries),
+    }
+
+
+def _turn_on_cuda(
+    rest: Tensor, posed: Tensor, corners: Incidence, triangles: Tensor | None, out: Sequence[Tensor | None]
+) -> None:
+    n_vertices, n_faces = len(rest), len(corners.table)
+    n_poses = len(posed) if posed.ndim == 3 else 1
+    blocks = n_poses * _blocks(n_faces)
+    rows_of_faces = rest.new_empty((n_poses * n_faces, 8))
+    flat_blocks = corners.table.new_empty(blocks)
+    vertex_quats, face_quats, area_ratio, vertex_area_ratio, signs, sums = map(pointer, out)
+    words = _cuda_words(rest, posed, corners, triangles) | {
+        "face_quats": face_quats,
+        "area_ratio": area_ratio,
+        "rows_of_faces": pointer(rows_of_faces),
+        "flat_blocks": pointer(flat_blocks),
+        "vertex_quats": vertex_quats,
+        "vertex_area_ratio": vertex_area_ratio,
+        "signs": signs,
+        "sums": sums,
+    }
+    stream = current_stream(rest.device)
+    run_cuda(cuda_kernels.turn_faces, words, blocks, stream)
+    run_cuda(cuda_kernels.turn_vertices, words, n_poses * _blocks(n_vertices), stream)
+
+
 def _gradients(rest: Tensor, posed: Tensor, needs_rest: bool, needs_posed: bool) -> tuple[Tensor, Tensor]:
     return (
         rest.new_empty((len(rest) if needs_rest else 0, 3)),
-        posed.new_empty((len(posed) if needs_posed else 0, 3)),
+        posed.new_empty((len(posed) if needs_posed else 0, *posed.shape[1:])),
     )
 
 
@@ -121,6 +191,7 @@ def _face_rotations_backward(
     rest: Tensor,
     posed: Tensor,
     faces: Tensor,
+    triangles: Tensor | None,
     vertex_quats: Tensor,
     face_quats: Tensor,
     vertex_area_ratio: Tensor,
@@ -134,8 +205,22 @@ def _face_rotations_backward(
     needs_posed: bool,
 ) -> tuple[Tensor, Tensor]:
     corners = incidence("faces", faces, len(rest), "vertices")
-    rest, posed = rest.contiguous(), posed.contiguous()
+    rest, posed, triangles = rest.contiguous(), posed.contiguous(), aligned(triangles)
     n_vertices, n_faces = len(rest), len(faces)
+    kept = vertex_quats, face_quats, vertex_area_ratio, signs, sums
+    grads = grad_vertex_quats, grad_face_quats, grad_area_ratio, grad_vertex_area_ratio
+    if has_cuda_kernels(rest):
+        return _turn_backward_on_cuda(rest, posed, corners, triangles, kept, grads, needs_rest, needs_posed)
+    if posed.ndim == 3:
+        found = _gradients(rest, posed, needs_rest, needs_posed)
+
+        def one(k: int) -> tuple[Tensor, Tensor]:
+            of_pose = (at_pose(part, k) for part in (*kept, *grads))
+            return _face_rotations_backward(rest, posed[k], faces, triangles, *of_pose, needs_rest, needs_posed)
+
+        pose_by_pose(found, len(posed), one, shared=(True, False))
+        return found
+
     if has_vectors(rest):
         by_vertex_quats, by_face_quats, by_ratio, by_vertex_ratio = (
             None if grad is None else grad.contiguous()
@@ -146,7 +231,7 @@ def _face_rotations_backward(
         posed_edges = rest.new_empty((n_faces, 8)) if needs_posed else None
         state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
         found = _gradients(rest, posed, needs_rest, needs_posed)
-        words = _mesh_words(rest, posed, corners, state) | {
+        words = _mesh_words(rest, posed, corners, triangles, state) | {
             "vertex_quats": place(vertex_quats, 4 * n_vertices),
             "face_quats": place(face_quats, 4 * n_faces),
             "vertex_area_ratio": place(vertex_area_ratio, n_vertices),
@@ -196,6 +281,47 @@ def _face_rotations_backward(
     )
 
 
+def _turn_backward_on_cuda(
+    rest: Tensor,
+    posed: Tensor,
+    corners: Incidence,
+    triangles: Tensor | None,
+    kept: Sequence[Tensor],
+    grads: Sequence[Tensor | None],
+    needs_rest: bool,
+    needs_posed: bool,
+) -> tuple[Tensor, Tensor]:
+    n_vertices, n_faces = len(rest), len(corners.table)
+    batched = posed.ndim == 3
+    n_poses = len(posed) if batched else 1
+    vertex_quats, face_quats, vertex_area_ratio, signs, sums = kept
+    given = [aligned(grad) for grad in grads]
+    rest_edges, posed_edges = (
+        rest.new_empty((n_poses * n_faces, 8)) if needed else None for needed in (needs_rest, needs_posed)
+    )
+    by_rest = rest.new_empty((*posed.shape[:-2], n_vertices, 3)) if needs_rest else None
+    by_posed = _gradients(rest, posed, False, needs_posed)[1]
+    words = _cuda_words(rest, posed, corners, triangles) | {
+        "vertex_quats": pointer(vertex_quats),
+        "face_quats": pointer(face_quats),
+        "vertex_area_ratio": pointer(vertex_area_ratio),
+        "signs": pointer(signs),
+        "sums": pointer(sums),
+        "g_vertex_quats": pointer(given[0]),
+        "g_face_quats": pointer(given[1]),
+        "g_area_ratio": pointer(given[2]),
+        "g_vertex_area_ratio": pointer(given[3]),
+        "rest_edges": pointer(rest_edges),
+        "posed_edges": pointer(posed_edges),
+        "g_rest": pointer(by_rest),
+        "g_posed": pointer(by_posed),
+    }
+    stream = current_stream(rest.device)
+    run_cuda(cuda_kernels.turn_faces_backward, words, n_poses * _blocks(n_faces), stream)
+    run_cuda(cuda_kernels.gather_edges, words, n_poses * _blocks(n_vertices), stream)
+    return rest.new_empty((0, 3)) if by_rest is None else summed_over_poses(by_rest, batched), by_posed
+
+
 _operator = operator("face_rotations", _face_rotations, _outputs)
 _adjoint = adjoint("face_rotations_backward", _face_rotations_backward, _fake_backward)
 
@@ -204,7 +330,7 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None
     ctx.set_materialize_grads(False)
     vertex_quats, face_quats, _, vertex_area_ratio, signs, sums = output
     ctx.mark_non_differentiable(signs, sums)
-    ctx.save_for_backward(*inputs[:3], vertex_quats, face_quats, vertex_area_ratio, signs, sums)
+    ctx.save_for_backward(*inputs[:4], vertex_quats, face_quats, vertex_area_ratio, signs, sums)
 
 
 def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
@@ -214,6 +340,7 @@ def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         rest if needs_rest else None,  # rest
         posed if needs_posed else None,  # posed
         None,  # faces
+        None,  # triangles
         None,  # keep
         None,  # validate
     )
@@ -223,8 +350,8 @@ differentiable(_operator, _backward, _save)
 
 
 def face_rotations(
-    rest_vertices: Float[Tensor, "V 3"],
-    posed_vertices: Float[Tensor, "V 3"],
+    rest_vertices: Float[Tensor, "V 3"] | RestMesh,
+    posed_vertices: Float[Tensor, "*B V 3"],
     faces: Int[Tensor, "F 3"],
     *,
     validate: bool = True,
@@ -243,8 +370,10 @@ def face_rotations(
     tensor and remembered while it lives.
 
     Args:
-        rest_vertices: Vertices at rest, any unit of length, shape [V, 3], float32 or float64.
-        posed_vertices: The same vertices posed, shape [V, 3].
+        rest_vertices: Vertices at rest, any unit of length, shape [V, 3], float32 or float64; or the `rest_mesh` of
+            these vertices and faces, where one mesh is posed many times.
+        posed_vertices: The same vertices posed, shape [V, 3]; or B poses of them, shape [B, V, 3]: then every output
+            has that axis too, and is what as many calls give.
         faces: Vertex indices, shape [F, 3]; F may be 0.
         validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
             Shapes and indices are always checked, indices once a tensor.
@@ -253,10 +382,17 @@ def face_rotations(
         ValueError: a wrong shape, dtype or index, or a value that is not finite.
     """
     sizes: dict[str, int] = {}
-    check_shape("rest_vertices", rest_vertices, "V", 3, sizes=sizes)
-    check_shape("posed_vertices", posed_vertices, "V", 3, sizes=sizes, hint="One for each rest vertex.")
-    check_float("rest_vertices", rest_vertices)
-    check_float("posed_vertices", posed_vertices, rest_vertices)
-    check_shape("faces", faces, "F", 3, hint="Three vertex indices a face.")
-    keep = needs_gradient(rest_vertices, posed_vertices)
-    return FaceRotations(*_operator(rest_vertices, posed_vertices, faces, keep, validate)[:4])
+    rest, triangles = rest_vertices if isinstance(rest_vertices, RestMesh) else (rest_vertices, None)
+    check_shape("rest_vertices", rest, "V", 3, sizes=sizes)
+    batch = ("B",) if posed_vertices.ndim == 3 else ()
+    check_shape("posed_vertices", posed_vertices, *batch, "V", 3, sizes=sizes, hint="One for each rest vertex.")
+    check_float("rest_vertices", rest)
+    check_float("posed_vertices", posed_vertices, rest)
+    check_shape("faces", faces, "F", 3, sizes=sizes, hint="Three vertex indices a face.")
+    if triangles is not None and not len(triangles):  # as in float64
+        triangles = None
+    if triangles is not None:
+        check_shape("rest_vertices.triangles", triangles, "F", 12, sizes=sizes, hint="Of the rest_mesh of these faces.")
+        check_float("rest_vertices.triangles", triangles, rest)
+    keep = needs_gradient(rest, posed_vertices)
+    return FaceRotations(*_operator(rest, posed_vertices, faces, triangles, keep, validate)[:4])

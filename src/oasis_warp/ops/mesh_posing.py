@@ -8,9 +8,11 @@ from torch import Tensor
 from oasis_kernels import barycentric as kernels
 from oasis_warp.core.checks import check_choice, check_float, check_shape
 from oasis_warp.ops._incidence import sum_at_items
-from oasis_warp.ops._launch import even_cuts, has_vectors, launch_ranges, view
+from oasis_warp.ops._launch import even_cuts, has_cuda_kernels, has_vectors, launch_ranges, view
+from oasis_warp.ops._poses import at_pose, pose_by_pose
 from oasis_warp.ops._registration import adjoint, differentiable, operator
-from oasis_warp.ops._riders import Floats, Riders, find_riders, pose_backward_vectorised, pose_vectorised
+from oasis_warp.ops._riders import SHARED, Floats, Riders, find_riders, pose_backward_vectorised, pose_vectorised
+from oasis_warp.ops._riders_cuda import pose_backward_on_cuda, pose_on_cuda
 from oasis_warp.ops._values import check_finite
 
 HALF_POWERS = {"sqrt_area": 1, "area": 2, "none": 0}
@@ -20,22 +22,18 @@ HALF_POWERS = {"sqrt_area": 1, "area": 2, "none": 0}
 class PosedOnMesh(NamedTuple):
     """Gaussians in a pose: those on vertices first, then those on faces."""
 
-    means: Float[Tensor, "N 3"]
-    quats: Float[Tensor, "N 4"]
-    scales: Float[Tensor, "N 3"]
+    means: Float[Tensor, "*B N 3"]
+    quats: Float[Tensor, "*B N 4"]
+    scales: Float[Tensor, "*B N 3"]
 
 
-def _posed_like(quats: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    n = len(quats)
-    return quats.new_empty((n, 3)), quats.new_empty((n, 4)), quats.new_empty((n, 3))
+def _posed_like(posed_vertices: Tensor, quats: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    shape = *posed_vertices.shape[:-2], len(quats)
+    return quats.new_empty((*shape, 3)), quats.new_empty((*shape, 4)), quats.new_empty((*shape, 3))
 
 
 def _fake(*inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
-    return _posed_like(inputs[6])
-
-
-def _contiguous(*tensors: Tensor | None) -> list[Any]:
-    return [None if tensor is None else tensor.contiguous() for tensor in tensors]
+    return _posed_like(inputs[0], inputs[6])
 
 
 def _pose_on_mesh(
@@ -64,13 +62,26 @@ def _pose_on_mesh(
             offsets=offsets,
             vertex_area_ratio=vertex_area_ratio,
         )
-    riders = find_riders(faces, face_index, vertex_index, len(posed_vertices), transposed=False)
+    riders = find_riders(faces, face_index, vertex_index, posed_vertices.shape[-2], transposed=False)
     inputs = Floats(
-        *_contiguous(
-            posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio
-        )
+        posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio
     )
-    posed = _posed_like(quats)
+    posed = _posed_like(posed_vertices, quats)
+    if has_cuda_kernels(quats):
+        pose_on_cuda(inputs, riders, half_powers, posed)
+        return posed
+    if posed_vertices.ndim == 3:
+
+        def one(k: int) -> tuple[Tensor, Tensor, Tensor]:
+            floats = inputs.at_pose(k)
+            return _pose_on_mesh(
+                floats.vertices, faces, face_index, barycentrics, floats.vertex_quats, floats.area_ratio, quats, scales,
+                vertex_index, offsets, floats.vertex_area_ratio, half_powers, validate=False,
+            )  # fmt: skip
+
+        pose_by_pose(posed, len(posed_vertices), one)
+        return posed
+    inputs = inputs.contiguous()
     if has_vectors(quats):
         pose_vectorised(inputs, riders, half_powers, posed)
         return posed
@@ -146,27 +157,43 @@ def _pose_on_mesh_backward(
     needs: list[bool],
 ) -> list[Tensor]:
     inputs = Floats(
-        *_contiguous(
-            posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio
-        )
+        posed_vertices, barycentrics, vertex_quats, area_ratio, quats, scales, offsets, vertex_area_ratio
     )
     found = [
         quats.new_empty(tensor.shape if needed and tensor is not None else (0,))
         for tensor, needed in zip(inputs, needs, strict=True)
     ]
-    if not len(quats):  # empty scratch has no address, by which kernels know what is wanted
+    if not len(quats) or not len(posed_vertices):  # empty scratch has no address, by which kernels know what is wanted
         return [grad.zero_() for grad in found]
     wanted = Floats(*needs)
     at_vertices = wanted.vertices or wanted.vertex_quats or wanted.vertex_area_ratio
-    riders = find_riders(faces, face_index, vertex_index, len(posed_vertices), transposed=at_vertices)
-    grads = _contiguous(grad_means, grad_quats, grad_scales)
+    riders = find_riders(faces, face_index, vertex_index, posed_vertices.shape[-2], transposed=at_vertices)
+    grads = grad_means, grad_quats, grad_scales
+    g = [grad if needed else None for grad, needed in zip(found, needs, strict=True)]
+    if has_cuda_kernels(quats):
+        by_inputs = pose_backward_on_cuda(inputs, riders, half_powers, grads, g)
+        return [empty if grad is None else grad for grad, empty in zip(by_inputs, found, strict=True)]
+    if posed_vertices.ndim == 3:
+
+        def one(k: int) -> list[Tensor]:
+            floats = inputs.at_pose(k)
+            of_pose = (at_pose(grad, k) for grad in grads)
+            return _pose_on_mesh_backward(
+                floats.vertices, faces, face_index, barycentrics, floats.vertex_quats, floats.area_ratio, quats, scales,
+                vertex_index, offsets, floats.vertex_area_ratio, half_powers, *of_pose, needs,
+            )  # fmt: skip
+
+        pose_by_pose(found, len(posed_vertices), one, SHARED)
+        return found
+    inputs = inputs.contiguous()
+    grads = [None if grad is None else grad.contiguous() for grad in grads]
     if has_vectors(quats):
-        g = [grad if needed else None for grad, needed in zip(found, needs, strict=True)]
         pose_backward_vectorised(inputs, riders, half_powers, grads, g)
         return found
 
     given = [
-        like.zero_() if grad is None else grad for grad, like in zip(grads, _posed_like(quats), strict=True)
+        like.zero_() if grad is None else grad
+        for grad, like in zip(grads, _posed_like(posed_vertices, quats), strict=True)
     ]
     p, q = riders.p, riders.q
 
@@ -242,19 +269,19 @@ differentiable(_operator, _backward, _save)
 
 
 def pose_on_mesh(
-    posed_vertices: Float[Tensor, "V 3"],
+    posed_vertices: Float[Tensor, "*B V 3"],
     faces: Int[Tensor, "F 3"],
     face_index: Int[Tensor, "Q"],
     barycentrics: Float[Tensor, "Q 3"],
-    vertex_quats: Float[Tensor, "V 4"],
-    area_ratio: Float[Tensor, "F"],
+    vertex_quats: Float[Tensor, "*B V 4"],
+    area_ratio: Float[Tensor, "*B F"],
     quats: Float[Tensor, "N 4"],
     scales: Float[Tensor, "N 3"],
     scale_law: Literal["sqrt_area", "area", "none"] = "sqrt_area",
     *,
     vertex_index: Int[Tensor, "P"] | None = None,
     offsets: Float[Tensor, "P 3"] | None = None,
-    vertex_area_ratio: Float[Tensor, "V"] | None = None,
+    vertex_area_ratio: Float[Tensor, "*B V"] | None = None,
     validate: bool = True,
 ) -> PosedOnMesh:
     """Gaussians on the faces of a mesh, and on its vertices, carried into its pose (OASIS, MM '26, eq. 7, appendix).
@@ -271,21 +298,24 @@ def pose_on_mesh(
     Differentiable in every float argument. Which Gaussians ride on what is computed once for each `face_index` tensor
     and remembered while it lives.
 
+    With an axis of poses B before `posed_vertices` and all that `face_rotations` made of them, the same Gaussians are
+    carried into every pose in one call, and every output has that axis too; it is what as many calls give.
+
     Args:
-        posed_vertices: Vertices of the posed mesh [m], shape [V, 3].
+        posed_vertices: Vertices of the posed mesh [m], shape [V, 3], or of B poses of it, shape [B, V, 3].
         faces: Vertex indices, shape [F, 3].
         face_index: The face each Gaussian rides on, shape [Q]; Q may be 0.
         barycentrics: Weights of that face's corners, rows of sum 1 and not negative, shape [Q, 3].
-        vertex_quats: Unit rotations from rest to posed, wxyz, shape [V, 4]; from `face_rotations`.
-        area_ratio: Posed area over rest area, shape [F]; from `face_rotations`.
+        vertex_quats: Unit rotations from rest to posed, wxyz, shape [V, 4] or [B, V, 4]; from `face_rotations`.
+        area_ratio: Posed area over rest area, shape [F] or [B, F]; from `face_rotations`.
         quats: Canonical rotations, wxyz, shape [N, 4], N = P + Q: first of the Gaussians on vertices, then of those on
             faces. Their norms carry over.
         scales: Canonical standard deviations [m], shape [N, 3].
         scale_law: How scales follow areas.
         vertex_index: The vertex each of the first P Gaussians rides on, shape [P]; None for P = 0.
         offsets: Shift of each of them from its vertex at rest [m], shape [P, 3]. Goes with `vertex_index`.
-        vertex_area_ratio: Posed area over rest area round each vertex, shape [V]; from `face_rotations`. Goes with
-            `vertex_index`.
+        vertex_area_ratio: Posed area over rest area round each vertex, shape [V] or [B, V]; from `face_rotations`. Goes
+            with `vertex_index`.
         validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
             Shapes and indices are always checked, indices once a tensor.
 
@@ -294,12 +324,13 @@ def pose_on_mesh(
             for Gaussians on vertices.
     """
     sizes: dict[str, int] = {}
-    check_shape("posed_vertices", posed_vertices, "V", 3, sizes=sizes)
+    batch = ("B",) if posed_vertices.ndim == 3 else ()
+    check_shape("posed_vertices", posed_vertices, *batch, "V", 3, sizes=sizes)
     check_shape("faces", faces, "F", 3, sizes=sizes, hint="Three vertex indices a face.")
     check_shape("face_index", face_index, "Q", sizes=sizes, hint="One face a Gaussian.")
     check_shape("barycentrics", barycentrics, "Q", 3, sizes=sizes)
-    check_shape("vertex_quats", vertex_quats, "V", 4, sizes=sizes, hint="Quaternions are wxyz.")
-    check_shape("area_ratio", area_ratio, "F", sizes=sizes, hint="One ratio a face.")
+    check_shape("vertex_quats", vertex_quats, *batch, "V", 4, sizes=sizes, hint="Quaternions are wxyz.")
+    check_shape("area_ratio", area_ratio, *batch, "F", sizes=sizes, hint="One ratio a face.")
     floats = {
         "posed_vertices": posed_vertices,
         "barycentrics": barycentrics,
@@ -314,7 +345,7 @@ def pose_on_mesh(
         n += len(vertex_index)
     for name, tensor, shape in (
         ("offsets", offsets, (len(vertex_index) if vertex_index is not None else 0, 3)),
-        ("vertex_area_ratio", vertex_area_ratio, (len(posed_vertices),)),
+        ("vertex_area_ratio", vertex_area_ratio, posed_vertices.shape[:-1]),
     ):
         if (tensor is None) != (vertex_index is None):
             expected, got = ("None", "a tensor") if vertex_index is None else ("a tensor", "None")

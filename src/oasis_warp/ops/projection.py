@@ -6,23 +6,26 @@ A shape is a quaternion with three scales, or a covariance.
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Float64, Int32
+from jaxtyping import Float, Float64, Int32, UInt8
 from torch import Tensor
 
 from oasis_warp.core.checks import check_finite
-from oasis_warp.ops._launch import has_vectors
+from oasis_warp.ops._launch import has_cuda_kernels, has_vectors
 from oasis_warp.ops._project_launch import (
     Incoming,
     Limits,
     Outputs,
     Scene,
+    backward_cuda,
     backward_generic,
     backward_vectors,
     check_arrays,
     empty_outputs,
+    project_cuda,
     project_generic,
     project_vectors,
 )
+from oasis_warp.ops._records import Tables, tables
 from oasis_warp.ops._registration import adjoint, differentiable, operator
 
 INPUTS = "means", "quats", "scales", "covars", "viewmats"
@@ -43,14 +46,12 @@ class Projection(NamedTuple):
     """Inverse covariances xx, xy, yy; for reading, without gradient, as all below."""
     radii: Int32[Tensor, "C N 2"]
     """Half the sides of the box outside which the Gaussian is fainter than 1/255 [px], rounded up."""
-    sort_depths: Float64[Tensor, "C N"]
-    """Camera z as computed, to sort by."""
-    centers: Float[Tensor, "C N 4"]
-    """means2d as whole x, whole y, remainder x, remainder y."""
-    whitenings: Float[Tensor, "C N 4"]
-    """Rows of W with W^T W the inverse covariance."""
-    boxes: Int32[Tensor, "C N 4"]
-    """Pixels x0, y0, x1, y1 (past the end) that the Gaussian can reach."""
+    records: UInt8[Tensor, "B"]
+    """For whoever draws: see `_records`."""
+
+    def tables(self) -> Tables:
+        """The records."""
+        return tables(self.records, *self.depths.shape, self.depths.dtype)
 
 
 def check_values(
@@ -107,10 +108,14 @@ def _project(
 ) -> Outputs:
     scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
     check_arrays(scene, opacities=(opacities, means.shape[:1], means.dtype))
-    out = empty_outputs(means, viewmats)
-    if len(means) and len(viewmats) and has_vectors(means):
+    out = empty_outputs(means, viewmats, width, height)
+    if has_cuda_kernels(means) or (len(means) and len(viewmats) and has_vectors(means)):
         # The kernel looks at the values as it reads them; what is wrong with them is for the slow checks to say.
-        sound = project_vectors(scene.contiguous(), opacities.contiguous(), Limits(*limits), out)
+        scene, opacities = scene.contiguous(), opacities.contiguous()
+        if means.is_cuda:
+            sound = project_cuda(scene, opacities, Limits(*limits), out, validate)
+        else:
+            sound = project_vectors(scene, opacities, Limits(*limits), out)
         if validate and not sound:
             check_values(means, quats, scales, covars, opacities, viewmats, Ks)
             raise AssertionError("the kernel has met a bad value that is not in its inputs")
@@ -129,9 +134,12 @@ def _project_fake(
     covars: Tensor | None,
     opacities: Tensor,
     viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
     *_: Any,
 ) -> Outputs:
-    return empty_outputs(means, viewmats)
+    return empty_outputs(means, viewmats, width, height)
 
 
 def _project_backward(
@@ -164,7 +172,7 @@ def _project_backward(
             gradient.zero_()
         return out
     incoming = Incoming(g_means2d, g_covars2d, g_depths).contiguous()
-    run = backward_vectors if has_vectors(means) else backward_generic
+    run = backward_vectors if has_vectors(means) else backward_cuda if has_cuda_kernels(means) else backward_generic
     named = {name: g for name, g, asked in zip(INPUTS, out, wanted, strict=True) if asked}
     run(scene.contiguous(), radii.contiguous(), incoming, named)
     return out

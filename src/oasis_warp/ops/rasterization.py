@@ -1,5 +1,8 @@
 """3D Gaussians -> images: the public rasterizer, with gsplat's signature."""
 
+from collections.abc import Sequence
+from contextlib import nullcontext
+from operator import is_
 from typing import Any
 
 import torch
@@ -7,12 +10,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels import constants
+from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.checks import check_choice
+from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._scene_checks import check_cameras, check_coefficients, check_colors, check_gaussians
-from oasis_warp.ops._values import check_finite
+from oasis_warp.ops._values import Look, check_finite
 from oasis_warp.ops.blending import blend
-from oasis_warp.ops.projection import Projection, project
-from oasis_warp.ops.spherical_harmonics import spherical_harmonics
+from oasis_warp.ops.projection import project
+from oasis_warp.ops.seen_colors import seen_colors
 
 UNSUPPORTED: dict[str, tuple[Any, str]] = {
     "sparse_grad": (False, "Gradients are dense."),
@@ -30,6 +35,8 @@ UNSUPPORTED: dict[str, tuple[Any, str]] = {
     "viewmats_rs": (None, "The whole image has one pose."),
 }
 """Arguments of gsplat that are taken by name: their default, and what to do instead of another value."""
+USUAL = tuple(default for default, _ in UNSUPPORTED.values())
+RENDER_MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
 
 
 def rasterization(
@@ -123,7 +130,8 @@ def rasterization(
         rolling_shutter: Not supported.
         viewmats_rs: Not supported.
         validate: Look at the values of the tensors: refuse NaN, infinities, magnitudes above 1e15, zero quaternions,
-            opacities outside [0, 1] and zero focal lengths. Waits for a CUDA device; switch it off for trusted inputs.
+            opacities outside [0, 1] and zero focal lengths. Waits for a CUDA device; switch it off for trusted inputs,
+            and while a CUDA graph is being captured.
 
     Returns:
         render: Shape [C, H, W, X], X being D, 1 or D + 1.
@@ -134,15 +142,18 @@ def rasterization(
     Raises:
         ValueError: names the argument, what was expected and what it was.
     """
-    arguments = locals()
-    for name, (default, hint) in UNSUPPORTED.items():
-        refuse_unless_default(name, arguments[name], default, hint)
-    check_choice("render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
+    unsupported = (
+        sparse_grad, absgrad, rasterize_mode, distributed, camera_model, with_ut, with_eval3d, radial_coeffs,
+        tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, rolling_shutter, viewmats_rs,
+    )  # fmt: skip
+    if not all(map(is_, unsupported, USUAL)):
+        refuse_unsupported(unsupported)
+    check_choice("render_mode", render_mode, RENDER_MODES)
     if covars is not None:
         quats = scales = None
     check_gaussians(means, quats, scales, covars, opacities)
     check_cameras(viewmats, Ks, means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size)
-    n_cameras = len(viewmats)
+    n_cameras = viewmats.shape[0]
     if sh_degree is not None:
         check_coefficients(colors, sh_degree, means, n_cameras)
         colors = seen_colors(sh_degree, means, colors, viewmats)
@@ -150,25 +161,54 @@ def rasterization(
     if validate and render_mode in ("D", "ED") and not torch.compiler.is_compiling():
         check_finite(colors=colors, backgrounds=backgrounds)  # nobody draws them, who would see what is wrong
 
-    projection = project(
-        means, quats, scales, opacities, viewmats, Ks, width, height, near_plane=near_plane, far_plane=far_plane,
-        radius_clip=radius_clip, eps2d=eps2d, covars=covars, validate=validate,
-    )  # fmt: skip
+    # Projection waits for what it says of its own inputs: a look at the others costs next to nothing meanwhile.
+    looking = validate and render_mode == "RGB" and means.is_cuda and not is_traced()
+    with Look(colors=colors, backgrounds=backgrounds) if looking else nullcontext():
+        projection = project(
+            means, quats, scales, opacities, viewmats, Ks, width, height, near_plane=near_plane, far_plane=far_plane,
+            radius_clip=radius_clip, eps2d=eps2d, covars=covars, validate=validate,
+        )  # fmt: skip
     opacities = for_each_camera(opacities, n_cameras)
     colors = for_each_camera(colors, n_cameras) if colors.dim() == 2 else colors
     channels = layers_to_blend(colors, projection.depths, render_mode)
+    n_channels = channels.shape[-1]
     if backgrounds is None or render_mode in ("D", "ED"):
-        behind = channels.new_zeros(n_cameras, channels.shape[-1])
-    else:
-        behind = torch.nn.functional.pad(backgrounds, (0, channels.shape[-1] - backgrounds.shape[-1]))
-    render, alphas = blend(projection, opacities, channels, behind, width, height, tile_size, validate=validate)
+        backgrounds = plain_background((0.0,) * n_channels, n_cameras, like=means)
+    elif n_channels > backgrounds.shape[-1]:
+        backgrounds = torch.nn.functional.pad(backgrounds, (0, n_channels - backgrounds.shape[-1]))
+    render, alphas = blend(
+        projection, opacities, channels, backgrounds, width, height, tile_size, validate=validate and not looking
+    )
     if render_mode in ("ED", "RGB+ED"):
         # Over the weights' own sum: alpha, as 1 - T, has lost digits where little was drawn.
         depth, cover = render[..., -2:-1], render[..., -1:]
         drawn = cover > 0
         expected = torch.where(drawn, depth / torch.where(drawn, cover, 1), 0)
         render = torch.cat([render[..., :-2], expected], -1)
-    return render, alphas, describe(projection, opacities, width, height, tile_size)
+    meta = {
+        "camera_ids": None,
+        "gaussian_ids": None,
+        "means2d": projection.means2d,
+        "depths": projection.depths,
+        "conics": projection.conics,
+        "radii": projection.radii,
+        "opacities": opacities,
+        "tile_size": tile_size,
+        "width": width,
+        "height": height,
+        "n_cameras": n_cameras,
+    }
+    return render, alphas, meta
+
+
+def refuse_unsupported(values: Sequence[Any]) -> None:
+    """Refuse what is not built in among `values` of the `UNSUPPORTED` arguments.
+
+    Raises:
+        ValueError: names the argument.
+    """
+    for (name, (default, hint)), value in zip(UNSUPPORTED.items(), values, strict=True):
+        refuse_unless_default(name, value, default, hint)
 
 
 def refuse_unless_default(name: str, value: Any, default: Any, hint: str) -> None:
@@ -179,23 +219,6 @@ def refuse_unless_default(name: str, value: Any, default: Any, hint: str) -> Non
         return
     got = repr(value) if isinstance(value, bool | int | str) else type(value).__name__
     raise ValueError(f"{name}: expected {default!r}, got {got}. Not supported in this version. {hint}")
-
-
-def seen_colors(
-    sh_degree: int,
-    means: Float[Tensor, "N 3"],
-    coefficients: Float[Tensor, "N K 3"] | Float[Tensor, "C N K 3"],
-    viewmats: Float[Tensor, "C 4 4"],
-) -> Float[Tensor, "C N 3"]:
-    """Colours of the Gaussians as each camera sees them.
-
-    A far camera's centre cancels against the means in float32: their difference is taken in float64. Values are not
-    looked at: bad ones come out as bad colours, which blending refuses by that name.
-    """
-    pose = viewmats.double()
-    centres, _ = torch.linalg.solve_ex(pose[:, :3, :3], -pose[:, :3, 3:])
-    directions = (means.double() - centres.mT).to(means.dtype)
-    return (spherical_harmonics(sh_degree, directions, coefficients, validate=False) + 0.5).clamp_min(0)
 
 
 def for_each_camera(tensor: Tensor, n_cameras: int) -> Tensor:
@@ -210,22 +233,3 @@ def layers_to_blend(colors: Tensor, depths: Tensor, render_mode: str) -> Tensor:
     drawn = [] if render_mode in ("D", "ED") else [colors]
     ones = [torch.ones_like(depths)[..., None]] if render_mode in ("ED", "RGB+ED") else []
     return torch.cat([*drawn, depths[..., None], *ones], -1)
-
-
-def describe(
-    projection: Projection, opacities: Tensor, width: int, height: int, tile_size: int
-) -> dict[str, Any]:
-    """The `meta` of `rasterization`."""
-    return {
-        "camera_ids": None,
-        "gaussian_ids": None,
-        "means2d": projection.means2d,
-        "depths": projection.depths,
-        "conics": projection.conics,
-        "radii": projection.radii,
-        "opacities": opacities,
-        "tile_size": tile_size,
-        "width": width,
-        "height": height,
-        "n_cameras": len(projection.depths),
-    }

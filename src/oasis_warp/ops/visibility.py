@@ -7,7 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_warp.core.checks import check_float, check_positive, check_shape
-from oasis_warp.ops._depth_buffer import Query, Scene, draw, vertex_gradients
+from oasis_warp.ops._depth_buffer import draw, gradients
+from oasis_warp.ops._depth_scene import Query, Scene, Wanted
 from oasis_warp.ops._incidence import incidence
 from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
 from oasis_warp.ops.depth_map import batched, check_batched, check_scene
@@ -17,7 +18,10 @@ MARGIN_TAUS = 3.0
 
 
 class DepthVisibility(NamedTuple):
-    """Visibility of points, and the depth buffer it came from. The batch axis B is there if an argument has one."""
+    """Visibility of points, and the depth buffer it came from. The batch axis B is there if an argument has one.
+
+    Without `maps`, the two maps have no rows and no columns.
+    """
 
     visibility: Float[Tensor, "P"] | Float[Tensor, "B P"]
     """1 is seen, 0 is hidden."""
@@ -40,29 +44,31 @@ def _visibility(
     near_plane: float,
     tau: float,
     margin: float,
+    maps: bool,
     keep: bool,
     validate: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     table = incidence("faces", faces, vertices.shape[1], "vertices").table
     scene = Scene(vertices, table, viewmats, Ks, width, height, near_plane)
     if point_vertices is not None:
-        point_vertices = point_vertices.to(torch.int32).contiguous()
+        point_vertices = point_vertices.contiguous()
     query = Query(points, point_vertices, by_identity, tau, margin, keep)
-    buffer, scores = draw(scene, query, False, validate)
+    # The adjoint asks which face each score came from.
+    buffer, scores = draw(scene, query, Wanted(depth=maps, face_ids=maps or keep, barycentrics=False), validate)
     assert scores is not None
     return scores.visibility, buffer.depth, buffer.face_ids, scores.slopes, scores.pixels
 
 
 def _visibility_fake(
-    points, vertices, faces, viewmats, Ks, point_vertices, by_identity, width, height, near_plane, tau, margin, keep,
-    validate,
+    points, vertices, faces, viewmats, Ks, point_vertices, by_identity, width, height, near_plane, tau, margin, maps,
+    keep, validate,
 ):  # fmt: skip
     batch, n_points, _ = points.shape
-    buffer, kept = (batch, height, width), (batch, n_points if keep else 0)
+    size, nothing, kept = (batch, height, width), (batch, 0, 0), (batch, n_points if keep else 0)
     return (
         points.new_empty((batch, n_points)),
-        points.new_empty(buffer),
-        points.new_empty(buffer, dtype=torch.int32),
+        points.new_empty(size if maps else nothing),
+        points.new_empty(size if maps or keep else nothing, dtype=torch.int32),
         points.new_empty(kept),
         points.new_empty(kept, dtype=torch.int32),
     )
@@ -81,16 +87,10 @@ def _visibility_backward(
     needs_points: bool,
     needs_vertices: bool,
 ) -> tuple[Tensor, Tensor]:
-    grad_points, grad_vertices = vertices.new_empty(0), vertices.new_empty(0)
-    if needs_points:
-        # The point's depth is the third row of the view.
-        grad_points = (grad_visibility * slopes)[..., None] * viewmats[:, None, 2, :3]
-    if needs_vertices:
-        table = incidence("faces", faces, vertices.shape[1], "vertices").table
-        height, width = face_ids.shape[1:]
-        scene = Scene(vertices, table, viewmats, Ks, width, height, near_plane)
-        grad_vertices = vertex_gradients(scene, face_ids, grad_visibility, slopes, pixels)
-    return grad_points, grad_vertices
+    table = incidence("faces", faces, vertices.shape[1], "vertices").table
+    height, width = face_ids.shape[1:]
+    scene = Scene(vertices, table, viewmats, Ks, width, height, near_plane)
+    return gradients(scene, face_ids, grad_visibility, slopes, pixels, needs_points, needs_vertices)
 
 
 def _visibility_backward_fake(
@@ -127,7 +127,7 @@ def _backward(ctx, grad_visibility, *_):
     return (
         grad_points if needs_points else None,  # points
         grad_vertices if needs_vertices else None,  # vertices
-        *[None] * 12,  # the mesh's faces, the camera and the options
+        *[None] * 13,  # the mesh's faces, the camera and the options
     )
 
 
@@ -148,6 +148,7 @@ def depth_visibility(
     point_vertices: Int[Tensor, "P"] | None = None,
     near_plane: float = 0.01,
     *,
+    maps: bool = True,
     validate: bool = True,
 ) -> DepthVisibility:
     """How visible points are past a mesh: p = sigmoid((dz + margin) / tau), dz = depth buffer - depth of the point.
@@ -176,6 +177,7 @@ def depth_visibility(
         literal: Equation 4 as printed: `margin` is 0, and `point_vertices` is not used.
         point_vertices: Vertex that each point is, or -1, shape [P], the same for all of the batch.
         near_plane: Depth up to which nothing is seen [m].
+        maps: Return the depth map and its face ids too. Leaving them out saves the writing of them on CUDA.
         validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
             Shapes and indices are always checked, indices once a tensor.
 
@@ -193,6 +195,7 @@ def depth_visibility(
     if point_vertices is not None:
         check_shape("point_vertices", point_vertices, points.shape[-2], hint="One vertex a point, -1 for none.")
     batch = sizes.get("B", 1)
+    keep = needs_gradient(points, vertices)
     visibility, depth, face_ids, _, _ = _op(
         batched(points, batch, 2),
         batched(vertices, batch, 2),
@@ -206,9 +209,12 @@ def depth_visibility(
         near_plane,
         tau,
         0.0 if literal else margin,
-        needs_gradient(points, vertices),
+        maps,
+        keep,
         validate,
     )
+    if keep and not maps:
+        face_ids = face_ids[:, :0, :0]
     if "B" not in sizes:
         visibility, depth, face_ids = visibility[0], depth[0], face_ids[0]
     return DepthVisibility(visibility, depth, face_ids)

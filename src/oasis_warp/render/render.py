@@ -1,7 +1,8 @@
 """Draw Gaussians."""
 
-import torch
+from torch import Tensor
 
+from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.config import BLACK, Color
 from oasis_warp.core.types import Camera, Gaussians, Render
 from oasis_warp.ops import rasterization
@@ -12,18 +13,22 @@ def render(gaussians: Gaussians, camera: Camera, *, background: Color = BLACK) -
 
     Values are not checked here, shapes are.
     """
-    like = gaussians.means
+    means = gaussians.means
+    if isinstance(background, Tensor):
+        backgrounds = background.to(means)[None]
+    else:
+        backgrounds = plain_background(background, 1, like=means)
     images, alphas, _ = rasterization(
-        gaussians.means,
+        means,
         gaussians.quats,
         gaussians.scales,
         gaussians.opacities,
         gaussians.colors,
-        camera.viewmat[None].to(like),
-        camera.K[None].to(like),
+        camera.viewmat.to(means)[None],
+        camera.K.to(means)[None],
         camera.width,
         camera.height,
-        backgrounds=torch.as_tensor(background, dtype=like.dtype, device=like.device)[None],
+        backgrounds=backgrounds,
         validate=False,
     )
     return Render(images[0], alphas[0, ..., 0])

@@ -1,0 +1,194 @@
+"""The network: photos and posed surfaces in, canonical Gaussians out; the only file that knows the order of parts."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.network.anchors import batch_anchors, faces_of_vertices
+from oasis_warp.network.attention import Perceptron
+from oasis_warp.network.config import NetworkConfig
+from oasis_warp.network.convolutional import ConvolutionalEncoder
+from oasis_warp.network.dinov2 import DinoV2Encoder
+from oasis_warp.network.encoding import encode
+from oasis_warp.network.feature_on_mesh import FeatureOnMesh
+from oasis_warp.network.features import ImageFeatures
+from oasis_warp.network.heads import FACE_OUTPUTS, TRUST, VERTEX_OUTPUTS, GaussianHead, decode, decode_offsets
+from oasis_warp.network.inputs import NetworkInput, Prediction
+from oasis_warp.network.mean_hand import MeanHand, MeanHands
+from oasis_warp.network.observation import Sighting, sight
+from oasis_warp.network.point_features import PointEvidence, PointFeatures, seen_difference
+from oasis_warp.network.refinement import CoarseLevel, Refinement
+from oasis_warp.network.tokenizer import PlaceEncoding, Tokenizer, VisualTokens, grid_places
+from oasis_warp.network.vpia import JointAttention, VisibilityAttention
+
+HAND_LENGTH = 0.2
+"""Scale of template coordinates for their encoding [m]: they lie in [-1, 1] then."""
+TONE = 7
+"""Numbers that say how the photo's skin looks as a whole: log melanin, log gains, mean colour."""
+
+
+class HandNetwork(nn.Module):
+    """The paper's prior network for the hand model `hand`; `config` sets sizes and switches.
+
+    Runs under autocast: attention and perceptrons in the lower precision, geometry and Gaussians in float32.
+    """
+
+    faces: Tensor
+    rim: Tensor
+    vertex_faces: Tensor
+    vertex_index: Tensor
+    face_index: Tensor
+    """All vertices, and all faces that carry a Gaussian: always these tensors, as operators check indices once each."""
+    template_encoding: Tensor
+
+    def __init__(self, config: NetworkConfig, hand: HandModel):
+        super().__init__()
+        self.config = config
+        self.hand_name = hand.name
+        self._remember(hand)
+        width, heads = config.width, config.heads
+        if config.backbone == "convolutional":
+            self.encoder = ConvolutionalEncoder(config.image_size, width)
+            aligned, fine = width, self.encoder.fine_channels
+        else:
+            self.encoder = DinoV2Encoder(config.backbone, config.image_size)
+            aligned, fine = self.encoder.aligned_channels, 0
+        direct = config.point_evidence == "on"
+        self.level = None if config.n_coarse is None else CoarseLevel(hand, config.n_coarse)
+        self.mean_hands = MeanHands(hand)
+        self.geometry = Perceptron(6 * config.frequencies, width, width)
+        self.global_token = Perceptron(self.encoder.deep_channels + (TONE if direct else 0), width, width)
+        self.place = PlaceEncoding(width)
+        if config.vet == "off":
+            self.flatten = nn.Linear(self.encoder.deep_channels, width)
+        if config.vet != "off" or direct:
+            neighborhood = 1 if config.vet == "no_aggr" else config.neighborhood
+            self.point_features = PointFeatures(aligned, fine, width, neighborhood)
+        if config.vet == "mlp":
+            self.tokenizer = Perceptron(width, 4 * width, width)
+        elif config.vet != "off":
+            self.tokenizer = Tokenizer(width, heads, config.n_tokens, config.tokenizer == "literal")
+        self.point_evidence = PointEvidence(width) if direct else None
+        if config.vpia == "off":
+            self.fusion = JointAttention(width, heads)
+        else:
+            self.fusion = VisibilityAttention(width, heads, config.n_tokens, config.vpia == "on")
+        self.refinement = Refinement(width, heads, config.refine_layers) if config.refine == "on" else None
+        more = TRUST if direct else {}
+        self.vertex_head = GaussianHead(width, config.head_width, VERTEX_OUTPUTS | more)
+        if config.fom == "on":
+            self.feature_on_mesh = FeatureOnMesh(len(hand.faces))
+            self.face_head = GaussianHead(width, config.head_width, FACE_OUTPUTS | more)
+
+    def _remember(self, hand: HandModel) -> None:
+        """Keep what never changes of the hand; it is not saved with the weights."""
+        for name, tensor in {
+            "faces": hand.faces,
+            "rim": hand.rim,
+            "vertex_faces": faces_of_vertices(hand.faces, len(hand.template)),
+            "vertex_index": torch.arange(len(hand.template)),
+            "face_index": torch.arange(len(hand.faces) if self.config.fom == "on" else 0),
+            "template_encoding": encode(hand.template / HAND_LENGTH, self.config.frequencies),
+        }.items():
+            self.register_buffer(name, tensor, persistent=False)
+
+    def forward(self, inputs: NetworkInput) -> Prediction:
+        """Canonical Gaussians of every hand of the batch."""
+        with torch.autocast(inputs.image.device.type, enabled=False):
+            sighting = self.look(inputs)
+            mean = self.mean_hands(sighting.colors, sighting.confidence)
+            seen = None if self.point_evidence is None else seen_difference(sighting, mean)
+        points, local, context = self.tokens(inputs, sighting, mean, seen)
+        features = self.fuse(points, local, context, sighting.visibility)
+        if self.refinement is not None:
+            features = self.refinement(features, self.level)
+        return self.decode(features, mean.colors, seen, inputs.rest)
+
+    def look(self, inputs: NetworkInput) -> Sighting:
+        """What each photo shows of each vertex."""
+        identity = None if self.config.visibility == "literal" else self.vertex_index
+        return sight(inputs, self.faces, self.vertex_faces, identity)
+
+    def tokens(
+        self, inputs: NetworkInput, sighting: Sighting, mean: MeanHand, seen: Float[Tensor, "B V 3"] | None
+    ) -> tuple[Float[Tensor, "B V C"], Float[Tensor, "B M C"], Float[Tensor, "B C"]]:
+        """Geometric tokens, local image tokens and the global token; `seen` comes with point evidence."""
+        features = self.encoder(inputs.image, inputs.mask)
+        geometric = self.geometry(self.template_encoding).expand(len(inputs.image), -1, -1)
+        pooled = features.deep.amax((2, 3))
+        if self.point_evidence is None or seen is None:
+            context = self.global_token(pooled)
+            aligned = self._aligned(features, sighting) if self.config.vet != "off" else None
+            points, visual = geometric, self._visual(features, aligned, None, sighting)
+        else:
+            tone = torch.cat([mean.log_melanin[:, None], mean.log_gain, _mean_color(sighting)], dim=1)
+            context = self.global_token(torch.cat([pooled, tone.to(pooled.dtype)], dim=1))
+            aligned = self._aligned(features, sighting)
+            visual = self._visual(features, aligned, geometric, sighting)
+            points = geometric + self.point_evidence(aligned, seen, sighting, mean)
+            points = points + self.place(sighting.uv) * sighting.inside[..., None]
+        return points, visual.tokens + self.place(visual.centers), context
+
+    def fuse(
+        self,
+        points: Float[Tensor, "B V C"],
+        local: Float[Tensor, "B M C"],
+        context: Float[Tensor, "B C"],
+        visibility: Float[Tensor, "B V"],
+    ) -> Float[Tensor, "B V C"]:
+        """Occlusion-aware Gaussian features."""
+        if isinstance(self.fusion, VisibilityAttention):
+            return self.fusion(points, local, context, visibility)
+        if self.level is None:
+            return self.fusion(points, local, context)
+        coarse = self.level.down(points)
+        return points + self.level.up(self.fusion(coarse, local, context) - coarse)
+
+    def decode(
+        self,
+        features: Float[Tensor, "B V C"],
+        colors: Float[Tensor, "B V 3"],
+        seen: Float[Tensor, "B V 3"] | None,
+        rest: Float[Tensor, "B V 3"],
+    ) -> Prediction:
+        """Both heads, applied to the anchors on `rest`, the mean colours, and what the photo shows instead of them."""
+        raw = self.vertex_head(features)
+        barycentrics = features.new_zeros((len(features), 0, 3), dtype=torch.float32)
+        with torch.autocast(features.device.type, enabled=False):
+            anchors = batch_anchors(rest, self.faces, self.vertex_faces, self.rim)
+            offsets = decode_offsets(raw)
+        if self.config.fom == "on":
+            on_faces = self.face_head(self.feature_on_mesh(features, self.faces))
+            barycentrics = on_faces.pop("barycentrics").softmax(-1)
+            raw = {name: torch.cat([raw[name], values], dim=1) for name, values in on_faces.items()}
+            colors = torch.cat([colors, colors[:, self.faces].mean(2)], dim=1)
+            seen = None if seen is None else torch.cat([seen, seen[:, self.faces].mean(2)], dim=1)
+        count = colors.shape[1]
+        with torch.autocast(features.device.type, enabled=False):
+            attributes = decode(
+                raw, anchors.quats[:, :count], anchors.scales[:, :count], anchors.fade[:, :count], colors, seen
+            )
+        return Prediction(offsets, barycentrics, *attributes, anchors.scales[:, :count])
+
+    def _aligned(self, features: ImageFeatures, sighting: Sighting) -> Tensor:
+        return self.point_features(features, sighting.uv, sighting.inside)
+
+    def _visual(
+        self, features: ImageFeatures, aligned: Tensor | None, geometric: Tensor | None, sighting: Sighting
+    ) -> VisualTokens:
+        if self.config.vet == "off" or aligned is None:
+            tokens = self.flatten(features.deep.flatten(2).transpose(1, 2))
+            places = grid_places(*features.deep.shape[2:], like=sighting.uv)
+            return VisualTokens(tokens, places.expand(len(tokens), -1, -1))
+        if isinstance(self.tokenizer, Tokenizer):
+            return self.tokenizer(aligned, geometric, sighting.uv, sighting.inside)
+        if self.level is None:
+            return VisualTokens(self.tokenizer(aligned), sighting.uv)
+        return VisualTokens(self.tokenizer(self.level.down(aligned)), self.level.down(sighting.uv))
+
+
+def _mean_color(sighting: Sighting) -> Float[Tensor, "B 3"]:
+    """Of what is seen well."""
+    weight = sighting.confidence[..., None]
+    return (weight * sighting.colors).sum(1) / weight.sum(1).clamp_min(1)

@@ -1,0 +1,83 @@
+"""Gaussian heads: features -> attributes, as changes of the anchors and the mean colours (equation 8).
+
+The last layer of a head starts at zero, so that an untrained network draws the mean hand.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import gelu, normalize
+
+from oasis_warp.avatar.anchors import OPACITY
+from oasis_warp.core import rotation
+
+MAX_LOG_SCALE = math.log(4.0)
+"""A Gaussian is at most this much larger or smaller than its anchor."""
+MAX_OFFSET = 0.012
+"""Farthest that a vertex Gaussian can leave its vertex along an axis [m]; the loss pulls from half of it on."""
+COLOR_MARGIN = 1e-3
+"""Distance that mean colours keep from 0 and 1, where the logit ends."""
+SHARED = {"quats": 4, "scales": 3, "opacities": 1, "colors": 3}
+VERTEX_OUTPUTS = {**SHARED, "offsets": 3}
+FACE_OUTPUTS = {**SHARED, "barycentrics": 3}
+TRUST = {"trust": 1}
+"""Further output where points are told what the photo shows of them: how much of it to take over."""
+
+
+class GaussianHead(nn.Module):
+    """Layer norm and a three-layer perceptron that names what it puts out."""
+
+    def __init__(self, width: int, hidden: int, outputs: dict[str, int]):
+        super().__init__()
+        self.outputs = outputs
+        self.norm = nn.LayerNorm(width)
+        self.first, self.second = nn.Linear(width, hidden), nn.Linear(hidden, hidden)
+        self.last = nn.Linear(hidden, sum(outputs.values()))
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(self, features: Float[Tensor, "B N C"]) -> dict[str, Float[Tensor, "B N _"]]:
+        """Raw outputs in float32, without a unit; 0 means no change."""
+        raw = self.last(gelu(self.second(gelu(self.first(self.norm(features)))))).float()
+        return dict(zip(self.outputs, raw.split(list(self.outputs.values()), dim=-1), strict=True))
+
+
+class Attributes(NamedTuple):
+    """What vertex and face Gaussians have in common."""
+
+    quats: Float[Tensor, "B N 4"]
+    scales: Float[Tensor, "B N 3"]
+    opacities: Float[Tensor, "B N"]
+    colors: Float[Tensor, "B N 3"]
+
+
+def decode(
+    raw: dict[str, Tensor],
+    quats: Float[Tensor, "B N 4"],
+    scales: Float[Tensor, "B N 3"],
+    fade: Float[Tensor, "B N"],
+    colors: Float[Tensor, "B N 3"],
+    seen: Float[Tensor, "B N 3"] | None,
+) -> Attributes:
+    """Apply raw outputs to anchors and mean colours; raw zeros return them.
+
+    A rotation turns in the anchor's own frame, a scale grows by exp of a bounded number, opacity moves in logits below
+    what the wrist's fade allows, colour moves in logits, and with `seen`, the photo's difference from `colors` in
+    logits, by the share of it that the head trusts.
+    """
+    identity = raw["quats"].new_tensor([1.0, 0, 0, 0])
+    turn = normalize(raw["quats"] + identity, dim=-1, eps=1e-6)
+    grow = (MAX_LOG_SCALE * torch.tanh(raw["scales"] / MAX_LOG_SCALE)).exp()
+    opacity = torch.sigmoid(raw["opacities"][..., 0] + math.log(OPACITY / (1 - OPACITY)))
+    color = raw["colors"] + torch.logit(colors, COLOR_MARGIN)
+    if seen is not None:
+        color = color + raw["trust"] * seen
+    return Attributes(rotation.multiply(quats, turn), scales * grow, fade * opacity, torch.sigmoid(color))
+
+
+def decode_offsets(raw: dict[str, Tensor]) -> Float[Tensor, "B V 3"]:
+    """Shifts of vertex Gaussians [m]: a raw 1 is about 10 mm."""
+    return MAX_OFFSET * torch.tanh(raw["offsets"])

@@ -1,0 +1,150 @@
+"""The weights file: safetensors with a JSON header that says what network they belong to; loading executes nothing.
+
+Its metadata have one entry, "oasis-network": a JSON object with `version`, `config` (every field of `NetworkConfig`),
+`hand_model`, `n_vertices`, `n_faces`, `creator` and `notes` (free text by the trainer). A frozen backbone's weights are
+not in it: they lie in a file of their own.
+"""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from oasis_warp import __version__
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.data.atomic import write_file
+from oasis_warp.network.config import NetworkConfig
+from oasis_warp.network.dinov2 import DinoV2Encoder
+from oasis_warp.network.hand_network import HandNetwork
+
+FORMAT = "oasis-network"
+VERSION = 1
+PRECISIONS = {"float16": torch.float16, "float32": torch.float32}
+HEADER = {"version": int, "config": dict, "hand_model": str, "n_vertices": int, "n_faces": int}
+"""Keys that a header has at least, and their types."""
+
+
+def save_network(
+    path: Path | str, network: HandNetwork, *, precision: Literal["float16", "float32"] = "float16", notes: str = ""
+) -> None:
+    """Write the trained weights of `network`, all or nothing.
+
+    Raises:
+        ValueError: a weight is not finite, or too large for `precision`.
+        InputError: `path` cannot be written.
+    """
+    stored = {}
+    for name, tensor in trained_state(network).items():
+        stored[name] = tensor.to("cpu", PRECISIONS[precision]).contiguous()
+        if not bool(stored[name].isfinite().all()):
+            raise ValueError(f"network: expected weights that {precision} can hold, got others in {name}.")
+    header = {
+        "version": VERSION,
+        "config": asdict(network.config),
+        "hand_model": network.hand_name,
+        "n_vertices": len(network.template_encoding),
+        "n_faces": len(network.faces),
+        "creator": f"oasis_warp {__version__}",
+        "notes": notes,
+    }
+    write_file(path, save(stored, {FORMAT: json.dumps(header, allow_nan=False, sort_keys=True)}))
+
+
+def load_network(path: Path | str, hand: HandModel, *, backbone_weights: Path | str | None = None) -> HandNetwork:
+    """The network of a weights file, in float32 on the CPU, for inference.
+
+    Args:
+        path: What `save_network` wrote.
+        hand: The hand model that it was trained for.
+        backbone_weights: DINOv2's own file, where the network reads photos with it.
+
+    Raises:
+        InputError: missing, no weights file, of a newer version, cut short, for another hand model, with tensors that
+            are missing, unknown or of another shape; or the backbone's file is missing.
+    """
+    path = Path(path)
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no such file"
+        raise InputError(f"{path}: expected a network's weights, found {found}; `oasis pretrain` writes them.")
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = _read_header(path, (file.metadata() or {}).get(FORMAT))
+            tensors = {name: file.get_tensor(name).float() for name in file.keys()}
+    except SafetensorError as error:
+        raise InputError(
+            f"{path}: expected a network's weights, got another format or a file cut short ({error}); copy it again."
+        ) from error
+    config = _read_config(path, header["config"])
+    got = (header["hand_model"], header["n_vertices"], header["n_faces"])
+    want = (hand.name, len(hand.template), len(hand.faces))
+    if got != want:
+        raise InputError(
+            f"{path}: trained for the hand model {got[0]!r} ({got[1]} vertices, {got[2]} faces), but the one in use is "
+            f"{want[0]!r} ({want[1]}, {want[2]}); give weights that fit."
+        )
+    network = HandNetwork(config, hand)
+    _fill(path, network, tensors)
+    if isinstance(network.encoder, DinoV2Encoder):
+        if backbone_weights is None:
+            raise InputError(f"{path}: reads photos with {config.backbone}; give the file of its weights too.")
+        network.encoder.load(Path(backbone_weights))
+    return network.eval()
+
+
+def trained_state(network: HandNetwork) -> dict[str, Tensor]:
+    """The tensors that training changes: all but a frozen backbone's."""
+    frozen = isinstance(network.encoder, DinoV2Encoder)
+    return {
+        name: tensor.detach()
+        for name, tensor in network.state_dict().items()
+        if not (frozen and name.startswith("encoder."))
+    }
+
+
+def _read_header(path: Path, text: str | None) -> dict[str, Any]:
+    if text is None:
+        raise InputError(f"{path}: a safetensors file, but no network of ours; give the one `oasis pretrain` wrote.")
+    try:
+        header = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: damaged, its header is no JSON ({error}); copy it again.") from error
+    version = header.get("version") if isinstance(header, dict) else None
+    if isinstance(version, int) and version > VERSION:
+        raise InputError(
+            f"{path}: a network of version {version}, but {VERSION} is the last known here; update oasis-warp."
+        )
+    known = header if isinstance(header, dict) else {}
+    wrong = [key for key, kind in HEADER.items() if not isinstance(known.get(key), kind)]
+    if wrong or version != VERSION:
+        raise InputError(f"{path}: damaged, its header has no valid {(wrong or ['version'])[0]}; copy it again.")
+    return known
+
+
+def _read_config(path: Path, stored: dict[str, Any]) -> NetworkConfig:
+    try:
+        return NetworkConfig(**stored)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: its header describes no network known here ({error}); update oasis-warp.") from error
+
+
+def _fill(path: Path, network: HandNetwork, tensors: dict[str, Tensor]) -> None:
+    own = trained_state(network)
+    wrong = sorted(
+        name for name in own.keys() | tensors.keys()
+        if name not in own or name not in tensors or own[name].shape != tensors[name].shape
+    )  # fmt: skip
+    if wrong:
+        raise InputError(
+            f"{path}: {len(wrong)} tensors do not fit the network that the header describes, {wrong[0]} first; "
+            "copy it again."
+        )
+    bad = [name for name, tensor in tensors.items() if not bool(tensor.isfinite().all())]
+    if bad:
+        raise InputError(f"{path}: damaged, {bad[0]} holds values that are not finite; copy it again.")
+    network.load_state_dict(tensors, strict=False)

@@ -1,0 +1,159 @@
+"""How many pairs of a Gaussian and a tile a CUDA rasterization has: read off the device, or expected in a graph.
+
+An eager call waits for its count, the one moment at which the host waits for the device, and takes memory for exactly
+that many. A call that a CUDA graph captures cannot wait: it takes what the last eager call of its kind needed and half
+as much again. Where a replay needs more, lists that do not fit stay empty, and `Overflow.happened` says so.
+"""
+
+import threading
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from oasis_kernels.cuda_binning import REPORT
+from oasis_warp.ops._tiles import MAX_PAIRS
+
+PAGE = 4096
+"""Words of host memory that are taken at a time for reports."""
+SLACK = 1.5
+
+
+class Counts(NamedTuple):
+    """What a call needs, or has memory for."""
+
+    pairs: int
+    longest: int
+    """Length of the longest list of a tile."""
+
+
+Kind = tuple[torch.device, int, int, int, int]
+"""Device, cameras, Gaussians, width, height."""
+_last: dict[Kind, Counts] = {}
+
+
+class _Slots:
+    """Words of page-locked host memory that kernels write to, handed out in parts of `REPORT`."""
+
+    def __init__(self) -> None:
+        self.free: list[Tensor] = []
+        self.lock = threading.Lock()
+
+    def take(self) -> Tensor:
+        with self.lock:
+            if not self.free:
+                page = torch.zeros(PAGE, dtype=torch.int64, pin_memory=True)
+                self.free = list(page[: PAGE // REPORT * REPORT].split(REPORT))
+            return self.free.pop()
+
+    def give(self, slot: Tensor) -> None:
+        with self.lock:
+            self.free.append(slot)
+
+
+slots = _Slots()
+"""For kernels that tell the host a few numbers."""
+
+
+class _Own(threading.local):
+    """A slot a thread, for calls that wait."""
+
+    def __init__(self) -> None:
+        self.slot = slots.take()
+        weakref.finalize(threading.current_thread(), slots.give, self.slot)
+
+
+_own: _Own | None = None
+_start = threading.Lock()
+
+
+def own_slot() -> Tensor:
+    """Host memory [REPORT], int64, of this thread, for one call at a time that waits for the device."""
+    global _own
+    with _start:
+        if _own is None:  # not at import: page-locked memory needs a device
+            _own = _Own()
+    return _own.slot
+
+
+class Overflow:
+    """Whether graphs that were captured while this was watching have met more pairs than they have memory for."""
+
+    def __init__(self) -> None:
+        self._reports: list[tuple[Tensor, Counts]] = []
+
+    def expect(self, kind: Kind) -> tuple[Tensor, Counts]:
+        """A report's memory and the capacity for a call of this `kind`."""
+        slot, capacity = slots.take().zero_(), capacity_of(kind)
+        self._reports.append((slot, capacity))
+        weakref.finalize(self, slots.give, slot)
+        return slot, capacity
+
+    def happened(self) -> bool:
+        """Whether the last replay overflowed; wait for it first (`torch.cuda.synchronize`).
+
+        If so, call eagerly once and capture again.
+        """
+        return any(
+            slot[0].item() > capacity.pairs or slot[1].item() > capacity.longest for slot, capacity in self._reports
+        )
+
+
+_watching: ContextVar[Overflow | None] = ContextVar("watching", default=None)
+
+
+@contextmanager
+def watch_overflow() -> Iterator[Overflow]:
+    """Watch the rasterizations that a CUDA graph captures inside the block.
+
+    A captured call of `rasterization` has memory for half as many pairs of a Gaussian and a tile again as the last
+    eager call with the same device, numbers of cameras and Gaussians, and size. After a replay that needed more, the
+    picture lacks Gaussians and `Overflow.happened()` is true. Capturing outside such a block is refused, for nobody
+    would learn of it.
+    """
+    overflow = Overflow()
+    token = _watching.set(overflow)
+    try:
+        yield overflow
+    finally:
+        _watching.reset(token)
+
+
+def capacity_of(kind: Kind) -> Counts:
+    """Memory for a captured call.
+
+    Raises:
+        RuntimeError: no eager call of this kind has been made.
+    """
+    if kind not in _last:
+        device, n_cameras, n, width, height = kind
+        raise RuntimeError(
+            f"rasterization: expected an eager call before it is captured in a CUDA graph, got none with {n_cameras} "
+            f"cameras of {width} x {height} px and {n} Gaussians on {device}. Warm up with the same sizes."
+        )
+    last = _last[kind]
+    return Counts(min(int(SLACK * last.pairs) + 4096, MAX_PAIRS), int(SLACK * last.longest) + 32)
+
+
+def watching() -> Overflow:
+    """Who watches this capture.
+
+    Raises:
+        RuntimeError: nobody does.
+    """
+    overflow = _watching.get()
+    if overflow is None:
+        raise RuntimeError(
+            "rasterization: expected a capture inside `with watch_overflow() as overflow`, got one outside. "
+            "Pictures of a graph are whole only while overflow.happened() is false."
+        )
+    return overflow
+
+
+def remember(kind: Kind, counts: Counts) -> None:
+    """Keep what an eager call needed."""
+    _last[kind] = counts

@@ -1,0 +1,188 @@
+"""Train the prior network on many hands: paper, section 4.1 and appendix B.2."""
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.types import TrainingBatch
+from oasis_warp.data.atomic import write_file
+from oasis_warp.data.pictures import to_uint8, write_picture
+from oasis_warp.losses.detail import detail_difference
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.inputs import input_of_batch
+from oasis_warp.network.weights_file import save_network
+from oasis_warp.training.checkpoint import load_checkpoint, save_checkpoint
+from oasis_warp.training.distributed import Place, mean_over_processes
+from oasis_warp.training.losses import LossConfig, Perceptual, objective, picture_psnr
+from oasis_warp.training.targets import Pictures, draw_targets, true_pictures
+
+CHECKPOINT, WEIGHTS, METRICS, SHEET = "checkpoint.safetensors", "network.safetensors", "metrics.jsonl", "pictures.png"
+"""What training leaves in its folder."""
+SHEET_HANDS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class PretrainConfig:
+    """How the prior is trained."""
+
+    steps: int = 20_000
+    """Batches that each process sees."""
+    learning_rate: float = 4e-4
+    """Of Adam, at its highest; the paper's."""
+    warmup: int = 200
+    """Steps over which the learning rate rises from nothing."""
+    decay: Literal["cosine", "none"] = "cosine"
+    """Down to nothing at the last step, which short trainings need, or constant as in the paper."""
+    precision: Literal["bfloat16", "float32"] = "bfloat16"
+    """Of attention and perceptrons; geometry, Gaussians and weights are float32."""
+    clip: float = 1.0
+    """Largest norm of the gradient of all weights together; a longer one is shortened."""
+    losses: LossConfig = field(default_factory=LossConfig)
+    checkpoint_every: int = 500
+    """Steps between two checkpoints."""
+    log_every: int = 20
+    """Steps between two lines of metrics."""
+
+
+@runtime_checkable
+class BatchSource(Protocol):
+    """Training data. Batch k of a process depends on k, rank and world alone, so that training can go on anywhere."""
+
+    def __call__(self, first_step: int, rank: int, world: int) -> Iterator[TrainingBatch]:
+        """Batches from step `first_step` on, on the device of the network."""
+        ...
+
+
+class StepResult(NamedTuple):
+    """What one step found; numbers are still on the device."""
+
+    loss: Tensor
+    terms: dict[str, Tensor]
+    psnr: Tensor
+    drawn: Pictures
+    true: Pictures
+
+
+def learning_rate(config: PretrainConfig, step: int) -> float:
+    """Of step `step`, counted from 0."""
+    rise = min(1.0, (step + 1) / max(config.warmup, 1))
+    fall = 0.5 + 0.5 * math.cos(math.pi * step / config.steps) if config.decay == "cosine" else 1.0
+    return config.learning_rate * rise * fall
+
+
+class Trainer:
+    """A network in training, and its optimiser; `step` counts the steps done."""
+
+    def __init__(
+        self,
+        network: HandNetwork,
+        config: PretrainConfig,
+        place: Place,
+        perceptual: Perceptual = detail_difference,
+    ):
+        self.network = network.to(place.device).train()
+        self.config, self.place, self.perceptual = config, place, perceptual
+        self.trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
+        self.optimizer = torch.optim.Adam(self.trained, lr=config.learning_rate, fused=place.device.type == "cuda")
+        self.model: torch.nn.Module = network
+        if place.world > 1:
+            devices = [place.device.index] if place.device.type == "cuda" else None
+            self.model = DistributedDataParallel(network, device_ids=devices, broadcast_buffers=False)
+        self.step = 0
+
+    def advance(self, batch: TrainingBatch) -> StepResult:
+        """One step of Adam; no value is waited for."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.config, self.step)
+        result = self.evaluate(batch)
+        self.optimizer.zero_grad(set_to_none=True)
+        result.loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
+        self.optimizer.step()
+        self.step += 1
+        return result
+
+    def evaluate(self, batch: TrainingBatch) -> StepResult:
+        """Predict, draw every target and compare."""
+        half = self.config.precision == "bfloat16"
+        with torch.autocast(self.place.device.type, torch.bfloat16, enabled=half):
+            prediction = self.model(input_of_batch(batch))
+        drawn = draw_targets(prediction, batch, self.network)
+        true = true_pictures(batch, self.network.faces, self.network.rim)
+        loss, terms = objective(prediction, drawn, true, self.config.losses, self.perceptual)
+        return StepResult(loss, terms, picture_psnr(drawn, true), drawn, true)
+
+
+def pretrain(
+    network: HandNetwork,
+    source: BatchSource,
+    config: PretrainConfig,
+    folder: Path,
+    place: Place,
+    *,
+    perceptual: Perceptual = detail_difference,
+    progress: Progress = silent,
+) -> None:
+    """Train until `config.steps`, going on from the checkpoint in `folder` where there is one.
+
+    Leaves there a checkpoint, the weights in half precision, a line of JSON every few steps and a sheet of pictures:
+    photo, target, drawn. Process 0 writes. A training that was stopped and taken up again ends, on the CPU, with the
+    bits of one that was not, as steps and batches count from the start and nothing else is random.
+
+    Raises:
+        InputError: a checkpoint of another network, a folder that cannot be written, or a loss that is not finite.
+    """
+    trainer = Trainer(network, config, place, perceptual)
+    if (folder / CHECKPOINT).is_file():
+        trainer.step = load_checkpoint(folder / CHECKPOINT, network, trainer.optimizer)
+    if place.rank == 0:
+        _forget_after(folder / METRICS, trainer.step)
+    began, first = time.perf_counter(), trainer.step
+    batches = source(trainer.step, place.rank, place.world)
+    while trainer.step < config.steps:
+        batch = next(batches)
+        result = trainer.advance(batch)
+        stop_here = trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps
+        if trainer.step % config.log_every == 0 or stop_here:
+            names = ["loss", "psnr", *result.terms]
+            values = torch.stack([result.loss, result.psnr, *result.terms.values()]).detach()
+            numbers = dict(zip(names, mean_over_processes(values, place.world).tolist(), strict=True))
+            if not math.isfinite(numbers["loss"]):
+                raise InputError(f"{folder}: the loss is not finite at step {trainer.step}; lower the learning rate.")
+            if place.rank == 0:
+                pace = (time.perf_counter() - began) / (trainer.step - first)
+                line = {"step": trainer.step, "seconds_per_step": pace, **numbers}
+                with (folder / METRICS).open("a") as file:
+                    file.write(json.dumps(line) + "\n")
+            progress("pretraining", trainer.step, config.steps)
+        if place.rank == 0 and stop_here:
+            save_checkpoint(folder / CHECKPOINT, network, trainer.optimizer, trainer.step)
+            save_network(folder / WEIGHTS, network, notes=json.dumps({"step": trainer.step, **asdict(config)}))
+            write_picture(folder / SHEET, to_uint8(_sheet(batch, result)))
+
+
+def _forget_after(path: Path, step: int) -> None:
+    """Drop the lines of steps that will be done again."""
+    if path.is_file():
+        lines = [line for line in path.read_text().splitlines() if json.loads(line)["step"] <= step]
+        write_file(path, "".join(line + "\n" for line in lines).encode())
+
+
+def _sheet(batch: TrainingBatch, result: StepResult) -> Tensor:
+    """A row a hand: its photo, its first target, and what was drawn of it."""
+    targets = batch.target_images.shape[1]
+    size = batch.target_images.shape[2]
+    photos = batch.image.permute(0, 3, 1, 2)
+    photos = torch.nn.functional.interpolate(photos, size=(size, size), mode="bilinear").permute(0, 2, 3, 1)
+    columns = [photos, result.true.images[::targets], result.drawn.images.detach()[::targets]]
+    return torch.cat([column[:SHEET_HANDS].flatten(0, 1) for column in columns], dim=1)

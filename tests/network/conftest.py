@@ -1,0 +1,60 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, evidence_of
+
+from oasis_warp.avatar.prior import MeanPrior
+from oasis_warp.network.config import COMPACT
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.inputs import NetworkInput, input_of_evidence
+
+
+@pytest.fixture(scope="session")
+def tiny():
+    """The compact profile with few channels: every part is there, a pass takes a fifth of a second."""
+    return replace(
+        COMPACT, image_size=64, width=32, heads=2, n_tokens=16, n_coarse=64, refine_layers=1, head_width=16
+    )
+
+
+@pytest.fixture(scope="session")
+def evidences(hand):
+    """A light palm and a dark back."""
+    prior = MeanPrior(hand)
+    light, _, _ = evidence_of(hand, prior.vertex_colors(0.02), size=64, orientation=PALM_TO_CAMERA)
+    dark, _, _ = evidence_of(
+        hand, prior.vertex_colors(0.2), size=64, orientation=BACK_TO_CAMERA, pose_name="fist"
+    )
+    return light, dark
+
+
+@pytest.fixture(scope="session")
+def batch(evidences):
+    return NetworkInput(*(torch.cat(parts) for parts in zip(*map(input_of_evidence, evidences), strict=True)))
+
+
+@pytest.fixture(scope="session")
+def make_network(hand):
+    def make(config, awake=True):
+        """Seeded weights; `awake` ones have heads that say something, and gates and biases that are not at rest."""
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            network = HandNetwork(config, hand)
+            if awake:
+                for name, parameter in network.named_parameters():
+                    if not parameter.any() or "norm" in name:
+                        torch.nn.init.normal_(parameter, std=0.1)
+        return network
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def network(make_network, tiny):
+    return make_network(tiny)
+
+
+@pytest.fixture
+def random():
+    return torch.Generator().manual_seed(0)

@@ -1,0 +1,218 @@
+"""Bone transforms: twin, gradients, laws, poison values, messages."""
+
+import math
+
+import pytest
+import torch
+from reference.kinematics import bone_transforms as twin
+from reference.kinematics import joint_rotations
+
+from oasis_warp.core.rotation import from_axis_angle, to_matrix
+from oasis_warp.ops import bone_transforms, skin
+
+PARENTS = (-1, 0, 1, 1, 0, 4, 3)  # a chain of four, two forks
+FLOATS = ("angles", "orientation", "translation", "joints")
+
+
+def skeleton(seed, dtype=torch.float64, device="cpu", poses=()):
+    """Random joints, axes and poses."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(device, dtype)
+
+    n = len(PARENTS)
+    return {
+        "angles": normal(*poses, n - 1, 3),
+        "orientation": to_matrix(normal(*poses, 4)),
+        "translation": normal(*poses, 3),
+        "joints": normal(n, 3),
+        "axes": torch.nn.functional.normalize(normal(n, 3, 3), dim=-1),
+        "parents": PARENTS,
+    }
+
+
+def rel(a, b):
+    """Relative L2 distance."""
+    return (a.detach().double().cpu() - b.detach()).norm() / b.detach().norm()
+
+
+def weighted(out, seed=0):
+    """A random weighting of all outputs."""
+    generator = torch.Generator().manual_seed(seed)
+    return sum((o * torch.randn(o.shape, generator=generator, dtype=torch.float64).to(o)).sum() for o in out)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("seed", range(3))
+def test_values_and_gradients_are_those_of_the_twin(seed, dtype, device):
+    ours = skeleton(seed, dtype, device)
+    theirs = {name: t.cpu().double() if name != "parents" else t for name, t in ours.items()}
+    leaves = [ours[name].requires_grad_() for name in FLOATS]
+    wide = [theirs[name].requires_grad_() for name in FLOATS]
+    got, want = bone_transforms(**ours), twin(**theirs)
+    # Axes are rounded to the same numbers; the twin's formulas are exact for unit ones, and so is the adjoint.
+    tolerance = 2e-7 if dtype == torch.float32 else 1e-14
+    for a, b in zip(got, want, strict=True):
+        assert a.dtype == dtype and rel(a, b) < tolerance
+    pairs = zip(
+        FLOATS, torch.autograd.grad(weighted(got), leaves), torch.autograd.grad(weighted(want), wide), strict=True
+    )
+    for name, a, b in pairs:
+        assert rel(a, b) < (1e-6 if dtype == torch.float32 else 1e-13), name
+
+
+@pytest.mark.parametrize("poses", [(), (2,)])
+def test_gradcheck_passes_for_every_input(poses):
+    arguments = skeleton(3, poses=poses)
+    leaves = [arguments[name].requires_grad_() for name in FLOATS]
+    assert torch.autograd.gradcheck(lambda *floats: tuple(bone_transforms(*floats, arguments["axes"], PARENTS)), leaves)
+
+
+@pytest.mark.parametrize("wanted", FLOATS)
+def test_only_inputs_that_require_a_gradient_get_one_and_it_is_the_same(wanted):
+    alone, together = skeleton(4), skeleton(4)
+    alone[wanted].requires_grad_()
+    for name in FLOATS:
+        together[name].requires_grad_()
+    for arguments in (alone, together):
+        weighted(bone_transforms(**arguments)).backward()
+    assert [name for name in FLOATS if alone[name].grad is not None] == [wanted]
+    assert torch.equal(alone[wanted].grad, together[wanted].grad)
+
+
+def test_the_gradient_of_one_output_is_its_share_of_the_gradient_of_both():
+    arguments = skeleton(5)
+    arguments["angles"].requires_grad_()
+    out = bone_transforms(**arguments)
+    generator = torch.Generator().manual_seed(0)
+    parts = [(o * torch.randn(o.shape, generator=generator, dtype=torch.float64)).sum() for o in out]
+    shares = [torch.autograd.grad(part, arguments["angles"], retain_graph=True)[0] for part in parts]
+    torch.testing.assert_close(sum(shares), torch.autograd.grad(sum(parts), arguments["angles"])[0])
+
+
+def test_a_second_derivative_is_refused():
+    arguments = skeleton(6)
+    arguments["angles"].requires_grad_()
+    out = bone_transforms(**arguments)
+    (first,) = torch.autograd.grad(weighted(out), arguments["angles"], create_graph=True)
+    with pytest.raises(RuntimeError, match="bone_transforms: expected one derivative"):
+        first.sum().backward()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_many_poses_are_what_as_many_calls_give(dtype, device):
+    arguments = skeleton(7, dtype, device, poses=(5,))
+    leaves = [arguments[name].requires_grad_() for name in FLOATS]
+    together = bone_transforms(**arguments)
+    alone = [
+        bone_transforms(*(leaf[k] for leaf in leaves[:3]), *leaves[3:], arguments["axes"], PARENTS) for k in range(5)
+    ]
+    stacked = [torch.stack(parts) for parts in zip(*alone, strict=True)]
+    assert all(torch.equal(a, b) for a, b in zip(together, stacked, strict=True))
+    by_together, by_alone = (torch.autograd.grad(weighted(out), leaves) for out in (together, stacked))
+    for a, b in zip(by_together, by_alone, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_no_poses_give_nothing_and_a_zero_gradient(device):
+    arguments = skeleton(0, device=device, poses=(0,))
+    arguments["joints"].requires_grad_()
+    out = bone_transforms(**arguments)
+    assert out.transforms.shape == (0, 7, 3, 4) and out.bends.shape == (0, 12)
+    (grad,) = torch.autograd.grad(out.transforms.sum(), arguments["joints"])
+    assert grad.shape == (7, 3) and not grad.any()
+
+
+def test_a_skeleton_of_one_bone_only_moves():
+    orientation, translation = to_matrix(torch.tensor([1.0, 2, 3, 4])), torch.tensor([1.0, 2, 3])
+    nothing = torch.zeros(0, 3)
+    out = bone_transforms(nothing, orientation, translation, torch.ones(1, 3), torch.ones(1, 3, 3), [-1])
+    assert torch.equal(out.transforms[0], torch.cat([orientation, translation[:, None]], 1)) and not len(out.bends)
+
+
+def test_without_angles_every_bone_moves_as_the_first():
+    arguments = skeleton(8)
+    arguments["angles"].zero_()
+    moved = torch.cat([arguments["orientation"], arguments["translation"][:, None]], 1)
+    out = bone_transforms(**arguments)
+    torch.testing.assert_close(out.transforms, moved.expand(7, 3, 4))
+    assert not out.bends.any()
+
+
+def test_a_joint_stays_where_its_parent_carries_it():
+    arguments = skeleton(9)
+    transforms, joints = bone_transforms(**arguments).transforms, arguments["joints"]
+    parents = [max(parent, 0) for parent in PARENTS]
+    by_itself, by_parent = (
+        (t[..., :3] @ joints[..., None])[..., 0] + t[..., 3] for t in (transforms, transforms[parents])
+    )
+    torch.testing.assert_close(by_itself, by_parent)
+
+
+def test_flexion_acts_last_and_twist_first():
+    arguments = skeleton(10)
+    arguments["orientation"] = torch.eye(3, dtype=torch.float64)
+    turns = [from_axis_angle(arguments["axes"][1, k], arguments["angles"][0, k]) for k in range(3)]
+    torch.testing.assert_close(bone_transforms(**arguments).transforms[1, :, :3], turns[0] @ turns[1] @ turns[2])
+
+
+def test_bends_keep_their_digits_at_small_angles():
+    arguments = skeleton(11, torch.float32)
+    arguments["angles"] = torch.full((6, 3), 1e-3)
+    want = 1 - math.cos(float(torch.tensor(1e-3)))
+    torch.testing.assert_close(bone_transforms(**arguments).bends[::2], torch.full((6,), want), rtol=1e-6, atol=0)
+
+
+def test_the_joints_of_the_twin_turn_by_rotations_and_the_first_not_at_all():
+    arguments = skeleton(12)
+    local = joint_rotations(arguments["angles"], arguments["axes"])
+    eye = torch.eye(3, dtype=torch.float64)
+    torch.testing.assert_close(local @ local.mT, eye.expand(7, 3, 3))
+    assert torch.linalg.det(local).gt(0).all() and torch.equal(local[0], eye)
+
+
+def test_skinning_by_them_is_differentiable_through_both():
+    arguments = skeleton(13)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(4, 3, generator=generator, dtype=torch.float64)
+    weights = torch.randn(4, 7, generator=generator, dtype=torch.float64).softmax(-1)
+    shifts = torch.randn(4, 3, 12, generator=generator, dtype=torch.float64)
+    angles = arguments.pop("angles").requires_grad_()
+
+    def posed(angles):
+        bones = bone_transforms(angles, **arguments)
+        return skin(points, None, weights, bones.transforms, displacements=shifts, strengths=bones.bends).means
+
+    assert torch.autograd.gradcheck(posed, [angles])
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
+@pytest.mark.parametrize("name", [*FLOATS, "axes"])
+def test_values_that_are_no_numbers_are_refused_by_name(name, value):
+    arguments = skeleton(0)
+    arguments[name].view(-1)[2] = value
+    with pytest.raises(ValueError, match=rf"^{name}: expected finite values .* got 1 of "):
+        bone_transforms(**arguments)
+    bone_transforms(**arguments, validate=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"angles": torch.zeros(5, 3).double()}, r"angles: expected shape \[6, 3\], got \[5, 3\]. One row for each"),
+        ({"angles": torch.zeros(2, 6, 3).double()}, r"orientation: expected shape \[2, 3, 3\], got \[3, 3\]."),
+        ({"orientation": torch.eye(4).double()}, r"orientation: expected shape \[3, 3\], got \[4, 4\]."),
+        ({"translation": torch.zeros(1, 3).double()}, r"translation: expected shape \[3\], got \[1, 3\]."),
+        ({"joints": torch.zeros(6, 3).double()}, r"joints: expected shape \[7, 3\], got \[6, 3\]. One for each"),
+        ({"axes": torch.zeros(7, 3).double()}, r"axes: expected shape \[7, 3, 3\], got \[7, 3\]. Three for each"),
+        ({"angles": torch.zeros(6, 3).half()}, "angles: expected float32 or float64, got float16."),
+        ({"joints": torch.zeros(7, 3)}, "joints: expected torch.float64 on cpu, got torch.float32 on cpu."),
+        ({"parents": (-1, 0, 2, 1, 0, 4, 3)}, "parents: expected -1, then an earlier bone for each other one, got "),
+        ({"parents": (0, 0, 1, 1, 0, 4, 3)}, "parents: expected -1, then an earlier bone for each other one, got "),
+        ({"parents": ()}, r"parents: expected -1, then an earlier bone for each other one, got \[\]."),
+    ],
+)
+def test_a_wrong_argument_is_named_with_what_was_expected(change, message, as_shipped):
+    with pytest.raises(ValueError, match="^" + message):
+        bone_transforms(**skeleton(0) | change)

@@ -1,0 +1,132 @@
+"""Pictures of posed hands become training batches whose surfaces lie on their pictures."""
+
+import math
+from typing import NamedTuple
+
+import pytest
+import torch
+from torch import Tensor
+
+from oasis_warp.core.types import HandPose
+from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand.skinning import mirror_pose, rest_hand, skin
+from oasis_warp.ops import depth_map
+from oasis_warp.training.photographed import (
+    CROP_MARGIN,
+    EstimatorNoise,
+    Photographed,
+    crop_to_mask,
+    pose_hands,
+    training_batch,
+)
+
+SIZE, CROP = 240, 160
+EXACT = EstimatorNoise(angles=0.0, turn=0.0, shift=0.0, shape=0.0, crop=0.0)
+
+
+class Stub(NamedTuple):
+    image: Tensor
+    alpha: Tensor
+    mask: Tensor
+    angles: Tensor
+    orientation: Tensor
+    translation: Tensor
+    shape: Tensor
+    K: Tensor
+    left: Tensor
+
+
+def turned(angle):
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[0, s, c], [1.0, 0, 0], [0, c, -s]])  # fingers up
+
+
+def photographed(hand, names, left):
+    """Silhouettes of the hand; a left one drawn from the mirrored model, as its photo would show it."""
+    K = torch.tensor([[375.0, 0, 125], [0, 375, 115], [0, 0, 1]])
+    made = []
+    for k, (name, is_left) in enumerate(zip(names, left, strict=True)):
+        shape = 0.5 * torch.randn(len(hand.shape_names), generator=torch.Generator().manual_seed(k // 3))
+        pose = HandPose(named_pose(hand, name), turned(0.4 * k), torch.tensor([0.01, 0.05, 0.4]))
+        vertices = skin(hand, rest_hand(hand, shape), pose).vertices
+        if is_left:
+            vertices, pose = vertices * torch.tensor([-1.0, 1, 1]), mirror_pose(pose)
+        mask = (depth_map(vertices, hand.faces, torch.eye(4), K, SIZE, SIZE).face_ids >= 0).float()
+        image = torch.stack([mask, 0.5 * mask, 0.2 * mask], dim=-1)
+        made.append((image, mask, mask, pose.angles, pose.orientation, pose.translation, shape, K))
+    return Stub(*(torch.stack(parts) for parts in zip(*made, strict=True)), torch.tensor(left).int())
+
+
+@pytest.fixture(scope="module")
+def pictures(hand):
+    names = ("open", "fist", "pinch")
+    return photographed(hand, names, (0, 1, 1)), photographed(hand, names * 2, (0, 0, 1, 1, 0, 1))
+
+
+def overlap(hand, vertices, K, mask):
+    drawn = depth_map(vertices, hand.faces, torch.eye(4), K, mask.shape[1], mask.shape[0]).face_ids >= 0
+    return float((drawn & (mask > 0.5)).sum() / (drawn | (mask > 0.5)).sum())
+
+
+def test_many_hands_are_posed_as_one_by_one(hand, pictures):
+    photos, _ = pictures
+    assert isinstance(photos, Photographed)
+    out = pose_hands(hand, photos.shape, photos.angles, photos.orientation, photos.translation)
+    for k in range(3):
+        rest = rest_hand(hand, photos.shape[k])
+        posed = skin(hand, rest, HandPose(photos.angles[k], photos.orientation[k], photos.translation[k]))
+        torch.testing.assert_close(out.rest[k], rest.vertices, atol=1e-6, rtol=0)
+        torch.testing.assert_close(out.posed[k], posed.vertices, atol=2e-6, rtol=0)
+
+
+def test_surfaces_lie_on_their_pictures_left_hands_as_right_ones(hand, pictures):
+    batch = training_batch(hand, *pictures, CROP, torch.Generator().manual_seed(0), EXACT)
+    for k in range(3):
+        assert overlap(hand, batch.posed[k], batch.K[k], batch.mask[k]) > 0.94
+        for t in range(2):
+            assert overlap(hand, batch.target_posed[k, t], batch.target_Ks[k, t], batch.target_masks[k, t]) > 0.94
+
+
+def test_crops_frame_their_hands(hand, pictures):
+    batch = training_batch(hand, *pictures, CROP, torch.Generator().manual_seed(0), EXACT)
+    for mask in (*batch.mask, *batch.target_masks.flatten(0, 1)):
+        rows, columns = torch.nonzero(mask > 0.5).unbind(1)
+        extent = max(int(rows.max() - rows.min()), int(columns.max() - columns.min())) + 1
+        assert abs(extent - CROP / CROP_MARGIN) < 2
+        assert abs(float(rows.max() + rows.min() + 1) / 2 - CROP / 2) < 1.5
+
+
+def test_targets_show_the_hand_alone(hand, pictures):
+    photos, targets = pictures
+    arm = targets.mask * (torch.arange(SIZE)[:, None] < 100)
+    sleeved = targets._replace(mask=arm)
+    batch = training_batch(hand, photos, sleeved, CROP, torch.Generator().manual_seed(0), EXACT)
+    assert not batch.target_images[batch.target_masks == 0].any()
+    covered = batch.target_known < 0.01
+    assert covered.any() and not batch.target_masks[covered].any()
+    inside = batch.target_masks > 0.99
+    green = batch.target_images[inside][:, 1]
+    torch.testing.assert_close(green, torch.full_like(green, 0.5), atol=0.01, rtol=0)
+
+
+def test_errors_are_those_of_an_estimator_and_only_in_what_it_says(hand, pictures):
+    def make(seed, noise):
+        return training_batch(hand, *pictures, CROP, torch.Generator().manual_seed(seed), noise)
+
+    exact, noise = make(0, EXACT), EstimatorNoise()
+    noisy, again, other = make(1, noise), make(1, noise), make(2, noise)
+    assert all(torch.equal(a, b) for a, b in zip(noisy, again, strict=True))
+    assert not torch.equal(noisy.posed, other.posed)
+    for field in ("rest", "target_images", "target_masks", "target_posed", "target_Ks"):
+        assert torch.equal(getattr(noisy, field), getattr(exact, field))
+    error = (noisy.posed - exact.posed).norm(dim=-1).mean(1)
+    assert 0.0005 < float(error.min()) and float(error.max()) < 0.008
+    for k in range(3):
+        assert overlap(hand, noisy.posed[k], noisy.K[k], noisy.mask[k]) > 0.85
+
+
+def test_an_empty_mask_keeps_the_picture():
+    planes = torch.rand(1, 8, 8, 1)
+    crop = crop_to_mask(planes, torch.zeros(1, 8, 8), torch.eye(3)[None], 8, torch.zeros(1, 3))
+    assert bool(crop.planes.isfinite().all())
+    assert float(crop.K[0, 0, 0]) == pytest.approx(1 / CROP_MARGIN)
