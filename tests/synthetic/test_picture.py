@@ -10,6 +10,7 @@ from oasis_warp.synthetic import people
 from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.picture import render_batch, stream
 from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, plan_ahead, plan_shots, sample_shot
+from oasis_warp.training.photographed import Photographed, training_batch
 
 SIZE = 64
 SEED = 13
@@ -106,6 +107,22 @@ def test_even_looks_show_the_same_person_on_black_without_clothes(batch):
     lit = even.image[even.mask > 0.99]
     assert 0.05 < float(lit.mean()) < 0.95
     assert bool((even.left == batch.left[:2]).all())
+
+
+def test_photos_and_even_looks_make_a_training_batch(batch, hand):
+    photos = render_batch(SEED, [0, PICTURES_EACH], SIZE)
+    indices = [1, 2, PICTURES_EACH + 1, PICTURES_EACH + 2]
+    targets = render_batch(SEED, indices, SIZE, scenery=Scenery(look="even"))
+    assert isinstance(photos, Photographed)
+    made = training_batch(hand, photos, targets, SIZE, torch.Generator().manual_seed(0))
+    assert made.target_images.shape == (2, 2, SIZE, SIZE, 3)
+    # The surface of the truth, drawn by the truth's camera, is where the true picture shows the hand.
+    seen = depth_map(
+        made.target_posed.flatten(0, 1), hand.faces, made.target_viewmats.flatten(0, 1), made.target_Ks.flatten(0, 1),
+        SIZE, SIZE,
+    )  # fmt: skip
+    shown, inside = made.target_masks.flatten(0, 1) > 0.5, seen.face_ids >= 0
+    assert float((shown & inside).sum() / shown.sum()) > 0.93
 
 
 def test_the_hand_is_shown_as_large_as_it_was_drawn(batch):

@@ -65,7 +65,16 @@ def _body(device: str) -> Body:
     body = bundled_body()
     moved = {
         name: getattr(body, name).to(device)
-        for name in ("faces", "materials", "uv", "uv_faces", "normals", "knuckle_rise", "coarse_vertices", "coarse_faces")
+        for name in (
+            "faces",
+            "materials",
+            "uv",
+            "uv_faces",
+            "normals",
+            "knuckle_rise",
+            "coarse_vertices",
+            "coarse_faces",
+        )
     }
     return replace(body, hand=body.hand.to(device), **moved)
 
@@ -118,7 +127,8 @@ def render_shots(
         n_hand_faces=body.n_hand_faces, ring=RING,
     )  # fmt: skip
     if look == "even":
-        image = srgb(shaded.color.clamp(0, 1))
+        share = shaded.alpha[..., None]
+        image = share * srgb((shaded.color / share.clamp_min(1e-3)).clamp(0, 1))  # over black, as splats are drawn
     else:
         solids = torch.from_numpy(np.stack([s.room.solids for s in shots])).to(device)
         apertures = torch.tensor([s.room.aperture for s in shots], device=device)
