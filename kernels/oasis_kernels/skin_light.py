@@ -12,9 +12,6 @@ from oasis_kernels.sky import cosine_lobe, harmonics
 
 wp.set_module_options({"enable_backward": False})
 
-CHANNELS = wp.constant(10)
-"""Of a transfer: nine harmonics, and the visible share of the sky."""
-
 
 @wp.kernel
 def surface_state(
