@@ -18,6 +18,7 @@ Command = (
     Annotated[options.Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[options.Render, tyro.conf.subcommand("render")]
     | Annotated[options.Animate, tyro.conf.subcommand("animate")]
+    | Annotated[options.Synthesize, tyro.conf.subcommand("synthesize")]
     | Annotated[options.Gradcheck, tyro.conf.subcommand("gradcheck")]
     | Annotated[options.Bench, tyro.conf.subcommand("bench")]
     | Annotated[options.Doctor, tyro.conf.subcommand("doctor")]

@@ -223,3 +223,29 @@ class Bench:
 @dataclass(frozen=True, kw_only=True)
 class Doctor:
     """Check that everything is there and computes what it should; each failing line says what to do."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synthesize:
+    """Make pictures of synthetic hands, with mask, depth, pose, shape, camera and landmarks.
+
+    They are written as tar files of 64 (WebDataset). A run that is stopped goes on when it is started again, and ends
+    with the same files. With --sheet they go on one picture instead, one for each person.
+    """
+
+    out: Positional[Path]
+    """Folder for the shards, or the picture to write with --sheet; the parent must exist."""
+    count: int = 64
+    """How many pictures; eight in a row show one person."""
+    seed: int = 0
+    """Of the world: picture k of a seed is always the same, whatever the count."""
+    size: int = 256
+    """Side of the pictures [px]."""
+    look: Literal["photo", "even"] = "photo"
+    """Photos with everything, or hands alone in even light on black."""
+    backgrounds: Path | None = None
+    """Folder of pictures to put behind the hands, instead of rooms."""
+    sheet: FlagCreatePairsOff[bool] = False
+    """One contact sheet instead of shards."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""

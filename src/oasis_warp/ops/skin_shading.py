@@ -1,0 +1,327 @@
+"""Deferred shading of a posed, textured hand: light on its vertices, then the colours of a picture's pixels."""
+
+from typing import NamedTuple
+
+import torch
+import warp as wp
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from oasis_kernels import skin_light, skin_shading
+from oasis_warp.core.checks import check_positive, check_shape
+from oasis_warp.ops._incidence import incidence
+from oasis_warp.ops._launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._registration import operator
+from oasis_warp.ops.depth_map import DepthMap
+
+LIGHT_WIDTHS = (1.25e-3, 0.45e-3, 0.25e-3)
+"""How far red, green and blue light comes out from where it entered skin: standard deviations [m]."""
+LIGHT_REACH = 3e-3
+"""Depth step that light does not cross [m]."""
+
+
+class SurfaceState(NamedTuple):
+    """Of a batch of posed meshes."""
+
+    normals: Float[Tensor, "B V 3"]
+    """Unit, area-weighted; zero where no face is."""
+    areas: Float[Tensor, "B V"]
+    """Twice the area of the faces round each vertex."""
+
+
+class Lamps(NamedTuple):
+    """Round lamps, with the depth buffers that they see; L lamps an image. A black one is none."""
+
+    positions: Float[Tensor, "B L 3"]
+    colors: Float[Tensor, "B L 3"]
+    """Irradiance over pi on a surface that faces the lamp at distance `ranges`, linear RGB."""
+    ranges: Float[Tensor, "B L"]
+    spreads: Float[Tensor, "B L"]
+    """Radius over distance."""
+    viewmats: Float[Tensor, "B L 4 4"]
+    focals: Float[Tensor, "B L"]
+    """Of the depth buffers [px], whose axis is their middle."""
+    depths: Float[Tensor, "B L M M"]
+
+
+class Worn(NamedTuple):
+    """What covers the skin: one row for each material of the faces, material 0 being skin."""
+
+    materials: Int[Tensor, "F"]
+    """int32."""
+    looks: Float[Tensor, "B T 6"]
+    """Red, green, blue (linear), roughness, metal 0 to 1, cloth 0 or 1."""
+
+
+class Texture(NamedTuple):
+    """Skin textures of several people."""
+
+    atlas: Float[Tensor, "P Y X 8"]
+    """float16: linear RGB, height, fold, wrinkle [mm], roughness, oil (see `oasis_warp.synthetic.bake`)."""
+    slots: Int[Tensor, "B"]
+    """int32: which of the P an image shows."""
+    uv: Float[Tensor, "U 2"]
+    """Texels, centres at .5."""
+    uv_faces: Int[Tensor, "S 3"]
+    """Of the faces of skin, which come first."""
+
+
+class Shaded(NamedTuple):
+    """A batch of pictures, linear light."""
+
+    color: Float[Tensor, "B H W 3"]
+    """Multiplied by alpha."""
+    alpha: Float[Tensor, "B H W"]
+    mask: Float[Tensor, "B H W"]
+    """Share of each pixel that is hand, without forearm and clothes."""
+    depth: Float[Tensor, "B H W"]
+    """Nearest surface of each pixel [m], +inf where there is none."""
+
+
+def _surface_state(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    batch, n = vertices.shape[:2]
+    index = incidence("faces", faces, n, "vertices")
+    normals, areas = torch.empty_like(vertices), vertices.new_empty((batch, n))
+    inputs = [
+        view(vertices.contiguous(), wp.vec3f), *map(view, index), view(normals, wp.vec3f), view(areas),
+    ]  # fmt: skip
+    launch_ranges(skin_light.surface_state, even_cuts(batch * n), inputs, like=vertices)
+    return normals, areas
+
+
+def _surface_state_fake(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(vertices), vertices.new_empty(vertices.shape[:2])
+
+
+_surface_state_op = operator("surface_state", _surface_state, _surface_state_fake)
+
+
+@torch.no_grad()
+def surface_state(vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]) -> SurfaceState:
+    """Vertex normals and the areas round vertices of float32 meshes, summed in a fixed order.
+
+    Raises:
+        ValueError: a wrong shape or index.
+    """
+    check_shape("vertices", vertices, "B", "V", 3)
+    check_shape("faces", faces, "F", 3)
+    return SurfaceState(*_surface_state_op(vertices, faces))
+
+
+def _smooth(values: Tensor, faces: Tensor) -> Tensor:
+    batch, n, _ = values.shape
+    index = incidence("faces", faces, n, "vertices")
+    out = torch.empty_like(values)
+    launch_ranges(
+        skin_light.smooth, even_cuts(batch * n), [view(values.contiguous()), *map(view, index), view(out)], like=values
+    )
+    return out
+
+
+def _smooth_fake(values: Tensor, faces: Tensor) -> Tensor:
+    return torch.empty_like(values)
+
+
+_smooth_op = operator("smooth_over_faces", _smooth, _smooth_fake)
+
+
+@torch.no_grad()
+def smooth_over_faces(values: Float[Tensor, "B V C"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "B V C"]:
+    """Mean over the corners of the faces round each vertex, which counts itself once a face; others stay.
+
+    Raises:
+        ValueError: a wrong shape or index.
+    """
+    check_shape("values", values, "B", "V", "C")
+    check_shape("faces", faces, "F", 3)
+    return _smooth_op(values, faces)
+
+
+def _sky_transfer(
+    vertices: Tensor, normals: Tensor, directions: Tensor, viewmats: Tensor, focals: Tensor, depths: Tensor,
+    lift: float, n_lit: int,
+) -> Tensor:  # fmt: skip
+    batch, n = vertices.shape[:2]
+    out = vertices.new_zeros((batch, n, 10))
+    inputs = [
+        view(vertices.contiguous(), wp.vec3f), view(normals.contiguous(), wp.vec3f),
+        view(directions.contiguous(), wp.vec3f), view(viewmats.contiguous(), wp.mat44f), view(focals.contiguous()),
+        view(depths.contiguous()), lift, n_lit, view(out),
+    ]  # fmt: skip
+    launch_ranges(skin_light.sky_transfer, even_cuts(batch * n_lit), inputs, like=vertices)
+    return out
+
+
+def _sky_transfer_fake(vertices, normals, directions, viewmats, focals, depths, lift, n_lit):
+    return vertices.new_empty((*vertices.shape[:2], 10))
+
+
+_sky_transfer_op = operator("sky_transfer", _sky_transfer, _sky_transfer_fake)
+
+
+@torch.no_grad()
+def sky_transfer(
+    vertices: Float[Tensor, "B V 3"],
+    normals: Float[Tensor, "B V 3"],
+    directions: Float[Tensor, "D 3"],
+    viewmats: Float[Tensor, "B D 4 4"],
+    focals: Float[Tensor, "B"],
+    depths: Float[Tensor, "B D M M"],
+    *,
+    lift: float = 0.002,
+    n_lit: int | None = None,
+) -> Float[Tensor, "B V 10"]:
+    """How each vertex sees light from all around: nine harmonics of its unhidden cosine lobe, and the unhidden share.
+
+    The scalar product of the nine with a light's coefficients (order 1, y, z, x, xy, yz, 3 z^2 - 1, xz, x^2 - y^2) is
+    the irradiance over pi (precomputed radiance transfer, Sloan et al. 2002).
+
+    Args:
+        vertices: float32 [B, V, 3] [m].
+        normals: Of `surface_state`.
+        directions: Unit vectors spread evenly over the sphere, towards the sky, [D, 3].
+        viewmats: To the frame of a far camera in each direction that looks back at the mesh, [B, D, 4, 4].
+        focals: Of those cameras [px], whose axis is the middle of the buffer, [B].
+        depths: What they see, [B, D, M, M].
+        lift: Distance off the surface from which vertices look [m]; as much again is allowed in depth.
+        n_lit: Only the first so many vertices are wanted; the rows of the others are 0.
+
+    Raises:
+        ValueError: wrong shapes, or a lift that is not positive.
+    """
+    sizes: dict[str, int] = {}
+    check_shape("vertices", vertices, "B", "V", 3, sizes=sizes)
+    check_shape("normals", normals, "B", "V", 3, sizes=sizes)
+    check_shape("directions", directions, "D", 3, sizes=sizes)
+    check_shape("viewmats", viewmats, "B", "D", 4, 4, sizes=sizes)
+    check_shape("focals", focals, "B", sizes=sizes)
+    check_shape("depths", depths, "B", "D", "M", "M", sizes=sizes)
+    check_positive("lift", lift)
+    n_lit = sizes["V"] if n_lit is None else n_lit
+    if not 0 <= n_lit <= sizes["V"]:
+        raise ValueError(f"n_lit: expected 0 to {sizes['V']}, got {n_lit}.")
+    return _sky_transfer_op(vertices, normals, directions, viewmats, focals, depths, lift, n_lit)
+
+
+def _shade(
+    face_ids: Tensor, barycentrics: Tensor, depths: Tensor, focals: Tensor, samples: int, n_hand_faces: int, ring: int,
+    vertices: Tensor, faces: Tensor, normals: Tensor, transfer: Tensor, stretch: Tensor,
+    materials: Tensor, looks: Tensor, atlas: Tensor, slots: Tensor, uv: Tensor, uv_faces: Tensor, tones: Tensor,
+    texels_a_pixel: Tensor, sky: Tensor, lamp_positions: Tensor, lamp_colors: Tensor, lamp_ranges: Tensor,
+    lamp_spreads: Tensor, lamp_viewmats: Tensor, lamp_focals: Tensor, lamp_depths: Tensor, seeds: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    batch, rows, columns = face_ids.shape
+    light, tone, mirrored = (vertices.new_zeros((batch, rows, columns, 3)) for _ in range(3))
+    vec3 = lambda t: view(t.contiguous(), wp.vec3f)  # noqa: E731
+    whole = lambda t: view(t.to(torch.int32).contiguous())  # noqa: E731
+    ids, kinds, table = view(face_ids), whole(materials), incidence("faces", faces, vertices.shape[1], "vertices").table
+    cuts = even_cuts(batch * rows * columns)
+    launch_ranges(
+        skin_shading.shade,
+        cuts,
+        [
+            ids, vec3(barycentrics), vec3(vertices), vec3(normals), view(transfer.contiguous()),
+            view(stretch.contiguous()), view(table), kinds, view(uv.contiguous(), wp.vec2f), whole(uv_faces),
+            view(atlas.contiguous()), whole(slots), view(looks.contiguous()), vec3(tones), vec3(sky),
+            vec3(lamp_positions), vec3(lamp_colors), view(lamp_ranges.contiguous()), view(lamp_spreads.contiguous()),
+            view(lamp_viewmats.contiguous(), wp.mat44f), view(lamp_focals.contiguous()),
+            view(lamp_depths.flatten(0, 1).contiguous()), view(texels_a_pixel.contiguous()), whole(seeds),
+            view(light, wp.vec3f), view(tone, wp.vec3f), view(mirrored, wp.vec3f),
+        ],
+        like=vertices,
+    )  # fmt: skip
+    depth, focal = view(depths.contiguous()), view(focals.contiguous())
+    between = torch.zeros_like(light)
+    for vertical, source, target in ((0, light, between), (1, between, light)):
+        inputs = [ids, depth, kinds, focal, wp.vec3f(*LIGHT_WIDTHS), LIGHT_REACH, vertical,
+                  view(source, wp.vec3f), view(target, wp.vec3f)]  # fmt: skip
+        launch_ranges(skin_shading.scatter, cuts, inputs, like=vertices)
+    size = (batch, rows // samples, columns // samples)
+    color, (alpha, mask, nearest) = vertices.new_empty((*size, 3)), (vertices.new_empty(size) for _ in range(3))
+    launch_ranges(
+        skin_shading.resolve,
+        even_cuts(alpha.numel()),
+        [
+            ids, depth, kinds, n_hand_faces, ring, view(light, wp.vec3f), view(tone, wp.vec3f),
+            view(mirrored, wp.vec3f), view(color, wp.vec3f), view(alpha), view(mask), view(nearest),
+        ],
+        like=vertices,
+    )  # fmt: skip
+    return color, alpha, mask, nearest
+
+
+def _shade_fake(face_ids, barycentrics, depths, focals, samples, n_hand_faces, ring, vertices, *_):
+    size = (len(face_ids), face_ids.shape[1] // samples, face_ids.shape[2] // samples)
+    return vertices.new_empty((*size, 3)), *(vertices.new_empty(size) for _ in range(3))
+
+
+_shade_op = operator("shade_skin", _shade, _shade_fake)
+
+
+@torch.no_grad()
+def shade_skin(
+    seen: DepthMap,
+    focals: Float[Tensor, "B"],
+    samples: int,
+    vertices: Float[Tensor, "B V 3"],
+    faces: Int[Tensor, "F 3"],
+    normals: Float[Tensor, "B V 3"],
+    transfer: Float[Tensor, "B V 10"],
+    stretch: Float[Tensor, "B V 1"],
+    texture: Texture,
+    worn: Worn,
+    tones: Float[Tensor, "B 3"],
+    texels_a_pixel: Float[Tensor, "B"],
+    sky: Float[Tensor, "B 9 3"],
+    lamps: Lamps,
+    seeds: Int[Tensor, "B"],
+    *,
+    n_hand_faces: int,
+    ring: int,
+) -> Shaded:
+    """Pictures of skin: textured relief, subsurface light, two-lobed gloss, soft shadows of lamps, hidden sky.
+
+    The same values on every device, up to rounding, and in a batch as alone; nothing here carries a gradient.
+
+    Args:
+        seen: Depth map of the mesh at `samples` times the picture's size, in the camera's own frame, batched.
+        focals: Focal length of that map [px].
+        samples: Sub-pixels along a side of a pixel.
+        vertices: In the camera's frame (x right, y down, z forward) [m], float32.
+        faces: As drawn in `seen`.
+        normals: Of `surface_state`.
+        transfer: Of `sky_transfer`.
+        stretch: Area of the posed over that of the resting surface round each vertex.
+        texture: Of the skin.
+        worn: Materials of the faces and how they look.
+        tones: Mean reflectance of each image's skin, linear RGB, for light that skin throws on skin.
+        texels_a_pixel: Size of a sub-pixel on the hand: relief finer than that is left out.
+        sky: Coefficients of the light from all around.
+        lamps: The lamps.
+        seeds: int32, of the weave of cloth.
+        n_hand_faces: The first so many faces are the hand's.
+        ring: Material that counts as hand in the mask.
+
+    Raises:
+        ValueError: wrong shapes.
+    """
+    sizes: dict[str, int] = {}
+    check_shape("seen.face_ids", seen.face_ids, "B", "H", "W", sizes=sizes, hint="A batch, of one image at least.")
+    check_shape("vertices", vertices, "B", "V", 3, sizes=sizes)
+    check_shape("faces", faces, "F", 3, sizes=sizes)
+    check_shape("normals", normals, "B", "V", 3, sizes=sizes)
+    check_shape("transfer", transfer, "B", "V", 10, sizes=sizes)
+    check_shape("stretch", stretch, "B", "V", 1, sizes=sizes)
+    check_shape("texture.atlas", texture.atlas, "P", "Y", "X", 8, sizes=sizes)
+    check_shape("worn.looks", worn.looks, "B", "T", skin_shading.MATERIAL_WORDS, sizes=sizes)
+    check_shape("sky", sky, "B", 9, 3, sizes=sizes)
+    check_shape("lamps.depths", lamps.depths, "B", "L", "M", "M", sizes=sizes)
+    check_shape("lamps.positions", lamps.positions, "B", "L", 3, sizes=sizes)
+    if sizes["H"] % samples or sizes["W"] % samples:
+        raise ValueError(f"samples: expected a divisor of {sizes['H']} and {sizes['W']}, got {samples}.")
+    return Shaded(
+        *_shade_op(
+            seen.face_ids, seen.barycentrics, seen.depth, focals, samples, n_hand_faces, ring, vertices, faces, normals,
+            transfer, stretch, worn.materials, worn.looks, *texture, tones, texels_a_pixel, sky, *lamps, seeds,
+        )
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""A world of synthetic hands: identities, gestures, light, rooms and a camera, all drawn from a seed."""

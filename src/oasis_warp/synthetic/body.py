@@ -1,0 +1,224 @@
+"""The mesh that is photographed: the hand, a forearm, and what can be worn: sleeve, wristband and ring.
+
+The topology never changes, so that pictures share batches: what an image does not wear is folded up to a point.
+Vertices are those of the hand, then of the rows of the forearm (towards the elbow), sleeve, wristband and ring.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from oasis_warp.core import surface
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.hand.template import bundled_hand
+
+FINGERS = ("index", "middle", "little", "ring", "thumb")
+"""In the order of their joints: finger k has joints 3 k + 1 to 3 k + 3."""
+_TIP_OF_FINGER = (1, 2, 4, 3, 0)
+"""Row of `HandModel.tips` of each of `FINGERS`."""
+
+ARM_ROWS, ARM_LENGTH = 20, 0.30
+"""Rings of the forearm, and its length [m]."""
+SLEEVE_ROWS, BAND_ROWS = 28, 7
+RING_COLUMNS, RING_ROWS = 48, 8
+ATLAS_HAND_SHARE = 1024 / 1408
+"""Share of the atlas's height that the hand's texture coordinates fill; the forearm lies above."""
+ATLAS_ARM_BIAS = 0.7
+"""The forearm's rows are denser at the wrist by 1 + this, sparser at the elbow by 1 - this."""
+
+SKIN, SLEEVE, BAND, RING = range(4)
+"""Materials of faces."""
+COARSE_FACES = 4000
+KNUCKLE_RISE = (2.0, 1.7, 0.8)
+"""How far a knuckle stands out of a finger bent by 90 degrees, from the hand outwards [mm]."""
+
+
+@dataclass(frozen=True)
+class Bone:
+    """A finger bone at rest [mm]."""
+
+    origin: np.ndarray
+    along: np.ndarray
+    """To the next joint or the tip."""
+    back: np.ndarray
+    side: np.ndarray
+    length: float
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """Coordinates along, to the side and to the back [mm]."""
+        return (points - self.origin) @ np.stack([self.along, self.side, self.back], 1)
+
+
+def _bone(hand: HandModel, finger: int, place: int) -> Bone:
+    joint = 3 * finger + 1 + place
+    start = hand.joints[joint].double().numpy() * 1e3
+    end = hand.joints[joint + 1] if place < 2 else hand.tips[_TIP_OF_FINGER[finger]]
+    along = end.double().numpy() * 1e3 - start
+    length = float(np.linalg.norm(along))
+    along = along / length
+    back = hand.pose_axes[joint, 1].double().numpy()
+    back = back - along * (back @ along)
+    back /= np.linalg.norm(back)
+    return Bone(start, along, back, np.cross(back, along), length)
+
+
+def _knuckle_rise(points: np.ndarray, normals: np.ndarray, bones: tuple[tuple[Bone, ...], ...]) -> Tensor:
+    """Blend skinning rounds a bent joint off; bone does not. Arguments in millimetres; [V, 15] in metres."""
+    out = np.zeros((len(points), 15))
+    for finger, of_finger in enumerate(bones):
+        for place, bone in enumerate(of_finger):
+            if FINGERS[finger] == "thumb" and place == 0:  # lies deep in the hand
+                continue
+            along, side, back = bone.local(points).T
+            t = np.clip((normals @ bone.back - 0.15) / 0.65, 0, 1)
+            width, length = (7.5, 7.0) if place == 0 else (6.0, 5.0)
+            shape = np.exp(-((side / width) ** 2) - ((along - 0.5) / length) ** 2) * (np.abs(side) < 14) * (back > 0)
+            out[:, 3 * finger + place] = KNUCKLE_RISE[place] * t * t * (3 - 2 * t) * shape
+    return torch.from_numpy(out * 1e-3).float()
+
+
+def _tube_faces(rows: np.ndarray) -> np.ndarray:
+    """Two triangles for each cell between rows [R, C] of vertex numbers that close to rings."""
+    a, b = rows[:-1], rows[1:]
+    quad = np.stack([a, b, np.roll(b, -1, 1), np.roll(a, -1, 1)], -1).reshape(-1, 4)
+    return np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]], 1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Body:
+    """Topology, texture coordinates and labels; `bundled_body` makes the one that is used."""
+
+    hand: HandModel
+    faces: Int[Tensor, "F 3"]
+    materials: Int[Tensor, "F"]
+    """int32: SKIN, SLEEVE, BAND or RING."""
+    uv: Float[Tensor, "U 2"]
+    """In [0, 1]; the hand's and the forearm's."""
+    uv_faces: Int[Tensor, "S 3"]
+    """For the faces of skin, which come first."""
+    n_hand_faces: int
+    n_vertices: int
+    rest: Float[Tensor, "K 3"]
+    """Hand and forearm at rest, mean shape [mm]."""
+    normals: Float[Tensor, "K 3"]
+    palm: Float[Tensor, "K"]
+    """0 on the back, 1 on the palm, soft between."""
+    finger_weights: Float[Tensor, "K 5"]
+    """Share of each finger's joints in the skinning."""
+    bones: tuple[tuple[Bone, ...], ...]
+    """[finger][place]."""
+    coarse_vertices: Int[Tensor, "C"]
+    """Some vertices of hand and forearm, and the faces between them: what hides the sky from others."""
+    coarse_faces: Int[Tensor, "G 3"]
+    knuckle_rise: Float[Tensor, "V 15"]
+    """Displacement of the hand's vertices along their normals, for each joint of a finger bent by 90 degrees [m]."""
+
+    @property
+    def n_hand(self) -> int:
+        """Vertices of the hand."""
+        return len(self.hand.template)
+
+
+def arm_rows(
+    rim: Float[Tensor, "B C 3"], turns: Float[Tensor, "B R 3 3"], girth: Float[Tensor, "B"]
+) -> Float[Tensor, "B R C 3"]:
+    """Rings that carry the wrist's rim on to the elbow, +x without a bend; lengths in metres.
+
+    Args:
+        rim: The hand's open end.
+        turns: Rotation of each ring about the middle of the rim.
+        girth: Growth of the forearm's thickest place over the wrist, 0.35 or so.
+    """
+    center = rim.mean(1, keepdim=True)
+    s = torch.linspace(0, 1, ARM_ROWS + 1, device=rim.device)[1:, None]
+    swell = smoothstep(0.02, 0.75, s)
+    flat = 1 - smoothstep(0.0, 0.4, s)  # the rim is not plane
+    around = (rim - center)[:, None]
+    grow = girth[:, None, None] * swell
+    rows = torch.stack(
+        [around[..., 0] * flat + ARM_LENGTH * s, around[..., 1] * (1 + grow), around[..., 2] * (1 + 1.15 * grow)], -1
+    )
+    return torch.einsum("brij,brcj->brci", turns, rows) + center[:, None]
+
+
+def smoothstep(low: float, high: float, x: Tensor) -> Tensor:
+    """0 at `low`, 1 at `high`, which may be the smaller one; flat at both ends."""
+    t = ((x - low) / (high - low)).clamp(0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def _coarse(rest: Tensor, faces: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Vertices that are kept when edges are collapsed, and the faces that are left."""
+    _, left, _, kept = igl.decimate(rest.double().numpy(), np.ascontiguousarray(faces, np.int64), COARSE_FACES, False)
+    return torch.from_numpy(np.asarray(kept, np.int64)), torch.from_numpy(np.ascontiguousarray(left, np.int64))
+
+
+@functools.cache
+def bundled_body() -> Body:
+    """The bundled hand with its forearm and its wardrobe, on the CPU."""
+    hand = bundled_hand()
+    n, rim = len(hand.template), hand.rim.numpy()
+    columns = len(rim)
+    arm = n + np.arange(ARM_ROWS * columns).reshape(ARM_ROWS, columns)
+    arm_faces = _tube_faces(np.concatenate([rim[None], arm]))
+    n_uv = len(hand.uv)
+    grid = n_uv + np.arange((ARM_ROWS + 1) * (columns + 1)).reshape(ARM_ROWS + 1, columns + 1)
+    a, b = grid[:-1], grid[1:]
+    quad = np.stack([a[:, :-1], b[:, :-1], b[:, 1:], a[:, 1:]], -1).reshape(-1, 4)
+    arm_uv_faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]], 1).reshape(-1, 3)
+    s = np.linspace(0, 1, ARM_ROWS + 1)
+    rise = 0.006 + (1 - ATLAS_HAND_SHARE - 0.012) * (s + ATLAS_ARM_BIAS * s * (1 - s))
+    u, v = np.meshgrid(np.linspace(0.01, 0.99, columns + 1), ATLAS_HAND_SHARE + rise)
+    uv = np.concatenate([hand.uv.numpy() * [1, ATLAS_HAND_SHARE], np.stack([u, v], -1).reshape(-1, 2)])
+
+    still = torch.eye(3).expand(1, ARM_ROWS, 3, 3)
+    rows = arm_rows(hand.template[hand.rim][None], still, torch.tensor([0.4]))[0]
+    rest = torch.cat([hand.template, rows.reshape(-1, 3)])
+    corners = rest.numpy()[arm_faces[len(arm_faces) // 2]]
+    outward = corners[0] - rows[ARM_ROWS // 2].mean(0).numpy()
+    if np.cross(corners[1] - corners[0], corners[2] - corners[0]) @ outward < 0:
+        arm_faces, arm_uv_faces = arm_faces[:, ::-1], arm_uv_faces[:, ::-1]
+    skin_faces = np.concatenate([hand.faces.numpy(), arm_faces])
+
+    first = len(rest)
+    worn, materials = [], [np.full(len(skin_faces), SKIN)]
+    for material, n_rows, n_columns in ((SLEEVE, SLEEVE_ROWS, columns), (BAND, BAND_ROWS, columns),
+                                        (RING, RING_ROWS, RING_COLUMNS)):  # fmt: skip
+        rows_of = first + np.arange(n_rows * n_columns).reshape(n_rows, n_columns)
+        first += rows_of.size
+        if material == RING:  # closed across, too
+            rows_of = np.concatenate([rows_of, rows_of[:1]])
+        worn.append(_tube_faces(rows_of))
+        materials.append(np.full(len(worn[-1]), material))
+
+    skin = torch.from_numpy(np.ascontiguousarray(skin_faces))
+    normals = surface.vertex_normals(rest, skin)
+    edges = surface.mesh_edges(skin)
+    toward = torch.cat([0.5 - 0.5 * torch.cos(hand.bone_theta), 0.5 - 0.5 * normals[n:, 1]])
+    palm = surface.smooth_over_mesh(toward[:, None], edges, 5)[:, 0]
+    weights = torch.cat([hand.weights, torch.eye(16)[:1].expand(len(rest) - n, 16)])
+    bones = tuple(tuple(_bone(hand, finger, place) for place in range(3)) for finger in range(5))
+    by_finger = torch.stack([weights[:, 3 * k + 1 : 3 * k + 4].sum(1) for k in range(5)], 1)
+    coarse_vertices, coarse_faces = _coarse(rest, skin_faces)
+    return Body(
+        hand=hand,
+        coarse_vertices=coarse_vertices,
+        coarse_faces=coarse_faces,
+        faces=torch.from_numpy(np.concatenate([skin_faces, *worn])),
+        materials=torch.from_numpy(np.concatenate(materials)).to(torch.int32),
+        uv=torch.from_numpy(uv).float(),
+        uv_faces=torch.from_numpy(np.concatenate([hand.uv_faces.numpy(), arm_uv_faces])),
+        n_hand_faces=len(hand.faces),
+        n_vertices=first,
+        rest=rest * 1e3,
+        normals=normals,
+        palm=palm,
+        finger_weights=by_finger,
+        bones=bones,
+        knuckle_rise=_knuckle_rise(rest[:n].double().numpy() * 1e3, normals[:n].double().numpy(), bones),
+    )

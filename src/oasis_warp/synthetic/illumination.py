@@ -1,0 +1,84 @@
+"""Light on a batch of posed hands: depth buffers from the lamps and from all around."""
+
+import functools
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.ops import depth_map
+from oasis_warp.ops.skin_shading import Lamps, sky_transfer, smooth_over_faces
+from oasis_warp.synthetic.body import Body
+from oasis_warp.synthetic.posing import Posed
+from oasis_warp.synthetic.stage import Light, sphere
+
+SKY_DIRECTIONS, SKY_SIZE = 40, 112
+"""Depth buffers that sample the sky, and their side [px]."""
+SKY_DISTANCE = 20.0
+"""Of their cameras, in radii of the hand: nearly parallel."""
+LAMP_SIZE = 256
+LAMP_MARGIN = 1.35
+"""Radius that a lamp's buffer covers, in radii of the hand: some of the arm casts shadows, too."""
+
+
+def look_at(positions: Float[Tensor, "*batch 3"], targets: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
+    """World to the camera at `positions` whose axis goes through `targets`; roll is arbitrary."""
+    z = torch.nn.functional.normalize(targets - positions, dim=-1)
+    least = torch.nn.functional.one_hot(z.abs().argmin(-1), 3).to(z)
+    x = torch.nn.functional.normalize(torch.linalg.cross(least, z), dim=-1)
+    rows = torch.stack([x, torch.linalg.cross(z, x), z], -2)
+    shift = -(rows @ positions[..., None])
+    last = torch.zeros_like(rows[..., :1, :])
+    bottom = torch.cat([last, torch.ones_like(last[..., :1])], -1)
+    return torch.cat([torch.cat([rows, shift], -1), bottom], -2)
+
+
+def _intrinsics(focal: Tensor, size: int) -> Tensor:
+    K = torch.zeros(*focal.shape, 3, 3, device=focal.device)
+    K[..., 0, 0] = K[..., 1, 1] = focal
+    K[..., 0, 2] = K[..., 1, 2] = size / 2
+    K[..., 2, 2] = 1
+    return K
+
+
+def _depths(vertices: Tensor, faces: Tensor, viewmats: Tensor, focals: Tensor, size: int) -> Tensor:
+    """Depth buffers of each image's mesh from each of its [B, N] cameras, [B, N, size, size]."""
+    batch, n = focals.shape
+    vertices = vertices[:, None].expand(-1, n, -1, -1).flatten(0, 1)
+    K = _intrinsics(focals.flatten(), size)
+    return depth_map(vertices, faces, viewmats.flatten(0, 1), K, size, size, validate=False).depth.unflatten(
+        0, (batch, n)
+    )
+
+
+@functools.cache
+def _directions() -> Tensor:
+    return torch.from_numpy(sphere(SKY_DIRECTIONS)).float()
+
+
+def see_sky(body: Body, posed: Posed, normals: Tensor) -> Float[Tensor, "B V 10"]:
+    """Hidden-sky transfer of every vertex, smoothed once."""
+    directions = _directions().to(posed.vertices.device)
+    radius = posed.radius * 1.02
+    away = posed.center[:, None] + directions * (SKY_DISTANCE * radius)[:, None, None]
+    viewmats = look_at(away, posed.center[:, None].expand_as(away))
+    focals = SKY_DISTANCE * SKY_SIZE / 2 * torch.ones_like(radius)
+    coarse = posed.vertices[:, body.coarse_vertices]
+    each = focals[:, None].expand(-1, len(directions)).contiguous()
+    depths = _depths(coarse, body.coarse_faces, viewmats, each, SKY_SIZE)
+    transfer = sky_transfer(posed.vertices, normals, directions, viewmats, focals, depths)
+    return smooth_over_faces(transfer, body.faces)
+
+
+def light_lamps(body: Body, posed: Posed, lights: list[Light]) -> Lamps:
+    """The lamps of each picture, with what they see of the hand."""
+    device = posed.vertices.device
+    on_device = lambda name: torch.from_numpy(np.stack([getattr(light, name) for light in lights])).float().to(device)  # noqa: E731
+    directions, distances = on_device("directions"), on_device("distances")
+    center = posed.center[:, None].expand_as(directions)
+    positions = center + directions * distances[..., None]
+    viewmats = look_at(positions, center)
+    focals = LAMP_SIZE / 2 * distances / (LAMP_MARGIN * posed.radius)[:, None]
+    depths = _depths(posed.vertices, body.faces, viewmats, focals, LAMP_SIZE)
+    return Lamps(positions, on_device("colors"), distances, on_device("spreads"), viewmats, focals, depths)

@@ -1,0 +1,167 @@
+"""The lines of a palm. No two palms have the same: each line's course, length, breaks and branches are drawn anew.
+
+Places on the palm are (u, s): u from 0 below the index finger to 1 below the little one, s from 0 at the wrist to 1 at
+the knuckles' row.
+"""
+
+import numpy as np
+
+from oasis_warp.synthetic.atlas import Atlas
+from oasis_warp.synthetic.identity import Identity
+from oasis_warp.synthetic.strokes import Strokes, through
+
+_INDEX_KNUCKLE, _LITTLE_KNUCKLE = 1, 7
+"""Joints."""
+SINGLE_CREASE = 0.05
+"""Share of people whose head and heart lines are one."""
+
+
+class Palm:
+    """Draws on the palm of one person."""
+
+    def __init__(self, atlas: Atlas, strokes: Strokes, identity: Identity):
+        self.atlas, self.strokes, self.identity, self.rng = atlas, strokes, identity, strokes.rng
+        joints = atlas.body.hand.joints.double().numpy() * 1e3
+        self.index, self.little = joints[_INDEX_KNUCKLE], joints[_LITTLE_KNUCKLE]
+        self.thumb = joints[13], joints[14]
+
+    def place(self, us: np.ndarray) -> np.ndarray:
+        """Points of the skin [mm] at rows of (u, s)."""
+        u, s = np.asarray(us, float).T
+        arch = np.array([-6.0, 0, 0]) * np.sin(np.pi * u.clip(0, 1))[:, None]
+        top = self.index + (self.little - self.index) * u[:, None] + arch
+        bottom = np.array([-6.0, 0, 0]) + np.array([0, 0, 1.0]) * (16 - 34 * u)[:, None]
+        return self.atlas.snap(bottom + (top - bottom) * s[:, None], "palm")
+
+    def line(self, kind: str, controls: np.ndarray, width: float, strength: float, *, branches: int = 0,
+             gap: float = 0.0, wobble: float = 0.5) -> np.ndarray:  # fmt: skip
+        """A line with side branches; with probability `gap` it breaks off and goes on beside itself."""
+        rng, curve = self.rng, through(controls, 48)
+        if rng.random() < gap:
+            cut, shift = rng.integers(14, 36), rng.normal(0, 0.035, 2)
+            over = rng.integers(2, 7)
+            self.strokes.add(kind, self.place(curve[: cut + over]), width, strength, taper=0.3, wobble=wobble)
+            self.strokes.add(kind, self.place(curve[cut:] + shift), width * 0.9, strength * rng.uniform(0.6, 1),
+                             taper=0.3, wobble=wobble)  # fmt: skip
+        else:
+            self.strokes.add(kind, self.place(curve), width, strength, taper=rng.uniform(0.12, 0.4), wobble=wobble)
+        for _ in range(branches):
+            i = rng.integers(4, 42)
+            away = rng.normal(0, 0.10, 2) + (curve[i + 4] - curve[i]) * rng.uniform(0.5, 2.5)
+            branch = curve[i] + np.linspace(0, 1, 12)[:, None] * away
+            self.strokes.add(kind, self.place(branch), 0.55 * width, strength * rng.uniform(0.25, 0.6), taper=0.5,
+                             wobble=wobble)  # fmt: skip
+        return curve
+
+    def draw(self) -> None:
+        """All lines of the palm."""
+        life = self._main_lines()
+        self._thenar(life)
+        self._fine_lines()
+        self._finger_roots()
+
+    def _main_lines(self) -> np.ndarray:
+        rng, depth, u = self.rng, self.identity.line_depth, self.rng.uniform
+        jitter = lambda rows, sd=0.02: np.asarray(rows) + rng.normal(0, sd, np.shape(rows))  # noqa: E731
+        n_branches = lambda: int(rng.integers(0, 2 + 3 * self.identity.line_wealth))  # noqa: E731
+        start = np.array([u(-0.34, -0.22), u(0.84, 0.98)])
+        belly, end = u(0.24, 0.52), u(-0.02, 0.34)
+        life = self.line(
+            "main", jitter([start, (belly * 0.55, u(0.70, 0.84)), (belly, u(0.40, 0.6)), (u(0.22, 0.48), end)]),
+            u(0.8, 1.15), depth * u(0.8, 1.2), branches=n_branches(), gap=0.2,
+        )  # fmt: skip
+        self.strokes.add("halo", self.place(life), 2.6, depth)
+        if rng.random() < SINGLE_CREASE:
+            single = self.line("main", jitter([start, (0.2, 0.86), (0.65, 0.84), (1.15, u(0.72, 0.86))]), 0.95, depth,
+                               branches=2)  # fmt: skip
+            self.strokes.add("halo", self.place(single), 2.6, depth)
+        else:
+            joined = rng.random() < 0.65
+            head_start = start + ([u(0, 0.05), u(0, 0.02)] if joined else [u(0, 0.08), u(0.05, 0.13)])
+            drop, reach = u(0.05, 0.5), u(0.62, 1.05)
+            head = self.line(
+                "main", jitter([head_start, (0.12, 0.9 - 0.2 * drop), (0.5 * reach + 0.1, 0.86 - 0.5 * drop),
+                                (reach, 0.82 - drop * u(0.8, 1.2))]),
+                u(0.75, 1.1), depth * u(0.7, 1.15), branches=n_branches(), gap=0.25,
+            )  # fmt: skip
+            rise, finish = u(-0.02, 0.2), u(-0.02, 0.42)
+            heart = self.line(
+                "main", jitter([(u(1.15, 1.25), u(0.72, 0.84)), (0.9, 0.86 + 0.3 * rise), (0.6, 0.93 + 0.25 * rise),
+                                (finish, 0.95 + rise)]),
+                u(0.75, 1.1), depth * u(0.75, 1.2), branches=n_branches() + 1, gap=0.2,
+            )  # fmt: skip
+            for curve in (head, heart):
+                self.strokes.add("halo", self.place(curve), 2.6, depth * 0.9)
+        for chance, controls in (
+            (0.6, [(u(0.3, 0.6), u(0.05, 0.35)), (0.48, 0.5), (u(0.35, 0.55), u(0.65, 0.95))]),  # fate
+            (0.4, [(u(0.65, 0.85), u(0.3, 0.6)), (0.74, 0.7), (u(0.65, 0.8), 0.95)]),  # sun
+            (0.3, [(u(0.35, 0.6), u(0.1, 0.3)), (0.8, 0.55), (1.0, u(0.75, 0.9))]),  # mercury
+            (0.2, [(0.2, 1.02), (0.45, 0.96), (0.75, 1.0)]),  # girdle of Venus
+        ):
+            if rng.random() < chance:
+                self.line("main", jitter(controls, 0.03), u(0.4, 0.6), depth * u(0.25, 0.6), branches=n_branches() // 2,
+                          gap=0.4)  # fmt: skip
+        for _ in range(rng.integers(1, 4)):  # short lines at the edge below the little finger
+            s = u(0.86, 0.98)
+            self.line("minor", jitter([(1.28, s), (1.1, s + u(-0.02, 0.03))], 0.01), 0.45, depth * u(0.4, 0.8))
+        return life
+
+    def _thenar(self, life: np.ndarray) -> None:
+        """Wrinkles of the ball of the thumb: along the life line and across it, deep where the thumb squeezes it."""
+        rng, u, age = self.rng, self.rng.uniform, self.identity.age
+        root = np.array([-0.42, 0.22]) + rng.normal(0, 0.03, 2)  # middle of the thumb's side, in (u, s)
+        for _ in range(int(rng.integers(9, 17) + 10 * age)):
+            toward = u(0.08, 0.85)
+            i = rng.integers(2, 26)
+            part = life[i : i + rng.integers(9, 22)]
+            bent = (
+                part
+                + (root - part) * toward
+                + rng.normal(0, 0.012, (1, 2))
+                + np.linspace(-1, 1, len(part))[:, None] * rng.normal(0, 0.03, 2)
+            )
+            self.strokes.add("wrinkle", self.place(bent), u(0.55, 0.9), u(0.4, 1.0), taper=0.4, wobble=0.5)
+            if rng.random() < 0.35 + 0.4 * age:
+                self.strokes.add("minor", self.place(bent), u(0.35, 0.5), u(0.2, 0.5), taper=0.5, wobble=0.4)
+        for _ in range(int(rng.integers(5, 12) + 8 * age)):  # across: from the thumb's root over the ball
+            i = rng.integers(8, 40)
+            a, b = root + rng.normal(0, 0.08, 2), life[i]
+            c = a + (b - a) * np.linspace(u(0.05, 0.3), u(0.6, 1.0), 14)[:, None]
+            self.strokes.add("wrinkle", self.place(c), u(0.4, 0.7), u(0.25, 0.6), taper=0.5, wobble=0.6)
+        web = np.array([-0.33, 0.86])
+        for _ in range(rng.integers(4, 9)):  # the web between thumb and index
+            c = (
+                web
+                + rng.normal(0, [0.05, 0.05], 2)
+                + np.linspace(-1, 1, 12)[:, None] * np.array([u(0.05, 0.16), u(-0.1, 0.04)])
+            )
+            self.strokes.add("wrinkle", self.place(c), u(0.45, 0.7), u(0.4, 0.9), taper=0.5, wobble=0.4)
+        for _ in range(rng.integers(4, 10)):  # the ball below the little finger
+            c = np.array([u(0.75, 1.15), u(0.12, 0.6)]) + np.linspace(-1, 1, 12)[:, None] * [
+                u(0.05, 0.16),
+                u(-0.05, 0.06),
+            ]
+            self.strokes.add("wrinkle", self.place(c), u(0.4, 0.7), u(0.3, 0.7), taper=0.5, wobble=0.5)
+
+    def _fine_lines(self) -> None:
+        rng, identity = self.rng, self.identity
+        favourite = rng.uniform(0, np.pi, 4)
+        for _ in range(int(45 + 120 * identity.line_wealth + 40 * identity.age)):
+            middle, angle = rng.uniform([-0.25, 0.05], [1.15, 1.06]), rng.choice(favourite) + rng.normal(0, 0.3)
+            length = rng.uniform(0.06, 0.34)
+            step = np.array([np.cos(angle), np.sin(angle)]) * length
+            controls = middle + np.linspace(-0.5, 0.5, 4)[:, None] * step + rng.normal(0, 0.012, (4, 2))
+            self.strokes.add("minor", self.place(through(controls, 16)), rng.uniform(0.3, 0.6),
+                             rng.uniform(0.12, 0.6) * identity.line_depth, taper=0.5, wobble=0.5)  # fmt: skip
+
+    def _finger_roots(self) -> None:
+        """Short lines that run from the fingers' roots into the palm."""
+        rng = self.rng
+        for middle in (0.0, 0.33, 0.67, 1.0):
+            for _ in range(rng.integers(0, 4)):
+                u = middle + rng.normal(0, 0.06)
+                c = np.array([u, rng.uniform(1.02, 1.14)]) + np.linspace(0, 1, 10)[:, None] * [
+                    rng.normal(0, 0.03),
+                    -rng.uniform(0.05, 0.16),
+                ]
+                self.strokes.add("minor", self.place(c), 0.4, rng.uniform(0.2, 0.5), taper=0.5)

@@ -1,0 +1,129 @@
+"""Plan pictures: all that is drawn at random, before anything is rendered. On the CPU, a few milliseconds each."""
+
+import functools
+import multiprocessing
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from oasis_warp.core.types import Side
+from oasis_warp.synthetic.body import bundled_body
+from oasis_warp.synthetic.contact import separate
+from oasis_warp.synthetic.gestures import sample_gesture
+from oasis_warp.synthetic.identity import Identity, Population, sample_identity
+from oasis_warp.synthetic.rooms import Room, sample_room
+from oasis_warp.synthetic.sensor import Sensor, sample_sensor
+from oasis_warp.synthetic.stage import Light, Look, View, sample_light, sample_view
+from oasis_warp.synthetic.wardrobe import Clothes, sample_clothes
+
+PICTURES_EACH = 8
+"""Consecutive indices that show one person: a texture is baked once for so many."""
+PICTURE_STREAM = 2
+"""Tells the random numbers of pictures from those of identities with the same seed."""
+HAND_REACH = 0.11
+"""Of a hand beyond its middle, roughly: rooms begin behind it [m]."""
+AHEAD = 3
+"""Batches a worker that are planned ahead."""
+EVERYBODY = Population()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenery:
+    """What pictures show, besides what the seed decides."""
+
+    look: Look = "photo"
+    population: Population = EVERYBODY
+    people: int | None = None
+    """How many people there are: then the first comes again, in other pictures. No end when None."""
+    backgrounds: tuple[Path, ...] = ()
+    """Pictures to stand behind the hands (see `backgrounds.list_backgrounds`); rooms when empty."""
+
+
+PHOTOS = Scenery()
+
+
+class Shot(NamedTuple):
+    """All that is drawn for one picture, before anything is rendered."""
+
+    index: int
+    person: int
+    side: Side
+    gesture: str
+    angles: np.ndarray
+    """Of all joints about the pose axes, 0 at rest, [16, 3] [rad]."""
+    bend: np.ndarray
+    view: View
+    light: Light
+    clothes: Clothes
+    room: Room
+    sensor: Sensor
+    seed: int
+    """Of whatever is drawn a pixel at a time."""
+
+
+def sample_shot(seed: int, index: int, scenery: Scenery = PHOTOS) -> Shot:
+    """Draw picture `index` of the world `seed`; fingers may still sink in."""
+    look = scenery.look
+    rng = np.random.default_rng([seed, PICTURE_STREAM, index, look == "even"])
+    name, angles = sample_gesture(rng, bundled_body().hand)
+    bend = np.array([0.0, rng.normal(0, 0.15), rng.normal(0, 0.30)])
+    number = index // PICTURES_EACH
+    if scenery.people is not None:
+        number %= scenery.people
+    view = sample_view(rng, look, closed=bool((angles[[1, 4, 7, 10], 0] > 0.9).sum() >= 3))
+    return Shot(
+        index=index,
+        person=number,
+        side="left" if np.random.default_rng([seed, PICTURE_STREAM, number]).random() < 0.5 else "right",
+        gesture=name,
+        angles=angles,
+        bend=bend,
+        view=view,
+        light=sample_light(rng, look),
+        clothes=sample_clothes(rng, bare=look == "even"),
+        room=sample_room(rng, view.distance, HAND_REACH),
+        sensor=sample_sensor(rng),
+        seed=int(rng.integers(1 << 31)),
+    )
+
+
+@functools.lru_cache(4096)
+def _identity(seed: int, number: int, population: Population) -> Identity:
+    return sample_identity(bundled_body().hand, seed, number, population)
+
+
+def plan_shots(seed: int, indices: Sequence[int], scenery: Scenery = PHOTOS) -> list[Shot]:
+    """Pictures `indices` of the world `seed`, their fingers kept apart: each as if it were alone."""
+    hand = bundled_body().hand
+    shots = [sample_shot(seed, int(index), scenery) for index in indices]
+    shapes = np.stack([_identity(seed, shot.person, scenery.population).shape for shot in shots])
+    joints, basis = hand.joints.double().numpy(), hand.joint_basis.double().numpy()
+    at_rest = joints + (basis * shapes[:, None, None]).sum(-1)
+    angles, _ = separate(np.stack([shot.angles for shot in shots]), at_rest * 1e3)
+    return [shot._replace(angles=a) for shot, a in zip(shots, angles, strict=True)]
+
+
+def plan_ahead(seed: int, blocks: Iterable[Sequence[int]], scenery: Scenery, workers: int) -> Iterator[list[Shot]]:
+    """`plan_shots` of each of `blocks` in turn, drawn ahead by `workers` processes where there are any."""
+    if workers < 1:
+        for block in blocks:
+            yield plan_shots(seed, block, scenery)
+        return
+    # A forked child of a process with a CUDA context or threads may hang, a spawned one does not.
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        waiting: deque = deque()
+        try:
+            for block in blocks:
+                waiting.append(pool.submit(plan_shots, seed, block, scenery))
+                if len(waiting) >= AHEAD * workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()

@@ -1,0 +1,180 @@
+"""What a phone makes of light: exposure, white balance, lens, noise, tone curve, sharpening, JPEG."""
+
+import functools
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, conv2d, interpolate, pad
+
+from oasis_warp.ops.pixel_noise import pixel_noise
+
+_LUMA = (0.2126, 0.7152, 0.0722)
+_TAPS = 4
+"""Pixels on either side that a blur reaches."""
+# Annex K of the JPEG standard (ITU-T T.81), and the JFIF colour transform.
+_LUMA_STEPS = (
+    16, 11, 10, 16, 24, 40, 51, 61, 12, 12, 14, 19, 26, 58, 60, 55, 14, 13, 16, 24, 40, 57, 69, 56, 14, 17, 22, 29, 51,
+    87, 80, 62, 18, 22, 37, 56, 68, 109, 103, 77, 24, 35, 55, 64, 81, 104, 113, 92, 49, 64, 78, 87, 103, 121, 120, 101,
+    72, 92, 95, 98, 112, 100, 103, 99,
+)  # fmt: skip
+_CHROMA_STEPS = (
+    17, 18, 24, 47, 99, 99, 99, 99, 18, 21, 26, 66, 99, 99, 99, 99, 24, 26, 56, 99, 99, 99, 99, 99, 47, 66, 99, 99, 99,
+    99, 99, 99, *(99,) * 32,
+)  # fmt: skip
+_TO_YCC = ((0.299, 0.587, 0.114), (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.081312))
+
+
+class Sensor(NamedTuple):
+    """One camera and its mood."""
+
+    exposure: float
+    """Exposed value of a grey card of 18 % in mean light."""
+    metering: float
+    """0: for the light that falls in, 1: for what the picture throws back, which turns pale and dark hands grey."""
+    balance: float
+    """Share of the light's colour that white balance takes out."""
+    tint: np.ndarray
+    """Its error, a factor a colour, [3]."""
+    vignette: float
+    blur: float
+    """Of the lens: standard deviation [px at a side of 256]."""
+    noise: float
+    grain: float
+    """Blur of the noise [px]."""
+    filmic: bool
+    contrast: float
+    saturation: float
+    sharpening: float
+    quality: int
+    """Of JPEG."""
+
+
+def sample_sensor(rng: np.random.Generator) -> Sensor:
+    """Phones mostly: near daylight balance, some contrast, some sharpening, JPEG 60 to 95."""
+    u = rng.uniform
+    return Sensor(
+        exposure=float(np.exp(rng.normal(-1.72, 0.30))),
+        metering=u(0.2, 0.65),
+        balance=u(0.35, 1.0),
+        tint=np.exp(rng.normal(0, [0.045, 0.02, 0.06])),
+        vignette=u(0, 0.18),
+        blur=u(0.3, 0.85) if rng.random() < 0.85 else u(0.85, 1.5),
+        noise=float(np.exp(u(np.log(0.0015), np.log(0.014)))),
+        grain=u(0.3, 0.9),
+        filmic=bool(rng.random() < 0.35),
+        contrast=u(0.2, 0.85),
+        saturation=u(0.88, 1.12),
+        sharpening=u(0, 0.45),
+        quality=int(rng.integers(60, 96)),
+    )
+
+
+def _blur(images: Tensor, sigmas: Tensor) -> Tensor:
+    """Gaussian blur of each of [B, C, H, W] by its own width, edges repeated."""
+    batch, channels = images.shape[:2]
+    at = torch.arange(-_TAPS, _TAPS + 1, device=images.device)
+    kernel = torch.exp(-0.5 * (at / sigmas[:, None].clamp_min(0.05)) ** 2)
+    kernel = (kernel / kernel.sum(1, keepdim=True)).repeat_interleave(channels, 0)[:, None]
+    flat = images.reshape(1, batch * channels, *images.shape[2:])
+    with torch.backends.cudnn.flags(deterministic=True, allow_tf32=False):  # the same picture as on the CPU
+        flat = conv2d(pad(flat, (_TAPS, _TAPS, 0, 0), mode="replicate"), kernel[:, :, None], groups=batch * channels)
+        flat = conv2d(pad(flat, (0, 0, _TAPS, _TAPS), mode="replicate"), kernel[..., None], groups=batch * channels)
+    return flat.view_as(images)
+
+
+@functools.cache
+def _dct() -> Tensor:
+    k = torch.arange(8, dtype=torch.float64)
+    basis = torch.cos(math.pi * (2 * k + 1) * k[:, None] / 16) / 2
+    basis[0] /= math.sqrt(2)
+    return basis.float()
+
+
+def _quantised(planes: Tensor, steps: Tensor) -> Tensor:
+    """Planes [B, C, H, W] of whole 8 x 8 blocks, their cosine coefficients rounded to multiples of [B, 8, 8]."""
+    dct = _dct().to(planes.device)
+    blocks = planes.unflatten(3, (-1, 8)).unflatten(2, (-1, 8)).transpose(3, 4)
+    steps = steps[:, None, None, None]
+    rounded = (dct @ blocks @ dct.T / steps).round() * steps
+    return (dct.T @ rounded @ dct).transpose(3, 4).flatten(4, 5).flatten(2, 3)
+
+
+def jpeg(images: Float[Tensor, "B 3 H W"], qualities: list[int]) -> Float[Tensor, "B 3 H W"]:
+    """What JPEG with chroma at half size leaves of sRGB images in [0, 1]: the loss, without the file."""
+    device, (height, width) = images.device, images.shape[2:]
+    quality = torch.tensor(qualities, device=device)
+    scale = torch.where(quality < 50, 5000 / quality, 200 - 2 * quality).float()[:, None]
+
+    def steps(table: tuple[int, ...]) -> Tensor:
+        row = torch.tensor(table, device=device)
+        return ((row * scale + 50) / 100).floor().clamp(1, 255).view(-1, 8, 8)
+
+    whole = (images * 255).round()
+    whole = pad(whole, (0, -width % 16, 0, -height % 16), mode="replicate")
+    to_ycc = torch.tensor(_TO_YCC, device=device)
+    ycc = torch.einsum("cd,bdhw->bchw", to_ycc, whole)
+    luma = _quantised(ycc[:, :1] - 128, steps(_LUMA_STEPS)) + 128
+    chroma = _quantised(avg_pool2d(ycc[:, 1:], 2), steps(_CHROMA_STEPS))
+    chroma = interpolate(chroma, scale_factor=2, mode="bilinear", align_corners=False)
+    rgb = torch.einsum("cd,bdhw->bchw", torch.linalg.inv(to_ycc), torch.cat([luma, chroma], 1))
+    return (rgb[..., :height, :width] / 255).clamp(0, 1)
+
+
+def srgb(linear: Tensor) -> Tensor:
+    """SRGB of linear light."""
+    return torch.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(1e-8) ** (1 / 2.4) - 0.055)
+
+
+def expose(
+    light: Float[Tensor, "B H W 3"],
+    alpha: Float[Tensor, "B H W"],
+    sensors: list[Sensor],
+    incident: Float[Tensor, "B 3"],
+    seeds: Int[Tensor, "B"],
+) -> Float[Tensor, "B H W 3"]:
+    """Photos in [0, 1], sRGB, of linear light.
+
+    Args:
+        light: Of the scene.
+        alpha: Where the hand is: it is metered first.
+        sensors: One an image.
+        incident: Irradiance over pi on the hand, linear RGB.
+        seeds: Of the noise.
+    """
+    device, size = light.device, light.shape[2]
+
+    def column(name: str) -> Tensor:
+        return torch.tensor(np.array([getattr(s, name) for s in sensors]), device=device, dtype=torch.float32)
+
+    def cast(name: str) -> Tensor:
+        return column(name)[:, None, None, None]
+
+    x = light.permute(0, 3, 1, 2)
+    luma = torch.tensor(_LUMA, device=device)[:, None, None]
+    weight = alpha * 0.7 + 0.25
+    mirrored = ((x * luma).sum(1).clamp(max=2.0) * weight).sum((1, 2)) / weight.sum((1, 2))
+    falling = 0.18 * (incident * luma[:, 0, 0]).sum(1)
+    share = column("metering")
+    gain = column("exposure") / (falling.clamp_min(1e-3) ** (1 - share) * mirrored.clamp_min(1e-3) ** share)
+    white = incident / incident.mean(1, keepdim=True)
+    balance = column("tint") / white ** column("balance")[:, None]
+    x = x * gain[:, None, None, None] * balance[:, :, None, None]
+    at = (torch.arange(size, device=device) + 0.5) / size * 2 - 1
+    x = x * (1 - cast("vignette") * (at[:, None] ** 2 + at**2))
+    x = _blur(x, column("blur") * size / 256)
+    grain = pixel_noise(seeds, 3, x.shape[2], size)
+    grain = _blur(grain, column("grain")) * cast("noise") * (x.clamp_min(0) + 0.01).sqrt() * 1.5
+    x = (x + grain).clamp_min(0)
+    film = x * 1.1
+    film = film * (2.51 * film + 0.05) / (film * (2.43 * film + 0.59) + 0.14)
+    x = torch.where(cast("filmic") > 0, film, 1 - torch.exp(-1.55 * x))
+    x = srgb(x)
+    x = x + cast("contrast") * x * (1 - x) * (2 * x - 0.9)
+    grey = (x * luma).sum(1, keepdim=True)
+    x = grey + (x - grey) * cast("saturation")
+    x = x + cast("sharpening") * (x - _blur(x, torch.full((len(x),), 1.2, device=device)))
+    return jpeg(x.clamp(0, 1), [s.quality for s in sensors]).permute(0, 2, 3, 1)

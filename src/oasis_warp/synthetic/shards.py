@@ -1,0 +1,135 @@
+"""Write pictures for others: tar files in the WebDataset layout, whole or not there, the same bytes every time.
+
+Picture i is four members: `i.jpg`, `i.mask.png` (share of the pixel that is hand), `i.depth.png` (16 bits, tenths of a
+millimetre, 0 for none) and `i.json` with the truth.
+"""
+
+import io
+import json
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.logging import Progress, silent
+from oasis_warp.data.atomic import output_file, write_file
+from oasis_warp.synthetic.picture import SyntheticBatch, render_batch
+from oasis_warp.synthetic.plan import Scenery
+
+SHARD = 64
+"""Pictures a file: a whole number of people."""
+JPEG_QUALITY = 95
+DEPTH_UNIT = 1e-4
+"""Of depth pictures [m]."""
+DESCRIPTION = "dataset.json"
+
+
+def shard_name(number: int) -> str:
+    """File name of shard `number`."""
+    return f"hands-{number:06d}.tar"
+
+
+def write_shards(
+    folder: Path, *, count: int, seed: int, size: int, device: str, scenery: Scenery, settings: dict[str, Any],
+    batch: int, progress: Progress = silent,
+) -> int:  # fmt: skip
+    """Render pictures 0 to `count` - 1 into shards of `folder`; those that are there already stay. How many were new.
+
+    A run that was stopped goes on where it was, and ends with the same files.
+
+    Args:
+        folder: Made if need be; its parent must exist.
+        count: Pictures in all.
+        seed: Of the world.
+        size: Side of the pictures [px].
+        device: Where to compute.
+        scenery: What they show.
+        settings: What else decides on the pictures, for `dataset.json`; a folder with others is refused.
+        batch: Pictures rendered together.
+        progress: Told of every batch.
+
+    Raises:
+        InputError: the folder holds other pictures, or cannot be written.
+    """
+    described = {"seed": seed, "size": size, "shard": SHARD, **settings}
+    _claim(folder, described)
+    n_shards = -(-count // SHARD)
+    made = 0
+    for number in range(n_shards):
+        first, end = number * SHARD, min((number + 1) * SHARD, count)
+        path = folder / shard_name(number)
+        if path.is_file() and _holds(path) == end - first:
+            progress("pictures", end, count)
+            continue
+        with output_file(path) as part, tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar:
+            for start in range(first, end, batch):
+                indices = range(start, min(start + batch, end))
+                rendered = render_batch(seed, indices, size, device, scenery=scenery)
+                for k in range(len(indices)):
+                    for name, data in encode(rendered, k).items():
+                        member = tarfile.TarInfo(f"{indices[k]:08d}.{name}")
+                        member.size = len(data)
+                        tar.addfile(member, io.BytesIO(data))
+                made += len(indices)
+                progress("pictures", indices[-1] + 1, count)
+    return made
+
+
+def _holds(path: Path) -> int:
+    """Pictures in a shard."""
+    with tarfile.open(path) as tar:
+        return sum(name.endswith(".json") for name in tar.getnames())
+
+
+def _claim(folder: Path, described: dict[str, Any]) -> None:
+    """Make the folder, or check that what it holds was made with the same settings."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder to write to, found a file; choose another name.")
+    if not folder.parent.is_dir():
+        raise InputError(f"{folder}: expected the folder {folder.parent} to write to, found none; make it first.")
+    folder.mkdir(exist_ok=True)
+    file = folder / DESCRIPTION
+    text = json.dumps(described, indent=1, sort_keys=True) + "\n"
+    if file.exists():
+        if file.read_text() != text:
+            raise InputError(
+                f"{folder}: holds pictures made with other settings (see {DESCRIPTION}); choose another folder."
+            )
+    else:
+        write_file(file, text.encode())
+
+
+def encode(batch: SyntheticBatch, k: int) -> dict[str, bytes]:
+    """Picture `k` of a batch as files, by the end of their names."""
+    rgb = (batch.image[k].cpu() * 255).round().to(torch.uint8).numpy()
+    mask = (batch.mask[k].cpu() * 255).round().to(torch.uint8).numpy()
+    depth = batch.depth[k].cpu().numpy().astype(np.float64)
+    depth = np.where(np.isfinite(depth), np.clip(np.round(depth / DEPTH_UNIT), 1, 65535), 0).astype(np.uint16)
+    truth = {
+        "index": int(batch.index[k]),
+        "person": int(batch.person[k]),
+        "side": "left" if int(batch.left[k]) else "right",
+        "gesture": batch.gestures[k],
+        "landmarks": _rounded(batch.landmarks[k], 3),
+        "landmarks_3d": _rounded(batch.landmarks_3d[k], 6),
+        "angles": _rounded(batch.angles[k], 6),
+        "orientation": _rounded(batch.orientation[k], 7),
+        "translation": _rounded(batch.translation[k], 6),
+        "shape": _rounded(batch.shape[k], 6),
+        "K": _rounded(batch.K[k], 4),
+    }
+    _, jpg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return {
+        "jpg": jpg.tobytes(),
+        "mask.png": cv2.imencode(".png", mask)[1].tobytes(),
+        "depth.png": cv2.imencode(".png", depth)[1].tobytes(),
+        "json": (json.dumps(truth) + "\n").encode(),
+    }
+
+
+def _rounded(tensor: torch.Tensor, digits: int) -> list:
+    return np.round(tensor.cpu().double().numpy(), digits).tolist()

@@ -1,0 +1,148 @@
+"""What a hand wears: the meshes of sleeves, wristbands and rings on a posed hand, and how they look."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.synthetic.body import ARM_LENGTH, ARM_ROWS, BAND_ROWS, RING_COLUMNS, RING_ROWS, SLEEVE_ROWS, Body
+from oasis_warp.synthetic.identity import Identity
+
+BAND_PROFILE = (-0.6, 0.7, 1.0, 1.0, 1.0, 0.7, -0.6)
+"""Height of a wristband's rows over the skin, in its thickness."""
+RING_ROUNDNESS = 0.6
+"""Half thickness of a ring [mm]."""
+SKIN_LOOK = (0.0, 0.0, 0.0, 0.5, 0.0, 0.0)
+AWAY = (0.0, 0.0, -1.0)
+"""Where vertices wait that an image does not show, in the camera's frame: behind it."""
+
+
+class Clothes(NamedTuple):
+    """Of one picture; lengths in metres."""
+
+    sleeve_start: float
+    """Distance of its edge from the wrist; beyond the arm where there is none."""
+    sleeve_gap: float
+    sleeve_phases: np.ndarray
+    """Of the wrinkles, [4]."""
+    sleeve_look: tuple[float, ...]
+    band_start: float
+    """Beyond the arm where there is none."""
+    band_width: float
+    band_thickness: float
+    band_look: tuple[float, ...]
+
+
+def sample_clothes(rng: np.random.Generator, bare: bool) -> Clothes:
+    """A sleeve on a third of the arms, a wristband or strap on an eighth, none if `bare`."""
+    u = rng.uniform
+
+    def cloth_color() -> tuple[float, float, float]:
+        dark = np.exp(u(-4.2, -0.5))
+        tint = np.exp(rng.normal(0, rng.choice([0.08, 0.5], p=[0.6, 0.4]), 3))
+        return tuple(np.clip(dark * tint, 0.008, 0.85))
+
+    sleeve, band = rng.random() < 0.36 and not bare, rng.random() < 0.12 and not bare
+    start = u(0.008, 0.13)
+    look = (*cloth_color(), 0.85, 0.0, 1.0)
+    metal = float(rng.random() < 0.35)
+    strap = (0.75, 0.74, 0.72) if metal else cloth_color()
+    return Clothes(
+        sleeve_start=start if sleeve else 2 * ARM_LENGTH,
+        sleeve_gap=u(0.002, 0.009),
+        sleeve_phases=u(0, 2 * np.pi, 4),
+        sleeve_look=look,
+        band_start=u(0.012, 0.035) if band else 2 * ARM_LENGTH,
+        band_width=u(0.006, 0.022),
+        band_thickness=u(0.0012, 0.003),
+        band_look=(*strap, u(0.22, 0.55), metal, 0.0),
+    )
+
+
+def _along_arm(rows: Tensor, s: Tensor) -> Tensor:
+    """Rings of the arm at places `s` [B, R] (0 wrist, 1 elbow) of rows [B, ARM_ROWS + 1, C, 3]."""
+    place = s.clamp(0, 1) * ARM_ROWS
+    low = place.floor().clamp(max=ARM_ROWS - 1)
+    index = low.long()[..., None, None].expand(-1, -1, *rows.shape[2:])
+    start, end = rows.gather(1, index), rows.gather(1, index + 1)
+    return start + (place - low)[..., None, None] * (end - start)
+
+
+def _outward(rings: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(rings - rings.mean(2, keepdim=True), dim=-1)
+
+
+def sleeves(rows: Float[Tensor, "B R C 3"], clothes: list[Clothes]) -> Float[Tensor, "B K C 3"]:
+    """Wrinkled tubes round arms, whose rows start with the wrist's rim; rows of absent ones are not to be used."""
+    column = rows.new_tensor
+    start = column([c.sleeve_start for c in clothes])[:, None] / ARM_LENGTH
+    gap = column([c.sleeve_gap for c in clothes])[:, None]
+    share = torch.linspace(0, 1, SLEEVE_ROWS - 2, device=rows.device)
+    s = torch.cat([start, start, start + (1 - start) * share], 1)
+    rings = _along_arm(rows, s)
+    lift = gap.expand(-1, SLEEVE_ROWS).clone()
+    lift[:, 0] = -1e-3
+    lift[:, 1] = (gap - 1.2e-3)[:, 0]
+    phase = column(np.stack([c.sleeve_phases for c in clothes]))[:, :, None, None]
+    angle = torch.linspace(0, 2 * torch.pi, rows.shape[2] + 1, device=rows.device)[:-1]
+    along = s[:, :, None] * ARM_LENGTH
+    folds = (
+        torch.sin(along / 0.0065 + 1.7 * torch.sin(angle + phase[:, 0]) + phase[:, 1])
+        + 0.8 * torch.sin(along / 0.011 + 2 * torch.sin(2 * angle + phase[:, 2]))
+        + 0.9 * torch.sin(3 * angle + phase[:, 3] + along / 0.03)
+    )
+    folds = folds * (torch.arange(SLEEVE_ROWS, device=rows.device) > 1)[:, None]
+    lift = lift[:, :, None] + 0.22 * gap[:, :, None].clamp(max=0.006) * folds
+    return rings + _outward(rings) * lift[..., None]
+
+
+def bands(rows: Float[Tensor, "B R C 3"], clothes: list[Clothes]) -> Float[Tensor, "B K C 3"]:
+    """Flat bands round wrists."""
+    column = rows.new_tensor
+    start, width, thickness = (
+        column([getattr(c, name) for c in clothes])[:, None] for name in ("band_start", "band_width", "band_thickness")
+    )
+    share = torch.tensor([0.0, 0.02, 0.15, 0.5, 0.85, 0.98, 1.0], device=rows.device)
+    rings = _along_arm(rows, (start + width * share) / ARM_LENGTH)
+    lift = thickness * torch.tensor(BAND_PROFILE, device=rows.device)
+    assert len(BAND_PROFILE) == BAND_ROWS
+    return rings + _outward(rings) * lift[..., None, None]
+
+
+def ring_at_rest(
+    body: Body, rest: Float[Tensor, "V 3"], joints: Float[Tensor, "16 3"], identity: Identity
+) -> Float[Tensor, "K 3"]:
+    """A band that fits the identity's finger, in the hand's frame at rest [m]; nothing to be used if it has none."""
+    finger = max(identity.ring_finger, 0)
+    bone = body.bones[finger][0]
+    joint = 3 * finger + 1
+    points = rest.double().numpy() * 1e3 - (joints[joint].double().numpy() * 1e3)
+    axes = np.stack([bone.along, bone.side, bone.back], 1)
+    local = points @ axes
+    place = (
+        identity.ring_place
+        * bone.length
+        * np.linalg.norm((joints[joint + 1] - joints[joint]).numpy() * 1e3)
+        / bone.length
+    )
+    on_finger = body.finger_weights[: body.n_hand, finger].numpy() > 0.6
+    near = local[on_finger & (np.abs(local[:, 0] - place) < 3.5)][:, 1:]
+    middle = (near.max(0) + near.min(0)) / 2
+    around = near - middle
+    angle, radius = np.arctan2(around[:, 1], around[:, 0]), np.hypot(around[:, 0], around[:, 1])
+    turns = np.linspace(-np.pi, np.pi, RING_COLUMNS, endpoint=False)
+    weight = np.exp(30 * (np.cos(angle[None] - turns[:, None]) - 1))
+    fit = (weight * radius).sum(1) / weight.sum(1) + 0.15
+    across = np.linspace(0, 2 * np.pi, RING_ROWS, endpoint=False)[:, None]
+    wide = place + identity.ring_width / 2 * np.sign(np.cos(across)) * np.abs(np.cos(across)) ** 0.6 + 0 * fit
+    reach = fit + RING_ROUNDNESS * np.sin(across)
+    side, up = reach * np.cos(turns) + middle[0], reach * np.sin(turns) + middle[1]
+    points = np.stack([wide, side, up], -1).reshape(-1, 3) @ axes.T * 1e-3 + joints[joint].double().numpy()
+    return torch.from_numpy(points).float()
+
+
+def ring_look(identity: Identity) -> tuple[float, ...]:
+    """Metal."""
+    return (*identity.ring_metal, 0.18 + 0.2 * identity.gloss, 1.0, 0.0)
