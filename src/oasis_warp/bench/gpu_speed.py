@@ -130,7 +130,7 @@ def make_graphs(way: Way, device: torch.device) -> Graphs:
     if device.type != "cuda":
         return Graphs(reason="no CUDA device")
     if way.captured is None:
-        return Graphs(reason="not tried")
+        return Graphs()  # a peer that no graph can hold, or graphs already
     try:
         return Graphs(capture(way.captured), capture(way.captured, STEPS_A_GRAPH))
     except NotCaptured as error:
