@@ -249,3 +249,38 @@ class Synthesize:
     """One contact sheet instead of shards."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pretrain:
+    """Train the learned prior on synthetic hands: network.safetensors, metrics.jsonl and pictures.png.
+
+    People are baked first and kept in OUT/people, 23 MB each. A training that was stopped goes on when it is started
+    again with the same options, and on the CPU ends with the same bits. Ctrl-C ends it after the step it is at.
+    torchrun starts it on several GPUs.
+    """
+
+    out: Positional[Path]
+    """Folder for what training leaves; its parent must exist."""
+    profile: Literal["compact", "paper"] = "compact"
+    """Sizes of the network: ours, or the paper's."""
+    steps: int = 20_000
+    """Batches that each process sees."""
+    hands: int = 16
+    """Photos a batch and process, each of another person."""
+    views: int = 2
+    """Targets a photo: the same hand in other poses and even light, 1 to 8."""
+    people: int = 512
+    """How many there are."""
+    size: int = 256
+    """Side of photos and targets [px], a multiple of 16."""
+    seed: int = 0
+    """Of the weights, the people, the pictures and the estimator's errors."""
+    device: Literal["cpu", "cuda"] = "cuda"
+    """Where to compute."""
+    precision: Literal["bf16", "float32"] = "bf16"
+    """Of attention and perceptrons; all else is float32."""
+    workers: int = 8
+    """Processes that bake people and plan pictures ahead, for each GPU; 0 for none."""
+    backbone_weights: Path | None = None
+    """DINOv2's model.safetensors, for the paper's profile."""

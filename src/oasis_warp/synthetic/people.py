@@ -1,26 +1,33 @@
 """People of a world, baked once and kept: texture, resting surface and what goes with them."""
 
-import multiprocessing
+import json
 from collections import OrderedDict
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save
 from torch import Tensor
 
+from oasis_warp import __version__
 from oasis_warp.core.logging import Progress, silent
+from oasis_warp.data.atomic import write_file
 from oasis_warp.ops.skin_shading import surface_state
 from oasis_warp.synthetic.atlas import bundled_atlas
 from oasis_warp.synthetic.bake import bake
 from oasis_warp.synthetic.body import ARM_ROWS, arm_rows, bundled_body
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
+from oasis_warp.synthetic.processes import worker_pool
 from oasis_warp.synthetic.relief import relief
 from oasis_warp.synthetic.wardrobe import ring_at_rest, ring_look
 
 KEPT = {"cpu": 48, "cuda": 1024}
 """People kept on a device, 23 MB each."""
+FORMAT = "oasis-person"
 
 
 class Person(NamedTuple):
@@ -54,12 +61,23 @@ def person(seed: int, number: int, population: Population, device: str) -> Perso
 
 
 def bake_people(
-    seed: int, numbers: Sequence[int], population: Population, device: str, *, jobs: int, progress: Progress = silent
-) -> None:
-    """Make `person` ready for each of `numbers`, in `jobs` processes: before training, so that it never waits.
+    seed: int, numbers: Sequence[int], population: Population, device: str, *, jobs: int, folder: Path | None = None,
+    progress: Progress = silent,
+) -> None:  # fmt: skip
+    """Make `person` ready for each of `numbers`: before training, so that it never waits.
+
+    Args:
+        seed: Of the world.
+        numbers: Of the people.
+        population: What they may have.
+        device: Where they are kept.
+        jobs: Processes that bake; 0 for this one.
+        folder: Where each person is written to, 23 MB, and read from when it has been made before; no files when None.
+        progress: Told of every person.
 
     Raises:
         ValueError: more people than are kept on the device.
+        InputError: the folder cannot be written.
     """
     most = KEPT[torch.device(device).type]
     if len(numbers) > most:
@@ -67,12 +85,59 @@ def bake_people(
             f"numbers: expected at most {most} people on {device}, got {len(numbers)}. Others are forgotten."
         )
     missing = [n for n in numbers if (seed, n, population, device) not in _known]
-    # A forked child of a process with a CUDA context or threads may hang, a spawned one does not.
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        born = pool.map(_born, [seed] * len(missing), missing, [population] * len(missing))
-        for k, (number, found) in enumerate(zip(missing, born, strict=True)):
+    count = len(missing)
+    if missing:
+        progress("people", 0, count)
+
+    def keep(made: Iterable[Person | Path]) -> None:
+        for k, (number, found) in enumerate(zip(missing, made, strict=True)):
+            found = _read(found, seed, number, population) if isinstance(found, Path) else found
             _keep((seed, number, population, device), found)
-            progress("people", k + 1, len(missing))
+            progress("people", k + 1, count)
+
+    what = ([seed] * count, missing, [population] * count, [folder] * count)
+    if jobs < 1:
+        keep(map(_make, *what))
+        return
+    with worker_pool(jobs) as pool:
+        try:
+            keep(pool.map(_make, *what))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # or hundreds of people would still be baked
+            raise
+
+
+def _make(seed: int, number: int, population: Population, folder: Path | None) -> Person | Path:
+    """A person, or with a folder its file, which may be there already."""
+    if folder is None:
+        return _born(seed, number, population)
+    path = folder / f"{number:06d}.safetensors"
+    if not _is_there(path, _about(seed, number, population)):
+        found = _born(seed, number, population)
+        tensors = {name: value.contiguous() for name, value in found._asdict().items() if isinstance(value, Tensor)}
+        write_file(path, save(tensors, {FORMAT: _about(seed, number, population)}))
+    return path
+
+
+def _about(seed: int, number: int, population: Population) -> str:
+    """Tells a person from all others, and from the same one as another version baked it."""
+    return json.dumps([__version__, seed, number, asdict(population)], sort_keys=True)
+
+
+def _is_there(path: Path, about: str) -> bool:
+    if not path.is_file():
+        return False
+    try:
+        with safe_open(path, framework="pt") as file:
+            return (file.metadata() or {}).get(FORMAT) == about
+    except SafetensorError:  # cut short: baked again
+        return False
+
+
+def _read(path: Path, seed: int, number: int, population: Population) -> Person:
+    """What `_make` has written."""
+    identity = sample_identity(bundled_body().hand, seed, number, population)
+    return Person(identity=identity, ring_look=ring_look(identity), **load_file(path))
 
 
 def _keep(key: tuple[int, int, Population, str], found: Person) -> Person:

@@ -1,10 +1,8 @@
 """Plan pictures: all that is drawn at random, before anything is rendered. On the CPU, a few milliseconds each."""
 
 import functools
-import multiprocessing
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +14,7 @@ from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.contact import separate
 from oasis_warp.synthetic.gestures import sample_gesture
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
+from oasis_warp.synthetic.processes import worker_pool
 from oasis_warp.synthetic.rooms import Room, sample_room
 from oasis_warp.synthetic.sensor import Sensor, sample_sensor
 from oasis_warp.synthetic.stage import Light, Look, View, sample_light, sample_view
@@ -114,8 +113,7 @@ def plan_ahead(seed: int, blocks: Iterable[Sequence[int]], scenery: Scenery, wor
         for block in blocks:
             yield plan_shots(seed, block, scenery)
         return
-    # A forked child of a process with a CUDA context or threads may hang, a spawned one does not.
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with worker_pool(workers) as pool:
         waiting: deque = deque()
         try:
             for block in blocks:

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import torch
 
-from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.data.atomic import output_file, write_file
+from oasis_warp.data.atomic import output_file
+from oasis_warp.data.claimed_folder import claim_folder
 from oasis_warp.synthetic.picture import SyntheticBatch, render_batch
 from oasis_warp.synthetic.plan import Scenery
 
@@ -56,7 +56,7 @@ def write_shards(
         InputError: the folder holds other pictures, or cannot be written.
     """
     described = {"seed": seed, "size": size, "shard": SHARD, **settings}
-    _claim(folder, described)
+    claim_folder(folder, DESCRIPTION, described, "pictures")
     n_shards = -(-count // SHARD)
     made = 0
     for number in range(n_shards):
@@ -83,24 +83,6 @@ def _holds(path: Path) -> int:
     """Pictures in a shard."""
     with tarfile.open(path) as tar:
         return sum(name.endswith(".json") for name in tar.getnames())
-
-
-def _claim(folder: Path, described: dict[str, Any]) -> None:
-    """Make the folder, or check that what it holds was made with the same settings."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder to write to, found a file; choose another name.")
-    if not folder.parent.is_dir():
-        raise InputError(f"{folder}: expected the folder {folder.parent} to write to, found none; make it first.")
-    folder.mkdir(exist_ok=True)
-    file = folder / DESCRIPTION
-    text = json.dumps(described, indent=1, sort_keys=True) + "\n"
-    if file.exists():
-        if file.read_text() != text:
-            raise InputError(
-                f"{folder}: holds pictures made with other settings (see {DESCRIPTION}); choose another folder."
-            )
-    else:
-        write_file(file, text.encode())
 
 
 def encode(batch: SyntheticBatch, k: int) -> dict[str, bytes]:

@@ -9,6 +9,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from oasis_warp.core.errors import InputError
+
 
 class Place(NamedTuple):
     """This process among all."""
@@ -20,10 +22,19 @@ class Place(NamedTuple):
 
 @contextmanager
 def join_processes(device: str) -> Iterator[Place]:
-    """Join the processes that torchrun started, over NCCL on CUDA and gloo on the CPU; a process alone joins none."""
+    """Join the processes that torchrun started, over NCCL on CUDA and gloo on the CPU; a process alone joins none.
+
+    Raises:
+        InputError: fewer CUDA devices than processes.
+    """
     world, local = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("LOCAL_RANK", 0))
     here = torch.device(device, local) if device == "cuda" else torch.device(device)
     if device == "cuda":
+        found = torch.cuda.device_count()
+        if local >= found:
+            raise InputError(
+                f"--nproc-per-node: expected one process a CUDA device, of which there are {found}; give {found} or less."
+            )
         torch.cuda.set_device(here)
     if world == 1:
         yield Place(0, 1, here)
@@ -41,3 +52,17 @@ def mean_over_processes(values: Tensor, world: int) -> Tensor:
         dist.all_reduce(values)
         values = values / world
     return values
+
+
+def any_process(says_so: bool, place: Place) -> bool:
+    """Whether one of the processes says so: the same answer in all, which all must ask for."""
+    if place.world == 1:
+        return says_so
+    votes = torch.tensor(float(says_so), device=place.device)
+    dist.all_reduce(votes)
+    return bool(votes > 0)
+
+
+def wait_for_all(place: Place) -> None:
+    """Go on when every process has come here."""
+    any_process(False, place)

@@ -3,9 +3,10 @@
 import json
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -22,7 +23,7 @@ from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.weights_file import save_network
 from oasis_warp.training.checkpoint import load_checkpoint, save_checkpoint
-from oasis_warp.training.distributed import Place, mean_over_processes
+from oasis_warp.training.distributed import Place, any_process, mean_over_processes
 from oasis_warp.training.losses import LossConfig, Perceptual, objective, picture_psnr
 from oasis_warp.training.targets import Pictures, draw_targets, true_pictures
 
@@ -71,6 +72,11 @@ class StepResult(NamedTuple):
     psnr: Tensor
     drawn: Pictures
     true: Pictures
+
+
+def never() -> bool:
+    """Nobody asks to stop."""
+    return False
 
 
 def learning_rate(config: PretrainConfig, step: int) -> float:
@@ -131,13 +137,26 @@ def pretrain(
     place: Place,
     *,
     perceptual: Perceptual = detail_difference,
+    about: Mapping[str, Any] = MappingProxyType({}),
+    stop_asked: Callable[[], bool] = never,
     progress: Progress = silent,
-) -> None:
-    """Train until `config.steps`, going on from the checkpoint in `folder` where there is one.
+) -> int:
+    """Train until `config.steps`, going on from the checkpoint in `folder` where there is one; the steps done in all.
 
     Leaves there a checkpoint, the weights in half precision, a line of JSON every few steps and a sheet of pictures:
     photo, target, drawn. Process 0 writes. A training that was stopped and taken up again ends, on the CPU, with the
     bits of one that was not, as steps and batches count from the start and nothing else is random.
+
+    Args:
+        network: Changed in place.
+        source: Of batches.
+        config: How to train.
+        folder: Where files go.
+        place: This process.
+        perceptual: Term of the objective.
+        about: More to say in the notes of the weights file, beside `config`: what JSON can hold.
+        stop_asked: Asked after every step, by several processes when they write metrics: then this is the last step.
+        progress: Told of the steps to do from here on.
 
     Raises:
         InputError: a checkpoint of another network, a folder that cannot be written, or a loss that is not finite.
@@ -149,11 +168,18 @@ def pretrain(
         _forget_after(folder / METRICS, trainer.step)
     began, first = time.perf_counter(), trainer.step
     batches = source(trainer.step, place.rank, place.world)
-    while trainer.step < config.steps:
+    notes = {**about, **asdict(config)}
+    stopping = trainer.step >= config.steps
+    progress("pretraining", 0, config.steps - first)
+    while not stopping:
         batch = next(batches)
         result = trainer.advance(batch)
-        stop_here = trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps
-        if trainer.step % config.log_every == 0 or stop_here:
+        log_here = trainer.step % config.log_every == 0
+        # several processes stop together or wait for each other for ever, and agreeing costs a wait for the device
+        asked = (place.world == 1 or log_here) and any_process(stop_asked(), place)
+        stopping = asked or trainer.step == config.steps
+        save_here = stopping or trainer.step % config.checkpoint_every == 0
+        if log_here or save_here:
             names = ["loss", "psnr", *result.terms]
             values = torch.stack([result.loss, result.psnr, *result.terms.values()]).detach()
             numbers = dict(zip(names, mean_over_processes(values, place.world).tolist(), strict=True))
@@ -164,11 +190,12 @@ def pretrain(
                 line = {"step": trainer.step, "seconds_per_step": pace, **numbers}
                 with (folder / METRICS).open("a") as file:
                     file.write(json.dumps(line) + "\n")
-            progress("pretraining", trainer.step, config.steps)
-        if place.rank == 0 and stop_here:
+        if place.rank == 0 and save_here:
             save_checkpoint(folder / CHECKPOINT, network, trainer.optimizer, trainer.step)
-            save_network(folder / WEIGHTS, network, notes=json.dumps({"step": trainer.step, **asdict(config)}))
+            save_network(folder / WEIGHTS, network, notes=json.dumps({"step": trainer.step, **notes}))
             write_picture(folder / SHEET, to_uint8(_sheet(batch, result)))
+        progress("pretraining", trainer.step - first, config.steps - first)
+    return trainer.step
 
 
 def _forget_after(path: Path, step: int) -> None:

@@ -1,0 +1,176 @@
+"""`oasis pretrain`: train the learned prior on the synthetic world."""
+
+import hashlib
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from oasis_warp.commands.exit_codes import INTERRUPTED
+from oasis_warp.commands.look import check_device
+from oasis_warp.commands.options import Pretrain
+from oasis_warp.commands.progress import show_progress
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.logging import Progress, silent
+from oasis_warp.data.claimed_folder import claim_folder
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.network.config import PROFILES, NetworkConfig
+from oasis_warp.network.dinov2 import DinoV2Encoder
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.synthetic.people import KEPT
+from oasis_warp.synthetic.plan import PICTURES_EACH
+from oasis_warp.training.distributed import Place, join_processes, wait_for_all
+from oasis_warp.training.pretrain import CHECKPOINT, PretrainConfig, pretrain
+from oasis_warp.training.synthetic_source import MULTIPLE, SyntheticHands
+
+SETTINGS, PEOPLE = "training.json", "people"
+"""In the folder: with what the training began, and the people that have been baked."""
+PRECISIONS = {"bf16": "bfloat16", "float32": "float32"}
+SIZES = range(32, 1025, MULTIPLE)
+
+
+def run(options: Pretrain) -> int:
+    """Train, or go on; Ctrl-C keeps what is done.
+
+    Raises:
+        InputError: a wrong option or folder, weights that do not fit, or a loss that is not finite.
+    """
+    check_device(options.device)
+    check_options(options)
+    with join_processes(options.device) as place:
+        shown = show_progress(Console(stderr=True)) if place.rank == 0 else nullcontext(silent)
+        try:
+            with shown as progress:
+                done = train(options, place, progress)
+        except KeyboardInterrupt:
+            done = 0
+    if done == options.steps:
+        return 0
+    if place.rank == 0:
+        print(f"oasis: stopped; what is done stays in {options.out}, the same command goes on.", file=sys.stderr)
+    return INTERRUPTED
+
+
+def check_options(options: Pretrain) -> None:
+    """Refuse what can be refused before anything is made.
+
+    Raises:
+        InputError: a number out of its range, or weights for a network that reads none.
+    """
+    for name in ("steps", "hands", "people"):
+        value = getattr(options, name)
+        if value < 1:
+            raise InputError(f"--{name}: expected 1 or more, got {value}.")
+    for name in ("seed", "workers"):
+        value = getattr(options, name)
+        if value < 0:
+            raise InputError(f"--{name}: expected 0 or more, got {value}.")
+    if not 1 <= options.views <= PICTURES_EACH:
+        raise InputError(f"--views: expected 1 to {PICTURES_EACH}, got {options.views}; more hands do the same.")
+    if options.size not in SIZES:
+        raise InputError(
+            f"--size: expected a multiple of {MULTIPLE} from {SIZES[0]} to {SIZES[-1]} pixels, got {options.size}."
+        )
+    backbone, weights = PROFILES[options.profile].backbone, options.backbone_weights
+    if backbone == "convolutional" and weights is not None:
+        raise InputError(f"--backbone-weights: the {options.profile} profile trains its own encoder; leave them out.")
+    if backbone != "convolutional" and weights is None:
+        raise InputError(
+            f"--profile {options.profile}: reads photos with {backbone}; give its model.safetensors by "
+            "--backbone-weights."
+        )
+    if weights is not None and not weights.is_file():
+        raise InputError(f"--backbone-weights {weights}: no such file; download model.safetensors of {backbone}.")
+
+
+def train(options: Pretrain, place: Place, progress: Progress) -> int:
+    """This process's share of the training; how many steps are done in all.
+
+    Raises:
+        InputError: a folder that cannot be used, weights that do not fit, or a loss that is not finite.
+    """
+    hands = SyntheticHands(
+        seed=options.seed, people=options.people, hands=options.hands, views=options.views, size=options.size,
+        device=place.device, workers=options.workers,
+    )  # fmt: skip
+    met = hands.people_met(place.rank, place.world, options.steps)
+    most = KEPT[place.device.type]
+    if len(met) > most:
+        raise InputError(
+            f"--people: expected at most {most} that one {place.device.type} device meets, got {len(met)}; "
+            "each takes 23 MB there."
+        )
+    network = make_network(PROFILES[options.profile], options.seed, options.backbone_weights)
+    settings = settings_of(options, place.world)
+    if place.rank == 0:
+        claim(options.out, settings)
+    wait_for_all(place)
+    hands.bake(met, options.out / PEOPLE, options.workers, progress)
+    config = PretrainConfig(steps=options.steps, precision=PRECISIONS[options.precision])
+    with stop_signals(can_force=place.world == 1) as stop_asked:
+        return pretrain(
+            network, hands, config, options.out, place, about=settings, stop_asked=stop_asked, progress=progress
+        )
+
+
+def make_network(config: NetworkConfig, seed: int, backbone_weights: Path | None) -> HandNetwork:
+    """A network that knows nothing yet.
+
+    Raises:
+        InputError: the backbone's weights do not fit.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = HandNetwork(config, bundled_hand())
+    if isinstance(network.encoder, DinoV2Encoder) and backbone_weights is not None:
+        network.encoder.load(backbone_weights)
+    return network
+
+
+def settings_of(options: Pretrain, processes: int) -> dict[str, Any]:
+    """All that decides on the weights; where and with how many workers they are computed does not."""
+    names = ("profile", "steps", "hands", "views", "people", "size", "seed", "precision")
+    settings = {name: getattr(options, name) for name in names} | {"processes": processes}
+    if options.backbone_weights is not None:
+        with options.backbone_weights.open("rb") as file:
+            settings["backbone_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+    return settings
+
+
+def claim(folder: Path, settings: dict[str, Any]) -> None:
+    """Make the folder, or check that the training in it is this one.
+
+    Raises:
+        InputError: it is not, or no folder can be made there.
+    """
+    if (folder / CHECKPOINT).exists() and not (folder / SETTINGS).exists():
+        raise InputError(f"{folder}: holds a checkpoint but no {SETTINGS} that says of what; choose another folder.")
+    claim_folder(folder, SETTINGS, settings, "a training")
+    (folder / PEOPLE).mkdir(exist_ok=True)
+
+
+@contextmanager
+def stop_signals(*, can_force: bool) -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C or SIGTERM has come in this block; where `can_force`, a second Ctrl-C ends the work at once."""
+    asked = False
+
+    def ask(number: int, frame: object) -> None:
+        nonlocal asked
+        if asked and can_force and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        if not asked:  # print may not be called from here: it could have been interrupted itself
+            os.write(2, b"\noasis: stopping after this step.\n")
+        asked = True
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,98 @@
+"""The synthetic world as the source of training: photos with everything, targets of the same hands in even light."""
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.types import TrainingBatch
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.synthetic.people import bake_people
+from oasis_warp.synthetic.picture import render_shots
+from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, plan_ahead
+from oasis_warp.training.photographed import training_batch
+
+ERROR_STREAM = 3
+"""Tells the random numbers of the estimator's errors from those of identities and pictures with the same seed."""
+SURROUNDINGS = 1.25
+"""Side of a rendered picture over that of the crop round its hand."""
+MULTIPLE = 16
+"""Of a crop's side [px]: the rendered picture and the scales that losses look at are whole pixels then."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticHands:
+    """A `BatchSource`. On the CPU a batch has the same bits wherever training was taken up."""
+
+    seed: int
+    """Of the world and of the estimator's errors."""
+    people: int
+    """How many there are, over and over again in other photos."""
+    hands: int
+    """Photos a batch, each of another person."""
+    views: int
+    """Targets a photo, up to `PICTURES_EACH`."""
+    size: int
+    """Side of photos and targets [px], a multiple of `MULTIPLE`."""
+    device: torch.device
+    """Where pictures are rendered."""
+    workers: int = 0
+    """Processes that plan pictures ahead; 0 for none, else one at least for photos and one for targets."""
+
+    def __call__(self, first_step: int, rank: int, world: int) -> Iterator[TrainingBatch]:
+        """Batches without end. People that have not been baked make it wait, some seconds each."""
+        hand, device = bundled_hand().to(self.device), str(self.device)
+        photo, even = Scenery(people=self.people), Scenery(look="even", people=self.people)
+        rendered = int(self.size * SURROUNDINGS)
+        planners = 0 if self.workers < 1 else max(1, self.workers // (1 + self.views))
+        more = 0 if self.workers < 1 else max(1, self.workers - planners)
+
+        def numbers() -> Iterator[int]:
+            return itertools.count(first_step * world + rank, world)
+
+        photos = plan_ahead(self.seed, map(self.photo_indices, numbers()), photo, planners)
+        targets = plan_ahead(self.seed, map(self.target_indices, numbers()), even, more)
+        for number, photo_shots, target_shots in zip(numbers(), photos, targets, strict=True):
+            yield training_batch(
+                hand,
+                render_shots(self.seed, photo_shots, rendered, device, scenery=photo),
+                render_shots(self.seed, target_shots, rendered, device, scenery=even),
+                self.size,
+                self.errors(number),
+            )
+
+    def photo_indices(self, number: int) -> list[int]:
+        """Pictures that are the photos of batch `number`."""
+        return [PICTURES_EACH * (number * self.hands + k) for k in range(self.hands)]
+
+    def target_indices(self, number: int) -> list[int]:
+        """Pictures that are its targets, those of the first photo first; in the other look, so nothing comes twice."""
+        return [index + view for index in self.photo_indices(number) for view in range(self.views)]
+
+    def errors(self, number: int) -> torch.Generator:
+        """The random numbers of the estimator's errors in batch `number`."""
+        (state,) = np.random.SeedSequence([self.seed, ERROR_STREAM, number]).generate_state(1)
+        return torch.Generator().manual_seed(int(state))
+
+    def people_met(self, rank: int, world: int, steps: int) -> list[int]:
+        """Whom process `rank` of `world` meets in so many steps.
+
+        Processes that meet the same people find them in another order, so that they need not bake the same at once.
+        """
+        batches = range(rank, min(steps, self.people) * world, world)  # after that many steps they come again
+        met = sorted({(number * self.hands + k) % self.people for number in batches for k in range(self.hands)})
+        first = rank * len(met) // world
+        return met[first:] + met[:first]
+
+    def bake(self, met: list[int], folder: Path, jobs: int, progress: Progress = silent) -> None:
+        """Make the people of `people_met` ready, or read those that `folder` holds already.
+
+        Raises:
+            ValueError: more than `synthetic.people.KEPT`.
+            InputError: the folder cannot be written.
+        """
+        bake_people(self.seed, met, EVERYBODY, str(self.device), jobs=jobs, folder=folder, progress=progress)

@@ -1,0 +1,158 @@
+"""`oasis pretrain`: refusals in words, what it leaves, and stopping and going on."""
+
+import json
+import signal
+from contextlib import contextmanager
+from dataclasses import replace
+
+import pytest
+from safetensors import safe_open
+
+from oasis_warp.cli import main
+from oasis_warp.commands import pretrain as command
+from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
+from oasis_warp.network.config import COMPACT, PROFILES
+from oasis_warp.network.weights_file import load_network
+from oasis_warp.training.pretrain import CHECKPOINT, METRICS, SHEET, WEIGHTS
+
+TINY = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
+SMALL = ("--hands", "1", "--views", "1", "--people", "1", "--size", "32", "--steps", "2", "--workers", "0",
+         "--device", "cpu", "--precision", "float32")  # fmt: skip
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    monkeypatch.setitem(PROFILES, "compact", TINY)
+
+
+def stop_after_one_step(monkeypatch):
+    """Have Ctrl-C come while the first step is reported."""
+
+    @contextmanager
+    def shown(console):
+        def progress(stage, done, total):
+            if (stage, done) == ("pretraining", 1):
+                signal.raise_signal(signal.SIGINT)
+
+        yield progress
+
+    monkeypatch.setattr(command, "show_progress", shown)
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    """A training that nothing stopped."""
+    folder = tmp_path_factory.mktemp("unbroken") / "prior"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PROFILES, "compact", TINY)
+        assert main(["pretrain", str(folder), *SMALL]) == 0
+    return folder
+
+
+def test_a_training_leaves_weights_metrics_and_pictures(unbroken, hand):
+    names = {CHECKPOINT, WEIGHTS, METRICS, SHEET, command.SETTINGS, command.PEOPLE}
+    assert {path.name for path in unbroken.iterdir()} == names
+    (line,) = map(json.loads, (unbroken / METRICS).read_text().splitlines())
+    assert line["step"] == 2 and line["loss"] > 0
+    assert load_network(unbroken / WEIGHTS, hand).config == TINY
+    assert [path.name for path in (unbroken / command.PEOPLE).iterdir()] == ["000000.safetensors"]
+
+
+def test_the_weights_say_how_they_came_about(unbroken):
+    with safe_open(unbroken / WEIGHTS, framework="pt") as file:
+        notes = json.loads(json.loads(file.metadata()["oasis-network"])["notes"])
+    assert notes["step"] == 2 and notes["learning_rate"] > 0
+    assert notes["precision"] == "float32" and notes["people"] == 1 and notes["processes"] == 1
+
+
+def test_ctrl_c_ends_it_after_the_step_and_the_same_command_ends_with_the_same_bits(
+    unbroken, tmp_path, tiny, monkeypatch, capfd
+):
+    asked = signal.getsignal(signal.SIGINT)
+    folder = tmp_path / "prior"
+    with monkeypatch.context() as patch:
+        stop_after_one_step(patch)
+        assert main(["pretrain", str(folder), *SMALL]) == INTERRUPTED
+    said = capfd.readouterr().err
+    assert "stopping after this step" in said and "the same command goes on" in said
+    assert signal.getsignal(signal.SIGINT) is asked
+    assert [json.loads(line)["step"] for line in (folder / METRICS).read_text().splitlines()] == [1]
+    assert main(["pretrain", str(folder), *SMALL]) == 0
+    for name in (CHECKPOINT, WEIGHTS, SHEET):
+        assert (folder / name).read_bytes() == (unbroken / name).read_bytes(), name
+
+
+def test_a_finished_training_is_left_as_it_is(unbroken, tiny):
+    before = {path: path.read_bytes() for path in unbroken.iterdir() if path.is_file()}
+    assert main(["pretrain", str(unbroken), *SMALL]) == 0
+    assert {path: path.read_bytes() for path in unbroken.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize("other", [["--seed", "1"], ["--steps", "3"], ["--people", "2"], ["--precision", "bf16"]])
+def test_another_training_in_the_same_folder_is_refused(unbroken, tiny, capsys, other):
+    before = (unbroken / CHECKPOINT).read_bytes()
+    assert main(["pretrain", str(unbroken), *SMALL, *other]) == BAD_INPUT
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"a training made with other settings, {other[0].removeprefix('--')} " in said
+    assert (unbroken / CHECKPOINT).read_bytes() == before
+
+
+def test_a_checkpoint_of_unknown_origin_is_refused(unbroken, tiny, tmp_path, capsys):
+    (tmp_path / CHECKPOINT).write_bytes((unbroken / CHECKPOINT).read_bytes())
+    assert main(["pretrain", str(tmp_path), *SMALL]) == BAD_INPUT
+    assert "holds a checkpoint but no training.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--steps", "0"], "--steps: expected 1 or more, got 0"),
+        (["--hands", "0"], "--hands: expected 1 or more, got 0"),
+        (["--people", "-3"], "--people: expected 1 or more, got -3"),
+        (["--people", "49", "--steps", "49"], "--people: expected at most 48 that one cpu device meets, got 49"),
+        (["--views", "9"], "--views: expected 1 to 8, got 9"),
+        (["--size", "100"], "--size: expected a multiple of 16 from 32 to 1024 pixels, got 100"),
+        (["--seed", "-1"], "--seed: expected 0 or more, got -1"),
+        (["--workers", "-1"], "--workers: expected 0 or more, got -1"),
+        (["--profile", "paper"], "--profile paper: reads photos with dinov2-large; give its model.safetensors"),
+        (["--profile", "paper", "--backbone-weights", "none"], "--backbone-weights none: no such file"),
+        (["--backbone-weights", "none"], "the compact profile trains its own encoder"),
+    ],
+)
+def test_wrong_options_are_one_sentence(tmp_path, tiny, capsys, arguments, words):
+    out = tmp_path / "prior"
+    assert main(["pretrain", str(out), *SMALL, *arguments]) == BAD_INPUT
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(("name", "words"), [("file", "found a file"), ("none/prior", "make it first")])
+def test_a_place_that_is_no_folder_is_refused(tmp_path, tiny, capsys, name, words):
+    (tmp_path / "file").write_text("mine")
+    assert main(["pretrain", str(tmp_path / name), *SMALL]) == BAD_INPUT
+    assert words in capsys.readouterr().err
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_machine_without_a_gpu_is_told_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert main(["pretrain", str(tmp_path / "prior")]) == BAD_INPUT
+    assert "--device cuda: torch finds no CUDA device" in capsys.readouterr().err
+
+
+def test_a_second_ctrl_c_ends_it_at_once(capfd):
+    with pytest.raises(KeyboardInterrupt), command.stop_signals(can_force=True) as asked:
+        assert not asked()
+        signal.raise_signal(signal.SIGINT)
+        assert asked()
+        signal.raise_signal(signal.SIGINT)
+    assert capfd.readouterr().err.count("stopping") == 1
+
+
+def test_sigterm_ends_it_after_the_step_and_so_does_a_second_one():
+    with command.stop_signals(can_force=True) as asked:
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        assert asked()

@@ -1,0 +1,48 @@
+"""People that are baked once, written, and read again."""
+
+import pytest
+import torch
+
+from oasis_warp.synthetic import people
+from oasis_warp.synthetic.plan import EVERYBODY
+
+SEED = 13
+
+
+@pytest.fixture(autouse=True)
+def nobody_known(monkeypatch):
+    monkeypatch.setattr(people, "_known", type(people._known)())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("people")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(people, "_known", type(people._known)())
+        people.bake_people(SEED, [2], EVERYBODY, "cpu", jobs=0, folder=made)
+    return made
+
+
+def test_a_person_that_was_written_is_read_and_not_baked(folder, monkeypatch):
+    baked = people._born(SEED, 2, EVERYBODY)
+    monkeypatch.setattr(people, "_born", None)
+    told = []
+    people.bake_people(SEED, [2], EVERYBODY, "cpu", jobs=0, folder=folder, progress=lambda *what: told.append(what))
+    read = people.person(SEED, 2, EVERYBODY, "cpu")
+    assert told == [("people", 0, 1), ("people", 1, 1)]
+    assert read.ring_look == baked.ring_look and read.identity.seed == baked.identity.seed
+    for name, value in baked._asdict().items():
+        if isinstance(value, torch.Tensor):
+            assert value.dtype == getattr(read, name).dtype and torch.equal(value, getattr(read, name)), name
+
+
+@pytest.mark.parametrize("damage", ["cut short", "another's"])
+def test_a_file_that_is_damaged_or_of_somebody_else_is_made_again(folder, tmp_path, monkeypatch, damage):
+    data = (folder / "000002.safetensors").read_bytes()
+    number = 2 if damage == "cut short" else 3
+    (tmp_path / f"{number:06d}.safetensors").write_bytes(data[:1000] if damage == "cut short" else data)
+    asked = []
+    there = people._born(SEED, 2, EVERYBODY)
+    monkeypatch.setattr(people, "_born", lambda *who: asked.append(who) or there)
+    people.bake_people(SEED, [number], EVERYBODY, "cpu", jobs=0, folder=tmp_path)
+    assert asked == [(SEED, number, EVERYBODY)]

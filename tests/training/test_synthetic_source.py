@@ -1,0 +1,64 @@
+"""The synthetic world as a source of batches: which pictures come in which batch, and that they are always the same."""
+
+from collections import Counter
+
+import pytest
+import torch
+
+from oasis_warp.synthetic.plan import PICTURES_EACH
+from oasis_warp.training.pretrain import BatchSource
+from oasis_warp.training.synthetic_source import SyntheticHands
+
+CPU = torch.device("cpu")
+
+
+def source(**changes):
+    return SyntheticHands(**{"seed": 3, "people": 1, "hands": 1, "views": 2, "size": 32, "device": CPU} | changes)
+
+
+def test_a_batch_is_the_same_wherever_training_is_taken_up():
+    hands = source()
+    assert isinstance(hands, BatchSource)
+    from_start = hands(0, 0, 1)
+    first, second = next(from_start), next(from_start)
+    later = next(hands(1, 0, 1))
+    other_process = next(hands(0, 1, 2))  # batch 1 too
+    for name, value in second._asdict().items():
+        assert torch.equal(value, getattr(later, name)), name
+        assert torch.equal(value, getattr(other_process, name)), name
+        assert bool(value.isfinite().all()), name
+    assert not torch.equal(first.image, second.image)
+    assert second.image.shape == (1, 32, 32, 3)
+    assert second.target_images.shape == (1, 2, 32, 32, 3)
+
+
+def test_targets_show_the_hands_of_the_photos():
+    hands = source(hands=3, views=2)
+    photos, targets = hands.photo_indices(5), hands.target_indices(5)
+    assert len(set(targets)) == 6
+    assert [index // PICTURES_EACH for index in targets] == [p // PICTURES_EACH for p in photos for _ in range(2)]
+
+
+def test_all_processes_together_see_every_picture_once():
+    hands = source(hands=3)
+    seen = Counter(p for step in range(4) for rank in range(2) for p in hands.photo_indices(2 * step + rank))
+    assert sorted(seen) == [PICTURES_EACH * k for k in range(24)] and set(seen.values()) == {1}
+
+
+@pytest.mark.parametrize(("people", "hands", "world", "steps"), [(12, 3, 2, 50), (7, 2, 3, 50), (100, 4, 2, 3)])
+def test_each_process_meets_whom_its_batches_show(people, hands, world, steps):
+    made = source(people=people, hands=hands)
+    for rank in range(world):
+        shown = {
+            index // PICTURES_EACH % people
+            for step in range(steps)
+            for index in made.photo_indices(step * world + rank)
+        }
+        met = made.people_met(rank, world, steps)
+        assert set(met) == shown and len(met) == len(shown)
+
+
+def test_the_errors_of_an_estimator_differ_from_batch_to_batch_and_seed_to_seed():
+    drawn = [float(torch.rand((), generator=s.errors(n))) for s in (source(), source(seed=4)) for n in (0, 1)]
+    assert len(set(drawn)) == 4
+    assert drawn[0] == float(torch.rand((), generator=source().errors(0)))
