@@ -1,9 +1,13 @@
 """`oasis pretrain`: refusals in words, what it leaves, and stopping and going on."""
 
 import json
+import os
 import signal
+import subprocess
+import sys
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from safetensors import safe_open
@@ -13,6 +17,7 @@ from oasis_warp.commands import pretrain as command
 from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
 from oasis_warp.network.config import COMPACT, PROFILES
 from oasis_warp.network.weights_file import load_network
+from oasis_warp.synthetic import people
 from oasis_warp.training.pretrain import CHECKPOINT, METRICS, SHEET, WEIGHTS
 
 TINY = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
@@ -45,6 +50,7 @@ def unbroken(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unbroken") / "prior"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PROFILES, "compact", TINY)
+        patch.setattr(people, "_known", type(people._known)())  # as in a process of its own
         assert main(["pretrain", str(folder), *SMALL]) == 0
     return folder
 
@@ -156,3 +162,21 @@ def test_sigterm_ends_it_after_the_step_and_so_does_a_second_one():
         signal.raise_signal(signal.SIGTERM)
         signal.raise_signal(signal.SIGTERM)
         assert asked()
+
+
+@pytest.mark.slow
+def test_two_processes_train_one_network_on_people_of_their_own(tmp_path, hand):
+    folder, script = tmp_path / "prior", Path(__file__).with_name("pretrain_together.py")
+    start = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    done = subprocess.run(
+        [*start, str(script), str(folder), *SMALL, "--people", "2"], capture_output=True, text=True, timeout=280,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads((folder / command.SETTINGS).read_text())["processes"] == 2
+    assert sorted(path.name for path in (folder / command.PEOPLE).iterdir()) == [
+        "000000.safetensors",
+        "000001.safetensors",
+    ]
+    assert [json.loads(line)["step"] for line in (folder / METRICS).read_text().splitlines()] == [2]
+    assert load_network(folder / WEIGHTS, hand).config == TINY

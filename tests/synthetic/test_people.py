@@ -42,7 +42,7 @@ def test_a_file_that_is_damaged_or_of_somebody_else_is_made_again(folder, tmp_pa
     number = 2 if damage == "cut short" else 3
     (tmp_path / f"{number:06d}.safetensors").write_bytes(data[:1000] if damage == "cut short" else data)
     asked = []
-    there = people._born(SEED, 2, EVERYBODY)
+    there = people._read(folder / "000002.safetensors", SEED, 2, EVERYBODY)
     monkeypatch.setattr(people, "_born", lambda *who: asked.append(who) or there)
     people.bake_people(SEED, [number], EVERYBODY, "cpu", jobs=0, folder=tmp_path)
     assert asked == [(SEED, number, EVERYBODY)]

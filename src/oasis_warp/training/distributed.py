@@ -33,7 +33,7 @@ def join_processes(device: str) -> Iterator[Place]:
         found = torch.cuda.device_count()
         if local >= found:
             raise InputError(
-                f"--nproc-per-node: expected one process a CUDA device, of which there are {found}; give {found} or less."
+                f"--nproc-per-node: expected at most {found}, as many as there are CUDA devices; give torchrun less."
             )
         torch.cuda.set_device(here)
     if world == 1:

@@ -137,7 +137,7 @@ def pretrain(
     place: Place,
     *,
     perceptual: Perceptual = detail_difference,
-    about: Mapping[str, Any] = MappingProxyType({}),
+    about: Mapping[str, object] = MappingProxyType({}),
     stop_asked: Callable[[], bool] = never,
     progress: Progress = silent,
 ) -> int:
@@ -174,6 +174,7 @@ def pretrain(
     while not stopping:
         batch = next(batches)
         result = trainer.advance(batch)
+        progress("pretraining", trainer.step - first, config.steps - first)
         log_here = trainer.step % config.log_every == 0
         # several processes stop together or wait for each other for ever, and agreeing costs a wait for the device
         asked = (place.world == 1 or log_here) and any_process(stop_asked(), place)
@@ -194,7 +195,6 @@ def pretrain(
             save_checkpoint(folder / CHECKPOINT, network, trainer.optimizer, trainer.step)
             save_network(folder / WEIGHTS, network, notes=json.dumps({"step": trainer.step, **notes}))
             write_picture(folder / SHEET, to_uint8(_sheet(batch, result)))
-        progress("pretraining", trainer.step - first, config.steps - first)
     return trainer.step
 
 
