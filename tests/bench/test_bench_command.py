@@ -124,7 +124,7 @@ def test_kernels_on_a_gpu_are_its_own_cases_on_both_clocks(gpu, tmp_path, capsys
     files = [tmp_path / name for name in ("k.json", "k.csv")]
     arguments = ["--device", "cuda", "--only", "12k", "--repeats", "9", "--json", str(files[0]), "--csv", str(files[1])]
     assert main(["bench", "kernels", *arguments]) == 0
-    assert [case.name for case in gpu["cases"]] == ["12k at 256 x 256"] * 2
+    assert [case.name for case in gpu["cases"]] == ["12k at 256 x 256"] * 2 + ["12k at 256 x 256, recorded"] * 2
     assert (gpu["groups"], gpu["device"].type, gpu["peers"]) == (9, "cuda", {})
     records = json.loads(files[0].read_text())
     assert [r["way"] for r in records] == ["warp", "gsplat", "warp"]

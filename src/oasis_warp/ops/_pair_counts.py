@@ -89,9 +89,9 @@ class Overflow:
 
     def expect(self, kind: Kind) -> tuple[Tensor, Counts]:
         """A report's memory and the capacity for a call of this `kind`."""
+        # The slot is the graph's for ever: it may be replayed when nobody watches any more.
         slot, capacity = slots.take().zero_(), capacity_of(kind)
         self._reports.append((slot, capacity))
-        weakref.finalize(self, slots.give, slot)
         return slot, capacity
 
     def happened(self) -> bool:
