@@ -19,7 +19,7 @@ from oasis_warp.ops._depth_scene import (
     empty_scores,
     shared,
 )
-from oasis_warp.ops._launch import device_and_stream, run_cuda
+from oasis_warp.ops._launch import current_stream, run_cuda
 
 MOST_BLOCKS = 1 << 22
 """Of a launch: Warp counts threads in 32 bits. Kernels go round until all is done."""
@@ -77,8 +77,7 @@ def draw(
     buffer = empty_buffer(scene, wanted)
     scores = None if query is None else empty_scores(scene, query)
     batch, n_faces, plane = len(scene.vertices), len(scene.faces), scene.width * scene.height
-    _, stream = device_and_stream(scene.vertices)
-    assert stream is not None
+    stream = current_stream(scene.vertices.device)
 
     at_once = BLOCKS_AT_ONCE * stream.device.sm_count
     key_pairs = -(-batch * plane // 2)
@@ -154,8 +153,7 @@ def gradients(
     grad_visibility = grad_visibility.contiguous()
     grad_points = scene.room(n_points, 3) if needs_points else scene.vertices.new_empty(0)
     grad_vertices = scene.room(n_vertices, 3) if needs_vertices else scene.vertices.new_empty(0)
-    _, stream = device_and_stream(scene.vertices)
-    assert stream is not None
+    stream = current_stream(scene.vertices.device)
     blocks = min(batch * _blocks(n_points), cuda_depth_pull.PEAKS)
     if needs_vertices and not blocks:
         grad_vertices.zero_()

@@ -51,6 +51,11 @@ class _Slots:
                 self.free = list(page[: PAGE // REPORT * REPORT].split(REPORT))
             return self.free.pop()
 
+    def stock(self) -> None:
+        """Have slots ready for captures to come, during which no memory can be page-locked."""
+        if not self.free:
+            self.give(self.take())
+
     def give(self, slot: Tensor) -> None:
         with self.lock:
             self.free.append(slot)
@@ -158,5 +163,6 @@ def watching() -> Overflow:
 
 
 def remember(kind: Kind, counts: Counts) -> None:
-    """Keep what an eager call needed."""
+    """Keep what an eager call needed, as a graph of the same kind may come next."""
     _last[kind] = counts
+    slots.stock()

@@ -8,7 +8,7 @@ from torch import Tensor
 from oasis_kernels import cuda_values
 from oasis_kernels.finite import ALL_FINITE
 from oasis_warp.core import checks
-from oasis_warp.ops._launch import device_and_stream, has_vectors, run_cuda, run_native
+from oasis_warp.ops._launch import current_stream, has_vectors, run_cuda, run_native
 from oasis_warp.ops._pair_counts import slots
 
 
@@ -61,7 +61,7 @@ class Look:
         self._device = tensors[0].device
         self._found = slots.take()
         self._found[0] = 0
-        stream = device_and_stream(tensors[0])[1]
+        stream = current_stream(self._device)
         for first in range(0, len(tensors), cuda_values.ARRAYS):
             words: dict[str, int | float] = dict.fromkeys(cuda_values.all_finite().parameters, 0)
             words |= {"found": self._found.data_ptr(), "largest": checks.FINITE_LIMIT}

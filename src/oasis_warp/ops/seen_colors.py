@@ -12,7 +12,7 @@ from oasis_warp.ops._launch import (
     SCALAR,
     VEC3,
     VEC4,
-    device_and_stream,
+    current_stream,
     even_cuts,
     has_cuda_kernels,
     launch_ranges,
@@ -31,7 +31,7 @@ def _seen(means: Tensor, coefficients: Tensor, viewmats: Tensor, degree: int) ->
     if has_cuda_kernels(means):
         words = _cuda_words(means, coefficients, viewmats) | {"total": total, "colors": colors.data_ptr()}
         n_blocks = -(-total // cuda_kernels.BLOCK)
-        run_cuda(cuda_kernels.see(degree), words, n_blocks, device_and_stream(means)[1])
+        run_cuda(cuda_kernels.see(degree), words, n_blocks, current_stream(means.device))
         return colors
     vec3 = VEC3[means.dtype]
     launch_ranges(
@@ -91,7 +91,7 @@ def _seen_backward(
             "g_centers": g_centers.data_ptr(),
         }  # fmt: skip
         n_blocks = -(-n // cuda_kernels.BLOCK)
-        run_cuda(cuda_kernels.see_backward(degree), words, n_blocks, device_and_stream(means)[1])
+        run_cuda(cuda_kernels.see_backward(degree), words, n_blocks, current_stream(means.device))
     else:
         vec3 = VEC3[means.dtype]
         launch_ranges(
