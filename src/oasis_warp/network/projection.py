@@ -63,6 +63,7 @@ class Aggregation(nn.Module):
         total = spread(planes.reshape(batch * channels, 1, height, width))
         total = total.reshape(batch, channels, *total.shape[2:])
         count = spread(planes.new_ones(1, 1, height, width)).expand(batch, -1, -1, -1)
-        cells = uv.new_tensor([width, height])
-        inner = (uv * cells + 1) / (cells + 2)
+        inner = torch.stack(
+            [(part * n + 1) / (n + 2) for part, n in zip(uv.unbind(-1), (width, height), strict=True)], -1
+        )
         return sample(total, inner) / sample(count, inner).clamp_min(1e-6)
