@@ -48,8 +48,7 @@ class Aggregation(nn.Module):
         """Logarithm of the fall-off, in cells: one cell at first."""
 
     def weights(self) -> tuple[Float[Tensor, "K K"], Float[Tensor, "K K"]]:
-        """w = exp(-d / sigma) and dw / d log sigma = w d / sigma; the softmax's denominator is left to the samples that
-        count."""
+        """The weights w = exp(-d / sigma), whose sum is left to the samples that count, and dw / d log sigma."""
         offset = torch.arange(-self.reach, self.reach + 1, dtype=self.log_sigma.dtype, device=self.log_sigma.device)
         with torch.no_grad():
             distance = torch.hypot(offset[:, None], offset) / self.log_sigma.exp()
