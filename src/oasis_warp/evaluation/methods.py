@@ -1,8 +1,8 @@
-"""The ways to an avatar that are held against each other."""
+"""The ways to an avatar that are held against each other: a prior, and how far its guess is fitted to the photo."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import NamedTuple
 
 import torch
 
@@ -12,16 +12,34 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Evidence
 from oasis_warp.training.adapt import adapt
 
-Method = Literal["mean_calibrated", "mean_one_shot", "learned_raw", "learned_calibrated", "learned_one_shot"]
-METHODS: dict[Method, str] = {
-    "mean_calibrated": "mean texture, colour-matched to the photo",
-    "mean_one_shot": "one-shot without a learned prior",
-    "learned_raw": "learned prior without adaptation",
-    "learned_calibrated": "learned prior, colour-matched to the photo",
-    "learned_one_shot": "one-shot with the learned prior",
-}
-"""And what they are. The first part of a name is the prior's."""
-BASELINE: Method = "mean_calibrated"
+RAW, CALIBRATED, ONE_SHOT = "raw", "calibrated", "one_shot"
+STAGES = (RAW, CALIBRATED, ONE_SHOT)
+"""As the prior says, with its colours matched to the photo's as a whole, and fully adapted."""
+
+
+class Method(NamedTuple):
+    """What is measured."""
+
+    prior: str
+    """"mean" or "learned", or whatever the caller calls his."""
+    stage: str
+    """One of `STAGES`."""
+
+
+METHODS = (
+    Method("mean", CALIBRATED),
+    Method("mean", ONE_SHOT),
+    Method("learned", RAW),
+    Method("learned", CALIBRATED),
+    Method("learned", ONE_SHOT),
+)
+"""Of the tables: what needs no training, and each step beyond it."""
+BASELINE = METHODS[0]
+
+
+def label(method: Method) -> str:
+    """What to call it."""
+    return f"{method.prior} {method.stage.replace('_', '-')}"
 
 
 def reconstructions(
@@ -36,24 +54,25 @@ def reconstructions(
     Args:
         hand: On the CPU, as in `pipeline.reconstruct`.
         evidence: Of one photo.
-        priors: "mean", "learned" or both.
+        priors: By the names that methods have for them.
         wanted: What to make.
         config: Of the adaptation.
     """
     for name, prior in priors.items():
-        mine = {method.removeprefix(f"{name}_"): method for method in wanted if method.startswith(f"{name}_")}
-        if not mine:
+        stages = {method.stage for method in wanted if method.prior == name}
+        if not stages:
             continue
         with torch.no_grad():
             guess = prior(evidence)
-        if "raw" in mine:
-            yield mine["raw"], guess
-        if not {"calibrated", "one_shot"} & mine.keys():
+        if RAW in stages:
+            yield Method(name, RAW), guess
+        if not {CALIBRATED, ONE_SHOT} & stages:
             continue
-        if "one_shot" not in mine:
-            config = replace(config, texture_steps=0, reference_views=0)
-        adapted = adapt(hand, guess, evidence, config)
-        if "calibrated" in mine:
-            yield mine["calibrated"], guess._replace(colors=adapted.calibration.apply(guess.colors))
-        if "one_shot" in mine:
-            yield mine["one_shot"], adapted.gaussians
+        fully = ONE_SHOT in stages
+        adapted = adapt(
+            hand, guess, evidence, config if fully else replace(config, texture_steps=0, reference_views=0)
+        )
+        if CALIBRATED in stages:
+            yield Method(name, CALIBRATED), guess._replace(colors=adapted.calibration.apply(guess.colors))
+        if fully:
+            yield Method(name, ONE_SHOT), adapted.gaussians

@@ -42,16 +42,18 @@ class Truth(NamedTuple):
 def score(image: Float[Tensor, "H W 3"], truth: Truth, perceptual: Perceptual | None = None) -> Scores:
     """Measure `image`, drawn over black, by every one of `MEASURES`.
 
-    PSNR [dB] weighs pixels by the mask, the inner one leaves out two pixels at the outline, where shape decides and not
-    skin. SSIM is the mean over the whole picture, over the mask's box, and over the mask. LPIPS is of the hand alone.
+    PSNR [dB] weighs pixels by the mask; the inner one, and those of parts, leave out two pixels at the outline, where
+    shape decides and not skin. SSIM is the mean over the whole picture, over the mask's box, and over the mask. LPIPS
+    is of the hand alone.
     """
     drawn = image.clamp(0, 1) * truth.known[..., None]
     mask, error = truth.mask, (drawn - truth.image).square().mean(-1)
+    inner = mask * (inner_mask(mask) > 0.5)
     similarity = ssim_map(drawn, truth.image)
     rows, columns = (torch.nonzero((mask > 0.5).any(axis))[:, 0] for axis in (1, 0))
     scores: Scores = {
         "psnr": _psnr(error, mask),
-        "psnr_inner": _psnr(error, mask * (inner_mask(mask) > 0.5)),
+        "psnr_inner": _psnr(error, inner),
         "ssim": float(similarity.mean()),
         "ssim_box": None,
         "ssim_mask": float((similarity * mask).sum() / mask.sum().clamp_min(1)),
@@ -68,7 +70,7 @@ def score(image: Float[Tensor, "H W 3"], truth: Truth, perceptual: Perceptual | 
         "stretched": truth.stretched,
         "unstretched": ~truth.stretched,
     }.items():
-        scores[f"psnr_{name}"] = _psnr(error, mask * part)
+        scores[f"psnr_{name}"] = _psnr(error, inner * part)
     return scores
 
 

@@ -5,7 +5,7 @@ Nothing here needs more than the package's core: a script on a machine with CUDA
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from oasis_warp.evaluation.held_out import (
     scale_noise,
     true_targets,
 )
-from oasis_warp.evaluation.methods import METHODS, Method, reconstructions
+from oasis_warp.evaluation.methods import METHODS, Method, label, reconstructions
 from oasis_warp.evaluation.metrics import Truth, match_colors, score
 from oasis_warp.evaluation.pictures import (
     ATTENTION_COLUMNS,
@@ -76,7 +76,8 @@ class SyntheticEvaluation:
     """Times the estimator's errors, for every group; 0 is the true pose."""
     curve: tuple[float, ...] = (2.0, 4.0)
     """More of them, for the first group only."""
-    methods: tuple[Method, ...] = tuple(METHODS)
+    methods: tuple[Method, ...] = METHODS
+    """Those whose prior is not given are left out."""
     shoot: Shoot = field(default_factory=Shoot)
     adapt: AdaptConfig = field(default_factory=AdaptConfig)
     estimator: EstimatorNoise = field(default_factory=EstimatorNoise)
@@ -84,7 +85,7 @@ class SyntheticEvaluation:
 
 
 def evaluate(
-    network: HandNetwork | None,
+    priors: Mapping[str, Prior],
     config: SyntheticEvaluation,
     folder: Path,
     device: torch.device,
@@ -98,7 +99,7 @@ def evaluate(
     A run that was stopped goes on with the people that are missing.
 
     Args:
-        network: The learned prior; without one only methods that need none are measured.
+        priors: By the names that methods have for them; see `usual_priors`.
         config: What to measure.
         folder: Where files go; its parent must exist.
         device: Where to compute.
@@ -109,16 +110,16 @@ def evaluate(
     Raises:
         InputError: the folder cannot be used, or holds an evaluation with other settings.
     """
-    digest = None if network is None else weights_digest(network)
     settings = {
         "version": __version__,
-        "weights_sha256": digest,
+        "priors": {name: prior_digest(prior) for name, prior in priors.items()},
         "lpips": perceptual is not None,
         **asdict(config),
     }
-    claim_folder(folder, SETTINGS, json.loads(json.dumps(settings)), "an evaluation")
+    settings = json.loads(json.dumps(settings))  # tuples become lists, as a file has them
+    claim_folder(folder, SETTINGS, settings, "an evaluation")
     (folder / PEOPLE).mkdir(exist_ok=True)
-    bench = _Bench(network, config, device, perceptual)
+    bench = _Bench(priors, config, device, perceptual)
     everybody = [(group, FIRST_PERSON + k) for group in config.groups for k in range(config.people)]
     done = sum(_place(folder, *who).exists() for who in everybody)
     for group in config.groups:
@@ -136,7 +137,7 @@ def evaluate(
         path for group in config.groups for k in range(min(SHOWN, config.people))
         if (path := _place(folder, group, FIRST_PERSON + k).with_suffix(".png")).exists()
     ]  # fmt: skip
-    write_sheet(folder / SHEET, strips, ["photo", "truth", *bench.methods])
+    write_sheet(folder / SHEET, strips, ["photo", "truth", *map(label, bench.methods)])
     maps = sorted((folder / PEOPLE).glob("*_attention.png"))
     if maps:
         write_sheet(folder / ATTENTION, maps, ATTENTION_COLUMNS)
@@ -145,10 +146,20 @@ def evaluate(
     return found
 
 
-def weights_digest(network: HandNetwork) -> str:
-    """SHA-256 of all that training has changed, names included."""
+def usual_priors(network: HandNetwork | None) -> dict[str, Prior]:
+    """The priors of `METHODS`: the mean hand, and the learned one where there is a network."""
+    priors: dict[str, Prior] = {"mean": MeanPrior(bundled_hand())}
+    if network is not None:
+        priors["learned"] = NetworkPrior(network)
+    return priors
+
+
+def prior_digest(prior: Prior) -> str | None:
+    """SHA-256 of all that training has changed in a network's prior, names included; None for others."""
+    if not isinstance(prior, NetworkPrior):
+        return None
     digest = hashlib.sha256()
-    for name, tensor in sorted(trained_state(network).items()):
+    for name, tensor in sorted(trained_state(prior.network).items()):
         digest.update(name.encode())
         digest.update(tensor.float().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
@@ -162,17 +173,14 @@ class _Bench:
     """What every person is measured with."""
 
     def __init__(
-        self, network: HandNetwork | None, config: SyntheticEvaluation, device: torch.device,
+        self, priors: Mapping[str, Prior], config: SyntheticEvaluation, device: torch.device,
         perceptual: Perceptual | None,
     ):  # fmt: skip
-        self.network, self.config, self.device, self.perceptual = network, config, device, perceptual
+        self.priors, self.config, self.device, self.perceptual = priors, config, device, perceptual
         self.hand = bundled_hand()
         self.hand_there = self.hand.to(device)
         self.vertex_faces = faces_of_vertices(self.hand_there.faces, len(self.hand.template))
-        self.priors: dict[str, Prior] = {"mean": MeanPrior(self.hand)}
-        if network is not None:
-            self.priors["learned"] = NetworkPrior(network.to(device))
-        self.methods = [method for method in config.methods if method.split("_")[0] in self.priors]
+        self.methods = [method for name in priors for method in config.methods if method.prior == name]
 
     def measure(self, folder: Path, group: Group, number: int) -> None:
         """Write the records of one person, and pictures of the first few; the records last."""
@@ -188,8 +196,8 @@ class _Bench:
                 batch = as_estimated(self.hand_there, session, light, config.shoot, noise)
                 row = [tile(batch.image[0]), tile(truths[0].image)]
                 for method, images in self.draw(batch):
-                    about = {"group": group, "person": number, "light": light, "noise": factor, "method": method}
-                    records += [{**about, **found} for found in self.score(images, truths)]
+                    about = {"group": group, "person": number, "light": light, "noise": factor}
+                    records += [{**about, **method._asdict(), **found} for found in self.score(images, truths)]
                     row.append(tile(images[0]))
                 if factor == config.noise[-1]:
                     rows.append(row)
@@ -223,9 +231,10 @@ class _Bench:
                 yield {"target": k, "colors": colors, **numbers}
 
     def write_attention(self, path: Path, batch: TrainingBatch) -> None:
-        """Write where the network looks, if it has such attention."""
-        if self.network is not None and has_attention(self.network):
-            write_strip(path, [draw_attention(self.network, input_of_batch(batch))])
+        """Write where the learned prior looks, if its network has such attention."""
+        prior = self.priors.get("learned")
+        if isinstance(prior, NetworkPrior) and has_attention(prior.network):
+            write_strip(path, [draw_attention(prior.network, input_of_batch(batch))])
 
 
 def evidence_of(batch: TrainingBatch) -> Evidence:
