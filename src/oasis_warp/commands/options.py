@@ -13,6 +13,7 @@ Output = Annotated[Path, arg(aliases=["-o"], metavar="PATH")]
 FamilyName = Literal[
     "rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "skin"
 ]
+Kind = Literal["freckles", "hair", "polish", "tattoo", "ring", "plaster"]
 PoseName = Literal["photo", "rest", "open", "relaxed", "fist", "pinch", "thumbs_up", "victory", "point", "ok"]
 
 
@@ -272,6 +273,8 @@ class Pretrain:
     """Targets a photo: the same hand in other poses and even light, 1 to 8."""
     people: int = 512
     """How many there are."""
+    hold_out: tuple[Kind, ...] = ()
+    """Kinds that nobody has, so that `oasis evaluate` can ask for what was never seen."""
     size: int = 256
     """Side of photos and targets [px], a multiple of 16."""
     seed: int = 0
