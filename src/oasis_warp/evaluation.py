@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import OPACITY
+from oasis_warp.avatar.anchors import OPACITY, place_anchors
 from oasis_warp.avatar.appearance import label_regions, region_masks
 from oasis_warp.avatar.observe import Observation, inner_mask, observe
 from oasis_warp.core.config import BLACK
@@ -28,11 +28,12 @@ COVERAGE_VIEWS = 8
 def coverage(avatar: Avatar, size: int = 256) -> Float[Tensor, "P C"]:
     """Share of the posed mesh's silhouette with alpha >= 0.9, for each pose and each of 8 views around it.
 
-    The wrist's rim, where opacity fades out on purpose, is not part of the silhouette.
+    The wrist's rim, where opacity fades out on purpose, is not part of the silhouette; where a learned prior made
+    Gaussians fainter, it is.
     """
-    faces = avatar.hand.faces
+    faces, anchors = avatar.hand.faces, place_anchors(avatar.hand, avatar.rest)
     solid = torch.zeros(len(avatar.rest.vertices), device=avatar.device)
-    solid[avatar.gaussians.vertex_index] = avatar.gaussians.opacities[: len(avatar.gaussians.vertex_index)]
+    solid[anchors.vertex_index] = anchors.opacities[: len(anchors.vertex_index)]
     solid_faces = (solid[faces] >= OPACITY - 1e-4).all(1)
     shares = torch.zeros(len(COVERAGE_POSES), COVERAGE_VIEWS)
     for p, name in enumerate(COVERAGE_POSES):
@@ -93,11 +94,11 @@ def compare_with_photo(avatar: Avatar, evidence: Evidence, pose: HandPose) -> Pa
 def _region_errors(avatar: Avatar, evidence: Evidence, pose: HandPose, gain: Tensor) -> dict[str, float]:
     hand, index = avatar.hand, avatar.gaussians.vertex_index
     seen: Observation = observe(hand, evidence)
-    colors = torch.zeros_like(seen.colors)
-    colors[index] = avatar.gaussians.colors[: len(index)]
+    colors, drawn = torch.zeros_like(seen.colors), torch.zeros_like(seen.confidence)
+    colors[index], drawn[index] = avatar.gaussians.colors[: len(index)], 1
     errors = {}
     for name, where in region_masks(label_regions(hand)).items():
-        weight = (where * seen.confidence)[:, None]
+        weight = (where * seen.confidence * drawn)[:, None]
         if float(weight.sum()) < 20:  # vertices: too few to speak of a region
             continue
         difference = ((colors * gain - seen.colors) * weight).sum(0) / weight.sum()

@@ -13,7 +13,7 @@ from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import Evidence, HandFit, Landmarks, Photo
+from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmarks, Photo
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.keypoints_file import read_keypoints
@@ -99,15 +99,7 @@ def reconstruct(
         adaptation = adapt(
             hand, guess, evidence, AdaptConfig(texture_steps=config.steps, seed=config.seed), progress
         )
-    camera = evidence.camera
-    avatar = Avatar(
-        side=fit.side,
-        shape=fit.shape.to(evidence.image),
-        surface_offsets=offsets.to(evidence.image),
-        gaussians=adaptation.gaussians,
-        source_pose=fit.pose,
-        source_camera=mirrored_camera(camera) if fit.side == "left" else camera,
-    )
+    avatar = make_avatar(fit, offsets, evidence, adaptation.gaussians)
     errors = {
         "reprojection_percent": fit.reprojection,
         "worst_point_percent": fit.worst_point,
@@ -149,6 +141,21 @@ def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: Rec
         camera=crop._replace(viewmat=crop.viewmat.to(device), K=crop.K.to(device)),
         rest=there(rest),
         posed=there(posed),
+    )
+
+
+def make_avatar(
+    fit: HandFit, offsets: torch.Tensor, evidence: Evidence, gaussians: CanonicalGaussians
+) -> Avatar:
+    """The hand of `fit` with the looks of `gaussians`; `offsets` and `evidence` are those that it was made with."""
+    camera = evidence.camera
+    return Avatar(
+        side=fit.side,
+        shape=fit.shape.to(evidence.image),
+        surface_offsets=offsets.to(evidence.image),
+        gaussians=gaussians,
+        source_pose=fit.pose,
+        source_camera=mirrored_camera(camera) if fit.side == "left" else camera,
     )
 
 
