@@ -96,7 +96,7 @@ class SyntheticHands:
         """Make the people of `people_met` ready, or read those that `folder` holds already.
 
         Raises:
-            ValueError: more than `synthetic.people.KEPT`.
+            ValueError: more than `synthetic.people.most_kept`.
             InputError: the folder cannot be written.
         """
         bake_people(self.seed, met, self.population, str(self.device), jobs=jobs, folder=folder, progress=progress)
