@@ -208,7 +208,8 @@ def sight(
     gloss = solids[b, hit, GLOSS]
     open_ = wp.float32(1.0)
     widest = wp.clamp(0.12 * p[2], 0.02, 0.3)
-    for k in range(2):
+    rolled = wp.int32(2)  # a number that the compiler does not know: code for each turn would not fit into the cache
+    for k in range(rolled):
         reach = widest * (0.2 + 0.8 * float(k))
         open_ -= (reach - clearance(solids, b, p + reach * n, reach)) / reach * 0.36
     open_ = wp.max(open_, 0.12)
@@ -236,7 +237,8 @@ def sight(
                 if share > 0.0 and lamp == 0:  # the first lamp's shadows of the solids themselves
                     s = 0.015 + 0.0016 * turn
                     soft = 1.0 / wp.max(lamp_spreads[b, lamp], 0.05)
-                    for _k in range(5):
+                    rolled = wp.int32(5)
+                    for _k in range(rolled):
                         # Further away nothing darkens and no step is longer.
                         near = clearance(solids, b, p + 0.004 * n + s * w, wp.max(1.01 * s / soft, 0.3))
                         share = wp.min(share, wp.clamp(0.5 + 0.5 * soft * near / s, 0.0, 1.0))
@@ -276,7 +278,8 @@ def trace(
     nearest = float(FAR)
     if hidden[b, y, x] <= 0.999:
         turn = dither(x, y)
-        for k in range(RAYS):
+        rolled = wp.int32(RAYS)
+        for k in range(rolled):
             right = float(x) + (float(k) + 0.5) / float(RAYS) - 0.5 * float(columns)
             down = float(y) + (0.3 if k % 2 == 0 else 0.7) - 0.5 * float(rows)
             d = wp.normalize(wp.vec3f(right / focals[b], down / focals[b], 1.0))
