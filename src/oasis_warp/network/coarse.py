@@ -55,10 +55,7 @@ def place_coarse_points(hand: HandModel, count: int) -> CoarsePoints:
 
 def to_coarse(values: Float[Tensor, "B V C"], pool: Int[Tensor, "N 16"]) -> Float[Tensor, "B N C"]:
     """Means round the coarse points."""
-    total = values.index_select(1, pool[:, 0])
-    for column in pool.unbind(1)[1:]:
-        total = total + values.index_select(1, column)
-    return total / pool.shape[1]
+    return values.index_select(1, pool.flatten()).unflatten(1, pool.shape).mean(2)
 
 
 def to_fine(
