@@ -1,11 +1,12 @@
 """The synthetic world as a source of batches: which pictures come in which batch, and that they are always the same."""
 
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
 
-from oasis_warp.synthetic.plan import PICTURES_EACH
+from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH
 from oasis_warp.training.pretrain import BatchSource
 from oasis_warp.training.synthetic_source import SyntheticHands
 
@@ -62,3 +63,10 @@ def test_the_errors_of_an_estimator_differ_from_batch_to_batch_and_seed_to_seed(
     drawn = [float(torch.rand((), generator=s.errors(n))) for s in (source(), source(seed=4)) for n in (0, 1)]
     assert len(set(drawn)) == 4
     assert drawn[0] == float(torch.rand((), generator=source().errors(0)))
+
+
+def test_a_kind_that_is_held_out_is_not_shown_and_nothing_else_changes():
+    bare, ringed = (replace(EVERYBODY, tattoo=0.0, ring=share) for share in (0.0, 1.0))
+    without, with_ring = (next(source(population=population)(0, 0, 1)) for population in (bare, ringed))
+    assert torch.equal(without.rest, with_ring.rest) and torch.equal(without.target_posed, with_ring.target_posed)
+    assert not torch.equal(without.target_images, with_ring.target_images)

@@ -13,6 +13,7 @@ Output = Annotated[Path, arg(aliases=["-o"], metavar="PATH")]
 FamilyName = Literal[
     "rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "skin"
 ]
+Kind = Literal["freckles", "hair", "polish", "tattoo", "ring", "plaster"]
 PoseName = Literal["photo", "rest", "open", "relaxed", "fist", "pinch", "thumbs_up", "victory", "point", "ok"]
 
 
@@ -32,6 +33,11 @@ class Reconstruct:
     """Which hand of the photo: a side, the largest, or a number from 0 for the best found, 1 for the next."""
     keypoints: Path | None = None
     """JSON file with 21 landmarks, or with pose and camera, to use instead of the networks; for one photo only."""
+    prior: Literal["learned", "none"] | Path = "learned"
+    """What to assume of the hand before the photo is fitted: what the bundled network sees in the photo, only mean
+    colours in its skin tone, or what your own network sees: network.safetensors of `oasis pretrain`."""
+    backbone_weights: Path | None = None
+    """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0
@@ -272,6 +278,8 @@ class Pretrain:
     """Targets a photo: the same hand in other poses and even light, 1 to 8."""
     people: int = 512
     """How many there are."""
+    hold_out: tuple[Kind, ...] = ()
+    """Kinds that nobody has, so that `oasis evaluate` can ask for what was never seen."""
     size: int = 256
     """Side of photos and targets [px], a multiple of 16."""
     seed: int = 0

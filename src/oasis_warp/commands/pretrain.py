@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.dinov2 import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.synthetic.people import KEPT
-from oasis_warp.synthetic.plan import PICTURES_EACH
+from oasis_warp.synthetic.people import most_kept
+from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH
 from oasis_warp.training.distributed import Place, join_processes, wait_for_all
 from oasis_warp.training.pretrain import CHECKPOINT, PretrainConfig, pretrain
 from oasis_warp.training.synthetic_source import MULTIPLE, SyntheticHands
@@ -97,10 +98,11 @@ def train(options: Pretrain, place: Place, progress: Progress) -> int:
     """
     hands = SyntheticHands(
         seed=options.seed, people=options.people, hands=options.hands, views=options.views, size=options.size,
-        device=place.device, workers=options.workers,
+        device=place.device, population=replace(EVERYBODY, **dict.fromkeys(options.hold_out, 0.0)),
+        workers=options.workers,
     )  # fmt: skip
     met = hands.people_met(place.rank, place.world, options.steps)
-    most = KEPT[place.device.type]
+    most = most_kept(str(place.device))
     if len(met) > most:
         raise InputError(
             f"--people: expected at most {most} that one {place.device.type} device meets, got {len(met)}; "
@@ -137,6 +139,7 @@ def settings_of(options: Pretrain, processes: int) -> dict[str, Any]:
     """All that decides on the weights; where and with how many workers they are computed does not."""
     names = ("profile", "steps", "hands", "views", "people", "size", "seed", "precision")
     settings = {name: getattr(options, name) for name in names} | {"processes": processes}
+    settings["hold_out"] = sorted(options.hold_out)
     if options.backbone_weights is not None:
         with options.backbone_weights.open("rb") as file:
             settings["backbone_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()

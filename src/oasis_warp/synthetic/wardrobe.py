@@ -118,29 +118,25 @@ def ring_at_rest(
     finger = max(identity.ring_finger, 0)
     bone = body.bones[finger][0]
     joint = 3 * finger + 1
-    points = rest.double().numpy() * 1e3 - (joints[joint].double().numpy() * 1e3)
-    axes = np.stack([bone.along, bone.side, bone.back], 1)
-    local = points @ axes
-    place = (
-        identity.ring_place
-        * bone.length
-        * np.linalg.norm((joints[joint + 1] - joints[joint]).numpy() * 1e3)
-        / bone.length
-    )
-    on_finger = body.finger_weights[: body.n_hand, finger].numpy() > 0.6
-    near = local[on_finger & (np.abs(local[:, 0] - place) < 3.5)][:, 1:]
-    middle = (near.max(0) + near.min(0)) / 2
-    around = near - middle
-    angle, radius = np.arctan2(around[:, 1], around[:, 0]), np.hypot(around[:, 0], around[:, 1])
-    turns = np.linspace(-np.pi, np.pi, RING_COLUMNS, endpoint=False)
-    weight = np.exp(30 * (np.cos(angle[None] - turns[:, None]) - 1))
-    fit = (weight * radius).sum(1) / weight.sum(1) + 0.15
-    across = np.linspace(0, 2 * np.pi, RING_ROWS, endpoint=False)[:, None]
-    wide = place + identity.ring_width / 2 * np.sign(np.cos(across)) * np.abs(np.cos(across)) ** 0.6 + 0 * fit
-    reach = fit + RING_ROUNDNESS * np.sin(across)
-    side, up = reach * np.cos(turns) + middle[0], reach * np.sin(turns) + middle[1]
-    points = np.stack([wide, side, up], -1).reshape(-1, 3) @ axes.T * 1e-3 + joints[joint].double().numpy()
-    return torch.from_numpy(points).float()
+    axes = rest.new_tensor(np.stack([bone.along, bone.side, bone.back], 1), dtype=torch.float64)
+    joints = joints.double() * 1e3
+    local = (rest.double() * 1e3 - joints[joint]) @ axes
+    place = identity.ring_place * (joints[joint + 1] - joints[joint]).norm()
+    near = (body.finger_weights[: body.n_hand, finger] > 0.6) & ((local[:, 0] - place).abs() < 3.5)
+    high = local[:, 1:].where(near[:, None], -torch.inf).amax(0)
+    low = local[:, 1:].where(near[:, None], torch.inf).amin(0)
+    middle = (high + low) / 2
+    side, up = (local[:, 1:] - middle).unbind(1)
+    angle, radius = torch.atan2(up, side), torch.hypot(side, up)
+    turns = torch.arange(RING_COLUMNS, device=rest.device, dtype=torch.float64) * (2 * torch.pi / RING_COLUMNS)
+    turns = turns - torch.pi
+    weight = torch.exp(30 * (torch.cos(angle - turns[:, None]) - 1)) * near
+    fit = (weight @ radius) / weight.sum(1) + 0.15
+    across = torch.arange(RING_ROWS, device=rest.device, dtype=torch.float64)[:, None] * (2 * torch.pi / RING_ROWS)
+    wide = place + identity.ring_width / 2 * torch.cos(across).sign() * torch.cos(across).abs() ** 0.6 + 0 * fit
+    reach = fit + RING_ROUNDNESS * torch.sin(across)
+    points = torch.stack([wide, reach * torch.cos(turns) + middle[0], reach * torch.sin(turns) + middle[1]], -1)
+    return ((points.reshape(-1, 3) @ axes.T + joints[joint]) * 1e-3).float()
 
 
 def ring_look(identity: Identity) -> tuple[float, ...]:

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ import torch
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.hand.template import bundled_hand
+from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.people import bake_people
 from oasis_warp.synthetic.picture import render_shots
 from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, plan_ahead
@@ -40,13 +41,16 @@ class SyntheticHands:
     """Side of photos and targets [px], a multiple of `MULTIPLE`."""
     device: torch.device
     """Where pictures are rendered."""
+    population: Population = EVERYBODY
+    """What they may have."""
     workers: int = 0
     """Processes that plan pictures ahead; 0 for none, else one at least for photos and one for targets."""
 
     def __call__(self, first_step: int, rank: int, world: int) -> Iterator[TrainingBatch]:
         """Batches without end. People that have not been baked make it wait, some seconds each."""
         hand, device = bundled_hand().to(self.device), str(self.device)
-        photo, even = Scenery(people=self.people), Scenery(look="even", people=self.people)
+        photo = Scenery(people=self.people, population=self.population)
+        even = replace(photo, look="even")
         rendered = int(self.size * SURROUNDINGS)
         planners = 0 if self.workers < 1 else max(1, self.workers // (1 + self.views))
         more = 0 if self.workers < 1 else max(1, self.workers - planners)
@@ -92,7 +96,7 @@ class SyntheticHands:
         """Make the people of `people_met` ready, or read those that `folder` holds already.
 
         Raises:
-            ValueError: more than `synthetic.people.KEPT`.
+            ValueError: more than `synthetic.people.most_kept`.
             InputError: the folder cannot be written.
         """
-        bake_people(self.seed, met, EVERYBODY, str(self.device), jobs=jobs, folder=folder, progress=progress)
+        bake_people(self.seed, met, self.population, str(self.device), jobs=jobs, folder=folder, progress=progress)

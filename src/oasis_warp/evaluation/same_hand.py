@@ -1,50 +1,18 @@
-"""Measure avatars: holes from any side, and one photo's avatar against another photo of the same hand."""
+"""One photo's avatar against another photo of the same hand."""
 
-import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import OPACITY
 from oasis_warp.avatar.appearance import label_regions, region_masks
 from oasis_warp.avatar.observe import Observation, inner_mask, observe
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.types import Evidence, HandPose
-from oasis_warp.hand.poses import named_pose
+from oasis_warp.evaluation.coverage import COVERED
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
-from oasis_warp.ops import depth_map
-from oasis_warp.render.cameras import mirrored_camera, orbit_camera
-
-COVERED = 0.9
-"""Alpha from which a pixel counts as covered."""
-COVERAGE_POSES = ("rest", "fist", "pinch", "point")
-COVERAGE_VIEWS = 8
-
-
-@torch.no_grad()
-def coverage(avatar: Avatar, size: int = 256) -> Float[Tensor, "P C"]:
-    """Share of the posed mesh's silhouette with alpha >= 0.9, for each pose and each of 8 views around it.
-
-    The wrist's rim, where opacity fades out on purpose, is not part of the silhouette.
-    """
-    faces = avatar.hand.faces
-    solid = torch.zeros(len(avatar.rest.vertices), device=avatar.device)
-    solid[avatar.gaussians.vertex_index] = avatar.gaussians.opacities[: len(avatar.gaussians.vertex_index)]
-    solid_faces = (solid[faces] >= OPACITY - 1e-4).all(1)
-    shares = torch.zeros(len(COVERAGE_POSES), COVERAGE_VIEWS)
-    for p, name in enumerate(COVERAGE_POSES):
-        pose = avatar.source_pose._replace(angles=named_pose(avatar.hand, name))
-        vertices = avatar.mesh(pose).vertices
-        for c in range(COVERAGE_VIEWS):
-            camera = orbit_camera(vertices, 2 * math.pi * c / COVERAGE_VIEWS, size=size)
-            ids = depth_map(vertices, faces, camera.viewmat, camera.K, size, size).face_ids
-            inside = (ids >= 0) & solid_faces[ids.clamp_min(0).long()]
-            alpha = avatar.render(camera, pose).alpha
-            shares[p, c] = (alpha[inside] >= COVERED).float().mean()
-    return shares
+from oasis_warp.render.cameras import mirrored_camera
 
 
 class PairScore(NamedTuple):
