@@ -54,7 +54,8 @@ def test_a_photo_becomes_an_avatar_that_looks_like_it(finished):
     assert report["hand"]["side"] == "left"
     assert report["errors"]["input_psnr_db"] > 20
     assert report["errors"]["mask_iou"] > 0.85
-    assert {"read", "landmarks", "fit", "prior", "adaptation", "summary", "turntable", "save"} <= report["seconds"].keys()
+    stages = {"read", "landmarks", "fit", "prior", "adaptation", "summary", "turntable", "save"}
+    assert stages <= report["seconds"].keys()
     assert report["prior"]["name"] == "learned" and len(report["prior"]["sha256"]) == 64
     assert "left hand" in done.stdout
     assert "texture" in done.stderr
