@@ -24,7 +24,7 @@ def folder(tmp_path_factory):
 
 
 def test_a_person_that_was_written_is_read_and_not_baked(folder, monkeypatch):
-    baked = people._born(SEED, 2, EVERYBODY)
+    baked = people._born(SEED, 2, EVERYBODY, "cpu")
     monkeypatch.setattr(people, "_born", None)
     told = []
     people.bake_people(SEED, [2], EVERYBODY, "cpu", jobs=0, folder=folder, progress=lambda *what: told.append(what))
@@ -45,4 +45,4 @@ def test_a_file_that_is_damaged_or_of_somebody_else_is_made_again(folder, tmp_pa
     there = people._read(folder / "000002.safetensors", SEED, 2, EVERYBODY)
     monkeypatch.setattr(people, "_born", lambda *who: asked.append(who) or there)
     people.bake_people(SEED, [number], EVERYBODY, "cpu", jobs=0, folder=tmp_path)
-    assert asked == [(SEED, number, EVERYBODY)]
+    assert asked == [(SEED, number, EVERYBODY, "cpu")]

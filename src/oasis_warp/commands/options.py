@@ -33,6 +33,11 @@ class Reconstruct:
     """Which hand of the photo: a side, the largest, or a number from 0 for the best found, 1 for the next."""
     keypoints: Path | None = None
     """JSON file with 21 landmarks, or with pose and camera, to use instead of the networks; for one photo only."""
+    prior: Literal["learned", "none"] | Path = "learned"
+    """What to assume of the hand before the photo is fitted: what the bundled network sees in the photo, only mean
+    colours in its skin tone, or what your own network sees: network.safetensors of `oasis pretrain`."""
+    backbone_weights: Path | None = None
+    """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0

@@ -24,7 +24,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.dinov2 import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.synthetic.people import KEPT
+from oasis_warp.synthetic.people import most_kept
 from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH
 from oasis_warp.training.distributed import Place, join_processes, wait_for_all
 from oasis_warp.training.pretrain import CHECKPOINT, PretrainConfig, pretrain
@@ -102,7 +102,7 @@ def train(options: Pretrain, place: Place, progress: Progress) -> int:
         workers=options.workers,
     )  # fmt: skip
     met = hands.people_met(place.rank, place.world, options.steps)
-    most = KEPT[place.device.type]
+    most = most_kept(str(place.device))
     if len(met) > most:
         raise InputError(
             f"--people: expected at most {most} that one {place.device.type} device meets, got {len(met)}; "

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import OPACITY
+from oasis_warp.avatar.anchors import OPACITY, place_anchors
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
@@ -22,11 +22,12 @@ COVERAGE_VIEWS = 8
 def coverage(avatar: Avatar, size: int = 256) -> Float[Tensor, "P C"]:
     """Share of the posed mesh's silhouette with alpha >= 0.9, for each pose and each of 8 views around it.
 
-    The wrist's rim, where opacity fades out on purpose, is not part of the silhouette.
+    The wrist's rim, where opacity fades out on purpose, is not part of the silhouette; where a learned prior made
+    Gaussians fainter, it is.
     """
-    faces = avatar.hand.faces
+    faces, anchors = avatar.hand.faces, place_anchors(avatar.hand, avatar.rest)
     solid = torch.zeros(len(avatar.rest.vertices), device=avatar.device)
-    solid[avatar.gaussians.vertex_index] = avatar.gaussians.opacities[: len(avatar.gaussians.vertex_index)]
+    solid[anchors.vertex_index] = anchors.opacities[: len(anchors.vertex_index)]
     solid_faces = (solid[faces] >= OPACITY - 1e-4).all(1)
     shares = torch.zeros(len(COVERAGE_POSES), COVERAGE_VIEWS)
     for p, name in enumerate(COVERAGE_POSES):

@@ -61,11 +61,11 @@ def compare_with_photo(avatar: Avatar, evidence: Evidence, pose: HandPose) -> Pa
 def _region_errors(avatar: Avatar, evidence: Evidence, pose: HandPose, gain: Tensor) -> dict[str, float]:
     hand, index = avatar.hand, avatar.gaussians.vertex_index
     seen: Observation = observe(hand, evidence)
-    colors = torch.zeros_like(seen.colors)
-    colors[index] = avatar.gaussians.colors[: len(index)]
+    colors, present = torch.zeros_like(seen.colors), torch.zeros_like(seen.confidence)
+    colors[index], present[index] = avatar.gaussians.colors[: len(index)], 1
     errors = {}
     for name, where in region_masks(label_regions(hand)).items():
-        weight = (where * seen.confidence)[:, None]
+        weight = (where * seen.confidence * present)[:, None]
         if float(weight.sum()) < 20:  # vertices: too few to speak of a region
             continue
         difference = ((colors * gain - seen.colors) * weight).sum(0) / weight.sum()

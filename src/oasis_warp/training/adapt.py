@@ -51,9 +51,11 @@ def adapt(
 
     progress("completion", 0, 1)
     seen = observe(hand, evidence)
-    at_vertices = torch.zeros_like(seen.colors)
-    at_vertices[gaussians.vertex_index] = gaussians.colors[: len(gaussians.vertex_index)]
-    difference = complete_field(evidence.rest.vertices, faces, seen.colors - at_vertices, seen.confidence)
+    index = gaussians.vertex_index
+    missing, known = torch.zeros_like(seen.colors), torch.zeros_like(seen.confidence)
+    missing[index] = seen.colors[index] - gaussians.colors[: len(index)]
+    known[index] = seen.confidence[index]  # where a prior put no Gaussian there is nothing to differ from
+    difference = complete_field(evidence.rest.vertices, faces, missing, known)
     colors = (gaussians.colors + vertex_to_gaussians(difference, faces, gaussians)).clamp(0, 1)
     gaussians = gaussians._replace(colors=colors)
     progress("completion", 1, 1)
