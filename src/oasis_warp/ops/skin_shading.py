@@ -231,7 +231,8 @@ def _shade(
             vec3(sky), vec3(lamp_positions), vec3(lamp_colors), view(lamp_ranges.contiguous()),
             view(lamp_spreads.contiguous()), view(lamp_viewmats.contiguous(), wp.mat44f),
             view(lamp_focals.contiguous()), view(lamp_depths.flatten(0, 1).contiguous()),
-            view(texels_a_pixel.contiguous()), whole(seeds), view(light, wp.vec3f), view(tone, wp.vec3f), view(mirrored, wp.vec3f),
+            view(texels_a_pixel.contiguous()), whole(seeds),
+            view(light, wp.vec3f), view(tone, wp.vec3f), view(mirrored, wp.vec3f),
         ],
         like=vertices,
     )  # fmt: skip
