@@ -106,6 +106,8 @@ def train_together(names: list[str], options: argparse.Namespace) -> None:
         behind = {name: trainer for name, trainer in trainers.items() if trainer.step == step}
         found = {name: trainer.advance(batch).psnr for name, trainer in behind.items()}
         if (step + 1) % LOG_EVERY == 0:
+            for trainer in behind.values():
+                trainer.check_recording()
             line = {"step": step + 1, "psnr": {name: round(float(psnr), 3) for name, psnr in found.items()}}
             with (options.out / "training.jsonl").open("a") as file:
                 file.write(json.dumps(line) + "\n")
