@@ -19,7 +19,7 @@ from oasis_warp.core.logging import Progress
 from oasis_warp.evaluation.held_out import HELD_OUT_SEED, Shoot
 from oasis_warp.evaluation.methods import Method, label
 from oasis_warp.evaluation.same_hand import evaluate_photos
-from oasis_warp.evaluation.summary import Record
+from oasis_warp.evaluation.summary import Record, select
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.lpips import load_lpips
@@ -89,7 +89,7 @@ def check_options(options: Evaluate) -> None:
     if photos and options.folder is None:
         raise InputError("--dataset same-hand: expected a folder with a subfolder of photos for each hand; name it.")
     if not photos and options.folder is not None:
-        raise InputError(f"{options.folder}: synthetic hands need no folder; leave it out, or give --dataset same-hand.")
+        raise InputError(f"{options.folder}: synthetic hands need no folder; leave it out, or use --dataset same-hand.")
     if photos and options.lpips is not None:
         raise InputError("--lpips: is measured on synthetic hands only; leave it out.")
     if options.people < 1:
@@ -124,10 +124,8 @@ def on_synthetic_hands(options: Evaluate, priors: dict[str, Prior], progress: Pr
             # wild photos stand in a light of their own: one gain a channel to that of the targets
             colors = "raw" if light == "studio" else "matched"
             title = f"{group} people, {light} photos" + (", colours matched" if colors == "matched" else "")
-            rows = [
-                row for row in summary
-                if (row["group"], row["light"], row["colors"]) == (group, light, colors) and row["noise"] in config.noise
-            ]  # fmt: skip
+            rows = select(summary, group=group, light=light, colors=colors)
+            rows = [row for row in rows if row["noise"] in config.noise]
             tables.append(make_table(title, rows, SYNTHETIC_COLUMNS))
     return [*tables, noise_table(summary, config)]
 
@@ -137,10 +135,10 @@ def noise_table(summary: Sequence[Record], config: SyntheticEvaluation) -> Table
     group, light = config.groups[0], config.lights[0]
     factors = (*config.noise, *config.curve)
     table = Table(title=f"PSNR of {group} people, {light} photos, against the estimator's errors")
-    table.add_column("method")
+    table.add_column("method", no_wrap=True)
     for factor in factors:
         table.add_column("true pose" if factor == 0 else f"x {factor:g}", justify="right")
-    wanted = [row for row in summary if (row["group"], row["light"], row["colors"]) == (group, light, "raw")]
+    wanted = select(summary, group=group, light=light, colors="raw")
     for method in dict.fromkeys(_method(row) for row in wanted):
         by_factor = {row["noise"]: row["psnr"] for row in wanted if _method(row) == method}
         table.add_row(label(method), *(_cell(by_factor.get(factor), "{:.2f}") for factor in factors))
@@ -155,22 +153,22 @@ def on_photos(options: Evaluate, priors: dict[str, Prior], progress: Progress) -
     )
     found = evaluate_photos(priors, options.folder, options.out, config, progress)
     rows, n_out = found["summary"], len(found["left_out"])
-    title = f"{rows[0]['pairs']} ordered pairs of photos of the same hand" + (f", {n_out} photos left out" if n_out else "")
-    return [make_table(title, rows, PHOTO_COLUMNS)]
+    title = f"{rows[0]['pairs']} ordered pairs of photos of the same hand"
+    return [make_table(title + (f", {n_out} photos left out" if n_out else ""), rows, PHOTO_COLUMNS)]
 
 
 def make_table(title: str, rows: Sequence[Record], columns: dict[str, tuple[str, str]]) -> Table:
     """A line a row of a summary; the pose's errors, where there are several, in a column of their own."""
     table = Table(title=title)
     factors = {row["noise"] for row in rows if "noise" in row}
-    table.add_column("method")
+    table.add_column("method", no_wrap=True)
     if factors:
         table.add_column("pose")
     shown = {name: form for name, form in columns.items() if any(row[name] is not None for row in rows)}
     for words, _ in shown.values():
         table.add_column(words, justify="right")
     for row in rows:
-        pose = [("true" if row["noise"] == 0 else "estimated")] if factors else []
+        pose = [("true" if row["noise"] == 0 else "est.")] if factors else []
         cells = (_cell(row[name], form) for name, (_, form) in shown.items())
         table.add_row(label(_method(row)), *pose, *cells)
     if "lpips" in columns and "lpips" not in shown:

@@ -28,7 +28,6 @@ from oasis_warp.evaluation.held_out import (
     Shoot,
     as_estimated,
     photograph,
-    scale_noise,
     true_targets,
 )
 from oasis_warp.evaluation.methods import METHODS, Method, label, prior_digest, reconstructions
@@ -49,7 +48,6 @@ from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.render.render import render
 from oasis_warp.synthetic.people import bake_people
 from oasis_warp.training.losses import Perceptual
-from oasis_warp.training.photographed import EstimatorNoise
 
 SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (
     "evaluation.json", "metrics.json", "sheet.png", "attention.png", "people"
@@ -77,8 +75,6 @@ class SyntheticEvaluation:
     """Those whose prior is not given are left out."""
     shoot: Shoot = field(default_factory=Shoot)
     adapt: AdaptConfig = field(default_factory=AdaptConfig)
-    estimator: EstimatorNoise = field(default_factory=EstimatorNoise)
-    """Its errors."""
 
 
 def evaluate(
@@ -167,11 +163,10 @@ class _Bench:
         records, rows, shown = [], [], number < FIRST_PERSON + SHOWN
         factors = config.noise + (config.curve if group == config.groups[0] else ())
         for light in config.lights:
-            exact = as_estimated(self.hand_there, session, light, config.shoot, scale_noise(config.estimator, 0.0))
+            exact = as_estimated(self.hand_there, session, light, config.shoot, 0.0)
             truths = true_targets(exact, self.hand_there, self.vertex_faces)
             for factor in factors:
-                noise = scale_noise(config.estimator, factor)
-                batch = as_estimated(self.hand_there, session, light, config.shoot, noise)
+                batch = as_estimated(self.hand_there, session, light, config.shoot, factor)
                 row = [tile(batch.image[0]), tile(truths[0].image)]
                 for method, images in self.draw(batch):
                     about = {"group": group, "person": number, "light": light, "noise": factor}
