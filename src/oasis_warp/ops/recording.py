@@ -1,7 +1,7 @@
 """A function of tensors as one CUDA graph: thousands of launches, which take Python far longer than the device."""
 
 from collections.abc import Callable
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,13 +14,13 @@ Result = TypeVar("Result")
 class Recording(Generic[Result]):
     """A function that was recorded once and is replayed for all inputs of the same shapes."""
 
-    def __init__(self, function: Callable[[Any], Result], inputs: NamedTuple, slack: float = 1.5):
+    def __init__(self, function: Callable[[Any], Result], inputs: tuple[Tensor, ...], slack: float = 1.5):
         """Record `function`; its work is not done yet.
 
         Args:
             function: It has run before, which loads kernels, and waits for nothing. What it reads besides its inputs
                 stays where it is.
-            inputs: A NamedTuple of tensors on a CUDA device, to take the shapes from.
+            inputs: A NamedTuple on a CUDA device, to take the shapes from.
             slack: Memory for the Gaussians of a rasterization, over what the last one needed.
         """
         self._inputs = _tuple_like(inputs, [tensor.clone() for tensor in inputs])
@@ -29,14 +29,14 @@ class Recording(Generic[Result]):
             with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
                 self._result = function(self._inputs)
 
-    def fits(self, inputs: NamedTuple) -> bool:
+    def fits(self, inputs: tuple[Tensor, ...]) -> bool:
         """Whether it was recorded for tensors like these."""
         return all(
             new.shape == kept.shape and new.dtype == kept.dtype and new.device == kept.device
             for new, kept in zip(inputs, self._inputs, strict=True)
         )
 
-    def __call__(self, inputs: NamedTuple) -> Result:
+    def __call__(self, inputs: tuple[Tensor, ...]) -> Result:
         """What the function makes of `inputs`; the next call writes over the tensors of its result."""
         torch._foreach_copy_(list[Tensor](self._inputs), list[Tensor](inputs))
         self._graph.replay()
@@ -50,5 +50,5 @@ class Recording(Generic[Result]):
         return self._overflow.happened()
 
 
-def _tuple_like(inputs: NamedTuple, tensors: list[Tensor]) -> Any:
-    return type(inputs)(*tensors)
+def _tuple_like(inputs: tuple[Tensor, ...], tensors: list[Tensor]) -> Any:
+    return type(inputs)(*tensors)  # a NamedTuple of the same kind
