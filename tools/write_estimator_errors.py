@@ -25,7 +25,7 @@ from oasis_warp.data.atomic import write_file
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map, depth_visibility
-from oasis_warp.training.estimator_errors import ALIKE, MeasuredErrors, estimate, frames_of, landmark_shares, looks
+from oasis_warp.training.estimator_errors import ALIKE, MeasuredErrors, estimate, frames_of, looks, of_surface
 from oasis_warp.training.posed_hands import Posed, pose_hands
 
 BEGIN, END = "<!-- errors -->", "<!-- end of errors -->"
@@ -85,7 +85,7 @@ def measured_errors(hand: HandModel, true: Hands, found: Hands) -> MeasuredError
         lens=torch.stack([(found.focal / true.focal).log(), log_size(true, found)], 1),
         place=(frames.landmarks.transpose(2, 3) @ moved[..., None])[..., 0],
         kept=kept,
-        shares=landmark_shares(hand),
+        **of_surface(hand),
     )
 
 
@@ -261,7 +261,9 @@ def main() -> None:
     size = int(rows[0]["size"])
     true, found = Hands(hand, rows, "true"), Hands(hand, rows, "found")
     measured = measured_errors(hand, true, found)
-    write_file(options.asset, save({k: v.half().contiguous() for k, v in measured._asdict().items() if k != "shares"}))
+    of_hand = of_surface(hand)
+    stored = {name: part.half().contiguous() for name, part in measured._asdict().items() if name not in of_hand}
+    write_file(options.asset, save(stored))
     scale = CROP / torch.tensor([float(row["square"][2]) for row in rows])
     truth = Surfaces(hand, true.posed.posed, true.K, size)
     seen = {

@@ -189,7 +189,7 @@ class _Bench:
         records, rows, shown = [], [], number < FIRST_PERSON + SHOWN
         factors = config.noise + (config.curve if group == config.groups[0] else ())
         for light in config.lights:
-            exact = as_estimated(self.hand_there, session, light, config.shoot, scale_noise(config.estimator, 0))
+            exact = as_estimated(self.hand_there, session, light, config.shoot, scale_noise(config.estimator, 0.0))
             truths = true_targets(exact, self.hand_there, self.vertex_faces)
             for factor in factors:
                 noise = scale_noise(config.estimator, factor)
