@@ -11,7 +11,7 @@ from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.evaluation import synthetic
 from oasis_warp.evaluation.held_out import FIRST_PERSON, Shoot, as_estimated, photograph, scale_noise
-from oasis_warp.evaluation.methods import METHODS, Method, reconstructions
+from oasis_warp.evaluation.methods import METHODS, Method, prior_digest, reconstructions, usual_priors
 from oasis_warp.evaluation.metrics import MEASURES
 from oasis_warp.evaluation.synthetic import (
     ATTENTION,
@@ -22,8 +22,6 @@ from oasis_warp.evaluation.synthetic import (
     SyntheticEvaluation,
     evaluate,
     evidence_of,
-    prior_digest,
-    usual_priors,
 )
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
