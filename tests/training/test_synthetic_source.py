@@ -1,5 +1,6 @@
 """The synthetic world as a source of batches: which pictures come in which batch, and that they are always the same."""
 
+import itertools
 from collections import Counter
 from dataclasses import replace
 
@@ -22,11 +23,15 @@ def test_a_batch_is_the_same_wherever_training_is_taken_up():
     assert isinstance(hands, BatchSource)
     from_start = hands(0, 0, 1)
     first, second = next(from_start), next(from_start)
-    later = next(hands(1, 0, 1))
-    other_process = next(hands(0, 1, 2))  # batch 1 too
+    others = {
+        "taken up": next(hands(1, 0, 1)),
+        "of another process": next(hands(0, 1, 2)),
+        "rendered with the one before": next(itertools.islice(source(ahead=2)(0, 0, 1), 1, None)),
+        "rendered with the one after": next(source(ahead=2)(1, 0, 1)),
+    }
     for name, value in second._asdict().items():
-        assert torch.equal(value, getattr(later, name)), name
-        assert torch.equal(value, getattr(other_process, name)), name
+        for where, other in others.items():
+            assert torch.equal(value, getattr(other, name)), (where, name)
         assert bool(value.isfinite().all()), name
     assert not torch.equal(first.image, second.image)
     assert second.image.shape == (1, 32, 32, 3)

@@ -15,8 +15,9 @@ from oasis_warp.evaluation.metrics import Truth
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.observation import sight
 from oasis_warp.ops import depth_map
-from oasis_warp.synthetic.picture import SyntheticBatch, render_shots
+from oasis_warp.synthetic.picture import SyntheticBatch, render_planned
 from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, Shot, plan_shots
+from oasis_warp.synthetic.planned import tabulate
 from oasis_warp.synthetic.stage import sample_light
 from oasis_warp.synthetic.wardrobe import sample_clothes
 from oasis_warp.training.photographed import EstimatorNoise, training_batch
@@ -67,14 +68,17 @@ def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) ->
     even = replace(wild, look="even")
     (photo,) = plan_shots(shoot.seed, [first], wild)
     goals = plan_shots(shoot.seed, range(first, first + shoot.targets), even)
-    where = (size, str(device))
-    studio = render_shots(shoot.seed, [_evenly_lit(photo)], *where, scenery=even)
+
+    def shown(shots: list[Shot], scenery: Scenery) -> SyntheticBatch:
+        return render_planned(shoot.seed, tabulate(shoot.seed, shots, scenery), size, device, scenery=scenery)
+
+    studio = shown([_evenly_lit(photo)], even)
     wall = torch.tensor(np.random.default_rng([shoot.seed, WALL_STREAM, number]).uniform(0.1, 0.9, 3)).to(studio.image)
     studio = studio._replace(image=studio.image + (1 - studio.alpha[..., None]) * wall)
     return Session(
         number,
-        {"studio": studio, "wild": render_shots(shoot.seed, [photo], *where, scenery=wild)},
-        render_shots(shoot.seed, goals, *where, scenery=even),
+        {"studio": studio, "wild": shown([photo], wild)},
+        shown(goals, even),
     )
 
 
