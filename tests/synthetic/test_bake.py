@@ -105,7 +105,8 @@ def test_a_gpu_bakes_the_person_that_the_cpu_bakes(baked, monkeypatch):
     torch.testing.assert_close(there.tone.cpu(), here.tone, atol=1e-5, rtol=0)
     off = (there.texture.cpu().float() - here.texture.float()).abs()
     assert float(off.mean()) < 1e-5
-    assert float((off > 4e-3).float().mean()) < 1e-5  # the end of a dab falls either way
+    # A hole in a plaster or the end of a dab falls one way or the other.
+    assert float((off > 4e-3).float().mean()) < 1e-5
 
 
 @pytest.mark.gpu

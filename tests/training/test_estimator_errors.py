@@ -14,6 +14,7 @@ from oasis_warp.training.estimator_errors import (
     frames_of,
     landmark_shares,
     looks,
+    of_surface,
 )
 from oasis_warp.training.posed_hands import pose_hands
 
@@ -114,7 +115,7 @@ def test_a_hand_borrows_from_hands_that_look_alike(hand, errors):
         rows = torch.cat([far[near].expand(ALIKE, -1) - 1.0, far[near].expand(ALIKE, -1)])
         nothing = {name: getattr(errors, name)[:1].expand(2 * ALIKE, *getattr(errors, name).shape[1:]) * 0
                    for name in ("angles", "turn", "shape", "place")}  # fmt: skip
-        return MeasuredErrors(looks=rows, lens=lens, kept=errors.kept, shares=errors.shares, **nothing)
+        return MeasuredErrors(looks=rows, lens=lens, **of_surface(hand), kept=errors.kept, **nothing)
 
     for near in range(3):
         found = seen(hand, given, table(near), torch.full((3,), ALIKE - 1))[1]

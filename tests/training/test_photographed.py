@@ -22,7 +22,7 @@ from oasis_warp.training.posed_hands import pose_hands
 
 SIZE, CROP = 240, 160
 CROP_OF_DOCS = 256
-EXACT = EstimatorNoise(surface=0.0)
+EXACT = EstimatorNoise(surface=0.0, mask=0.0)
 
 
 class Stub(NamedTuple):
@@ -134,7 +134,7 @@ def test_errors_are_those_of_an_estimator_and_only_in_what_it_says(hand, picture
 
 def test_errors_are_as_large_as_is_asked(hand, pictures):
     def projections(strength):
-        noise = EstimatorNoise(surface=strength)
+        noise = EstimatorNoise(surface=strength, mask=0.0)
         return projected(training_batch(hand, *pictures, CROP, torch.Generator().manual_seed(1), noise))
 
     none, some, all_ = projections(0.0), projections(0.3), projections(1.0)

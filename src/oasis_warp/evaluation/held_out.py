@@ -1,6 +1,6 @@
 """Synthetic people that no training has met, photographed for evaluation: who, in which light, how well estimated."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,8 +15,9 @@ from oasis_warp.evaluation.metrics import Truth
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.observation import sight
 from oasis_warp.ops import depth_map
-from oasis_warp.synthetic.picture import SyntheticBatch, render_shots
+from oasis_warp.synthetic.picture import SyntheticBatch, render_planned
 from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, Shot, plan_shots
+from oasis_warp.synthetic.planned import tabulate
 from oasis_warp.synthetic.stage import sample_light
 from oasis_warp.synthetic.wardrobe import sample_clothes
 from oasis_warp.training.photographed import EstimatorNoise, training_batch
@@ -67,14 +68,17 @@ def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) ->
     even = replace(wild, look="even")
     (photo,) = plan_shots(shoot.seed, [first], wild)
     goals = plan_shots(shoot.seed, range(first, first + shoot.targets), even)
-    where = (size, str(device))
-    studio = render_shots(shoot.seed, [_evenly_lit(photo)], *where, scenery=even)
+
+    def shown(shots: list[Shot], scenery: Scenery) -> SyntheticBatch:
+        return render_planned(shoot.seed, tabulate(shoot.seed, shots, scenery), size, device, scenery=scenery)
+
+    studio = shown([_evenly_lit(photo)], even)
     wall = torch.tensor(np.random.default_rng([shoot.seed, WALL_STREAM, number]).uniform(0.1, 0.9, 3)).to(studio.image)
     studio = studio._replace(image=studio.image + (1 - studio.alpha[..., None]) * wall)
     return Session(
         number,
-        {"studio": studio, "wild": render_shots(shoot.seed, [photo], *where, scenery=wild)},
-        render_shots(shoot.seed, goals, *where, scenery=even),
+        {"studio": studio, "wild": shown([photo], wild)},
+        shown(goals, even),
     )
 
 
@@ -83,22 +87,27 @@ def _evenly_lit(shot: Shot) -> Shot:
     return shot._replace(light=sample_light(rng, "even"), clothes=sample_clothes(rng, bare=True))
 
 
-def scale_noise(noise: EstimatorNoise, factor: float) -> EstimatorNoise:
-    """All errors `factor` times as large; 0 is the true pose."""
-    return replace(noise, **{field.name: factor * getattr(noise, field.name) for field in fields(noise)})
+def estimator_noise(factor: float) -> EstimatorNoise:
+    """Errors of pose, shape and camera `factor` times as large as the estimator's; 0 is the truth.
+
+    Those of the mask come with them, but no larger than they are: a mask has no twice.
+    """
+    return EstimatorNoise(surface=factor, mask=min(factor, 1.0))
 
 
 def as_estimated(
-    hand: HandModel, session: Session, light: Lighting, shoot: Shoot, noise: EstimatorNoise
+    hand: HandModel, session: Session, light: Lighting, shoot: Shoot, factor: float
 ) -> TrainingBatch:
-    """One photo and its targets as training sees them; the errors of any size point the same way.
+    """One photo and its targets as training sees them, with `estimator_noise`; of any size it points the same way.
 
     They are in where the photo is read. Targets are drawn on the true surface, or else the outline of a wrong one
     would drown what is asked for.
     """
     (state,) = np.random.SeedSequence([shoot.seed, ERROR_STREAM, session.number]).generate_state(1)
     random = torch.Generator().manual_seed(int(state))
-    return training_batch(hand, session.photos[light], session.targets, shoot.size, random, noise)
+    return training_batch(
+        hand, session.photos[light], session.targets, shoot.size, random, estimator_noise(factor)
+    )
 
 
 def true_targets(

@@ -118,7 +118,11 @@ def _places() -> dict[str, tuple[slice, tuple[int, ...]]]:
 
 def plan_table(seed: int, indices: Sequence[int], scenery: Scenery) -> Planned:
     """`plan_shots` as tables."""
-    shots = plan_shots(seed, indices, scenery)
+    return tabulate(seed, plan_shots(seed, indices, scenery), scenery)
+
+
+def tabulate(seed: int, shots: Sequence[Shot], scenery: Scenery) -> Planned:
+    """Shots as tables."""
     identities = [identity_of(seed, shot.person, scenery.population) for shot in shots]
     joints = np.stack([_joints(seed, shot.person, scenery.population) for shot in shots])
     columns = _columns(shots, identities, joints)

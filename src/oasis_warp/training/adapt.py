@@ -11,11 +11,15 @@ from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import CanonicalGaussians, Evidence
+from oasis_warp.ops import blend_colors
 from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.training.calibrate import Calibration, calibrate
 from oasis_warp.training.complete import complete_field
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
+
+MIN_ALPHA = 0.05
+"""Below it a pixel says nothing about the colour of the hand."""
 
 
 class Adaptation(NamedTuple):
@@ -50,12 +54,10 @@ def adapt(
     progress("calibration", 1, 1)
 
     progress("completion", 0, 1)
-    seen = observe(hand, evidence)
-    index = gaussians.vertex_index
-    missing, known = torch.zeros_like(seen.colors), torch.zeros_like(seen.confidence)
-    missing[index] = seen.colors[index] - gaussians.colors[: len(index)]
-    known[index] = seen.confidence[index]  # where a prior put no Gaussian there is nothing to differ from
-    difference = complete_field(evidence.rest.vertices, faces, missing, known)
+    with torch.no_grad():  # what is drawn, not the Gaussians' own colours: those of a learned prior need not agree
+        drawn = blend_colors(view, gaussians.colors) / view.alphas.clamp_min(MIN_ALPHA)
+    missing = observe(hand, evidence._replace(image=evidence.image - drawn))
+    difference = complete_field(evidence.rest.vertices, faces, missing.colors, missing.confidence)
     colors = (gaussians.colors + vertex_to_gaussians(difference, faces, gaussians)).clamp(0, 1)
     gaussians = gaussians._replace(colors=colors)
     progress("completion", 1, 1)

@@ -5,6 +5,7 @@ keeps the differences. One photo says where a hand lies in the picture but littl
 turn, shape and focal length are large and hang together: drawn one by one they would carry the surface far off its
 picture. An error is therefore all of one measured hand's, of one of those that look most alike from the camera. What
 it does to this hand's landmarks in the picture is put right: they are off as that hand's were, and the surface follows.
+Last, as by `hand.surface_offsets`, what forms the outline goes back to where it is.
 """
 
 import functools
@@ -14,6 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from safetensors.torch import load
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 
 from oasis_warp.assets import asset
 from oasis_warp.core.hand_model import HandModel
@@ -29,6 +31,8 @@ _BONES = (*((0, k) for k in range(1, 21, 4)), *((k, k + 1) for k in range(1, 20)
 """First and last landmark of the bones that carry flesh along."""
 _FORESHORTENED = 0.1
 """Share of the palm's length, as seen, below which a bone is taken to point as the palm does."""
+_GRAZING = 0.5
+"""Largest |normal . view| of a vertex that belongs to the outline, ever less up to there."""
 _SOFT = 0.004
 """Bones that are nearer to a vertex than this share it evenly [m]."""
 
@@ -52,6 +56,8 @@ class MeasuredErrors(NamedTuple):
     """Share of a shape coefficient that the estimator finds."""
     shares: Float[Tensor, "V 21"]
     """How much of each landmark's shift a vertex takes part in; rows sum to one."""
+    normals: Float[Tensor, "V 3"]
+    """Of the surface at rest."""
 
     def times(self, strength: float) -> "MeasuredErrors":
         """Larger or smaller errors; none for 0."""
@@ -72,8 +78,16 @@ class Estimated(NamedTuple):
 def bundled_errors(device: torch.device) -> MeasuredErrors:
     """The errors that ship with the package, of the bundled hand."""
     stored = load(asset("training", "estimator_errors.safetensors").read_bytes())
-    tensors = {name: value.float() for name, value in stored.items()} | {"shares": landmark_shares(bundled_hand())}
+    tensors = {name: value.float() for name, value in stored.items()} | of_surface(bundled_hand())
     return MeasuredErrors(**{name: value.to(device) for name, value in tensors.items()})
+
+
+def of_surface(hand: HandModel) -> dict[str, Tensor]:
+    """The fields of `MeasuredErrors` that are the hand's own."""
+    a, b, c = hand.template[hand.faces].unbind(1)
+    across = torch.linalg.cross(b - a, c - a)
+    normals = torch.zeros_like(hand.template).index_add_(0, hand.faces.flatten(), across.repeat_interleave(3, 0))
+    return {"shares": landmark_shares(hand), "normals": normalize(normals, dim=-1)}
 
 
 def landmark_shares(hand: HandModel) -> Float[Tensor, "V 21"]:
@@ -108,9 +122,9 @@ def frames_of(landmarks: Float[Tensor, "N 21 3"]) -> Frames:
     bones = fingers.diff(dim=2) + _FORESHORTENED * up[:, None, None]
     knuckles = up[:, None, None].expand(-1, FINGERS, 1, -1)
     along = torch.cat([up[:, None], torch.cat([knuckles, bones], 2).flatten(1, 2)], 1)
-    x, y = torch.nn.functional.normalize(along, dim=-1).unbind(-1)
+    x, y = normalize(along, dim=-1).unbind(-1)
     turns = torch.stack([-y, -x, x, -y], -1).unflatten(-1, (2, 2))
-    hand = torch.nn.functional.pad(turns[:, 0], (0, 1, 0, 1))
+    hand = pad(turns[:, 0], (0, 1, 0, 1))
     hand[:, 2, 2] = 1
     return Frames(hand, turns)
 
@@ -162,4 +176,17 @@ def estimate(
     new_depth = new_depth - new_depth.mean(1, keepdim=True) + middle * focal * log_size.exp()[:, None, None]
     shift = torch.cat([rays * new_depth, new_depth], -1) - found.landmarks
     K = K * torch.cat([focal, focal, torch.ones_like(focal)], dim=2)
-    return Estimated(found.posed + measured.shares @ shift, K)
+    posed = found.posed + measured.shares @ shift
+    return Estimated(_onto_outline(posed, focal, true, measured.normals), K)
+
+
+def _onto_outline(posed: Tensor, focal: Tensor, true: Posed, normals: Tensor) -> Tensor:
+    """`posed` with the vertices on the true outline moved onto it, across it; `focal` is over the true focal length."""
+    out = (true.turns @ normals[..., None])[..., 0]
+    view = normalize(true.posed, dim=-1)
+    rim = (1 - (normalize(out, dim=-1) * view).sum(-1, keepdim=True).abs() / _GRAZING).clamp(min=0)
+    out = normalize(out[..., :2], dim=-1)
+    depth = posed[..., 2:] / focal
+    gap = posed[..., :2] / depth - true.posed[..., :2] / true.posed[..., 2:]
+    back = rim * (gap * out).sum(-1, keepdim=True) * out * depth
+    return torch.cat([posed[..., :2] - back, posed[..., 2:]], dim=-1)

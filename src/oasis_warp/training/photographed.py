@@ -11,6 +11,7 @@ from torch.nn.functional import grid_sample
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.training.estimator_errors import ALIKE, bundled_errors, estimate
+from oasis_warp.training.mask_errors import NUMBERS, ended, wandering
 from oasis_warp.training.posed_hands import Posed, pose_hands
 
 CROP_MARGIN = 1.12
@@ -76,6 +77,8 @@ class EstimatorNoise:
 
     surface: float = 1.0
     """Of those of pose, shape and camera."""
+    mask: float = 1.0
+    """Of those of the mask, and so of the crop round it."""
 
 
 class Crops(NamedTuple):
@@ -120,7 +123,7 @@ def _extent(touched: Tensor) -> tuple[Tensor, Tensor]:
     return first.float(), last.float()
 
 
-def _as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+def as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image, alpha, mask, orientation, translation and K, left hands seen in the mirror."""
     left = pictures.left.bool()
 
@@ -128,7 +131,8 @@ def _as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Ten
         return torch.where(left.view(-1, *[1] * (planes.dim() - 1)), planes.flip(2), planes)
 
     like = pictures.translation
-    sign = torch.where(left[:, None], like.new_tensor([-1.0, 1.0, 1.0]), torch.ones_like(like))
+    sign = torch.ones_like(like)
+    sign[:, 0] -= 2 * left
     K = pictures.K.clone()
     K[:, 0, 2] = torch.where(left, pictures.image.shape[2] - K[:, 0, 2], K[:, 0, 2])
     orientation = sign[:, :, None] * pictures.orientation * sign[:, None]
@@ -152,13 +156,13 @@ def training_batch(
         targets: B T of them, those of the first hand first: what the avatar must look like, the hand alone over black.
         size: Side of the crops [px].
         random: On the CPU, of the estimator's errors; the same state gives the same batch.
-        noise: How large they are; they are in `posed` and `K` of the photo, nowhere else.
+        noise: How large they are; they are in the photo's `posed`, `K`, `mask` and crop, nowhere else.
     """
-    image, _, mask, orientation, translation, K = _as_right_hands(photos)
+    image, alpha, mask, orientation, translation, K = as_right_hands(photos)
     count, like = len(image), translation
 
     views = len(targets.image) // count
-    goal_image, goal_alpha, goal_mask, *place, goal_K = _as_right_hands(targets)
+    goal_image, goal_alpha, goal_mask, *place, goal_K = as_right_hands(targets)
     both = pose_hands(
         hand, torch.cat([photos.shape, targets.shape]), torch.cat([photos.angles, targets.angles]),
         torch.cat([orientation, place[0]]), torch.cat([translation, place[1]]),
@@ -167,6 +171,8 @@ def training_batch(
     errors = bundled_errors(like.device).times(noise.surface)
     choice = torch.randint(ALIKE, (count,), generator=random).to(like.device, non_blocking=True)
     seen = estimate(hand, true, photos.shape, photos.angles, orientation, K, errors, choice)
+    numbers = torch.randn(count, 1 + NUMBERS, generator=random).to(like, non_blocking=True)
+    mask = ended(mask, alpha, true.landmarks, K, numbers[:, 0], noise.mask)
     crop = crop_to_mask(torch.cat([image, mask[..., None]], dim=-1), mask, seen.K, size)
 
     alone = goal_image * (goal_mask / goal_alpha.clamp_min(1e-3)).clamp(0, 1)[..., None]  # over black already
@@ -179,7 +185,7 @@ def training_batch(
 
     return TrainingBatch(
         image=crop.planes[..., :3].clamp(0, 1),
-        mask=crop.planes[..., 3].clamp(0, 1),
+        mask=wandering(crop.planes[..., 3].clamp(0, 1), numbers[:, 1:], noise.mask),
         posed=seen.posed,
         viewmat=still.expand(count, -1, -1),
         K=crop.K,

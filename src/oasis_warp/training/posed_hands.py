@@ -22,6 +22,8 @@ class Posed(NamedTuple):
     posed: Float[Tensor, "N V 3"]
     landmarks: Float[Tensor, "N 21 3"]
     """As `hand.skinning.hand21`, posed."""
+    turns: Float[Tensor, "N V 3 3"]
+    """From rest to pose, blended as skinning does: nearly rotations."""
 
 
 def pose_hands(
@@ -40,10 +42,11 @@ def pose_hands(
     blended = torch.einsum("vj,njk->nvk", hand.weights, torch.cat([rotation.flatten(2), offset], dim=2))
     strengths = torch.vmap(lambda a: corrective_coefficients(hand, a))(angles)
     flesh = rest + torch.einsum("vdc,nc->nvd", hand.corrective_basis, strengths)
-    turned = (blended[..., :9].unflatten(2, (3, 3)) * flesh[:, :, None]).sum(-1)
+    turns = blended[..., :9].unflatten(2, (3, 3))
+    posed = (turns * flesh[:, :, None]).sum(-1) + blended[..., 9:]
     last = [torch.stack([part[:, bone] for bone in TIP_BONES], 1) for part in (rotation, offset)]
     ends = (last[0] @ tips[..., None])[..., 0] + last[1]
-    return Posed(rest, turned + blended[..., 9:], torch.cat([origin, ends], 1)[:, hand.keypoint_index])
+    return Posed(rest, posed, torch.cat([origin, ends], 1)[:, hand.keypoint_index], turns)
 
 
 def _bones(
