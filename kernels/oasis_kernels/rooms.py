@@ -11,8 +11,7 @@ import warp as wp
 from oasis_kernels.room_patterns import CLOTH, painted, rough_noise
 from oasis_kernels.sky import blurred, cosine_lobe, disc, dither, harmonics, light_along, lit_share
 
-# Pictures, not geometry: on CUDA, sines and quotients of a few last digits less in half the instructions.
-wp.set_module_options({"enable_backward": False, "fast_math": True})
+wp.set_module_options({"enable_backward": False})  # fast_math makes NaN of powers: a dot product may exceed 1
 
 SOLID_WORDS = wp.constant(27)
 SHAPE, PATTERN, CELL, GLOSS, GLOW, SEED = (wp.constant(k) for k in range(6))
