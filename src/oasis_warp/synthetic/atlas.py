@@ -11,8 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from scipy.ndimage import distance_transform_edt
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -35,12 +34,10 @@ class Atlas:
     """int64 [N, 3]: vertices round the texel."""
     weights: Float[Tensor, "N 3"]
     """Of those vertices."""
-    fill: Tensor
-    """int64 [H, W]: texel shown at each place; beyond the islands the nearest, so that interpolation does not bleed."""
 
     def __init__(self, body: Body):
         faces, weights = _drawn((body.uv * torch.tensor([WIDTH, HEIGHT])).double().numpy(), body.uv_faces.numpy())
-        shown = faces >= 0
+        self._shown = shown = faces >= 0
         self.body, self.corners = body, body.skin_faces[torch.from_numpy(faces[shown])]
         self.weights = torch.from_numpy(weights[shown]).float()
         self.points, self.palm = self._spread(body.rest), self._spread(body.palm[:, None])[:, 0]
@@ -49,10 +46,16 @@ class Atlas:
         self.finger_weight, best = share.max(1)
         self.finger = torch.where(self.finger_weight > 0.5, best, -1)
         self.positions = self.points.double().numpy()
-        nearest = np.asarray(distance_transform_edt(~shown, return_distances=False, return_indices=True))
-        number = np.cumsum(shown).reshape(shown.shape) - 1
-        self.fill = torch.from_numpy(number[nearest[0], nearest[1]])
         self._trees: dict[str, tuple[np.ndarray, cKDTree, list[int]]] = {}
+
+    @functools.cached_property
+    def fill(self) -> Int[Tensor, "H W"]:
+        """The texel shown at each place; beyond the islands the nearest, so that interpolation does not bleed."""
+        from scipy.ndimage import distance_transform_edt  # a third of a second that those who only plan save
+
+        nearest = np.asarray(distance_transform_edt(~self._shown, return_distances=False, return_indices=True))
+        number = np.cumsum(self._shown).reshape(self._shown.shape) - 1
+        return torch.from_numpy(number[nearest[0], nearest[1]])
 
     def _spread(self, values: Float[Tensor, "K C"]) -> Float[Tensor, "N C"]:
         """Values of the vertices of hand and forearm, interpolated at the texels."""
@@ -98,14 +101,16 @@ def _drawn(uv: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     face = np.repeat(np.arange(len(faces)), count)  # of each pair with a texel of its box
     within = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
     x, y = low[face, 0] + within % columns[face], low[face, 1] + within // columns[face]
-    a, b, c = (corners[face, k] - np.stack([x + 0.5, y + 0.5], 1) for k in range(3))
-    areas = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))], 1)
-    whole = areas.sum(1)
-    hit = ((areas >= 0).all(1) | (areas <= 0).all(1)) & (whole != 0)
-    hit = np.nonzero(hit)[0][::-1]  # the first face is written last
+    # Column by column, which is three times as fast as rows of two and three numbers.
+    a, b, c = ((corners[:, k, 0][face] - (x + 0.5), corners[:, k, 1][face] - (y + 0.5)) for k in range(3))
+    areas = [p[0] * q[1] - p[1] * q[0] for p, q in ((b, c), (c, a), (a, b))]
+    whole = areas[0] + areas[1] + areas[2]
+    low_area, high_area = (of(of(areas[0], areas[1]), areas[2]) for of in (np.minimum, np.maximum))
+    hit = np.nonzero(((low_area >= 0) | (high_area <= 0)) & (whole != 0))[0][::-1]  # the first face is written last
     found, weights = np.full((HEIGHT, WIDTH), -1), np.zeros((HEIGHT, WIDTH, 3))
-    found[y[hit], x[hit]] = face[hit]
-    weights[y[hit], x[hit]] = areas[hit] / whole[hit, None]
+    x, y = x[hit], y[hit]
+    found[y, x] = face[hit]
+    weights[y, x] = np.stack([area[hit] for area in areas], 1) / whole[hit, None]
     return found, weights
 
 
