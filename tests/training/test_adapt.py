@@ -117,7 +117,7 @@ def test_without_calibration_what_was_not_seen_stays_as_the_prior_has_it(hand, r
         change = (adapted.gaussians.colors - prior.colors)[: len(back)][back]
         moved[choice] = float(change.abs().amax(1).median())
     assert adapted.calibration.gain.tolist() == [1, 1, 1] and adapted.calibration.offset.tolist() == [0, 0, 0]
-    assert moved["off"] < 0.03 < 0.06 < moved["on"]  # the rest is what fades over from the palm
+    assert moved["off"] < 0.03 < 0.05 < moved["on"]  # the rest is what fades over from the palm
 
 
 @pytest.mark.parametrize("orientation", [PALM_TO_CAMERA, BACK_TO_CAMERA])
