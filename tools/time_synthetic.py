@@ -32,6 +32,8 @@ class Options:
     repeats: int = 5
     threads: int = 1
     seed: int = 0
+    kernels: bool = False
+    """List the GPU's time by kernel, too."""
     training: bool = False
     """Time batches of `training.synthetic_source` in place of the stages; `size` is that of the crops then."""
     hands: int = 16
@@ -75,6 +77,18 @@ def time_training(options: Options) -> None:
           f"{options.ahead} batches at once")  # fmt: skip
     print(f"a batch: {min(done):.1f} ms, mean {sum(done) / len(done):.1f} ms; "
           f"the call returns after {min(asked):.1f} ms")  # fmt: skip
+    if options.kernels and options.device == "cuda":
+        list_kernels(several, options.hands * (1 + options.views) * options.ahead)
+
+
+def list_kernels(render: Callable[[], object], pictures: int) -> None:
+    """GPU time of each kernel."""
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        render()
+    spent = sorted(profile.key_averages(), key=lambda row: -row.device_time_total)
+    print(f"on the GPU: {sum(row.device_time_total for row in spent) / pictures:.0f} us a picture")
+    for row in spent[:30]:
+        print(f"  {row.device_time_total / pictures:8.2f} us a picture, {row.count:4d} x {row.key[:90]}")
 
 
 def time_stages(options: Options) -> None:
@@ -124,6 +138,8 @@ def time_stages(options: Options) -> None:
     print(f"planning, on one core: {min(planning) / options.batch * 1e3:.2f} ms a picture")
     print(f"rendering {options.size} px, batch {options.batch}: {best / options.batch * 1e3:.2f} ms a picture, "
           f"{options.batch / best:.1f} a second")  # fmt: skip
+    if options.kernels and options.device == "cuda":
+        list_kernels(render, options.batch)
     for name in STAGES:
         setattr(picture, name, timed(name, getattr(picture, name)))
     rows = []

@@ -13,8 +13,7 @@ import warp as wp
 
 from oasis_kernels.sky import blurred, cosine_lobe, dither, harmonics, light_along, lit_share, vec9
 
-# Pictures, not geometry: on CUDA, sines and quotients of a few last digits less in half the instructions.
-wp.set_module_options({"enable_backward": False, "fast_math": True})
+wp.set_module_options({"enable_backward": False})  # fast_math makes NaN of powers: a dot product may exceed 1
 
 SKIN = wp.constant(0)
 MATERIAL_WORDS = wp.constant(6)

@@ -108,12 +108,11 @@ def surface_state(vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]) -
 
 
 def _smooth(values: Tensor, faces: Tensor) -> Tensor:
-    batch, n, _ = values.shape
-    index = incidence("faces", faces, n, "vertices")
+    index = incidence("faces", faces, values.shape[1], "vertices")
+    values = values.contiguous()
     out = torch.empty_like(values)
-    launch_ranges(
-        skin_light.smooth, even_cuts(batch * n), [view(values.contiguous()), *map(view, index), view(out)], like=values
-    )
+    inputs = [view(values), *map(view, index), view(out)]
+    launch_ranges(skin_light.smooth, even_cuts(values.numel()), inputs, like=values)
     return out
 
 

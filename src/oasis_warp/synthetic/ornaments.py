@@ -15,9 +15,7 @@ PLASTER, HAIR = (0.62, 0.42, 0.28), (0.30, 0.18, 0.09)
 """Linear RGB of a plaster, and of fair hair."""
 
 
-def ornamented(
-    color: Float[Tensor, "3 N"], canvas: Canvas, plan: SkinPlan, marks: Marks
-) -> Float[Tensor, "3 N"]:
+def ornamented(color: Float[Tensor, "3 N"], canvas: Canvas, plan: SkinPlan, marks: Marks) -> Float[Tensor, "3 N"]:
     """Tattoo, plaster, polish, hair, and the fold around the nails."""
     plate, identity = marks.nails.plate, plan.identity
     if plan.tattoo is not None:

@@ -208,4 +208,3 @@ def _stretch(body: Body, people: list[Person], areas: Tensor) -> Tensor:
     for _ in range(STRETCH_PASSES):
         stretch = smooth_over_faces(stretch, body.faces)
     return stretch
-
