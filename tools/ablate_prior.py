@@ -2,8 +2,8 @@
 
     python tools/ablate_prior.py out/ablation --steps 3000 --device cuda --workers 14
 
-All variants are trained in one process on the very same batches, which are rendered once for all of them. A run that
-was stopped goes on from its checkpoints. With --only several processes share the training (in one folder); a run
+Variants are trained side by side on the very same batches, which are rendered once for all of them. A run that was
+stopped goes on from its checkpoints. With --only several processes share the training (in one folder); a run
 without it trains what is left, evaluates all, prints the tables and leaves ablation.json.
 """
 
@@ -161,6 +161,7 @@ def main() -> None:
     parser.add_argument("--baked", type=Path, help="folder of people that were baked before, as of oasis pretrain")
     parser.add_argument("--held-out", type=int, default=32, help="people to evaluate on")
     parser.add_argument("--one-shot", action="store_true", help="evaluate the adapted avatars too")
+    parser.add_argument("--together", type=int, default=5, help="variants at a time: each holds a step's memory")
     parser.add_argument("--only", help="variants to train now, with commas between them; nothing is evaluated")
     options = parser.parse_args()
     names = list(VARIANTS) if options.only is None else options.only.split(",")
@@ -168,7 +169,8 @@ def main() -> None:
         parser.error(f"--only: expected some of {', '.join(VARIANTS)}, got {', '.join(sorted(unknown))}")
     fixed = ("steps", "hands", "views", "people", "size", "seed", "profile", "evidence", "precision")
     claim_folder(options.out, "ablation_settings.json", {name: getattr(options, name) for name in fixed}, "ablations")
-    train_together(names, options)
+    for k in range(0, len(names), options.together):
+        train_together(names[k : k + options.together], options)
     if options.only is not None:
         return
     records = evaluate_all(options)
