@@ -2,9 +2,9 @@
 
     python tools/ablate_prior.py out/ablation --steps 3000 --device cuda --workers 14
 
-All variants are trained in one process on the very same batches, which are rendered once for all of them. A run that
-was stopped goes on from its checkpoints. With --only several processes share the training (in one folder); a run
-without it trains what is left, evaluates all, and leaves ablation.json and ablation.md.
+Variants are trained side by side on the very same batches, which are rendered once for all of them. A run that was
+stopped goes on from its checkpoints. With --only several processes share the training (in one folder); a run
+without it trains what is left, evaluates all, prints the tables and leaves ablation.json.
 """
 
 import argparse
@@ -20,9 +20,10 @@ import torch
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.claimed_folder import claim_folder
+from oasis_warp.evaluation.ablation import COLORS, ablation_rows, as_markdown
 from oasis_warp.evaluation.held_out import POPULATIONS
 from oasis_warp.evaluation.methods import BASELINE, ONE_SHOT, RAW, Method
-from oasis_warp.evaluation.summary import Record, difference, mean, select
+from oasis_warp.evaluation.summary import Record
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PROFILES, NetworkConfig
@@ -57,10 +58,6 @@ VARIANTS = {
     "evidence": Variant("point evidence switched", {}),
 }
 """The paper's rows, then ours. The last has what the others have not, or not what they have: see --evidence."""
-COLUMNS = {
-    "psnr": "PSNR", "psnr_inner": "inside the outline", "psnr_visible": "visible", "psnr_hidden": "hidden",
-    "psnr_stretched": "stretched", "ssim": "SSIM", "ssim_mask": "in the mask",
-}  # fmt: skip
 CHECKPOINT_EVERY, LOG_EVERY = 250, 25
 
 
@@ -137,44 +134,6 @@ def evaluate_all(options: argparse.Namespace) -> list[Record]:
     return found["pictures"]
 
 
-def rows_of(records: list[Record], light: str, stage: str) -> list[Record]:
-    """A row a variant: means, and how they differ from the full model's on the same pictures."""
-    seen = select(records, light=light, stage=stage, colors="raw" if light == "studio" else "matched")
-    whole = select(seen, prior=FULL)
-    rows = []
-    for name, variant in VARIANTS.items():
-        if own := select(seen, prior=name):
-            changes = {measure: difference(own, whole, measure) for measure in COLUMNS}
-            rows.append(
-                {
-                    "variant": name,
-                    "title": variant.title,
-                    **{measure: mean(own, measure) for measure in COLUMNS},
-                    "change": {measure: change and change._asdict() for measure, change in changes.items()},
-                }
-            )
-    return rows
-
-
-def as_markdown(rows: list[Record]) -> str:
-    """Means of the full model, and differences from it with their standard errors."""
-    lines = ["| | " + " | ".join(COLUMNS.values()) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
-    for row in rows:
-        cells = []
-        for measure in COLUMNS:
-            digits = 4 if measure.startswith("ssim") else 2
-            change = row["change"][measure]
-            if row[measure] is None:
-                cells.append("")
-            elif row["variant"] == FULL or change is None:
-                cells.append(f"{row[measure]:.{digits}f}")
-            else:
-                spread = "" if change["error"] is None else f" ± {change['error']:.{digits}f}"
-                cells.append(f"{change['mean']:+.{digits}f}{spread}")
-        lines.append(f"| {row['title']} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
 def report(stage: str, done: int, total: int) -> None:
     """A line now and then."""
     if total and (done == total or done % max(1, total // 10) == 0):
@@ -202,6 +161,7 @@ def main() -> None:
     parser.add_argument("--baked", type=Path, help="folder of people that were baked before, as of oasis pretrain")
     parser.add_argument("--held-out", type=int, default=32, help="people to evaluate on")
     parser.add_argument("--one-shot", action="store_true", help="evaluate the adapted avatars too")
+    parser.add_argument("--together", type=int, default=5, help="variants at a time: each holds a step's memory")
     parser.add_argument("--only", help="variants to train now, with commas between them; nothing is evaluated")
     options = parser.parse_args()
     names = list(VARIANTS) if options.only is None else options.only.split(",")
@@ -209,19 +169,21 @@ def main() -> None:
         parser.error(f"--only: expected some of {', '.join(VARIANTS)}, got {', '.join(sorted(unknown))}")
     fixed = ("steps", "hands", "views", "people", "size", "seed", "profile", "evidence", "precision")
     claim_folder(options.out, "ablation_settings.json", {name: getattr(options, name) for name in fixed}, "ablations")
-    train_together(names, options)
+    for k in range(0, len(names), options.together):
+        train_together(names[k : k + options.together], options)
     if options.only is not None:
         return
     records = evaluate_all(options)
-    stages = (RAW, ONE_SHOT) if options.one_shot else (RAW,)
-    tables = [(light, stage, rows_of(records, light, stage)) for stage in stages for light in ("studio", "wild")]
+    tables = []
+    for stage in (RAW, ONE_SHOT) if options.one_shot else (RAW,):
+        variants = {name: (variant.title, Method(name, stage)) for name, variant in VARIANTS.items()}
+        tables += [(light, stage, ablation_rows(records, light, variants, FULL)) for light in COLORS]
     found = [{"light": light, "stage": stage, "rows": rows} for light, stage, rows in tables]
     settings = {name: getattr(options, name) for name in (*fixed, "held_out")}
-    text = json.dumps({"settings": settings, "tables": found}, indent=1)
+    text = json.dumps({"settings": settings, "whole": FULL, "tables": found}, indent=1)
     write_file(options.out / "ablation.json", text.encode())
-    parts = [f"### {light}, {stage.replace('_', '-')}\n\n{as_markdown(rows)}" for light, stage, rows in tables]
-    write_file(options.out / "ablation.md", ("\n\n".join(parts) + "\n").encode())
-    print("\n\n".join(parts))
+    for light, stage, rows in tables:
+        print(f"{light} photos, {stage.replace('_', '-')}\n\n{as_markdown(rows, FULL)}\n")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.evaluation.held_out import HELD_OUT_SEED, Shoot
 from oasis_warp.evaluation.methods import Method, label
-from oasis_warp.evaluation.same_hand import evaluate_photos
+from oasis_warp.evaluation.same_hand import METRICS, evaluate_photos
 from oasis_warp.evaluation.summary import Record, select
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate
 from oasis_warp.hand.template import bundled_hand
@@ -28,6 +28,8 @@ from oasis_warp.synthetic.plan import PICTURES_EACH
 from oasis_warp.training.synthetic_source import MULTIPLE
 
 SIZES = range(64, 1025)
+TABLE_WIDTH = 120
+"""Of tables where there is no terminal, or a narrow one [characters]."""
 SYNTHETIC_COLUMNS = {
     "psnr": ("PSNR", "{:.2f}"),
     "gain": ("gain", "{:+.2f}"),
@@ -74,6 +76,7 @@ def run(options: Evaluate) -> int:
         print(f"oasis: stopped; what is whole stays in {options.out}, the same command goes on.", file=sys.stderr)
         return INTERRUPTED
     console = Console()
+    console = console if console.width >= TABLE_WIDTH else Console(width=TABLE_WIDTH)
     for table in made:
         console.print(table)
     return 0
@@ -153,8 +156,10 @@ def on_photos(options: Evaluate, priors: dict[str, Prior], progress: Progress) -
     )
     found = evaluate_photos(priors, options.folder, options.out, config, progress)
     rows, n_out = found["summary"], len(found["left_out"])
-    title = f"{rows[0]['pairs']} ordered pairs of photos of the same hand"
-    return [make_table(title + (f", {n_out} photos left out" if n_out else ""), rows, PHOTO_COLUMNS)]
+    table = make_table(f"{rows[0]['pairs']} ordered pairs of photos of the same hand", rows, PHOTO_COLUMNS)
+    if n_out:
+        table.caption = f"photos left out: {n_out}, see {METRICS}"
+    return [table]
 
 
 def make_table(title: str, rows: Sequence[Record], columns: dict[str, tuple[str, str]]) -> Table:

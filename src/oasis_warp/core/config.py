@@ -12,6 +12,8 @@ from torch import Tensor
 class AdaptConfig:
     """How an avatar is fitted to one photo. Defaults are the paper's (appendix B) unless a field says otherwise."""
 
+    calibration: Literal["on", "off"] = "on"
+    """Match the prior's colours to the photo's as a whole first, or leave them as they are."""
     calibration_steps: int = 100
     """Steps of colour calibration after its closed-form start."""
     texture_steps: int | None = None

@@ -57,6 +57,8 @@ SHOWN = 4
 """People of each group on the sheet, and hands on the picture of attention."""
 DIGITS = 5
 """Of the numbers in files."""
+BAKED_TOGETHER = 16
+"""People that are kept at a time: a CPU keeps few."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,13 +119,12 @@ def evaluate(
     done = sum(_place(folder, *who).exists() for who in everybody)
     for group in config.groups:
         missing = [number for of, number in everybody if of == group and not _place(folder, of, number).exists()]
-        bake_people(
-            config.shoot.seed, missing, POPULATIONS[group], str(device), jobs=workers, progress=progress
-        )
-        for number in missing:
-            progress("evaluation", done, len(everybody))
-            bench.measure(folder, group, number)
-            done += 1
+        for few in (missing[k : k + BAKED_TOGETHER] for k in range(0, len(missing), BAKED_TOGETHER)):
+            bake_people(config.shoot.seed, few, POPULATIONS[group], str(device), jobs=workers, progress=progress)
+            for number in few:
+                progress("evaluation", done, len(everybody))
+                bench.measure(folder, group, number)
+                done += 1
     progress("evaluation", done, len(everybody))
     records = [record for who in everybody for record in json.loads(_place(folder, *who).read_text())]
     strips = [
@@ -207,7 +208,7 @@ class _Bench:
         """Write where the learned prior looks, if its network has such attention."""
         prior = self.priors.get("learned")
         if isinstance(prior, NetworkPrior) and has_attention(prior.network):
-            write_strip(path, [draw_attention(prior.network, input_of_batch(batch))])
+            write_strip(path, [draw_attention(prior.network.to(self.device), input_of_batch(batch))])
 
 
 def evidence_of(batch: TrainingBatch) -> Evidence:

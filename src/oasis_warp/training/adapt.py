@@ -49,7 +49,10 @@ def adapt(
     trusted = inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5)
 
     progress("calibration", 0, 1)
-    calibration = calibrate(view, prior.colors, evidence.image, trusted, config)
+    if config.calibration == "on":
+        calibration = calibrate(view, prior.colors, evidence.image, trusted, config)
+    else:
+        calibration = Calibration(torch.ones_like(prior.colors[0]), torch.zeros_like(prior.colors[0]))
     gaussians = prior._replace(colors=calibration.apply(prior.colors))
     progress("calibration", 1, 1)
 
