@@ -27,7 +27,7 @@ from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.evaluation.coverage import coverage
-from oasis_warp.evaluation.same_hand import compare_with_photo
+from oasis_warp.evaluation.photo_pairs import compare_pairs
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
@@ -98,32 +98,25 @@ def measure(path: Path, root: Path, out: Path, prior: str, seed: int) -> dict[st
 
 def measure_pairs(folder: Path, out: Path) -> list[dict[str, object]]:
     """Rows of every ordered pair of photos in `folder`; avatars must lie in `out` already."""
-    estimator, config, rows = HandEstimator(bundled_hand()), ReconstructConfig(force=True), []
-    paths = photos_below(folder)
-    for target in paths:
-        photo = read_photo(target)
-        landmarks = choose_hand(estimator.find(photo), "largest", photo.name)
-        for source in paths:
-            file = (out / folder.name / source.stem).with_suffix(".safetensors")
-            if source == target or not file.exists():
-                continue
-            avatar = Avatar.load(file)
-            fit = estimator.fit(photo, landmarks, shape=avatar.shape, force=True)
-            if fit.side != avatar.side:
-                continue
-            evidence = make_evidence(photo, fit, avatar.surface_offsets, config)
-            score = compare_with_photo(avatar, evidence, fit.pose)
-            regions = {f"error_{name}": round(value, 4) for name, value in score.region_errors.items()}
-            rows.append(
-                {
-                    "source": f"{folder.name}/{source.stem}",
-                    "target": f"{folder.name}/{target.stem}",
-                    "psnr_db": round(score.psnr, 2),
-                    "psnr_plain_db": round(score.psnr_plain, 2),
-                    "overlap": round(score.overlap, 3),
-                    **regions,
-                }
-            )
+    estimator, photos, avatars = HandEstimator(bundled_hand()), {}, {}
+    for path in photos_below(folder):
+        photo = read_photo(path)
+        photos[path.stem] = photo, choose_hand(estimator.find(photo), "largest", photo.name)
+        if (file := (out / folder.name / path.stem).with_suffix(".safetensors")).exists():
+            avatars[path.stem] = {"avatar": Avatar.load(file)}
+    rows = []
+    for pair in compare_pairs(estimator, photos, avatars, ReconstructConfig()):
+        score = pair.scores["avatar"]
+        rows.append(
+            {
+                "source": f"{folder.name}/{pair.source}",
+                "target": f"{folder.name}/{pair.target}",
+                "psnr_db": round(score.psnr, 2),
+                "psnr_plain_db": round(score.psnr_plain, 2),
+                "overlap": round(score.overlap, 3),
+                **{f"error_{name}": round(value, 4) for name, value in score.region_errors.items()},
+            }
+        )
     return rows
 
 

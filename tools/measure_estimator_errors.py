@@ -1,6 +1,6 @@
 """Estimate synthetic hands as `pipeline.reconstruct` does, and keep what is true beside what was found.
 
-    python tools/measure_estimator_errors.py out/estimates --count 256
+    python tools/measure_estimator_errors.py out/estimates --count 224
 
 One file a picture, named by its number; those that are there already are left, so a run that was stopped goes on, and
 several may share the work by `--first`. `tools/write_estimator_errors.py` reads the folder. Left hands are kept as the
@@ -106,7 +106,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--count", type=int, default=256)
+    parser.add_argument("--count", type=int, default=224)
     parser.add_argument("--each", type=int, default=2, help=f"pictures of each person, up to {PICTURES_EACH}")
     parser.add_argument("--seed", type=int, default=7001, help="of a world that is not the training's")
     parser.add_argument("--size", type=int, default=384, help="side of the pictures [px]")

@@ -1,17 +1,18 @@
 """Tabulate what `tools/measure_estimator_errors.py` left in a folder, and make the asset that training draws from.
 
-    python tools/measure_estimator_errors.py out/estimates --count 256
+    python tools/measure_estimator_errors.py out/estimates --count 224
     python tools/write_estimator_errors.py out/estimates --json out/estimator_errors.json
 
 It writes assets/training/estimator_errors.safetensors, the tables between the markers of docs/estimator.md, and the
 numbers as JSON. The second table holds found surfaces beside those that training sees: each measured hand once more,
-with the error of another one (`training.estimator_errors`), so that none is compared with itself.
+with the error of another one (`training.estimator_errors`), so that none is compared with itself; the third does so for
+masks.
 """
 
 import argparse
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,10 +23,15 @@ from torch import Tensor
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandPose
 from oasis_warp.data.atomic import write_file
+from oasis_warp.hand.outline import wrist_line
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map, depth_visibility
+from oasis_warp.synthetic.picture import render_batch
+from oasis_warp.synthetic.plan import PICTURES_EACH
 from oasis_warp.training.estimator_errors import ALIKE, MeasuredErrors, estimate, frames_of, looks, of_surface
+from oasis_warp.training.mask_errors import NUMBERS, ended, wandering
+from oasis_warp.training.photographed import as_right_hands, crop_to_mask
 from oasis_warp.training.posed_hands import Posed, pose_hands
 
 BEGIN, END = "<!-- errors -->", "<!-- end of errors -->"
@@ -33,6 +39,8 @@ ASSET = Path(__file__).parents[1] / "src" / "oasis_warp" / "assets" / "training"
 CROP = 256
 """Pixel errors are given in a crop of this side."""
 PERCENTILES = (10, 50, 90)
+RENDERED = 320
+"""Side of the pictures whose masks are made [px]: that of training."""
 MARGIN = 0.0015
 """Of visibility, as the network sees it [m]."""
 Row = dict[str, Any]
@@ -191,20 +199,53 @@ def errors_of_parts(true: Hands, found: Hands, scale: Tensor) -> dict[str, Tenso
     }
 
 
-def errors_of_masks(rows: list[Row]) -> dict[str, Tensor]:
-    """Of the masks above the wrist line, of whole masks, and of the crops that come from them."""
+class Masks(NamedTuple):
+    """True masks and others, in the crops of the latter."""
+
+    true: Tensor
+    found: Tensor
+    above: Tensor
+    """The hand's side of the wrist line."""
+    side: Tensor
+    """Of the crop, over that of the true mask's."""
+
+
+def found_masks(rows: list[Row]) -> Masks:
+    """Those that the estimator cut."""
     true, found, above = (torch.from_numpy(np.stack([row[name] for row in rows])) > 127
                           for name in ("true_mask", "found_mask", "above"))  # fmt: skip
-    square, wanted = (torch.from_numpy(np.stack([row[name] for row in rows])) for name in ("square", "true_square"))
+    return Masks(true, found, above, torch.tensor([float(row["square"][2] / row["true_square"][2]) for row in rows]))
+
+
+def masks_in_training(hand: HandModel, seed: int, count: int) -> Masks:
+    """Those of `training_batch`, of one picture of each person of a world."""
+    random = torch.Generator().manual_seed(seed)
+    parts = []
+    for k in range(count):
+        photo = render_batch(seed, [PICTURES_EACH * k], RENDERED)
+        _, alpha, mask, orientation, translation, K = as_right_hands(photo)
+        landmarks = pose_hands(hand, photo.shape, photo.angles, orientation, translation).landmarks
+        numbers = torch.randn(1, 1 + NUMBERS, generator=random)
+        made = ended(mask, alpha, landmarks, K, numbers[:, 0])
+        crop = crop_to_mask(torch.stack([mask, made], -1), made, K, CROP)
+        found = wandering(crop.planes[..., 1], numbers[:, 1:])
+        seen = project(landmarks, crop.K)[0].numpy()
+        above = torch.from_numpy(wrist_line(seen).above_mask((CROP, CROP)))[None]
+        side = crop_to_mask(mask[..., None], mask, K, CROP).K[:, 0, 0] / crop.K[:, 0, 0]
+        parts.append(Masks(crop.planes[..., 0] > 0.5, found > 0.5, above, side))
+    return Masks(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+
+def errors_of_masks(masks: Masks) -> dict[str, Tensor]:
+    """Of whole masks, of what is above the wrist line, and of the crops that come from them."""
+    true, found, above, side = masks
     hand = (true & above).flatten(1).sum(1)
-    middle = (square[:, :2] + square[:, 2:] / 2) - (wanted[:, :2] + wanted[:, 2:] / 2)
     return {
-        "masks, IoU": iou(true, found),
-        "masks above the wrist line, IoU": iou(true & above, found & above),
+        "IoU with the true mask": iou(true, found),
+        "the same above the wrist line": iou(true & above, found & above),
         "of the hand above it, left out [%]": 100 * (true & ~found & above).flatten(1).sum(1) / hand,
         "as much of what is not hand, taken in [%]": 100 * (found & ~true & above).flatten(1).sum(1) / hand,
-        "side of the crop, found over true [%]": 100 * (square[:, 2] / wanted[:, 2] - 1),
-        "middle of the crop [% of its side]": 100 * middle.norm(dim=1) / wanted[:, 2],
+        "side of the crop, over that of the true one [%]": 100 * (side - 1),
     }
 
 
@@ -253,6 +294,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--page", type=Path, default=Path("docs/estimator.md"))
     parser.add_argument("--asset", type=Path, default=ASSET)
+    parser.add_argument("--masks", type=int, default=64, help="masks of training to compare with")
+    parser.add_argument("--seed", type=int, default=7001, help="of the world that they are of")
     options = parser.parse_args()
     torch.set_num_threads(1)
     every, hand = read(options.folder), bundled_hand()
@@ -270,12 +313,13 @@ def main() -> None:
         "found": Surfaces(hand, with_offsets(hand, rows, found), found.K, size),
         "in training": Surfaces(hand, *leave_one_out(hand, true, measured, 0), size),
     }
+    masks = {"found": found_masks(rows), "in training": masks_in_training(hand, options.seed, options.masks)}
     numbers = {
         "pictures": len(every),
         "results": {name: results.count(name) for name in sorted(set(results))},
         "warned": sum(len(row["warnings"]) > 0 for row in rows),
         "parts": percentiles(errors_of_parts(true, found, scale)),
-        "masks": percentiles(errors_of_masks(rows)),
+        "masks": {name: percentiles(errors_of_masks(those)) for name, those in masks.items()},
         "correlations": correlations(true, found),
         "surfaces": {name: percentiles(compare(truth, those, scale)) for name, those in seen.items()},
     }
@@ -285,9 +329,12 @@ def main() -> None:
     text = "\n\n".join([
         f"{len(every)} pictures: {outcome}; {numbers['warned']} fits are warned about. Pixels are those of the "
         f"{CROP} px crop.",
-        table({"": numbers["parts"] | numbers["masks"]}),
+        table({"": numbers["parts"]}),
         f"Correlations: {hang}.",
+        "Surfaces, and those that training gives the network:",
         table(numbers["surfaces"]),
+        f"Masks, and {options.masks} that training gives it:",
+        table(numbers["masks"]),
     ])  # fmt: skip
     head, rest = options.page.read_text().split(BEGIN)
     options.page.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}")

@@ -15,14 +15,12 @@ from oasis_warp.evaluation.held_out import (
     Shoot,
     as_estimated,
     photograph,
-    scale_noise,
     true_targets,
 )
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.ops import depth_map
 from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.synthetic.identity import sample_identity
-from oasis_warp.training.photographed import EstimatorNoise
 
 CPU = torch.device("cpu")
 SHOOT = Shoot(targets=2, size=64)
@@ -108,10 +106,11 @@ def test_groups_are_the_same_people_with_one_thing_more(hand):
 
 def test_estimated_poses_are_off_by_as_much_as_the_factor_says(hand, session):
     def posed(factor):
-        return as_estimated(hand, session, "studio", SHOOT, scale_noise(EstimatorNoise(), factor))
+        return as_estimated(hand, session, "studio", SHOOT, factor)
 
     true, once, twice = posed(0.0), posed(1.0), posed(2.0)
     near, far = ((batch.posed - true.posed).norm(dim=-1).mean() for batch in (once, twice))
     assert 0 < float(near) < float(far)
     assert torch.equal(true.target_images, twice.target_images) and torch.equal(true.rest, twice.rest)
     assert torch.equal(once.posed, posed(1.0).posed)
+    assert 0 <= float(posed(4.0).mask.min()) and float(posed(4.0).mask.max()) <= 1

@@ -10,8 +10,8 @@ import torch
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.evaluation import synthetic
-from oasis_warp.evaluation.held_out import FIRST_PERSON, Shoot, as_estimated, photograph, scale_noise
-from oasis_warp.evaluation.methods import METHODS, Method, reconstructions
+from oasis_warp.evaluation.held_out import FIRST_PERSON, Shoot, as_estimated, photograph
+from oasis_warp.evaluation.methods import METHODS, Method, prior_digest, reconstructions, usual_priors
 from oasis_warp.evaluation.metrics import MEASURES
 from oasis_warp.evaluation.synthetic import (
     ATTENTION,
@@ -22,8 +22,6 @@ from oasis_warp.evaluation.synthetic import (
     SyntheticEvaluation,
     evaluate,
     evidence_of,
-    prior_digest,
-    usual_priors,
 )
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
@@ -126,7 +124,7 @@ def test_a_place_that_is_no_folder_is_refused(tmp_path):
 
 def test_each_stage_goes_on_from_the_one_before(hand, network):
     session = photograph(CONFIG.shoot, "ordinary", FIRST_PERSON, CPU)
-    batch = as_estimated(hand, session, "wild", CONFIG.shoot, scale_noise(CONFIG.estimator, 0.0))
+    batch = as_estimated(hand, session, "wild", CONFIG.shoot, 0.0)
     evidence = evidence_of(batch)
     made = dict(reconstructions(hand, evidence, usual_priors(network), METHODS, CONFIG.adapt))
     assert tuple(made) == METHODS

@@ -1,5 +1,6 @@
 """Skin that is baked on any device, and what it needs for that."""
 
+import pickle
 import subprocess
 import sys
 
@@ -10,17 +11,21 @@ import torch
 from oasis_warp.ops import depth_map
 from oasis_warp.synthetic import people
 from oasis_warp.synthetic.atlas import HEIGHT, WIDTH, bundled_atlas
-from oasis_warp.synthetic.bake import CHANNELS, bake
+from oasis_warp.synthetic.bake import CHANNELS, paint
 from oasis_warp.synthetic.body import bundled_body, skin_mesh
 from oasis_warp.synthetic.canvas import canvas_on
-from oasis_warp.synthetic.identity import Population, sample_identity
+from oasis_warp.synthetic.drawn_lines import draw_lines
+from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.plan import EVERYBODY
+from oasis_warp.synthetic.processes import worker_pool
+from oasis_warp.synthetic.skin_plan import plan_person
 from oasis_warp.synthetic.strokes import KINDS, Strokes
 
 SEED = 13
 KINDS_OF_PAINT = ("freckles", "hair", "polish", "tattoo", "ring", "plaster")
 PAINTED, BARE = (Population(**dict.fromkeys(KINDS_OF_PAINT, share)) for share in (1.0, 0.0))
 NEEDLESS = ("igl", "trimesh", "tyro", "rich")
+NEEDLESS_TO_PLAN = ("warp", "oasis_kernels", "scipy.ndimage")
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +64,7 @@ def test_a_line_is_drawn_where_it_was_added(device):
     strokes = Strokes(np.random.default_rng(0))
     strokes.add("main", rows, 1.0, 0.8, taper=0.1, wobble=0.0)
     strokes.add("hair", rows[:1].repeat(3, 0), 1.0, 0.8)  # of no length: nothing
-    drawn = strokes.draw(grid)
+    drawn = draw_lines(strokes.lines(), grid)
     assert set(drawn) == set(KINDS) and not bool(drawn["hair"].any())
     far = torch.cdist(bundled_atlas().points.to(device), torch.from_numpy(rows).float().to(device)).amin(1)
     line = drawn["main"]
@@ -67,6 +72,11 @@ def test_a_line_is_drawn_where_it_was_added(device):
     middle = torch.from_numpy(rows[10:20]).float().to(device)
     there = torch.cdist(middle, bundled_atlas().points.to(device)).argmin(1)
     assert float(line[there].min()) > 0.5
+
+
+def test_where_no_line_was_added_none_is_drawn(device):
+    lines = Strokes(np.random.default_rng(0)).lines()
+    assert not any(bool(drawn.any()) for drawn in draw_lines(lines, canvas_on(str(device)).grid).values())
 
 
 def test_what_is_put_on_skin_shows_in_its_colour(baked):
@@ -88,16 +98,30 @@ def test_the_tone_is_the_mean_of_the_texture(baked):
     torch.testing.assert_close(baked[0].tone, baked[0].texture[..., :3].float().mean((0, 1)))
 
 
-def test_a_person_is_the_same_again(baked):
-    identity = sample_identity(bundled_body().hand, SEED, 4, BARE)
-    assert torch.equal(bake(identity, "cpu"), baked[1].texture)
+def test_a_plan_travels_and_is_painted_the_same_again(baked):
+    sent = pickle.dumps(plan_person(SEED, 4, PAINTED))
+    assert len(sent) < 2e6
+    assert torch.equal(paint(pickle.loads(sent), "cpu"), baked[0].texture)
+
+
+@pytest.mark.slow
+def test_processes_plan_the_same_skin():
+    with worker_pool(1) as pool:
+        plans = list(pool.map(plan_person, [SEED] * 3, [4, 5, 6], [PAINTED] * 3, chunksize=2))
+    for number, there in zip([4, 5, 6], plans, strict=True):
+        here = plan_person(SEED, number, PAINTED)
+        np.testing.assert_array_equal(there.lines.numbers, here.lines.numbers)
+        np.testing.assert_array_equal(there.spots, here.spots)
+        assert there.identity.seed == here.identity.seed
 
 
 @pytest.mark.gpu
 def test_a_gpu_bakes_the_person_that_the_cpu_bakes(baked, monkeypatch):
     monkeypatch.setattr(people, "_known", type(people._known)())
-    people.bake_people(SEED, [4], PAINTED, "cuda", jobs=2)
+    monkeypatch.setattr(people, "PLANNED_HERE", 0)
+    people.bake_people(SEED, [4], PAINTED, "cuda", jobs=1)
     ((_, there),) = people._known.items()
+    assert people.person(SEED, 4, PAINTED, "cuda:0") is there
     here = baked[0]
     for name in ("rest", "joints", "tips", "ring"):
         torch.testing.assert_close(getattr(there, name).cpu(), getattr(here, name), atol=1e-6, rtol=0)
@@ -126,8 +150,14 @@ def test_a_gpu_needs_no_kernel_for_the_cpu(monkeypatch):
     people.person(SEED, 4, EVERYBODY, "cuda")
 
 
-def test_baking_imports_nothing_that_is_not_needed():
-    blocked = "".join(f"sys.modules[{name!r}] = None;" for name in NEEDLESS)
-    code = f"import sys; {blocked} import oasis_warp.synthetic.picture; from oasis_warp.synthetic import people;"
-    code += "from oasis_warp.synthetic.canvas import canvas_on; canvas_on('cpu')"
+def test_baking_imports_nothing_that_is_not_needed_and_planning_still_less():
+    code = f"""
+import sys
+sys.modules.update(dict.fromkeys({(*NEEDLESS, *NEEDLESS_TO_PLAN)}))
+from oasis_warp.synthetic import processes, skin_plan
+skin_plan.bundled_atlas()
+for name in {NEEDLESS_TO_PLAN}:
+    del sys.modules[name]
+import oasis_warp.synthetic.picture
+"""
     subprocess.run([sys.executable, "-c", code], check=True)

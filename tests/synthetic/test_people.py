@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from oasis_warp.synthetic import people
+from oasis_warp.synthetic.body import device_name
 from oasis_warp.synthetic.plan import EVERYBODY
 
 SEED = 13
@@ -34,6 +35,13 @@ def test_a_person_that_was_written_is_read_and_not_baked(folder, monkeypatch):
     for name, value in baked._asdict().items():
         if isinstance(value, torch.Tensor):
             assert value.dtype == getattr(read, name).dtype and torch.equal(value, getattr(read, name)), name
+
+
+def test_a_device_has_one_name(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+    assert [device_name(d) for d in ("cpu", "cuda", "cuda:0", torch.device("cuda"))] == [
+        "cpu", "cuda:1", "cuda:0", "cuda:1"
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("damage", ["cut short", "another's"])

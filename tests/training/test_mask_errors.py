@@ -59,7 +59,9 @@ def test_no_strength_no_error(comb):
 def test_rims_wander_by_some_pixels_and_no_farther(comb):
     mask = comb[0].expand(32, -1, -1)
     made = wandering(mask, numbers(32))
-    assert float(made.min()) >= 0 and float(made.max()) <= 1
+    for strength in (1.0, 2.0):
+        shares = wandering(mask, numbers(32), strength)
+        assert float(shares.min()) >= 0 and float(shares.max()) <= 1
     wrong = (made - mask).abs() > 0.5
     assert not wrong[:, 115:195, 65:155].any(), "the middle of the palm"
     assert not wrong[:, :24].any() and not wrong[:, 206:].any() and not wrong[:, :, :54].any(), "the background"

@@ -292,3 +292,40 @@ class Pretrain:
     """Processes that bake people and plan pictures ahead, for each GPU; 0 for none."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for the paper's profile."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """Measure what avatars are worth: metrics.json with every number, sheet.png, and a table.
+
+    On synthetic hands that no training has met, in poses and from sides that the photo does not show; or on a folder of
+    photos with a subfolder for each hand, where the avatar of one photo is held against the others. A run that was
+    stopped goes on when it is started again with the same options.
+    """
+
+    folder: Positional[Path | None] = None
+    """With a subfolder of photos for each hand, for same-hand."""
+    out: Output
+    """Folder for the results; its parent must exist."""
+    dataset: Literal["synthetic", "same-hand"] = "synthetic"
+    """What to measure on."""
+    prior: Literal["learned", "none"] | Path = "learned"
+    """The learned prior to hold against the mean hand, as for `oasis reconstruct`; none for the mean hand alone."""
+    backbone_weights: Path | None = None
+    """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
+    people: int = 16
+    """Synthetic people without tattoo or ring, and as many with each."""
+    targets: int = 4
+    """Pictures of each of them to compare with, 1 to 8."""
+    steps: int | None = None
+    """Steps of texture learning; stops by itself when not given."""
+    size: int = 256
+    """Side of the pictures [px]; a multiple of 16 for synthetic ones."""
+    seed: int = 0
+    """Of people, pictures and adaptation."""
+    lpips: tuple[Path, Path] | None = None
+    """Weights of LPIPS: alexnet-owt-7be5be79.pth of torchvision and alex.pth of LPIPS; no LPIPS without them."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""
+    workers: int = 0
+    """Processes that bake synthetic people; 0 for none."""

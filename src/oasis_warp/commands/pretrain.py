@@ -31,7 +31,7 @@ from oasis_warp.training.pretrain import CHECKPOINT, PretrainConfig, pretrain
 from oasis_warp.training.synthetic_source import MULTIPLE, SyntheticHands
 
 SETTINGS, PEOPLE = "training.json", "people"
-"""In the folder: with what the training began, and the people that have been baked."""
+"""In the folder: with what the training began, and the people that a CPU has baked."""
 PRECISIONS = {"bf16": "bfloat16", "float32": "float32"}
 SIZES = range(32, 1025, MULTIPLE)
 
@@ -112,6 +112,8 @@ def train(options: Pretrain, place: Place, progress: Progress) -> int:
     settings = settings_of(options, place.world)
     if place.rank == 0:
         claim(options.out, settings)
+        if place.device.type == "cpu":
+            (options.out / PEOPLE).mkdir(exist_ok=True)
     wait_for_all(place)
     hands.bake(met, options.out / PEOPLE, options.workers, progress)
     config = PretrainConfig(steps=options.steps, precision=PRECISIONS[options.precision])
@@ -155,7 +157,6 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
     if (folder / CHECKPOINT).exists() and not (folder / SETTINGS).exists():
         raise InputError(f"{folder}: holds a checkpoint but no {SETTINGS} that says of what; choose another folder.")
     claim_folder(folder, SETTINGS, settings, "a training")
-    (folder / PEOPLE).mkdir(exist_ok=True)
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """Synthetic people that no training has met, photographed for evaluation: who, in which light, how well estimated."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -87,22 +87,27 @@ def _evenly_lit(shot: Shot) -> Shot:
     return shot._replace(light=sample_light(rng, "even"), clothes=sample_clothes(rng, bare=True))
 
 
-def scale_noise(noise: EstimatorNoise, factor: float) -> EstimatorNoise:
-    """All errors `factor` times as large; 0 is the true pose."""
-    return replace(noise, **{field.name: factor * getattr(noise, field.name) for field in fields(noise)})
+def estimator_noise(factor: float) -> EstimatorNoise:
+    """Errors of pose, shape and camera `factor` times as large as the estimator's; 0 is the truth.
+
+    Those of the mask come with them, but no larger than they are: a mask has no twice.
+    """
+    return EstimatorNoise(surface=factor, mask=min(factor, 1.0))
 
 
 def as_estimated(
-    hand: HandModel, session: Session, light: Lighting, shoot: Shoot, noise: EstimatorNoise
+    hand: HandModel, session: Session, light: Lighting, shoot: Shoot, factor: float
 ) -> TrainingBatch:
-    """One photo and its targets as training sees them; the errors of any size point the same way.
+    """One photo and its targets as training sees them, with `estimator_noise`; of any size it points the same way.
 
     They are in where the photo is read. Targets are drawn on the true surface, or else the outline of a wrong one
     would drown what is asked for.
     """
     (state,) = np.random.SeedSequence([shoot.seed, ERROR_STREAM, session.number]).generate_state(1)
     random = torch.Generator().manual_seed(int(state))
-    return training_batch(hand, session.photos[light], session.targets, shoot.size, random, noise)
+    return training_batch(
+        hand, session.photos[light], session.targets, shoot.size, random, estimator_noise(factor)
+    )
 
 
 def true_targets(

@@ -1,15 +1,20 @@
 """The ways to an avatar that are held against each other: a prior, and how far its guess is fitted to the photo."""
 
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 
-from oasis_warp.avatar.prior import Prior
+from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Evidence
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.prior import NetworkPrior
+from oasis_warp.network.weights_file import trained_state
 from oasis_warp.training.adapt import adapt
 
 RAW, CALIBRATED, ONE_SHOT = "raw", "calibrated", "one_shot"
@@ -40,6 +45,25 @@ BASELINE = METHODS[0]
 def label(method: Method) -> str:
     """What to call it."""
     return f"{method.prior} {method.stage.replace('_', '-')}"
+
+
+def usual_priors(network: HandNetwork | None) -> dict[str, Prior]:
+    """The priors of `METHODS`: the mean hand, and the learned one where there is a network."""
+    priors: dict[str, Prior] = {"mean": MeanPrior(bundled_hand())}
+    if network is not None:
+        priors["learned"] = NetworkPrior(network)
+    return priors
+
+
+def prior_digest(prior: Prior) -> str | None:
+    """SHA-256 of all that training has changed in a network's prior, names included; None for others."""
+    if not isinstance(prior, NetworkPrior):
+        return None
+    digest = hashlib.sha256()
+    for name, tensor in sorted(trained_state(prior.network).items()):
+        digest.update(name.encode())
+        digest.update(tensor.float().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def reconstructions(

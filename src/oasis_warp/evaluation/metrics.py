@@ -81,13 +81,19 @@ def _psnr(error: Tensor, weight: Tensor) -> float | None:
     return -10 * math.log10(max(float((error * weight).sum()) / total, ERROR_FLOOR))
 
 
+def color_gain(
+    image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], mask: Float[Tensor, "H W"]
+) -> Float[Tensor, "3"]:
+    """The gain of each channel that brings `image` nearest to `target` inside `mask` (least squares).
+
+    A photo does not tell a coloured hand from coloured light, and what it is compared with stands in another light.
+    """
+    weighted = image * mask[..., None]
+    return (weighted * target).sum((0, 1)) / (weighted * image).sum((0, 1)).clamp_min(1e-6)
+
+
 def match_colors(
     image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], mask: Float[Tensor, "H W"]
 ) -> Float[Tensor, "H W 3"]:
-    """`image` times the gain of each channel that brings it nearest to `target` inside `mask` (least squares).
-
-    One photo does not tell a coloured hand from coloured light, and the target stands in another light.
-    """
-    weighted = image * mask[..., None]
-    gain = (weighted * target).sum((0, 1)) / (weighted * image).sum((0, 1)).clamp_min(1e-6)
-    return (image * gain).clamp(0, 1)
+    """`image` after `color_gain`, kept in [0, 1]."""
+    return (image * color_gain(image, target, mask)).clamp(0, 1)

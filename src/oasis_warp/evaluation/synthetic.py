@@ -3,7 +3,6 @@
 Nothing here needs more than the package's core: a script on a machine with CUDA can call `evaluate`.
 """
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from oasis_warp import __version__
 from oasis_warp.avatar.pose import pose_gaussians
-from oasis_warp.avatar.prior import MeanPrior, Prior
+from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import Camera, Evidence, PosedHand, TrainingBatch
@@ -29,10 +28,9 @@ from oasis_warp.evaluation.held_out import (
     Shoot,
     as_estimated,
     photograph,
-    scale_noise,
     true_targets,
 )
-from oasis_warp.evaluation.methods import METHODS, Method, label, reconstructions
+from oasis_warp.evaluation.methods import METHODS, Method, label, prior_digest, reconstructions
 from oasis_warp.evaluation.metrics import Truth, match_colors, score
 from oasis_warp.evaluation.pictures import (
     ATTENTION_COLUMNS,
@@ -45,14 +43,11 @@ from oasis_warp.evaluation.pictures import (
 from oasis_warp.evaluation.summary import Record, summarise
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.anchors import faces_of_vertices
-from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.prior import NetworkPrior
-from oasis_warp.network.weights_file import trained_state
 from oasis_warp.render.render import render
 from oasis_warp.synthetic.people import bake_people
 from oasis_warp.training.losses import Perceptual
-from oasis_warp.training.photographed import EstimatorNoise
 
 SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (
     "evaluation.json", "metrics.json", "sheet.png", "attention.png", "people"
@@ -80,8 +75,6 @@ class SyntheticEvaluation:
     """Those whose prior is not given are left out."""
     shoot: Shoot = field(default_factory=Shoot)
     adapt: AdaptConfig = field(default_factory=AdaptConfig)
-    estimator: EstimatorNoise = field(default_factory=EstimatorNoise)
-    """Its errors."""
 
 
 def evaluate(
@@ -99,7 +92,7 @@ def evaluate(
     A run that was stopped goes on with the people that are missing.
 
     Args:
-        priors: By the names that methods have for them; see `usual_priors`.
+        priors: By the names that methods have for them; see `methods.usual_priors`.
         config: What to measure.
         folder: Where files go; its parent must exist.
         device: Where to compute.
@@ -146,25 +139,6 @@ def evaluate(
     return found
 
 
-def usual_priors(network: HandNetwork | None) -> dict[str, Prior]:
-    """The priors of `METHODS`: the mean hand, and the learned one where there is a network."""
-    priors: dict[str, Prior] = {"mean": MeanPrior(bundled_hand())}
-    if network is not None:
-        priors["learned"] = NetworkPrior(network)
-    return priors
-
-
-def prior_digest(prior: Prior) -> str | None:
-    """SHA-256 of all that training has changed in a network's prior, names included; None for others."""
-    if not isinstance(prior, NetworkPrior):
-        return None
-    digest = hashlib.sha256()
-    for name, tensor in sorted(trained_state(prior.network).items()):
-        digest.update(name.encode())
-        digest.update(tensor.float().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
-
-
 def _place(folder: Path, group: Group, number: int) -> Path:
     return folder / PEOPLE / f"{group}_{number}.json"
 
@@ -189,11 +163,10 @@ class _Bench:
         records, rows, shown = [], [], number < FIRST_PERSON + SHOWN
         factors = config.noise + (config.curve if group == config.groups[0] else ())
         for light in config.lights:
-            exact = as_estimated(self.hand_there, session, light, config.shoot, scale_noise(config.estimator, 0.0))
+            exact = as_estimated(self.hand_there, session, light, config.shoot, 0.0)
             truths = true_targets(exact, self.hand_there, self.vertex_faces)
             for factor in factors:
-                noise = scale_noise(config.estimator, factor)
-                batch = as_estimated(self.hand_there, session, light, config.shoot, noise)
+                batch = as_estimated(self.hand_there, session, light, config.shoot, factor)
                 row = [tile(batch.image[0]), tile(truths[0].image)]
                 for method, images in self.draw(batch):
                     about = {"group": group, "person": number, "light": light, "noise": factor}

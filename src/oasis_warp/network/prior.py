@@ -22,6 +22,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.inputs import Prediction, input_of_evidence
 from oasis_warp.network.weights_file import load_network, read_header
+from oasis_warp.ops.recording import Recording
 
 BUNDLED = ("prior", "compact.safetensors")
 """Where the weights that ship lie among the package's assets."""
@@ -29,17 +30,28 @@ UNNAMED = MappingProxyType({"name": "network"})
 
 
 class NetworkPrior:
-    """`avatar.prior.Prior` by a `HandNetwork`, in float32."""
+    """`avatar.prior.Prior` by a `HandNetwork`, in float32.
+
+    On CUDA the second photo of a size is encoded by a recording of the network, as are all after it.
+    """
 
     def __init__(self, network: HandNetwork, about: Mapping[str, str | int] = UNNAMED):
         self.network = network.eval()
         self.about = about
+        self._recording: Recording[Prediction] | None = None
+        self._ready_for: tuple[torch.device, int] | None = None
+        """Where and for which size of photos all kernels are loaded."""
 
     @torch.no_grad()
     def __call__(self, evidence: Evidence) -> CanonicalGaussians:
         """The whole hand, guessed from one photo; the network goes where the photo is."""
-        prediction = self.network.to(evidence.image.device)(input_of_evidence(evidence))
-        return canonical_gaussians(prediction, 0)
+        device, inputs = evidence.image.device, input_of_evidence(evidence)
+        if device.type != "cuda" or self._ready_for != (device, len(evidence.image)):
+            self._ready_for, self._recording = (device, len(evidence.image)), None
+            return canonical_gaussians(self.network.to(device)(inputs), 0)
+        if self._recording is None:
+            self._recording = Recording(self.network, inputs)
+        return canonical_gaussians(self._recording(inputs), 0)
 
 
 def choose_prior(choice: Literal["learned", "none"] | Path, backbone_weights: Path | None = None) -> Prior:

@@ -11,8 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from scipy.ndimage import distance_transform_edt
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -20,6 +19,8 @@ from oasis_warp.synthetic.body import FINGERS, Body, bundled_body
 
 WIDTH, HEIGHT = 1024, 1408
 """Texels of the atlas: .34 mm each on the hand, enough for a hand that fills 512 pixels."""
+_FACES_AT_ONCE, _TEXELS_AT_ONCE = 1024, 1 << 15
+"""So many, for their numbers to stay in the processor's cache."""
 
 
 class Atlas:
@@ -35,12 +36,10 @@ class Atlas:
     """int64 [N, 3]: vertices round the texel."""
     weights: Float[Tensor, "N 3"]
     """Of those vertices."""
-    fill: Tensor
-    """int64 [H, W]: texel shown at each place; beyond the islands the nearest, so that interpolation does not bleed."""
 
     def __init__(self, body: Body):
         faces, weights = _drawn((body.uv * torch.tensor([WIDTH, HEIGHT])).double().numpy(), body.uv_faces.numpy())
-        shown = faces >= 0
+        self._shown = shown = faces >= 0
         self.body, self.corners = body, body.skin_faces[torch.from_numpy(faces[shown])]
         self.weights = torch.from_numpy(weights[shown]).float()
         self.points, self.palm = self._spread(body.rest), self._spread(body.palm[:, None])[:, 0]
@@ -49,14 +48,21 @@ class Atlas:
         self.finger_weight, best = share.max(1)
         self.finger = torch.where(self.finger_weight > 0.5, best, -1)
         self.positions = self.points.double().numpy()
-        nearest = np.asarray(distance_transform_edt(~shown, return_distances=False, return_indices=True))
-        number = np.cumsum(shown).reshape(shown.shape) - 1
-        self.fill = torch.from_numpy(number[nearest[0], nearest[1]])
         self._trees: dict[str, tuple[np.ndarray, cKDTree, list[int]]] = {}
+
+    @functools.cached_property
+    def fill(self) -> Int[Tensor, "H W"]:
+        """The texel shown at each place; beyond the islands the nearest, so that interpolation does not bleed."""
+        from scipy.ndimage import distance_transform_edt  # a third of a second that those who only plan save
+
+        nearest = np.asarray(distance_transform_edt(~self._shown, return_distances=False, return_indices=True))
+        number = np.cumsum(self._shown).reshape(self._shown.shape) - 1
+        return torch.from_numpy(number[nearest[0], nearest[1]])
 
     def _spread(self, values: Float[Tensor, "K C"]) -> Float[Tensor, "N C"]:
         """Values of the vertices of hand and forearm, interpolated at the texels."""
-        return (values[self.corners] * self.weights[..., None]).sum(1)
+        parts = zip(self.corners.split(_TEXELS_AT_ONCE), self.weights.split(_TEXELS_AT_ONCE), strict=True)
+        return torch.cat([(values[corners] * weights[..., None]).sum(1) for corners, weights in parts])
 
     def snap(self, points: np.ndarray, region: str) -> np.ndarray:
         """The nearest surface points [mm] of a named region: a finger's name, "palm", "back" or "wrist".
@@ -94,22 +100,27 @@ def _drawn(uv: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low = np.ceil(corners.min(1) - 0.5).astype(np.int64).clip(0, [WIDTH, HEIGHT])
     high = np.floor(corners.max(1) - 0.5).astype(np.int64).clip(-1, [WIDTH - 1, HEIGHT - 1])
     columns, rows = (high - low + 1).clip(0).T
-    count = columns * rows
-    face = np.repeat(np.arange(len(faces)), count)  # of each pair with a texel of its box
-    within = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
-    x, y = low[face, 0] + within % columns[face], low[face, 1] + within // columns[face]
-    a, b, c = (corners[face, k] - np.stack([x + 0.5, y + 0.5], 1) for k in range(3))
-    areas = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))], 1)
-    whole = areas.sum(1)
-    hit = ((areas >= 0).all(1) | (areas <= 0).all(1)) & (whole != 0)
-    hit = np.nonzero(hit)[0][::-1]  # the first face is written last
+    counts = columns * rows
     found, weights = np.full((HEIGHT, WIDTH), -1), np.zeros((HEIGHT, WIDTH, 3))
-    found[y[hit], x[hit]] = face[hit]
-    weights[y[hit], x[hit]] = areas[hit] / whole[hit, None]
+    # Some at a time, column by column: whole arrays cost most of a second in pages that are touched once. The first
+    # face is written last.
+    for first in reversed(range(0, len(faces), _FACES_AT_ONCE)):
+        count = counts[first : first + _FACES_AT_ONCE]
+        face = np.repeat(np.arange(first, first + len(count)), count)  # of each pair with a texel of its box
+        within = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
+        x, y = low[face, 0] + within % columns[face], low[face, 1] + within // columns[face]
+        a, b, c = ((corners[:, k, 0][face] - (x + 0.5), corners[:, k, 1][face] - (y + 0.5)) for k in range(3))
+        areas = [p[0] * q[1] - p[1] * q[0] for p, q in ((b, c), (c, a), (a, b))]
+        whole = areas[0] + areas[1] + areas[2]
+        least, most = (of(of(areas[0], areas[1]), areas[2]) for of in (np.minimum, np.maximum))
+        hit = np.nonzero(((least >= 0) | (most <= 0)) & (whole != 0))[0][::-1]
+        x, y = x[hit], y[hit]
+        found[y, x] = face[hit]
+        weights[y, x] = np.stack([area[hit] for area in areas], 1) / whole[hit, None]
     return found, weights
 
 
 @functools.cache
 def bundled_atlas() -> Atlas:
-    """The atlas of `bundled_body`: about a second the first time."""
+    """The atlas of `bundled_body`: half a second the first time."""
     return Atlas(bundled_body())

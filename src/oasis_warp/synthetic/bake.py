@@ -1,26 +1,24 @@
 """Bake one person's skin into the texture atlas: reflectance, relief and gloss. Lengths are millimetres.
 
-Random numbers and the courses of lines come from the CPU; whatever is done a texel is done on the canvas's device.
+Random numbers and the courses of lines come from the CPU, as a `SkinPlan`; whatever is done a texel is done on the
+canvas's device.
 """
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.ops.surface_patterns import NoiseField, surface_dabs, surface_noise
-from oasis_warp.synthetic.atlas import bundled_atlas
 from oasis_warp.synthetic.body import body_on, smoothstep
 from oasis_warp.synthetic.canvas import Canvas, canvas_on
-from oasis_warp.synthetic.hand_lines import draw_back, draw_fingers, draw_wrist
+from oasis_warp.synthetic.drawn_lines import draw_lines
 from oasis_warp.synthetic.identity import Identity
 from oasis_warp.synthetic.nails import grown_nails
 from oasis_warp.synthetic.ornaments import ornamented
-from oasis_warp.synthetic.palm_lines import Palm
 from oasis_warp.synthetic.pigment import Marks, skin_color
-from oasis_warp.synthetic.strokes import Strokes
+from oasis_warp.synthetic.skin_plan import SkinPlan
 
 CHANNELS = ("red", "green", "blue", "height", "fold", "wrinkle", "roughness", "oil")
 """Of the texture: linear reflectance; relief, folds (negative: grooves) that flatten when stretched, wrinkles that
@@ -53,28 +51,19 @@ def _noises(canvas: Canvas, rest: Float[Tensor, "K 3"], identity: Identity) -> d
     return dict(zip((*COARSE_NOISES, *everywhere, *PALM_NOISES), (*coarse, *fine, *palmar), strict=True))
 
 
-def _spots(canvas: Canvas, identity: Identity, rng: np.random.Generator) -> Float[Tensor, "N"]:
+def _spots(canvas: Canvas, plan: SkinPlan) -> Float[Tensor, "N"]:
     """Freckles and moles: strength of pigment."""
-    total = identity.freckles + identity.moles
-    if not total:
+    if not len(plan.spots):
         return torch.zeros_like(canvas.palm)
-    centers = bundled_atlas().positions[rng.choice(len(canvas.points), total)]
-    radius, strength = rng.uniform(0.35, 1.1, total), rng.uniform(0.2, 1.2, total)
-    strength[identity.freckles :] *= 1.6
-    spots = torch.from_numpy(np.c_[centers, radius, strength]).float().to(canvas.points.device)
-    kinds = torch.zeros(total, dtype=torch.int32, device=spots.device)
+    spots = torch.from_numpy(plan.spots).float().to(canvas.points.device)
+    kinds = torch.zeros(len(spots), dtype=torch.int32, device=spots.device)
     return surface_dabs(canvas.grid, spots[:, :3], spots[:, 3], spots[:, 4], kinds, 1, flat=True)[0]
 
 
-def _marks(canvas: Canvas, identity: Identity, noise: dict[str, Tensor], rng: np.random.Generator) -> Marks:
+def _marks(canvas: Canvas, plan: SkinPlan, noise: dict[str, Tensor]) -> Marks:
     """Everything that random numbers decide but paint."""
-    atlas, strokes = bundled_atlas(), Strokes(rng)
-    draw_fingers(atlas, strokes, identity)
-    Palm(atlas, strokes, identity).draw()
-    draw_wrist(atlas, strokes)
-    draw_back(atlas, strokes, identity)
-    line = strokes.draw(canvas.grid)
-    nails = grown_nails(canvas, identity, rng)
+    line = draw_lines(plan.lines, canvas.grid)
+    nails = grown_nails(canvas, plan.identity, plan.nail_shifts)
     palm = smoothstep(0.28, 0.80, canvas.palm + 0.08 * noise["palm_edge"])
     palm = palm * smoothstep(9.0, -9.0, canvas.points[:, 0] + 3 * noise["wrist_edge"])
     line["crease"] = line["crease"] * smoothstep(0.28, 0.5, canvas.palm + 0.1 * canvas.hand)
@@ -82,16 +71,16 @@ def _marks(canvas: Canvas, identity: Identity, noise: dict[str, Tensor], rng: np
         line[kind] = line[kind] * palm
     line["fold"] = line["fold"] * (1 - palm) * (1 - nails.plate)
     groove = line["crease"] + line["main"] + 0.7 * line["minor"]
-    return Marks(palm, line, groove, nails, _spots(canvas, identity, rng), noise)
+    return Marks(palm, line, groove, nails, _spots(canvas, plan), noise)
 
 
 @torch.no_grad()
-def bake(identity: Identity, device: str) -> Float[Tensor, "H W 8"]:
-    """The texture of one person, `CHANNELS`, float16, made on the device."""
-    canvas, rng = canvas_on(device), np.random.default_rng([identity.seed])
+def paint(plan: SkinPlan, device: str) -> Float[Tensor, "H W 8"]:
+    """The texture of the person that was planned, `CHANNELS`, float16, made on the device."""
+    canvas, identity = canvas_on(device), plan.identity
     noise = _noises(canvas, body_on(device).rest, identity)
-    marks = _marks(canvas, identity, noise, rng)
-    color = ornamented(skin_color(canvas, identity, marks), canvas, identity, marks, rng)
+    marks = _marks(canvas, plan, noise)
+    color = ornamented(skin_color(canvas, identity, marks), canvas, plan, marks)
     palm, plate, gloss = marks.palm, marks.nails.plate, noise["gloss"]
     roughness = identity.roughness + 0.05 * gloss + 0.04 * palm - 0.06 * canvas.tip * palm
     shine = 0.16 + 0.2 * identity.gloss if identity.polish is not None else 0.32

@@ -247,7 +247,15 @@ def bundled_body() -> Body:
     )
 
 
+def device_name(device: torch.device | str) -> str:
+    """The one name of a device: that of the current GPU for "cuda"."""
+    device = torch.device(device)
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", torch.cuda.current_device())
+    return str(device)
+
+
 @functools.cache
 def body_on(device: str) -> Body:
-    """`bundled_body` on a device, the same object each time."""
+    """`bundled_body` on a device, by its `device_name`; the same object each time."""
     return bundled_body().to(device)

@@ -54,10 +54,10 @@ def _labelled() -> np.ndarray:
     return np.array(rows)
 
 
-def grown_nails(canvas: Canvas, identity: Identity, rng: np.random.Generator) -> Nails:
-    """Nails as the identity has them."""
+def grown_nails(canvas: Canvas, identity: Identity, shifts: np.ndarray) -> Nails:
+    """Nails as the identity has them, the root of each moved along its finger by `shifts` [5], in millimetres."""
     start, end, left, right = _labelled().T
-    low = start - 1.2 + rng.normal(0, 0.3, len(FINGERS))
+    low = start - 1.2 + shifts
     high = end + 0.2 + 0.5 * identity.nail_length
     size = identity.lunula * np.where(np.arange(len(FINGERS)) == THUMB, 0.7, 0.4) * (high - low) / 2
     outline = np.stack([

@@ -3,7 +3,6 @@
 import functools
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ from oasis_warp.ops.room_tracing import trace_rooms
 from oasis_warp.ops.skin_shading import Texture, Worn, shade_skin, smooth_over_faces, surface_state
 from oasis_warp.synthetic.atlas import HEIGHT, WIDTH
 from oasis_warp.synthetic.backgrounds import cut_background
-from oasis_warp.synthetic.body import RING, Body, bundled_body
+from oasis_warp.synthetic.body import RING, Body, body_on, device_name
 from oasis_warp.synthetic.illumination import light_lamps, no_lamps, pinhole, see_sky
 from oasis_warp.synthetic.people import Person, person
 from oasis_warp.synthetic.plan import PHOTOS, Scenery
@@ -62,28 +61,9 @@ class SyntheticBatch(NamedTuple):
 
 
 @functools.cache
-def _body(device: torch.device) -> Body:
-    body = bundled_body()
-    moved = {
-        name: getattr(body, name).to(device)
-        for name in (
-            "faces",
-            "materials",
-            "uv",
-            "uv_faces",
-            "normals",
-            "knuckle_rise",
-            "coarse_vertices",
-            "coarse_faces",
-        )
-    }
-    return replace(body, hand=body.hand.to(device), **moved)
-
-
-@functools.cache
 def _texels(device: torch.device) -> tuple[Tensor, Tensor]:
     """Texture coordinates, and the corners of the faces among them."""
-    body = _body(device)
+    body = body_on(str(device))
     return body.uv * torch.tensor([WIDTH, HEIGHT], device=device), body.uv_faces.to(torch.int32)
 
 
@@ -116,9 +96,9 @@ def render_planned(
 
     Nothing waits for the device.
     """
-    device = torch.device(device)
-    body = _body(device)
-    people = [person(seed, number, scenery.population, str(device)) for number in planned.whole[:, 1].tolist()]
+    name = device_name(device)
+    device, body = torch.device(name), body_on(name)
+    people = [person(seed, number, scenery.population, name) for number in planned.whole[:, 1].tolist()]
     numbers = numbers_of(planned, device)
     index, number, left, seeds = send(torch.from_numpy(planned.whole), device).unbind(1)
     posed = pose_people(body, people, numbers)
@@ -228,4 +208,3 @@ def _stretch(body: Body, people: list[Person], areas: Tensor) -> Tensor:
     for _ in range(STRETCH_PASSES):
         stretch = smooth_over_faces(stretch, body.faces)
     return stretch
-

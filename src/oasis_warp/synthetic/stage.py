@@ -60,7 +60,7 @@ class View(NamedTuple):
 
 def rotation_about(axis: Vector, angle: float) -> np.ndarray:
     """Rotation matrix (Rodrigues)."""
-    cross = _cross(*axis)
+    cross = _cross(*map(float, axis))
     return _STILL + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 

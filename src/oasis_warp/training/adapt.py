@@ -18,7 +18,6 @@ from oasis_warp.training.complete import complete_field
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
 
-
 MIN_ALPHA = 0.05
 """Below it a pixel says nothing about the colour of the hand."""
 

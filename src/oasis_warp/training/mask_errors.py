@@ -43,7 +43,7 @@ def ended(
         landmarks: In the camera's frame [m].
         K: Intrinsics [px].
         numbers: Standard normal ones, of where.
-        strength: 1 for errors as they were measured, 0 for none.
+        strength: 1 for errors as they were measured, 0 for none, more for fuller ones.
     """
     seen = landmarks @ K.transpose(1, 2)
     pixels = seen[..., :2] / seen[..., 2:]
@@ -53,7 +53,7 @@ def ended(
     x, y = (up[:, k, None] * (place - wrist[:, k, None]) for k in (0, 1))
     past = (_END[0] + _END[1] * numbers) * K[:, 0, 0] / landmarks[:, 0, 2]
     above = (x[:, None] + y[:, :, None] + past[:, None, None] + 0.5).clamp(0, 1)
-    return mask + strength * (alpha * above - mask)
+    return (mask + strength * (alpha * above - mask)).clamp(0, 1)
 
 
 def wandering(
@@ -70,7 +70,7 @@ def wandering(
     soft = avg_pool2d(made[:, None], _BLUR, 1, _BLUR // 2, count_include_pad=False)[:, 0]
     shift = ((_RIM[0] + _RIM[1] * far).exp() * rim).clamp(-0.45, 0.45)
     made = ((soft - 0.5 + shift) * _BLUR + 0.5).clamp(0, 1)
-    return mask + strength * (made - mask)
+    return (mask + strength * (made - mask)).clamp(0, 1)
 
 
 def _grown(mask: Tensor, reach: int) -> Tensor:

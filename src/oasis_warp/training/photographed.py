@@ -123,7 +123,7 @@ def _extent(touched: Tensor) -> tuple[Tensor, Tensor]:
     return first.float(), last.float()
 
 
-def _as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+def as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image, alpha, mask, orientation, translation and K, left hands seen in the mirror."""
     left = pictures.left.bool()
 
@@ -131,7 +131,8 @@ def _as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Ten
         return torch.where(left.view(-1, *[1] * (planes.dim() - 1)), planes.flip(2), planes)
 
     like = pictures.translation
-    sign = torch.where(left[:, None], like.new_tensor([-1.0, 1.0, 1.0]), torch.ones_like(like))
+    sign = torch.ones_like(like)
+    sign[:, 0] -= 2 * left
     K = pictures.K.clone()
     K[:, 0, 2] = torch.where(left, pictures.image.shape[2] - K[:, 0, 2], K[:, 0, 2])
     orientation = sign[:, :, None] * pictures.orientation * sign[:, None]
@@ -157,11 +158,11 @@ def training_batch(
         random: On the CPU, of the estimator's errors; the same state gives the same batch.
         noise: How large they are; they are in the photo's `posed`, `K`, `mask` and crop, nowhere else.
     """
-    image, alpha, mask, orientation, translation, K = _as_right_hands(photos)
+    image, alpha, mask, orientation, translation, K = as_right_hands(photos)
     count, like = len(image), translation
 
     views = len(targets.image) // count
-    goal_image, goal_alpha, goal_mask, *place, goal_K = _as_right_hands(targets)
+    goal_image, goal_alpha, goal_mask, *place, goal_K = as_right_hands(targets)
     both = pose_hands(
         hand, torch.cat([photos.shape, targets.shape]), torch.cat([photos.angles, targets.angles]),
         torch.cat([orientation, place[0]]), torch.cat([translation, place[1]]),

@@ -21,10 +21,10 @@ from oasis_warp.losses.detail import detail_difference
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.weights_file import save_network
+from oasis_warp.ops.recording import Recording
 from oasis_warp.training.checkpoint import load_checkpoint, save_checkpoint
 from oasis_warp.training.distributed import Place, any_process, average_gradients, mean_over_processes, share_weights
 from oasis_warp.training.losses import LossConfig, Perceptual, objective, picture_psnr
-from oasis_warp.training.recorded_step import RecordedStep
 from oasis_warp.training.targets import Pictures, draw_targets, true_pictures
 
 CHECKPOINT, WEIGHTS, METRICS, SHEET = "checkpoint.safetensors", "network.safetensors", "metrics.jsonl", "pictures.png"
@@ -32,6 +32,8 @@ CHECKPOINT, WEIGHTS, METRICS, SHEET = "checkpoint.safetensors", "network.safeten
 SHEET_HANDS = 8
 EAGER_STEPS = 4
 """Steps on CUDA before one is recorded: they load kernels, and show how many Gaussians pictures may show."""
+SLACK = 3.0
+"""Times the memory that a picture needed for its Gaussians: each hand and pose needs another."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +109,7 @@ class Trainer:
         rate = torch.tensor(config.learning_rate, device=place.device) if on_cuda else config.learning_rate
         self.optimizer = torch.optim.Adam(self.trained, lr=rate, fused=on_cuda, capturable=on_cuda)
         self.step = 0
-        self._recorded: RecordedStep[StepResult] | None = None
+        self._recorded: Recording[StepResult] | None = None
         self._eager_steps = 0
 
     def advance(self, batch: TrainingBatch) -> StepResult:
@@ -122,7 +124,7 @@ class Trainer:
             else:
                 group["lr"] = rate
         if self._recorded is None and self.place.device.type == "cuda" and self._eager_steps >= EAGER_STEPS:
-            self._recorded = RecordedStep(self._update, batch)
+            self._recorded = Recording(self._update, batch, SLACK)
         if self._recorded is None:
             self._eager_steps += 1
             result = self._update(batch)
