@@ -48,6 +48,17 @@ def test_the_photo_is_explained(hand, case):
     assert after > 30
 
 
+def test_what_is_drawn_is_completed_and_not_what_each_gaussian_would_be_alone(hand, case):
+    evidence, _, prior, _ = case
+    n = len(prior.vertex_index)
+    apart = torch.cat([prior.colors[:n] + 0.1, prior.colors[n:] - 0.1]).clamp(0, 1)  # they overlap everywhere
+    inside = (evidence.mask > 0.9).float()
+    for colors in (prior.colors, apart):
+        untaught = AdaptConfig(texture_steps=0, reference_views=0)
+        completed = adapt(hand, prior._replace(colors=colors), evidence, untaught).gaussians
+        assert masked_psnr(drawn(hand, completed, evidence).image, evidence.image, inside) > 28
+
+
 def test_the_side_that_was_not_seen_takes_the_light_of_the_photo(hand, regions, case):
     _, truth, _, adapted = case
     back = (regions.palm < 0.05) & (regions.nail < 0.1) & (hand.template[:, 0] < -0.02)
