@@ -13,9 +13,9 @@ from oasis_warp.avatar.anchors import FACE_SPREAD, face_shapes
 from oasis_warp.core import surface
 from oasis_warp.core.types import CanonicalGaussians
 
-PART_SPREAD = 1.3
+PART_SPREAD = 1.6
 """Standard deviations of a part's Gaussian over those of the part as a uniform plate."""
-PART_OPACITY = 0.8
+PART_OPACITY = 0.5
 """Opacity of a part's Gaussian over that of the face's. The more opaque Gaussians overlap, the more the nearer ones hide
 those beside them, and the picture moves to the side that is nearer in the view at hand."""
 NEIGHBOURS = 12

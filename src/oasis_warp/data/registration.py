@@ -16,8 +16,10 @@ SEARCH_SIDE = 128
 SIZES = (0.12, 1.6)
 """Smallest and largest square that is looked for, over the photo's longer side."""
 SIZE_STEP = 1.05
-BLURS = (4.0, 2.0, 1.0)
-"""Of both pictures while the place is refined, from coarse to fine [px]."""
+BLURS = (4.0, 2.0)
+"""Of both pictures while the place is refined, from coarse to fine [px]; without, an avatar's own noise pulls."""
+RIM = 2
+"""Pixels inside the outline that are left out: there the avatar may differ most."""
 ROUNDS = 8
 """Of refinement for each blur."""
 MAX_GROWTH = 0.1
@@ -44,7 +46,7 @@ def find_square(
 
     The best of all places and sizes in small copies, then Gauss-Newton on place and size with Geman-McClure weights.
     """
-    inside = cv2.erode((alpha.numpy() > 0.5).astype(np.float32), np.ones((3, 3), np.uint8))
+    inside = cv2.erode((alpha.numpy() > 0.5).astype(np.float32), np.ones((3, 3), np.uint8), iterations=RIM)
     square = _search(picture.numpy(), inside, photo.numpy())
     for blur in BLURS:
         goal = cv2.GaussianBlur(picture.numpy(), (0, 0), blur)
@@ -62,7 +64,7 @@ def _search(picture: np.ndarray, inside: np.ndarray, photo: np.ndarray) -> tuple
     small = cv2.resize(photo, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
     border = SEARCH_SIDE // 3  # the square may reach over the photo's edge, but not the hand
     small = cv2.copyMakeBorder(small, border, border, border, border, cv2.BORDER_REPLICATE)
-    best, found = np.inf, (0.0, 0.0, float(max(height, width)))
+    best, found = -np.inf, (0.0, 0.0, float(max(height, width)))
     side = SIZES[0] * SEARCH_SIDE
     while side <= SIZES[1] * SEARCH_SIDE:
         n = round(side)
@@ -70,10 +72,12 @@ def _search(picture: np.ndarray, inside: np.ndarray, photo: np.ndarray) -> tuple
             shrunk = cv2.resize(picture, (n, n), interpolation=cv2.INTER_AREA)
             mask = (cv2.resize(inside, (n, n), interpolation=cv2.INTER_AREA) > 0.9).astype(np.float32)
             if mask.sum() > 0:
-                errors = cv2.matchTemplate(small, shrunk, cv2.TM_SQDIFF, mask=np.dstack([mask] * 3)) / mask.sum()
-                low, _, (x, y), _ = cv2.minMaxLoc(errors)
-                if low < best:
-                    best, found = low, ((x - border) / scale, (y - border) / scale, n / scale)
+                # Correlation, since differences are smallest where a tiny hand lies on plain skin.
+                alike = cv2.matchTemplate(small, shrunk, cv2.TM_CCOEFF_NORMED, mask=np.dstack([mask] * 3))
+                alike[~(np.abs(alike) <= 1.001)] = -1  # over plain ground it is undefined
+                _, high, _, (x, y) = cv2.minMaxLoc(alike)
+                if high > best:
+                    best, found = high, ((x - border) / scale, (y - border) / scale, n / scale)
         side = max(side * SIZE_STEP, n + 1)
     return found
 

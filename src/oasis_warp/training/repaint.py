@@ -17,7 +17,7 @@ from oasis_warp.core.types import Camera, CanonicalGaussians
 from oasis_warp.ops import BlendWeights, blend_colors, depth_map
 from oasis_warp.training.views import freeze_view
 
-GRAZING, FACING = 0.12, 0.3
+GRAZING, FACING = 0.04, 0.12
 """Cosines between surface and view below which paint says nothing, and above which it is taken as it is: on a slant a
 pixel is drawn out to a streak."""
 STEP = 0.003
@@ -28,11 +28,13 @@ MIN_PAINT = 0.02
 """Share of paint from which a pixel's face is cut into finer parts."""
 SPACING = 1.0
 """Distance between the finer Gaussians [pixels of the painted picture]."""
-TURNS = ((0.0, 0.6), (0.0, -0.6), (0.6, 0.0), (-0.6, 0.0))
+TURNS = ((0.0, 0.45), (0.0, -0.45), (0.45, 0.0), (-0.45, 0.0))
 """Of the views beside the photo's, about its horizontal and its vertical axis [rad]. Which Gaussian hides which depends
 on the view; colours that suit one view alone come out shifted and frayed in others."""
 ZOOMS = (1.0, 2.0)
 """Sizes of those views over the photo's: the smaller a picture, the more the rasterizer's own blur."""
+PHOTO_WEIGHT = 2.0
+"""Of a pixel in the photo's own view, against those beside it."""
 PULL = 0.1
 """Weight that holds each new Gaussian at the colour read off the painted picture [pixels]."""
 MARGIN = 8
@@ -77,6 +79,8 @@ class _View(NamedTuple):
     weights: BlendWeights
     goal: Float[Tensor, "H W 3"]
     """What the new Gaussians have to add to the picture."""
+    weight: float
+    """Of each of its pixels."""
 
 
 def repaint(
@@ -124,12 +128,12 @@ def repaint(
     share, color = _read(canvas, seen, new.means[n_kept:])
     start = torch.lerp(dense.colors[n_kept:], color, share[:, None])
     views = []
-    for camera in _cameras(canvas.camera, posed[faces[around]].flatten(0, 1)):
+    for camera, weight in _cameras(canvas.camera, posed[faces[around]].flatten(0, 1)):
         before = blend_colors(freeze_view(old, camera), old.colors)
         target = _painted(before, canvas, seen, posed, faces, camera)
         weights = freeze_view(new, camera)
         kept = blend_colors(weights, torch.cat([dense.colors[:n_kept], torch.zeros_like(start)]))
-        views.append(_View(weights, target - kept))
+        views.append(_View(weights, target - kept, weight))
     colors, losses = _fit(views, start, n_kept, steps, progress)
     _, areas = surface.face_normals(rest, faces)
     on = dense.face_index[n_kept - len(dense.vertex_index) :]
@@ -185,10 +189,13 @@ def _painted(before: Tensor, canvas: Canvas, seen: _Seen, posed: Tensor, faces: 
     return target
 
 
-def _cameras(camera: Camera, points: Float[Tensor, "K 3"]) -> list[Camera]:
-    """The photo's camera and those beside it, turned about the middle of `points` and cut to show just these."""
+def _cameras(camera: Camera, points: Float[Tensor, "K 3"]) -> list[tuple[Camera, float]]:
+    """The photo's camera and those beside it, turned about the middle of `points` and cut to show just these.
+
+    With each the weight of its pixels.
+    """
     center = (points.amin(0) + points.amax(0)) / 2
-    cameras = [_cut(camera, points, 1.0)]
+    cameras = [(_cut(camera, points, 1.0), PHOTO_WEIGHT)]
     for about_x, about_y in TURNS:
         turn = from_axis_angle(camera.viewmat.new_tensor([1.0, 0.0, 0.0]), camera.viewmat.new_tensor(about_x))
         turn = turn @ from_axis_angle(camera.viewmat.new_tensor([0.0, 1.0, 0.0]), camera.viewmat.new_tensor(about_y))
@@ -196,7 +203,7 @@ def _cameras(camera: Camera, points: Float[Tensor, "K 3"]) -> list[Camera]:
         viewmat = camera.viewmat.clone()
         viewmat[:3, :3] = turn @ camera.viewmat[:3, :3]
         viewmat[:3, 3] = turn @ (camera.viewmat[:3, 3] - local) + local
-        cameras += [_cut(camera._replace(viewmat=viewmat), points, zoom) for zoom in ZOOMS]
+        cameras += [(_cut(camera._replace(viewmat=viewmat), points, zoom), 1 / zoom**2) for zoom in ZOOMS]
     return cameras
 
 
@@ -229,17 +236,17 @@ def _fit(
         return (weights.transpose @ picture.flatten(0, 1))[n_kept:]
 
     bound = torch.full_like(start, PULL)
-    for weights, _ in views:
-        bound += gather(weights, draw(weights, torch.ones_like(start)))
-    n_values = sum(goal.numel() for _, goal in views)
+    for weights, _, weight in views:
+        bound += weight * gather(weights, draw(weights, torch.ones_like(start)))
+    total = sum(weight * goal.numel() for _, goal, weight in views)
     colors, ahead, momentum, losses = start, start, 1.0, []
     for step in range(steps):
         gradient, loss = PULL * (ahead - start), 0.0
-        for weights, goal in views:
+        for weights, goal, weight in views:
             difference = draw(weights, ahead) - goal
-            gradient += gather(weights, difference)
-            loss += float(difference.square().sum())
-        losses.append(loss / n_values)
+            gradient += weight * gather(weights, difference)
+            loss += weight * float(difference.square().sum())
+        losses.append(loss / total)
         last, colors = colors, (ahead - gradient / bound).clamp(0, 1)
         before, momentum = momentum, (1 + (1 + 4 * momentum**2) ** 0.5) / 2
         ahead = colors + (before - 1) / momentum * (colors - last)
