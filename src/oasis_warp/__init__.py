@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from oasis_warp.core.config import EditConfig as EditConfig
     from oasis_warp.core.config import ReconstructConfig as ReconstructConfig
     from oasis_warp.core.errors import InputError as InputError
     from oasis_warp.core.types import Camera as Camera
     from oasis_warp.core.types import Gaussians as Gaussians
     from oasis_warp.core.types import HandPose as HandPose
     from oasis_warp.data.photo import read_photo as read_photo
+    from oasis_warp.editing import edit as edit
     from oasis_warp.hand_avatar import Avatar as Avatar
     from oasis_warp.ops import depth_map as depth_map
     from oasis_warp.ops import depth_visibility as depth_visibility
@@ -27,12 +29,14 @@ if TYPE_CHECKING:
 _HOMES = {
     "Avatar": "hand_avatar",
     "Camera": "core.types",
+    "EditConfig": "core.config",
     "Gaussians": "core.types",
     "HandPose": "core.types",
     "InputError": "core.errors",
     "ReconstructConfig": "core.config",
     "depth_map": "ops",
     "depth_visibility": "ops",
+    "edit": "editing",
     "face_rotations": "ops",
     "pose_on_mesh": "ops",
     "pose_on_mesh_covars": "ops",
@@ -43,9 +47,9 @@ _HOMES = {
     "spherical_harmonics": "ops",
 }
 __all__ = [
-    "Avatar", "Camera", "Gaussians", "HandPose", "InputError", "ReconstructConfig", "depth_map", "depth_visibility",
-    "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "rasterization", "read_photo", "reconstruct", "skin",
-    "spherical_harmonics",
+    "Avatar", "Camera", "EditConfig", "Gaussians", "HandPose", "InputError", "ReconstructConfig", "depth_map",
+    "depth_visibility", "edit", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "rasterization", "read_photo",
+    "reconstruct", "skin", "spherical_harmonics",
 ]  # fmt: skip
 
 

@@ -59,8 +59,13 @@ def _vertex_shapes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     return surface_frames(normals, axis), scales
 
 
-def _face_shapes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Principal axes of each triangle as a uniform plate: covariance (1/12) sum (v - c)(v - c)^T."""
+def face_shapes(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+) -> tuple[Float[Tensor, "F 4"], Float[Tensor, "F 3"]]:
+    """Quaternions and standard deviations [m] of a flat Gaussian a face.
+
+    Its axes are those of the triangle as a uniform plate, of covariance (1/12) sum (v - c)(v - c)^T.
+    """
     normals, _ = surface.face_normals(vertices, faces)
     corners = vertices[faces]
     arms = corners - corners.mean(1, keepdim=True)
@@ -86,7 +91,7 @@ def place_anchors(hand: HandModel, rest: PosedHand) -> Anchors:
     keep_vertex = torch.nonzero(opacity >= MIN_OPACITY)[:, 0]
     keep_face = torch.nonzero(face_opacity >= MIN_OPACITY)[:, 0]
     vertex_quats, vertex_scales = _vertex_shapes(vertices, faces)
-    face_quats, face_scales = _face_shapes(vertices, faces)
+    face_quats, face_scales = face_shapes(vertices, faces)
     third = torch.full((len(keep_face), 3), 1 / 3, dtype=vertices.dtype, device=vertices.device)
     return Anchors(
         vertex_index=keep_vertex,

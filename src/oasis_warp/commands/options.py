@@ -329,3 +329,31 @@ class Evaluate:
     """Where to compute."""
     workers: int = 0
     """Processes that bake synthetic people; 0 for none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edit:
+    """Bring what was painted on an avatar's photo into the avatar.
+
+    Paint on the photo in any program, save the whole picture under another name, and give both. Writes the new avatar,
+    NAME.png with before and after, and NAME.json with what was measured.
+    """
+
+    avatar: Positional[Path]
+    """avatar.safetensors of `oasis reconstruct`."""
+    painted: Positional[Path]
+    """The painted photo; scaled or saved as JPEG is fine, cut or turned is not."""
+    photo: Path | None = None
+    """The photo that the avatar was made from: what differs from it is paint."""
+    mask: Path | None = None
+    """Picture that is white where there is paint, instead of the difference."""
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="PATH")] = None
+    """Avatar file to write: PAINTED.safetensors beside the avatar when not given."""
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace files of an earlier edit."""
+    steps: int = 40
+    """Steps of the colours' fit."""
+    size: int = 1024
+    """Side of the square around the hand above which the painted picture is scaled down [px]."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""

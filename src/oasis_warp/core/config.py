@@ -57,6 +57,16 @@ class ReconstructConfig:
     """Go on with a fit that is too poor to be trusted."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class EditConfig:
+    """How a painted photo is brought into an avatar."""
+
+    steps: int = 40
+    """Steps of the colours' fit; each is worth many of a plain optimiser's."""
+    size: int = 1024
+    """Side of the square around the hand above which the painted picture is scaled down [px]."""
+
+
 Color = tuple[float, float, float] | Float[Tensor, "3"]
 WHITE = (1.0, 1.0, 1.0)
 BLACK = (0.0, 0.0, 0.0)

@@ -1,0 +1,139 @@
+"""More Gaussians where more is to be seen: faces are cut into parts, and each part gets a Gaussian of its own."""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from oasis_warp.avatar.anchors import FACE_SPREAD, face_shapes
+from oasis_warp.core import surface
+from oasis_warp.core.types import CanonicalGaussians
+
+PART_SPREAD = 1.6
+"""Standard deviations of a part's Gaussian over those of the part as a uniform plate."""
+PART_OPACITY = 0.5
+"""Opacity of a part's Gaussian over that of the face's. The more opaque Gaussians overlap, the more the nearer ones hide
+those beside them, and the picture moves to the side that is nearer in the view at hand."""
+NEIGHBOURS = 12
+"""Old Gaussians that a new one takes its colour from."""
+
+
+class Densified(NamedTuple):
+    """Canonical Gaussians with more of them on some faces."""
+
+    gaussians: CanonicalGaussians
+    """Those that stay, bit for bit and in their order; then, at the end, the new ones, all on faces."""
+    n_new: int
+    """How many are new."""
+
+
+def parts_for_spacing(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], spacing: Float[Tensor, "F"]
+) -> Int[Tensor, "F"]:
+    """Parts an edge that faces are to be cut into, so that a part is at most `spacing` [m] squared; 1 where it is."""
+    _, areas = surface.face_normals(vertices, faces)
+    return (areas.sqrt() / spacing).ceil().clamp_min(1).long()
+
+
+def densify(
+    gaussians: CanonicalGaussians,
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    parts: Int[Tensor, "F"],
+) -> Densified:
+    """Replace what rides on some faces by finer Gaussians that look the same.
+
+    A face of n > 1 parts an edge is cut into n^2 triangles of its own shape, each with a Gaussian at its centre. The
+    face's Gaussians go, and so do vertex Gaussians all of whose faces are cut. A new Gaussian has the colour that
+    the old ones have there together. Faces without a Gaussian, in the fade at the wrist,
+    stay without.
+
+    Args:
+        gaussians: On the surface at rest.
+        vertices: Of the surface at rest [m].
+        faces: Of the surface.
+        parts: An edge, for each face; 1 leaves the face as it is.
+    """
+    n_points = len(gaussians.vertex_index)
+    opacity = _face_opacities(gaussians, len(faces))
+    cut = (parts > 1) & (opacity > 0)
+    keep_vertex = ~_inside(cut, faces, len(vertices))[gaussians.vertex_index]
+    keep_face = ~cut[gaussians.face_index]
+    keep = torch.cat([keep_vertex, keep_face])
+
+    face_index, barycentrics = _cut(parts, cut, vertices.dtype)
+    quats, scales = face_shapes(vertices, faces)
+    scales = scales * (PART_SPREAD / FACE_SPREAD / parts[:, None])
+    centers = (vertices[faces[face_index]] * barycentrics[..., None]).sum(1)
+    colors = color_at(gaussians, vertices, faces, centers)
+    dense = CanonicalGaussians(
+        gaussians.vertex_index[keep_vertex],
+        gaussians.offsets[keep_vertex],
+        torch.cat([gaussians.face_index[keep_face], face_index]),
+        torch.cat([gaussians.barycentrics[keep_face], barycentrics]),
+        torch.cat([gaussians.quats[keep], quats[face_index]]),
+        torch.cat([gaussians.scales[keep], scales[face_index]]),
+        torch.cat([gaussians.opacities[keep], PART_OPACITY * opacity[face_index]]),
+        torch.cat([gaussians.colors[keep], colors]),
+    )
+    return Densified(dense, len(face_index))
+
+
+def _face_opacities(gaussians: CanonicalGaussians, n_faces: int) -> Tensor:
+    """Highest opacity of the Gaussians on each face, 0 where there is none."""
+    opacity = torch.zeros(n_faces, dtype=gaussians.opacities.dtype, device=gaussians.opacities.device)
+    on_faces = gaussians.opacities[len(gaussians.vertex_index) :]
+    return opacity.scatter_reduce_(0, gaussians.face_index, on_faces, "amax")
+
+
+def _inside(cut: Bool[Tensor, "F"], faces: Tensor, n_vertices: int) -> Bool[Tensor, "V"]:
+    """Vertices all of whose faces are cut."""
+    whole = torch.zeros(n_vertices, dtype=torch.bool, device=faces.device)
+    whole[faces[~cut].flatten()] = True
+    return ~whole
+
+
+def _cut(parts: Tensor, cut: Tensor, dtype: torch.dtype) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"]]:
+    """Face and barycentrics of the centre of every part."""
+    index, place = [torch.zeros(0, dtype=torch.int64)], [torch.zeros(0, 3, dtype=dtype)]
+    wanted = torch.where(cut, parts, 0).cpu()
+    for n in wanted.unique().tolist():
+        if n:
+            on = torch.nonzero(wanted == n)[:, 0]
+            index.append(on.repeat_interleave(n * n))
+            place.append(_part_centers(n).to(dtype).repeat(len(on), 1))
+    return torch.cat(index).to(parts.device), torch.cat(place).to(parts.device)
+
+
+@functools.cache
+def _part_centers(n: int) -> Float[Tensor, "n*n 3"]:
+    """Barycentrics of the centres of the n^2 parts of a face: those that stand like it, then those upside down."""
+    i, j = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
+    upright, turned = i + j < n, i + j < n - 1
+    first = torch.cat([i[upright] + 1 / 3, i[turned] + 2 / 3]) / n
+    second = torch.cat([j[upright] + 1 / 3, j[turned] + 2 / 3]) / n
+    return torch.stack([1 - first - second, first, second], -1).double()
+
+
+def color_at(
+    gaussians: CanonicalGaussians,
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    points: Float[Tensor, "M 3"],
+) -> Float[Tensor, "M 3"]:
+    """Colour of the nearest Gaussians at `points` of the surface at rest [m], each weighted by what it covers there."""
+    on_vertices = vertices[gaussians.vertex_index] + gaussians.offsets
+    on_faces = (vertices[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
+    centers = torch.cat([on_vertices, on_faces])
+    tree = cKDTree(centers.detach().cpu().double().numpy())
+    _, near = tree.query(points.detach().cpu().double().numpy(), min(NEIGHBOURS, len(centers)))
+    near = torch.from_numpy(np.asarray(near)).to(points.device).view(len(points), -1)
+    # Along the surface only: a point of it may lie off a flat Gaussian's plane and still be under it.
+    spread = gaussians.scales[:, :2].prod(1).sqrt()
+    apart = (points[:, None] - centers[near]).square().sum(-1) / spread[near].square()
+    weight = torch.softmax(-0.5 * apart, 1) * gaussians.opacities[near]
+    return (weight[..., None] * gaussians.colors[near]).sum(1) / weight.sum(1, keepdim=True).clamp_min(1e-12)

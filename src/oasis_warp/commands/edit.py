@@ -1,0 +1,148 @@
+"""`oasis edit`: a painted photo in, an avatar that wears the paint out."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from oasis_warp import __version__
+from oasis_warp.commands.drawing import Panel, make_sheet, panel_side
+from oasis_warp.commands.look import check_device
+from oasis_warp.commands.options import Edit as Options
+from oasis_warp.commands.progress import show_progress
+from oasis_warp.commands.report import to_json
+from oasis_warp.commands.summary import GROUND, WIDTH
+from oasis_warp.core.config import EditConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import Camera, HandPose
+from oasis_warp.data.atomic import write_file
+from oasis_warp.data.crop import resample_square
+from oasis_warp.data.photo import read_photo
+from oasis_warp.data.pictures import to_uint8, write_picture
+from oasis_warp.editing import Edit, edit
+from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.render.cameras import crop_camera, orbit_camera
+
+SIDES = (64, 4096)
+"""Of the painted picture's square around the hand [px]."""
+TURN = 0.5
+"""Of the views beside the photo's in the summary [rad]."""
+POSES = ("open", "fist", "point")
+MEASURES = {
+    "painted_mm2": ("skin painted", "{:.0f} mm²"),
+    "new_gaussians": ("new Gaussians", "{:.0f}"),
+    "n_gaussians": ("Gaussians", "{:.0f}"),
+    "left_out_percent": ("paint left out, on a slant", "{:.1f} %"),
+    "input_psnr_db": ("likeness to the painted photo", "{:.1f} dB"),
+    "unchanged_psnr_db": ("likeness to before, elsewhere", "{:.1f} dB"),
+}
+"""Words and unit for what `Edit.measures` holds."""
+
+
+def run(options: Options) -> int:
+    """Write the new avatar, its summary and its report.
+
+    Raises:
+        InputError: a wrong file or option, an output that exists, or no paint on the hand.
+    """
+    check_device(options.device)
+    low, high = SIDES
+    if not low <= options.size <= high:
+        raise InputError(f"--size {options.size}: expected {low} to {high} pixels; choose another size.")
+    if options.steps < 0:
+        raise InputError(f"--steps {options.steps}: expected 0 or more; leave it out for the default.")
+    out = options.out or options.avatar.parent / f"{options.painted.stem}.safetensors"
+    if out.suffix != ".safetensors":
+        raise InputError(f"{out}: expected a name that ends in .safetensors; rename the output.")
+    files = out, out.with_suffix(".png"), out.with_suffix(".json")
+    given = {path.resolve() for path in (options.avatar, options.painted, options.photo, options.mask) if path}
+    for file in files:
+        if file.resolve() in given:
+            raise InputError(f"{file}: would replace an input of the edit; choose another name with --out.")
+        if file.exists() and not options.overwrite:
+            raise InputError(f"{file}: exists already; choose another name with --out, or give --overwrite.")
+    with show_progress(Console(stderr=True)) as progress:
+        before = Avatar.load(options.avatar, options.device)
+        made = edit(
+            before,
+            read_photo(options.painted),
+            photo=read_photo(options.photo) if options.photo else None,
+            mask=read_photo(options.mask) if options.mask else None,
+            config=EditConfig(steps=options.steps, size=options.size),
+            progress=progress,
+        )
+    report, summary = _report(options, made), draw_edit(before, made, options.painted.name)
+    write_picture(files[1], summary)
+    write_file(files[2], to_json(report).encode())
+    made.avatar.save(files[0])
+    _print(Console(), report, out)
+    return 0
+
+
+def _report(options: Options, made: Edit) -> dict[str, Any]:
+    given = {name: path.name for name in ("avatar", "painted", "photo", "mask") if (path := getattr(options, name))}
+    return {
+        "creator": f"oasis_warp {__version__}",
+        **given,
+        "square": made.square._asdict(),
+        "config": {"steps": options.steps, "size": options.size},
+        "seconds": {**made.stages, "total": sum(made.stages.values())},
+        "measures": made.measures,
+        "warnings": list(made.warnings),
+    }
+
+
+def _print(console: Console, report: dict[str, Any], out: Path) -> None:
+    table = Table(title=f"{report['painted']} on {report['avatar']}", show_header=False)
+    table.add_column()
+    table.add_column(justify="right")
+    for stage, seconds in report["seconds"].items():
+        table.add_row(stage, f"{seconds:.2f} s", end_section=stage == "total")
+    for name, value in report["measures"].items():
+        words, unit = MEASURES[name]
+        table.add_row(words, unit.format(value))
+    console.print(table)
+    console.print(f"written: {out}", highlight=False, soft_wrap=True)
+    for warning in report["warnings"]:
+        console.print(f"Warning: {warning}", style="yellow", highlight=False, soft_wrap=True)
+
+
+@torch.no_grad()
+def draw_edit(before: Avatar, made: Edit, title: str) -> torch.Tensor:
+    """Painted photo, mask, the avatar before and after in the photo's view; then other views and poses."""
+    side, after = panel_side(4, WIDTH), made.avatar
+    n = len(made.image)
+
+    def whole(picture: torch.Tensor) -> Any:
+        return to_uint8(resample_square(picture.contiguous(), 0.0, 0.0, float(n), side)).numpy()
+
+    source = after.source_camera
+    camera = crop_camera(source, 0.0, 0.0, float(source.width), side)
+
+    def draw(avatar: Avatar, camera: Camera, pose: HandPose) -> Any:
+        return to_uint8(avatar.render(camera, pose, GROUND).image).numpy()
+
+    pose = after.source_pose
+    first = [
+        Panel(whole(made.image), "painted photo"),
+        Panel(whole(made.mask[..., None].expand(-1, -1, 3)), "paint"),
+        Panel(draw(before, camera, pose), "before"),
+        Panel(draw(after, camera, pose), "after"),
+    ]
+    side = panel_side(2 + len(POSES), WIDTH)
+    around = after.mesh(pose).vertices
+    views = [(turn, pose, around) for turn in (TURN, -TURN)]
+    second = [
+        Panel(draw(after, orbit_camera(v, turn, 0.0, side), p), f"{math.degrees(turn):.0f}°") for turn, p, v in views
+    ]
+    for name in POSES:
+        held = pose._replace(angles=named_pose(after.hand, name))
+        second.append(Panel(draw(after, orbit_camera(after.mesh(held).vertices, 0.0, 0.0, side), held), name))
+    measures = made.measures
+    words = [MEASURES[name][1].format(measures[name]) for name in ("painted_mm2", "input_psnr_db")]
+    words.append(f"{measures['new_gaussians']:.0f} new Gaussians")
+    return torch.from_numpy(make_sheet(title, ", ".join(words), [first, second], WIDTH))

@@ -1,0 +1,98 @@
+"""What somebody painted on a photo: the difference of two pictures, with the noise of saving and scaling left out."""
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import Photo
+
+ASPECT_PIXELS = 1.5
+"""By which a scaled copy may miss the photo's proportions, since sides are rounded [px]."""
+CERTAIN, POSSIBLE = 0.1, 0.03
+"""Colour differences from which a pixel is paint, and from which it is if it touches such a one."""
+CERTAIN_NOISE, POSSIBLE_NOISE = 12.0, 4.0
+"""The same as multiples of the noise, where that says more."""
+BUSY_SHARES = (0.25, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
+"""Shares of the pixels that part them by how busy the photo is around them: compression and scaling change edges most."""
+BUSY_WINDOW = 9
+"""Side of the square that is looked at for that, about a block of JPEG [px]."""
+QUIET_SHARE = 0.3
+"""Of a bin's pixels that nobody has painted on, whatever the drawing; their differences tell the noise."""
+HALO_SHARE, HALO_WINDOW = 0.2, 17
+"""Of the largest difference nearby [px], below which a difference is no paint but the halo that compression spreads."""
+SMALLEST = 4
+"""Certain pixels that a stroke or dot has at least."""
+RIM = 2
+"""Pixels around the paint that its smooth edge may reach."""
+
+
+def match_size(photo: Photo, width: int, height: int, name: str) -> Float[Tensor, "H W 3"]:
+    """`photo` as a picture of another size that `name` has, in [0, 1].
+
+    Raises:
+        InputError: the size has other proportions.
+    """
+    rows, columns = photo.rgb.shape[:2]
+    if abs(columns * height / rows - width) > ASPECT_PIXELS and abs(rows * width / columns - height) > ASPECT_PIXELS:
+        raise InputError(
+            f"{name}: {width} x {height} pixels are no scaled copy of {photo.name} with {columns} x {rows}; paint on "
+            "the whole photo, without cutting or turning it."
+        )
+    return _scaled(photo.rgb.float() / 255, width, height)
+
+
+def _scaled(picture: Tensor, width: int, height: int) -> Tensor:
+    rows, columns = picture.shape[:2]
+    if (rows, columns) == (height, width):
+        return picture
+    how = cv2.INTER_AREA if width < columns else cv2.INTER_CUBIC
+    return torch.from_numpy(cv2.resize(picture.numpy(), (width, height), interpolation=how)).clamp(0, 1)
+
+
+def read_mask(mask: Photo, width: int, height: int) -> Float[Tensor, "H W"]:
+    """A mask that a user drew, white or opaque where there is paint, as a picture of another size.
+
+    Raises:
+        InputError: it has other proportions.
+    """
+    same = match_size(mask, width, height, "the painted picture")
+    return same.mean(-1) if mask.alpha is None else _scaled(mask.alpha, width, height)
+
+
+def find_paint(
+    photo: Float[Tensor, "H W 3"], painted: Float[Tensor, "H W 3"]
+) -> Float[Tensor, "H W"]:
+    """Share of each pixel of `painted` that is paint, by its difference from the `photo`; 0 everywhere if there is none.
+
+    The noise of compression and scaling is measured on the pair itself, for each degree of busyness of the photo.
+    Paint has pixels well above it, and every pixel that hangs together with these and is above it at all.
+    """
+    apart = np.abs(photo.numpy() - painted.numpy()).max(-1)
+    noise = _noise(photo.numpy(), cv2.GaussianBlur(apart, (0, 0), 1.0))
+    near = HALO_SHARE * cv2.dilate(apart, np.ones((HALO_WINDOW, HALO_WINDOW), np.uint8))
+    possible = (apart > np.maximum(np.maximum(POSSIBLE, near), POSSIBLE_NOISE * noise)).astype(np.uint8)
+    certain = apart > np.maximum(CERTAIN, CERTAIN_NOISE * noise)
+    # Strokes are joined over the gap that a pixel of the photo's own colour leaves in them.
+    joined = cv2.morphologyEx(possible, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    count, labels = cv2.connectedComponents(joined, connectivity=8)
+    sure = np.bincount(labels[certain], minlength=count)
+    kept = sure >= SMALLEST
+    kept[0] = False
+    paint = kept[labels].astype(np.uint8)
+    size = 2 * RIM + 1
+    grown = cv2.dilate(paint, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+    return torch.from_numpy(cv2.GaussianBlur(grown.astype(np.float32), (0, 0), RIM / 3))
+
+
+def _noise(photo: np.ndarray, apart: np.ndarray) -> np.ndarray:
+    """Size of the differences that are no paint, at each pixel."""
+    window = np.ones((BUSY_WINDOW, BUSY_WINDOW), np.uint8)
+    busy = (cv2.dilate(photo, window) - cv2.erode(photo, window)).max(-1)
+    bins = np.searchsorted(np.quantile(busy, BUSY_SHARES), busy)
+    quiet = np.zeros(len(BUSY_SHARES) + 1, np.float32)
+    for k in np.unique(bins):
+        quiet[k] = np.quantile(apart[bins == k], QUIET_SHARE)
+    return quiet[bins]

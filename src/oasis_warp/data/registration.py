@@ -1,0 +1,104 @@
+"""Find where in a photo a square was cut out, from a picture of what the square shows."""
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.data.crop import resample_square
+
+SEARCH_SIDE = 128
+"""Longer side of the photo in the search over all places and sizes [px]."""
+SIZES = (0.12, 1.6)
+"""Smallest and largest square that is looked for, over the photo's longer side."""
+SIZE_STEP = 1.05
+BLURS = (4.0, 2.0)
+"""Of both pictures while the place is refined, from coarse to fine [px]; without, an avatar's own noise pulls."""
+RIM = 2
+"""Pixels inside the outline that are left out: there the avatar may differ most."""
+ROUNDS = 8
+"""Of refinement for each blur."""
+MAX_GROWTH = 0.1
+"""Of the side in one round."""
+OUTLIER = 0.08
+"""Colour difference above which a pixel hardly counts: there is paint, or background."""
+
+
+class Square(NamedTuple):
+    """A square of a photo."""
+
+    left: float
+    top: float
+    side: float
+    """All in pixels of the photo."""
+    difference: float
+    """Median colour difference between the picture and the photo there, in [0, 1]."""
+
+
+def find_square(
+    picture: Float[Tensor, "S S 3"], alpha: Float[Tensor, "S S"], photo: Float[Tensor, "H W 3"]
+) -> Square:
+    """The square of `photo` that `picture` shows where its `alpha` is above a half.
+
+    The best of all places and sizes in small copies, then Gauss-Newton on place and size with Geman-McClure weights.
+    """
+    inside = cv2.erode((alpha.numpy() > 0.5).astype(np.float32), np.ones((3, 3), np.uint8), iterations=RIM)
+    square = _search(picture.numpy(), inside, photo.numpy())
+    for blur in BLURS:
+        goal = cv2.GaussianBlur(picture.numpy(), (0, 0), blur)
+        # Blurring brings the picture's background in over the outline.
+        deep = cv2.erode(inside, np.ones((3, 3), np.uint8), iterations=round(2 * blur))
+        for _ in range(ROUNDS):
+            square = _refine(goal, deep, photo, square, blur)
+    apart = np.abs(resample_square(photo, *square, len(picture)).numpy() - picture.numpy()).mean(-1)
+    return Square(*square, float(np.median(apart[inside > 0])) if inside.any() else 1.0)
+
+
+def _search(picture: np.ndarray, inside: np.ndarray, photo: np.ndarray) -> tuple[float, float, float]:
+    height, width = photo.shape[:2]
+    scale = SEARCH_SIDE / max(height, width)
+    small = cv2.resize(photo, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
+    border = SEARCH_SIDE // 3  # the square may reach over the photo's edge, but not the hand
+    small = cv2.copyMakeBorder(small, border, border, border, border, cv2.BORDER_REPLICATE)
+    best, found = -np.inf, (0.0, 0.0, float(max(height, width)))
+    side = SIZES[0] * SEARCH_SIDE
+    while side <= SIZES[1] * SEARCH_SIDE:
+        n = round(side)
+        if n <= min(small.shape[:2]):
+            shrunk = cv2.resize(picture, (n, n), interpolation=cv2.INTER_AREA)
+            mask = (cv2.resize(inside, (n, n), interpolation=cv2.INTER_AREA) > 0.9).astype(np.float32)
+            if mask.sum() > 0:
+                # Correlation, since differences are smallest where a tiny hand lies on plain skin.
+                alike = cv2.matchTemplate(small, shrunk, cv2.TM_CCOEFF_NORMED, mask=np.dstack([mask] * 3))
+                alike[~(np.abs(alike) <= 1.001)] = -1  # over plain ground it is undefined
+                _, high, _, (x, y) = cv2.minMaxLoc(alike)
+                if high > best:
+                    best, found = high, ((x - border) / scale, (y - border) / scale, n / scale)
+        side = max(side * SIZE_STEP, n + 1)
+    return found
+
+
+def _refine(
+    goal: np.ndarray, inside: np.ndarray, photo: Tensor, square: tuple[float, float, float], blur: float
+) -> tuple[float, float, float]:
+    """One Gauss-Newton step on left, top and the logarithm of the side."""
+    left, top, side = square
+    n = len(goal)
+    crop = cv2.GaussianBlur(resample_square(photo, left, top, side, n).numpy(), (0, 0), blur)
+    error = crop - goal
+    weight = inside / (1 + np.square(error).mean(-1) / OUTLIER**2) ** 2
+    across, down = (cv2.Sobel(crop, cv2.CV_32F, *axis, ksize=3, scale=1 / 8) for axis in ((1, 0), (0, 1)))
+    # Moving the square by one pixel of its own moves what it shows by as much; growing it moves what lies off its
+    # top left corner.
+    place = (np.arange(n, dtype=np.float32) + 0.5)
+    grown = across * place[None, :, None] + down * place[:, None, None]
+    slopes = np.stack([across, down, grown], -1)
+    normal = np.einsum("ijck,ijcl,ij->kl", slopes, slopes, weight)
+    right = -np.einsum("ijck,ijc,ij->k", slopes, error, weight)
+    right_by, down_by, growth = np.linalg.lstsq(normal, right, rcond=None)[0].tolist()
+    pixel = side / n
+    return left + right_by * pixel, top + down_by * pixel, side * math.exp(min(max(growth, -MAX_GROWTH), MAX_GROWTH))
