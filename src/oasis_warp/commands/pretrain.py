@@ -33,6 +33,8 @@ from oasis_warp.training.synthetic_source import MULTIPLE, SyntheticHands
 SETTINGS, PEOPLE = "training.json", "people"
 """In the folder: with what the training began, and the people that a CPU has baked."""
 PRECISIONS = {"bf16": "bfloat16", "float32": "float32"}
+AHEAD = 4
+"""Batches that a GPU renders together."""
 SIZES = range(32, 1025, MULTIPLE)
 
 
@@ -99,7 +101,7 @@ def train(options: Pretrain, place: Place, progress: Progress) -> int:
     hands = SyntheticHands(
         seed=options.seed, people=options.people, hands=options.hands, views=options.views, size=options.size,
         device=place.device, population=replace(EVERYBODY, **dict.fromkeys(options.hold_out, 0.0)),
-        workers=options.workers,
+        workers=options.workers, ahead=AHEAD if place.device.type == "cuda" else 1,
     )  # fmt: skip
     met = hands.people_met(place.rank, place.world, options.steps)
     most = most_kept(str(place.device))
