@@ -1,7 +1,7 @@
 """Reconstruct every photo of a folder and tabulate what was measured.
 
-    python tools/evaluate_photos.py tests/data/photos --out out/photos
-    python tools/evaluate_photos.py tests/data/photos/same_hand --pairs --out out/same_hand
+    python tools/evaluate_photos.py tests/data/photos --out out/photos/learned
+    python tools/evaluate_photos.py tests/data/photos/same_hand --prior none --pairs --out out/same_hand/none
 
 Writes photos.csv, photos.md (the table of docs/results.md) and a sheet of renders; with --pairs also pairs.csv and
 pairs.md, where the folder's subfolders are photos of one hand each: every avatar is drawn as every other photo of
@@ -26,7 +26,8 @@ import torch
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
-from oasis_warp.evaluation import compare_with_photo, coverage
+from oasis_warp.evaluation.coverage import coverage
+from oasis_warp.evaluation.photo_pairs import compare_pairs
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
@@ -37,7 +38,7 @@ from oasis_warp.render.cameras import orbit_camera
 SUFFIXES = {".jpg", ".jpeg", ".png", ".webp"}
 TILE = 192
 LEFT_OUT = (
-    "result", "worst_point_percent", "coverage_mean", "warnings", "n_gaussians", "kernels_s", "crop_s", "prior_s"
+    "result", "worst_point_percent", "coverage_mean", "warnings", "n_gaussians", "kernels_s", "crop_s"
 )  # fmt: skip
 """Columns of the CSV that the short table does not show."""
 
@@ -62,11 +63,11 @@ def tiles(avatar: Avatar, photo_crop: torch.Tensor) -> np.ndarray:
     return (np.hstack(small).clip(0, 1) * 255).astype(np.uint8)
 
 
-def measure(path: Path, root: Path, out: Path, seed: int) -> dict[str, object]:
+def measure(path: Path, root: Path, out: Path, prior: str, seed: int) -> dict[str, object]:
     """One photo's row; writes its avatar and its strip of pictures."""
     name = path.relative_to(root).with_suffix("").as_posix()
     start = time.perf_counter()
-    config = ReconstructConfig(seed=seed)
+    config = ReconstructConfig(prior=prior if prior in ("learned", "none") else Path(prior), seed=seed)
     try:
         photo = read_photo(path)
         made = reconstruct(photo, config)
@@ -97,32 +98,25 @@ def measure(path: Path, root: Path, out: Path, seed: int) -> dict[str, object]:
 
 def measure_pairs(folder: Path, out: Path) -> list[dict[str, object]]:
     """Rows of every ordered pair of photos in `folder`; avatars must lie in `out` already."""
-    estimator, config, rows = HandEstimator(bundled_hand()), ReconstructConfig(force=True), []
-    paths = photos_below(folder)
-    for target in paths:
-        photo = read_photo(target)
-        landmarks = choose_hand(estimator.find(photo), "largest", photo.name)
-        for source in paths:
-            file = (out / folder.name / source.stem).with_suffix(".safetensors")
-            if source == target or not file.exists():
-                continue
-            avatar = Avatar.load(file)
-            fit = estimator.fit(photo, landmarks, shape=avatar.shape, force=True)
-            if fit.side != avatar.side:
-                continue
-            evidence = make_evidence(photo, fit, avatar.surface_offsets, config)
-            score = compare_with_photo(avatar, evidence, fit.pose)
-            regions = {f"error_{name}": round(value, 4) for name, value in score.region_errors.items()}
-            rows.append(
-                {
-                    "source": f"{folder.name}/{source.stem}",
-                    "target": f"{folder.name}/{target.stem}",
-                    "psnr_db": round(score.psnr, 2),
-                    "psnr_plain_db": round(score.psnr_plain, 2),
-                    "overlap": round(score.overlap, 3),
-                    **regions,
-                }
-            )
+    estimator, photos, avatars = HandEstimator(bundled_hand()), {}, {}
+    for path in photos_below(folder):
+        photo = read_photo(path)
+        photos[path.stem] = photo, choose_hand(estimator.find(photo), "largest", photo.name)
+        if (file := (out / folder.name / path.stem).with_suffix(".safetensors")).exists():
+            avatars[path.stem] = {"avatar": Avatar.load(file)}
+    rows = []
+    for pair in compare_pairs(estimator, photos, avatars, ReconstructConfig()):
+        score = pair.scores["avatar"]
+        rows.append(
+            {
+                "source": f"{folder.name}/{pair.source}",
+                "target": f"{folder.name}/{pair.target}",
+                "psnr_db": round(score.psnr, 2),
+                "psnr_plain_db": round(score.psnr_plain, 2),
+                "overlap": round(score.overlap, 3),
+                **{f"error_{name}": round(value, 4) for name, value in score.region_errors.items()},
+            }
+        )
     return rows
 
 
@@ -153,6 +147,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--pairs", action="store_true", help="compare photos of one hand with each other")
+    parser.add_argument("--prior", default="learned", help="learned, none or a weights file")
     parser.add_argument("--jobs", type=int, default=1, help="photos at a time; timings hold for 1 only")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -160,7 +155,9 @@ def main() -> None:
     threads = max(1, (os.cpu_count() or 1) // options.jobs)
     with ProcessPoolExecutor(options.jobs, initializer=torch.set_num_threads, initargs=(threads,)) as pool:
         paths = photos_below(options.folder)
-        row_of = functools.partial(measure, root=options.folder, out=options.out, seed=options.seed)
+        row_of = functools.partial(
+            measure, root=options.folder, out=options.out, prior=options.prior, seed=options.seed
+        )
         rows = list(pool.map(row_of, paths))
         write_table(rows, options.out / "photos", leave_out=LEFT_OUT)
         strips = [cv2.imread(str((options.out / str(row["photo"])).with_suffix(".png"))) for row in rows

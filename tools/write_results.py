@@ -1,9 +1,11 @@
 """Write docs/results.md from what the evaluations left behind.
 
-Four commands make the page; the first three measure:
+Six commands make the page; the first five measure:
 
-    python tools/evaluate_photos.py tests/data/photos --out out/photos --jobs 2
-    python tools/evaluate_photos.py tests/data/photos/same_hand --pairs --out out/same_hand --jobs 2
+    python tools/evaluate_photos.py tests/data/photos --out out/photos/learned --jobs 2
+    python tools/evaluate_photos.py tests/data/photos --prior none --out out/photos/none --jobs 2
+    python tools/evaluate_photos.py tests/data/photos/same_hand --pairs --out out/same_hand/learned --jobs 2
+    python tools/evaluate_photos.py tests/data/photos/same_hand --prior none --pairs --out out/same_hand/none --jobs 2
     python tools/evaluate_masks.py tests/data/photos --out out/masks.md
     python tools/write_results.py out docs/results.md
 
@@ -17,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 Row = dict[str, str]
+PRIORS = ("none", "learned")
 
 TEMPLATE = """# Measurements
 
@@ -33,9 +36,17 @@ avatar in the photo's pose over black, against the photo, at 256 px, inside the 
 mask is wrong, black is compared with background. *Coverage*: share of the posed mesh's silhouette with alpha >= 0.9,
 the fading rim of the wrist left out. *Fit* includes both masks and the second looks.
 
-{summary}
+## The estimator
 
-Times are with the other core busy: alone, a fit takes about 0.8 s and the adaptation about 4 s.
+{estimator}
+
+## The avatar
+
+With the learned prior, which is the default, and without it (`--prior none`).
+
+{avatar}
+
+Times are with the other core busy, by other work too.
 
 ## Single photos
 
@@ -44,6 +55,11 @@ Times are with the other core busy: alone, a fit takes about 0.8 s and the adapt
 `palm_open_right_01` has the lowest PSNR of all: between its fingers the mask keeps white board, which the avatar
 rightly leaves black. `backlit_victory_14` is nearly a silhouette; its avatar is as dark. Side and detection are right
 on all, the two photos marked hard included.
+
+![Each photo with the guesses of both priors and what adaptation makes of them](_static/priors.jpg)
+
+The sheet is made by `python tools/compare_priors.py docs/_static/priors.jpg tests/data/photos/*.*`: the photo, then for
+each prior its guess and the adapted hand, from the photo's view, the side and behind.
 
 ## Masks and surfaces against hand-drawn outlines
 
@@ -54,21 +70,26 @@ IoU above the wrist; two careful drawings of one photo agree to about 0.985.
 ## The same hand in another photo
 
 The avatar of photo A in the pose and camera of photo B (estimated with A's shape), compared inside both masks. The
-photos differ in exposure, white balance and shading, hence one gain a channel. It is the baseline for what follows:
-the first prior knows mean colours only, and a colour seen in one light is drawn in another.
+photos differ in exposure, white balance and shading, hence one gain a channel.
 
 {pairs}
+
+Of two avatars of one photo, the one made with the learned prior is nearer to photo B on {pairs_won} of the pairs, by
+PSNR with one gain a channel.
 """
 
-SUMMARY = {
+ESTIMATOR = {
     "reprojection_percent": ("reprojection, % of the box", ".2f"),
     "mask_iou": ("fitted mesh against mask, IoU above the wrist", ".3f"),
-    "input_psnr_db": ("PSNR inside the mask, dB", ".1f"),
-    "input_psnr_inner_db": ("PSNR 2 px inside the mask, dB", ".1f"),
-    "coverage_worst": ("coverage, worst of 4 poses x 8 views", ".4f"),
     "landmarks_s": ("seconds: landmarks", ".2f"),
     "fit_s": ("seconds: fit", ".2f"),
     "outline_s": ("seconds: outline", ".2f"),
+}
+AVATAR = {
+    "input_psnr_db": ("PSNR inside the mask, dB", ".1f"),
+    "input_psnr_inner_db": ("PSNR 2 px inside the mask, dB", ".1f"),
+    "coverage_worst": ("coverage, worst of 4 poses x 8 views", ".4f"),
+    "prior_s": ("seconds: prior", ".2f"),
     "adaptation_s": ("seconds: adaptation", ".1f"),
     "total_s": ("seconds: photo to avatar, warm", ".1f"),
     "peak_gib": ("peak memory of the process, GiB", ".2f"),
@@ -77,12 +98,11 @@ SINGLE = {
     "side": ("side", "s"),
     "reprojection_percent": ("reprojection %", ".2f"),
     "mask_iou": ("mask IoU", ".3f"),
+}
+SINGLE_BY_PRIOR = {
     "input_psnr_db": ("PSNR dB", ".1f"),
-    "input_psnr_inner_db": ("PSNR 2 px inside, dB", ".1f"),
-    "coverage_worst": ("coverage, worst of 32", ".3f"),
-    "fit_s": ("fit s", ".1f"),
-    "adaptation_s": ("adaptation s", ".1f"),
-    "total_s": ("total s", ".1f"),
+    "input_psnr_inner_db": ("2 px inside, dB", ".1f"),
+    "coverage_worst": ("coverage", ".3f"),
 }
 PAIRS = {
     "psnr_db": ("PSNR with one gain a channel, dB", ".1f"),
@@ -100,27 +120,41 @@ def read(path: Path) -> list[Row]:
         return list(csv.DictReader(file))
 
 
-def spread(rows: list[Row], columns: dict[str, tuple[str, str]], title: str) -> str:
-    """Percentiles and extremes of some columns as a Markdown table."""
-    lines = [f"| {title} | 10 % | median | 90 % | least | most |", "|---|---|---|---|---|---|"]
+def spread(rows: dict[str, list[Row]], columns: dict[str, tuple[str, str]], title: str) -> str:
+    """Percentiles and extremes of some columns as a Markdown table, with a line for each of the sets of `rows`."""
+    sets = f" {title} | prior |" if len(rows) > 1 else f" {title} |"
+    lines = [f"|{sets} 10 % | median | 90 % | least | most |", "|" + "---|" * (sets.count("|") + 5)]
     for key, (name, form) in columns.items():
-        values = np.array([float(row[key]) for row in rows if row.get(key)])
-        numbers = [*np.percentile(values, (10, 50, 90)), values.min(), values.max()]
-        lines.append(f"| {name} | " + " | ".join(format(number, form) for number in numbers) + " |")
+        for label, part in rows.items():
+            values = np.array([float(row[key]) for row in part if row.get(key)])
+            numbers = [*np.percentile(values, (10, 50, 90)), values.min(), values.max()]
+            cells = [name, label] if len(rows) > 1 else [name]
+            lines.append("| " + " | ".join([*cells, *(format(number, form) for number in numbers)]) + " |")
     return "\n".join(lines)
 
 
-def listing(rows: list[Row]) -> str:
+def listing(rows: dict[str, list[Row]]) -> str:
     """One line a photo."""
-    lines = ["| photo | " + " | ".join(name for name, _ in SINGLE.values()) + " |", "|" + "---|" * (len(SINGLE) + 1)]
-    for row in rows:
+    names = [name for name, _ in SINGLE.values()]
+    names += [f"{name}, {prior}" for name, _ in SINGLE_BY_PRIOR.values() for prior in rows]
+    lines = ["| photo | " + " | ".join(names) + " |", "|" + "---|" * (len(names) + 1)]
+    for several in zip(*rows.values(), strict=True):
+        row = several[0]
         if row["result"] != "ok":
             why = row["result"].split(": ")[1].split(";")[0]
-            lines.append(f"| {row['photo']} | refused: {why} |" + " |" * (len(SINGLE) - 1))
+            lines.append(f"| {row['photo']} | refused: {why} |" + " |" * (len(names) - 1))
             continue
-        cells = (row[key] if form == "s" else format(float(row[key]), form) for key, (_, form) in SINGLE.items())
+        cells = [row[key] if form == "s" else format(float(row[key]), form) for key, (_, form) in SINGLE.items()]
+        cells += [format(float(one[key]), form) for key, (_, form) in SINGLE_BY_PRIOR.items() for one in several]
         lines.append(f"| {row['photo']} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def share_won(rows: dict[str, list[Row]], key: str) -> str:
+    """Share of the pairs at which the learned prior has the larger value."""
+    values = {prior: {(row["source"], row["target"]): float(row[key]) for row in part} for prior, part in rows.items()}
+    both = values["none"].keys() & values["learned"].keys()
+    return f"{np.mean([values['learned'][pair] > values['none'][pair] for pair in both]):.0%}"
 
 
 def main() -> None:
@@ -129,18 +163,24 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="holds photos/, same_hand/ and masks.md")
     parser.add_argument("page", type=Path)
     options = parser.parse_args()
-    single, sets = read(options.folder / "photos" / "photos.csv"), read(options.folder / "same_hand" / "photos.csv")
-    pairs = read(options.folder / "same_hand" / "pairs.csv")
-    good = [row for row in single + sets if row["result"] == "ok"]
+
+    def both(folder: str, name: str) -> dict[str, list[Row]]:
+        return {prior: read(options.folder / folder / prior / name) for prior in PRIORS}
+
+    single, sets, pairs = both("photos", "photos.csv"), both("same_hand", "photos.csv"), both("same_hand", "pairs.csv")
+    good = {prior: [row for row in single[prior] + sets[prior] if row["result"] == "ok"] for prior in PRIORS}
     commands = [line.strip() for line in (__doc__ or "").splitlines() if line.startswith("    python")]
+    title = f"all {len(good['none'])} hands"
     page = TEMPLATE.format(
-        n_single=sum(row["result"] == "ok" for row in single),
-        n_sets=len(sets),
+        n_single=sum(row["result"] == "ok" for row in single["none"]),
+        n_sets=len(sets["none"]),
         commands="\n".join(commands),
-        summary=spread(good, SUMMARY, f"all {len(good)} hands"),
+        estimator=spread({"none": good["none"]}, ESTIMATOR, title),
+        avatar=spread(good, AVATAR, title),
         single=listing(single),
         masks=(options.folder / "masks.md").read_text().strip(),
-        pairs=spread(pairs, PAIRS, f"{len(pairs)} ordered pairs"),
+        pairs=spread(pairs, PAIRS, f"{len(pairs['none'])} ordered pairs"),
+        pairs_won=share_won(pairs, "psnr_db"),
     )
     options.page.write_text(page)
 

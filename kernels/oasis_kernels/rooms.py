@@ -11,7 +11,7 @@ import warp as wp
 from oasis_kernels.room_patterns import CLOTH, painted, rough_noise
 from oasis_kernels.sky import blurred, cosine_lobe, disc, dither, harmonics, light_along, lit_share
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False})  # fast_math makes NaN of powers: a dot product may exceed 1
 
 SOLID_WORDS = wp.constant(27)
 SHAPE, PATTERN, CELL, GLOSS, GLOW, SEED = (wp.constant(k) for k in range(6))
@@ -91,15 +91,25 @@ def entry(shape: int, half: wp.vec3f, o: wp.vec3f, d: wp.vec3f) -> float:
 
 
 @wp.func
-def clearance(solids: wp.array3d[wp.float32], b: int, p: wp.vec3f) -> float:
-    """Distance to the nearest solid, negative inside one."""
-    least = float(FAR)
+def in_the_way(center: wp.vec3f, half: wp.vec3f, d: wp.vec3f) -> bool:
+    """Whether a ray from the camera may meet a solid: whether it comes near the ball round it, rounding allowed for."""
+    ahead = wp.dot(center, d)
+    away = wp.dot(center, center)
+    size = wp.dot(half, half)
+    return away - ahead * ahead < 1.001 * size + 1.0e-5 * away and (ahead > 0.0 or away < 1.001 * size)
+
+
+@wp.func
+def clearance(solids: wp.array3d[wp.float32], b: int, p: wp.vec3f, limit: float) -> float:
+    """Distance to the nearest solid, negative inside one; `limit` where all are further away."""
+    least = limit
     for k in range(solids.shape[1]):
         shape = int(solids[b, k, SHAPE])
         if shape != NOTHING:
             q = p - vector_at(solids, b, k, CENTER)
             half = vector_at(solids, b, k, HALF)
-            if wp.length(q) < wp.length(half) + least:
+            reach = wp.length(half) + least
+            if wp.dot(q, q) < reach * reach:
                 q = turned(solids, b, k, q)
                 if shape == BOX:
                     e = wp.vec3f(wp.abs(q[0]) - half[0], wp.abs(q[1]) - half[1], wp.abs(q[2]) - half[2])
@@ -138,11 +148,13 @@ def sight(
     for k in range(solids.shape[1]):
         shape = int(solids[b, k, SHAPE])
         if shape != NOTHING:
-            o = turned(solids, b, k, -vector_at(solids, b, k, CENTER))
-            s = entry(shape, vector_at(solids, b, k, HALF), o, turned(solids, b, k, d))
-            if s < t:
-                t = s
-                hit = k
+            center = vector_at(solids, b, k, CENTER)
+            size = vector_at(solids, b, k, HALF)
+            if in_the_way(center, size, d):
+                s = entry(shape, size, turned(solids, b, k, -center), turned(solids, b, k, d))
+                if s < t:
+                    t = s
+                    hit = k
     if hit < 0:
         sky_light = 2.0 * light_along(sky, b, blurred(harmonics(d), 0.8))
         return wp.vec4f(sky_light[0], sky_light[1], sky_light[2], FAR)
@@ -194,10 +206,11 @@ def sight(
     glow = solids[b, hit, GLOW]
     gloss = solids[b, hit, GLOSS]
     open_ = wp.float32(1.0)
-    size = wp.clamp(0.12 * p[2], 0.02, 0.3)
-    for k in range(2):
-        reach = size * (0.2 + 0.8 * float(k))
-        open_ -= wp.max(reach - clearance(solids, b, p + reach * n), 0.0) / reach * 0.36
+    widest = wp.clamp(0.12 * p[2], 0.02, 0.3)
+    rolled = wp.int32(2)  # a number that the compiler does not know: code for each turn would not fit into the cache
+    for k in range(rolled):
+        reach = widest * (0.2 + 0.8 * float(k))
+        open_ -= (reach - clearance(solids, b, p + reach * n, reach)) / reach * 0.36
     open_ = wp.max(open_, 0.12)
     total = light_along(sky, b, cosine_lobe(n)) * open_
     for lamp in range(lamps.shape[1]):
@@ -223,8 +236,10 @@ def sight(
                 if share > 0.0 and lamp == 0:  # the first lamp's shadows of the solids themselves
                     s = 0.015 + 0.0016 * turn
                     soft = 1.0 / wp.max(lamp_spreads[b, lamp], 0.05)
-                    for _k in range(5):
-                        near = clearance(solids, b, p + 0.004 * n + s * w)
+                    rolled = wp.int32(5)
+                    for _k in range(rolled):
+                        # Further away nothing darkens and no step is longer.
+                        near = clearance(solids, b, p + 0.004 * n + s * w, wp.max(1.01 * s / soft, 0.3))
                         share = wp.min(share, wp.clamp(0.5 + 0.5 * soft * near / s, 0.0, 1.0))
                         s += wp.clamp(near, 0.03, 0.3)
                 total += color * (fall * fall * facing * share)
@@ -262,7 +277,8 @@ def trace(
     nearest = float(FAR)
     if hidden[b, y, x] <= 0.999:
         turn = dither(x, y)
-        for k in range(RAYS):
+        rolled = wp.int32(RAYS)
+        for k in range(rolled):
             right = float(x) + (float(k) + 0.5) / float(RAYS) - 0.5 * float(columns)
             down = float(y) + (0.3 if k % 2 == 0 else 0.7) - 0.5 * float(rows)
             d = wp.normalize(wp.vec3f(right / focals[b], down / focals[b], 1.0))

@@ -3,7 +3,7 @@
 `surface_state`: one thread a vertex and image. `sky_transfer`: the same; it compares the vertex with depth buffers of
 the mesh, one for each of D directions spread over the sphere. The open sky is known in closed form, so the directions
 only sample what is hidden: T = cosine lobe - sum over hidden d of max(0, n . d) Y(d) 4 / D. `smooth`: means over the
-faces round a vertex.
+faces round a vertex, one thread a channel.
 """
 
 import warp as wp
@@ -49,20 +49,19 @@ def smooth(
     out: wp.array3d[wp.float32],
 ):
     i = first + wp.tid()
-    n_vertices = values.shape[1]
-    b = i // n_vertices
-    v = i - b * n_vertices
+    n_vertices, n_channels = values.shape[1], values.shape[2]
+    b = i // (n_vertices * n_channels)
+    v = (i - b * n_vertices * n_channels) // n_channels
+    c = i - (b * n_vertices + v) * n_channels
     begin, end = offsets[v], offsets[v + 1]
-    share = 1.0 / (3.0 * float(wp.max(end - begin, 1)))
-    for c in range(values.shape[2]):
-        total = wp.float32(0.0)
-        for e in range(begin, end):
-            f = entries[e] // 3
-            for k in range(3):
-                total += values[b, faces[f, k], c]
-        if end == begin:
-            total = values[b, v, c] * 3.0
-        out[b, v, c] = total * share
+    total = wp.float32(0.0)
+    for e in range(begin, end):
+        f = entries[e] // 3
+        for k in range(3):
+            total += values[b, faces[f, k], c]
+    if end == begin:
+        total = values[b, v, c] * 3.0
+    out[b, v, c] = total * (1.0 / (3.0 * float(wp.max(end - begin, 1))))
 
 
 @wp.kernel

@@ -13,7 +13,7 @@ import warp as wp
 
 from oasis_kernels.sky import blurred, cosine_lobe, dither, harmonics, light_along, lit_share, vec9
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False})  # fast_math makes NaN of powers: a dot product may exceed 1
 
 SKIN = wp.constant(0)
 MATERIAL_WORDS = wp.constant(6)
@@ -26,37 +26,36 @@ WRAP = wp.constant(wp.vec3f(0.22, 0.08, 0.04))
 PI = wp.constant(3.14159265)
 
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
+vec8h = wp.types.vector(length=8, dtype=wp.float16)
 
 
 @wp.func
-def texel(atlas: wp.array4d[wp.float16], slot: int, x: float, y: float) -> vec8:
+def texel(page: wp.array2d[vec8h], x: float, y: float) -> vec8:
     """Bilinear; x and y in texels, centres at .5."""
-    u, v = wp.clamp(x - 0.5, 0.0, float(atlas.shape[2]) - 1.001), wp.clamp(y - 0.5, 0.0, float(atlas.shape[1]) - 1.001)
+    u, v = wp.clamp(x - 0.5, 0.0, float(page.shape[1]) - 1.001), wp.clamp(y - 0.5, 0.0, float(page.shape[0]) - 1.001)
     i, j = int(u), int(v)
     a, b = u - float(i), v - float(j)
     out = vec8()
+    t0, t1, t2, t3 = page[j, i], page[j, i + 1], page[j + 1, i], page[j + 1, i + 1]
     for c in range(8):
-        top = (1.0 - a) * float(atlas[slot, j, i, c]) + a * float(atlas[slot, j, i + 1, c])
-        low = (1.0 - a) * float(atlas[slot, j + 1, i, c]) + a * float(atlas[slot, j + 1, i + 1, c])
+        top = (1.0 - a) * float(t0[c]) + a * float(t1[c])
+        low = (1.0 - a) * float(t2[c]) + a * float(t3[c])
         out[c] = (1.0 - b) * top + b * low
     return out
 
 
 @wp.func
-def height(atlas: wp.array4d[wp.float16], slot: int, x: float, y: float, fold: float, wrinkle: float) -> float:
+def height(page: wp.array2d[vec8h], x: float, y: float, fold: float, wrinkle: float) -> float:
     """Relief [m]."""
-    u, v = wp.clamp(x - 0.5, 0.0, float(atlas.shape[2]) - 1.001), wp.clamp(y - 0.5, 0.0, float(atlas.shape[1]) - 1.001)
+    u, v = wp.clamp(x - 0.5, 0.0, float(page.shape[1]) - 1.001), wp.clamp(y - 0.5, 0.0, float(page.shape[0]) - 1.001)
     i, j = int(u), int(v)
     a, b = u - float(i), v - float(j)
     total = wp.float32(0.0)
     for dj in range(2):
         for di in range(2):
             w = (a if di == 1 else 1.0 - a) * (b if dj == 1 else 1.0 - b)
-            total += w * (
-                float(atlas[slot, j + dj, i + di, 3])
-                + fold * float(atlas[slot, j + dj, i + di, 4])
-                + wrinkle * float(atlas[slot, j + dj, i + di, 5])
-            )
+            t = page[j + dj, i + di]
+            total += w * (float(t[3]) + fold * float(t[4]) + wrinkle * float(t[5]))
     return 0.001 * total
 
 
@@ -83,8 +82,9 @@ def shade(
     materials: wp.array[wp.int32],
     uv: wp.array[wp.vec2f],  # texels
     uv_faces: wp.array2d[wp.int32],
-    atlas: wp.array4d[wp.float16],
-    slots: wp.array[wp.int32],  # which picture of the atlas an image uses
+    pages: wp.array[wp.int64],  # address of each image's texture
+    page_rows: int,
+    page_columns: int,
     worn: wp.array3d[wp.float32],  # [image, material, MATERIAL_WORDS]
     tones: wp.array[wp.vec3f],  # mean reflectance of each image's skin
     sky: wp.array2d[wp.vec3f],
@@ -127,13 +127,13 @@ def shade(
     cavity = wp.float32(1.0)
     m = n
     if material == SKIN:
-        slot = slots[b]
+        page = wp.array(ptr=wp.uint64(pages[b]), shape=(page_rows, page_columns), dtype=vec8h)
         t0, t1, t2 = uv[uv_faces[f, 0]], uv[uv_faces[f, 1]], uv[uv_faces[f, 2]]
         t = w[0] * t0 + w[1] * t1 + w[2] * t2
         area = w[0] * stretch[b, a0, 0] + w[1] * stretch[b, a1, 0] + w[2] * stretch[b, a2, 0]
         fold = wp.clamp(2.2 - 1.3 * area, 0.15, 1.8)
         wrinkle = wp.clamp(0.32 + 5.0 * (0.98 - area), 0.12, 1.5)
-        s = texel(atlas, slot, t[0], t[1])
+        s = texel(page, t[0], t[1])
         base = wp.vec3f(s[0], s[1], s[2])
         # Stretched skin pales, squeezed skin reddens; grooves are dark and warm.
         blush = wp.clamp(0.35 * (1.0 - area), -0.16, 0.22)
@@ -155,11 +155,11 @@ def shade(
             volume = wp.dot(pu, r1)
             if wp.abs(volume) > 1.0e-14:
                 o = wp.max(0.75, 0.5 * texels_a_pixel[b])
-                hu = height(atlas, slot, t[0] + o, t[1], fold, wrinkle) - height(
-                    atlas, slot, t[0] - o, t[1], fold, wrinkle
+                hu = height(page, t[0] + o, t[1], fold, wrinkle) - height(
+                    page, t[0] - o, t[1], fold, wrinkle
                 )
-                hv = height(atlas, slot, t[0], t[1] + o, fold, wrinkle) - height(
-                    atlas, slot, t[0], t[1] - o, fold, wrinkle
+                hv = height(page, t[0], t[1] + o, fold, wrinkle) - height(
+                    page, t[0], t[1] - o, fold, wrinkle
                 )
                 gradient = (hu * r1 + hv * r2) / (2.0 * o * volume)
                 steep = wp.length(gradient)

@@ -21,6 +21,7 @@ Command = (
     | Annotated[options.Edit, tyro.conf.subcommand("edit")]
     | Annotated[options.Synthesize, tyro.conf.subcommand("synthesize")]
     | Annotated[options.Pretrain, tyro.conf.subcommand("pretrain")]
+    | Annotated[options.Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[options.Gradcheck, tyro.conf.subcommand("gradcheck")]
     | Annotated[options.Bench, tyro.conf.subcommand("bench")]
     | Annotated[options.Doctor, tyro.conf.subcommand("doctor")]

@@ -1,7 +1,7 @@
 """`reconstruct`: one photo in, an avatar out. The only file that knows the order of the stages."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -9,11 +9,11 @@ from typing import NamedTuple
 import torch
 
 from oasis_warp.avatar.observe import inner_mask
-from oasis_warp.avatar.prior import MeanPrior, Prior
+from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import Evidence, HandFit, Landmarks, Photo
+from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmarks, Photo
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.keypoints_file import read_keypoints
@@ -23,6 +23,7 @@ from oasis_warp.hand.surface_offsets import outline_offsets
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
+from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 from oasis_warp.training.adapt import adapt
@@ -37,6 +38,8 @@ class Reconstruction(NamedTuple):
     avatar: Avatar
     fit: HandFit
     """In the photo's own frame."""
+    prior: Mapping[str, str | int]
+    """Which prior was asked: its `about`."""
     stages: dict[str, float]
     """Seconds of each stage."""
     errors: dict[str, float]
@@ -58,7 +61,7 @@ def reconstruct(
         photo: From `oasis_warp.read_photo`.
         config: Options.
         keypoints: A JSON file with 21 landmarks, or with pose and camera, to use instead of the networks.
-        prior: What to assume of a hand before its photo is fitted; the mean appearance when not given.
+        prior: What to assume of a hand before its photo is fitted; the one that `config.prior` names when not given.
         progress: Called as work goes on.
 
     Raises:
@@ -71,11 +74,13 @@ def reconstruct(
         progress(name, 0, 1)
         start = time.perf_counter()
         yield
-        stages[name] = time.perf_counter() - start
+        stages[name] = stages.pop(name, 0.0) + time.perf_counter() - start
         progress(name, 1, 1)
 
     hand = bundled_hand()
     estimator = HandEstimator(hand)
+    with stage("prior"):  # a wrong file is told before the long work, not after it
+        prior = prior or choose_prior(config.prior, config.backbone_weights)
     with stage("landmarks"):
         given = read_keypoints(keypoints, photo) if keypoints else choose_hand(
             estimator.find(photo), config.hand, photo.name
@@ -89,27 +94,19 @@ def reconstruct(
     with stage("crop"):
         evidence = make_evidence(photo, fit, offsets, config)
     with stage("prior"):
-        guess = (prior or MeanPrior(hand))(evidence)
+        guess = prior(evidence)
     with stage("adaptation"):
         adaptation = adapt(
             hand, guess, evidence, AdaptConfig(texture_steps=config.steps, seed=config.seed), progress
         )
-    camera = evidence.camera
-    avatar = Avatar(
-        side=fit.side,
-        shape=fit.shape.to(evidence.image),
-        surface_offsets=offsets.to(evidence.image),
-        gaussians=adaptation.gaussians,
-        source_pose=fit.pose,
-        source_camera=mirrored_camera(camera) if fit.side == "left" else camera,
-    )
+    avatar = make_avatar(fit, offsets, evidence, adaptation.gaussians)
     errors = {
         "reprojection_percent": fit.reprojection,
         "worst_point_percent": fit.worst_point,
         "mask_iou": fit.mask_iou,
         **input_errors(avatar, evidence),
     }
-    return Reconstruction(avatar, fit, stages, errors, fit.warnings)
+    return Reconstruction(avatar, fit, prior.about, stages, errors, fit.warnings)
 
 
 def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: ReconstructConfig) -> Evidence:
@@ -144,6 +141,21 @@ def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: Rec
         camera=crop._replace(viewmat=crop.viewmat.to(device), K=crop.K.to(device)),
         rest=there(rest),
         posed=there(posed),
+    )
+
+
+def make_avatar(
+    fit: HandFit, offsets: torch.Tensor, evidence: Evidence, gaussians: CanonicalGaussians
+) -> Avatar:
+    """The hand of `fit` with the looks of `gaussians`; `offsets` and `evidence` are those that it was made with."""
+    camera = evidence.camera
+    return Avatar(
+        side=fit.side,
+        shape=fit.shape.to(evidence.image),
+        surface_offsets=offsets.to(evidence.image),
+        gaussians=gaussians,
+        source_pose=fit.pose,
+        source_camera=mirrored_camera(camera) if fit.side == "left" else camera,
     )
 
 

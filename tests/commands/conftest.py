@@ -1,3 +1,6 @@
+import json
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -6,6 +9,9 @@ from oasis_warp.core.types import Camera, CanonicalGaussians, HandFit, HandPose,
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.hand_avatar import Avatar
+from oasis_warp.network.config import COMPACT
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.weights_file import save_network
 from oasis_warp.ops import depth_map
 from oasis_warp.pipeline import Reconstruction
 
@@ -56,10 +62,20 @@ def scene(hand):
 @pytest.fixture
 def made(scene):
     _, fit, avatar = scene
-    return Reconstruction(avatar, fit, {"landmarks": 0.5, "fit": 0.25}, {"input_psnr_db": 30.0, "mask_iou": 0.97}, ())
+    seconds, errors = {"landmarks": 0.5, "fit": 0.25}, {"input_psnr_db": 30.0, "mask_iou": 0.97}
+    return Reconstruction(avatar, fit, {"name": "learned", "sha256": "0a1b", "step": 7}, seconds, errors, ())
 
 
 @pytest.fixture
 def avatar_file(scene, tmp_path):
     scene[2].save(tmp_path / "avatar.safetensors")
     return tmp_path / "avatar.safetensors"
+
+
+@pytest.fixture(scope="session")
+def weights_file(hand, tmp_path_factory):
+    """Of a small network that knows nothing yet."""
+    small = replace(COMPACT, width=32, heads=2, n_tokens=16, n_coarse=64, refine_layers=1, head_width=16)
+    path = tmp_path_factory.mktemp("weights") / "network.safetensors"
+    save_network(path, HandNetwork(small, hand), notes=json.dumps({"step": 7}))
+    return path

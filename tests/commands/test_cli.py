@@ -29,6 +29,21 @@ def test_help_imports_nothing_that_takes_seconds(arguments):
     assert done.stdout
 
 
+def test_an_avatar_is_drawn_and_animated_without_the_network_that_made_it(avatar_file, tmp_path):
+    code = """
+import sys
+from oasis_warp.cli import main
+avatar, folder = sys.argv[1:]
+assert main(["render", avatar, "-o", f"{folder}/picture.png", "--size", "32"]) == 0
+assert main(["animate", avatar, "-o", f"{folder}/film.gif", "--size", "32", "--seconds", "0.2"]) == 0
+once = ("oasis_warp.network", "oasis_warp.pipeline", "oasis_warp.training", "oasis_warp.hand.networks")
+print(*(name for name in sys.modules if name.startswith(once)))
+"""
+    arguments = [sys.executable, "-c", code, str(avatar_file), str(tmp_path)]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
 def test_the_version_is_printed(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"oasis_warp {__version__}\n"

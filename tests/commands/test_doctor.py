@@ -6,8 +6,18 @@ import torch
 
 from oasis_warp.cli import main
 from oasis_warp.commands import doctor
+from oasis_warp.network import prior as home
 
 PYPROJECT = Path(__file__).parents[2] / "pyproject.toml"
+
+
+@pytest.fixture(autouse=True)
+def prior_that_ships(monkeypatch, weights_file):
+    """A small one in its place until it does."""
+    monkeypatch.setattr(home, "asset", lambda *parts: weights_file)
+    home.bundled_prior.cache_clear()
+    yield
+    home.bundled_prior.cache_clear()
 
 
 def test_this_installation_is_healthy(capsys):
@@ -25,7 +35,7 @@ def test_a_fault_is_told_with_its_remedy_and_exits_with_one(capsys, monkeypatch)
     assert f'FAIL torch           {torch.__version__}, expected >=99; run `pip install "torch>=99"`' in out
     assert 'FAIL no-such-package not installed; run `pip install "no-such-package>=1,<2"`' in out
     assert "FAIL networks" in out
-    assert out.endswith("3 of 10 checks failed.\n")
+    assert out.endswith("3 of 11 checks failed.\n")
 
 
 def test_the_table_of_packages_is_that_of_the_project():
@@ -43,6 +53,14 @@ def test_the_table_of_packages_is_that_of_the_project():
 )
 def test_versions_are_compared_by_their_numbers(text, numbers):
     assert doctor.parse_version(text) == numbers
+
+
+def test_a_prior_that_is_missing_is_found(monkeypatch, tmp_path):
+    monkeypatch.setattr(home, "asset", lambda *parts: tmp_path / "nothing.safetensors")
+    home.bundled_prior.cache_clear()
+    with pytest.raises(doctor.FaultError, match="the learned prior is not installed") as caught:
+        doctor.check_prior()
+    assert caught.value.remedy == "reinstall oasis-warp, or use --prior none"
 
 
 def test_the_newest_version_that_is_not_known_to_work_is_refused(monkeypatch):

@@ -54,9 +54,23 @@ def test_a_photo_becomes_an_avatar_that_looks_like_it(finished):
     assert report["hand"]["side"] == "left"
     assert report["errors"]["input_psnr_db"] > 20
     assert report["errors"]["mask_iou"] > 0.85
-    assert {"read", "landmarks", "fit", "adaptation", "summary", "turntable", "save"} <= report["seconds"].keys()
+    stages = {"read", "landmarks", "fit", "prior", "adaptation", "summary", "turntable", "save"}
+    assert stages <= report["seconds"].keys()
+    assert report["prior"]["name"] == "learned" and len(report["prior"]["sha256"]) == 64
     assert "left hand" in done.stdout
     assert "texture" in done.stderr
+
+
+@pytest.mark.parametrize("prior", ["none", "file"])
+def test_another_prior_makes_another_avatar_of_the_photo(finished, weights_file, tmp_path, prior):
+    photo, choice = PHOTOS / "palm_open_left_02.png", weights_file if prior == "file" else prior
+    done = oasis("reconstruct", photo, "-o", tmp_path / "out", "--steps", 20, "--prior", choice)
+    assert done.returncode == 0, done.stderr
+    learned, other = (json.loads((folder / "report.json").read_text()) for folder in (finished[0], tmp_path / "out"))
+    assert other["prior"]["name"] == str(choice)
+    assert other["errors"]["reprojection_percent"] == learned["errors"]["reprojection_percent"]
+    assert other["errors"]["input_psnr_db"] > 20
+    assert other["errors"]["input_psnr_db"] != learned["errors"]["input_psnr_db"]
 
 
 def test_the_avatar_can_be_drawn_and_animated_without_its_photo(finished, tmp_path):

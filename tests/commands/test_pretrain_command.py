@@ -68,6 +68,7 @@ def test_the_weights_say_how_they_came_about(unbroken):
     with safe_open(unbroken / WEIGHTS, framework="pt") as file:
         notes = json.loads(json.loads(file.metadata()["oasis-network"])["notes"])
     assert notes["step"] == 2 and notes["learning_rate"] > 0
+    assert notes["hold_out"] == []
     assert notes["precision"] == "float32" and notes["people"] == 1 and notes["processes"] == 1
 
 
@@ -94,13 +95,14 @@ def test_a_finished_training_is_left_as_it_is(unbroken, tiny):
     assert {path: path.read_bytes() for path in unbroken.iterdir() if path.is_file()} == before
 
 
-@pytest.mark.parametrize("other", [["--seed", "1"], ["--steps", "3"], ["--people", "2"], ["--precision", "bf16"]])
+@pytest.mark.parametrize("other", [["--seed", "1"], ["--steps", "3"], ["--people", "2"], ["--precision", "bf16"],
+                                   ["--hold-out", "tattoo"]])  # fmt: skip
 def test_another_training_in_the_same_folder_is_refused(unbroken, tiny, capsys, other):
     before = (unbroken / CHECKPOINT).read_bytes()
     assert main(["pretrain", str(unbroken), *SMALL, *other]) == BAD_INPUT
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert f"a training made with other settings, {other[0].removeprefix('--')} " in said
+    assert f"a training made with other settings, {other[0].removeprefix('--').replace('-', '_')} " in said
     assert (unbroken / CHECKPOINT).read_bytes() == before
 
 

@@ -81,6 +81,31 @@ def test_options_reach_the_pipeline(pipeline, photo_file, tmp_path):
     assert (photo.name, config.hand, got) == ("hand.png", 1, keypoints)
 
 
+def test_the_prior_is_chosen_and_told(pipeline, photo_file, weights_file, tmp_path, capsys):
+    for number, prior in enumerate(("learned", "none", str(weights_file))):
+        assert main(["reconstruct", photo_file(), "-o", str(tmp_path / "out"), "--prior", prior]) == 0
+        assert str(pipeline[number][1].prior) == prior
+        report = json.loads((tmp_path / "out" / "report.json").read_text())
+        assert report["config"]["prior"] == prior
+        assert report["prior"] == {"name": "learned", "sha256": "0a1b", "step": 7}  # what the pipeline says it was
+    assert "prior learned" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no weights"])
+def test_a_file_that_is_no_prior_is_refused_once_and_before_any_photo_is_read(
+    pipeline, photo_file, tmp_path, capsys, content
+):
+    weights = tmp_path / "own.safetensors"
+    if content is not None:
+        weights.write_bytes(content)
+    photos = [photo_file("a.png"), photo_file("b.png")]
+    assert main(["reconstruct", *photos, "-o", str(tmp_path / "out"), "--prior", str(weights)]) == 2
+    errors = capsys.readouterr().err
+    assert errors.startswith(f"oasis: {weights}: expected a network's weights")
+    assert errors.count("oasis:") == 1
+    assert not pipeline and not (tmp_path / "out").exists()
+
+
 def test_several_photos_get_a_folder_each(pipeline, photo_file, tmp_path):
     photos = [photo_file("a.png"), photo_file("b.png")]
     assert main(["reconstruct", *photos, "-o", str(tmp_path / "out")]) == 0

@@ -1,5 +1,6 @@
 import io
 import json
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -15,6 +16,7 @@ def test_a_report_holds_the_run(scene, made):
     assert report["photo"]["name"] == "known.png"
     assert report["hand"] == {"side": "right", "side_score": 0.99, "presence": 0.98, "landmarks_from": "network"}
     assert report["config"]["seed"] == 3
+    assert report["prior"] == {"name": "learned", "sha256": "0a1b", "step": 7}
     assert report["seconds"] == {"fit": 0.25, "save": 0.5, "total": 0.75}
     assert report["errors"] == made.errors
     assert report["warnings"] == ["the thumb is hidden"]
@@ -25,12 +27,19 @@ def test_numbers_that_json_does_not_know_become_null():
     assert json.loads(text) == {"a": [None, {"b": None}], "c": 1.5}
 
 
+def test_a_path_is_written_as_text(scene, made):
+    config = ReconstructConfig(prior=Path("own") / "network.safetensors")
+    report = json.loads(to_json(make_report(scene[0], made, config, {})))
+    assert report["config"]["prior"] == str(Path("own") / "network.safetensors")
+
+
 def test_the_table_says_everything_in_words(scene, made):
     made = made._replace(errors={**made.errors, "new_measure": 0.123456}, warnings=("the thumb is hidden",))
     out = io.StringIO()
     print_report(Console(file=out, width=100), make_report(scene[0], made, ReconstructConfig(), {"fit": 1.234}))
     text = out.getvalue()
-    for part in ("fit", "1.23 s", "total", "likeness to the photo", "30.0 dB", "new_measure", "0.1235"):
+    said = ("fit", "1.23 s", "total", "likeness to the photo", "30.0 dB", "new_measure", "0.1235")
+    for part in ("prior learned", *said):
         assert part in text
     assert "Warning: the thumb is hidden" in text
 

@@ -1,5 +1,9 @@
 """The network at the seam of priors."""
 
+import hashlib
+import json
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,9 +11,12 @@ from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core import rotation
 from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.errors import InputError
 from oasis_warp.losses.image import masked_psnr
+from oasis_warp.network import prior as home
 from oasis_warp.network.inputs import input_of_evidence
-from oasis_warp.network.prior import NetworkPrior, all_gaussians, canonical_gaussians
+from oasis_warp.network.prior import NetworkPrior, all_gaussians, bundled_prior, canonical_gaussians, choose_prior
+from oasis_warp.network.weights_file import save_network
 from oasis_warp.render.render import render
 from oasis_warp.training.adapt import adapt
 
@@ -64,3 +71,77 @@ def test_its_guess_can_be_adapted_to_the_photo(network, hand, evidences):
         return masked_psnr(render(posed, evidence.camera).image.clamp(0, 1), evidence.image, evidence.mask)
 
     assert psnr(done.gaussians) > psnr(guess)
+
+
+@pytest.fixture(scope="module")
+def weights(network, tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "network.safetensors"
+    save_network(path, network, notes=json.dumps({"step": 1200, "seed": 3}))
+    return path
+
+
+@pytest.fixture
+def bundle(monkeypatch):
+    """Put another file where the bundled weights lie."""
+
+    def put(path):
+        monkeypatch.setattr(home, "asset", lambda *parts: path)
+        bundled_prior.cache_clear()
+
+    yield put
+    bundled_prior.cache_clear()
+
+
+def digest(path):
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_a_prior_is_chosen_by_word_or_by_file(weights, bundle, network, evidences):
+    bundle(weights)
+    learned, none, own = choose_prior("learned"), choose_prior("none"), choose_prior(weights)
+    assert learned.about == {"name": "learned", "sha256": digest(weights), "step": 1200}
+    assert own.about == {"name": str(weights), "sha256": digest(weights), "step": 1200}
+    assert none.about == {"name": "none"}
+    assert isinstance(none, MeanPrior)
+    for field, ours, its in zip(learned(evidences[0])._fields, learned(evidences[0]), own(evidences[0]), strict=True):
+        assert torch.equal(ours, its), field
+    assert choose_prior("learned") is learned  # read once a process
+
+
+def test_a_network_is_told_from_another_by_its_digest_where_its_notes_say_nothing(network, tmp_path):
+    path = tmp_path / "network.safetensors"
+    save_network(path, network, notes="trained by hand")
+    assert choose_prior(path).about == {"name": str(path), "sha256": digest(path)}
+
+
+def test_a_bundled_prior_that_is_missing_is_told(bundle, tmp_path):
+    bundle(tmp_path / "nothing.safetensors")
+    with pytest.raises(InputError, match=r"the learned prior is not installed; reinstall oasis-warp, or use --prior"):
+        choose_prior("learned")
+
+
+def test_a_file_that_is_no_network_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"none.safetensors: expected a network's weights, found no such file"):
+        choose_prior(tmp_path / "none.safetensors")
+    (tmp_path / "text.safetensors").write_text("text")
+    with pytest.raises(InputError, match="got another format or a file cut short"):
+        choose_prior(tmp_path / "text.safetensors")
+
+
+def test_a_network_of_another_hand_is_refused(weights, tmp_path, monkeypatch, hand):
+    monkeypatch.setattr(home, "bundled_hand", lambda: replace(hand, name="other"))
+    with pytest.raises(InputError, match="trained for the hand model 'bundled' .* but the one in use is 'other'"):
+        choose_prior(weights)
+
+
+def test_weights_of_a_backbone_that_nobody_reads_are_refused(weights, tmp_path):
+    with pytest.raises(InputError, match=r"network.safetensors: reads photos with an encoder of its own"):
+        choose_prior(weights, tmp_path / "model.safetensors")
+    for word in ("learned", "none"):
+        with pytest.raises(InputError, match=f"the prior '{word}' has no use for a backbone's weights"):
+            choose_prior(word, tmp_path / "model.safetensors")
+
+
+def test_a_word_that_names_no_prior_is_an_error(as_shipped):
+    with pytest.raises(ValueError, match="prior: expected 'learned', 'none' or a Path, got 'mean'"):
+        choose_prior("mean")

@@ -34,13 +34,13 @@ def test_an_eager_call_leaves_slots_for_a_capture(slots, monkeypatch):
 def test_a_capture_has_room_for_half_as_much_again(longest, can_be_sorted, slots, monkeypatch):
     kind = (torch.device("cuda", 0), 1, 10, 8, 8)
     monkeypatch.setattr(_pair_counts, "_last", {kind: Counts(1000, longest)})
-    assert _pair_counts.capacity_of(kind) == Counts(1500 + 4096, can_be_sorted)
+    assert _pair_counts.capacity_of(kind, 1.5) == Counts(1500 + 4096, can_be_sorted)
 
 
 def test_a_capture_without_an_eager_call_or_a_watcher_is_refused():
     kind = (torch.device("cuda", 0), 3, 123_457, 8, 8)
     with pytest.raises(RuntimeError, match="expected an eager call before it is captured"):
-        _pair_counts.capacity_of(kind)
+        _pair_counts.capacity_of(kind, 1.5)
     with pytest.raises(RuntimeError, match="watch_overflow"):
         _pair_counts.watching()
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from oasis_warp.synthetic import people
+from oasis_warp.synthetic.body import device_name
 from oasis_warp.synthetic.plan import EVERYBODY
 
 SEED = 13
@@ -24,7 +25,7 @@ def folder(tmp_path_factory):
 
 
 def test_a_person_that_was_written_is_read_and_not_baked(folder, monkeypatch):
-    baked = people._born(SEED, 2, EVERYBODY)
+    baked = people._born(SEED, 2, EVERYBODY, "cpu")
     monkeypatch.setattr(people, "_born", None)
     told = []
     people.bake_people(SEED, [2], EVERYBODY, "cpu", jobs=0, folder=folder, progress=lambda *what: told.append(what))
@@ -36,6 +37,13 @@ def test_a_person_that_was_written_is_read_and_not_baked(folder, monkeypatch):
             assert value.dtype == getattr(read, name).dtype and torch.equal(value, getattr(read, name)), name
 
 
+def test_a_device_has_one_name(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+    assert [device_name(d) for d in ("cpu", "cuda", "cuda:0", torch.device("cuda"))] == [
+        "cpu", "cuda:1", "cuda:0", "cuda:1"
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("damage", ["cut short", "another's"])
 def test_a_file_that_is_damaged_or_of_somebody_else_is_made_again(folder, tmp_path, monkeypatch, damage):
     data = (folder / "000002.safetensors").read_bytes()
@@ -45,4 +53,4 @@ def test_a_file_that_is_damaged_or_of_somebody_else_is_made_again(folder, tmp_pa
     there = people._read(folder / "000002.safetensors", SEED, 2, EVERYBODY)
     monkeypatch.setattr(people, "_born", lambda *who: asked.append(who) or there)
     people.bake_people(SEED, [number], EVERYBODY, "cpu", jobs=0, folder=tmp_path)
-    assert asked == [(SEED, number, EVERYBODY)]
+    assert asked == [(SEED, number, EVERYBODY, "cpu")]

@@ -9,7 +9,8 @@ from oasis_warp.ops import depth_map
 from oasis_warp.synthetic import people
 from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.picture import render_batch, stream
-from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, plan_ahead, plan_shots, sample_shot
+from oasis_warp.synthetic.plan import EVERYBODY, PHOTOS, PICTURES_EACH, Scenery, sample_shot
+from oasis_warp.synthetic.planned import joined, plan_ahead, plan_table
 from oasis_warp.training.photographed import Photographed, training_batch
 
 SIZE = 64
@@ -151,7 +152,9 @@ def test_a_gpu_shows_what_the_cpu_shows(batch):
 def test_lights_and_views_are_finite_over_many_seeds():
     for index in range(60):
         shot = sample_shot(3, index, Scenery(look="even" if index % 2 else "photo"))
-        assert np.isfinite(shot.light.sky).all() and np.isfinite(shot.room.solids).all()
+        assert np.isfinite(shot.light.sky).all()
+        assert (shot.room is None) == (shot.sensor is None) == bool(index % 2)
+        assert shot.room is None or np.isfinite(shot.room.solids).all()
         np.testing.assert_allclose(shot.view.rotation @ shot.view.rotation.T, np.eye(3), atol=1e-9)
         assert np.linalg.det(shot.view.rotation) > 0
 
@@ -162,14 +165,12 @@ def test_people_come_again_where_there_are_few():
 
 
 def test_processes_that_plan_ahead_plan_the_same():
-    blocks = [range(k, k + 2) for k in (0, 2, 4)]
-    alone = [plan_shots(SEED, block) for block in blocks]
-    ahead = list(plan_ahead(SEED, blocks, Scenery(), workers=1))
-    for a, b in zip(alone, ahead, strict=True):
-        for one, other in zip(a, b, strict=True):
-            assert one.seed == other.seed
-            np.testing.assert_array_equal(one.angles, other.angles)
-            np.testing.assert_array_equal(one.room.solids, other.room.solids)
+    blocks = [(range(k, k + 2), PHOTOS) for k in (0, 2, 4)]
+    together = plan_table(SEED, range(6), PHOTOS)
+    ahead = joined(list(plan_ahead(SEED, blocks, workers=1)))
+    assert ahead.gestures == together.gestures
+    np.testing.assert_array_equal(ahead.whole, together.whole)
+    np.testing.assert_array_equal(ahead.numbers, together.numbers)
 
 
 @pytest.mark.slow

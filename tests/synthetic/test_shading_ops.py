@@ -8,7 +8,7 @@ from oasis_warp.ops import depth_map
 from oasis_warp.ops.pixel_noise import pixel_noise
 from oasis_warp.ops.room_tracing import PATTERNS, SHAPES, SOLID_WORDS, trace_rooms
 from oasis_warp.ops.skin_shading import Lamps, sky_transfer, smooth_over_faces, surface_state
-from oasis_warp.ops.surface_patterns import NoiseField, surface_lines, surface_noise
+from oasis_warp.ops.surface_patterns import NoiseField, point_grid, surface_dabs, surface_noise
 from oasis_warp.synthetic.illumination import look_at
 from oasis_warp.synthetic.stage import sphere
 
@@ -96,27 +96,30 @@ def test_a_wall_in_even_light_shows_its_own_colour(device):
     torch.testing.assert_close(seen, 0.5 * torch.tensor([0.6, 0.3, 0.1]), rtol=0.08, atol=0)
 
 
-def test_lines_are_the_strongest_sample_near_by(device):
+@pytest.mark.parametrize("flat", [False, True])
+def test_a_dab_is_seen_where_it_is_the_strongest_of_its_kind(device, flat):
     rng = np.random.default_rng(0)
-    points, samples = rng.uniform(0, 10, (300, 3)), rng.uniform(0, 10, (200, 3))
-    widths, strengths, kinds = rng.uniform(0.4, 0.9, 200), rng.uniform(0.2, 1, 200), rng.integers(0, 3, 200)
-    q = ((points[:, None] - samples) ** 2).sum(-1) / widths**2
-    each = np.where(q < 8, strengths * np.exp(-q), 0)
-    wanted = np.stack([each[:, kinds == k].max(1) for k in range(3)], 1)
+    points, centers = rng.uniform(0, 10, (300, 3)), rng.uniform(-1, 11, (200, 3))
+    widths, strengths, kinds = rng.uniform(0.4, 0.9, 200), rng.uniform(-0.1, 1, 200), rng.integers(0, 3, 200)
+    q = ((points[:, None] - centers) ** 2).sum(-1) / widths**2
+    each = np.where(q < 8, strengths * np.exp(-(q**2 if flat else q)), 0).clip(0)
+    wanted = np.stack([each[:, kinds == k].max(1) for k in range(3)])
     t = lambda a: torch.from_numpy(a).float().to(device)  # noqa: E731
-    found = surface_lines(t(points), t(samples), t(widths), t(strengths), torch.from_numpy(kinds).to(device), 3)
+    grid = point_grid(t(points), 0.7)
+    found = surface_dabs(grid, t(centers), t(widths), t(strengths), torch.from_numpy(kinds).to(device), 3, flat=flat)
     np.testing.assert_allclose(found.cpu(), wanted, atol=1e-5)
 
 
-def test_no_lines_leave_no_trace(device):
+def test_no_dabs_leave_no_trace(device):
     none = torch.zeros(0, device=device)
-    out = surface_lines(torch.zeros(4, 3, device=device), torch.zeros(0, 3, device=device), none, none, none.int(), 2)
-    assert out.shape == (4, 2) and not bool(out.any())
+    grid = point_grid(torch.zeros(4, 3, device=device), 1.0)
+    out = surface_dabs(grid, torch.zeros(0, 3, device=device), none, none, none.int(), 2)
+    assert out.shape == (2, 4) and not bool(out.any())
 
 
 def test_noise_depends_on_its_seed_and_hardly_leaves_one(device):
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)).to(device) * 40
-    a, b, c = surface_noise(points, [NoiseField(5.0, 1), NoiseField(5.0, 2), NoiseField(5.0, 1)]).unbind(1)
+    a, b, c = surface_noise(points, [NoiseField(5.0, 1), NoiseField(5.0, 2), NoiseField(5.0, 1)])
     assert torch.equal(a, c) and not torch.equal(a, b)
     assert 0.2 < float(a.std()) < 0.8 and float(a.abs().max()) < 1.6
 
@@ -129,8 +132,13 @@ def test_pixel_noise_is_normal_and_each_seeds_own(device):
 
 
 def test_wrong_arguments_are_named(as_shipped):
+    grid = point_grid(torch.zeros(1, 3), 1.0)
+    with pytest.raises(ValueError, match="kinds"):
+        surface_dabs(grid, torch.zeros(2, 3), torch.ones(2), torch.ones(2), torch.tensor([0, 1]), 1)
     with pytest.raises(ValueError, match="widths"):
-        surface_lines(torch.zeros(1, 3), torch.zeros(2, 3), torch.zeros(2), torch.ones(2), torch.zeros(2).int(), 1)
+        surface_dabs(grid, torch.zeros(2, 3), torch.ones(3), torch.ones(2), torch.zeros(2).int(), 1)
+    with pytest.raises(ValueError, match="points"):
+        point_grid(torch.zeros(0, 3), 1.0)
     with pytest.raises(ValueError, match="normals"):
         sky_transfer(torch.zeros(1, 5, 3), torch.zeros(1, 4, 3), torch.zeros(2, 3), torch.zeros(1, 2, 4, 4),
                      torch.ones(1), torch.ones(1, 2, 8, 8))  # fmt: skip

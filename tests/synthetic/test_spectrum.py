@@ -4,15 +4,18 @@ import torch
 
 from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.identity import Population, sample_identity
-from oasis_warp.synthetic.spectrum import SkinColor, linear_to_lab, skin_reflectance
+from oasis_warp.synthetic.spectrum import Tint, linear_to_lab, skin_colors, skin_reflectance
 
 
 def test_the_table_of_a_person_agrees_with_the_spectrum():
     rng = np.random.default_rng(0)
     melanin, blood = np.exp(rng.uniform(np.log(0.004), np.log(0.5), 200)), np.exp(rng.uniform(-5.5, -2.5, 200))
     how = {"oxygen": 0.75, "epidermis": 80.0, "carotene": 0.1}
-    table = SkinColor(**how)(torch.from_numpy(melanin).float(), torch.from_numpy(blood).float())
-    np.testing.assert_allclose(table.numpy(), skin_reflectance(melanin, blood, **how), atol=3e-3)
+    other = how | {"oxygen": 0.15}
+    tints = [Tint(**how), Tint(**other)]
+    first, second = skin_colors(torch.from_numpy(melanin).float(), torch.from_numpy(blood).float(), tints)
+    np.testing.assert_allclose(first.T, skin_reflectance(melanin, blood, **how), atol=3e-3)
+    np.testing.assert_allclose(second.T, skin_reflectance(melanin, blood, **other), atol=3e-3)
 
 
 def test_melanin_darkens_and_blood_reddens():

@@ -48,6 +48,17 @@ def test_the_photo_is_explained(hand, case):
     assert after > 30
 
 
+def test_what_is_drawn_is_completed_and_not_what_each_gaussian_would_be_alone(hand, case):
+    evidence, _, prior, _ = case
+    n = len(prior.vertex_index)
+    apart = torch.cat([prior.colors[:n] + 0.1, prior.colors[n:] - 0.1]).clamp(0, 1)  # they overlap everywhere
+    inside = (evidence.mask > 0.9).float()
+    for colors in (prior.colors, apart):
+        untaught = AdaptConfig(texture_steps=0, reference_views=0)
+        completed = adapt(hand, prior._replace(colors=colors), evidence, untaught).gaussians
+        assert masked_psnr(drawn(hand, completed, evidence).image, evidence.image, inside) > 28
+
+
 def test_the_side_that_was_not_seen_takes_the_light_of_the_photo(hand, regions, case):
     _, truth, _, adapted = case
     back = (regions.palm < 0.05) & (regions.nail < 0.1) & (hand.template[:, 0] < -0.02)
@@ -105,6 +116,19 @@ def test_texture_learning_stops_by_itself_and_obeys_a_given_number(hand, case):
     evidence, _, prior, _ = case
     assert len(adapt(hand, prior, evidence, AdaptConfig(texture_steps=3)).losses) == 3
     assert len(adapt(hand, prior, evidence, AdaptConfig(texture_steps=0)).losses) == 0
+
+
+def test_without_calibration_what_was_not_seen_stays_as_the_prior_has_it(hand, regions, case):
+    evidence, _, prior, _ = case
+    back = ((regions.palm < 0.05) & (regions.nail < 0.1))[prior.vertex_index]  # the photo shows the palm
+    moved = {}
+    for choice in ("on", "off"):
+        config = AdaptConfig(calibration=choice, texture_steps=0, reference_views=0)
+        adapted = adapt(hand, prior, evidence, config)
+        change = (adapted.gaussians.colors - prior.colors)[: len(back)][back]
+        moved[choice] = float(change.abs().amax(1).median())
+    assert adapted.calibration.gain.tolist() == [1, 1, 1] and adapted.calibration.offset.tolist() == [0, 0, 0]
+    assert moved["off"] < 0.03 < 0.05 < moved["on"]  # the rest is what fades over from the palm
 
 
 @pytest.mark.parametrize("orientation", [PALM_TO_CAMERA, BACK_TO_CAMERA])

@@ -1,8 +1,10 @@
+import igl
 import numpy as np
+import pytest
 import torch
 import trimesh
 
-from oasis_warp.training.complete import FADE_LENGTH, complete_field
+from oasis_warp.training.complete import FADE_LENGTH, complete_field, laplacian_and_mass
 
 
 def hand_sized_sphere():
@@ -39,3 +41,12 @@ def test_nothing_seen_is_nothing_added():
     vertices, faces = hand_sized_sphere()
     field = complete_field(vertices, faces, torch.ones(len(vertices), 3), torch.zeros(len(vertices)))
     assert float(field.abs().max()) == 0
+
+
+def test_laplacian_and_mass_are_those_of_libigl(hand):
+    points, triangles = hand.template.double().numpy(), hand.faces.numpy()
+    laplacian, mass = laplacian_and_mass(points, triangles)
+    # libigl works on squared lengths and loses digits on slivers, whose cotangents are large
+    assert abs(laplacian + igl.cotmatrix(points, triangles)).max() < 1e-6 * abs(laplacian).max()
+    theirs = igl.massmatrix(points, triangles, igl.MASSMATRIX_TYPE_BARYCENTRIC).diagonal()
+    assert mass == pytest.approx(theirs, rel=1e-9)

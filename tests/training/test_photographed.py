@@ -9,19 +9,20 @@ from torch import Tensor
 
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.skinning import mirror_pose, rest_hand, skin
+from oasis_warp.hand.skinning import hand21, mirror_pose, rest_hand, skin
 from oasis_warp.ops import depth_map
 from oasis_warp.training.photographed import (
     CROP_MARGIN,
     EstimatorNoise,
     Photographed,
     crop_to_mask,
-    pose_hands,
     training_batch,
 )
+from oasis_warp.training.posed_hands import pose_hands
 
 SIZE, CROP = 240, 160
-EXACT = EstimatorNoise(angles=0.0, turn=0.0, shift=0.0, shape=0.0, crop=0.0)
+CROP_OF_DOCS = 256
+EXACT = EstimatorNoise(surface=0.0, mask=0.0)
 
 
 class Stub(NamedTuple):
@@ -63,6 +64,11 @@ def pictures(hand):
     return photographed(hand, names, (0, 1, 1)), photographed(hand, names * 2, (0, 0, 1, 1, 0, 1))
 
 
+def projected(batch):
+    seen = batch.posed @ batch.K.transpose(1, 2)
+    return seen[..., :2] / seen[..., 2:]
+
+
 def overlap(hand, vertices, K, mask):
     drawn = depth_map(vertices, hand.faces, torch.eye(4), K, mask.shape[1], mask.shape[0]).face_ids >= 0
     return float((drawn & (mask > 0.5)).sum() / (drawn | (mask > 0.5)).sum())
@@ -77,6 +83,7 @@ def test_many_hands_are_posed_as_one_by_one(hand, pictures):
         posed = skin(hand, rest, HandPose(photos.angles[k], photos.orientation[k], photos.translation[k]))
         torch.testing.assert_close(out.rest[k], rest.vertices, atol=1e-6, rtol=0)
         torch.testing.assert_close(out.posed[k], posed.vertices, atol=2e-6, rtol=0)
+        torch.testing.assert_close(out.landmarks[k], hand21(posed, hand), atol=2e-6, rtol=0)
 
 
 def test_surfaces_lie_on_their_pictures_left_hands_as_right_ones(hand, pictures):
@@ -119,14 +126,24 @@ def test_errors_are_those_of_an_estimator_and_only_in_what_it_says(hand, picture
     assert not torch.equal(noisy.posed, other.posed)
     for field in ("rest", "target_images", "target_masks", "target_posed", "target_Ks"):
         assert torch.equal(getattr(noisy, field), getattr(exact, field))
-    error = (noisy.posed - exact.posed).norm(dim=-1).mean(1)
-    assert 0.0005 < float(error.min()) and float(error.max()) < 0.008
+    error = CROP_OF_DOCS / CROP * (projected(noisy) - projected(exact)).norm(dim=-1).median(1).values
+    assert 1 < float(error.min()) and float(error.max()) < 40  # [px], docs/estimator.md: 3 to 11 for most hands
     for k in range(3):
-        assert overlap(hand, noisy.posed[k], noisy.K[k], noisy.mask[k]) > 0.85
+        assert overlap(hand, noisy.posed[k], noisy.K[k], noisy.mask[k]) > 0.65
+
+
+def test_errors_are_as_large_as_is_asked(hand, pictures):
+    def projections(strength):
+        noise = EstimatorNoise(surface=strength, mask=0.0)
+        return projected(training_batch(hand, *pictures, CROP, torch.Generator().manual_seed(1), noise))
+
+    none, some, all_ = projections(0.0), projections(0.3), projections(1.0)
+    half, whole = (some - none).norm(dim=-1).mean(), (all_ - none).norm(dim=-1).mean()
+    assert 0.15 * whole < half < 0.5 * whole
 
 
 def test_an_empty_mask_keeps_the_picture():
     planes = torch.rand(1, 8, 8, 1)
-    crop = crop_to_mask(planes, torch.zeros(1, 8, 8), torch.eye(3)[None], 8, torch.zeros(1, 3))
+    crop = crop_to_mask(planes, torch.zeros(1, 8, 8), torch.eye(3)[None], 8)
     assert bool(crop.planes.isfinite().all())
     assert float(crop.K[0, 0, 0]) == pytest.approx(1 / CROP_MARGIN)

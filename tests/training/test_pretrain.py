@@ -17,6 +17,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, trained_state
+from oasis_warp.training.checkpoint import load_checkpoint, save_checkpoint
 from oasis_warp.training.distributed import Place
 from oasis_warp.training.pretrain import (
     CHECKPOINT,
@@ -134,6 +135,18 @@ def test_ablated_networks_train_too(hand, source, switch):
     trainer.advance(source.batch(0))
     after = list(trainer.network.vertex_head.parameters())
     assert not torch.equal(before[-1], after[-1])
+
+
+def test_a_part_that_a_switch_leaves_out_of_use_is_saved_and_read_too(hand, source, tmp_path):
+    made = [Trainer(small_network(hand, vet="off", point_evidence="off"), CONFIG, ALONE) for _ in range(2)]
+    made[0].advance(source.batch(0))
+    unused = [name for name, parameter in made[0].network.named_parameters() if parameter.grad is None]
+    assert unused
+    save_checkpoint(tmp_path / CHECKPOINT, made[0].network, made[0].optimizer, made[0].step)
+    made[1].step = load_checkpoint(tmp_path / CHECKPOINT, made[1].network, made[1].optimizer)
+    for trainer in made:
+        trainer.advance(source.batch(1))
+    assert all(map(torch.equal, made[0].network.parameters(), made[1].network.parameters()))
 
 
 @pytest.mark.slow

@@ -1,11 +1,13 @@
 """The synthetic world as a source of batches: which pictures come in which batch, and that they are always the same."""
 
+import itertools
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
 
-from oasis_warp.synthetic.plan import PICTURES_EACH
+from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH
 from oasis_warp.training.pretrain import BatchSource
 from oasis_warp.training.synthetic_source import SyntheticHands
 
@@ -21,11 +23,15 @@ def test_a_batch_is_the_same_wherever_training_is_taken_up():
     assert isinstance(hands, BatchSource)
     from_start = hands(0, 0, 1)
     first, second = next(from_start), next(from_start)
-    later = next(hands(1, 0, 1))
-    other_process = next(hands(0, 1, 2))  # batch 1 too
+    others = {
+        "taken up": next(hands(1, 0, 1)),
+        "of another process": next(hands(0, 1, 2)),
+        "rendered with the one before": next(itertools.islice(source(ahead=2)(0, 0, 1), 1, None)),
+        "rendered with the one after": next(source(ahead=2)(1, 0, 1)),
+    }
     for name, value in second._asdict().items():
-        assert torch.equal(value, getattr(later, name)), name
-        assert torch.equal(value, getattr(other_process, name)), name
+        for where, other in others.items():
+            assert torch.equal(value, getattr(other, name)), (where, name)
         assert bool(value.isfinite().all()), name
     assert not torch.equal(first.image, second.image)
     assert second.image.shape == (1, 32, 32, 3)
@@ -62,3 +68,10 @@ def test_the_errors_of_an_estimator_differ_from_batch_to_batch_and_seed_to_seed(
     drawn = [float(torch.rand((), generator=s.errors(n))) for s in (source(), source(seed=4)) for n in (0, 1)]
     assert len(set(drawn)) == 4
     assert drawn[0] == float(torch.rand((), generator=source().errors(0)))
+
+
+def test_a_kind_that_is_held_out_is_not_shown_and_nothing_else_changes():
+    bare, ringed = (replace(EVERYBODY, tattoo=0.0, ring=share) for share in (0.0, 1.0))
+    without, with_ring = (next(source(population=population)(0, 0, 1)) for population in (bare, ringed))
+    assert torch.equal(without.rest, with_ring.rest) and torch.equal(without.target_posed, with_ring.target_posed)
+    assert not torch.equal(without.target_images, with_ring.target_images)

@@ -1,4 +1,4 @@
-"""Files that ship with the package: the hand, the landmark networks, one photo."""
+"""Files that ship with the package: the hand, the landmark networks, the learned prior, one photo."""
 
 from importlib import resources
 from importlib.resources.abc import Traversable

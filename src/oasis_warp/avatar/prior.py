@@ -1,6 +1,8 @@
-"""What a hand looks like before its photo is fitted. The mean prior here; a learned one is called the same way."""
+"""What a hand looks like before its photo is fitted: the interface, and the prior that knows mean colours only."""
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -27,6 +29,11 @@ SIGMA_CAST = 0.155
 @runtime_checkable
 class Prior(Protocol):
     """Canonical Gaussians of the whole hand from what one photo shows."""
+
+    @property
+    def about(self) -> Mapping[str, str | int]:
+        """Which prior this is, for reports: its name, and what else tells it from others."""
+        ...
 
     def __call__(self, evidence: Evidence) -> CanonicalGaussians:
         """Guess the hand of `evidence`."""
@@ -60,6 +67,7 @@ class MeanPrior:
     """The mean appearance of palm, back, joints and nails in the photo's skin tone."""
 
     def __init__(self, hand: HandModel):
+        self.about = MappingProxyType({"name": "none"})
         self.hand = hand
         self.regions = label_regions(hand)
 

@@ -82,6 +82,7 @@ def checks() -> dict[str, Check]:
         "CUDA": check_cuda,
         "hand": check_hand,
         "networks": check_networks,
+        "prior": check_prior,
         "kernels": check_kernels,
         "videos": check_videos,
     }
@@ -167,6 +168,22 @@ def check_networks() -> str:
 
     check_networks()
     return "palm detection and hand landmarks give the known answers"
+
+
+def check_prior() -> str:
+    """The learned prior loads, and belongs to the bundled hand."""
+    from oasis_warp.core.errors import InputError
+    from oasis_warp.network.prior import bundled_prior
+
+    try:
+        prior = bundled_prior()
+    except InputError as error:
+        what, _, remedy = str(error).rpartition("; ")
+        raise FaultError(what, remedy.rstrip(".")) from error
+    parameters = sum(parameter.numel() for parameter in prior.network.parameters())
+    about = dict(prior.about)
+    trained = f", {about['step']} steps" if "step" in about else ""
+    return f"{prior.network.config.profile}, {parameters / 1e6:.1f} M weights{trained}, sha256 {about['sha256'][:12]}"
 
 
 def check_kernels() -> str:

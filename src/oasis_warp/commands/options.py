@@ -13,6 +13,7 @@ Output = Annotated[Path, arg(aliases=["-o"], metavar="PATH")]
 FamilyName = Literal[
     "rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "skin"
 ]
+Kind = Literal["freckles", "hair", "polish", "tattoo", "ring", "plaster"]
 PoseName = Literal["photo", "rest", "open", "relaxed", "fist", "pinch", "thumbs_up", "victory", "point", "ok"]
 
 
@@ -32,6 +33,11 @@ class Reconstruct:
     """Which hand of the photo: a side, the largest, or a number from 0 for the best found, 1 for the next."""
     keypoints: Path | None = None
     """JSON file with 21 landmarks, or with pose and camera, to use instead of the networks; for one photo only."""
+    prior: Literal["learned", "none"] | Path = "learned"
+    """What to assume of the hand before the photo is fitted: what the bundled network sees in the photo, only mean
+    colours in its skin tone, or what your own network sees: network.safetensors of `oasis pretrain`."""
+    backbone_weights: Path | None = None
+    """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0
@@ -272,6 +278,8 @@ class Pretrain:
     """Targets a photo: the same hand in other poses and even light, 1 to 8."""
     people: int = 512
     """How many there are."""
+    hold_out: tuple[Kind, ...] = ()
+    """Kinds that nobody has, so that `oasis evaluate` can ask for what was never seen."""
     size: int = 256
     """Side of photos and targets [px], a multiple of 16."""
     seed: int = 0
@@ -284,6 +292,43 @@ class Pretrain:
     """Processes that bake people and plan pictures ahead, for each GPU; 0 for none."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for the paper's profile."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """Measure what avatars are worth: metrics.json with every number, sheet.png, and a table.
+
+    On synthetic hands that no training has met, in poses and from sides that the photo does not show; or on a folder of
+    photos with a subfolder for each hand, where the avatar of one photo is held against the others. A run that was
+    stopped goes on when it is started again with the same options.
+    """
+
+    folder: Positional[Path | None] = None
+    """With a subfolder of photos for each hand, for same-hand."""
+    out: Output
+    """Folder for the results; its parent must exist."""
+    dataset: Literal["synthetic", "same-hand"] = "synthetic"
+    """What to measure on."""
+    prior: Literal["learned", "none"] | Path = "learned"
+    """The learned prior to hold against the mean hand, as for `oasis reconstruct`; none for the mean hand alone."""
+    backbone_weights: Path | None = None
+    """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
+    people: int = 16
+    """Synthetic people without tattoo or ring, and as many with each."""
+    targets: int = 4
+    """Pictures of each of them to compare with, 1 to 8."""
+    steps: int | None = None
+    """Steps of texture learning; stops by itself when not given."""
+    size: int = 256
+    """Side of the pictures [px]; a multiple of 16 for synthetic ones."""
+    seed: int = 0
+    """Of people, pictures and adaptation."""
+    lpips: tuple[Path, Path] | None = None
+    """Weights of LPIPS: alexnet-owt-7be5be79.pth of torchvision and alex.pth of LPIPS; no LPIPS without them."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""
+    workers: int = 0
+    """Processes that bake synthetic people; 0 for none."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +24,17 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.dinov2 import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.synthetic.people import KEPT
-from oasis_warp.synthetic.plan import PICTURES_EACH
+from oasis_warp.synthetic.people import most_kept
+from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH
 from oasis_warp.training.distributed import Place, join_processes, wait_for_all
 from oasis_warp.training.pretrain import CHECKPOINT, PretrainConfig, pretrain
 from oasis_warp.training.synthetic_source import MULTIPLE, SyntheticHands
 
 SETTINGS, PEOPLE = "training.json", "people"
-"""In the folder: with what the training began, and the people that have been baked."""
+"""In the folder: with what the training began, and the people that a CPU has baked."""
 PRECISIONS = {"bf16": "bfloat16", "float32": "float32"}
+AHEAD = 4
+"""Batches that a GPU renders together."""
 SIZES = range(32, 1025, MULTIPLE)
 
 
@@ -97,10 +100,11 @@ def train(options: Pretrain, place: Place, progress: Progress) -> int:
     """
     hands = SyntheticHands(
         seed=options.seed, people=options.people, hands=options.hands, views=options.views, size=options.size,
-        device=place.device, workers=options.workers,
+        device=place.device, population=replace(EVERYBODY, **dict.fromkeys(options.hold_out, 0.0)),
+        workers=options.workers, ahead=AHEAD if place.device.type == "cuda" else 1,
     )  # fmt: skip
     met = hands.people_met(place.rank, place.world, options.steps)
-    most = KEPT[place.device.type]
+    most = most_kept(str(place.device))
     if len(met) > most:
         raise InputError(
             f"--people: expected at most {most} that one {place.device.type} device meets, got {len(met)}; "
@@ -110,6 +114,8 @@ def train(options: Pretrain, place: Place, progress: Progress) -> int:
     settings = settings_of(options, place.world)
     if place.rank == 0:
         claim(options.out, settings)
+        if place.device.type == "cpu":
+            (options.out / PEOPLE).mkdir(exist_ok=True)
     wait_for_all(place)
     hands.bake(met, options.out / PEOPLE, options.workers, progress)
     config = PretrainConfig(steps=options.steps, precision=PRECISIONS[options.precision])
@@ -137,6 +143,7 @@ def settings_of(options: Pretrain, processes: int) -> dict[str, Any]:
     """All that decides on the weights; where and with how many workers they are computed does not."""
     names = ("profile", "steps", "hands", "views", "people", "size", "seed", "precision")
     settings = {name: getattr(options, name) for name in names} | {"processes": processes}
+    settings["hold_out"] = sorted(options.hold_out)
     if options.backbone_weights is not None:
         with options.backbone_weights.open("rb") as file:
             settings["backbone_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
@@ -152,7 +159,6 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
     if (folder / CHECKPOINT).exists() and not (folder / SETTINGS).exists():
         raise InputError(f"{folder}: holds a checkpoint but no {SETTINGS} that says of what; choose another folder.")
     claim_folder(folder, SETTINGS, settings, "a training")
-    (folder / PEOPLE).mkdir(exist_ok=True)
 
 
 @contextmanager

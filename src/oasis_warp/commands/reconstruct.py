@@ -26,6 +26,7 @@ from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.data.video import write_video
 from oasis_warp.hand_avatar import Avatar
+from oasis_warp.network.weights_file import read_header
 from oasis_warp.pipeline import reconstruct
 
 CROP_SIDES = (64, 1024)
@@ -42,6 +43,8 @@ def run(options: Reconstruct) -> int:
     check_device(options.device)
     _check_photos(options)
     _check_numbers(options)
+    if isinstance(options.prior, Path):
+        read_header(options.prior)  # once, and not again for every photo
     config = ReconstructConfig(**{field.name: getattr(options, field.name) for field in fields(ReconstructConfig)})
     if len(options.photos) == 1:
         report = _reconstruct_one(options.photos[0], options.out, config, options.keypoints)

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -49,6 +50,7 @@ def make_report(
             "presence": landmarks.presence,
             "landmarks_from": landmarks.source,
         },
+        "prior": dict(made.prior),
         "config": asdict(config),
         "seconds": {**stages, "total": sum(stages.values())},
         "errors": made.errors,
@@ -57,13 +59,15 @@ def make_report(
 
 
 def to_json(report: Mapping[str, Any]) -> str:
-    """`report` as JSON; a number that is not finite becomes null."""
+    """`report` as JSON; a number that is not finite becomes null, a path its text."""
 
     def clean(value: Any) -> Any:
         if isinstance(value, Mapping):
             return {key: clean(item) for key, item in value.items()}
         if isinstance(value, list | tuple):
             return [clean(item) for item in value]
+        if isinstance(value, Path):
+            return str(value)
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
     return json.dumps(clean(report), indent=2, allow_nan=False) + "\n"
@@ -71,7 +75,8 @@ def to_json(report: Mapping[str, Any]) -> str:
 
 def print_report(console: Console, report: Mapping[str, Any]) -> None:
     """Print the stages with their times, the measures and the warnings in words."""
-    table = Table(title=f"{report['photo']['name']}: {report['hand']['side']} hand", show_header=False)
+    title = f"{report['photo']['name']}: {report['hand']['side']} hand, prior {report['prior']['name']}"
+    table = Table(title=title, show_header=False)
     table.add_column()
     table.add_column(justify="right")
     for stage, seconds in report["seconds"].items():

@@ -1,6 +1,7 @@
 """Every option of the pipeline as a frozen dataclass; the text under a field is its `--help`."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from jaxtyping import Float
@@ -11,6 +12,8 @@ from torch import Tensor
 class AdaptConfig:
     """How an avatar is fitted to one photo. Defaults are the paper's (appendix B) unless a field says otherwise."""
 
+    calibration: Literal["on", "off"] = "on"
+    """Match the prior's colours to the photo's as a whole first, or leave them as they are."""
     calibration_steps: int = 100
     """Steps of colour calibration after its closed-form start."""
     texture_steps: int | None = None
@@ -37,6 +40,11 @@ class ReconstructConfig:
 
     hand: Literal["left", "right", "largest"] | int = "largest"
     """Which hand of the photo: a side, the largest, or a number from 0 for the best found, 1 for the next."""
+    prior: Literal["learned", "none"] | Path = "learned"
+    """What to assume of a hand before its photo is fitted: what the bundled network sees in the photo, nothing but mean
+    colours in its skin tone, or what a network of your own sees, of which this is the weights file."""
+    backbone_weights: Path | None = None
+    """DINOv2's model.safetensors, for a network of your own that reads photos with it."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0

@@ -40,25 +40,35 @@ def place_coarse_points(hand: HandModel, count: int) -> CoarsePoints:
         raise ValueError(f"n_coarse: expected at most {len(hand.template)}, the vertices of the hand, got {count}.")
     normals = surface.vertex_normals(hand.template.double(), hand.faces)
     places = torch.cat([hand.template.double() / LENGTH, normals, hand.weights.double()], dim=1)
-    nearest = torch.full((len(places),), float("inf"), dtype=places.dtype)
-    chosen = [0]
-    for _ in range(count - 1):
-        nearest = torch.minimum(nearest, (places - places[chosen[-1]]).square().sum(1))
-        chosen.append(int(nearest.argmax()))
-    index = torch.tensor(chosen)
-    distance = torch.cdist(places, places[index])
-    near, blend = distance.topk(BLENDED, dim=1, largest=False)
+    index, squared = _spread(places, count)
+    near, blend = squared.T.topk(BLENDED, dim=1, largest=False)
+    near = near.sqrt()
     weights = 1 / (near / near.mean() + 1e-3).square()
-    pool = distance.T.topk(POOLED, dim=1, largest=False).indices
+    pool = squared.topk(POOLED, dim=1, largest=False).indices
     return CoarsePoints(index, pool, blend, (weights / weights.sum(1, keepdim=True)).float())
+
+
+def _spread(places: Float[Tensor, "V D"], count: int) -> tuple[Int[Tensor, "N"], Float[Tensor, "N V"]]:
+    """Farthest-point sampling from place 0, and the squared distances of all places to those chosen.
+
+    |a - b|^2 as |a|^2 - 2 a b + |b|^2: one product with a matrix for each point, as every network is built with this.
+    """
+    lengths = places.square().sum(1)
+    index = torch.zeros(count, dtype=torch.int64)
+    squared = places.new_empty(count, len(places))
+    nearest = torch.full_like(lengths, float("inf"))
+    for k in range(count):
+        if k:
+            index[k] = nearest.argmax()
+        last = int(index[k])
+        squared[k] = torch.addmv(lengths + lengths[last], places, places[last], alpha=-2).clamp_min(0)
+        nearest = torch.minimum(nearest, squared[k])
+    return index, squared
 
 
 def to_coarse(values: Float[Tensor, "B V C"], pool: Int[Tensor, "N 16"]) -> Float[Tensor, "B N C"]:
     """Means round the coarse points."""
-    total = values.index_select(1, pool[:, 0])
-    for column in pool.unbind(1)[1:]:
-        total = total + values.index_select(1, column)
-    return total / pool.shape[1]
+    return values.index_select(1, pool.flatten()).unflatten(1, pool.shape).mean(2)
 
 
 def to_fine(

@@ -68,7 +68,7 @@ def decode(
     what the wrist's fade allows, colour moves in logits, and with `seen`, the photo's difference from `colors` in
     logits, by the share of it that the head trusts.
     """
-    identity = raw["quats"].new_tensor([1.0, 0, 0, 0])
+    identity = torch.nn.functional.pad(torch.ones_like(raw["quats"][..., :1]), (0, 3))
     turn = normalize(raw["quats"] + identity, dim=-1, eps=1e-6)
     grow = (MAX_LOG_SCALE * torch.tanh(raw["scales"] / MAX_LOG_SCALE)).exp()
     opacity = torch.sigmoid(raw["opacities"][..., 0] + math.log(OPACITY / (1 - OPACITY)))

@@ -1,26 +1,144 @@
 """The trained network as a prior: what `pipeline.reconstruct` asks before it fits a photo."""
 
+import functools
+import hashlib
+import json
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import MIN_OPACITY
+from oasis_warp.assets import asset
+from oasis_warp.avatar.anchors import MIN_OPACITY, RIM_FADE
+from oasis_warp.avatar.prior import MeanPrior, Prior
+from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians, Evidence
+from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.inputs import Prediction, input_of_evidence
+from oasis_warp.network.weights_file import load_network, read_header
+from oasis_warp.ops.recording import Recording
+
+BUNDLED = ("prior", "compact.safetensors")
+"""Where the weights that ship lie among the package's assets."""
+REACH = 1.5
+"""Times the length of the fade at the wrist: up to there colours are darker than they should be."""
+UNNAMED = MappingProxyType({"name": "network"})
 
 
 class NetworkPrior:
-    """`avatar.prior.Prior` by a `HandNetwork`, in float32."""
+    """`avatar.prior.Prior` by a `HandNetwork`, in float32.
 
-    def __init__(self, network: HandNetwork):
+    On CUDA the second photo of a size is encoded by a recording of the network, as are all after it.
+    """
+
+    def __init__(self, network: HandNetwork, about: Mapping[str, str | int] = UNNAMED):
         self.network = network.eval()
+        self.about = about
+        self._recording: Recording[Prediction] | None = None
+        self._ready_for: tuple[torch.device, int] | None = None
+        """Where and for which size of photos all kernels are loaded."""
 
     @torch.no_grad()
     def __call__(self, evidence: Evidence) -> CanonicalGaussians:
         """The whole hand, guessed from one photo; the network goes where the photo is."""
-        prediction = self.network.to(evidence.image.device)(input_of_evidence(evidence))
-        return canonical_gaussians(prediction, 0)
+        prediction, network = self._predict(evidence), self.network
+        colors = spread_to_rim(prediction.colors[0], evidence.rest.vertices, network.faces, network.rim)
+        return canonical_gaussians(prediction._replace(colors=colors[None]), 0)
+
+    def _predict(self, evidence: Evidence) -> Prediction:
+        device, inputs = evidence.image.device, input_of_evidence(evidence)
+        if device.type != "cuda" or self._ready_for != (device, len(evidence.image)):
+            self._ready_for, self._recording = (device, len(evidence.image)), None
+            return self.network.to(device)(inputs)
+        if self._recording is None:
+            self._recording = Recording(self.network, inputs)
+        return self._recording(inputs)
+
+
+def choose_prior(choice: Literal["learned", "none"] | Path, backbone_weights: Path | None = None) -> Prior:
+    """The prior that `ReconstructConfig.prior` names.
+
+    Args:
+        choice: The bundled network, the mean hand, or the weights file of another network.
+        backbone_weights: DINOv2's own file, where the network of the weights file reads photos with it.
+
+    Raises:
+        ValueError: a word that names no prior.
+        InputError: a file that is missing, no weights file, damaged or for another hand model; or a backbone's file
+            that is missing or not needed.
+    """
+    if isinstance(choice, Path):
+        backbone = read_header(choice)["config"].get("backbone")
+        if backbone_weights is not None and backbone == "convolutional":
+            raise InputError(f"{choice}: reads photos with an encoder of its own; leave out the backbone's weights.")
+        return NetworkPrior(
+            load_network(choice, bundled_hand(), backbone_weights=backbone_weights), _identity(str(choice), choice)
+        )
+    if backbone_weights is not None:
+        raise InputError(f"{backbone_weights}: the prior {choice!r} has no use for a backbone's weights; leave it out.")
+    if choice == "learned":
+        return bundled_prior()
+    if choice == "none":
+        return MeanPrior(bundled_hand())
+    raise ValueError(f"prior: expected 'learned', 'none' or a Path, got {choice!r}.")
+
+
+@functools.cache
+def bundled_prior() -> NetworkPrior:
+    """The prior that ships with the package, trained on synthetic hands: see docs/prior.md.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    with resources.as_file(asset(*BUNDLED)) as path:
+        if not path.is_file():
+            raise InputError(f"{path}: the learned prior is not installed; reinstall oasis-warp, or use --prior none.")
+        return NetworkPrior(load_network(path, bundled_hand()), _identity("learned", path))
+
+
+def _identity(name: str, path: Path) -> dict[str, str | int]:
+    """Name and digest of a weights file, and the step of the training that wrote it where its notes say so."""
+    with path.open("rb") as file:
+        about: dict[str, str | int] = {"name": name, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+    try:
+        about["step"] = int(json.loads(read_header(path)["notes"])["step"])
+    except (KeyError, TypeError, ValueError):
+        pass  # notes are free text
+    return about
+
+
+def spread_to_rim(
+    colors: Float[Tensor, "N 3"], rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], rim: Int[Tensor, "R"]
+) -> Float[Tensor, "N 3"]:
+    """Colours where Gaussians fade out at the wrist become those of the nearest ones that do not.
+
+    The pictures that the network learned from fade to black there, and so do its colours: over another background the
+    wrist would end in a dark line.
+
+    Args:
+        colors: Of the vertices, and of the faces if they carry Gaussians.
+        rest: Vertices at rest [m].
+        faces: Corners.
+        rim: Vertices of the open wrist.
+    """
+    from_rim = torch.cdist(rest, rest[rim]).amin(1)
+    parts = [(rest, from_rim, colors[: len(rest)])]
+    if len(colors) > len(rest):
+        parts.append((rest[faces].mean(1), from_rim[faces].amin(1), colors[len(rest) :]))
+    settled = []
+    for places, away, own in parts:
+        fading, near = away < REACH * RIM_FADE, (away >= REACH * RIM_FADE) & (away < 2 * REACH * RIM_FADE)
+        nearest = torch.cdist(places[fading], places[near]).argmin(1)
+        own = own.clone()
+        own[fading] = own[near][nearest]
+        settled.append(own)
+    return torch.cat(settled)
 
 
 def canonical_gaussians(prediction: Prediction, hand: int) -> CanonicalGaussians:

@@ -47,22 +47,32 @@ class Aggregation(nn.Module):
         self.log_sigma = nn.Parameter(torch.zeros(()))
         """Logarithm of the fall-off, in cells: one cell at first."""
 
-    def weights(self) -> Float[Tensor, "K K"]:
-        """exp(-d / sigma); the softmax's denominator is left to the samples that count."""
+    def weights(self) -> tuple[Float[Tensor, "K K"], Float[Tensor, "K K"]]:
+        """The weights w = exp(-d / sigma), whose sum is left to the samples that count, and dw / d log sigma."""
         offset = torch.arange(-self.reach, self.reach + 1, dtype=self.log_sigma.dtype, device=self.log_sigma.device)
-        return torch.exp(-torch.hypot(offset[:, None], offset) / self.log_sigma.exp())
+        with torch.no_grad():
+            distance = torch.hypot(offset[:, None], offset) / self.log_sigma.exp()
+            weights = torch.exp(-distance)
+        return weights, weights * distance
 
     def forward(self, planes: Float[Tensor, "B C H W"], uv: Float[Tensor, "B P 2"]) -> Float[Tensor, "B P C"]:
         """Point-aligned features at `uv` (edges at 0 and 1), which lie inside the image."""
         batch, channels, height, width = planes.shape
-        kernel, border = self.weights()[None, None].to(planes.dtype), self.reach + 1
+        border = self.reach + 1
+        kernel, slope = (w[None, None].to(planes.dtype) for w in self.weights())
+        learning = torch.is_grad_enabled() and self.log_sigma.requires_grad
 
         def spread(single: Tensor) -> Tensor:  # one cell wider on every side than the map, for points on its edge
-            return conv2d(pad(single, (border,) * 4), kernel)
+            padded = pad(single, (border,) * 4)
+            total = conv2d(padded, kernel)
+            if learning:  # its one weight's gradient is a second convolution; asked of the first it takes 20 times that
+                total = total + (self.log_sigma - self.log_sigma.detach()) * conv2d(padded.detach(), slope)
+            return total
 
         total = spread(planes.reshape(batch * channels, 1, height, width))
         total = total.reshape(batch, channels, *total.shape[2:])
         count = spread(planes.new_ones(1, 1, height, width)).expand(batch, -1, -1, -1)
-        cells = uv.new_tensor([width, height])
-        inner = (uv * cells + 1) / (cells + 2)
+        inner = torch.stack(
+            [(part * n + 1) / (n + 2) for part, n in zip(uv.unbind(-1), (width, height), strict=True)], -1
+        )
         return sample(total, inner) / sample(count, inner).clamp_min(1e-6)

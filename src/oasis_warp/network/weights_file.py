@@ -6,6 +6,8 @@ not in it: they lie in a file of their own.
 """
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -69,17 +71,9 @@ def load_network(path: Path | str, hand: HandModel, *, backbone_weights: Path | 
             are missing, unknown or of another shape; or the backbone's file is missing.
     """
     path = Path(path)
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
-        raise InputError(f"{path}: expected a network's weights, found {found}; `oasis pretrain` writes them.")
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = _read_header(path, (file.metadata() or {}).get(FORMAT))
-            tensors = {name: file.get_tensor(name).float() for name in file.keys()}
-    except SafetensorError as error:
-        raise InputError(
-            f"{path}: expected a network's weights, got another format or a file cut short ({error}); copy it again."
-        ) from error
+    with _opened(path) as file:
+        header = _checked_header(path, file)
+        tensors = {name: file.get_tensor(name).float() for name in file.keys()}
     config = _read_config(path, header["config"])
     got = (header["hand_model"], header["n_vertices"], header["n_faces"])
     want = (hand.name, len(hand.template), len(hand.faces))
@@ -97,6 +91,17 @@ def load_network(path: Path | str, hand: HandModel, *, backbone_weights: Path | 
     return network.eval()
 
 
+def read_header(path: Path | str) -> dict[str, Any]:
+    """What a weights file says of itself: `HEADER` and more, see above.
+
+    Raises:
+        InputError: missing, no weights file, of a newer version or cut short.
+    """
+    path = Path(path)
+    with _opened(path) as file:
+        return _checked_header(path, file)
+
+
 def trained_state(network: HandNetwork) -> dict[str, Tensor]:
     """The tensors that training changes: all but a frozen backbone's."""
     frozen = isinstance(network.encoder, DinoV2Encoder)
@@ -107,7 +112,22 @@ def trained_state(network: HandNetwork) -> dict[str, Tensor]:
     }
 
 
-def _read_header(path: Path, text: str | None) -> dict[str, Any]:
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no such file"
+        raise InputError(f"{path}: expected a network's weights, found {found}; `oasis pretrain` writes them.")
+    try:
+        with safe_open(path, framework="pt") as file:
+            yield file
+    except SafetensorError as error:
+        raise InputError(
+            f"{path}: expected a network's weights, got another format or a file cut short ({error}); copy it again."
+        ) from error
+
+
+def _checked_header(path: Path, file: Any) -> dict[str, Any]:
+    text = (file.metadata() or {}).get(FORMAT)
     if text is None:
         raise InputError(f"{path}: a safetensors file, but no network of ours; give the one `oasis pretrain` wrote.")
     try:

@@ -1,8 +1,8 @@
 """How many pairs of a Gaussian and a tile a CUDA rasterization has: read off the device, or expected in a graph.
 
 An eager call waits for its count, the one moment at which the host waits for the device, and takes memory for exactly
-that many. A call that a CUDA graph captures cannot wait: it takes what the last eager call of its kind needed and half
-as much again. Where a replay needs more, lists that do not fit stay empty, and `Overflow.happened` says so.
+that many. A call that a CUDA graph captures cannot wait: it takes what the last eager call of its kind needed and some
+more. Where a replay needs more, lists that do not fit stay empty, and `Overflow.happened` says so.
 """
 
 import threading
@@ -21,7 +21,6 @@ from oasis_warp.ops._tiles import MAX_PAIRS
 
 PAGE = 4096
 """Words of host memory that are taken at a time for reports."""
-SLACK = 1.5
 
 
 class Counts(NamedTuple):
@@ -89,13 +88,14 @@ def own_slot() -> Tensor:
 class Overflow:
     """Whether graphs that were captured while this was watching have met more pairs than they have memory for."""
 
-    def __init__(self) -> None:
+    def __init__(self, slack: float) -> None:
+        self._slack = slack
         self._reports: list[tuple[Tensor, Counts]] = []
 
     def expect(self, kind: Kind) -> tuple[Tensor, Counts]:
         """A report's memory and the capacity for a call of this `kind`."""
         # The slot is the graph's for ever: it may be replayed when nobody watches any more.
-        slot, capacity = slots.take().zero_(), capacity_of(kind)
+        slot, capacity = slots.take().zero_(), capacity_of(kind, self._slack)
         self._reports.append((slot, capacity))
         return slot, capacity
 
@@ -113,15 +113,15 @@ _watching: ContextVar[Overflow | None] = ContextVar("watching", default=None)
 
 
 @contextmanager
-def watch_overflow() -> Iterator[Overflow]:
+def watch_overflow(slack: float = 1.5) -> Iterator[Overflow]:
     """Watch the rasterizations that a CUDA graph captures inside the block.
 
-    A captured call of `rasterization` has memory for half as many pairs of a Gaussian and a tile again as the last
+    A captured call of `rasterization` has memory for `slack` times as many pairs of a Gaussian and a tile as the last
     eager call with the same device, numbers of cameras and Gaussians, and size. After a replay that needed more, the
     picture lacks Gaussians and `Overflow.happened()` is true. Capturing outside such a block is refused, for nobody
     would learn of it.
     """
-    overflow = Overflow()
+    overflow = Overflow(slack)
     token = _watching.set(overflow)
     try:
         yield overflow
@@ -129,7 +129,7 @@ def watch_overflow() -> Iterator[Overflow]:
         _watching.reset(token)
 
 
-def capacity_of(kind: Kind) -> Counts:
+def capacity_of(kind: Kind, slack: float) -> Counts:
     """Memory for a captured call.
 
     Raises:
@@ -142,9 +142,9 @@ def capacity_of(kind: Kind) -> Counts:
             f"cameras of {width} x {height} px and {n} Gaussians on {device}. Warm up with the same sizes."
         )
     last = _last[kind]
-    longest = int(SLACK * last.longest)
+    longest = int(slack * last.longest)
     sorted_ = next(limit for limit in (cuda_draw.LONGEST, cuda_long_lists.RUN, MAX_PAIRS) if limit >= longest)
-    return Counts(min(int(SLACK * last.pairs) + 4096, MAX_PAIRS), sorted_)
+    return Counts(min(int(slack * last.pairs) + 4096, MAX_PAIRS), sorted_)
 
 
 def watching() -> Overflow:

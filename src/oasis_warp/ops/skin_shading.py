@@ -56,10 +56,9 @@ class Worn(NamedTuple):
 class Texture(NamedTuple):
     """Skin textures of several people."""
 
-    atlas: Float[Tensor, "P Y X 8"]
-    """float16: linear RGB, height, fold, wrinkle [mm], roughness, oil (see `oasis_warp.synthetic.bake`)."""
-    slots: Int[Tensor, "B"]
-    """int32: which of the P an image shows."""
+    pages: list[Float[Tensor, "Y X 8"]]
+    """One an image, float16, all of one size: linear RGB, height, fold, wrinkle [mm], roughness, oil (see
+    `oasis_warp.synthetic.bake`). They are read where they lie: images may share one."""
     uv: Float[Tensor, "U 2"]
     """Texels, centres at .5."""
     uv_faces: Int[Tensor, "S 3"]
@@ -109,12 +108,11 @@ def surface_state(vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]) -
 
 
 def _smooth(values: Tensor, faces: Tensor) -> Tensor:
-    batch, n, _ = values.shape
-    index = incidence("faces", faces, n, "vertices")
+    index = incidence("faces", faces, values.shape[1], "vertices")
+    values = values.contiguous()
     out = torch.empty_like(values)
-    launch_ranges(
-        skin_light.smooth, even_cuts(batch * n), [view(values.contiguous()), *map(view, index), view(out)], like=values
-    )
+    inputs = [view(values), *map(view, index), view(out)]
+    launch_ranges(skin_light.smooth, even_cuts(values.numel()), inputs, like=values)
     return out
 
 
@@ -203,10 +201,16 @@ def sky_transfer(
     return _sky_transfer_op(vertices, normals, directions, viewmats, focals, depths, lift, n_lit)
 
 
+def _addresses(pages: list[Tensor], device: torch.device) -> Tensor:
+    """Where each begins, as a tensor on their device."""
+    host = torch.tensor([page.data_ptr() for page in pages])
+    return host.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else host
+
+
 def _shade(
     face_ids: Tensor, barycentrics: Tensor, depths: Tensor, focals: Tensor, samples: int, n_hand_faces: int, ring: int,
     vertices: Tensor, faces: Tensor, normals: Tensor, transfer: Tensor, stretch: Tensor,
-    materials: Tensor, looks: Tensor, atlas: Tensor, slots: Tensor, uv: Tensor, uv_faces: Tensor, tones: Tensor,
+    materials: Tensor, looks: Tensor, pages: list[Tensor], uv: Tensor, uv_faces: Tensor, tones: Tensor,
     texels_a_pixel: Tensor, sky: Tensor, lamp_positions: Tensor, lamp_colors: Tensor, lamp_ranges: Tensor,
     lamp_spreads: Tensor, lamp_viewmats: Tensor, lamp_focals: Tensor, lamp_depths: Tensor, seeds: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
@@ -222,10 +226,11 @@ def _shade(
         [
             ids, vec3(barycentrics), vec3(vertices), vec3(normals), view(transfer.contiguous()),
             view(stretch.contiguous()), view(table), kinds, view(uv.contiguous(), wp.vec2f), whole(uv_faces),
-            view(atlas.contiguous()), whole(slots), view(looks.contiguous()), vec3(tones), vec3(sky),
-            vec3(lamp_positions), vec3(lamp_colors), view(lamp_ranges.contiguous()), view(lamp_spreads.contiguous()),
-            view(lamp_viewmats.contiguous(), wp.mat44f), view(lamp_focals.contiguous()),
-            view(lamp_depths.flatten(0, 1).contiguous()), view(texels_a_pixel.contiguous()), whole(seeds),
+            view(_addresses(pages, vertices.device)), *pages[0].shape[:2], view(looks.contiguous()), vec3(tones),
+            vec3(sky), vec3(lamp_positions), vec3(lamp_colors), view(lamp_ranges.contiguous()),
+            view(lamp_spreads.contiguous()), view(lamp_viewmats.contiguous(), wp.mat44f),
+            view(lamp_focals.contiguous()), view(lamp_depths.flatten(0, 1).contiguous()),
+            view(texels_a_pixel.contiguous()), whole(seeds),
             view(light, wp.vec3f), view(tone, wp.vec3f), view(mirrored, wp.vec3f),
         ],
         like=vertices,
@@ -312,7 +317,12 @@ def shade_skin(
     check_shape("normals", normals, "B", "V", 3, sizes=sizes)
     check_shape("transfer", transfer, "B", "V", 10, sizes=sizes)
     check_shape("stretch", stretch, "B", "V", 1, sizes=sizes)
-    check_shape("texture.atlas", texture.atlas, "P", "Y", "X", 8, sizes=sizes)
+    if len(texture.pages) != sizes["B"]:
+        raise ValueError(f"texture.pages: expected {sizes['B']}, one an image, got {len(texture.pages)}.")
+    for page in texture.pages:
+        check_shape("texture.pages", page, "Y", "X", 8, sizes=sizes)
+        if page.dtype != torch.float16 or not page.is_contiguous() or page.device != vertices.device:
+            raise ValueError("texture.pages: expected contiguous float16 on the device of the vertices.")
     check_shape("worn.looks", worn.looks, "B", "T", skin_shading.MATERIAL_WORDS, sizes=sizes)
     check_shape("sky", sky, "B", 9, 3, sizes=sizes)
     check_shape("lamps.depths", lamps.depths, "B", "L", "M", "M", sizes=sizes)

@@ -1,4 +1,4 @@
-"""Procedural patterns on points of a surface: gradient noise and lines."""
+"""Procedural patterns on points of a surface: gradient noise, lines and spots."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,12 +9,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels import surface_patterns as kernels
-from oasis_warp.core.checks import check_positive, check_shape
-from oasis_warp.ops._launch import even_cuts, launch_ranges, view
+from oasis_warp.core.checks import check_index, check_positive, check_shape
+from oasis_warp.ops._launch import even_cuts, launch, launch_ranges, view
 from oasis_warp.ops._registration import operator
-
-REACH = 8.0**0.5
-"""Widths beyond which a line is nothing: the kernel's own bound."""
 
 
 class NoiseField(NamedTuple):
@@ -28,20 +25,20 @@ class NoiseField(NamedTuple):
 
 
 def _noise(points: Tensor, cells: Tensor, seeds: Tensor, octaves: Tensor) -> Tensor:
-    out = points.new_empty((len(points), len(cells)))
+    out = points.new_empty((len(cells), len(points)))
     inputs = [view(points.contiguous(), wp.vec3f), view(cells), view(seeds), view(octaves), view(out)]
     launch_ranges(kernels.noise, even_cuts(len(points)), inputs, like=points)
     return out
 
 
 def _noise_fake(points: Tensor, cells: Tensor, seeds: Tensor, octaves: Tensor) -> Tensor:
-    return points.new_empty((len(points), len(cells)))
+    return points.new_empty((len(cells), len(points)))
 
 
 _noise_op = operator("surface_noise", _noise, _noise_fake)
 
 
-def surface_noise(points: Float[Tensor, "N 3"], fields: Sequence[NoiseField]) -> Float[Tensor, "N K"]:
+def surface_noise(points: Float[Tensor, "N 3"], fields: Sequence[NoiseField]) -> Float[Tensor, "K N"]:
     """Gradient noise (Perlin 2002) of each of `fields` at float32 `points`, about [-1, 1] an octave, no gradient.
 
     Raises:
@@ -62,64 +59,105 @@ def surface_noise(points: Float[Tensor, "N 3"], fields: Sequence[NoiseField]) ->
     )
 
 
-def _lines(
-    points: Tensor, samples: Tensor, widths: Tensor, strengths: Tensor, kinds: Tensor, n_kinds: int, cell: float
-) -> Tensor:
-    out = points.new_zeros((len(points), n_kinds))
-    if not len(samples):
-        return out
-    low = samples.amin(0)
-    size = [int(n) + 1 for n in ((samples.amax(0) - low) / cell).floor().tolist()]
-    place = ((samples - low) / cell).floor().to(torch.int64)
+class PointGrid(NamedTuple):
+    """Points of a surface, sorted into cells of space: what `surface_dabs` draws on. See `point_grid`."""
+
+    points: Float[Tensor, "N 3"]
+    """Those of one cell after those of another."""
+    numbers: Int[Tensor, "N"]
+    """int32: of the points, as they came."""
+    starts: Int[Tensor, "C"]
+    """int32: of each cell's points, the cells in rows along z, those in rows along y; one more at the end."""
+    low: tuple[float, float, float]
+    """Corner of the first cell."""
+    cell: float
+    size: tuple[int, int, int]
+    """Cells along each axis."""
+
+    def to(self, device: torch.device | str) -> "PointGrid":
+        """The same grid on another device."""
+        tensors = (self.points.to(device), self.numbers.to(device), self.starts.to(device))
+        return PointGrid(*tensors, self.low, self.cell, self.size)
+
+
+def point_grid(points: Float[Tensor, "N 3"], cell: float) -> PointGrid:
+    """Sort one or more float32 points into cubes with edges of `cell`; finer ones serve narrower dabs.
+
+    Raises:
+        ValueError: a wrong shape, no point, or a cell that is not positive.
+    """
+    check_shape("points", points, "N", 3)
+    check_positive("cell", cell)
+    if not len(points):
+        raise ValueError("points: expected one or more, got none.")
+    low = points.amin(0)
+    place = ((points - low) / cell).floor().to(torch.int64)
+    size = [int(n) + 1 for n in place.amax(0)]
     row = (place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]
     order = torch.argsort(row, stable=True)
     bounds = torch.arange(size[0] * size[1] * size[2] + 1, device=points.device)
-    starts = torch.searchsorted(row[order], bounds).to(torch.int32)
+    starts = torch.searchsorted(row[order], bounds)
+    x, y, z = low.tolist()
+    return PointGrid(
+        points[order], order.to(torch.int32), starts.to(torch.int32), (x, y, z), cell, (size[0], size[1], size[2])
+    )
+
+
+def _dabs(
+    centers: Tensor, widths: Tensor, strengths: Tensor, kinds: Tensor, n_kinds: int, flat: bool, points: Tensor,
+    numbers: Tensor, starts: Tensor, low: list[float], cell: float, size: list[int],
+) -> Tensor:  # fmt: skip
+    out = points.new_zeros((n_kinds, len(points)))
     inputs = [
-        view(points.contiguous(), wp.vec3f), view(samples[order].contiguous(), wp.vec3f),
-        *(view(t[order].contiguous()) for t in (widths, strengths, kinds)), view(starts),
-        wp.vec3f(*low.tolist()), cell, wp.vec3i(*size), view(out),
+        view(centers.contiguous(), wp.vec3f), view(widths.contiguous()), view(strengths.contiguous()),
+        view(kinds.contiguous()), flat, view(points, wp.vec3f), view(numbers), view(starts), wp.vec3f(*low), cell,
+        wp.vec3i(*size), view(out),
     ]  # fmt: skip
-    launch_ranges(kernels.lines, even_cuts(len(points)), inputs, like=points)
+    launch(kernels.dabs, len(centers), inputs, like=points)
     return out
 
 
-def _lines_fake(points, samples, widths, strengths, kinds, n_kinds, cell):
-    return points.new_empty((len(points), n_kinds))
+def _dabs_fake(centers, widths, strengths, kinds, n_kinds, flat, points, numbers, starts, low, cell, size):
+    return points.new_empty((n_kinds, len(points)))
 
 
-_lines_op = operator("surface_lines", _lines, _lines_fake)
+_dabs_op = operator("surface_dabs", _dabs, _dabs_fake)
 
 
-def surface_lines(
-    points: Float[Tensor, "N 3"],
-    samples: Float[Tensor, "M 3"],
+@torch.no_grad()
+def surface_dabs(
+    grid: PointGrid,
+    centers: Float[Tensor, "M 3"],
     widths: Float[Tensor, "M"],
     strengths: Float[Tensor, "M"],
     kinds: Int[Tensor, "M"],
     n_kinds: int,
-) -> Float[Tensor, "N K"]:
-    """Profiles of lines, given as rows of samples: for each kind the largest s exp(-(d / w)^2), 0 where none is near.
+    *,
+    flat: bool = False,
+) -> Float[Tensor, "K N"]:
+    """At each point of a surface the strongest dab of each kind: the largest s exp(-(d / w)^2), 0 where none is near.
+
+    Dabs closer together than they are wide make a line. No gradient.
 
     Args:
-        points: Where to evaluate, float32 [N, 3].
-        samples: Points of all lines, closer together than they are wide, [M, 3]; M may be 0.
-        widths: Of the Gaussian profile at each sample, in the unit of the points, [M]; all are of one order, because
-            the widest sets the size of the search cells.
-        strengths: Values on the line, >= 0, [M].
-        kinds: int32 column of the result that each sample counts for, [M].
-        n_kinds: Number of columns.
+        grid: The surface; the points of the result are in the order in which `point_grid` got them.
+        centers: float32 [M, 3]; M may be 0.
+        widths: Of the profile, in the unit of the points, [M]; beyond sqrt(8) of them a dab ends.
+        strengths: Values at the centres, [M]; up to 0 nothing is drawn.
+        kinds: Row of the result that each dab counts for, [M].
+        n_kinds: Number of rows.
+        flat: The profile is exp(-(d / w)^4), a spot with an even middle.
 
     Raises:
-        ValueError: wrong shapes, or a width that is not positive.
+        ValueError: wrong shapes, or a kind that has no row.
     """
     sizes: dict[str, int] = {}
-    check_shape("points", points, "N", 3)
-    check_shape("samples", samples, "M", 3, sizes=sizes)
+    check_shape("centers", centers, "M", 3, sizes=sizes)
     for name, tensor in (("widths", widths), ("strengths", strengths), ("kinds", kinds)):
         check_shape(name, tensor, "M", sizes=sizes)
-    widest = 1.0
-    if len(widths):
-        check_positive("widths", float(widths.min()))
-        widest = float(widths.max())
-    return _lines_op(points, samples, widths, strengths, kinds.to(torch.int32), n_kinds, REACH * widest)
+    check_index("kinds", kinds, n_kinds, "kinds")
+    points, numbers, starts, low, cell, size = grid
+    return _dabs_op(
+        centers.float(), widths.float(), strengths.float(), kinds.to(torch.int32), n_kinds, flat, points, numbers,
+        starts, list(low), cell, list(size),
+    )  # fmt: skip

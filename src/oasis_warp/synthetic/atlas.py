@@ -1,6 +1,9 @@
 """The texture atlas: which point of the resting surface each texel shows, and what is known of that point.
 
 Everything that is painted is a function of these points, so it has no seams. Lengths are millimetres of the mean hand.
+An atlas is made and asked by numpy on the CPU, whatever device is painted on: lines are drawn over its points one after
+the other, each with random numbers that depend on how long the one before became, so that a texel more or less would
+change all of a person.
 """
 
 import functools
@@ -8,16 +11,16 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from scipy.ndimage import distance_transform_edt
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from oasis_warp.ops import depth_map
 from oasis_warp.synthetic.body import FINGERS, Body, bundled_body
 
 WIDTH, HEIGHT = 1024, 1408
 """Texels of the atlas: .34 mm each on the hand, enough for a hand that fills 512 pixels."""
+_FACES_AT_ONCE, _TEXELS_AT_ONCE = 1024, 1 << 15
+"""So many, for their numbers to stay in the processor's cache."""
 
 
 class Atlas:
@@ -29,42 +32,37 @@ class Atlas:
     finger: Tensor
     """int64 [N]: place in `body.FINGERS`, -1 on palm and arm."""
     finger_weight: Float[Tensor, "N"]
-    local: Float[Tensor, "N 3 3"]
-    """Coordinates (along, side, back) about each of the three bones of the texel's finger; nonsense off the fingers."""
+    corners: Tensor
+    """int64 [N, 3]: vertices round the texel."""
+    weights: Float[Tensor, "N 3"]
+    """Of those vertices."""
 
     def __init__(self, body: Body):
-        scale = torch.tensor([WIDTH, HEIGHT], dtype=torch.float32)
-        flat = torch.cat([body.uv * scale, torch.ones(len(body.uv), 1)], 1)
-        seen = depth_map(flat, body.uv_faces, torch.eye(4), torch.eye(3), WIDTH, HEIGHT)
-        shown = seen.face_ids >= 0
-        corners = body.faces[seen.face_ids[shown].long()]
-        self.body, self._corners, self._weights = body, corners, seen.barycentrics[shown][..., None]
-        self.points, self.palm = self.spread(body.rest), self.spread(body.palm[:, None])[:, 0]
-        self.normals = torch.nn.functional.normalize(self.spread(body.normals), dim=-1)
-        share = self.spread(body.finger_weights)
+        faces, weights = _drawn((body.uv * torch.tensor([WIDTH, HEIGHT])).double().numpy(), body.uv_faces.numpy())
+        self._shown = shown = faces >= 0
+        self.body, self.corners = body, body.skin_faces[torch.from_numpy(faces[shown])]
+        self.weights = torch.from_numpy(weights[shown]).float()
+        self.points, self.palm = self._spread(body.rest), self._spread(body.palm[:, None])[:, 0]
+        self.normals = torch.nn.functional.normalize(self._spread(body.normals), dim=-1)
+        share = self._spread(body.finger_weights)
         self.finger_weight, best = share.max(1)
         self.finger = torch.where(self.finger_weight > 0.5, best, -1)
-        self._positions = self.points.double().numpy()
-        local = np.zeros((len(self.points), 3, 3), np.float32)
-        for finger, bones in enumerate(body.bones):
-            here = (self.finger == finger).numpy()
-            for place, bone in enumerate(bones):
-                local[here, place] = bone.local(self._positions[here])
-        self.local = torch.from_numpy(local)
-        nearest = np.asarray(distance_transform_edt(~shown.numpy(), return_distances=False, return_indices=True))
-        number = torch.full((HEIGHT, WIDTH), -1, dtype=torch.int64)
-        number[shown] = torch.arange(int(shown.sum()))
-        self._fill = number[torch.from_numpy(nearest[0]).long(), torch.from_numpy(nearest[1]).long()]
-        """Texel shown at each place; beyond the islands the nearest, so that interpolation does not bleed."""
-        self._trees: dict[str, tuple[np.ndarray, cKDTree, tuple[int, ...]]] = {}
+        self.positions = self.points.double().numpy()
+        self._trees: dict[str, tuple[np.ndarray, cKDTree, list[int]]] = {}
 
-    def spread(self, values: Float[Tensor, "K C"]) -> Float[Tensor, "N C"]:
+    @functools.cached_property
+    def fill(self) -> Int[Tensor, "H W"]:
+        """The texel shown at each place; beyond the islands the nearest, so that interpolation does not bleed."""
+        from scipy.ndimage import distance_transform_edt  # a third of a second that those who only plan save
+
+        nearest = np.asarray(distance_transform_edt(~self._shown, return_distances=False, return_indices=True))
+        number = np.cumsum(self._shown).reshape(self._shown.shape) - 1
+        return torch.from_numpy(number[nearest[0], nearest[1]])
+
+    def _spread(self, values: Float[Tensor, "K C"]) -> Float[Tensor, "N C"]:
         """Values of the vertices of hand and forearm, interpolated at the texels."""
-        return (values[self._corners] * self._weights).sum(1)
-
-    def image(self, values: Float[Tensor, "N C"]) -> Float[Tensor, "H W C"]:
-        """Values of the texels as a picture of the atlas."""
-        return values[self._fill.to(values.device)]
+        parts = zip(self.corners.split(_TEXELS_AT_ONCE), self.weights.split(_TEXELS_AT_ONCE), strict=True)
+        return torch.cat([(values[corners] * weights[..., None]).sum(1) for corners, weights in parts])
 
     def snap(self, points: np.ndarray, region: str) -> np.ndarray:
         """The nearest surface points [mm] of a named region: a finger's name, "palm", "back" or "wrist".
@@ -73,25 +71,56 @@ class Atlas:
         """
         if region not in self._trees:
             keep, axes = self._region(region)
-            index = np.nonzero(keep)[0]
-            self._trees[region] = index, cKDTree(self._positions[index][:, axes]), axes
-        index, tree, axes = self._trees[region]
-        return self._positions[index[tree.query(np.asarray(points)[:, axes])[1]]]
+            there = self.positions[keep]
+            self._trees[region] = there, cKDTree(there[:, axes]), axes
+        there, tree, axes = self._trees[region]
+        return there[tree.query(points[:, axes])[1]]
 
-    def _region(self, region: str) -> tuple[np.ndarray, tuple[int, ...]]:
+    def _region(self, region: str) -> tuple[np.ndarray, list[int]]:
         if region in FINGERS:
-            return (self.finger == FINGERS.index(region)).numpy(), (0, 1, 2)
-        n, x = self.normals[:, 1].numpy(), self._positions[:, 0]
+            return (self.finger == FINGERS.index(region)).numpy(), [0, 1, 2]
+        n, x = self.normals[:, 1].numpy(), self.positions[:, 0]
         on_hand = ((self.finger < 0) | (self.finger_weight < 0.92)).numpy()
         keep: dict[str, Callable[[], np.ndarray]] = {
             "palm": lambda: (n < -0.15) & on_hand & (x < 8),
             "back": lambda: (n > 0.15) & on_hand,
             "wrist": lambda: (n < -0.1) & (x > -14),
         }
-        return keep[region](), (0, 2)
+        return keep[region](), [0, 2]
+
+
+def _drawn(uv: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The face at each texel's centre, -1 where there is none, and the weights of its corners; the first of several.
+
+    Args:
+        uv: Texels, centres at .5, [U, 2].
+        faces: [S, 3].
+    """
+    corners = uv[faces]
+    low = np.ceil(corners.min(1) - 0.5).astype(np.int64).clip(0, [WIDTH, HEIGHT])
+    high = np.floor(corners.max(1) - 0.5).astype(np.int64).clip(-1, [WIDTH - 1, HEIGHT - 1])
+    columns, rows = (high - low + 1).clip(0).T
+    counts = columns * rows
+    found, weights = np.full((HEIGHT, WIDTH), -1), np.zeros((HEIGHT, WIDTH, 3))
+    # Some at a time, column by column: whole arrays cost most of a second in pages that are touched once. The first
+    # face is written last.
+    for first in reversed(range(0, len(faces), _FACES_AT_ONCE)):
+        count = counts[first : first + _FACES_AT_ONCE]
+        face = np.repeat(np.arange(first, first + len(count)), count)  # of each pair with a texel of its box
+        within = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
+        x, y = low[face, 0] + within % columns[face], low[face, 1] + within // columns[face]
+        a, b, c = ((corners[:, k, 0][face] - (x + 0.5), corners[:, k, 1][face] - (y + 0.5)) for k in range(3))
+        areas = [p[0] * q[1] - p[1] * q[0] for p, q in ((b, c), (c, a), (a, b))]
+        whole = areas[0] + areas[1] + areas[2]
+        least, most = (of(of(areas[0], areas[1]), areas[2]) for of in (np.minimum, np.maximum))
+        hit = np.nonzero(((least >= 0) | (most <= 0)) & (whole != 0))[0][::-1]
+        x, y = x[hit], y[hit]
+        found[y, x] = face[hit]
+        weights[y, x] = np.stack([area[hit] for area in areas], 1) / whole[hit, None]
+    return found, weights
 
 
 @functools.cache
 def bundled_atlas() -> Atlas:
-    """The atlas of `bundled_body`: about a second the first time."""
+    """The atlas of `bundled_body`: half a second the first time."""
     return Atlas(bundled_body())

@@ -5,14 +5,15 @@ Vertices are those of the hand, then of the rows of the forearm (towards the elb
 """
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
-import igl
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from oasis_warp.assets import asset
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.hand.template import bundled_hand
@@ -33,7 +34,6 @@ ATLAS_ARM_BIAS = 0.7
 
 SKIN, SLEEVE, BAND, RING = range(4)
 """Materials of faces."""
-COARSE_FACES = 4000
 KNUCKLE_RISE = (2.0, 1.7, 0.8)
 """How far a knuckle stands out of a finger bent by 90 degrees, from the hand outwards [mm]."""
 
@@ -112,8 +112,11 @@ class Body:
     """Share of each finger's joints in the skinning."""
     bones: tuple[tuple[Bone, ...], ...]
     """[finger][place]."""
+    skin_faces: Int[Tensor, "S 3"]
+    """The first of `faces`: of hand and forearm."""
     coarse_vertices: Int[Tensor, "C"]
-    """Some vertices of hand and forearm, and the faces between them: what hides the sky from others."""
+    """Some vertices of hand and forearm, and the faces between them: what hides the sky from others. Made by
+    `tools/build_coarse_body.py`."""
     coarse_faces: Int[Tensor, "G 3"]
     knuckle_rise: Float[Tensor, "V 15"]
     """Displacement of the hand's vertices along their normals, for each joint of a finger bent by 90 degrees [m]."""
@@ -122,6 +125,11 @@ class Body:
     def n_hand(self) -> int:
         """Vertices of the hand."""
         return len(self.hand.template)
+
+    def to(self, device: torch.device | str) -> "Body":
+        """The same body on another device; its bones, which are numpy's, stay."""
+        moved = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{k: v.to(device) for k, v in moved.items() if isinstance(v, Tensor | HandModel)})
 
 
 def arm_rows(
@@ -152,22 +160,23 @@ def smoothstep(low: float, high: float, x: Tensor) -> Tensor:
     return t * t * (3 - 2 * t)
 
 
-def _coarse(rest: Tensor, faces: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Vertices that are kept when edges are collapsed, and the faces that are left."""
-    _, left, _, kept = igl.decimate(rest.double().numpy(), np.ascontiguousarray(faces, np.int64), COARSE_FACES, False)
-    return torch.from_numpy(np.asarray(kept, np.int64)), torch.from_numpy(np.ascontiguousarray(left, np.int64))
+class SkinMesh(NamedTuple):
+    """Hand and forearm at rest, mean shape."""
+
+    rest: Float[Tensor, "K 3"]
+    """Vertices [m], the hand's first."""
+    faces: Int[Tensor, "S 3"]
+    uv: Float[Tensor, "U 2"]
+    uv_faces: Int[Tensor, "S 3"]
 
 
-@functools.cache
-def bundled_body() -> Body:
-    """The bundled hand with its forearm and its wardrobe, on the CPU."""
-    hand = bundled_hand()
+def skin_mesh(hand: HandModel) -> SkinMesh:
+    """A hand with a forearm, and where each is on the atlas."""
     n, rim = len(hand.template), hand.rim.numpy()
     columns = len(rim)
     arm = n + np.arange(ARM_ROWS * columns).reshape(ARM_ROWS, columns)
     arm_faces = _tube_faces(np.concatenate([rim[None], arm]))
-    n_uv = len(hand.uv)
-    grid = n_uv + np.arange((ARM_ROWS + 1) * (columns + 1)).reshape(ARM_ROWS + 1, columns + 1)
+    grid = len(hand.uv) + np.arange((ARM_ROWS + 1) * (columns + 1)).reshape(ARM_ROWS + 1, columns + 1)
     a, b = grid[:-1], grid[1:]
     quad = np.stack([a[:, :-1], b[:, :-1], b[:, 1:], a[:, 1:]], -1).reshape(-1, 4)
     arm_uv_faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]], 1).reshape(-1, 3)
@@ -183,10 +192,23 @@ def bundled_body() -> Body:
     outward = corners[0] - rows[ARM_ROWS // 2].mean(0).numpy()
     if np.cross(corners[1] - corners[0], corners[2] - corners[0]) @ outward < 0:
         arm_faces, arm_uv_faces = arm_faces[:, ::-1], arm_uv_faces[:, ::-1]
-    skin_faces = np.concatenate([hand.faces.numpy(), arm_faces])
+    return SkinMesh(
+        rest,
+        torch.from_numpy(np.concatenate([hand.faces.numpy(), arm_faces])),
+        torch.from_numpy(uv).float(),
+        torch.from_numpy(np.concatenate([hand.uv_faces.numpy(), arm_uv_faces])),
+    )
+
+
+@functools.cache
+def bundled_body() -> Body:
+    """The bundled hand with its forearm and its wardrobe, on the CPU."""
+    hand = bundled_hand()
+    n, columns = len(hand.template), len(hand.rim)
+    rest, skin, uv, uv_faces = skin_mesh(hand)
 
     first = len(rest)
-    worn, materials = [], [np.full(len(skin_faces), SKIN)]
+    worn, materials = [], [np.full(len(skin), SKIN)]
     for material, n_rows, n_columns in ((SLEEVE, SLEEVE_ROWS, columns), (BAND, BAND_ROWS, columns),
                                         (RING, RING_ROWS, RING_COLUMNS)):  # fmt: skip
         rows_of = first + np.arange(n_rows * n_columns).reshape(n_rows, n_columns)
@@ -196,7 +218,6 @@ def bundled_body() -> Body:
         worn.append(_tube_faces(rows_of))
         materials.append(np.full(len(worn[-1]), material))
 
-    skin = torch.from_numpy(np.ascontiguousarray(skin_faces))
     normals = surface.vertex_normals(rest, skin)
     edges = surface.mesh_edges(skin)
     toward = torch.cat([0.5 - 0.5 * torch.cos(hand.bone_theta), 0.5 - 0.5 * normals[n:, 1]])
@@ -204,15 +225,17 @@ def bundled_body() -> Body:
     weights = torch.cat([hand.weights, torch.eye(16)[:1].expand(len(rest) - n, 16)])
     bones = tuple(tuple(_bone(hand, finger, place) for place in range(3)) for finger in range(5))
     by_finger = torch.stack([weights[:, 3 * k + 1 : 3 * k + 4].sum(1) for k in range(5)], 1)
-    coarse_vertices, coarse_faces = _coarse(rest, skin_faces)
+    with asset("synthetic", "coarse_body.npz").open("rb") as file, np.load(file, allow_pickle=False) as stored:
+        coarse_vertices, coarse_faces = (torch.from_numpy(stored[k].astype(np.int64)) for k in ("vertices", "faces"))
     return Body(
         hand=hand,
         coarse_vertices=coarse_vertices,
         coarse_faces=coarse_faces,
-        faces=torch.from_numpy(np.concatenate([skin_faces, *worn])),
+        faces=torch.from_numpy(np.concatenate([skin.numpy(), *worn])),
+        skin_faces=skin,
         materials=torch.from_numpy(np.concatenate(materials)).to(torch.int32),
-        uv=torch.from_numpy(uv).float(),
-        uv_faces=torch.from_numpy(np.concatenate([hand.uv_faces.numpy(), arm_uv_faces])),
+        uv=uv,
+        uv_faces=uv_faces,
         n_hand_faces=len(hand.faces),
         n_vertices=first,
         rest=rest * 1e3,
@@ -222,3 +245,17 @@ def bundled_body() -> Body:
         bones=bones,
         knuckle_rise=_knuckle_rise(rest[:n].double().numpy() * 1e3, normals[:n].double().numpy(), bones),
     )
+
+
+def device_name(device: torch.device | str) -> str:
+    """The one name of a device: that of the current GPU for "cuda"."""
+    device = torch.device(device)
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", torch.cuda.current_device())
+    return str(device)
+
+
+@functools.cache
+def body_on(device: str) -> Body:
+    """`bundled_body` on a device, by its `device_name`; the same object each time."""
+    return bundled_body().to(device)

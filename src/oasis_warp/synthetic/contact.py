@@ -144,8 +144,8 @@ def overlaps(angles: np.ndarray, joints: np.ndarray) -> np.ndarray:
     place = balls.center - rest[balls.joint] + joints[:, balls.joint]
     posed = (rotation[:, balls.joint] @ place[..., None])[..., 0] + shift[:, balls.joint]
     i, j = balls.pairs.T
-    between = posed[:, i] - posed[:, j]
-    distance = np.sqrt((between * between).sum(-1))
+    x, y, z = (along.take(i, 1) - along.take(j, 1) for along in posed.transpose(2, 0, 1))
+    distance = np.sqrt(x * x + y * y + z * z)
     return np.maximum(balls.radius[i] + balls.radius[j] - distance - balls.allowed, 0)
 
 

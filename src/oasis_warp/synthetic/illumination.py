@@ -2,7 +2,6 @@
 
 import functools
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -10,8 +9,9 @@ from torch import Tensor
 from oasis_warp.ops import depth_map
 from oasis_warp.ops.skin_shading import Lamps, sky_transfer, smooth_over_faces
 from oasis_warp.synthetic.body import Body
+from oasis_warp.synthetic.planned import Numbers
 from oasis_warp.synthetic.posing import Posed
-from oasis_warp.synthetic.stage import Light, sphere
+from oasis_warp.synthetic.stage import sphere
 
 SKY_DIRECTIONS, SKY_SIZE = 40, 112
 """Depth buffers that sample the sky, and their side [px]."""
@@ -34,7 +34,8 @@ def look_at(positions: Float[Tensor, "*batch 3"], targets: Float[Tensor, "*batch
     return torch.cat([torch.cat([rows, shift], -1), bottom], -2)
 
 
-def _intrinsics(focal: Tensor, size: int) -> Tensor:
+def pinhole(focal: Float[Tensor, "*batch"], size: int) -> Float[Tensor, "*batch 3 3"]:
+    """Intrinsics of square pictures of `size` pixels whose axis is their middle."""
     K = torch.zeros(*focal.shape, 3, 3, device=focal.device)
     K[..., 0, 0] = K[..., 1, 1] = focal
     K[..., 0, 2] = K[..., 1, 2] = size / 2
@@ -46,20 +47,20 @@ def _depths(vertices: Tensor, faces: Tensor, viewmats: Tensor, focals: Tensor, s
     """Depth buffers of each image's mesh from each of its [B, N] cameras, [B, N, size, size]."""
     batch, n = focals.shape
     vertices = vertices[:, None].expand(-1, n, -1, -1).flatten(0, 1)
-    K = _intrinsics(focals.flatten(), size)
+    K = pinhole(focals.flatten(), size)
     return depth_map(vertices, faces, viewmats.flatten(0, 1), K, size, size, validate=False).depth.unflatten(
         0, (batch, n)
     )
 
 
 @functools.cache
-def _directions() -> Tensor:
-    return torch.from_numpy(sphere(SKY_DIRECTIONS)).float()
+def _directions(device: torch.device) -> Tensor:
+    return torch.from_numpy(sphere(SKY_DIRECTIONS)).float().to(device)
 
 
 def see_sky(body: Body, posed: Posed, normals: Tensor) -> Float[Tensor, "B V 10"]:
     """Hidden-sky transfer of every vertex, smoothed once."""
-    directions = _directions().to(posed.vertices.device)
+    directions = _directions(posed.vertices.device)
     radius = posed.radius * 1.02
     away = posed.center[:, None] + directions * (SKY_DISTANCE * radius)[:, None, None]
     viewmats = look_at(away, posed.center[:, None].expand_as(away))
@@ -71,14 +72,19 @@ def see_sky(body: Body, posed: Posed, normals: Tensor) -> Float[Tensor, "B V 10"
     return smooth_over_faces(transfer, body.faces)
 
 
-def light_lamps(body: Body, posed: Posed, lights: list[Light]) -> Lamps:
+def light_lamps(body: Body, posed: Posed, numbers: Numbers) -> Lamps:
     """The lamps of each picture, with what they see of the hand."""
-    device = posed.vertices.device
-    on_device = lambda name: torch.from_numpy(np.stack([getattr(light, name) for light in lights])).float().to(device)  # noqa: E731
-    directions, distances = on_device("directions"), on_device("distances")
-    center = posed.center[:, None].expand_as(directions)
-    positions = center + directions * distances[..., None]
+    distances = numbers.lamp_distances
+    center = posed.center[:, None].expand_as(numbers.lamp_directions)
+    positions = center + numbers.lamp_directions * distances[..., None]
     viewmats = look_at(positions, center)
     focals = LAMP_SIZE / 2 * distances / (LAMP_MARGIN * posed.radius)[:, None]
     depths = _depths(posed.vertices, body.faces, viewmats, focals, LAMP_SIZE)
-    return Lamps(positions, on_device("colors"), distances, on_device("spreads"), viewmats, focals, depths)
+    return Lamps(positions, numbers.lamp_colors, distances, numbers.lamp_spreads, viewmats, focals, depths)
+
+
+def no_lamps(like: Tensor) -> Lamps:
+    """For pictures without any."""
+    none = like.new_empty((len(like), 0))
+    points, views = like.new_empty((len(like), 0, 3)), like.new_empty((len(like), 0, 4, 4))
+    return Lamps(points, points, none, none, views, none, like.new_empty((len(like), 0, 1, 1)))

@@ -1,5 +1,6 @@
 """People of a world, baked once and kept: texture, resting surface and what goes with them."""
 
+import functools
 import json
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
@@ -17,16 +18,24 @@ from oasis_warp import __version__
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.data.atomic import write_file
 from oasis_warp.ops.skin_shading import surface_state
-from oasis_warp.synthetic.atlas import bundled_atlas
-from oasis_warp.synthetic.bake import bake
-from oasis_warp.synthetic.body import ARM_ROWS, arm_rows, bundled_body
+from oasis_warp.synthetic.bake import paint
+from oasis_warp.synthetic.body import ARM_ROWS, arm_rows, body_on, bundled_body, device_name
+from oasis_warp.synthetic.canvas import canvas_on
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
 from oasis_warp.synthetic.processes import worker_pool
 from oasis_warp.synthetic.relief import relief
+from oasis_warp.synthetic.skin_plan import SkinPlan, plan_person
 from oasis_warp.synthetic.wardrobe import ring_at_rest, ring_look
 
-KEPT = {"cpu": 48, "cuda": 1024}
-"""People kept on a device, 23 MB each."""
+PERSON_BYTES = 24_000_000
+"""Of a person that is kept, nearly all of it texture."""
+CPU_KEPT = 48
+CUDA_SHARE = 0.5
+"""Of a GPU's memory that people may fill: an H200 keeps 3,000."""
+PLANNED_HERE = 48
+"""So few people are planned sooner by this process than by others, which take seconds to start."""
+PLANS_AT_ONCE = 8
+"""That a process hands over."""
 FORMAT = "oasis-person"
 
 
@@ -51,18 +60,26 @@ class Person(NamedTuple):
 _known: OrderedDict[tuple[int, int, Population, str], Person] = OrderedDict()
 
 
-def person(seed: int, number: int, population: Population, device: str) -> Person:
-    """Person `number` of the world `seed`; a few seconds the first time, then kept until many others have come."""
-    key = (seed, number, population, device)
+def person(seed: int, number: int, population: Population, device: torch.device | str) -> Person:
+    """Person `number` of the world `seed`; a second on a CPU the first time, then kept until many others have come."""
+    key = (seed, number, population, device_name(device))
     if key in _known:
         _known.move_to_end(key)
         return _known[key]
-    return _keep(key, _born(seed, number, population))
+    return _keep(key, _born(*key))
+
+
+@functools.cache
+def most_kept(device: str) -> int:
+    """People that can be kept on a device."""
+    if torch.device(device).type == "cpu":
+        return CPU_KEPT
+    return int(CUDA_SHARE * torch.cuda.get_device_properties(device).total_memory / PERSON_BYTES)
 
 
 def bake_people(
-    seed: int, numbers: Sequence[int], population: Population, device: str, *, jobs: int, folder: Path | None = None,
-    progress: Progress = silent,
+    seed: int, numbers: Sequence[int], population: Population, device: torch.device | str, *, jobs: int,
+    folder: Path | None = None, progress: Progress = silent,
 ) -> None:  # fmt: skip
     """Make `person` ready for each of `numbers`: before training, so that it never waits.
 
@@ -70,16 +87,19 @@ def bake_people(
         seed: Of the world.
         numbers: Of the people.
         population: What they may have.
-        device: Where they are kept.
-        jobs: Processes that bake; 0 for this one.
-        folder: Where each person is written to, 23 MB, and read from when it has been made before; no files when None.
+        device: Where they are made and kept.
+        jobs: Processes that help; 0 for none. On the CPU they bake. For a CUDA device they plan more than a few
+            people's skin, which this process paints.
+        folder: Where a CPU writes each person to, 23 MB, and reads from when it has been made before; no files when
+            None. A CUDA device bakes about as fast as a disk reads.
         progress: Told of every person.
 
     Raises:
         ValueError: more people than are kept on the device.
         InputError: the folder cannot be written.
     """
-    most = KEPT[torch.device(device).type]
+    device = device_name(device)
+    most = most_kept(device)
     if len(numbers) > most:
         raise ValueError(
             f"numbers: expected at most {most} people on {device}, got {len(numbers)}. Others are forgotten."
@@ -89,31 +109,39 @@ def bake_people(
     if missing:
         progress("people", 0, count)
 
-    def keep(made: Iterable[Person | Path]) -> None:
+    def keep(made: Iterable[Person | Path | SkinPlan]) -> None:
         for k, (number, found) in enumerate(zip(missing, made, strict=True)):
-            found = _read(found, seed, number, population) if isinstance(found, Path) else found
+            if isinstance(found, Path):
+                found = _read(found, seed, number, population)
+            elif isinstance(found, SkinPlan):
+                found = _painted(found, device)
             _keep((seed, number, population, device), found)
             progress("people", k + 1, count)
 
-    what = ([seed] * count, missing, [population] * count, [folder] * count)
-    if jobs < 1:
-        keep(map(_make, *what))
+    on_cpu = device == "cpu"
+    what = ([seed] * count, missing, [population] * count)
+    work, what = (_make, (*what, [folder] * count)) if on_cpu else (plan_person, what)
+    if jobs < 1 or (not on_cpu and count <= PLANNED_HERE):
+        keep(map(work, *what))
         return
     with worker_pool(jobs) as pool:
         try:
-            keep(pool.map(_make, *what))
+            made = pool.map(work, *what, chunksize=1 if on_cpu else PLANS_AT_ONCE)
+            if not on_cpu:
+                canvas_on(device)  # seconds, in which the processes start
+            keep(made)
         except BaseException:
             pool.shutdown(cancel_futures=True)  # or hundreds of people would still be baked
             raise
 
 
 def _make(seed: int, number: int, population: Population, folder: Path | None) -> Person | Path:
-    """A person, or with a folder its file, which may be there already."""
+    """A person made on the CPU, or with a folder its file, which may be there already."""
     if folder is None:
-        return _born(seed, number, population)
+        return _born(seed, number, population, "cpu")
     path = folder / f"{number:06d}.safetensors"
     if not _is_there(path, _about(seed, number, population)):
-        found = _born(seed, number, population)
+        found = _born(seed, number, population, "cpu")
         tensors = {name: value.contiguous() for name, value in found._asdict().items() if isinstance(value, Tensor)}
         write_file(path, save(tensors, {FORMAT: _about(seed, number, population)}))
     return path
@@ -141,38 +169,39 @@ def _read(path: Path, seed: int, number: int, population: Population) -> Person:
 
 
 def _keep(key: tuple[int, int, Population, str], found: Person) -> Person:
-    """Move a person to the key's device and remember it, and forget the one that was not met for longest."""
+    """Remember a person, and forget the one on the same device that was not met for longest."""
     device = key[3]
-    moved = {name: value.to(device) for name, value in found._asdict().items() if isinstance(value, Tensor)}
-    found = found._replace(**moved)
     _known[key] = found
-    if sum(k[3] == device for k in _known) > KEPT[torch.device(device).type]:
+    if sum(k[3] == device for k in _known) > most_kept(device):
         del _known[next(k for k in _known if k[3] == device)]
     return found
 
 
-def _born(seed: int, number: int, population: Population) -> Person:
-    """On the CPU."""
-    body, atlas = bundled_body(), bundled_atlas()
+def _born(seed: int, number: int, population: Population, device: str) -> Person:
+    """Made on the device."""
+    return _painted(plan_person(seed, number, population), device)
+
+
+@torch.no_grad()
+def _painted(plan: SkinPlan, device: str) -> Person:
+    """What is left to do of a person once the skin is planned."""
+    body, identity = body_on(device), plan.identity
     hand = body.hand
-    identity = sample_identity(hand, seed, number, population)
-    shape = torch.from_numpy(identity.shape).float()
+    shape = torch.from_numpy(identity.shape).float().to(device)
     smooth = hand.template + hand.shape_basis @ shape
-    rest = smooth + body.normals[: body.n_hand] * relief(body, identity)[:, None]
+    rest = smooth + body.normals[: body.n_hand] * relief(identity, device)[:, None]
     joints, tips = hand.joints + hand.joint_basis @ shape, hand.tips + hand.tip_basis @ shape
-    texture = bake(atlas, identity)
-    still = torch.eye(3).expand(1, ARM_ROWS, 3, 3)
-    arm = arm_rows(rest[hand.rim][None], still, torch.tensor([identity.arm_girth]))
-    n_skin = len(body.uv_faces)
+    texture = paint(plan, device)
+    still = torch.eye(3, device=device).expand(1, ARM_ROWS, 3, 3)
+    arm = arm_rows(rest[hand.rim][None], still, torch.tensor([identity.arm_girth], device=device))
     whole = torch.cat([rest, arm.reshape(-1, 3)])[None]
-    areas = surface_state(whole, body.faces[:n_skin]).areas[0]
     return Person(
         identity,
         texture,
         rest,
         joints,
         tips,
-        areas,
+        surface_state(whole, body.skin_faces).areas[0],
         texture[..., :3].float().mean((0, 1)),
         ring_at_rest(body, rest, joints, identity),
         ring_look(identity),

@@ -3,7 +3,6 @@
 import functools
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,19 +15,20 @@ from oasis_warp.ops.room_tracing import trace_rooms
 from oasis_warp.ops.skin_shading import Texture, Worn, shade_skin, smooth_over_faces, surface_state
 from oasis_warp.synthetic.atlas import HEIGHT, WIDTH
 from oasis_warp.synthetic.backgrounds import cut_background
-from oasis_warp.synthetic.body import RING, Body, bundled_body
-from oasis_warp.synthetic.illumination import light_lamps, see_sky
+from oasis_warp.synthetic.body import RING, Body, body_on, device_name
+from oasis_warp.synthetic.illumination import light_lamps, no_lamps, pinhole, see_sky
 from oasis_warp.synthetic.people import Person, person
-from oasis_warp.synthetic.plan import PHOTOS, Scenery, Shot, plan_ahead, plan_shots
+from oasis_warp.synthetic.plan import PHOTOS, Scenery
+from oasis_warp.synthetic.planned import Planned, numbers_of, plan_ahead, plan_table, send
 from oasis_warp.synthetic.posing import pose_people
 from oasis_warp.synthetic.sensor import expose, srgb
-from oasis_warp.synthetic.wardrobe import SKIN_LOOK
 
 SAMPLES = 2
 """Sub-pixels along a pixel's side."""
 TEXEL = 0.34e-3
 """Size of a texel on the hand [m]."""
 STRETCH_PASSES = 2
+MIRROR = (-1.0, 1.0, 1.0)
 
 
 class SyntheticBatch(NamedTuple):
@@ -61,22 +61,15 @@ class SyntheticBatch(NamedTuple):
 
 
 @functools.cache
-def _body(device: str) -> Body:
-    body = bundled_body()
-    moved = {
-        name: getattr(body, name).to(device)
-        for name in (
-            "faces",
-            "materials",
-            "uv",
-            "uv_faces",
-            "normals",
-            "knuckle_rise",
-            "coarse_vertices",
-            "coarse_faces",
-        )
-    }
-    return replace(body, hand=body.hand.to(device), **moved)
+def _texels(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Texture coordinates, and the corners of the faces among them."""
+    body = body_on(str(device))
+    return body.uv * torch.tensor([WIDTH, HEIGHT], device=device), body.uv_faces.to(torch.int32)
+
+
+@functools.cache
+def _mirror(device: torch.device) -> Tensor:
+    return torch.tensor(MIRROR, device=device)
 
 
 def render_batch(
@@ -92,54 +85,49 @@ def render_batch(
     A picture depends on seed, index, size and scenery alone: not on its batch, nor on the device, up to
     rounding. Indices 8 n to 8 n + 7 show one person, whose texture is baked when first met (seconds) and kept.
     """
-    return render_shots(seed, plan_shots(seed, indices, scenery), size, device, scenery=scenery)
+    return render_planned(seed, plan_table(seed, indices, scenery), size, device, scenery=scenery)
 
 
 @torch.no_grad()
-def render_shots(
-    seed: int, shots: Sequence[Shot], size: int, device: torch.device | str, *, scenery: Scenery
+def render_planned(
+    seed: int, planned: Planned, size: int, device: torch.device | str, *, scenery: Scenery
 ) -> SyntheticBatch:
-    """The second half of `render_batch`: pictures of what `plan_shots` has drawn for the same seed and scenery."""
-    device, look = str(device), scenery.look
-    body = _body(device)
-    people = [person(seed, shot.person, scenery.population, device) for shot in shots]
-    angles = np.stack([shot.angles for shot in shots])
-    posed = pose_people(
-        body, people, angles, np.stack([s.bend for s in shots]), [s.view for s in shots], [s.clothes for s in shots]
-    )
-    seeds = torch.tensor([s.seed for s in shots], device=device, dtype=torch.int32)
+    """The second half of `render_batch`: pictures of what `plan_table` has drawn for the same seed and scenery.
+
+    Nothing waits for the device.
+    """
+    name = device_name(device)
+    device, body = torch.device(name), body_on(name)
+    people = [person(seed, number, scenery.population, name) for number in planned.whole[:, 1].tolist()]
+    numbers = numbers_of(planned, device)
+    index, number, left, seeds = send(torch.from_numpy(planned.whole), device).unbind(1)
+    posed = pose_people(body, people, numbers)
     fine = size * SAMPLES
-    K = torch.zeros(len(shots), 3, 3, device=device)
-    K[:, 0, 0] = K[:, 1, 1] = posed.focal * fine
-    K[:, 0, 2] = K[:, 1, 2] = fine / 2
-    K[:, 2, 2] = 1
-    still = torch.eye(4, device=device).expand(len(shots), 4, 4)
+    K = pinhole(posed.focal * fine, fine)
+    still = torch.eye(4, device=device).expand(len(people), 4, 4)
     seen = depth_map(posed.vertices, body.faces, still, K, fine, fine, validate=False)
     state = surface_state(posed.vertices, body.faces)
-    lights = [s.light for s in shots]
-    distance = torch.tensor([s.view.distance for s in shots], device=device, dtype=torch.float32)
-    sky = torch.from_numpy(np.stack([light.sky for light in lights])).float().to(device)
-    lamps = light_lamps(body, posed, lights)
+    lamps = no_lamps(posed.vertices) if scenery.look == "even" else light_lamps(body, posed, numbers)
+    distance, sky = numbers.view_distance, numbers.sky
     shaded = shade_skin(
         seen, K[:, 0, 0], SAMPLES, posed.vertices, body.faces, state.normals, see_sky(body, posed, state.normals),
-        _stretch(body, people, state.areas), _textures(body, people), _worn(body, shots, people),
-        torch.stack([p.tone for p in people]), distance / (posed.focal * fine) / TEXEL, sky, lamps, seeds,
-        n_hand_faces=body.n_hand_faces, ring=RING,
+        _stretch(body, people, state.areas), Texture([p.texture for p in people], *_texels(device)),
+        Worn(body.materials, numbers.looks), torch.stack([p.tone for p in people]),
+        distance / (posed.focal * fine) / TEXEL, sky, lamps, seeds, n_hand_faces=body.n_hand_faces, ring=RING,
     )  # fmt: skip
-    if look == "even":
+    if scenery.look == "even":
         share = shaded.alpha[..., None]
         image = share * srgb((shaded.color / share.clamp_min(1e-3)).clamp(0, 1))  # over black, as splats are drawn
     else:
-        solids = torch.from_numpy(np.stack([s.room.solids for s in shots])).to(device)
-        apertures = torch.tensor([s.room.aperture for s in shots], device=device)
         if scenery.backgrounds:
-            behind = torch.stack([_cut(scenery, shot, size) for shot in shots]).to(device)
+            behind = send(_cut_backgrounds(scenery, planned, size), device)
         else:
-            behind = trace_rooms(solids, posed.focal * size, sky, lamps, shaded.alpha, distance, apertures)
+            behind = trace_rooms(
+                numbers.solids, posed.focal * size, sky, lamps, shaded.alpha, distance, numbers.aperture
+            )
         light = shaded.color + (1 - shaded.alpha[..., None]) * behind
-        incident = torch.from_numpy(np.stack([s.light.incident for s in shots])).float().to(device)
-        image = expose(light, shaded.alpha, [s.sensor for s in shots], incident, seeds)
-    K = K / torch.tensor([SAMPLES, SAMPLES, 1.0], device=device)[:, None]
+        image = expose(light, shaded.alpha, numbers.sensor, numbers.incident, seeds)
+    K = pinhole(posed.focal * size, size)
     marks = posed.landmarks @ K.transpose(1, 2)
     batch = SyntheticBatch(
         image=image,
@@ -148,17 +136,22 @@ def render_shots(
         depth=shaded.depth,
         landmarks=marks[..., :2] / marks[..., 2:],
         landmarks_3d=posed.landmarks,
-        angles=torch.from_numpy(angles[:, 1:]).float().to(device),
-        orientation=torch.from_numpy(np.stack([s.view.rotation for s in shots])).float().to(device),
+        angles=numbers.angles,
+        orientation=numbers.view_rotation,
         translation=posed.translation,
-        shape=torch.from_numpy(np.stack([p.identity.shape for p in people])).float().to(device),
+        shape=numbers.shape,
         K=K,
-        left=torch.tensor([int(s.side == "left") for s in shots], device=device),
-        person=torch.tensor([s.person for s in shots], device=device),
-        index=torch.tensor([s.index for s in shots], device=device),
-        gestures=tuple(s.gesture for s in shots),
+        left=left,
+        person=number,
+        index=index,
+        gestures=planned.gestures,
     )
     return _mirror_left(batch, size)
+
+
+def part(batch: SyntheticBatch, rows: slice) -> SyntheticBatch:
+    """Some of the pictures."""
+    return SyntheticBatch(*(field[rows] for field in batch))
 
 
 def stream(
@@ -169,15 +162,18 @@ def stream(
 
     Drawing a shot takes a CPU some milliseconds; with `workers`, so many processes draw ahead while a GPU renders.
     """
-    blocks = (range(first, first + batch) for first in itertools.count(start, batch))
-    for shots in plan_ahead(seed, blocks, scenery, workers):
-        yield render_shots(seed, shots, size, device, scenery=scenery)
+    blocks = ((range(first, first + batch), scenery) for first in itertools.count(start, batch))
+    for planned in plan_ahead(seed, blocks, workers):
+        yield render_planned(seed, planned, size, device, scenery=scenery)
 
 
-def _cut(scenery: Scenery, shot: Shot, size: int) -> Tensor:
-    """A picture of the folder as bright as the light on the hand."""
-    cut = cut_background(scenery.backgrounds, np.random.default_rng([shot.seed]), size, shot.room.aperture * size)
-    return cut * float(shot.light.incident.mean())
+def _cut_backgrounds(scenery: Scenery, planned: Planned, size: int) -> Tensor:
+    """A picture of the folder for each plan, as bright as the light on the hand; on the CPU."""
+    numbers, cuts = numbers_of(planned, torch.device("cpu")), []
+    for aperture, light, seed in zip(numbers.aperture, numbers.incident, planned.whole[:, 3], strict=True):
+        random = np.random.default_rng([int(seed)])
+        cuts.append(cut_background(scenery.backgrounds, random, size, float(aperture) * size) * light.mean())
+    return torch.stack(cuts)
 
 
 def _mirror_left(batch: SyntheticBatch, size: int) -> SyntheticBatch:
@@ -187,7 +183,7 @@ def _mirror_left(batch: SyntheticBatch, size: int) -> SyntheticBatch:
     def flip(images: Tensor) -> Tensor:
         return torch.where(left.view(-1, *[1] * (images.dim() - 1)), images.flip(2), images)
 
-    mirror = torch.tensor([-1.0, 1.0, 1.0], device=batch.image.device)
+    mirror = _mirror(batch.image.device)
     sign = torch.where(left[:, None], mirror, torch.ones_like(mirror))
     u, v = batch.landmarks.unbind(-1)
     return batch._replace(
@@ -212,23 +208,3 @@ def _stretch(body: Body, people: list[Person], areas: Tensor) -> Tensor:
     for _ in range(STRETCH_PASSES):
         stretch = smooth_over_faces(stretch, body.faces)
     return stretch
-
-
-def _textures(body: Body, people: list[Person]) -> Texture:
-    """The textures of a batch, each once."""
-    slots: dict[int, int] = {}
-    numbers = [slots.setdefault(id(p), len(slots)) for p in people]
-    pages = {slots[id(p)]: p.texture for p in people}
-    device = people[0].texture.device
-    return Texture(
-        pages[0][None] if len(pages) == 1 else torch.stack([pages[k] for k in range(len(pages))]),
-        torch.tensor(numbers, device=device, dtype=torch.int32),
-        body.uv * torch.tensor([WIDTH, HEIGHT], device=device),
-        body.uv_faces,
-    )
-
-
-def _worn(body: Body, shots: list[Shot], people: list[Person]) -> Worn:
-    looks = [[SKIN_LOOK, s.clothes.sleeve_look, s.clothes.band_look, p.ring_look]
-             for s, p in zip(shots, people, strict=True)]  # fmt: skip
-    return Worn(body.materials, torch.tensor(looks, device=body.faces.device, dtype=torch.float32))

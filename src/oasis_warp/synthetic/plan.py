@@ -1,8 +1,7 @@
 """Plan pictures: all that is drawn at random, before anything is rendered. On the CPU, a few milliseconds each."""
 
 import functools
-from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +13,6 @@ from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.contact import separate
 from oasis_warp.synthetic.gestures import sample_gesture
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
-from oasis_warp.synthetic.processes import worker_pool
 from oasis_warp.synthetic.rooms import Room, sample_room
 from oasis_warp.synthetic.sensor import Sensor, sample_sensor
 from oasis_warp.synthetic.stage import Light, Look, View, sample_light, sample_view
@@ -26,8 +24,6 @@ PICTURE_STREAM = 2
 """Tells the random numbers of pictures from those of identities with the same seed."""
 HAND_REACH = 0.11
 """Of a hand beyond its middle, roughly: rooms begin behind it [m]."""
-AHEAD = 3
-"""Batches a worker that are planned ahead."""
 EVERYBODY = Population()
 
 
@@ -59,16 +55,17 @@ class Shot(NamedTuple):
     view: View
     light: Light
     clothes: Clothes
-    room: Room
-    sensor: Sensor
+    room: Room | None
+    """As the sensor, none in even light."""
+    sensor: Sensor | None
     seed: int
     """Of whatever is drawn a pixel at a time."""
 
 
 def sample_shot(seed: int, index: int, scenery: Scenery = PHOTOS) -> Shot:
     """Draw picture `index` of the world `seed`; fingers may still sink in."""
-    look = scenery.look
-    rng = np.random.default_rng([seed, PICTURE_STREAM, index, look == "even"])
+    look, even = scenery.look, scenery.look == "even"
+    rng = np.random.default_rng([seed, PICTURE_STREAM, index, even])
     name, angles = sample_gesture(rng, bundled_body().hand)
     bend = np.array([0.0, rng.normal(0, 0.15), rng.normal(0, 0.30)])
     number = index // PICTURES_EACH
@@ -84,15 +81,16 @@ def sample_shot(seed: int, index: int, scenery: Scenery = PHOTOS) -> Shot:
         bend=bend,
         view=view,
         light=sample_light(rng, look),
-        clothes=sample_clothes(rng, bare=look == "even"),
-        room=sample_room(rng, view.distance, HAND_REACH),
-        sensor=sample_sensor(rng),
+        clothes=sample_clothes(rng, bare=even),
+        room=None if even else sample_room(rng, view.distance, HAND_REACH),
+        sensor=None if even else sample_sensor(rng),
         seed=int(rng.integers(1 << 31)),
     )
 
 
 @functools.lru_cache(4096)
-def _identity(seed: int, number: int, population: Population) -> Identity:
+def identity_of(seed: int, number: int, population: Population) -> Identity:
+    """Person `number` of the world `seed`, remembered."""
     return sample_identity(bundled_body().hand, seed, number, population)
 
 
@@ -100,28 +98,8 @@ def plan_shots(seed: int, indices: Sequence[int], scenery: Scenery = PHOTOS) -> 
     """Pictures `indices` of the world `seed`, their fingers kept apart: each as if it were alone."""
     hand = bundled_body().hand
     shots = [sample_shot(seed, int(index), scenery) for index in indices]
-    shapes = np.stack([_identity(seed, shot.person, scenery.population).shape for shot in shots])
+    shapes = np.stack([identity_of(seed, shot.person, scenery.population).shape for shot in shots])
     joints, basis = hand.joints.double().numpy(), hand.joint_basis.double().numpy()
     at_rest = joints + (basis * shapes[:, None, None]).sum(-1)
     angles, _ = separate(np.stack([shot.angles for shot in shots]), at_rest * 1e3)
     return [shot._replace(angles=a) for shot, a in zip(shots, angles, strict=True)]
-
-
-def plan_ahead(seed: int, blocks: Iterable[Sequence[int]], scenery: Scenery, workers: int) -> Iterator[list[Shot]]:
-    """`plan_shots` of each of `blocks` in turn, drawn ahead by `workers` processes where there are any."""
-    if workers < 1:
-        for block in blocks:
-            yield plan_shots(seed, block, scenery)
-        return
-    with worker_pool(workers) as pool:
-        waiting: deque = deque()
-        try:
-            for block in blocks:
-                waiting.append(pool.submit(plan_shots, seed, block, scenery))
-                if len(waiting) >= AHEAD * workers:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()

@@ -1,21 +1,19 @@
 """Pose a batch of people, dress them, and put them before their cameras."""
 
+import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.hand.correctives import corrective_coefficients
-from oasis_warp.synthetic.body import ARM_LENGTH, ARM_ROWS, Body, arm_rows
-from oasis_warp.synthetic.contact import bundled_skeleton
+from oasis_warp.ops.flesh import pose_flesh
+from oasis_warp.synthetic.body import Body, arm_rows
 from oasis_warp.synthetic.people import Person
-from oasis_warp.synthetic.stage import View
-from oasis_warp.synthetic.wardrobe import AWAY, Clothes, bands, sleeves
+from oasis_warp.synthetic.planned import Numbers
+from oasis_warp.synthetic.wardrobe import AWAY, bands, sleeves
 
-ARM_BEND = 0.15
-"""Share of the forearm over which it bends at the wrist."""
 _LAST_JOINTS = (15, 3, 6, 12, 9)
 """Of thumb, index, middle, ring, little: they carry the tips."""
 
@@ -36,85 +34,69 @@ class Posed(NamedTuple):
     """Of a ball round it that holds the hand."""
 
 
-def arm_turns(bends: np.ndarray) -> np.ndarray:
-    """Rotations of the arm's rings, [B, R, 3, 3], for bends at the wrist about axes with lengths [rad], [B, 3]."""
-    share = np.minimum(1.0, np.linspace(0, 1, ARM_ROWS + 1)[1:] / ARM_BEND)
-    lengths = np.linalg.norm(bends, axis=1)
-    x, y, z = (bends / np.maximum(lengths, 1e-12)[:, None]).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 1, 3, 3)
-    angles = (lengths[:, None] * share)[..., None, None]
-    return np.eye(3) + np.sin(angles) * cross + (1 - np.cos(angles)) * cross @ cross
+@functools.cache
+def _away(device: torch.device) -> Tensor:
+    return torch.tensor(AWAY, device=device)
 
 
-def pose_people(
-    body: Body, people: list[Person], angles: np.ndarray, bends: np.ndarray, views: list[View], clothes: list[Clothes]
-) -> Posed:
+@functools.cache
+def _carriers(device: torch.device) -> Tensor:
+    """Joints that carry the joints and tips."""
+    return torch.tensor([*range(16), *_LAST_JOINTS], device=device)
+
+
+def _moved(rotations: Tensor, points: Tensor) -> Tensor:
+    """Points [B, N, 3], turned by rotations [B, 3, 3] or [B, N, 3, 3]."""
+    rotations = rotations[:, None] if rotations.dim() == 3 else rotations
+    return (rotations * points[:, :, None]).sum(-1)
+
+
+def pose_people(body: Body, people: Sequence[Person], numbers: Numbers) -> Posed:
     """Skin the hands with their pose correctives, grow arms, lay clothes on, and fit the cameras.
 
     Args:
         body: On the people's device.
         people: One an image.
-        angles: Of all joints [rad], [B, 16, 3].
-        bends: Of the wrist [rad], [B, 3].
-        views: One an image.
-        clothes: One an image.
+        numbers: Of the images.
     """
-    device, hand = people[0].rest.device, body.hand
-    on_device = lambda a: torch.from_numpy(np.ascontiguousarray(a)).float().to(device)  # noqa: E731
-    joints = torch.stack([p.joints for p in people])
-    rotation, shift = bundled_skeleton().transforms(angles, joints.double().cpu().numpy())
-    rotation, shift = on_device(rotation), on_device(shift)
-    coefficients = torch.stack([corrective_coefficients(hand, on_device(a[1:])) for a in angles])
-    rest = torch.stack([p.rest for p in people])
-    rest = rest + (coefficients @ hand.corrective_basis.flatten(0, 1).T).unflatten(1, (-1, 3))
-    bony = torch.tensor([0.4 + 0.9 * p.identity.bony for p in people], device=device)
-    bent = on_device(1 - np.cos(np.maximum(angles[:, 1:, 0] + hand.rest_bend[1:].cpu().numpy(), 0)))
-    rise = (bent * bony[:, None]) @ body.knuckle_rise.T
-    rest = rest + body.normals[: body.n_hand] * rise[..., None]
-    blended = hand.weights @ torch.cat([rotation.flatten(2), shift], 2)  # B V 12
-    skinned = (blended[..., :9].unflatten(2, (3, 3)) * rest[:, :, None]).sum(-1) + blended[..., 9:]
+    hand = body.hand
+    rest, joints, tips, ring = (torch.stack([getattr(p, name) for p in people])
+                                for name in ("rest", "joints", "tips", "ring"))  # fmt: skip
+    bend = 1 - torch.cos(numbers.angles[..., 0])
+    correctives = torch.stack([bend, bend * bend], -1).flatten(1)  # `hand.correctives.corrective_coefficients`
+    skinned = pose_flesh(
+        rest, hand.corrective_basis, correctives, body.normals[: body.n_hand], body.knuckle_rise, numbers.knuckles,
+        hand.weights, numbers.rotations, numbers.shifts,
+    )  # fmt: skip
 
-    girth = torch.tensor([p.identity.arm_girth for p in people], device=device)
-    arm = arm_rows(skinned[:, hand.rim], on_device(arm_turns(bends)), girth)
-    rows = torch.cat([skinned[:, hand.rim][:, None], arm], 1)
-    finger = torch.tensor([max(p.identity.ring_finger, 0) for p in people], device=device)
-    ring_joint = 3 * finger + 1
-    each = torch.arange(len(people), device=device)
-    ring = torch.stack([p.ring for p in people])
-    ring = (rotation[each, ring_joint][:, None] * ring[:, :, None]).sum(-1) + shift[each, ring_joint][:, None]
-    worn = [sleeves(rows, clothes).flatten(1, 2), bands(rows, clothes).flatten(1, 2), ring]
-    wears = [
-        [c.sleeve_start < ARM_LENGTH for c in clothes],
-        [c.band_start < ARM_LENGTH for c in clothes],
-        [p.identity.ring_finger >= 0 for p in people],
+    rim = skinned[:, hand.rim]
+    arm = arm_rows(rim, numbers.arm_turns, numbers.arm_girth)
+    rows = torch.cat([rim[:, None], arm], 1)
+    worn = [
+        sleeves(rows, numbers.sleeve_start, numbers.sleeve_gap, numbers.sleeve_phases).flatten(1, 2),
+        bands(rows, numbers.band_start, numbers.band_width, numbers.band_thickness).flatten(1, 2),
+        _moved(numbers.ring_rotation, ring) + numbers.ring_shift[:, None],
     ]
 
-    turn = on_device(np.stack([v.rotation for v in views]))
-    seen = (turn[:, None] * skinned[:, :, None]).sum(-1)
-    low, high = seen.amin(1), seen.amax(1)
+    turn, distance, fill = numbers.view_rotation, numbers.view_distance, numbers.view_fill
+    seen = _moved(turn, skinned)
+    low, high = seen.aminmax(dim=1)
     middle = (low + high) / 2
     extent = (high - low)[:, :2].amax(1)
-    distance = on_device([v.distance for v in views])
-    shifts = on_device(np.stack([v.shift for v in views]))
-    fill = on_device([v.fill for v in views])
     focal = fill * distance / extent
-    off = torch.cat([shifts * (extent / fill)[:, None], distance[:, None]], 1)
+    off = torch.cat([numbers.view_shift * (extent / fill)[:, None], distance[:, None]], 1)
     translation = off - middle
-    move = lambda points: (turn[:, None] * points[:, :, None]).sum(-1) + translation[:, None]  # noqa: E731
-    away = torch.tensor(AWAY, device=device)
+    move = lambda points: _moved(turn, points) + translation[:, None]  # noqa: E731
     parts = [seen + translation[:, None], move(arm.flatten(1, 2))]
-    for points, there in zip(worn, wears, strict=True):
-        parts.append(torch.where(torch.tensor(there, device=device)[:, None, None], move(points), away))
+    for k, points in enumerate(worn):
+        parts.append(torch.where(numbers.wears[:, k, None, None] > 0, move(points), _away(points.device)))
 
-    tips = torch.stack([p.tips for p in people])
-    last = torch.tensor(_LAST_JOINTS, device=device)
-    bone_points = torch.cat([joints, tips], 1)
-    carriers = torch.cat([torch.arange(16, device=device), last])
-    marks = (rotation[:, carriers] * bone_points[:, :, None]).sum(-1) + shift[:, carriers]
+    carriers = _carriers(rest.device)[hand.keypoint_index]
+    carried = torch.cat([joints, tips], 1)[:, hand.keypoint_index]
+    marks = _moved(numbers.rotations[:, carriers], carried) + numbers.shifts[:, carriers]
     return Posed(
         torch.cat(parts, 1),
-        move(marks[:, hand.keypoint_index]),
+        move(marks),
         translation,
         focal,
         middle + translation,

@@ -13,6 +13,14 @@ from torch.nn.functional import avg_pool2d, conv2d, interpolate, pad
 from oasis_warp.ops.pixel_noise import pixel_noise
 
 _LUMA = (0.2126, 0.7152, 0.0722)
+_PLACES = {
+    "exposure": 0, "metering": 1, "balance": 2, "tint": slice(3, 6), "vignette": 6, "blur": 7, "noise": 8, "grain": 9,
+    "filmic": 10, "contrast": 11, "saturation": 12, "sharpening": 13, "quality": 14,
+}  # fmt: skip
+"""Of a sensor's fields in its row."""
+SENSOR_WORDS = 15
+_SHARPENED = 1.2
+"""Blur that sharpening compares with [px]."""
 _TAPS = 4
 """Pixels on either side that a blur reaches."""
 # Annex K of the JPEG standard (ITU-T T.81), and the JFIF colour transform.
@@ -73,6 +81,16 @@ def sample_sensor(rng: np.random.Generator) -> Sensor:
     )
 
 
+def sensor_row(sensor: Sensor) -> list[float]:
+    """The numbers of a sensor in a row."""
+    return [float(number) for value in sensor for number in np.atleast_1d(value)]
+
+
+@functools.cache
+def _constant(values: tuple, device: torch.device) -> Tensor:
+    return torch.tensor(values, device=device)
+
+
 def _blur(images: Tensor, sigmas: Tensor) -> Tensor:
     """Gaussian blur of each of [B, C, H, W] by its own width, edges repeated."""
     batch, channels = images.shape[:2]
@@ -87,40 +105,45 @@ def _blur(images: Tensor, sigmas: Tensor) -> Tensor:
 
 
 @functools.cache
-def _dct() -> Tensor:
+def _dct(device: torch.device) -> Tensor:
     k = torch.arange(8, dtype=torch.float64)
     basis = torch.cos(math.pi * (2 * k + 1) * k[:, None] / 16) / 2
     basis[0] /= math.sqrt(2)
-    return basis.float()
+    return basis.float().to(device)
+
+
+@functools.cache
+def _color_transforms(device: torch.device) -> tuple[Tensor, Tensor]:
+    """From RGB to luma and chroma, and back."""
+    there = torch.tensor(_TO_YCC)
+    return there.to(device), torch.linalg.inv(there).to(device)
 
 
 def _quantised(planes: Tensor, steps: Tensor) -> Tensor:
     """Planes [B, C, H, W] of whole 8 x 8 blocks, their cosine coefficients rounded to multiples of [B, 8, 8]."""
-    dct = _dct().to(planes.device)
+    dct = _dct(planes.device)
     blocks = planes.unflatten(3, (-1, 8)).unflatten(2, (-1, 8)).transpose(3, 4)
     steps = steps[:, None, None, None]
     rounded = (dct @ blocks @ dct.T / steps).round() * steps
     return (dct.T @ rounded @ dct).transpose(3, 4).flatten(4, 5).flatten(2, 3)
 
 
-def jpeg(images: Float[Tensor, "B 3 H W"], qualities: list[int]) -> Float[Tensor, "B 3 H W"]:
+def jpeg(images: Float[Tensor, "B 3 H W"], qualities: Float[Tensor, "B"]) -> Float[Tensor, "B 3 H W"]:
     """What JPEG with chroma at half size leaves of sRGB images in [0, 1]: the loss, without the file."""
     device, (height, width) = images.device, images.shape[2:]
-    quality = torch.tensor(qualities, device=device)
-    scale = torch.where(quality < 50, 5000 / quality, 200 - 2 * quality).float()[:, None]
+    scale = torch.where(qualities < 50, 5000 / qualities, 200 - 2 * qualities)[:, None]
 
     def steps(table: tuple[int, ...]) -> Tensor:
-        row = torch.tensor(table, device=device)
-        return ((row * scale + 50) / 100).floor().clamp(1, 255).view(-1, 8, 8)
+        return ((_constant(table, device) * scale + 50) / 100).floor().clamp(1, 255).view(-1, 8, 8)
 
     whole = (images * 255).round()
     whole = pad(whole, (0, -width % 16, 0, -height % 16), mode="replicate")
-    to_ycc = torch.tensor(_TO_YCC, device=device)
+    to_ycc, from_ycc = _color_transforms(device)
     ycc = torch.einsum("cd,bdhw->bchw", to_ycc, whole)
     luma = _quantised(ycc[:, :1] - 128, steps(_LUMA_STEPS)) + 128
     chroma = _quantised(avg_pool2d(ycc[:, 1:], 2), steps(_CHROMA_STEPS))
     chroma = interpolate(chroma, scale_factor=2, mode="bilinear", align_corners=False)
-    rgb = torch.einsum("cd,bdhw->bchw", torch.linalg.inv(to_ycc), torch.cat([luma, chroma], 1))
+    rgb = torch.einsum("cd,bdhw->bchw", from_ycc, torch.cat([luma, chroma], 1))
     return (rgb[..., :height, :width] / 255).clamp(0, 1)
 
 
@@ -132,7 +155,7 @@ def srgb(linear: Tensor) -> Tensor:
 def expose(
     light: Float[Tensor, "B H W 3"],
     alpha: Float[Tensor, "B H W"],
-    sensors: list[Sensor],
+    sensors: Float[Tensor, "B 15"],
     incident: Float[Tensor, "B 3"],
     seeds: Int[Tensor, "B"],
 ) -> Float[Tensor, "B H W 3"]:
@@ -141,20 +164,20 @@ def expose(
     Args:
         light: Of the scene.
         alpha: Where the hand is: it is metered first.
-        sensors: One an image.
+        sensors: A `sensor_row` an image.
         incident: Irradiance over pi on the hand, linear RGB.
         seeds: Of the noise.
     """
     device, size = light.device, light.shape[2]
 
     def column(name: str) -> Tensor:
-        return torch.tensor(np.array([getattr(s, name) for s in sensors]), device=device, dtype=torch.float32)
+        return sensors[:, _PLACES[name]]
 
     def cast(name: str) -> Tensor:
         return column(name)[:, None, None, None]
 
     x = light.permute(0, 3, 1, 2)
-    luma = torch.tensor(_LUMA, device=device)[:, None, None]
+    luma = _constant(_LUMA, device)[:, None, None]
     weight = alpha * 0.7 + 0.25
     mirrored = ((x * luma).sum(1).clamp(max=2.0) * weight).sum((1, 2)) / weight.sum((1, 2))
     falling = 0.18 * (incident * luma[:, 0, 0]).sum(1)
@@ -176,5 +199,5 @@ def expose(
     x = x + cast("contrast") * x * (1 - x) * (2 * x - 0.9)
     grey = (x * luma).sum(1, keepdim=True)
     x = grey + (x - grey) * cast("saturation")
-    x = x + cast("sharpening") * (x - _blur(x, torch.full((len(x),), 1.2, device=device)))
-    return jpeg(x.clamp(0, 1), [s.quality for s in sensors]).permute(0, 2, 3, 1)
+    x = x + cast("sharpening") * (x - _blur(x, torch.full((len(x),), _SHARPENED, device=device)))
+    return jpeg(x.clamp(0, 1), column("quality")).permute(0, 2, 3, 1)

@@ -7,6 +7,9 @@ skin colours from CIELAB L 72 to L 30. Those were measured with the mirrored lig
 half of that is left to the gloss, which is rendered for itself: with both, dark skin would be chalky.
 """
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -32,6 +35,7 @@ _WHITE = np.array([0.9505, 1.0, 1.089])
 
 ABOVE_MELANIN = 0.018
 """Share of light that comes back before it meets melanin, mirrored light left out."""
+REFLECTANCE_RANGE = (0.002, 0.95)
 MELANIN_RANGE = (0.002, 0.8)
 BLOOD_RANGE = (0.001, 0.15)
 _TABLE = (48, 40)
@@ -51,6 +55,9 @@ def _matching() -> np.ndarray:
     return rows / rows.sum(1, keepdims=True) * _WHITE[:, None]
 
 
+_TO_RGB = _XYZ_TO_RGB @ _matching()
+
+
 def skin_reflectance(
     melanin: np.ndarray, blood: np.ndarray, *, oxygen: float = 0.7, epidermis: float = 80.0, carotene: float = 0.0
 ) -> np.ndarray:
@@ -63,7 +70,20 @@ def skin_reflectance(
         epidermis: Thickness of the epidermis [um].
         carotene: Amount of yellow (carotene and a thick horn layer), 0 to about 0.4.
     """
-    melanin, blood = np.asarray(melanin, float)[..., None], np.asarray(blood, float)[..., None]
+    crossed, dermis = _layers(
+        np.asarray(melanin, float)[..., None], np.asarray(blood, float)[..., None], oxygen, epidermis, carotene
+    )
+    returned = ABOVE_MELANIN + (1 - ABOVE_MELANIN) * crossed * dermis
+    return np.clip(returned @ _TO_RGB.T, *REFLECTANCE_RANGE)
+
+
+def _layers(
+    melanin: np.ndarray, blood: np.ndarray, oxygen: float, epidermis: float, carotene: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Share of light that the epidermis lets through, forth and back, and that the dermis returns, a wavelength each.
+
+    Arguments [..., 1] as in `skin_reflectance`; both results [..., 31].
+    """
     bloodless = 0.244 + 85.3 * np.exp(-(_NM - 154) / 66.2)
     absorbed = blood * 2.303 * 150 / 64500 * (oxygen * _OXYGENATED + (1 - oxygen) * _BARE) + bloodless
     absorbed = absorbed + carotene * 6 * np.exp(-0.5 * ((_NM - 460) / 28) ** 2)
@@ -72,28 +92,42 @@ def skin_reflectance(
     depth = np.sqrt(3 * (1 - albedo))
     dermis = albedo / 2 * (1 + np.exp(-4 / 3 * 3.25 * depth)) * np.exp(-depth) * 1.12
     crossed = (melanin * 494 * (_NM / 550) ** -2.36 + bloodless) * epidermis * 1e-4 * 3.2
-    returned = ABOVE_MELANIN + (1 - ABOVE_MELANIN) * (1 + crossed / 4.75) ** -4.75 * dermis
-    return np.clip(returned @ _matching().T @ _XYZ_TO_RGB.T, 0.002, 0.95)
+    return (1 + crossed / 4.75) ** -4.75, dermis
 
 
-class SkinColor:
-    """`skin_reflectance` of one person, as a table over the logarithms of melanin and blood."""
+class Tint(NamedTuple):
+    """What is the same all over a part of one person's skin: see `skin_reflectance`."""
 
-    def __init__(self, *, oxygen: float, epidermis: float, carotene: float, device: torch.device | str = "cpu"):
-        melanin, blood = (np.geomspace(*r, n) for r, n in zip((MELANIN_RANGE, BLOOD_RANGE), _TABLE, strict=True))
-        grid = np.meshgrid(melanin, blood, indexing="ij")
-        colors = skin_reflectance(*grid, oxygen=oxygen, epidermis=epidermis, carotene=carotene)
-        self.table = torch.from_numpy(colors).float().permute(2, 0, 1)[None].to(device)
+    oxygen: float
+    epidermis: float
+    carotene: float
 
-    def __call__(self, melanin: Float[Tensor, "N"], blood: Float[Tensor, "N"]) -> Float[Tensor, "N 3"]:
-        """Linear sRGB; shares beyond the table are clamped."""
 
-        def place(values: Tensor, ends: tuple[float, float]) -> Tensor:
-            low, high = np.log(ends)
-            return (values.clamp(*ends).log() - low) / (high - low) * 2 - 1
+def _table(tint: Tint) -> np.ndarray:
+    """`skin_reflectance` at the knots of melanin and blood, [3, melanin, blood]."""
+    melanin, blood = (np.geomspace(*r, n) for r, n in zip((MELANIN_RANGE, BLOOD_RANGE), _TABLE, strict=True))
+    crossed, dermis = _layers(melanin[:, None], blood[:, None], *tint)
+    # What comes back is a product of the two layers at each wavelength, so a colour is a matrix product.
+    deep = (_TO_RGB[:, None] * crossed) @ dermis.T
+    return (ABOVE_MELANIN * _TO_RGB.sum(1)[:, None, None] + (1 - ABOVE_MELANIN) * deep).clip(*REFLECTANCE_RANGE)
 
-        where = torch.stack([place(blood, BLOOD_RANGE), place(melanin, MELANIN_RANGE)], -1)
-        return grid_sample(self.table, where[None, None], align_corners=True)[0, :, 0].T
+
+def skin_colors(
+    melanin: Float[Tensor, "N"], blood: Float[Tensor, "N"], tints: Sequence[Tint]
+) -> tuple[Float[Tensor, "3 N"], ...]:
+    """Linear sRGB of skin for each of `tints`, from tables over the logarithms of melanin and blood.
+
+    Shares beyond `MELANIN_RANGE` and `BLOOD_RANGE` are clamped.
+    """
+    tables = torch.from_numpy(np.concatenate([_table(tint) for tint in tints])).float().to(melanin.device)
+
+    def place(values: Tensor, ends: tuple[float, float]) -> Tensor:
+        low, high = np.log(ends)
+        return (values.clamp(*ends).log() - low) * (2 / (high - low)) - 1
+
+    where = torch.stack([place(blood, BLOOD_RANGE), place(melanin, MELANIN_RANGE)], -1)
+    colors = grid_sample(tables[None], where[None, None], padding_mode="border", align_corners=True)[0, :, 0]
+    return colors.split(3)
 
 
 def linear_to_lab(linear: np.ndarray) -> np.ndarray:

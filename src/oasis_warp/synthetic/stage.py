@@ -3,6 +3,7 @@
 The camera looks along +z, x right, y down, metres; colours are linear RGB.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -21,6 +22,7 @@ _FACING = {
 }
 """Rotations from the hand's frame to a camera that sees this side, fingers up."""
 _VIEW_SHARES = {"palm": 0.40, "back": 0.32, "thumb": 0.11, "little": 0.03, "any": 0.14}
+_STILL = np.eye(3)
 _TO_CAMERA = np.array([0.0, 0.0, -1.0])
 DIRECTIONS = 400
 """Of the sky, when its harmonics are summed."""
@@ -58,9 +60,15 @@ class View(NamedTuple):
 
 def rotation_about(axis: Vector, angle: float) -> np.ndarray:
     """Rotation matrix (Rodrigues)."""
-    x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    cross = _cross(*map(float, axis))
+    return _STILL + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+@functools.lru_cache(16)
+def _cross(x: float, y: float, z: float) -> np.ndarray:
+    """Matrix of the vector product with the unit vector along an axis; few axes are asked for, over and over."""
+    x, y, z = np.array([x, y, z], float) / np.linalg.norm([x, y, z])
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 def sample_view(rng: np.random.Generator, look: Look, closed: bool) -> View:
@@ -120,14 +128,19 @@ _SPHERE = sphere(DIRECTIONS)
 _SPHERE_HARMONICS = _harmonics(_SPHERE) * (4 * np.pi / DIRECTIONS)
 
 
+@functools.cache
+def _even_light() -> Light:
+    d = _SPHERE
+    level = 0.9 * np.ones((DIRECTIONS, 1)) - 0.12 * d[:, 1:2] - 0.18 * d[:, 2:3]
+    sky = _SPHERE_HARMONICS.T @ (level * np.ones(3))
+    none = np.zeros((N_LAMPS, 3))
+    return Light(sky, none + _TO_CAMERA, np.ones(N_LAMPS), none, np.full(N_LAMPS, 0.1), np.ones(3))
+
+
 def sample_light(rng: np.random.Generator, look: Look) -> Light:
     """Environment and soft lamps of a room, a window, the open air, or a flash; even looks get a bright plain sky."""
     if look == "even":
-        d = _SPHERE
-        level = 0.9 * np.ones((DIRECTIONS, 1)) - 0.12 * d[:, 1:2] - 0.18 * d[:, 2:3]
-        sky = _SPHERE_HARMONICS.T @ (level * np.ones(3))
-        none = np.zeros((N_LAMPS, 3))
-        return Light(sky, none + _TO_CAMERA, np.ones(N_LAMPS), none, np.full(N_LAMPS, 0.1), np.ones(3))
+        return _even_light()
     u, d = rng.uniform, _SPHERE
     up = np.array([rng.normal(0, 0.3), -1, rng.normal(0, 0.3)])
     up /= np.linalg.norm(up)

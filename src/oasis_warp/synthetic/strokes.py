@@ -1,21 +1,52 @@
-"""Lines on the skin, collected as rows of samples that `ops.surface_lines` draws."""
+"""Lines on the skin, collected one by one with the random numbers of each; `drawn_lines` draws them all at once.
+
+Nothing here needs a device: processes that plan people import it.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
-from oasis_warp.ops.surface_patterns import surface_lines
 
 KINDS = ("crease", "main", "minor", "fold", "wrinkle", "vein", "tendon", "hair", "halo")
 """Flexion creases of the fingers and wrist; the palm's main and its fine lines; folds over the knuckles; compression
 wrinkles; vessels; tendons; hairs; the soft valley along main lines."""
-_WIDE = ("vein", "tendon", "halo")
-"""Drawn apart: the widest line sets the search's cells."""
 _LONG = ("crease", "main", "halo")
 _SPACING = 0.25
 """Between samples of one line, and of hairs [mm]."""
 _HAIR_SPACING = 0.14
+PLACE_CELL, STRENGTH_CELL = 5.0, 4.0
+"""Distances between the values that a line's place and width, and its strength, wander through [mm]."""
+_WALKS = 5
+"""Of one line: three of its place, one of its strength, one of its width."""
+LINE_WORDS, CORNER_WORDS = 15, 4
+"""Numbers in `Lines` for each line and for each of its corners."""
+
+
+class Lines(NamedTuple):
+    """Lines in one array, so that they travel in one copy."""
+
+    numbers: np.ndarray
+    """float64: `n_lines` rows of the fields of `_Line`, the number of the line's samples, the sums over the lines
+    before it of samples, corners, lengths + 1 and knots, and by how much its strength wanders; `n_corners` rows of
+    x, y, z and distance from the line's start; the knots of the walks, line after line."""
+    n_lines: int
+    n_corners: int
+    n_samples: int
+
+
+class _Line(NamedTuple):
+    """Numbers of one line."""
+
+    corners: int
+    length: float
+    width: float
+    strength: float
+    taper: float
+    wobble: float
+    kind: int
+    place_knots: int
+    """Random values of each walk but that of the strength."""
+    strength_knots: int
 
 
 class Strokes:
@@ -23,11 +54,13 @@ class Strokes:
 
     def __init__(self, rng: np.random.Generator):
         self.rng = rng
-        self._rows: list[np.ndarray] = []  # x, y, z, width, strength, kind
+        self._lines: list[_Line] = []
+        self._corners: list[np.ndarray] = []
+        self._knots: list[np.ndarray] = []
 
     def add(self, kind: str, points: np.ndarray, width: float, strength: float, *, taper: float = 0.25,
             wobble: float = 0.3) -> None:  # fmt: skip
-        """Draw a line through `points` [n, 3].
+        """A line through `points` [n, 3].
 
         Args:
             kind: One of `KINDS`.
@@ -37,39 +70,34 @@ class Strokes:
             taper: Share of the length over which either end fades.
             wobble: Amplitude of the line's own wander.
         """
-        points = np.asarray(points, float)
-        along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-        length = along[-1]
+        steps = points[1:] - points[:-1]
+        corners = np.empty((len(points), CORNER_WORDS))
+        corners[:, :3] = points
+        corners[0, 3] = 0
+        np.cumsum(np.sqrt((steps * steps).sum(1)), out=corners[1:, 3])
+        length = float(corners[-1, 3])
         if length < 1e-6:
             return
-        t = np.linspace(0, length, max(4, int(length / (_HAIR_SPACING if kind == "hair" else _SPACING))))
-        line = np.stack([np.interp(t, along, points[:, k]) for k in range(3)], 1)
+        place_knots, strength_knots = (int(np.ceil(length / cell + 3)) for cell in (PLACE_CELL, STRENGTH_CELL))
+        self._knots.append(self.rng.uniform(-1, 1, (_WALKS - 1) * place_knots + strength_knots))
+        self._corners.append(corners)
+        self._lines.append(
+            _Line(len(points), length, width, strength, taper, wobble, KINDS.index(kind), place_knots, strength_knots)
+        )
 
-        def walk(cell: float) -> np.ndarray:
-            knots = np.arange(-1, length / cell + 2) * cell
-            return np.interp(t, knots, self.rng.uniform(-1, 1, len(knots)))
-
-        line += wobble * np.stack([walk(5.0) for _ in range(3)], 1)
-        u = t / length
-        fade = np.clip(np.minimum(u, 1 - u) / max(taper, 1e-3), 0, 1) ** 0.7
-        amplitude = strength * fade * (1 + (0.25 if kind in _LONG else 0.5) * walk(4.0))
-        widths = width * (1 + 0.2 * walk(5.0))
-        self._rows.append(np.c_[line, widths, amplitude, np.full(len(t), KINDS.index(kind))])
-
-    def draw(self, points: Float[Tensor, "N 3"]) -> dict[str, Float[Tensor, "N"]]:
-        """The profile of each kind at `points`: the strongest line near by."""
-        rows = np.concatenate(self._rows) if self._rows else np.zeros((0, 6))
-        rows = rows[rows[:, 4] > 1e-3]
-        wide = np.isin(rows[:, 5], [KINDS.index(kind) for kind in _WIDE])
-        values = torch.zeros(len(points), len(KINDS), device=points.device)
-        for part in (rows[wide], rows[~wide]):
-            some = torch.from_numpy(part.astype(np.float32)).to(points.device)
-            kinds = some[:, 5].to(torch.int32)
-            drawn = surface_lines(
-                points, some[:, :3].contiguous(), some[:, 3].contiguous(), some[:, 4].contiguous(), kinds, len(KINDS)
-            )
-            values = torch.maximum(values, drawn)
-        return dict(zip(KINDS, values.unbind(1), strict=True))
+    def lines(self) -> Lines:
+        """All that has been added so far."""
+        table = np.array(self._lines, float).reshape(-1, len(_Line._fields))
+        line = dict(zip(_Line._fields, table.T, strict=True))
+        spacing = np.where(line["kind"] == KINDS.index("hair"), _HAIR_SPACING, _SPACING)
+        counts = np.maximum(4, (line["length"] / spacing).astype(np.int64))
+        before = lambda n: np.cumsum(n) - n  # noqa: E731
+        knots = (_WALKS - 1) * line["place_knots"] + line["strength_knots"]
+        firsts = np.stack([before(counts), before(line["corners"]), before(line["length"] + 1.0), before(knots)])
+        loud = np.where(np.isin(line["kind"], [KINDS.index(k) for k in _LONG]), 0.25, 0.5)
+        rows = np.concatenate([table, counts[:, None], firsts.T, loud[:, None]], 1)
+        numbers = np.concatenate([rows.ravel(), *(c.ravel() for c in self._corners), *self._knots])
+        return Lines(numbers, len(rows), int(line["corners"].sum()), int(counts.sum()))
 
 
 def through(controls: np.ndarray, n: int = 40) -> np.ndarray:

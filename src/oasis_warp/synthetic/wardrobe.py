@@ -1,5 +1,6 @@
 """What a hand wears: the meshes of sleeves, wristbands and rings on a posed hand, and how they look."""
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,8 @@ from torch import Tensor
 from oasis_warp.synthetic.body import ARM_LENGTH, ARM_ROWS, BAND_ROWS, RING_COLUMNS, RING_ROWS, SLEEVE_ROWS, Body
 from oasis_warp.synthetic.identity import Identity
 
+BAND_PLACES = (0.0, 0.02, 0.15, 0.5, 0.85, 0.98, 1.0)
+"""Of a wristband's rows over its width."""
 BAND_PROFILE = (-0.6, 0.7, 1.0, 1.0, 1.0, 0.7, -0.6)
 """Height of a wristband's rows over the skin, in its thickness."""
 RING_ROUNDNESS = 0.6
@@ -74,18 +77,18 @@ def _outward(rings: Tensor) -> Tensor:
     return torch.nn.functional.normalize(rings - rings.mean(2, keepdim=True), dim=-1)
 
 
-def sleeves(rows: Float[Tensor, "B R C 3"], clothes: list[Clothes]) -> Float[Tensor, "B K C 3"]:
+def sleeves(
+    rows: Float[Tensor, "B R C 3"], start: Float[Tensor, "B"], gap: Float[Tensor, "B"], phases: Float[Tensor, "B 4"]
+) -> Float[Tensor, "B K C 3"]:
     """Wrinkled tubes round arms, whose rows start with the wrist's rim; rows of absent ones are not to be used."""
-    column = rows.new_tensor
-    start = column([c.sleeve_start for c in clothes])[:, None] / ARM_LENGTH
-    gap = column([c.sleeve_gap for c in clothes])[:, None]
+    start, gap = start[:, None] / ARM_LENGTH, gap[:, None]
     share = torch.linspace(0, 1, SLEEVE_ROWS - 2, device=rows.device)
     s = torch.cat([start, start, start + (1 - start) * share], 1)
     rings = _along_arm(rows, s)
     lift = gap.expand(-1, SLEEVE_ROWS).clone()
     lift[:, 0] = -1e-3
     lift[:, 1] = (gap - 1.2e-3)[:, 0]
-    phase = column(np.stack([c.sleeve_phases for c in clothes]))[:, :, None, None]
+    phase = phases[:, :, None, None]
     angle = torch.linspace(0, 2 * torch.pi, rows.shape[2] + 1, device=rows.device)[:-1]
     along = s[:, :, None] * ARM_LENGTH
     folds = (
@@ -98,16 +101,20 @@ def sleeves(rows: Float[Tensor, "B R C 3"], clothes: list[Clothes]) -> Float[Ten
     return rings + _outward(rings) * lift[..., None]
 
 
-def bands(rows: Float[Tensor, "B R C 3"], clothes: list[Clothes]) -> Float[Tensor, "B K C 3"]:
+@functools.cache
+def _band_profile(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Place of a wristband's rows over its width, and their height over its thickness."""
+    assert len(BAND_PLACES) == len(BAND_PROFILE) == BAND_ROWS
+    return torch.tensor(BAND_PLACES, device=device), torch.tensor(BAND_PROFILE, device=device)
+
+
+def bands(
+    rows: Float[Tensor, "B R C 3"], start: Float[Tensor, "B"], width: Float[Tensor, "B"], thickness: Float[Tensor, "B"]
+) -> Float[Tensor, "B K C 3"]:
     """Flat bands round wrists."""
-    column = rows.new_tensor
-    start, width, thickness = (
-        column([getattr(c, name) for c in clothes])[:, None] for name in ("band_start", "band_width", "band_thickness")
-    )
-    share = torch.tensor([0.0, 0.02, 0.15, 0.5, 0.85, 0.98, 1.0], device=rows.device)
-    rings = _along_arm(rows, (start + width * share) / ARM_LENGTH)
-    lift = thickness * torch.tensor(BAND_PROFILE, device=rows.device)
-    assert len(BAND_PROFILE) == BAND_ROWS
+    share, profile = _band_profile(rows.device)
+    rings = _along_arm(rows, (start[:, None] + width[:, None] * share) / ARM_LENGTH)
+    lift = thickness[:, None] * profile
     return rings + _outward(rings) * lift[..., None, None]
 
 
@@ -118,29 +125,25 @@ def ring_at_rest(
     finger = max(identity.ring_finger, 0)
     bone = body.bones[finger][0]
     joint = 3 * finger + 1
-    points = rest.double().numpy() * 1e3 - (joints[joint].double().numpy() * 1e3)
-    axes = np.stack([bone.along, bone.side, bone.back], 1)
-    local = points @ axes
-    place = (
-        identity.ring_place
-        * bone.length
-        * np.linalg.norm((joints[joint + 1] - joints[joint]).numpy() * 1e3)
-        / bone.length
-    )
-    on_finger = body.finger_weights[: body.n_hand, finger].numpy() > 0.6
-    near = local[on_finger & (np.abs(local[:, 0] - place) < 3.5)][:, 1:]
-    middle = (near.max(0) + near.min(0)) / 2
-    around = near - middle
-    angle, radius = np.arctan2(around[:, 1], around[:, 0]), np.hypot(around[:, 0], around[:, 1])
-    turns = np.linspace(-np.pi, np.pi, RING_COLUMNS, endpoint=False)
-    weight = np.exp(30 * (np.cos(angle[None] - turns[:, None]) - 1))
-    fit = (weight * radius).sum(1) / weight.sum(1) + 0.15
-    across = np.linspace(0, 2 * np.pi, RING_ROWS, endpoint=False)[:, None]
-    wide = place + identity.ring_width / 2 * np.sign(np.cos(across)) * np.abs(np.cos(across)) ** 0.6 + 0 * fit
-    reach = fit + RING_ROUNDNESS * np.sin(across)
-    side, up = reach * np.cos(turns) + middle[0], reach * np.sin(turns) + middle[1]
-    points = np.stack([wide, side, up], -1).reshape(-1, 3) @ axes.T * 1e-3 + joints[joint].double().numpy()
-    return torch.from_numpy(points).float()
+    axes = rest.new_tensor(np.stack([bone.along, bone.side, bone.back], 1), dtype=torch.float64)
+    joints = joints.double() * 1e3
+    local = (rest.double() * 1e3 - joints[joint]) @ axes
+    place = identity.ring_place * (joints[joint + 1] - joints[joint]).norm()
+    near = (body.finger_weights[: body.n_hand, finger] > 0.6) & ((local[:, 0] - place).abs() < 3.5)
+    high = local[:, 1:].where(near[:, None], -torch.inf).amax(0)
+    low = local[:, 1:].where(near[:, None], torch.inf).amin(0)
+    middle = (high + low) / 2
+    side, up = (local[:, 1:] - middle).unbind(1)
+    angle, radius = torch.atan2(up, side), torch.hypot(side, up)
+    turns = torch.arange(RING_COLUMNS, device=rest.device, dtype=torch.float64) * (2 * torch.pi / RING_COLUMNS)
+    turns = turns - torch.pi
+    weight = torch.exp(30 * (torch.cos(angle - turns[:, None]) - 1)) * near
+    fit = (weight @ radius) / weight.sum(1) + 0.15
+    across = torch.arange(RING_ROWS, device=rest.device, dtype=torch.float64)[:, None] * (2 * torch.pi / RING_ROWS)
+    wide = place + identity.ring_width / 2 * torch.cos(across).sign() * torch.cos(across).abs() ** 0.6 + 0 * fit
+    reach = fit + RING_ROUNDNESS * torch.sin(across)
+    points = torch.stack([wide, reach * torch.cos(turns) + middle[0], reach * torch.sin(turns) + middle[1]], -1)
+    return ((points.reshape(-1, 3) @ axes.T + joints[joint]) * 1e-3).float()
 
 
 def ring_look(identity: Identity) -> tuple[float, ...]:

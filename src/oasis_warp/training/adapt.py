@@ -11,11 +11,15 @@ from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import CanonicalGaussians, Evidence
+from oasis_warp.ops import blend_colors
 from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.training.calibrate import Calibration, calibrate
 from oasis_warp.training.complete import complete_field
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
+
+MIN_ALPHA = 0.05
+"""Below it a pixel says nothing about the colour of the hand."""
 
 
 class Adaptation(NamedTuple):
@@ -45,15 +49,18 @@ def adapt(
     trusted = inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5)
 
     progress("calibration", 0, 1)
-    calibration = calibrate(view, prior.colors, evidence.image, trusted, config)
+    if config.calibration == "on":
+        calibration = calibrate(view, prior.colors, evidence.image, trusted, config)
+    else:
+        calibration = Calibration(torch.ones_like(prior.colors[0]), torch.zeros_like(prior.colors[0]))
     gaussians = prior._replace(colors=calibration.apply(prior.colors))
     progress("calibration", 1, 1)
 
     progress("completion", 0, 1)
-    seen = observe(hand, evidence)
-    at_vertices = torch.zeros_like(seen.colors)
-    at_vertices[gaussians.vertex_index] = gaussians.colors[: len(gaussians.vertex_index)]
-    difference = complete_field(evidence.rest.vertices, faces, seen.colors - at_vertices, seen.confidence)
+    with torch.no_grad():  # what is drawn, not the Gaussians' own colours: those of a learned prior need not agree
+        drawn = blend_colors(view, gaussians.colors) / view.alphas.clamp_min(MIN_ALPHA)
+    missing = observe(hand, evidence._replace(image=evidence.image - drawn))
+    difference = complete_field(evidence.rest.vertices, faces, missing.colors, missing.confidence)
     colors = (gaussians.colors + vertex_to_gaussians(difference, faces, gaussians)).clamp(0, 1)
     gaussians = gaussians._replace(colors=colors)
     progress("completion", 1, 1)

@@ -24,7 +24,8 @@ def save_checkpoint(path: Path, network: HandNetwork, optimizer: torch.optim.Ada
     for name, parameter in _trained(network).items():
         tensors[f"weights.{name}"] = parameter
         for moment in MOMENTS:
-            tensors[f"{moment}.{name}"] = optimizer.state[parameter][moment]
+            # a switch may leave a part without gradients, and Adam without moments for it
+            tensors[f"{moment}.{name}"] = optimizer.state[parameter].get(moment, torch.zeros_like(parameter))
     header = {"step": step, "config": asdict(network.config), "hand_model": network.hand_name}
     stored = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     write_file(path, save(stored, {FORMAT: json.dumps(header, sort_keys=True)}))

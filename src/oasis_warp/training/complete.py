@@ -1,6 +1,5 @@
 """Carry what the photo shows over the rim of the seen region, so that it fades into the prior without a seam."""
 
-import igl
 import numpy as np
 import scipy.sparse as sparse
 import torch
@@ -12,6 +11,8 @@ DETAIL_LENGTH = 0.001
 """Length below which differences between neighbouring observations are averaged [m]."""
 FADE_LENGTH = 0.015
 """Distance over which the surface forgets the photo and returns to the prior [m]."""
+DEGENERATE = 1e-12
+"""Doubled area of a triangle below which its angles mean nothing [m^2]: the hand's are over 100,000 times that."""
 
 
 def complete_field(
@@ -23,15 +24,31 @@ def complete_field(
     """The smooth field that follows `observed` where it is known and fades to zero along the surface elsewhere.
 
     Minimises the integral over the surface of confidence |x - observed|^2 / detail^2 + |grad x|^2 + |x|^2 / fade^2,
-    the screened Poisson equation (M (c / d^2 + 1 / l^2) + L) x = M c / d^2 observed, with libigl's cotangent Laplacian
-    L and mass matrix M.
+    the screened Poisson equation (M (c / d^2 + 1 / l^2) + L) x = M c / d^2 observed, with the cotangent Laplacian L and
+    the lumped mass matrix M.
     """
     points = vertices.detach().cpu().numpy().astype(np.float64)
     triangles = faces.detach().cpu().numpy().astype(np.int64)
-    laplacian = -igl.cotmatrix(points, triangles)
-    mass = igl.massmatrix(points, triangles, igl.MASSMATRIX_TYPE_BARYCENTRIC).diagonal().astype(np.float64)
+    laplacian, mass = laplacian_and_mass(points, triangles)
     data = mass * confidence.detach().cpu().numpy().astype(np.float64) / DETAIL_LENGTH**2
     system = laplacian + sparse.diags(data + mass / FADE_LENGTH**2)
     right = data[:, None] * observed.detach().cpu().numpy().astype(np.float64)
     solution = splu(system.tocsc()).solve(np.ascontiguousarray(right))
     return torch.from_numpy(solution).to(observed)
+
+
+def laplacian_and_mass(points: np.ndarray, triangles: np.ndarray) -> tuple[sparse.csc_array, np.ndarray]:
+    """The cotangent Laplacian, positive semi-definite, [V, V], and a third of the area round each vertex, [V].
+
+    An edge weighs half the sum of the cotangents of the angles opposite to it (Pinkall and Polthier 1993).
+    """
+    n = len(points)
+    corners = points[triangles]
+    arms = corners[:, [1, 2, 0]] - corners, corners[:, [2, 0, 1]] - corners
+    double_area = np.linalg.norm(np.cross(arms[0][:, 0], arms[1][:, 0]), axis=-1)
+    cotangents = (arms[0] * arms[1]).sum(-1) / np.maximum(double_area, DEGENERATE)[:, None]
+    start, end, weight = triangles[:, [1, 2, 0]].ravel(), triangles[:, [2, 0, 1]].ravel(), cotangents.ravel() / 2
+    edges = sparse.coo_array((weight, (start, end)), shape=(n, n))
+    edges = (edges + edges.T).tocsc()
+    mass = np.bincount(triangles.ravel(), np.repeat(double_area / 6, 3), minlength=n)
+    return sparse.diags_array(edges.sum(0)).tocsc() - edges, mass

@@ -1,7 +1,7 @@
 """Several processes, one model: what torchrun set up, or a process alone."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -52,6 +52,25 @@ def mean_over_processes(values: Tensor, world: int) -> Tensor:
         dist.all_reduce(values)
         values = values / world
     return values
+
+
+def share_weights(parameters: Sequence[Tensor], world: int) -> None:
+    """All processes start with the weights of process 0."""
+    if world > 1:
+        for parameter in parameters:
+            dist.broadcast(parameter.data, 0)
+
+
+def average_gradients(parameters: Sequence[Tensor], world: int) -> None:
+    """Every gradient becomes its mean over the processes, in one exchange; a CUDA graph can record it."""
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    if world == 1 or not gradients:
+        return
+    together = torch.cat([gradient.flatten() for gradient in gradients])
+    dist.all_reduce(together)
+    together /= world
+    parts = together.split([gradient.numel() for gradient in gradients])
+    torch._foreach_copy_(gradients, [part.view_as(g) for part, g in zip(parts, gradients, strict=True)])
 
 
 def any_process(says_so: bool, place: Place) -> bool:

@@ -9,9 +9,10 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.core.types import TrainingBatch
-from oasis_warp.hand.correctives import corrective_coefficients
+from oasis_warp.training.estimator_errors import ALIKE, bundled_errors, estimate
+from oasis_warp.training.mask_errors import NUMBERS, ended, wandering
+from oasis_warp.training.posed_hands import Posed, pose_hands
 
 CROP_MARGIN = 1.12
 """Side of a crop over the longer extent of its mask, as in `pipeline.reconstruct`."""
@@ -72,54 +73,12 @@ class Photographed(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorNoise:
-    """How far an estimated pose is off, as standard deviations; about the errors that docs/estimator.md measures."""
+    """How much of the estimator's errors is in what the network is given; 1 as they were measured, 0 for none."""
 
-    angles: float = 0.03
-    """Of every joint angle [rad]."""
-    turn: float = 0.015
-    """Of the hand as a whole, about each axis [rad]."""
-    shift: float = 0.001
-    """Of its place across the view [m]."""
-    shape: float = 0.15
-    """Of shape coefficients."""
-    crop: float = 0.02
-    """Of the crop's place, over its side."""
-
-
-class Posed(NamedTuple):
-    """N right hands."""
-
-    rest: Float[Tensor, "N V 3"]
-    posed: Float[Tensor, "N V 3"]
-
-
-def pose_hands(
-    hand: HandModel,
-    shape: Float[Tensor, "N S"],
-    angles: Float[Tensor, "N 15 3"],
-    orientation: Float[Tensor, "N 3 3"],
-    translation: Float[Tensor, "N 3"],
-) -> Posed:
-    """`hand.skinning.rest_hand` and `skin` for many hands at once, in a fixed number of launches."""
-    rest = hand.template + torch.einsum("vds,ns->nvd", hand.shape_basis, shape)
-    joints = hand.joints + torch.einsum("jds,ns->njd", hand.joint_basis, shape)
-    axes = hand.pose_axes[1:].expand(len(angles), -1, -1, -1)
-    flexion, abduction, twist = (from_axis_angle(axes[:, :, k], angles[:, :, k]) for k in range(3))
-    local = flexion @ abduction @ twist
-    rotations = [orientation]
-    origins = [(orientation @ joints[:, 0, :, None])[..., 0] + translation]
-    for j in range(1, len(hand.parents)):
-        parent = hand.parents[j]
-        arm = (joints[:, j] - joints[:, parent])[..., None]
-        origins.append((rotations[parent] @ arm)[..., 0] + origins[parent])
-        rotations.append(rotations[parent] @ local[:, j - 1])
-    rotation, origin = torch.stack(rotations, 1), torch.stack(origins, 1)
-    offset = origin - (rotation @ joints[..., None])[..., 0]
-    blended = torch.einsum("vj,njk->nvk", hand.weights, torch.cat([rotation.flatten(2), offset], dim=2))
-    strengths = torch.vmap(lambda a: corrective_coefficients(hand, a))(angles)
-    flesh = rest + torch.einsum("vdc,nc->nvd", hand.corrective_basis, strengths)
-    turned = (blended[..., :9].unflatten(2, (3, 3)) * flesh[:, :, None]).sum(-1)
-    return Posed(rest, turned + blended[..., 9:])
+    surface: float = 1.0
+    """Of those of pose, shape and camera."""
+    mask: float = 1.0
+    """Of those of the mask, and so of the crop round it."""
 
 
 class Crops(NamedTuple):
@@ -134,9 +93,8 @@ def crop_to_mask(
     mask: Float[Tensor, "N H H"],
     K: Float[Tensor, "N 3 3"],
     size: int,
-    jitter: Float[Tensor, "N 3"],
 ) -> Crops:
-    """The squares round the masks as `size` pixels, bilinear; moved and grown by `jitter` (x, y, log side) of the side.
+    """The squares round the masks as `size` pixels, bilinear.
 
     An empty mask keeps the whole picture. Nothing waits for the device.
     """
@@ -144,8 +102,8 @@ def crop_to_mask(
     inside = mask > 0.5
     low, high = zip(*(_extent(inside.any(axis)) for axis in (1, 2)), strict=True)  # columns, then rows
     low, high = torch.stack(low, 1), torch.stack(high, 1)
-    side = CROP_MARGIN * (high - low).amax(1, keepdim=True) * jitter[:, 2:].exp()
-    corner = (low + high - side) / 2 + jitter[:, :2] * side
+    side = CROP_MARGIN * (high - low).amax(1, keepdim=True)
+    corner = (low + high - side) / 2
     cells = (torch.arange(size, dtype=K.dtype, device=K.device) + 0.5) / size
     x, y = (corner[:, k, None] + cells * side for k in range(2))
     grid = torch.stack(torch.broadcast_tensors(x[:, None], y[:, :, None]), dim=-1) * 2 / full - 1
@@ -165,7 +123,7 @@ def _extent(touched: Tensor) -> tuple[Tensor, Tensor]:
     return first.float(), last.float()
 
 
-def _as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+def as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image, alpha, mask, orientation, translation and K, left hands seen in the mirror."""
     left = pictures.left.bool()
 
@@ -173,7 +131,8 @@ def _as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Ten
         return torch.where(left.view(-1, *[1] * (planes.dim() - 1)), planes.flip(2), planes)
 
     like = pictures.translation
-    sign = torch.where(left[:, None], like.new_tensor([-1.0, 1.0, 1.0]), torch.ones_like(like))
+    sign = torch.ones_like(like)
+    sign[:, 0] -= 2 * left
     K = pictures.K.clone()
     K[:, 0, 2] = torch.where(left, pictures.image.shape[2] - K[:, 0, 2], K[:, 0, 2])
     orientation = sign[:, :, None] * pictures.orientation * sign[:, None]
@@ -197,33 +156,28 @@ def training_batch(
         targets: B T of them, those of the first hand first: what the avatar must look like, the hand alone over black.
         size: Side of the crops [px].
         random: On the CPU, of the estimator's errors; the same state gives the same batch.
-        noise: Those errors; they are in `posed` and the photo's crop, nowhere else.
+        noise: How large they are; they are in the photo's `posed`, `K`, `mask` and crop, nowhere else.
     """
-    image, _, mask, orientation, translation, K = _as_right_hands(photos)
+    image, alpha, mask, orientation, translation, K = as_right_hands(photos)
     count, like = len(image), translation
 
-    def off(scale: float, *shape: int) -> Tensor:
-        return scale * torch.randn(count, *shape, generator=random).to(like)
-
-    true = pose_hands(hand, photos.shape, photos.angles, orientation, translation)
-    turn = off(noise.turn, 3)
-    angle = turn.norm(dim=1)
-    wrong = from_axis_angle(turn / angle.clamp_min(1e-12)[:, None], angle)
-    middle = true.posed.mean(1)  # an estimate turns about the hand, not about its wrist
-    place = (wrong @ (translation - middle)[..., None])[..., 0] + middle
-    seen = pose_hands(
-        hand, photos.shape + off(noise.shape, photos.shape.shape[1]),
-        photos.angles + off(noise.angles, 15, 3), wrong @ orientation, place + off(noise.shift, 3),
-    )  # fmt: skip
-    crop = crop_to_mask(torch.cat([image, mask[..., None]], dim=-1), mask, K, size, off(noise.crop, 3))
-
     views = len(targets.image) // count
-    image, alpha, mask, orientation, translation, K = _as_right_hands(targets)
-    goal = pose_hands(hand, targets.shape, targets.angles, orientation, translation)
-    alone = image * (mask / alpha.clamp_min(1e-3)).clamp(0, 1)[..., None]  # the picture is over black already
-    hidden = (alpha - mask).clamp(0, 1)
-    planes = torch.cat([alone, mask[..., None], hidden[..., None]], dim=-1)
-    cut = crop_to_mask(planes, mask, K, size, K.new_zeros(len(K), 3))
+    goal_image, goal_alpha, goal_mask, *place, goal_K = as_right_hands(targets)
+    both = pose_hands(
+        hand, torch.cat([photos.shape, targets.shape]), torch.cat([photos.angles, targets.angles]),
+        torch.cat([orientation, place[0]]), torch.cat([translation, place[1]]),
+    )  # fmt: skip
+    true = Posed(*(part[:count] for part in both))
+    errors = bundled_errors(like.device).times(noise.surface)
+    choice = torch.randint(ALIKE, (count,), generator=random).to(like.device, non_blocking=True)
+    seen = estimate(hand, true, photos.shape, photos.angles, orientation, K, errors, choice)
+    numbers = torch.randn(count, 1 + NUMBERS, generator=random).to(like, non_blocking=True)
+    mask = ended(mask, alpha, true.landmarks, K, numbers[:, 0], noise.mask)
+    crop = crop_to_mask(torch.cat([image, mask[..., None]], dim=-1), mask, seen.K, size)
+
+    alone = goal_image * (goal_mask / goal_alpha.clamp_min(1e-3)).clamp(0, 1)[..., None]  # over black already
+    hidden = (goal_alpha - goal_mask).clamp(0, 1)
+    cut = crop_to_mask(torch.cat([alone, torch.stack([goal_mask, hidden], -1)], dim=-1), goal_mask, goal_K, size)
     still = torch.eye(4, dtype=like.dtype, device=like.device)
 
     def by_hand(tensor: Tensor) -> Tensor:
@@ -231,7 +185,7 @@ def training_batch(
 
     return TrainingBatch(
         image=crop.planes[..., :3].clamp(0, 1),
-        mask=crop.planes[..., 3].clamp(0, 1),
+        mask=wandering(crop.planes[..., 3].clamp(0, 1), numbers[:, 1:], noise.mask),
         posed=seen.posed,
         viewmat=still.expand(count, -1, -1),
         K=crop.K,
@@ -239,7 +193,7 @@ def training_batch(
         target_images=by_hand(cut.planes[..., :3].clamp(0, 1)),
         target_masks=by_hand(cut.planes[..., 3].clamp(0, 1)),
         target_known=by_hand(1 - cut.planes[..., 4].clamp(0, 1)),
-        target_posed=by_hand(goal.posed),
+        target_posed=by_hand(both.posed[count:]),
         target_viewmats=still.expand(count, views, -1, -1),
         target_Ks=by_hand(cut.K),
     )

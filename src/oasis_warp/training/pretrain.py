@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
-from torch.nn.parallel import DistributedDataParallel
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
@@ -22,14 +21,19 @@ from oasis_warp.losses.detail import detail_difference
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.weights_file import save_network
+from oasis_warp.ops.recording import Recording
 from oasis_warp.training.checkpoint import load_checkpoint, save_checkpoint
-from oasis_warp.training.distributed import Place, any_process, mean_over_processes
+from oasis_warp.training.distributed import Place, any_process, average_gradients, mean_over_processes, share_weights
 from oasis_warp.training.losses import LossConfig, Perceptual, objective, picture_psnr
 from oasis_warp.training.targets import Pictures, draw_targets, true_pictures
 
 CHECKPOINT, WEIGHTS, METRICS, SHEET = "checkpoint.safetensors", "network.safetensors", "metrics.jsonl", "pictures.png"
 """What training leaves in its folder."""
 SHEET_HANDS = 8
+EAGER_STEPS = 4
+"""Steps on CUDA before one is recorded: they load kernels, and show how many Gaussians pictures may show."""
+SLACK = 3.0
+"""Times the memory that a picture needed for its Gaussians: each hand and pose needs another."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,34 +103,69 @@ class Trainer:
         self.network = network.to(place.device).train()
         self.config, self.place, self.perceptual = config, place, perceptual
         self.trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
-        self.optimizer = torch.optim.Adam(self.trained, lr=config.learning_rate, fused=place.device.type == "cuda")
-        self.model: torch.nn.Module = network
-        if place.world > 1:
-            devices = [place.device.index] if place.device.type == "cuda" else None
-            self.model = DistributedDataParallel(network, device_ids=devices, broadcast_buffers=False)
+        share_weights(self.trained, place.world)
+        on_cuda = place.device.type == "cuda"
+        # a recorded step reads the learning rate where it lies on the device
+        rate = torch.tensor(config.learning_rate, device=place.device) if on_cuda else config.learning_rate
+        self.optimizer = torch.optim.Adam(self.trained, lr=rate, fused=on_cuda, capturable=on_cuda)
         self.step = 0
+        self._recorded: Recording[StepResult] | None = None
+        self._eager_steps = 0
 
     def advance(self, batch: TrainingBatch) -> StepResult:
-        """One step of Adam; no value is waited for."""
+        """One step of Adam; no value is waited for.
+
+        On CUDA the result's tensors are those of a recorded step: the next one writes over them.
+        """
         for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(self.config, self.step)
-        result = self.evaluate(batch)
-        self.optimizer.zero_grad(set_to_none=True)
-        result.loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
-        self.optimizer.step()
+            rate = learning_rate(self.config, self.step)
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+        if self._recorded is None and self.place.device.type == "cuda" and self._eager_steps >= EAGER_STEPS:
+            self._recorded = Recording(self._update, batch, SLACK)
+        if self._recorded is None:
+            self._eager_steps += 1
+            result = self._update(batch)
+        else:
+            result = self._recorded(batch)
         self.step += 1
         return result
+
+    def check_recording(self) -> None:
+        """Record anew where the last step had too little memory for its pictures; waits for the device."""
+        if self._recorded is not None and self._recorded.lacked_memory():
+            self._recorded, self._eager_steps = None, 0
 
     def evaluate(self, batch: TrainingBatch) -> StepResult:
         """Predict, draw every target and compare."""
         half = self.config.precision == "bfloat16"
         with torch.autocast(self.place.device.type, torch.bfloat16, enabled=half):
-            prediction = self.model(input_of_batch(batch))
+            prediction = self.network(input_of_batch(batch))
         drawn = draw_targets(prediction, batch, self.network)
         true = true_pictures(batch, self.network.faces, self.network.rim)
         loss, terms = objective(prediction, drawn, true, self.config.losses, self.perceptual)
         return StepResult(loss, terms, picture_psnr(drawn, true), drawn, true)
+
+    def _update(self, batch: TrainingBatch) -> StepResult:
+        result = self.evaluate(batch)
+        gradients = torch.autograd.grad(result.loss, self.trained, allow_unused=True)
+        for parameter, gradient in zip(self.trained, gradients, strict=True):
+            if gradient is not None and gradient.stride() != parameter.stride():
+                gradient = torch.empty_like(parameter).copy_(gradient)  # the fused optimiser wants the same strides
+            parameter.grad = gradient
+        average_gradients(self.trained, self.place.world)
+        torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
+        self.optimizer.step()
+        return _without_history(result)
+
+
+def _without_history(result: StepResult) -> StepResult:
+    """The same numbers, that hold on to nothing they were computed from."""
+    terms = {name: term.detach() for name, term in result.terms.items()}
+    drawn, true = (Pictures(*(tensor.detach() for tensor in pictures)) for pictures in (result.drawn, result.true))
+    return StepResult(result.loss.detach(), terms, result.psnr.detach(), drawn, true)
 
 
 def pretrain(
@@ -182,8 +221,9 @@ def pretrain(
         save_here = stopping or trainer.step % config.checkpoint_every == 0
         if log_here or save_here:
             names = ["loss", "psnr", *result.terms]
-            values = torch.stack([result.loss, result.psnr, *result.terms.values()]).detach()
+            values = torch.stack([result.loss, result.psnr, *result.terms.values()])
             numbers = dict(zip(names, mean_over_processes(values, place.world).tolist(), strict=True))
+            trainer.check_recording()
             if not math.isfinite(numbers["loss"]):
                 raise InputError(f"{folder}: the loss is not finite at step {trainer.step}; lower the learning rate.")
             if place.rank == 0:

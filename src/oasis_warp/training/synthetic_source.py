@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +11,11 @@ import torch
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.hand.template import bundled_hand
+from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.people import bake_people
-from oasis_warp.synthetic.picture import render_shots
-from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, plan_ahead
+from oasis_warp.synthetic.picture import part, render_planned
+from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery
+from oasis_warp.synthetic.planned import joined, plan_ahead
 from oasis_warp.training.photographed import training_batch
 
 ERROR_STREAM = 3
@@ -40,30 +42,38 @@ class SyntheticHands:
     """Side of photos and targets [px], a multiple of `MULTIPLE`."""
     device: torch.device
     """Where pictures are rendered."""
+    population: Population = EVERYBODY
+    """What they may have."""
     workers: int = 0
-    """Processes that plan pictures ahead; 0 for none, else one at least for photos and one for targets."""
+    """Processes that plan pictures ahead; 0 for none."""
+    ahead: int = 1
+    """Batches that are rendered together: several make better use of a GPU, and are the same batches."""
 
     def __call__(self, first_step: int, rank: int, world: int) -> Iterator[TrainingBatch]:
         """Batches without end. People that have not been baked make it wait, some seconds each."""
-        hand, device = bundled_hand().to(self.device), str(self.device)
-        photo, even = Scenery(people=self.people), Scenery(look="even", people=self.people)
+        hand = bundled_hand().to(self.device)
+        photo = Scenery(people=self.people, population=self.population)
+        looks = photo, replace(photo, look="even")
         rendered = int(self.size * SURROUNDINGS)
-        planners = 0 if self.workers < 1 else max(1, self.workers // (1 + self.views))
-        more = 0 if self.workers < 1 else max(1, self.workers - planners)
 
         def numbers() -> Iterator[int]:
             return itertools.count(first_step * world + rank, world)
 
-        photos = plan_ahead(self.seed, map(self.photo_indices, numbers()), photo, planners)
-        targets = plan_ahead(self.seed, map(self.target_indices, numbers()), even, more)
-        for number, photo_shots, target_shots in zip(numbers(), photos, targets, strict=True):
-            yield training_batch(
-                hand,
-                render_shots(self.seed, photo_shots, rendered, device, scenery=photo),
-                render_shots(self.seed, target_shots, rendered, device, scenery=even),
-                self.size,
-                self.errors(number),
+        def blocks() -> Iterator[tuple[list[int], Scenery]]:
+            for number in numbers():
+                yield from zip((self.photo_indices(number), self.target_indices(number)), looks, strict=True)
+
+        plans, batch_numbers = plan_ahead(self.seed, blocks(), self.workers), numbers()
+        while True:
+            together = list(itertools.islice(plans, len(looks) * self.ahead))
+            photos, targets = (
+                render_planned(self.seed, joined(together[k :: len(looks)]), rendered, self.device, scenery=scenery)
+                for k, scenery in enumerate(looks)
             )
+            for k, number in enumerate(itertools.islice(batch_numbers, self.ahead)):
+                photo = part(photos, slice(k * self.hands, (k + 1) * self.hands))
+                target = part(targets, slice(k * self.hands * self.views, (k + 1) * self.hands * self.views))
+                yield training_batch(hand, photo, target, self.size, self.errors(number))
 
     def photo_indices(self, number: int) -> list[int]:
         """Pictures that are the photos of batch `number`."""
@@ -88,11 +98,11 @@ class SyntheticHands:
         first = rank * len(met) // world
         return met[first:] + met[:first]
 
-    def bake(self, met: list[int], folder: Path, jobs: int, progress: Progress = silent) -> None:
-        """Make the people of `people_met` ready, or read those that `folder` holds already.
+    def bake(self, met: list[int], folder: Path | None, jobs: int, progress: Progress = silent) -> None:
+        """Make the people of `people_met` ready, or read those that `folder`, if any, holds already.
 
         Raises:
-            ValueError: more than `synthetic.people.KEPT`.
+            ValueError: more than `synthetic.people.most_kept`.
             InputError: the folder cannot be written.
         """
-        bake_people(self.seed, met, EVERYBODY, str(self.device), jobs=jobs, folder=folder, progress=progress)
+        bake_people(self.seed, met, self.population, str(self.device), jobs=jobs, folder=folder, progress=progress)

@@ -28,11 +28,11 @@ def draw_targets(prediction: Prediction, batch: TrainingBatch, network: HandNetw
     images, alphas = [], []
     for hand in range(len(batch.rest)):
         canonical = all_gaussians(prediction, hand, network.vertex_index, network.face_index)
-        for target in range(batch.target_posed.shape[1]):
-            posed = pose_gaussians(canonical, network.faces, batch.rest[hand], batch.target_posed[hand, target])
+        posed = pose_gaussians(canonical, network.faces, batch.rest[hand], batch.target_posed[hand])
+        for target, (means, quats, scales) in enumerate(zip(*posed[:3], strict=True)):
             image, alpha, _ = rasterization(
-                *posed, batch.target_viewmats[hand, target][None], batch.target_Ks[hand, target][None], size, size,
-                validate=False,
+                means, quats, scales, posed.opacities, posed.colors, batch.target_viewmats[hand, target][None],
+                batch.target_Ks[hand, target][None], size, size, validate=False,
             )  # fmt: skip
             images.append(image[0])
             alphas.append(alpha[0, ..., 0])

@@ -1,0 +1,189 @@
+"""`oasis evaluate`: measure avatars on synthetic hands, where the truth is known, and on photos of the same hands."""
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from oasis_warp.avatar.prior import MeanPrior, Prior
+from oasis_warp.commands.exit_codes import INTERRUPTED
+from oasis_warp.commands.look import check_device
+from oasis_warp.commands.options import Evaluate
+from oasis_warp.commands.progress import show_progress
+from oasis_warp.core.config import AdaptConfig, ReconstructConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.logging import Progress
+from oasis_warp.evaluation.held_out import HELD_OUT_SEED, Shoot
+from oasis_warp.evaluation.methods import Method, label
+from oasis_warp.evaluation.same_hand import METRICS, evaluate_photos
+from oasis_warp.evaluation.summary import Record, select
+from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.losses.lpips import load_lpips
+from oasis_warp.network.prior import choose_prior
+from oasis_warp.synthetic.plan import PICTURES_EACH
+from oasis_warp.training.synthetic_source import MULTIPLE
+
+SIZES = range(64, 1025)
+TABLE_WIDTH = 120
+"""Of tables where there is no terminal, or a narrow one [characters]."""
+SYNTHETIC_COLUMNS = {
+    "psnr": ("PSNR", "{:.2f}"),
+    "gain": ("gain", "{:+.2f}"),
+    "psnr_inner": ("inside", "{:.2f}"),
+    "psnr_visible": ("visible", "{:.2f}"),
+    "psnr_hidden": ("hidden", "{:.2f}"),
+    "psnr_stretched": ("stretched", "{:.2f}"),
+    "ssim": ("SSIM", "{:.4f}"),
+    "ssim_box": ("in box", "{:.4f}"),
+    "ssim_mask": ("in mask", "{:.4f}"),
+    "lpips": ("LPIPS", "{:.4f}"),
+}
+"""Names and forms of what the table shows of `evaluation.summary`."""
+PHOTO_COLUMNS = {
+    "psnr": ("PSNR", "{:.2f}"),
+    "psnr_plain": ("plain", "{:.2f}"),
+    "ssim_quarter": ("SSIM at a quarter", "{:.3f}"),
+    "error_palm": ("palm", "{:.3f}"),
+    "error_back": ("back", "{:.3f}"),
+    "error_nail": ("nails", "{:.3f}"),
+    "beaten_psnr": ("one-shot better, PSNR", "{:.0%}"),
+    "beaten_ssim_quarter": ("SSIM", "{:.0%}"),
+    "beaten_error": ("colours", "{:.0%}"),
+}
+
+
+def run(options: Evaluate) -> int:
+    """Measure and print; Ctrl-C keeps what is whole.
+
+    Raises:
+        InputError: a wrong option, folder or weights file.
+    """
+    check_device(options.device)
+    check_options(options)
+    priors: dict[str, Prior] = {"mean": MeanPrior(bundled_hand())}
+    chosen = choose_prior(options.prior, options.backbone_weights)
+    if options.prior != "none":
+        priors["learned"] = chosen
+    tables = {"synthetic": on_synthetic_hands, "same-hand": on_photos}
+    try:
+        with show_progress(Console(stderr=True)) as progress:
+            made = tables[options.dataset](options, priors, progress)
+    except KeyboardInterrupt:
+        print(f"oasis: stopped; what is whole stays in {options.out}, the same command goes on.", file=sys.stderr)
+        return INTERRUPTED
+    console = Console()
+    console = console if console.width >= TABLE_WIDTH else Console(width=TABLE_WIDTH)
+    for table in made:
+        console.print(table)
+    return 0
+
+
+def check_options(options: Evaluate) -> None:
+    """Refuse what can be refused before anything is made.
+
+    Raises:
+        InputError: a number out of its range, or a folder too many or missing.
+    """
+    photos = options.dataset == "same-hand"
+    if photos and options.folder is None:
+        raise InputError("--dataset same-hand: expected a folder with a subfolder of photos for each hand; name it.")
+    if not photos and options.folder is not None:
+        raise InputError(f"{options.folder}: synthetic hands need no folder; leave it out, or use --dataset same-hand.")
+    if photos and options.lpips is not None:
+        raise InputError("--lpips: is measured on synthetic hands only; leave it out.")
+    if options.people < 1:
+        raise InputError(f"--people: expected 1 or more, got {options.people}.")
+    if not 1 <= options.targets <= PICTURES_EACH:
+        raise InputError(f"--targets: expected 1 to {PICTURES_EACH}, got {options.targets}; more people do the same.")
+    if options.size not in SIZES or (not photos and options.size % MULTIPLE):
+        kind = "pixels" if photos else f"pixels in steps of {MULTIPLE}"
+        raise InputError(f"--size: expected {SIZES[0]} to {SIZES[-1]} {kind}, got {options.size}.")
+    for name in ("steps", "seed", "workers"):
+        value = getattr(options, name)
+        if value is not None and value < 0:
+            raise InputError(f"--{name}: expected 0 or more, got {value}.")
+
+
+def on_synthetic_hands(options: Evaluate, priors: dict[str, Prior], progress: Progress) -> list[Table]:
+    """A table for each group of people and light of the photo, and the curve of quality against wrong poses."""
+    config = SyntheticEvaluation(
+        people=options.people,
+        shoot=Shoot(targets=options.targets, size=options.size, seed=HELD_OUT_SEED + options.seed),
+        adapt=AdaptConfig(texture_steps=options.steps, seed=options.seed),
+    )
+    device = torch.device(options.device)
+    perceptual = None if options.lpips is None else load_lpips(*options.lpips).to(device)
+    found = evaluate(
+        priors, config, options.out, device, perceptual=perceptual, workers=options.workers, progress=progress
+    )
+    summary: list[Record] = found["summary"]
+    tables = []
+    for group in config.groups:
+        for light in config.lights:
+            # wild photos stand in a light of their own: one gain a channel to that of the targets
+            colors = "raw" if light == "studio" else "matched"
+            title = f"{group} people, {light} photos" + (", colours matched" if colors == "matched" else "")
+            rows = select(summary, group=group, light=light, colors=colors)
+            rows = [row for row in rows if row["noise"] in config.noise]
+            tables.append(make_table(title, rows, SYNTHETIC_COLUMNS))
+    return [*tables, noise_table(summary, config)]
+
+
+def noise_table(summary: Sequence[Record], config: SyntheticEvaluation) -> Table:
+    """PSNR of the first group against how wrong the estimated poses are."""
+    group, light = config.groups[0], config.lights[0]
+    factors = (*config.noise, *config.curve)
+    table = Table(title=f"PSNR of {group} people, {light} photos, against the estimator's errors")
+    table.add_column("method", no_wrap=True)
+    for factor in factors:
+        table.add_column("true pose" if factor == 0 else f"x {factor:g}", justify="right")
+    wanted = select(summary, group=group, light=light, colors="raw")
+    for method in dict.fromkeys(_method(row) for row in wanted):
+        by_factor = {row["noise"]: row["psnr"] for row in wanted if _method(row) == method}
+        table.add_row(label(method), *(_cell(by_factor.get(factor), "{:.2f}") for factor in factors))
+    return table
+
+
+def on_photos(options: Evaluate, priors: dict[str, Prior], progress: Progress) -> list[Table]:
+    """One table: medians over all ordered pairs."""
+    assert options.folder is not None  # checked with the other options
+    config = ReconstructConfig(
+        steps=options.steps, seed=options.seed, size=options.size, device=options.device
+    )
+    found = evaluate_photos(priors, options.folder, options.out, config, progress)
+    rows, n_out = found["summary"], len(found["left_out"])
+    table = make_table(f"{rows[0]['pairs']} ordered pairs of photos of the same hand", rows, PHOTO_COLUMNS)
+    if n_out:
+        table.caption = f"photos left out: {n_out}, see {METRICS}"
+    return [table]
+
+
+def make_table(title: str, rows: Sequence[Record], columns: dict[str, tuple[str, str]]) -> Table:
+    """A line a row of a summary; the pose's errors, where there are several, in a column of their own."""
+    table = Table(title=title)
+    factors = {row["noise"] for row in rows if "noise" in row}
+    table.add_column("method", no_wrap=True)
+    if factors:
+        table.add_column("pose")
+    shown = {name: form for name, form in columns.items() if any(row[name] is not None for row in rows)}
+    for words, _ in shown.values():
+        table.add_column(words, justify="right")
+    for row in rows:
+        pose = [("true" if row["noise"] == 0 else "est.")] if factors else []
+        cells = (_cell(row[name], form) for name, (_, form) in shown.items())
+        table.add_row(label(_method(row)), *pose, *cells)
+    if "lpips" in columns and "lpips" not in shown:
+        table.caption = "LPIPS: no weights given (--lpips)"
+    return table
+
+
+def _method(row: Record) -> Method:
+    return Method(row["prior"], row["stage"])
+
+
+def _cell(value: Any, form: str) -> str:
+    return "" if value is None else form.format(value)

@@ -1,0 +1,150 @@
+"""Synthetic people that no training has met, photographed for evaluation: who, in which light, how well estimated."""
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from oasis_warp.core import surface
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import TrainingBatch
+from oasis_warp.evaluation.metrics import Truth
+from oasis_warp.network.inputs import input_of_batch
+from oasis_warp.network.observation import sight
+from oasis_warp.ops import depth_map
+from oasis_warp.synthetic.picture import SyntheticBatch, render_planned
+from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, Shot, plan_shots
+from oasis_warp.synthetic.planned import tabulate
+from oasis_warp.synthetic.stage import sample_light
+from oasis_warp.synthetic.wardrobe import sample_clothes
+from oasis_warp.training.photographed import EstimatorNoise, training_batch
+from oasis_warp.training.synthetic_source import ERROR_STREAM, SURROUNDINGS
+from oasis_warp.training.targets import true_pictures
+
+Group = Literal["ordinary", "tattoo", "ring"]
+"""Kinds of people. Their bodies and photos are the same: only the tattoo or the ring is more."""
+Lighting = Literal["studio", "wild"]
+"""The photo's: the targets' own, before a plain wall, or whatever comes, with sleeves, shadows and a cheap sensor."""
+
+_BARE = replace(EVERYBODY, tattoo=0.0, ring=0.0)
+POPULATIONS = {"ordinary": _BARE, "tattoo": replace(_BARE, tattoo=1.0), "ring": replace(_BARE, ring=1.0)}
+HELD_OUT_SEED, FIRST_PERSON = 20_261_121, 1_000_000
+"""A world and numbers of people that training does not reach."""
+WALL_STREAM = 5
+"""Tells the random numbers of walls from those of everything else with the same seed."""
+STRETCH = 1.25
+"""Area of a face in the pose over that at rest, or the inverse, from which skin counts as stretched: a tenth of all
+skin, most of it squeezed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shoot:
+    """How everybody is photographed."""
+
+    targets: int = 4
+    """Pictures of each hand in other poses, from other sides, in even light; up to `PICTURES_EACH`."""
+    size: int = 256
+    """Side of photos and targets [px], a multiple of 16."""
+    seed: int = HELD_OUT_SEED
+    """Of people, pictures and the estimator's errors."""
+
+
+class Session(NamedTuple):
+    """One person's pictures."""
+
+    number: int
+    photos: dict[Lighting, SyntheticBatch]
+    """One each."""
+    targets: SyntheticBatch
+
+
+def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) -> Session:
+    """Render the photos and targets of person `number`; both photos show the same pose from the same side."""
+    size, first = int(shoot.size * SURROUNDINGS), PICTURES_EACH * number
+    wild = Scenery(population=POPULATIONS[group])
+    even = replace(wild, look="even")
+    (photo,) = plan_shots(shoot.seed, [first], wild)
+    goals = plan_shots(shoot.seed, range(first, first + shoot.targets), even)
+
+    def shown(shots: list[Shot], scenery: Scenery) -> SyntheticBatch:
+        return render_planned(shoot.seed, tabulate(shoot.seed, shots, scenery), size, device, scenery=scenery)
+
+    studio = shown([_evenly_lit(photo)], even)
+    wall = torch.tensor(np.random.default_rng([shoot.seed, WALL_STREAM, number]).uniform(0.1, 0.9, 3)).to(studio.image)
+    studio = studio._replace(image=studio.image + (1 - studio.alpha[..., None]) * wall)
+    return Session(
+        number,
+        {"studio": studio, "wild": shown([photo], wild)},
+        shown(goals, even),
+    )
+
+
+def _evenly_lit(shot: Shot) -> Shot:
+    rng = np.random.default_rng([shot.seed])
+    return shot._replace(light=sample_light(rng, "even"), clothes=sample_clothes(rng, bare=True))
+
+
+def estimator_noise(factor: float) -> EstimatorNoise:
+    """Errors of pose, shape and camera `factor` times as large as the estimator's; 0 is the truth.
+
+    Those of the mask come with them, but no larger than they are: a mask has no twice.
+    """
+    return EstimatorNoise(surface=factor, mask=min(factor, 1.0))
+
+
+def as_estimated(
+    hand: HandModel, session: Session, light: Lighting, shoot: Shoot, factor: float
+) -> TrainingBatch:
+    """One photo and its targets as training sees them, with `estimator_noise`; of any size it points the same way.
+
+    They are in where the photo is read. Targets are drawn on the true surface, or else the outline of a wrong one
+    would drown what is asked for.
+    """
+    (state,) = np.random.SeedSequence([shoot.seed, ERROR_STREAM, session.number]).generate_state(1)
+    random = torch.Generator().manual_seed(int(state))
+    return training_batch(
+        hand, session.photos[light], session.targets, shoot.size, random, estimator_noise(factor)
+    )
+
+
+def true_targets(
+    batch: TrainingBatch, hand: HandModel, vertex_faces: Int[Tensor, "V M"]
+) -> list[Truth]:
+    """What must come out of the one hand of `batch`, in which nothing is off.
+
+    Args:
+        batch: With the photo's true pose.
+        hand: On the device of the batch.
+        vertex_faces: From `network.anchors.faces_of_vertices`.
+    """
+    pictures = true_pictures(batch, hand.faces, hand.rim)
+    size, vertices = batch.target_images.shape[2], batch.target_posed[0]
+    seen = depth_map(
+        vertices, hand.faces, batch.target_viewmats[0], batch.target_Ks[0], size, size, validate=False
+    )
+    every_vertex = torch.arange(len(hand.template), device=vertices.device)
+    visible = sight(input_of_batch(batch), hand.faces, vertex_faces, every_vertex).visibility[0]
+    at_rest = _face_areas(batch.rest[0], hand.faces)
+    truths = []
+    for k, (image, mask) in enumerate(zip(*pictures, strict=True)):
+        face = seen.face_ids[k].clamp_min(0).long()
+        shown = (visible[hand.faces[face]] * seen.barycentrics[k]).sum(-1)
+        ratio = (_face_areas(vertices[k], hand.faces) / at_rest)[face]
+        on_hand = seen.face_ids[k] >= 0
+        truths.append(
+            Truth(
+                image,
+                mask,
+                batch.target_known[0, k],
+                on_hand & (shown < 0.5),
+                on_hand & ((ratio > STRETCH) | (ratio < 1 / STRETCH)),
+            )
+        )
+    return truths
+
+
+def _face_areas(vertices: Tensor, faces: Tensor) -> Tensor:
+    return surface.face_normals(vertices, faces)[1].clamp_min(1e-12)

@@ -1,0 +1,102 @@
+"""The ways to an avatar that are held against each other: a prior, and how far its guess is fitted to the photo."""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+
+from oasis_warp.avatar.prior import MeanPrior, Prior
+from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import CanonicalGaussians, Evidence
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.prior import NetworkPrior
+from oasis_warp.network.weights_file import trained_state
+from oasis_warp.training.adapt import adapt
+
+RAW, CALIBRATED, ONE_SHOT = "raw", "calibrated", "one_shot"
+STAGES = (RAW, CALIBRATED, ONE_SHOT)
+"""As the prior says, with its colours matched to the photo's as a whole, and fully adapted."""
+
+
+class Method(NamedTuple):
+    """What is measured."""
+
+    prior: str
+    """"mean" or "learned", or whatever the caller calls his."""
+    stage: str
+    """One of `STAGES`."""
+
+
+METHODS = (
+    Method("mean", CALIBRATED),
+    Method("mean", ONE_SHOT),
+    Method("learned", RAW),
+    Method("learned", CALIBRATED),
+    Method("learned", ONE_SHOT),
+)
+"""Of the tables: what needs no training, and each step beyond it."""
+BASELINE = METHODS[0]
+
+
+def label(method: Method) -> str:
+    """What to call it."""
+    return f"{method.prior} {method.stage.replace('_', '-')}"
+
+
+def usual_priors(network: HandNetwork | None) -> dict[str, Prior]:
+    """The priors of `METHODS`: the mean hand, and the learned one where there is a network."""
+    priors: dict[str, Prior] = {"mean": MeanPrior(bundled_hand())}
+    if network is not None:
+        priors["learned"] = NetworkPrior(network)
+    return priors
+
+
+def prior_digest(prior: Prior) -> str | None:
+    """SHA-256 of all that training has changed in a network's prior, names included; None for others."""
+    if not isinstance(prior, NetworkPrior):
+        return None
+    digest = hashlib.sha256()
+    for name, tensor in sorted(trained_state(prior.network).items()):
+        digest.update(name.encode())
+        digest.update(tensor.float().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def reconstructions(
+    hand: HandModel,
+    evidence: Evidence,
+    priors: Mapping[str, Prior],
+    wanted: Sequence[Method],
+    config: AdaptConfig,
+) -> Iterator[tuple[Method, CanonicalGaussians]]:
+    """The Gaussians of every method of `wanted` whose prior is there, each prior asked and fitted once.
+
+    Args:
+        hand: On the CPU, as in `pipeline.reconstruct`.
+        evidence: Of one photo.
+        priors: By the names that methods have for them.
+        wanted: What to make.
+        config: Of the adaptation.
+    """
+    for name, prior in priors.items():
+        stages = {method.stage for method in wanted if method.prior == name}
+        if not stages:
+            continue
+        with torch.no_grad():
+            guess = prior(evidence)
+        if RAW in stages:
+            yield Method(name, RAW), guess
+        if not {CALIBRATED, ONE_SHOT} & stages:
+            continue
+        fully = ONE_SHOT in stages
+        adapted = adapt(
+            hand, guess, evidence, config if fully else replace(config, texture_steps=0, reference_views=0)
+        )
+        if CALIBRATED in stages:
+            yield Method(name, CALIBRATED), guess._replace(colors=adapted.calibration.apply(guess.colors))
+        if fully:
+            yield Method(name, ONE_SHOT), adapted.gaussians

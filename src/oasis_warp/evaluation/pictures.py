@@ -1,0 +1,92 @@
+"""Pictures of an evaluation: what every method makes of a photo, and where the network looks (the paper's figures)."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from oasis_warp.core import surface
+from oasis_warp.core.types import Camera
+from oasis_warp.data.photo import read_photo
+from oasis_warp.data.pictures import to_uint8, write_picture
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.inputs import NetworkInput
+from oasis_warp.network.point_features import seen_difference
+from oasis_warp.network.vpia import VisibilityAttention
+from oasis_warp.ops import depth_map
+from oasis_warp.render.cameras import orbit_camera
+
+TILE = 160
+"""Side of a picture on a sheet [px]."""
+HEADING = 22
+"""Height of the line with the names of the columns [px]."""
+INK, PAPER = 40, 255
+ATTENTION_COLUMNS = ("photo", "visibility", "other side", "global attention", "other side")
+
+
+def tile(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "t t 3"]:
+    """The picture at the size of a sheet's tiles, on the CPU."""
+    small = interpolate(image.permute(2, 0, 1)[None], size=(TILE, TILE), mode="area")
+    return small[0].permute(1, 2, 0).cpu()
+
+
+def write_strip(path: Path, rows: Sequence[Sequence[Float[Tensor, "t t 3"]]]) -> None:
+    """Write rows of tiles as one picture."""
+    write_picture(path, to_uint8(torch.cat([torch.cat(list(row), dim=1) for row in rows])))
+
+
+def write_sheet(path: Path, strips: Sequence[Path], columns: Sequence[str]) -> None:
+    """Write the pictures `strips`, equally wide, one below the other, under the names of their columns."""
+    parts = [read_photo(strip).rgb for strip in strips]
+    heading = np.full((HEADING, parts[0].shape[1], 3), PAPER, np.uint8)
+    for k, name in enumerate(columns):
+        place = (k * TILE + 4, HEADING - 7)
+        cv2.putText(heading, name, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (INK, INK, INK), 1, cv2.LINE_AA)
+    write_picture(path, torch.cat([torch.from_numpy(heading), *parts]))
+
+
+def has_attention(network: HandNetwork) -> bool:
+    """Whether the network weighs local tokens against a global one."""
+    return isinstance(network.fusion, VisibilityAttention)
+
+
+@torch.no_grad()
+def draw_attention(network: HandNetwork, inputs: NetworkInput) -> list[Float[Tensor, "t t 3"]]:
+    """The row of `ATTENTION_COLUMNS` for the one hand of `inputs`.
+
+    Visibility is equation 4, the global attention the share of a point's attention that the global token gets, both
+    from 0 (dark) to 1 (bright), on the posed surface as the photo sees it and from behind.
+    """
+    if not isinstance(network.fusion, VisibilityAttention):
+        raise ValueError("network: expected one with visibility-conditioned attention, got another fusion.")
+    sighting = network.look(inputs)
+    mean = network.mean_hands(sighting.colors, sighting.confidence)
+    seen = None if network.point_evidence is None else seen_difference(sighting, mean)
+    points, local, context = network.tokens(inputs, sighting, mean, seen)
+    share = network.fusion.global_share(points, local, context, sighting.visibility)
+    size, vertices = inputs.image.shape[1], inputs.posed[0]
+    cameras = (
+        Camera(inputs.viewmat[0], inputs.K[0], size, size), orbit_camera(vertices, math.pi, size=size)
+    )  # fmt: skip
+    fields = (sighting.visibility[0], share[0])
+    drawn = [_draw_field(field, vertices, network.faces, camera) for field in fields for camera in cameras]
+    return [tile(inputs.image[0]), *map(tile, drawn)]
+
+
+def _draw_field(field: Float[Tensor, "V"], vertices: Tensor, faces: Tensor, camera: Camera) -> Tensor:
+    """A number a vertex as a colour on the shaded surface."""
+    seen = depth_map(vertices, faces, camera.viewmat, camera.K, camera.width, camera.height, validate=False)
+    corners, on_hand = faces[seen.face_ids.clamp_min(0).long()], seen.face_ids >= 0
+    value = (field[corners] * seen.barycentrics).sum(-1)
+    grey = (value.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    color = torch.from_numpy(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()).to(value) / 255
+    normals = surface.vertex_normals(vertices, faces) @ camera.viewmat[:3, :3].T
+    facing = -(normals[corners] * seen.barycentrics[..., None]).sum(-2)[..., 2]
+    shade = 0.45 + 0.55 * facing.clamp(0, 1)
+    return torch.where(on_hand[..., None], color * shade[..., None], torch.ones_like(color))

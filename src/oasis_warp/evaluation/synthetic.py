@@ -1,0 +1,225 @@
+"""Evaluate the prior and one-shot adaptation on synthetic people that were never met.
+
+Nothing here needs more than the package's core: a script on a machine with CUDA can call `evaluate`.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from oasis_warp import __version__
+from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.prior import Prior
+from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.types import Camera, Evidence, PosedHand, TrainingBatch
+from oasis_warp.data.atomic import write_file
+from oasis_warp.data.claimed_folder import claim_folder
+from oasis_warp.evaluation.held_out import (
+    FIRST_PERSON,
+    POPULATIONS,
+    Group,
+    Lighting,
+    Shoot,
+    as_estimated,
+    photograph,
+    true_targets,
+)
+from oasis_warp.evaluation.methods import METHODS, Method, label, prior_digest, reconstructions
+from oasis_warp.evaluation.metrics import Truth, match_colors, score
+from oasis_warp.evaluation.pictures import (
+    ATTENTION_COLUMNS,
+    draw_attention,
+    has_attention,
+    tile,
+    write_sheet,
+    write_strip,
+)
+from oasis_warp.evaluation.summary import Record, summarise
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.network.anchors import faces_of_vertices
+from oasis_warp.network.inputs import input_of_batch
+from oasis_warp.network.prior import NetworkPrior
+from oasis_warp.render.render import render
+from oasis_warp.synthetic.people import bake_people
+from oasis_warp.training.losses import Perceptual
+
+SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (
+    "evaluation.json", "metrics.json", "sheet.png", "attention.png", "people"
+)  # fmt: skip
+"""What an evaluation leaves in its folder; the last is a folder of what was found of each person."""
+SHOWN = 4
+"""People of each group on the sheet, and hands on the picture of attention."""
+DIGITS = 5
+"""Of the numbers in files."""
+BAKED_TOGETHER = 16
+"""People that are kept at a time: a CPU keeps few."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticEvaluation:
+    """What is asked, of whom, and how."""
+
+    groups: tuple[Group, ...] = ("ordinary", "tattoo", "ring")
+    people: int = 16
+    """In each group."""
+    lights: tuple[Lighting, ...] = ("studio", "wild")
+    noise: tuple[float, ...] = (0.0, 1.0)
+    """Times the estimator's errors, for every group; 0 is the true pose."""
+    curve: tuple[float, ...] = (2.0, 4.0)
+    """More of them, for the first group only."""
+    methods: tuple[Method, ...] = METHODS
+    """Those whose prior is not given are left out."""
+    shoot: Shoot = field(default_factory=Shoot)
+    adapt: AdaptConfig = field(default_factory=AdaptConfig)
+
+
+def evaluate(
+    priors: Mapping[str, Prior],
+    config: SyntheticEvaluation,
+    folder: Path,
+    device: torch.device,
+    *,
+    perceptual: Perceptual | None = None,
+    workers: int = 0,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Measure every method on every person, and leave numbers and pictures in `folder`; what METRICS then holds.
+
+    A run that was stopped goes on with the people that are missing.
+
+    Args:
+        priors: By the names that methods have for them; see `methods.usual_priors`.
+        config: What to measure.
+        folder: Where files go; its parent must exist.
+        device: Where to compute.
+        perceptual: LPIPS, where its weights are at hand.
+        workers: Processes that bake people.
+        progress: Told of people as they are baked and measured.
+
+    Raises:
+        InputError: the folder cannot be used, or holds an evaluation with other settings.
+    """
+    settings = {
+        "version": __version__,
+        "priors": {name: prior_digest(prior) for name, prior in priors.items()},
+        "lpips": perceptual is not None,
+        **asdict(config),
+    }
+    settings = json.loads(json.dumps(settings))  # tuples become lists, as a file has them
+    claim_folder(folder, SETTINGS, settings, "an evaluation")
+    (folder / PEOPLE).mkdir(exist_ok=True)
+    bench = _Bench(priors, config, device, perceptual)
+    everybody = [(group, FIRST_PERSON + k) for group in config.groups for k in range(config.people)]
+    done = sum(_place(folder, *who).exists() for who in everybody)
+    for group in config.groups:
+        missing = [number for of, number in everybody if of == group and not _place(folder, of, number).exists()]
+        for few in (missing[k : k + BAKED_TOGETHER] for k in range(0, len(missing), BAKED_TOGETHER)):
+            bake_people(config.shoot.seed, few, POPULATIONS[group], str(device), jobs=workers, progress=progress)
+            for number in few:
+                progress("evaluation", done, len(everybody))
+                bench.measure(folder, group, number)
+                done += 1
+    progress("evaluation", done, len(everybody))
+    records = [record for who in everybody for record in json.loads(_place(folder, *who).read_text())]
+    strips = [
+        path for group in config.groups for k in range(min(SHOWN, config.people))
+        if (path := _place(folder, group, FIRST_PERSON + k).with_suffix(".png")).exists()
+    ]  # fmt: skip
+    write_sheet(folder / SHEET, strips, ["photo", "truth", *map(label, bench.methods)])
+    maps = sorted((folder / PEOPLE).glob("*_attention.png"))
+    if maps:
+        write_sheet(folder / ATTENTION, maps, ATTENTION_COLUMNS)
+    found = {"settings": settings, "summary": summarise(records), "pictures": records}
+    write_file(folder / METRICS, json.dumps(found, allow_nan=False).encode())
+    return found
+
+
+def _place(folder: Path, group: Group, number: int) -> Path:
+    return folder / PEOPLE / f"{group}_{number}.json"
+
+
+class _Bench:
+    """What every person is measured with."""
+
+    def __init__(
+        self, priors: Mapping[str, Prior], config: SyntheticEvaluation, device: torch.device,
+        perceptual: Perceptual | None,
+    ):  # fmt: skip
+        self.priors, self.config, self.device, self.perceptual = priors, config, device, perceptual
+        self.hand = bundled_hand()
+        self.hand_there = self.hand.to(device)
+        self.vertex_faces = faces_of_vertices(self.hand_there.faces, len(self.hand.template))
+        self.methods = [method for name in priors for method in config.methods if method.prior == name]
+
+    def measure(self, folder: Path, group: Group, number: int) -> None:
+        """Write the records of one person, and pictures of the first few; the records last."""
+        config, place = self.config, _place(folder, group, number)
+        session = photograph(config.shoot, group, number, self.device)
+        records, rows, shown = [], [], number < FIRST_PERSON + SHOWN
+        factors = config.noise + (config.curve if group == config.groups[0] else ())
+        for light in config.lights:
+            exact = as_estimated(self.hand_there, session, light, config.shoot, 0.0)
+            truths = true_targets(exact, self.hand_there, self.vertex_faces)
+            for factor in factors:
+                batch = as_estimated(self.hand_there, session, light, config.shoot, factor)
+                row = [tile(batch.image[0]), tile(truths[0].image)]
+                for method, images in self.draw(batch):
+                    about = {"group": group, "person": number, "light": light, "noise": factor}
+                    records += [{**about, **method._asdict(), **found} for found in self.score(images, truths)]
+                    row.append(tile(images[0]))
+                if factor == config.noise[-1]:
+                    rows.append(row)
+            if shown and group == config.groups[0] and light == config.lights[-1]:
+                self.write_attention(place.with_name(f"{number}_attention.png"), exact)
+        if shown:
+            write_strip(place.with_suffix(".png"), rows)
+        write_file(place, json.dumps(records, allow_nan=False).encode())
+
+    def draw(self, batch: TrainingBatch) -> Iterator[tuple[Method, list[Tensor]]]:
+        """What each method makes of the one photo of `batch`, drawn as each target shows it, over black."""
+        evidence, size = evidence_of(batch), batch.target_images.shape[2]
+        for method, gaussians in reconstructions(
+            self.hand, evidence, self.priors, self.methods, self.config.adapt
+        ):
+            images = []
+            for posed, viewmat, K in zip(
+                batch.target_posed[0], batch.target_viewmats[0], batch.target_Ks[0], strict=True
+            ):
+                there = pose_gaussians(gaussians, self.hand_there.faces, batch.rest[0], posed)
+                images.append(render(there, Camera(viewmat, K, size, size)).image)
+            yield method, images
+
+    def score(self, images: list[Tensor], truths: list[Truth]) -> Iterator[Record]:
+        """Two records a target: as drawn, and with the colours matched to it."""
+        for k, (image, truth) in enumerate(zip(images, truths, strict=True)):
+            for colors in ("raw", "matched"):
+                judged = match_colors(image, truth.image, truth.mask) if colors == "matched" else image
+                found = score(judged, truth, self.perceptual)
+                numbers = {name: None if value is None else round(value, DIGITS) for name, value in found.items()}
+                yield {"target": k, "colors": colors, **numbers}
+
+    def write_attention(self, path: Path, batch: TrainingBatch) -> None:
+        """Write where the learned prior looks, if its network has such attention."""
+        prior = self.priors.get("learned")
+        if isinstance(prior, NetworkPrior) and has_attention(prior.network):
+            write_strip(path, [draw_attention(prior.network.to(self.device), input_of_batch(batch))])
+
+
+def evidence_of(batch: TrainingBatch) -> Evidence:
+    """The one photo of `batch` as what priors and adaptation look at."""
+    size = batch.image.shape[1]
+    unknown = [batch.rest.new_full((n, 3), float("nan")) for n in (16, 5)]  # joints and tips: nobody asks for them
+    return Evidence(
+        image=batch.image[0],
+        mask=batch.mask[0],
+        above_wrist=torch.ones_like(batch.mask[0]),
+        camera=Camera(batch.viewmat[0], batch.K[0], size, size),
+        rest=PosedHand(batch.rest[0], *unknown),
+        posed=PosedHand(batch.posed[0], *unknown),
+    )

@@ -1,0 +1,228 @@
+"""`oasis evaluate`: refusals in words, both data sets on a small scale, and what real photos are compared by."""
+
+import json
+import re
+
+import pytest
+import torch
+
+from oasis_warp.cli import main
+from oasis_warp.commands import evaluate as command
+from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
+from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.data.pictures import write_picture
+from oasis_warp.evaluation import same_hand
+from oasis_warp.evaluation.photo_pairs import compare_pairs, compare_with_photo, draw_as_photo
+from oasis_warp.evaluation.same_hand import photos_of_hands, summarise_pairs
+from oasis_warp.hand.estimator import HandEstimator
+from oasis_warp.pipeline import make_evidence
+
+SMALL = ReconstructConfig(size=96)
+
+
+class KnownEstimator(HandEstimator):
+    """Knows where the hand of `scene` is, and that pictures called `no_hand` show none."""
+
+    def __init__(self, fit):
+        self.known, self.shapes = fit, []
+
+    def find(self, photo):
+        return [] if photo.name.startswith("no_hand") else [self.known.landmarks]
+
+    def fit(self, photo, landmarks, shape=None, force=False):
+        self.shapes.append(shape)
+        return self.known
+
+
+def in_light(photo, *gains):
+    return photo._replace(rgb=(photo.rgb * torch.tensor(gains)).to(torch.uint8))
+
+
+def score_in(scene, photo, avatar=None):
+    _, fit, made = scene
+    avatar = avatar or made
+    evidence = make_evidence(photo, fit, avatar.surface_offsets, SMALL)
+    return compare_with_photo(avatar, draw_as_photo(avatar, evidence, fit.pose), evidence)
+
+
+def test_an_avatar_is_like_the_photo_that_it_was_made_of(scene):
+    score = score_in(scene, scene[0])
+    assert score.psnr > 34 and score.psnr_plain > 32 and score.ssim_quarter > 0.99
+    assert score.overlap > 0.7  # its few Gaussians leave gaps
+    assert len(score.region_errors) > 0 and max(score.region_errors.values()) < 0.03
+
+
+def test_another_light_is_matched_by_one_gain_a_channel(scene):
+    score = score_in(scene, in_light(scene[0], 0.9, 0.7, 0.5))
+    assert score.psnr > 34 and score.psnr_plain < 20
+    assert max(score.region_errors.values()) < 0.03
+
+
+def test_a_wrong_colour_on_half_the_hand_is_found(scene, hand):
+    avatar = scene[2]
+    half = hand.template[avatar.gaussians.vertex_index, :1] < -0.1
+    wrong = type(avatar)(
+        side=avatar.side, shape=avatar.shape, surface_offsets=avatar.surface_offsets,
+        gaussians=avatar.gaussians._replace(colors=avatar.gaussians.colors * torch.where(half, 0.5, 1.0)),
+        source_pose=avatar.source_pose, source_camera=avatar.source_camera,
+    )  # fmt: skip
+    score, right = score_in(scene, scene[0], wrong), score_in(scene, scene[0])
+    assert score.psnr < right.psnr - 10
+    assert score.ssim_quarter < right.ssim_quarter
+    assert score.overlap == right.overlap
+
+
+def test_every_ordered_pair_is_compared_and_the_second_photo_is_fitted_with_the_firsts_shape(scene):
+    photo, fit, avatar = scene
+    estimator = KnownEstimator(fit)
+    photos = {name: (photo, fit.landmarks) for name in "abc"}
+    pairs = list(compare_pairs(estimator, photos, {"a": {"x": avatar, "y": avatar}, "b": {"x": avatar}}, SMALL))
+    assert [(pair.source, pair.target) for pair in pairs] == [("b", "a"), ("a", "b"), ("a", "c"), ("b", "c")]
+    assert list(pairs[1].scores) == ["x", "y"] and list(pairs[0].scores) == ["x"]
+    assert all(torch.equal(shape, avatar.shape) for shape in estimator.shapes)
+    assert pairs[0].photo.shape == pairs[0].drawn["x"].shape == (96, 96, 3)
+
+
+def test_a_left_hand_is_no_target_of_a_right_one(scene):
+    photo, fit, avatar = scene
+    left = KnownEstimator(fit._replace(side="left"))
+    photos = {name: (photo, fit.landmarks) for name in "ab"}
+    assert list(compare_pairs(left, photos, {"a": {"x": avatar}, "b": {}}, SMALL)) == []
+
+
+def pair(target, prior, stage, psnr, error=None):
+    record = {"hand": "h", "source": "s", "target": target, "prior": prior, "stage": stage, "psnr": psnr,
+              "psnr_plain": psnr, "ssim_quarter": 0.5, "overlap": 0.9}  # fmt: skip
+    return record if error is None else record | {"error": error, "error_palm": error}
+
+
+def test_the_share_of_pairs_on_which_one_shot_is_better():
+    pairs = [
+        pair("a", "mean", "one_shot", 20.0, 0.2), pair("b", "mean", "one_shot", 21.0),
+        pair("c", "mean", "one_shot", 9.0),
+        pair("a", "learned", "one_shot", 22.0, 0.1), pair("b", "learned", "one_shot", 20.0, 0.1),
+        pair("c", "learned", "one_shot", 10.0),
+    ]  # fmt: skip
+    mean, learned = summarise_pairs(pairs)
+    assert (mean["pairs"], mean["psnr"], mean["error_palm"], mean["error_nail"]) == (3, 20.0, 0.2, None)
+    assert mean["beaten_psnr"] == pytest.approx(2 / 3)
+    assert mean["beaten_error"] == 1.0 and mean["beaten_ssim_quarter"] == 0.0
+    assert learned["beaten_psnr"] is None
+
+
+@pytest.fixture
+def hands(scene, tmp_path, monkeypatch):
+    """A folder with two photos of one hand and one of another, one of them of no hand."""
+    folder = tmp_path / "hands"
+    for name in ("mine/a.png", "mine/b.png", "mine/no_hand.png", "single/a.png", "empty/note.txt"):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".png":
+            write_picture(path, scene[0].rgb)
+        else:
+            path.write_text("nothing to see")
+    monkeypatch.setattr(same_hand, "HandEstimator", lambda hand: KnownEstimator(scene[1]))
+    monkeypatch.setattr(same_hand, "outline_offsets", lambda hand, fit: torch.zeros_like(hand.template))
+    return folder
+
+
+def test_photos_of_the_same_hand_are_measured_and_the_run_is_not_done_twice(hands, tmp_path, capsys, monkeypatch):
+    assert list(photos_of_hands(hands)) == ["mine"]
+    out = tmp_path / "found"
+    arguments = ["evaluate", "--dataset", "same-hand", str(hands), "--out", str(out), "--prior", "none", "--steps", "1",
+                 "--size", "64"]  # fmt: skip
+    assert main(arguments) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "2 ordered pairs" in said and "photos left out: 1" in said and re.search(r"mean one-shot │ \d\d\.\d\d", said)
+    found = json.loads((out / "metrics.json").read_text())
+    assert {(p["source"], p["target"]) for p in found["pairs"]} == {("a", "b"), ("b", "a")}
+    assert all(p["psnr"] > 25 for p in found["pairs"])
+    assert list(found["left_out"]) == ["mine/no_hand.png"]
+    assert {path.name for path in out.iterdir()} == {"evaluation.json", "metrics.json", "sheet.png", "hands"}
+    monkeypatch.setattr(same_hand, "HandEstimator", lambda hand: pytest.fail("measured again"))
+    assert main(arguments) == 0
+    assert json.loads((out / "metrics.json").read_text()) == found
+
+
+def test_folders_without_pairs_are_refused_in_one_sentence(hands, tmp_path, capsys):
+    (hands / "mine" / "a.png").unlink()
+    (hands / "mine" / "b.png").rename(hands / "mine" / "no_hand_either.png")
+    for folder, words in (
+        (tmp_path / "none", "found no such folder"), (hands / "mine" / "no_hand.png", "found a file"),
+        (hands / "single", "found none"), (hands, "of no hand are there two photos"),
+    ):  # fmt: skip
+        options = ["--dataset", "same-hand", "--out", str(tmp_path / "found"), "--prior", "none"]
+        assert main(["evaluate", str(folder), *options]) == BAD_INPUT
+        said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("oasis: ")]
+        assert len(said) == 1 and words in said[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--dataset", "same-hand"], "expected a folder with a subfolder of photos for each hand; name it"),
+        (["photos"], "photos: synthetic hands need no folder"),
+        (["--people", "0"], "--people: expected 1 or more, got 0"),
+        (["--targets", "9"], "--targets: expected 1 to 8, got 9"),
+        (["--size", "100"], "--size: expected 64 to 1024 pixels in steps of 16, got 100"),
+        (["--steps", "-1"], "--steps: expected 0 or more, got -1"),
+        (["--prior", "nowhere.safetensors"], "nowhere.safetensors: expected a network's weights, found no such file"),
+        (["--lpips", "a.pth", "b.pth"], "a.pth: expected weights of LPIPS, found no such file"),
+        (["photos", "--dataset", "same-hand", "--lpips", "a.pth", "b.pth"], "--lpips: is measured on synthetic"),
+    ],
+)
+def test_wrong_options_are_one_sentence(tmp_path, capsys, arguments, words):
+    out = tmp_path / "found"
+    prior = [] if "--prior" in arguments else ["--prior", "none"]
+    assert main(["evaluate", "--out", str(out), *prior, *arguments]) == BAD_INPUT
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+    assert not out.exists()
+
+
+def test_ctrl_c_keeps_what_is_whole(tmp_path, monkeypatch, capsys):
+    def stopped(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "evaluate", stopped)
+    assert main(["evaluate", "--out", str(tmp_path / "found"), "--prior", "none"]) == INTERRUPTED
+    assert "what is whole stays in" in capsys.readouterr().err
+
+
+def test_a_machine_without_a_gpu_is_told_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert main(["evaluate", "--out", str(tmp_path / "found"), "--device", "cuda"]) == BAD_INPUT
+    assert "torch finds no CUDA device" in capsys.readouterr().err
+
+
+def test_synthetic_hands_are_measured_and_printed(tmp_path, monkeypatch, capsys):
+    rows = [
+        {"group": group, "light": light, "noise": noise, "colors": colors, "prior": "mean", "stage": "calibrated",
+         "people": 1, "pictures": 4, "psnr": 21.5 + noise, "gain": 0.0, "gain_error": None, "better": 0.0,
+         "psnr_inner": 25.0, "psnr_visible": None, "psnr_hidden": 24.0, "psnr_stretched": None, "ssim": 0.9,
+         "ssim_box": 0.8, "ssim_mask": 0.7, "lpips": None}
+        for group in ("ordinary", "tattoo", "ring") for light in ("studio", "wild")
+        for noise in (0.0, 1.0, 2.0, 4.0) for colors in ("raw", "matched")
+    ]  # fmt: skip
+    asked = []
+
+    def found(priors, config, out, device, **options):
+        asked.append((list(priors), config.people, config.shoot.size, config.adapt.texture_steps, str(device)))
+        return {"summary": rows}
+
+    monkeypatch.setattr(command, "evaluate", found)
+    options = ["--people", "3", "--size", "128", "--steps", "5", "--prior", "none"]
+    assert main(["evaluate", "--out", str(tmp_path / "found"), *options]) == 0
+    said = capsys.readouterr().out
+    assert asked == [(["mean"], 3, 128, 5, "cpu")]
+    assert said.count("mean calibrated") == 6 * 2 + 1 and "LPIPS: no weights given" in said
+    assert "tattoo people, wild photos, colours matched" in said and "visible" not in said
+    assert re.search(r"mean calibrated .*21\.50.*22\.50.*23\.50.*25\.50", said)
+
+
+def test_one_photo_of_a_hand_is_no_pair(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "a.jpg").touch()
+    with pytest.raises(InputError, match="with two photos of it or more, found none"):
+        photos_of_hands(tmp_path)

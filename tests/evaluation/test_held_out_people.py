@@ -1,0 +1,116 @@
+"""Who is photographed for an evaluation, and which pixels count as hidden or stretched."""
+
+import math
+
+import pytest
+import torch
+from synthetic import posed_hand
+
+from oasis_warp.core.types import TrainingBatch
+from oasis_warp.evaluation.held_out import (
+    FIRST_PERSON,
+    HELD_OUT_SEED,
+    POPULATIONS,
+    STRETCH,
+    Shoot,
+    as_estimated,
+    photograph,
+    true_targets,
+)
+from oasis_warp.network.anchors import faces_of_vertices
+from oasis_warp.ops import depth_map
+from oasis_warp.render.cameras import orbit_camera
+from oasis_warp.synthetic.identity import sample_identity
+
+CPU = torch.device("cpu")
+SHOOT = Shoot(targets=2, size=64)
+
+
+def seen_from(hand, azimuths, target_vertices=None, size=96):
+    """An open hand photographed from the palm, and its targets from these sides."""
+    rest, _, posed = posed_hand(hand)
+    vertices = posed.vertices if target_vertices is None else target_vertices
+    photo, *cameras = (orbit_camera(posed.vertices, azimuth, size=size) for azimuth in (0.0, *azimuths))
+    n, plane = len(azimuths), torch.ones(1, len(azimuths), size, size)
+    return TrainingBatch(
+        image=torch.zeros(1, size, size, 3), mask=torch.ones(1, size, size), posed=posed.vertices[None],
+        viewmat=photo.viewmat[None], K=photo.K[None], rest=rest.vertices[None],
+        target_images=0.5 * plane[..., None].expand(-1, -1, -1, -1, 3), target_masks=plane, target_known=plane,
+        target_posed=vertices.expand(1, n, -1, -1), target_viewmats=torch.stack([c.viewmat for c in cameras])[None],
+        target_Ks=torch.stack([c.K for c in cameras])[None],
+    )  # fmt: skip
+
+
+def labels(hand, batch):
+    """Pixels of the hand in each target, hidden ones and stretched ones."""
+    size, vertices = batch.target_images.shape[2], batch.target_posed[0]
+    ids = depth_map(vertices, hand.faces, batch.target_viewmats[0], batch.target_Ks[0], size, size).face_ids
+    truths = true_targets(batch, hand, faces_of_vertices(hand.faces, len(hand.template)))
+    return [
+        (int((seen >= 0).sum()), int(truth.hidden.sum()), int(truth.stretched.sum()))
+        for seen, truth in zip(ids, truths, strict=True)
+    ]
+
+
+def test_from_the_photos_own_side_nothing_is_hidden_and_from_behind_nearly_all_is(hand):
+    (area, hidden, _), (area_behind, hidden_behind, _) = labels(hand, seen_from(hand, (0.0, math.pi)))
+    assert hidden < 0.02 * area
+    assert hidden_behind > 0.95 * area_behind
+
+
+@pytest.mark.parametrize("growth", [1.02, 1.2, 1 / 1.2])
+def test_skin_is_stretched_from_a_ratio_of_areas_on(hand, growth):
+    vertices = posed_hand(hand, pose_name="rest")[2].vertices
+    middle = vertices.mean(0)
+    ((area, _, stretched),) = labels(hand, seen_from(hand, (0.0,), middle + growth * (vertices - middle)))
+    assert stretched == (area if abs(math.log(growth**2)) > math.log(STRETCH) else 0)
+
+
+@pytest.fixture(scope="module")
+def session():
+    return photograph(SHOOT, "ordinary", FIRST_PERSON, CPU)
+
+
+def test_both_photos_show_the_same_hand_in_the_same_pose(session):
+    studio, wild = session.photos["studio"], session.photos["wild"]
+    for name in ("angles", "orientation", "shape", "left", "person"):
+        assert torch.equal(getattr(studio, name), getattr(wild, name)), name
+    torch.testing.assert_close(studio.translation, wild.translation)
+    assert not torch.allclose(studio.image, wild.image, atol=0.05)
+    assert session.targets.image.shape == (2, 80, 80, 3)
+    assert torch.equal(session.targets.shape[0], wild.shape[0])
+
+
+def test_a_studios_wall_is_plain_and_the_hand_before_it_lit_as_its_targets(session):
+    studio = session.photos["studio"]
+    wall = studio.image[studio.alpha == 0]
+    assert len(wall) > 500 and torch.equal(wall, wall[:1].expand_as(wall))
+
+
+def test_the_same_picture_comes_again(session):
+    again = photograph(SHOOT, "ordinary", FIRST_PERSON, CPU)
+    for light, photo in session.photos.items():
+        assert torch.equal(photo.image, again.photos[light].image)
+
+
+def test_groups_are_the_same_people_with_one_thing_more(hand):
+    number = FIRST_PERSON + 3
+    bare, tattooed, ringed = (
+        sample_identity(hand, HELD_OUT_SEED, number, POPULATIONS[group]) for group in ("ordinary", "tattoo", "ring")
+    )
+    assert (bare.tattoo, bare.ring_finger) == (0, -1)
+    assert tattooed.tattoo > 0 and tattooed._replace(tattoo=0).ring_finger == -1
+    assert ringed.ring_finger >= 0 and ringed.tattoo == 0
+    assert bare.melanin == tattooed.melanin == ringed.melanin and bare.seed == ringed.seed
+
+
+def test_estimated_poses_are_off_by_as_much_as_the_factor_says(hand, session):
+    def posed(factor):
+        return as_estimated(hand, session, "studio", SHOOT, factor)
+
+    true, once, twice = posed(0.0), posed(1.0), posed(2.0)
+    near, far = ((batch.posed - true.posed).norm(dim=-1).mean() for batch in (once, twice))
+    assert 0 < float(near) < float(far)
+    assert torch.equal(true.target_images, twice.target_images) and torch.equal(true.rest, twice.rest)
+    assert torch.equal(once.posed, posed(1.0).posed)
+    assert 0 <= float(posed(4.0).mask.min()) and float(posed(4.0).mask.max()) <= 1

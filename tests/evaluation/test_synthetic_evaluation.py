@@ -1,0 +1,137 @@
+"""The evaluation as a whole: what it leaves, that it goes on where it was stopped, and what it refuses."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.evaluation import synthetic
+from oasis_warp.evaluation.held_out import FIRST_PERSON, Shoot, as_estimated, photograph
+from oasis_warp.evaluation.methods import METHODS, Method, prior_digest, reconstructions, usual_priors
+from oasis_warp.evaluation.metrics import MEASURES
+from oasis_warp.evaluation.synthetic import (
+    ATTENTION,
+    METRICS,
+    PEOPLE,
+    SETTINGS,
+    SHEET,
+    SyntheticEvaluation,
+    evaluate,
+    evidence_of,
+)
+from oasis_warp.network.config import COMPACT
+from oasis_warp.network.hand_network import HandNetwork
+
+CPU = torch.device("cpu")
+TINY = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
+CONFIG = SyntheticEvaluation(
+    groups=("ordinary",), people=1, noise=(1.0,), curve=(), shoot=Shoot(targets=2, size=64),
+    adapt=AdaptConfig(texture_steps=1, reference_views=1),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def network(hand):
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return HandNetwork(TINY, hand)
+
+
+@pytest.fixture(scope="module")
+def left(network, tmp_path_factory):
+    """What an evaluation leaves, and what it returns."""
+    folder = tmp_path_factory.mktemp("evaluation") / "found"
+    return folder, evaluate(usual_priors(network), CONFIG, folder, CPU)
+
+
+def test_numbers_and_pictures_are_left(left, network):
+    folder, found = left
+    assert {path.name for path in folder.iterdir()} == {SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE}
+    assert json.loads((folder / METRICS).read_text()) == found
+    assert len(found["pictures"]) == 2 * 2 * 2 * len(METHODS)  # lights, targets, colours
+    assert all(set(MEASURES) < set(record) for record in found["pictures"])
+    assert all(10 < record["psnr"] < 45 for record in found["pictures"])
+    assert found["settings"]["priors"]["mean"] is None
+    assert found["settings"]["priors"]["learned"] == prior_digest(usual_priors(network)["learned"])
+    by_colors = [
+        [record["psnr"] for record in found["pictures"] if record["colors"] == colors] for colors in ("raw", "matched")
+    ]
+    assert all(matched >= raw - 0.02 for raw, matched in zip(*by_colors, strict=True))  # clipped after the best gain
+
+
+def test_an_untrained_network_is_the_mean_hand(left):
+    rows = [row for row in left[1]["summary"] if row["stage"] == "one_shot" and row["colors"] == "matched"]
+    for light in ("studio", "wild"):
+        mean, learned = (row for row in rows if row["light"] == light)
+        assert mean["psnr"] == pytest.approx(learned["psnr"], abs=0.15)
+
+
+def test_without_a_network_what_needs_none_is_measured_alone(left, tmp_path):
+    found = evaluate(usual_priors(None), replace(CONFIG, lights=("studio",)), tmp_path / "found", CPU)
+    assert {record["prior"] for record in found["pictures"]} == {"mean"}
+    assert not (tmp_path / "found" / ATTENTION).exists()
+    same = [r for r in left[1]["pictures"] if (r["prior"], r["light"]) == ("mean", "studio")]
+    assert found["pictures"] == same
+
+
+def test_a_run_that_was_stopped_goes_on_with_who_is_missing(left, network, tmp_path, monkeypatch):
+    changes = {"groups": ("ordinary", "ring"), "lights": ("studio",), "curve": (2.0,), "methods": (METHODS[2],)}
+    config = replace(CONFIG, **changes)
+    folder = tmp_path / "found"
+
+    def stop(stage, done, total):
+        if (stage, done) == ("evaluation", 1):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(usual_priors(network), config, folder, CPU, progress=stop)
+    assert not (folder / METRICS).exists()
+    first = folder / PEOPLE / f"ordinary_{FIRST_PERSON}.json"
+    written = first.stat().st_mtime_ns
+    met = []
+    monkeypatch.setattr(synthetic, "photograph", lambda *who: met.append(who[1:3]) or photograph(*who))
+    found = evaluate(usual_priors(network), config, folder, CPU)
+    assert met == [("ring", FIRST_PERSON)] and first.stat().st_mtime_ns == written
+    measured = {(record["group"], record["noise"]) for record in found["pictures"]}
+    assert measured == {("ordinary", 1.0), ("ordinary", 2.0), ("ring", 1.0)}
+    again = evaluate(usual_priors(network), config, folder, CPU)
+    assert again == found and len(met) == 1
+
+
+def test_another_evaluation_in_the_same_folder_is_refused(left, network):
+    before = (left[0] / METRICS).read_bytes()
+    with pytest.raises(InputError, match="an evaluation made with other settings, curve"):
+        evaluate(usual_priors(network), replace(CONFIG, curve=(4.0,)), left[0], CPU)
+    with torch.no_grad():
+        network.vertex_head.last.bias += 1
+    with pytest.raises(InputError, match="an evaluation made with other settings, priors"):
+        evaluate(usual_priors(network), CONFIG, left[0], CPU)
+    with torch.no_grad():
+        network.vertex_head.last.bias -= 1
+    assert (left[0] / METRICS).read_bytes() == before
+
+
+def test_a_place_that_is_no_folder_is_refused(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for place, words in ((tmp_path / "file", "found a file"), (tmp_path / "none" / "found", "make it first")):
+        with pytest.raises(InputError, match=words):
+            evaluate(usual_priors(None), CONFIG, Path(place), CPU)
+
+
+def test_each_stage_goes_on_from_the_one_before(hand, network):
+    session = photograph(CONFIG.shoot, "ordinary", FIRST_PERSON, CPU)
+    batch = as_estimated(hand, session, "wild", CONFIG.shoot, 0.0)
+    evidence = evidence_of(batch)
+    made = dict(reconstructions(hand, evidence, usual_priors(network), METHODS, CONFIG.adapt))
+    assert tuple(made) == METHODS
+    raw, calibrated, one_shot = (made[Method("learned", stage)].colors for stage in ("raw", "calibrated", "one_shot"))
+    gains = (calibrated - calibrated.mean(0)) / (raw - raw.mean(0))
+    clear = ((raw - raw.mean(0)).abs() > 0.02).all(1) & ((calibrated > 0) & (calibrated < 1)).all(1)
+    assert float(gains[clear].std(0).max()) < 1e-2  # one gain and one offset a channel
+    assert not torch.allclose(calibrated, one_shot, atol=0.01)
+    (alone,) = reconstructions(hand, evidence, usual_priors(network), METHODS[:1], CONFIG.adapt)
+    assert torch.equal(alone[1].colors, made[METHODS[0]].colors)

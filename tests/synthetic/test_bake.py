@@ -1,0 +1,163 @@
+"""Skin that is baked on any device, and what it needs for that."""
+
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from oasis_warp.ops import depth_map
+from oasis_warp.synthetic import people
+from oasis_warp.synthetic.atlas import HEIGHT, WIDTH, bundled_atlas
+from oasis_warp.synthetic.bake import CHANNELS, paint
+from oasis_warp.synthetic.body import bundled_body, skin_mesh
+from oasis_warp.synthetic.canvas import canvas_on
+from oasis_warp.synthetic.drawn_lines import draw_lines
+from oasis_warp.synthetic.identity import Population
+from oasis_warp.synthetic.plan import EVERYBODY
+from oasis_warp.synthetic.processes import worker_pool
+from oasis_warp.synthetic.skin_plan import plan_person
+from oasis_warp.synthetic.strokes import KINDS, Strokes
+
+SEED = 13
+KINDS_OF_PAINT = ("freckles", "hair", "polish", "tattoo", "ring", "plaster")
+PAINTED, BARE = (Population(**dict.fromkeys(KINDS_OF_PAINT, share)) for share in (1.0, 0.0))
+NEEDLESS = ("igl", "trimesh", "tyro", "rich")
+NEEDLESS_TO_PLAN = ("warp", "oasis_kernels", "scipy.ndimage")
+
+
+@pytest.fixture(scope="module")
+def baked(hand):
+    """Somebody with everything that is painted, and the same skin bare of it."""
+    return [people._born(SEED, 4, population, "cpu") for population in (PAINTED, BARE)]
+
+
+def test_the_atlas_shows_what_a_depth_buffer_shows():
+    body, atlas = bundled_body(), bundled_atlas()
+    flat = torch.cat([body.uv * torch.tensor([WIDTH, HEIGHT]), torch.ones(len(body.uv), 1)], 1)
+    seen = depth_map(flat, body.uv_faces, torch.eye(4), torch.eye(3), WIDTH, HEIGHT)
+    shown = seen.face_ids >= 0
+    assert torch.equal(body.faces[seen.face_ids[shown].long()], atlas.corners)
+    torch.testing.assert_close(seen.barycentrics[shown], atlas.weights, atol=2e-7, rtol=0)
+    assert torch.equal(atlas.fill[shown], torch.arange(len(atlas.points)))
+
+
+def test_values_spread_from_vertices_to_texels(device):
+    canvas = canvas_on(str(device))
+    rest = bundled_body().rest.to(device)
+    torch.testing.assert_close(canvas.spread(rest.T.contiguous()).T, canvas.points, atol=1e-4, rtol=0)
+
+
+def test_the_coarse_mesh_is_the_one_that_its_tool_builds(hand):
+    from build_coarse_body import coarse_mesh
+
+    body, built = bundled_body(), coarse_mesh(skin_mesh(hand))
+    np.testing.assert_array_equal(body.coarse_vertices, built["vertices"])
+    np.testing.assert_array_equal(body.coarse_faces, built["faces"])
+
+
+def test_a_line_is_drawn_where_it_was_added(device):
+    grid = canvas_on(str(device)).grid
+    rows = bundled_atlas().snap(np.linspace([-60.0, 0, -8], [-30.0, 0, 6], 30), "palm")
+    strokes = Strokes(np.random.default_rng(0))
+    strokes.add("main", rows, 1.0, 0.8, taper=0.1, wobble=0.0)
+    strokes.add("hair", rows[:1].repeat(3, 0), 1.0, 0.8)  # of no length: nothing
+    drawn = draw_lines(strokes.lines(), grid)
+    assert set(drawn) == set(KINDS) and not bool(drawn["hair"].any())
+    far = torch.cdist(bundled_atlas().points.to(device), torch.from_numpy(rows).float().to(device)).amin(1)
+    line = drawn["main"]
+    assert 0.6 <= float(line.max()) <= 1.0 and float(line[far > 4].max()) == 0
+    middle = torch.from_numpy(rows[10:20]).float().to(device)
+    there = torch.cdist(middle, bundled_atlas().points.to(device)).argmin(1)
+    assert float(line[there].min()) > 0.5
+
+
+def test_where_no_line_was_added_none_is_drawn(device):
+    lines = Strokes(np.random.default_rng(0)).lines()
+    assert not any(bool(drawn.any()) for drawn in draw_lines(lines, canvas_on(str(device)).grid).values())
+
+
+def test_what_is_put_on_skin_shows_in_its_colour(baked):
+    painted, bare = (p.texture[..., :3].float() for p in baked)
+    assert 0.02 < float(((painted - bare).abs().amax(-1) > 0.02).float().mean()) < 0.6
+
+
+def test_textures_are_finite_and_in_range(baked):
+    for person in baked:
+        texture = dict(zip(CHANNELS, person.texture.float().unbind(-1), strict=True))
+        assert bool(person.texture.isfinite().all())
+        for name in ("red", "green", "blue"):
+            assert 0.002 < float(texture[name].min()) and float(texture[name].max()) < 0.91
+        assert float(texture["fold"].max()) <= 0 and float(texture["wrinkle"].max()) <= 0
+        assert float(texture["fold"].min()) < -0.1 and float(texture["height"].min()) < -0.2
+
+
+def test_the_tone_is_the_mean_of_the_texture(baked):
+    torch.testing.assert_close(baked[0].tone, baked[0].texture[..., :3].float().mean((0, 1)))
+
+
+def test_a_plan_travels_and_is_painted_the_same_again(baked):
+    sent = pickle.dumps(plan_person(SEED, 4, PAINTED))
+    assert len(sent) < 2e6
+    assert torch.equal(paint(pickle.loads(sent), "cpu"), baked[0].texture)
+
+
+@pytest.mark.slow
+def test_processes_plan_the_same_skin():
+    with worker_pool(1) as pool:
+        plans = list(pool.map(plan_person, [SEED] * 3, [4, 5, 6], [PAINTED] * 3, chunksize=2))
+    for number, there in zip([4, 5, 6], plans, strict=True):
+        here = plan_person(SEED, number, PAINTED)
+        np.testing.assert_array_equal(there.lines.numbers, here.lines.numbers)
+        np.testing.assert_array_equal(there.spots, here.spots)
+        assert there.identity.seed == here.identity.seed
+
+
+@pytest.mark.gpu
+def test_a_gpu_bakes_the_person_that_the_cpu_bakes(baked, monkeypatch):
+    monkeypatch.setattr(people, "_known", type(people._known)())
+    monkeypatch.setattr(people, "PLANNED_HERE", 0)
+    people.bake_people(SEED, [4], PAINTED, "cuda", jobs=1)
+    ((_, there),) = people._known.items()
+    assert people.person(SEED, 4, PAINTED, "cuda:0") is there
+    here = baked[0]
+    for name in ("rest", "joints", "tips", "ring"):
+        torch.testing.assert_close(getattr(there, name).cpu(), getattr(here, name), atol=1e-6, rtol=0)
+    torch.testing.assert_close(there.areas.cpu(), here.areas, atol=1e-10, rtol=1e-3)
+    torch.testing.assert_close(there.tone.cpu(), here.tone, atol=1e-5, rtol=0)
+    off = (there.texture.cpu().float() - here.texture.float()).abs()
+    assert float(off.mean()) < 1e-5
+    # A hole in a plaster or the end of a dab falls one way or the other.
+    assert float((off > 4e-3).float().mean()) < 1e-5
+
+
+@pytest.mark.gpu
+def test_a_gpu_needs_no_kernel_for_the_cpu(monkeypatch):
+    from oasis_warp.ops import _launch
+
+    people._known.clear()
+    was = _launch.device_and_stream
+
+    def refuse(tensor):
+        assert tensor.is_cuda, "a kernel was launched on the CPU"
+        return was(tensor)
+
+    monkeypatch.setattr(_launch, "device_and_stream", refuse)
+    for cached in (bundled_atlas, bundled_body, canvas_on):
+        cached.cache_clear()
+    people.person(SEED, 4, EVERYBODY, "cuda")
+
+
+def test_baking_imports_nothing_that_is_not_needed_and_planning_still_less():
+    code = f"""
+import sys
+sys.modules.update(dict.fromkeys({(*NEEDLESS, *NEEDLESS_TO_PLAN)}))
+from oasis_warp.synthetic import processes, skin_plan
+skin_plan.bundled_atlas()
+for name in {NEEDLESS_TO_PLAN}:
+    del sys.modules[name]
+import oasis_warp.synthetic.picture
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
