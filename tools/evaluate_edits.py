@@ -3,22 +3,32 @@
     python tools/evaluate_edits.py --out out/edits
     python tools/evaluate_edits.py --out out/edits --sheet docs/_static/edits.jpg
 
-Writes edits.csv, a row for every drawing and view, and edits.md, the table of docs/editing.md. Each drawing is painted on
-the photo of an open palm or back that is drawn from a mesh with known skin, saved as a JPEG, and found again by its
+Writes edits.csv, a row for every drawing and view, and edits.md, the table of docs/editing.md. Each drawing is painted
+on the photo of an open palm or back that is drawn from a mesh with known skin, saved as a JPEG, and found again by its
 difference from the photo. With --sheet, the same drawings on real photos, too.
 """
 
 import argparse
 import csv
-import math
 import time
 from pathlib import Path
 from statistics import mean
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from painted_truth import KINDS, Chart, Truth, draw_truth, edited_area, make_truth, other_views, paint_photo, photographed
+from painted_truth import (
+    KINDS,
+    Chart,
+    Truth,
+    draw_truth,
+    edited_area,
+    make_truth,
+    other_views,
+    paint_photo,
+    photographed,
+)
 
 from oasis_warp.commands.drawing import Panel, make_sheet, panel_side
 from oasis_warp.commands.summary import GROUND
@@ -51,8 +61,8 @@ COVERED = 0.99
 def saved(photo: Photo, quality: int) -> Photo:
     """The photo after a JPEG encoder."""
     _, data = cv2.imencode(".jpg", photo.rgb.numpy()[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, quality))
-    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1]
-    return photo._replace(rgb=torch.from_numpy(np.ascontiguousarray(pixels)), name="painted.jpg")
+    pixels = cv2.cvtColor(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB)
+    return photo._replace(rgb=torch.from_numpy(pixels), name="painted.jpg")
 
 
 @torch.no_grad()
@@ -70,7 +80,7 @@ def judge(truth: Truth, chart: Chart, edited: Avatar, pose: HandPose, camera: Ca
     return row
 
 
-def measure(truth: Truth, kind: str, side: str, quality: int) -> list[dict[str, object]]:
+def measure(truth: Truth, kind: str, side: str, quality: int) -> list[dict[str, Any]]:
     """A row for the photo's view and each other view."""
     chart = Chart(truth, kind)
     painted = saved(paint_photo(truth, chart), quality)
@@ -86,11 +96,11 @@ def measure(truth: Truth, kind: str, side: str, quality: int) -> list[dict[str, 
     ]  # fmt: skip
 
 
-def table(rows: list[dict[str, object]]) -> str:
+def table(rows: list[dict[str, Any]]) -> str:
     """A line for each drawing: its own view, the others' mean and worst, and what changed elsewhere at most."""
     lines = [
-        "| drawing | on the | skin, mm² | new Gaussians | photo's view, dB | other poses, mean | worst | before | paint "
-        "alone, mean | elsewhere, largest change, dB | s |",
+        "| drawing | on the | skin, mm² | new Gaussians | photo's view, dB | other poses, mean | worst | before "
+        "| paint alone, mean | elsewhere, largest change, dB | s |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for key in dict.fromkeys((row["drawing"], row["side"]) for row in rows):
@@ -98,12 +108,13 @@ def table(rows: list[dict[str, object]]) -> str:
         others = [row for row in mine if row["view"] != "photo"]
         change = max((row["elsewhere_after"] - row["elsewhere_before"] for row in mine), key=abs)
         own = mine[0]
-        lines.append(
-            f"| {key[0]} | {key[1]} | {own['painted_mm2']:.0f} | {own['new_gaussians']:.0f} | {own['area_after']:.1f} | "
-            f"{mean(r['area_after'] for r in others):.1f} | {min(r['area_after'] for r in others):.1f} | "
-            f"{mean(r['area_before'] for r in others):.1f} | {mean(r['paint_after'] for r in others):.1f} | "
-            f"{change:+.3f} | {own['seconds']:.1f} |"
-        )
+        cells = [
+            *key, f"{own['painted_mm2']:.0f}", f"{own['new_gaussians']:.0f}", f"{own['area_after']:.1f}",
+            f"{mean(r['area_after'] for r in others):.1f}", f"{min(r['area_after'] for r in others):.1f}",
+            f"{mean(r['area_before'] for r in others):.1f}", f"{mean(r['paint_after'] for r in others):.1f}",
+            f"{change:+.3f}", f"{own['seconds']:.1f}",
+        ]  # fmt: skip
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 

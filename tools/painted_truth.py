@@ -257,8 +257,10 @@ def edited_area(truth: Truth, paint: Float[Tensor, "H W"], camera: Camera, reach
 
 def other_views(truth: Truth, size: int) -> dict[str, tuple[HandPose, Camera]]:
     """Poses and views that the photo does not show, but the paint can be seen in."""
-    angles = {"turned left": ("open", 0.5, 0.0), "turned right": ("open", -0.4, 0.3), "fist": ("fist", 0.2, 0.0),
-              "point": ("point", -0.25, -0.2), "rest": ("rest", 0.0, 0.35), "victory": ("victory", 0.3, 0.2)}  # fmt: skip
+    angles = {
+        "turned left": ("open", 0.5, 0.0), "turned right": ("open", -0.4, 0.3), "fist": ("fist", 0.2, 0.0),
+        "point": ("point", -0.25, -0.2), "rest": ("rest", 0.0, 0.35), "victory": ("victory", 0.3, 0.2),
+    }  # fmt: skip
     views = {}
     for name, (gesture, azimuth, elevation) in angles.items():
         pose = truth.pose._replace(angles=named_pose(truth.hand, gesture))

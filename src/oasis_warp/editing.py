@@ -12,7 +12,7 @@ from torch import Tensor
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import Camera, Photo
+from oasis_warp.core.types import Photo
 from oasis_warp.data.crop import resample_square
 from oasis_warp.data.painted import find_paint, match_size, read_mask
 from oasis_warp.data.registration import Square, find_square
@@ -111,7 +111,9 @@ def edit(
             )  # fmt: skip
         except ValueError as error:
             where = "on the hand" if mask else "on the hand that differs from the photo"
-            raise InputError(f"{painted.name}: there is no paint {where}; paint on the hand, or give a mask.") from error
+            raise InputError(
+                f"{painted.name}: there is no paint {where}; paint on the hand, or give a mask."
+            ) from error
     edited = Avatar(
         side=avatar.side, shape=avatar.shape, surface_offsets=avatar.surface_offsets, gaussians=made.gaussians,
         source_pose=avatar.source_pose, source_camera=avatar.source_camera,

@@ -15,9 +15,9 @@ from oasis_warp.core.types import CanonicalGaussians
 
 PART_SPREAD = 1.6
 """Standard deviations of a part's Gaussian over those of the part as a uniform plate."""
-PART_OPACITY = 0.5
-"""Opacity of a part's Gaussian over that of the face's. The more opaque Gaussians overlap, the more the nearer ones hide
-those beside them, and the picture moves to the side that is nearer in the view at hand."""
+PART_OPACITY = 0.6
+"""Opacity of a part's Gaussian over that of the face's. The more opaque Gaussians overlap, the more the nearer ones
+hide those beside them, and the picture moves to the side that is nearer in the view at hand."""
 NEIGHBOURS = 12
 """Old Gaussians that a new one takes its colour from."""
 
@@ -58,7 +58,6 @@ def densify(
         faces: Of the surface.
         parts: An edge, for each face; 1 leaves the face as it is.
     """
-    n_points = len(gaussians.vertex_index)
     opacity = _face_opacities(gaussians, len(faces))
     cut = (parts > 1) & (opacity > 0)
     keep_vertex = ~_inside(cut, faces, len(vertices))[gaussians.vertex_index]
@@ -110,7 +109,7 @@ def _cut(parts: Tensor, cut: Tensor, dtype: torch.dtype) -> tuple[Int[Tensor, "M
 
 
 @functools.cache
-def _part_centers(n: int) -> Float[Tensor, "n*n 3"]:
+def _part_centers(n: int) -> Float[Tensor, "P 3"]:
     """Barycentrics of the centres of the n^2 parts of a face: those that stand like it, then those upside down."""
     i, j = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
     upright, turned = i + j < n, i + j < n - 1
@@ -130,8 +129,9 @@ def color_at(
     on_faces = (vertices[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
     centers = torch.cat([on_vertices, on_faces])
     tree = cKDTree(centers.detach().cpu().double().numpy())
-    _, near = tree.query(points.detach().cpu().double().numpy(), min(NEIGHBOURS, len(centers)))
-    near = torch.from_numpy(np.asarray(near)).to(points.device).view(len(points), -1)
+    count = min(NEIGHBOURS, len(centers))
+    _, near = tree.query(points.detach().cpu().double().numpy(), count)
+    near = torch.from_numpy(np.asarray(near)).to(points.device).view(len(points), count)
     # Along the surface only: a point of it may lie off a flat Gaussian's plane and still be under it.
     spread = gaussians.scales[:, :2].prod(1).sqrt()
     apart = (points[:, None] - centers[near]).square().sum(-1) / spread[near].square()

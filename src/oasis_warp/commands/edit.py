@@ -55,7 +55,7 @@ def run(options: Options) -> int:
         raise InputError(f"--size {options.size}: expected {low} to {high} pixels; choose another size.")
     if options.steps < 0:
         raise InputError(f"--steps {options.steps}: expected 0 or more; leave it out for the default.")
-    out = options.out or options.avatar.parent / f"{options.painted.stem}.safetensors"
+    out = options.out or options.avatar.with_name(f"{options.avatar.stem}-{options.painted.stem}.safetensors")
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: expected a name that ends in .safetensors; rename the output.")
     files = out, out.with_suffix(".png"), out.with_suffix(".json")

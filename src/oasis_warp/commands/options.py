@@ -348,7 +348,7 @@ class Edit:
     mask: Path | None = None
     """Picture that is white where there is paint, instead of the difference."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="PATH")] = None
-    """Avatar file to write: PAINTED.safetensors beside the avatar when not given."""
+    """Avatar file to write, NAME.safetensors: AVATAR-PAINTED.safetensors beside the avatar when not given."""
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace files of an earlier edit."""
     steps: int = 40

@@ -16,7 +16,7 @@ CERTAIN, POSSIBLE = 0.1, 0.03
 CERTAIN_NOISE, POSSIBLE_NOISE = 12.0, 4.0
 """The same as multiples of the noise, where that says more."""
 BUSY_SHARES = (0.25, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
-"""Shares of the pixels that part them by how busy the photo is around them: compression and scaling change edges most."""
+"""Shares of the pixels that part them by how busy the photo is around them: compression changes edges most."""
 BUSY_WINDOW = 9
 """Side of the square that is looked at for that, about a block of JPEG [px]."""
 QUIET_SHARE = 0.3
@@ -62,10 +62,8 @@ def read_mask(mask: Photo, width: int, height: int) -> Float[Tensor, "H W"]:
     return same.mean(-1) if mask.alpha is None else _scaled(mask.alpha, width, height)
 
 
-def find_paint(
-    photo: Float[Tensor, "H W 3"], painted: Float[Tensor, "H W 3"]
-) -> Float[Tensor, "H W"]:
-    """Share of each pixel of `painted` that is paint, by its difference from the `photo`; 0 everywhere if there is none.
+def find_paint(photo: Float[Tensor, "H W 3"], painted: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
+    """Share of each pixel of `painted` that is paint, by its difference from the `photo`; 0 if there is none.
 
     The noise of compression and scaling is measured on the pair itself, for each degree of busyness of the photo.
     Paint has pixels well above it, and every pixel that hangs together with these and is above it at all.

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -39,9 +38,7 @@ class Square(NamedTuple):
     """Median colour difference between the picture and the photo there, in [0, 1]."""
 
 
-def find_square(
-    picture: Float[Tensor, "S S 3"], alpha: Float[Tensor, "S S"], photo: Float[Tensor, "H W 3"]
-) -> Square:
+def find_square(picture: Float[Tensor, "S S 3"], alpha: Float[Tensor, "S S"], photo: Float[Tensor, "H W 3"]) -> Square:
     """The square of `photo` that `picture` shows where its `alpha` is above a half.
 
     The best of all places and sizes in small copies, then Gauss-Newton on place and size with Geman-McClure weights.
@@ -70,16 +67,38 @@ def _search(picture: np.ndarray, inside: np.ndarray, photo: np.ndarray) -> tuple
         n = round(side)
         if n <= min(small.shape[:2]):
             shrunk = cv2.resize(picture, (n, n), interpolation=cv2.INTER_AREA)
-            mask = (cv2.resize(inside, (n, n), interpolation=cv2.INTER_AREA) > 0.9).astype(np.float32)
-            if mask.sum() > 0:
-                # Correlation, since differences are smallest where a tiny hand lies on plain skin.
-                alike = cv2.matchTemplate(small, shrunk, cv2.TM_CCOEFF_NORMED, mask=np.dstack([mask] * 3))
-                alike[~(np.abs(alike) <= 1.001)] = -1  # over plain ground it is undefined
-                _, high, _, (x, y) = cv2.minMaxLoc(alike)
-                if high > best:
-                    best, found = high, ((x - border) / scale, (y - border) / scale, n / scale)
+            mask = cv2.resize(inside, (n, n), interpolation=cv2.INTER_AREA) > 0.9
+            for x, y in _candidates(small, shrunk, mask):
+                alike = _likeness(small[y : y + n, x : x + n], shrunk, mask)
+                if alike > best:
+                    best, found = alike, ((x - border) / scale, (y - border) / scale, n / scale)
         side = max(side * SIZE_STEP, n + 1)
     return found
+
+
+def _candidates(photo: np.ndarray, picture: np.ndarray, mask: np.ndarray) -> list[tuple[int, int]]:
+    """Where in the photo a picture of the same scale may lie: most correlated, and least different."""
+    if not mask.any():
+        return []
+    weights = np.dstack([mask.astype(np.float32)] * 3)
+    alike = cv2.matchTemplate(photo, picture, cv2.TM_CCOEFF_NORMED, mask=weights)
+    alike[~(np.abs(alike) <= 1.001)] = -1  # over plain ground it is undefined
+    apart = cv2.matchTemplate(photo, picture, cv2.TM_SQDIFF, mask=weights)
+    (x, y), (left, top) = cv2.minMaxLoc(alike)[3], cv2.minMaxLoc(apart)[2]
+    return [(x, y), (left, top)]
+
+
+def _likeness(crop: np.ndarray, picture: np.ndarray, mask: np.ndarray) -> float:
+    """Correlation over the pixels whose colours are near, times their share.
+
+    Paint drops out. Differences alone would be smallest for a tiny hand on a patch of plain skin.
+    """
+    near = mask & (np.abs(crop - picture).mean(-1) < OUTLIER)
+    if not near.any():
+        return -1.0
+    a, b = (plane[near] - plane[near].mean(0) for plane in (crop, picture))
+    size = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum()) / max(size, 1e-6) * float(near.sum() / mask.sum())
 
 
 def _refine(
@@ -94,7 +113,7 @@ def _refine(
     across, down = (cv2.Sobel(crop, cv2.CV_32F, *axis, ksize=3, scale=1 / 8) for axis in ((1, 0), (0, 1)))
     # Moving the square by one pixel of its own moves what it shows by as much; growing it moves what lies off its
     # top left corner.
-    place = (np.arange(n, dtype=np.float32) + 0.5)
+    place = np.arange(n, dtype=np.float32) + 0.5
     grown = across * place[None, :, None] + down * place[:, None, None]
     slopes = np.stack([across, down, grown], -1)
     normal = np.einsum("ijck,ijcl,ij->kl", slopes, slopes, weight)

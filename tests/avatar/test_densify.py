@@ -1,0 +1,111 @@
+import pytest
+import torch
+
+from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
+from oasis_warp.avatar.densify import color_at, densify, parts_for_spacing
+from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.core import surface
+from oasis_warp.hand.skinning import rest_hand
+from oasis_warp.losses.image import masked_psnr
+from oasis_warp.render.cameras import orbit_camera
+from oasis_warp.render.render import render
+
+
+@pytest.fixture(scope="module")
+def dressed(hand):
+    """The hand at rest in colours that change smoothly, and the faces around the middle of its back."""
+    rest = rest_hand(hand, torch.zeros(hand.shape_basis.shape[-1]))
+    anchors = place_anchors(hand, rest)
+    waves = 0.5 + 0.3 * torch.sin(rest.vertices @ (60 * torch.eye(3)))
+    gaussians = anchors.with_colors(vertex_to_gaussians(waves, hand.faces, anchors))
+    center = rest.vertices[hand.segment == 0].mean(0)
+    normals, _ = surface.face_normals(rest.vertices, hand.faces)
+    near = (rest.vertices[hand.faces].mean(1) - center).norm(dim=1) < 0.03
+    return gaussians, rest.vertices, hand.faces, near & (normals[:, 1] > 0.3)
+
+
+def split(dressed, n):
+    gaussians, vertices, faces, chosen = dressed
+    return densify(gaussians, vertices, faces, torch.where(chosen, n, 1))
+
+
+def test_a_face_of_n_parts_an_edge_gets_n_squared_gaussians_inside_it(dressed):
+    made = split(dressed, 3)
+    _, _, faces, chosen = dressed
+    new = made.gaussians.face_index[-made.n_new :]
+    assert made.n_new == 9 * int(chosen.sum())
+    assert torch.equal(new.bincount(minlength=len(faces)), torch.where(chosen, 9, 0))
+    places = made.gaussians.barycentrics[-made.n_new :]
+    assert (places > 0).all()
+    assert torch.allclose(places.sum(1), torch.ones(len(places)))
+    means = torch.zeros(len(faces), 3).index_add_(0, new, places)[chosen] / 9
+    assert torch.allclose(means, torch.full_like(means, 1 / 3), atol=1e-6)
+    assert len(torch.unique(places.round(decimals=5), dim=0)) == 9
+
+
+def test_gaussians_on_other_faces_stay_bit_for_bit_and_in_order(dressed):
+    gaussians, _, faces, chosen = dressed
+    made = split(dressed, 2).gaussians
+    inner = torch.tensor([bool(chosen[(faces == v).any(1)].all()) for v in gaussians.vertex_index.tolist()])
+    kept = torch.cat([~inner, ~chosen[gaussians.face_index]])
+    for name in ("quats", "scales", "opacities", "colors"):
+        before, after = getattr(gaussians, name)[kept], getattr(made, name)
+        assert torch.equal(after[: len(before)], before), name
+    assert torch.equal(made.vertex_index, gaussians.vertex_index[~inner])
+
+
+def test_a_hand_with_finer_gaussians_looks_the_same(dressed):
+    gaussians, vertices, faces, _ = dressed
+    for n in (2, 5):
+        made = split(dressed, n)
+        for azimuth, elevation in ((0.0, -1.4), (0.3, -0.9)):  # the back, from above
+            camera = orbit_camera(vertices, azimuth, elevation, 256)
+            both = (pose_gaussians(layer, faces, vertices, vertices) for layer in (gaussians, made.gaussians))
+            before, after = (render(posed, camera) for posed in both)
+            changed = ((before.image - after.image).abs().amax(-1) > 0).float()
+            assert changed.sum() > 300  # it is in view
+            assert masked_psnr(after.image, before.image, changed) > 38
+            assert (after.alpha - before.alpha).abs().max() < 0.03
+
+
+def test_parts_are_as_small_as_the_spacing_asks(dressed):
+    _, vertices, faces, _ = dressed
+    _, areas = surface.face_normals(vertices, faces)
+    spacing = torch.full((len(faces),), 0.4e-3)
+    parts = parts_for_spacing(vertices, faces, spacing)
+    assert (areas.sqrt() / parts <= spacing + 1e-9).all()
+    assert (areas.sqrt() / (parts - 1) >= spacing)[parts > 1].all()
+    assert (parts_for_spacing(vertices, faces, torch.full((len(faces),), 1.0)) == 1).all()
+
+
+def test_asking_for_no_parts_changes_nothing(dressed):
+    gaussians = dressed[0]
+    made = split(dressed, 1)
+    assert made.n_new == 0
+    assert all(torch.equal(a, b) for a, b in zip(made.gaussians, gaussians, strict=True))
+
+
+def test_faces_can_be_split_again(dressed):
+    _, vertices, faces, chosen = dressed
+    once = split(dressed, 2)
+    twice = densify(once.gaussians, vertices, faces, torch.where(chosen, 4, 1))
+    direct = split(dressed, 4)
+    assert twice.n_new == direct.n_new
+    assert torch.equal(twice.gaussians.scales, direct.gaussians.scales)
+    assert (twice.gaussians.colors - direct.gaussians.colors).abs().max() < 0.02
+
+
+def test_the_fade_at_the_wrist_stays_faded(dressed):
+    gaussians, vertices, faces, _ = dressed
+    made = densify(gaussians, vertices, faces, torch.full((len(faces),), 2))
+    with_gaussian = torch.zeros(len(faces), dtype=torch.bool)
+    with_gaussian[gaussians.face_index] = True
+    assert made.n_new == 4 * int(with_gaussian.sum())
+    assert made.gaussians.opacities.min() < 0.05
+
+
+def test_the_colour_at_a_gaussian_of_an_even_hand_is_that_colour(dressed):
+    gaussians, vertices, faces, _ = dressed
+    even = gaussians._replace(colors=torch.tensor([0.2, 0.5, 0.8]).expand_as(gaussians.colors))
+    found = color_at(even, vertices, faces, vertices[::500])
+    assert torch.allclose(found, torch.tensor([0.2, 0.5, 0.8]).expand_as(found), atol=1e-6)

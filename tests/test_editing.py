@@ -1,0 +1,163 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from painted_truth import Chart, make_truth, paint_photo
+
+from oasis_warp.cli import main
+from oasis_warp.core.config import EditConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import Photo
+from oasis_warp.editing import edit
+from oasis_warp.hand.skinning import mirror_pose
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.render.cameras import mirrored_camera
+
+QUICK = EditConfig(steps=10)
+
+
+@pytest.fixture(scope="module")
+def truth(hand):
+    return make_truth(hand, back=False, size=224, steps=20)
+
+
+@pytest.fixture(scope="module")
+def chart(truth):
+    return Chart(truth, "ring")
+
+
+@pytest.fixture(scope="module")
+def painted(truth, chart):
+    return paint_photo(truth, chart)
+
+
+@pytest.fixture(scope="module")
+def made(truth, painted):
+    return edit(truth.avatar, painted, photo=truth.photo, config=QUICK)
+
+
+def mask_of(chart) -> Photo:
+    share = chart.rgba[..., 3].view(224, 4, 224, 4).mean((1, 3))
+    return Photo((share[..., None].expand(-1, -1, 3) * 255).round().to(torch.uint8), None, None, "mask.png", 1.0)
+
+
+def test_the_square_of_the_source_camera_is_found(truth, made):
+    source, side = truth.avatar.source_camera, made.square.side
+    scale = side / source.width
+    assert scale * float(source.K[0, 0]) == pytest.approx(float(truth.camera.K[0, 0]), rel=0.005)
+    found = made.square.left + scale * float(source.K[0, 2]), made.square.top + scale * float(source.K[1, 2])
+    assert found == pytest.approx(truth.camera.K[:2, 2].tolist(), abs=0.7)
+
+
+def test_the_paint_is_seen_and_the_rest_stays(made):
+    measures = made.measures
+    assert measures["input_psnr_db"] > 18
+    assert measures["unchanged_psnr_db"] > 45
+    assert 150 < measures["painted_mm2"] < 450  # a ring of 6 mm on half a finger, with its soft rim
+    assert measures["n_gaussians"] == len(made.avatar.gaussians.opacities)
+    assert not made.warnings
+
+
+def test_the_avatar_given_is_not_changed(truth, made):
+    assert len(truth.avatar.gaussians.opacities) < len(made.avatar.gaussians.opacities)
+    assert torch.equal(truth.avatar.source_pose.angles, made.avatar.source_pose.angles)
+
+
+def test_a_mask_replaces_the_photo(truth, chart, painted, made):
+    masked = edit(truth.avatar, painted, mask=mask_of(chart), config=QUICK)
+    assert masked.square.side == pytest.approx(made.square.side, rel=0.005)
+    assert masked.measures["painted_mm2"] < made.measures["painted_mm2"]  # the difference has a rim around it
+    assert masked.measures["input_psnr_db"] > 16
+
+
+def test_a_transparent_layer_is_paint(truth, chart, made):
+    share = mask_of(chart).rgb[..., 0].float() / 255
+    layer = Photo(torch.full((224, 224, 3), 30, dtype=torch.uint8), share, None, "layer.png", 1.0)
+    worn = edit(truth.avatar, layer, photo=truth.photo, config=QUICK)
+    assert torch.allclose(worn.mask.max(), torch.tensor(1.0), atol=0.02)
+    assert worn.measures["painted_mm2"] < made.measures["painted_mm2"]
+
+
+def test_a_left_hand_is_the_mirror_image_of_a_right_one(truth, painted, made):
+    avatar = truth.avatar
+    left = Avatar(
+        side="left", shape=avatar.shape, surface_offsets=avatar.surface_offsets, gaussians=avatar.gaussians,
+        source_pose=mirror_pose(avatar.source_pose), source_camera=mirrored_camera(avatar.source_camera),
+    )  # fmt: skip
+    photos = (picture._replace(rgb=picture.rgb.flip(1).contiguous()) for picture in (painted, truth.photo))
+    mirrored = edit(left, next(photos), photo=next(photos), config=QUICK)
+    assert mirrored.measures["new_gaussians"] == pytest.approx(made.measures["new_gaussians"], rel=0.05)
+    for name in ("painted_mm2", "input_psnr_db"):
+        assert mirrored.measures[name] == pytest.approx(made.measures[name], rel=0.05)
+    camera = avatar.source_camera
+    right_view = made.avatar.render(camera, avatar.source_pose).image
+    left_view = mirrored.avatar.render(left.source_camera, left.source_pose).image.flip(1)
+    assert (right_view - left_view).abs().mean() < 2e-3
+
+
+def test_without_photo_and_mask_nothing_is_guessed(truth, painted):
+    with pytest.raises(InputError, match="give the photo from before as well, or a mask"):
+        edit(truth.avatar, painted)
+
+
+def test_a_photo_without_paint_is_refused(truth):
+    with pytest.raises(InputError, match="there is no paint on the hand that differs from the photo"):
+        edit(truth.avatar, truth.photo, photo=truth.photo)
+
+
+def test_a_photo_of_something_else_is_refused(truth):
+    noise = torch.randint(0, 256, (200, 260, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
+    other = Photo(noise, None, None, "noise.png", 1.0)
+    with pytest.raises(InputError, match=r"noise\.png: does not show the avatar's hand"):
+        edit(truth.avatar, other, photo=other)
+
+
+@pytest.fixture
+def files(truth, painted, tmp_path):
+    truth.avatar.save(tmp_path / "avatar.safetensors")
+    for photo in (truth.photo, painted):
+        cv2.imwrite(str(tmp_path / photo.name), photo.rgb.numpy()[..., ::-1])
+    return tmp_path
+
+
+def command(files, *more):
+    given = [str(files / "avatar.safetensors"), str(files / "painted.png"), "--photo", str(files / "truth.png")]
+    return main(["edit", *given, *(() if "--steps" in more else ("--steps", "5")), *more])
+
+
+def test_the_command_writes_avatar_picture_and_report(files, capsys):
+    assert command(files) == 0
+    out = files / "avatar-painted.safetensors"
+    report = json.loads(out.with_suffix(".json").read_text())
+    assert report["measures"]["new_gaussians"] > 0
+    assert report["seconds"]["total"] > 0
+    assert np.asarray(cv2.imread(str(out.with_suffix(".png")))).shape[1] == 1600
+    assert len(Avatar.load(out).gaussians.opacities) == report["measures"]["n_gaussians"]
+    assert "skin painted" in capsys.readouterr().out
+
+
+def test_nothing_is_overwritten_without_being_told(files, capsys):
+    before = (files / "avatar.safetensors").read_bytes()
+    assert command(files, "-o", str(files / "painted.safetensors")) == 2  # its summary would be painted.png
+    assert "would replace an input" in capsys.readouterr().err
+    assert command(files, "-o", str(files / "avatar.safetensors"), "--overwrite") == 2
+    (files / "ring.json").write_text("{}")
+    assert command(files, "-o", str(files / "ring.safetensors")) == 2
+    assert "exists already; choose another name with --out, or give --overwrite" in capsys.readouterr().err
+    assert (files / "avatar.safetensors").read_bytes() == before
+    assert not (files / "ring.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["-o", "ring.ply"], "expected a name that ends in .safetensors"),
+        (["--size", "8"], "--size 8: expected 64 to 4096 pixels"),
+        (["--steps", "-1"], "--steps -1: expected 0 or more"),
+    ],
+)
+def test_wrong_options_get_one_sentence(files, capsys, more, said):
+    assert command(files, *more) == 2
+    assert said in capsys.readouterr().err
