@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from oasis_warp.avatar.anchors import RIM_FADE
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core import rotation
@@ -15,7 +16,15 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network import prior as home
 from oasis_warp.network.inputs import input_of_evidence
-from oasis_warp.network.prior import NetworkPrior, all_gaussians, bundled_prior, canonical_gaussians, choose_prior
+from oasis_warp.network.prior import (
+    REACH,
+    NetworkPrior,
+    all_gaussians,
+    bundled_prior,
+    canonical_gaussians,
+    choose_prior,
+    spread_to_rim,
+)
 from oasis_warp.network.weights_file import save_network
 from oasis_warp.render.render import render
 from oasis_warp.training.adapt import adapt
@@ -41,9 +50,27 @@ def test_an_untrained_network_is_the_mean_prior(untrained, hand, evidences, whic
     assert not ours.offsets.any()
     torch.testing.assert_close(ours.scales, mean.scales, atol=1e-8, rtol=1e-4)
     torch.testing.assert_close(ours.opacities, mean.opacities, atol=1e-6, rtol=1e-5)
-    torch.testing.assert_close(ours.colors, mean.colors, atol=2e-3, rtol=0)
+    rest = evidences[which].rest.vertices
+    from_rim = torch.cdist(rest, rest[hand.rim]).amin(1)
+    from_rim = torch.cat([from_rim[mean.vertex_index], from_rim[hand.faces[mean.face_index]].amin(1)])
+    beyond = from_rim >= REACH * RIM_FADE
+    torch.testing.assert_close(ours.colors[beyond], mean.colors[beyond], atol=2e-3, rtol=0)
     error = (covariances(ours) - covariances(mean)).abs().amax((1, 2)) / covariances(mean).abs().amax((1, 2))
     assert float(error.max()) < 2e-5
+
+
+def test_the_rim_takes_over_the_colours_beyond_it(hand):
+    rest = hand.template
+    from_rim = torch.cdist(rest, rest[hand.rim]).amin(1)
+    shades = torch.where(from_rim < RIM_FADE, 0.1, 0.5 + 0.1 * rest[:, 2] / rest[:, 2].abs().amax())
+    colors = torch.cat([shades, shades[hand.faces].amin(1)])[:, None].expand(-1, 3)
+    for count in (len(colors), len(rest)):  # with face Gaussians and without
+        spread = spread_to_rim(colors[:count], rest, hand.faces, hand.rim)
+        assert float(spread.min()) > 0.38
+        near = from_rim < REACH * RIM_FADE
+        assert torch.equal(spread[: len(rest)][~near], colors[: len(rest)][~near])
+        wanted = 0.5 + 0.1 * rest[near, 2] / rest[:, 2].abs().amax()
+        assert float((spread[: len(rest)][near, 0] - wanted).abs().max()) < 0.05
 
 
 def test_faint_gaussians_are_left_out_of_an_avatar_and_kept_for_training(untrained, hand, evidences):
