@@ -53,7 +53,7 @@ SHOWN = (
 """Photos of tests/data/photos and what is painted on them for the sheet."""
 SHOWN_POSES = (("open", 0.5), ("fist", 0.0), ("point", -0.3))
 """And how far the view is turned [rad]."""
-SHEET_WIDTH, SHEET_QUALITY = 1280, 88
+SHEET_WIDTH, SHEET_QUALITY, FINER = 1280, 88, 3
 COVERED = 0.99
 """Share of a pixel that is hand, from which it is judged: a fringe of background is no matter of the paint."""
 
@@ -118,12 +118,21 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-@torch.no_grad()
+def draw(avatar: Avatar, pose: HandPose, camera: Camera) -> np.ndarray:
+    """A picture of the avatar, drawn `FINER` times as large and averaged, as bytes."""
+    large = crop_camera(camera, 0.0, 0.0, float(camera.width), FINER * camera.width)
+    with torch.no_grad():
+        pixels = to_uint8(avatar.render(large, pose, GROUND).image).numpy()
+    return cv2.resize(pixels, (camera.width, camera.width), interpolation=cv2.INTER_AREA)
+
+
 def sheet(photos: Path, out: Path) -> None:
     """A row for each drawing of `SHOWN`: photo, painted photo, the avatar in the same view and in other poses."""
     side, truths, rows = panel_side(3 + len(SHOWN_POSES), SHEET_WIDTH), {}, []
     for name, kind in SHOWN:
-        truth = truths.setdefault(name, photographed(photos / name))
+        if name not in truths:
+            truths[name] = photographed(photos / name)
+        truth = truths[name]
         painted = saved(paint_photo(truth, Chart(truth, kind)), JPEG_QUALITY)
         made = edit(truth.avatar, painted, photo=truth.photo)
         source = made.avatar.source_camera
@@ -132,11 +141,11 @@ def sheet(photos: Path, out: Path) -> None:
             Panel(to_uint8(resample_square(picture.rgb.float() / 255, *made.square[:3], side)).numpy(), words)
             for picture, words in ((truth.photo, "photo"), (painted, f"painted: {kind}"))
         ]
-        row.append(Panel(to_uint8(made.avatar.render(camera, truth.pose, GROUND).image).numpy(), "avatar"))
+        row.append(Panel(draw(made.avatar, truth.pose, camera), "avatar"))
         for gesture, azimuth in SHOWN_POSES:
             pose = truth.pose._replace(angles=named_pose(truth.hand, gesture))
             around = orbit_camera(made.avatar.mesh(pose).vertices, azimuth, 0.0, side)
-            row.append(Panel(to_uint8(made.avatar.render(around, pose, GROUND).image).numpy(), gesture))
+            row.append(Panel(draw(made.avatar, pose, around), gesture))
         rows.append(row)
     title = "Painted on a photo, worn by the avatar"
     pixels = make_sheet(title, "tools/evaluate_edits.py --sheet", rows, SHEET_WIDTH)

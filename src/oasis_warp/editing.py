@@ -93,7 +93,7 @@ def edit(
         progress(name, 1, 1)
 
     with stage("kernels"):
-        warm_up(str(avatar.device))
+        warm_up(avatar.device)
     with stage("difference"):
         image, before, paint = _compare(painted, photo, mask)
     with stage("registration"):

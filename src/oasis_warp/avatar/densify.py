@@ -13,11 +13,13 @@ from oasis_warp.avatar.anchors import FACE_SPREAD, face_shapes
 from oasis_warp.core import surface
 from oasis_warp.core.types import CanonicalGaussians
 
-PART_SPREAD = 1.6
+PART_SPREAD = 1.9
 """Standard deviations of a part's Gaussian over those of the part as a uniform plate."""
-PART_OPACITY = 0.6
+PART_OPACITY = 0.3
 """Opacity of a part's Gaussian over that of the face's. The more opaque Gaussians overlap, the more the nearer ones
 hide those beside them, and the picture moves to the side that is nearer in the view at hand."""
+SINK = 0.001
+"""Depth at which the vertex Gaussians of cut faces go on, as a ground that the parts' Gaussians lie on [m]."""
 NEIGHBOURS = 12
 """Old Gaussians that a new one takes its colour from."""
 
@@ -26,7 +28,9 @@ class Densified(NamedTuple):
     """Canonical Gaussians with more of them on some faces."""
 
     gaussians: CanonicalGaussians
-    """Those that stay, bit for bit and in their order; then, at the end, the new ones, all on faces."""
+    """Those on faces that are not cut stay bit for bit and in their order; the parts' own are the last."""
+    changed: Bool[Tensor, "N"]
+    """Which are new, or sunk under new ones."""
     n_new: int
     """How many are new."""
 
@@ -60,9 +64,10 @@ def densify(
     """
     opacity = _face_opacities(gaussians, len(faces))
     cut = (parts > 1) & (opacity > 0)
-    keep_vertex = ~_inside(cut, faces, len(vertices))[gaussians.vertex_index]
-    keep_face = ~cut[gaussians.face_index]
-    keep = torch.cat([keep_vertex, keep_face])
+    sunk = _inside(cut, faces, len(vertices))[gaussians.vertex_index]
+    normals = surface.vertex_normals(vertices, faces)[gaussians.vertex_index]
+    on_top = ~cut[gaussians.face_index]
+    keep = torch.cat([torch.ones_like(sunk), on_top])
 
     face_index, barycentrics = _cut(parts, cut, vertices.dtype)
     quats, scales = face_shapes(vertices, faces)
@@ -70,16 +75,18 @@ def densify(
     centers = (vertices[faces[face_index]] * barycentrics[..., None]).sum(1)
     colors = color_at(gaussians, vertices, faces, centers)
     dense = CanonicalGaussians(
-        gaussians.vertex_index[keep_vertex],
-        gaussians.offsets[keep_vertex],
-        torch.cat([gaussians.face_index[keep_face], face_index]),
-        torch.cat([gaussians.barycentrics[keep_face], barycentrics]),
+        gaussians.vertex_index,
+        torch.where(sunk[:, None], gaussians.offsets - SINK * normals, gaussians.offsets),
+        torch.cat([gaussians.face_index[on_top], face_index]),
+        torch.cat([gaussians.barycentrics[on_top], barycentrics]),
         torch.cat([gaussians.quats[keep], quats[face_index]]),
         torch.cat([gaussians.scales[keep], scales[face_index]]),
         torch.cat([gaussians.opacities[keep], PART_OPACITY * opacity[face_index]]),
         torch.cat([gaussians.colors[keep], colors]),
     )
-    return Densified(dense, len(face_index))
+    n_new = len(face_index)
+    changed = torch.cat([sunk, torch.zeros_like(on_top[on_top]), torch.ones_like(face_index, dtype=torch.bool)])
+    return Densified(dense, changed, n_new)
 
 
 def _face_opacities(gaussians: CanonicalGaussians, n_faces: int) -> Tensor:

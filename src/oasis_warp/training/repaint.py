@@ -35,7 +35,7 @@ ZOOMS = (1.0, 2.0)
 """Sizes of those views over the photo's: the smaller a picture, the more the rasterizer's own blur."""
 PHOTO_WEIGHT = 2.0
 """Of a pixel in the photo's own view, against those beside it."""
-PULL = 0.1
+PULL = 0.05
 """Weight that holds each new Gaussian at the colour read off the painted picture [pixels]."""
 MARGIN = 8
 """Around the repainted faces in each view [px]."""
@@ -54,7 +54,7 @@ class Repainted(NamedTuple):
     """Gaussians with the paint."""
 
     gaussians: CanonicalGaussians
-    """Those that were not touched, bit for bit and in their order; then the new ones."""
+    """Those that were not touched are the same bit for bit, in their order; the new ones are the last."""
     n_new: int
     faces: Bool[Tensor, "F"]
     """Whose Gaussians are new: under the paint, and their neighbours."""
@@ -121,28 +121,27 @@ def repaint(
     pixel = depth[faces].mean(1) / canvas.camera.K[0, 0]
     # A face of one part would keep its vertices' Gaussians, which reach into the faces beside it.
     parts = torch.where(around, parts_for_spacing(rest, faces, SPACING * pixel).clamp_min(2), 1)
-    dense, n_new = densify(gaussians, rest, faces, parts)
-    n_kept = len(dense.colors) - n_new
+    dense, changed, n_new = densify(gaussians, rest, faces, parts)
 
     old, new = (pose_gaussians(layer, faces, rest, posed) for layer in (gaussians, dense))
-    share, color = _read(canvas, seen, new.means[n_kept:])
-    start = torch.lerp(dense.colors[n_kept:], color, share[:, None])
+    share, color = _read(canvas, seen, new.means[changed])
+    start = torch.lerp(dense.colors[changed], color, share[:, None])
+    still = torch.where(changed[:, None], 0, dense.colors)
     views = []
     for camera, weight in _cameras(canvas.camera, posed[faces[around]].flatten(0, 1)):
         before = blend_colors(freeze_view(old, camera), old.colors)
         target = _painted(before, canvas, seen, posed, faces, camera)
         weights = freeze_view(new, camera)
-        kept = blend_colors(weights, torch.cat([dense.colors[:n_kept], torch.zeros_like(start)]))
-        views.append(_View(weights, target - kept, weight))
-    colors, losses = _fit(views, start, n_kept, steps, progress)
+        views.append(_View(weights, target - blend_colors(weights, still), weight))
+    learned, losses = _fit(views, start, changed, steps, progress)
     _, areas = surface.face_normals(rest, faces)
-    on = dense.face_index[n_kept - len(dense.vertex_index) :]
+    on = dense.face_index[-n_new:]
     on_hand = (canvas.mask * (seen.faces >= 0)).sum()
     return Repainted(
-        dense._replace(colors=torch.cat([dense.colors[:n_kept], colors])),
+        dense._replace(colors=still.masked_scatter(changed[:, None], learned)),
         n_new,
         around,
-        float((areas[on] / parts[on].square() * share).sum()),
+        float((areas[on] / parts[on].square() * share[-n_new:]).sum()),
         float(1 - seen.paint.sum() / on_hand),
         losses,
     )
@@ -219,7 +218,7 @@ def _cut(camera: Camera, points: Tensor, zoom: float) -> Camera:
 
 
 def _fit(
-    views: list[_View], start: Float[Tensor, "M 3"], n_kept: int, steps: int, progress: Progress
+    views: list[_View], start: Float[Tensor, "M 3"], changed: Bool[Tensor, "N"], steps: int, progress: Progress
 ) -> tuple[Float[Tensor, "M 3"], tuple[float, ...]]:
     """Colours in [0, 1] with the least squared difference in all views, held at `start` where these say nothing.
 
@@ -227,13 +226,14 @@ def _fit(
     matrix of the row sums of W^T W bounds it: with the inverse as step no step length has to be found, and clamping
     is the projection.
     """
-    nothing = start.new_zeros(n_kept, 3)
+    rows = torch.nonzero(changed)[:, 0]
+    nothing = start.new_zeros(len(changed), 3)
 
     def draw(weights: BlendWeights, colors: Tensor) -> Tensor:
-        return blend_colors(weights, torch.cat([nothing, colors]))
+        return blend_colors(weights, nothing.index_copy(0, rows, colors))
 
     def gather(weights: BlendWeights, picture: Tensor) -> Tensor:
-        return (weights.transpose @ picture.flatten(0, 1))[n_kept:]
+        return (weights.transpose @ picture.flatten(0, 1))[rows]
 
     bound = torch.full_like(start, PULL)
     for weights, _, weight in views:
