@@ -6,6 +6,7 @@ import pytest
 import torch
 from painted_truth import Chart, make_truth, paint_photo
 
+from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.cli import main
 from oasis_warp.core.config import EditConfig
 from oasis_warp.core.errors import InputError
@@ -20,7 +21,7 @@ QUICK = EditConfig(steps=10)
 
 @pytest.fixture(scope="module")
 def truth(hand):
-    return make_truth(hand, back=False, size=224, steps=20)
+    return make_truth(hand, MeanPrior(hand), back=False, size=224, steps=20)
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ from painted_truth import (
 
 from oasis_warp.commands.drawing import Panel, make_sheet, panel_side
 from oasis_warp.commands.summary import GROUND
-from oasis_warp.core.config import BLACK
+from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.types import Camera, HandPose, Photo
 from oasis_warp.data.crop import resample_square
 from oasis_warp.data.pictures import to_uint8
@@ -41,6 +41,7 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
+from oasis_warp.network.prior import choose_prior
 from oasis_warp.render.cameras import crop_camera, orbit_camera
 
 AROUND = 0.002
@@ -164,9 +165,9 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    hand, rows = bundled_hand(), []
+    hand, prior, rows = bundled_hand(), choose_prior(ReconstructConfig().prior), []
     for side in ("palm", "back"):
-        truth = make_truth(hand, back=side == "back", size=arguments.size)
+        truth = make_truth(hand, prior, back=side == "back", size=arguments.size)
         for kind in arguments.kinds:
             if kind == "nail polish" and side == "palm":  # the nails do not show
                 continue

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.prior import MeanPrior
+from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.hand_model import HandModel
@@ -93,7 +93,7 @@ def _look(vertices: Tensor, faces: Tensor, camera: Camera) -> Surface:
     return Surface(seen.face_ids, seen.barycentrics)
 
 
-def make_truth(hand: HandModel, *, back: bool, size: int, steps: int | None = None) -> Truth:
+def make_truth(hand: HandModel, prior: Prior, *, back: bool, size: int, steps: int | None = None) -> Truth:
     """An open hand seen from its palm or back on a photo of `size` pixels, and the avatar made from that photo."""
     shape = torch.zeros(hand.shape_basis.shape[-1])
     # Fingers up; the hand's -x is the picture's -y, its -y or +y looks to the camera.
@@ -120,7 +120,7 @@ def make_truth(hand: HandModel, *, back: bool, size: int, steps: int | None = No
     fit = HandFit("right", shape, pose, camera, landmarks, drawn.alpha, 0.0, 0.0, 1.0, 0.0, ())
     still = torch.zeros_like(hand.template)
     evidence = make_evidence(photo, fit, still, ReconstructConfig())
-    adapted = adapt(hand, MeanPrior(hand)(evidence), evidence, AdaptConfig(texture_steps=steps))
+    adapted = adapt(hand, prior(evidence), evidence, AdaptConfig(texture_steps=steps))
     avatar = Avatar(
         side="right", shape=shape, surface_offsets=still, gaussians=adapted.gaussians, source_pose=pose,
         source_camera=evidence.camera,

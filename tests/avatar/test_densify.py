@@ -63,6 +63,31 @@ def test_vertex_gaussians_under_the_parts_sink_into_the_hand(dressed):
     assert torch.allclose(depth, torch.where(sunk, SINK, 0.0), atol=1e-7)
 
 
+def test_parts_of_faint_faces_are_as_opaque_as_those_of_solid_ones(dressed):
+    gaussians, vertices, faces, chosen = dressed
+    n = len(gaussians.vertex_index)
+    faint = gaussians._replace(opacities=torch.cat([gaussians.opacities[:n], 0.5 * gaussians.opacities[n:]]))
+    parts = torch.where(chosen, 2, 1)
+    solid, made = (densify(layer, vertices, faces, parts) for layer in (gaussians, faint))
+    assert torch.equal(made.gaussians.opacities[-made.n_new :], solid.gaussians.opacities[-made.n_new :])
+
+
+def test_the_ground_is_the_same_whatever_lay_on_the_vertices(dressed):
+    gaussians, vertices, faces, chosen = dressed
+    n, parts = len(gaussians.vertex_index), torch.where(chosen, 2, 1)
+    normals = surface.vertex_normals(vertices, faces)[gaussians.vertex_index]
+    wide = gaussians._replace(
+        offsets=-2 * SINK * normals,
+        scales=torch.cat([3 * gaussians.scales[:n], gaussians.scales[n:]]),
+        opacities=torch.cat([0.6 * gaussians.opacities[:n], gaussians.opacities[n:]]),
+    )
+    plain, made = (densify(layer, vertices, faces, parts) for layer in (gaussians, wide))
+    for name in ("scales", "quats", "opacities"):
+        assert torch.equal(*(getattr(d.gaussians, name)[d.changed] for d in (plain, made))), name
+    ground = made.changed[:n]
+    assert torch.equal(made.gaussians.offsets[ground], plain.gaussians.offsets[ground])
+
+
 def test_a_hand_with_finer_gaussians_looks_the_same(dressed):
     gaussians, vertices, faces, _ = dressed
     for n in (2, 5):

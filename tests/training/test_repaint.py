@@ -3,6 +3,7 @@ import torch
 from painted_truth import Chart, draw_truth, make_truth
 
 from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.types import Camera
 from oasis_warp.losses.image import masked_psnr
@@ -15,7 +16,7 @@ SIZE = 256
 
 @pytest.fixture(scope="module")
 def truth(hand):
-    return make_truth(hand, back=False, size=SIZE, steps=20)
+    return make_truth(hand, MeanPrior(hand), back=False, size=SIZE, steps=20)
 
 
 def painted(truth, kind="tattoo"):

@@ -51,7 +51,10 @@ def surface_frames(normals: Float[Tensor, "N 3"], along: Float[Tensor, "N 3"]) -
     return rotation.from_matrix(torch.stack([x, torch.linalg.cross(normals, x), normals], dim=-1))
 
 
-def _vertex_shapes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+def vertex_shapes(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+) -> tuple[Float[Tensor, "V 4"], Float[Tensor, "V 3"]]:
+    """Quaternions and standard deviations [m] of a disc a vertex, as large as its share of the surface."""
     normals = surface.vertex_normals(vertices, faces)
     spread = VERTEX_SPREAD * (surface.vertex_areas(vertices, faces) / math.pi).sqrt().clamp_min(MIN_SCALE)
     scales = torch.stack([spread, spread, THICKNESS * spread], dim=-1)
@@ -90,7 +93,7 @@ def place_anchors(hand: HandModel, rest: PosedHand) -> Anchors:
     face_opacity = opacity[faces].mean(1)
     keep_vertex = torch.nonzero(opacity >= MIN_OPACITY)[:, 0]
     keep_face = torch.nonzero(face_opacity >= MIN_OPACITY)[:, 0]
-    vertex_quats, vertex_scales = _vertex_shapes(vertices, faces)
+    vertex_quats, vertex_scales = vertex_shapes(vertices, faces)
     face_quats, face_scales = face_shapes(vertices, faces)
     third = torch.full((len(keep_face), 3), 1 / 3, dtype=vertices.dtype, device=vertices.device)
     return Anchors(

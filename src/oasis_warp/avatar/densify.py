@@ -9,17 +9,19 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import FACE_SPREAD, face_shapes
+from oasis_warp.avatar.anchors import FACE_SPREAD, OPACITY, face_shapes, vertex_shapes
 from oasis_warp.core import surface
 from oasis_warp.core.types import CanonicalGaussians
 
 PART_SPREAD = 1.9
 """Standard deviations of a part's Gaussian over those of the part as a uniform plate."""
-PART_OPACITY = 0.3
-"""Opacity of a part's Gaussian over that of the face's. The more opaque Gaussians overlap, the more the nearer ones
-hide those beside them, and the picture moves to the side that is nearer in the view at hand."""
+PART_OPACITY = 0.28
+"""Opacity of a part's Gaussian. The more opaque Gaussians overlap, the more the nearer ones hide those beside them, and
+the picture moves to the side that is nearer in the view at hand."""
+SOLID = 0.25
+"""Opacity of an old Gaussian below which the surface itself is taken for fading, as at the wrist."""
 SINK = 0.001
-"""Depth at which the vertex Gaussians of cut faces go on, as a ground that the parts' Gaussians lie on [m]."""
+"""Depth at which the vertex Gaussians of cut faces go on, as discs that are the ground under the parts' [m]."""
 NEIGHBOURS = 12
 """Old Gaussians that a new one takes its colour from."""
 
@@ -64,25 +66,32 @@ def densify(
     """
     opacity = _face_opacities(gaussians, len(faces))
     cut = (parts > 1) & (opacity > 0)
-    sunk = _inside(cut, faces, len(vertices))[gaussians.vertex_index]
-    normals = surface.vertex_normals(vertices, faces)[gaussians.vertex_index]
+    n_points, index = len(gaussians.vertex_index), gaussians.vertex_index
+    sunk = _inside(cut, faces, len(vertices))[index]
+    depth = SINK * surface.vertex_normals(vertices, faces)[index]
+    disc_quats, disc_scales = vertex_shapes(vertices, faces)
+    disc_opacities = OPACITY * (gaussians.opacities[:n_points] / SOLID).clamp(max=1)
     on_top = ~cut[gaussians.face_index]
-    keep = torch.cat([torch.ones_like(sunk), on_top])
 
     face_index, barycentrics = _cut(parts, cut, vertices.dtype)
     quats, scales = face_shapes(vertices, faces)
     scales = scales * (PART_SPREAD / FACE_SPREAD / parts[:, None])
     centers = (vertices[faces[face_index]] * barycentrics[..., None]).sum(1)
     colors = color_at(gaussians, vertices, faces, centers)
+
+    def joined(old: Tensor, ground: Tensor, fine: Tensor) -> Tensor:
+        points = torch.where(sunk.view(-1, *[1] * (old.ndim - 1)), ground, old[:n_points])
+        return torch.cat([points, old[n_points:][on_top], fine])
+
     dense = CanonicalGaussians(
-        gaussians.vertex_index,
-        torch.where(sunk[:, None], gaussians.offsets - SINK * normals, gaussians.offsets),
+        index,
+        torch.where(sunk[:, None], -depth, gaussians.offsets),
         torch.cat([gaussians.face_index[on_top], face_index]),
         torch.cat([gaussians.barycentrics[on_top], barycentrics]),
-        torch.cat([gaussians.quats[keep], quats[face_index]]),
-        torch.cat([gaussians.scales[keep], scales[face_index]]),
-        torch.cat([gaussians.opacities[keep], PART_OPACITY * opacity[face_index]]),
-        torch.cat([gaussians.colors[keep], colors]),
+        joined(gaussians.quats, disc_quats[index], quats[face_index]),
+        joined(gaussians.scales, disc_scales[index], scales[face_index]),
+        joined(gaussians.opacities, disc_opacities, PART_OPACITY * (opacity[face_index] / SOLID).clamp(max=1)),
+        joined(gaussians.colors, gaussians.colors[:n_points], colors),
     )
     n_new = len(face_index)
     changed = torch.cat([sunk, torch.zeros_like(on_top[on_top]), torch.ones_like(face_index, dtype=torch.bool)])
