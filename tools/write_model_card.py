@@ -1,12 +1,13 @@
-"""Fill the numbers of the prior that ships into docs/prior.md, between its markers.
+r"""Fill the numbers of the prior that ships into docs/prior.md, between its markers.
 
     oasis evaluate --dataset synthetic --out out/evaluation
-    python tools/time_prior.py --threads 2 --json out/prior_cpu.json
+    python tools/time_prior.py --json out/prior_cpu.json
     python tools/time_prior.py --device cuda --json out/prior_cuda.json
-    python tools/write_model_card.py docs/prior.md out/evaluation/metrics.json out/prior_cpu.json out/prior_cuda.json
+    python tools/write_model_card.py docs/prior.md --metrics out/evaluation/metrics.json \
+        --speed out/prior_cpu.json out/prior_cuda.json
 
 What the file is and how it was trained comes from its own header, the measurements from the evaluation, the times from
-the other files. The prose around the markers is written by hand.
+the other files; sections whose files are not given stay as they are. The prose around the markers is written by hand.
 """
 
 import argparse
@@ -99,10 +100,13 @@ def speed_table(files: list[Path]) -> str:
         found = json.loads(path.read_text())
         memory = found["device_gib"] if found["device_gib"] is not None else found["grown_gib"]
         lines.append(
-            [found["device"], f"{found['load_seconds']:.2f} s", f"{1e3 * found['encode_seconds_fastest']:.1f} ms",
-             f"{1e3 * found['encode_seconds_median']:.1f} ms", f"{memory:.2f} GiB", found["torch"]]
+            [found["device"], f"{found['load_cpu_seconds']:.2f} s", f"{1e3 * found['encode_seconds_fastest']:.1f} ms",
+             f"{1e3 * found['encode_seconds_median']:.1f} ms", f"{1e3 * found['encode_cpu_seconds_fastest']:.1f} ms",
+             f"{memory:.2f} GiB", found["torch"]]
         )  # fmt: skip
-    return table(["device", "loading", "encoding, fastest", "median", "memory", "torch"], lines)
+    return table(
+        ["device", "loading, CPU time", "encoding, fastest", "median", "CPU time", "memory", "torch"], lines
+    )
 
 
 def cells(row: Row) -> list[str]:
@@ -137,13 +141,17 @@ def main() -> None:
     """Read the numbers, rewrite the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page", type=Path)
-    parser.add_argument("metrics", type=Path, help="metrics.json of `oasis evaluate`")
-    parser.add_argument("speed", type=Path, nargs="+", help="of tools/time_prior.py")
+    parser.add_argument("--metrics", type=Path, help="metrics.json of `oasis evaluate`")
+    parser.add_argument("--speed", type=Path, nargs="+", help="of tools/time_prior.py")
     options = parser.parse_args()
     with resources.as_file(asset(*BUNDLED)) as weights:
-        texts = file_table(weights), training_text(weights), measurement_tables(options.metrics)
+        texts = {"file": file_table(weights), "training": training_text(weights)}
+    if options.metrics is not None:
+        texts["measurements"] = measurement_tables(options.metrics)
+    if options.speed is not None:
+        texts["speed"] = speed_table(options.speed)
     page = options.page.read_text()
-    for name, text in zip(SECTIONS, (*texts, speed_table(options.speed)), strict=True):
+    for name, text in texts.items():
         page = put(page, name, text)
     options.page.write_text(page)
 

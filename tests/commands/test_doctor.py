@@ -11,15 +11,6 @@ from oasis_warp.network import prior as home
 PYPROJECT = Path(__file__).parents[2] / "pyproject.toml"
 
 
-@pytest.fixture(autouse=True)
-def prior_that_ships(monkeypatch, weights_file):
-    """A small one in its place until it does."""
-    monkeypatch.setattr(home, "asset", lambda *parts: weights_file)
-    home.bundled_prior.cache_clear()
-    yield
-    home.bundled_prior.cache_clear()
-
-
 def test_this_installation_is_healthy(capsys):
     assert main(["doctor"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -61,6 +52,7 @@ def test_a_prior_that_is_missing_is_found(monkeypatch, tmp_path):
     with pytest.raises(doctor.FaultError, match="the learned prior is not installed") as caught:
         doctor.check_prior()
     assert caught.value.remedy == "reinstall oasis-warp, or use --prior none"
+    home.bundled_prior.cache_clear()
 
 
 def test_the_newest_version_that_is_not_known_to_work_is_refused(monkeypatch):

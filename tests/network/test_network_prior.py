@@ -3,10 +3,12 @@
 import hashlib
 import json
 from dataclasses import replace
+from importlib import resources
 
 import pytest
 import torch
 
+from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import RIM_FADE
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, Prior
@@ -25,7 +27,7 @@ from oasis_warp.network.prior import (
     choose_prior,
     spread_to_rim,
 )
-from oasis_warp.network.weights_file import save_network
+from oasis_warp.network.weights_file import read_header, save_network
 from oasis_warp.render.render import render
 from oasis_warp.training.adapt import adapt
 
@@ -172,3 +174,15 @@ def test_weights_of_a_backbone_that_nobody_reads_are_refused(weights, tmp_path):
 def test_a_word_that_names_no_prior_is_an_error(as_shipped):
     with pytest.raises(ValueError, match="prior: expected 'learned', 'none' or a Path, got 'mean'"):
         choose_prior("mean")
+
+
+def test_the_prior_that_ships_is_small_says_how_it_was_trained_and_knows_the_bundled_hand(hand, evidences):
+    bundled_prior.cache_clear()
+    prior = choose_prior("learned")
+    assert int(prior.about["step"]) > 0
+    with resources.as_file(asset(*home.BUNDLED)) as path:
+        assert path.stat().st_size <= 10_000_000
+        assert json.loads(read_header(path)["notes"])["seed"] >= 0
+    guess, mean = prior(evidences[0]), MeanPrior(hand)(evidences[0])
+    assert all(bool(part.isfinite().all()) for part in guess)
+    assert not torch.equal(guess.colors[:100], mean.colors[:100])
