@@ -151,7 +151,7 @@ class Lists(Overflow):
     """Says that lists overflowed, or did not."""
 
     def __init__(self, full: bool) -> None:
-        super().__init__()
+        super().__init__(slack=1.5)
         self.full = full
 
     def happened(self) -> bool:
