@@ -1,8 +1,6 @@
 """`edit`: paint on the photo that an avatar was made from, and the avatar wears the paint. No estimator runs."""
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 import torch
@@ -11,7 +9,7 @@ from torch import Tensor
 
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.types import Photo
 from oasis_warp.data.crop import resample_square
 from oasis_warp.data.painted import find_paint, match_size, read_mask
@@ -84,13 +82,8 @@ def edit(
         )
     stages: dict[str, float] = {}
 
-    @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        progress(name, 0, 1)
-        start = time.perf_counter()
-        yield
-        stages[name] = time.perf_counter() - start
-        progress(name, 1, 1)
+    def stage(name: str) -> AbstractContextManager[None]:
+        return timed_stage(name, stages, progress)
 
     with stage("kernels"):
         warm_up(avatar.device)

@@ -1,8 +1,7 @@
 """`reconstruct`: one photo in, an avatar out. The only file that knows the order of the stages."""
 
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmarks, Photo
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
@@ -69,13 +68,8 @@ def reconstruct(
     """
     stages: dict[str, float] = {}
 
-    @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        progress(name, 0, 1)
-        start = time.perf_counter()
-        yield
-        stages[name] = stages.pop(name, 0.0) + time.perf_counter() - start
-        progress(name, 1, 1)
+    def stage(name: str) -> AbstractContextManager[None]:
+        return timed_stage(name, stages, progress)
 
     hand = bundled_hand()
     estimator = HandEstimator(hand)

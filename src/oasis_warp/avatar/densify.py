@@ -54,9 +54,9 @@ def densify(
     """Replace what rides on some faces by finer Gaussians that look the same.
 
     A face of n > 1 parts an edge is cut into n^2 triangles of its own shape, each with a Gaussian at its centre. The
-    face's Gaussians go, and so do vertex Gaussians all of whose faces are cut. A new Gaussian has the colour that
-    the old ones have there together. Faces without a Gaussian, in the fade at the wrist,
-    stay without.
+    face's Gaussians go; vertex Gaussians all of whose faces are cut sink and become the ground under the new ones. A
+    new Gaussian has the colour that the old ones have there together. Faces without a Gaussian, in the fade at the
+    wrist, stay without.
 
     Args:
         gaussians: On the surface at rest.

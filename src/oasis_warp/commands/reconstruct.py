@@ -1,7 +1,6 @@
 """`oasis reconstruct`: photos in, a folder with an avatar out for each."""
 
 import sys
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +19,7 @@ from oasis_warp.commands.report import make_report, print_report, to_json
 from oasis_warp.commands.summary import GROUND, draw_summary
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.logging import Progress
+from oasis_warp.core.logging import Progress, timed_stage
 from oasis_warp.data.atomic import output_folder
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
@@ -117,15 +116,15 @@ def _reconstruct_one(
     """Write one avatar's folder; its report."""
     seconds: dict[str, float] = {}
     with output_folder(folder) as part, show_progress(Console(stderr=True)) as progress:
-        with _timed("read", seconds):
+        with timed_stage("read", seconds):
             photo = read_photo(path)
         made = reconstruct(photo, config, keypoints=keypoints, progress=progress)
         seconds.update(made.stages)
-        with _timed("summary", seconds):
+        with timed_stage("summary", seconds):
             write_picture(part / "summary.png", draw_summary(photo, made, progress=progress))
-        with _timed("turntable", seconds):
+        with timed_stage("turntable", seconds):
             _write_turntable(part / "turntable.mp4", made.avatar, progress)
-        with _timed("save", seconds):
+        with timed_stage("save", seconds):
             made.avatar.save(part / "avatar.safetensors")
         report = make_report(photo, made, config, seconds)
         (part / "report.json").write_text(to_json(report))
@@ -136,10 +135,3 @@ def _write_turntable(path: Path, avatar: Avatar, progress: Progress) -> None:
     look = {"elevation": 0.0, "background": GROUND, "progress": progress}
     frames = turntable(avatar, avatar.source_pose, TURNTABLE_FRAMES, TURNTABLE_SIZE, **look)
     write_video(path, frames, TURNTABLE_FPS)
-
-
-@contextmanager
-def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    seconds[stage] = time.perf_counter() - start

@@ -1,6 +1,9 @@
 """The package logger and the progress callback. Nothing is printed outside `oasis_warp.cli`."""
 
 import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol, runtime_checkable
 
 logger = logging.getLogger("oasis_warp")
@@ -16,3 +19,13 @@ class Progress(Protocol):
 
 def silent(stage: str, done: int, total: int) -> None:
     """A `Progress` that reports nothing."""
+
+
+@contextmanager
+def timed_stage(stage: str, seconds: dict[str, float], progress: Progress = silent) -> Iterator[None]:
+    """Add the seconds of this block to those of `stage`, which becomes the last one, and report its start and end."""
+    progress(stage, 0, 1)
+    start = time.perf_counter()
+    yield
+    seconds[stage] = seconds.pop(stage, 0.0) + time.perf_counter() - start
+    progress(stage, 1, 1)

@@ -29,13 +29,6 @@ class Recording(Generic[Result]):
             with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
                 self._result = function(self._inputs)
 
-    def fits(self, inputs: tuple[Tensor, ...]) -> bool:
-        """Whether it was recorded for tensors like these."""
-        return all(
-            new.shape == kept.shape and new.dtype == kept.dtype and new.device == kept.device
-            for new, kept in zip(inputs, self._inputs, strict=True)
-        )
-
     def __call__(self, inputs: tuple[Tensor, ...]) -> Result:
         """What the function makes of `inputs`; the next call writes over the tensors of its result."""
         torch._foreach_copy_(list[Tensor](self._inputs), list[Tensor](inputs))
