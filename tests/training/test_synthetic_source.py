@@ -55,7 +55,7 @@ def test_now_and_then_photos_are_in_the_even_light_of_their_targets_before_a_pla
         border = torch.cat([image[0], image[-1], image[:, 0], image[:, -1]])
         return float(((border - border.median(0).values).abs().amax(1) < 1e-3).float().mean())
 
-    assert alike(evenly_lit) > 0.6 and alike(in_a_room) < 0.2
+    assert alike(evenly_lit) > 0.5 and alike(in_a_room) < 0.2
     hand = evenly_lit.mask[0] > 0.9
     shown, target = evenly_lit.image[0][hand].mean(0), evenly_lit.target_images[0, 0]
     goal = target[evenly_lit.target_masks[0, 0] > 0.9].mean(0)
