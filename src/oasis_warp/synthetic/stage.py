@@ -128,6 +128,13 @@ _SPHERE = sphere(DIRECTIONS)
 _SPHERE_HARMONICS = _harmonics(_SPHERE) * (4 * np.pi / DIRECTIONS)
 
 
+def turn_light(light: Light, rotation: np.ndarray) -> Light:
+    """The same light as a camera sees it whose frame is the old one's, turned: `rotation` leads from the old to it."""
+    spread = _harmonics(_SPHERE @ rotation) @ light.sky
+    sky = np.linalg.lstsq(_harmonics(_SPHERE), spread, rcond=None)[0]  # exact: turned harmonics are of the same degree
+    return light._replace(sky=sky, directions=light.directions @ rotation.T)
+
+
 @functools.cache
 def _even_light() -> Light:
     d = _SPHERE
