@@ -116,7 +116,7 @@ def on_synthetic_hands(options: Evaluate, priors: dict[str, Prior], progress: Pr
         adapt=AdaptConfig(texture_steps=options.steps, seed=options.seed),
     )
     device = torch.device(options.device)
-    perceptual = None if options.lpips is None else load_lpips(*options.lpips).to(device)
+    perceptual = None if options.lpips is None else load_lpips(*options.lpips)
     found = evaluate(
         priors, config, options.out, device, perceptual=perceptual, workers=options.workers, progress=progress
     )

@@ -328,7 +328,7 @@ class Evaluate:
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
     workers: int = 0
-    """Processes that bake synthetic people; 0 for none."""
+    """Processes that measure synthetic people side by side; 0 for none."""
 
 
 @dataclass(frozen=True, kw_only=True)

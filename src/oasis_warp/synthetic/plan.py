@@ -15,7 +15,16 @@ from oasis_warp.synthetic.gestures import sample_gesture
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
 from oasis_warp.synthetic.rooms import Room, sample_room
 from oasis_warp.synthetic.sensor import Sensor, sample_sensor
-from oasis_warp.synthetic.stage import Light, Look, View, rotation_about, sample_light, sample_view, turn_light
+from oasis_warp.synthetic.stage import (
+    Light,
+    Look,
+    View,
+    clear_of_arm,
+    rotation_about,
+    sample_light,
+    sample_view,
+    turn_light,
+)
 from oasis_warp.synthetic.wardrobe import Clothes, sample_clothes
 
 PICTURES_EACH = 8
@@ -75,7 +84,7 @@ def sample_shot(seed: int, index: int, scenery: Scenery = PHOTOS) -> Shot:
     number = index // PICTURES_EACH
     if scenery.people is not None:
         number %= scenery.people
-    view = sample_view(rng, look, closed=bool((angles[[1, 4, 7, 10], 0] > 0.9).sum() >= 3))
+    view = clear_of_arm(sample_view(rng, look, closed=bool((angles[[1, 4, 7, 10], 0] > 0.9).sum() >= 3)), bend)
     return Shot(
         index=index,
         person=number,

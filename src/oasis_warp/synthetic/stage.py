@@ -23,6 +23,11 @@ _FACING = {
 """Rotations from the hand's frame to a camera that sees this side, fingers up."""
 _VIEW_SHARES = {"palm": 0.40, "back": 0.32, "thumb": 0.11, "little": 0.03, "any": 0.14}
 _STILL = np.eye(3)
+_TO_ELBOW = np.array([1.0, 0.0, 0.0])
+"""In the hand's frame, as long as the wrist is straight."""
+_TURNED_ROUND = np.diag([-1.0, 1.0, -1.0])
+ARM_CONE = np.radians(35)
+"""Of directions round the forearm's from which it hides the hand, half of it on average [rad]."""
 _TO_CAMERA = np.array([0.0, 0.0, -1.0])
 DIRECTIONS = 400
 """Of the sky, when its harmonics are summed."""
@@ -101,6 +106,19 @@ def sample_view(rng: np.random.Generator, look: Look, closed: bool) -> View:
         )
     fill = u(0.45, 0.86) if look == "photo" else u(0.66, 0.86)
     return View(rotation, float(np.exp(u(np.log(0.32), np.log(0.85)))), fill, rng.normal(0, 0.05, 2))
+
+
+def clear_of_arm(view: View, bend: np.ndarray) -> View:
+    """The view, or where the forearm would stand before the hand, that from the opposite side.
+
+    Args:
+        view: Any.
+        bend: Of the forearm at the wrist, an axis with its angle as length [rad], [3].
+    """
+    arm = rotation_about(bend, float(np.linalg.norm(bend))) @ _TO_ELBOW
+    if -(view.rotation @ arm)[2] < np.cos(ARM_CONE):
+        return view
+    return view._replace(rotation=_TURNED_ROUND @ view.rotation)
 
 
 def warmth(t: float) -> np.ndarray:
