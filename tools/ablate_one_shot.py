@@ -15,7 +15,8 @@ import torch
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.data.atomic import write_file
-from oasis_warp.evaluation.ablation import COLORS, ablation_rows, as_markdown
+from oasis_warp.evaluation.ablation import ablation_rows, as_markdown
+from oasis_warp.evaluation.columns import COLORS
 from oasis_warp.evaluation.methods import ONE_SHOT, Method
 from oasis_warp.evaluation.summary import Record
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate

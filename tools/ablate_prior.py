@@ -20,7 +20,8 @@ import torch
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.claimed_folder import claim_folder
-from oasis_warp.evaluation.ablation import COLORS, ablation_rows, as_markdown
+from oasis_warp.evaluation.ablation import ablation_rows, as_markdown
+from oasis_warp.evaluation.columns import COLORS
 from oasis_warp.evaluation.held_out import POPULATIONS
 from oasis_warp.evaluation.methods import BASELINE, ONE_SHOT, RAW, Method
 from oasis_warp.evaluation.summary import Record

@@ -11,7 +11,8 @@ import torch
 import write_evaluation
 from safetensors.torch import load_file
 
-from oasis_warp.evaluation.ablation import COLUMNS, ablation_rows, as_markdown
+from oasis_warp.evaluation.ablation import ablation_rows, as_markdown
+from oasis_warp.evaluation.columns import ABLATION
 from oasis_warp.evaluation.methods import METHODS, Method
 from oasis_warp.evaluation.metrics import MEASURES
 from oasis_warp.evaluation.summary import summarise
@@ -57,7 +58,7 @@ def test_photos_in_another_light_are_judged_by_matched_colours(rows):
 
 def test_a_table_shows_differences_and_leaves_out_what_was_not_measured(rows):
     heading, _, full, less = as_markdown(rows["studio"], "full").splitlines()
-    assert heading.count("|") == 2 + len(COLUMNS) - 1 and "LPIPS" not in heading
+    assert heading.count("|") == 2 + len(ABLATION) - 1 and "LPIPS" not in heading
     assert full.startswith("| full model | 26.67 |")
     assert less.startswith("| w/o a part | -2.00 ± 1.00 | +0.00 ± 0.00 |")
 
@@ -83,8 +84,9 @@ def test_the_page_is_filled_with_what_is_there(rows, tmp_path):
     page = "".join(f"before\n<!-- {name} -->\nold\n<!-- end of {name} -->\n" for name in write_evaluation.SECTIONS)
     filled = write_evaluation.fill(page, tmp_path)
     assert filled.count("old") == 2 and filled.count("before") == 5  # same-hand and one-shot have no file
-    assert "| mean one-shot | true | 21.00 | +1.00 | 0.00 | 100% |" in filled
-    assert "| mean calibrated | studio | 20.00 | 20.00 | 20.00 |" in filled
+    assert "| mean one-shot | true pose | 21.00 | +1.00 | 0.00 | 100% |" in filled
+    assert "| method | true pose | estimated | errors x 2 |" in filled
+    assert "| mean calibrated | 20.00 | 20.00 | 20.00 |" in filled
     assert "| w/o a part | -2.00 ± 1.00 |" in filled and "Settings: steps 7." in filled
     assert write_evaluation.fill(filled, tmp_path) == filled
 
@@ -105,7 +107,7 @@ def test_variants_are_trained_alike_and_go_on_where_they_were_stopped(tmp_path, 
     said = capsys.readouterr().out
     assert "w/o bias" in said and "full model" in said
     tables = json.loads((tmp_path / "whole" / "ablation.json").read_text())["tables"]
-    assert [(table["light"], len(table["rows"])) for table in tables] == [("studio", 3), ("wild", 3)]
+    assert [(table["light"], len(table["rows"])) for table in tables] == [("same", 3), ("studio", 3), ("wild", 3)]
 
     advance = ablate_prior.Trainer.advance
 
@@ -136,6 +138,7 @@ def test_adaptation_is_measured_without_each_of_its_parts(tmp_path, monkeypatch,
     run(monkeypatch, ablate_one_shot, tmp_path / "out", *options)
     said = capsys.readouterr().out
     assert all(title in said for title in ablate_one_shot.TITLES.values())
-    (studio, wild) = json.loads((tmp_path / "out" / "ablation.json").read_text())["tables"]
-    assert [row["variant"] for row in studio["rows"]] == list(ablate_one_shot.TITLES)
-    assert [row["variant"] for row in wild["rows"]] == list(ablate_one_shot.TITLES)
+    tables = json.loads((tmp_path / "out" / "ablation.json").read_text())["tables"]
+    assert [table["light"] for table in tables] == ["same", "studio", "wild"]
+    for table in tables:
+        assert [row["variant"] for row in table["rows"]] == list(ablate_one_shot.TITLES)

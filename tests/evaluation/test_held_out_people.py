@@ -77,8 +77,18 @@ def test_both_photos_show_the_same_hand_in_the_same_pose(session):
         assert torch.equal(getattr(studio, name), getattr(wild, name)), name
     torch.testing.assert_close(studio.translation, wild.translation)
     assert not torch.allclose(studio.image, wild.image, atol=0.05)
-    assert session.targets.image.shape == (2, 80, 80, 3)
-    assert torch.equal(session.targets.shape[0], wild.shape[0])
+    for targets in session.targets.values():
+        assert targets.image.shape == (2, 80, 80, 3)
+        assert torch.equal(targets.shape[0], wild.shape[0])
+
+
+def test_targets_of_one_capture_are_the_even_ones_in_other_light(session):
+    same, even = session.targets["same"], session.targets["studio"]
+    for name in ("angles", "orientation", "translation", "mask", "depth"):
+        assert torch.equal(getattr(same, name), getattr(even, name)), name
+    hand, black = same.mask[..., None] > 0.99, same.alpha == 0
+    assert float(same.image[black].abs().max()) == 0
+    assert float((same.image - even.image)[hand.expand_as(same.image)].std()) > 0.05
 
 
 def test_a_studios_wall_is_plain_and_the_hand_before_it_lit_as_its_targets(session):

@@ -2,15 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
+from oasis_warp.evaluation.columns import ABLATION, COLORS, SYNTHETIC, markdown
 from oasis_warp.evaluation.methods import Method
 from oasis_warp.evaluation.summary import Record, difference, mean, select
-
-COLUMNS = {
-    "psnr": "PSNR", "psnr_inner": "inside the outline", "psnr_visible": "visible", "psnr_hidden": "hidden",
-    "psnr_stretched": "stretched", "ssim": "SSIM", "ssim_mask": "in the mask", "lpips": "LPIPS",
-}  # fmt: skip
-COLORS = {"studio": "raw", "wild": "matched"}
-"""How pictures are judged by the light of the photo: one in another light cannot tell the colours of even light."""
 
 
 def ablation_rows(
@@ -30,13 +24,13 @@ def ablation_rows(
     for name, (title, _) in variants.items():
         if not own[name]:
             continue
-        changes = {measure: difference(own[name], own[whole], measure) for measure in COLUMNS}
+        changes = {measure: difference(own[name], own[whole], measure) for measure in ABLATION}
         rows.append(
             {
                 "variant": name,
                 "title": title,
                 "people": len({record["person"] for record in own[name]}),
-                **{measure: mean(own[name], measure) for measure in COLUMNS},
+                **{measure: mean(own[name], measure) for measure in ABLATION},
                 "change": {measure: change and change._asdict() for measure, change in changes.items()},
             }
         )
@@ -45,12 +39,9 @@ def ablation_rows(
 
 def as_markdown(rows: Sequence[Record], whole: str) -> str:
     """Means of the variant `whole`, and differences from it with their standard errors over people."""
-    shown = [measure for measure in COLUMNS if any(row[measure] is not None for row in rows)]
-    lines = ["| | " + " | ".join(COLUMNS[measure] for measure in shown) + " |", "|---" * (len(shown) + 1) + "|"]
-    for row in rows:
-        cells = [_cell(row, measure, whole) for measure in shown]
-        lines.append(f"| {row['title']} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    shown = [measure for measure in ABLATION if any(row[measure] is not None for row in rows)]
+    heading = ["", *(SYNTHETIC[measure].words for measure in shown)]
+    return markdown(heading, [[row["title"], *(_cell(row, measure, whole) for measure in shown)] for row in rows])
 
 
 def _cell(row: Record, measure: str, whole: str) -> str:

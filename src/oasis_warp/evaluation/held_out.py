@@ -18,7 +18,7 @@ from oasis_warp.ops import depth_map
 from oasis_warp.synthetic.picture import SyntheticBatch, part, render_capture, render_planned
 from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, Shot, capture_shots, plan_shots
 from oasis_warp.synthetic.planned import Planned, tabulate
-from oasis_warp.synthetic.stage import sample_light
+from oasis_warp.synthetic.stage import sample_light, soften_light
 from oasis_warp.synthetic.wardrobe import sample_clothes
 from oasis_warp.training.photographed import EstimatorNoise, training_batch
 from oasis_warp.training.synthetic_source import ERROR_STREAM, SURROUNDINGS
@@ -27,9 +27,9 @@ from oasis_warp.training.targets import true_pictures
 Group = Literal["ordinary", "tattoo", "ring"]
 """Kinds of people. Their bodies and photos are the same: only the tattoo or the ring is more."""
 Lighting = Literal["studio", "same", "wild"]
-"""Of photo and targets: both in even light, the photo before a plain wall; the photo in whatever light comes, with
-sleeves, shadows and a cheap sensor, and targets of that capture, in its light and exposure; such a photo, and targets
-in even light."""
+"""Of photo and targets: "same", of one capture, with the soft light, the colours and the exposure of a room and its
+cheap camera; "studio", both in even light, the photo before a plain wall; "wild", the photo in whatever light comes,
+with hard shadows, and targets in even light."""
 
 _BARE = replace(EVERYBODY, tattoo=0.0, ring=0.0)
 POPULATIONS = {"ordinary": _BARE, "tattoo": replace(_BARE, tattoo=1.0), "ring": replace(_BARE, ring=1.0)}
@@ -37,6 +37,9 @@ HELD_OUT_SEED, FIRST_PERSON = 20_261_121, 1_000_000
 """A world and numbers of people that training does not reach."""
 WALL_STREAM = 5
 """Tells the random numbers of walls from those of everything else with the same seed."""
+DIRECTED = 0.25
+"""Share of a capture's light that keeps its direction. All of it is a test of relighting: a side that is lit in the
+photo and dark in a target, or the other way round, hides whatever else is told of the hand."""
 STRETCH = 1.25
 """Area of a face in the pose over that at rest, or the inverse, from which skin counts as stretched: a tenth of all
 skin, most of it squeezed."""
@@ -59,13 +62,13 @@ class Session(NamedTuple):
 
     number: int
     photos: dict[Lighting, SyntheticBatch]
-    """One each; "same" and "wild" share theirs."""
+    """One each, in the same pose from the same side."""
     targets: dict[Lighting, SyntheticBatch]
     """The same poses from the same sides; "studio" and "wild" share them."""
 
 
 def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) -> Session:
-    """Render the photos and targets of person `number`; both photos show the same pose from the same side."""
+    """Render the photos and targets of person `number`."""
     seed, size, first = shoot.seed, int(shoot.size * SURROUNDINGS), PICTURES_EACH * number
     wild = Scenery(population=POPULATIONS[group])
     even = replace(wild, look="even")
@@ -79,12 +82,13 @@ def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) ->
     studio, even_goals = part(plain, slice(1)), part(plain, slice(1, None))
     wall = torch.tensor(np.random.default_rng([seed, WALL_STREAM, number]).uniform(0.1, 0.9, 3)).to(studio.image)
     studio = studio._replace(image=studio.image + (1 - studio.alpha[..., None]) * wall)
-    taken, same_goals = render_capture(
-        seed, planned([photo]), planned(capture_shots(seed, photo, goals)), size, device, scenery=wild
+    soft = photo._replace(light=soften_light(photo.light, DIRECTED))
+    same, same_goals = render_capture(
+        seed, planned([soft]), planned(capture_shots(seed, soft, goals)), size, device, scenery=wild
     )
     return Session(
         number,
-        {"studio": studio, "same": taken, "wild": taken},
+        {"studio": studio, "same": same, "wild": render_planned(seed, planned([photo]), size, device, scenery=wild)},
         {"studio": even_goals, "same": same_goals, "wild": even_goals},
     )
 

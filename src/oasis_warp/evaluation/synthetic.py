@@ -199,50 +199,30 @@ def _measure_there(packed: bytes, folder: Path, device: torch.device, group: Gro
 
 
 def measure(bench: _Bench, folder: Path, device: torch.device, group: Group, number: int) -> None:
-    """Write the records of one person, and pictures of the first few; the records last.
-
-    What "same" and "wild" differ in is what the avatar is held against: it is made and drawn once for both.
-    """
+    """Write the records of one person, and pictures of the first few; the records last."""
     config, hand, place = bench.config, bundled_hand().to(device), _place(folder, group, number)
     perceptual = bench.perceptual.to(device) if bench.perceptual else None
     vertex_faces = faces_of_vertices(hand.faces, len(hand.template))
     session = photograph(config.shoot, group, number, device)
-    exact = {light: as_estimated(hand, session, light, config.shoot, 0.0) for light in config.lights}
-    truths = {light: true_targets(batch, hand, vertex_faces) for light, batch in exact.items()}
-    records, rows, shown = [], {}, number < FIRST_PERSON + SHOWN
-    for lights in lights_by_photo(config.lights):
-        for factor in dict.fromkeys(config.noise + config.curve):
-            judged = [light for light in lights if factor in factors_of(config, group, light)]
-            if not judged:
-                continue
-            batch = as_estimated(hand, session, judged[0], config.shoot, factor)
-            drawn = list(draw(bench, hand, batch))
-            for light in judged:
+    records, rows, shown = [], [], number < FIRST_PERSON + SHOWN
+    for light in config.lights:
+        exact = as_estimated(hand, session, light, config.shoot, 0.0)
+        truths = true_targets(exact, hand, vertex_faces)
+        curve = config.curve if (group, light) == (config.groups[0], config.lights[0]) else ()
+        for factor in config.noise + curve:
+            batch = as_estimated(hand, session, light, config.shoot, factor)
+            row = [tile(batch.image[0]), tile(truths[0].image)]
+            for method, images in draw(bench, hand, batch):
                 about = {"group": group, "person": number, "light": light, "noise": factor}
-                records += [
-                    {**about, **method._asdict(), **found}
-                    for method, images in drawn for found in score_all(images, truths[light], perceptual)
-                ]  # fmt: skip
-                if factor == config.noise[-1]:
-                    pictures = [batch.image[0], truths[light][0].image, *(images[0] for _, images in drawn)]
-                    rows[light] = [tile(picture) for picture in pictures]
+                records += [{**about, **method._asdict(), **found} for found in score_all(images, truths, perceptual)]
+                row.append(tile(images[0]))
+            if factor == config.noise[-1]:
+                rows.append(row)
+        if shown and (group, light) == (config.groups[0], config.lights[0]):
+            write_attention(place.with_name(f"{number}_attention.png"), bench.priors, exact)
     if shown:
-        write_strip(place.with_suffix(".png"), [rows[light] for light in config.lights])
-    if shown and group == config.groups[0]:
-        write_attention(place.with_name(f"{number}_attention.png"), bench.priors, exact[config.lights[0]])
+        write_strip(place.with_suffix(".png"), rows)
     write_file(place, json.dumps(records, allow_nan=False).encode())
-
-
-def lights_by_photo(lights: Sequence[Lighting]) -> list[list[Lighting]]:
-    """Those that share a photo together."""
-    plain = [light for light in lights if light == "studio"]
-    return [part for part in (plain, [light for light in lights if light != "studio"]) if part]
-
-
-def factors_of(config: SyntheticEvaluation, group: Group, light: Lighting) -> tuple[float, ...]:
-    """How wrong poses are for this group and light."""
-    first = group == config.groups[0] and light == config.lights[0]
-    return config.noise + (config.curve if first else ())
 
 
 def draw(bench: _Bench, hand: HandModel, batch: TrainingBatch) -> Iterator[tuple[Method, list[Tensor]]]:

@@ -153,6 +153,13 @@ def turn_light(light: Light, rotation: np.ndarray) -> Light:
     return light._replace(sky=sky, directions=light.directions @ rotation.T)
 
 
+def soften_light(light: Light, share: float) -> Light:
+    """As much light of the same colour, of which `share` comes as it did and the rest from all around."""
+    sky = share * light.sky
+    sky[0] = light.sky[0] + 0.65 * (1 - share) * light.colors.sum(0) / 0.2820948
+    return light._replace(sky=sky, colors=share * light.colors)
+
+
 @functools.cache
 def _even_light() -> Light:
     d = _SPHERE
