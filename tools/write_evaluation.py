@@ -1,9 +1,9 @@
 """Put what was evaluated into docs/evaluation.md, each table between its two markers, and the pictures beside it.
 
-    oasis evaluate --dataset synthetic --people 32 --device cuda --out out/evaluation
+    oasis evaluate --dataset synthetic --people 32 --device cuda --workers 8 --out out/evaluation
     oasis evaluate --dataset same-hand tests/data/photos/same_hand --out out/same_hand
     python tools/ablate_prior.py out/ablation --steps 3000 --device cuda --workers 14
-    python tools/ablate_one_shot.py out/one_shot --device cuda
+    python tools/ablate_one_shot.py out/one_shot --device cuda --workers 8
     python tools/write_evaluation.py docs/evaluation.md out
 
 What has no file in the folder stays as it is on the page.
@@ -20,7 +20,7 @@ import torch
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
-from oasis_warp.evaluation.ablation import as_markdown
+from oasis_warp.evaluation.ablation import as_markdown, heading
 from oasis_warp.evaluation.columns import (
     COLORS,
     GROUPS,
@@ -59,8 +59,8 @@ def synthetic(found: dict[str, Any]) -> str:
             ]  # fmt: skip
             shown = present(rows, SYNTHETIC)
             lines = [[name_of(row), pose_words(row["noise"]), *cells(row, shown)] for row in rows]
-            heading = ["method", "pose", *(column.words for column in shown.values())]
-            parts.append(f"{GROUPS[group]}, {LIGHTS[light]}:\n\n{markdown(heading, lines)}")
+            names = ["method", "pose", *(column.words for column in shown.values())]
+            parts.append(f"{GROUPS[group]}, {LIGHTS[light]}:\n\n{markdown(names, lines)}")
     shoot = settings["shoot"]
     parts.append(
         f"{settings['people']} people, {shoot['targets']} targets each, {shoot['size']} px. "
@@ -87,17 +87,13 @@ def photos(found: dict[str, Any]) -> str:
     if found["left_out"]:
         words += f" Photos left out: {len(found['left_out'])}."
     shown = present(rows, PHOTOS)
-    heading = ["method", *(column.words for column in shown.values())]
-    return f"{markdown(heading, [[name_of(row), *cells(row, shown)] for row in rows])}\n\n{words}"
+    names = ["method", *(column.words for column in shown.values())]
+    return f"{markdown(names, [[name_of(row), *cells(row, shown)] for row in rows])}\n\n{words}"
 
 
 def ablation(found: dict[str, Any]) -> str:
-    """A table for each light and stage."""
-    parts = []
-    for made in found["tables"]:
-        people = made["rows"][0]["people"]
-        heading = f"{LIGHTS[made['light']][0].upper()}{LIGHTS[made['light']][1:]}, {made['stage'].replace('_', '-')}"
-        parts.append(f"{heading}, {people} people:\n\n{as_markdown(made['rows'], found['whole'])}")
+    """Its tables, and how they were made."""
+    parts = [f"{heading(table)}:\n\n{as_markdown(table)}" for table in found["tables"]]
     settings = ", ".join(f"{name} {value}" for name, value in found["settings"].items())
     return "\n\n".join([*parts, f"Settings: {settings}."])
 

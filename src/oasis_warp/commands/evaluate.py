@@ -78,7 +78,7 @@ def check_options(options: Evaluate) -> None:
     """
     photos = options.dataset == "same-hand"
     if photos and options.folder is None:
-        raise InputError("--dataset same-hand: expected a folder with a subfolder of photos for each hand; name it.")
+        raise InputError("--dataset same-hand: expected a folder of photos, or one with a subfolder a hand; name it.")
     if not photos and options.folder is not None:
         raise InputError(f"{options.folder}: synthetic hands need no folder; leave it out, or use --dataset same-hand.")
     if photos and options.lpips is not None:

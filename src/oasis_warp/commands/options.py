@@ -304,7 +304,7 @@ class Evaluate:
     """
 
     folder: Positional[Path | None] = None
-    """With a subfolder of photos for each hand, for same-hand."""
+    """With a subfolder of photos for each hand, or with photos of one, for same-hand."""
     out: Output
     """Folder for the results; its parent must exist."""
     dataset: Literal["synthetic", "same-hand"] = "synthetic"

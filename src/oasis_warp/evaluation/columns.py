@@ -23,7 +23,8 @@ SYNTHETIC = {
     "psnr_visible": Column("visible", ".2f"),
     "psnr_hidden": Column("hidden", ".2f"),
     "psnr_stretched": Column("stretched", ".2f"),
-    "psnr_unstretched": Column("not stretched", ".2f"),
+    "psnr_squeezed": Column("squeezed", ".2f"),
+    "psnr_unchanged": Column("neither", ".2f"),
     "ssim": Column("SSIM", ".4f"),
     "ssim_box": Column("in the box", ".4f"),
     "ssim_mask": Column("in the mask", ".4f"),
@@ -42,11 +43,6 @@ PHOTOS = {
     "beaten_error": Column("by colours", ".0%"),
 }
 """Of `same_hand.summarise_pairs`."""
-ABLATION = (
-    "psnr", "psnr_inner", "psnr_visible", "psnr_hidden", "psnr_stretched", "psnr_unstretched", "ssim", "ssim_mask",
-    "lpips",
-)  # fmt: skip
-"""Measures whose differences `ablation` tables."""
 COLORS = {"same": "raw", "studio": "raw", "wild": "matched"}
 """How pictures are judged by the light: a photo in another light cannot tell the colours of even light."""
 GROUPS = {"ordinary": "People as in training", "tattoo": "The same people with a tattoo", "ring": "And with a ring"}

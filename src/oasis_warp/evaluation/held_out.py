@@ -41,8 +41,8 @@ DIRECTED = 0.25
 """Share of a capture's light that keeps its direction. All of it is a test of relighting: a side that is lit in the
 photo and dark in a target, or the other way round, hides whatever else is told of the hand."""
 STRETCH = 1.25
-"""Area of a face in the pose over that at rest, or the inverse, from which skin counts as stretched: a tenth of all
-skin, most of it squeezed."""
+"""Area of a face in the pose over that at rest from which skin counts as stretched, a twentieth of all that is shown;
+the inverse for squeezed skin, another twentieth."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +152,8 @@ def true_targets(
                 mask,
                 batch.target_known[0, k],
                 on_hand & (shown < 0.5),
-                on_hand & ((ratio > STRETCH) | (ratio < 1 / STRETCH)),
+                on_hand & (ratio > STRETCH),
+                on_hand & (ratio < 1 / STRETCH),
             )
         )
     return truths
