@@ -3,6 +3,7 @@
     oasis evaluate --dataset synthetic --people 32 --device cuda --workers 8 --out out/evaluation
     oasis evaluate --dataset same-hand tests/data/photos/same_hand --out out/same_hand
     python tools/ablate_prior.py out/ablation --steps 3000 --device cuda --workers 14
+    python tools/probe_prior.py out/probe --device cuda --workers 8
     python tools/ablate_one_shot.py out/one_shot --device cuda --workers 8
     python tools/write_evaluation.py docs/evaluation.md out
 
@@ -103,6 +104,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "noise": ("evaluation/metrics.json", noise),
     "same-hand": ("same_hand/metrics.json", photos),
     "network": ("ablation/ablation.json", ablation),
+    "probe": ("probe/ablation.json", ablation),
     "one-shot": ("one_shot/ablation.json", ablation),
 }
 """By the word in the markers: file below the folder, and what is made of it."""
@@ -132,7 +134,7 @@ def main() -> None:
     """Read the folder, rewrite the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page", type=Path)
-    parser.add_argument("folder", type=Path, help="holds evaluation, same_hand, ablation and one_shot, or some of them")
+    parser.add_argument("folder", type=Path, help="holds evaluation, same_hand, ablation, probe and one_shot")
     options = parser.parse_args()
     write_file(options.page, fill(options.page.read_text(), options.folder).encode())
     copy_pictures(options.folder, options.page.parent / "_static")

@@ -1,12 +1,14 @@
 """Tables of ablations, the page that shows them, and the tools that train and adapt without one part."""
 
 import argparse
+import copy
 import json
 import sys
 from dataclasses import replace
 
 import ablate_one_shot
 import ablate_prior
+import probe_prior
 import pytest
 import torch
 import write_evaluation
@@ -101,12 +103,32 @@ def test_the_page_is_filled_with_what_is_there(tables, tmp_path):
     (tmp_path / "ablation" / "ablation.json").write_text(json.dumps(made))
     page = "".join(f"before\n<!-- {name} -->\nold\n<!-- end of {name} -->\n" for name in write_evaluation.SECTIONS)
     filled = write_evaluation.fill(page, tmp_path)
-    assert filled.count("old") == 2 and filled.count("before") == 5  # same-hand and one-shot have no file
+    assert filled.count("old") == 3 and filled.count("before") == 6  # same-hand, probe and one-shot have no file
     assert "| mean one-shot | true pose | 21.00 | +1.00 | 0.00 | 100% |" in filled
     assert "| method | true pose | estimated | errors x 2 |" in filled
     assert "| mean calibrated | 20.00 | 20.00 | 20.00 |" in filled
     assert "| w/o a part | -2.00 ± 1.00 |" in filled and "Settings: steps 7." in filled
     assert write_evaluation.fill(filled, tmp_path) == filled
+
+
+def test_a_probe_changes_its_part_alone(hand):
+    network = HandNetwork(TINY, hand)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter)
+    before = {name: value.clone() for name, value in network.named_parameters()}
+    touched = {
+        "full": set(), "no_bias": {"fusion.log_beta"}, "twice": {"fusion.log_beta"},
+        "mixing": {"feature_on_mesh.logits"}, "places": {"face_head.last.weight", "face_head.last.bias"},
+        "colors": {"face_head.last.weight", "face_head.last.bias"},
+    }  # fmt: skip
+    assert list(touched) == list(probe_prior.PROBES)
+    for name, probe in probe_prior.PROBES.items():
+        changed = copy.deepcopy(network)
+        probe.change(changed)
+        after = dict(changed.named_parameters())
+        assert {key for key, value in before.items() if not torch.equal(value, after[key])} == touched[name]
+        still = (after["face_head.last.weight"] == 0).all(1).sum()
+        assert int(still) == {"places": 3, "colors": 3}.get(name, 0)
 
 
 def run(monkeypatch, tool, *arguments):
