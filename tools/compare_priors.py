@@ -20,11 +20,10 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8, write_picture
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
-from oasis_warp.hand.surface_offsets import outline_offsets
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.prior import choose_prior
-from oasis_warp.pipeline import make_avatar, make_evidence
+from oasis_warp.pipeline import carrier_offsets, make_avatar, make_evidence
 from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.training.adapt import adapt
 
@@ -57,7 +56,7 @@ def row(path: Path, priors: list[str], side: int) -> torch.Tensor:
     hand, photo = bundled_hand(), read_photo(path)
     estimator, config = HandEstimator(hand), ReconstructConfig()
     fit = estimator.fit(photo, choose_hand(estimator.find(photo), config.hand, photo.name), force=True)
-    offsets = outline_offsets(hand, fit)
+    offsets = carrier_offsets(hand, fit)
     evidence = make_evidence(photo, fit, offsets, config)
     gap = torch.full((side, GAP, 3), PAPER / 255)
     parts = [shrink(evidence.image.flip(1) if fit.side == "left" else evidence.image, side)]

@@ -45,7 +45,8 @@ class Avatar:
         self.shape = shape
         """Shape coefficients of the hand model [standard deviations]."""
         self.surface_offsets = surface_offsets
-        """What the photo's outline adds to the rest surface [m]."""
+        """From the model's surface at rest to the one that carries Gaussians [m]: onto the photo's outline, then
+        below the skin (`avatar.anchors.SINK`)."""
         self._gaussians = gaussians
         self.source_pose = source_pose
         """The pose in the photo, in the frame of `source_camera`."""
@@ -89,7 +90,7 @@ class Avatar:
         return HandPose(*(part.to(self.shape) for part in pose))
 
     def mesh(self, pose: HandPose, *, validate: bool = True) -> PosedHand:
-        """The surface in `pose` [m]; the faces of a left hand wind the other way.
+        """The surface that carries Gaussians, in `pose` [m]; the faces of a left hand wind the other way.
 
         Args:
             pose: One, or with an axis in front of every part many.

@@ -6,11 +6,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from oasis_warp.avatar.anchors import below_skin
 from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmarks, Photo
 from oasis_warp.data.crop import resample_square, square_around
@@ -82,7 +86,7 @@ def reconstruct(
     with stage("fit"):
         fit = estimator.fit(photo, given, force=config.force) if isinstance(given, Landmarks) else given
     with stage("outline"):
-        offsets = outline_offsets(hand, fit)
+        offsets = carrier_offsets(hand, fit)
     with stage("kernels"):  # compiled only once there is a hand to draw
         warm_up(config.device)
     with stage("crop"):
@@ -101,6 +105,11 @@ def reconstruct(
         **input_errors(avatar, evidence),
     }
     return Reconstruction(avatar, fit, prior.about, stages, errors, fit.warnings)
+
+
+def carrier_offsets(hand: HandModel, fit: HandFit) -> Float[Tensor, "V 3"]:
+    """From the fitted rest surface to the one that carries Gaussians [m]: onto the photo's outline, then inwards."""
+    return outline_offsets(hand, fit) + below_skin(hand)
 
 
 def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: ReconstructConfig) -> Evidence:

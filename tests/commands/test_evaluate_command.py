@@ -123,7 +123,7 @@ def hands(scene, tmp_path, monkeypatch):
         else:
             path.write_text("nothing to see")
     monkeypatch.setattr(same_hand, "HandEstimator", lambda hand: KnownEstimator(scene[1]))
-    monkeypatch.setattr(same_hand, "outline_offsets", lambda hand, fit: torch.zeros_like(hand.template))
+    monkeypatch.setattr(same_hand, "carrier_offsets", lambda hand, fit: torch.zeros_like(hand.template))
     return folder
 
 

@@ -9,8 +9,10 @@ from oasis_warp.avatar.anchors import OPACITY
 from oasis_warp.core import rotation
 from oasis_warp.network.feature_on_mesh import FeatureOnMesh
 from oasis_warp.network.heads import (
+    FACE_LIMITS,
     FACE_OUTPUTS,
     MAX_OFFSET,
+    VERTEX_LIMITS,
     VERTEX_OUTPUTS,
     GaussianHead,
     decode,
@@ -29,6 +31,7 @@ def anchors(random):
         "fade": torch.tensor([[1.0, 1.0, 0.5, 0.01, 0.0]]),
         "colors": torch.rand(1, 5, 3, generator=random) * 0.8 + 0.1,
         "seen": None,
+        "limits": VERTEX_LIMITS,
     }
 
 
@@ -52,21 +55,24 @@ def test_outputs_stay_in_float32_under_autocast(random):
         assert head(torch.randn(1, 3, 16, generator=random))["colors"].dtype == torch.float32
 
 
-def test_no_output_leaves_the_anchors_as_they_are(anchors, random):
-    same = decode(raw_outputs(0.0, random), **anchors)
+@pytest.mark.parametrize("limits", [VERTEX_LIMITS, FACE_LIMITS], ids=["vertices", "faces"])
+def test_no_output_leaves_the_anchors_as_they_are(limits, anchors, random):
+    same = decode(raw_outputs(0.0, random), **{**anchors, "limits": limits})
     torch.testing.assert_close(same.quats, anchors["quats"])
     torch.testing.assert_close(same.scales, anchors["scales"])
     torch.testing.assert_close(same.opacities, OPACITY * anchors["fade"])
     torch.testing.assert_close(same.colors, anchors["colors"])
 
 
-def test_any_output_gives_gaussians_that_can_be_drawn(anchors, random):
+@pytest.mark.parametrize("limits", [VERTEX_LIMITS, FACE_LIMITS], ids=["vertices", "faces"])
+def test_any_output_gives_gaussians_that_can_be_drawn(limits, anchors, random):
     raw = raw_outputs(50.0, random)
-    out = decode(raw, **anchors)
+    out = decode(raw, **{**anchors, "limits": limits})
     ratio = out.scales / anchors["scales"]
-    assert 1 / 4.001 < float(ratio.min()) and float(ratio.max()) < 4.001
+    assert 0.999 / limits.growth < float(ratio.min()) and float(ratio.max()) < 1.001 * limits.growth
     torch.testing.assert_close(out.quats.norm(dim=-1), torch.ones(1, 5))
-    assert bool((out.opacities <= anchors["fade"]).all()) and bool((out.opacities >= 0).all())
+    assert bool((out.opacities <= anchors["fade"]).all())
+    assert bool((out.opacities >= limits.opacity * anchors["fade"]).all())
     assert float(out.colors.min()) >= 0 and float(out.colors.max()) <= 1
     assert float(decode_offsets(raw).abs().max()) <= MAX_OFFSET + 1e-9
 

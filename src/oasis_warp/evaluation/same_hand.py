@@ -20,10 +20,9 @@ from oasis_warp.evaluation.photo_pairs import Pair, PairScore, compare_pairs
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, select
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
-from oasis_warp.hand.surface_offsets import outline_offsets
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.pipeline import make_avatar, make_evidence
+from oasis_warp.pipeline import carrier_offsets, make_avatar, make_evidence
 
 PHOTO_METHODS = (Method("mean", ONE_SHOT), Method("learned", RAW), Method("learned", ONE_SHOT))
 """No prior, no adaptation, and both."""
@@ -141,7 +140,7 @@ def _make_avatars(
     """Avatars of one photo by the labels of methods, and its crop; the photo is fitted once."""
     hand = bundled_hand()
     fit = estimator.fit(photo, landmarks)
-    offsets = outline_offsets(hand, fit)
+    offsets = carrier_offsets(hand, fit)
     evidence = make_evidence(photo, fit, offsets, config)
     settings = AdaptConfig(texture_steps=config.steps, seed=config.seed)
     made = {

@@ -13,7 +13,16 @@ from oasis_warp.network.dinov2 import DinoV2Encoder
 from oasis_warp.network.encoding import encode
 from oasis_warp.network.feature_on_mesh import FeatureOnMesh
 from oasis_warp.network.features import ImageFeatures
-from oasis_warp.network.heads import FACE_OUTPUTS, TRUST, VERTEX_OUTPUTS, GaussianHead, decode, decode_offsets
+from oasis_warp.network.heads import (
+    FACE_LIMITS,
+    FACE_OUTPUTS,
+    TRUST,
+    VERTEX_LIMITS,
+    VERTEX_OUTPUTS,
+    GaussianHead,
+    decode,
+    decode_offsets,
+)
 from oasis_warp.network.inputs import NetworkInput, Prediction
 from oasis_warp.network.mean_hand import MeanHand, MeanHands
 from oasis_warp.network.observation import Sighting, sight
@@ -153,23 +162,20 @@ class HandNetwork(nn.Module):
         rest: Float[Tensor, "B V 3"],
     ) -> Prediction:
         """Both heads, applied to the anchors on `rest`, the mean colours, and what the photo shows instead of them."""
-        raw = self.vertex_head(features)
+        raw, n = self.vertex_head(features), features.shape[1]
         barycentrics = features.new_zeros((len(features), 0, 3), dtype=torch.float32)
+        on_faces = self.face_head(self.feature_on_mesh(features, self.faces)) if self.config.fom == "on" else None
         with torch.autocast(features.device.type, enabled=False):
-            anchors = batch_anchors(rest, self.faces, self.vertex_faces, self.rim)
-            offsets = decode_offsets(raw)
-        if self.config.fom == "on":
-            on_faces = self.face_head(self.feature_on_mesh(features, self.faces))
+            quats, scales, fade = batch_anchors(rest, self.faces, self.vertex_faces, self.rim)
+            attributes = decode(raw, quats[:, :n], scales[:, :n], fade[:, :n], colors, seen, VERTEX_LIMITS)
+            if on_faces is None:
+                return Prediction(decode_offsets(raw), barycentrics, *attributes, scales[:, :n])
             barycentrics = on_faces.pop("barycentrics").softmax(-1)
-            raw = {name: torch.cat([raw[name], values], dim=1) for name, values in on_faces.items()}
-            colors = torch.cat([colors, colors[:, self.faces].mean(2)], dim=1)
-            seen = None if seen is None else torch.cat([seen, seen[:, self.faces].mean(2)], dim=1)
-        count = colors.shape[1]
-        with torch.autocast(features.device.type, enabled=False):
-            attributes = decode(
-                raw, anchors.quats[:, :count], anchors.scales[:, :count], anchors.fade[:, :count], colors, seen
-            )
-        return Prediction(offsets, barycentrics, *attributes, anchors.scales[:, :count])
+            colors = colors[:, self.faces].mean(2)
+            seen = None if seen is None else seen[:, self.faces].mean(2)
+            more = decode(on_faces, quats[:, n:], scales[:, n:], fade[:, n:], colors, seen, FACE_LIMITS)
+            both = (torch.cat(parts, dim=1) for parts in zip(attributes, more, strict=True))
+            return Prediction(decode_offsets(raw), barycentrics, *both, scales)
 
     def _aligned(self, features: ImageFeatures, sighting: Sighting) -> Tensor:
         return self.point_features(features, sighting.uv, sighting.inside)

@@ -14,8 +14,6 @@ from torch.nn.functional import gelu, normalize
 from oasis_warp.avatar.anchors import OPACITY
 from oasis_warp.core import rotation
 
-MAX_LOG_SCALE = math.log(4.0)
-"""A Gaussian is at most this much larger or smaller than its anchor."""
 MAX_OFFSET = 0.012
 """Farthest that a vertex Gaussian can leave its vertex along an axis [m]; the loss pulls from half of it on."""
 COLOR_MARGIN = 1e-3
@@ -25,6 +23,20 @@ VERTEX_OUTPUTS = {**SHARED, "offsets": 3}
 FACE_OUTPUTS = {**SHARED, "barycentrics": 3}
 TRUST = {"trust": 1}
 """Further output where points are told what the photo shows of them: how much of it to take over."""
+
+
+class Limits(NamedTuple):
+    """How far a head may go."""
+
+    growth: float
+    """A Gaussian is at most this much larger or smaller than its anchor."""
+    opacity: float
+    """Least opacity, before the wrist's fade."""
+
+
+VERTEX_LIMITS, FACE_LIMITS = Limits(4.0, 0.0), Limits(1.5, 0.8)
+"""Free to, faces vanish in training, as large smooth Gaussians on vertices draw skin well enough; but
+texture learning needs something small and opaque to paint a photo's detail on."""
 
 
 class GaussianHead(nn.Module):
@@ -61,17 +73,21 @@ def decode(
     fade: Float[Tensor, "B N"],
     colors: Float[Tensor, "B N 3"],
     seen: Float[Tensor, "B N 3"] | None,
+    limits: Limits,
 ) -> Attributes:
     """Apply raw outputs to anchors and mean colours; raw zeros return them.
 
-    A rotation turns in the anchor's own frame, a scale grows by exp of a bounded number, opacity moves in logits below
-    what the wrist's fade allows, colour moves in logits, and with `seen`, the photo's difference from `colors` in
-    logits, by the share of it that the head trusts.
+    A rotation turns in the anchor's own frame, a scale grows by exp of a bounded number, opacity moves in logits from
+    `limits.opacity` up, below what the wrist's fade allows, colour moves in logits, and with `seen`, the photo's
+    difference from `colors` in logits, by the share of it that the head trusts.
     """
     identity = torch.nn.functional.pad(torch.ones_like(raw["quats"][..., :1]), (0, 3))
     turn = normalize(raw["quats"] + identity, dim=-1, eps=1e-6)
-    grow = (MAX_LOG_SCALE * torch.tanh(raw["scales"] / MAX_LOG_SCALE)).exp()
-    opacity = torch.sigmoid(raw["opacities"][..., 0] + math.log(OPACITY / (1 - OPACITY)))
+    farthest, least = math.log(limits.growth), limits.opacity
+    grow = (farthest * torch.tanh(raw["scales"] / farthest)).exp()
+    opacity = least + (1 - least) * torch.sigmoid(
+        raw["opacities"][..., 0] + math.log((OPACITY - least) / (1 - OPACITY))
+    )
     color = raw["colors"] + torch.logit(colors, COLOR_MARGIN)
     if seen is not None:
         color = color + raw["trust"] * seen

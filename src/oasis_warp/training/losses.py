@@ -16,6 +16,10 @@ Perceptual = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Distance of N images and N targets inside N masks, one number each."""
 
 
+LEAST_AREA = 0.05
+"""Share of the picture that a mask counts as at least: little depends on a hand that hides behind its arm."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class LossConfig:
     """Weights of the objective; the paper's."""
@@ -52,9 +56,10 @@ def objective(
     """
     images, alphas = drawn
     targets, masks = true
+    areas = masks.sum((1, 2)).clamp_min(LEAST_AREA * masks[0].numel())
     terms = {
         "rgb": torch.vmap(masked_l1)(images, targets, masks).mean(),
-        "mask": ((alphas - masks).abs().sum((1, 2)) / masks.sum((1, 2)).clamp_min(1)).mean(),
+        "mask": ((alphas - masks).abs().sum((1, 2)) / areas).mean(),
         "ssim": torch.vmap(masked_dssim)(images, targets, masks).mean(),
         "perceptual": perceptual(images, targets, masks).mean(),
         "position": position_loss(prediction.offsets, config.offset_limit),

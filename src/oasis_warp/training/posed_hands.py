@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.avatar.anchors import below_skin
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.hand.correctives import corrective_coefficients
@@ -16,7 +17,7 @@ FINGERS, BONES = 5, 3
 
 
 class Posed(NamedTuple):
-    """N right hands [m]."""
+    """N right hands [m]; surfaces are those that carry Gaussians."""
 
     rest: Float[Tensor, "N V 3"]
     posed: Float[Tensor, "N V 3"]
@@ -33,8 +34,8 @@ def pose_hands(
     orientation: Float[Tensor, "N 3 3"],
     translation: Float[Tensor, "N 3"],
 ) -> Posed:
-    """`hand.skinning.rest_hand`, `skin` and `hand21` for many hands."""
-    rest = hand.template + torch.einsum("vds,ns->nvd", hand.shape_basis, shape)
+    """`hand.skinning.rest_hand`, moved by `avatar.anchors.below_skin`, `skin` and `hand21` for many hands."""
+    rest = hand.template + below_skin(hand) + torch.einsum("vds,ns->nvd", hand.shape_basis, shape)
     joints = hand.joints + torch.einsum("jds,ns->njd", hand.joint_basis, shape)
     tips = hand.tips + torch.einsum("tds,ns->ntd", hand.tip_basis, shape)
     rotation, origin = _bones(hand, joints, angles, orientation, translation)
