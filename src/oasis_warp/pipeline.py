@@ -20,6 +20,7 @@ from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmar
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.keypoints_file import read_keypoints
+from oasis_warp.hand.moved_fit import with_pose
 from oasis_warp.hand.outline import wrist_line
 from oasis_warp.hand.skinning import mirror_pose, rest_hand, skin
 from oasis_warp.hand.surface_offsets import outline_offsets
@@ -30,6 +31,7 @@ from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 from oasis_warp.training.adapt import adapt
+from oasis_warp.training.refine import refine
 
 CROP_MARGIN = 1.12
 """Side of the crop over the longer extent of the mask."""
@@ -93,6 +95,16 @@ def reconstruct(
         evidence = make_evidence(photo, fit, offsets, config)
     with stage("prior"):
         guess = prior(evidence)
+    moved = 0.0
+    if config.refine == "on" and isinstance(given, Landmarks):  # a pose that was given is right as it is
+        with stage("refinement"):
+            refinement = refine(hand, guess, evidence)
+            if refinement.accepted:
+                pose, moved = refinement.pose, refinement.moved
+                fit = with_pose(hand, fit, mirror_pose(pose) if fit.side == "left" else pose)
+                offsets = carrier_offsets(hand, fit)
+                evidence = make_evidence(photo, fit, offsets, config)
+                guess = prior(evidence)
     with stage("adaptation"):
         adaptation = adapt(
             hand, guess, evidence, AdaptConfig(texture_steps=config.steps, seed=config.seed), progress
@@ -102,6 +114,7 @@ def reconstruct(
         "reprojection_percent": fit.reprojection,
         "worst_point_percent": fit.worst_point,
         "mask_iou": fit.mask_iou,
+        "refined_px": moved,
         **input_errors(avatar, evidence),
     }
     return Reconstruction(avatar, fit, prior.about, stages, errors, fit.warnings)

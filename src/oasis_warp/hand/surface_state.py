@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from oasis_warp.hand.fit_state import FitState
@@ -15,8 +16,8 @@ _ANGLE = 2.0
 """Of angles about rest: holds those that no vertex tells [rad]."""
 _SILENT = 2e-3
 """Shape coefficients that move the surface less than this are held near zero [m, over all of it]."""
-_PALM = 0.9
-"""Share of the wrist's bone from which a vertex belongs to the palm."""
+_OWN = 0.9
+"""Share of a bone, of the largest that any vertex has, from which a vertex turns as the bone does."""
 _STEPS, _TOLERANCE = 25, 1e-4
 
 
@@ -95,13 +96,19 @@ class _System:
 def _placed(
     rig: Rig, rest: np.ndarray, posed: np.ndarray, shape: np.ndarray, focal: float, centre: np.ndarray
 ) -> FitState:
-    """All angles at rest, the palm where it is (Kabsch 1976)."""
-    palm = rig.weights[:, 0] > _PALM
-    a, b = rest[palm], posed[palm]
-    u, _, vt = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
-    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    x, y, z = b.mean(0) - turn @ a.mean(0)
-    return FitState(turn, np.array([x / z, y / z, np.log(z)]), np.zeros(len(rig.dofs)), shape, focal, centre)
+    """The palm where it is, and every bone turned against its parent as the flesh around both is."""
+    owned = rig.weights > _OWN * rig.weights.max(0)
+    turns = [_turn_of(rest[own], posed[own]) for own in owned.T]
+    against = [cv2.Rodrigues(turns[parent].T @ turn)[0][:, 0] for parent, turn in zip(rig.parents, turns, strict=True)]
+    angles = np.array([against[joint] @ rig.axes[joint, axis] for joint, axis in rig.dofs])
+    x, y, z = (posed - rest @ turns[0].T)[owned[:, 0]].mean(0)
+    return FitState(turns[0], np.array([x / z, y / z, np.log(z)]), angles, shape, focal, centre)
+
+
+def _turn_of(rest: np.ndarray, posed: np.ndarray) -> np.ndarray:
+    """Rotation that carries some vertices best to where they are (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd((posed - posed.mean(0)).T @ (rest - rest.mean(0)))
+    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
 
 
 def _detail(rig: Rig, state: FitState, posed: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandPose, PosedHand
 from oasis_warp.hand.evidence import Evidence as FitEvidence
-from oasis_warp.hand.fit import Fitter, FitSettings
+from oasis_warp.hand.fit import FitSettings, Fitter
 from oasis_warp.hand.fit_state import FitState
 from oasis_warp.hand.kinematics import Rig, unit
 from oasis_warp.hand.landmarks import BONES
@@ -96,7 +96,7 @@ class Refinement(NamedTuple):
     """The refined pose, or the start where nothing better was found."""
 
     pose: HandPose
-    """In the frame of the evidence's camera."""
+    """In the frame of the evidence's camera; on the CPU, as fits are."""
     evidence: Evidence
     """With the surface in that pose."""
     accepted: bool
@@ -138,7 +138,7 @@ def refine(
     places = [project(evidence.camera, vertices)[0] for vertices in (evidence.posed.vertices, posed.vertices)]
     change = problem.change(found)
     return Refinement(
-        pose=problem.pose([found], batch=False),
+        pose=HandPose(*(part.cpu() for part in problem.pose([found], batch=False))),
         evidence=evidence._replace(posed=posed),
         accepted=accepted,
         before=before,
@@ -181,7 +181,8 @@ class _Problem:
         above = wrist_line(self.fitter.evidence.xy).above_mask(size, WRIST)
         judged = torch.from_numpy(above).to(evidence.mask) * evidence.above_wrist
         self.scene = make_scene(self.hand, guess, evidence, judged, SIZE)
-        self.outline_pixels = OUTLINE_PIXELS * 4 * float((self.scene.mask * self.scene.judged).sum().clamp_min(1).sqrt())
+        area = float((self.scene.mask * self.scene.judged).sum().clamp_min(1))
+        self.outline_pixels = OUTLINE_PIXELS * 4 * area**0.5
         self.sigmas = {blurs: self._photo_sigma(blurs) for blurs in LEVELS}
         axis = self.rig.dofs[:, 1]
         self.reach = np.r_[np.full(3, TURN), np.full(2, ACROSS), AWAY, np.array(ANGLES)[axis]]
