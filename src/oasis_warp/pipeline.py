@@ -16,11 +16,11 @@ from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmarks, Photo
+from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, HandFit, Landmarks, Photo
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.keypoints_file import read_keypoints
-from oasis_warp.hand.moved_fit import with_pose
+from oasis_warp.hand.moved_fit import no_more_doubtful, with_pose
 from oasis_warp.hand.outline import wrist_line
 from oasis_warp.hand.skinning import mirror_pose, rest_hand, skin
 from oasis_warp.hand.surface_offsets import outline_offsets
@@ -98,10 +98,11 @@ def reconstruct(
     moved = 0.0
     if config.refine == "on" and isinstance(given, Landmarks):  # a pose that was given is right as it is
         with stage("refinement"):
-            refinement = refine(hand, guess, evidence)
-            if refinement.accepted:
-                pose, moved = refinement.pose, refinement.moved
-                fit = with_pose(hand, fit, mirror_pose(pose) if fit.side == "left" else pose)
+            refinement = refine(hand, guess, evidence, landmarks_in_crop(fit, evidence.camera))
+            pose = refinement.pose
+            found = with_pose(hand, fit, mirror_pose(pose) if fit.side == "left" else pose)
+            if refinement.accepted and no_more_doubtful(found, fit):
+                fit, moved = found, refinement.moved
                 offsets = carrier_offsets(hand, fit)
                 evidence = make_evidence(photo, fit, offsets, config)
                 guess = prior(evidence)
@@ -123,6 +124,15 @@ def reconstruct(
 def carrier_offsets(hand: HandModel, fit: HandFit) -> Float[Tensor, "V 3"]:
     """From the fitted rest surface to the one that carries Gaussians [m]: onto the photo's outline, then inwards."""
     return outline_offsets(hand, fit) + below_skin(hand)
+
+
+def landmarks_in_crop(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
+    """The fit's landmarks as the crop of its hand shows them [px]; those of a left hand are mirrored."""
+    xy, camera = fit.landmarks.xy, fit.camera
+    if fit.side == "left":
+        xy, camera = torch.stack([camera.width - xy[:, 0], xy[:, 1]], 1), mirrored_camera(camera)
+    K = crop.K.cpu()
+    return (xy - camera.K[:2, 2]) * K.diagonal()[:2] / camera.K.diagonal()[:2] + K[:2, 2]
 
 
 def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: ReconstructConfig) -> Evidence:

@@ -18,11 +18,11 @@ def known(hand, rig):
     random = np.random.default_rng(0)
     shape = random.normal(size=len(hand.shape_names))
     angles = named_pose(hand, "fist").numpy().astype(np.float64)[rig.dofs[:, 0] - 1, rig.dofs[:, 1]]
-    start = state_of_surface(rig, shape, rig.rest_surface(shape), rig.rest_surface(shape) + [0, 0, 0.5], 500.0,
-                             np.array([64.0, 64.0])).state  # fmt: skip
+    rest = rig.rest_surface(shape)
+    start = state_of_surface(rig, shape, rest, rest + np.array([0, 0, 0.5]), 500.0, np.array([64.0, 64.0])).state
     state = start.moved(np.r_[0.4, -0.2, 0.3, 0.1, 0.05, 0.1, angles, np.zeros(len(shape) + 1)])
     posed = state.in_camera(rig.surface(rig.chain(state.angles, shape), state.angles, shape))
-    return state, rig.rest_surface(shape), posed
+    return state, rest, posed
 
 
 def test_a_surface_of_the_model_gives_back_its_state(rig, known):

@@ -3,7 +3,7 @@
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandFit, HandPose
 from oasis_warp.hand.evidence import evidence_of
-from oasis_warp.hand.fit_quality import measure
+from oasis_warp.hand.fit_quality import DOUBTFUL, measure
 from oasis_warp.hand.kinematics import Rig
 from oasis_warp.hand.right_view import fitted_view
 
@@ -22,4 +22,13 @@ def with_pose(hand: HandModel, fit: HandFit, pose: HandPose) -> HandFit:
     quality = measure(rig, evidence, view.state, view.mask, fit.cost)
     return moved._replace(
         reprojection=quality.reprojection, worst_point=quality.worst_point, mask_iou=quality.mask_iou
+    )
+
+
+def no_more_doubtful(moved: HandFit, fit: HandFit) -> bool:
+    """Whether no number of `moved` is beyond what is warned about, unless that of `fit` is, too."""
+    return (
+        moved.reprojection <= max(DOUBTFUL.reprojection, fit.reprojection)
+        and moved.worst_point <= max(DOUBTFUL.worst_point, fit.worst_point)
+        and moved.mask_iou >= min(DOUBTFUL.mask_iou, fit.mask_iou)
     )

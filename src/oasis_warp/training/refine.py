@@ -54,9 +54,10 @@ PHOTO_SCALE, OUTLINE_SCALE = 2.0, 2.0
 OUTLINE_SIGMA = 0.15
 OUTLINE_PIXELS = 4.5
 """Width of a blurred outline [px of `SIZE`]."""
-FIT_WEIGHT = 0.25
-"""Of the fit's own terms: what they hold, they have settled already."""
-FIT = FitSettings(landmark=0.03)
+DETECTED, FIT_WEIGHT = FitSettings(), 1.0
+"""The fit's own terms where there are landmarks."""
+UNKNOWN, ANCHOR_WEIGHT = FitSettings(landmark=0.03), 0.25
+"""The same where those of the start stand in for them, which only hold the hand where it is."""
 WRIST = 0.15
 """Outlines count from so far above the wrist, in shares of the way to the knuckles."""
 TURN, ACROSS, AWAY = 0.5, 0.1, 0.2
@@ -178,6 +179,7 @@ class _Problem:
         self.skin = bare._replace(vertices=bare.vertices + real(detail - sunk).to(device))
         size = (camera.width, camera.height)
         self.fitter = _anchor(self.rig, self.start, size, landmarks)
+        self.fit_weight = ANCHOR_WEIGHT if landmarks is None else FIT_WEIGHT
         above = wrist_line(self.fitter.evidence.xy).above_mask(size, WRIST)
         judged = torch.from_numpy(above).to(evidence.mask) * evidence.above_wrist
         self.scene = make_scene(self.hand, guess, evidence, judged, SIZE)
@@ -248,7 +250,7 @@ class _Problem:
         photo, outline, share = self._gaps(self.drawn([state]), light, blurs)
         of_fit = self.fitter.system(state)[2]
         held = float(((self.change(state) / self.reach) ** 2).sum())
-        return self._picture_cost(photo[0], outline[0], share) + FIT_WEIGHT * of_fit + held
+        return self._picture_cost(photo[0], outline[0], share) + self.fit_weight * of_fit + held
 
     def linearize(self, state: FitState, blurs: tuple[float, float]) -> _Linear:
         """Cost, normal matrix and gradient, in the light that suits `state` best."""
@@ -267,9 +269,9 @@ class _Problem:
         jacobian, change = jacobian[:, : self.n], self.change(state)
         held = float(((change / self.reach) ** 2).sum())
         return _Linear(
-            self._picture_cost(photo[0], outline[0], share) + FIT_WEIGHT * of_fit + held,
-            both[:, :-1] + FIT_WEIGHT * jacobian.T @ jacobian + np.diag(self.reach**-2.0),
-            both[:, -1] + FIT_WEIGHT * jacobian.T @ residual + change / self.reach**2,
+            self._picture_cost(photo[0], outline[0], share) + self.fit_weight * of_fit + held,
+            both[:, :-1] + self.fit_weight * jacobian.T @ jacobian + np.diag(self.reach**-2.0),
+            both[:, -1] + self.fit_weight * jacobian.T @ residual + change / self.reach**2,
             light,
         )
 
@@ -314,7 +316,8 @@ def _anchor(rig: Rig, start: FitState, size: tuple[int, int], landmarks: Tensor 
     points = rig.landmarks(rig.chain(start.angles, start.shape), start.shape)[0]
     xy, seen = start.project(points) if landmarks is None else array(landmarks), start.in_camera(points)
     bones = unit(seen[BONES[:, 1]] - seen[BONES[:, 0]])
-    return Fitter(rig, FitEvidence(xy, bones, None, None, size, start.focal), settings=FIT, shape=start.shape)
+    settings = UNKNOWN if landmarks is None else DETECTED
+    return Fitter(rig, FitEvidence(xy, bones, None, None, size, start.focal), settings=settings, shape=start.shape)
 
 
 def _cauchy(squared: Tensor, scale: float) -> tuple[Tensor, Tensor]:
