@@ -195,6 +195,6 @@ def test_adaptation_is_measured_without_each_of_its_parts(tmp_path, monkeypatch,
     said = capsys.readouterr().out
     assert all(title in said for title in ablate_one_shot.TITLES.values())
     tables = json.loads((tmp_path / "out" / "ablation.json").read_text())["tables"]
-    assert [table["light"] for table in tables] == ["same", "studio"]
+    assert [table["light"] for table in tables] == ["same", "studio", "wild"]
     for table in tables:
         assert [row["variant"] for row in table["rows"]] == list(ablate_one_shot.TITLES)
