@@ -5,7 +5,6 @@ from typing import NamedTuple
 import torch
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
-from oasis_warp.avatar.detail import carry_detail
 from oasis_warp.avatar.observe import inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.config import AdaptConfig
@@ -40,12 +39,12 @@ def adapt(
     config: AdaptConfig = AdaptConfig(),  # noqa: B008 - frozen
     progress: Progress = silent,
 ) -> Adaptation:
-    """Fit the colours of `prior` to the photo; geometry stays, but for Gaussians that a photo's detail needs.
+    """Fit the colours of `prior` to the photo; geometry stays.
 
     Colour calibration first, then the seen colours are carried smoothly over the rim of the seen region, then texture
     learning with reference views.
     """
-    faces, prior = hand.faces.to(evidence.image.device), carry_detail(hand, prior, evidence.rest)
+    faces = hand.faces.to(evidence.image.device)
     posed = pose_gaussians(prior, faces, evidence.rest.vertices, evidence.posed.vertices)
     view = freeze_view(posed, evidence.camera)
     trusted = inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5)
