@@ -34,6 +34,8 @@ class Fusion(NamedTuple):
     """The Gaussians of all photos, in the light of the first, and how they came about."""
 
     gaussians: CanonicalGaussians
+    guess: CanonicalGaussians
+    """Before adaptation: the prior's guesses of all photos, mixed."""
     sightings: Sightings
     gains: Float[Tensor, "K 3"]
     """How much brighter each photo is than the first."""
@@ -65,11 +67,12 @@ def fuse(
     sightings = look(hand, evidences, resolution)
     if len(guesses) == 1:
         made = adapt(hand, guesses[0], evidences[0], config, progress)
-        return Fusion(made.gaussians, sightings, torch.ones_like(sightings.colors[:, 0]))
+        return Fusion(made.gaussians, guesses[0], sightings, torch.ones_like(sightings.colors[:, 0]))
     faces = hand.faces.to(evidences[0].image.device)
     guess = mix_guesses(guesses, sightings.confidence * sightings.share + UNSEEN, faces)
     gains = photo_gains(sightings, _vertex_colors(guess, len(hand.template)))
-    return Fusion(_adapt(hand, guess, evidences, sightings, gains, config, progress), sightings, gains)
+    made = _adapt(hand, guess, evidences, sightings, gains, config, progress)
+    return Fusion(made, guess, sightings, gains)
 
 
 def _vertex_colors(guess: CanonicalGaussians, n_vertices: int) -> Float[Tensor, "V 3"]:
