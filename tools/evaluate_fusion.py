@@ -4,8 +4,8 @@
     python tools/evaluate_fusion.py same-hand out/fusion --photos tests/data/photos/same_hand
 
 `synthetic`: people that no training has met, photographed in several poses from several sides with the estimator's
-errors, against the truth in other poses and views. `same-hand`: a folder of photos for each hand; each photo in turn is
-held out, avatars are made of the ones that follow it, and compared with it as `oasis evaluate --dataset same-hand` does.
+errors, against the truth in other poses and views. `same-hand`: a folder of photos for each hand; each in turn is
+held out, avatars are made of the ones that follow it, and compared as `oasis evaluate --dataset same-hand` does.
 Colours are matched to the target. Prints the tables of docs/same_hand.md and leaves every number in synthetic.json and
 same_hand.json.
 """

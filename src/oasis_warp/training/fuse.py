@@ -26,6 +26,10 @@ from oasis_warp.training.sightings import Sightings, look, photo_gains
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
 
+SHADING_LENGTH = 0.01
+"""What changes over a longer way along the skin may be light, and photos meet halfway in it [m]."""
+REACH = 0.1
+"""Way over which a photo's shading would be forgotten where the photo says nothing [m]: not within a hand."""
 UNSEEN = 0.02
 """Weight of a photo's guess where the photo shows nothing, against one that sees the place well."""
 
@@ -100,20 +104,29 @@ def _adapt(
         solid = view.alphas > 0.5
         believed = (drawn / view.alphas.clamp_min(MIN_ALPHA) * solid)[..., 0]
         trusted.append(inner_mask(evidence.mask, 1) * believed)
-    tall, image, trust = stack_weights(views), torch.cat(lit), torch.cat(trusted)
+    tall, trust = stack_weights(views), torch.cat(trusted)
 
     progress("calibration", 0, 1)
     if config.calibration == "on":
-        guess = guess._replace(colors=calibrate(tall, guess.colors, image, trust, config).apply(guess.colors))
+        guess = guess._replace(colors=calibrate(tall, guess.colors, torch.cat(lit), trust, config).apply(guess.colors))
     progress("calibration", 1, 1)
 
     progress("completion", 0, 1)
     weight = sightings.confidence * sightings.share
-    missing = torch.zeros_like(sightings.colors[0])
-    for evidence, view, photo, own in zip(evidences, views, lit, weight, strict=True):
-        drawn = blend_colors(view, guess.colors) / view.alphas.clamp_min(MIN_ALPHA)
-        missing += own[:, None] * observe(hand, evidence._replace(image=photo - drawn)).colors
-    missing /= weight.sum(0).clamp_min(1e-12)[:, None]
+    drawn = [blend_colors(view, guess.colors) / view.alphas.clamp_min(MIN_ALPHA) for view in views]
+
+    def differences() -> Tensor:
+        return torch.stack([
+            observe(hand, evidence._replace(image=photo - picture)).colors
+            for evidence, photo, picture in zip(evidences, lit, drawn, strict=True)
+        ])  # fmt: skip
+
+    shading = _other_shading(hand, first.rest.vertices, differences(), sightings.confidence)
+    lit = [
+        photo + blend_colors(view, vertex_to_gaussians(other, faces, guess)) / view.alphas.clamp_min(MIN_ALPHA)
+        for photo, view, other in zip(lit, views, shading, strict=True)
+    ]
+    missing = (weight[..., None] * differences()).sum(0) / weight.sum(0).clamp_min(1e-12)[:, None]
     difference = complete_field(first.rest.vertices, faces, missing, weight.amax(0))
     colors = (guess.colors + vertex_to_gaussians(difference, faces, guess)).clamp(0, 1)
     progress("completion", 1, 1)
@@ -124,4 +137,22 @@ def _adapt(
     ]
     mask = torch.cat([evidence.mask for evidence in evidences]) * trust
     guess = guess._replace(colors=colors)
-    return guess._replace(colors=learn_texture(guess, faces, tall, image, mask, references, config, progress).colors)
+    return guess._replace(
+        colors=learn_texture(guess, faces, tall, torch.cat(lit), mask, references, config, progress).colors
+    )
+
+
+def _other_shading(
+    hand: HandModel, rest: Float[Tensor, "V 3"], differences: Float[Tensor, "K V 3"], confidence: Float[Tensor, "K V"]
+) -> Float[Tensor, "K V 3"]:
+    """What to add to each photo, smoothly over the skin, so that photos agree wherever two show the same place.
+
+    Lamps stand elsewhere in every photo, and fingers shade each other. No photo is right about it: they meet at the
+    mean of what each differs from the guess. Detail stays with the photo that shows it best.
+    """
+    smooth = torch.stack([
+        complete_field(rest, hand.faces, own, seen, detail=SHADING_LENGTH, fade=REACH)
+        for own, seen in zip(differences, confidence, strict=True)
+    ])  # fmt: skip
+    mean = (confidence[..., None] * smooth).sum(0) / confidence.sum(0).clamp_min(1e-12)[:, None]
+    return torch.where(confidence[..., None] > 0, mean - smooth, 0.0)
