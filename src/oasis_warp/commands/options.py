@@ -295,6 +295,8 @@ class Pretrain:
     """Processes that bake people and plan pictures ahead, for each GPU; 0 for none."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for the paper's profile."""
+    start: Path | None = None
+    """Weights to begin with: a network.safetensors of the same profile. From nothing when not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -307,7 +309,7 @@ class Evaluate:
     """
 
     folder: Positional[Path | None] = None
-    """With a subfolder of photos for each hand, for same-hand."""
+    """With a subfolder of photos for each hand, or with photos of one, for same-hand."""
     out: Output
     """Folder for the results; its parent must exist."""
     dataset: Literal["synthetic", "same-hand"] = "synthetic"
@@ -331,7 +333,7 @@ class Evaluate:
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
     workers: int = 0
-    """Processes that bake synthetic people; 0 for none."""
+    """Processes that measure synthetic people side by side; 0 for none."""
 
 
 @dataclass(frozen=True, kw_only=True)
