@@ -8,9 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
-from oasis_warp.avatar.detail import carry_detail
 from oasis_warp.avatar.mixture import mix_guesses
-from oasis_warp.avatar.observe import inner_mask, observe
+from oasis_warp.avatar.observe import Observation, inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig
@@ -22,6 +21,7 @@ from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.training.adapt import MIN_ALPHA, adapt
 from oasis_warp.training.calibrate import calibrate
 from oasis_warp.training.complete import complete_field
+from oasis_warp.training.light import even_photo
 from oasis_warp.training.sightings import Sightings, look, photo_gains
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
@@ -94,7 +94,7 @@ def _adapt(
     A pixel counts as much as its photo is to be believed there.
     """
     first = evidences[0]
-    faces, guess = hand.faces.to(first.image.device), carry_detail(hand, guess, first.rest)
+    faces, rest = hand.faces.to(first.image.device), first.rest.vertices
     posed = [pose_gaussians(guess, faces, e.rest.vertices, e.posed.vertices) for e in evidences]
     views = [freeze_view(there, evidence.camera) for there, evidence in zip(posed, evidences, strict=True)]
     lit = [evidence.image / gain for evidence, gain in zip(evidences, gains, strict=True)]
@@ -121,13 +121,20 @@ def _adapt(
             for evidence, photo, picture in zip(evidences, lit, drawn, strict=True)
         ])  # fmt: skip
 
-    shading = _other_shading(hand, first.rest.vertices, differences(), sightings.confidence)
+    shading = _other_shading(hand, rest, differences(), sightings.confidence)
     lit = [
         photo + blend_colors(view, vertex_to_gaussians(other, faces, guess)) / view.alphas.clamp_min(MIN_ALPHA)
         for photo, view, other in zip(lit, views, shading, strict=True)
     ]
+    if config.light == "even":
+        lit = [
+            even_photo(photo, picture, Observation(own, seen), view, guess, rest, faces)
+            for photo, picture, own, seen, view in zip(
+                lit, drawn, differences(), sightings.confidence, views, strict=True
+            )
+        ]
     missing = (weight[..., None] * differences()).sum(0) / weight.sum(0).clamp_min(1e-12)[:, None]
-    difference = complete_field(first.rest.vertices, faces, missing, weight.amax(0))
+    difference = complete_field(rest, faces, missing, weight.amax(0))
     colors = (guess.colors + vertex_to_gaussians(difference, faces, guess)).clamp(0, 1)
     progress("completion", 1, 1)
 
