@@ -45,14 +45,18 @@ def fused(hand, palm, back):
     return fuse(hand, [palm, lit(back, LIGHT)], [1.0, 1.0], MeanPrior(hand), STEPS)
 
 
+@pytest.fixture(scope="module")
+def alone(hand, palm):
+    return adapt(hand, MeanPrior(hand)(palm), palm, STEPS).gaussians
+
+
 def likeness(hand, gaussians, evidence):
     posed = pose_gaussians(gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices)
     image = render(posed, evidence.camera).image
     return masked_psnr(image, evidence.image, (evidence.mask > 0.9).float())
 
 
-def test_two_photos_explain_palm_and_back_in_the_light_of_the_first(hand, palm, back, fused):
-    alone = adapt(hand, MeanPrior(hand)(palm), palm, STEPS).gaussians
+def test_two_photos_explain_palm_and_back_in_the_light_of_the_first(hand, palm, back, fused, alone):
     assert likeness(hand, fused.gaussians, palm) > 27
     assert likeness(hand, fused.gaussians, back) > 24  # in the first one's light, as `back` itself is
     assert likeness(hand, fused.gaussians, back) > likeness(hand, alone, back) + 1.5
@@ -85,8 +89,7 @@ def test_of_one_photo_comes_what_one_shot_adaptation_makes_of_it(hand, palm):
     assert torch.equal(fuse(hand, [palm], [1.0], MeanPrior(hand), few).gaussians.colors, alone.colors)
 
 
-def test_the_same_photo_twice_is_nearly_one_photo(hand, palm):
-    alone = adapt(hand, MeanPrior(hand)(palm), palm, STEPS).gaussians
+def test_the_same_photo_twice_is_nearly_one_photo(hand, palm, alone):
     twice = fuse(hand, [palm, palm], [1.0, 1.0], MeanPrior(hand), STEPS)
     assert torch.allclose(twice.gains, torch.ones(2, 3))
     assert float((twice.gaussians.colors - alone.colors).abs().mean()) < 0.01
