@@ -107,9 +107,9 @@ def reconstruct(
     return Reconstruction(avatar, fit, prior.about, stages, errors, fit.warnings)
 
 
-def carrier_offsets(hand: HandModel, fit: HandFit) -> Float[Tensor, "V 3"]:
-    """From the fitted rest surface to the one that carries Gaussians [m]: onto the photo's outline, then inwards."""
-    return outline_offsets(hand, fit) + below_skin(hand)
+def carrier_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
+    """From the fitted rest surface to the one that carries Gaussians [m]: onto the photos' outlines, then inwards."""
+    return outline_offsets(hand, *fits) + below_skin(hand)
 
 
 def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: ReconstructConfig) -> Evidence:
