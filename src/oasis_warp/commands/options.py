@@ -44,8 +44,9 @@ class Reconstruct:
     """The same seed gives the same avatar."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
-    size: int = 256
-    """Side of the square crop that the avatar is fitted to [px]."""
+    size: int | Literal["auto"] = "auto"
+    """Side of the square crop whose detail the avatar shows [px], 64 to 1024; by itself the photo's own, from 256 to
+    1024."""
     force: FlagCreatePairsOff[bool] = False
     """Go on with a fit that is too poor to be trusted."""
 

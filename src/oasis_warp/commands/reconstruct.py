@@ -64,7 +64,7 @@ def _check_photos(options: Reconstruct) -> None:
 
 def _check_numbers(options: Reconstruct) -> None:
     low, high = CROP_SIDES
-    if not low <= options.size <= high:
+    if options.size != "auto" and not low <= options.size <= high:
         raise InputError(f"--size {options.size}: expected {low} to {high} pixels; choose another size.")
     if options.steps is not None and options.steps < 0:
         raise InputError(f"--steps {options.steps}: expected 0 or more; leave it out to stop by itself.")
