@@ -12,11 +12,12 @@ from torch import Tensor
 from oasis_warp.avatar.anchors import below_skin
 from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.avatar.prior import Prior
+from oasis_warp.avatar.quality import SurfaceQuality, assess_surface, photo_doubts, shares, surface_doubts
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmarks, Photo
+from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmarks, Photo, Render
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.keypoints_file import read_keypoints
@@ -54,6 +55,9 @@ class Reconstruction(NamedTuple):
     errors: dict[str, float]
     """What was measured: reprojection_percent, mask_iou, input_psnr_db, ..."""
     warnings: tuple[str, ...]
+    """Of the fit, the photo and what it shows, in words; empty when nothing is doubtful."""
+    quality: SurfaceQuality
+    """How well each place of the surface is known."""
 
 
 def reconstruct(
@@ -109,13 +113,19 @@ def reconstruct(
             close = make_evidence(photo, fit, offsets, config, size)
             gaussians = sharpen(hand, gaussians, close, progress).gaussians
     avatar = make_avatar(fit, offsets, evidence, gaussians)
-    errors = {
-        "reprojection_percent": fit.reprojection,
-        "worst_point_percent": fit.worst_point,
-        "mask_iou": fit.mask_iou,
-        **input_errors(avatar, close),
-    }
-    return Reconstruction(avatar, fit, prior.about, stages, errors, fit.warnings)
+    with stage("quality"):
+        quality = assess_surface(hand, evidence, over_photo(avatar, evidence))
+        shown = shares(hand, evidence.rest.vertices, quality)
+        _, _, side = square_around(fit.mask, CROP_MARGIN)
+        doubts = (*surface_doubts(shown), *photo_doubts(close.image, close.mask, side))
+        errors = {
+            "reprojection_percent": fit.reprojection,
+            "worst_point_percent": fit.worst_point,
+            "mask_iou": fit.mask_iou,
+            **input_errors(avatar, close),
+            **shown,
+        }
+    return Reconstruction(avatar, fit, prior.about, stages, errors, (*fit.warnings, *doubts), quality)
 
 
 def carrier_offsets(hand: HandModel, fit: HandFit) -> Float[Tensor, "V 3"]:
@@ -188,13 +198,25 @@ def make_avatar(
     )
 
 
+def _input_view(avatar: Avatar, evidence: Evidence) -> Render:
+    """The avatar over black as `evidence` shows the hand; a left hand is mirrored."""
+    if avatar.side == "right":
+        return avatar.render(evidence.camera, avatar.source_pose, BLACK)
+    image, alpha = avatar.render(mirrored_camera(evidence.camera), avatar.source_pose, BLACK)
+    return Render(image.flip(1), alpha.flip(1))
+
+
+@torch.no_grad()
+def over_photo(avatar: Avatar, evidence: Evidence) -> Float[Tensor, "S S 3"]:
+    """The avatar drawn over its own photo."""
+    image, alpha = _input_view(avatar, evidence)
+    return image + (1 - alpha)[..., None] * evidence.image
+
+
 @torch.no_grad()
 def input_errors(avatar: Avatar, evidence: Evidence) -> dict[str, float]:
     """How well the avatar explains its own photo: over black, inside the mask above the wrist line, in the crop."""
-    camera = mirrored_camera(evidence.camera) if avatar.side == "left" else evidence.camera
-    image, alpha = avatar.render(camera, avatar.source_pose, BLACK)
-    if avatar.side == "left":
-        image, alpha = image.flip(1), alpha.flip(1)
+    image, alpha = _input_view(avatar, evidence)
     judged = evidence.above_wrist > 0.5
     inside = ((evidence.mask > 0.5) & judged).to(image)
     covered = (alpha > 0.5) & judged

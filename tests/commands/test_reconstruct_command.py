@@ -12,7 +12,7 @@ from oasis_warp.data.avatar_file import load_avatar
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 
-FILES = {"avatar.safetensors", "summary.png", "turntable.mp4", "report.json"}
+FILES = {"avatar.safetensors", "summary.png", "quality.png", "turntable.mp4", "report.json"}
 
 
 @pytest.fixture(autouse=True)

@@ -19,7 +19,7 @@ PoseName = Literal["photo", "rest", "open", "relaxed", "fist", "pinch", "thumbs_
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstruct:
-    """Turn photos of a hand into avatars: avatar.safetensors, summary.png, turntable.mp4 and report.json.
+    """Turn photos of a hand into avatars: avatar.safetensors, summary.png, quality.png, turntable.mp4 and report.json.
 
     One photo's files go into the folder --out itself, those of several into a folder each, --out/NAME for NAME.jpg.
     Files of an earlier run are replaced, all other files in the folder stay.

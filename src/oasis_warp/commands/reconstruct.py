@@ -15,6 +15,7 @@ from oasis_warp.commands.film import turntable
 from oasis_warp.commands.look import check_device
 from oasis_warp.commands.options import Reconstruct
 from oasis_warp.commands.progress import show_progress
+from oasis_warp.commands.quality_sheet import draw_quality
 from oasis_warp.commands.report import make_report, print_report, to_json
 from oasis_warp.commands.summary import GROUND, draw_summary
 from oasis_warp.core.config import ReconstructConfig
@@ -122,6 +123,7 @@ def _reconstruct_one(
         seconds.update(made.stages)
         with timed_stage("summary", seconds):
             write_picture(part / "summary.png", draw_summary(photo, made, progress=progress))
+            write_picture(part / "quality.png", draw_quality(photo.name, made))
         with timed_stage("turntable", seconds):
             _write_turntable(part / "turntable.mp4", made.avatar, progress)
         with timed_stage("save", seconds):
