@@ -182,3 +182,19 @@ def test_two_processes_train_one_network_on_people_of_their_own(tmp_path, hand):
     ]
     assert [json.loads(line)["step"] for line in (folder / METRICS).read_text().splitlines()] == [2]
     assert load_network(folder / WEIGHTS, hand).config == TINY
+
+
+def test_it_begins_with_weights_that_are_given(tiny, unbroken, tmp_path, capsys):
+    start = unbroken / WEIGHTS
+    assert main(["pretrain", str(tmp_path / "on"), *SMALL, "--start", str(start)]) == 0
+    with safe_open(tmp_path / "on" / WEIGHTS, "pt") as file, safe_open(start, "pt") as before:
+        ends = [f.get_tensor("vertex_head.second.weight").float() for f in (file, before)]
+    assert 0 < float((ends[0] - ends[1]).abs().max()) < 0.01
+    assert "start_sha256" in json.loads((tmp_path / "on" / command.SETTINGS).read_text())
+
+
+def test_weights_of_another_profile_are_no_start(unbroken, tmp_path, capsys):
+    start = unbroken / WEIGHTS
+    assert main(["pretrain", str(tmp_path / "on"), *SMALL, "--start", str(start)]) == BAD_INPUT
+    assert "of another network than --profile compact" in capsys.readouterr().err
+    assert not (tmp_path / "on").exists()

@@ -69,7 +69,7 @@ def test_any_output_gives_gaussians_that_can_be_drawn(limits, anchors, random):
     raw = raw_outputs(50.0, random)
     out = decode(raw, **{**anchors, "limits": limits})
     ratio = out.scales / anchors["scales"]
-    assert 0.999 / limits.growth < float(ratio.min()) and float(ratio.max()) < 1.001 * limits.growth
+    assert bool((ratio > 0.999 / torch.tensor(limits.shrink)).all()) and float(ratio.max()) < 1.001 * limits.growth
     torch.testing.assert_close(out.quats.norm(dim=-1), torch.ones(1, 5))
     assert bool((out.opacities <= anchors["fade"]).all())
     assert bool((out.opacities >= limits.opacity * anchors["fade"]).all())

@@ -9,7 +9,7 @@ import torch
 
 from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH
 from oasis_warp.training.pretrain import BatchSource
-from oasis_warp.training.synthetic_source import SyntheticHands
+from oasis_warp.training.synthetic_source import EVEN_EVERY, SyntheticHands
 
 CPU = torch.device("cpu")
 
@@ -43,6 +43,23 @@ def test_targets_show_the_hands_of_the_photos():
     photos, targets = hands.photo_indices(5), hands.target_indices(5)
     assert len(set(targets)) == 6
     assert [index // PICTURES_EACH for index in targets] == [p // PICTURES_EACH for p in photos for _ in range(2)]
+
+
+def test_now_and_then_photos_are_in_the_even_light_of_their_targets_before_a_plain_wall():
+    batches = source()(EVEN_EVERY - 2, 0, 1)
+    in_a_room, evenly_lit = next(batches), next(batches)
+
+    def alike(batch):
+        """Share of the border, part of which is the arm, in one colour."""
+        image = batch.image[0]
+        border = torch.cat([image[0], image[-1], image[:, 0], image[:, -1]])
+        return float(((border - border.median(0).values).abs().amax(1) < 1e-3).float().mean())
+
+    assert alike(evenly_lit) > 0.5 and alike(in_a_room) < 0.2
+    hand = evenly_lit.mask[0] > 0.9
+    shown, target = evenly_lit.image[0][hand].mean(0), evenly_lit.target_images[0, 0]
+    goal = target[evenly_lit.target_masks[0, 0] > 0.9].mean(0)
+    torch.testing.assert_close(shown, goal, atol=0.03, rtol=0)
 
 
 def test_all_processes_together_see_every_picture_once():

@@ -16,7 +16,7 @@ VERTEX_SPREAD = 0.75
 """Standard deviation of a vertex Gaussian over the radius of a disc of the vertex's area: neighbours blend at 60 %."""
 FACE_SPREAD = 1.5
 """Standard deviations of a face Gaussian over those of a uniform triangle."""
-THICKNESS = 0.25
+THICKNESS = 0.5
 """Standard deviation across the surface over the smaller one along it."""
 MIN_SCALE = 1e-4
 """Smallest standard deviation [m], for slivers."""
@@ -25,9 +25,9 @@ MAX_ANISOTROPY = 3.0
 OPACITY = 0.95
 RIM_FADE = 0.008
 """The last stretch before the open wrist, over which opacity falls to nothing [m]."""
-SINK = 0.0006
+SINK = 0.0008
 """Distance from the skin to the surface that carries Gaussians, inwards [m]: they draw beyond their means, and on the
-skin itself outlines come out a pixel too fat. Of 0, .3, .6, .9 and 1.2 mm this drew synthetic hands best."""
+skin itself outlines come out a pixel too fat. For each thickness there is one that draws synthetic hands best."""
 MIN_OPACITY = 1 / 255
 """Fainter Gaussians are never drawn, so they are left out."""
 

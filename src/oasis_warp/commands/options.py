@@ -293,6 +293,8 @@ class Pretrain:
     """Processes that bake people and plan pictures ahead, for each GPU; 0 for none."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for the paper's profile."""
+    start: Path | None = None
+    """Weights to begin with: a network.safetensors of the same profile. From nothing when not given."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.dinov2 import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.weights_file import load_network, read_config
 from oasis_warp.synthetic.people import most_kept
 from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH
 from oasis_warp.training.distributed import Place, join_processes, wait_for_all
@@ -90,6 +91,8 @@ def check_options(options: Pretrain) -> None:
         )
     if weights is not None and not weights.is_file():
         raise InputError(f"--backbone-weights {weights}: no such file; download model.safetensors of {backbone}.")
+    if options.start is not None and read_config(options.start) != PROFILES[options.profile]:
+        raise InputError(f"--start {options.start}: of another network than --profile {options.profile}.")
 
 
 def train(options: Pretrain, place: Place, progress: Progress) -> int:
@@ -110,7 +113,7 @@ def train(options: Pretrain, place: Place, progress: Progress) -> int:
             f"--people: expected at most {most} that one {place.device.type} device meets, got {len(met)}; "
             "each takes 23 MB there."
         )
-    network = make_network(PROFILES[options.profile], options.seed, options.backbone_weights)
+    network = make_network(PROFILES[options.profile], options.seed, options.backbone_weights, options.start)
     settings = settings_of(options, place.world)
     if place.rank == 0:
         claim(options.out, settings)
@@ -125,12 +128,16 @@ def train(options: Pretrain, place: Place, progress: Progress) -> int:
         )
 
 
-def make_network(config: NetworkConfig, seed: int, backbone_weights: Path | None) -> HandNetwork:
-    """A network that knows nothing yet.
+def make_network(
+    config: NetworkConfig, seed: int, backbone_weights: Path | None, start: Path | None
+) -> HandNetwork:
+    """A network that knows nothing yet, or what `start` knows.
 
     Raises:
-        InputError: the backbone's weights do not fit.
+        InputError: weights do not fit.
     """
+    if start is not None:
+        return load_network(start, bundled_hand(), backbone_weights=backbone_weights)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = HandNetwork(config, bundled_hand())
@@ -144,9 +151,10 @@ def settings_of(options: Pretrain, processes: int) -> dict[str, Any]:
     names = ("profile", "steps", "hands", "views", "people", "size", "seed", "precision")
     settings = {name: getattr(options, name) for name in names} | {"processes": processes}
     settings["hold_out"] = sorted(options.hold_out)
-    if options.backbone_weights is not None:
-        with options.backbone_weights.open("rb") as file:
-            settings["backbone_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+    for name, path in {"backbone": options.backbone_weights, "start": options.start}.items():
+        if path is not None:
+            with path.open("rb") as file:
+                settings[f"{name}_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
     return settings
 
 

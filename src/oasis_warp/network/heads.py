@@ -29,14 +29,16 @@ class Limits(NamedTuple):
     """How far a head may go."""
 
     growth: float
-    """A Gaussian is at most this much larger or smaller than its anchor."""
+    """A Gaussian is at most this much larger than its anchor."""
+    shrink: tuple[float, float, float]
+    """And at most this much smaller, along each axis."""
     opacity: float
     """Least opacity, before the wrist's fade."""
 
 
-VERTEX_LIMITS, FACE_LIMITS = Limits(4.0, 0.0), Limits(1.5, 0.8)
-"""Free to, faces vanish in training, as large smooth Gaussians on vertices draw skin well enough; but
-texture learning needs something small and opaque to paint a photo's detail on."""
+VERTEX_LIMITS, FACE_LIMITS = Limits(4.0, (4.0, 4.0, 4.0), 0.0), Limits(1.5, (1.5, 1.5, 4.0), 0.8)
+"""Free to, faces vanish in training, as large smooth Gaussians on vertices draw skin well enough; but texture learning
+needs something small and opaque to paint a photo's detail on. Thin they may get: it keeps them within the outline."""
 
 
 class GaussianHead(nn.Module):
@@ -83,15 +85,18 @@ def decode(
     """
     identity = torch.nn.functional.pad(torch.ones_like(raw["quats"][..., :1]), (0, 3))
     turn = normalize(raw["quats"] + identity, dim=-1, eps=1e-6)
-    farthest, least = math.log(limits.growth), limits.opacity
-    grow = (farthest * torch.tanh(raw["scales"] / farthest)).exp()
+    larger, smaller = math.log(limits.growth), raw["scales"].new_tensor(limits.shrink).log()
+    change = torch.where(
+        raw["scales"] > 0, larger * torch.tanh(raw["scales"] / larger), smaller * torch.tanh(raw["scales"] / smaller)
+    )
+    least = limits.opacity
     opacity = least + (1 - least) * torch.sigmoid(
         raw["opacities"][..., 0] + math.log((OPACITY - least) / (1 - OPACITY))
     )
     color = raw["colors"] + torch.logit(colors, COLOR_MARGIN)
     if seen is not None:
         color = color + raw["trust"] * seen
-    return Attributes(rotation.multiply(quats, turn), scales * grow, fade * opacity, torch.sigmoid(color))
+    return Attributes(rotation.multiply(quats, turn), scales * change.exp(), fade * opacity, torch.sigmoid(color))
 
 
 def decode_offsets(raw: dict[str, Tensor]) -> Float[Tensor, "B V 3"]:

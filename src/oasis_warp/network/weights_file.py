@@ -74,7 +74,7 @@ def load_network(path: Path | str, hand: HandModel, *, backbone_weights: Path | 
     with _opened(path) as file:
         header = _checked_header(path, file)
         tensors = {name: file.get_tensor(name).float() for name in file.keys()}
-    config = _read_config(path, header["config"])
+    config = _config_of(path, header["config"])
     got = (header["hand_model"], header["n_vertices"], header["n_faces"])
     want = (hand.name, len(hand.template), len(hand.faces))
     if got != want:
@@ -100,6 +100,15 @@ def read_header(path: Path | str) -> dict[str, Any]:
     path = Path(path)
     with _opened(path) as file:
         return _checked_header(path, file)
+
+
+def read_config(path: Path | str) -> NetworkConfig:
+    """Sizes and switches of a weights file's network.
+
+    Raises:
+        InputError: as `read_header`, or of a network that is not known here.
+    """
+    return _config_of(Path(path), read_header(path)["config"])
 
 
 def trained_state(network: HandNetwork) -> dict[str, Tensor]:
@@ -146,7 +155,7 @@ def _checked_header(path: Path, file: Any) -> dict[str, Any]:
     return known
 
 
-def _read_config(path: Path, stored: dict[str, Any]) -> NetworkConfig:
+def _config_of(path: Path, stored: dict[str, Any]) -> NetworkConfig:
     try:
         return NetworkConfig(**stored)
     except (TypeError, ValueError) as error:

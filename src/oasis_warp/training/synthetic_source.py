@@ -13,7 +13,7 @@ from oasis_warp.core.types import TrainingBatch
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.people import bake_people
-from oasis_warp.synthetic.picture import part, render_planned
+from oasis_warp.synthetic.picture import SyntheticBatch, part, render_planned
 from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery
 from oasis_warp.synthetic.planned import joined, plan_ahead
 from oasis_warp.training.photographed import training_batch
@@ -22,6 +22,10 @@ ERROR_STREAM = 3
 """Tells the random numbers of the estimator's errors from those of identities and pictures with the same seed."""
 SURROUNDINGS = 1.25
 """Side of a rendered picture over that of the crop round its hand."""
+EVEN_EVERY = 4
+"""Of so many batches, one has photos in the even light of its targets, as captures in a studio are."""
+WALL_STREAM = 4
+"""Of the colours of the walls behind them; beside `ERROR_STREAM`."""
 MULTIPLE = 16
 """Of a crop's side [px]: the rendered picture and the scales that losses look at are whole pixels then."""
 
@@ -73,6 +77,8 @@ class SyntheticHands:
             for k, number in enumerate(itertools.islice(batch_numbers, self.ahead)):
                 photo = part(photos, slice(k * self.hands, (k + 1) * self.hands))
                 target = part(targets, slice(k * self.hands * self.views, (k + 1) * self.hands * self.views))
+                if number % EVEN_EVERY == EVEN_EVERY - 1:
+                    photo = self.before_walls(part(target, slice(None, None, self.views)), number)
                 yield training_batch(hand, photo, target, self.size, self.errors(number))
 
     def photo_indices(self, number: int) -> list[int]:
@@ -82,6 +88,14 @@ class SyntheticHands:
     def target_indices(self, number: int) -> list[int]:
         """Pictures that are its targets, those of the first photo first; in the other look, so nothing comes twice."""
         return [index + view for index in self.photo_indices(number) for view in range(self.views)]
+
+    def before_walls(self, pictures: SyntheticBatch, number: int) -> SyntheticBatch:
+        """Pictures over black in front of plain walls instead."""
+        like = pictures.image
+        random = np.random.default_rng([self.seed, WALL_STREAM, number])
+        walls = torch.tensor(random.uniform(0.1, 0.9, (len(like), 1, 1, 3)), dtype=like.dtype)
+        walls = walls.to(like.device, non_blocking=True)
+        return pictures._replace(image=like + (1 - pictures.alpha[..., None]) * walls)
 
     def errors(self, number: int) -> torch.Generator:
         """The random numbers of the estimator's errors in batch `number`."""
