@@ -5,11 +5,21 @@ from dataclasses import replace
 
 import pytest
 import write_model_card
-from write_model_card import METHODS, SECTIONS, file_table, measurement_tables, put, speed_table, training_text
+from write_model_card import (
+    METHODS,
+    SECTIONS,
+    file_table,
+    gaussian_table,
+    measurement_tables,
+    photo_table,
+    put,
+    speed_table,
+    training_text,
+)
 
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.weights_file import save_network
+from oasis_warp.network.weights_file import load_network, save_network
 
 NOTES = {
     "step": 1234, "steps": 2000, "hands": 16, "people": 512, "seed": 3, "precision": "bfloat16", "profile": "compact",
@@ -27,7 +37,8 @@ def weights(hand, tmp_path_factory):
 
 def row(method, **changes):
     about = {"group": "ordinary", "light": "wild", "noise": 1.0, "colors": "matched", "people": 4, "pictures": 16}
-    found = {"psnr": 20.0, "psnr_visible": 21.0, "psnr_hidden": None, "ssim_mask": 0.9, "gain": 3.25, "better": 0.75}
+    found = {"psnr": 20.0, "psnr_visible": 21.0, "psnr_hidden": None, "ssim_mask": 0.9, "gain": 3.25, "better": 0.75,
+             "gain_error": 0.5}  # fmt: skip
     return {**about, "prior": method[0], "stage": method[1], **found, **changes}
 
 
@@ -57,7 +68,7 @@ def test_measurements_are_those_with_estimated_poses_and_matched_colours(tmp_pat
     (tmp_path / "metrics.json").write_text(json.dumps({"summary": rows + others}))
     text = measurement_tables(tmp_path / "metrics.json")
     assert "4 people, 16 pictures" in text and "99" not in text
-    assert "| the prior, one-shot | 24.00 | 21.00 |  | 0.900 | +3.25 | 75% |" in text
+    assert "| the prior, one-shot | 24.00 | +3.25 | 0.50 | 75% | 21.00 |  | 0.9000 |" in text
     assert text.count("| no prior") == 2
 
 
@@ -68,6 +79,26 @@ def test_speed_names_the_device(tmp_path):
     (tmp_path / "cpu.json").write_text(json.dumps(found))
     line = "| CPU, 2 threads | 0.50 s | 600.0 ms | 700.0 ms | 550.0 ms | 0.30 GiB | 2.9 |"
     assert line in speed_table([tmp_path / "cpu.json"])
+
+
+def test_an_untrained_prior_has_the_gaussians_of_the_mean_hand(weights, hand):
+    lines = gaussian_table(load_network(weights, hand).eval(), 1).splitlines()
+    rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in lines}
+    assert [float(cell) for cell in rows["on vertices: opacity"]] == [0.95] * 3
+    assert [float(cell) for cell in rows["on vertices: under the skin, mm"]] == [0.6] * 3
+    assert [float(cell) for cell in rows["on faces: from the middle of the face, mm"]] == [0.0] * 3
+    assert [float(cell) for cell in rows["on faces: largest share of a corner in a face's features"]] == [0.33] * 3
+    low, middle, high = (float(cell) for cell in rows["on faces: largest deviation, mm"])
+    assert 0.1 < low < middle < high < 2
+
+
+def test_real_photos_are_compared_where_both_priors_made_an_avatar(tmp_path):
+    heading = "photo,result,input_psnr_db,coverage_worst,render_mask_iou\n"
+    (tmp_path / "none.csv").write_text(heading + "a,ok,30,1,0.9\nb,ok,34,0.98,0.94\nc,ok,99,1,1\n")
+    (tmp_path / "learned.csv").write_text(heading + "a,ok,31,1,0.92\nb,ok,32,1,0.96\nc,found no hand,,,\n")
+    text = photo_table(tmp_path / "none.csv", tmp_path / "learned.csv")
+    assert "| no prior | 32.0 | 0.990 | 0.920 |" in text and "| the prior | 31.5 | 1.000 | 0.940 |" in text
+    assert text.endswith("2 photos, medians.")
 
 
 def test_a_section_is_replaced_and_the_prose_stays():

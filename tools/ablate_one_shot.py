@@ -15,7 +15,8 @@ import torch
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.data.atomic import write_file
-from oasis_warp.evaluation.ablation import COLORS, ablation_rows, as_markdown
+from oasis_warp.evaluation.ablation import ablation_table, as_markdown, heading
+from oasis_warp.evaluation.columns import COLORS
 from oasis_warp.evaluation.methods import ONE_SHOT, Method
 from oasis_warp.evaluation.summary import Record
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate
@@ -23,6 +24,8 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
 
 FULL = "full"
+LIGHTS = ("same", "studio")
+"""In which an adapted avatar can come out right: what it takes over of the photo's light is in its targets, too."""
 LEARNED = Method("learned", ONE_SHOT)
 SETTINGS = {
     FULL: AdaptConfig(),
@@ -43,7 +46,7 @@ def measure(name: str, options: argparse.Namespace) -> list[Record]:
     if name == FULL:
         priors["mean"] = MeanPrior(bundled_hand())
     config = SyntheticEvaluation(
-        groups=("ordinary",), people=options.people, noise=(1.0,), curve=(), adapt=SETTINGS[name],
+        groups=("ordinary",), people=options.people, lights=LIGHTS, noise=(1.0,), curve=(), adapt=SETTINGS[name],
         methods=tuple(Method(prior, ONE_SHOT) for prior in priors),
     )  # fmt: skip
     found = evaluate(
@@ -67,19 +70,16 @@ def main() -> None:
     parser.add_argument("--prior", default="learned", help="learned, or a weights file")
     parser.add_argument("--people", type=int, default=32)
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--workers", type=int, default=0, help="processes that bake people on a CPU")
+    parser.add_argument("--workers", type=int, default=0, help="processes that measure people side by side")
     options = parser.parse_args()
     options.out.mkdir(exist_ok=True)
     records = [record for name in SETTINGS for record in measure(name, options)]
     variants = {name: (title, Method(name, ONE_SHOT)) for name, title in TITLES.items()}
-    tables = [
-        {"light": light, "stage": ONE_SHOT, "rows": ablation_rows(records, light, variants, FULL)} for light in COLORS
-    ]
+    tables = [ablation_table(records, light, COLORS[light], ONE_SHOT, variants, FULL) for light in LIGHTS]
     settings = {"people": options.people, "prior": str(options.prior)}
-    found = {"settings": settings, "whole": FULL, "tables": tables}
-    write_file(options.out / "ablation.json", json.dumps(found, indent=1).encode())
+    write_file(options.out / "ablation.json", json.dumps({"settings": settings, "tables": tables}, indent=1).encode())
     for table in tables:
-        print(f"{table['light']} photos\n\n{as_markdown(table['rows'], FULL)}\n")
+        print(f"{heading(table)}\n\n{as_markdown(table)}\n")
 
 
 if __name__ == "__main__":

@@ -1,14 +1,17 @@
 """Train the network with one part removed at a time, and evaluate each on the same people: the paper's table 2.
 
-    python tools/ablate_prior.py out/ablation --steps 3000 --device cuda --workers 14
+    python tools/ablate_prior.py out/ablation --steps 3000 --device cuda --workers 14 --minutes 9
 
-Variants are trained side by side on the very same batches, which are rendered once for all of them. A run that was
-stopped goes on from its checkpoints. With --only several processes share the training (in one folder); a run
-without it trains what is left, evaluates all, prints the tables and leaves ablation.json.
+Every variant is trained without point evidence, which is ours and does part of the work of the paper's parts, and
+with it; --evidence picks one of the two. Variants are trained side by side on the very same batches, which are
+rendered once for all of them. A run that was stopped, or has had its --minutes, goes on from its checkpoints when the
+same command comes again. With --only several processes share the training (in one folder); a run without it trains
+what is left, evaluates all, prints the tables and leaves ablation.json.
 """
 
 import argparse
 import json
+import math
 import sys
 import time
 from dataclasses import replace
@@ -20,7 +23,7 @@ import torch
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.claimed_folder import claim_folder
-from oasis_warp.evaluation.ablation import COLORS, ablation_rows, as_markdown
+from oasis_warp.evaluation.ablation import ablation_table, as_markdown, heading
 from oasis_warp.evaluation.held_out import POPULATIONS
 from oasis_warp.evaluation.methods import BASELINE, ONE_SHOT, RAW, Method
 from oasis_warp.evaluation.summary import Record
@@ -55,18 +58,33 @@ VARIANTS = {
     "fom_off": Variant("w/o FoM", {"fom": "off"}),
     "refine_off": Variant("w/o refinement", {"refine": "off"}),
     "literal": Variant("visibility as printed", {"visibility": "literal"}),
-    "evidence": Variant("point evidence switched", {}),
 }
-"""The paper's rows, then ours. The last has what the others have not, or not what they have: see --evidence."""
+"""The paper's rows, then one of ours."""
+WITH = "_with_evidence"
+"""Ends the names of networks that have point evidence."""
+TABLES = (("studio", "raw"), ("studio", "matched"), ("wild", "matched"))
+"""Light and colours; matched ones tell less of the hand's tone, and so more of everything else."""
 CHECKPOINT_EVERY, LOG_EVERY = 250, 25
 
 
+def networks_of(options: argparse.Namespace) -> list[str]:
+    """Names of what is trained, as folders have them."""
+    ends = {"off": ("",), "on": (WITH,), "both": ("", WITH)}[options.evidence]
+    return [name + end for end in ends for name in VARIANTS]
+
+
 def config_of(name: str, options: argparse.Namespace) -> NetworkConfig:
-    """The variant's network."""
-    evidence = options.evidence
-    if name == "evidence":
-        evidence = "off" if evidence == "on" else "on"
-    return replace(PROFILES[options.profile], point_evidence=evidence, **VARIANTS[name].switches)
+    """The network of that name."""
+    switches = VARIANTS[name.removesuffix(WITH)].switches
+    return replace(PROFILES[options.profile], point_evidence="on" if name.endswith(WITH) else "off", **switches)
+
+
+def rows_of(names: list[str], end: str) -> dict[str, str]:
+    """Titles of a table's rows by the names of networks: those that end so, and what point evidence itself is worth."""
+    titles = {name + end: variant.title for name, variant in VARIANTS.items() if name + end in names}
+    if not end and FULL + WITH in names:
+        titles[FULL + WITH] = "with point evidence"
+    return titles
 
 
 def make_trainer(name: str, options: argparse.Namespace, folder: Path) -> Trainer:
@@ -81,11 +99,11 @@ def make_trainer(name: str, options: argparse.Namespace, folder: Path) -> Traine
     return trainer
 
 
-def train_together(names: list[str], options: argparse.Namespace) -> None:
-    """Train the variants side by side; those with weights already are left alone."""
+def train_together(names: list[str], options: argparse.Namespace, deadline: float) -> bool:
+    """Train the networks side by side; those with weights already are left alone. Whether time was enough."""
     missing = [name for name in names if not (options.out / name / WEIGHTS).is_file()]
     if not missing:
-        return
+        return True
     hands = SyntheticHands(
         seed=options.seed, people=options.people, hands=options.hands, views=options.views, size=options.size,
         device=torch.device(options.device), population=POPULATIONS["ordinary"], workers=options.workers,
@@ -110,20 +128,24 @@ def train_together(names: list[str], options: argparse.Namespace) -> None:
                 file.write(json.dumps(line) + "\n")
             pace = (time.perf_counter() - began) / (step + 1 - first)
             print(f"step {step + 1}: {pace:.2f} s each, PSNR {line['psnr']}", file=sys.stderr)
-        if (step + 1) % CHECKPOINT_EVERY == 0 or step + 1 == options.steps:
+        late = time.monotonic() > deadline and step + 1 < options.steps
+        if late or (step + 1) % CHECKPOINT_EVERY == 0 or step + 1 == options.steps:
             for name, trainer in behind.items():
                 save_checkpoint(options.out / name / CHECKPOINT, trainer.network, trainer.optimizer, trainer.step)
+        if late:
+            return False
     for name, trainer in trainers.items():
         save_network(options.out / name / WEIGHTS, trainer.network, notes=json.dumps({"step": trainer.step}))
+    return True
 
 
-def evaluate_all(options: argparse.Namespace) -> list[Record]:
-    """Every variant on the same held-out people; the records of all pictures."""
+def evaluate_all(names: list[str], options: argparse.Namespace) -> list[Record]:
+    """Every network on the same held-out people; the records of all pictures."""
     hand = bundled_hand()
-    priors = {name: NetworkPrior(load_network(options.out / name / WEIGHTS, hand)) for name in VARIANTS}
+    priors = {name: NetworkPrior(load_network(options.out / name / WEIGHTS, hand)) for name in names}
     stages = (RAW, ONE_SHOT) if options.one_shot else (RAW,)
     config = SyntheticEvaluation(
-        groups=("ordinary",), people=options.held_out, noise=(1.0,), curve=(),
+        groups=("ordinary",), people=options.held_out, lights=("studio", "wild"), noise=(1.0,), curve=(),
         methods=(BASELINE, *(Method(name, stage) for name in priors for stage in stages)),
     )  # fmt: skip
     folder = options.out / f"evaluation_{options.held_out}_{stages[-1]}"
@@ -151,10 +173,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--profile", choices=PROFILES, default="compact")
-    parser.add_argument(
-        "--evidence", choices=("on", "off"), default="off",
-        help="point evidence of all rows but the last: it is ours, and the paper's parts do its work without it",
-    )  # fmt: skip
+    parser.add_argument("--evidence", choices=("off", "on", "both"), default="both", help="point evidence")
     parser.add_argument("--precision", choices=("bfloat16", "float32"), default="bfloat16")
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--workers", type=int, default=8, help="processes that bake people and plan pictures")
@@ -162,28 +181,33 @@ def main() -> None:
     parser.add_argument("--held-out", type=int, default=32, help="people to evaluate on")
     parser.add_argument("--one-shot", action="store_true", help="evaluate the adapted avatars too")
     parser.add_argument("--together", type=int, default=5, help="variants at a time: each holds a step's memory")
-    parser.add_argument("--only", help="variants to train now, with commas between them; nothing is evaluated")
+    parser.add_argument("--only", help="networks to train now, with commas between them; nothing is evaluated")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="to train; what is left waits")
     options = parser.parse_args()
-    names = list(VARIANTS) if options.only is None else options.only.split(",")
-    if unknown := set(names) - VARIANTS.keys():
-        parser.error(f"--only: expected some of {', '.join(VARIANTS)}, got {', '.join(sorted(unknown))}")
+    deadline = time.monotonic() + 60 * options.minutes
+    everything = networks_of(options)
+    names = everything if options.only is None else options.only.split(",")
+    if unknown := set(names) - set(everything):
+        parser.error(f"--only: expected some of {', '.join(everything)}, got {', '.join(sorted(unknown))}")
     fixed = ("steps", "hands", "views", "people", "size", "seed", "profile", "evidence", "precision")
     claim_folder(options.out, "ablation_settings.json", {name: getattr(options, name) for name in fixed}, "ablations")
     for k in range(0, len(names), options.together):
-        train_together(names[k : k + options.together], options)
+        if not train_together(names[k : k + options.together], options, deadline):
+            print("stopped for lack of time; the same command goes on.", file=sys.stderr)
+            return
     if options.only is not None:
         return
-    records = evaluate_all(options)
+    records = evaluate_all(everything, options)
     tables = []
-    for stage in (RAW, ONE_SHOT) if options.one_shot else (RAW,):
-        variants = {name: (variant.title, Method(name, stage)) for name, variant in VARIANTS.items()}
-        tables += [(light, stage, ablation_rows(records, light, variants, FULL)) for light in COLORS]
-    found = [{"light": light, "stage": stage, "rows": rows} for light, stage, rows in tables]
+    for end in ("", WITH):
+        for stage in (RAW, ONE_SHOT) if options.one_shot else (RAW,):
+            variants = {name: (title, Method(name, stage)) for name, title in rows_of(everything, end).items()}
+            if FULL + end in variants:
+                tables += [ablation_table(records, *kind, stage, variants, FULL + end) for kind in TABLES]
     settings = {name: getattr(options, name) for name in (*fixed, "held_out")}
-    text = json.dumps({"settings": settings, "whole": FULL, "tables": found}, indent=1)
-    write_file(options.out / "ablation.json", text.encode())
-    for light, stage, rows in tables:
-        print(f"{light} photos, {stage.replace('_', '-')}\n\n{as_markdown(rows, FULL)}\n")
+    write_file(options.out / "ablation.json", json.dumps({"settings": settings, "tables": tables}, indent=1).encode())
+    for table in tables:
+        print(f"{heading(table)}\n\n{as_markdown(table)}\n")
 
 
 if __name__ == "__main__":

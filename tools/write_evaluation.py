@@ -1,9 +1,10 @@
 """Put what was evaluated into docs/evaluation.md, each table between its two markers, and the pictures beside it.
 
-    oasis evaluate --dataset synthetic --people 32 --device cuda --out out/evaluation
+    oasis evaluate --dataset synthetic --people 32 --device cuda --workers 8 --out out/evaluation
     oasis evaluate --dataset same-hand tests/data/photos/same_hand --out out/same_hand
     python tools/ablate_prior.py out/ablation --steps 3000 --device cuda --workers 14
-    python tools/ablate_one_shot.py out/one_shot --device cuda
+    python tools/probe_prior.py out/probe --device cuda --workers 8
+    python tools/ablate_one_shot.py out/one_shot --device cuda --workers 8
     python tools/write_evaluation.py docs/evaluation.md out
 
 What has no file in the folder stays as it is on the page.
@@ -20,39 +21,27 @@ import torch
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
-from oasis_warp.evaluation.ablation import COLORS, as_markdown
+from oasis_warp.evaluation.ablation import as_markdown, heading
+from oasis_warp.evaluation.columns import (
+    COLORS,
+    GROUPS,
+    LIGHTS,
+    PHOTOS,
+    SYNTHETIC,
+    cells,
+    markdown,
+    noise_rows,
+    number_words,
+    pose_words,
+    present,
+)
 from oasis_warp.evaluation.methods import Method, label
 from oasis_warp.evaluation.summary import Record, select
 
-GROUPS = {"ordinary": "People as in training", "tattoo": "The same people with a tattoo", "ring": "And with a ring"}
-LIGHTS = {"studio": "photo in even light", "wild": "photo in any light, colours matched to the target"}
-SYNTHETIC = {
-    "psnr": ("PSNR", ".2f"), "gain": ("gain", "+.2f"), "gain_error": ("±", ".2f"), "better": ("better for", ".0%"),
-    "psnr_inner": ("inside the outline", ".2f"), "psnr_visible": ("visible", ".2f"), "psnr_hidden": ("hidden", ".2f"),
-    "psnr_stretched": ("stretched", ".2f"), "ssim": ("SSIM", ".4f"), "ssim_box": ("in the box", ".4f"),
-    "ssim_mask": ("in the mask", ".4f"), "lpips": ("LPIPS", ".4f"),
-}  # fmt: skip
-PHOTOS = {
-    "psnr": ("PSNR, dB", ".2f"), "psnr_plain": ("without a gain", ".2f"), "ssim_quarter": ("SSIM at a quarter", ".3f"),
-    "error_palm": ("colour of the palm", ".3f"), "error_back": ("of the back", ".3f"),
-    "error_nail": ("of the nails", ".3f"), "beaten_psnr": ("one-shot better by PSNR", ".0%"),
-    "beaten_ssim_quarter": ("by SSIM", ".0%"), "beaten_error": ("by colours", ".0%"),
-}  # fmt: skip
 PICTURES = {"evaluation": ("sheet.png", "attention.png"), "same_hand": ("sheet.png",)}
 """Copied beside the page as _static/FOLDER_NAME.jpg."""
 ROWS_SHOWN = 1300
 """Of a picture on the page [px]."""
-
-
-def table(rows: list[Record], columns: dict[str, tuple[str, str]], first: dict[str, Callable[[Record], str]]) -> str:
-    """Markdown; columns that no row has are left out."""
-    shown = {name: form for name, form in columns.items() if any(row[name] is not None for row in rows)}
-    heading = [*first, *(words for words, _ in shown.values())]
-    lines = [heading, ["---"] * len(heading)]
-    for row in rows:
-        cells = ["" if row[name] is None else format(row[name], form) for name, (_, form) in shown.items()]
-        lines.append([*(words(row) for words in first.values()), *cells])
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def name_of(row: Record) -> str:
@@ -61,16 +50,18 @@ def name_of(row: Record) -> str:
 
 
 def synthetic(found: dict[str, Any]) -> str:
-    """A table for each group and light, and the curve."""
+    """A table for each group and light."""
     settings, parts = found["settings"], []
-    first = {"method": name_of, "pose": lambda row: "true" if row["noise"] == 0 else "estimated"}
     for group in settings["groups"]:
         for light in settings["lights"]:
             rows = [
                 row for row in select(found["summary"], group=group, light=light, colors=COLORS[light])
                 if row["noise"] in settings["noise"]
             ]  # fmt: skip
-            parts.append(f"{GROUPS[group]}, {LIGHTS[light]}:\n\n{table(rows, SYNTHETIC, first)}")
+            shown = present(rows, SYNTHETIC)
+            lines = [[name_of(row), pose_words(row["noise"]), *cells(row, shown)] for row in rows]
+            names = ["method", "pose", *(column.words for column in shown.values())]
+            parts.append(f"{GROUPS[group]}, {LIGHTS[light]}:\n\n{markdown(names, lines)}")
     shoot = settings["shoot"]
     parts.append(
         f"{settings['people']} people, {shoot['targets']} targets each, {shoot['size']} px. "
@@ -81,17 +72,13 @@ def synthetic(found: dict[str, Any]) -> str:
 
 
 def noise(found: dict[str, Any]) -> str:
-    """PSNR by how wrong the pose is, people without tattoos and rings."""
+    """PSNR by how wrong the pose is, for the first group and light."""
     settings = found["settings"]
-    group, factors = settings["groups"][0], settings["noise"] + settings["curve"]
-    lines = [["method", "photo", *("true pose" if factor == 0 else f"errors x {factor:g}" for factor in factors)]]
-    lines.append(["---"] * len(lines[0]))
-    for light in settings["lights"]:
-        rows = select(found["summary"], group=group, light=light, colors=COLORS[light])
-        for method in dict.fromkeys(name_of(row) for row in rows):
-            psnr = {row["noise"]: row["psnr"] for row in rows if name_of(row) == method}
-            lines.append([method, light, *(f"{psnr[factor]:.2f}" for factor in factors)])
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    group, light, factors = settings["groups"][0], settings["lights"][0], sorted(settings["noise"] + settings["curve"])
+    rows = noise_rows(found["summary"], group, light, factors)
+    lines = [[label(Method(*method)), *(number_words(psnr, ".2f") for psnr in of)] for method, of in rows.items()]
+    title = f"PSNR, {GROUPS[group][0].lower()}{GROUPS[group][1:]}, {LIGHTS[light]}:"
+    return f"{title}\n\n{markdown(['method', *map(pose_words, factors)], lines)}"
 
 
 def photos(found: dict[str, Any]) -> str:
@@ -100,16 +87,14 @@ def photos(found: dict[str, Any]) -> str:
     words = f"{rows[0]['pairs']} ordered pairs of {len(found['settings']['photos'])} sets, medians."
     if found["left_out"]:
         words += f" Photos left out: {len(found['left_out'])}."
-    return f"{table(rows, PHOTOS, {'method': name_of})}\n\n{words}"
+    shown = present(rows, PHOTOS)
+    names = ["method", *(column.words for column in shown.values())]
+    return f"{markdown(names, [[name_of(row), *cells(row, shown)] for row in rows])}\n\n{words}"
 
 
 def ablation(found: dict[str, Any]) -> str:
-    """A table for each light and stage."""
-    parts = []
-    for made in found["tables"]:
-        people = made["rows"][0]["people"]
-        heading = f"{LIGHTS[made['light']][0].upper()}{LIGHTS[made['light']][1:]}, {made['stage'].replace('_', '-')}"
-        parts.append(f"{heading}, {people} people:\n\n{as_markdown(made['rows'], found['whole'])}")
+    """Its tables, and how they were made."""
+    parts = [f"{heading(table)}:\n\n{as_markdown(table)}" for table in found["tables"]]
     settings = ", ".join(f"{name} {value}" for name, value in found["settings"].items())
     return "\n\n".join([*parts, f"Settings: {settings}."])
 
@@ -119,6 +104,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "noise": ("evaluation/metrics.json", noise),
     "same-hand": ("same_hand/metrics.json", photos),
     "network": ("ablation/ablation.json", ablation),
+    "probe": ("probe/ablation.json", ablation),
     "one-shot": ("one_shot/ablation.json", ablation),
 }
 """By the word in the markers: file below the folder, and what is made of it."""
@@ -148,7 +134,7 @@ def main() -> None:
     """Read the folder, rewrite the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page", type=Path)
-    parser.add_argument("folder", type=Path, help="holds evaluation, same_hand, ablation and one_shot, or some of them")
+    parser.add_argument("folder", type=Path, help="holds evaluation, same_hand, ablation, probe and one_shot")
     options = parser.parse_args()
     write_file(options.page, fill(options.page.read_text(), options.folder).encode())
     copy_pictures(options.folder, options.page.parent / "_static")

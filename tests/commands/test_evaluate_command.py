@@ -136,13 +136,21 @@ def test_photos_of_the_same_hand_are_measured_and_the_run_is_not_done_twice(hand
     said = " ".join(capsys.readouterr().out.split())
     assert "2 ordered pairs" in said and "photos left out: 1" in said and re.search(r"mean one-shot │ \d\d\.\d\d", said)
     found = json.loads((out / "metrics.json").read_text())
-    assert {(p["source"], p["target"]) for p in found["pairs"]} == {("a", "b"), ("b", "a")}
+    assert {(p["source"], p["target"]) for p in found["pairs"]} == {("a.png", "b.png"), ("b.png", "a.png")}
     assert all(p["psnr"] > 25 for p in found["pairs"])
     assert list(found["left_out"]) == ["mine/no_hand.png"]
     assert {path.name for path in out.iterdir()} == {"evaluation.json", "metrics.json", "sheet.png", "hands"}
     monkeypatch.setattr(same_hand, "HandEstimator", lambda hand: pytest.fail("measured again"))
     assert main(arguments) == 0
     assert json.loads((out / "metrics.json").read_text()) == found
+
+
+def test_a_folder_of_photos_is_one_hand_and_photos_of_one_stem_are_two(hands):
+    mine = hands / "mine"
+    (mine / "b.png").rename(mine / "a.webp")
+    assert photos_of_hands(mine) == {"mine": [mine / "a.png", mine / "a.webp", mine / "no_hand.png"]}
+    (hands / "c.png").mkdir()
+    assert list(photos_of_hands(hands)) == ["mine"]
 
 
 def test_folders_without_pairs_are_refused_in_one_sentence(hands, tmp_path, capsys):
@@ -161,7 +169,7 @@ def test_folders_without_pairs_are_refused_in_one_sentence(hands, tmp_path, caps
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--dataset", "same-hand"], "expected a folder with a subfolder of photos for each hand; name it"),
+        (["--dataset", "same-hand"], "expected a folder of photos, or one with a subfolder a hand; name it"),
         (["photos"], "photos: synthetic hands need no folder"),
         (["--people", "0"], "--people: expected 1 or more, got 0"),
         (["--targets", "9"], "--targets: expected 1 to 8, got 9"),
@@ -200,10 +208,10 @@ def test_synthetic_hands_are_measured_and_printed(tmp_path, monkeypatch, capsys)
     rows = [
         {"group": group, "light": light, "noise": noise, "colors": colors, "prior": "mean", "stage": "calibrated",
          "people": 1, "pictures": 4, "psnr": 21.5 + noise, "gain": 0.0, "gain_error": None, "better": 0.0,
-         "psnr_inner": 25.0, "psnr_visible": None, "psnr_hidden": 24.0, "psnr_stretched": None, "ssim": 0.9,
-         "ssim_box": 0.8, "ssim_mask": 0.7, "lpips": None}
-        for group in ("ordinary", "tattoo", "ring") for light in ("studio", "wild")
-        for noise in (0.0, 1.0, 2.0, 4.0) for colors in ("raw", "matched")
+         "psnr_inner": 25.0, "psnr_visible": None, "psnr_hidden": 24.0, "psnr_stretched": None,
+         "psnr_squeezed": 20.0, "psnr_unchanged": 24.0, "ssim": 0.9, "ssim_box": 0.8, "ssim_mask": 0.7, "lpips": None}
+        for group in ("ordinary", "tattoo", "ring") for light in ("same", "studio", "wild")
+        for noise in (0.0, 0.5, 1.0, 2.0, 4.0) for colors in ("raw", "matched")
     ]  # fmt: skip
     asked = []
 
@@ -216,13 +224,13 @@ def test_synthetic_hands_are_measured_and_printed(tmp_path, monkeypatch, capsys)
     assert main(["evaluate", "--out", str(tmp_path / "found"), *options]) == 0
     said = capsys.readouterr().out
     assert asked == [(["mean"], 3, 128, 5, "cpu")]
-    assert said.count("mean calibrated") == 6 * 2 + 1 and "LPIPS: no weights given" in said
-    assert "tattoo people, wild photos, colours matched" in said and "visible" not in said
-    assert re.search(r"mean calibrated .*21\.50.*22\.50.*23\.50.*25\.50", said)
+    assert said.count("mean calibrated") == 9 * 2 + 1 and "LPIPS: no weights given" in said
+    assert "The same people with a tattoo" in said and "matched" in said and "visible" not in said
+    assert re.search(r"mean calibrated .*21\.50.*22\.00.*22\.50.*23\.50.*25\.50", said)
 
 
 def test_one_photo_of_a_hand_is_no_pair(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "a.jpg").touch()
-    with pytest.raises(InputError, match="with two photos of it or more, found none"):
+    with pytest.raises(InputError, match="two photos of one hand or more, .* found none"):
         photos_of_hands(tmp_path)

@@ -42,28 +42,29 @@ def seen_from(hand, azimuths, target_vertices=None, size=96):
 
 
 def labels(hand, batch):
-    """Pixels of the hand in each target, hidden ones and stretched ones."""
+    """Pixels of the hand in each target; hidden, stretched and squeezed ones."""
     size, vertices = batch.target_images.shape[2], batch.target_posed[0]
     ids = depth_map(vertices, hand.faces, batch.target_viewmats[0], batch.target_Ks[0], size, size).face_ids
     truths = true_targets(batch, hand, faces_of_vertices(hand.faces, len(hand.template)))
     return [
-        (int((seen >= 0).sum()), int(truth.hidden.sum()), int(truth.stretched.sum()))
+        tuple(int(part.sum()) for part in (seen >= 0, truth.hidden, truth.stretched, truth.squeezed))
         for seen, truth in zip(ids, truths, strict=True)
     ]
 
 
 def test_from_the_photos_own_side_nothing_is_hidden_and_from_behind_nearly_all_is(hand):
-    (area, hidden, _), (area_behind, hidden_behind, _) = labels(hand, seen_from(hand, (0.0, math.pi)))
+    (area, hidden, *_), (area_behind, hidden_behind, *_) = labels(hand, seen_from(hand, (0.0, math.pi)))
     assert hidden < 0.02 * area
     assert hidden_behind > 0.95 * area_behind
 
 
 @pytest.mark.parametrize("growth", [1.02, 1.2, 1 / 1.2])
-def test_skin_is_stretched_from_a_ratio_of_areas_on(hand, growth):
+def test_skin_is_stretched_or_squeezed_from_a_ratio_of_areas_on(hand, growth):
     vertices = posed_hand(hand, pose_name="rest")[2].vertices
     middle = vertices.mean(0)
-    ((area, _, stretched),) = labels(hand, seen_from(hand, (0.0,), middle + growth * (vertices - middle)))
-    assert stretched == (area if abs(math.log(growth**2)) > math.log(STRETCH) else 0)
+    ((area, _, stretched, squeezed),) = labels(hand, seen_from(hand, (0.0,), middle + growth * (vertices - middle)))
+    assert stretched == (area if growth**2 > STRETCH else 0)
+    assert squeezed == (area if growth**2 < 1 / STRETCH else 0)
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +78,18 @@ def test_both_photos_show_the_same_hand_in_the_same_pose(session):
         assert torch.equal(getattr(studio, name), getattr(wild, name)), name
     torch.testing.assert_close(studio.translation, wild.translation)
     assert not torch.allclose(studio.image, wild.image, atol=0.05)
-    assert session.targets.image.shape == (2, 80, 80, 3)
-    assert torch.equal(session.targets.shape[0], wild.shape[0])
+    for targets in session.targets.values():
+        assert targets.image.shape == (2, 80, 80, 3)
+        assert torch.equal(targets.shape[0], wild.shape[0])
+
+
+def test_targets_of_one_capture_are_the_even_ones_in_other_light(session):
+    same, even = session.targets["same"], session.targets["studio"]
+    for name in ("angles", "orientation", "translation", "mask", "depth"):
+        torch.testing.assert_close(getattr(same, name), getattr(even, name), atol=1e-4, rtol=1e-4, msg=name)
+    hand, black = same.mask[..., None] > 0.99, same.alpha == 0
+    assert float(same.image[black].abs().max()) == 0
+    assert float((same.image - even.image)[hand.expand_as(same.image)].std()) > 0.02
 
 
 def test_a_studios_wall_is_plain_and_the_hand_before_it_lit_as_its_targets(session):

@@ -11,13 +11,13 @@ SIZE, LOW, HIGH = 64, 16, 48
 INNER = slice(LOW + 2, HIGH - 2)
 
 
-def square(value=0.5, hidden=None, stretched=None):
+def square(value=0.5, hidden=None, stretched=None, squeezed=None):
     mask = torch.zeros(SIZE, SIZE)
     mask[LOW:HIGH, LOW:HIGH] = 1
     nowhere = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     return Truth(
         value * mask[..., None].expand(-1, -1, 3), mask, torch.ones_like(mask),
-        nowhere if hidden is None else hidden, nowhere if stretched is None else stretched,
+        *(nowhere if part is None else part for part in (hidden, stretched, squeezed)),
     )  # fmt: skip
 
 
@@ -53,7 +53,7 @@ def test_errors_at_the_outline_do_not_count_inside():
 
 
 def test_parts_are_told_apart():
-    truth = square(hidden=halves(), stretched=halves().T)
+    truth = square(hidden=halves(), stretched=halves().T, squeezed=~halves().T)
     image = truth.image.clone()
     image[halves()] += 0.1
     image[~halves()] += 0.01
@@ -61,7 +61,8 @@ def test_parts_are_told_apart():
     assert found["psnr_hidden"] == pytest.approx(20, abs=1e-3)
     assert found["psnr_visible"] == pytest.approx(40, abs=1e-2)
     both = pytest.approx(-10 * torch.tensor((0.1**2 + 0.01**2) / 2).log10().item(), abs=1e-3)
-    assert found["psnr_stretched"] == both and found["psnr_unstretched"] == both
+    assert found["psnr_stretched"] == both and found["psnr_squeezed"] == both
+    assert found["psnr_unchanged"] is None
 
 
 def test_of_a_part_of_few_pixels_nothing_is_said():
@@ -87,7 +88,7 @@ def test_ssim_is_the_formula_in_the_mask_and_rises_with_the_black_round_it():
     a, b = 0.5, 0.7
     truth = square(a)
     image = truth.image * (b / a)
-    inside = Truth(truth.image, torch.zeros(SIZE, SIZE), truth.known, truth.hidden, truth.stretched)
+    inside = Truth(truth.image, torch.zeros(SIZE, SIZE), *truth[2:])
     inside.mask[26:38, 26:38] = 1  # further from the edge than the window reaches: no structure, luminance alone
     expected = (2 * a * b + SSIM_C1) / (a * a + b * b + SSIM_C1)
     assert score(image, inside)["ssim_mask"] == pytest.approx(expected, abs=1e-4)

@@ -52,7 +52,7 @@ def test_numbers_and_pictures_are_left(left, network):
     folder, found = left
     assert {path.name for path in folder.iterdir()} == {SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE}
     assert json.loads((folder / METRICS).read_text()) == found
-    assert len(found["pictures"]) == 2 * 2 * 2 * len(METHODS)  # lights, targets, colours
+    assert len(found["pictures"]) == 3 * 2 * 2 * len(METHODS)  # lights, targets, colours
     assert all(set(MEASURES) < set(record) for record in found["pictures"])
     assert all(10 < record["psnr"] < 45 for record in found["pictures"])
     assert found["settings"]["priors"]["mean"] is None
@@ -65,7 +65,7 @@ def test_numbers_and_pictures_are_left(left, network):
 
 def test_an_untrained_network_is_the_mean_hand(left):
     rows = [row for row in left[1]["summary"] if row["stage"] == "one_shot" and row["colors"] == "matched"]
-    for light in ("studio", "wild"):
+    for light in ("same", "studio", "wild"):
         mean, learned = (row for row in rows if row["light"] == light)
         assert mean["psnr"] == pytest.approx(learned["psnr"], abs=0.15)
 

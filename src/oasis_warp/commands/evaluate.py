@@ -1,8 +1,7 @@
 """`oasis evaluate`: measure avatars on synthetic hands, where the truth is known, and on photos of the same hands."""
 
 import sys
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import torch
 from rich.console import Console
@@ -16,6 +15,19 @@ from oasis_warp.commands.progress import show_progress
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
+from oasis_warp.evaluation.columns import (
+    COLORS,
+    GROUPS,
+    LIGHTS,
+    PHOTOS,
+    SYNTHETIC,
+    Column,
+    cells,
+    noise_rows,
+    number_words,
+    pose_words,
+    present,
+)
 from oasis_warp.evaluation.held_out import HELD_OUT_SEED, Shoot
 from oasis_warp.evaluation.methods import Method, label
 from oasis_warp.evaluation.same_hand import METRICS, evaluate_photos
@@ -30,30 +42,6 @@ from oasis_warp.training.synthetic_source import MULTIPLE
 SIZES = range(64, 1025)
 TABLE_WIDTH = 120
 """Of tables where there is no terminal, or a narrow one [characters]."""
-SYNTHETIC_COLUMNS = {
-    "psnr": ("PSNR", "{:.2f}"),
-    "gain": ("gain", "{:+.2f}"),
-    "psnr_inner": ("inside", "{:.2f}"),
-    "psnr_visible": ("visible", "{:.2f}"),
-    "psnr_hidden": ("hidden", "{:.2f}"),
-    "psnr_stretched": ("stretched", "{:.2f}"),
-    "ssim": ("SSIM", "{:.4f}"),
-    "ssim_box": ("in box", "{:.4f}"),
-    "ssim_mask": ("in mask", "{:.4f}"),
-    "lpips": ("LPIPS", "{:.4f}"),
-}
-"""Names and forms of what the table shows of `evaluation.summary`."""
-PHOTO_COLUMNS = {
-    "psnr": ("PSNR", "{:.2f}"),
-    "psnr_plain": ("plain", "{:.2f}"),
-    "ssim_quarter": ("SSIM at a quarter", "{:.3f}"),
-    "error_palm": ("palm", "{:.3f}"),
-    "error_back": ("back", "{:.3f}"),
-    "error_nail": ("nails", "{:.3f}"),
-    "beaten_psnr": ("one-shot better, PSNR", "{:.0%}"),
-    "beaten_ssim_quarter": ("SSIM", "{:.0%}"),
-    "beaten_error": ("colours", "{:.0%}"),
-}
 
 
 def run(options: Evaluate) -> int:
@@ -90,7 +78,7 @@ def check_options(options: Evaluate) -> None:
     """
     photos = options.dataset == "same-hand"
     if photos and options.folder is None:
-        raise InputError("--dataset same-hand: expected a folder with a subfolder of photos for each hand; name it.")
+        raise InputError("--dataset same-hand: expected a folder of photos, or one with a subfolder a hand; name it.")
     if not photos and options.folder is not None:
         raise InputError(f"{options.folder}: synthetic hands need no folder; leave it out, or use --dataset same-hand.")
     if photos and options.lpips is not None:
@@ -116,7 +104,7 @@ def on_synthetic_hands(options: Evaluate, priors: dict[str, Prior], progress: Pr
         adapt=AdaptConfig(texture_steps=options.steps, seed=options.seed),
     )
     device = torch.device(options.device)
-    perceptual = None if options.lpips is None else load_lpips(*options.lpips).to(device)
+    perceptual = None if options.lpips is None else load_lpips(*options.lpips)
     found = evaluate(
         priors, config, options.out, device, perceptual=perceptual, workers=options.workers, progress=progress
     )
@@ -124,27 +112,22 @@ def on_synthetic_hands(options: Evaluate, priors: dict[str, Prior], progress: Pr
     tables = []
     for group in config.groups:
         for light in config.lights:
-            # wild photos stand in a light of their own: one gain a channel to that of the targets
-            colors = "raw" if light == "studio" else "matched"
-            title = f"{group} people, {light} photos" + (", colours matched" if colors == "matched" else "")
-            rows = select(summary, group=group, light=light, colors=colors)
+            rows = select(summary, group=group, light=light, colors=COLORS[light])
             rows = [row for row in rows if row["noise"] in config.noise]
-            tables.append(make_table(title, rows, SYNTHETIC_COLUMNS))
+            tables.append(make_table(f"{GROUPS[group]}, {LIGHTS[light]}", rows, SYNTHETIC))
     return [*tables, noise_table(summary, config)]
 
 
 def noise_table(summary: Sequence[Record], config: SyntheticEvaluation) -> Table:
-    """PSNR of the first group against how wrong the estimated poses are."""
+    """PSNR of the first group and light against how wrong the estimated poses are."""
     group, light = config.groups[0], config.lights[0]
-    factors = (*config.noise, *config.curve)
-    table = Table(title=f"PSNR of {group} people, {light} photos, against the estimator's errors")
+    factors = sorted(config.noise + config.curve)
+    table = Table(title=f"PSNR against wrong poses; {GROUPS[group]}, {LIGHTS[light]}")
     table.add_column("method", no_wrap=True)
     for factor in factors:
-        table.add_column("true pose" if factor == 0 else f"x {factor:g}", justify="right")
-    wanted = select(summary, group=group, light=light, colors="raw")
-    for method in dict.fromkeys(_method(row) for row in wanted):
-        by_factor = {row["noise"]: row["psnr"] for row in wanted if _method(row) == method}
-        table.add_row(label(method), *(_cell(by_factor.get(factor), "{:.2f}") for factor in factors))
+        table.add_column(pose_words(factor), justify="right")
+    for method, found in noise_rows(summary, group, light, factors).items():
+        table.add_row(label(Method(*method)), *(number_words(psnr, ".2f") for psnr in found))
     return table
 
 
@@ -156,34 +139,25 @@ def on_photos(options: Evaluate, priors: dict[str, Prior], progress: Progress) -
     )
     found = evaluate_photos(priors, options.folder, options.out, config, progress)
     rows, n_out = found["summary"], len(found["left_out"])
-    table = make_table(f"{rows[0]['pairs']} ordered pairs of photos of the same hand", rows, PHOTO_COLUMNS)
+    table = make_table(f"{rows[0]['pairs']} ordered pairs of photos of the same hand", rows, PHOTOS)
     if n_out:
         table.caption = f"photos left out: {n_out}, see {METRICS}"
     return [table]
 
 
-def make_table(title: str, rows: Sequence[Record], columns: dict[str, tuple[str, str]]) -> Table:
+def make_table(title: str, rows: Sequence[Record], columns: Mapping[str, Column]) -> Table:
     """A line a row of a summary; the pose's errors, where there are several, in a column of their own."""
     table = Table(title=title)
     factors = {row["noise"] for row in rows if "noise" in row}
     table.add_column("method", no_wrap=True)
     if factors:
         table.add_column("pose")
-    shown = {name: form for name, form in columns.items() if any(row[name] is not None for row in rows)}
-    for words, _ in shown.values():
-        table.add_column(words, justify="right")
+    shown = present(rows, columns)
+    for column in shown.values():
+        table.add_column(column.words, justify="right")
     for row in rows:
-        pose = [("true" if row["noise"] == 0 else "est.")] if factors else []
-        cells = (_cell(row[name], form) for name, (_, form) in shown.items())
-        table.add_row(label(_method(row)), *pose, *cells)
+        pose = [pose_words(row["noise"])] if factors else []
+        table.add_row(label(Method(row["prior"], row["stage"])), *pose, *cells(row, shown))
     if "lpips" in columns and "lpips" not in shown:
         table.caption = "LPIPS: no weights given (--lpips)"
     return table
-
-
-def _method(row: Record) -> Method:
-    return Method(row["prior"], row["stage"])
-
-
-def _cell(value: Any, form: str) -> str:
-    return "" if value is None else form.format(value)

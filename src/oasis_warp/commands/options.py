@@ -307,7 +307,7 @@ class Evaluate:
     """
 
     folder: Positional[Path | None] = None
-    """With a subfolder of photos for each hand, for same-hand."""
+    """With a subfolder of photos for each hand, or with photos of one, for same-hand."""
     out: Output
     """Folder for the results; its parent must exist."""
     dataset: Literal["synthetic", "same-hand"] = "synthetic"
@@ -331,7 +331,7 @@ class Evaluate:
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
     workers: int = 0
-    """Processes that bake synthetic people; 0 for none."""
+    """Processes that measure synthetic people side by side; 0 for none."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,8 +14,11 @@ class AdaptConfig:
 
     calibration: Literal["on", "off"] = "on"
     """Match the prior's colours to the photo's as a whole first, or leave them as they are."""
-    calibration_steps: int = 100
-    """Steps of colour calibration after its closed-form start."""
+    calibration_steps: int = 0
+    """Steps of the paper's colour calibration after its closed form, which is the better without them; the paper's 100."""
+    light: Literal["keep", "even"] = "keep"
+    """Take over all that the photo shows, its shadows too, so that the avatar looks like its photo; or only what is
+    likelier skin than light, so that it looks right elsewhere."""
     texture_steps: int | None = None
     """Steps of texture learning; None stops when the loss is flat, after 400 at most."""
     weight_rgb: float = 10.0

@@ -15,10 +15,10 @@ from oasis_warp.evaluation.metrics import Truth
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.observation import sight
 from oasis_warp.ops import depth_map
-from oasis_warp.synthetic.picture import SyntheticBatch, render_planned
-from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, Shot, plan_shots
-from oasis_warp.synthetic.planned import tabulate
-from oasis_warp.synthetic.stage import sample_light
+from oasis_warp.synthetic.picture import SyntheticBatch, part, render_capture, render_planned
+from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, Shot, capture_shots, plan_shots
+from oasis_warp.synthetic.planned import Planned, tabulate
+from oasis_warp.synthetic.stage import sample_light, soften_light
 from oasis_warp.synthetic.wardrobe import sample_clothes
 from oasis_warp.training.photographed import EstimatorNoise, training_batch
 from oasis_warp.training.synthetic_source import ERROR_STREAM, SURROUNDINGS
@@ -26,8 +26,10 @@ from oasis_warp.training.targets import true_pictures
 
 Group = Literal["ordinary", "tattoo", "ring"]
 """Kinds of people. Their bodies and photos are the same: only the tattoo or the ring is more."""
-Lighting = Literal["studio", "wild"]
-"""The photo's: the targets' own, before a plain wall, or whatever comes, with sleeves, shadows and a cheap sensor."""
+Lighting = Literal["studio", "same", "wild"]
+"""Of photo and targets: "same", of one capture, with the soft light, the colours and the exposure of a room and its
+cheap camera; "studio", both in even light, the photo before a plain wall; "wild", the photo in whatever light comes,
+with hard shadows, and targets in even light."""
 
 _BARE = replace(EVERYBODY, tattoo=0.0, ring=0.0)
 POPULATIONS = {"ordinary": _BARE, "tattoo": replace(_BARE, tattoo=1.0), "ring": replace(_BARE, ring=1.0)}
@@ -35,9 +37,12 @@ HELD_OUT_SEED, FIRST_PERSON = 20_261_121, 1_000_000
 """A world and numbers of people that training does not reach."""
 WALL_STREAM = 5
 """Tells the random numbers of walls from those of everything else with the same seed."""
+DIRECTED = 0.25
+"""Share of a capture's light that keeps its direction. All of it is a test of relighting: a side that is lit in the
+photo and dark in a target, or the other way round, hides whatever else is told of the hand."""
 STRETCH = 1.25
-"""Area of a face in the pose over that at rest, or the inverse, from which skin counts as stretched: a tenth of all
-skin, most of it squeezed."""
+"""Area of a face in the pose over that at rest from which skin counts as stretched, a twentieth of all that is shown;
+the inverse for squeezed skin, another twentieth."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +50,7 @@ class Shoot:
     """How everybody is photographed."""
 
     targets: int = 4
-    """Pictures of each hand in other poses, from other sides, in even light; up to `PICTURES_EACH`."""
+    """Pictures of each hand in other poses, from other sides; up to `PICTURES_EACH`."""
     size: int = 256
     """Side of photos and targets [px], a multiple of 16."""
     seed: int = HELD_OUT_SEED
@@ -57,34 +62,41 @@ class Session(NamedTuple):
 
     number: int
     photos: dict[Lighting, SyntheticBatch]
-    """One each."""
-    targets: SyntheticBatch
+    """One each, in the same pose from the same side."""
+    targets: dict[Lighting, SyntheticBatch]
+    """The same poses from the same sides; "studio" and "wild" share them."""
 
 
 def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) -> Session:
-    """Render the photos and targets of person `number`; both photos show the same pose from the same side."""
-    size, first = int(shoot.size * SURROUNDINGS), PICTURES_EACH * number
+    """Render the photos and targets of person `number`."""
+    seed, size, first = shoot.seed, int(shoot.size * SURROUNDINGS), PICTURES_EACH * number
     wild = Scenery(population=POPULATIONS[group])
     even = replace(wild, look="even")
-    (photo,) = plan_shots(shoot.seed, [first], wild)
-    goals = plan_shots(shoot.seed, range(first, first + shoot.targets), even)
+    (photo,) = plan_shots(seed, [first], wild)
+    goals = plan_shots(seed, range(first, first + shoot.targets), even)
 
-    def shown(shots: list[Shot], scenery: Scenery) -> SyntheticBatch:
-        return render_planned(shoot.seed, tabulate(shoot.seed, shots, scenery), size, device, scenery=scenery)
+    def planned(shots: list[Shot]) -> Planned:
+        return tabulate(seed, shots, wild)
 
-    studio = shown([_evenly_lit(photo)], even)
-    wall = torch.tensor(np.random.default_rng([shoot.seed, WALL_STREAM, number]).uniform(0.1, 0.9, 3)).to(studio.image)
+    plain = render_planned(seed, planned([_evenly_lit(photo), *goals]), size, device, scenery=even)
+    studio, even_goals = part(plain, slice(1)), part(plain, slice(1, None))
+    wall = torch.tensor(np.random.default_rng([seed, WALL_STREAM, number]).uniform(0.1, 0.9, 3)).to(studio.image)
     studio = studio._replace(image=studio.image + (1 - studio.alpha[..., None]) * wall)
+    soft = photo._replace(light=soften_light(photo.light, DIRECTED))
+    same, same_goals = render_capture(
+        seed, planned([soft]), planned(capture_shots(seed, soft, goals)), size, device, scenery=wild
+    )
     return Session(
         number,
-        {"studio": studio, "wild": shown([photo], wild)},
-        shown(goals, even),
+        {"studio": studio, "same": same, "wild": render_planned(seed, planned([photo]), size, device, scenery=wild)},
+        {"studio": even_goals, "same": same_goals, "wild": even_goals},
     )
 
 
 def _evenly_lit(shot: Shot) -> Shot:
     rng = np.random.default_rng([shot.seed])
-    return shot._replace(light=sample_light(rng, "even"), clothes=sample_clothes(rng, bare=True))
+    clothes = sample_clothes(rng, bare=True)
+    return shot._replace(light=sample_light(rng, "even"), clothes=clothes, room=None, sensor=None)
 
 
 def estimator_noise(factor: float) -> EstimatorNoise:
@@ -106,7 +118,7 @@ def as_estimated(
     (state,) = np.random.SeedSequence([shoot.seed, ERROR_STREAM, session.number]).generate_state(1)
     random = torch.Generator().manual_seed(int(state))
     return training_batch(
-        hand, session.photos[light], session.targets, shoot.size, random, estimator_noise(factor)
+        hand, session.photos[light], session.targets[light], shoot.size, random, estimator_noise(factor)
     )
 
 
@@ -140,7 +152,8 @@ def true_targets(
                 mask,
                 batch.target_known[0, k],
                 on_hand & (shown < 0.5),
-                on_hand & ((ratio > STRETCH) | (ratio < 1 / STRETCH)),
+                on_hand & (ratio > STRETCH),
+                on_hand & (ratio < 1 / STRETCH),
             )
         )
     return truths

@@ -2,11 +2,12 @@
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 
+from oasis_warp.avatar.observe import inner_mask
+from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
@@ -16,6 +17,8 @@ from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.network.weights_file import trained_state
 from oasis_warp.training.adapt import adapt
+from oasis_warp.training.calibrate import Calibration, calibrate
+from oasis_warp.training.views import freeze_view
 
 RAW, CALIBRATED, ONE_SHOT = "raw", "calibrated", "one_shot"
 STAGES = (RAW, CALIBRATED, ONE_SHOT)
@@ -92,11 +95,21 @@ def reconstructions(
             yield Method(name, RAW), guess
         if not {CALIBRATED, ONE_SHOT} & stages:
             continue
-        fully = ONE_SHOT in stages
-        adapted = adapt(
-            hand, guess, evidence, config if fully else replace(config, texture_steps=0, reference_views=0)
-        )
+        adapted = adapt(hand, guess, evidence, config) if ONE_SHOT in stages else None
         if CALIBRATED in stages:
-            yield Method(name, CALIBRATED), guess._replace(colors=adapted.calibration.apply(guess.colors))
-        if fully:
+            calibration = adapted.calibration if adapted else calibration_of(hand, guess, evidence, config)
+            yield Method(name, CALIBRATED), guess._replace(colors=calibration.apply(guess.colors))
+        if adapted:
             yield Method(name, ONE_SHOT), adapted.gaussians
+
+
+def calibration_of(
+    hand: HandModel, guess: CanonicalGaussians, evidence: Evidence, config: AdaptConfig
+) -> Calibration:
+    """The colour calibration that adaptation begins with, for those who want no more of it."""
+    faces = hand.faces.to(evidence.image.device)
+    view = freeze_view(
+        pose_gaussians(guess, faces, evidence.rest.vertices, evidence.posed.vertices), evidence.camera
+    )  # fmt: skip
+    trusted = inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5)
+    return calibrate(view, guess.colors, evidence.image, trusted, config)

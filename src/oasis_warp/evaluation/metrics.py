@@ -20,7 +20,7 @@ Scores = dict[str, float | None]
 """By name of the measure; None where there is nothing to measure, or nothing to measure it with."""
 MEASURES = (
     "psnr", "psnr_inner", "ssim", "ssim_box", "ssim_mask", "lpips", "psnr_visible", "psnr_hidden", "psnr_stretched",
-    "psnr_unstretched",
+    "psnr_squeezed", "psnr_unchanged",
 )  # fmt: skip
 
 
@@ -36,7 +36,9 @@ class Truth(NamedTuple):
     hidden: Bool[Tensor, "H W"]
     """Whether the photo does not show this place of the surface."""
     stretched: Bool[Tensor, "H W"]
-    """Whether the pose has stretched or squeezed the skin there."""
+    """Whether the pose has stretched the skin there."""
+    squeezed: Bool[Tensor, "H W"]
+    """Or squeezed it, as inside bent joints: folds, darker than any colour that skin has at rest."""
 
 
 def score(image: Float[Tensor, "H W 3"], truth: Truth, perceptual: Perceptual | None = None) -> Scores:
@@ -68,7 +70,8 @@ def score(image: Float[Tensor, "H W 3"], truth: Truth, perceptual: Perceptual | 
         "visible": ~truth.hidden,
         "hidden": truth.hidden,
         "stretched": truth.stretched,
-        "unstretched": ~truth.stretched,
+        "squeezed": truth.squeezed,
+        "unchanged": ~(truth.stretched | truth.squeezed),
     }.items():
         scores[f"psnr_{name}"] = _psnr(error, inner * part)
     return scores

@@ -37,20 +37,29 @@ DIGITS = 5
 def photos_of_hands(folder: Path) -> dict[str, list[Path]]:
     """The photos in each subfolder of `folder` that holds two or more, in the order of their names.
 
+    Where no subfolder does, the photos of `folder` itself are those of one hand.
+
     Raises:
-        InputError: no folder, or none of its subfolders has two photos.
+        InputError: no folder, or none with two photos.
     """
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: expected a folder with a subfolder of photos for each hand, found {found}.")
     hands = {}
     for inner in sorted(path for path in folder.iterdir() if path.is_dir()):
-        photos = sorted(path for path in inner.iterdir() if path.suffix.lower() in SUFFIXES)
-        if len(photos) > 1:
+        if len(photos := _photos_in(inner)) > 1:
             hands[inner.name] = photos
+    if not hands and len(photos := _photos_in(folder)) > 1:
+        hands[folder.resolve().name] = photos
     if not hands:
-        raise InputError(f"{folder}: expected a subfolder for each hand with two photos of it or more, found none.")
+        raise InputError(
+            f"{folder}: expected two photos of one hand or more, or a subfolder with them for each hand, found none."
+        )
     return hands
+
+
+def _photos_in(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
 
 
 def evaluate_photos(
@@ -115,8 +124,8 @@ def _measure_hand(
         progress(stage, k, len(paths))
         try:
             photo = read_photo(path)
-            photos[path.stem] = photo, choose_hand(estimator.find(photo), "largest", photo.name)
-            avatars[path.stem], crops[path.stem] = _make_avatars(estimator, *photos[path.stem], priors, methods, config)
+            photos[path.name] = photo, choose_hand(estimator.find(photo), "largest", photo.name)
+            avatars[path.name], crops[path.name] = _make_avatars(estimator, *photos[path.name], priors, methods, config)
         except InputError as error:
             left_out[f"{name}/{path.name}"] = str(error)
     progress(stage, len(paths), len(paths))

@@ -3,11 +3,17 @@
 Nothing here needs more than the package's core: a script on a machine with CUDA can call `evaluate`.
 """
 
+import copyreg
+import functools
+import io
 import json
-from collections.abc import Iterator, Mapping
+import pickle
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,13 +22,13 @@ from oasis_warp import __version__
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import Camera, Evidence, PosedHand, TrainingBatch
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.claimed_folder import claim_folder
 from oasis_warp.evaluation.held_out import (
     FIRST_PERSON,
-    POPULATIONS,
     Group,
     Lighting,
     Shoot,
@@ -42,11 +48,12 @@ from oasis_warp.evaluation.pictures import (
 )
 from oasis_warp.evaluation.summary import Record, summarise
 from oasis_warp.hand.template import bundled_hand
+from oasis_warp.losses.lpips import Lpips
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.render.render import render
-from oasis_warp.synthetic.people import bake_people
+from oasis_warp.synthetic.processes import worker_pool
 from oasis_warp.training.losses import Perceptual
 
 SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (
@@ -57,8 +64,6 @@ SHOWN = 4
 """People of each group on the sheet, and hands on the picture of attention."""
 DIGITS = 5
 """Of the numbers in files."""
-BAKED_TOGETHER = 16
-"""People that are kept at a time: a CPU keeps few."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,11 +73,11 @@ class SyntheticEvaluation:
     groups: tuple[Group, ...] = ("ordinary", "tattoo", "ring")
     people: int = 16
     """In each group."""
-    lights: tuple[Lighting, ...] = ("studio", "wild")
+    lights: tuple[Lighting, ...] = ("same", "studio", "wild")
     noise: tuple[float, ...] = (0.0, 1.0)
     """Times the estimator's errors, for every group; 0 is the true pose."""
-    curve: tuple[float, ...] = (2.0, 4.0)
-    """More of them, for the first group only."""
+    curve: tuple[float, ...] = (0.5, 2.0, 4.0)
+    """More of them, for the first group and light only."""
     methods: tuple[Method, ...] = METHODS
     """Those whose prior is not given are left out."""
     shoot: Shoot = field(default_factory=Shoot)
@@ -85,7 +90,7 @@ def evaluate(
     folder: Path,
     device: torch.device,
     *,
-    perceptual: Perceptual | None = None,
+    perceptual: Lpips | None = None,
     workers: int = 0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -99,8 +104,9 @@ def evaluate(
         folder: Where files go; its parent must exist.
         device: Where to compute.
         perceptual: LPIPS, where its weights are at hand.
-        workers: Processes that bake people.
-        progress: Told of people as they are baked and measured.
+        workers: Processes that measure people side by side, once the first has been measured; 0 for none. Most of the
+            time a GPU waits for one.
+        progress: Told of people as they are measured.
 
     Raises:
         InputError: the folder cannot be used, or holds an evaluation with other settings.
@@ -114,24 +120,19 @@ def evaluate(
     settings = json.loads(json.dumps(settings))  # tuples become lists, as a file has them
     claim_folder(folder, SETTINGS, settings, "an evaluation")
     (folder / PEOPLE).mkdir(exist_ok=True)
-    bench = _Bench(priors, config, device, perceptual)
     everybody = [(group, FIRST_PERSON + k) for group in config.groups for k in range(config.people)]
-    done = sum(_place(folder, *who).exists() for who in everybody)
-    for group in config.groups:
-        missing = [number for of, number in everybody if of == group and not _place(folder, of, number).exists()]
-        for few in (missing[k : k + BAKED_TOGETHER] for k in range(0, len(missing), BAKED_TOGETHER)):
-            bake_people(config.shoot.seed, few, POPULATIONS[group], str(device), jobs=workers, progress=progress)
-            for number in few:
-                progress("evaluation", done, len(everybody))
-                bench.measure(folder, group, number)
-                done += 1
-    progress("evaluation", done, len(everybody))
+    missing = [who for who in everybody if not _place(folder, *who).exists()]
+    measured = _measured(_Bench(priors, config, perceptual), folder, missing, device, workers)
+    for done in range(len(everybody) - len(missing), len(everybody)):
+        progress("evaluation", done, len(everybody))
+        next(measured)
+    progress("evaluation", len(everybody), len(everybody))
     records = [record for who in everybody for record in json.loads(_place(folder, *who).read_text())]
     strips = [
         path for group in config.groups for k in range(min(SHOWN, config.people))
         if (path := _place(folder, group, FIRST_PERSON + k).with_suffix(".png")).exists()
     ]  # fmt: skip
-    write_sheet(folder / SHEET, strips, ["photo", "truth", *map(label, bench.methods)])
+    write_sheet(folder / SHEET, strips, ["photo", "truth", *map(label, asked_methods(priors, config))])
     maps = sorted((folder / PEOPLE).glob("*_attention.png"))
     if maps:
         write_sheet(folder / ATTENTION, maps, ATTENTION_COLUMNS)
@@ -144,71 +145,116 @@ def _place(folder: Path, group: Group, number: int) -> Path:
     return folder / PEOPLE / f"{group}_{number}.json"
 
 
-class _Bench:
-    """What every person is measured with."""
+def asked_methods(priors: Mapping[str, Prior], config: SyntheticEvaluation) -> list[Method]:
+    """Those of `config` whose prior is there, a prior after the other."""
+    return [method for name in priors for method in config.methods if method.prior == name]
 
-    def __init__(
-        self, priors: Mapping[str, Prior], config: SyntheticEvaluation, device: torch.device,
-        perceptual: Perceptual | None,
-    ):  # fmt: skip
-        self.priors, self.config, self.device, self.perceptual = priors, config, device, perceptual
-        self.hand = bundled_hand()
-        self.hand_there = self.hand.to(device)
-        self.vertex_faces = faces_of_vertices(self.hand_there.faces, len(self.hand.template))
-        self.methods = [method for name in priors for method in config.methods if method.prior == name]
 
-    def measure(self, folder: Path, group: Group, number: int) -> None:
-        """Write the records of one person, and pictures of the first few; the records last."""
-        config, place = self.config, _place(folder, group, number)
-        session = photograph(config.shoot, group, number, self.device)
-        records, rows, shown = [], [], number < FIRST_PERSON + SHOWN
-        factors = config.noise + (config.curve if group == config.groups[0] else ())
-        for light in config.lights:
-            exact = as_estimated(self.hand_there, session, light, config.shoot, 0.0)
-            truths = true_targets(exact, self.hand_there, self.vertex_faces)
-            for factor in factors:
-                batch = as_estimated(self.hand_there, session, light, config.shoot, factor)
-                row = [tile(batch.image[0]), tile(truths[0].image)]
-                for method, images in self.draw(batch):
-                    about = {"group": group, "person": number, "light": light, "noise": factor}
-                    records += [{**about, **method._asdict(), **found} for found in self.score(images, truths)]
-                    row.append(tile(images[0]))
-                if factor == config.noise[-1]:
-                    rows.append(row)
-            if shown and group == config.groups[0] and light == config.lights[-1]:
-                self.write_attention(place.with_name(f"{number}_attention.png"), exact)
-        if shown:
-            write_strip(place.with_suffix(".png"), rows)
-        write_file(place, json.dumps(records, allow_nan=False).encode())
+class _Bench(NamedTuple):
+    """What every person is measured with, wherever that is done."""
 
-    def draw(self, batch: TrainingBatch) -> Iterator[tuple[Method, list[Tensor]]]:
-        """What each method makes of the one photo of `batch`, drawn as each target shows it, over black."""
-        evidence, size = evidence_of(batch), batch.target_images.shape[2]
-        for method, gaussians in reconstructions(
-            self.hand, evidence, self.priors, self.methods, self.config.adapt
+    priors: Mapping[str, Prior]
+    config: SyntheticEvaluation
+    perceptual: Lpips | None
+
+
+def _measured(
+    bench: _Bench, folder: Path, missing: Sequence[tuple[Group, int]], device: torch.device, workers: int
+) -> Iterator[None]:
+    """Measure everybody, one a step."""
+    here = 1 if workers else len(missing)  # kernels are compiled once, and not by every process
+    packed = _packed(bench) if workers else b""
+    for who in missing[:here]:
+        yield measure(bench, folder, device, *who)
+    there = missing[here:]
+    if not there:
+        return
+    with worker_pool(min(workers, len(there))) as pool:
+        try:
+            waiting = [pool.submit(_measure_there, packed, folder, device, *who) for who in there]
+            for done in as_completed(waiting):
+                yield done.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # or all others would still be measured
+            raise
+
+
+def _packed(bench: _Bench) -> bytes:
+    """As a whole: tensors one by one would go through shared memory, of which containers have little."""
+    buffer = io.BytesIO()
+    pickler = pickle.Pickler(buffer)
+    pickler.dispatch_table = {**copyreg.dispatch_table, MappingProxyType: lambda proxy: (dict, (dict(proxy),))}
+    pickler.dump(bench)
+    return buffer.getvalue()
+
+
+@functools.lru_cache(1)
+def _unpacked(packed: bytes) -> _Bench:
+    return pickle.loads(packed)
+
+
+def _measure_there(packed: bytes, folder: Path, device: torch.device, group: Group, number: int) -> None:
+    """`measure` in another process, which unpacks the bench once."""
+    measure(_unpacked(packed), folder, device, group, number)
+
+
+def measure(bench: _Bench, folder: Path, device: torch.device, group: Group, number: int) -> None:
+    """Write the records of one person, and pictures of the first few; the records last."""
+    config, hand, place = bench.config, bundled_hand().to(device), _place(folder, group, number)
+    perceptual = bench.perceptual.to(device) if bench.perceptual else None
+    vertex_faces = faces_of_vertices(hand.faces, len(hand.template))
+    session = photograph(config.shoot, group, number, device)
+    records, rows, shown = [], [], number < FIRST_PERSON + SHOWN
+    for light in config.lights:
+        exact = as_estimated(hand, session, light, config.shoot, 0.0)
+        truths = true_targets(exact, hand, vertex_faces)
+        curve = config.curve if (group, light) == (config.groups[0], config.lights[0]) else ()
+        for factor in config.noise + curve:
+            batch = as_estimated(hand, session, light, config.shoot, factor)
+            row = [tile(batch.image[0]), tile(truths[0].image)]
+            for method, images in draw(bench, hand, batch):
+                about = {"group": group, "person": number, "light": light, "noise": factor}
+                records += [{**about, **method._asdict(), **found} for found in score_all(images, truths, perceptual)]
+                row.append(tile(images[0]))
+            if factor == config.noise[-1]:
+                rows.append(row)
+        if shown and (group, light) == (config.groups[0], config.lights[0]):
+            write_attention(place.with_name(f"{number}_attention.png"), bench.priors, exact)
+    if shown:
+        write_strip(place.with_suffix(".png"), rows)
+    write_file(place, json.dumps(records, allow_nan=False).encode())
+
+
+def draw(bench: _Bench, hand: HandModel, batch: TrainingBatch) -> Iterator[tuple[Method, list[Tensor]]]:
+    """What each method makes of the one photo of `batch`, drawn as each target shows it, over black."""
+    evidence, size = evidence_of(batch), batch.target_images.shape[2]
+    for method, gaussians in reconstructions(
+        bundled_hand(), evidence, bench.priors, asked_methods(bench.priors, bench.config), bench.config.adapt
+    ):
+        images = []
+        for posed, viewmat, K in zip(
+            batch.target_posed[0], batch.target_viewmats[0], batch.target_Ks[0], strict=True
         ):
-            images = []
-            for posed, viewmat, K in zip(
-                batch.target_posed[0], batch.target_viewmats[0], batch.target_Ks[0], strict=True
-            ):
-                there = pose_gaussians(gaussians, self.hand_there.faces, batch.rest[0], posed)
-                images.append(render(there, Camera(viewmat, K, size, size)).image)
-            yield method, images
+            there = pose_gaussians(gaussians, hand.faces, batch.rest[0], posed)
+            images.append(render(there, Camera(viewmat, K, size, size)).image)
+        yield method, images
 
-    def score(self, images: list[Tensor], truths: list[Truth]) -> Iterator[Record]:
-        """Two records a target: as drawn, and with the colours matched to it."""
-        for k, (image, truth) in enumerate(zip(images, truths, strict=True)):
-            for colors in ("raw", "matched"):
-                judged = match_colors(image, truth.image, truth.mask) if colors == "matched" else image
-                found = score(judged, truth, self.perceptual)
-                numbers = {name: None if value is None else round(value, DIGITS) for name, value in found.items()}
-                yield {"target": k, "colors": colors, **numbers}
 
-    def write_attention(self, path: Path, batch: TrainingBatch) -> None:
-        """Write where the learned prior looks, if its network has such attention."""
-        prior = self.priors.get("learned")
-        if isinstance(prior, NetworkPrior) and has_attention(prior.network):
-            write_strip(path, [draw_attention(prior.network.to(self.device), input_of_batch(batch))])
+def score_all(images: list[Tensor], truths: list[Truth], perceptual: Perceptual | None) -> Iterator[Record]:
+    """Two records a target: as drawn, and with the colours matched to it."""
+    for k, (image, truth) in enumerate(zip(images, truths, strict=True)):
+        for colors in ("raw", "matched"):
+            judged = match_colors(image, truth.image, truth.mask) if colors == "matched" else image
+            found = score(judged, truth, perceptual)
+            numbers = {name: None if value is None else round(value, DIGITS) for name, value in found.items()}
+            yield {"target": k, "colors": colors, **numbers}
+
+
+def write_attention(path: Path, priors: Mapping[str, Prior], batch: TrainingBatch) -> None:
+    """Write where the learned prior looks, if its network has such attention."""
+    prior = priors.get("learned")
+    if isinstance(prior, NetworkPrior) and has_attention(prior.network):
+        write_strip(path, [draw_attention(prior.network.to(batch.image.device), input_of_batch(batch))])
 
 
 def evidence_of(batch: TrainingBatch) -> Evidence:

@@ -85,10 +85,12 @@ def decode(
     """
     identity = torch.nn.functional.pad(torch.ones_like(raw["quats"][..., :1]), (0, 3))
     turn = normalize(raw["quats"] + identity, dim=-1, eps=1e-6)
-    larger, smaller = math.log(limits.growth), raw["scales"].new_tensor(limits.shrink).log()
-    change = torch.where(
-        raw["scales"] > 0, larger * torch.tanh(raw["scales"] / larger), smaller * torch.tanh(raw["scales"] / smaller)
-    )
+    larger = math.log(limits.growth)
+    shrunk = torch.stack([  # no tensor of the limits: a recording could not bring it to the device
+        math.log(limit) * torch.tanh(axis / math.log(limit))
+        for axis, limit in zip(raw["scales"].unbind(-1), limits.shrink, strict=True)
+    ], dim=-1)  # fmt: skip
+    change = torch.where(raw["scales"] > 0, larger * torch.tanh(raw["scales"] / larger), shrunk)
     least = limits.opacity
     opacity = least + (1 - least) * torch.sigmoid(
         raw["opacities"][..., 0] + math.log((OPACITY - least) / (1 - OPACITY))

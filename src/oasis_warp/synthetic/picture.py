@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,16 +12,25 @@ from torch import Tensor
 
 from oasis_warp.ops import depth_map
 from oasis_warp.ops.room_tracing import trace_rooms
-from oasis_warp.ops.skin_shading import Texture, Worn, shade_skin, smooth_over_faces, surface_state
+from oasis_warp.ops.skin_shading import (
+    Lamps,
+    Shaded,
+    Texture,
+    Worn,
+    shade_skin,
+    smooth_over_faces,
+    surface_state,
+)
 from oasis_warp.synthetic.atlas import HEIGHT, WIDTH
 from oasis_warp.synthetic.backgrounds import cut_background
 from oasis_warp.synthetic.body import RING, Body, body_on, device_name
+from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.illumination import light_lamps, no_lamps, pinhole, see_sky
 from oasis_warp.synthetic.people import Person, person
 from oasis_warp.synthetic.plan import PHOTOS, Scenery
-from oasis_warp.synthetic.planned import Planned, numbers_of, plan_ahead, plan_table, send
-from oasis_warp.synthetic.posing import pose_people
-from oasis_warp.synthetic.sensor import expose, srgb
+from oasis_warp.synthetic.planned import Numbers, Planned, numbers_of, plan_ahead, plan_table, send
+from oasis_warp.synthetic.posing import Posed, pose_people
+from oasis_warp.synthetic.sensor import develop, expose, meter, srgb
 
 SAMPLES = 2
 """Sub-pixels along a pixel's side."""
@@ -96,37 +105,106 @@ def render_planned(
 
     Nothing waits for the device.
     """
+    even = scenery.look == "even"
+    staged = _stage(seed, planned, size, torch.device(device), scenery.population, lamps=not even)
+    if even:
+        image = _alone(staged.shaded, lambda linear: srgb(linear.clamp(max=1)))
+    else:
+        image = _photo(staged, _seen_light(staged, planned, size, scenery))
+    return _with_truth(staged, image, planned, size)
+
+
+@torch.no_grad()
+def render_capture(
+    seed: int, photo: Planned, others: Planned, size: int, device: torch.device | str, *, scenery: Scenery
+) -> tuple[SyntheticBatch, SyntheticBatch]:
+    """One photo, and pictures of the hand alone in the same light and exposure, over black, as a clean camera sees it.
+
+    Args:
+        seed: Of the world.
+        photo: One plan, with everything.
+        others: Of `plan.capture_shots` with this photo.
+        size: Side of all pictures [px].
+        device: Where to render.
+        scenery: Of the photo.
+    """
+    device = torch.device(device)
+    staged = _stage(seed, photo, size, device, scenery.population, lamps=True)
+    light = _seen_light(staged, photo, size, scenery)
+    again = _stage(seed, others, size, device, scenery.population, lamps=True)
+    count = len(others.numbers)
+    gains = meter(light, staged.shaded.alpha, staged.numbers.sensor, staged.numbers.incident).expand(count, -1)
+    sensors = staged.numbers.sensor.expand(count, -1)
+    image = _alone(again.shaded, lambda linear: develop(linear, gains, sensors))
+    return _with_truth(staged, _photo(staged, light), photo, size), _with_truth(again, image, others, size)
+
+
+class _Staged(NamedTuple):
+    """A batch posed, lit and shaded, before any camera makes a picture of it."""
+
+    numbers: Numbers
+    whole: Int[Tensor, "B 4"]
+    posed: Posed
+    lamps: Lamps
+    shaded: Shaded
+
+
+def _stage(
+    seed: int, planned: Planned, size: int, device: torch.device, population: Population, *, lamps: bool
+) -> _Staged:
     name = device_name(device)
     device, body = torch.device(name), body_on(name)
-    people = [person(seed, number, scenery.population, name) for number in planned.whole[:, 1].tolist()]
+    people = [person(seed, number, population, name) for number in planned.whole[:, 1].tolist()]
     numbers = numbers_of(planned, device)
-    index, number, left, seeds = send(torch.from_numpy(planned.whole), device).unbind(1)
+    whole = send(torch.from_numpy(planned.whole), device)
     posed = pose_people(body, people, numbers)
     fine = size * SAMPLES
     K = pinhole(posed.focal * fine, fine)
     still = torch.eye(4, device=device).expand(len(people), 4, 4)
     seen = depth_map(posed.vertices, body.faces, still, K, fine, fine, validate=False)
     state = surface_state(posed.vertices, body.faces)
-    lamps = no_lamps(posed.vertices) if scenery.look == "even" else light_lamps(body, posed, numbers)
-    distance, sky = numbers.view_distance, numbers.sky
+    lit = light_lamps(body, posed, numbers) if lamps else no_lamps(posed.vertices)
     shaded = shade_skin(
         seen, K[:, 0, 0], SAMPLES, posed.vertices, body.faces, state.normals, see_sky(body, posed, state.normals),
         _stretch(body, people, state.areas), Texture([p.texture for p in people], *_texels(device)),
         Worn(body.materials, numbers.looks), torch.stack([p.tone for p in people]),
-        distance / (posed.focal * fine) / TEXEL, sky, lamps, seeds, n_hand_faces=body.n_hand_faces, ring=RING,
+        numbers.view_distance / (posed.focal * fine) / TEXEL, numbers.sky, lit, whole[:, 3],
+        n_hand_faces=body.n_hand_faces, ring=RING,
     )  # fmt: skip
-    if scenery.look == "even":
-        share = shaded.alpha[..., None]
-        image = share * srgb((shaded.color / share.clamp_min(1e-3)).clamp(0, 1))  # over black, as splats are drawn
+    return _Staged(numbers, whole, posed, lit, shaded)
+
+
+def _alone(shaded: Shaded, camera: Callable[[Tensor], Tensor]) -> Float[Tensor, "B H W 3"]:
+    """What the camera makes of the linear light of hand and arm, over black, as splats are drawn."""
+    share = shaded.alpha[..., None]
+    return share * camera((shaded.color / share.clamp_min(1e-3)).clamp_min(0))
+
+
+def _seen_light(staged: _Staged, planned: Planned, size: int, scenery: Scenery) -> Float[Tensor, "B H W 3"]:
+    """The linear light of hand, arm and what is behind them."""
+    numbers, shaded = staged.numbers, staged.shaded
+    if scenery.backgrounds:
+        behind = send(_cut_backgrounds(scenery, planned, size), shaded.color.device)
     else:
-        if scenery.backgrounds:
-            behind = send(_cut_backgrounds(scenery, planned, size), device)
-        else:
-            behind = trace_rooms(
-                numbers.solids, posed.focal * size, sky, lamps, shaded.alpha, distance, numbers.aperture
-            )
-        light = shaded.color + (1 - shaded.alpha[..., None]) * behind
-        image = expose(light, shaded.alpha, numbers.sensor, numbers.incident, seeds)
+        behind = trace_rooms(
+            numbers.solids, staged.posed.focal * size, numbers.sky, staged.lamps, shaded.alpha, numbers.view_distance,
+            numbers.aperture,
+        )  # fmt: skip
+    return shaded.color + (1 - shaded.alpha[..., None]) * behind
+
+
+def _photo(staged: _Staged, light: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:
+    """What the sensor makes of the light."""
+    numbers = staged.numbers
+    return expose(light, staged.shaded.alpha, numbers.sensor, numbers.incident, staged.whole[:, 3])
+
+
+def _with_truth(
+    staged: _Staged, image: Float[Tensor, "B H W 3"], planned: Planned, size: int
+) -> SyntheticBatch:
+    """The pictures and what is known about them, left hands mirrored."""
+    numbers, posed, shaded = staged.numbers, staged.posed, staged.shaded
+    index, number, left, _ = staged.whole.unbind(1)
     K = pinhole(posed.focal * size, size)
     marks = posed.landmarks @ K.transpose(1, 2)
     batch = SyntheticBatch(

@@ -15,13 +15,26 @@ from oasis_warp.synthetic.gestures import sample_gesture
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
 from oasis_warp.synthetic.rooms import Room, sample_room
 from oasis_warp.synthetic.sensor import Sensor, sample_sensor
-from oasis_warp.synthetic.stage import Light, Look, View, sample_light, sample_view
+from oasis_warp.synthetic.stage import (
+    Light,
+    Look,
+    View,
+    clear_of_arm,
+    rotation_about,
+    sample_light,
+    sample_view,
+    turn_light,
+)
 from oasis_warp.synthetic.wardrobe import Clothes, sample_clothes
 
 PICTURES_EACH = 8
 """Consecutive indices that show one person: a texture is baked once for so many."""
 PICTURE_STREAM = 2
 """Tells the random numbers of pictures from those of identities with the same seed."""
+CAMERA_STREAM = 4
+"""And those of a camera that moves between pictures of one capture."""
+CAMERA_YAW, CAMERA_PITCH = 0.9, 0.3
+"""How far it moves round the hand at most [rad]; the rest of a new view is the hand's turning."""
 HAND_REACH = 0.11
 """Of a hand beyond its middle, roughly: rooms begin behind it [m]."""
 EVERYBODY = Population()
@@ -71,7 +84,7 @@ def sample_shot(seed: int, index: int, scenery: Scenery = PHOTOS) -> Shot:
     number = index // PICTURES_EACH
     if scenery.people is not None:
         number %= scenery.people
-    view = sample_view(rng, look, closed=bool((angles[[1, 4, 7, 10], 0] > 0.9).sum() >= 3))
+    view = clear_of_arm(sample_view(rng, look, closed=bool((angles[[1, 4, 7, 10], 0] > 0.9).sum() >= 3)), bend)
     return Shot(
         index=index,
         person=number,
@@ -103,3 +116,17 @@ def plan_shots(seed: int, indices: Sequence[int], scenery: Scenery = PHOTOS) -> 
     at_rest = joints + (basis * shapes[:, None, None]).sum(-1)
     angles, _ = separate(np.stack([shot.angles for shot in shots]), at_rest * 1e3)
     return [shot._replace(angles=a) for shot, a in zip(shots, angles, strict=True)]
+
+
+def capture_shots(seed: int, photo: Shot, others: Sequence[Shot]) -> list[Shot]:
+    """`others`, drawn in even light, as pictures of the capture that `photo` is of: in its light, with its sensor.
+
+    Lamps and walls stay; the hand turns before them, and the camera moves round it.
+    """
+    shots = []
+    for shot in others:
+        random = np.random.default_rng([seed, CAMERA_STREAM, shot.index])
+        yaw, pitch = random.uniform(-1, 1, 2) * (CAMERA_YAW, CAMERA_PITCH)
+        moved = rotation_about([1, 0, 0], pitch) @ rotation_about([0, 1, 0], yaw)
+        shots.append(shot._replace(light=turn_light(photo.light, moved), sensor=photo.sensor))
+    return shots

@@ -228,5 +228,6 @@ def _columns(shots: Sequence[Shot], identities: Sequence[Identity], joints: np.n
     if rooms:  # all are photos
         columns["solids"] = [room.solids for room in rooms]
         columns["aperture"] = [room.aperture for room in rooms]
+    if sensors:  # photos, or pictures of the hand alone that were taken with one
         columns["sensor"] = [sensor_row(sensor) for sensor in sensors]
     return columns

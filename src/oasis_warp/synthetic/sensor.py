@@ -152,6 +152,47 @@ def srgb(linear: Tensor) -> Tensor:
     return torch.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(1e-8) ** (1 / 2.4) - 0.055)
 
 
+def meter(
+    light: Float[Tensor, "B H W 3"],
+    alpha: Float[Tensor, "B H W"],
+    sensors: Float[Tensor, "B 15"],
+    incident: Float[Tensor, "B 3"],
+) -> Float[Tensor, "B 3"]:
+    """By what the channels of linear light are multiplied: exposure and white balance. Arguments as of `expose`."""
+    luma = _constant(_LUMA, light.device)
+    weight = alpha * 0.7 + 0.25
+    mirrored = ((light * luma).sum(3).clamp(max=2.0) * weight).sum((1, 2)) / weight.sum((1, 2))
+    falling = 0.18 * (incident * luma).sum(1)
+    exposure, share, tint, balance = (
+        sensors[:, _PLACES[name]] for name in ("exposure", "metering", "tint", "balance")
+    )  # fmt: skip
+    gain = exposure / (falling.clamp_min(1e-3) ** (1 - share) * mirrored.clamp_min(1e-3) ** share)
+    white = incident / incident.mean(1, keepdim=True)
+    return gain[:, None] * tint / white ** balance[:, None]
+
+
+def _toned(x: Float[Tensor, "B 3 H W"], sensors: Float[Tensor, "B 15"]) -> Float[Tensor, "B 3 H W"]:
+    """What a camera makes of exposed linear light: its curve, contrast and saturation, in sRGB."""
+
+    def cast(name: str) -> Tensor:
+        return sensors[:, _PLACES[name]][:, None, None, None]
+
+    film = x * 1.1
+    film = film * (2.51 * film + 0.05) / (film * (2.43 * film + 0.59) + 0.14)
+    x = srgb(torch.where(cast("filmic") > 0, film, 1 - torch.exp(-1.55 * x)))
+    x = x + cast("contrast") * x * (1 - x) * (2 * x - 0.9)
+    grey = (x * _constant(_LUMA, x.device)[:, None, None]).sum(1, keepdim=True)
+    return grey + (x - grey) * cast("saturation")
+
+
+def develop(
+    light: Float[Tensor, "B H W 3"], gains: Float[Tensor, "B 3"], sensors: Float[Tensor, "B 15"]
+) -> Float[Tensor, "B H W 3"]:
+    """`expose` with the exposure given (see `meter`), through a camera without blur, noise, vignette or JPEG."""
+    x = light.permute(0, 3, 1, 2) * gains[:, :, None, None]
+    return _toned(x.clamp_min(0), sensors).clamp(0, 1).permute(0, 2, 3, 1)
+
+
 def expose(
     light: Float[Tensor, "B H W 3"],
     alpha: Float[Tensor, "B H W"],
@@ -176,28 +217,12 @@ def expose(
     def cast(name: str) -> Tensor:
         return column(name)[:, None, None, None]
 
-    x = light.permute(0, 3, 1, 2)
-    luma = _constant(_LUMA, device)[:, None, None]
-    weight = alpha * 0.7 + 0.25
-    mirrored = ((x * luma).sum(1).clamp(max=2.0) * weight).sum((1, 2)) / weight.sum((1, 2))
-    falling = 0.18 * (incident * luma[:, 0, 0]).sum(1)
-    share = column("metering")
-    gain = column("exposure") / (falling.clamp_min(1e-3) ** (1 - share) * mirrored.clamp_min(1e-3) ** share)
-    white = incident / incident.mean(1, keepdim=True)
-    balance = column("tint") / white ** column("balance")[:, None]
-    x = x * gain[:, None, None, None] * balance[:, :, None, None]
+    x = light.permute(0, 3, 1, 2) * meter(light, alpha, sensors, incident)[:, :, None, None]
     at = (torch.arange(size, device=device) + 0.5) / size * 2 - 1
     x = x * (1 - cast("vignette") * (at[:, None] ** 2 + at**2))
     x = _blur(x, column("blur") * size / 256)
     grain = pixel_noise(seeds, 3, x.shape[2], size)
     grain = _blur(grain, column("grain")) * cast("noise") * (x.clamp_min(0) + 0.01).sqrt() * 1.5
-    x = (x + grain).clamp_min(0)
-    film = x * 1.1
-    film = film * (2.51 * film + 0.05) / (film * (2.43 * film + 0.59) + 0.14)
-    x = torch.where(cast("filmic") > 0, film, 1 - torch.exp(-1.55 * x))
-    x = srgb(x)
-    x = x + cast("contrast") * x * (1 - x) * (2 * x - 0.9)
-    grey = (x * luma).sum(1, keepdim=True)
-    x = grey + (x - grey) * cast("saturation")
+    x = _toned((x + grain).clamp_min(0), sensors)
     x = x + cast("sharpening") * (x - _blur(x, torch.full((len(x),), _SHARPENED, device=device)))
     return jpeg(x.clamp(0, 1), column("quality")).permute(0, 2, 3, 1)

@@ -23,6 +23,11 @@ _FACING = {
 """Rotations from the hand's frame to a camera that sees this side, fingers up."""
 _VIEW_SHARES = {"palm": 0.40, "back": 0.32, "thumb": 0.11, "little": 0.03, "any": 0.14}
 _STILL = np.eye(3)
+_TO_ELBOW = np.array([1.0, 0.0, 0.0])
+"""In the hand's frame, as long as the wrist is straight."""
+_TURNED_ROUND = np.diag([-1.0, 1.0, -1.0])
+ARM_CONE = np.radians(35)
+"""Of directions round the forearm's from which it hides the hand, half of it on average [rad]."""
 _TO_CAMERA = np.array([0.0, 0.0, -1.0])
 DIRECTIONS = 400
 """Of the sky, when its harmonics are summed."""
@@ -103,6 +108,19 @@ def sample_view(rng: np.random.Generator, look: Look, closed: bool) -> View:
     return View(rotation, float(np.exp(u(np.log(0.32), np.log(0.85)))), fill, rng.normal(0, 0.05, 2))
 
 
+def clear_of_arm(view: View, bend: np.ndarray) -> View:
+    """The view, or where the forearm would stand before the hand, that from the opposite side.
+
+    Args:
+        view: Any.
+        bend: Of the forearm at the wrist, an axis with its angle as length [rad], [3].
+    """
+    arm = rotation_about(bend, float(np.linalg.norm(bend))) @ _TO_ELBOW
+    if -(view.rotation @ arm)[2] < np.cos(ARM_CONE):
+        return view
+    return view._replace(rotation=_TURNED_ROUND @ view.rotation)
+
+
 def warmth(t: float) -> np.ndarray:
     """Colour of light from bluish (negative) over white (0) to lamp-like (1), mean about 1."""
     return np.array([1.0, 1 - 0.18 * t, 1 - 0.42 * t]) / (1 - 0.16 * t)
@@ -126,6 +144,20 @@ def sphere(n: int) -> np.ndarray:
 
 _SPHERE = sphere(DIRECTIONS)
 _SPHERE_HARMONICS = _harmonics(_SPHERE) * (4 * np.pi / DIRECTIONS)
+
+
+def turn_light(light: Light, rotation: np.ndarray) -> Light:
+    """The same light as a camera sees it whose frame is the old one's, turned: `rotation` leads from the old to it."""
+    spread = _harmonics(_SPHERE @ rotation) @ light.sky
+    sky = np.linalg.lstsq(_harmonics(_SPHERE), spread, rcond=None)[0]  # exact: turned harmonics are of the same degree
+    return light._replace(sky=sky, directions=light.directions @ rotation.T)
+
+
+def soften_light(light: Light, share: float) -> Light:
+    """As much light of the same colour, of which `share` comes as it did and the rest from all around."""
+    sky = share * light.sky
+    sky[0] = light.sky[0] + 0.65 * (1 - share) * light.colors.sum(0) / 0.2820948
+    return light._replace(sky=sky, colors=share * light.colors)
 
 
 @functools.cache

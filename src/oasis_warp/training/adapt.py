@@ -5,7 +5,6 @@ from typing import NamedTuple
 import torch
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
-from oasis_warp.avatar.detail import carry_detail
 from oasis_warp.avatar.observe import inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.config import AdaptConfig
@@ -16,6 +15,7 @@ from oasis_warp.ops import blend_colors
 from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.training.calibrate import Calibration, calibrate
 from oasis_warp.training.complete import complete_field
+from oasis_warp.training.light import even_photo
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
 
@@ -39,12 +39,12 @@ def adapt(
     config: AdaptConfig = AdaptConfig(),  # noqa: B008 - frozen
     progress: Progress = silent,
 ) -> Adaptation:
-    """Fit the colours of `prior` to the photo; geometry stays, but for Gaussians that a photo's detail needs.
+    """Fit the colours of `prior` to the photo; geometry stays.
 
     Colour calibration first, then the seen colours are carried smoothly over the rim of the seen region, then texture
     learning with reference views.
     """
-    faces, prior = hand.faces.to(evidence.image.device), carry_detail(hand, prior, evidence.rest)
+    faces = hand.faces.to(evidence.image.device)
     posed = pose_gaussians(prior, faces, evidence.rest.vertices, evidence.posed.vertices)
     view = freeze_view(posed, evidence.camera)
     trusted = inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5)
@@ -60,7 +60,11 @@ def adapt(
     progress("completion", 0, 1)
     with torch.no_grad():  # what is drawn, not the Gaussians' own colours: those of a learned prior need not agree
         drawn = blend_colors(view, gaussians.colors) / view.alphas.clamp_min(MIN_ALPHA)
-    missing = observe(hand, evidence._replace(image=evidence.image - drawn))
+    photo = evidence.image
+    missing = observe(hand, evidence._replace(image=photo - drawn))
+    if config.light == "even":
+        photo = even_photo(photo, drawn, missing, view, gaussians, evidence.rest.vertices, faces)
+        missing = observe(hand, evidence._replace(image=photo - drawn))
     difference = complete_field(evidence.rest.vertices, faces, missing.colors, missing.confidence)
     colors = (gaussians.colors + vertex_to_gaussians(difference, faces, gaussians)).clamp(0, 1)
     gaussians = gaussians._replace(colors=colors)
@@ -71,6 +75,6 @@ def adapt(
         for azimuth in reference_azimuths(config.reference_views)
     ]
     texture = learn_texture(
-        gaussians, faces, view, evidence.image, evidence.mask * trusted, references, config, progress
+        gaussians, faces, view, photo, evidence.mask * trusted, references, config, progress
     )
     return Adaptation(gaussians._replace(colors=texture.colors), calibration, texture.losses)

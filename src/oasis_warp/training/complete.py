@@ -20,18 +20,28 @@ def complete_field(
     faces: Int[Tensor, "F 3"],
     observed: Float[Tensor, "V D"],
     confidence: Float[Tensor, "V"],
+    detail: float = DETAIL_LENGTH,
+    fade: float = FADE_LENGTH,
 ) -> Float[Tensor, "V D"]:
     """The smooth field that follows `observed` where it is known and fades to zero along the surface elsewhere.
 
     Minimises the integral over the surface of confidence |x - observed|^2 / detail^2 + |grad x|^2 + |x|^2 / fade^2,
     the screened Poisson equation (M (c / d^2 + 1 / l^2) + L) x = M c / d^2 observed, with the cotangent Laplacian L and
     the lumped mass matrix M.
+
+    Args:
+        vertices: Of the surface [m].
+        faces: Corners.
+        observed: Values; those without confidence do not matter.
+        confidence: 0 to 1.
+        detail: Length d below which neighbouring observations are averaged [m].
+        fade: Length l over which the surface forgets them [m].
     """
     points = vertices.detach().cpu().numpy().astype(np.float64)
     triangles = faces.detach().cpu().numpy().astype(np.int64)
     laplacian, mass = laplacian_and_mass(points, triangles)
-    data = mass * confidence.detach().cpu().numpy().astype(np.float64) / DETAIL_LENGTH**2
-    system = laplacian + sparse.diags(data + mass / FADE_LENGTH**2)
+    data = mass * confidence.detach().cpu().numpy().astype(np.float64) / detail**2
+    system = laplacian + sparse.diags(data + mass / fade**2)
     right = data[:, None] * observed.detach().cpu().numpy().astype(np.float64)
     solution = splu(system.tocsc()).solve(np.ascontiguousarray(right))
     return torch.from_numpy(solution).to(observed)
