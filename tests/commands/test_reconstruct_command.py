@@ -13,7 +13,7 @@ from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.fusion import FusedReconstruction, PhotoOfHand
 
-FILES = {"avatar.safetensors", "summary.png", "turntable.mp4", "report.json"}
+FILES = {"avatar.safetensors", "summary.png", "quality.png", "turntable.mp4", "report.json"}
 
 
 @pytest.fixture(autouse=True)

@@ -19,7 +19,7 @@ PoseName = Literal["photo", "rest", "open", "relaxed", "fist", "pinch", "thumbs_
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstruct:
-    """Turn photos of a hand into avatars: avatar.safetensors, summary.png, turntable.mp4 and report.json.
+    """Turn photos of a hand into avatars: avatar.safetensors, summary.png, quality.png, turntable.mp4 and report.json.
 
     One photo's files go into the folder --out itself, those of several into a folder each, --out/NAME for NAME.jpg.
     With --same-hand several photos make one avatar, in --out itself. Files of an earlier run are replaced, all other
@@ -47,8 +47,9 @@ class Reconstruct:
     """The same seed gives the same avatar."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
-    size: int = 256
-    """Side of the square crop that the avatar is fitted to [px]."""
+    size: int | Literal["auto"] = "auto"
+    """Side of the square crop whose detail the avatar shows [px], 64 to 1024; by itself the photo's own, from 256 to
+    1024."""
     force: FlagCreatePairsOff[bool] = False
     """Go on with a fit that is too poor to be trusted."""
 

@@ -16,6 +16,7 @@ from oasis_warp.commands.fused_report import make_fused_report, print_fused_repo
 from oasis_warp.commands.look import check_device
 from oasis_warp.commands.options import Reconstruct
 from oasis_warp.commands.progress import show_progress
+from oasis_warp.commands.quality_sheet import draw_quality
 from oasis_warp.commands.report import make_report, print_report, to_json
 from oasis_warp.commands.summary import GROUND, draw_fused_summary, draw_summary
 from oasis_warp.core.config import ReconstructConfig
@@ -70,7 +71,7 @@ def _check_photos(options: Reconstruct) -> None:
 
 def _check_numbers(options: Reconstruct) -> None:
     low, high = CROP_SIDES
-    if not low <= options.size <= high:
+    if options.size != "auto" and not low <= options.size <= high:
         raise InputError(f"--size {options.size}: expected {low} to {high} pixels; choose another size.")
     if options.steps is not None and options.steps < 0:
         raise InputError(f"--steps {options.steps}: expected 0 or more; leave it out to stop by itself.")
@@ -130,6 +131,7 @@ def _reconstruct_one(
         seconds.update(made.stages)
         with timed_stage("summary", seconds):
             write_picture(part / "summary.png", draw_summary(photo, made, progress=progress))
+            write_picture(part / "quality.png", draw_quality(photo.name, made))
         _write_avatar(part, made.avatar, seconds, progress)
         report = make_report(photo, made, config, seconds)
         (part / "report.json").write_text(to_json(report))

@@ -22,7 +22,13 @@ MEASURES = {
     "input_psnr_db": ("likeness to the photo", "{:.1f} dB"),
     "input_psnr_inner_db": ("likeness away from the outline", "{:.1f} dB"),
     "render_mask_iou": ("overlap of avatar and mask", "{:.3f}"),
-    "coverage_percent": ("surface that the photo shows", "{:.0f} %"),
+    "seen_percent": ("surface that the photo shows", "{:.0f} %"),
+    "grazed_percent": ("surface that it grazes", "{:.0f} %"),
+    "extrapolated_percent": ("surface that it does not show", "{:.0f} %"),
+    "palm_seen_percent": ("palm that it shows", "{:.0f} %"),
+    "back_seen_percent": ("back that it shows", "{:.0f} %"),
+    "nail_seen_percent": ("nails that it shows", "{:.0f} %"),
+    "uncertainty_mean": ("mean uncertainty", "{:.2f}"),
     "n_gaussians": ("Gaussians", "{:.0f}"),
 }
 """Words and unit for what `Reconstruction.errors` holds; a measure without an entry is shown under its own name."""

@@ -54,8 +54,8 @@ class ReconstructConfig:
     """The same seed gives the same avatar."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
-    size: int = 256
-    """Side of the square crop that the avatar is fitted to [px]."""
+    size: int | Literal["auto"] = "auto"
+    """Side of the square crop whose detail the avatar shows [px]; by itself the photo's own, from 256 to 1024."""
     force: bool = False
     """Go on with a fit that is too poor to be trusted."""
 
