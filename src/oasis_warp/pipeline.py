@@ -21,6 +21,7 @@ from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmar
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.keypoints_file import read_keypoints
+from oasis_warp.hand.moved_fit import with_pose
 from oasis_warp.hand.outline import wrist_line
 from oasis_warp.hand.skinning import mirror_pose, rest_hand, skin
 from oasis_warp.hand.surface_offsets import outline_offsets
@@ -103,10 +104,21 @@ def reconstruct(
         evidence = make_evidence(photo, fit, offsets, config)
     with stage("prior"):
         guess = prior(evidence)
+    moved = 0.0
+    if config.refine == "on" and isinstance(given, Landmarks):  # a pose that was given is right as it is
+        with stage("refinement"):
+            refinement = refine(hand, guess, evidence)
+            if refinement.accepted:
+                pose, moved = refinement.pose, refinement.moved
+                fit = with_pose(hand, fit, mirror_pose(pose) if fit.side == "left" else pose)
+                offsets = carrier_offsets(hand, fit)
+                evidence = make_evidence(photo, fit, offsets, config)
+                guess = prior(evidence)
     with stage("adaptation"):
         adaptation = adapt(
             hand, guess, evidence, AdaptConfig(texture_steps=config.steps, seed=config.seed), progress
         )
+<<<<<<< HEAD
     gaussians, close = adaptation.gaussians, evidence
     if (size := detail_size(fit, config)) > len(evidence.image):
         with stage("detail"):
@@ -126,6 +138,17 @@ def reconstruct(
             **shown,
         }
     return Reconstruction(avatar, fit, prior.about, stages, errors, (*fit.warnings, *doubts), quality)
+=======
+    avatar = make_avatar(fit, offsets, evidence, adaptation.gaussians)
+    errors = {
+        "reprojection_percent": fit.reprojection,
+        "worst_point_percent": fit.worst_point,
+        "mask_iou": fit.mask_iou,
+        "refined_px": moved,
+        **input_errors(avatar, evidence),
+    }
+    return Reconstruction(avatar, fit, prior.about, stages, errors, fit.warnings)
+>>>>>>> refine
 
 
 def carrier_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:

@@ -19,6 +19,7 @@ MEASURES = {
     "reprojection_percent": ("landmarks miss the model by", "{:.1f} % of the hand"),
     "worst_point_percent": ("the worst of them by", "{:.1f} %"),
     "mask_iou": ("overlap of fit and mask", "{:.3f}"),
+    "refined_px": ("refinement moved the surface by", "{:.1f} px"),
     "input_psnr_db": ("likeness to the photo", "{:.1f} dB"),
     "input_psnr_inner_db": ("likeness away from the outline", "{:.1f} dB"),
     "render_mask_iou": ("overlap of avatar and mask", "{:.3f}"),

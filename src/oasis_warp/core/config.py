@@ -48,6 +48,8 @@ class ReconstructConfig:
     colours in its skin tone, or what a network of your own sees, of which this is the weights file."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for a network of your own that reads photos with it."""
+    refine: Literal["on", "off"] = "off"
+    """Move the fitted hand to where what the prior saw in the photo explains it better, and look again; or leave it."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0
