@@ -118,7 +118,6 @@ def reconstruct(
         adaptation = adapt(
             hand, guess, evidence, AdaptConfig(texture_steps=config.steps, seed=config.seed), progress
         )
-<<<<<<< HEAD
     gaussians, close = adaptation.gaussians, evidence
     if (size := detail_size(fit, config)) > len(evidence.image):
         with stage("detail"):
@@ -134,21 +133,11 @@ def reconstruct(
             "reprojection_percent": fit.reprojection,
             "worst_point_percent": fit.worst_point,
             "mask_iou": fit.mask_iou,
+            "refined_px": moved,
             **input_errors(avatar, close),
             **shown,
         }
     return Reconstruction(avatar, fit, prior.about, stages, errors, (*fit.warnings, *doubts), quality)
-=======
-    avatar = make_avatar(fit, offsets, evidence, adaptation.gaussians)
-    errors = {
-        "reprojection_percent": fit.reprojection,
-        "worst_point_percent": fit.worst_point,
-        "mask_iou": fit.mask_iou,
-        "refined_px": moved,
-        **input_errors(avatar, evidence),
-    }
-    return Reconstruction(avatar, fit, prior.about, stages, errors, fit.warnings)
->>>>>>> refine
 
 
 def carrier_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
