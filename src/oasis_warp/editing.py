@@ -19,7 +19,8 @@ from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
-from oasis_warp.training.repaint import Canvas, repaint
+from oasis_warp.training.carried import Canvas
+from oasis_warp.training.repaint import repaint
 
 OTHER_PHOTO = 0.06
 """Median colour difference between avatar and photo from which this is not the photo that the avatar was made from."""

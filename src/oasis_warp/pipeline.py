@@ -12,11 +12,12 @@ from torch import Tensor
 from oasis_warp.avatar.anchors import below_skin
 from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.avatar.prior import Prior
+from oasis_warp.avatar.quality import SurfaceQuality, assess_surface, photo_doubts, shares, surface_doubts
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, HandFit, Landmarks, Photo
+from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, HandFit, Landmarks, Photo, Render
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.keypoints_file import read_keypoints
@@ -31,10 +32,15 @@ from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 from oasis_warp.training.adapt import adapt
-from oasis_warp.training.refine import refine
+from oasis_warp.training.sharpen import sharpen
 
 CROP_MARGIN = 1.12
 """Side of the crop over the longer extent of the mask."""
+COARSE_SIZE = 256
+"""Side of the crop that the prior reads and the whole hand is fitted to [px]: as many pixels as it has Gaussians. What
+a larger one shows beyond it goes into finer Gaussians."""
+FINEST_SIZE = 1024
+"""Side that is chosen for a photo at most [px]."""
 
 
 class Reconstruction(NamedTuple):
@@ -50,6 +56,9 @@ class Reconstruction(NamedTuple):
     errors: dict[str, float]
     """What was measured: reprojection_percent, mask_iou, input_psnr_db, ..."""
     warnings: tuple[str, ...]
+    """Of the fit, the photo and what it shows, in words; empty when nothing is doubtful."""
+    quality: SurfaceQuality
+    """How well each place of the surface is known."""
 
 
 def reconstruct(
@@ -110,20 +119,31 @@ def reconstruct(
         adaptation = adapt(
             hand, guess, evidence, AdaptConfig(texture_steps=config.steps, seed=config.seed), progress
         )
-    avatar = make_avatar(fit, offsets, evidence, adaptation.gaussians)
-    errors = {
-        "reprojection_percent": fit.reprojection,
-        "worst_point_percent": fit.worst_point,
-        "mask_iou": fit.mask_iou,
-        "refined_px": moved,
-        **input_errors(avatar, evidence),
-    }
-    return Reconstruction(avatar, fit, prior.about, stages, errors, fit.warnings)
+    gaussians, close = adaptation.gaussians, evidence
+    if (size := detail_size(fit, config)) > len(evidence.image):
+        with stage("detail"):
+            close = make_evidence(photo, fit, offsets, config, size)
+            gaussians = sharpen(hand, gaussians, close, progress).gaussians
+    avatar = make_avatar(fit, offsets, evidence, gaussians)
+    with stage("quality"):
+        quality = assess_surface(hand, evidence, over_photo(avatar, evidence))
+        shown = shares(hand, evidence.rest.vertices, quality)
+        _, _, side = square_around(fit.mask, CROP_MARGIN)
+        doubts = (*surface_doubts(shown), *photo_doubts(close.image, close.mask, side))
+        errors = {
+            "reprojection_percent": fit.reprojection,
+            "worst_point_percent": fit.worst_point,
+            "mask_iou": fit.mask_iou,
+            "refined_px": moved,
+            **input_errors(avatar, close),
+            **shown,
+        }
+    return Reconstruction(avatar, fit, prior.about, stages, errors, (*fit.warnings, *doubts), quality)
 
 
-def carrier_offsets(hand: HandModel, fit: HandFit) -> Float[Tensor, "V 3"]:
-    """From the fitted rest surface to the one that carries Gaussians [m]: onto the photo's outline, then inwards."""
-    return outline_offsets(hand, fit) + below_skin(hand)
+def carrier_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
+    """From the fitted rest surface to the one that carries Gaussians [m]: onto the photos' outlines, then inwards."""
+    return outline_offsets(hand, *fits) + below_skin(hand)
 
 
 def landmarks_in_crop(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
@@ -135,9 +155,24 @@ def landmarks_in_crop(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
     return (xy - camera.K[:2, 2]) * K.diagonal()[:2] / camera.K.diagonal()[:2] + K[:2, 2]
 
 
-def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: ReconstructConfig) -> Evidence:
-    """The square crop that avatars are fitted to, with the fitted surface in its camera; a left hand is mirrored."""
+def detail_size(fit: HandFit, config: ReconstructConfig) -> int:
+    """Side of the crop with all the detail that `config` asks for [px]."""
+    if config.size != "auto":
+        return config.size
+    _, _, side = square_around(fit.mask, CROP_MARGIN)
+    return min(max(round(side), COARSE_SIZE), FINEST_SIZE)
+
+
+def make_evidence(
+    photo: Photo, fit: HandFit, offsets: torch.Tensor, config: ReconstructConfig, size: int | None = None
+) -> Evidence:
+    """The square crop that avatars are fitted to, with the fitted surface in its camera; a left hand is mirrored.
+
+    Its side is `size` [px], or else what `config` asks for, up to `COARSE_SIZE`.
+    """
     hand = bundled_hand()
+    if size is None:
+        size = COARSE_SIZE if config.size == "auto" else min(config.size, COARSE_SIZE)
     image, mask, camera, pose = photo.rgb.float() / 255, fit.mask, fit.camera, fit.pose
     if fit.side == "left":
         image, mask = image.flip(1), mask.flip(1)
@@ -151,14 +186,14 @@ def make_evidence(photo: Photo, fit: HandFit, offsets: torch.Tensor, config: Rec
     rest = rest_hand(hand, fit.shape)
     rest = rest._replace(vertices=rest.vertices + offsets)
     posed = skin(hand, rest, pose)
-    crop = crop_camera(camera, left, top, side, config.size)
+    crop = crop_camera(camera, left, top, side, size)
     device = torch.device(config.device)
 
     def there(nouns):
         return type(nouns)(*(part.to(device) for part in nouns))
 
     def cut(plane):
-        return resample_square(plane.contiguous(), left, top, side, config.size).clamp(0, 1).to(device)
+        return resample_square(plane.contiguous(), left, top, side, size).clamp(0, 1).to(device)
 
     return Evidence(
         image=cut(image),
@@ -185,13 +220,25 @@ def make_avatar(
     )
 
 
+def _input_view(avatar: Avatar, evidence: Evidence) -> Render:
+    """The avatar over black as `evidence` shows the hand; a left hand is mirrored."""
+    if avatar.side == "right":
+        return avatar.render(evidence.camera, avatar.source_pose, BLACK)
+    image, alpha = avatar.render(mirrored_camera(evidence.camera), avatar.source_pose, BLACK)
+    return Render(image.flip(1), alpha.flip(1))
+
+
+@torch.no_grad()
+def over_photo(avatar: Avatar, evidence: Evidence) -> Float[Tensor, "S S 3"]:
+    """The avatar drawn over its own photo."""
+    image, alpha = _input_view(avatar, evidence)
+    return image + (1 - alpha)[..., None] * evidence.image
+
+
 @torch.no_grad()
 def input_errors(avatar: Avatar, evidence: Evidence) -> dict[str, float]:
     """How well the avatar explains its own photo: over black, inside the mask above the wrist line, in the crop."""
-    drawn = avatar.render(avatar.source_camera, avatar.source_pose, BLACK)
-    image, alpha = drawn.image, drawn.alpha
-    if avatar.side == "left":
-        image, alpha = image.flip(1), alpha.flip(1)
+    image, alpha = _input_view(avatar, evidence)
     judged = evidence.above_wrist > 0.5
     inside = ((evidence.mask > 0.5) & judged).to(image)
     covered = (alpha > 0.5) & judged

@@ -4,6 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from oasis_warp.avatar.quality import SurfaceQuality
 from oasis_warp.core.camera import project
 from oasis_warp.core.types import Camera, CanonicalGaussians, HandFit, HandPose, Landmarks, Photo
 from oasis_warp.hand.poses import named_pose
@@ -62,8 +63,10 @@ def scene(hand):
 @pytest.fixture
 def made(scene):
     _, fit, avatar = scene
+    n = len(avatar.hand.template)
+    quality = SurfaceQuality(torch.arange(n) / n, 1 - torch.arange(n) / n)
     seconds, errors = {"landmarks": 0.5, "fit": 0.25}, {"input_psnr_db": 30.0, "mask_iou": 0.97}
-    return Reconstruction(avatar, fit, {"name": "learned", "sha256": "0a1b", "step": 7}, seconds, errors, ())
+    return Reconstruction(avatar, fit, {"name": "learned", "sha256": "0a1b", "step": 7}, seconds, errors, (), quality)
 
 
 @pytest.fixture

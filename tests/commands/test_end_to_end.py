@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 PHOTOS = Path(__file__).parents[1] / "data" / "photos"
-FILES = {"avatar.safetensors", "summary.png", "turntable.mp4", "report.json"}
+FILES = {"avatar.safetensors", "summary.png", "quality.png", "turntable.mp4", "report.json"}
 OASIS = [sys.executable, "-m", "oasis_warp"]
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]

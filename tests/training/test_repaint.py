@@ -9,7 +9,8 @@ from oasis_warp.core.types import Camera
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import depth_map
 from oasis_warp.render.render import render
-from oasis_warp.training.repaint import Canvas, repaint
+from oasis_warp.training.carried import Canvas
+from oasis_warp.training.repaint import repaint
 
 SIZE = 256
 

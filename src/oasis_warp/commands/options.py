@@ -19,16 +19,19 @@ PoseName = Literal["photo", "rest", "open", "relaxed", "fist", "pinch", "thumbs_
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstruct:
-    """Turn photos of a hand into avatars: avatar.safetensors, summary.png, turntable.mp4 and report.json.
+    """Turn photos of a hand into avatars: avatar.safetensors, summary.png, quality.png, turntable.mp4 and report.json.
 
     One photo's files go into the folder --out itself, those of several into a folder each, --out/NAME for NAME.jpg.
-    Files of an earlier run are replaced, all other files in the folder stay.
+    With --same-hand several photos make one avatar, in --out itself. Files of an earlier run are replaced, all other
+    files in the folder stay.
     """
 
     photos: Positional[tuple[Path, ...]]
     """JPEG, PNG, WebP, AVIF, BMP or TIFF files."""
     out: Output
     """Folder for the results; its parent must exist."""
+    same_hand: FlagCreatePairsOff[bool] = False
+    """All photos show one hand: make one avatar of them, in the first one's light."""
     hand: Literal["left", "right", "largest"] | int = "largest"
     """Which hand of the photo: a side, the largest, or a number from 0 for the best found, 1 for the next."""
     keypoints: Path | None = None
@@ -46,8 +49,9 @@ class Reconstruct:
     """The same seed gives the same avatar."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
-    size: int = 256
-    """Side of the square crop that the avatar is fitted to [px]."""
+    size: int | Literal["auto"] = "auto"
+    """Side of the square crop whose detail the avatar shows [px], 64 to 1024; by itself the photo's own, from 256 to
+    1024."""
     force: FlagCreatePairsOff[bool] = False
     """Go on with a fit that is too poor to be trusted."""
 

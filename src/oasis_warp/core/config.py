@@ -15,7 +15,7 @@ class AdaptConfig:
     calibration: Literal["on", "off"] = "on"
     """Match the prior's colours to the photo's as a whole first, or leave them as they are."""
     calibration_steps: int = 0
-    """Steps of the paper's colour calibration after its closed form, which is the better without them; the paper's 100."""
+    """Steps of the paper's calibration after its closed form, which is better without them; the paper takes 100."""
     light: Literal["keep", "even"] = "keep"
     """Take over all that the photo shows, its shadows too, so that the avatar looks like its photo; or only what is
     likelier skin than light, so that it looks right elsewhere."""
@@ -56,8 +56,8 @@ class ReconstructConfig:
     """The same seed gives the same avatar."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
-    size: int = 256
-    """Side of the square crop that the avatar is fitted to [px]."""
+    size: int | Literal["auto"] = "auto"
+    """Side of the square crop whose detail the avatar shows [px]; by itself the photo's own, from 256 to 1024."""
     force: bool = False
     """Go on with a fit that is too poor to be trusted."""
 

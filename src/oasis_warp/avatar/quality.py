@@ -1,0 +1,142 @@
+"""What an avatar rests on: how much of the surface the photo showed, how sure the rest is, and what ails the photo."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sparse
+import torch
+from jaxtyping import Float
+from scipy.sparse.csgraph import dijkstra
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from oasis_warp.avatar.appearance import label_regions, region_masks
+from oasis_warp.avatar.observe import inner_mask, observe
+from oasis_warp.core import surface
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import Evidence
+
+SEEN = 0.5
+"""Confidence of an observation from which a place counts as seen; below it the photo only grazes it."""
+REACH = 0.015
+"""Distance along the surface over which what the photo shows says e times less [m]."""
+TOLERATED = 0.08
+"""Colour difference between avatar and photo that makes a place e times less trusted [sRGB]."""
+LITTLE_SEEN = 20.0
+"""Share of the surface below which the photo shows little of it [%]: 25 to 38 on fifteen photos of whole hands."""
+DARK, CLIPPED, CLIP = 0.15, 0.1, 0.99
+"""Mean brightness of a hand that is too dark; share of its pixels at the upper end, from CLIP on, that is too many."""
+BLURRED, BLUR_SIDE, BLUR_WINDOW = 0.75, 512, 9
+"""Blur [0 to 1] from which a photo counts as blurred, side of the crop at which it is measured, at most, and length of
+the test's own blur [px]. Fifteen hands of 206 to 562 px have .41 to .62, and blurred by 2 px .74 and more."""
+LUMA = (0.299, 0.587, 0.114)
+SKIN_REDNESS = 1.03
+"""Red over green and over blue, below which a hand is not skin in ordinary light: 1.10 and more on the same photos."""
+MIN_TRUST = 1e-6
+
+
+class SurfaceQuality(NamedTuple):
+    """How well each vertex of the surface is known."""
+
+    visibility: Float[Tensor, "V"]
+    """1 seen by the photo from the front, falling to 0 where it grazes the surface or does not show it."""
+    uncertainty: Float[Tensor, "V"]
+    """0 where the avatar is as the photo shows it, 1 where only the prior knows anything."""
+
+
+@torch.no_grad()
+def assess_surface(hand: HandModel, evidence: Evidence, drawn: Float[Tensor, "S S 3"]) -> SurfaceQuality:
+    """Where the surface is known from the photo, by a first guess that no truth is needed for.
+
+    Trust in a vertex is the observation's confidence times exp(-|avatar - photo| / TOLERATED). It is handed on along
+    the surface, e times less every REACH: uncertainty is 1 - max_w trust(w) exp(-d(v, w) / REACH), with the
+    distances d along edges, found by one run of Dijkstra's algorithm from all vertices at once.
+
+    Args:
+        hand: Whose surface it is.
+        evidence: The photo.
+        drawn: The avatar in the photo's view, over the photo.
+    """
+    seen = observe(hand, evidence._replace(image=evidence.image - drawn))
+    residual = seen.colors.square().mean(-1).sqrt()
+    trust = (seen.confidence * torch.exp(-residual / TOLERATED)).cpu().double().numpy()
+    vertices, edges = evidence.rest.vertices.cpu().double(), surface.mesh_edges(hand.faces.cpu())
+    lengths = (vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1).numpy()
+    n, known = len(vertices), np.flatnonzero(trust > MIN_TRUST)
+    # A source beside the graph, as far from each vertex as its trust has already fallen; an edge of 0 would be none.
+    start = np.maximum(-REACH * np.log(trust[known]), 1e-12)
+    ends = np.concatenate([edges[:, 0], np.full(len(known), n)]), np.concatenate([edges[:, 1], known])
+    graph = sparse.csr_array((np.concatenate([lengths, start]), ends), shape=(n + 1, n + 1))
+    away = dijkstra(graph, directed=False, indices=n)[:n]
+    uncertainty = torch.from_numpy(1 - np.exp(-away / REACH)).to(seen.confidence)
+    return SurfaceQuality(seen.confidence, uncertainty)
+
+
+def shares(hand: HandModel, rest: Float[Tensor, "V 3"], quality: SurfaceQuality) -> dict[str, float]:
+    """Shares of the surface [%]: seen, grazed, not seen; seen of palm, back and nails; and the mean uncertainty."""
+    area = surface.vertex_areas(rest, hand.faces.to(rest.device)).cpu()
+    visibility = quality.visibility.cpu()
+    seen, grazed = (visibility >= SEEN).float(), ((visibility > 0) & (visibility < SEEN)).float()
+
+    def mean(values: Tensor, weight: Tensor) -> float:
+        return float((values * weight).sum() / weight.sum())
+
+    found = {"seen_percent": 100 * mean(seen, area), "grazed_percent": 100 * mean(grazed, area)}
+    found["extrapolated_percent"] = 100 - found["seen_percent"] - found["grazed_percent"]
+    for name, weight in region_masks(label_regions(hand)).items():
+        found[f"{name}_seen_percent"] = 100 * mean(seen, area * weight)
+    found["uncertainty_mean"] = mean(quality.uncertainty.cpu(), area)
+    return found
+
+
+def surface_doubts(found: dict[str, float]) -> list[str]:
+    """What `shares` gives reason to warn about, in words."""
+    if found["seen_percent"] >= LITTLE_SEEN:
+        return []
+    percent = f"{found['seen_percent']:.0f} %"
+    return [f"little was seen: the photo shows {percent} of the hand from the front, the rest is guessed"]
+
+
+@torch.no_grad()
+def photo_doubts(image: Float[Tensor, "S S 3"], mask: Float[Tensor, "S S"], side: float) -> list[str]:
+    """What ails the photo of a hand, in words: dark, over-exposed, not the colour of skin, blurred.
+
+    Args:
+        image: The square crop around the hand.
+        mask: Share of each pixel that is hand.
+        side: Of that square in the photo [px].
+    """
+    inside = inner_mask(mask) > 0.5
+    if not bool(inside.any()):
+        return ["the hand is thinner than a few pixels: its colours hold the background"]
+    pixels, said = image[inside], []
+    red, green, blue = pixels.mean(0).tolist()
+    brightness = red * LUMA[0] + green * LUMA[1] + blue * LUMA[2]
+    clipped = float((pixels.amax(1) > CLIP).float().mean())
+    if brightness < DARK:
+        said.append(f"dark photo: the hand has {100 * brightness:.0f} % of full brightness, its colours are noise")
+    if clipped > CLIPPED:
+        said.append(f"over-exposed photo: {100 * clipped:.0f} % of the hand is white or nearly so and has no detail")
+    if red < SKIN_REDNESS * max(green, blue):
+        said.append("the hand has not the colour of skin: coloured light or a glove, and all of it is taken for skin")
+    if (found := _blur(image, mask, side)) > BLURRED:
+        said.append(f"blurred photo: the avatar will be, too (blur {found:.2f}, sharp photos have less than .65)")
+    return said
+
+
+def _blur(image: Tensor, mask: Tensor, side: float) -> float:
+    """Share of the differences between neighbouring pixels that survives a blur: little where the picture is sharp.
+
+    Along the worse of both axes (Crete et al. 2007, "The blur effect"), at the photo's own size.
+    """
+    size = min(round(side), BLUR_SIDE)
+    planes = torch.cat([(image @ image.new_tensor(LUMA))[None, None], mask[None, None]], 1)
+    grey, hand = interpolate(planes, size=(size, size), mode="bilinear", antialias=True)[0]
+    inside = inner_mask((hand > 0.5).float(), 4) > 0.5
+    worst = 0.0
+    for picture, within in ((grey, inside), (grey.T, inside.T)):
+        blurred = avg_pool2d(picture[None, None], (BLUR_WINDOW, 1), stride=1, padding=(BLUR_WINDOW // 2, 0))[0, 0]
+        sharp, soft = (plane.diff(dim=0).abs()[within[1:]] for plane in (picture, blurred))
+        lost = float((sharp - soft).clamp_min(0).sum())
+        worst = max(worst, 1 - lost / max(float(sharp.sum()), 1e-9))
+    return worst

@@ -1,0 +1,121 @@
+import pytest
+import torch
+from synthetic import evidence_of
+from torch.nn.functional import avg_pool2d
+
+from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.prior import MeanPrior
+from oasis_warp.avatar.quality import REACH, assess_surface, photo_doubts, shares, surface_doubts
+from oasis_warp.core import surface
+from oasis_warp.core.config import AdaptConfig
+from oasis_warp.render.render import render
+from oasis_warp.training.adapt import adapt
+
+SIDE = 192.0
+SKIN = torch.tensor([0.75, 0.55, 0.45])
+
+
+@pytest.fixture(scope="module")
+def case(hand):
+    """An open palm with stripes that no prior knows, and how well it is known if all that is seen is explained."""
+    stripes = 0.08 * torch.sin(hand.template[:, :1] * (2 * torch.pi / 0.012))
+    colors = (region_colors(label_regions(hand), 0.03) + stripes).clamp(0, 1)
+    evidence, truth, _ = evidence_of(hand, colors)
+    return evidence, truth, assess_surface(hand, evidence, evidence.image)
+
+
+def test_the_side_towards_the_camera_is_seen_and_the_other_is_not(hand, case):
+    evidence, _, quality = case
+    toward = -surface.vertex_normals(evidence.posed.vertices, hand.faces)[:, 2]  # the camera looks along z
+    assert quality.visibility[toward > 0.7].mean() > 0.8
+    assert quality.visibility[toward < 0].max() == 0
+    assert quality.uncertainty[toward > 0.7].mean() < 0.1
+    assert quality.uncertainty[toward < -0.7].mean() > 0.5
+    assert 0 <= quality.uncertainty.min() and quality.uncertainty.max() <= 1
+
+
+def test_uncertainty_grows_no_faster_than_the_distance_along_the_surface(hand, case):
+    evidence, _, quality = case
+    a, b = surface.mesh_edges(hand.faces).T
+    lost = -torch.log(1 - quality.uncertainty.double())
+    length = (evidence.rest.vertices[a] - evidence.rest.vertices[b]).norm(dim=1)
+    assert ((lost[a] - lost[b]).abs() <= length / REACH + 1e-3).all()
+
+
+def test_where_the_avatar_is_unlike_the_photo_it_is_less_certain(hand, case):
+    evidence, _, quality = case
+    left = torch.arange(evidence.image.shape[1]) < evidence.image.shape[1] // 2
+    wrong = torch.where(left[:, None], evidence.image * 0.6, evidence.image)
+    doubted = assess_surface(hand, evidence, wrong)
+    change = doubted.uncertainty - quality.uncertainty
+    assert change.min() >= -1e-6
+    uv = evidence.posed.vertices @ evidence.camera.viewmat[:3, :3].T + evidence.camera.viewmat[:3, 3]
+    on_left = uv[:, 0] / uv[:, 2] < -0.04
+    seen = quality.visibility > 0.9
+    assert change[seen & on_left].mean() > 0.3
+    assert change[seen & (uv[:, 0] / uv[:, 2] > 0.04)].max() < 0.01
+
+
+def test_what_is_uncertain_is_more_often_wrong(hand, case):
+    evidence, truth, _ = case
+    adapted = adapt(hand, MeanPrior(hand)(evidence), evidence, AdaptConfig(texture_steps=20, reference_views=0))
+    posed = pose_gaussians(adapted.gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices)
+    quality = assess_surface(hand, evidence, render(posed, evidence.camera).image)
+    n = len(truth.vertex_index)
+    error = (adapted.gaussians.colors[:n] - truth.colors[:n]).abs().mean(1)
+    uncertainty = quality.uncertainty[truth.vertex_index]
+    sure, unsure = (error[part].mean() for part in (uncertainty < 0.2, uncertainty > 0.8))
+    assert unsure > 2 * sure
+
+
+def test_shares_of_the_surface_add_up(hand, case):
+    evidence, _, quality = case
+    found = shares(hand, evidence.rest.vertices, quality)
+    assert sum(found[f"{kind}_percent"] for kind in ("seen", "grazed", "extrapolated")) == pytest.approx(100)
+    assert found["palm_seen_percent"] > 60 and found["back_seen_percent"] < 10
+    assert 0 < found["uncertainty_mean"] < 1
+    assert surface_doubts(found) == []
+
+
+def test_a_hand_of_which_nothing_is_seen_is_guessed_throughout(hand, case):
+    evidence, _, _ = case
+    quality = assess_surface(hand, evidence._replace(mask=torch.zeros_like(evidence.mask)), evidence.image)
+    assert (quality.visibility == 0).all() and (quality.uncertainty == 1).all()
+    found = shares(hand, evidence.rest.vertices, quality)
+    assert found["extrapolated_percent"] == 100
+    assert "little was seen" in surface_doubts(found)[0]
+
+
+def photo(color=SKIN, blurs=0):
+    """A disc of skin with fine lines."""
+    rows, columns = torch.meshgrid(*(2 * [torch.arange(SIDE) - SIDE / 2]), indexing="ij")
+    lines = 0.06 * torch.sin(columns * 2.4) + 0.06 * torch.sin(rows * 2.1)
+    for _ in range(blurs):
+        lines = avg_pool2d(lines[None], 5, 1, 2)[0]
+    slope = 0.1 * columns / SIDE
+    mask = (rows.hypot(columns) < 0.4 * SIDE).float()
+    return (color * (1 + lines + slope)[..., None]).clamp(0, 1), mask
+
+
+def test_an_ordinary_photo_raises_no_doubt():
+    assert photo_doubts(*photo(), SIDE) == []
+
+
+@pytest.mark.parametrize(
+    ("pictured", "said"),
+    [
+        (photo(0.1 * SKIN), "dark photo"),
+        (photo(torch.tensor([1.3, 0.9, 0.8])), "over-exposed photo"),
+        (photo(SKIN.flip(0)), "not the colour of skin"),
+        (photo(blurs=4), "blurred photo"),
+    ],
+)
+def test_what_ails_a_photo_is_said_and_nothing_else(pictured, said):
+    doubts = photo_doubts(*pictured, SIDE)
+    assert len(doubts) == 1 and said in doubts[0]
+
+
+def test_a_mask_of_a_few_pixels_is_said_to_hold_the_background():
+    image, mask = photo()
+    assert "background" in photo_doubts(image, mask * 0, SIDE)[0]
