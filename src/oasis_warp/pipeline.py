@@ -32,6 +32,7 @@ from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 from oasis_warp.training.adapt import adapt
+from oasis_warp.training.refine import refine
 from oasis_warp.training.sharpen import sharpen
 
 CROP_MARGIN = 1.12
