@@ -106,7 +106,7 @@ def test_a_mask_without_the_hand_leaves_the_start(hand, photo, wrong, mask):
     assert kept.moved == kept.turned == kept.bent == 0
 
 
-@pytest.mark.parametrize("level", [0.0, 1.0])
+@pytest.mark.parametrize("level", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_photo_without_any_detail_gives_a_finite_answer(hand, photo, wrong, level):
     made = refine(hand, photo[1], wrong._replace(image=torch.full_like(wrong.image, level)))
     assert torch.isfinite(made.evidence.posed.vertices).all()

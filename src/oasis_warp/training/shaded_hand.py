@@ -5,12 +5,14 @@ and where one hides another the shading jumps. The light is therefore solved for
 harmonics of the normal in each channel, which a small matrix does.
 """
 
+import functools
+import math
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import conv2d, interpolate, normalize, pad
+from torch.nn.functional import interpolate, normalize
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Evidence
@@ -25,8 +27,6 @@ FLATTEST = (0.0, 1e-3, 1e-3, 1e-3, 3e-3, 3e-3, 3e-3, 3e-3, 3e-3)
 LIGHT_ROUNDS = 4
 CERTAIN = 0.5
 """Share of a pixel from which it counts as hand."""
-REACH = 2.5
-"""Radius of a blur, in standard deviations."""
 
 
 class Drawn(NamedTuple):
@@ -139,11 +139,15 @@ def _mean_around(values: Tensor, weight: Tensor, width: float) -> Tensor:
 
 
 def blur(planes: Float[Tensor, "B C H W"], width: float) -> Float[Tensor, "B C H W"]:
-    """Convolution with a Gaussian of standard deviation `width` [px]; black surrounds the picture."""
-    radius = int(REACH * width + 1)
-    t = torch.arange(-radius, radius + 1, dtype=planes.dtype, device=planes.device)
-    kernel = torch.exp(-(t * t) / (2 * width * width))
-    kernel = kernel / kernel.sum()
-    flat = pad(planes.flatten(0, 1)[:, None], (radius, radius, radius, radius))
-    across = conv2d(flat, kernel.view(1, 1, 1, -1))
-    return conv2d(across, kernel.view(1, 1, -1, 1))[:, 0].view(planes.shape)
+    """Convolution with a Gaussian of standard deviation `width` [px, at least 1]; black surrounds the picture.
+
+    As products with matrices: a CPU convolves planes of one channel three times as slowly.
+    """
+    down, across = (_gaussian(size, width).to(planes) for size in planes.shape[-2:])
+    return down @ planes @ across
+
+
+@functools.cache
+def _gaussian(size: int, width: float) -> Float[Tensor, "n n"]:
+    t = torch.arange(size, dtype=torch.float64)
+    return torch.exp(-((t - t[:, None]) ** 2) / (2 * width * width)) / (width * math.sqrt(2 * math.pi))
