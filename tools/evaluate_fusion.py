@@ -109,7 +109,7 @@ def measure_person(number: int, look: str, prior: Prior, options: argparse.Names
     batches, truths = photograph(number, options.size, look, torch.device(options.device))
     evidences = [evidence_of(batch) for batch in batches]
     pixels = [float(SURROUNDINGS) for _ in batches]
-    config = AdaptConfig(texture_steps=options.steps)
+    config = AdaptConfig(texture_steps=options.steps, light=options.light)
     for chosen in [(k,) for k in range(MOST)] + [tuple(range(n)) for n in range(2, MOST + 1)]:
         fusion = fuse(bundled_hand(), [evidences[k] for k in chosen], [pixels[k] for k in chosen], prior, config)
         seen = (fusion.sightings.confidence > 0.5).any(0).float().mean()
@@ -126,28 +126,32 @@ def measure_person(number: int, look: str, prior: Prior, options: argparse.Names
 
 
 def avatar_of(
-    estimator: HandEstimator, pairs: list[tuple[Photo, Landmarks]], prior: Prior, config: ReconstructConfig
+    estimator: HandEstimator,
+    pairs: list[tuple[Photo, Landmarks]],
+    prior: Prior,
+    config: ReconstructConfig,
+    adapt: AdaptConfig,
 ) -> tuple[Avatar, float]:
     """As `reconstruct_same_hand`, from landmarks that are known; and the share of vertices that are seen."""
     photos, landmarks = zip(*pairs, strict=True)
     fits = fit_together(estimator, photos, landmarks)
     surfaces = fit_surfaces(fits)
     evidences = make_evidences(photos, fits, surfaces, config)
-    settings = AdaptConfig(texture_steps=config.steps)
-    fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), prior, settings)
+    fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), prior, adapt)
     seen = float((fusion.sightings.confidence > 0.5).any(0).float().mean())
     return make_avatar(fits[0], surfaces.shared, evidences[0], fusion.gaussians), seen
 
 
 def measure_hand(name: str, paths: list[Path], prior: Prior, options: argparse.Namespace) -> Iterator[Row]:
     """Rows of every photo held out: avatars of each that follows it, and of the first 2, 3, ... of those."""
-    estimator, config = HandEstimator(bundled_hand()), ReconstructConfig(size=options.size, steps=options.steps)
+    estimator, config = HandEstimator(bundled_hand()), ReconstructConfig(size=options.size)
+    adapt = AdaptConfig(texture_steps=options.steps, light=options.light)
     pairs, alone = [], []
     for path in paths:
         try:
             photo = read_photo(path)
             pair = photo, choose_hand(estimator.find(photo), "largest", photo.name)
-            alone.append(avatar_of(estimator, [pair], prior, config))
+            alone.append(avatar_of(estimator, [pair], prior, config, adapt))
             pairs.append(pair)
         except InputError as error:
             print(f"left out: {error}", file=sys.stderr)
@@ -157,7 +161,7 @@ def measure_hand(name: str, paths: list[Path], prior: Prior, options: argparse.N
         others = [(target + k) % count for k in range(1, most + 1)]
         made = [((k,), alone[k]) for k in others]
         made += [
-            (tuple(others[:n]), avatar_of(estimator, [pairs[k] for k in others[:n]], prior, config))
+            (tuple(others[:n]), avatar_of(estimator, [pairs[k] for k in others[:n]], prior, config, adapt))
             for n in range(2, most + 1)
         ]
         photo, landmarks = pairs[target]
@@ -222,6 +226,7 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=6)
     parser.add_argument("--lights", nargs="*", default=["studio", "wild"])
     parser.add_argument("--prior", default="learned", help="learned, none or a weights file")
+    parser.add_argument("--light", default="even", choices=("even", "keep"), help="of photos; see AdaptConfig")
     parser.add_argument("--steps", type=int, help="of texture learning; stops by itself when not given")
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--device", default="cpu", help="for synthetic people")

@@ -30,6 +30,9 @@ SHADING_LENGTH = 0.01
 """What changes over a longer way along the skin may be light, and photos meet halfway in it [m]."""
 REACH = 0.1
 """Way over which a photo's shading would be forgotten where the photo says nothing [m]: not within a hand."""
+GUESS_LIGHT = 4.0
+"""Weight of the prior's guess in the shading, against a photo that sees the place well: on synthetic people in any light
+more is better up to here at least (4 photos, inside the outline: 20.8 dB without, 22.3 with 1, 23.3 with 4)."""
 UNSEEN = 0.02
 """Weight of a photo's guess where the photo shows nothing, against one that sees the place well."""
 
@@ -155,11 +158,12 @@ def _other_shading(
     """What to add to each photo, smoothly over the skin, so that photos agree wherever two show the same place.
 
     Lamps stand elsewhere in every photo, and fingers shade each other. No photo is right about it: they meet at the
-    mean of what each differs from the guess. Detail stays with the photo that shows it best.
+    mean of what each differs from the guess, the guess itself among them. Detail stays with the photo that shows it
+    best.
     """
     smooth = torch.stack([
         complete_field(rest, hand.faces, own, seen, detail=SHADING_LENGTH, fade=REACH)
         for own, seen in zip(differences, confidence, strict=True)
     ])  # fmt: skip
-    mean = (confidence[..., None] * smooth).sum(0) / confidence.sum(0).clamp_min(1e-12)[:, None]
+    mean = (confidence[..., None] * smooth).sum(0) / (confidence.sum(0) + GUESS_LIGHT)[:, None]
     return torch.where(confidence[..., None] > 0, mean - smooth, 0.0)
