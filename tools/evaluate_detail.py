@@ -186,6 +186,7 @@ def main() -> None:
     """Measure, and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=Path, default=Path("tests/data/photos"))
+    parser.add_argument("--names", nargs="+", default=PHOTOS, help="of photos in that folder, or synthetic:K")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--prior", default="learned", help="learned, none or a weights file")
     parser.add_argument("--device", default="cpu")
@@ -196,7 +197,7 @@ def main() -> None:
     config = ReconstructConfig(prior=prior, device=options.device)
     if options.sheet:
         return sheet(options.photos, config, options.sheet)
-    rows = [row for name in PHOTOS for row in measure(name, options.photos, config)]
+    rows = [row for name in options.names for row in measure(name, options.photos, config)]
     write_file(options.out / "detail.json", json.dumps(rows, indent=1).encode())
     print(table(rows))
     return None
