@@ -4,10 +4,10 @@
     python tools/evaluate_detail.py --out out/detail --sheet docs/_static/detail.jpg
 
 Writes detail.json and prints the table of docs/detail.md. Every photo is made into an avatar with each --size; its
-pictures are compared with the photo in a crop as large as the photo's own, away from the outline and above the wrist,
-and at a quarter of 1024 px. "synthetic:K" is person K of the held-out synthetic hands, photographed at 1024 px: of real
-photos there are none so large among the tests. Frame times are those of one picture of 512 px, over that of the avatar
-of 256 px.
+pictures are compared with the photo in a crop as large as the photo's own and in one of 256 px, away from the outline
+and above the wrist. "synthetic:K" is person K of the held-out synthetic hands, photographed in even light on 1280 px:
+of real photos there are none so large among the tests. Frame times are those of one picture of 512 px, over that of the
+avatar of 256 px.
 """
 
 import argparse
@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
-from stress_one_shot import SYNTHETIC
+from named_photos import SYNTHETIC, photo_of
 from torch import Tensor
 
 from oasis_warp.avatar.observe import inner_mask
@@ -28,28 +28,26 @@ from oasis_warp.commands.drawing import Panel, make_sheet, panel_side
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.rotation import from_axis_angle
-from oasis_warp.core.types import Camera, Evidence, Photo
+from oasis_warp.core.types import Camera, Evidence
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.crop import resample_square, square_around
-from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8
-from oasis_warp.evaluation.held_out import FIRST_PERSON, Shoot, photograph
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.pipeline import CROP_MARGIN, Reconstruction, detail_size, make_evidence, reconstruct
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 
 PHOTOS = (
-    "synthetic:0", "synthetic:3", "back_flat_right_04.jpg", "palm_open_left_02.png", "small_pointing_right_13.jpg"
+    "synthetic:2", "synthetic:7", "back_flat_right_04.jpg", "palm_open_left_02.png", "small_pointing_right_13.jpg"
 )  # fmt: skip
 SIZES = (64, 128, 256, 512, 1024)
 PLAIN, FAR = 256, 256
 """Sides of the crop that the others are compared with, and of the picture from afar [px]."""
-SYNTHETIC_SIZE, FRAME_SIZE, FRAMES = 1024, 512, 9
+SYNTHETIC_SIZE, FRAME_SIZE, FRAMES = 1280, 512, 9
 RIM = 1 / 64
 """Share of the crop's side, at the outline, that is not judged."""
 CLOSE = (
-    ("synthetic:0", 4, "thumb nail"), ("synthetic:0", 6, "creases"), ("back_flat_right_04.jpg", 10, "knuckle"),
+    ("synthetic:2", 12, "nail"), ("synthetic:7", 10, "creases"), ("back_flat_right_04.jpg", 10, "knuckle"),
     ("back_flat_right_04.jpg", 12, "nail"),
 )  # fmt: skip
 """Photo, landmark in the middle and name of each row of the sheet."""
@@ -58,13 +56,9 @@ TURNED = 0.7
 """The last panel of a row is turned by so much [rad]: the finer part must not show its border."""
 
 
-def photo_of(name: str, folder: Path) -> Photo:
-    """A photo of the tests, or a synthetic one."""
-    if not name.startswith(SYNTHETIC):
-        return read_photo(folder / name)
-    shoot, number = Shoot(size=SYNTHETIC_SIZE, targets=1), FIRST_PERSON + int(name.removeprefix(SYNTHETIC))
-    batch = photograph(shoot, "ordinary", number, torch.device("cpu")).photos["wild"]
-    return Photo((batch.image[0] * 255).round().to(torch.uint8), None, None, name, 1.0)
+def place(name: str, folder: Path) -> str:
+    """Where a photo of the tests lies; a synthetic one lies nowhere."""
+    return name if name.startswith(SYNTHETIC) else str(folder / name)
 
 
 @torch.no_grad()
@@ -105,7 +99,7 @@ def frame_times(avatars: list[Avatar]) -> list[float]:
 
 def measure(name: str, folder: Path, config: ReconstructConfig) -> list[dict[str, object]]:
     """A row for each size."""
-    photo, made = photo_of(name, folder), {}
+    photo, made = photo_of(place(name, folder), SYNTHETIC_SIZE, config.device), {}
     for size in SIZES:
         made[size] = reconstruct(photo, ReconstructConfig(**{**vars(config), "size": size, "force": True}))
     first = made[PLAIN]
@@ -154,7 +148,7 @@ def sheet(folder: Path, config: ReconstructConfig, path: Path) -> None:
     rows, known, pixels = [], {}, panel_side(4, SHEET_WIDTH)
     for name, landmark, words in CLOSE:
         if name not in known:
-            photo = photo_of(name, folder)
+            photo = photo_of(place(name, folder), SYNTHETIC_SIZE, config.device)
             both = [reconstruct(photo, ReconstructConfig(**{**vars(config), "size": s})) for s in (PLAIN, "auto")]
             known[name] = photo, *both
         photo, plain, fine = known[name]
@@ -169,10 +163,10 @@ def sheet(folder: Path, config: ReconstructConfig, path: Path) -> None:
         for made, seen, caption in (
             (plain, camera, "avatar, 256 px"), (fine, camera, f"avatar, {size} px"), (fine, beside, "from beside"),
         ):  # fmt: skip
-            panels.append(Panel(to_uint8(made.avatar.render(seen, fit.pose).image).numpy(), caption))
+            panels.append(Panel(to_uint8(made.avatar.render(seen, fit.pose).image).cpu().numpy(), caption))
         rows.append(panels)
     picture = make_sheet("Detail", "before and after, and from beside", rows, SHEET_WIDTH)
-    _, data = cv2.imencode(path.suffix, picture[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
+    _, data = cv2.imencode(".jpg", picture[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
     write_file(path, np.asarray(data).tobytes())
 
 
@@ -192,17 +186,18 @@ def main() -> None:
     """Measure, and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=Path, default=Path("tests/data/photos"))
+    parser.add_argument("--names", nargs="+", default=PHOTOS, help="of photos in that folder, or synthetic:K")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--prior", default="learned", help="learned, none or a weights file")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--sheet", type=Path, help="picture to draw, instead of the table")
+    parser.add_argument("--sheet", type=Path, help="JPEG to draw, instead of the table")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     prior = options.prior if options.prior in ("learned", "none") else Path(options.prior)
     config = ReconstructConfig(prior=prior, device=options.device)
     if options.sheet:
         return sheet(options.photos, config, options.sheet)
-    rows = [row for name in PHOTOS for row in measure(name, options.photos, config)]
+    rows = [row for name in options.names for row in measure(name, options.photos, config)]
     write_file(options.out / "detail.json", json.dumps(rows, indent=1).encode())
     print(table(rows))
     return None

@@ -118,10 +118,11 @@ def tiny(photo: Photo, made: Reconstruction) -> Stressed:
 
 
 def glove(photo: Photo, made: Reconstruction) -> Stressed:
-    """The hand wears a thin, plain glove."""
+    """The hand wears a thin, plain glove; where it is, is given: the networks know skin only."""
     pixels, mask = photo.rgb.numpy().astype(np.float32), made.fit.mask.numpy()[..., None]
     brightness = pixels.mean(2, keepdims=True) / max(float((pixels * mask).sum() / (3 * mask.sum())), 1.0)
-    return Stressed(_with(photo, pixels * (1 - mask) + mask * 255 * brightness * np.array(GLOVE)))
+    gloved = _with(photo, pixels * (1 - mask) + mask * 255 * brightness * np.array(GLOVE))
+    return Stressed(gloved, {"side": made.fit.side, "xy": made.fit.landmarks.xy.tolist(), **_world(made)})
 
 
 def _painted(photo: Photo, made: Reconstruction, kind: str) -> Stressed:

@@ -1,0 +1,96 @@
+"""Damaged photos: quality falls gently, the report says so, and nothing is infinite or explodes."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from stress_one_shot import is_sane, likeness, make
+from stresses import STRESSES, Stressed, box
+from synthetic import evidence_of
+
+from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.prior import MeanPrior
+from oasis_warp.core.config import AdaptConfig, ReconstructConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.data.photo import read_photo
+from oasis_warp.pipeline import reconstruct
+from oasis_warp.training.adapt import adapt
+from oasis_warp.training.sharpen import sharpen
+
+PHOTO = Path(__file__).parent / "data" / "photos" / "palm_open_left_02.png"
+FEW = ReconstructConfig(steps=20)
+SAID = {
+    "mask eroded": "", "mask dilated": "", "landmarks off": "poor fit", "half out": "border", "warm light": "",
+    "cold light": "colour of skin", "dark": "dark photo", "blurred": "blurred photo", "tiny": "small hand",
+    "nail polish": "", "tattoo": "", "glove": "colour of skin",
+}  # fmt: skip
+"""What the report must warn about, if anything."""
+LIKE = 18.0
+"""An avatar of a damaged photo is as like that of the whole one as this, at least [dB]."""
+
+
+@pytest.fixture(scope="module")
+def evidence(hand):
+    return evidence_of(hand, region_colors(label_regions(hand), 0.03), size=48)[0]
+
+
+@pytest.mark.parametrize("damage", ["black", "white", "no mask", "all mask", "one pixel", "noise"])
+def test_no_photo_and_no_mask_makes_colours_that_are_none(hand, evidence, damage):
+    image, mask = evidence.image, evidence.mask
+    one = torch.zeros_like(mask)
+    one[len(mask) // 2, len(mask) // 2] = 1
+    image, mask = {
+        "black": (torch.zeros_like(image), mask),
+        "white": (torch.ones_like(image), mask),
+        "no mask": (image, torch.zeros_like(mask)),
+        "all mask": (image, torch.ones_like(mask)),
+        "one pixel": (image, one),
+        "noise": (torch.rand(image.shape, generator=torch.Generator().manual_seed(0)), mask),
+    }[damage]
+    damaged = evidence._replace(image=image, mask=mask)
+    few = AdaptConfig(calibration_steps=5, texture_steps=3, reference_views=1)
+    adapted = adapt(hand, MeanPrior(hand)(damaged), damaged, few)
+    assert is_sane(sharpen(hand, adapted.gaussians, damaged).gaussians)
+
+
+def test_gaussians_that_are_no_numbers_no_colours_or_too_large_are_told(hand, evidence):
+    gaussians = MeanPrior(hand)(evidence)
+    assert is_sane(gaussians)
+    for name, value in (("colors", float("nan")), ("colors", 1.5), ("scales", 1.0), ("opacities", float("inf"))):
+        broken = getattr(gaussians, name).clone()
+        broken.view(-1)[7] = value
+        assert not is_sane(gaussians._replace(**{name: broken})), name
+
+
+@pytest.fixture(scope="module")
+def whole():
+    photo = read_photo(PHOTO)
+    return photo, reconstruct(photo, FEW)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STRESSES)
+def test_a_damaged_photo_makes_a_hand_and_the_report_says_what_ails_it(whole, name):
+    photo, base = whole
+    assert base.warnings == ()
+    made = make(STRESSES[name](photo, base), FEW, force=True)
+    assert is_sane(made.avatar.gaussians)
+    assert likeness(base.avatar, made.avatar) > LIKE
+    assert SAID[name] in "; ".join(made.warnings)
+
+
+@pytest.mark.slow
+def test_a_tiny_hand_is_refused_unless_forced(whole):
+    photo, base = whole
+    stressed = STRESSES["tiny"](photo, base)
+    assert isinstance(stressed, Stressed) and box(base) > 200
+    with pytest.raises(InputError, match="pixels large"):
+        make(stressed, FEW, force=False)
+
+
+@pytest.mark.slow
+def test_three_fits_with_the_same_seed_have_the_same_bits(whole):
+    photo, base = whole
+    for _ in range(2):
+        again = reconstruct(photo, FEW).avatar.gaussians
+        assert all(torch.equal(a, b) for a, b in zip(again, base.avatar.gaussians, strict=True))
