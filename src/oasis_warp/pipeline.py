@@ -94,9 +94,8 @@ def reconstruct(
     with stage("prior"):
         guess = prior(evidence)
     with stage("adaptation"):
-        adaptation = adapt(
-            hand, guess, evidence, AdaptConfig(texture_steps=config.steps, seed=config.seed), progress
-        )
+        settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
+        adaptation = adapt(hand, guess, evidence, settings, progress)
     avatar = make_avatar(fit, offsets, evidence, adaptation.gaussians)
     errors = {
         "reprojection_percent": fit.reprojection,

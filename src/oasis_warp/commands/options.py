@@ -38,6 +38,8 @@ class Reconstruct:
     colours in its skin tone, or what your own network sees: network.safetensors of `oasis pretrain`."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
+    light: Literal["keep", "even"] = "keep"
+    """Whether the avatar keeps the light of its photo, shadows too, or is as in even light wherever one can tell."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0
