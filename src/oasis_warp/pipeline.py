@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import below_skin
+from oasis_warp.avatar.anchors import PICTURE, below_skin
 from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.avatar.quality import SurfaceQuality, assess_surface, photo_doubts, shares, surface_doubts
@@ -37,7 +37,7 @@ from oasis_warp.training.sharpen import sharpen
 
 CROP_MARGIN = 1.12
 """Side of the crop over the longer extent of the mask."""
-COARSE_SIZE = 256
+COARSE_SIZE = PICTURE
 """Side of the crop that the prior reads and the whole hand is fitted to [px]: as many pixels as it has Gaussians. What
 a larger one shows beyond it goes into finer Gaussians."""
 FINEST_SIZE = 1024
@@ -108,7 +108,7 @@ def reconstruct(
     moved = 0.0
     if config.refine == "on" and isinstance(given, Landmarks):  # a pose that was given is right as it is
         with stage("refinement"):
-            refinement = refine(hand, guess, evidence, landmarks_in_crop(fit, evidence.camera))
+            refinement = refine(hand, guess, evidence, landmarks_in_crop(fit, evidence.camera), own_size(fit))
             pose = refinement.pose
             found = with_pose(hand, fit, mirror_pose(pose) if fit.side == "left" else pose)
             if refinement.accepted and no_more_doubtful(found, fit):
@@ -117,11 +117,11 @@ def reconstruct(
                 evidence = make_evidence(photo, fit, offsets, config)
                 guess = prior(evidence)
     with stage("adaptation"):
-        adaptation = adapt(
-            hand, guess, evidence, AdaptConfig(texture_steps=config.steps, seed=config.seed), progress
-        )
+        settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
+        adaptation = adapt(hand, guess, evidence, settings, progress)
     gaussians, close = adaptation.gaussians, evidence
-    if (size := detail_size(fit, config)) > len(evidence.image):
+    # detail is laid over what the photo shows, light and all
+    if config.light == "keep" and (size := detail_size(fit, config)) > len(evidence.image):
         with stage("detail"):
             close = make_evidence(photo, fit, offsets, config, size)
             gaussians = sharpen(hand, gaussians, close, progress).gaussians
@@ -143,8 +143,17 @@ def reconstruct(
 
 
 def carrier_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
-    """From the fitted rest surface to the one that carries Gaussians [m]: onto the photos' outlines, then inwards."""
-    return outline_offsets(hand, *fits) + below_skin(hand)
+    """From the fitted rest surface to the one that carries Gaussians [m]: onto the photos' outlines, then inwards.
+
+    How far inwards is right for pictures as fine as the finest of the photos.
+    """
+    return outline_offsets(hand, *fits) + below_skin(hand, max(map(own_size, fits)))
+
+
+def own_size(fit: HandFit) -> int:
+    """Side of the crop that shows all there is in the photo, within what is of use here [px]."""
+    _, _, side = square_around(fit.mask, CROP_MARGIN)
+    return min(max(round(side), COARSE_SIZE), FINEST_SIZE)
 
 
 def landmarks_in_crop(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
@@ -158,10 +167,7 @@ def landmarks_in_crop(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
 
 def detail_size(fit: HandFit, config: ReconstructConfig) -> int:
     """Side of the crop with all the detail that `config` asks for [px]."""
-    if config.size != "auto":
-        return config.size
-    _, _, side = square_around(fit.mask, CROP_MARGIN)
-    return min(max(round(side), COARSE_SIZE), FINEST_SIZE)
+    return own_size(fit) if config.size == "auto" else config.size
 
 
 def make_evidence(

@@ -41,8 +41,10 @@ class Reconstruct:
     colours in its skin tone, or what your own network sees: network.safetensors of `oasis pretrain`."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
-    refine: Literal["on", "off"] = "on"
+    refine: Literal["on", "off"] = "off"
     """Move the fitted hand to where what the prior saw in the photo explains it better, and look again; or leave it."""
+    light: Literal["keep", "even"] = "keep"
+    """Whether the avatar keeps the light of its photo, shadows too, or is as in even light wherever one can tell."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0

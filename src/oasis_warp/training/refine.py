@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import below_skin
+from oasis_warp.avatar.anchors import PICTURE, below_skin
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandPose, PosedHand
@@ -116,6 +116,7 @@ def refine(
     guess: CanonicalGaussians,
     evidence: Evidence,
     landmarks: Float[Tensor, "21 2"] | None = None,
+    size: int = PICTURE,
 ) -> Refinement:
     """Move the posed surface of `evidence` to where the colours of `guess` explain the photo best.
 
@@ -124,8 +125,9 @@ def refine(
         guess: What a prior makes of `evidence`; its colours should be those of even light.
         evidence: Camera with an identity viewmat; joints and tips are not asked for.
         landmarks: What was detected [px of the evidence]; the model's own at the start when not given.
+        size: As of `avatar.anchors.below_skin`, by which the surface of `evidence` lies below the skin.
     """
-    problem = _Problem(hand, guess, evidence, landmarks)
+    problem = _Problem(hand, guess, evidence, landmarks, size)
     start = problem.start
     before = problem.explain(start)
     found, after = start, before
@@ -163,12 +165,12 @@ class _Problem:
     """One photo, and what it costs to explain it by a state."""
 
     def __init__(
-        self, hand: HandModel, guess: CanonicalGaussians, evidence: Evidence, landmarks: Tensor | None
+        self, hand: HandModel, guess: CanonicalGaussians, evidence: Evidence, landmarks: Tensor | None, size: int
     ):
         self.rig, camera = Rig(hand), evidence.camera
         device = evidence.image.device
         self.hand = hand.to(device)
-        K, carrier, sunk = array(camera.K), array(evidence.rest.vertices), array(below_skin(hand))
+        K, carrier, sunk = array(camera.K), array(evidence.rest.vertices), array(below_skin(hand, size))
         shape = shape_of(self.rig, carrier - sunk)
         self.start, detail = state_of_surface(
             self.rig, shape, carrier, array(evidence.posed.vertices), float(K[0, 0]), K[:2, 2]
