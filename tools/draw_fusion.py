@@ -1,8 +1,7 @@
 """Draw avatars of single photos of a hand beside the one of all: the picture of docs/same_hand.md.
 
     D=tests/data/photos/same_hand/a1_wood_right
-    python tools/draw_fusion.py $D/02_flat_closed.jpg $D/03_flat_closed_back.jpg $D/05_c_shape_open.jpg \\
-        -o docs/_static/fusion.jpg
+    python tools/draw_fusion.py -o docs/_static/fusion.jpg $D/02*.jpg $D/03*.jpg $D/05*.jpg
 
 A column for each photo and one for all together; rows: the photo, then the open hand from the palm and from the back.
 """

@@ -226,7 +226,7 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=6)
     parser.add_argument("--lights", nargs="*", default=["studio", "wild"])
     parser.add_argument("--prior", default="learned", help="learned, none or a weights file")
-    parser.add_argument("--light", default="even", choices=("even", "keep"), help="of photos; see AdaptConfig")
+    parser.add_argument("--light", default="keep", choices=("even", "keep"), help="of photos; see AdaptConfig")
     parser.add_argument("--steps", type=int, help="of texture learning; stops by itself when not given")
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--device", default="cpu", help="for synthetic people")

@@ -71,8 +71,8 @@ def reconstruct_same_hand(
 
     Args:
         photos: From `oasis_warp.read_photo`. The first decides on exposure and white balance, the source pose and the
-            source camera. Shadows of several photos are left out. Of one photo alone comes what `reconstruct` makes of
-            it.
+            source camera. Of one photo alone comes what `reconstruct` makes of it; shading of several is
+            evened out.
         config: Options, for every photo.
         prior: What to assume of a hand before its photos are fitted; the one that `config.prior` names when not given.
         progress: Called as work goes on.
@@ -106,8 +106,7 @@ def reconstruct_same_hand(
     with stage("crop"):
         evidences = make_evidences(photos, fits, surfaces, config)
     with stage("fusion"):
-        light = "even" if len(photos) > 1 else "keep"  # each photo has another light, and none suits all places
-        settings = AdaptConfig(texture_steps=config.steps, seed=config.seed, light=light)
+        settings = AdaptConfig(texture_steps=config.steps, seed=config.seed)
         fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), prior, settings, progress)
     with stage("check"):
         avatar = make_avatar(fits[0], surfaces.shared, evidences[0], fusion.gaussians)
