@@ -24,19 +24,18 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
 
 FULL = "full"
-LIGHTS = ("same", "studio")
-"""In which an adapted avatar can come out right: what it takes over of the photo's light is in its targets, too."""
 LEARNED = Method("learned", ONE_SHOT)
 SETTINGS = {
     FULL: AdaptConfig(),
     "calibration": AdaptConfig(calibration="off"),
     "texture": AdaptConfig(texture_steps=0),
     "references": AdaptConfig(reference_views=0),
+    "even": AdaptConfig(light="even"),
 }
 """How the learned prior is adapted; "full" is done for the mean prior too."""
 TITLES = {
     FULL: "full model", "prior": "w/o learned prior", "calibration": "w/o colour calibration",
-    "texture": "w/o texture learning", "references": "w/o reference views",
+    "texture": "w/o texture learning", "references": "w/o reference views", "even": "only what is no light",
 }  # fmt: skip
 
 
@@ -46,7 +45,7 @@ def measure(name: str, options: argparse.Namespace) -> list[Record]:
     if name == FULL:
         priors["mean"] = MeanPrior(bundled_hand())
     config = SyntheticEvaluation(
-        groups=("ordinary",), people=options.people, lights=LIGHTS, noise=(1.0,), curve=(), adapt=SETTINGS[name],
+        groups=("ordinary",), people=options.people, noise=(1.0,), curve=(), adapt=SETTINGS[name],
         methods=tuple(Method(prior, ONE_SHOT) for prior in priors),
     )  # fmt: skip
     found = evaluate(
@@ -75,7 +74,7 @@ def main() -> None:
     options.out.mkdir(exist_ok=True)
     records = [record for name in SETTINGS for record in measure(name, options)]
     variants = {name: (title, Method(name, ONE_SHOT)) for name, title in TITLES.items()}
-    tables = [ablation_table(records, light, COLORS[light], ONE_SHOT, variants, FULL) for light in LIGHTS]
+    tables = [ablation_table(records, light, COLORS[light], ONE_SHOT, variants, FULL) for light in COLORS]
     settings = {"people": options.people, "prior": str(options.prior)}
     write_file(options.out / "ablation.json", json.dumps({"settings": settings, "tables": tables}, indent=1).encode())
     for table in tables:

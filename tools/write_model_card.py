@@ -26,7 +26,7 @@ from typing import Any
 import torch
 
 from oasis_warp.assets import asset
-from oasis_warp.avatar.anchors import SINK
+from oasis_warp.avatar.anchors import SINK, SINK_BLUR
 from oasis_warp.core import surface
 from oasis_warp.evaluation.columns import COLORS, GROUPS, LIGHTS, SYNTHETIC, cells, markdown
 from oasis_warp.evaluation.held_out import FIRST_PERSON, Shoot, as_estimated, photograph
@@ -88,6 +88,8 @@ def training_text(path: Path) -> str:
     if losses:
         lines.append(["losses", losses])
     options = [f"--{name} {notes[name]}" for name in RETRAIN if name in notes]
+    if notes.get("start_sha256"):
+        options.append("--start START.safetensors")  # the weights of that SHA-256
     if notes.get("hold_out"):
         options.append("--hold-out " + " ".join(notes["hold_out"]))
     command = f"```sh\noasis pretrain prior {' '.join(options).replace('bfloat16', 'bf16')}\n```"
@@ -125,7 +127,7 @@ def gaussian_table(network: HandNetwork, photos: int) -> str:
         batch = as_estimated(hand, session, "wild", shoot, 1.0)
         found, rest = network(input_of_batch(batch)), batch.rest[0]
         n = found.offsets.shape[1]
-        deep = SINK - (found.offsets[0] * surface.vertex_normals(rest, hand.faces)).sum(-1)
+        deep = SINK + SINK_BLUR - (found.offsets[0] * surface.vertex_normals(rest, hand.faces)).sum(-1)
         kinds["on vertices"].append(
             {**_shapes(found.opacities[0, :n], found.scales[0, :n]), "under the skin, mm": 1e3 * deep}
         )

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from oasis_warp.core.types import HandPose as HandPose
     from oasis_warp.data.photo import read_photo as read_photo
     from oasis_warp.editing import edit as edit
+    from oasis_warp.fusion import reconstruct_same_hand as reconstruct_same_hand
     from oasis_warp.hand_avatar import Avatar as Avatar
     from oasis_warp.ops import depth_map as depth_map
     from oasis_warp.ops import depth_visibility as depth_visibility
@@ -43,13 +44,14 @@ _HOMES = {
     "rasterization": "ops",
     "read_photo": "data.photo",
     "reconstruct": "pipeline",
+    "reconstruct_same_hand": "fusion",
     "skin": "ops",
     "spherical_harmonics": "ops",
 }
 __all__ = [
     "Avatar", "Camera", "EditConfig", "Gaussians", "HandPose", "InputError", "ReconstructConfig", "depth_map",
     "depth_visibility", "edit", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "rasterization", "read_photo",
-    "reconstruct", "skin", "spherical_harmonics",
+    "reconstruct", "reconstruct_same_hand", "skin", "spherical_harmonics",
 ]  # fmt: skip
 
 

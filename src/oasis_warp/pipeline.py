@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import below_skin
+from oasis_warp.avatar.anchors import PICTURE, below_skin
 from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.avatar.quality import SurfaceQuality, assess_surface, photo_doubts, shares, surface_doubts
@@ -17,10 +17,11 @@ from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmarks, Photo, Render
+from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, HandFit, Landmarks, Photo, Render
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.keypoints_file import read_keypoints
+from oasis_warp.hand.moved_fit import no_more_doubtful, with_pose
 from oasis_warp.hand.outline import wrist_line
 from oasis_warp.hand.skinning import mirror_pose, rest_hand, skin
 from oasis_warp.hand.surface_offsets import outline_offsets
@@ -31,11 +32,12 @@ from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 from oasis_warp.training.adapt import adapt
+from oasis_warp.training.refine import refine
 from oasis_warp.training.sharpen import sharpen
 
 CROP_MARGIN = 1.12
 """Side of the crop over the longer extent of the mask."""
-COARSE_SIZE = 256
+COARSE_SIZE = PICTURE
 """Side of the crop that the prior reads and the whole hand is fitted to [px]: as many pixels as it has Gaussians. What
 a larger one shows beyond it goes into finer Gaussians."""
 FINEST_SIZE = 1024
@@ -103,12 +105,23 @@ def reconstruct(
         evidence = make_evidence(photo, fit, offsets, config)
     with stage("prior"):
         guess = prior(evidence)
+    moved = 0.0
+    if config.refine == "on" and isinstance(given, Landmarks):  # a pose that was given is right as it is
+        with stage("refinement"):
+            refinement = refine(hand, guess, evidence, landmarks_in_crop(fit, evidence.camera), own_size(fit))
+            pose = refinement.pose
+            found = with_pose(hand, fit, mirror_pose(pose) if fit.side == "left" else pose)
+            if refinement.accepted and no_more_doubtful(found, fit):
+                fit, moved = found, refinement.moved
+                offsets = carrier_offsets(hand, fit)
+                evidence = make_evidence(photo, fit, offsets, config)
+                guess = prior(evidence)
     with stage("adaptation"):
-        adaptation = adapt(
-            hand, guess, evidence, AdaptConfig(texture_steps=config.steps, seed=config.seed), progress
-        )
+        settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
+        adaptation = adapt(hand, guess, evidence, settings, progress)
     gaussians, close = adaptation.gaussians, evidence
-    if (size := detail_size(fit, config)) > len(evidence.image):
+    # detail is laid over what the photo shows, light and all
+    if config.light == "keep" and (size := detail_size(fit, config)) > len(evidence.image):
         with stage("detail"):
             close = make_evidence(photo, fit, offsets, config, size)
             gaussians = sharpen(hand, gaussians, close, progress).gaussians
@@ -122,23 +135,39 @@ def reconstruct(
             "reprojection_percent": fit.reprojection,
             "worst_point_percent": fit.worst_point,
             "mask_iou": fit.mask_iou,
+            "refined_px": moved,
             **input_errors(avatar, close),
             **shown,
         }
     return Reconstruction(avatar, fit, prior.about, stages, errors, (*fit.warnings, *doubts), quality)
 
 
-def carrier_offsets(hand: HandModel, fit: HandFit) -> Float[Tensor, "V 3"]:
-    """From the fitted rest surface to the one that carries Gaussians [m]: onto the photo's outline, then inwards."""
-    return outline_offsets(hand, fit) + below_skin(hand)
+def carrier_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
+    """From the fitted rest surface to the one that carries Gaussians [m]: onto the photos' outlines, then inwards.
+
+    How far inwards is right for pictures as fine as the finest of the photos.
+    """
+    return outline_offsets(hand, *fits) + below_skin(hand, max(map(own_size, fits)))
+
+
+def own_size(fit: HandFit) -> int:
+    """Side of the crop that shows all there is in the photo, within what is of use here [px]."""
+    _, _, side = square_around(fit.mask, CROP_MARGIN)
+    return min(max(round(side), COARSE_SIZE), FINEST_SIZE)
+
+
+def landmarks_in_crop(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
+    """The fit's landmarks as the crop of its hand shows them [px]; those of a left hand are mirrored."""
+    xy, camera = fit.landmarks.xy, fit.camera
+    if fit.side == "left":
+        xy, camera = torch.stack([camera.width - xy[:, 0], xy[:, 1]], 1), mirrored_camera(camera)
+    K = crop.K.cpu()
+    return (xy - camera.K[:2, 2]) * K.diagonal()[:2] / camera.K.diagonal()[:2] + K[:2, 2]
 
 
 def detail_size(fit: HandFit, config: ReconstructConfig) -> int:
     """Side of the crop with all the detail that `config` asks for [px]."""
-    if config.size != "auto":
-        return config.size
-    _, _, side = square_around(fit.mask, CROP_MARGIN)
-    return min(max(round(side), COARSE_SIZE), FINEST_SIZE)
+    return own_size(fit) if config.size == "auto" else config.size
 
 
 def make_evidence(

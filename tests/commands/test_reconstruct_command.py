@@ -11,6 +11,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.data.avatar_file import load_avatar
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
+from oasis_warp.fusion import FusedReconstruction, PhotoOfHand
 
 FILES = {"avatar.safetensors", "summary.png", "quality.png", "turntable.mp4", "report.json"}
 
@@ -120,7 +121,62 @@ def test_a_photo_that_fails_does_not_stop_the_others(pipeline, photo_file, tmp_p
     errors = capsys.readouterr().err
     assert "oasis: bad.png: no hand was found" in errors
     assert "none.png: expected a photo, found no such file" in errors
-    assert errors.endswith("oasis: 2 of 4 photos are done, the others failed.\n")
+    assert errors.endswith(f"oasis: 2 of 4 photos are done; failed: {photos[1]}, {photos[2]}.\n")
+
+
+@pytest.fixture
+def fusion(monkeypatch, made, scene):
+    """The fusion, already knowing the answer; a photo whose name has "bad" in it is refused."""
+
+    def answer(photos, config, *, progress):
+        for photo in photos:
+            if "bad" in photo.name:
+                raise InputError(f"{photo.name}: shows a left hand, the other photos a right one; leave it out.")
+        calls.append(photos)
+        shares = {"seen_percent": 30.0, "best_percent": 20.0, "input_psnr_db": 25.0}
+        errors = {"reprojection_percent": 1.0, "mask_iou": 0.9, **shares}
+        about = tuple(PhotoOfHand(photo.name, scene[1], (1.0, 1.0, 1.0), errors) for photo in photos)
+        return FusedReconstruction(
+            made.avatar, about, made.prior, {"fusion": 1.0}, {"seen_percent": 50.0}, ("b.png: small",)
+        )
+
+    calls = []
+    monkeypatch.setattr(command, "reconstruct_same_hand", answer)
+    return calls
+
+
+def test_several_photos_of_the_same_hand_make_one_avatar(fusion, photo_file, tmp_path, capsys):
+    photos = [photo_file(name) for name in ("a.png", "b.png", "c.png")]
+    assert main(["reconstruct", *photos, "--same-hand", "-o", str(tmp_path / "out")]) == 0
+    assert names(tmp_path / "out") == FILES
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert [part["photo"]["name"] for part in report["photos"]] == ["a.png", "b.png", "c.png"]
+    assert report["photos"][1]["gain"] == [1.0, 1.0, 1.0]
+    assert report["warnings"] == ["b.png: small"]
+    rows = read_photo(tmp_path / "out" / "summary.png").rgb.shape[0]
+    printed = capsys.readouterr().out
+    assert "3 photos of a right hand" in printed and "b.png" in printed and "50 %" in printed
+    assert main(["reconstruct", *photos[:2], "--same-hand", "-o", str(tmp_path / "two")]) == 0
+    assert read_photo(tmp_path / "two" / "summary.png").rgb.shape[0] < rows  # a row for each photo
+
+
+def test_one_wrong_photo_of_the_same_hand_is_named_and_nothing_is_left(fusion, photo_file, tmp_path, capsys):
+    photos = [photo_file(name) for name in ("a.png", "bad.png")]
+    assert main(["reconstruct", *photos, "--same-hand", "-o", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.startswith("oasis: bad.png: shows a left hand")
+    assert names(tmp_path) == {"a.png", "bad.png"}
+
+
+def test_one_photo_of_the_same_hand_is_a_photo_like_any_other(pipeline, fusion, photo_file, tmp_path):
+    assert main(["reconstruct", photo_file(), "--same-hand", "-o", str(tmp_path / "out")]) == 0
+    assert len(pipeline) == 1 and not fusion
+    assert names(tmp_path / "out") == FILES
+
+
+def test_the_same_photo_may_be_given_twice_for_the_same_hand(fusion, photo_file, tmp_path):
+    photo = photo_file()
+    assert main(["reconstruct", photo, photo, "--same-hand", "-o", str(tmp_path / "out")]) == 0
+    assert len(fusion[0]) == 2
 
 
 def test_a_failure_leaves_nothing(pipeline, photo_file, tmp_path):
@@ -176,6 +232,8 @@ def test_a_full_disk_is_told_and_leaves_nothing(pipeline, photo_file, tmp_path, 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
+        (["a.png", "b.png", "--same-hand", "--keypoints", "k.json"], "--keypoints: belongs to one photo"),
+        (["--same-hand"], "photos: expected at least one"),
         ([], "photos: expected at least one"),
         (["a/x.png", "b/x.jpg"], "would share one output folder"),
         (["a.png", "b.png", "--keypoints", "k.json"], "--keypoints: belongs to one photo"),

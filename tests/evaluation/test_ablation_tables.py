@@ -172,9 +172,10 @@ def test_variants_are_trained_alike_and_go_on_where_they_were_stopped(tmp_path, 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(ablate_prior.Trainer, "advance", until_stopped)
         run(monkeypatch, ablate_prior, tmp_path / "parts", *few, "--only", "full,vet_off")
-    run(monkeypatch, ablate_prior, tmp_path / "parts", *few, "--only", "vet_off", "--minutes", 0)
+    run(monkeypatch, ablate_prior, tmp_path / "parts", *few, "--only", "no_bias", "--minutes", 0)
     assert "the same command goes on" in capsys.readouterr().err
-    assert not (tmp_path / "parts" / "vet_off" / WEIGHTS).exists()
+    assert (tmp_path / "parts" / "no_bias" / CHECKPOINT).exists()
+    assert not (tmp_path / "parts" / "no_bias" / WEIGHTS).exists()
     run(monkeypatch, ablate_prior, tmp_path / "parts", *few, "--only", "vet_off")
     run(monkeypatch, ablate_prior, tmp_path / "parts", *few, "--only", "full,no_bias")
     for name in ablate_prior.VARIANTS:
@@ -195,6 +196,6 @@ def test_adaptation_is_measured_without_each_of_its_parts(tmp_path, monkeypatch,
     said = capsys.readouterr().out
     assert all(title in said for title in ablate_one_shot.TITLES.values())
     tables = json.loads((tmp_path / "out" / "ablation.json").read_text())["tables"]
-    assert [table["light"] for table in tables] == ["same", "studio"]
+    assert [table["light"] for table in tables] == ["same", "studio", "wild"]
     for table in tables:
         assert [row["variant"] for row in table["rows"]] == list(ablate_one_shot.TITLES)

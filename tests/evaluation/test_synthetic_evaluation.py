@@ -20,6 +20,9 @@ from oasis_warp.evaluation.synthetic import (
     SETTINGS,
     SHEET,
     SyntheticEvaluation,
+    _Bench,
+    _packed,
+    _unpacked,
     evaluate,
     evidence_of,
 )
@@ -100,6 +103,27 @@ def test_a_run_that_was_stopped_goes_on_with_who_is_missing(left, network, tmp_p
     assert measured == {("ordinary", 1.0), ("ordinary", 2.0), ("ring", 1.0)}
     again = evaluate(usual_priors(network), config, folder, CPU)
     assert again == found and len(met) == 1
+
+
+def test_what_measures_people_travels_whole(hand, network):
+    priors = usual_priors(network)
+    there = _unpacked(_packed(_Bench(priors, CONFIG, None)))
+    assert list(there.priors) == list(priors) and there.config == CONFIG and there.perceptual is None
+    assert {name: prior_digest(prior) for name, prior in there.priors.items()} == {
+        name: prior_digest(prior) for name, prior in priors.items()
+    }
+    assert all(dict(there.priors[name].about) == dict(prior.about) for name, prior in priors.items())
+
+
+@pytest.mark.slow
+def test_people_measured_by_other_processes_come_out_the_same(left, network, tmp_path):
+    config = replace(CONFIG, people=2, lights=("studio",))
+    here = evaluate(usual_priors(network), config, tmp_path / "here", CPU)
+    there = evaluate(usual_priors(network), config, tmp_path / "there", CPU, workers=1)
+    assert [record["person"] for record in there["pictures"][:: len(there["pictures"]) // 2]] == [
+        FIRST_PERSON, FIRST_PERSON + 1
+    ]  # fmt: skip
+    assert there == here
 
 
 def test_another_evaluation_in_the_same_folder_is_refused(left, network):

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -121,3 +122,18 @@ def test_a_left_hands_offsets_are_those_of_the_mirrored_photo(hand, fitted, offs
 
 def test_offsets_are_the_same_bits_again(hand, fitted, offsets):
     assert torch.equal(outline_offsets(hand, fitted(RIGHT)[2]), offsets(RIGHT))
+
+
+def test_two_photos_share_one_surface_between_their_outlines(hand, rig, fitted, offsets):
+    """The second is the first with a mask that is thinner all round; both count alike."""
+    fit = fitted(RIGHT)[2]
+    thin = fit._replace(mask=torch.from_numpy(cv2.erode(fit.mask.numpy(), np.ones((7, 7)))))
+    alone, thinner = offsets(RIGHT).numpy(), outline_offsets(hand, thin).numpy()
+    shared = outline_offsets(hand, fit, thin).numpy()
+    _, rest, _ = posed(rig, fit, 0.0)
+    normals = vertex_normals(rest, rig.faces)
+    out = [(shift * normals).sum(1) for shift in (thinner, shared, alone)]
+    told = np.flatnonzero(out[2] - out[0] > 5e-4)
+    assert len(told) > 500
+    assert np.all(np.diff([part[told].mean() for part in out]) > 1e-4)
+    assert iou(rig, fit, shared) > iou(rig, fit, thinner) and iou(rig, thin, shared) > iou(rig, thin, alone)

@@ -22,13 +22,16 @@ class Reconstruct:
     """Turn photos of a hand into avatars: avatar.safetensors, summary.png, quality.png, turntable.mp4 and report.json.
 
     One photo's files go into the folder --out itself, those of several into a folder each, --out/NAME for NAME.jpg.
-    Files of an earlier run are replaced, all other files in the folder stay.
+    With --same-hand several photos make one avatar, in --out itself. Files of an earlier run are replaced, all other
+    files in the folder stay.
     """
 
     photos: Positional[tuple[Path, ...]]
     """JPEG, PNG, WebP, AVIF, BMP or TIFF files."""
     out: Output
     """Folder for the results; its parent must exist."""
+    same_hand: FlagCreatePairsOff[bool] = False
+    """All photos show one hand: make one avatar of them, in the first one's light."""
     hand: Literal["left", "right", "largest"] | int = "largest"
     """Which hand of the photo: a side, the largest, or a number from 0 for the best found, 1 for the next."""
     keypoints: Path | None = None
@@ -38,6 +41,10 @@ class Reconstruct:
     colours in its skin tone, or what your own network sees: network.safetensors of `oasis pretrain`."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
+    refine: Literal["on", "off"] = "off"
+    """Move the fitted hand to where what the prior saw in the photo explains it better, and look again; or leave it."""
+    light: Literal["keep", "even"] = "keep"
+    """Whether the avatar keeps the light of its photo, shadows too, or is as in even light wherever one can tell."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0

@@ -1,8 +1,8 @@
-"""`oasis reconstruct`: photos in, a folder with an avatar out for each."""
+"""`oasis reconstruct`: photos in, a folder with an avatar out for each, or one for all of the same hand."""
 
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -12,12 +12,13 @@ from rich.console import Console
 
 from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
 from oasis_warp.commands.film import turntable
+from oasis_warp.commands.fused_report import make_fused_report, print_fused_report
 from oasis_warp.commands.look import check_device
 from oasis_warp.commands.options import Reconstruct
 from oasis_warp.commands.progress import show_progress
 from oasis_warp.commands.quality_sheet import draw_quality
 from oasis_warp.commands.report import make_report, print_report, to_json
-from oasis_warp.commands.summary import GROUND, draw_summary
+from oasis_warp.commands.summary import GROUND, draw_fused_summary, draw_summary
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, timed_stage
@@ -25,6 +26,7 @@ from oasis_warp.data.atomic import output_folder
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.data.video import write_video
+from oasis_warp.fusion import reconstruct_same_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.weights_file import read_header
 from oasis_warp.pipeline import reconstruct
@@ -46,9 +48,11 @@ def run(options: Reconstruct) -> int:
     if isinstance(options.prior, Path):
         read_header(options.prior)  # once, and not again for every photo
     config = ReconstructConfig(**{field.name: getattr(options, field.name) for field in fields(ReconstructConfig)})
-    if len(options.photos) == 1:
-        report = _reconstruct_one(options.photos[0], options.out, config, options.keypoints)
-        print_report(Console(), report)
+    if len(options.photos) == 1:  # with --same-hand too: there is nothing to fuse
+        print_report(Console(), _reconstruct_one(options.photos[0], options.out, config, options.keypoints))
+        return 0
+    if options.same_hand:
+        print_fused_report(Console(), _reconstruct_same_hand(options.photos, options.out, config))
         return 0
     return _reconstruct_all(options, config)
 
@@ -58,6 +62,8 @@ def _check_photos(options: Reconstruct) -> None:
         raise InputError("photos: expected at least one, got none; name them after `oasis reconstruct`.")
     if len(options.photos) > 1 and options.keypoints is not None:
         raise InputError("--keypoints: belongs to one photo, but several were given; run them one by one.")
+    if options.same_hand:
+        return
     counts = Counter(photo.stem for photo in options.photos)
     if twins := [str(photo) for photo in options.photos if counts[photo.stem] > 1]:
         raise InputError(f"photos: {' and '.join(twins)} would share one output folder; run them one by one.")
@@ -76,6 +82,7 @@ def _check_numbers(options: Reconstruct) -> None:
 def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
     """Every photo into its own folder; one that fails does not stop the others."""
     n_photos, n_done = len(options.photos), 0
+    failed: list[str] = []
     with _shared_folder(options.out):
         try:
             for number, photo in enumerate(options.photos, 1):
@@ -84,14 +91,15 @@ def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
                     report = _reconstruct_one(photo, options.out / photo.stem, config, None)
                 except InputError as error:
                     print(f"oasis: {error}", file=sys.stderr)
+                    failed.append(str(photo))
                 else:
                     print_report(Console(), report)
                     n_done += 1
         except KeyboardInterrupt:
             print(f"oasis: stopped; {n_done} of {n_photos} photos are done.", file=sys.stderr)
             return INTERRUPTED
-    if n_done < n_photos:
-        print(f"oasis: {n_done} of {n_photos} photos are done, the others failed.", file=sys.stderr)
+    if failed:
+        print(f"oasis: {n_done} of {n_photos} photos are done; failed: {', '.join(failed)}.", file=sys.stderr)
         return BAD_INPUT
     return 0
 
@@ -124,13 +132,33 @@ def _reconstruct_one(
         with timed_stage("summary", seconds):
             write_picture(part / "summary.png", draw_summary(photo, made, progress=progress))
             write_picture(part / "quality.png", draw_quality(photo.name, made))
-        with timed_stage("turntable", seconds):
-            _write_turntable(part / "turntable.mp4", made.avatar, progress)
-        with timed_stage("save", seconds):
-            made.avatar.save(part / "avatar.safetensors")
+        _write_avatar(part, made.avatar, seconds, progress)
         report = make_report(photo, made, config, seconds)
         (part / "report.json").write_text(to_json(report))
     return report
+
+
+def _reconstruct_same_hand(paths: Sequence[Path], folder: Path, config: ReconstructConfig) -> dict[str, Any]:
+    """Write the folder of one avatar of all photos; its report."""
+    seconds: dict[str, float] = {}
+    with output_folder(folder) as part, show_progress(Console(stderr=True)) as progress:
+        with timed_stage("read", seconds):
+            photos = [read_photo(path) for path in paths]
+        made = reconstruct_same_hand(photos, config, progress=progress)
+        seconds.update(made.stages)
+        with timed_stage("summary", seconds):
+            write_picture(part / "summary.png", draw_fused_summary(photos, made, progress=progress))
+        _write_avatar(part, made.avatar, seconds, progress)
+        report = make_fused_report(photos, made, config, seconds)
+        (part / "report.json").write_text(to_json(report))
+    return report
+
+
+def _write_avatar(part: Path, avatar: Avatar, seconds: dict[str, float], progress: Progress) -> None:
+    with timed_stage("turntable", seconds):
+        _write_turntable(part / "turntable.mp4", avatar, progress)
+    with timed_stage("save", seconds):
+        avatar.save(part / "avatar.safetensors")
 
 
 def _write_turntable(path: Path, avatar: Avatar, progress: Progress) -> None:

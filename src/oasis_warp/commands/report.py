@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,14 @@ from rich.table import Table
 
 from oasis_warp import __version__
 from oasis_warp.core.config import ReconstructConfig
-from oasis_warp.core.types import Photo
+from oasis_warp.core.types import HandFit, Photo
 from oasis_warp.pipeline import Reconstruction
 
 MEASURES = {
     "reprojection_percent": ("landmarks miss the model by", "{:.1f} % of the hand"),
     "worst_point_percent": ("the worst of them by", "{:.1f} %"),
     "mask_iou": ("overlap of fit and mask", "{:.3f}"),
+    "refined_px": ("refinement moved the surface by", "{:.1f} px"),
     "input_psnr_db": ("likeness to the photo", "{:.1f} dB"),
     "input_psnr_inner_db": ("likeness away from the outline", "{:.1f} dB"),
     "render_mask_iou": ("overlap of avatar and mask", "{:.3f}"),
@@ -38,29 +39,39 @@ def make_report(
     photo: Photo, made: Reconstruction, config: ReconstructConfig, stages: Mapping[str, float]
 ) -> dict[str, Any]:
     """Everything about a run that JSON can hold; `stages` [s] replaces `made.stages`."""
-    height, width = photo.rgb.shape[:2]
-    landmarks = made.fit.landmarks
     return {
         "creator": f"oasis_warp {__version__}",
-        "photo": {
-            "name": photo.name,
-            "width": width,
-            "height": height,
-            "shrink": photo.shrink,
-            "focal_px": photo.focal,
-            "has_alpha": photo.alpha is not None,
-        },
-        "hand": {
-            "side": made.fit.side,
-            "side_score": landmarks.side_score,
-            "presence": landmarks.presence,
-            "landmarks_from": landmarks.source,
-        },
+        "photo": about_photo(photo),
+        "hand": about_hand(made.fit),
         "prior": dict(made.prior),
         "config": asdict(config),
         "seconds": {**stages, "total": sum(stages.values())},
         "errors": made.errors,
         "warnings": list(made.warnings),
+    }
+
+
+def about_photo(photo: Photo) -> dict[str, Any]:
+    """What was read."""
+    height, width = photo.rgb.shape[:2]
+    return {
+        "name": photo.name,
+        "width": width,
+        "height": height,
+        "shrink": photo.shrink,
+        "focal_px": photo.focal,
+        "has_alpha": photo.alpha is not None,
+    }
+
+
+def about_hand(fit: HandFit) -> dict[str, Any]:
+    """What was found."""
+    landmarks = fit.landmarks
+    return {
+        "side": fit.side,
+        "side_score": landmarks.side_score,
+        "presence": landmarks.presence,
+        "landmarks_from": landmarks.source,
     }
 
 
@@ -91,5 +102,10 @@ def print_report(console: Console, report: Mapping[str, Any]) -> None:
         words, unit = MEASURES.get(name, (name, "{:.4g}"))
         table.add_row(words, unit.format(value))
     console.print(table)
-    for warning in report["warnings"]:
+    print_warnings(console, report["warnings"])
+
+
+def print_warnings(console: Console, warnings: Sequence[str]) -> None:
+    """A line each."""
+    for warning in warnings:
         console.print(f"Warning: {warning}", style="yellow", highlight=False, soft_wrap=True)

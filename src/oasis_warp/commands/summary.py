@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float, UInt8
@@ -15,6 +15,7 @@ from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import Camera, HandFit, HandPose, Photo, PosedHand
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.data.pictures import to_uint8
+from oasis_warp.fusion import FusedReconstruction
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
@@ -28,33 +29,51 @@ VIEWS = 6
 POSES = ("open", "fist", "victory", "point", "ok")
 
 
-@torch.no_grad()
 def draw_summary(photo: Photo, made: Reconstruction, *, progress: Progress = silent) -> UInt8[Tensor, "H W 3"]:
     """Photo, fit, mask and avatar in the photo's view; six views around; other poses. `WIDTH` pixels wide."""
-    avatar, fit = made.avatar, made.fit
-    drawn = itertools.count(1)
+    fit = made.fit
+    measures = [f"landmarks {fit.reprojection:.1f} % off", f"mask overlap {fit.mask_iou:.2f}"]
+    if "input_psnr_db" in made.errors:
+        measures.append(f"{made.errors['input_psnr_db']:.1f} dB to the photo")
+    return _draw(made.avatar, [(photo, fit)], measures, bool(made.warnings), progress)
+
+
+def draw_fused_summary(
+    photos: Sequence[Photo], made: FusedReconstruction, *, progress: Progress = silent
+) -> UInt8[Tensor, "H W 3"]:
+    """The same with a row for every photo; the avatar is in the light of the first."""
+    fits = [photo.fit for photo in made.photos]
+    measures = [f"{made.errors['seen_percent']:.0f} % of the surface seen"]
+    return _draw(made.avatar, list(zip(photos, fits, strict=True)), measures, bool(made.warnings), progress)
+
+
+@torch.no_grad()
+def _draw(
+    avatar: Avatar, photos: Sequence[tuple[Photo, HandFit]], measures: list[str], doubtful: bool, progress: Progress
+) -> UInt8[Tensor, "H W 3"]:
+    drawn, total = itertools.count(1), len(photos) + VIEWS + len(POSES)
 
     def draw(camera: Camera, pose: HandPose) -> Pixels:
         picture = to_uint8(avatar.render(camera, pose, GROUND).image).numpy()
-        progress("summary", next(drawn), 1 + VIEWS + len(POSES))
+        progress("summary", next(drawn), total)
         return picture
 
-    side, around = panel_side(VIEWS, WIDTH), avatar.mesh(fit.pose).vertices
+    first = photos[0][1]
+    side, around = panel_side(VIEWS, WIDTH), avatar.mesh(first.pose).vertices
     views = [
-        Panel(draw(orbit_camera(around, 2 * math.pi * k / VIEWS, 0.0, side), fit.pose), f"{360 * k // VIEWS}°")
+        Panel(draw(orbit_camera(around, 2 * math.pi * k / VIEWS, 0.0, side), first.pose), f"{360 * k // VIEWS}°")
         for k in range(VIEWS)
     ]
     held = {name: avatar.source_pose._replace(angles=named_pose(avatar.hand, name)) for name in POSES}
     reach = torch.cat([avatar.mesh(pose).vertices for pose in held.values()])  # one camera: the poses compare
     camera = orbit_camera(reach, 0.0, 0.0, panel_side(len(POSES), WIDTH))
     poses = [Panel(draw(camera, pose), name) for name, pose in held.items()]
-    measures = [f"landmarks {fit.reprojection:.1f} % off", f"mask overlap {fit.mask_iou:.2f}"]
-    if "input_psnr_db" in made.errors:
-        measures.append(f"{made.errors['input_psnr_db']:.1f} dB to the photo")
-    if made.warnings:
-        measures.append("doubtful: see the warnings in report.json")
-    rows = [photo_row(photo, avatar, fit, draw, panel_side(4, WIDTH)), views, poses]
-    return torch.from_numpy(make_sheet(f"{photo.name}, {fit.side} hand", ", ".join(measures), rows, WIDTH))
+    rows = [photo_row(photo, avatar, fit, draw, panel_side(4, WIDTH)) for photo, fit in photos]
+    if doubtful:
+        measures = [*measures, "doubtful: see the warnings in report.json"]
+    names = ", ".join(photo.name for photo, _ in photos)
+    title = f"{names}, {first.side} hand"
+    return torch.from_numpy(make_sheet(title, ", ".join(measures), [*rows, views, poses], WIDTH))
 
 
 def photo_row(

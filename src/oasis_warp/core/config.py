@@ -15,12 +15,12 @@ class AdaptConfig:
     calibration: Literal["on", "off"] = "on"
     """Match the prior's colours to the photo's as a whole first, or leave them as they are."""
     calibration_steps: int = 0
-    """Steps of the paper's colour calibration after its closed form, which is the better without them; the paper's 100."""
+    """Steps of the paper's calibration after its closed form, which is better without them; the paper takes 100."""
     light: Literal["keep", "even"] = "keep"
     """Take over all that the photo shows, its shadows too, so that the avatar looks like its photo; or only what is
     likelier skin than light, so that it looks right elsewhere."""
     texture_steps: int | None = None
-    """Steps of texture learning; None stops when the loss is flat, after 400 at most."""
+    """Steps of texture learning, which "even" does without; None stops when the loss is flat, after 400 at most."""
     weight_rgb: float = 10.0
     """Of the mean absolute colour difference."""
     weight_ssim: float = 1.0
@@ -48,6 +48,10 @@ class ReconstructConfig:
     colours in its skin tone, or what a network of your own sees, of which this is the weights file."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for a network of your own that reads photos with it."""
+    refine: Literal["on", "off"] = "off"
+    """Move the fitted hand to where what the prior saw in the photo explains it better, and look again; or leave it."""
+    light: Literal["keep", "even"] = "keep"
+    """Whether the avatar keeps the light of its photo, shadows too, or is as in even light wherever one can tell."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0

@@ -40,18 +40,23 @@ _WINDOW = 1000
 """Longer side of the picture in which outlines are compared [px]."""
 
 
-def outline_offsets(hand: HandModel, fit: HandFit) -> Float[Tensor, "V 3"]:
-    """Displacement of the rest surface of `fit` that brings the posed outline onto the mask's [m].
+def outline_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
+    """Displacement of the rest surface that brings the posed outlines onto the masks' [m].
 
     Add it to the vertices at rest (`skinning.rest_hand`) before skinning; for a left hand, before mirroring, as the
-    pose is. Zero where the outline says nothing: at the wrist, at the photo's border, across gaps wider than 4 % of
+    pose is. Zero where no outline says anything: at the wrist, at a photo's border, across gaps wider than 4 % of
     the hand, and towards the far side of the hand.
+
+    Args:
+        hand: The model.
+        fits: One photo of a hand, or several of the same hand, all with one shape: then one displacement for all.
     """
-    view = _View(hand, fit)
-    bending = _bending(view.rig)
-    moved = np.zeros_like(view.rest)
+    views = [_View(hand, fit) for fit in fits]
+    bending = _bending(views[0].rig)
+    moved = np.zeros_like(views[0].rest)
     for _ in range(_ROUNDS):
-        vertices, target, weight = view.observe(moved)
+        seen = zip(*(view.observe(moved) for view in views), strict=True)
+        vertices, target, weight = (np.concatenate(part) for part in seen)
         if len(vertices) == 0:
             break
         moved = _smooth(bending, len(moved), vertices, target, weight)
@@ -142,8 +147,8 @@ def _smooth(
 ) -> np.ndarray:
     """The smooth displacement [V, 3] that comes nearest to the targets."""
     diagonal, right = np.zeros(n_vertices), np.zeros((n_vertices, 3))
-    diagonal[vertices] = weight
-    right[vertices] = weight[:, None] * target
+    np.add.at(diagonal, vertices, weight)
+    np.add.at(right, vertices, weight[:, None] * target)
     system = (bending + sparse.diags_array(diagonal)).tocsc()
     factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return factors.solve(right)

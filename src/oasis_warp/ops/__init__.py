@@ -6,6 +6,7 @@ from oasis_warp.ops._values import check_finite as check_finite
 from oasis_warp.ops.blend_weights import BlendWeights as BlendWeights
 from oasis_warp.ops.blend_weights import blend_colors as blend_colors
 from oasis_warp.ops.blend_weights import blend_weights as blend_weights
+from oasis_warp.ops.blend_weights import stack_weights as stack_weights
 from oasis_warp.ops.bone_transforms import BoneTransforms as BoneTransforms
 from oasis_warp.ops.bone_transforms import bone_transforms as bone_transforms
 from oasis_warp.ops.depth_map import DepthMap as DepthMap

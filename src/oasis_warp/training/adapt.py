@@ -42,7 +42,8 @@ def adapt(
     """Fit the colours of `prior` to the photo; geometry stays.
 
     Colour calibration first, then the seen colours are carried smoothly over the rim of the seen region, then texture
-    learning with reference views.
+    learning with reference views. With `config.light` "even" the photo is freed from its light before that, and the
+    last step falls away.
     """
     faces = hand.faces.to(evidence.image.device)
     posed = pose_gaussians(prior, faces, evidence.rest.vertices, evidence.posed.vertices)
@@ -60,21 +61,22 @@ def adapt(
     progress("completion", 0, 1)
     with torch.no_grad():  # what is drawn, not the Gaussians' own colours: those of a learned prior need not agree
         drawn = blend_colors(view, gaussians.colors) / view.alphas.clamp_min(MIN_ALPHA)
-    photo = evidence.image
-    missing = observe(hand, evidence._replace(image=photo - drawn))
+    missing = observe(hand, evidence._replace(image=evidence.image - drawn))
     if config.light == "even":
-        photo = even_photo(photo, drawn, missing, view, gaussians, evidence.rest.vertices, faces)
-        missing = observe(hand, evidence._replace(image=photo - drawn))
+        even = even_photo(evidence.image, drawn, missing, view, gaussians, evidence.rest.vertices, faces)
+        missing = observe(hand, evidence._replace(image=even - drawn))
     difference = complete_field(evidence.rest.vertices, faces, missing.colors, missing.confidence)
     colors = (gaussians.colors + vertex_to_gaussians(difference, faces, gaussians)).clamp(0, 1)
     gaussians = gaussians._replace(colors=colors)
     progress("completion", 1, 1)
 
+    if config.light == "even":  # what is left to learn is the photo's light
+        return Adaptation(gaussians, calibration, ())
     references = [
         freeze_view(posed, orbit_camera(evidence.posed.vertices, azimuth, size=evidence.camera.width))
         for azimuth in reference_azimuths(config.reference_views)
     ]
     texture = learn_texture(
-        gaussians, faces, view, photo, evidence.mask * trusted, references, config, progress
+        gaussians, faces, view, evidence.image, evidence.mask * trusted, references, config, progress
     )
     return Adaptation(gaussians._replace(colors=texture.colors), calibration, texture.losses)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 DETAIL_LENGTH = 0.001
 """Length below which differences between neighbouring observations are averaged [m]."""
-FADE_LENGTH = 0.015
+FADE_LENGTH = 0.012
 """Distance over which the surface forgets the photo and returns to the prior [m]."""
 DEGENERATE = 1e-12
 """Doubled area of a triangle below which its angles mean nothing [m^2]: the hand's are over 100,000 times that."""

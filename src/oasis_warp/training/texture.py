@@ -24,7 +24,7 @@ TRUSTED_PIXELS = 0.5
 """Share of the photo [pixels] from which a Gaussian learns freely. One that only shimmers through its neighbours
 would be driven to any colour by the last bits of theirs, since Adam's steps do not shrink with the gradient."""
 MAX_STEPS = 400
-FLAT_WINDOW, FLAT_GAIN = 40, 0.01
+FLAT_WINDOW, FLAT_GAIN = 20, 0.05
 """Without a given number of steps, learning ends when the loss of this many steps fell by less than this share."""
 COLOR_MARGIN = 1e-3
 """Distance that colours keep from 0 and 1, where the logit ends."""

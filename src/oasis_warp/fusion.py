@@ -1,0 +1,243 @@
+"""`reconstruct_same_hand`: several photos of one hand in, one avatar out."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import NamedTuple
+
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.avatar.prior import Prior
+from oasis_warp.core import surface
+from oasis_warp.core.config import AdaptConfig, ReconstructConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.logging import Progress, silent, timed_stage
+from oasis_warp.core.types import Evidence, HandFit, Landmarks, Photo, PosedHand
+from oasis_warp.hand.estimator import HandEstimator, choose_hand
+from oasis_warp.hand.shared_shape import shared_shape
+from oasis_warp.hand.skinning import rest_hand
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.network.prior import choose_prior
+from oasis_warp.ops import warm_up
+from oasis_warp.pipeline import carrier_offsets, input_errors, make_avatar, make_evidence
+from oasis_warp.training.fuse import Fusion, fuse
+from oasis_warp.training.sightings import Sightings
+
+SEEN = 0.5
+"""Confidence from which a photo counts as showing a place."""
+OTHER_LIGHT = 1.6
+"""Times by which a photo is brighter or darker than the first, in any channel, from which it is worth a warning."""
+NOTHING_NEW = 0.5
+"""Share of the surface [%] that a photo must show better than all others, or it was not needed."""
+
+
+class PhotoOfHand(NamedTuple):
+    """One of the photos and its part in the avatar."""
+
+    name: str
+    fit: HandFit
+    """In the photo's own frame, with the shape that all photos share."""
+    gain: tuple[float, float, float]
+    """How much brighter it is than the first, channel by channel."""
+    errors: dict[str, float]
+    """As `Reconstruction.errors`, in the photo's own light; and of the surface [%] seen_percent, what it shows, and
+    best_percent, what it shows better than the others."""
+
+
+class FusedReconstruction(NamedTuple):
+    """An avatar of several photos and how it came about."""
+
+    avatar: Avatar
+    """In the light of the first photo, whose pose and camera are its source."""
+    photos: tuple[PhotoOfHand, ...]
+    prior: Mapping[str, str | int]
+    """Which prior was asked: its `about`."""
+    stages: dict[str, float]
+    """Seconds of each stage."""
+    errors: dict[str, float]
+    """seen_percent: of the surface, what any photo shows; n_gaussians."""
+    warnings: tuple[str, ...]
+
+
+def reconstruct_same_hand(
+    photos: Sequence[Photo],
+    config: ReconstructConfig = ReconstructConfig(),  # noqa: B008 - frozen
+    *,
+    prior: Prior | None = None,
+    progress: Progress = silent,
+) -> FusedReconstruction:
+    """Make one avatar of one hand of which there are several photos, of any poses and sides.
+
+    Args:
+        photos: From `oasis_warp.read_photo`. The first decides on exposure and white balance, the source pose and the
+            source camera. Of one photo alone comes what `reconstruct` makes of it; shading of several is
+            evened out.
+        config: Options, for every photo.
+        prior: What to assume of a hand before its photos are fitted; the one that `config.prior` names when not given.
+        progress: Called as work goes on.
+
+    Raises:
+        ValueError: no photo.
+        InputError: a photo without such a hand, with a hand of the other side, or with a fit too poor to go on (see
+            `ReconstructConfig.force`); the sentence names it. Or a wrong file.
+    """
+    if not photos:
+        raise ValueError("photos: expected at least one, got none. Read them with oasis_warp.read_photo.")
+    stages: dict[str, float] = {}
+
+    def stage(name: str) -> AbstractContextManager[None]:
+        return timed_stage(name, stages, progress)
+
+    estimator = HandEstimator(bundled_hand())
+    with stage("prior"):
+        prior = prior or choose_prior(config.prior, config.backbone_weights)
+    landmarks = []
+    for photo in photos:
+        with stage("landmarks"):
+            landmarks.append(choose_hand(estimator.find(photo), config.hand, photo.name))
+    check_sides(photos, landmarks)
+    with stage("fit"):
+        fits = fit_together(estimator, photos, landmarks, force=config.force, progress=progress)
+    with stage("outline"):
+        surfaces = fit_surfaces(fits)
+    with stage("kernels"):
+        warm_up(config.device)
+    with stage("crop"):
+        evidences = make_evidences(photos, fits, surfaces, config)
+    with stage("fusion"):
+        settings = AdaptConfig(texture_steps=config.steps, seed=config.seed)
+        fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), prior, settings, progress)
+    with stage("check"):
+        avatar = make_avatar(fits[0], surfaces.shared, evidences[0], fusion.gaussians)
+        about = tuple(
+            PhotoOfHand(photo.name, fit, (gain[0], gain[1], gain[2]), {
+                "reprojection_percent": fit.reprojection,
+                "worst_point_percent": fit.worst_point,
+                "mask_iou": fit.mask_iou,
+                **_own_errors(fusion, k, fit, surfaces.own[k], evidences[k]),
+                **shares,
+            })
+            for k, (photo, fit, gain, shares) in enumerate(
+                zip(photos, fits, fusion.gains.tolist(), surface_shares(evidences[0], fusion.sightings), strict=True)
+            )
+        )  # fmt: skip
+    seen = (fusion.sightings.confidence > SEEN).any(0)
+    errors = {
+        "seen_percent": 100 * _area_share(evidences[0], seen),
+        "n_gaussians": float(len(fusion.gaussians.opacities)),
+    }
+    return FusedReconstruction(avatar, about, prior.about, stages, errors, _warnings(about))
+
+
+def check_sides(photos: Sequence[Photo], landmarks: Sequence[Landmarks]) -> None:
+    """All hands must be of one side: mirrored, the other hand would be another one.
+
+    Raises:
+        InputError: some are not; it names those that the fewer, or less sure, say so.
+    """
+    for_right = sum((1 if found.side == "right" else -1) * found.side_score for found in landmarks)
+    side = landmarks[0].side if for_right == 0 else "right" if for_right > 0 else "left"
+    odd = [photo.name for photo, found in zip(photos, landmarks, strict=True) if found.side != side]
+    if odd:
+        shows = "shows" if len(odd) == 1 else "show"
+        other = "left" if side == "right" else "right"
+        raise InputError(
+            f"{' and '.join(odd)}: {shows} a {other} hand, the other photos a {side} one; give photos of one hand, or "
+            f"--hand {side} where both hands are in a photo."
+        )
+
+
+def fit_together(
+    estimator: HandEstimator, photos: Sequence[Photo], landmarks: Sequence[Landmarks], *, force: bool = False,
+    progress: Progress = silent,
+) -> list[HandFit]:  # fmt: skip
+    """Fits of all photos with one shape: each alone first, then again with the shape that they agree on.
+
+    Raises:
+        InputError: as `HandEstimator.fit`, of a photo alone; that a shared shape suits it less is only warned about.
+    """
+    pairs, fits = list(zip(photos, landmarks, strict=True)), []
+    total = len(pairs) if len(pairs) == 1 else 2 * len(pairs)
+    for photo, points in pairs:
+        fits.append(estimator.fit(photo, points, force=force))
+        progress("fit", len(fits), total)
+    if len(fits) == 1:
+        return fits
+    shape, again = shared_shape([fit.shape for fit in fits]), []
+    for photo, points in pairs:
+        again.append(estimator.fit(photo, points, shape=shape, force=True)._replace(shape=shape))
+        progress("fit", len(pairs) + len(again), total)
+    return again
+
+
+class Surfaces(NamedTuple):
+    """From the fitted rest surface to those that carry Gaussians [m]."""
+
+    shared: Float[Tensor, "V 3"]
+    """The avatar's, nearest to all outlines at once."""
+    own: list[Float[Tensor, "V 3"]]
+    """That of each photo, by which it is read: on its own outline no background gets on the hand."""
+
+
+def fit_surfaces(fits: Sequence[HandFit]) -> Surfaces:
+    """See `pipeline.carrier_offsets`, of all fits together and of each."""
+    hand = bundled_hand()
+    own = [carrier_offsets(hand, fit) for fit in fits]
+    return Surfaces(own[0] if len(own) == 1 else carrier_offsets(hand, *fits), own)
+
+
+def make_evidences(
+    photos: Sequence[Photo], fits: Sequence[HandFit], surfaces: Surfaces, config: ReconstructConfig
+) -> list[Evidence]:
+    """As `pipeline.make_evidence`, each photo seen on its own surface, all with the shared one at rest."""
+    plain = rest_hand(bundled_hand(), fits[0].shape)
+    shared = plain._replace(vertices=plain.vertices + surfaces.shared)
+    evidences = []
+    for photo, fit, own in zip(photos, fits, surfaces.own, strict=True):
+        evidence = make_evidence(photo, fit, own, config)
+        evidences.append(evidence._replace(rest=PosedHand(*(part.to(evidence.image) for part in shared))))
+    return evidences
+
+
+def resolutions(fits: Sequence[HandFit], evidences: Sequence[Evidence]) -> list[float]:
+    """Pixels of each photo a pixel of its crop, along a line."""
+    return [float(fit.camera.K[0, 0] / e.camera.K[0, 0]) for fit, e in zip(fits, evidences, strict=True)]
+
+
+def _own_errors(fusion: Fusion, k: int, fit: HandFit, offsets: Tensor, evidence: Evidence) -> dict[str, float]:
+    """How well the avatar explains photo k, in that photo's light and on the surface by which it was read."""
+    colors = (fusion.gaussians.colors * fusion.gains[k]).clamp(0, 1)
+    errors = input_errors(make_avatar(fit, offsets, evidence, fusion.gaussians._replace(colors=colors)), evidence)
+    return {name: value for name, value in errors.items() if name != "n_gaussians"}
+
+
+def surface_shares(evidence: Evidence, sightings: Sightings) -> list[dict[str, float]]:
+    """Of the hand's surface at rest [%]: what each photo shows, and what it shows best of all."""
+    seen = sightings.confidence > SEEN
+    best = (sightings.confidence * sightings.share).argmax(0)
+    return [
+        {
+            "seen_percent": 100 * _area_share(evidence, shown),
+            "best_percent": 100 * _area_share(evidence, shown & (best == k)),
+        }
+        for k, shown in enumerate(seen)
+    ]
+
+
+def _area_share(evidence: Evidence, where: Tensor) -> float:
+    faces = bundled_hand().faces.to(evidence.image.device)
+    areas = surface.vertex_areas(evidence.rest.vertices, faces)
+    return float((areas * where).sum() / areas.sum())
+
+
+def _warnings(photos: Sequence[PhotoOfHand]) -> tuple[str, ...]:
+    said = [f"{photo.name}: {warning}" for photo in photos for warning in photo.fit.warnings]
+    for photo in photos[1:]:
+        factor = max(photo.gain, key=lambda gain: max(gain, 1 / gain))
+        if max(factor, 1 / factor) > OTHER_LIGHT:
+            how = f"{factor:.1f} times as bright as" if factor > 1 else f"{1 / factor:.1f} times darker than"
+            said.append(f"{photo.name}: its light is another, {how} {photos[0].name}; its colours may not fit in")
+        if photo.errors["best_percent"] < NOTHING_NEW:
+            said.append(f"{photo.name}: adds next to nothing, other photos show all of it as well or better")
+    return tuple(said)

@@ -1,0 +1,116 @@
+"""Several photos of one hand, from files to an avatar."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import Landmarks, Photo
+from oasis_warp.data.photo import read_photo
+from oasis_warp.fusion import check_sides, reconstruct_same_hand
+from oasis_warp.losses.image import masked_psnr
+from oasis_warp.pipeline import reconstruct
+from oasis_warp.render.cameras import orbit_camera
+
+PHOTOS = Path(__file__).parent / "data" / "photos"
+WOOD = PHOTOS / "same_hand" / "a1_wood_right"
+PALM, BACK = WOOD / "02_flat_closed.jpg", WOOD / "03_flat_closed_back.jpg"
+OTHER_SIDE = PHOTOS / "same_hand" / "a7_wood_left" / "03_ring_closed.jpg"
+SMALL = ReconstructConfig(size=96, steps=10)
+
+
+def found(*hands):
+    """Photos without a pixel, and a hand in each: "name side score"."""
+    photos, landmarks = [], []
+    for name, side, score in map(str.split, hands):
+        photos.append(Photo(torch.zeros(4, 4, 3, dtype=torch.uint8), None, None, name, 1.0))
+        landmarks.append(Landmarks(torch.zeros(21, 2), None, side, float(score), 1.0, "network"))
+    return photos, landmarks
+
+
+def test_photos_of_one_side_are_accepted():
+    check_sides(*found("a left 0.9", "b left 0.6"))
+
+
+@pytest.mark.parametrize(
+    ("hands", "named"),
+    [
+        (("a right 0.9", "b left 0.9", "c right 0.9"), "^b: shows a left hand, the other photos a right one"),
+        (("a right 0.9", "b left 0.9", "c left 0.9"), "^a: shows a right hand, the other photos a left one"),
+        (("a right 0.9", "b left 0.9"), "^b: shows a left hand"),  # the first decides
+        (("a right 0.6", "b left 0.9"), "^a: shows a right hand"),  # unless it is less sure
+        (("a left 1", "b right 1", "c right 1", "d left 1", "e left 1"), "^b and c: show a right hand.*--hand left"),
+    ],
+)
+def test_a_photo_of_the_other_side_is_named(hands, named):
+    with pytest.raises(InputError, match=named):
+        check_sides(*found(*hands))
+
+
+def test_no_photo_is_an_error_of_the_caller():
+    with pytest.raises(ValueError, match="photos: expected at least one"):
+        reconstruct_same_hand([])
+
+
+def test_photos_of_two_hands_are_refused_before_the_long_work():
+    with pytest.raises(InputError, match="03_ring_closed.jpg: shows a left hand, the other photos a right one"):
+        reconstruct_same_hand([read_photo(path) for path in (PALM, OTHER_SIDE)], SMALL)
+
+
+def test_a_photo_without_a_hand_is_named():
+    with pytest.raises(InputError, match="^no_hand_cup_15.jpg: found no hand"):
+        reconstruct_same_hand([read_photo(path) for path in (PALM, PHOTOS / "no_hand_cup_15.jpg")], SMALL)
+
+
+@pytest.fixture(scope="module")
+def palm():
+    return read_photo(PALM)
+
+
+@pytest.fixture(scope="module")
+def alone(palm):
+    return reconstruct(palm, SMALL)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_palm_and_back_show_twice_as_much_as_the_palm(palm, alone):
+    made = reconstruct_same_hand([palm, read_photo(BACK)], SMALL)
+    first, second = (photo.errors for photo in made.photos)
+    assert made.errors["seen_percent"] > 1.7 * first["seen_percent"]
+    assert first["best_percent"] > 20 and second["best_percent"] > 20
+    assert made.photos[0].gain == (1.0, 1.0, 1.0)
+    assert first["input_psnr_db"] > 22 and second["input_psnr_db"] > 22
+    assert torch.equal(made.photos[0].fit.shape, made.photos[1].fit.shape)
+    assert abs(first["mask_iou"] - alone.errors["mask_iou"]) < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_one_photo_is_reconstructed_as_ever(palm, alone):
+    made = reconstruct_same_hand([palm], SMALL)
+    assert torch.equal(made.avatar.gaussians.colors, alone.avatar.gaussians.colors)
+    assert torch.equal(made.avatar.surface_offsets, alone.avatar.surface_offsets)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_same_photo_twice_is_nearly_one_photo_but_for_its_shading(palm, alone):
+    twice = reconstruct_same_hand([palm, palm], SMALL)
+    assert torch.allclose(twice.avatar.shape, alone.avatar.shape, atol=1e-3)
+    camera = orbit_camera(alone.avatar.mesh(alone.avatar.source_pose).vertices, 0.5, size=96)
+    one, two = (made.avatar.render(camera, alone.avatar.source_pose) for made in (alone, twice))
+    assert masked_psnr(one.image, two.image, (one.alpha > 0.9).float()) > 22
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_photo_in_much_less_light_is_brought_to_the_first_one_s(palm, alone):
+    dark = palm._replace(rgb=(palm.rgb.float() * 0.4).to(torch.uint8), name="dark.jpg")
+    made = reconstruct_same_hand([palm, dark], SMALL)
+    assert made.photos[1].gain == pytest.approx((0.4, 0.4, 0.4), abs=0.04)
+    assert any(warning.startswith("dark.jpg: its light is another, 2.5 times darker") for warning in made.warnings)
+    mean = [avatar.gaussians.colors.mean(0) for avatar in (alone.avatar, made.avatar)]
+    assert torch.allclose(*mean, atol=0.04)
