@@ -30,12 +30,14 @@ SETTINGS = {
     "calibration": AdaptConfig(calibration="off"),
     "texture": AdaptConfig(texture_steps=0),
     "references": AdaptConfig(reference_views=0),
-    "even": AdaptConfig(light="even"),
+    "light": AdaptConfig(light="even"),
+    "paper": AdaptConfig(calibration_steps=100, texture_steps=400),
 }
 """How the learned prior is adapted; "full" is done for the mean prior too."""
 TITLES = {
     FULL: "full model", "prior": "w/o learned prior", "calibration": "w/o colour calibration",
-    "texture": "w/o texture learning", "references": "w/o reference views", "even": "only what is no light",
+    "texture": "w/o texture learning", "references": "w/o reference views",
+    "light": "w/o the photo's light", "paper": "the paper's 100 + 400 steps",
 }  # fmt: skip
 
 

@@ -43,6 +43,7 @@ METHODS = {
     ("mean", "one_shot"): "no prior, one-shot",
     ("learned", "raw"): "the prior's guess",
     ("learned", "calibrated"): "its guess, colours matched",
+    ("learned", "even_one_shot"): "the prior, one-shot without the photo's light",
     ("learned", "one_shot"): "the prior, one-shot",
 }
 MEASURES = {

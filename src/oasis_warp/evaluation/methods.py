@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -20,9 +21,10 @@ from oasis_warp.training.adapt import adapt
 from oasis_warp.training.calibrate import Calibration, calibrate
 from oasis_warp.training.views import freeze_view
 
-RAW, CALIBRATED, ONE_SHOT = "raw", "calibrated", "one_shot"
-STAGES = (RAW, CALIBRATED, ONE_SHOT)
-"""As the prior says, with its colours matched to the photo's as a whole, and fully adapted."""
+RAW, CALIBRATED, EVEN, ONE_SHOT = "raw", "calibrated", "even_one_shot", "one_shot"
+STAGES = (RAW, CALIBRATED, EVEN, ONE_SHOT)
+"""As the prior says, with its colours matched to the photo's as a whole, adapted to what is likelier skin than light,
+and adapted to all that the photo shows."""
 
 
 class Method(NamedTuple):
@@ -39,6 +41,7 @@ METHODS = (
     Method("mean", ONE_SHOT),
     Method("learned", RAW),
     Method("learned", CALIBRATED),
+    Method("learned", EVEN),
     Method("learned", ONE_SHOT),
 )
 """Of the tables: what needs no training, and each step beyond it."""
@@ -93,6 +96,8 @@ def reconstructions(
             guess = prior(evidence)
         if RAW in stages:
             yield Method(name, RAW), guess
+        if EVEN in stages:
+            yield Method(name, EVEN), adapt(hand, guess, evidence, replace(config, light="even")).gaussians
         if not {CALIBRATED, ONE_SHOT} & stages:
             continue
         adapted = adapt(hand, guess, evidence, config) if ONE_SHOT in stages else None

@@ -32,8 +32,7 @@ REACH = 0.1
 """Way over which a photo's shading would be forgotten where the photo says nothing [m]: not within a hand."""
 GUESS_LIGHT = 4.0
 """Weight of the prior's guess in the shading, against a photo that sees the place well. On synthetic people in any
-light more is better, up to here at least: 4 photos come to 20.8 dB inside the outline without it, 22.3 with 1, 23.3
-with 4."""
+light more is better, up to here at least: 4 photos come to 20.8 dB without it, 22.3 with 1, 23.3 with 4."""
 UNSEEN = 0.02
 """Weight of a photo's guess where the photo shows nothing, against one that sees the place well."""
 

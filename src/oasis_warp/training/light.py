@@ -15,9 +15,9 @@ LIGHT_LENGTH = 0.008
 the most even photo [m]."""
 REACH = 0.1
 """Distance to which shading is continued beyond what is seen [m]."""
-SKIN_DEVIATION = 0.003
-"""Standard deviation of what a trained prior misses of creases, veins and spots [sRGB]. With .003 to .007 nothing is
-lost against the prior's own colours on held-out people; from .01 on light and noise weigh more."""
+SKIN_DEVIATION = 0.007
+"""Standard deviation of what a trained prior misses of creases, veins and spots [sRGB]. On synthetic people .003 loses
+nothing against the prior's own colours and .007 up to .06 dB, but real skin has more to it."""
 
 
 def even_photo(

@@ -165,12 +165,12 @@ class _Problem:
     """One photo, and what it costs to explain it by a state."""
 
     def __init__(
-        self, hand: HandModel, guess: CanonicalGaussians, evidence: Evidence, landmarks: Tensor | None, size: int
+        self, hand: HandModel, guess: CanonicalGaussians, evidence: Evidence, landmarks: Tensor | None, picture: int
     ):
         self.rig, camera = Rig(hand), evidence.camera
         device = evidence.image.device
         self.hand = hand.to(device)
-        K, carrier, sunk = array(camera.K), array(evidence.rest.vertices), array(below_skin(hand, size))
+        K, carrier, sunk = array(camera.K), array(evidence.rest.vertices), array(below_skin(hand, picture))
         shape = shape_of(self.rig, carrier - sunk)
         self.start, detail = state_of_surface(
             self.rig, shape, carrier, array(evidence.posed.vertices), float(K[0, 0]), K[:2, 2]
