@@ -51,7 +51,6 @@ def densify(
     faces: Int[Tensor, "F 3"],
     parts: Int[Tensor, "F"],
     *,
-    sink: float = SINK,
     thickness: float = 0.0,
 ) -> Densified:
     """Replace what rides on some faces by finer Gaussians that look the same.
@@ -66,14 +65,13 @@ def densify(
         vertices: Of the surface at rest [m].
         faces: Of the surface.
         parts: An edge, for each face; 1 leaves the face as it is.
-        sink: Depth at which the vertex Gaussians of cut faces go on [m].
         thickness: Least standard deviation of the parts' Gaussians across the surface [m].
     """
     opacity = _face_opacities(gaussians, len(faces))
     cut = (parts > 1) & (opacity > 0)
     n_points, index = len(gaussians.vertex_index), gaussians.vertex_index
     sunk = _inside(cut, faces, len(vertices))[index]
-    depth = sink * surface.vertex_normals(vertices, faces)[index]
+    depth = SINK * surface.vertex_normals(vertices, faces)[index]
     disc_quats, disc_scales = vertex_shapes(vertices, faces)
     disc_opacities = OPACITY * (gaussians.opacities[:n_points] / SOLID).clamp(max=1)
     on_top = ~cut[gaussians.face_index]
