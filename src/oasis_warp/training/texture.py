@@ -23,9 +23,12 @@ ROUGHNESS_DECAY = 0.5
 TRUSTED_PIXELS = 0.5
 """Share of the photo [pixels] from which a Gaussian learns freely. One that only shimmers through its neighbours
 would be driven to any colour by the last bits of theirs, since Adam's steps do not shrink with the gradient."""
+AVERAGED = 10
+"""Steps over which what is learned is averaged: Adam's last steps are as long as its first, each for its own view."""
 MAX_STEPS = 400
-FLAT_WINDOW, FLAT_GAIN = 20, 0.05
-"""Without a given number of steps, learning ends when the loss of this many steps fell by less than this share."""
+FLAT_WINDOW, FLAT_GAIN = 21, 0.05
+"""Without a given number of steps, learning ends when the loss of this many steps, three rounds of seven reference
+views, fell by less than this share."""
 COLOR_MARGIN = 1e-3
 """Distance that colours keep from 0 and 1, where the logit ends."""
 
@@ -54,7 +57,8 @@ def learn_texture(
     residual of every face Gaussian. A Gaussian that hides behind its neighbours in the photo therefore learns with
     them, and does not come out as a speckle when another pose shows it. The photo itself shows through where the
     Gaussians leave it free, as at the wrist: over black they would learn to glow there. Reference views must stay as
-    `gaussians` draws them; one of them takes part in each step.
+    `gaussians` draws them; one of them takes part in each step, all of
+    them in turn, in an order that `config.seed` shuffles.
     """
     base = torch.logit(gaussians.colors, COLOR_MARGIN)
     n_vertices, n_points = int(faces.max()) + 1, len(gaussians.vertex_index)
@@ -64,7 +68,7 @@ def learn_texture(
     trust, vertex_trust = _trust(gaussians, faces, view)
     edges = surface.mesh_edges(faces)
 
-    def colors() -> Tensor:
+    def colors(field: Tensor, residual: Tensor) -> Tensor:
         learned = vertex_to_gaussians(vertex_trust * field, faces, gaussians)
         return torch.sigmoid(base + learned + trust * torch.cat([still, residual]))
 
@@ -76,13 +80,16 @@ def learn_texture(
     optimiser = torch.optim.Adam([field, residual], lr=LEARNING_RATE)
     total = MAX_STEPS if config.texture_steps is None else config.texture_steps
     losses: list[float] = []
+    views: list[int] = []
+    settled = [torch.zeros_like(field), torch.zeros_like(residual)]
     for step in range(total):
-        now = colors()
+        now = colors(field, residual)
         image = blend_colors(view, now) + beyond
         loss = config.weight_rgb * masked_l1(image, target, mask)
         loss = loss + config.weight_ssim * masked_dssim(image * mask[..., None], photo, mask)
         if references:
-            k = int(torch.randint(len(references), (1,), generator=order))
+            views = views or torch.randperm(len(references), generator=order).tolist()
+            k = views.pop()
             drift = masked_l1(blend_colors(references[k], now), goals[k], references[k].alphas[..., 0])
             loss = loss + config.weight_reference * config.weight_rgb * len(references) * drift
         ends = (vertex_trust * field).index_select(0, edges.flatten()).unflatten(0, (-1, 2))
@@ -91,12 +98,14 @@ def learn_texture(
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
+        for mean, value in zip(settled, (field, residual), strict=True):
+            mean.lerp_(value.detach(), max(1 / (step + 1), 1 / AVERAGED))
         losses.append(loss.item())
         progress("texture", step + 1, total)
         if config.texture_steps is None and _is_flat(losses):
             progress("texture", total, total)
             break
-    return Texture(colors().detach(), tuple(losses))
+    return Texture(colors(*settled), tuple(losses))
 
 
 def _trust(
@@ -114,7 +123,7 @@ def _trust(
 
 
 def _is_flat(losses: list[float]) -> bool:
-    if len(losses) < 2 * FLAT_WINDOW:
+    if len(losses) < 2 * FLAT_WINDOW or len(losses) % FLAT_WINDOW:  # ends that differ by a step differ in the result
         return False
     before = sum(losses[-2 * FLAT_WINDOW : -FLAT_WINDOW])
     return sum(losses[-FLAT_WINDOW:]) > (1 - FLAT_GAIN) * before
