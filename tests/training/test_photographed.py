@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import SINK, SINK_BLUR, below_skin
+from oasis_warp.avatar.anchors import SINK, below_skin
 from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
@@ -72,7 +72,7 @@ def projected(batch):
 
 
 def overlap(hand, vertices, K, mask):
-    vertices = vertices + (SINK + SINK_BLUR) * vertex_normals(vertices, hand.faces)
+    vertices = vertices + SINK * vertex_normals(vertices, hand.faces)
     drawn = depth_map(vertices, hand.faces, torch.eye(4), K, mask.shape[1], mask.shape[0]).face_ids >= 0
     return float((drawn & (mask > 0.5)).sum() / (drawn | (mask > 0.5)).sum())
 

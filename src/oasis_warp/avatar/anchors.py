@@ -25,10 +25,9 @@ MAX_ANISOTROPY = 3.0
 OPACITY = 0.95
 RIM_FADE = 0.008
 """The last stretch before the open wrist, over which opacity falls to nothing [m]."""
-SINK, SINK_BLUR = 0.0002, 0.0006
-"""Distance from the skin to the surface that carries Gaussians, inwards [m], for pictures without end of pixels, and
-what is added where a crop of the hand has `PICTURE` pixels a side. Gaussians draw beyond their means, by their own
-thickness and by the blur of a pixel; on the skin itself outlines come out a pixel too fat."""
+SINK = 0.0008
+"""Distance from the skin to the surface that carries Gaussians, inwards, where a crop of the hand has `PICTURE` pixels
+a side [m]. A pixel's blur draws Gaussians beyond their size: on the skin itself outlines come out a pixel too fat."""
 PICTURE = 256
 """Side of the crops that the prior reads, and of the pictures that it is trained on [px]."""
 MIN_OPACITY = 1 / 255
@@ -94,7 +93,7 @@ def _rim_opacity(hand: HandModel, vertices: Tensor) -> Tensor:
 
 def below_skin(hand: HandModel, size: int = PICTURE) -> Float[Tensor, "V 3"]:
     """From the skin at rest to the surface that carries Gaussians in pictures of the hand of `size` pixels [m]."""
-    return -(SINK + SINK_BLUR * PICTURE / size) * surface.vertex_normals(hand.template, hand.faces)
+    return -SINK * PICTURE / size * surface.vertex_normals(hand.template, hand.faces)
 
 
 def place_anchors(hand: HandModel, rest: PosedHand) -> Anchors:
