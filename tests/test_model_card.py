@@ -68,7 +68,7 @@ def test_measurements_are_those_with_estimated_poses_and_matched_colours(tmp_pat
     (tmp_path / "metrics.json").write_text(json.dumps({"summary": rows + others}))
     text = measurement_tables(tmp_path / "metrics.json")
     assert "4 people, 16 pictures" in text and "99" not in text
-    assert "| the prior, one-shot | 24.00 | +3.25 | 0.50 | 75% | 21.00 |  | 0.9000 |" in text
+    assert "| the prior, one-shot | 25.00 | +3.25 | 0.50 | 75% | 21.00 |  | 0.9000 |" in text
     assert text.count("| no prior") == 2
 
 
@@ -85,7 +85,7 @@ def test_an_untrained_prior_has_the_gaussians_of_the_mean_hand(weights, hand):
     lines = gaussian_table(load_network(weights, hand).eval(), 1).splitlines()
     rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in lines}
     assert [float(cell) for cell in rows["on vertices: opacity"]] == [0.95] * 3
-    assert [float(cell) for cell in rows["on vertices: under the skin, mm"]] == [0.6] * 3
+    assert [float(cell) for cell in rows["on vertices: under the skin, mm"]] == [0.8] * 3
     assert [float(cell) for cell in rows["on faces: from the middle of the face, mm"]] == [0.0] * 3
     assert [float(cell) for cell in rows["on faces: largest share of a corner in a face's features"]] == [0.33] * 3
     low, middle, high = (float(cell) for cell in rows["on faces: largest deviation, mm"])

@@ -96,14 +96,12 @@ def reconstructions(
             guess = prior(evidence)
         if RAW in stages:
             yield Method(name, RAW), guess
-        if EVEN in stages:
-            yield Method(name, EVEN), adapt(hand, guess, evidence, replace(config, light="even")).gaussians
-        if not {CALIBRATED, ONE_SHOT} & stages:
-            continue
         adapted = adapt(hand, guess, evidence, config) if ONE_SHOT in stages else None
         if CALIBRATED in stages:
             calibration = adapted.calibration if adapted else calibration_of(hand, guess, evidence, config)
             yield Method(name, CALIBRATED), guess._replace(colors=calibration.apply(guess.colors))
+        if EVEN in stages:
+            yield Method(name, EVEN), adapt(hand, guess, evidence, replace(config, light="even")).gaussians
         if adapted:
             yield Method(name, ONE_SHOT), adapted.gaussians
 
