@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from oasis_warp.assets import asset
-from oasis_warp.avatar.anchors import RIM_FADE
+from oasis_warp.avatar.anchors import OPACITY, RIM_FADE
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core import rotation
@@ -19,14 +19,13 @@ from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network import prior as home
 from oasis_warp.network.inputs import input_of_evidence
 from oasis_warp.network.prior import (
-    REACH,
     NetworkPrior,
     all_gaussians,
     bundled_prior,
     canonical_gaussians,
     choose_prior,
-    spread_to_rim,
 )
+from oasis_warp.network.rim import DARK, FIRST, LAST, settle_rim, spread_to_rim
 from oasis_warp.network.weights_file import read_header, save_network
 from oasis_warp.render.render import render
 from oasis_warp.training.adapt import adapt
@@ -55,7 +54,7 @@ def test_an_untrained_network_is_the_mean_prior(untrained, hand, evidences, whic
     rest = evidences[which].rest.vertices
     from_rim = torch.cdist(rest, rest[hand.rim]).amin(1)
     from_rim = torch.cat([from_rim[mean.vertex_index], from_rim[hand.faces[mean.face_index]].amin(1)])
-    beyond = from_rim >= REACH * RIM_FADE
+    beyond = from_rim >= DARK * RIM_FADE
     torch.testing.assert_close(ours.colors[beyond], mean.colors[beyond], atol=2e-3, rtol=0)
     error = (covariances(ours) - covariances(mean)).abs().amax((1, 2)) / covariances(mean).abs().amax((1, 2))
     assert float(error.max()) < 2e-5
@@ -67,12 +66,30 @@ def test_the_rim_takes_over_the_colours_beyond_it(hand):
     shades = torch.where(from_rim < RIM_FADE, 0.1, 0.5 + 0.1 * rest[:, 2] / rest[:, 2].abs().amax())
     colors = torch.cat([shades, shades[hand.faces].amin(1)])[:, None].expand(-1, 3)
     for count in (len(colors), len(rest)):  # with face Gaussians and without
-        spread = spread_to_rim(colors[:count], rest, hand.faces, hand.rim)
+        away = torch.cat([from_rim, from_rim[hand.faces].amin(1)])[:count]
+        spread = spread_to_rim(colors[:count], rest, hand.faces, away)
         assert float(spread.min()) > 0.38
-        near = from_rim < REACH * RIM_FADE
+        near = from_rim < DARK * RIM_FADE
         assert torch.equal(spread[: len(rest)][~near], colors[: len(rest)][~near])
         wanted = 0.5 + 0.1 * rest[near, 2] / rest[:, 2].abs().amax()
         assert float((spread[: len(rest)][near, 0] - wanted).abs().max()) < 0.05
+
+
+def test_at_the_wrists_end_gaussians_have_the_shapes_of_their_anchors(network, hand, evidences):
+    with torch.no_grad():
+        prediction = network(input_of_evidence(evidences[0]))
+    rest = evidences[0].rest.vertices
+    settled = settle_rim(prediction, rest, network.faces, network.vertex_faces, network.rim)
+    at_vertices = torch.cdist(rest, rest[hand.rim]).amin(1)
+    from_rim = torch.cat([at_vertices, at_vertices[hand.faces].amin(1)])
+    near, far = from_rim <= FIRST * RIM_FADE, from_rim >= LAST * RIM_FADE
+    torch.testing.assert_close(settled.scales[0, near], prediction.anchor_scales[0, near])
+    assert not settled.offsets[0, near[: len(rest)]].any()
+    assert float(settled.opacities[0, near].max()) <= OPACITY + 1e-6
+    assert not torch.allclose(prediction.scales[0, near], prediction.anchor_scales[0, near], rtol=1e-3)
+    for name in ("quats", "scales", "opacities"):
+        torch.testing.assert_close(getattr(settled, name)[0, far], getattr(prediction, name)[0, far])
+    assert torch.equal(settled.offsets[0, far[: len(rest)]], prediction.offsets[0, far[: len(rest)]])
 
 
 def test_faint_gaussians_are_left_out_of_an_avatar_and_kept_for_training(untrained, hand, evidences):

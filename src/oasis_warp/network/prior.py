@@ -10,24 +10,23 @@ from types import MappingProxyType
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from oasis_warp.assets import asset
-from oasis_warp.avatar.anchors import MIN_OPACITY, RIM_FADE
+from oasis_warp.avatar.anchors import MIN_OPACITY
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians, Evidence
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.inputs import Prediction, input_of_evidence
+from oasis_warp.network.rim import settle_rim
 from oasis_warp.network.weights_file import load_network, read_header
 from oasis_warp.ops.recording import Recording
 
 BUNDLED = ("prior", "compact.safetensors")
 """Where the weights that ship lie among the package's assets."""
-REACH = 1.5
-"""Times the length of the fade at the wrist: up to there colours are darker than they should be."""
 UNNAMED = MappingProxyType({"name": "network"})
 
 
@@ -48,8 +47,9 @@ class NetworkPrior:
     def __call__(self, evidence: Evidence) -> CanonicalGaussians:
         """The whole hand, guessed from one photo; the network goes where the photo is."""
         prediction, network = self._predict(evidence), self.network
-        colors = spread_to_rim(prediction.colors[0], evidence.rest.vertices, network.faces, network.rim)
-        return canonical_gaussians(prediction._replace(colors=colors[None]), 0)
+        rest = evidence.rest.vertices
+        settled = settle_rim(prediction, rest, network.faces, network.vertex_faces, network.rim)
+        return canonical_gaussians(settled, 0)
 
     def _predict(self, evidence: Evidence) -> Prediction:
         device, inputs = evidence.image.device, input_of_evidence(evidence)
@@ -111,34 +111,6 @@ def _identity(name: str, path: Path) -> dict[str, str | int]:
     except (KeyError, TypeError, ValueError):
         pass  # notes are free text
     return about
-
-
-def spread_to_rim(
-    colors: Float[Tensor, "N 3"], rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], rim: Int[Tensor, "R"]
-) -> Float[Tensor, "N 3"]:
-    """Colours where Gaussians fade out at the wrist become those of the nearest ones that do not.
-
-    The pictures that the network learned from fade to black there, and so do its colours: over another background the
-    wrist would end in a dark line.
-
-    Args:
-        colors: Of the vertices, and of the faces if they carry Gaussians.
-        rest: Vertices at rest [m].
-        faces: Corners.
-        rim: Vertices of the open wrist.
-    """
-    from_rim = torch.cdist(rest, rest[rim]).amin(1)
-    parts = [(rest, from_rim, colors[: len(rest)])]
-    if len(colors) > len(rest):
-        parts.append((rest[faces].mean(1), from_rim[faces].amin(1), colors[len(rest) :]))
-    settled = []
-    for places, away, own in parts:
-        fading, near = away < REACH * RIM_FADE, (away >= REACH * RIM_FADE) & (away < 2 * REACH * RIM_FADE)
-        nearest = torch.cdist(places[fading], places[near]).argmin(1)
-        own = own.clone()
-        own[fading] = own[near][nearest]
-        settled.append(own)
-    return torch.cat(settled)
 
 
 def canonical_gaussians(prediction: Prediction, hand: int) -> CanonicalGaussians:
