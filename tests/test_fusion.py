@@ -1,10 +1,12 @@
 """Several photos of one hand, from files to an avatar."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from oasis_warp import fusion
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Landmarks, Photo
@@ -72,6 +74,20 @@ def palm():
 @pytest.fixture(scope="module")
 def alone(palm):
     return reconstruct(palm, SMALL)
+
+
+def test_even_light_is_asked_for_of_several_photos_as_of_one(palm, monkeypatch):
+    asked = []
+
+    def stop(hand, evidences, resolution, prior, config, progress):
+        asked.append(config.light)
+        raise InterruptedError
+
+    monkeypatch.setattr(fusion, "fuse", stop)
+    for light in ("keep", "even"):
+        with pytest.raises(InterruptedError):
+            reconstruct_same_hand([palm], replace(SMALL, light=light))
+    assert asked == ["keep", "even"]
 
 
 @pytest.mark.slow

@@ -106,7 +106,7 @@ def reconstruct_same_hand(
     with stage("crop"):
         evidences = make_evidences(photos, fits, surfaces, config)
     with stage("fusion"):
-        settings = AdaptConfig(texture_steps=config.steps, seed=config.seed)
+        settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
         fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), prior, settings, progress)
     with stage("check"):
         avatar = make_avatar(fits[0], surfaces.shared, evidences[0], fusion.gaussians)

@@ -25,7 +25,7 @@ from oasis_warp.network.prior import (
     canonical_gaussians,
     choose_prior,
 )
-from oasis_warp.network.rim import DARK, FIRST, LAST, settle_rim, spread_to_rim
+from oasis_warp.network.rim import FIRST, LAST, settle_rim, spread_to_rim
 from oasis_warp.network.weights_file import read_header, save_network
 from oasis_warp.render.render import render
 from oasis_warp.training.adapt import adapt
@@ -54,7 +54,7 @@ def test_an_untrained_network_is_the_mean_prior(untrained, hand, evidences, whic
     rest = evidences[which].rest.vertices
     from_rim = torch.cdist(rest, rest[hand.rim]).amin(1)
     from_rim = torch.cat([from_rim[mean.vertex_index], from_rim[hand.faces[mean.face_index]].amin(1)])
-    beyond = from_rim >= DARK * RIM_FADE
+    beyond = from_rim >= LAST * RIM_FADE
     torch.testing.assert_close(ours.colors[beyond], mean.colors[beyond], atol=2e-3, rtol=0)
     error = (covariances(ours) - covariances(mean)).abs().amax((1, 2)) / covariances(mean).abs().amax((1, 2))
     assert float(error.max()) < 2e-5
@@ -69,7 +69,7 @@ def test_the_rim_takes_over_the_colours_beyond_it(hand):
         away = torch.cat([from_rim, from_rim[hand.faces].amin(1)])[:count]
         spread = spread_to_rim(colors[:count], rest, hand.faces, away)
         assert float(spread.min()) > 0.38
-        near = from_rim < DARK * RIM_FADE
+        near = from_rim < LAST * RIM_FADE
         assert torch.equal(spread[: len(rest)][~near], colors[: len(rest)][~near])
         wanted = 0.5 + 0.1 * rest[near, 2] / rest[:, 2].abs().amax()
         assert float((spread[: len(rest)][near, 0] - wanted).abs().max()) < 0.05

@@ -116,6 +116,12 @@ def place_anchors(hand: HandModel, rest: PosedHand) -> Anchors:
     )
 
 
+def vertex_colors(gaussians: CanonicalGaussians, n_vertices: int) -> Float[Tensor, "V 3"]:
+    """Those of the vertices' Gaussians; the mean of all where there are none, next to the wrist's end."""
+    own = gaussians.colors[: len(gaussians.vertex_index)]
+    return own.mean(0).repeat(n_vertices, 1).index_copy(0, gaussians.vertex_index, own)
+
+
 def vertex_to_gaussians(
     values: Float[Tensor, "V D"], faces: Int[Tensor, "F 3"], anchors: Anchors | CanonicalGaussians
 ) -> Float[Tensor, "N D"]:

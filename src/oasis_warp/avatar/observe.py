@@ -3,14 +3,14 @@
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d, normalize
 
 from oasis_warp.core import surface
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import Evidence
+from oasis_warp.core.types import Camera, Evidence
 from oasis_warp.ops import depth_visibility
 
 RIM_PIXELS = 2
@@ -41,6 +41,14 @@ def _sample(planes: Float[Tensor, "C S S"], uv: Float[Tensor, "N 2"]) -> Float[T
     return grid_sample(planes[None], grid, align_corners=False)[0, :, 0].T
 
 
+def facing(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], camera: Camera
+) -> Float[Tensor, "V"]:
+    """Cosine between each vertex's normal and its direction to the camera: negative where it turns away."""
+    center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
+    return (surface.vertex_normals(vertices, faces) * normalize(center - vertices, dim=-1)).sum(-1)
+
+
 def observe(hand: HandModel, evidence: Evidence) -> Observation:
     """Read the photo at every vertex, by projection and the depth buffer of the posed surface."""
     vertices, camera = evidence.posed.vertices, evidence.camera
@@ -50,10 +58,7 @@ def observe(hand: HandModel, evidence: Evidence) -> Observation:
         point_vertices=torch.arange(len(vertices), device=vertices.device),
     )  # fmt: skip
     uv, _ = project(camera, vertices)
-    center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
-    toward = normalize(center - vertices, dim=-1)
-    facing = (surface.vertex_normals(vertices, faces) * toward).sum(-1)
-    trust = ((facing - GRAZING) / (FACING - GRAZING)).clamp(0, 1)
+    trust = ((facing(vertices, faces, camera) - GRAZING) / (FACING - GRAZING)).clamp(0, 1)
     planes = torch.cat([evidence.image.permute(2, 0, 1), inner_mask(evidence.mask)[None]])
     sampled = _sample(planes, uv)
     return Observation(sampled[:, :3], visible * trust * sampled[:, 3].clamp(0, 1))

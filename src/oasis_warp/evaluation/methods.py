@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 import torch
 
-from oasis_warp.avatar.observe import inner_mask
-from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
@@ -17,9 +15,8 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.network.weights_file import trained_state
-from oasis_warp.training.adapt import adapt
-from oasis_warp.training.calibrate import Calibration, calibrate
-from oasis_warp.training.views import freeze_view
+from oasis_warp.training.adapt import adapt, in_photo
+from oasis_warp.training.calibrate import calibrate
 
 RAW, CALIBRATED, EVEN, ONE_SHOT = "raw", "calibrated", "even_one_shot", "one_shot"
 STAGES = (RAW, CALIBRATED, EVEN, ONE_SHOT)
@@ -98,21 +95,13 @@ def reconstructions(
             yield Method(name, RAW), guess
         adapted = adapt(hand, guess, evidence, config) if ONE_SHOT in stages else None
         if CALIBRATED in stages:
-            calibration = adapted.calibration if adapted else calibration_of(hand, guess, evidence, config)
+            if adapted:
+                calibration = adapted.calibration
+            else:
+                _, view, trusted = in_photo(hand, guess, evidence)
+                calibration = calibrate(view, guess.colors, evidence.image, trusted, config)
             yield Method(name, CALIBRATED), guess._replace(colors=calibration.apply(guess.colors))
         if EVEN in stages:
             yield Method(name, EVEN), adapt(hand, guess, evidence, replace(config, light="even")).gaussians
         if adapted:
             yield Method(name, ONE_SHOT), adapted.gaussians
-
-
-def calibration_of(
-    hand: HandModel, guess: CanonicalGaussians, evidence: Evidence, config: AdaptConfig
-) -> Calibration:
-    """The colour calibration that adaptation begins with, for those who want no more of it."""
-    faces = hand.faces.to(evidence.image.device)
-    view = freeze_view(
-        pose_gaussians(guess, faces, evidence.rest.vertices, evidence.posed.vertices), evidence.camera
-    )  # fmt: skip
-    trusted = inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5)
-    return calibrate(view, guess.colors, evidence.image, trusted, config)

@@ -14,9 +14,7 @@ from oasis_warp.network.inputs import Prediction
 
 FIRST, LAST = 1.0, 2.5
 """Times the length of the fade at the wrist: up to the first Gaussians have the shapes of their anchors, from the last
-on those that the network gave them."""
-DARK = 2.5
-"""Times the same length: up to there colours may be darker than they should be."""
+on those that the network gave them. Nearer than that its colours may be too dark."""
 
 
 def settle_rim(
@@ -70,7 +68,7 @@ def spread_to_rim(
         own, away = colors[part].clone(), from_rim[part]
         if len(own) == 0:
             continue
-        fading, near = away < DARK * RIM_FADE, (away >= DARK * RIM_FADE) & (away < 1.5 * DARK * RIM_FADE)
+        fading, near = away < LAST * RIM_FADE, (away >= LAST * RIM_FADE) & (away < 1.5 * LAST * RIM_FADE)
         own[fading] = own[near][torch.cdist(places[fading], places[near]).argmin(1)]
         settled.append(own)
     return torch.cat(settled)

@@ -3,6 +3,8 @@
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.observe import inner_mask, observe
@@ -10,8 +12,8 @@ from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import CanonicalGaussians, Evidence
-from oasis_warp.ops import blend_colors
+from oasis_warp.core.types import CanonicalGaussians, Evidence, Gaussians
+from oasis_warp.ops import BlendWeights, blend_colors
 from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.training.calibrate import Calibration, calibrate
 from oasis_warp.training.complete import complete_field
@@ -32,6 +34,23 @@ class Adaptation(NamedTuple):
     """Of texture learning, a step each."""
 
 
+class InPhoto(NamedTuple):
+    """Gaussians as a photo shows them."""
+
+    posed: Gaussians
+    view: BlendWeights
+    trusted: Float[Tensor, "H W"]
+    """1 where the photo's colours are those of the hand."""
+
+
+def in_photo(hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence) -> InPhoto:
+    """Pose `gaussians` as in the photo and blend them once."""
+    faces = hand.faces.to(evidence.image.device)
+    posed = pose_gaussians(gaussians, faces, evidence.rest.vertices, evidence.posed.vertices)
+    view = freeze_view(posed, evidence.camera)
+    return InPhoto(posed, view, inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5))
+
+
 def adapt(
     hand: HandModel,
     prior: CanonicalGaussians,
@@ -46,9 +65,7 @@ def adapt(
     last step falls away.
     """
     faces = hand.faces.to(evidence.image.device)
-    posed = pose_gaussians(prior, faces, evidence.rest.vertices, evidence.posed.vertices)
-    view = freeze_view(posed, evidence.camera)
-    trusted = inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5)
+    posed, view, trusted = in_photo(hand, prior, evidence)
 
     progress("calibration", 0, 1)
     if config.calibration == "on":

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import grid_sample, max_pool2d, normalize
+from torch.nn.functional import grid_sample, max_pool2d
 
-from oasis_warp.core import surface
+from oasis_warp.avatar import observe
 from oasis_warp.core.camera import project
 from oasis_warp.core.logging import Progress
 from oasis_warp.core.rotation import from_axis_angle
@@ -68,8 +68,7 @@ def look(posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], canvas: Canvas,
     seen = depth_map(posed, faces, camera.viewmat, camera.K, camera.width, camera.height)
     ids, depth = seen.face_ids.long(), seen.depth.clamp_max(FAR)
     before = -max_pool2d(-depth[None, None], 3, stride=1, padding=1)[0, 0]
-    center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
-    toward = (surface.vertex_normals(posed, faces) * normalize(center - posed, dim=-1)).sum(-1)
+    toward = observe.facing(posed, faces, camera)
     cosine = (toward[faces[ids.clamp_min(0)]] * seen.barycentrics).sum(-1)
     trust = ((cosine - facing[0]) / (facing[1] - facing[0])).clamp(0, 1)
     return Seen(ids, depth, canvas.mask * trust * ((ids >= 0) & (depth - before < STEP)))

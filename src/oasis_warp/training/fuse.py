@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import vertex_to_gaussians
+from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.mixture import mix_guesses
 from oasis_warp.avatar.observe import Observation, inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
@@ -77,15 +77,9 @@ def fuse(
         return Fusion(made.gaussians, guesses[0], sightings, torch.ones_like(sightings.colors[:, 0]))
     faces = hand.faces.to(evidences[0].image.device)
     guess = mix_guesses(guesses, sightings.confidence * sightings.share + UNSEEN, faces)
-    gains = photo_gains(sightings, _vertex_colors(guess, len(hand.template)))
+    gains = photo_gains(sightings, vertex_colors(guess, len(hand.template)))
     made = _adapt(hand, guess, evidences, sightings, gains, config, progress)
     return Fusion(made, guess, sightings, gains)
-
-
-def _vertex_colors(guess: CanonicalGaussians, n_vertices: int) -> Float[Tensor, "V 3"]:
-    """Those of the vertices' Gaussians; the mean of all next to the wrist's end, where there are none."""
-    own = guess.colors[: len(guess.vertex_index)]
-    return own.mean(0).repeat(n_vertices, 1).index_copy(0, guess.vertex_index, own)
 
 
 def _adapt(

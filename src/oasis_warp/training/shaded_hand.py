@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
+from oasis_warp.avatar.anchors import vertex_colors
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Evidence
 from oasis_warp.ops import depth_map
@@ -65,14 +66,6 @@ def make_scene(
     mask, line = reduced(torch.stack([evidence.mask, judged]))
     albedo = vertex_colors(guess, len(hand.template)).clamp_min(DARKEST)
     return Scene(reduced(evidence.image.permute(2, 0, 1)), mask, line, K, hand.faces.to(mask.device), albedo)
-
-
-def vertex_colors(guess: CanonicalGaussians, n_vertices: int) -> Float[Tensor, "V 3"]:
-    """Of the vertices' own Gaussians; the mean of all where a vertex has none."""
-    own = guess.colors[: len(guess.vertex_index)]
-    colors = own.mean(0).repeat(n_vertices, 1)
-    colors[guess.vertex_index] = own
-    return colors
 
 
 def draw(scene: Scene, posed: Float[Tensor, "B V 3"]) -> Drawn:

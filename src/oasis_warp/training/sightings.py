@@ -6,10 +6,8 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from oasis_warp.avatar.observe import VISIBILITY_MARGIN, inner_mask, observe
-from oasis_warp.core import surface
+from oasis_warp.avatar.observe import VISIBILITY_MARGIN, facing, inner_mask, observe
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Evidence
@@ -65,11 +63,10 @@ def _pixel_density(hand: HandModel, evidence: Evidence) -> Float[Tensor, "V"]:
         vertices, vertices, faces, camera.K, camera.viewmat, camera.width, camera.height, margin=VISIBILITY_MARGIN,
         point_vertices=torch.arange(len(vertices), device=vertices.device),
     )  # fmt: skip
-    center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
-    facing = (surface.vertex_normals(vertices, faces) * normalize(center - vertices, dim=-1)).sum(-1).clamp(0, 1)
+    turned = facing(vertices, faces, camera).clamp(0, 1)
     _, depth = project(camera, vertices)
     inside = observe(hand, evidence._replace(image=inner_mask(evidence.mask, 1)[..., None].expand(-1, -1, 3)))
-    return visible * facing * inside.colors[:, 0].clamp(0, 1) * (camera.K[0, 0] / depth.clamp_min(1e-3)) ** 2
+    return visible * turned * inside.colors[:, 0].clamp(0, 1) * (camera.K[0, 0] / depth.clamp_min(1e-3)) ** 2
 
 
 def photo_gains(sightings: Sightings, guess: Float[Tensor, "V 3"]) -> Float[Tensor, "K 3"]:
