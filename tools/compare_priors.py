@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import torch
 
-from oasis_warp.core.config import AdaptConfig, ReconstructConfig
+from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8, write_picture
@@ -62,9 +62,9 @@ def row(path: Path, priors: list[str], side: int) -> torch.Tensor:
     parts = [shrink(evidence.image.flip(1) if fit.side == "left" else evidence.image, side)]
     for name in priors:
         guess = choose_prior(name if name in ("learned", "none") else Path(name))(evidence)
-        adapted = adapt(hand, guess, evidence, AdaptConfig()).gaussians
-        for gaussians in (guess, adapted):
-            parts += [gap, views(make_avatar(fit, offsets, evidence, gaussians), side)]
+        adapted = adapt(hand, guess, evidence)
+        for gaussians, light in ((guess, None), (adapted.gaussians, adapted.light)):
+            parts += [gap, views(make_avatar(fit, offsets, evidence, gaussians, light), side)]
     return torch.cat(parts, dim=1)
 
 

@@ -168,7 +168,7 @@ def measure_hand(name: str, paths: list[Path], prior: Prior, options: argparse.N
         for chosen, (avatar, seen) in made:
             fit = estimator.fit(photo, landmarks, shape=avatar.shape.cpu(), force=True)
             evidence = make_evidence(photo, fit, avatar.surface_offsets.cpu(), config)
-            found = compare_with_photo(avatar, draw_as_photo(avatar, evidence, fit.pose), evidence)
+            found = compare_with_photo(avatar, draw_as_photo(avatar, evidence, fit.pose), evidence, fit.pose)
             yield {
                 "who": f"{name}/{photo.name}", "photos": chosen, "stage": "one_shot", "seen": seen,
                 "psnr": found.psnr, "ssim_quarter": found.ssim_quarter, "overlap": found.overlap,

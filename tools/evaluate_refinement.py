@@ -23,6 +23,7 @@ from torch import Tensor
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.camera import project
+from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, TrainingBatch
 from oasis_warp.evaluation.held_out import (
     ERROR_STREAM,
@@ -161,7 +162,7 @@ def measure(bench: Bench, prior: Prior, options: argparse.Namespace) -> tuple[di
                         ("estimated", case.evidence), ("refined", refined.evidence), ("true", case.truth)
                     ):  # fmt: skip
                         guess = prior(evidence)
-                        adapted = adapt(bench.hand, guess, evidence).gaussians
+                        adapted = adapt(bench.hand, guess, evidence, AdaptConfig(light="keep")).gaussians
                         for stage, gaussians in (("raw", guess), ("one-shot", adapted)):
                             found = bench.pictures(gaussians, case, light, truths)
                             avatars[light, factor, name, stage].append(float(np.mean(list(found))))

@@ -123,7 +123,7 @@ def make_truth(hand: HandModel, prior: Prior, *, back: bool, size: int, steps: i
     adapted = adapt(hand, prior(evidence), evidence, AdaptConfig(texture_steps=steps))
     avatar = Avatar(
         side="right", shape=shape, surface_offsets=still, gaussians=adapted.gaussians, source_pose=pose,
-        source_camera=evidence.camera,
+        source_camera=evidence.camera, light=adapted.light,
     )  # fmt: skip
     return Truth(hand, pose, camera, avatar, photo, waves)
 

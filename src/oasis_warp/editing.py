@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.avatar.lighting import shading_picture
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
@@ -100,8 +101,8 @@ def edit(
         posed = skin(avatar.hand, avatar.rest, pose).vertices
         try:
             made = repaint(
-                avatar.gaussians, avatar.hand.faces, avatar.rest.vertices, posed, canvas, steps=config.steps,
-                progress=progress,
+                avatar.gaussians, avatar.hand.faces, avatar.rest.vertices, posed, _without_light(avatar, posed, canvas),
+                steps=config.steps, progress=progress,
             )  # fmt: skip
         except ValueError as error:
             where = "on the hand" if mask else "on the hand that differs from the photo"
@@ -110,7 +111,7 @@ def edit(
             ) from error
     edited = Avatar(
         side=avatar.side, shape=avatar.shape, surface_offsets=avatar.surface_offsets, gaussians=made.gaussians,
-        source_pose=avatar.source_pose, source_camera=avatar.source_camera,
+        source_pose=avatar.source_pose, source_camera=avatar.source_camera, light=avatar.light,
     )  # fmt: skip
     measures = {
         "painted_mm2": 1e6 * made.area,
@@ -155,6 +156,14 @@ def _right_handed(avatar: Avatar, image: Tensor, mask: Tensor, size: int) -> Can
     if avatar.side == "left":
         image, mask, camera = image.flip(1), mask.flip(1), mirrored_camera(camera)
     return Canvas(image.to(avatar.device), mask.to(avatar.device), camera)
+
+
+def _without_light(avatar: Avatar, posed: Float[Tensor, "V 3"], canvas: Canvas) -> Canvas:
+    """The canvas as the avatar's own colours are, which its light is laid over."""
+    if avatar.light is None:
+        return canvas
+    factor = shading_picture(avatar.light, avatar.rest.vertices, posed, avatar.hand.faces, canvas.camera)
+    return canvas._replace(image=(canvas.image / factor).clamp(0, 1))
 
 
 def _errors(before: Avatar, after: Avatar, canvas: Canvas) -> dict[str, float]:

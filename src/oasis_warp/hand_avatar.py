@@ -7,12 +7,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.avatar.lighting import in_even_light, mirror_light
 from oasis_warp.avatar.pose import mirror_canonical, pose_gaussians
+from oasis_warp.core import surface
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.checks import check_shape
 from oasis_warp.core.config import WHITE, Color
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandPose, PosedHand, Render, Side
+from oasis_warp.core.types import (
+    Camera,
+    CanonicalGaussians,
+    Gaussians,
+    HandLight,
+    HandPose,
+    PosedHand,
+    Render,
+    Side,
+)
 from oasis_warp.data.avatar_file import load_avatar, save_avatar
 from oasis_warp.hand.skinning import mirror_hand, mirror_points, rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand
@@ -40,6 +51,7 @@ class Avatar:
         gaussians: CanonicalGaussians,
         source_pose: HandPose,
         source_camera: Camera,
+        light: HandLight | None = None,
     ):
         self.side: Side = side
         self.shape = shape
@@ -52,6 +64,9 @@ class Avatar:
         """The pose in the photo, in the frame of `source_camera`."""
         self.source_camera = source_camera
         """The camera of the square crop that the avatar was fitted to."""
+        self.light = light
+        """The photo's light, in which the hand is posed and drawn; of a left hand in the mirror. None where light is
+        part of the colours, or even."""
         self.hand = bundled_hand().to(self.device)
         plain = rest_hand(self.hand, shape)
         self.rest = plain._replace(vertices=plain.vertices + surface_offsets)
@@ -65,6 +80,10 @@ class Avatar:
         self._rest_mesh = (
             vertices if vertices.requires_grad else rest_mesh(vertices, self.hand.faces, validate=False)
         )
+        self._light = None
+        if light is not None:
+            normals = surface.vertex_normals(self.rest.vertices, self.hand.faces)
+            self._light = (mirror_light(light), mirror_points(normals)) if left else (light, normals)
         self._fixed = (*self._canonical, vertices, self._rest.joints)
         self._recordings = Recordings()
 
@@ -102,17 +121,18 @@ class Avatar:
         return skin(self._model, self._rest, self._checked(pose, validate))
 
     def pose(self, pose: HandPose, *, validate: bool = True) -> Gaussians:
-        """The Gaussians in `pose`, in the world of its orientation and translation.
+        """The Gaussians in `pose`, in the world of its orientation and translation, where its light stays too.
 
         Args:
-            pose: One, or with an axis in front of every part many.
+            pose: One, or with an axis in front of every part many: then means, quats and scales have it too, and
+                colours where there is a `light`.
             validate: Look at the pose's values too. Waits for a CUDA device if they are there.
 
         Raises:
             ValueError: a part of the pose has another shape or is not finite.
         """
         posed = skin_surface(self._model, self._rest, self._checked(pose, validate))
-        return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed)
+        return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light)
 
     def render(
         self, camera: Camera, pose: HandPose, background: Color = WHITE, *, validate: bool = True
@@ -158,6 +178,14 @@ class Avatar:
         with Look(**named) if looking else nullcontext():
             return Render(*replayed(self._recordings, size, lambda: Recording(draw, inputs, self.shape), draw, inputs))
 
+    def in_even_light(self) -> "Avatar":
+        """The same hand without its photo's light, as far as that is known."""
+        return Avatar(
+            side=self.side, shape=self.shape, surface_offsets=self.surface_offsets,
+            gaussians=in_even_light(self.gaussians, self.light) if self.light else self.gaussians,
+            source_pose=self.source_pose, source_camera=self.source_camera,
+        )  # fmt: skip
+
     def save(self, path: Path | str) -> None:
         """Write the avatar file (safetensors, versioned; see docs/avatar_file.md)."""
         camera, pose, gaussians = self.source_camera, self.source_pose, self.gaussians
@@ -169,6 +197,8 @@ class Avatar:
             "source_camera.viewmat": camera.viewmat,
             "source_camera.K": camera.K,
         }
+        if self.light is not None:
+            tensors |= {f"light.{name}": value for name, value in self.light._asdict().items()}
         header = {
             "side": self.side,
             "hand_model": self.hand.name,
@@ -199,4 +229,5 @@ class Avatar:
             gaussians=CanonicalGaussians(**group("gaussians.")),
             source_pose=HandPose(**group("source_pose.")),
             source_camera=Camera(**group("source_camera."), **header["source_camera"]),
+            light=HandLight(**light) if (light := group("light.")) else None,
         )

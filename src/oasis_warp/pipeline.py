@@ -17,7 +17,7 @@ from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, HandFit, Landmarks, Photo, Render
+from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, HandFit, HandLight, Landmarks, Photo, Render
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.keypoints_file import read_keypoints
@@ -33,6 +33,7 @@ from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 from oasis_warp.training.adapt import adapt
 from oasis_warp.training.refine import refine
+from oasis_warp.training.room_light import without_light
 from oasis_warp.training.sharpen import sharpen
 
 CROP_MARGIN = 1.12
@@ -120,24 +121,26 @@ def reconstruct(
         settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
         adaptation = adapt(hand, guess, evidence, settings, progress)
     gaussians, close = adaptation.gaussians, evidence
-    # detail is laid over what the photo shows, light and all
-    if config.light == "keep" and (size := detail_size(fit, config)) > len(evidence.image):
+    light = adaptation.light
+    # in even light what the photo shows beyond the prior is not taken over as it is
+    if config.light != "even" and (size := detail_size(fit, config)) > len(evidence.image):
         with stage("detail"):
             close = make_evidence(photo, fit, offsets, config, size)
-            gaussians = sharpen(hand, gaussians, close, progress).gaussians
-    avatar = make_avatar(fit, offsets, evidence, gaussians)
+            shown = without_light(hand, close, light) if light else close
+            gaussians = sharpen(hand, gaussians, shown, progress).gaussians
+    avatar = make_avatar(fit, offsets, evidence, gaussians, light)
     with stage("quality"):
         quality = assess_surface(hand, evidence, over_photo(avatar, evidence))
-        shown = shares(hand, evidence.rest.vertices, quality)
+        known = shares(hand, evidence.rest.vertices, quality)
         _, _, side = square_around(fit.mask, CROP_MARGIN)
-        doubts = (*surface_doubts(shown), *photo_doubts(close.image, close.mask, side))
+        doubts = (*surface_doubts(known), *photo_doubts(close.image, close.mask, side))
         errors = {
             "reprojection_percent": fit.reprojection,
             "worst_point_percent": fit.worst_point,
             "mask_iou": fit.mask_iou,
             "refined_px": moved,
             **input_errors(avatar, close),
-            **shown,
+            **known,
         }
     return Reconstruction(avatar, fit, prior.about, stages, errors, (*fit.warnings, *doubts), quality)
 
@@ -213,9 +216,13 @@ def make_evidence(
 
 
 def make_avatar(
-    fit: HandFit, offsets: torch.Tensor, evidence: Evidence, gaussians: CanonicalGaussians
+    fit: HandFit,
+    offsets: torch.Tensor,
+    evidence: Evidence,
+    gaussians: CanonicalGaussians,
+    light: HandLight | None = None,
 ) -> Avatar:
-    """The hand of `fit` with the looks of `gaussians`; `offsets` and `evidence` are those that it was made with."""
+    """The hand of `fit` with the looks of `gaussians` in `light`; `offsets` and `evidence` are those of its making."""
     camera = evidence.camera
     return Avatar(
         side=fit.side,
@@ -224,6 +231,7 @@ def make_avatar(
         gaussians=gaussians,
         source_pose=fit.pose,
         source_camera=mirrored_camera(camera) if fit.side == "left" else camera,
+        light=light,
     )
 
 

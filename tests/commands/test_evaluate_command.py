@@ -43,7 +43,7 @@ def score_in(scene, photo, avatar=None):
     _, fit, made = scene
     avatar = avatar or made
     evidence = make_evidence(photo, fit, avatar.surface_offsets, SMALL)
-    return compare_with_photo(avatar, draw_as_photo(avatar, evidence, fit.pose), evidence)
+    return compare_with_photo(avatar, draw_as_photo(avatar, evidence, fit.pose), evidence, fit.pose)
 
 
 def test_an_avatar_is_like_the_photo_that_it_was_made_of(scene):

@@ -7,7 +7,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.avatar_file import FORMAT, TENSORS, UNITS, VERSION, load_avatar, save_avatar
+from oasis_warp.data.avatar_file import FORMAT, LIGHT, TENSORS, UNITS, VERSION, load_avatar, save_avatar
 from oasis_warp.data.avatar_file import HEADER as FILE_HEADER
 
 SIZES = {"S": 4, "V": 30, "P": 5, "Q": 7, "N": 12}
@@ -183,3 +183,27 @@ def test_the_documentation_lists_every_tensor_and_header_key():
         assert f"| `{name}` | {str(entry.dtype).removeprefix('torch.')} | {shape} |" in page
     for key in FILE_HEADER:
         assert f"| `{key}` |" in page
+
+
+def test_light_comes_as_a_whole_or_not_at_all(tmp_path, tensors):
+    light = {name: torch.rand(entry.shape) + 0.1 for name, entry in LIGHT.items()}
+    light["light.limits"] = torch.tensor([[0.5] * 3, [1.5] * 3])
+    save_avatar(tmp_path / "lit", {**tensors, **light}, HEADER)
+    back, _ = load_avatar(tmp_path / "lit")
+    assert back.keys() == tensors.keys() | light.keys()
+    for change in (
+        {"light.limits": light["light.limits"].flip(0)},
+        {"light.limits": torch.zeros(2, 3)},
+        {"light.even": torch.zeros(3)},
+        {"light.harmonics": torch.full((4, 3), torch.nan)},
+    ):
+        with pytest.raises(ValueError, match=next(iter(change))):
+            save_avatar(tmp_path / "bad", {**tensors, **light, **change}, HEADER)
+    with pytest.raises(ValueError, match="missing light.even"):
+        save_avatar(tmp_path / "bad", {**tensors, **{k: v for k, v in light.items() if k != "light.even"}}, HEADER)
+    assert not (tmp_path / "bad").exists()
+
+
+def test_a_file_from_before_there_was_light_is_read(written):
+    rewrite(written, version=1)
+    assert load_avatar(written)[1]["version"] == 1

@@ -152,10 +152,11 @@ def test_each_stage_goes_on_from_the_one_before(hand, network):
     evidence = evidence_of(batch)
     made = dict(reconstructions(hand, evidence, usual_priors(network), METHODS, CONFIG.adapt))
     assert tuple(made) == METHODS
-    raw, calibrated, one_shot = (made[Method("learned", stage)].colors for stage in ("raw", "calibrated", "one_shot"))
+    stages = ("raw", "calibrated", "one_shot")
+    raw, calibrated, one_shot = (made[Method("learned", stage)].gaussians.colors for stage in stages)
     gains = (calibrated - calibrated.mean(0)) / (raw - raw.mean(0))
     clear = ((raw - raw.mean(0)).abs() > 0.02).all(1) & ((calibrated > 0) & (calibrated < 1)).all(1)
     assert float(gains[clear].std(0).max()) < 1e-2  # one gain and one offset a channel
     assert not torch.allclose(calibrated, one_shot, atol=0.01)
     (alone,) = reconstructions(hand, evidence, usual_priors(network), METHODS[:1], CONFIG.adapt)
-    assert torch.equal(alone[1].colors, made[METHODS[0]].colors)
+    assert torch.equal(alone[1].gaussians.colors, made[METHODS[0]].gaussians.colors)

@@ -30,6 +30,8 @@ def run(options: Animate) -> int:
     n_frames = count_frames(options.seconds, options.fps)
     names = read_names(options.poses)
     avatar = Avatar.load(options.avatar, options.device)
+    if options.light == "even":
+        avatar = avatar.in_even_light()
     with show_progress(Console(stderr=True)) as progress:
         look = {"elevation": math.radians(options.elevation), "background": background, "progress": progress}
         if options.motion == "turntable":

@@ -43,8 +43,9 @@ class Reconstruct:
     """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
     refine: Literal["on", "off"] = "off"
     """Move the fitted hand to where what the prior saw in the photo explains it better, and look again; or leave it."""
-    light: Literal["keep", "even"] = "keep"
-    """Whether the avatar keeps the light of its photo, shadows too, or is as in even light wherever one can tell."""
+    light: Literal["fit", "keep", "even"] = "fit"
+    """The photo's light: fit it, so that it stays where it is when the hand turns; keep it on the skin, shadows too; or
+    leave it out wherever one can tell."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0
@@ -74,6 +75,8 @@ class Render:
     """Degrees above the hand."""
     size: int = 512
     """Side of the picture [px]."""
+    light: Literal["photo", "even"] = "photo"
+    """The photo's light, as far as it is known apart from the skin, or even light."""
     background: str = "white"
     """white, black, transparent, or a colour as rrggbb."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -102,6 +105,8 @@ class Animate:
     """Degrees above the hand."""
     size: int = 384
     """Side of the picture [px]."""
+    light: Literal["photo", "even"] = "photo"
+    """The photo's light, as far as it is known apart from the skin, or even light."""
     background: str = "white"
     """white, black, or a colour as rrggbb."""
     device: Literal["cpu", "cuda"] = "cpu"

@@ -25,6 +25,8 @@ def run(options: Render) -> int:
     transparent = options.background == "transparent"
     background = BLACK if transparent else read_color(options.background)
     avatar = Avatar.load(options.avatar, options.device)
+    if options.light == "even":
+        avatar = avatar.in_even_light()
     pose = choose_pose(avatar, options.pose)
     camera = orbit_camera(
         avatar.mesh(pose).vertices, math.radians(options.azimuth), math.radians(options.elevation), options.size

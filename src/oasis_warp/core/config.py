@@ -16,9 +16,9 @@ class AdaptConfig:
     """Match the prior's colours to the photo's as a whole first, or leave them as they are."""
     calibration_steps: int = 0
     """Steps of the paper's calibration after its closed form, which is better without them; the paper takes 100."""
-    light: Literal["keep", "even"] = "keep"
-    """Take over all that the photo shows, its shadows too, so that the avatar looks like its photo; or only what is
-    likelier skin than light, so that it looks right elsewhere."""
+    light: Literal["fit", "keep", "even"] = "fit"
+    """Fit the photo's light, which stays where it is when the hand turns, and take over all that the photo shows beyond
+    it; take over light and shadows as if they were skin; or only what is likelier skin than light."""
     texture_steps: int | None = None
     """Steps of texture learning, which "even" does without; None stops when the loss is flat, after 400 at most."""
     weight_rgb: float = 10.0
@@ -50,8 +50,9 @@ class ReconstructConfig:
     """DINOv2's model.safetensors, for a network of your own that reads photos with it."""
     refine: Literal["on", "off"] = "off"
     """Move the fitted hand to where what the prior saw in the photo explains it better, and look again; or leave it."""
-    light: Literal["keep", "even"] = "keep"
-    """Whether the avatar keeps the light of its photo, shadows too, or is as in even light wherever one can tell."""
+    light: Literal["fit", "keep", "even"] = "fit"
+    """The photo's light: fit it, so that it stays where it is when the hand turns; keep it on the skin, shadows too; or
+    leave it out wherever one can tell."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0

@@ -54,6 +54,13 @@ def from_matrix(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
     return torch.where(q[..., :1] < 0, -q, q)
 
 
+def rotate(quats: Float[Tensor, "*batch 4"], vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Vectors turned by unit quaternions."""
+    axes = quats[..., 1:]
+    twice = 2 * torch.linalg.cross(axes, vectors)
+    return vectors + quats[..., :1] * twice + torch.linalg.cross(axes, twice)
+
+
 def from_axis_angle(axes: Float[Tensor, "*batch 3"], angles: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices about unit `axes` by `angles` [rad] (Rodrigues)."""
     x, y, z = axes.unbind(-1)

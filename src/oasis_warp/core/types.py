@@ -148,6 +148,21 @@ class Render(NamedTuple):
     alpha: Float[Tensor, "H W"]
 
 
+class HandLight(NamedTuple):
+    """Light that falls on a hand, smooth and without shadows; it stays in the world when the hand turns.
+
+    The light that skin reflects is multiplied with `[1, n] @ harmonics`, kept within `limits`, where n is the direction
+    in which skin faces in the world of the photo's camera.
+    """
+
+    harmonics: Float[Tensor, "4 3"]
+    """Of degree 0, then x, y and z; a column a colour."""
+    limits: Float[Tensor, "2 3"]
+    """Least and most of it that the photo shows, above 0: no more is guessed of what it does not show."""
+    even: Float[Tensor, "3"]
+    """Light as bright as that on what the photo shows on average, from all around."""
+
+
 class TrainingBatch(NamedTuple):
     """B hands, each as one photo shows it and as T pictures must come out: what a prior is trained on.
 

@@ -1,8 +1,8 @@
 """The avatar file: safetensors with a JSON header, so that loading one executes nothing.
 
-Tensors lie in the file as the table `TENSORS` says. Its metadata have one entry, "oasis-avatar": the header,
-a JSON object whose `version` is 1. A file of a newer version is refused. (One entry, because safetensors writes several
-in any order: the same avatar shall be the same bytes.)
+Tensors lie in the file as the tables `TENSORS` and `LIGHT` say. Its metadata have one entry, "oasis-avatar": the
+header, a JSON object whose `version` is 2, or 1 in files from before there was light. A file of a newer version is
+refused. (One entry, because safetensors writes several in any order: the same avatar shall be the same bytes.)
 """
 
 import json
@@ -21,7 +21,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.data.atomic import write_file
 
 FORMAT = "oasis-avatar"
-VERSION = 1
+VERSION = 2
 UNITS = {"length": "m", "angle": "rad", "quaternion": "wxyz", "color": "sRGB in [0, 1]", "camera": "OpenCV"}
 
 
@@ -53,6 +53,12 @@ TENSORS = {
     "source_camera.viewmat": Entry(torch.float32, (4, 4)),
     "source_camera.K": Entry(torch.float32, (3, 3)),
 }
+LIGHT = {
+    # The photo's light, where it is not part of the colours: all of it or nothing.
+    "light.harmonics": Entry(torch.float32, (4, 3)),
+    "light.limits": Entry(torch.float32, (2, 3)),
+    "light.even": Entry(torch.float32, (3,)),
+}
 HEADER = {"version": int, "side": str, "hand_model": str, "hand_licence": str, "source_camera": dict}
 """Keys that a header has at least, and their types; `source_camera` holds `width` and `height` [px]."""
 
@@ -62,7 +68,7 @@ def save_avatar(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping
 
     Args:
         path: Where to; an existing file is replaced.
-        tensors: One for every name of `TENSORS`, on any device.
+        tensors: One for every name of `TENSORS`, and of `LIGHT` or none of them, on any device.
         header: The keys of `HEADER` and any others; `version`, `units`, `counts` and `creator` are filled in.
 
     Raises:
@@ -135,8 +141,8 @@ def _check_header(header: Any) -> None:
     for key, kind in HEADER.items():
         if not isinstance(header.get(key), kind):
             raise ValueError(f"header: expected {key!r} of type {kind.__name__}, got {header.get(key)!r}")
-    if header["version"] != VERSION:
-        raise ValueError(f"header: expected version {VERSION}, got {header['version']}")
+    if header["version"] not in range(1, VERSION + 1):
+        raise ValueError(f"header: expected version 1 to {VERSION}, got {header['version']}")
     if header["side"] not in ("left", "right"):
         raise ValueError(f"header: expected side 'left' or 'right', got {header['side']!r}")
     size = [header["source_camera"].get(key) for key in ("width", "height")]
@@ -146,12 +152,13 @@ def _check_header(header: Any) -> None:
 
 def _check_tensors(tensors: Mapping[str, Tensor]) -> dict[str, int]:
     """Check the tensors against the table; the size of each letter."""
-    missing, unknown = TENSORS.keys() - tensors.keys(), tensors.keys() - TENSORS.keys()
+    table = TENSORS | LIGHT if tensors.keys() & LIGHT.keys() else TENSORS
+    missing, unknown = table.keys() - tensors.keys(), tensors.keys() - table.keys()
     if missing or unknown:
         found = {"missing": missing, "unknown": unknown}
         raise ValueError("tensors: " + "; ".join(f"{k} {', '.join(sorted(v))}" for k, v in found.items() if v))
     sizes: dict[str, int] = {}
-    for name, entry in TENSORS.items():
+    for name, entry in table.items():
         check_shape(name, tensors[name], *entry.shape, sizes=sizes)
         if tensors[name].dtype != entry.dtype:
             raise ValueError(f"{name}: expected {entry.dtype}, got {tensors[name].dtype}")
@@ -175,6 +182,10 @@ def _check_gaussians(tensors: Mapping[str, Tensor]) -> None:
         "gaussians.opacities": (tensors["gaussians.opacities"].clamp(0, 1) == tensors["gaussians.opacities"],
                                 "opacities in [0, 1]"),
     }
+    if "light.limits" in tensors:
+        limits = tensors["light.limits"]
+        good["light.limits"] = (limits > 0) & (limits[0] <= limits[1]), "the least, above 0, over the most"
+        good["light.even"] = tensors["light.even"] > 0, "light"
     for name, (ok, expected) in good.items():
         if not bool(ok.all()):
             raise ValueError(f"{name}: expected {expected}, got {int((~ok).sum())} bad rows of {len(ok)}")

@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_warp.core import surface
@@ -16,7 +16,15 @@ from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.observation import sight
 from oasis_warp.ops import depth_map
 from oasis_warp.synthetic.picture import SyntheticBatch, part, render_capture, render_planned
-from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery, Shot, capture_shots, plan_shots
+from oasis_warp.synthetic.plan import (
+    EVERYBODY,
+    PICTURES_EACH,
+    Scenery,
+    Shot,
+    camera_turn,
+    capture_shots,
+    plan_shots,
+)
 from oasis_warp.synthetic.planned import Planned, tabulate
 from oasis_warp.synthetic.stage import sample_light, soften_light
 from oasis_warp.synthetic.wardrobe import sample_clothes
@@ -65,6 +73,9 @@ class Session(NamedTuple):
     """One each, in the same pose from the same side."""
     targets: dict[Lighting, SyntheticBatch]
     """The same poses from the same sides; "studio" and "wild" share them."""
+    turns: dict[Lighting, Float[Tensor, "T 3 3"] | None]
+    """From the photo's frame to that of each target as the light turns; None where it is not the photo's light. All
+    are rendered as right hands, so this holds for left ones in the mirror."""
 
 
 def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) -> Session:
@@ -86,10 +97,12 @@ def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) ->
     same, same_goals = render_capture(
         seed, planned([soft]), planned(capture_shots(seed, soft, goals)), size, device, scenery=wild
     )
+    turns = torch.from_numpy(np.stack([camera_turn(seed, goal.index) for goal in goals])).float()
     return Session(
         number,
         {"studio": studio, "same": same, "wild": render_planned(seed, planned([photo]), size, device, scenery=wild)},
         {"studio": even_goals, "same": same_goals, "wild": even_goals},
+        {"studio": torch.eye(3).expand(shoot.targets, 3, 3), "same": turns, "wild": None},
     )
 
 

@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import torch
 
+from oasis_warp.avatar.lighting import in_even_light
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import CanonicalGaussians, Evidence
+from oasis_warp.core.types import CanonicalGaussians, Evidence, HandLight
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior
@@ -18,10 +19,10 @@ from oasis_warp.network.weights_file import trained_state
 from oasis_warp.training.adapt import adapt, in_photo
 from oasis_warp.training.calibrate import calibrate
 
-RAW, CALIBRATED, EVEN, ONE_SHOT = "raw", "calibrated", "even_one_shot", "one_shot"
-STAGES = (RAW, CALIBRATED, EVEN, ONE_SHOT)
+RAW, CALIBRATED, EVEN, KEEP, ONE_SHOT = "raw", "calibrated", "even_one_shot", "keep_one_shot", "one_shot"
+STAGES = (RAW, CALIBRATED, EVEN, KEEP, ONE_SHOT)
 """As the prior says, with its colours matched to the photo's as a whole, adapted to what is likelier skin than light,
-and adapted to all that the photo shows."""
+adapted to all that the photo shows, its light on the skin, and the same with the light apart, as avatars ship."""
 
 
 class Method(NamedTuple):
@@ -33,12 +34,26 @@ class Method(NamedTuple):
     """One of `STAGES`."""
 
 
+class Made(NamedTuple):
+    """What a method makes of a photo."""
+
+    gaussians: CanonicalGaussians
+    """In even light, or in the light that they are drawn in anywhere."""
+    light: HandLight | None = None
+    """In which they look like the photo, where that is known apart."""
+
+    def without_light(self) -> CanonicalGaussians:
+        """As in even light."""
+        return self.gaussians if self.light is None else in_even_light(self.gaussians, self.light)
+
+
 METHODS = (
     Method("mean", CALIBRATED),
     Method("mean", ONE_SHOT),
     Method("learned", RAW),
     Method("learned", CALIBRATED),
     Method("learned", EVEN),
+    Method("learned", KEEP),
     Method("learned", ONE_SHOT),
 )
 """Of the tables: what needs no training, and each step beyond it."""
@@ -75,15 +90,15 @@ def reconstructions(
     priors: Mapping[str, Prior],
     wanted: Sequence[Method],
     config: AdaptConfig,
-) -> Iterator[tuple[Method, CanonicalGaussians]]:
-    """The Gaussians of every method of `wanted` whose prior is there, each prior asked and fitted once.
+) -> Iterator[tuple[Method, Made]]:
+    """What every method of `wanted` makes whose prior is there; each prior is asked once.
 
     Args:
         hand: On the CPU, as in `pipeline.reconstruct`.
         evidence: Of one photo.
         priors: By the names that methods have for them.
         wanted: What to make.
-        config: Of the adaptation.
+        config: Of the adaptation, whose light the stage decides on but for `ONE_SHOT`.
     """
     for name, prior in priors.items():
         stages = {method.stage for method in wanted if method.prior == name}
@@ -92,16 +107,14 @@ def reconstructions(
         with torch.no_grad():
             guess = prior(evidence)
         if RAW in stages:
-            yield Method(name, RAW), guess
-        adapted = adapt(hand, guess, evidence, config) if ONE_SHOT in stages else None
+            yield Method(name, RAW), Made(guess)
         if CALIBRATED in stages:
-            if adapted:
-                calibration = adapted.calibration
-            else:
-                _, view, trusted = in_photo(hand, guess, evidence)
-                calibration = calibrate(view, guess.colors, evidence.image, trusted, config)
-            yield Method(name, CALIBRATED), guess._replace(colors=calibration.apply(guess.colors))
-        if EVEN in stages:
-            yield Method(name, EVEN), adapt(hand, guess, evidence, replace(config, light="even")).gaussians
-        if adapted:
-            yield Method(name, ONE_SHOT), adapted.gaussians
+            _, view, trusted = in_photo(hand, guess, evidence)
+            calibration = calibrate(view, guess.colors, evidence.image, trusted, config)
+            yield Method(name, CALIBRATED), Made(guess._replace(colors=calibration.apply(guess.colors)))
+        for stage, settings in (
+            (EVEN, replace(config, light="even")), (KEEP, replace(config, light="keep")), (ONE_SHOT, config)
+        ):  # fmt: skip
+            if stage in stages:
+                adapted = adapt(hand, guess, evidence, settings)
+                yield Method(name, stage), Made(adapted.gaussians, adapted.light)

@@ -76,7 +76,9 @@ def compare_pairs(
                 continue
             evidence = make_evidence(photo, fit, first.surface_offsets.cpu(), config)
             drawn = {name: draw_as_photo(avatar, evidence, fit.pose) for name, avatar in made.items()}
-            scores = {name: compare_with_photo(avatar, drawn[name], evidence) for name, avatar in made.items()}
+            scores = {
+                name: compare_with_photo(avatar, drawn[name], evidence, fit.pose) for name, avatar in made.items()
+            }
             yield Pair(source, target, evidence.image, {name: what.image for name, what in drawn.items()}, scores)
 
 
@@ -89,8 +91,8 @@ def draw_as_photo(avatar: Avatar, evidence: Evidence, pose: HandPose) -> Render:
 
 
 @torch.no_grad()
-def compare_with_photo(avatar: Avatar, drawn: Render, evidence: Evidence) -> PairScore:
-    """Compare what `draw_as_photo` drew of `avatar` with the photo of `evidence`."""
+def compare_with_photo(avatar: Avatar, drawn: Render, evidence: Evidence, pose: HandPose) -> PairScore:
+    """Compare what `draw_as_photo` drew of `avatar` in `pose` with the photo of `evidence`."""
     image, alpha = drawn
     judged = evidence.above_wrist > 0.5
     mask = (evidence.mask > 0.5) & judged
@@ -102,7 +104,7 @@ def compare_with_photo(avatar: Avatar, drawn: Render, evidence: Evidence) -> Pai
         psnr=masked_psnr(matched, evidence.image, weight),
         psnr_plain=masked_psnr(image, evidence.image, weight),
         ssim_quarter=_small_ssim(matched, evidence.image, weight),
-        region_errors=_region_errors(avatar, evidence, gain),
+        region_errors=_region_errors(avatar, avatar.pose(pose).colors, evidence, gain),
         overlap=float((covered & mask).sum() / (covered | mask).sum().clamp_min(1)),
     )
 
@@ -116,11 +118,13 @@ def _small_ssim(image: Tensor, target: Tensor, weight: Tensor) -> float:
     return float((similarity * share).sum() / share.sum().clamp_min(1e-6))
 
 
-def _region_errors(avatar: Avatar, evidence: Evidence, gain: Tensor) -> dict[str, float]:
+def _region_errors(
+    avatar: Avatar, lit: Float[Tensor, "N 3"], evidence: Evidence, gain: Tensor
+) -> dict[str, float]:
     hand, index = avatar.hand, avatar.gaussians.vertex_index
     seen: Observation = observe(hand, evidence)
     colors, present = torch.zeros_like(seen.colors), torch.zeros_like(seen.confidence)
-    colors[index], present[index] = avatar.gaussians.colors[: len(index)], 1
+    colors[index], present[index] = lit[: len(index)], 1
     errors = {}
     for name, where in region_masks(label_regions(hand)).items():
         weight = (where * seen.confidence * present)[:, None]

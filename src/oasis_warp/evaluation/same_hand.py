@@ -15,7 +15,7 @@ from oasis_warp.core.types import Landmarks, Photo
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.claimed_folder import claim_folder
 from oasis_warp.data.photo import read_photo
-from oasis_warp.evaluation.methods import EVEN, ONE_SHOT, RAW, Method, label, prior_digest, reconstructions
+from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, label, prior_digest, reconstructions
 from oasis_warp.evaluation.photo_pairs import Pair, PairScore, compare_pairs
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, select
@@ -24,7 +24,13 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.pipeline import carrier_offsets, make_avatar, make_evidence
 
-PHOTO_METHODS = (Method("mean", ONE_SHOT), Method("learned", RAW), Method("learned", EVEN), Method("learned", ONE_SHOT))
+PHOTO_METHODS = (
+    Method("mean", ONE_SHOT),
+    Method("learned", RAW),
+    Method("learned", EVEN),
+    Method("learned", KEEP),
+    Method("learned", ONE_SHOT),
+)
 """No prior, no adaptation, and both."""
 SETTINGS, METRICS, SHEET, HANDS = "evaluation.json", "metrics.json", "sheet.png", "hands"
 """What an evaluation leaves in its folder; the last is a folder of what was found of each hand."""
@@ -152,11 +158,11 @@ def _make_avatars(
     offsets = carrier_offsets(hand, fit)
     evidence = make_evidence(photo, fit, offsets, config)
     settings = AdaptConfig(texture_steps=config.steps, seed=config.seed)
-    made = {
-        label(method): make_avatar(fit, offsets, evidence, gaussians)
-        for method, gaussians in reconstructions(hand, evidence, priors, methods, settings)
+    avatars = {
+        label(method): make_avatar(fit, offsets, evidence, *made)
+        for method, made in reconstructions(hand, evidence, priors, methods, settings)
     }
-    return made, evidence.image
+    return avatars, evidence.image
 
 
 def _record(hand: str, pair: Pair, method: Method) -> Record:

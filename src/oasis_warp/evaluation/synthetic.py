@@ -16,11 +16,14 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp import __version__
+from oasis_warp.avatar.lighting import turn_light
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import Prior
+from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
@@ -212,7 +215,7 @@ def measure(bench: _Bench, folder: Path, device: torch.device, group: Group, num
         for factor in config.noise + curve:
             batch = as_estimated(hand, session, light, config.shoot, factor)
             row = [tile(batch.image[0]), tile(truths[0].image)]
-            for method, images in draw(bench, hand, batch):
+            for method, images in draw(bench, hand, batch, session.turns[light]):
                 about = {"group": group, "person": number, "light": light, "noise": factor}
                 records += [{**about, **method._asdict(), **found} for found in score_all(images, truths, perceptual)]
                 row.append(tile(images[0]))
@@ -225,17 +228,27 @@ def measure(bench: _Bench, folder: Path, device: torch.device, group: Group, num
     write_file(place, json.dumps(records, allow_nan=False).encode())
 
 
-def draw(bench: _Bench, hand: HandModel, batch: TrainingBatch) -> Iterator[tuple[Method, list[Tensor]]]:
-    """What each method makes of the one photo of `batch`, drawn as each target shows it, over black."""
+def draw(
+    bench: _Bench, hand: HandModel, batch: TrainingBatch, turns: Float[Tensor, "T 3 3"] | None
+) -> Iterator[tuple[Method, list[Tensor]]]:
+    """What each method makes of the one photo of `batch`, drawn as each target shows it, over black.
+
+    `turns` says how the photo's light falls on targets (`Session.turns`); without, it does not.
+    """
     evidence, size = evidence_of(batch), batch.target_images.shape[2]
-    for method, gaussians in reconstructions(
+    normals = surface.vertex_normals(evidence.rest.vertices, hand.faces)
+    for method, made in reconstructions(
         bundled_hand(), evidence, bench.priors, asked_methods(bench.priors, bench.config), bench.config.adapt
     ):
         images = []
-        for posed, viewmat, K in zip(
-            batch.target_posed[0], batch.target_viewmats[0], batch.target_Ks[0], strict=True
+        for k, (posed, viewmat, K) in enumerate(
+            zip(batch.target_posed[0], batch.target_viewmats[0], batch.target_Ks[0], strict=True)
         ):
-            there = pose_gaussians(gaussians, hand.faces, batch.rest[0], posed)
+            if made.light is None or turns is None:
+                there = pose_gaussians(made.without_light(), hand.faces, batch.rest[0], posed)
+            else:
+                light = turn_light(made.light, turns[k].to(normals)), normals
+                there = pose_gaussians(made.gaussians, hand.faces, batch.rest[0], posed, light)
             images.append(render(there, Camera(viewmat, K, size, size)).image)
         yield method, images
 

@@ -118,6 +118,13 @@ def plan_shots(seed: int, indices: Sequence[int], scenery: Scenery = PHOTOS) -> 
     return [shot._replace(angles=a) for shot, a in zip(shots, angles, strict=True)]
 
 
+def camera_turn(seed: int, index: int) -> np.ndarray:
+    """How the camera has moved round the hand in picture `index` of a capture, from the photo's frame to its own."""
+    random = np.random.default_rng([seed, CAMERA_STREAM, index])
+    yaw, pitch = random.uniform(-1, 1, 2) * (CAMERA_YAW, CAMERA_PITCH)
+    return rotation_about([1, 0, 0], pitch) @ rotation_about([0, 1, 0], yaw)
+
+
 def capture_shots(seed: int, photo: Shot, others: Sequence[Shot]) -> list[Shot]:
     """`others`, drawn in even light, as pictures of the capture that `photo` is of: in its light, with its sensor.
 
@@ -125,8 +132,6 @@ def capture_shots(seed: int, photo: Shot, others: Sequence[Shot]) -> list[Shot]:
     """
     shots = []
     for shot in others:
-        random = np.random.default_rng([seed, CAMERA_STREAM, shot.index])
-        yaw, pitch = random.uniform(-1, 1, 2) * (CAMERA_YAW, CAMERA_PITCH)
-        moved = rotation_about([1, 0, 0], pitch) @ rotation_about([0, 1, 0], yaw)
-        shots.append(shot._replace(light=turn_light(photo.light, moved), sensor=photo.sensor))
+        light = turn_light(photo.light, camera_turn(seed, shot.index))
+        shots.append(shot._replace(light=light, sensor=photo.sensor))
     return shots

@@ -7,17 +7,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
+from oasis_warp.avatar.lighting import in_even_light
 from oasis_warp.avatar.observe import inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import CanonicalGaussians, Evidence, Gaussians
+from oasis_warp.core.types import CanonicalGaussians, Evidence, Gaussians, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors
 from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.training.calibrate import Calibration, calibrate
 from oasis_warp.training.complete import complete_field
 from oasis_warp.training.light import even_photo
+from oasis_warp.training.room_light import fit_light, without_light
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
 
@@ -32,6 +34,8 @@ class Adaptation(NamedTuple):
     calibration: Calibration
     losses: tuple[float, ...]
     """Of texture learning, a step each."""
+    light: HandLight | None
+    """In which the Gaussians look like the photo; None where that is in their colours, or left out."""
 
 
 class InPhoto(NamedTuple):
@@ -61,23 +65,24 @@ def adapt(
     """Fit the colours of `prior` to the photo; geometry stays.
 
     Colour calibration first, then the seen colours are carried smoothly over the rim of the seen region, then texture
-    learning with reference views. With `config.light` "even" the photo is freed from its light before that, and the
-    last step falls away.
+    learning with reference views. With `config.light` "fit" all that is done with the photo without its light. With
+    "even" what else may be light is left out, too, and the last step falls away.
     """
     faces = hand.faces.to(evidence.image.device)
     posed, view, trusted = in_photo(hand, prior, evidence)
 
     progress("calibration", 0, 1)
-    if config.calibration == "on":
-        calibration = calibrate(view, prior.colors, evidence.image, trusted, config)
-    else:
-        calibration = Calibration(torch.ones_like(prior.colors[0]), torch.zeros_like(prior.colors[0]))
+    calibration = _calibration(prior, view, evidence, trusted, config)
+    light = None
+    if config.light != "keep":
+        light = fit_light(hand, _drawn(view, calibration.apply(prior.colors)), evidence)
+        evidence = without_light(hand, evidence, light)
+        calibration = _calibration(prior, view, evidence, trusted, config)
     gaussians = prior._replace(colors=calibration.apply(prior.colors))
     progress("calibration", 1, 1)
 
     progress("completion", 0, 1)
-    with torch.no_grad():  # what is drawn, not the Gaussians' own colours: those of a learned prior need not agree
-        drawn = blend_colors(view, gaussians.colors) / view.alphas.clamp_min(MIN_ALPHA)
+    drawn = _drawn(view, gaussians.colors)  # not the Gaussians' own colours: those of a learned prior need not agree
     missing = observe(hand, evidence._replace(image=evidence.image - drawn))
     if config.light == "even":
         even = even_photo(evidence.image, drawn, missing, view, gaussians, evidence.rest.vertices, faces)
@@ -88,7 +93,7 @@ def adapt(
     progress("completion", 1, 1)
 
     if config.light == "even":  # what is left to learn is the photo's light
-        return Adaptation(gaussians, calibration, ())
+        return Adaptation(in_even_light(gaussians, light) if light else gaussians, calibration, (), None)
     references = [
         freeze_view(posed, orbit_camera(evidence.posed.vertices, azimuth, size=evidence.camera.width))
         for azimuth in reference_azimuths(config.reference_views)
@@ -96,4 +101,18 @@ def adapt(
     texture = learn_texture(
         gaussians, faces, view, evidence.image, evidence.mask * trusted, references, config, progress
     )
-    return Adaptation(gaussians._replace(colors=texture.colors), calibration, texture.losses)
+    return Adaptation(gaussians._replace(colors=texture.colors), calibration, texture.losses, light)
+
+
+def _calibration(
+    prior: CanonicalGaussians, view: BlendWeights, evidence: Evidence, trusted: Tensor, config: AdaptConfig
+) -> Calibration:
+    if config.calibration == "on":
+        return calibrate(view, prior.colors, evidence.image, trusted, config)
+    return Calibration(torch.ones_like(prior.colors[0]), torch.zeros_like(prior.colors[0]))
+
+
+@torch.no_grad()
+def _drawn(view: BlendWeights, colors: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 3"]:
+    """The picture without its background."""
+    return blend_colors(view, colors) / view.alphas.clamp_min(MIN_ALPHA)

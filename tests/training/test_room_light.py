@@ -1,0 +1,132 @@
+"""The light of a photo is found, taken off it, and stays in the world when the hand turns."""
+
+import pytest
+import torch
+from synthetic import evidence_of
+
+from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.lighting import in_even_light, mirror_light, posed_normals, shading, turn_light
+from oasis_warp.avatar.observe import observe
+from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.prior import MeanPrior
+from oasis_warp.core import rotation, surface
+from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.types import HandLight
+from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand.skinning import mirror_points, mirror_pose
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.render.cameras import mirrored_camera
+from oasis_warp.render.render import render
+from oasis_warp.training.adapt import adapt
+from oasis_warp.training.room_light import fit_light, without_light
+
+LIGHT = HandLight(
+    torch.tensor([[0.8, 0.8, 0.8], [0.3, 0.25, 0.2], [-0.2, -0.25, -0.3], [-0.15, -0.15, -0.15]]),
+    torch.tensor([[0.3, 0.3, 0.3], [1.3, 1.3, 1.3]]),
+    torch.ones(3),
+)
+
+
+@pytest.fixture(scope="module")
+def scene(hand):
+    """Evidence in even light, its Gaussians and pose, and the same evidence in `LIGHT`."""
+    even, truth, pose = evidence_of(hand, 0.8 * region_colors(label_regions(hand), 0.03))
+    normals = surface.vertex_normals(even.rest.vertices, hand.faces)
+    there = pose_gaussians(truth, hand.faces, even.rest.vertices, even.posed.vertices, (LIGHT, normals))
+    drawn = render(there, even.camera)
+    behind = (1 - drawn.alpha)[..., None]
+    return even, truth, pose, even._replace(image=drawn.image + behind * even.image)
+
+
+def avatar(truth, pose, evidence, light, hand, side="right"):
+    left = side == "left"
+    return Avatar(
+        side=side, shape=torch.zeros(len(hand.shape_names)), surface_offsets=torch.zeros_like(hand.template),
+        gaussians=truth, source_pose=mirror_pose(pose) if left else pose,
+        source_camera=mirrored_camera(evidence.camera) if left else evidence.camera, light=light,
+    )  # fmt: skip
+
+
+def test_light_is_found_and_taken_off(hand, scene):
+    even, _, _, lit = scene
+    found = fit_light(hand, even.image, lit)
+    normals = posed_normals(even.rest.vertices, even.posed.vertices, hand.faces)
+    seen = observe(hand, even).confidence > 0.5
+    ratio = (shading(found, normals) / shading(LIGHT, normals))[seen]
+    assert float((ratio / ratio.mean(0) - 1).abs().quantile(0.95)) < 0.05
+
+    before = observe(hand, even).colors[seen]
+    after, untouched = (observe(hand, e).colors[seen] for e in (without_light(hand, lit, found), lit))
+
+    def error(colors):
+        return float((colors * (before.mean(0) / colors.mean(0)) - before).square().mean().sqrt())
+
+    assert error(after) < 0.2 * error(untouched)
+
+
+def test_light_on_nothing_is_even(hand, scene):
+    even, *_ = scene
+    nothing = even._replace(mask=torch.zeros_like(even.mask))
+    found = fit_light(hand, even.image, nothing)
+    assert torch.equal(shading(found, torch.eye(3)), torch.ones(3, 3))
+
+
+def test_what_light_does_to_a_photo_is_drawn_again(hand, scene):
+    _, _, pose, lit = scene
+    adapted = adapt(hand, MeanPrior(hand)(lit), lit, AdaptConfig(texture_steps=20))
+    assert adapted.light is not None
+    drawn = avatar(adapted.gaussians, pose, lit, adapted.light, hand).render(lit.camera, pose)
+    kept = adapt(hand, MeanPrior(hand)(lit), lit, AdaptConfig(texture_steps=20, light="keep"))
+    assert kept.light is None
+    baked = avatar(kept.gaussians, pose, lit, None, hand).render(lit.camera, pose)
+    inside = lit.mask > 0.99
+    errors = [float((image - lit.image)[inside].square().mean().sqrt()) for image in (drawn.image, baked.image)]
+    assert errors[0] < 1.1 * errors[1]
+
+
+def test_light_stays_when_the_hand_turns(hand, scene):
+    even, truth, pose, _ = scene
+    lit = avatar(truth, pose, even, LIGHT, hand)
+    half = rotation.from_axis_angle(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(torch.pi))
+    turned = pose._replace(orientation=half @ pose.orientation)
+    before, after = lit.pose(pose).colors, lit.pose(turned).colors
+    assert float((before - after).abs().max()) > 0.1
+    follows = avatar(truth, pose, even, turn_light(LIGHT, half), hand)
+    torch.testing.assert_close(follows.pose(turned).colors, before, atol=1e-5, rtol=0)
+
+
+def test_many_poses_are_lit_as_each_alone(hand, scene):
+    even, truth, pose, _ = scene
+    lit = avatar(truth, pose, even, LIGHT, hand)
+    poses = [pose, pose._replace(angles=named_pose(hand, "fist"))]
+    together = lit.pose(type(pose)(*map(torch.stack, zip(*poses, strict=True))))
+    for k, one in enumerate(poses):
+        torch.testing.assert_close(together.colors[k], lit.pose(one).colors, atol=1e-6, rtol=0)
+
+
+def test_a_left_hand_is_lit_in_the_mirror(hand, scene):
+    even, truth, pose, _ = scene
+    right, left = (avatar(truth, pose, even, LIGHT, hand, side) for side in ("right", "left"))
+    torch.testing.assert_close(left.pose(left.source_pose).colors, right.pose(pose).colors, atol=1e-5, rtol=0)
+    direction = torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, 0.7]]), dim=1)
+    assert torch.equal(shading(mirror_light(LIGHT), mirror_points(direction)), shading(LIGHT, direction))
+
+
+def test_the_file_keeps_the_light(hand, scene, tmp_path):
+    even, truth, pose, _ = scene
+    lit = avatar(truth, pose, even, LIGHT, hand)
+    lit.save(tmp_path / "a.safetensors")
+    back = Avatar.load(tmp_path / "a.safetensors")
+    assert all(torch.equal(a, b) for a, b in zip(back.light, LIGHT, strict=True))
+    assert torch.equal(back.pose(pose).colors, lit.pose(pose).colors)
+    plain = lit.in_even_light()
+    assert plain.light is None
+    torch.testing.assert_close(plain.gaussians.colors, in_even_light(truth, LIGHT).colors)
+
+
+def test_gradients_go_through_the_light(hand, scene):
+    even, truth, pose, _ = scene
+    lit = avatar(truth, pose, even, LIGHT, hand)
+    orientation = pose.orientation.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(lit.pose(pose._replace(orientation=orientation)).colors.sum(), orientation)
+    assert bool(gradient.isfinite().all()) and float(gradient.abs().max()) > 1
