@@ -13,7 +13,8 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Evidence
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.prior import NetworkPrior
+from oasis_warp.network.lora import ColorHeads
+from oasis_warp.network.prior import NetworkPrior, guess_with_heads
 from oasis_warp.network.weights_file import trained_state
 from oasis_warp.training.adapt import adapt, in_photo
 from oasis_warp.training.calibrate import calibrate
@@ -69,6 +70,16 @@ def prior_digest(prior: Prior) -> str | None:
     return digest.hexdigest()
 
 
+@torch.no_grad()
+def ask(prior: Prior, evidence: Evidence, config: AdaptConfig) -> tuple[CanonicalGaussians, ColorHeads | None]:
+    """The guess of `prior`, and its heads where `config` wants to train them.
+
+    Raises:
+        InputError: it wants to, and the prior is no network.
+    """
+    return guess_with_heads(prior, evidence) if config.texture == "lora" else (prior(evidence), None)
+
+
 def reconstructions(
     hand: HandModel,
     evidence: Evidence,
@@ -84,16 +95,18 @@ def reconstructions(
         priors: By the names that methods have for them.
         wanted: What to make.
         config: Of the adaptation.
+
+    Raises:
+        InputError: LoRA was asked for, and a prior that is no network.
     """
     for name, prior in priors.items():
         stages = {method.stage for method in wanted if method.prior == name}
         if not stages:
             continue
-        with torch.no_grad():
-            guess = prior(evidence)
+        guess, heads = ask(prior, evidence, config)
         if RAW in stages:
             yield Method(name, RAW), guess
-        adapted = adapt(hand, guess, evidence, config) if ONE_SHOT in stages else None
+        adapted = adapt(hand, guess, evidence, config, heads=heads) if ONE_SHOT in stages else None
         if CALIBRATED in stages:
             if adapted:
                 calibration = adapted.calibration
@@ -102,6 +115,7 @@ def reconstructions(
                 calibration = calibrate(view, guess.colors, evidence.image, trusted, config)
             yield Method(name, CALIBRATED), guess._replace(colors=calibration.apply(guess.colors))
         if EVEN in stages:
-            yield Method(name, EVEN), adapt(hand, guess, evidence, replace(config, light="even")).gaussians
+            even = replace(config, light="even")
+            yield Method(name, EVEN), adapt(hand, guess, evidence, even, heads=heads).gaussians
         if adapted:
             yield Method(name, ONE_SHOT), adapted.gaussians
