@@ -57,7 +57,7 @@ def test_updates_are_those_of_the_layers_weights(random, outputs):
     with torch.no_grad():
         for _, up in updates:
             up.normal_(generator=random)
-        first, second, last = (up @ down for down, up in updates)
+        first, second, last = (up.T @ down for down, up in updates)
     head.first.weight += first
     head.second.weight += second
     head.last.weight[kept] += last

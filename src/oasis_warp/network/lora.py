@@ -40,8 +40,8 @@ ColorHeads = tuple[HeadCache, ...]
 """Of the vertices' Gaussians, then of the faces' where these have a head: all of a guess, in its order."""
 
 LowRank = list[tuple[Tensor, Tensor]]
-"""A head's updates, one a layer: A of shape [rank, inputs] and B of shape [outputs, rank]; the layer's weight gets
-B A more."""
+"""A head's updates, one a layer: A of shape [rank, inputs] and the transpose of B, [rank, outputs]; the layer's weight
+gets B A more."""
 
 
 @torch.no_grad()
@@ -81,7 +81,7 @@ def zero_updates(cache: HeadCache, rank: int, random: torch.Generator) -> LowRan
 
     Args:
         cache: Of the head.
-        rank: Columns of B.
+        rank: Of B A.
         random: On the CPU, so that every device starts alike.
     """
     hidden = cache.first.shape[1]
@@ -89,20 +89,21 @@ def zero_updates(cache: HeadCache, rank: int, random: torch.Generator) -> LowRan
     updates = []
     for inputs, outputs in sizes:
         down = (2 * torch.rand(rank, inputs, generator=random) - 1) / math.sqrt(inputs)
-        updates.append((down.to(cache.first).requires_grad_(), cache.first.new_zeros(outputs, rank).requires_grad_()))
+        updates.append((down.to(cache.first).requires_grad_(), cache.first.new_zeros(rank, outputs).requires_grad_()))
     return updates
 
 
 def head_colors(cache: HeadCache, updates: LowRank) -> Float[Tensor, "N 3"]:
     """Colours of the Gaussians with the updates; differentiable in them."""
-    first, second, last = updates
-    hidden = gelu(cache.first + _product(cache.inputs, first))
-    hidden = gelu(linear(hidden, *cache.second) + _product(hidden, second))
-    raw = linear(hidden, *cache.last) + _product(hidden, last)
+    (down, up), second, last = updates
+    hidden = gelu(cache.first + linear(cache.inputs, down) @ up)
+    hidden = gelu(_updated(hidden, cache.second, second))
+    raw = _updated(hidden, cache.last, last)
     parts = dict(zip(cache.outputs, raw.split(list(cache.outputs.values()), dim=-1), strict=True))
     return decode_colors(parts, cache.colors, cache.seen)
 
 
-def _product(inputs: Tensor, update: tuple[Tensor, Tensor]) -> Tensor:
-    down, up = update
-    return linear(linear(inputs, down), up)
+def _updated(inputs: Tensor, layer: tuple[Tensor, Tensor], update: tuple[Tensor, Tensor]) -> Tensor:
+    """A layer with its update added to the weight: one product with all rows instead of three."""
+    (weight, bias), (down, up) = layer, update
+    return linear(inputs, weight + up.T @ down, bias)
