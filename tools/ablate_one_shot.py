@@ -31,13 +31,15 @@ SETTINGS = {
     "texture": AdaptConfig(texture_steps=0),
     "references": AdaptConfig(reference_views=0),
     "light": AdaptConfig(light="even"),
-    "paper": AdaptConfig(calibration_steps=100, texture_steps=400),
+    "schedule": AdaptConfig(calibration_steps=100, texture_steps=400),
+    "paper": AdaptConfig(calibration_steps=100, texture="lora", texture_steps=400, references="all"),
 }
 """How the learned prior is adapted; "full" is done for the mean prior too."""
 TITLES = {
     FULL: "full model", "prior": "w/o learned prior", "calibration": "w/o colour calibration",
     "texture": "w/o texture learning", "references": "w/o reference views",
-    "light": "w/o the photo's light", "paper": "the paper's 100 + 400 steps",
+    "light": "w/o the photo's light", "schedule": "100 + 400 steps of the field",
+    "paper": "the paper's 100 + 400 steps of LoRA",
 }  # fmt: skip
 
 

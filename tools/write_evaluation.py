@@ -5,6 +5,7 @@
     python tools/ablate_prior.py out/ablation --steps 3000 --device cuda --workers 14
     python tools/probe_prior.py out/probe --device cuda --workers 8
     python tools/ablate_one_shot.py out/one_shot --device cuda --workers 8
+    python tools/curve_one_shot.py out/curve
     python tools/write_evaluation.py docs/evaluation.md out
 
 What has no file in the folder stays as it is on the page.
@@ -16,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import curve_one_shot
 import torch
 
 from oasis_warp.data.atomic import write_file
@@ -99,6 +101,12 @@ def ablation(found: dict[str, Any]) -> str:
     return "\n\n".join([*parts, f"Settings: {settings}."])
 
 
+def curve(found: dict[str, Any]) -> str:
+    """A table a light."""
+    parts = [curve_one_shot.as_markdown(one) for one in found["tables"]]
+    return "\n\n".join([*parts, f"Weights {found['settings']['weights'][:12]}, {found['settings']['device']}."])
+
+
 SECTIONS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "synthetic": ("evaluation/metrics.json", synthetic),
     "noise": ("evaluation/metrics.json", noise),
@@ -106,6 +114,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "network": ("ablation/ablation.json", ablation),
     "probe": ("probe/ablation.json", ablation),
     "one-shot": ("one_shot/ablation.json", ablation),
+    "curve": ("curve/curve.json", curve),
 }
 """By the word in the markers: file below the folder, and what is made of it."""
 
@@ -134,7 +143,7 @@ def main() -> None:
     """Read the folder, rewrite the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page", type=Path)
-    parser.add_argument("folder", type=Path, help="holds evaluation, same_hand, ablation, probe and one_shot")
+    parser.add_argument("folder", type=Path, help="holds evaluation, same_hand, ablation, probe, one_shot and curve")
     options = parser.parse_args()
     write_file(options.page, fill(options.page.read_text(), options.folder).encode())
     copy_pictures(options.folder, options.page.parent / "_static")

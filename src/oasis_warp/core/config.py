@@ -19,6 +19,11 @@ class AdaptConfig:
     light: Literal["fit", "keep", "even"] = "fit"
     """Fit the photo's light, which stays where it is when the hand turns, and take over all that the photo shows beyond
     it; take over light and shadows as if they were skin; or only what is likelier skin than light."""
+    texture: Literal["field", "lora"] = "field"
+    """What learns the photo's detail: a field over the surface, after the seen colours were carried over its rim; or,
+    as in the paper, low-rank updates of the heads of a learned prior, from its calibrated guess on."""
+    lora_rank: int = 8
+    """Of those updates."""
     texture_steps: int | None = None
     """Steps of texture learning, which "even" does without; None stops when the loss is flat, after 400 at most."""
     weight_rgb: float = 10.0
@@ -33,8 +38,11 @@ class AdaptConfig:
     """Of the reference views, which hold the rest of the hand where the prior put it."""
     reference_views: int = 7
     """Views around the hand, 360 / (n + 1) degrees apart, the photo's own left out."""
+    references: Literal["in_turn", "all"] = "in_turn"
+    """One reference view a step, by its colour difference and for all of them; or all in every step, by the same
+    loss as the photo, as in the paper."""
     seed: int = 0
-    """Of the order of the reference views."""
+    """Of the order of the reference views, and of LoRA's start."""
 
 
 @dataclass(frozen=True, kw_only=True)

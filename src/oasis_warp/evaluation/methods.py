@@ -14,7 +14,8 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandLight
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.prior import NetworkPrior
+from oasis_warp.network.lora import ColorHeads
+from oasis_warp.network.prior import NetworkPrior, guess_with_heads
 from oasis_warp.network.weights_file import trained_state
 from oasis_warp.training.adapt import adapt, in_photo
 from oasis_warp.training.calibrate import calibrate
@@ -84,6 +85,16 @@ def prior_digest(prior: Prior) -> str | None:
     return digest.hexdigest()
 
 
+@torch.no_grad()
+def ask(prior: Prior, evidence: Evidence, config: AdaptConfig) -> tuple[CanonicalGaussians, ColorHeads | None]:
+    """The guess of `prior`, and its heads where `config` wants to train them.
+
+    Raises:
+        InputError: it wants to, and the prior is no network.
+    """
+    return guess_with_heads(prior, evidence) if config.texture == "lora" else (prior(evidence), None)
+
+
 def reconstructions(
     hand: HandModel,
     evidence: Evidence,
@@ -99,13 +110,15 @@ def reconstructions(
         priors: By the names that methods have for them.
         wanted: What to make.
         config: Of the adaptation, whose light the stage decides on but for `ONE_SHOT`.
+
+    Raises:
+        InputError: LoRA was asked for, and a prior that is no network.
     """
     for name, prior in priors.items():
         stages = {method.stage for method in wanted if method.prior == name}
         if not stages:
             continue
-        with torch.no_grad():
-            guess = prior(evidence)
+        guess, heads = ask(prior, evidence, config)
         if RAW in stages:
             yield Method(name, RAW), Made(guess)
         if CALIBRATED in stages:
@@ -116,5 +129,5 @@ def reconstructions(
             (EVEN, replace(config, light="even")), (KEEP, replace(config, light="keep")), (ONE_SHOT, config)
         ):  # fmt: skip
             if stage in stages:
-                adapted = adapt(hand, guess, evidence, settings)
+                adapted = adapt(hand, guess, evidence, settings, heads=heads)
                 yield Method(name, stage), Made(adapted.gaussians, adapted.light)

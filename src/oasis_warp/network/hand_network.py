@@ -1,5 +1,7 @@
 """The network: photos and posed surfaces in, canonical Gaussians out; the only file that knows the order of parts."""
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -35,6 +37,17 @@ HAND_LENGTH = 0.2
 """Scale of template coordinates for their encoding [m]: they lie in [-1, 1] then."""
 TONE = 7
 """Numbers that say how the photo's skin looks as a whole: log melanin, log gains, mean colour."""
+
+
+class Described(NamedTuple):
+    """What the heads are asked, of B hands."""
+
+    features: Float[Tensor, "B V C"]
+    """Of the points."""
+    colors: Float[Tensor, "B V 3"]
+    """Mean colours in the photo's tone."""
+    seen: Float[Tensor, "B V 3"] | None
+    """With point evidence, what the photo shows instead of them."""
 
 
 class HandNetwork(nn.Module):
@@ -104,6 +117,10 @@ class HandNetwork(nn.Module):
 
     def forward(self, inputs: NetworkInput) -> Prediction:
         """Canonical Gaussians of every hand of the batch."""
+        return self.decode(*self.describe(inputs), inputs.rest)
+
+    def describe(self, inputs: NetworkInput) -> Described:
+        """All but the heads."""
         with torch.autocast(inputs.image.device.type, enabled=False):
             sighting = self.look(inputs)
             mean = self.mean_hands(sighting.colors, sighting.confidence)
@@ -112,7 +129,7 @@ class HandNetwork(nn.Module):
         features = self.fuse(points, local, context, sighting.visibility)
         if self.refinement is not None:
             features = self.refinement(features, self.level)
-        return self.decode(features, mean.colors, seen, inputs.rest)
+        return Described(features, mean.colors, seen)
 
     def look(self, inputs: NetworkInput) -> Sighting:
         """What each photo shows of each vertex."""

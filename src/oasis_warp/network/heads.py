@@ -95,10 +95,18 @@ def decode(
     opacity = least + (1 - least) * torch.sigmoid(
         raw["opacities"][..., 0] + math.log((OPACITY - least) / (1 - OPACITY))
     )
+    color = decode_colors(raw, colors, seen)
+    return Attributes(rotation.multiply(quats, turn), scales * change.exp(), fade * opacity, color)
+
+
+def decode_colors(
+    raw: dict[str, Tensor], colors: Float[Tensor, "*batch 3"], seen: Float[Tensor, "*batch 3"] | None
+) -> Float[Tensor, "*batch 3"]:
+    """The colours of `decode`."""
     color = raw["colors"] + torch.logit(colors, COLOR_MARGIN)
     if seen is not None:
         color = color + raw["trust"] * seen
-    return Attributes(rotation.multiply(quats, turn), scales * change.exp(), fade * opacity, torch.sigmoid(color))
+    return torch.sigmoid(color)
 
 
 def decode_offsets(raw: dict[str, Tensor]) -> Float[Tensor, "B V 3"]:

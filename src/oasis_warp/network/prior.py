@@ -19,9 +19,10 @@ from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians, Evidence
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.hand_network import Described, HandNetwork
 from oasis_warp.network.inputs import Prediction, input_of_evidence
-from oasis_warp.network.rim import settle_rim
+from oasis_warp.network.lora import ColorHeads, cache_head
+from oasis_warp.network.rim import color_sources, distance_from_rim, settle_rim
 from oasis_warp.network.weights_file import load_network, read_header
 from oasis_warp.ops.recording import Recording
 
@@ -46,10 +47,32 @@ class NetworkPrior:
     @torch.no_grad()
     def __call__(self, evidence: Evidence) -> CanonicalGaussians:
         """The whole hand, guessed from one photo; the network goes where the photo is."""
-        prediction, network = self._predict(evidence), self.network
-        rest = evidence.rest.vertices
-        settled = settle_rim(prediction, rest, network.faces, network.vertex_faces, network.rim)
-        return canonical_gaussians(settled, 0)
+        return self._gaussians(self._predict(evidence), evidence)
+
+    @torch.no_grad()
+    def with_heads(self, evidence: Evidence) -> tuple[CanonicalGaussians, ColorHeads]:
+        """The same, and the heads that its colours come from with all that they are asked: LoRA trains them."""
+        network, inputs = self.network.to(evidence.image.device), input_of_evidence(evidence)
+        described = network.describe(inputs)
+        guess = self._gaussians(network.decode(*described, inputs.rest), evidence)
+        return guess, self._heads(guess, described, evidence)
+
+    def _heads(self, guess: CanonicalGaussians, described: Described, evidence: Evidence) -> ColorHeads:
+        network, rest = self.network, evidence.rest.vertices
+        away = distance_from_rim(rest, network.faces, network.rim)
+        rows, n = color_sources(rest, network.faces, away), len(rest)
+        features, colors, seen = described.features[0], described.colors[0], described.seen
+        seen = None if seen is None else seen[0]
+        on_vertices = cache_head(network.vertex_head, features, colors, seen, rows[:n][guess.vertex_index])
+        if network.config.fom == "off":
+            return (on_vertices,)
+        features, colors = network.feature_on_mesh(features[None], network.faces)[0], colors[network.faces].mean(1)
+        seen = None if seen is None else seen[network.faces].mean(1)
+        return on_vertices, cache_head(network.face_head, features, colors, seen, rows[n:][guess.face_index] - n)
+
+    def _gaussians(self, prediction: Prediction, evidence: Evidence) -> CanonicalGaussians:
+        network, rest = self.network, evidence.rest.vertices
+        return canonical_gaussians(settle_rim(prediction, rest, network.faces, network.vertex_faces, network.rim), 0)
 
     def _predict(self, evidence: Evidence) -> Prediction:
         device, inputs = evidence.image.device, input_of_evidence(evidence)
@@ -59,6 +82,19 @@ class NetworkPrior:
         if self._recording is None:
             self._recording = Recording(self.network, inputs)
         return self._recording(inputs)
+
+
+def guess_with_heads(prior: Prior, evidence: Evidence) -> tuple[CanonicalGaussians, ColorHeads]:
+    """What `prior` makes of one photo, and the heads behind it.
+
+    Raises:
+        InputError: it is no network.
+    """
+    if not isinstance(prior, NetworkPrior):
+        raise InputError(
+            f"prior {prior.about['name']!r}: has no heads for LoRA to train; choose a learned one, or texture 'field'."
+        )
+    return prior.with_heads(evidence)
 
 
 def choose_prior(choice: Literal["learned", "none"] | Path, backbone_weights: Path | None = None) -> Prior:

@@ -34,8 +34,7 @@ def settle_rim(
         rim: Vertices of the open wrist.
     """
     count = prediction.colors.shape[1]
-    at_vertices = torch.cdist(rest, rest[rim]).amin(1)
-    from_rim = torch.cat([at_vertices, at_vertices[faces].amin(1)])[:count]
+    from_rim = distance_from_rim(rest, faces, rim)[:count]
     share = ((from_rim / RIM_FADE - FIRST) / (LAST - FIRST)).clamp(0, 1)
     share = (share * share * (3 - 2 * share))[None, :, None]
     quats, scales, fade = (part[:, :count] for part in batch_anchors(rest[None], faces, vertex_faces, rim))
@@ -47,6 +46,14 @@ def settle_rim(
         opacities=torch.lerp(OPACITY * fade, prediction.opacities, share[..., 0]),
         colors=spread_to_rim(prediction.colors[0], rest, faces, from_rim)[None],
     )
+
+
+def distance_from_rim(
+    rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], rim: Int[Tensor, "R"]
+) -> Float[Tensor, "N"]:
+    """Of every vertex and face from the open wrist [m]."""
+    at_vertices = torch.cdist(rest, rest[rim]).amin(1)
+    return torch.cat([at_vertices, at_vertices[faces].amin(1)])
 
 
 def spread_to_rim(
@@ -63,12 +70,20 @@ def spread_to_rim(
         faces: Corners.
         from_rim: Distance of each of them from the open wrist [m].
     """
-    n, settled = len(rest), []
+    return colors[color_sources(rest, faces, from_rim)]
+
+
+def color_sources(
+    rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], from_rim: Float[Tensor, "N"]
+) -> Int[Tensor, "N"]:
+    """Whose colour each vertex, and each face if `from_rim` has them, takes in `spread_to_rim`."""
+    n, sources = len(rest), []
     for places, part in ((rest, slice(0, n)), (rest[faces].mean(1), slice(n, None))):
-        own, away = colors[part].clone(), from_rim[part]
-        if len(own) == 0:
+        away = from_rim[part]
+        if len(away) == 0:
             continue
+        own = torch.arange(len(away), device=away.device)
         fading, near = away < LAST * RIM_FADE, (away >= LAST * RIM_FADE) & (away < 1.5 * LAST * RIM_FADE)
         own[fading] = own[near][torch.cdist(places[fading], places[near]).argmin(1)]
-        settled.append(own)
-    return torch.cat(settled)
+        sources.append(own + (part.start or 0))
+    return torch.cat(sources)

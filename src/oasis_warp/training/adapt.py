@@ -14,11 +14,14 @@ from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import CanonicalGaussians, Evidence, Gaussians, HandLight
+from oasis_warp.network.lora import ColorHeads
 from oasis_warp.ops import BlendWeights, blend_colors
 from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.training.calibrate import Calibration, calibrate
 from oasis_warp.training.complete import complete_field
 from oasis_warp.training.light import even_photo
+from oasis_warp.training.lora_texture import learn_lora
+from oasis_warp.training.picture_fit import aim
 from oasis_warp.training.room_light import fit_light, without_light
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
@@ -61,13 +64,29 @@ def adapt(
     evidence: Evidence,
     config: AdaptConfig = AdaptConfig(),  # noqa: B008 - frozen
     progress: Progress = silent,
+    heads: ColorHeads | None = None,
 ) -> Adaptation:
     """Fit the colours of `prior` to the photo; geometry stays.
 
     Colour calibration first, then the seen colours are carried smoothly over the rim of the seen region, then texture
     learning with reference views. With `config.light` "fit" all that is done with the photo without its light. With
-    "even" what else may be light is left out, too, and the last step falls away.
+    "even" what else may be light is left out, too, and the last step falls away. With `config.texture` "lora" texture
+    learning follows upon calibration, as in the paper.
+
+    Args:
+        hand: The model.
+        prior: The whole hand, guessed.
+        evidence: The photo.
+        config: What to do.
+        progress: Called as work goes on.
+        heads: Those that the colours of `prior` come from, for "lora": see `network.prior.guess_with_heads`.
+
+    Raises:
+        ValueError: "lora" without heads.
     """
+    if config.texture == "lora" and heads is None:
+        raise ValueError("texture 'lora': expected the heads of the prior, got none. Ask it with guess_with_heads.")
+    trained = heads if config.texture == "lora" and config.light != "even" else None
     faces = hand.faces.to(evidence.image.device)
     posed, view, trusted = in_photo(hand, prior, evidence)
 
@@ -81,7 +100,29 @@ def adapt(
     gaussians = prior._replace(colors=calibration.apply(prior.colors))
     progress("calibration", 1, 1)
 
-    progress("completion", 0, 1)
+    if trained is None:
+        progress("completion", 0, 1)
+        gaussians = _complete(hand, gaussians, evidence, view, config)
+        progress("completion", 1, 1)
+    if config.light == "even":  # what is left to learn is the photo's light
+        return Adaptation(in_even_light(gaussians, light) if light else gaussians, calibration, (), None)
+    references = [
+        freeze_view(posed, orbit_camera(evidence.posed.vertices, azimuth, size=evidence.camera.width))
+        for azimuth in reference_azimuths(config.reference_views)
+    ]
+    pictures = aim(view, evidence.image, evidence.mask * trusted, references, gaussians.colors)
+    if trained is None:
+        texture = learn_texture(gaussians, faces, pictures, config, progress)
+    else:
+        texture = learn_lora(trained, calibration, pictures, config, progress)
+    return Adaptation(gaussians._replace(colors=texture.colors), calibration, texture.losses, light)
+
+
+def _complete(
+    hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence, view: BlendWeights, config: AdaptConfig
+) -> CanonicalGaussians:
+    """Calibrated Gaussians with what the photo shows of them, faded out around it."""
+    faces = hand.faces.to(evidence.image.device)
     drawn = _drawn(view, gaussians.colors)  # not the Gaussians' own colours: those of a learned prior need not agree
     missing = observe(hand, evidence._replace(image=evidence.image - drawn))
     if config.light == "even":
@@ -89,19 +130,7 @@ def adapt(
         missing = observe(hand, evidence._replace(image=even - drawn))
     difference = complete_field(evidence.rest.vertices, faces, missing.colors, missing.confidence)
     colors = (gaussians.colors + vertex_to_gaussians(difference, faces, gaussians)).clamp(0, 1)
-    gaussians = gaussians._replace(colors=colors)
-    progress("completion", 1, 1)
-
-    if config.light == "even":  # what is left to learn is the photo's light
-        return Adaptation(in_even_light(gaussians, light) if light else gaussians, calibration, (), None)
-    references = [
-        freeze_view(posed, orbit_camera(evidence.posed.vertices, azimuth, size=evidence.camera.width))
-        for azimuth in reference_azimuths(config.reference_views)
-    ]
-    texture = learn_texture(
-        gaussians, faces, view, evidence.image, evidence.mask * trusted, references, config, progress
-    )
-    return Adaptation(gaussians._replace(colors=texture.colors), calibration, texture.losses, light)
+    return gaussians._replace(colors=colors)
 
 
 def _calibration(

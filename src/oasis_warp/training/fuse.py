@@ -22,6 +22,7 @@ from oasis_warp.training.adapt import MIN_ALPHA, adapt
 from oasis_warp.training.calibrate import calibrate
 from oasis_warp.training.complete import complete_field
 from oasis_warp.training.light import even_photo
+from oasis_warp.training.picture_fit import aim
 from oasis_warp.training.sightings import Sightings, look, photo_gains
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
@@ -65,7 +66,12 @@ def fuse(
         prior: Asked for every photo.
         config: Of the adaptation.
         progress: Told of guesses and of the adaptation's steps.
+
+    Raises:
+        ValueError: `config.texture` is "lora": the heads of several guesses have no common colours to train.
     """
+    if config.texture == "lora":
+        raise ValueError("texture 'lora': is for one photo, got several to fuse. Choose 'field'.")
     guesses = []
     for k, evidence in enumerate(evidences):
         progress("guesses", k, len(evidences))
@@ -141,9 +147,8 @@ def _adapt(
     ]
     mask = torch.cat([evidence.mask for evidence in evidences]) * trust
     guess = guess._replace(colors=colors)
-    return guess._replace(
-        colors=learn_texture(guess, faces, tall, torch.cat(lit), mask, references, config, progress).colors
-    )
+    pictures = aim(tall, torch.cat(lit), mask, references, colors)
+    return guess._replace(colors=learn_texture(guess, faces, pictures, config, progress).colors)
 
 
 def _other_shading(
