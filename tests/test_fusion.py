@@ -5,15 +5,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.nn.functional import avg_pool2d
 
 from oasis_warp import fusion
+from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Landmarks, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.fusion import check_sides, reconstruct_same_hand
 from oasis_warp.losses.image import masked_psnr
-from oasis_warp.pipeline import reconstruct
+from oasis_warp.pipeline import make_avatar, make_evidence, over_photo, reconstruct
 from oasis_warp.render.cameras import orbit_camera
 
 PHOTOS = Path(__file__).parent / "data" / "photos"
@@ -101,6 +103,34 @@ def test_palm_and_back_show_twice_as_much_as_the_palm(palm, alone):
     assert first["input_psnr_db"] > 22 and second["input_psnr_db"] > 22
     assert torch.equal(made.photos[0].fit.shape, made.photos[1].fit.shape)
     assert abs(first["mask_iou"] - alone.errors["mask_iou"]) < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_detail_of_both_photos_is_in_the_avatar(palm):
+    photos, steps = [palm, read_photo(BACK)], 10
+    coarse = reconstruct_same_hand(photos, ReconstructConfig(size=256, steps=steps))
+    fine = reconstruct_same_hand(photos, ReconstructConfig(size=448, steps=steps))
+    assert fine.errors["n_gaussians"] > coarse.errors["n_gaussians"] + 10_000
+    assert fine.errors["back_seen_percent"] > 50 and fine.errors["palm_seen_percent"] > 50
+    for k, (photo, own) in enumerate(zip(photos, fine.photos, strict=True)):
+        evidence = make_evidence(photo, own.fit, fine.avatar.surface_offsets, ReconstructConfig(), 448)
+        before, after = (
+            detail_error(over_photo(as_in(made.avatar, own, evidence), evidence), evidence) for made in (coarse, fine)
+        )
+        assert after < 0.9 * before, (k, before, after)
+
+
+def as_in(avatar, photo, evidence):
+    """The avatar as a photo shows it, in the first photo's light."""
+    return make_avatar(photo.fit, avatar.surface_offsets, evidence, avatar.gaussians)
+
+
+def detail_error(picture, evidence):
+    """Root mean square of what differs from the photo within a few pixels, light aside, away from the outline."""
+    apart = (picture - evidence.image).permute(2, 0, 1)
+    fine = apart - avg_pool2d(apart, 9, stride=1, padding=4)
+    return float(fine[:, inner_mask(evidence.mask * evidence.above_wrist, 12) > 0.5].square().mean().sqrt())
 
 
 @pytest.mark.slow

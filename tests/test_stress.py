@@ -50,7 +50,7 @@ def test_no_photo_and_no_mask_makes_colours_that_are_none(hand, evidence, damage
     damaged = evidence._replace(image=image, mask=mask)
     few = AdaptConfig(calibration_steps=5, texture_steps=3, reference_views=1)
     adapted = adapt(hand, MeanPrior(hand)(damaged), damaged, few)
-    assert is_sane(sharpen(hand, adapted.gaussians, damaged).gaussians)
+    assert is_sane(sharpen(hand, adapted.gaussians, [damaged]).gaussians)
 
 
 def test_gaussians_that_are_no_numbers_no_colours_or_too_large_are_told(hand, evidence):

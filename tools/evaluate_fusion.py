@@ -39,7 +39,7 @@ from oasis_warp.evaluation.metrics import Truth, match_colors, score
 from oasis_warp.evaluation.photo_pairs import compare_with_photo, draw_as_photo
 from oasis_warp.evaluation.same_hand import photos_of_hands
 from oasis_warp.evaluation.synthetic import evidence_of
-from oasis_warp.fusion import fit_surfaces, fit_together, make_evidences, resolutions
+from oasis_warp.fusion import fit_surfaces, fit_together, make_evidences, resolutions, with_detail
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
@@ -139,12 +139,13 @@ def avatar_of(
     evidences = make_evidences(photos, fits, surfaces, config)
     fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), prior, adapt)
     seen = float((fusion.sightings.confidence > 0.5).any(0).float().mean())
-    return make_avatar(fits[0], surfaces.shared, evidences[0], fusion.gaussians), seen
+    gaussians, _ = with_detail(fusion, photos, fits, surfaces, config)
+    return make_avatar(fits[0], surfaces.shared, evidences[0], gaussians), seen
 
 
 def measure_hand(name: str, paths: list[Path], prior: Prior, options: argparse.Namespace) -> Iterator[Row]:
     """Rows of every photo held out: avatars of each that follows it, and of the first 2, 3, ... of those."""
-    estimator, config = HandEstimator(bundled_hand()), ReconstructConfig(size=options.size)
+    estimator, config = HandEstimator(bundled_hand()), ReconstructConfig(size=options.size, light=options.light)
     adapt = AdaptConfig(texture_steps=options.steps, light=options.light)
     pairs, alone = [], []
     for path in paths:

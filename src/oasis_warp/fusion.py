@@ -8,11 +8,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.prior import Prior
+from oasis_warp.avatar.quality import (
+    SEEN,
+    SurfaceQuality,
+    assess_surface,
+    best_known,
+    photo_doubts,
+    shares,
+    surface_doubts,
+)
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.types import Evidence, HandFit, Landmarks, Photo, PosedHand
+from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmarks, Photo, PosedHand
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.shared_shape import shared_shape
 from oasis_warp.hand.skinning import rest_hand
@@ -20,12 +29,19 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
-from oasis_warp.pipeline import carrier_offsets, input_errors, make_avatar, make_evidence
-from oasis_warp.training.fuse import Fusion, fuse
+from oasis_warp.pipeline import (
+    COARSE_SIZE,
+    carrier_offsets,
+    crop_side,
+    finer_size,
+    input_errors,
+    make_avatar,
+    make_evidence,
+    over_photo,
+)
+from oasis_warp.training.fuse import Fusion, add_detail, fuse
 from oasis_warp.training.sightings import Sightings
 
-SEEN = 0.5
-"""Confidence from which a photo counts as showing a place."""
 OTHER_LIGHT = 1.6
 """Times by which a photo is brighter or darker than the first, in any channel, from which it is worth a warning."""
 NOTHING_NEW = 0.5
@@ -56,8 +72,10 @@ class FusedReconstruction(NamedTuple):
     stages: dict[str, float]
     """Seconds of each stage."""
     errors: dict[str, float]
-    """seen_percent: of the surface, what any photo shows; n_gaussians."""
+    """What any of the photos shows of the surface: as `avatar.quality.shares`; n_gaussians."""
     warnings: tuple[str, ...]
+    quality: SurfaceQuality
+    """How well each place of the surface is known."""
 
 
 def reconstruct_same_hand(
@@ -108,26 +126,35 @@ def reconstruct_same_hand(
     with stage("fusion"):
         settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
         fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), prior, settings, progress)
-    with stage("check"):
-        avatar = make_avatar(fits[0], surfaces.shared, evidences[0], fusion.gaussians)
-        about = tuple(
-            PhotoOfHand(photo.name, fit, (gain[0], gain[1], gain[2]), {
+    with stage("detail"):
+        gaussians, close = with_detail(fusion, photos, fits, surfaces, config, progress)
+    lights = fusion.lights or [None] * len(photos)
+    avatar = make_avatar(fits[0], surfaces.shared, evidences[0], gaussians, lights[0])
+    with stage("quality"):
+        about, qualities = [], []
+        parts = zip(photos, fits, surfaces.own, evidences, close, fusion.gains, lights, strict=True)
+        for (photo, fit, own, evidence, near, gain, light), seen in zip(
+            parts, surface_shares(evidences[0], fusion.sightings), strict=True
+        ):
+            # in the photo's own light, and on the surface by which it was read
+            in_its_light = gaussians._replace(colors=(gaussians.colors * gain).clamp(0, 1))
+            there = make_avatar(fit, own, evidence, in_its_light, light)
+            qualities.append(assess_surface(estimator.hand, evidence, over_photo(there, evidence)))
+            errors = {
                 "reprojection_percent": fit.reprojection,
                 "worst_point_percent": fit.worst_point,
                 "mask_iou": fit.mask_iou,
-                **_own_errors(fusion, k, fit, surfaces.own[k], evidences[k]),
-                **shares,
-            })
-            for k, (photo, fit, gain, shares) in enumerate(
-                zip(photos, fits, fusion.gains.tolist(), surface_shares(evidences[0], fusion.sightings), strict=True)
-            )
-        )  # fmt: skip
-    seen = (fusion.sightings.confidence > SEEN).any(0)
-    errors = {
-        "seen_percent": 100 * _area_share(evidences[0], seen),
-        "n_gaussians": float(len(fusion.gaussians.opacities)),
-    }
-    return FusedReconstruction(avatar, about, prior.about, stages, errors, _warnings(about))
+                **{name: value for name, value in input_errors(there, near).items() if name != "n_gaussians"},
+                **seen,
+            }
+            red, green, blue = gain.tolist()
+            about.append(PhotoOfHand(photo.name, fit, (red, green, blue), errors))
+        quality = best_known(qualities)
+        shown = shares(estimator.hand, evidences[0].rest.vertices, quality)
+        doubts = [photo_doubts(near.image, near.mask, crop_side(fit)) for near, fit in zip(close, fits, strict=True)]
+    errors = {"n_gaussians": float(len(gaussians.opacities)), **shown}
+    said = (*_warnings(about, doubts), *surface_doubts(shown))
+    return FusedReconstruction(avatar, tuple(about), prior.about, stages, errors, said, quality)
 
 
 def check_sides(photos: Sequence[Photo], landmarks: Sequence[Landmarks]) -> None:
@@ -188,14 +215,22 @@ def fit_surfaces(fits: Sequence[HandFit]) -> Surfaces:
 
 
 def make_evidences(
-    photos: Sequence[Photo], fits: Sequence[HandFit], surfaces: Surfaces, config: ReconstructConfig
+    photos: Sequence[Photo],
+    fits: Sequence[HandFit],
+    surfaces: Surfaces,
+    config: ReconstructConfig,
+    *,
+    finer: bool = False,
 ) -> list[Evidence]:
-    """As `pipeline.make_evidence`, each photo seen on its own surface, all with the shared one at rest."""
+    """As `pipeline.make_evidence`, each photo seen on its own surface, all with the shared one at rest.
+
+    All of one size, or with `finer` each as large as its detail, if that is larger.
+    """
     plain = rest_hand(bundled_hand(), fits[0].shape)
     shared = plain._replace(vertices=plain.vertices + surfaces.shared)
     evidences = []
     for photo, fit, own in zip(photos, fits, surfaces.own, strict=True):
-        evidence = make_evidence(photo, fit, own, config)
+        evidence = make_evidence(photo, fit, own, config, finer_size(fit, config) if finer else None)
         evidences.append(evidence._replace(rest=PosedHand(*(part.to(evidence.image) for part in shared))))
     return evidences
 
@@ -205,16 +240,25 @@ def resolutions(fits: Sequence[HandFit], evidences: Sequence[Evidence]) -> list[
     return [float(fit.camera.K[0, 0] / e.camera.K[0, 0]) for fit, e in zip(fits, evidences, strict=True)]
 
 
-def _own_errors(fusion: Fusion, k: int, fit: HandFit, offsets: Tensor, evidence: Evidence) -> dict[str, float]:
-    """How well the avatar explains photo k, in that photo's light and on the surface by which it was read."""
-    colors = (fusion.gaussians.colors * fusion.gains[k]).clamp(0, 1)
-    errors = input_errors(make_avatar(fit, offsets, evidence, fusion.gaussians._replace(colors=colors)), evidence)
-    return {name: value for name, value in errors.items() if name != "n_gaussians"}
+def with_detail(
+    fusion: Fusion,
+    photos: Sequence[Photo],
+    fits: Sequence[HandFit],
+    surfaces: Surfaces,
+    config: ReconstructConfig,
+    progress: Progress = silent,
+) -> tuple[CanonicalGaussians, list[Evidence]]:
+    """The Gaussians of `fusion` with the detail that `config` asks for, and the crops that show it."""
+    close = make_evidences(photos, fits, surfaces, config, finer=True)
+    if all(finer_size(fit, config) is None for fit in fits):
+        return fusion.gaussians, close
+    resolution = resolutions(fits, close)
+    return add_detail(bundled_hand(), fusion, close, resolution, COARSE_SIZE, progress), close
 
 
 def surface_shares(evidence: Evidence, sightings: Sightings) -> list[dict[str, float]]:
     """Of the hand's surface at rest [%]: what each photo shows, and what it shows best of all."""
-    seen = sightings.confidence > SEEN
+    seen = sightings.confidence >= SEEN
     best = (sightings.confidence * sightings.share).argmax(0)
     return [
         {
@@ -231,8 +275,13 @@ def _area_share(evidence: Evidence, where: Tensor) -> float:
     return float((areas * where).sum() / areas.sum())
 
 
-def _warnings(photos: Sequence[PhotoOfHand]) -> tuple[str, ...]:
-    said = [f"{photo.name}: {warning}" for photo in photos for warning in photo.fit.warnings]
+def _warnings(photos: Sequence[PhotoOfHand], doubts: Sequence[Sequence[str]]) -> list[str]:
+    """Of the fits, the photos (`doubts`) and how they go together; each begins with the photo's name."""
+    said = [
+        f"{photo.name}: {warning}"
+        for photo, own in zip(photos, doubts, strict=True)
+        for warning in (*photo.fit.warnings, *own)
+    ]
     for photo in photos[1:]:
         factor = max(photo.gain, key=lambda gain: max(gain, 1 / gain))
         if max(factor, 1 / factor) > OTHER_LIGHT:
@@ -240,4 +289,4 @@ def _warnings(photos: Sequence[PhotoOfHand]) -> tuple[str, ...]:
             said.append(f"{photo.name}: its light is another, {how} {photos[0].name}; its colours may not fit in")
         if photo.errors["best_percent"] < NOTHING_NEW:
             said.append(f"{photo.name}: adds next to nothing, other photos show all of it as well or better")
-    return tuple(said)
+    return said

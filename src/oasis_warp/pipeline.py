@@ -122,25 +122,23 @@ def reconstruct(
         adaptation = adapt(hand, guess, evidence, settings, progress)
     gaussians, close = adaptation.gaussians, evidence
     light = adaptation.light
-    # in even light what the photo shows beyond the prior is not taken over as it is
-    if config.light != "even" and (size := detail_size(fit, config)) > len(evidence.image):
+    if (size := finer_size(fit, config)) is not None:
         with stage("detail"):
             close = make_evidence(photo, fit, offsets, config, size)
-            shown = without_light(hand, close, light) if light else close
-            gaussians = sharpen(hand, gaussians, shown, progress).gaussians
+            plain = without_light(hand, close, light) if light else close
+            gaussians = sharpen(hand, gaussians, [plain], progress=progress).gaussians
     avatar = make_avatar(fit, offsets, evidence, gaussians, light)
     with stage("quality"):
         quality = assess_surface(hand, evidence, over_photo(avatar, evidence))
-        known = shares(hand, evidence.rest.vertices, quality)
-        _, _, side = square_around(fit.mask, CROP_MARGIN)
-        doubts = (*surface_doubts(known), *photo_doubts(close.image, close.mask, side))
+        shown = shares(hand, evidence.rest.vertices, quality)
+        doubts = (*surface_doubts(shown), *photo_doubts(close.image, close.mask, crop_side(fit)))
         errors = {
             "reprojection_percent": fit.reprojection,
             "worst_point_percent": fit.worst_point,
             "mask_iou": fit.mask_iou,
             "refined_px": moved,
             **input_errors(avatar, close),
-            **known,
+            **shown,
         }
     return Reconstruction(avatar, fit, prior.about, stages, errors, (*fit.warnings, *doubts), quality)
 
@@ -155,8 +153,12 @@ def carrier_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
 
 def own_size(fit: HandFit) -> int:
     """Side of the crop that shows all there is in the photo, within what is of use here [px]."""
-    _, _, side = square_around(fit.mask, CROP_MARGIN)
-    return min(max(round(side), COARSE_SIZE), FINEST_SIZE)
+    return min(max(round(crop_side(fit)), COARSE_SIZE), FINEST_SIZE)
+
+
+def crop_side(fit: HandFit) -> float:
+    """Of the square around the hand in the photo [px]."""
+    return square_around(fit.mask, CROP_MARGIN)[2]
 
 
 def landmarks_in_crop(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
@@ -171,6 +173,15 @@ def landmarks_in_crop(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
 def detail_size(fit: HandFit, config: ReconstructConfig) -> int:
     """Side of the crop with all the detail that `config` asks for [px]."""
     return own_size(fit) if config.size == "auto" else config.size
+
+
+def finer_size(fit: HandFit, config: ReconstructConfig) -> int | None:
+    """Side of the crop whose detail goes into finer Gaussians [px]; None where the coarse ones do.
+
+    In even light there is none: what the photo shows beyond the prior is not taken over as it is.
+    """
+    size = detail_size(fit, config)
+    return size if config.light != "even" and size > COARSE_SIZE else None
 
 
 def make_evidence(

@@ -6,7 +6,15 @@ from torch.nn.functional import avg_pool2d
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
-from oasis_warp.avatar.quality import REACH, assess_surface, photo_doubts, shares, surface_doubts
+from oasis_warp.avatar.quality import (
+    REACH,
+    SurfaceQuality,
+    assess_surface,
+    best_known,
+    photo_doubts,
+    shares,
+    surface_doubts,
+)
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.render.render import render
@@ -76,6 +84,14 @@ def test_shares_of_the_surface_add_up(hand, case):
     assert found["palm_seen_percent"] > 60 and found["back_seen_percent"] < 10
     assert 0 < found["uncertainty_mean"] < 1
     assert surface_doubts(found) == []
+
+
+def test_of_several_photos_each_place_is_known_from_the_best():
+    one = SurfaceQuality(torch.tensor([1.0, 0.2, 0.0]), torch.tensor([0.1, 0.6, 0.9]))
+    other = SurfaceQuality(torch.tensor([0.0, 0.7, 0.0]), torch.tensor([0.8, 0.3, 1.0]))
+    together = best_known([one, other])
+    assert together.visibility.tolist() == pytest.approx([1.0, 0.7, 0.0])
+    assert together.uncertainty.tolist() == pytest.approx([0.1, 0.3, 0.9])
 
 
 def test_a_hand_of_which_nothing_is_seen_is_guessed_throughout(hand, case):

@@ -9,7 +9,7 @@ from oasis_warp.commands.summary import WIDTH
 
 def panels(made, visibility):
     quality = SurfaceQuality(visibility, 1 - visibility)
-    sheet = draw_quality("a hand", made._replace(quality=quality)).numpy()
+    sheet = draw_quality("a hand", made.avatar, quality).numpy()
     side, top = panel_side(4, WIDTH), 24 + 44
     assert sheet.shape[1] == WIDTH
     return [sheet[top : top + side, 24 + k * (side + 12) :][:, :side].astype(float) for k in range(4)]

@@ -137,8 +137,9 @@ def fusion(monkeypatch, made, scene):
         errors = {"reprojection_percent": 1.0, "mask_iou": 0.9, **shares}
         about = tuple(PhotoOfHand(photo.name, scene[1], (1.0, 1.0, 1.0), errors) for photo in photos)
         return FusedReconstruction(
-            made.avatar, about, made.prior, {"fusion": 1.0}, {"seen_percent": 50.0}, ("b.png: small",)
-        )
+            made.avatar, about, made.prior, {"fusion": 1.0}, {"seen_percent": 50.0}, ("b.png: small",),
+            made.quality,
+        )  # fmt: skip
 
     calls = []
     monkeypatch.setattr(command, "reconstruct_same_hand", answer)
@@ -148,7 +149,7 @@ def fusion(monkeypatch, made, scene):
 def test_several_photos_of_the_same_hand_make_one_avatar(fusion, photo_file, tmp_path, capsys):
     photos = [photo_file(name) for name in ("a.png", "b.png", "c.png")]
     assert main(["reconstruct", *photos, "--same-hand", "-o", str(tmp_path / "out")]) == 0
-    assert names(tmp_path / "out") == FILES - {"quality.png"}
+    assert names(tmp_path / "out") == FILES
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert [part["photo"]["name"] for part in report["photos"]] == ["a.png", "b.png", "c.png"]
     assert report["photos"][1]["gain"] == [1.0, 1.0, 1.0]

@@ -15,7 +15,8 @@ from oasis_warp.hand.skinning import skin
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.render.render import render
-from oasis_warp.training.sharpen import sharpen
+from oasis_warp.training.carried import Canvas, look
+from oasis_warp.training.sharpen import FACING, sharpen
 
 SIZE, WRIST = 512, 0.03
 
@@ -29,7 +30,7 @@ def case(hand):
     alpha = render(pose_gaussians(gaussians, hand.faces, rest.vertices, posed.vertices), truth.camera).alpha
     image = truth.photo.rgb.float() / 255
     evidence = Evidence(image, (alpha > 0.5).float(), torch.ones_like(alpha), truth.camera, rest, posed)
-    return evidence, gaussians, sharpen(hand, gaussians, evidence)
+    return evidence, gaussians, sharpen(hand, gaussians, [evidence])
 
 
 def draw(hand, evidence, gaussians, camera):
@@ -96,14 +97,14 @@ def test_seen_from_behind_the_hand_is_the_same(hand, case):
 def test_a_picture_that_is_explained_asks_for_nothing(hand, case):
     evidence, coarse, _ = case
     own = draw(hand, evidence, coarse, evidence.camera).image
-    made = sharpen(hand, coarse, evidence._replace(image=own))
+    made = sharpen(hand, coarse, [evidence._replace(image=own)])
     assert made.n_new == 0 and made.losses == ()
     assert all(torch.equal(a, b) for a, b in zip(made.gaussians, coarse, strict=True))
 
 
 def test_the_same_photo_gives_the_same_bits(hand, case):
     evidence, coarse, made = case
-    again = sharpen(hand, coarse, evidence)
+    again = sharpen(hand, coarse, [evidence])
     assert torch.equal(again.gaussians.colors, made.gaussians.colors)
 
 
@@ -111,3 +112,18 @@ def test_every_step_of_the_fit_comes_nearer(case):
     losses = case[2].losses
     assert all(after < before for before, after in itertools.pairwise(losses))
     assert losses[-1] < 0.9 * losses[0]
+
+
+def test_of_two_photos_each_gives_the_detail_where_it_is_believed(hand, case):
+    evidence, coarse, _ = case
+    darker = evidence._replace(image=0.85 * evidence.image)
+    first = (evidence.rest.vertices[:, 0] < evidence.rest.vertices[:, 0].mean()).float()
+    made = sharpen(hand, coarse, [evidence, darker], torch.stack([first, 1 - first]))
+    picture = draw(hand, evidence, made.gaussians, evidence.camera).image
+    shown = look(evidence.posed.vertices, hand.faces, Canvas(evidence.image, evidence.mask, evidence.camera), FACING)
+    believed = (first[hand.faces[shown.faces.clamp_min(0)]] * shown.barycentrics).sum(-1)
+    inside = judged(hand, evidence) * (shown.share > 0.99)
+    for photo, share in ((evidence, believed), (darker, 1 - believed)):
+        own = inside * (share > 0.99)
+        assert own.mean() > 0.05
+        assert masked_psnr(picture, photo.image, own) > 30

@@ -22,6 +22,9 @@ SOLID = 0.25
 """Opacity of an old Gaussian below which the surface itself is taken for fading, as at the wrist."""
 SINK = 0.001
 """Depth at which the vertex Gaussians of cut faces go on, as discs that are the ground under the parts' [m]."""
+GROUND_SPREAD = 1.4
+"""Standard deviations of those discs over those of a vertex Gaussian. Parts are half transparent: with 1 the hand's
+other side shimmers through, at the wrist the background; with 1.8 the hand from afar is less like its photo."""
 NEIGHBOURS = 12
 """Old Gaussians that a new one takes its colour from."""
 
@@ -73,7 +76,10 @@ def densify(
     sunk = _inside(cut, faces, len(vertices))[index]
     depth = SINK * surface.vertex_normals(vertices, faces)[index]
     disc_quats, disc_scales = vertex_shapes(vertices, faces)
-    disc_opacities = OPACITY * (gaussians.opacities[:n_points] / SOLID).clamp(max=1)
+    # Of the surface, not of the vertices' Gaussians alone: a learned prior lets faces cover where these are faint.
+    solid = gaussians.opacities.new_zeros(len(vertices)).index_copy(0, index, gaussians.opacities[:n_points])
+    solid.scatter_reduce_(0, faces.flatten(), opacity.repeat_interleave(3), "amax")
+    disc_opacities = OPACITY * (solid[index] / SOLID).clamp(max=1)
     on_top = ~cut[gaussians.face_index]
 
     face_index, barycentrics = _cut(parts, cut, vertices.dtype)
@@ -93,7 +99,7 @@ def densify(
         torch.cat([gaussians.face_index[on_top], face_index]),
         torch.cat([gaussians.barycentrics[on_top], barycentrics]),
         joined(gaussians.quats, disc_quats[index], quats[face_index]),
-        joined(gaussians.scales, disc_scales[index], scales[face_index]),
+        joined(gaussians.scales, GROUND_SPREAD * disc_scales[index], scales[face_index]),
         joined(gaussians.opacities, disc_opacities, PART_OPACITY * (opacity[face_index] / SOLID).clamp(max=1)),
         joined(gaussians.colors, gaussians.colors[:n_points], colors),
     )

@@ -1,5 +1,6 @@
 """What an avatar rests on: how much of the surface the photo showed, how sure the rest is, and what ails the photo."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -70,6 +71,12 @@ def assess_surface(hand: HandModel, evidence: Evidence, drawn: Float[Tensor, "S 
     away = dijkstra(graph, directed=False, indices=n)[:n]
     uncertainty = torch.from_numpy(1 - np.exp(-away / REACH)).to(seen.confidence)
     return SurfaceQuality(seen.confidence, uncertainty)
+
+
+def best_known(qualities: Sequence[SurfaceQuality]) -> SurfaceQuality:
+    """How well each vertex is known from several photos: as from the one that says most of it."""
+    visibility, uncertainty = (torch.stack(values) for values in zip(*qualities, strict=True))
+    return SurfaceQuality(visibility.amax(0), uncertainty.amin(0))
 
 
 def shares(hand: HandModel, rest: Float[Tensor, "V 3"], quality: SurfaceQuality) -> dict[str, float]:

@@ -8,29 +8,29 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from oasis_warp.avatar.quality import SEEN
+from oasis_warp.avatar.quality import SEEN, SurfaceQuality
 from oasis_warp.commands.drawing import Panel, Pixels, make_sheet, panel_side
 from oasis_warp.commands.summary import GROUND, WIDTH, shade_mesh
 from oasis_warp.core.types import Camera, PosedHand
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
-from oasis_warp.pipeline import Reconstruction
 from oasis_warp.render.cameras import orbit_camera
 
 SEEN_COLOR, GRAZED_COLOR, UNSEEN_COLOR = (0.30, 0.66, 0.42), (0.95, 0.76, 0.27), (0.62, 0.64, 0.68)
 
 
 @torch.no_grad()
-def draw_quality(title: str, made: Reconstruction) -> UInt8[Tensor, "H W 3"]:
-    """Visibility and uncertainty on the hand in the photo's pose, from the photo's side and from behind."""
-    avatar, side = made.avatar, panel_side(4, WIDTH)
-    posed = PosedHand(*(part.cpu() for part in avatar.mesh(made.fit.pose)))
-    faces, visibility = avatar.hand.faces.cpu(), made.quality.visibility.cpu()
+def draw_quality(title: str, avatar: Avatar, quality: SurfaceQuality) -> UInt8[Tensor, "H W 3"]:
+    """Visibility and uncertainty on the hand in the (first) photo's pose, from that photo's side and from behind."""
+    side = panel_side(4, WIDTH)
+    posed = PosedHand(*(part.cpu() for part in avatar.mesh(avatar.source_pose)))
+    faces, visibility = avatar.hand.faces.cpu(), quality.visibility.cpu()
     shown = torch.tensor(UNSEEN_COLOR).repeat(len(visibility), 1)
     shown[visibility > 0] = torch.tensor(GRAZED_COLOR)
     shown[visibility >= SEEN] = torch.tensor(SEEN_COLOR)
     panels = [
         Panel(_paint(posed, faces, colors, orbit_camera(posed.vertices, azimuth, size=side)), f"{what}, {where}")
-        for what, colors in (("seen (green), grazed (yellow)", shown), ("uncertainty", _heat(made.quality.uncertainty)))
+        for what, colors in (("seen (green), grazed (yellow)", shown), ("uncertainty", _heat(quality.uncertainty)))
         for where, azimuth in (("from the photo's side", 0.0), ("from behind", math.pi))
     ]  # fmt: skip
     said = "uncertainty: blue is as the photo shows it, yellow is guessed"

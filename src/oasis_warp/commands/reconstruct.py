@@ -131,7 +131,7 @@ def _reconstruct_one(
         seconds.update(made.stages)
         with timed_stage("summary", seconds):
             write_picture(part / "summary.png", draw_summary(photo, made, progress=progress))
-            write_picture(part / "quality.png", draw_quality(photo.name, made))
+            write_picture(part / "quality.png", draw_quality(photo.name, made.avatar, made.quality))
         _write_avatar(part, made.avatar, seconds, progress)
         report = make_report(photo, made, config, seconds)
         (part / "report.json").write_text(to_json(report))
@@ -148,6 +148,8 @@ def _reconstruct_same_hand(paths: Sequence[Path], folder: Path, config: Reconstr
         seconds.update(made.stages)
         with timed_stage("summary", seconds):
             write_picture(part / "summary.png", draw_fused_summary(photos, made, progress=progress))
+            title = ", ".join(photo.name for photo in photos)
+            write_picture(part / "quality.png", draw_quality(title, made.avatar, made.quality))
         _write_avatar(part, made.avatar, seconds, progress)
         report = make_fused_report(photos, made, config, seconds)
         (part / "report.json").write_text(to_json(report))

@@ -118,6 +118,15 @@ def adapt(
     return Adaptation(gaussians._replace(colors=texture.colors), calibration, texture.losses, light)
 
 
+def light_of_photo(
+    hand: HandModel, prior: CanonicalGaussians, evidence: Evidence, config: AdaptConfig
+) -> HandLight:
+    """The light that `adapt` finds in a photo."""
+    _, view, trusted = in_photo(hand, prior, evidence)
+    calibration = _calibration(prior, view, evidence, trusted, config)
+    return fit_light(hand, _drawn(view, calibration.apply(prior.colors)), evidence)
+
+
 def _complete(
     hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence, view: BlendWeights, config: AdaptConfig
 ) -> CanonicalGaussians:

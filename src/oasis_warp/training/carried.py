@@ -1,5 +1,6 @@
 """A picture on the posed surface: what other views show of it, and colours fitted to such views."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -44,8 +45,19 @@ class Seen(NamedTuple):
     faces: Int[Tensor, "H W"]
     """-1 where there is none."""
     depth: Float[Tensor, "H W"]
+    barycentrics: Float[Tensor, "H W 3"]
+    """In those faces."""
     share: Float[Tensor, "H W"]
     """Of each pixel that is in the mask and on a surface that faces the camera, clear of edges in front of it."""
+
+
+class Source(NamedTuple):
+    """A picture and the hand in it."""
+
+    canvas: Canvas
+    seen: Seen
+    posed: Float[Tensor, "V 3"]
+    """In the world of the canvas's camera [m]."""
 
 
 class View(NamedTuple):
@@ -71,7 +83,7 @@ def look(posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], canvas: Canvas,
     toward = observe.facing(posed, faces, camera)
     cosine = (toward[faces[ids.clamp_min(0)]] * seen.barycentrics).sum(-1)
     trust = ((cosine - facing[0]) / (facing[1] - facing[0])).clamp(0, 1)
-    return Seen(ids, depth, canvas.mask * trust * ((ids >= 0) & (depth - before < STEP)))
+    return Seen(ids, depth, seen.barycentrics, canvas.mask * trust * ((ids >= 0) & (depth - before < STEP)))
 
 
 def with_neighbours(chosen: Bool[Tensor, "F"], faces: Tensor, n_vertices: int) -> Bool[Tensor, "F"]:
@@ -92,16 +104,25 @@ def read(canvas: Canvas, seen: Seen, points: Float[Tensor, "M 3"]) -> tuple[Floa
     return sampled[:, 3] * (depth - front[0, 0, 0] < STEP), sampled[:, :3]
 
 
+def lay_over(
+    colors: Float[Tensor, "M 3"], sources: Sequence[Source], points: Sequence[Float[Tensor, "M 3"]]
+) -> Float[Tensor, "M 3"]:
+    """`colors` of some places under what each picture shows of them; with each the places in its pose [m]."""
+    for source, there in zip(sources, points, strict=True):
+        share, color = read(source.canvas, source.seen, there)
+        colors = torch.lerp(colors, color, share[:, None])
+    return colors
+
+
 def carried(
-    before: Float[Tensor, "h w 3"], canvas: Canvas, seen: Seen, posed: Tensor, faces: Tensor, camera: Camera
+    before: Float[Tensor, "h w 3"], sources: Sequence[Source], posed: Tensor, faces: Tensor, camera: Camera
 ) -> Float[Tensor, "h w 3"]:
-    """The picture `before` that `camera` makes of the old hand, with the canvas on its surface."""
+    """The picture `before` that `camera` makes of the old hand, `posed`, with what the surface carries of others."""
     shown = depth_map(posed, faces, camera.viewmat, camera.K, camera.width, camera.height)
     on = shown.face_ids >= 0
-    points = (posed[faces[shown.face_ids[on].long()]] * shown.barycentrics[on][..., None]).sum(1)
-    share, color = read(canvas, seen, points)
+    corners, place = faces[shown.face_ids[on].long()], shown.barycentrics[on][..., None]
     target = before.clone()
-    target[on] = torch.lerp(before[on], color, share[:, None])
+    target[on] = lay_over(before[on], sources, [(source.posed[corners] * place).sum(1) for source in sources])
     return target
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
+from oasis_warp.avatar.lighting import in_even_light
 from oasis_warp.avatar.mixture import mix_guesses
 from oasis_warp.avatar.observe import Observation, inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
@@ -15,14 +16,16 @@ from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import CanonicalGaussians, Evidence
-from oasis_warp.ops import blend_colors, stack_weights
+from oasis_warp.core.types import CanonicalGaussians, Evidence, HandLight
+from oasis_warp.ops import BlendWeights, blend_colors, stack_weights
 from oasis_warp.render.cameras import orbit_camera
-from oasis_warp.training.adapt import MIN_ALPHA, adapt
+from oasis_warp.training.adapt import MIN_ALPHA, adapt, in_photo, light_of_photo
 from oasis_warp.training.calibrate import calibrate
 from oasis_warp.training.complete import complete_field
 from oasis_warp.training.light import even_photo
 from oasis_warp.training.picture_fit import aim
+from oasis_warp.training.room_light import without_light
+from oasis_warp.training.sharpen import sharpen
 from oasis_warp.training.sightings import Sightings, look, photo_gains
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
@@ -36,6 +39,8 @@ GUESS_LIGHT = 4.0
 light more is better, up to here at least: 4 photos come to 20.8 dB without it, 22.3 with 1, 23.3 with 4."""
 UNSEEN = 0.02
 """Weight of a photo's guess where the photo shows nothing, against one that sees the place well."""
+DETAIL_SHARPNESS = 2.0
+"""Power of a photo's share beside the others' with which its detail counts: two photos' detail does not quite meet."""
 
 
 class Fusion(NamedTuple):
@@ -47,6 +52,10 @@ class Fusion(NamedTuple):
     sightings: Sightings
     gains: Float[Tensor, "K 3"]
     """How much brighter each photo is than the first."""
+    shading: Float[Tensor, "K V 3"]
+    """What to add to each photo then, so that photos agree where they show the same place."""
+    lights: tuple[HandLight, ...] | None
+    """In which the Gaussians, times gains, look like the photos; None where light is in the colours, or left out."""
 
 
 def fuse(
@@ -77,24 +86,73 @@ def fuse(
         progress("guesses", k, len(evidences))
         guesses.append(prior(evidence))
     progress("guesses", len(evidences), len(evidences))
-    sightings = look(hand, evidences, resolution)
     if len(guesses) == 1:
         made = adapt(hand, guesses[0], evidences[0], config, progress)
-        return Fusion(made.gaussians, guesses[0], sightings, torch.ones_like(sightings.colors[:, 0]))
+        sightings = look(hand, evidences, resolution)
+        gains, shading = torch.ones_like(sightings.colors[:, 0]), torch.zeros_like(sightings.colors)
+        return Fusion(made.gaussians, guesses[0], sightings, gains, shading, made.light and (made.light,))
+    lights = None
+    if config.light != "keep":
+        pairs = list(zip(guesses, evidences, strict=True))
+        lights = tuple(light_of_photo(hand, guess, evidence, config) for guess, evidence in pairs)
+        evidences = unlit(hand, evidences, lights)
+    sightings = look(hand, evidences, resolution)
     faces = hand.faces.to(evidences[0].image.device)
     guess = mix_guesses(guesses, sightings.confidence * sightings.share + UNSEEN, faces)
     gains = photo_gains(sightings, vertex_colors(guess, len(hand.template)))
-    made = _adapt(hand, guess, evidences, sightings, gains, config, progress)
-    return Fusion(made, guess, sightings, gains)
+    made, shading = _adapt(hand, guess, evidences, sightings, gains, config, progress)
+    if lights is not None and config.light == "even":
+        made, lights = in_even_light(made, lights[0]), None
+    return Fusion(made, guess, sightings, gains, shading, lights)
+
+
+def unlit(
+    hand: HandModel, evidences: Sequence[Evidence], lights: Sequence[HandLight] | None
+) -> Sequence[Evidence]:
+    """The photos without their lights, where these are known apart from the skin."""
+    if lights is None:
+        return evidences
+    return [without_light(hand, *pair) for pair in zip(evidences, lights, strict=True)]
+
+
+def add_detail(
+    hand: HandModel,
+    fusion: Fusion,
+    evidences: Sequence[Evidence],
+    resolution: Sequence[float],
+    size: int,
+    progress: Progress = silent,
+) -> CanonicalGaussians:
+    """The Gaussians of `fusion`, with finer ones that show each place as the photo does that shows it best.
+
+    Args:
+        hand: The model.
+        fusion: Of these photos.
+        evidences: The photos again, as large as their detail.
+        resolution: Of these; see `sightings.look`.
+        size: Side of the crops that were fused [px]. A photo whose crop is no larger has no detail to give, and no
+            other photo gives any where it is the best.
+        progress: Told of the colours' fit.
+    """
+    evidences = unlit(hand, evidences, fusion.lights)
+    share = look(hand, evidences, resolution).share ** DETAIL_SHARPNESS
+    share = share / share.sum(0)
+    finer = [k for k, evidence in enumerate(evidences) if len(evidence.image) > size]
+    lit = []
+    for k in finer:
+        view = in_photo(hand, fusion.gaussians, evidences[k]).view
+        image = _in_first_light(hand, evidences[k].image, view, fusion.gaussians, fusion.gains[k], fusion.shading[k])
+        lit.append(evidences[k]._replace(image=image))
+    return sharpen(hand, fusion.gaussians, lit, share[finer], progress).gaussians
 
 
 def _adapt(
     hand: HandModel, guess: CanonicalGaussians, evidences: Sequence[Evidence], sightings: Sightings, gains: Tensor,
     config: AdaptConfig, progress: Progress,
-) -> CanonicalGaussians:  # fmt: skip
+) -> tuple[CanonicalGaussians, Float[Tensor, "K V 3"]]:  # fmt: skip
     """The steps of `training.adapt.adapt`, on all photos at once: their pictures stand below each other as one.
 
-    A pixel counts as much as its photo is to be believed there.
+    A pixel counts as much as its photo is to be believed there. With the Gaussians comes `Fusion.shading`.
     """
     first = evidences[0]
     faces, rest = hand.faces.to(first.image.device), first.rest.vertices
@@ -126,8 +184,8 @@ def _adapt(
 
     shading = _other_shading(hand, rest, differences(), sightings.confidence)
     lit = [
-        photo + blend_colors(view, vertex_to_gaussians(other, faces, guess)) / view.alphas.clamp_min(MIN_ALPHA)
-        for photo, view, other in zip(lit, views, shading, strict=True)
+        _in_first_light(hand, evidence.image, view, guess, gain, other)
+        for evidence, view, gain, other in zip(evidences, views, gains, shading, strict=True)
     ]
     if config.light == "even":
         lit = [
@@ -148,7 +206,17 @@ def _adapt(
     mask = torch.cat([evidence.mask for evidence in evidences]) * trust
     guess = guess._replace(colors=colors)
     pictures = aim(tall, torch.cat(lit), mask, references, colors)
-    return guess._replace(colors=learn_texture(guess, faces, pictures, config, progress).colors)
+    texture = learn_texture(guess, faces, pictures, config, progress)
+    return guess._replace(colors=texture.colors), shading
+
+
+def _in_first_light(
+    hand: HandModel, photo: Float[Tensor, "S S 3"], view: BlendWeights, gaussians: CanonicalGaussians, gain: Tensor,
+    shading: Float[Tensor, "V 3"],
+) -> Float[Tensor, "S S 3"]:  # fmt: skip
+    """The photo without what its light has of its own, drawn by the `gaussians` of `view`."""
+    own = vertex_to_gaussians(shading, hand.faces.to(photo.device), gaussians)
+    return photo / gain + blend_colors(view, own) / view.alphas.clamp_min(MIN_ALPHA)
 
 
 def _other_shading(

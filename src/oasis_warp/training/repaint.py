@@ -16,6 +16,7 @@ from oasis_warp.ops import blend_colors
 from oasis_warp.training.carried import (
     PHOTO_WEIGHT,
     Canvas,
+    Source,
     View,
     beside,
     carried,
@@ -100,7 +101,7 @@ def repaint(
     views = []
     for camera, weight in _cameras(canvas.camera, posed[faces[around]].flatten(0, 1)):
         before = blend_colors(freeze_view(old, camera), old.colors)
-        target = carried(before, canvas, seen, posed, faces, camera)
+        target = carried(before, [Source(canvas, seen, posed)], posed, faces, camera)
         weights = freeze_view(new, camera)
         views.append(View(weights, target - blend_colors(weights, still), weight))
     learned, losses = fit_colors(views, start, changed, steps, progress)

@@ -1,33 +1,34 @@
-"""Bring a photo's own detail into an avatar: finer Gaussians where it shows more than the ones there can."""
+"""Bring the detail of photos into an avatar: finer Gaussians where they show more than the ones there can."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from oasis_warp.avatar.anchors import RIM_FADE
+from oasis_warp.avatar.anchors import RIM_FADE, vertex_to_gaussians
 from oasis_warp.avatar.densify import densify, parts_for_spacing
 from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence
+from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, Gaussians
 from oasis_warp.ops import blend_colors
 from oasis_warp.render.render import render
 from oasis_warp.training.carried import (
     PHOTO_WEIGHT,
     Canvas,
-    Seen,
+    Source,
     View,
     beside,
     carried,
     cut,
     fit_colors,
+    lay_over,
     look,
-    read,
     with_neighbours,
 )
 from oasis_warp.training.views import freeze_view
@@ -58,68 +59,103 @@ and those in front would hide more of the others than they do from near."""
 
 
 class Sharpened(NamedTuple):
-    """Gaussians with the photo's detail."""
+    """Gaussians with the photos' detail."""
 
     gaussians: CanonicalGaussians
     """Those that were not touched are the same bit for bit, in their order; the new ones are the last."""
     n_new: int
     losses: tuple[float, ...]
-    """Mean squared colour difference over all views, of every step; none where nothing was missing."""
+    """Mean squared colour difference over all views, of every step, photo after photo; none where nothing was
+    missing."""
 
 
 @torch.no_grad()
 def sharpen(
-    hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence, progress: Progress = silent
+    hand: HandModel,
+    gaussians: CanonicalGaussians,
+    evidences: Sequence[Evidence],
+    believed: Float[Tensor, "K V"] | None = None,
+    progress: Progress = silent,
 ) -> Sharpened:
-    """Replace Gaussians by finer ones where the picture of `evidence` shows more than they do.
+    """Replace Gaussians by finer ones where pictures of the hand show more than they do.
 
     A face whose picture differs from the avatar's is cut into as many parts as it takes to show what is there; faces
     around it are cut as well, so that finer Gaussians fade into coarser ones. The colours minimise the squared
-    difference of pictures that are linear in them: the photo in its own view, and what the surface carries of it in
-    four views beside, in both sizes. At outlines, on a slant and where the wrist ends the avatar stays as it is.
+    difference of pictures that are linear in them: a photo in its own view, and what the surface carries of all photos
+    in four views beside, in both sizes; of several photos each the colours where it is believed most, one after the
+    other. At outlines, on a slant and where the wrist ends the avatar stays as it is.
 
     Args:
         hand: Whose surface it is.
-        gaussians: Fitted to the photo, perhaps in a smaller picture of it.
-        evidence: The photo, as large as its detail.
+        gaussians: Fitted to the photos, perhaps in smaller pictures of them.
+        evidences: Of K photos, as large as their detail, with one surface at rest and in one light.
+        believed: How far to believe each at each vertex, at most 1 in all; a single photo wholly.
         progress: Called as work goes on.
     """
-    rest, posed, camera = evidence.rest.vertices, evidence.posed.vertices, evidence.camera
-    faces = hand.faces.to(posed.device)
-    old = pose_gaussians(gaussians, faces, rest, posed)
-    canvas = Canvas(evidence.image, _faded_in(evidence.mask), camera)
-    seen = look(posed, faces, canvas, FACING)
+    rest = evidences[0].rest.vertices
+    faces = hand.faces.to(rest.device)
+    believed = rest.new_ones(1, len(rest)) if believed is None else believed
     fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
     fading = with_neighbours(fading[faces].any(1), faces, len(rest))
-    seen = seen._replace(share=torch.where(fading[seen.faces.clamp_min(0)], 0, seen.share))
-    spacing = _wanted_spacing(canvas, seen, render(old, camera).image, len(faces))
+    sources = [_source(e, faces, fading, own) for e, own in zip(evidences, believed, strict=True)]
+    old = [pose_gaussians(gaussians, faces, rest, source.posed) for source in sources]
+    spacing = torch.stack([
+        _wanted_spacing(source, render(there, source.canvas.camera).image, faces)
+        for source, there in zip(sources, old, strict=True)
+    ]).amin(0)  # fmt: skip
     missing = spacing.isfinite()
     if not bool(missing.any()):
         return Sharpened(gaussians, 0, ())
     around = with_neighbours(missing, faces, len(rest))
-    _, depth = project(camera, posed)
-    pixel = depth[faces].mean(1) / camera.K[0, 0]
     # A face of one part would keep its vertices' Gaussians, which reach into the faces beside it.
-    parts = torch.where(around, parts_for_spacing(rest, faces, spacing * pixel).clamp_min(2), 1)
+    parts = torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
     dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
-    new = pose_gaussians(dense, faces, rest, posed)
-    share, color = read(canvas, seen, new.means[changed])
-    start = torch.lerp(dense.colors[changed], color, share[:, None])
-    still = torch.where(changed[:, None], 0, dense.colors)
-    points, views = posed[faces[around]].flatten(0, 1), []
+    new = [pose_gaussians(dense, faces, rest, source.posed) for source in sources]
+    start = lay_over(dense.colors[changed], sources, [there.means[changed] for there in new])
+    colors = dense.colors.masked_scatter(changed[:, None], start)
+    whose = vertex_to_gaussians(believed.T, faces, dense).argmax(1)
+    whose_face = believed[:, faces].mean(-1).argmax(0)
+    losses: list[float] = []
+    for k, source in enumerate(sources):
+        mine = changed & (whose == k)
+        if not bool(mine.any()):
+            continue
+        still = torch.where(mine[:, None], 0, colors)
+        points = source.posed[faces[around & (whose_face == k)]].flatten(0, 1)
+        views = _views(sources, k, points, faces, old[k], new[k], still)
+        learned, own = fit_colors(views, colors[mine], mine, STEPS, progress)
+        colors, losses = still.masked_scatter(mine[:, None], learned), [*losses, *own]
+    return Sharpened(dense._replace(colors=colors), n_new, tuple(losses))
+
+
+def _source(
+    evidence: Evidence, faces: Tensor, fading: Bool[Tensor, "F"], believed: Float[Tensor, "V"]
+) -> Source:
+    """The photo on its surface, with nothing of it on `fading` faces and elsewhere as much as it is believed."""
+    posed, canvas = evidence.posed.vertices, Canvas(evidence.image, _faded_in(evidence.mask), evidence.camera)
+    seen = look(posed, faces, canvas, FACING)
+    ids = seen.faces.clamp_min(0)
+    trust = torch.where(fading[ids], 0, (believed[faces[ids]] * seen.barycentrics).sum(-1))
+    return Source(canvas, seen._replace(share=seen.share * trust), posed)
+
+
+def _views(
+    sources: Sequence[Source], k: int, points: Tensor, faces: Tensor, old: Gaussians, new: Gaussians, still: Tensor
+) -> list[View]:
+    """Pictures of `points` in the pose of source k: in the photo's view and beside it, in both sizes."""
+    camera, posed, views = sources[k].canvas.camera, sources[k].posed, []
     for other, weight in ((camera, PHOTO_WEIGHT), *((other, 1.0) for other in beside(camera, points))):
         near = _divisible(cut(other, points, 1.0))
         image, alpha = render(old, near)
         alpha = alpha.clamp_min(MIN_ALPHA)[..., None]
-        target = alpha * carried(image / alpha, canvas, seen, posed, faces, near)
+        target = alpha * carried(image / alpha, sources, posed, faces, near)
         small = _pooled(target) / _pooled(alpha)
         for goal, shown, scale in ((target / alpha, near, 1), (small, _smaller(near), SHRUNK)):
             weights = freeze_view(new, shown)
             # Coverage is not to be fitted: in a small picture the rasterizer draws outlines wider.
             goal = goal * weights.alphas - blend_colors(weights, still)
             views.append(View(weights, goal, weight * scale**2))
-    learned, losses = fit_colors(views, start, changed, STEPS, progress)
-    return Sharpened(dense._replace(colors=still.masked_scatter(changed[:, None], learned)), n_new, losses)
+    return views
 
 
 def _faded_in(mask: Float[Tensor, "S S"]) -> Float[Tensor, "S S"]:
@@ -129,21 +165,23 @@ def _faded_in(mask: Float[Tensor, "S S"]) -> Float[Tensor, "S S"]:
     return avg_pool2d(inner[None, None], 2 * rim + 1, stride=1, padding=rim)[0, 0]
 
 
-def _wanted_spacing(canvas: Canvas, seen: Seen, drawn: Tensor, n_faces: int) -> Float[Tensor, "F"]:
-    """Distance between Gaussians with which each face would show the picture [px]; infinite where it does already."""
+def _wanted_spacing(source: Source, drawn: Float[Tensor, "S S 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F"]:
+    """Distance between Gaussians with which each face would show the picture [m]; infinite where it does already."""
+    (image, _, camera), seen = source.canvas, source.seen
 
     def worst(error: Float[Tensor, "S S 3"]) -> Float[Tensor, "F"]:
         local = avg_pool2d((error.square().mean(-1) * seen.share)[None, None], 3, stride=1, padding=1)[0, 0].sqrt()
         counted = seen.share > MIN_SHARE
-        values = torch.zeros(n_faces, dtype=local.dtype, device=local.device)
+        values = torch.zeros(len(faces), dtype=local.dtype, device=local.device)
         return values.scatter_reduce_(0, seen.faces[counted], local[counted], "amax")
 
-    spacing = torch.full((n_faces,), torch.inf, device=drawn.device)
-    short = worst(drawn - canvas.image) > TOLERANCE
+    spacing = torch.full((len(faces),), torch.inf, device=drawn.device)
+    short = worst(drawn - image) > TOLERANCE
     for finer in SPACINGS:
         spacing = torch.where(short, finer, spacing)
-        short = short & (worst(_sampled(canvas.image, finer) - canvas.image) > TOLERANCE)
-    return spacing
+        short = short & (worst(_sampled(image, finer) - image) > TOLERANCE)
+    _, depth = project(camera, source.posed)
+    return spacing * depth[faces].mean(1) / camera.K[0, 0]
 
 
 def _sampled(image: Float[Tensor, "S S 3"], spacing: float) -> Float[Tensor, "S S 3"]:
