@@ -3,7 +3,7 @@
     python tools/elastic_truth.py out/truth
 
 Writes one file a pose, and goes on where it stopped. Prints for the last step of each pose: flesh kept, share of it
-turned inside out, volume inside the skin, edges that cross other faces. An hour on one core.
+turned inside out, volume inside the skin, edges that cross other faces. Half an hour on a busy core.
 """
 
 import argparse

@@ -86,7 +86,7 @@ class Flesh:
         corners = at.T[:, self.solid.tetrahedra[part].T]
         edges = (corners[:, 1:] - corners[:, :1]).astype(np.float32)
         inverse = self._inverse[:, :, part]
-        return sum(edges[:, k, None] * inverse[k] for k in range(3))
+        return edges[:, 0, None] * inverse[0] + edges[:, 1, None] * inverse[1] + edges[:, 2, None] * inverse[2]
 
     def bend(self, at: Array, before: Array, after: Array) -> Array:
         """Nodes once the bones [16, 3, 4] have moved from `before` to `after`, nodes before them being `at`."""
@@ -98,9 +98,9 @@ class Flesh:
         start[self.held] = (after[own, :, :3] @ rest[..., None])[..., 0] + after[own, :, 3]
         return self.relax(start)
 
-    def relax(self, at: Array, rounds: int = ROUNDS) -> Array:
+    def relax(self, at: Array) -> Array:
         """Let the flesh settle; bones stay."""
-        for _ in range(rounds):
+        for _ in range(ROUNDS):
             contacts = self.contacts(at)
             at, settled = self._descend(at, contacts)
             if settled and not len(contacts.node):

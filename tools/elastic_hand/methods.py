@@ -1,13 +1,12 @@
 """Ways to skin a hand that are cheaper than flesh: dual quaternions, delta mush, fitted pose shapes."""
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 import torch
-from hand_build.anatomy import FIRST, PARENTS, Array, Index
+from hand_build.anatomy import FIRST, Array, Index
 from scipy.spatial.transform import Rotation
 
 from elastic_hand.surface import skinned
@@ -101,21 +100,14 @@ def flexion_features(hand: HandModel) -> Features:
 
 
 def wide_features(hand: HandModel) -> Features:
-    """Those of the product, sines of flexion, of the roots' abduction and twist, and products with neighbours."""
+    """Those of the product, sines of flexion, and sines of the roots' abduction, their squares, and of twist."""
     narrow = flexion_features(hand)
     roots = [joint - 1 for joint in FIRST.values()]
-    pairs = [(j - 1, PARENTS[j] - 1) for j in range(1, 16) if PARENTS[j] > 0]
-    order = [FIRST[f] - 1 for f in ("index", "middle", "ring", "little")]
-    pairs += itertools.pairwise(order)
 
     def features(angles: Array) -> Array:
-        c = 1 - np.cos(angles[:, 0])
         sines = np.sin(angles)
         sides = sines[roots, 1]
-        products = [c[a] * c[b] for a, b in pairs]
-        return np.concatenate(
-            [narrow(angles), sines[:, 0], sides, sides**2, sines[roots, 2], products, c[roots] * sides]
-        )
+        return np.concatenate([narrow(angles), sines[:, 0], sides, sides**2, sines[roots, 2]])
 
     return features
 

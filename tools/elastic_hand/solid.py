@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import igl
 import numpy as np
 import torch
-from hand_build.anatomy import FINGERS, FIRST, PARENTS, Array, Index, bone_ends
+from hand_build.anatomy import FINGERS, FIRST, Array, Index, bone_ends
 from hand_build.quality import closed
 from scipy.spatial import Delaunay, cKDTree
 
@@ -143,5 +143,5 @@ def _bones(hand: HandModel, nodes: Array, bone_share: float) -> Index:
     tips = points[[16 + FINGERS.index(f) for f in FINGERS]]
     nail_nodes = np.flatnonzero(nails.query(nodes)[0] < 0.1)
     bone[nail_nodes] = ends_of_fingers[cKDTree(tips).query(nodes[nail_nodes])[1]]
-    assert set(range(16)) == set(bone[bone >= 0].tolist()) and len(PARENTS) == 16
+    assert np.isin(np.arange(16), bone).all(), "every bone holds nodes"
     return bone

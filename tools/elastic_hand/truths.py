@@ -17,7 +17,7 @@ from oasis_warp.synthetic.gestures import sample_gesture
 
 TRAIN, HELD_OUT = "train", "held_out"
 SINGLE_STEPS, SIDE_STEPS, POSE_STEPS = 4, 2, 5
-N_TRAIN_GESTURES, N_HELD_OUT_GESTURES = 12, 8
+N_TRAIN_GESTURES, N_HELD_OUT_GESTURES = 8, 4
 
 
 @dataclass(frozen=True)
