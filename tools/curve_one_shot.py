@@ -77,7 +77,7 @@ def settings(longest: int) -> dict[str, Setting]:
     }
     for way in WAYS:
         rows |= {
-            f"{way}, {FEW} steps, {n} reference views": Setting(
+            f"{way}, {FEW} steps, reference views: {n}": Setting(
                 AdaptConfig(texture=way, texture_steps=FEW, reference_views=n)
             )
             for n in VIEWS
@@ -210,7 +210,7 @@ def as_markdown(found: dict[str, Any]) -> str:
         for row in found["rows"]
     ]
     names = ["", "steps", "own photo", "other poses and views", "time"]
-    return f"{light[0].upper()}{light[1:]}; {found['people']} people:\n\n{markdown(names, lines)}"
+    return f"{light[0].upper()}{light[1:]}; people: {found['people']}:\n\n{markdown(names, lines)}"
 
 
 def main() -> None:
