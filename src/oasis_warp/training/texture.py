@@ -94,7 +94,8 @@ def learn_texture(
             loss = loss + config.weight_reference * config.weight_rgb * len(references) * drift
         ends = (vertex_trust * field).index_select(0, edges.flatten()).unflatten(0, (-1, 2))
         loss = loss + ROUGHNESS_DECAY * (ends[:, 0] - ends[:, 1]).square().mean()
-        loss = loss + RESIDUAL_DECAY * residual.square().mean()
+        if len(residual):  # a small photo's hand has none
+            loss = loss + RESIDUAL_DECAY * residual.square().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
