@@ -7,6 +7,7 @@ from typing import NamedTuple
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.avatar.coarsen import coarsen
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.avatar.quality import (
     SEEN,
@@ -35,6 +36,7 @@ from oasis_warp.pipeline import (
     crop_side,
     finer_size,
     input_errors,
+    is_small,
     make_avatar,
     make_evidence,
     over_photo,
@@ -124,8 +126,14 @@ def reconstruct_same_hand(
     with stage("crop"):
         evidences = make_evidences(photos, fits, surfaces, config)
     with stage("fusion"):
+        small = is_small(config, *fits)
+
+        def guess(evidence: Evidence) -> CanonicalGaussians:
+            own = prior(evidence)
+            return coarsen(estimator.hand, own, evidence.rest) if small else own
+
         settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
-        fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), prior, settings, progress)
+        fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), guess, settings, progress)
     with stage("detail"):
         gaussians, close = with_detail(fusion, photos, fits, surfaces, config, progress)
     lights = fusion.lights or [None] * len(photos)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import PICTURE, below_skin
+from oasis_warp.avatar.coarsen import coarsen
 from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.avatar.quality import SurfaceQuality, assess_surface, photo_doubts, shares, surface_doubts
@@ -41,6 +42,8 @@ CROP_MARGIN = 1.12
 COARSE_SIZE = PICTURE
 """Side of the crop that the prior reads and the whole hand is fitted to [px]: as many pixels as it has Gaussians. What
 a larger one shows beyond it goes into finer Gaussians."""
+SMALL_SIZE = 128
+"""Side of the photo's own crop up to which a third of the Gaussians is as like the photo, or more so [px]."""
 FINEST_SIZE = 1024
 """Side that is chosen for a photo at most [px]."""
 
@@ -118,6 +121,8 @@ def reconstruct(
                 evidence = make_evidence(photo, fit, offsets, config)
                 guess = prior(evidence)
     with stage("adaptation"):
+        if is_small(config, fit):
+            guess = coarsen(hand, guess, evidence.rest)
         settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
         adaptation = adapt(hand, guess, evidence, settings, progress)
     gaussians, close = adaptation.gaussians, evidence
@@ -154,6 +159,11 @@ def carrier_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
 def own_size(fit: HandFit) -> int:
     """Side of the crop that shows all there is in the photo, within what is of use here [px]."""
     return min(max(round(crop_side(fit)), COARSE_SIZE), FINEST_SIZE)
+
+
+def is_small(config: ReconstructConfig, *fits: HandFit) -> bool:
+    """Whether all photos are so small that fewer Gaussians do; not when `config` asks for a size."""
+    return config.size == "auto" and max(map(crop_side, fits)) <= SMALL_SIZE
 
 
 def crop_side(fit: HandFit) -> float:

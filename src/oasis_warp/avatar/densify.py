@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import FACE_SPREAD, OPACITY, face_shapes, vertex_shapes
+from oasis_warp.avatar.anchors import FACE_SPREAD, MIN_OPACITY, OPACITY, face_shapes, vertex_shapes
 from oasis_warp.core import surface
 from oasis_warp.core.types import CanonicalGaussians
 
@@ -70,8 +70,8 @@ def densify(
         parts: An edge, for each face; 1 leaves the face as it is.
         thickness: Least standard deviation of the parts' Gaussians across the surface [m].
     """
-    opacity = _face_opacities(gaussians, len(faces))
-    cut = (parts > 1) & (opacity > 0)
+    opacity = _face_opacities(gaussians, faces)
+    cut = (parts > 1) & (opacity >= MIN_OPACITY)
     n_points, index = len(gaussians.vertex_index), gaussians.vertex_index
     sunk = _inside(cut, faces, len(vertices))[index]
     depth = SINK * surface.vertex_normals(vertices, faces)[index]
@@ -108,11 +108,18 @@ def densify(
     return Densified(dense, changed, n_new)
 
 
-def _face_opacities(gaussians: CanonicalGaussians, n_faces: int) -> Tensor:
-    """Highest opacity of the Gaussians on each face, 0 where there is none."""
-    opacity = torch.zeros(n_faces, dtype=gaussians.opacities.dtype, device=gaussians.opacities.device)
-    on_faces = gaussians.opacities[len(gaussians.vertex_index) :]
-    return opacity.scatter_reduce_(0, gaussians.face_index, on_faces, "amax")
+def _face_opacities(gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"]) -> Tensor:
+    """Highest opacity of the Gaussians on each face, 0 where there is none.
+
+    Where no face has any, as in a small photo's hand, what its vertices' Gaussians have.
+    """
+    n_points = len(gaussians.vertex_index)
+    if n_points == len(gaussians.opacities):
+        at_vertices = gaussians.opacities.new_zeros(int(faces.max()) + 1)
+        at_vertices = at_vertices.index_copy(0, gaussians.vertex_index, gaussians.opacities)
+        return at_vertices[faces].mean(1)
+    opacity = torch.zeros(len(faces), dtype=gaussians.opacities.dtype, device=gaussians.opacities.device)
+    return opacity.scatter_reduce_(0, gaussians.face_index, gaussians.opacities[n_points:], "amax")
 
 
 def _inside(cut: Bool[Tensor, "F"], faces: Tensor, n_vertices: int) -> Bool[Tensor, "V"]:

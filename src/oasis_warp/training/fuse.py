@@ -1,6 +1,6 @@
 """One avatar of several photos: their guesses mixed, their light made one, and one adaptation to all of them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -12,7 +12,6 @@ from oasis_warp.avatar.lighting import in_even_light
 from oasis_warp.avatar.mixture import mix_guesses
 from oasis_warp.avatar.observe import Observation, inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
-from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
@@ -62,7 +61,7 @@ def fuse(
     hand: HandModel,
     evidences: Sequence[Evidence],
     resolution: Sequence[float],
-    prior: Prior,
+    prior: Callable[[Evidence], CanonicalGaussians],
     config: AdaptConfig = AdaptConfig(),  # noqa: B008 - frozen
     progress: Progress = silent,
 ) -> Fusion:

@@ -52,8 +52,10 @@ def learn_texture(
 
     def penalty() -> Tensor:
         ends = (vertex_trust * field).index_select(0, edges.flatten()).unflatten(0, (-1, 2))
-        roughness = (ends[:, 0] - ends[:, 1]).square().mean()
-        return ROUGHNESS_DECAY * roughness + RESIDUAL_DECAY * residual.square().mean()
+        loss = ROUGHNESS_DECAY * (ends[:, 0] - ends[:, 1]).square().mean()
+        if len(residual):  # a small photo's hand has none
+            loss = loss + RESIDUAL_DECAY * residual.square().mean()
+        return loss
 
     losses = fit_parameters([field, residual], colors, penalty, pictures, LEARNING_RATE, config, progress)
     with torch.no_grad():
