@@ -12,7 +12,7 @@ from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.types import Evidence, HandFit, Landmarks, Photo, PosedHand
+from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmarks, Photo, PosedHand
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.shared_shape import shared_shape
 from oasis_warp.hand.skinning import rest_hand
@@ -20,7 +20,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
-from oasis_warp.pipeline import carrier_offsets, input_errors, make_avatar, make_evidence
+from oasis_warp.pipeline import carrier_offsets, input_errors, make_avatar, make_evidence, onto_drawn_outline
 from oasis_warp.training.fuse import Fusion, fuse
 from oasis_warp.training.sightings import Sightings
 
@@ -105,9 +105,16 @@ def reconstruct_same_hand(
         warm_up(config.device)
     with stage("crop"):
         evidences = make_evidences(photos, fits, surfaces, config)
+    guesses = []
+    for evidence in evidences:
+        with stage("guesses"):
+            guesses.append(prior(evidence))
+    with stage("outline"):
+        surfaces = settle_surfaces(photos, fits, surfaces, guesses, config)
+        evidences = make_evidences(photos, fits, surfaces, config)
     with stage("fusion"):
         settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
-        fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), prior, settings, progress)
+        fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), guesses, settings, progress)
     with stage("check"):
         avatar = make_avatar(fits[0], surfaces.shared, evidences[0], fusion.gaussians)
         about = tuple(
@@ -185,6 +192,20 @@ def fit_surfaces(fits: Sequence[HandFit]) -> Surfaces:
     hand = bundled_hand()
     own = [carrier_offsets(hand, fit) for fit in fits]
     return Surfaces(own[0] if len(own) == 1 else carrier_offsets(hand, *fits), own)
+
+
+def settle_surfaces(
+    photos: Sequence[Photo], fits: Sequence[HandFit], surfaces: Surfaces, guesses: Sequence[CanonicalGaussians],
+    config: ReconstructConfig,
+) -> Surfaces:  # fmt: skip
+    """See `pipeline.onto_drawn_outline`, of all photos together and of each."""
+    hand, each = bundled_hand(), zip(photos, fits, surfaces.own, guesses, strict=True)
+    own = [
+        onto_drawn_outline(hand, [photo], [fit], offsets, [guess], config) for photo, fit, offsets, guess in each
+    ]
+    if len(own) == 1:
+        return Surfaces(own[0], own)
+    return Surfaces(onto_drawn_outline(hand, photos, fits, surfaces.shared, guesses, config), own)
 
 
 def make_evidences(

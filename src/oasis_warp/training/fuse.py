@@ -11,7 +11,6 @@ from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.mixture import mix_guesses
 from oasis_warp.avatar.observe import Observation, inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
-from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
@@ -52,7 +51,7 @@ def fuse(
     hand: HandModel,
     evidences: Sequence[Evidence],
     resolution: Sequence[float],
-    prior: Prior,
+    guesses: Sequence[CanonicalGaussians],
     config: AdaptConfig = AdaptConfig(),  # noqa: B008 - frozen
     progress: Progress = silent,
 ) -> Fusion:
@@ -62,15 +61,10 @@ def fuse(
         hand: The model.
         evidences: All with one surface at rest, on one device, of one size.
         resolution: See `sightings.look`.
-        prior: Asked for every photo.
+        guesses: What the prior makes of every photo.
         config: Of the adaptation.
-        progress: Told of guesses and of the adaptation's steps.
+        progress: Told of the adaptation's steps.
     """
-    guesses = []
-    for k, evidence in enumerate(evidences):
-        progress("guesses", k, len(evidences))
-        guesses.append(prior(evidence))
-    progress("guesses", len(evidences), len(evidences))
     sightings = look(hand, evidences, resolution)
     if len(guesses) == 1:
         made = adapt(hand, guesses[0], evidences[0], config, progress)
