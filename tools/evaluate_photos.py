@@ -67,7 +67,8 @@ def measure(path: Path, root: Path, out: Path, prior: str, seed: int, size: int 
     """One photo's row; writes its avatar and its strip of pictures."""
     name = path.relative_to(root).with_suffix("").as_posix()
     start = time.perf_counter()
-    config = ReconstructConfig(prior=prior if prior in ("learned", "none") else Path(prior), seed=seed, size=size or "auto")
+    asked = prior if prior in ("learned", "none") else Path(prior)
+    config = ReconstructConfig(prior=asked, seed=seed, size=size or "auto")
     try:
         photo = read_photo(path)
         made = reconstruct(photo, config)
