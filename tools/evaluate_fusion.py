@@ -39,7 +39,7 @@ from oasis_warp.evaluation.metrics import Truth, match_colors, score
 from oasis_warp.evaluation.photo_pairs import compare_with_photo, draw_as_photo
 from oasis_warp.evaluation.same_hand import photos_of_hands
 from oasis_warp.evaluation.synthetic import evidence_of
-from oasis_warp.fusion import fit_surfaces, fit_together, make_evidences, resolutions, with_detail
+from oasis_warp.fusion import fit_surfaces, fit_together, make_evidences, resolutions, settle_surfaces, with_detail
 from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
@@ -108,10 +108,11 @@ def measure_person(number: int, look: str, prior: Prior, options: argparse.Names
     """Rows of avatars of each photo alone and of the first 2, 3, ..."""
     batches, truths = photograph(number, options.size, look, torch.device(options.device))
     evidences = [evidence_of(batch) for batch in batches]
-    pixels = [float(SURROUNDINGS) for _ in batches]
+    guesses, pixels = [prior(evidence) for evidence in evidences], [float(SURROUNDINGS) for _ in batches]
     config = AdaptConfig(texture_steps=options.steps, light=options.light)
     for chosen in [(k,) for k in range(MOST)] + [tuple(range(n)) for n in range(2, MOST + 1)]:
-        fusion = fuse(bundled_hand(), [evidences[k] for k in chosen], [pixels[k] for k in chosen], prior, config)
+        shown = ([part[k] for k in chosen] for part in (evidences, pixels, guesses))
+        fusion = fuse(bundled_hand(), *shown, config)
         seen = (fusion.sightings.confidence > 0.5).any(0).float().mean()
         for stage, gaussians in zip(STAGES, (fusion.guess, fusion.gaussians), strict=True):
             found = [
@@ -137,7 +138,10 @@ def avatar_of(
     fits = fit_together(estimator, photos, landmarks)
     surfaces = fit_surfaces(fits)
     evidences = make_evidences(photos, fits, surfaces, config)
-    fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), prior, adapt)
+    guesses = [prior(evidence) for evidence in evidences]
+    surfaces = settle_surfaces(photos, fits, surfaces, guesses, config)
+    evidences = make_evidences(photos, fits, surfaces, config)
+    fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), guesses, adapt)
     seen = float((fusion.sightings.confidence > 0.5).any(0).float().mean())
     gaussians, _ = with_detail(fusion, photos, fits, surfaces, config)
     return make_avatar(fits[0], surfaces.shared, evidences[0], gaussians), seen

@@ -63,11 +63,12 @@ def tiles(avatar: Avatar, photo_crop: torch.Tensor) -> np.ndarray:
     return (np.hstack(small).clip(0, 1) * 255).astype(np.uint8)
 
 
-def measure(path: Path, root: Path, out: Path, prior: str, seed: int) -> dict[str, object]:
+def measure(path: Path, root: Path, out: Path, prior: str, seed: int, size: int | None) -> dict[str, object]:
     """One photo's row; writes its avatar and its strip of pictures."""
     name = path.relative_to(root).with_suffix("").as_posix()
     start = time.perf_counter()
-    config = ReconstructConfig(prior=prior if prior in ("learned", "none") else Path(prior), seed=seed)
+    asked = prior if prior in ("learned", "none") else Path(prior)
+    config = ReconstructConfig(prior=asked, seed=seed, size=size or "auto")
     try:
         photo = read_photo(path)
         made = reconstruct(photo, config)
@@ -150,13 +151,14 @@ def main() -> None:
     parser.add_argument("--prior", default="learned", help="learned, none or a weights file")
     parser.add_argument("--jobs", type=int, default=1, help="photos at a time; timings hold for 1 only")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--size", type=int, help="side of the crop that is shown [px]; the photo's own if not given")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     threads = max(1, (os.cpu_count() or 1) // options.jobs)
     with ProcessPoolExecutor(options.jobs, initializer=torch.set_num_threads, initargs=(threads,)) as pool:
         paths = photos_below(options.folder)
         row_of = functools.partial(
-            measure, root=options.folder, out=options.out, prior=options.prior, seed=options.seed
+            measure, root=options.folder, out=options.out, prior=options.prior, seed=options.seed, size=options.size
         )
         rows = list(pool.map(row_of, paths))
         write_table(rows, options.out / "photos", leave_out=LEFT_OUT)

@@ -39,6 +39,7 @@ from oasis_warp.pipeline import (
     is_small,
     make_avatar,
     make_evidence,
+    onto_drawn_outline,
     over_photo,
 )
 from oasis_warp.training.fuse import Fusion, add_detail, fuse
@@ -125,15 +126,18 @@ def reconstruct_same_hand(
         warm_up(config.device)
     with stage("crop"):
         evidences = make_evidences(photos, fits, surfaces, config)
+    guesses = []
+    for evidence in evidences:
+        with stage("guesses"):
+            guesses.append(prior(evidence))
+    with stage("outline"):
+        surfaces = settle_surfaces(photos, fits, surfaces, guesses, config)
+        evidences = make_evidences(photos, fits, surfaces, config)
     with stage("fusion"):
-        small = is_small(config, *fits)
-
-        def guess(evidence: Evidence) -> CanonicalGaussians:
-            own = prior(evidence)
-            return coarsen(estimator.hand, own, evidence.rest) if small else own
-
+        if is_small(config, *fits):
+            guesses = [coarsen(estimator.hand, guess, evidences[0].rest) for guess in guesses]
         settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
-        fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), guess, settings, progress)
+        fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), guesses, settings, progress)
     with stage("detail"):
         gaussians, close = with_detail(fusion, photos, fits, surfaces, config, progress)
     lights = fusion.lights or [None] * len(photos)
@@ -220,6 +224,20 @@ def fit_surfaces(fits: Sequence[HandFit]) -> Surfaces:
     hand = bundled_hand()
     own = [carrier_offsets(hand, fit) for fit in fits]
     return Surfaces(own[0] if len(own) == 1 else carrier_offsets(hand, *fits), own)
+
+
+def settle_surfaces(
+    photos: Sequence[Photo], fits: Sequence[HandFit], surfaces: Surfaces, guesses: Sequence[CanonicalGaussians],
+    config: ReconstructConfig,
+) -> Surfaces:  # fmt: skip
+    """See `pipeline.onto_drawn_outline`, of all photos together and of each."""
+    hand, each = bundled_hand(), zip(photos, fits, surfaces.own, guesses, strict=True)
+    own = [
+        onto_drawn_outline(hand, [photo], [fit], offsets, [guess], config) for photo, fit, offsets, guess in each
+    ]
+    if len(own) == 1:
+        return Surfaces(own[0], own)
+    return Surfaces(onto_drawn_outline(hand, photos, fits, surfaces.shared, guesses, config), own)
 
 
 def make_evidences(

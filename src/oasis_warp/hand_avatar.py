@@ -57,8 +57,8 @@ class Avatar:
         self.shape = shape
         """Shape coefficients of the hand model [standard deviations]."""
         self.surface_offsets = surface_offsets
-        """From the model's surface at rest to the one that carries Gaussians [m]: onto the photo's outline, then
-        below the skin (`avatar.anchors.below_skin`)."""
+        """From the model's surface at rest to the one that carries Gaussians [m]: onto the photo's outline, below
+        the skin (`avatar.anchors.below_skin`), and by what the drawn outline still missed."""
         self._gaussians = gaussians
         self.source_pose = source_pose
         """The pose in the photo, in the frame of `source_camera`."""

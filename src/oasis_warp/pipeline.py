@@ -1,6 +1,6 @@
 """`reconstruct`: one photo in, an avatar out. The only file that knows the order of the stages."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple
@@ -33,6 +33,7 @@ from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 from oasis_warp.training.adapt import adapt
+from oasis_warp.training.outline import drawn_outline_offsets
 from oasis_warp.training.refine import refine
 from oasis_warp.training.room_light import without_light
 from oasis_warp.training.sharpen import sharpen
@@ -120,6 +121,9 @@ def reconstruct(
                 offsets = carrier_offsets(hand, fit)
                 evidence = make_evidence(photo, fit, offsets, config)
                 guess = prior(evidence)
+    with stage("outline"):
+        offsets = onto_drawn_outline(hand, [photo], [fit], offsets, [guess], config)
+        evidence = make_evidence(photo, fit, offsets, config)
     with stage("adaptation"):
         if is_small(config, fit):
             guess = coarsen(hand, guess, evidence.rest)
@@ -154,6 +158,22 @@ def carrier_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
     How far inwards is right for pictures as fine as the finest of the photos.
     """
     return outline_offsets(hand, *fits) + below_skin(hand, max(map(own_size, fits)))
+
+
+def onto_drawn_outline(
+    hand: HandModel,
+    photos: Sequence[Photo],
+    fits: Sequence[HandFit],
+    offsets: Float[Tensor, "V 3"],
+    guesses: Sequence[CanonicalGaussians],
+    config: ReconstructConfig,
+) -> Float[Tensor, "V 3"]:
+    """`offsets`, moved until the prior's guesses are drawn with the outlines of their photos [m]."""
+    views = [
+        make_evidence(photo, fit, offsets, config, detail_size(fit, config))
+        for photo, fit in zip(photos, fits, strict=True)
+    ]
+    return offsets + drawn_outline_offsets(hand, guesses, views).cpu()
 
 
 def own_size(fit: HandFit) -> int:

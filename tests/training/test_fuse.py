@@ -40,9 +40,13 @@ def back(hand, colors):
     return evidence_of(hand, colors, orientation=BACK_TO_CAMERA)[0]
 
 
+def fused_by_mean(hand, evidences, config):
+    return fuse(hand, evidences, [1.0] * len(evidences), [MeanPrior(hand)(one) for one in evidences], config)
+
+
 @pytest.fixture(scope="module")
 def fused(hand, palm, back):
-    return fuse(hand, [palm, lit(back, LIGHT)], [1.0, 1.0], MeanPrior(hand), STEPS)
+    return fused_by_mean(hand, [palm, lit(back, LIGHT)], STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -86,11 +90,11 @@ def test_a_shadow_over_part_of_a_photo_is_no_change_of_its_light(hand, palm):
 def test_of_one_photo_comes_what_one_shot_adaptation_makes_of_it(hand, palm):
     few = AdaptConfig(texture_steps=3, calibration_steps=3)
     alone = adapt(hand, MeanPrior(hand)(palm), palm, few).gaussians
-    assert torch.equal(fuse(hand, [palm], [1.0], MeanPrior(hand), few).gaussians.colors, alone.colors)
+    assert torch.equal(fused_by_mean(hand, [palm], few).gaussians.colors, alone.colors)
 
 
 def test_the_same_photo_twice_is_nearly_one_photo(hand, palm, alone):
-    twice = fuse(hand, [palm, palm], [1.0, 1.0], MeanPrior(hand), STEPS)
+    twice = fused_by_mean(hand, [palm, palm], STEPS)
     assert torch.allclose(twice.gains, torch.ones(2, 3))
     assert float((twice.gaussians.colors - alone.colors).abs().mean()) < 0.01
     assert abs(likeness(hand, twice.gaussians, palm) - likeness(hand, alone, palm)) < 0.5

@@ -52,14 +52,14 @@ def outline_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
         fits: One photo of a hand, or several of the same hand, all with one shape: then one displacement for all.
     """
     views = [_View(hand, fit) for fit in fits]
-    bending = _bending(views[0].rig)
+    stiffness = bending(views[0].rig.faces, len(views[0].rig.template))
     moved = np.zeros_like(views[0].rest)
     for _ in range(_ROUNDS):
         seen = zip(*(view.observe(moved) for view in views), strict=True)
         vertices, target, weight = (np.concatenate(part) for part in seen)
         if len(vertices) == 0:
             break
-        moved = _smooth(bending, len(moved), vertices, target, weight)
+        moved = smooth_displacement(stiffness, vertices, target, weight)
         moved *= np.minimum(1, LONGEST / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-12))
     return torch.from_numpy(moved.astype(np.float32))
 
@@ -103,8 +103,8 @@ class _View:
         rim = np.flatnonzero(grazing & (depth[pixel[:, 1], pixel[:, 0]] <= 0.008 * _WINDOW) & self.line.above(image))
         out = unit(normals[rim, :2])
         start, reach = (image[rim] - self.low) * self.scale, 1.5 * _REJECT * self.box * self.scale
-        mesh_edge = _crossing(drawn.astype(np.float32) / 255, start, out, reach)
-        gap = (_crossing(self.mask, start, out, reach) - mesh_edge) / self.scale
+        mesh_edge = crossing(drawn.astype(np.float32) / 255, start, out, reach)
+        gap = (crossing(self.mask, start, out, reach) - mesh_edge) / self.scale
         edge = image[rim] + out * (mesh_edge / self.scale + gap)[:, None]
         on_photo = ((edge > 2) & (edge < self.photo - 2)).all(1)
         good = np.isfinite(gap) & (np.abs(np.nan_to_num(gap)) < _REJECT * self.box) & on_photo
@@ -118,7 +118,7 @@ class _View:
         return rim, target, weight
 
 
-def _crossing(picture: np.ndarray, start: np.ndarray, out: np.ndarray, reach: float) -> np.ndarray:
+def crossing(picture: np.ndarray, start: np.ndarray, out: np.ndarray, reach: float) -> np.ndarray:
     """Signed way from each `start` along `out` to the nearest place where `picture` falls through a half; else NaN."""
     t = np.arange(-reach, reach + _STEP, _STEP)
     x, y = (start[:, k, None] + out[:, k, None] * t - 0.5 for k in (0, 1))
@@ -132,23 +132,24 @@ def _crossing(picture: np.ndarray, start: np.ndarray, out: np.ndarray, reach: fl
     return np.where(np.isfinite(away[row, nearest]), place, np.nan)
 
 
-def _bending(rig: Rig) -> sparse.csc_array:
+def bending(faces: np.ndarray, n: int) -> sparse.csc_array:
     """BEND L^T L + STAY with the umbrella operator L (mean of the neighbours minus the vertex)."""
-    a, b, c = rig.faces.T
-    i, j, n = np.r_[a, b, c, b, c, a], np.r_[b, c, a, a, b, c], len(rig.template)
+    a, b, c = faces.T
+    i, j = np.r_[a, b, c, b, c, a], np.r_[b, c, a, a, b, c]
     pairs = np.unique(np.stack([i, j]), axis=1)
     share = 1 / np.bincount(pairs[0], minlength=n)[pairs[0]]
     umbrella = sparse.csr_array((share, tuple(pairs)), shape=(n, n)) - sparse.eye_array(n)
     return (_BEND * umbrella.T @ umbrella + _STAY * sparse.eye_array(n)).tocsc()
 
 
-def _smooth(
-    bending: sparse.csc_array, n_vertices: int, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray
+def smooth_displacement(
+    stiffness: sparse.csc_array, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray
 ) -> np.ndarray:
-    """The smooth displacement [V, 3] that comes nearest to the targets."""
-    diagonal, right = np.zeros(n_vertices), np.zeros((n_vertices, 3))
+    """The smooth displacement [V, D] that comes nearest to the targets [K, D]; `stiffness` is that of `bending`."""
+    n_vertices = len(stiffness.diagonal())
+    diagonal, right = np.zeros(n_vertices), np.zeros((n_vertices, target.shape[1]))
     np.add.at(diagonal, vertices, weight)
     np.add.at(right, vertices, weight[:, None] * target)
-    system = (bending + sparse.diags_array(diagonal)).tocsc()
+    system = (stiffness + sparse.diags_array(diagonal)).tocsc()
     factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return factors.solve(right)

@@ -1,6 +1,6 @@
 """One avatar of several photos: their guesses mixed, their light made one, and one adaptation to all of them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -61,7 +61,7 @@ def fuse(
     hand: HandModel,
     evidences: Sequence[Evidence],
     resolution: Sequence[float],
-    prior: Callable[[Evidence], CanonicalGaussians],
+    guesses: Sequence[CanonicalGaussians],
     config: AdaptConfig = AdaptConfig(),  # noqa: B008 - frozen
     progress: Progress = silent,
 ) -> Fusion:
@@ -71,20 +71,15 @@ def fuse(
         hand: The model.
         evidences: All with one surface at rest, on one device, of one size.
         resolution: See `sightings.look`.
-        prior: Asked for every photo.
+        guesses: What the prior makes of every photo.
         config: Of the adaptation.
-        progress: Told of guesses and of the adaptation's steps.
+        progress: Told of the adaptation's steps.
 
     Raises:
         ValueError: `config.texture` is "lora": the heads of several guesses have no common colours to train.
     """
     if config.texture == "lora":
         raise ValueError("texture 'lora': is for one photo, got several to fuse. Choose 'field'.")
-    guesses = []
-    for k, evidence in enumerate(evidences):
-        progress("guesses", k, len(evidences))
-        guesses.append(prior(evidence))
-    progress("guesses", len(evidences), len(evidences))
     if len(guesses) == 1:
         made = adapt(hand, guesses[0], evidences[0], config, progress)
         sightings = look(hand, evidences, resolution)
