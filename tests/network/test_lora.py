@@ -106,4 +106,4 @@ def test_what_has_no_heads_is_refused(case, hand):
     with pytest.raises(ValueError, match="expected the heads of the prior, got none"):
         adapt(hand, guess, evidence, LORA)
     with pytest.raises(ValueError, match="is for one photo"):
-        fuse(hand, [evidence], [1.0], MeanPrior(hand), LORA)
+        fuse(hand, [evidence], [1.0], [guess], LORA)
