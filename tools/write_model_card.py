@@ -44,6 +44,7 @@ METHODS = {
     ("learned", "raw"): "the prior's guess",
     ("learned", "calibrated"): "its guess, colours matched",
     ("learned", "even_one_shot"): "the prior, one-shot without the photo's light",
+    ("learned", "keep_one_shot"): "the prior, one-shot with the photo's light on the skin",
     ("learned", "one_shot"): "the prior, one-shot",
 }
 MEASURES = {

@@ -10,7 +10,7 @@ from oasis_warp.core.types import CanonicalGaussians
 
 REACH = 2.0
 """Standard deviations from its middle to where a Gaussian is still seen."""
-HEIGHT = 0.001
+HEIGHT = 0.0015
 """Above the skin, up to which it may reach there; at twice of it nothing is left of it [m]."""
 ROWS = 4096
 """Of points whose distances to all vertices are held at once."""

@@ -12,7 +12,7 @@ from oasis_warp.avatar.anchors import OPACITY, RIM_FADE
 from oasis_warp.network.anchors import batch_anchors
 from oasis_warp.network.inputs import Prediction
 
-FIRST, LAST = 1.0, 2.5
+FIRST, LAST = 0.5, 1.25
 """Times the length of the fade at the wrist: up to the first Gaussians have the shapes of their anchors, from the last
 on those that the network gave them. Nearer than that its colours may be too dark."""
 
