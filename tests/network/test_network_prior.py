@@ -9,13 +9,12 @@ import pytest
 import torch
 
 from oasis_warp.assets import asset
-from oasis_warp.avatar.anchors import OPACITY, RIM_FADE, place_anchors
+from oasis_warp.avatar.anchors import OPACITY, RIM_FADE
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, Prior
-from oasis_warp.core import rotation, surface
+from oasis_warp.core import rotation
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
-from oasis_warp.hand.skinning import rest_hand
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network import prior as home
 from oasis_warp.network.inputs import input_of_evidence
@@ -26,7 +25,6 @@ from oasis_warp.network.prior import (
     canonical_gaussians,
     choose_prior,
 )
-from oasis_warp.network.protruding import fade_protruding
 from oasis_warp.network.rim import FIRST, LAST, settle_rim, spread_to_rim
 from oasis_warp.network.weights_file import read_header, save_network
 from oasis_warp.render.render import render
@@ -205,18 +203,3 @@ def test_the_prior_that_ships_is_small_says_how_it_was_trained_and_knows_the_bun
     guess, mean = prior(evidences[0]), MeanPrior(hand)(evidences[0])
     assert all(bool(part.isfinite().all()) for part in guess)
     assert not torch.equal(guess.colors[:100], mean.colors[:100])
-
-
-def test_what_sticks_out_of_the_skin_fades(hand):
-    anchors = place_anchors(hand, rest_hand(hand, torch.zeros(len(hand.shape_names))))
-    plain = anchors.with_colors(torch.rand(len(anchors.opacities), 3, generator=torch.Generator().manual_seed(0)))
-    normals = surface.vertex_normals(hand.template, hand.faces)[plain.vertex_index]
-    out, wide = plain.offsets.clone(), plain.scales.clone()
-    out[::3] = 0.004 * normals[::3]
-    wide[1 : len(out) : 3] *= 10
-    moved = plain._replace(offsets=out, scales=wide)
-    faded = fade_protruding(moved, hand.template, hand.faces)
-    kept = faded.opacities / moved.opacities
-    assert float(kept[: len(out) : 3].mean()) < 0.1  # between fingers what leaves one is in the other
-    assert float(kept[1 : len(out) : 3].mean()) < 0.6
-    assert float(kept[2 : len(out) : 3].mean()) > 0.99 and bool((kept[len(out) :] == 1).all())

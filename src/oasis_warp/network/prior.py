@@ -22,7 +22,6 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import Described, HandNetwork
 from oasis_warp.network.inputs import Prediction, input_of_evidence
 from oasis_warp.network.lora import ColorHeads, cache_head
-from oasis_warp.network.protruding import fade_protruding
 from oasis_warp.network.rim import color_sources, distance_from_rim, settle_rim
 from oasis_warp.network.weights_file import load_network, read_header
 from oasis_warp.ops.recording import Recording
@@ -73,8 +72,7 @@ class NetworkPrior:
 
     def _gaussians(self, prediction: Prediction, evidence: Evidence) -> CanonicalGaussians:
         network, rest = self.network, evidence.rest.vertices
-        settled = settle_rim(prediction, rest, network.faces, network.vertex_faces, network.rim)
-        return fade_protruding(canonical_gaussians(settled, 0), rest, network.faces)
+        return canonical_gaussians(settle_rim(prediction, rest, network.faces, network.vertex_faces, network.rim), 0)
 
     def _predict(self, evidence: Evidence) -> Prediction:
         device, inputs = evidence.image.device, input_of_evidence(evidence)
