@@ -68,7 +68,7 @@ def test_measurements_are_those_with_estimated_poses_and_matched_colours(tmp_pat
     (tmp_path / "metrics.json").write_text(json.dumps({"summary": rows + others}))
     text = measurement_tables(tmp_path / "metrics.json")
     assert "4 people, 16 pictures" in text and "99" not in text
-    assert "| the prior, one-shot | 25.00 | +3.25 | 0.50 | 75% | 21.00 |  | 0.9000 |" in text
+    assert "| the prior, one-shot | 26.00 | +3.25 | 0.50 | 75% | 21.00 |  | 0.9000 |" in text
     assert text.count("| no prior") == 2
 
 

@@ -188,7 +188,7 @@ def is_small(config: ReconstructConfig, *fits: HandFit) -> bool:
 
 def crop_side(fit: HandFit) -> float:
     """Of the square around the hand in the photo [px]."""
-    return square_around(fit.mask, CROP_MARGIN)[2]
+    return float(square_around(fit.mask, CROP_MARGIN)[2])
 
 
 def landmarks_in_crop(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:

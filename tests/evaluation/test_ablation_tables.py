@@ -103,7 +103,7 @@ def test_the_page_is_filled_with_what_is_there(tables, tmp_path):
     (tmp_path / "ablation" / "ablation.json").write_text(json.dumps(made))
     page = "".join(f"before\n<!-- {name} -->\nold\n<!-- end of {name} -->\n" for name in write_evaluation.SECTIONS)
     filled = write_evaluation.fill(page, tmp_path)
-    assert filled.count("old") == 3 and filled.count("before") == 6  # same-hand, probe and one-shot have no file
+    assert filled.count("old") == 4 and filled.count("before") == 7  # same-hand, probe, one-shot and curve have no file
     assert "| mean one-shot | true pose | 21.00 | +1.00 | 0.00 | 100% |" in filled
     assert "| method | true pose | estimated | errors x 2 |" in filled
     assert "| mean calibrated | 20.00 | 20.00 | 20.00 |" in filled
