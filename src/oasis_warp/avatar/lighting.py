@@ -57,7 +57,7 @@ def shading_picture(
     faces: Int[Tensor, "F 3"],
     camera: Camera,
 ) -> Float[Tensor, "H W 3"]:
-    """What `light` multiplies the colours of a picture of the hand with; 1 beside the hand."""
+    """What `light` multiplies the colours of a picture of the hand with; goes on a little beyond it, then 1."""
     factor = shading(light, posed_normals(rest, posed, faces))
     seen = depth_map(posed, faces, camera.viewmat, camera.K, camera.width, camera.height, validate=False)
     on_hand = (seen.face_ids >= 0).to(factor)[..., None]

@@ -62,7 +62,7 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence
 
 
 def without_light(hand: HandModel, evidence: Evidence, light: HandLight) -> Evidence:
-    """The same evidence with the photo as in even light; beside the hand nothing changes."""
+    """The same evidence with the photo as in even light; far from the hand nothing changes."""
     rest, posed = evidence.rest.vertices, evidence.posed.vertices
     factor = shading_picture(light, rest, posed, hand.faces.to(posed.device), evidence.camera)
     return evidence._replace(image=(evidence.image / factor).clamp(0, 1))
