@@ -22,7 +22,8 @@ from oasis_warp.training.complete import complete_field
 from oasis_warp.training.light import even_photo
 from oasis_warp.training.lora_texture import learn_lora
 from oasis_warp.training.picture_fit import aim
-from oasis_warp.training.room_light import fit_light, without_light
+from oasis_warp.training.room_light import fit_light, lit_picture, without_light
+from oasis_warp.training.surely_shown import surely_shown
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
 
@@ -55,7 +56,11 @@ def in_photo(hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence)
     faces = hand.faces.to(evidence.image.device)
     posed = pose_gaussians(gaussians, faces, evidence.rest.vertices, evidence.posed.vertices)
     view = freeze_view(posed, evidence.camera)
-    return InPhoto(posed, view, inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5))
+    return InPhoto(posed, view, _trusted(view, evidence))
+
+
+def _trusted(view: BlendWeights, evidence: Evidence) -> Float[Tensor, "H W"]:
+    return inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5)
 
 
 def adapt(
@@ -88,15 +93,12 @@ def adapt(
         raise ValueError("texture 'lora': expected the heads of the prior, got none. Ask it with guess_with_heads.")
     trained = heads if config.texture == "lora" and config.light != "even" else None
     faces = hand.faces.to(evidence.image.device)
-    posed, view, trusted = in_photo(hand, prior, evidence)
+    posed, view, _ = in_photo(hand, prior, evidence)
 
     progress("calibration", 0, 1)
+    evidence, light = _read(hand, prior, evidence, view, config)
+    trusted = _trusted(view, evidence)
     calibration = _calibration(prior, view, evidence, trusted, config)
-    light = None
-    if config.light != "keep":
-        light = fit_light(hand, _drawn(view, calibration.apply(prior.colors)), evidence)
-        evidence = without_light(hand, evidence, light)
-        calibration = _calibration(prior, view, evidence, trusted, config)
     gaussians = prior._replace(colors=calibration.apply(prior.colors))
     progress("calibration", 1, 1)
 
@@ -118,13 +120,35 @@ def adapt(
     return Adaptation(gaussians._replace(colors=texture.colors), calibration, texture.losses, light)
 
 
-def light_of_photo(
-    hand: HandModel, prior: CanonicalGaussians, evidence: Evidence, config: AdaptConfig
-) -> HandLight:
-    """The light that `adapt` finds in a photo."""
-    _, view, trusted = in_photo(hand, prior, evidence)
-    calibration = _calibration(prior, view, evidence, trusted, config)
-    return fit_light(hand, _drawn(view, calibration.apply(prior.colors)), evidence)
+class Reading(NamedTuple):
+    """A photo as texture is learned from it."""
+
+    evidence: Evidence
+    """As in even light where the light is fitted; its mask is where the photo surely shows what the surface has."""
+    light: HandLight | None
+    """Of the photo; None where it is kept."""
+
+
+def read(hand: HandModel, prior: CanonicalGaussians, evidence: Evidence, config: AdaptConfig) -> Reading:
+    """What `adapt` takes of a photo."""
+    return _read(hand, prior, evidence, in_photo(hand, prior, evidence).view, config)
+
+
+def _read(
+    hand: HandModel, prior: CanonicalGaussians, evidence: Evidence, view: BlendWeights, config: AdaptConfig
+) -> Reading:
+    def drawn(evidence: Evidence) -> Tensor:
+        calibration = _calibration(prior, view, evidence, _trusted(view, evidence), config)
+        return _drawn(view, calibration.apply(prior.colors))
+
+    picture = drawn(evidence)
+    if config.light == "keep":
+        return Reading(surely_shown(hand, picture, evidence), None)
+    # The shaded side of a hand before a dark wall is no wall: what is sure is judged in a first guess of the light.
+    first = lit_picture(hand, picture, evidence, fit_light(hand, picture, evidence))
+    evidence = surely_shown(hand, first, evidence)
+    light = fit_light(hand, drawn(evidence), evidence)
+    return Reading(without_light(hand, evidence, light), light)
 
 
 def _complete(

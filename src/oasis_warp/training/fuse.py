@@ -18,7 +18,7 @@ from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors, stack_weights
 from oasis_warp.render.cameras import orbit_camera
-from oasis_warp.training.adapt import MIN_ALPHA, adapt, in_photo, light_of_photo
+from oasis_warp.training.adapt import MIN_ALPHA, adapt, in_photo, read
 from oasis_warp.training.calibrate import calibrate
 from oasis_warp.training.complete import complete_field
 from oasis_warp.training.light import even_photo
@@ -85,11 +85,9 @@ def fuse(
         sightings = look(hand, evidences, resolution)
         gains, shading = torch.ones_like(sightings.colors[:, 0]), torch.zeros_like(sightings.colors)
         return Fusion(made.gaussians, guesses[0], sightings, gains, shading, made.light and (made.light,))
-    lights = None
-    if config.light != "keep":
-        pairs = list(zip(guesses, evidences, strict=True))
-        lights = tuple(light_of_photo(hand, guess, evidence, config) for guess, evidence in pairs)
-        evidences = unlit(hand, evidences, lights)
+    readings = [read(hand, guess, evidence, config) for guess, evidence in zip(guesses, evidences, strict=True)]
+    evidences = [reading.evidence for reading in readings]
+    lights = tuple(reading.light for reading in readings if reading.light) or None
     sightings = look(hand, evidences, resolution)
     faces = hand.faces.to(evidences[0].image.device)
     guess = mix_guesses(guesses, sightings.confidence * sightings.share + UNSEEN, faces)

@@ -9,8 +9,17 @@ from oasis_warp.avatar.observe import observe
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Evidence, HandLight
 
-RIDGE = 0.01
-"""Weight of an even light, against one of which every direction is seen."""
+USUAL = (1.0, 0.0, -0.12, -0.15)
+"""Harmonics that light has in the mean where a photo's tone is even: more from above, and from the camera's side."""
+SPREAD = (
+    (0.057, 0.0, -0.010, 0.018),
+    (0.0, 0.020, 0.0, 0.0),
+    (-0.010, 0.0, 0.033, -0.006),
+    (0.018, 0.0, -0.006, 0.064),
+)
+"""Their covariance. Both are those of synthetic rooms (tools/measure_light.py), made alike left and right."""
+RIDGE = 0.001
+"""Weight of what is usual, against a light of which every direction is seen."""
 SHOWN = 0.1
 """Confidence from which a vertex counts as shown."""
 RANGE = 0.03, 0.97
@@ -25,8 +34,9 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence
     """The light in which `drawn` looks most like the photo.
 
     Weighted least squares of photo = drawn (h_0 + h . n) over the vertices that the photo shows, a colour at a time, of
-    light and not of sRGB: the first two bands of the harmonics of irradiance (Ramamoorthi and Hanrahan 2001). Where
-    nothing is shown light is even.
+    light and not of sRGB: the first two bands of the harmonics of irradiance (Ramamoorthi and Hanrahan 2001). A photo
+    shows the skin that faces it; what falls on the rest is drawn to what is usual (the maximum a posteriori of a normal
+    distribution). Where nothing is shown light is even.
 
     Args:
         hand: Whose surface it is.
@@ -38,13 +48,13 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence
     faces = hand.faces.to(weight.device)
     normals = posed_normals(evidence.rest.vertices, evidence.posed.vertices, faces)
     basis = torch.cat([torch.ones_like(normals[:, :1]), normals], 1)
-    # a system a colour: [3, V, 4] and [3, V]
-    terms, wanted = basis * known.T[..., None], (light - known).T
+    # a system a colour: [3, V, 4]
+    terms = basis * known.T[..., None]
     weighted = terms * weight[:, None]
     scale = (weight[:, None] * known.square()).sum(0).clamp_min(torch.finfo(known.dtype).eps)
-    ridge = RIDGE * torch.eye(4, dtype=known.dtype, device=known.device) * scale[:, None, None]
-    found = torch.linalg.solve(weighted.mT @ terms + ridge, weighted.mT @ wanted[..., None])[..., 0].T
-    harmonics = torch.cat([found[:1] + 1, found[1:]])
+    ridge = RIDGE * torch.linalg.inv(known.new_tensor(SPREAD)) * scale[:, None, None]
+    right = weighted.mT @ light.T[..., None] + ridge @ known.new_tensor(USUAL)[:, None]
+    harmonics = torch.linalg.solve(weighted.mT @ terms + ridge, right)[..., 0].T
     shown = weight > SHOWN
     if not bool(shown.any()):
         harmonics = torch.zeros_like(harmonics)
@@ -63,6 +73,16 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence
 
 def without_light(hand: HandModel, evidence: Evidence, light: HandLight) -> Evidence:
     """The same evidence with the photo as in even light; far from the hand nothing changes."""
+    return evidence._replace(image=(evidence.image / _factor(hand, evidence, light)).clamp(0, 1))
+
+
+def lit_picture(
+    hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence, light: HandLight
+) -> Float[Tensor, "H W 3"]:
+    """`drawn`, a picture in even light of what `evidence` shows, as `light` shows it."""
+    return (drawn * _factor(hand, evidence, light)).clamp(0, 1)
+
+
+def _factor(hand: HandModel, evidence: Evidence, light: HandLight) -> Float[Tensor, "H W 3"]:
     rest, posed = evidence.rest.vertices, evidence.posed.vertices
-    factor = shading_picture(light, rest, posed, hand.faces.to(posed.device), evidence.camera)
-    return evidence._replace(image=(evidence.image / factor).clamp(0, 1))
+    return shading_picture(light, rest, posed, hand.faces.to(posed.device), evidence.camera)
