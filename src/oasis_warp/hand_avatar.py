@@ -198,7 +198,8 @@ class Avatar:
             "source_camera.K": camera.K,
         }
         if self.light is not None:
-            tensors |= {f"light.{name}": value for name, value in self.light._asdict().items()}
+            light = self.light._asdict()
+            tensors |= {f"light.{name}": value for name, value in light.items() if value is not None}
         header = {
             "side": self.side,
             "hand_model": self.hand.name,

@@ -178,7 +178,7 @@ def test_another_format_is_refused(tmp_path):
 
 def test_the_documentation_lists_every_tensor_and_header_key():
     page = (Path(__file__).parents[2] / "docs" / "avatar_file.md").read_text()
-    for name, entry in TENSORS.items():
+    for name, entry in (TENSORS | LIGHT | SHADE).items():
         shape = ", ".join(map(str, entry.shape))
         assert f"| `{name}` | {str(entry.dtype).removeprefix('torch.')} | {shape} |" in page
     for key in FILE_HEADER:
@@ -204,6 +204,26 @@ def test_light_comes_as_a_whole_or_not_at_all(tmp_path, tensors):
     assert not (tmp_path / "bad").exists()
 
 
-def test_a_file_from_before_there_was_light_is_read(written):
-    rewrite(written, version=1)
-    assert load_avatar(written)[1]["version"] == 1
+def test_shade_comes_with_light_as_a_whole_or_not_at_all(tmp_path, tensors):
+    n = len(tensors["surface_offsets"])
+    light = {name: torch.ones(entry.shape) for name, entry in LIGHT.items()}
+    shade = {"light.shade": torch.full((n, 3), 0.9), "light.facing": torch.eye(3)[torch.arange(n) % 3]}
+    save_avatar(tmp_path / "shaded", {**tensors, **light, **shade}, HEADER)
+    assert load_avatar(tmp_path / "shaded")[0].keys() == tensors.keys() | light.keys() | shade.keys()
+    for change in (
+        {"light.shade": torch.zeros(n, 3)},
+        {"light.shade": torch.ones(n + 1, 3)},
+        {"light.facing": torch.ones(n, 3)},
+    ):
+        with pytest.raises(ValueError, match=next(iter(change))):
+            save_avatar(tmp_path / "bad", {**tensors, **light, **shade, **change}, HEADER)
+    with pytest.raises(ValueError, match="missing light.facing"):
+        save_avatar(tmp_path / "bad", {**tensors, **light, "light.shade": shade["light.shade"]}, HEADER)
+    with pytest.raises(ValueError, match=r"missing light.even"):
+        save_avatar(tmp_path / "bad", {**tensors, **shade}, HEADER)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_an_older_file_is_read(written, version):
+    rewrite(written, version=version)
+    assert load_avatar(written)[1]["version"] == version

@@ -1,12 +1,14 @@
 """The light of a photo is found, taken off it, and stays in the world when the hand turns."""
 
+import math
+
 import pytest
 import torch
 from synthetic import evidence_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.lighting import in_even_light, mirror_light, posed_normals, shading, turn_light
-from oasis_warp.avatar.observe import observe
+from oasis_warp.avatar.observe import inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import rotation, surface
@@ -18,7 +20,7 @@ from oasis_warp.hand_avatar import Avatar
 from oasis_warp.render.cameras import mirrored_camera
 from oasis_warp.render.render import render
 from oasis_warp.training.adapt import adapt
-from oasis_warp.training.room_light import fit_light, without_light
+from oasis_warp.training.room_light import fit_light, with_shade, without_light
 
 LIGHT = HandLight(
     torch.tensor([[0.8, 0.8, 0.8], [0.3, 0.25, 0.2], [-0.2, -0.25, -0.3], [-0.15, -0.15, -0.15]]),
@@ -95,9 +97,59 @@ def test_light_stays_when_the_hand_turns(hand, scene):
     torch.testing.assert_close(follows.pose(turned).colors, before, atol=1e-5, rtol=0)
 
 
+def turn(pose, degrees):
+    x_axis = torch.tensor([1.0, 0.0, 0.0])
+    by = rotation.from_axis_angle(x_axis, torch.tensor(math.radians(degrees)))
+    return pose._replace(orientation=by @ pose.orientation)
+
+
+def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene):
+    even, truth, pose, _ = scene
+    facing = posed_normals(even.rest.vertices, even.posed.vertices, hand.faces)
+    darker = LIGHT._replace(shade=torch.full_like(facing, 0.9), facing=facing)
+    plain, shaded = (avatar(truth, pose, even, light, hand) for light in (LIGHT, darker))
+
+    def ratio(degrees):
+        there = turn(pose, degrees)
+        return shaded.pose(there).colors / plain.pose(there).colors
+
+    torch.testing.assert_close(ratio(0), torch.full_like(truth.colors, 0.9))
+    half = ratio(30)
+    assert bool((half > 0.9 - 1e-5).all()) and bool((half < 1 + 1e-5).all()) and float(half.std()) > 0.01
+    turned = turn(pose, 180)
+    away = (shaded.pose(turned).colors / plain.pose(turned).colors)[: len(truth.vertex_index)]
+    around = facing[truth.vertex_index, 0].abs() < 0.7  # others turn by less
+    torch.testing.assert_close(away[around], torch.ones_like(away[around]))
+    torch.testing.assert_close(shaded.in_even_light().gaussians.colors, plain.in_even_light().gaussians.colors)
+    turned_light = turn_light(darker, rotation.from_axis_angle(torch.tensor([0.0, 1.0, 0.0]), torch.tensor(0.7)))
+    mirrored = mirror_light(mirror_light(turned_light))
+    assert all(torch.equal(a, b) for a, b in zip(mirrored, turned_light, strict=True))
+
+
+def test_a_soft_shadow_is_taken_for_shade_and_a_mark_is_not(hand, scene):
+    even, *_ = scene
+    light = fit_light(hand, even.image, even)
+    height, width = even.mask.shape
+    rows = torch.arange(height)[:, None] / height
+    columns = torch.arange(width) / width
+    soft = 1 - 0.08 * torch.exp(-((rows - 0.6) ** 2 + (columns - 0.5) ** 2) / 0.03)[..., None]
+    shadowed = even._replace(image=even.image * soft)
+    shade = with_shade(hand, even.image, shadowed, shadowed, light)
+    rest = without_light(hand, shadowed, shade).image / without_light(hand, even, light).image.clamp_min(1e-3)
+    inside = inner_mask(even.mask, 6) > 0.5
+    there = inside & (soft[..., 0] < 0.94)
+    assert float((shadowed.image / even.image)[there].mean()) < 0.94 and float(rest[there].mean()) > 0.97
+
+    spot = ((rows - 0.6) ** 2 + (columns - 0.5) ** 2 < 0.002) & inside
+    marked = even._replace(image=torch.where(spot[..., None], 0.3 * even.image, even.image))
+    left = without_light(hand, marked, with_shade(hand, even.image, marked, marked, light)).image
+    assert float((left / without_light(hand, even, light).image)[spot].mean()) < 0.36
+
+
 def test_many_poses_are_lit_as_each_alone(hand, scene):
     even, truth, pose, _ = scene
-    lit = avatar(truth, pose, even, LIGHT, hand)
+    facing = posed_normals(even.rest.vertices, even.posed.vertices, hand.faces)
+    lit = avatar(truth, pose, even, LIGHT._replace(shade=torch.full_like(facing, 0.9), facing=facing), hand)
     poses = [pose, pose._replace(angles=named_pose(hand, "fist"))]
     together = lit.pose(type(pose)(*map(torch.stack, zip(*poses, strict=True))))
     for k, one in enumerate(poses):
@@ -114,10 +166,12 @@ def test_a_left_hand_is_lit_in_the_mirror(hand, scene):
 
 def test_the_file_keeps_the_light(hand, scene, tmp_path):
     even, truth, pose, _ = scene
-    lit = avatar(truth, pose, even, LIGHT, hand)
+    facing = posed_normals(even.rest.vertices, even.posed.vertices, hand.faces)
+    light = LIGHT._replace(shade=torch.full_like(facing, 0.9), facing=facing)
+    lit = avatar(truth, pose, even, light, hand)
     lit.save(tmp_path / "a.safetensors")
     back = Avatar.load(tmp_path / "a.safetensors")
-    assert all(torch.equal(a, b) for a, b in zip(back.light, LIGHT, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(back.light, light, strict=True))
     assert torch.equal(back.pose(pose).colors, lit.pose(pose).colors)
     plain = lit.in_even_light()
     assert plain.light is None

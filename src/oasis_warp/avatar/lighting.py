@@ -1,5 +1,7 @@
 """Light on posed skin: what colours of even light are multiplied with."""
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -12,12 +14,25 @@ from oasis_warp.ops import depth_map, face_rotations
 
 GAMMA = 2.2
 """Light is sRGB to this power, nearly."""
+AS_IN_PHOTO, TURNED_AWAY = math.cos(math.radians(15)), math.cos(math.radians(45))
+"""Cosines of the angle by which skin has turned from where the photo shows it, up to which its shade stays as it is and
+from which it is gone."""
 RIM = 1 / 32
 """Width over which light goes on beyond the surface's outline, over the picture's side."""
 
 
 def shading(light: HandLight, normals: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B V 3"]:
-    """Factor of the sRGB colours of skin that faces `normals` (unit, in the world of the photo's camera)."""
+    """Factor of the sRGB colours of vertices that face `normals` (unit, in the world of the photo's camera)."""
+    factor = directed(light, normals)
+    if light.shade is None or light.facing is None:
+        return factor
+    cosine = (normals * light.facing).sum(-1, keepdim=True)
+    stays = ((cosine - TURNED_AWAY) / (AS_IN_PHOTO - TURNED_AWAY)).clamp(0, 1)
+    return factor * (1 + stays * (light.shade - 1))
+
+
+def directed(light: HandLight, normals: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
+    """The part of the factor that the direction alone decides on."""
     received = light.harmonics[0] + normals @ light.harmonics[1:]
     least, most = light.limits.unbind(0)
     return torch.minimum(torch.maximum(received, least), most).pow(1 / GAMMA)
@@ -30,11 +45,21 @@ def lit_colors(
     normals: Float[Tensor, "*B V 3"],
 ) -> Float[Tensor, "*B N 3"]:
     """Colours of Gaussians in `light`, where the vertices face `normals`."""
-    factor = shading(light, normals)
-    if factor.ndim == 2:
-        return (canonical.colors * vertex_to_gaussians(factor, faces, canonical)).clamp(0, 1)
-    of_poses = vertex_to_gaussians(factor.movedim(0, 1).flatten(1), faces, canonical)
-    return (canonical.colors[:, None] * of_poses.unflatten(1, (-1, 3))).clamp(0, 1).movedim(1, 0)
+    return (canonical.colors * factors(canonical, faces, light, normals)).clamp(0, 1)
+
+
+def factors(
+    canonical: CanonicalGaussians,
+    faces: Int[Tensor, "F 3"],
+    light: HandLight,
+    normals: Float[Tensor, "*B V 3"],
+) -> Float[Tensor, "*B N 3"]:
+    """What `light` multiplies the colours of Gaussians with, where the vertices face `normals`."""
+    of_vertices = shading(light, normals)
+    if of_vertices.ndim == 2:
+        return vertex_to_gaussians(of_vertices, faces, canonical)
+    of_poses = vertex_to_gaussians(of_vertices.movedim(0, 1).flatten(1), faces, canonical)
+    return of_poses.unflatten(1, (-1, 3)).movedim(1, 0)
 
 
 def in_even_light(canonical: CanonicalGaussians, light: HandLight) -> CanonicalGaussians:
@@ -73,9 +98,11 @@ def shading_picture(
 def mirror_light(light: HandLight) -> HandLight:
     """The same light in the mirrored world (x -> -x)."""
     all_around, x, y, z = light.harmonics.unbind(0)
-    return light._replace(harmonics=torch.stack([all_around, -x, y, z]))
+    facing = None if light.facing is None else light.facing * light.facing.new_tensor([-1.0, 1.0, 1.0])
+    return light._replace(harmonics=torch.stack([all_around, -x, y, z]), facing=facing)
 
 
 def turn_light(light: HandLight, rotation: Float[Tensor, "3 3"]) -> HandLight:
     """The same light in a world that `rotation` leads to."""
-    return light._replace(harmonics=torch.cat([light.harmonics[:1], rotation @ light.harmonics[1:]]))
+    facing = None if light.facing is None else light.facing @ rotation.T
+    return light._replace(harmonics=torch.cat([light.harmonics[:1], rotation @ light.harmonics[1:]]), facing=facing)

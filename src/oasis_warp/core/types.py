@@ -149,10 +149,11 @@ class Render(NamedTuple):
 
 
 class HandLight(NamedTuple):
-    """Light that falls on a hand, smooth and without shadows; it stays in the world when the hand turns.
+    """Light that falls on a hand; it stays in the world when the hand turns.
 
     The light that skin reflects is multiplied with `[1, n] @ harmonics`, kept within `limits`, where n is the direction
-    in which skin faces in the world of the photo's camera.
+    in which skin faces in the world of the photo's camera. What that does not tell, soft shadows and gloss, stays on
+    skin for as long as it faces as in the photo.
     """
 
     harmonics: Float[Tensor, "4 3"]
@@ -161,6 +162,10 @@ class HandLight(NamedTuple):
     """Least and most of it that the photo shows, above 0: no more is guessed of what it does not show."""
     even: Float[Tensor, "3"]
     """Light as bright as that on what the photo shows on average, from all around."""
+    shade: Float[Tensor, "V 3"] | None = None
+    """Factor of the sRGB colours of vertices that face as in the photo, beyond all this."""
+    facing: Float[Tensor, "V 3"] | None = None
+    """Where they faced there, unit; comes with `shade`."""
 
 
 class TrainingBatch(NamedTuple):

@@ -1,8 +1,9 @@
 """The avatar file: safetensors with a JSON header, so that loading one executes nothing.
 
-Tensors lie in the file as the tables `TENSORS` and `LIGHT` say. Its metadata have one entry, "oasis-avatar": the
-header, a JSON object whose `version` is 2, or 1 in files from before there was light. A file of a newer version is
-refused. (One entry, because safetensors writes several in any order: the same avatar shall be the same bytes.)
+Tensors lie in the file as the tables `TENSORS`, `LIGHT` and `SHADE` say. Its metadata have one entry, "oasis-avatar":
+the header, a JSON object whose `version` is 3, or less in files from before there was light (1) or shade (2). A file of
+a newer version is refused. (One entry, because safetensors writes several in any order: the same avatar shall be the
+same bytes.)
 """
 
 import json
@@ -21,7 +22,8 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.data.atomic import write_file
 
 FORMAT = "oasis-avatar"
-VERSION = 2
+VERSION = 3
+UNIT_TOLERANCE = 1e-3
 UNITS = {"length": "m", "angle": "rad", "quaternion": "wxyz", "color": "sRGB in [0, 1]", "camera": "OpenCV"}
 
 
@@ -59,6 +61,11 @@ LIGHT = {
     "light.limits": Entry(torch.float32, (2, 3)),
     "light.even": Entry(torch.float32, (3,)),
 }
+SHADE = {
+    # What that light does not tell: both, or neither.
+    "light.shade": Entry(torch.float32, ("V", 3)),
+    "light.facing": Entry(torch.float32, ("V", 3)),
+}
 HEADER = {"version": int, "side": str, "hand_model": str, "hand_licence": str, "source_camera": dict}
 """Keys that a header has at least, and their types; `source_camera` holds `width` and `height` [px]."""
 
@@ -68,7 +75,8 @@ def save_avatar(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping
 
     Args:
         path: Where to; an existing file is replaced.
-        tensors: One for every name of `TENSORS`, and of `LIGHT` or none of them, on any device.
+        tensors: One for every name of `TENSORS`, of `LIGHT` or none of them, and then of `SHADE` or none, on any
+            device.
         header: The keys of `HEADER` and any others; `version`, `units`, `counts` and `creator` are filled in.
 
     Raises:
@@ -152,7 +160,11 @@ def _check_header(header: Any) -> None:
 
 def _check_tensors(tensors: Mapping[str, Tensor]) -> dict[str, int]:
     """Check the tensors against the table; the size of each letter."""
-    table = TENSORS | LIGHT if tensors.keys() & LIGHT.keys() else TENSORS
+    table = dict(TENSORS)
+    if tensors.keys() & (LIGHT.keys() | SHADE.keys()):
+        table |= LIGHT
+    if tensors.keys() & SHADE.keys():
+        table |= SHADE
     missing, unknown = table.keys() - tensors.keys(), tensors.keys() - table.keys()
     if missing or unknown:
         found = {"missing": missing, "unknown": unknown}
@@ -186,6 +198,9 @@ def _check_gaussians(tensors: Mapping[str, Tensor]) -> None:
         limits = tensors["light.limits"]
         good["light.limits"] = (limits > 0) & (limits[0] <= limits[1]), "the least, above 0, over the most"
         good["light.even"] = tensors["light.even"] > 0, "light"
+    if "light.shade" in tensors:
+        good["light.shade"] = (tensors["light.shade"] > 0).all(1), "factors above 0"
+        good["light.facing"] = (tensors["light.facing"].norm(dim=1) - 1).abs() < UNIT_TOLERANCE, "unit vectors"
     for name, (ok, expected) in good.items():
         if not bool(ok.all()):
             raise ValueError(f"{name}: expected {expected}, got {int((~ok).sum())} bad rows of {len(ok)}")

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
-from oasis_warp.avatar.lighting import in_even_light
+from oasis_warp.avatar.lighting import factors, in_even_light, posed_normals
 from oasis_warp.avatar.observe import inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.config import AdaptConfig
@@ -22,7 +22,7 @@ from oasis_warp.training.complete import complete_field
 from oasis_warp.training.light import even_photo
 from oasis_warp.training.lora_texture import learn_lora
 from oasis_warp.training.picture_fit import aim
-from oasis_warp.training.room_light import fit_light, lit_picture, without_light
+from oasis_warp.training.room_light import fit_light, lit_picture, with_shade, without_light
 from oasis_warp.training.surely_shown import surely_shown
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
@@ -74,9 +74,10 @@ def adapt(
     """Fit the colours of `prior` to the photo; geometry stays.
 
     Colour calibration first, then the seen colours are carried smoothly over the rim of the seen region, then texture
-    learning with reference views. With `config.light` "fit" all that is done with the photo without its light. With
-    "even" what else may be light is left out, too, and the last step falls away. With `config.texture` "lora" texture
-    learning follows upon calibration, as in the paper.
+    learning with reference views. With `config.light` "fit" the first two look at the photo without its light, where
+    it surely shows the hand, and the last draws colours in that light. With "even" what else may be light is left out,
+    too, and the last step falls away. With `config.texture` "lora" texture learning follows upon calibration, as in the
+    paper.
 
     Args:
         hand: The model.
@@ -96,7 +97,8 @@ def adapt(
     posed, view, _ = in_photo(hand, prior, evidence)
 
     progress("calibration", 0, 1)
-    evidence, light = _read(hand, prior, evidence, view, config)
+    photo = evidence
+    evidence, light = _read(hand, prior, photo, view, config)
     trusted = _trusted(view, evidence)
     calibration = _calibration(prior, view, evidence, trusted, config)
     gaussians = prior._replace(colors=calibration.apply(prior.colors))
@@ -112,7 +114,9 @@ def adapt(
         freeze_view(posed, orbit_camera(evidence.posed.vertices, azimuth, size=evidence.camera.width))
         for azimuth in reference_azimuths(config.reference_views)
     ]
-    pictures = aim(view, evidence.image, evidence.mask * trusted, references, gaussians.colors)
+    shown = photo.mask * _trusted(view, photo)
+    shining = light and _light_on(hand, gaussians, photo, light)
+    pictures = aim(view, photo.image, shown, references, gaussians.colors, shining)
     if trained is None:
         texture = learn_texture(gaussians, faces, pictures, config, progress)
     else:
@@ -121,10 +125,10 @@ def adapt(
 
 
 class Reading(NamedTuple):
-    """A photo as texture is learned from it."""
+    """A photo as the skin is read from it."""
 
     evidence: Evidence
-    """As in even light where the light is fitted; its mask is where the photo surely shows what the surface has."""
+    """As in even light, its mask where it surely shows what the surface has there. The photo itself with "keep"."""
     light: HandLight | None
     """Of the photo; None where it is kept."""
 
@@ -141,14 +145,22 @@ def _read(
         calibration = _calibration(prior, view, evidence, _trusted(view, evidence), config)
         return _drawn(view, calibration.apply(prior.colors))
 
-    picture = drawn(evidence)
     if config.light == "keep":
-        return Reading(surely_shown(hand, picture, evidence), None)
+        return Reading(evidence, None)
     # The shaded side of a hand before a dark wall is no wall: what is sure is judged in a first guess of the light.
-    first = lit_picture(hand, picture, evidence, fit_light(hand, picture, evidence))
-    evidence = surely_shown(hand, first, evidence)
-    light = fit_light(hand, drawn(evidence), evidence)
-    return Reading(without_light(hand, evidence, light), light)
+    picture = drawn(evidence)
+    sure = surely_shown(hand, lit_picture(hand, picture, evidence, fit_light(hand, picture, evidence)), evidence)
+    light = fit_light(hand, drawn(sure), sure)
+    light = with_shade(hand, drawn(without_light(hand, sure, light)), evidence, sure, light)
+    return Reading(without_light(hand, sure, light), light)
+
+
+def _light_on(
+    hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence, light: HandLight
+) -> Float[Tensor, "N 3"]:
+    """What the light of a photo multiplies the colours of `gaussians` with in it."""
+    rest, faces = evidence.rest.vertices, hand.faces.to(evidence.image.device)
+    return factors(gaussians, faces, light, posed_normals(rest, evidence.posed.vertices, faces))
 
 
 def _complete(

@@ -85,6 +85,7 @@ def fuse(
         sightings = look(hand, evidences, resolution)
         gains, shading = torch.ones_like(sightings.colors[:, 0]), torch.zeros_like(sightings.colors)
         return Fusion(made.gaussians, guesses[0], sightings, gains, shading, made.light and (made.light,))
+    photos = evidences
     readings = [read(hand, guess, evidence, config) for guess, evidence in zip(guesses, evidences, strict=True)]
     evidences = [reading.evidence for reading in readings]
     lights = tuple(reading.light for reading in readings if reading.light) or None
@@ -92,7 +93,7 @@ def fuse(
     faces = hand.faces.to(evidences[0].image.device)
     guess = mix_guesses(guesses, sightings.confidence * sightings.share + UNSEEN, faces)
     gains = photo_gains(sightings, vertex_colors(guess, len(hand.template)))
-    made, shading = _adapt(hand, guess, evidences, sightings, gains, config, progress)
+    made, shading = _adapt(hand, guess, photos, evidences, sightings, gains, config, progress)
     if lights is not None and config.light == "even":
         made, lights = in_even_light(made, lights[0]), None
     return Fusion(made, guess, sightings, gains, shading, lights)
@@ -139,25 +140,25 @@ def add_detail(
 
 
 def _adapt(
-    hand: HandModel, guess: CanonicalGaussians, evidences: Sequence[Evidence], sightings: Sightings, gains: Tensor,
-    config: AdaptConfig, progress: Progress,
+    hand: HandModel, guess: CanonicalGaussians, photos: Sequence[Evidence], evidences: Sequence[Evidence],
+    sightings: Sightings, gains: Tensor, config: AdaptConfig, progress: Progress,
 ) -> tuple[CanonicalGaussians, Float[Tensor, "K V 3"]]:  # fmt: skip
     """The steps of `training.adapt.adapt`, on all photos at once: their pictures stand below each other as one.
 
-    A pixel counts as much as its photo is to be believed there. With the Gaussians comes `Fusion.shading`.
+    A pixel counts as much as its photo is to be believed there. `evidences` are what `training.adapt.read` takes of
+    `photos`. With the Gaussians comes `Fusion.shading`.
     """
     first = evidences[0]
     faces, rest = hand.faces.to(first.image.device), first.rest.vertices
     posed = [pose_gaussians(guess, faces, e.rest.vertices, e.posed.vertices) for e in evidences]
     views = [freeze_view(there, evidence.camera) for there, evidence in zip(posed, evidences, strict=True)]
     lit = [evidence.image / gain for evidence, gain in zip(evidences, gains, strict=True)]
-    trusted = []
-    for evidence, view, share in zip(evidences, views, sightings.share, strict=True):
+    believed = []
+    for view, share in zip(views, sightings.share, strict=True):
         drawn = blend_colors(view, vertex_to_gaussians(share[:, None], faces, guess))
-        solid = view.alphas > 0.5
-        believed = (drawn / view.alphas.clamp_min(MIN_ALPHA) * solid)[..., 0]
-        trusted.append(inner_mask(evidence.mask, 1) * believed)
-    tall, trust = stack_weights(views), torch.cat(trusted)
+        believed.append((drawn / view.alphas.clamp_min(MIN_ALPHA) * (view.alphas > 0.5))[..., 0])
+    tall = stack_weights(views)
+    trust = torch.cat([inner_mask(e.mask, 1) * own for e, own in zip(evidences, believed, strict=True)])
 
     progress("calibration", 0, 1)
     if config.calibration == "on":
@@ -195,7 +196,7 @@ def _adapt(
         freeze_view(posed[0], orbit_camera(first.posed.vertices, azimuth, size=first.camera.width))
         for azimuth in reference_azimuths(config.reference_views)
     ]
-    mask = torch.cat([evidence.mask for evidence in evidences]) * trust
+    mask = torch.cat([e.mask * inner_mask(e.mask, 1) * own for e, own in zip(photos, believed, strict=True)])
     guess = guess._replace(colors=colors)
     pictures = aim(tall, torch.cat(lit), mask, references, colors)
     texture = learn_texture(guess, faces, pictures, config, progress)

@@ -33,6 +33,8 @@ class Aim(NamedTuple):
     references: list[BlendWeights]
     kept: list[Float[Tensor, "H W 3"]]
     """What each reference view must stay like."""
+    light: Float[Tensor, "N 3"] | None = None
+    """Factors that the photo's light multiplies colours with; reference views are in even light."""
 
 
 class Texture(NamedTuple):
@@ -44,11 +46,17 @@ class Texture(NamedTuple):
 
 
 def aim(
-    view: BlendWeights, target: Tensor, mask: Tensor, references: list[BlendWeights], colors: Float[Tensor, "N 3"]
+    view: BlendWeights,
+    target: Tensor,
+    mask: Tensor,
+    references: list[BlendWeights],
+    colors: Float[Tensor, "N 3"],
+    light: Float[Tensor, "N 3"] | None = None,
 ) -> Aim:
     """Reference views must stay as Gaussians of `colors` draw them."""
     with torch.no_grad():
-        return Aim(view, target, mask, references, [blend_colors(reference, colors) for reference in references])
+        kept = [blend_colors(reference, colors) for reference in references]
+    return Aim(view, target, mask, references, kept, light)
 
 
 def fit_parameters(
@@ -85,7 +93,7 @@ def fit_parameters(
     settled = [torch.zeros_like(parameter) for parameter in parameters]
     for step in range(total):
         now = colors()
-        image = blend_colors(aim.view, now) + beyond
+        image = blend_colors(aim.view, now if aim.light is None else now * aim.light) + beyond
         loss = config.weight_rgb * masked_l1(image, aim.target, aim.mask)
         loss = loss + config.weight_ssim * masked_dssim(image * aim.mask[..., None], photo, aim.mask)
         if aim.references and config.references == "in_turn":

@@ -8,6 +8,7 @@ from oasis_warp.avatar.lighting import GAMMA, posed_normals, shading, shading_pi
 from oasis_warp.avatar.observe import observe
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Evidence, HandLight
+from oasis_warp.training.complete import complete_field
 
 USUAL = (1.0, 0.0, -0.12, -0.15)
 """Harmonics that light has in the mean where a photo's tone is even: more from above, and from the camera's side."""
@@ -26,6 +27,14 @@ RANGE = 0.03, 0.97
 """Quantiles of the light on what is shown, between which it is kept."""
 BRIGHTEST = 0.995
 """Quantile of the colours of skin without its light that still are colours."""
+SHADE_LENGTH = 0.008
+"""What changes over longer ways on the skin is more likely light [m]; see `training.light`."""
+FAINT = 0.1
+"""Most that is taken for shade, as the logarithm of a colour."""
+STRANGE, STRANGE_FADE = 1.5, 0.001
+"""The same where the photo may show something else, and the way over which that ends [m]."""
+DARK = 0.02
+"""Colours below it have no logarithm worth the name [sRGB]."""
 DARKEST = 0.05
 """Least light, over the mean: colours are divided by it."""
 
@@ -68,7 +77,34 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence
     # Colours end at 1. Skin under less light than the mean would have to be brighter than that: all light is more then.
     ratio = seen.colors[shown] / shading(relative, normals[shown])
     brightest = torch.quantile(ratio.amax(1), BRIGHTEST).clamp_min(1) ** GAMMA
-    return HandLight(*(part * brightest for part in relative))
+    return HandLight(relative.harmonics * brightest, relative.limits * brightest, relative.even * brightest)
+
+
+def with_shade(
+    hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence, sure: Evidence, light: HandLight
+) -> HandLight:
+    """`light` with what it still misses of the photo and the skin should not keep.
+
+    That is what changes slowly along the skin and is faint: of such differences next to nothing is found again on other
+    pictures of a hand, they are soft shadows, light from wall and palm, gloss. Stronger ones may be a mark on the skin,
+    which stays the hand's. And it is all that is seen where the photo may show something else.
+
+    Args:
+        hand: Whose surface it is.
+        drawn: What the hand looks like in even light, as the photo shows it; everywhere on it.
+        evidence: The photo.
+        sure: The same with the mask of `surely_shown`.
+        light: Of the photo.
+    """
+    faces, rest = hand.faces.to(drawn.device), evidence.rest.vertices
+    lit = lit_picture(hand, drawn, evidence, light)
+    seen, known = observe(hand, evidence), observe(hand, evidence._replace(image=lit)).colors
+    missing = (seen.colors.clamp_min(DARK) / known.clamp_min(DARK)).log()
+    believed = observe(hand, sure).confidence
+    slow = complete_field(rest, faces, missing, believed, SHADE_LENGTH).clamp(-FAINT, FAINT)
+    strange = complete_field(rest, faces, missing - slow, seen.confidence - believed, fade=STRANGE_FADE)
+    facing = posed_normals(rest, evidence.posed.vertices, faces)
+    return light._replace(shade=(slow + strange.clamp(-STRANGE, STRANGE)).exp(), facing=facing)
 
 
 def without_light(hand: HandModel, evidence: Evidence, light: HandLight) -> Evidence:

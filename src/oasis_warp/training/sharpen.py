@@ -31,7 +31,6 @@ from oasis_warp.training.carried import (
     look,
     with_neighbours,
 )
-from oasis_warp.training.surely_shown import surely_shown
 from oasis_warp.training.views import freeze_view
 
 FACING = 0.3, 0.5
@@ -84,8 +83,7 @@ def sharpen(
     around it are cut as well, so that finer Gaussians fade into coarser ones. The colours minimise the squared
     difference of pictures that are linear in them: a photo in its own view, and what the surface carries of all photos
     in four views beside, in both sizes; of several photos each the colours where it is believed most, one after the
-    other. At outlines, on a slant, where the wrist ends and where a photo may show something else the avatar stays as
-    it is.
+    other. At outlines, on a slant and where the wrist ends the avatar stays as it is.
 
     Args:
         hand: Whose surface it is.
@@ -99,16 +97,12 @@ def sharpen(
     believed = rest.new_ones(1, len(rest)) if believed is None else believed
     fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
     fading = with_neighbours(fading[faces].any(1), faces, len(rest))
-    old = [pose_gaussians(gaussians, faces, rest, evidence.posed.vertices) for evidence in evidences]
-    drawn = [render(there, evidence.camera) for there, evidence in zip(old, evidences, strict=True)]
-    sure = [
-        surely_shown(hand, image / alpha.clamp_min(MIN_ALPHA)[..., None], evidence)
-        for (image, alpha), evidence in zip(drawn, evidences, strict=True)
-    ]
-    sources = [_source(e, faces, fading, own) for e, own in zip(sure, believed, strict=True)]
+    sources = [_source(e, faces, fading, own) for e, own in zip(evidences, believed, strict=True)]
+    old = [pose_gaussians(gaussians, faces, rest, source.posed) for source in sources]
     spacing = torch.stack([
-        _wanted_spacing(source, image, faces) for source, (image, _) in zip(sources, drawn, strict=True)
-    ]).amin(0)
+        _wanted_spacing(source, render(there, source.canvas.camera).image, faces)
+        for source, there in zip(sources, old, strict=True)
+    ]).amin(0)  # fmt: skip
     missing = spacing.isfinite()
     if not bool(missing.any()):
         return Sharpened(gaussians, 0, ())
