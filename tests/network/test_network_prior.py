@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import pickle
 from dataclasses import replace
 from importlib import resources
 
@@ -39,6 +40,19 @@ def covariances(gaussians):
 @pytest.fixture(scope="module")
 def untrained(make_network, tiny):
     return NetworkPrior(make_network(tiny, awake=False))
+
+
+def on_gpu(value):
+    if isinstance(value, torch.Tensor):
+        return value.to("cuda")
+    return type(value)(*map(on_gpu, value)) if isinstance(value, tuple) else value
+
+
+@pytest.mark.gpu
+def test_a_prior_that_was_recorded_can_be_sent_to_other_processes(make_network, tiny, evidences):
+    prior, there = NetworkPrior(make_network(tiny), {"name": "tiny"}), on_gpu(evidences[0])
+    guess = [prior(there) for _ in range(3)][-1]
+    torch.testing.assert_close(pickle.loads(pickle.dumps(prior))(there).colors, guess.colors)
 
 
 @pytest.mark.parametrize("which", [0, 1])

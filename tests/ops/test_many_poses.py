@@ -166,7 +166,8 @@ def test_a_graph_that_was_captured_once_follows_new_inputs_forwards_and_backward
     function, inputs = calls(device="cuda", validate=False)[name]
     _, others = calls(seed=3, device="cuda")[name]
     leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-    weights = [torch.randn_like(o) for o in function(*leaves)]
+    with torch.no_grad():
+        weights = [torch.randn_like(o) for o in function(*leaves)]
 
     def step():
         out = function(*leaves)

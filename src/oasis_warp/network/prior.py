@@ -44,6 +44,9 @@ class NetworkPrior:
         self._ready_for: tuple[torch.device, int] | None = None
         """Where and for which size of photos all kernels are loaded."""
 
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_recording": None, "_ready_for": None}  # a copy makes its own, where it is
+
     @torch.no_grad()
     def __call__(self, evidence: Evidence) -> CanonicalGaussians:
         """The whole hand, guessed from one photo; the network goes where the photo is."""
