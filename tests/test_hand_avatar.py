@@ -233,9 +233,10 @@ def test_a_gpu_poses_what_the_cpu_poses_in_a_graph_too(side, left, right, tmp_pa
         part.copy_(new)
     graph.replay()
     want, eager = here.pose(pose), there.pose(pose)
-    for ours, again, theirs in zip(captured[:3], eager[:3], want[:3], strict=True):
+    # The last bit of a vertex half a metre away, 6e-8 m, turns a face of .3 mm by 2e-4.
+    for ours, again, theirs, off in zip(captured[:3], eager[:3], want[:3], (1e-5, 5e-4, 1e-5), strict=True):
         assert torch.equal(ours, again)
-        torch.testing.assert_close(ours.cpu(), theirs, atol=1e-5, rtol=0)
+        torch.testing.assert_close(ours.cpu(), theirs, atol=off, rtol=0)
 
 
 def test_fewer_gaussians_make_a_smaller_file_and_still_an_avatar(right):

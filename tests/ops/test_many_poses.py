@@ -161,6 +161,7 @@ def test_wrong_correctives_are_named_with_what_was_expected(options, message, as
 
 
 @pytest.mark.gpu
+@pytest.mark.filterwarnings("ignore:The AccumulateGrad node's stream does not match")
 @pytest.mark.parametrize("name", [*SHARED, "skin correctives"])
 def test_a_graph_that_was_captured_once_follows_new_inputs_forwards_and_backwards(name):
     function, inputs = calls(device="cuda", validate=False)[name]

@@ -268,6 +268,7 @@ def test_a_bad_value_is_refused_by_name(name, device):
 
 
 @pytest.mark.gpu
+@pytest.mark.filterwarnings("ignore:The CUDA Graph is empty")
 def test_a_look_at_values_is_refused_in_a_graph():
     arguments = on("cuda", make(small_faces, 1, 33, 20, torch.float32))
     depth_map(*arguments)

@@ -90,7 +90,9 @@ def shading_picture(
     # the outlines of picture and surface may differ by a few pixels
     window = 2 * round(RIM * camera.width) + 1
     planes = torch.cat([inside * on_hand, on_hand], -1).permute(2, 0, 1)[None]
-    spread = avg_pool2d(planes, window, stride=1, padding=window // 2)[0].permute(1, 2, 0)
+    for size in ((1, window), (window, 1)):  # rows, then columns: the same mean
+        planes = avg_pool2d(planes, size, stride=1, padding=(size[0] // 2, size[1] // 2))
+    spread = planes[0].permute(1, 2, 0)
     beyond = torch.where(spread[..., 3:] > 0, spread[..., :3] / spread[..., 3:].clamp_min(1e-6), 1)
     return torch.where(on_hand > 0, inside, beyond)
 

@@ -47,7 +47,7 @@ def kernel_times(run: Callable[[], object], calls: int = 20) -> list[KernelTime]
     for _ in range(calls):
         run()
     torch.cuda.synchronize()
-    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA], acc_events=True) as profile:
         for _ in range(calls):
             run()
         torch.cuda.synchronize()

