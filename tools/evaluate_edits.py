@@ -68,9 +68,15 @@ def saved(photo: Photo, quality: int) -> Photo:
 
 @torch.no_grad()
 def judge(truth: Truth, chart: Chart, edited: Avatar, pose: HandPose, camera: Camera) -> dict[str, float]:
-    """PSNR [dB] against the truth: in the paint, around it too, and elsewhere, before and after."""
+    """PSNR [dB] against the truth: in the paint, around it too, and elsewhere, before and after.
+
+    The truth is lit alike from everywhere, so avatars are drawn in even light but for the photo's view.
+    """
     true = draw_truth(truth, chart, pose, camera)
-    before, after = (avatar.render(camera, pose, BLACK).image for avatar in (truth.avatar, edited))
+    avatars = [truth.avatar, edited]
+    if camera is not truth.camera:
+        avatars = [avatar.in_even_light() for avatar in avatars]
+    before, after = (avatar.render(camera, pose, BLACK).image for avatar in avatars)
     whole = (true.alpha > COVERED).float()
     area = edited_area(truth, true.paint, camera, AROUND) * whole
     paint = (true.paint > 0).float() * whole

@@ -34,6 +34,9 @@ MIN_PAINT = 0.02
 """Share of paint from which a pixel's face is cut into finer parts."""
 SPACING = 1.0
 """Distance between the finer Gaussians [pixels of the painted picture]."""
+RINGS = 4
+"""Of faces round the paint whose Gaussians are replaced, too: those of a learned prior reach so far, and would lay a
+veil over the paint in other views."""
 ZOOMS = (1.0, 2.0)
 """Sizes of the views beside the photo's over its own: the smaller a picture, the more the rasterizer's own blur."""
 
@@ -64,7 +67,7 @@ def repaint(
     steps: int = 40,
     progress: Progress = silent,
 ) -> Repainted:
-    """Replace the Gaussians under the paint, and one ring of faces around it, by finer ones that show the paint.
+    """Replace the Gaussians under the paint, and a few rings of faces around it, by finer ones that show it.
 
     Their colours minimise the squared difference of pictures that are linear in them: in the photo's view the painted
     picture where there is paint and the old avatar elsewhere, in views beside it the same carried over by the surface.
@@ -87,7 +90,9 @@ def repaint(
     under[seen.faces[seen.share > MIN_PAINT]] = True
     if not bool(under.any()):
         raise ValueError("canvas: expected paint on the hand, got none. Check its mask and its camera.")
-    around = with_neighbours(under, faces, len(rest))
+    around = under
+    for _ in range(RINGS):
+        around = with_neighbours(around, faces, len(rest))
     _, depth = project(canvas.camera, posed)
     pixel = depth[faces].mean(1) / canvas.camera.K[0, 0]
     # A face of one part would keep its vertices' Gaussians, which reach into the faces beside it.
