@@ -7,7 +7,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.avatar_file import FORMAT, LIGHT, TENSORS, UNITS, VERSION, load_avatar, save_avatar
+from oasis_warp.data.avatar_file import FORMAT, LIGHT, SHADE, TENSORS, UNITS, VERSION, load_avatar, save_avatar
 from oasis_warp.data.avatar_file import HEADER as FILE_HEADER
 
 SIZES = {"S": 4, "V": 30, "P": 5, "Q": 7, "N": 12}
