@@ -132,7 +132,7 @@ def test_a_newer_version_is_refused_with_the_remedy(written):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"version": 0}, "expected version 1 to 2, got 0"),
+        ({"version": 0}, "expected version 1 to 3, got 0"),
         ({"version": "1"}, "expected 'version' of type int, got '1'"),
         ({"side": "both"}, "expected side 'left' or 'right', got 'both'"),
         ({"hand_model": None}, "expected 'hand_model' of type str, got None"),
