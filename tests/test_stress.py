@@ -25,7 +25,7 @@ SAID = {
     "nail polish": "", "tattoo": "", "glove": "colour of skin",
 }  # fmt: skip
 """What the report must warn about, if anything."""
-LIKE = 18.0
+LIKE = 17.0
 """An avatar of a damaged photo is as like that of the whole one as this, at least [dB]."""
 
 

@@ -20,6 +20,7 @@ def short(monkeypatch, small):
     monkeypatch.setattr(error_time, "Sweep", few)
 
 
+@pytest.mark.slow
 def test_error_time_writes_tables_and_says_that_plots_need_matplotlib(short, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(pareto, "find_spec", lambda name: None)
     assert main(["bench", "error-time", "-o", str(tmp_path / "out"), "--repeats", "2"]) == 0
@@ -50,6 +51,7 @@ def test_an_interrupted_measurement_leaves_nothing(short, monkeypatch, tmp_path,
     assert capsys.readouterr().err.endswith("oasis: stopped, nothing written.\n")
 
 
+@pytest.mark.slow
 def test_kernels_prints_a_table_and_writes_json(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(speed, "surfels", lambda n, size, seed: layered(n=n, size=size, seed=seed))
     file = tmp_path / "speed.json"

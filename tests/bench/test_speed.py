@@ -18,6 +18,7 @@ def mesh():
     return hand_scenes(32)[1]
 
 
+@pytest.mark.slow
 def test_every_way_is_timed_in_every_pass_and_all_agree(small, cpu):
     rows = speed.measure_operator(OPERATORS["rasterization"], small, WAYS, cpu, 1, 2)
     assert [(r.pass_, r.way) for r in rows] == [

@@ -8,7 +8,7 @@ from oasis_warp.certify.determinism import differing, everything, same_bits
 from oasis_warp.certify.families import FAMILIES
 
 
-@pytest.mark.parametrize("repeats", [17, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("repeats", [17, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FAMILIES)
 def test_repeats_on_one_two_and_three_threads_give_the_same_bits(name, repeats, device):
     family = FAMILIES[name]

@@ -105,6 +105,7 @@ def test_the_command_line_offers_every_operator():
     assert get_args(options.FamilyName) == tuple(FAMILIES)
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_the_processes_of_the_grid_and_leaves_no_file(tmp_path):
     command = [sys.executable, "-m", "oasis_warp", "gradcheck", "--scenes", "100000", "--jobs", "2",
                "--json", str(tmp_path / "all.json")]  # fmt: skip

@@ -26,7 +26,9 @@ def test_float32_operators_keep_their_bounds_on_the_first_scenes_of_the_grid(nam
 SMALL = {"rasterization": {"n": 40, "size": (17, 15), "channels": 3, "mode": "RGB"}}
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize(
+    "dtype", [torch.float32, pytest.param(torch.float64, marks=pytest.mark.slow)], ids=["float32", "float64"]
+)
 @pytest.mark.parametrize("name", FAMILIES)
 def test_small_scenes_of_every_condition_equal_the_twins(name, dtype, device):
     family = FAMILIES[name]
@@ -37,6 +39,7 @@ def test_small_scenes_of_every_condition_equal_the_twins(name, dtype, device):
             assert not [m for m in found if not m.passed]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILIES)
 def test_float64_operators_are_exact_on_the_first_scenes_of_the_grid(name, device):
     family = FAMILIES[name]
@@ -114,6 +117,7 @@ def test_nan_fails_every_bound():
     assert LAYER > 1 / 255
 
 
+@pytest.mark.slow
 def test_processes_measure_what_one_process_measures():
     todo = grid.scenes(("pose_on_mesh", "face_rotations"), 44, 0)
     cpu = torch.device("cpu")

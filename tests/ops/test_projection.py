@@ -278,6 +278,7 @@ torch.save(bits(run(ordinary_scene(17, n=29, cameras=2))), sys.argv[1])
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="flags of x86")
 @pytest.mark.parametrize("flags", ["-target-cpu x86-64-v3", "-target-cpu x86-64-v2"])
 def test_narrower_vectors_give_the_same(flags, tmp_path):
