@@ -25,8 +25,10 @@ SAID = {
     "nail polish": "", "tattoo": "", "glove": "colour of skin",
 }  # fmt: skip
 """What the report must warn about, if anything."""
-LIKE = 17.0
+LIKE = 18.0
 """An avatar of a damaged photo is as like that of the whole one as this, at least [dB]."""
+LIKE_IN_THE_DARK = 17.0
+"""The same for a photo with hardly any light, of which less is told apart from skin."""
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +77,7 @@ def test_a_damaged_photo_makes_a_hand_and_the_report_says_what_ails_it(whole, na
     assert base.warnings == ()
     made = make(STRESSES[name](photo, base), FEW, force=True)
     assert is_sane(made.avatar.gaussians)
-    assert likeness(base.avatar, made.avatar) > LIKE
+    assert likeness(base.avatar, made.avatar) > (LIKE_IN_THE_DARK if name == "dark" else LIKE)
     assert SAID[name] in "; ".join(made.warnings)
 
 

@@ -23,19 +23,14 @@ RIM = 1 / 32
 
 def shading(light: HandLight, normals: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B V 3"]:
     """Factor of the sRGB colours of vertices that face `normals` (unit, in the world of the photo's camera)."""
-    factor = directed(light, normals)
+    received = light.harmonics[0] + normals @ light.harmonics[1:]
+    least, most = light.limits.unbind(0)
+    factor = torch.minimum(torch.maximum(received, least), most).pow(1 / GAMMA)
     if light.shade is None or light.facing is None:
         return factor
     cosine = (normals * light.facing).sum(-1, keepdim=True)
     stays = ((cosine - TURNED_AWAY) / (AS_IN_PHOTO - TURNED_AWAY)).clamp(0, 1)
     return factor * (1 + stays * (light.shade - 1))
-
-
-def directed(light: HandLight, normals: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
-    """The part of the factor that the direction alone decides on."""
-    received = light.harmonics[0] + normals @ light.harmonics[1:]
-    least, most = light.limits.unbind(0)
-    return torch.minimum(torch.maximum(received, least), most).pow(1 / GAMMA)
 
 
 def lit_colors(
