@@ -20,26 +20,36 @@ def views(device):
 
 
 def test_stacked_pictures_are_the_pictures_below_each_other(views, device):
-    colors = torch.rand(60, 3, generator=torch.Generator().manual_seed(1)).to(device)
+    random = torch.Generator().manual_seed(1)
+    colors = [torch.rand(60, 3, generator=random).to(device) for _ in views]
     stacked = stack_weights(views)
-    apart = torch.cat([blend_colors(view, colors) for view in views])
+    apart = torch.cat([blend_colors(view, own) for view, own in zip(views, colors, strict=True)])
     off = 0.0 if device.type == "cpu" else 1e-6  # a GPU adds in orders of its own
-    torch.testing.assert_close(blend_colors(stacked, colors), apart, atol=off, rtol=0)
+    torch.testing.assert_close(blend_colors(stacked, torch.cat(colors)), apart, atol=off, rtol=0)
     assert torch.equal(stacked.alphas, torch.cat([view.alphas for view in views]))
 
 
-def test_gradients_of_stacked_pictures_are_the_sums_of_theirs(views, device):
+def test_gradients_of_stacked_pictures_are_theirs(views, device):
     random = torch.Generator().manual_seed(2)
-    colors = torch.rand(60, 3, generator=random).to(device).requires_grad_(True)
+    colors = torch.rand(3, 60, 3, generator=random).to(device).requires_grad_(True)
     wanted = torch.randn(48, 24, 3, generator=random).to(device)
-    (together,) = torch.autograd.grad((blend_colors(stack_weights(views), colors) * wanted).sum(), colors)
-    apart = 0.0
-    for view, part in zip(views, wanted.split(16), strict=True):
-        (own,) = torch.autograd.grad((blend_colors(view, colors) * part).sum(), colors)
-        apart = apart + own
-    torch.testing.assert_close(together, apart)
+    (together,) = torch.autograd.grad((blend_colors(stack_weights(views), colors.flatten(0, 1)) * wanted).sum(), colors)
+    apart = []
+    for view, own, part in zip(views, colors, wanted.split(16), strict=True):
+        apart += torch.autograd.grad((blend_colors(view, own) * part).sum(), own)
+    torch.testing.assert_close(together, torch.stack(apart))
     dense = stack_weights(views).matrix.to_dense()
     assert torch.equal(stack_weights(views).transpose.to_dense(), dense.T)
+
+
+def test_pictures_of_different_gaussians_stack(views):
+    fewer = blend_weights(
+        torch.tensor([[0.0, 0.0, 1.0]]).to(views[0].alphas), torch.tensor([[1.0, 0.0, 0.0, 0.0]]).to(views[0].alphas),
+        torch.full((1, 3), 0.01).to(views[0].alphas), torch.ones(1).to(views[0].alphas),
+        torch.eye(4).to(views[0].alphas), torch.diag(torch.tensor([30.0, 30.0, 1.0])).to(views[0].alphas), 24, 8,
+    )  # fmt: skip
+    stacked = stack_weights([fewer, views[0]])
+    assert stacked.matrix.shape == (24 * (8 + 16), 61)
 
 
 def test_one_picture_is_stacked_as_it_is(views):
@@ -50,9 +60,9 @@ def test_pictures_that_do_not_stack_are_refused(views, device):
     other = blend_weights(
         torch.tensor([[0.0, 0.0, 1.0]], device=device), torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device),
         torch.full((1, 3), 0.01, device=device), torch.ones(1, device=device), torch.eye(4, device=device),
-        torch.eye(3, device=device), 24, 16,
+        torch.eye(3, device=device), 32, 16,
     )  # fmt: skip
-    with pytest.raises(ValueError, match="of 60 Gaussians, got 24 pixels and 1 Gaussians"):
+    with pytest.raises(ValueError, match="expected pictures 24 pixels wide, got 32"):
         stack_weights([views[0], other])
     with pytest.raises(ValueError, match="at least one"):
         stack_weights([])

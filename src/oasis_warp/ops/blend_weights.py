@@ -102,54 +102,42 @@ def _csr(starts: Tensor, columns: Tensor, values: Tensor, size: tuple[int, int])
 
 
 def stack_weights(views: Sequence[BlendWeights]) -> BlendWeights:
-    """Several pictures of the same Gaussians, one below the other, as one: what is fitted to it is fitted to all.
+    """Several pictures, one below the other, as one; the Gaussians of each follow upon those of the one before.
+
+    `blend_colors(stacked, torch.cat([colors of each]))` draws them all, each in colours of its own.
 
     Args:
-        views: Of equal width and number of Gaussians, on one device.
+        views: Of equal width, on one device.
 
     Raises:
-        ValueError: none, of different widths or Gaussians, or more weights than int32 can count.
+        ValueError: none, of different widths, or more weights than int32 can count.
     """
     if not views:
         raise ValueError("views: expected at least one, got none.")
-    width, n = views[0].alphas.shape[1], views[0].matrix.shape[1]
+    width = views[0].alphas.shape[1]
     for view in views[1:]:
-        if (view.alphas.shape[1], view.matrix.shape[1]) != (width, n):
+        if view.alphas.shape[1] != width:
             raise ValueError(
-                f"views: expected pictures {width} pixels wide of {n} Gaussians, got {view.alphas.shape[1]} pixels and "
-                f"{view.matrix.shape[1]} Gaussians. Draw all with the same Gaussians and size."
+                f"views: expected pictures {width} pixels wide, got {view.alphas.shape[1]}. Draw all of one size."
             )
     if len(views) == 1:
         return views[0]
-    counts = [view.matrix.values().numel() for view in views]
-    if sum(counts) > torch.iinfo(torch.int32).max:
-        raise ValueError(f"views: expected at most 2**31 - 1 weights in all, got {sum(counts)}. Draw smaller pictures.")
-    by_pixel = [view.matrix for view in views]
-    starts = [part.crow_indices()[1:] + sum(counts[:k]) for k, part in enumerate(by_pixel)]
-    first = torch.zeros_like(by_pixel[0].crow_indices()[:1])
-    columns, values = torch.cat([m.col_indices() for m in by_pixel]), torch.cat([m.values() for m in by_pixel])
-    heights = [view.alphas.shape[0] for view in views]
-    pixels = sum(heights) * width
-    matrix = _csr(torch.cat([first, *starts]).int(), columns, values, (pixels, n))
-    transpose = _side_by_side([view.transpose for view in views], n, pixels)
+    count = sum(view.matrix.values().numel() for view in views)
+    if count > torch.iinfo(torch.int32).max:
+        raise ValueError(f"views: expected at most 2**31 - 1 weights in all, got {count}. Draw smaller pictures.")
+    matrix, transpose = (_diagonal(parts) for parts in zip(*((v.matrix, v.transpose) for v in views), strict=True))
     return BlendWeights(matrix, transpose, torch.cat([view.alphas for view in views]))
 
 
-def _side_by_side(parts: Sequence[Tensor], rows: int, columns: int) -> Tensor:
-    """CSR matrices of `rows` rows in a row; every entry knows its place, so nothing is sorted."""
-    lengths = [part.crow_indices().diff().long() for part in parts]
-    starts = torch.cat([lengths[0].new_zeros(1), sum(lengths[1:], lengths[0]).cumsum(0)])
-    where = torch.empty(int(starts[-1]), dtype=torch.int32, device=starts.device)
-    values = torch.empty(len(where), dtype=parts[0].values().dtype, device=starts.device)
-    free, passed = starts[:-1].clone(), 0
-    for part, length in zip(parts, lengths, strict=True):
-        shift = (free - part.crow_indices()[:-1]).repeat_interleave(length)
-        place = shift + torch.arange(len(shift), device=shift.device)
-        where[place] = part.col_indices() + passed
-        values[place] = part.values()
-        free += length
-        passed += part.shape[1]
-    return _csr(starts.int(), where, values, (rows, columns))
+def _diagonal(parts: Sequence[Tensor]) -> Tensor:
+    """The CSR matrix with `parts` as its diagonal blocks."""
+    starts, columns, rows, width, count = [parts[0].crow_indices()[:1]], [], 0, 0, 0
+    for part in parts:
+        starts.append(part.crow_indices()[1:] + count)
+        columns.append(part.col_indices() + width)
+        rows, width, count = rows + part.shape[0], width + part.shape[1], count + part.values().numel()
+    values = torch.cat([part.values() for part in parts])
+    return _csr(torch.cat(starts).int(), torch.cat(columns).int(), values, (rows, width))
 
 
 class _BlendColors(torch.autograd.Function):

@@ -24,7 +24,7 @@ class Aim(NamedTuple):
     """What is drawn, and what must come out."""
 
     view: BlendWeights
-    """Of the photo."""
+    """Of the photo; of K photos `ops.stack_weights` of theirs, and what follows is one below the other, too."""
     target: Float[Tensor, "H W 3"]
     """The photo. It shows through where the Gaussians leave it free, as at the wrist: over black they would learn to
     glow there."""
@@ -33,8 +33,8 @@ class Aim(NamedTuple):
     references: list[BlendWeights]
     kept: list[Float[Tensor, "H W 3"]]
     """What each reference view must stay like."""
-    light: Float[Tensor, "N 3"] | None = None
-    """Factors that the photo's light multiplies colours with; reference views are in even light."""
+    light: Float[Tensor, "K N 3"] | None = None
+    """Factors that the light of each of K photos multiplies colours with; reference views are in even light."""
 
 
 class Texture(NamedTuple):
@@ -51,7 +51,7 @@ def aim(
     mask: Tensor,
     references: list[BlendWeights],
     colors: Float[Tensor, "N 3"],
-    light: Float[Tensor, "N 3"] | None = None,
+    light: Float[Tensor, "K N 3"] | None = None,
 ) -> Aim:
     """Reference views must stay as Gaussians of `colors` draw them."""
     with torch.no_grad():
@@ -93,7 +93,7 @@ def fit_parameters(
     settled = [torch.zeros_like(parameter) for parameter in parameters]
     for step in range(total):
         now = colors()
-        image = blend_colors(aim.view, now if aim.light is None else now * aim.light) + beyond
+        image = blend_colors(aim.view, now if aim.light is None else (now * aim.light).flatten(0, 1)) + beyond
         loss = config.weight_rgb * masked_l1(image, aim.target, aim.mask)
         loss = loss + config.weight_ssim * masked_dssim(image * aim.mask[..., None], photo, aim.mask)
         if aim.references and config.references == "in_turn":

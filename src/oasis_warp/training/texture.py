@@ -67,6 +67,7 @@ def _trust(
 ) -> tuple[Float[Tensor, "N 1"], Float[Tensor, "V 1"]]:
     """How freely each Gaussian, and each vertex through the best Gaussian that reads it, may learn: 0 to 1."""
     pixels = view.transpose @ torch.ones_like(view.alphas).view(-1, 1)
+    pixels = pixels.view(-1, len(gaussians.opacities), 1).sum(0)  # of all photos
     trust = (pixels / TRUSTED_PIXELS).clamp(max=1)
     n_points = len(gaussians.vertex_index)
     at_vertices = torch.zeros(int(faces.max()) + 1, 1, dtype=trust.dtype, device=trust.device)
