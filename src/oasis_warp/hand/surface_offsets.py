@@ -9,6 +9,7 @@ with the umbrella operator L, so that neighbours follow and the far side stays.
 """
 
 import functools
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -34,6 +35,11 @@ _ROUNDS = 4
 _BEND, _STAY = 100.0, 0.02
 """Weights against one observation a vertex. With edges of 2 mm an observation is shared along about 3 mm, and its
 effect ends after about 12 mm: (BEND / STAY / 16)^(1/4) edges."""
+_SETTLED = 1e-6
+"""Step of the displacement at which it is found [m]."""
+_MOST_STEPS = 100
+_TINY = 1e-300
+"""Where a column is solved, nothing is divided by 0."""
 _GRAZING = 0.5
 """Largest |normal . view| of a vertex that speaks for the rim."""
 _STEP = 0.25
@@ -54,14 +60,14 @@ def outline_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
         fits: One photo of a hand, or several of the same hand, all with one shape: then one displacement for all.
     """
     views = [_View(hand, fit) for fit in fits]
-    stiffness = bending(views[0].rig.faces, len(views[0].rig.template))
+    sheet = ThinSheet(views[0].rig.faces, len(views[0].rig.template))
     moved = np.zeros_like(views[0].rest)
     for _ in range(_ROUNDS):
         seen = zip(*(view.observe(moved) for view in views), strict=True)
         vertices, target, weight = (np.concatenate(part) for part in seen)
         if len(vertices) == 0:
             break
-        moved = smooth_displacement(stiffness, vertices, target, weight)
+        moved = sheet.drawn(vertices, target, weight)
         moved *= np.minimum(1, LONGEST / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-12))
     return torch.from_numpy(moved.astype(np.float32))
 
@@ -134,29 +140,58 @@ def crossing(picture: np.ndarray, start: np.ndarray, out: np.ndarray, reach: flo
     return np.where(np.isfinite(away[row, nearest]), place, np.nan)
 
 
-def bending(faces: np.ndarray, n: int) -> sparse.csc_array:
-    """BEND L^T L + STAY with the umbrella operator L (mean of the neighbours minus the vertex)."""
-    return _bending(np.ascontiguousarray(faces, np.int64).tobytes(), n)
+class ThinSheet:
+    """The surface as a sheet that resists bending, and is drawn to where its vertices are wanted."""
+
+    def __init__(self, faces: np.ndarray, n_vertices: int):
+        self._stiffness = _bending(np.ascontiguousarray(faces, np.int64).tobytes(), n_vertices)
+        self._solve: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def drawn(self, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """The displacement [V, D] that comes nearest to the targets [K, D] of some vertices.
+
+        The first is exact. For those that follow its factors serve as preconditioner of conjugate gradients: nearly the
+        same vertices are drawn again, so that a few steps take less than factors of their own.
+        """
+        n_vertices = len(self._stiffness.diagonal())
+        diagonal, right = np.zeros(n_vertices), np.zeros((n_vertices, target.shape[1]))
+        np.add.at(diagonal, vertices, weight)
+        np.add.at(right, vertices, weight[:, None] * target)
+        system = (self._stiffness + sparse.diags_array(diagonal)).tocsc()
+        if self._solve is None:
+            options = {"SymmetricMode": True}
+            factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            self._solve = factors.solve
+            return factors.solve(right)
+        return _conjugate_gradients(system, right, self._solve)
+
+
+def _conjugate_gradients(
+    system: sparse.csc_array, right: np.ndarray, precondition: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """The solution of each column of `right`, until no vertex moves by more than `_SETTLED` in a step."""
+    solution, residual = np.zeros_like(right), right
+    direction = preconditioned = precondition(residual)
+    product = (residual * preconditioned).sum(0)
+    for _ in range(_MOST_STEPS):
+        image = system @ direction
+        length = product / np.maximum((direction * image).sum(0), _TINY)
+        step = length * direction
+        solution, residual = solution + step, residual - length * image
+        if np.abs(step).max() < _SETTLED:
+            break
+        preconditioned = precondition(residual)
+        product, before = (residual * preconditioned).sum(0), product
+        direction = preconditioned + product / np.maximum(before, _TINY) * direction
+    return solution
 
 
 @functools.lru_cache(1)
 def _bending(faces: bytes, n: int) -> sparse.csc_array:
+    """BEND L^T L + STAY with the umbrella operator L (mean of the neighbours minus the vertex)."""
     a, b, c = np.frombuffer(faces, np.int64).reshape(-1, 3).T
     i, j = np.r_[a, b, c, b, c, a], np.r_[b, c, a, a, b, c]
     pairs = np.unique(np.stack([i, j]), axis=1)
     share = 1 / np.bincount(pairs[0], minlength=n)[pairs[0]]
     umbrella = sparse.csr_array((share, tuple(pairs)), shape=(n, n)) - sparse.eye_array(n)
     return (_BEND * umbrella.T @ umbrella + _STAY * sparse.eye_array(n)).tocsc()
-
-
-def smooth_displacement(
-    stiffness: sparse.csc_array, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray
-) -> np.ndarray:
-    """The smooth displacement [V, D] that comes nearest to the targets [K, D]; `stiffness` is that of `bending`."""
-    n_vertices = len(stiffness.diagonal())
-    diagonal, right = np.zeros(n_vertices), np.zeros((n_vertices, target.shape[1]))
-    np.add.at(diagonal, vertices, weight)
-    np.add.at(right, vertices, weight[:, None] * target)
-    system = (stiffness + sparse.diags_array(diagonal)).tocsc()
-    factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return factors.solve(right)

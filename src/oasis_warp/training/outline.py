@@ -22,7 +22,7 @@ from oasis_warp.core import surface
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Evidence
-from oasis_warp.hand.surface_offsets import bending, crossing, smooth_displacement
+from oasis_warp.hand.surface_offsets import ThinSheet, crossing
 from oasis_warp.render.render import render
 
 BEYOND = 0.5
@@ -66,7 +66,7 @@ def drawn_outline_offsets(
         (surface.vertex_normals(e.rest.vertices, faces), surface.vertex_normals(e.posed.vertices, faces))
         for e in evidences
     ]
-    stiffness = bending(hand.faces.cpu().numpy(), len(hand.template))
+    sheet = ThinSheet(hand.faces.cpu().numpy(), len(hand.template))
     outwards = np.zeros(len(hand.template))
     for _ in range(_ROUNDS):
         step = torch.from_numpy(outwards).to(evidences[0].mask)[:, None]
@@ -81,7 +81,7 @@ def drawn_outline_offsets(
         if len(vertices) == 0:
             break
         target = outwards[vertices] + missing
-        outwards = smooth_displacement(stiffness, vertices, target[:, None], weight)[:, 0]
+        outwards = sheet.drawn(vertices, target[:, None], weight)[:, 0]
     return torch.from_numpy(outwards).to(along[0][0])[:, None] * along[0][0]
 
 
