@@ -4,8 +4,9 @@
     python tools/evaluate_fusion.py same-hand out/fusion --photos tests/data/photos/same_hand
 
 `synthetic`: people that no training has met, photographed in several poses from several sides with the estimator's
-errors, against the truth in other poses and views. `same-hand`: a folder of photos for each hand; each in turn is
-held out, avatars are made of the ones that follow it, and compared as `oasis evaluate --dataset same-hand` does.
+errors, against the truth in other poses and views in even light. `same-hand`: a folder of photos for each hand; each
+in turn is held out, avatars are made of the ones that follow it, and compared as `oasis evaluate --dataset same-hand`
+does.
 Colours are matched to the target. Prints the tables of docs/same_hand.md and leaves every number in synthetic.json and
 same_hand.json.
 """
@@ -21,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from oasis_warp.avatar.lighting import in_even_light
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
@@ -114,7 +116,8 @@ def measure_person(number: int, look: str, prior: Prior, options: argparse.Names
         shown = ([part[k] for k in chosen] for part in (evidences, pixels, guesses))
         fusion = fuse(bundled_hand(), *shown, config)
         seen = (fusion.sightings.confidence > 0.5).any(0).float().mean()
-        for stage, gaussians in zip(STAGES, (fusion.guess, fusion.gaussians), strict=True):
+        fused = fusion.gaussians if fusion.lights is None else in_even_light(fusion.gaussians, fusion.lights[0])
+        for stage, gaussians in zip(STAGES, (fusion.guess, fused), strict=True):
             found = [
                 score(match_colors(image, truth.image, truth.mask), truth)
                 for image, truth in zip(draw(gaussians, batches[0]), truths, strict=True)
@@ -144,7 +147,8 @@ def avatar_of(
     fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), guesses, adapt)
     seen = float((fusion.sightings.confidence > 0.5).any(0).float().mean())
     gaussians, _ = with_detail(fusion, photos, fits, surfaces, config)
-    return make_avatar(fits[0], surfaces.shared, evidences[0], gaussians), seen
+    light = fusion.lights[0] if fusion.lights else None
+    return make_avatar(fits[0], surfaces.shared, evidences[0], gaussians, light), seen
 
 
 def measure_hand(name: str, paths: list[Path], prior: Prior, options: argparse.Namespace) -> Iterator[Row]:
@@ -231,7 +235,7 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=6)
     parser.add_argument("--lights", nargs="*", default=["studio", "wild"])
     parser.add_argument("--prior", default="learned", help="learned, none or a weights file")
-    parser.add_argument("--light", default="keep", choices=("even", "keep"), help="of photos; see AdaptConfig")
+    parser.add_argument("--light", default="fit", choices=("fit", "even", "keep"), help="see AdaptConfig")
     parser.add_argument("--steps", type=int, help="of texture learning; stops by itself when not given")
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--device", default="cpu", help="for synthetic people")

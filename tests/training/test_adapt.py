@@ -6,6 +6,7 @@ from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observe import observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, estimate_melanin
+from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import CanonicalGaussians, Evidence
 from oasis_warp.losses.image import masked_psnr
@@ -34,8 +35,9 @@ def case(hand, regions):
     return evidence, truth, prior, adapt(hand, prior, evidence, STEPS)
 
 
-def drawn(hand, gaussians, evidence):
-    posed = pose_gaussians(gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices)
+def drawn(hand, gaussians, evidence, light=None):
+    shining = None if light is None else (light, surface.vertex_normals(evidence.rest.vertices, hand.faces))
+    posed = pose_gaussians(gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices, shining)
     return render(posed, evidence.camera)
 
 
@@ -43,7 +45,7 @@ def test_the_photo_is_explained(hand, case):
     evidence, _, prior, adapted = case
     inside = (evidence.mask > 0.9).float()
     before = masked_psnr(drawn(hand, prior, evidence).image, evidence.image, inside)
-    after = masked_psnr(drawn(hand, adapted.gaussians, evidence).image, evidence.image, inside)
+    after = masked_psnr(drawn(hand, adapted.gaussians, evidence, adapted.light).image, evidence.image, inside)
     assert after > before + 8
     assert after > 30
 
@@ -55,8 +57,9 @@ def test_what_is_drawn_is_completed_and_not_what_each_gaussian_would_be_alone(ha
     inside = (evidence.mask > 0.9).float()
     for colors in (prior.colors, apart):
         untaught = AdaptConfig(texture_steps=0, reference_views=0)
-        completed = adapt(hand, prior._replace(colors=colors), evidence, untaught).gaussians
-        assert masked_psnr(drawn(hand, completed, evidence).image, evidence.image, inside) > 28
+        completed = adapt(hand, prior._replace(colors=colors), evidence, untaught)
+        image = drawn(hand, completed.gaussians, evidence, completed.light).image
+        assert masked_psnr(image, evidence.image, inside) > 28
 
 
 def test_the_side_that_was_not_seen_takes_the_light_of_the_photo(hand, regions, case):

@@ -8,7 +8,7 @@ from synthetic import evidence_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.lighting import in_even_light, mirror_light, posed_normals, shading, turn_light
-from oasis_warp.avatar.observe import inner_mask, observe
+from oasis_warp.avatar.observe import observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import rotation, surface
@@ -114,8 +114,8 @@ def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene):
         return shaded.pose(there).colors / plain.pose(there).colors
 
     torch.testing.assert_close(ratio(0), torch.full_like(truth.colors, 0.9))
-    half = ratio(30)
-    assert bool((half > 0.9 - 1e-5).all()) and bool((half < 1 + 1e-5).all()) and float(half.std()) > 0.01
+    half = ratio(20)
+    assert bool((half > 0.9 - 1e-3).all()) and bool((half < 1 + 1e-3).all()) and float(half.std()) > 0.01
     turned = turn(pose, 180)
     away = (shaded.pose(turned).colors / plain.pose(turned).colors)[: len(truth.vertex_index)]
     around = facing[truth.vertex_index, 0].abs() < 0.7  # others turn by less
@@ -126,24 +126,22 @@ def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene):
     assert all(torch.equal(a, b) for a, b in zip(mirrored, turned_light, strict=True))
 
 
-def test_a_soft_shadow_is_taken_for_shade_and_a_mark_is_not(hand, scene):
+def test_where_a_photo_may_show_something_else_that_is_shade(hand, scene):
     even, *_ = scene
     light = fit_light(hand, even.image, even)
     height, width = even.mask.shape
-    rows = torch.arange(height)[:, None] / height
-    columns = torch.arange(width) / width
-    soft = 1 - 0.08 * torch.exp(-((rows - 0.6) ** 2 + (columns - 0.5) ** 2) / 0.03)[..., None]
-    shadowed = even._replace(image=even.image * soft)
-    shade = with_shade(hand, even.image, shadowed, shadowed, light)
-    rest = without_light(hand, shadowed, shade).image / without_light(hand, even, light).image.clamp_min(1e-3)
-    inside = inner_mask(even.mask, 6) > 0.5
-    there = inside & (soft[..., 0] < 0.94)
-    assert float((shadowed.image / even.image)[there].mean()) < 0.94 and float(rest[there].mean()) > 0.97
+    rows, columns = torch.arange(height)[:, None] / height, torch.arange(width) / width
+    from_middle = (rows - 0.6) ** 2 + (columns - 0.5) ** 2
+    spot, amid = (from_middle < limit for limit in (0.006, 0.002))
+    stained = even._replace(image=torch.where(spot[..., None], 0.3 * even.image, even.image))
+    plain = without_light(hand, even, light).image
 
-    spot = ((rows - 0.6) ** 2 + (columns - 0.5) ** 2 < 0.002) & inside
-    marked = even._replace(image=torch.where(spot[..., None], 0.3 * even.image, even.image))
-    left = without_light(hand, marked, with_shade(hand, even.image, marked, marked, light)).image
-    assert float((left / without_light(hand, even, light).image)[spot].mean()) < 0.36
+    def left(sure):
+        shaded = with_shade(hand, even.image, stained, sure, light)
+        return float((without_light(hand, stained, shaded).image / plain.clamp_min(1e-3))[amid].mean())
+
+    assert left(stained) < 0.36
+    assert left(stained._replace(mask=stained.mask * ~spot)) > 0.8
 
 
 def test_many_poses_are_lit_as_each_alone(hand, scene):

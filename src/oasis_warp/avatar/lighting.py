@@ -14,7 +14,7 @@ from oasis_warp.ops import depth_map, face_rotations
 
 GAMMA = 2.2
 """Light is sRGB to this power, nearly."""
-AS_IN_PHOTO, TURNED_AWAY = math.cos(math.radians(15)), math.cos(math.radians(45))
+AS_IN_PHOTO, TURNED_AWAY = math.cos(math.radians(5)), math.cos(math.radians(30))
 """Cosines of the angle by which skin has turned from where the photo shows it, up to which its shade stays as it is and
 from which it is gone."""
 RIM = 1 / 32

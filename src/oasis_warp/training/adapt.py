@@ -23,6 +23,7 @@ from oasis_warp.training.light import even_photo
 from oasis_warp.training.lora_texture import learn_lora
 from oasis_warp.training.picture_fit import aim
 from oasis_warp.training.room_light import fit_light, lit_picture, with_shade, without_light
+from oasis_warp.training.skin_or_shade import skin_and_shade
 from oasis_warp.training.surely_shown import surely_shown
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
@@ -75,8 +76,9 @@ def adapt(
 
     Colour calibration first, then the seen colours are carried smoothly over the rim of the seen region, then texture
     learning with reference views. With `config.light` "fit" the first two look at the photo without its light, where
-    it surely shows the hand, and the last draws colours in that light. With "even" what else may be light is left out,
-    too, and the last step falls away. With `config.texture` "lora" texture learning follows upon calibration, as in the
+    it surely shows the hand, the last draws colours in that light, and of what they learned beyond the prior most is
+    shade, which goes when the hand turns. With "even" what else may be light is left out, too, and the last step falls
+    away. With `config.texture` "lora" texture learning follows upon calibration, as in the
     paper.
 
     Args:
@@ -115,13 +117,16 @@ def adapt(
         for azimuth in reference_azimuths(config.reference_views)
     ]
     shown = photo.mask * _trusted(view, photo)
-    shining = light and _light_on(hand, gaussians, photo, light)
+    shining = None if light is None else light_on(hand, gaussians, photo, light)[None]
     pictures = aim(view, photo.image, shown, references, gaussians.colors, shining)
     if trained is None:
         texture = learn_texture(gaussians, faces, pictures, config, progress)
     else:
         texture = learn_lora(trained, calibration, pictures, config, progress)
-    return Adaptation(gaussians._replace(colors=texture.colors), calibration, texture.losses, light)
+    gaussians = gaussians._replace(colors=texture.colors)
+    if light is not None:
+        gaussians, light = skin_and_shade(hand, calibration.apply(prior.colors), gaussians, light)
+    return Adaptation(gaussians, calibration, texture.losses, light)
 
 
 class Reading(NamedTuple):
@@ -133,7 +138,7 @@ class Reading(NamedTuple):
     """Of the photo; None where it is kept."""
 
 
-def read(hand: HandModel, prior: CanonicalGaussians, evidence: Evidence, config: AdaptConfig) -> Reading:
+def read_skin(hand: HandModel, prior: CanonicalGaussians, evidence: Evidence, config: AdaptConfig) -> Reading:
     """What `adapt` takes of a photo."""
     return _read(hand, prior, evidence, in_photo(hand, prior, evidence).view, config)
 
@@ -155,7 +160,7 @@ def _read(
     return Reading(without_light(hand, sure, light), light)
 
 
-def _light_on(
+def light_on(
     hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence, light: HandLight
 ) -> Float[Tensor, "N 3"]:
     """What the light of a photo multiplies the colours of `gaussians` with in it."""

@@ -18,7 +18,7 @@ from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors, stack_weights
 from oasis_warp.render.cameras import orbit_camera
-from oasis_warp.training.adapt import MIN_ALPHA, adapt, in_photo, read
+from oasis_warp.training.adapt import MIN_ALPHA, Reading, adapt, in_photo, light_on, read_skin
 from oasis_warp.training.calibrate import calibrate
 from oasis_warp.training.complete import complete_field
 from oasis_warp.training.light import even_photo
@@ -26,6 +26,7 @@ from oasis_warp.training.picture_fit import aim
 from oasis_warp.training.room_light import without_light
 from oasis_warp.training.sharpen import sharpen
 from oasis_warp.training.sightings import Sightings, look, photo_gains
+from oasis_warp.training.skin_or_shade import skin_and_shade
 from oasis_warp.training.texture import learn_texture
 from oasis_warp.training.views import freeze_view, reference_azimuths
 
@@ -86,16 +87,19 @@ def fuse(
         gains, shading = torch.ones_like(sightings.colors[:, 0]), torch.zeros_like(sightings.colors)
         return Fusion(made.gaussians, guesses[0], sightings, gains, shading, made.light and (made.light,))
     photos = evidences
-    readings = [read(hand, guess, evidence, config) for guess, evidence in zip(guesses, evidences, strict=True)]
+    readings = [read_skin(hand, guess, evidence, config) for guess, evidence in zip(guesses, evidences, strict=True)]
     evidences = [reading.evidence for reading in readings]
     lights = tuple(reading.light for reading in readings if reading.light) or None
     sightings = look(hand, evidences, resolution)
     faces = hand.faces.to(evidences[0].image.device)
     guess = mix_guesses(guesses, sightings.confidence * sightings.share + UNSEEN, faces)
     gains = photo_gains(sightings, vertex_colors(guess, len(hand.template)))
-    made, shading = _adapt(hand, guess, photos, evidences, sightings, gains, config, progress)
+    made, shading, calibrated = _adapt(hand, guess, photos, readings, sightings, gains, config, progress)
     if lights is not None and config.light == "even":
         made, lights = in_even_light(made, lights[0]), None
+    elif lights is not None:
+        parted = [skin_and_shade(hand, calibrated, made, light) for light in lights]
+        made, lights = parted[0][0], tuple(light for _, light in parted)
     return Fusion(made, guess, sightings, gains, shading, lights)
 
 
@@ -140,14 +144,15 @@ def add_detail(
 
 
 def _adapt(
-    hand: HandModel, guess: CanonicalGaussians, photos: Sequence[Evidence], evidences: Sequence[Evidence],
+    hand: HandModel, guess: CanonicalGaussians, photos: Sequence[Evidence], readings: Sequence[Reading],
     sightings: Sightings, gains: Tensor, config: AdaptConfig, progress: Progress,
-) -> tuple[CanonicalGaussians, Float[Tensor, "K V 3"]]:  # fmt: skip
+) -> tuple[CanonicalGaussians, Float[Tensor, "K V 3"], Float[Tensor, "N 3"]]:  # fmt: skip
     """The steps of `training.adapt.adapt`, on all photos at once: their pictures stand below each other as one.
 
-    A pixel counts as much as its photo is to be believed there. `evidences` are what `training.adapt.read` takes of
-    `photos`. With the Gaussians comes `Fusion.shading`.
+    A pixel counts as much as its photo is to be believed there. `readings` are what `training.adapt.read_skin` takes of
+    `photos`. With the Gaussians come `Fusion.shading` and the colours that the guess had after calibration.
     """
+    evidences = [reading.evidence for reading in readings]
     first = evidences[0]
     faces, rest = hand.faces.to(first.image.device), first.rest.vertices
     posed = [pose_gaussians(guess, faces, e.rest.vertices, e.posed.vertices) for e in evidences]
@@ -162,7 +167,9 @@ def _adapt(
 
     progress("calibration", 0, 1)
     if config.calibration == "on":
-        guess = guess._replace(colors=calibrate(tall, guess.colors, torch.cat(lit), trust, config).apply(guess.colors))
+        everywhere = guess.colors.repeat(len(views), 1)
+        guess = guess._replace(colors=calibrate(tall, everywhere, torch.cat(lit), trust, config).apply(guess.colors))
+    calibrated = guess.colors
     progress("calibration", 1, 1)
 
     progress("completion", 0, 1)
@@ -189,18 +196,26 @@ def _adapt(
         ]
     missing = (weight[..., None] * differences()).sum(0) / weight.sum(0).clamp_min(1e-12)[:, None]
     difference = complete_field(rest, faces, missing, weight.amax(0))
-    colors = (guess.colors + vertex_to_gaussians(difference, faces, guess)).clamp(0, 1)
+    guess = guess._replace(colors=(guess.colors + vertex_to_gaussians(difference, faces, guess)).clamp(0, 1))
     progress("completion", 1, 1)
+    if config.light == "even":  # what is left to learn is the photos' light
+        return guess, shading, calibrated
 
     references = [
         freeze_view(posed[0], orbit_camera(first.posed.vertices, azimuth, size=first.camera.width))
         for azimuth in reference_azimuths(config.reference_views)
     ]
     mask = torch.cat([e.mask * inner_mask(e.mask, 1) * own for e, own in zip(photos, believed, strict=True)])
-    guess = guess._replace(colors=colors)
-    pictures = aim(tall, torch.cat(lit), mask, references, colors)
+    # In each photo's own light: divided by a picture of it, photos would be wrong where two fingers share a pixel.
+    lights, targets = [], []
+    for photo, reading, gain, other, view in zip(photos, readings, gains, shading, views, strict=True):
+        light = gain.expand_as(guess.colors)
+        light = light if reading.light is None else light * light_on(hand, guess, photo, reading.light)
+        lights.append(light)
+        targets.append(photo.image + blend_colors(view, light * vertex_to_gaussians(other, faces, guess)))
+    pictures = aim(tall, torch.cat(targets), mask, references, guess.colors, torch.stack(lights))
     texture = learn_texture(guess, faces, pictures, config, progress)
-    return guess._replace(colors=texture.colors), shading
+    return guess._replace(colors=texture.colors), shading, calibrated
 
 
 def _in_first_light(

@@ -27,12 +27,8 @@ RANGE = 0.03, 0.97
 """Quantiles of the light on what is shown, between which it is kept."""
 BRIGHTEST = 0.995
 """Quantile of the colours of skin without its light that still are colours."""
-SHADE_LENGTH = 0.008
-"""What changes over longer ways on the skin is more likely light [m]; see `training.light`."""
-FAINT = 0.1
-"""Most that is taken for shade, as the logarithm of a colour."""
 STRANGE, STRANGE_FADE = 1.5, 0.001
-"""The same where the photo may show something else, and the way over which that ends [m]."""
+"""Largest logarithm of shade where the photo may show something else, and the way over which that ends [m]."""
 DARK = 0.02
 """Colours below it have no logarithm worth the name [sRGB]."""
 DARKEST = 0.05
@@ -83,11 +79,7 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence
 def with_shade(
     hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence, sure: Evidence, light: HandLight
 ) -> HandLight:
-    """`light` with what it still misses of the photo and the skin should not keep.
-
-    That is what changes slowly along the skin and is faint: of such differences next to nothing is found again on other
-    pictures of a hand, they are soft shadows, light from wall and palm, gloss. Stronger ones may be a mark on the skin,
-    which stays the hand's. And it is all that is seen where the photo may show something else.
+    """`light` with what it misses where the photo may show something else than the skin there.
 
     Args:
         hand: Whose surface it is.
@@ -101,10 +93,9 @@ def with_shade(
     seen, known = observe(hand, evidence), observe(hand, evidence._replace(image=lit)).colors
     missing = (seen.colors.clamp_min(DARK) / known.clamp_min(DARK)).log()
     believed = observe(hand, sure).confidence
-    slow = complete_field(rest, faces, missing, believed, SHADE_LENGTH).clamp(-FAINT, FAINT)
-    strange = complete_field(rest, faces, missing - slow, seen.confidence - believed, fade=STRANGE_FADE)
+    strange = complete_field(rest, faces, missing, seen.confidence - believed, STRANGE_FADE / 3, STRANGE_FADE)
     facing = posed_normals(rest, evidence.posed.vertices, faces)
-    return light._replace(shade=(slow + strange.clamp(-STRANGE, STRANGE)).exp(), facing=facing)
+    return light._replace(shade=strange.clamp(-STRANGE, STRANGE).exp(), facing=facing)
 
 
 def without_light(hand: HandModel, evidence: Evidence, light: HandLight) -> Evidence:
