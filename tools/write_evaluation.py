@@ -1,10 +1,10 @@
 """Put what was evaluated into docs/evaluation.md, each table between its two markers, and the pictures beside it.
 
-    oasis evaluate --dataset synthetic --people 32 --device cuda --workers 8 --out out/evaluation
+    oasis evaluate --dataset synthetic --seed 1 --device cuda --workers 8 --out out/evaluation
     oasis evaluate --dataset same-hand tests/data/photos/same_hand --out out/same_hand
     python tools/ablate_prior.py out/ablation --steps 3000 --device cuda --workers 14
     python tools/probe_prior.py out/probe --device cuda --workers 8
-    python tools/ablate_one_shot.py out/one_shot --device cuda --workers 8
+    python tools/ablate_one_shot.py out/one_shot --people 10 --device cuda --workers 8
     python tools/curve_one_shot.py out/curve
     python tools/write_evaluation.py docs/evaluation.md out
 
