@@ -100,6 +100,7 @@ def test_the_same_photo_twice_is_nearly_one_photo(hand, palm, alone):
     twice = fused_by_mean(hand, [palm, palm], STEPS)
     assert torch.allclose(twice.gains, torch.ones(2, 3))
     assert float((twice.gaussians.colors - alone.gaussians.colors).abs().mean()) < 0.01
+    assert twice.lights is not None
     of_both = likeness(hand, twice.gaussians, palm, twice.lights[0])
     assert abs(of_both - likeness(hand, alone.gaussians, palm, alone.light)) < 0.5
 
