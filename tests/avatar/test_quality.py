@@ -68,10 +68,12 @@ def test_where_the_avatar_is_unlike_the_photo_it_is_less_certain(hand, case):
 def test_what_is_uncertain_is_more_often_wrong(hand, case):
     evidence, truth, _ = case
     adapted = adapt(hand, MeanPrior(hand)(evidence), evidence, AdaptConfig(texture_steps=20, reference_views=0))
-    posed = pose_gaussians(adapted.gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices)
+    assert adapted.light is not None
+    light = adapted.light, surface.vertex_normals(evidence.rest.vertices, hand.faces)
+    posed = pose_gaussians(adapted.gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices, light)
     quality = assess_surface(hand, evidence, render(posed, evidence.camera).image)
     n = len(truth.vertex_index)
-    error = (adapted.gaussians.colors[:n] - truth.colors[:n]).abs().mean(1)
+    error = (posed.colors[:n] - truth.colors[:n]).abs().mean(1)
     uncertainty = quality.uncertainty[truth.vertex_index]
     sure, unsure = (error[part].mean() for part in (uncertainty < 0.2, uncertainty > 0.8))
     assert unsure > 2 * sure
