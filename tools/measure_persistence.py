@@ -30,7 +30,8 @@ from oasis_warp.network.prior import choose_prior
 from oasis_warp.pipeline import carrier_offsets, make_evidence
 from oasis_warp.training.adapt import adapt, read_skin
 from oasis_warp.training.complete import complete_field
-from oasis_warp.training.skin_or_shade import DARK, MOST, marks
+from oasis_warp.training.room_light import DARK
+from oasis_warp.training.skin_or_shade import MOST, marks
 
 ANGLES = (0, 15, 30, 45, 70, 180)
 """Between which the skin has turned [degrees]."""

@@ -1,7 +1,8 @@
 """What a photo shows beyond the guess: how much of it is the skin's, and how much goes when the hand turns.
 
-Two photos of one hand agree on little of it. Where skin faces as before, half of it is found again; where it has turned
-by 45 degrees, a tenth, at all scales alike (tools/measure_persistence.py). The rest is soft and hard shadows, gloss,
+Two photos of one hand agree on little of it. Where skin faces as before, a third to a half of it is found again; where
+it has turned by more than 45 degrees, a tenth at most; of what is finer than 2 mm even less
+(tools/measure_persistence.py). The rest is soft and hard shadows, gloss,
 wrinkles of the pose, and what lies beside its place since the fit is some pixels off. So most of it is shade, which the
 photo's own view keeps and other poses lose. Only what no light does to skin is taken for a mark, and stays whole.
 """
@@ -14,6 +15,7 @@ from oasis_warp.avatar.anchors import vertex_colors
 from oasis_warp.avatar.lighting import factors
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandLight
+from oasis_warp.training.room_light import DARK
 
 STAYS = 0.2
 """Share of what is no mark that is taken for skin."""
@@ -25,8 +27,6 @@ MARK = 3.5, 7.0
 vertices of bare skin are below the first; half-transparent ink has 5, ink 15, red polish 24."""
 BRIGHT = 0.45, 0.7
 """The same for what is brighter, in the mean of the logarithms: 99 in 100 of bare skin are below the first."""
-DARK = 0.02
-"""Colours below it have no logarithm worth the name [sRGB]."""
 MOST = 1.5
 """Largest logarithm of shade."""
 
