@@ -6,7 +6,6 @@ import pytest
 import torch
 from painted_truth import Chart, make_truth, paint_photo
 
-from oasis_warp.avatar.lighting import mirror_light
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.cli import main
 from oasis_warp.core.config import EditConfig
@@ -87,7 +86,7 @@ def test_a_left_hand_is_the_mirror_image_of_a_right_one(truth, painted, made):
     left = Avatar(
         side="left", shape=avatar.shape, surface_offsets=avatar.surface_offsets, gaussians=avatar.gaussians,
         source_pose=mirror_pose(avatar.source_pose), source_camera=mirrored_camera(avatar.source_camera),
-        light=mirror_light(avatar.light),
+        light=avatar.light,
     )  # fmt: skip
     photos = (picture._replace(rgb=picture.rgb.flip(1).contiguous()) for picture in (painted, truth.photo))
     mirrored = edit(left, next(photos), photo=next(photos), config=QUICK)

@@ -244,7 +244,7 @@ def test_fewer_gaussians_make_a_smaller_file_and_still_an_avatar(right):
     empty = torch.zeros(0, dtype=torch.int64)
     few = CanonicalGaussians(
         right.gaussians.vertex_index, right.gaussians.offsets, empty, torch.zeros(0, 3),
-        *(part[:n] for part in right.gaussians[4:]),
+        *(part[:n] for part in right.gaussians[4:8]),
     )  # fmt: skip
     avatar = Avatar(
         side="right", shape=right.shape, surface_offsets=right.surface_offsets, gaussians=few,

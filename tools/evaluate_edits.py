@@ -2,14 +2,16 @@
 
     python tools/evaluate_edits.py --out out/edits
     python tools/evaluate_edits.py --out out/edits --sheet docs/_static/edits.jpg
+    python tools/evaluate_edits.py --out out/edits_png --png
 
 Writes edits.csv, a row for every drawing and view, and edits.md, the table of docs/editing.md. Each drawing is painted
-on the photo of an open palm or back that is drawn from a mesh with known skin, saved as a JPEG, and found again by its
-difference from the photo. With --sheet, the same drawings on real photos, too.
+on the photo of an open palm or back that is drawn from a mesh with known skin, saved as a JPEG (or as it is, with
+--png), and found again by its difference from the photo. With --sheet, the same drawings on real photos, too.
 """
 
 import argparse
 import csv
+import math
 import time
 from pathlib import Path
 from statistics import mean
@@ -80,17 +82,18 @@ def judge(truth: Truth, chart: Chart, edited: Avatar, pose: HandPose, camera: Ca
     whole = (true.alpha > COVERED).float()
     area = edited_area(truth, true.paint, camera, AROUND) * whole
     paint = (true.paint > 0).float() * whole
-    row = {"pixels": float(paint.sum())}
+    row = {"pixels": float(paint.sum()), "area_pixels": float(area.sum())}
     for name, mask in (("paint", paint), ("area", area), ("elsewhere", whole * (1 - area))):
         row[f"{name}_before"] = masked_psnr(before, true.image, mask)
         row[f"{name}_after"] = masked_psnr(after, true.image, mask)
     return row
 
 
-def measure(truth: Truth, kind: str, side: str, quality: int) -> list[dict[str, Any]]:
+def measure(truth: Truth, kind: str, side: str, quality: int | None) -> list[dict[str, Any]]:
     """A row for the photo's view and each other view."""
     chart = Chart(truth, kind)
-    painted = saved(paint_photo(truth, chart), quality)
+    painted = paint_photo(truth, chart)
+    painted = painted if quality is None else saved(painted, quality)
     start = time.perf_counter()
     made = edit(truth.avatar, painted, photo=truth.photo)
     seconds = time.perf_counter() - start
@@ -104,11 +107,11 @@ def measure(truth: Truth, kind: str, side: str, quality: int) -> list[dict[str, 
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """A line for each drawing: its own view, the others' mean and worst, and what changed elsewhere at most."""
+    """A line for each drawing: its own view, the others', and what changed elsewhere at most."""
     lines = [
-        "| drawing | on the | skin, mm² | new Gaussians | photo's view, dB | other poses, mean | worst | before "
-        "| paint alone, mean | elsewhere, largest change, dB | s |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| drawing | on the | skin, mm² | new Gaussians | photo's view, dB | other poses, all pixels | mean | worst "
+        "| before | paint alone, mean | elsewhere, largest change, dB | s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for key in dict.fromkeys((row["drawing"], row["side"]) for row in rows):
         mine = [row for row in rows if (row["drawing"], row["side"]) == key and row["pixels"] > 0]
@@ -117,12 +120,19 @@ def table(rows: list[dict[str, Any]]) -> str:
         own = mine[0]
         cells = [
             *key, f"{own['painted_mm2']:.0f}", f"{own['new_gaussians']:.0f}", f"{own['area_after']:.1f}",
-            f"{mean(r['area_after'] for r in others):.1f}", f"{min(r['area_after'] for r in others):.1f}",
+            f"{pooled(others):.1f}", f"{mean(r['area_after'] for r in others):.1f}",
+            f"{min(r['area_after'] for r in others):.1f}",
             f"{mean(r['area_before'] for r in others):.1f}", f"{mean(r['paint_after'] for r in others):.1f}",
             f"{change:+.3f}", f"{own['seconds']:.1f}",
         ]  # fmt: skip
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def pooled(rows: list[dict[str, Any]]) -> float:
+    """PSNR over the paint and around it in all views together [dB]."""
+    squares = sum(row["area_pixels"] * 10 ** (-row["area_after"] / 10) for row in rows)
+    return -10 * math.log10(squares / sum(row["area_pixels"] for row in rows))
 
 
 def draw(avatar: Avatar, pose: HandPose, camera: Camera) -> np.ndarray:
@@ -165,6 +175,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for edits.csv, edits.md and pictures")
     parser.add_argument("--size", type=int, default=640, help="side of the photos [px]")
     parser.add_argument("--quality", type=int, default=JPEG_QUALITY, help="of the painted photo's JPEG")
+    parser.add_argument("--png", action="store_true", help="paint on a photo that no JPEG encoder sees again")
     parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
     parser.add_argument("--sheet", type=Path, help="picture of edits on real photos to write")
     parser.add_argument("--photos", type=Path, default=Path("tests/data/photos"), help="where those lie")
@@ -177,7 +188,7 @@ def main() -> None:
         for kind in arguments.kinds:
             if kind == "nail polish" and side == "palm":  # the nails do not show
                 continue
-            rows += measure(truth, kind, side, arguments.quality)
+            rows += measure(truth, kind, side, None if arguments.png else arguments.quality)
             print(table(rows[-7:]).splitlines()[-1], flush=True)
     with (arguments.out / "edits.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))

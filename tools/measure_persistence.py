@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_colors
+from oasis_warp.avatar.lighting import with_shade_on
 from oasis_warp.avatar.observe import observe
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
@@ -68,10 +69,8 @@ def read_hand(paths: list[Path]) -> list[Beyond]:
             guess = prior(evidence)
             sure, light = read_skin(hand, guess, evidence, settings)
         made = adapt(hand, guess, evidence, settings)
-        assert light is not None and made.light is not None and made.light.shade is not None
-        assert light.shade is not None and light.facing is not None
-        # what was learned in even light, before most of it became shade
-        learned = vertex_colors(made.gaussians, len(hand.template)) * made.light.shade / light.shade
+        assert light is not None and light.facing is not None
+        learned = vertex_colors(with_shade_on(made.gaussians), len(hand.template))
         guessed = vertex_colors(guess._replace(colors=made.calibration.apply(guess.colors)), len(hand.template))
         whole = (learned.clamp_min(DARK) / guessed.clamp_min(DARK)).log().clamp(-MOST, MOST)
         confidence = observe(hand, sure).confidence

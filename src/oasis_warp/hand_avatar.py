@@ -84,7 +84,7 @@ class Avatar:
         if light is not None:
             normals = surface.vertex_normals(self.rest.vertices, self.hand.faces)
             self._light = (mirror_light(light), mirror_points(normals)) if left else (light, normals)
-        self._fixed = (*self._canonical, vertices, self._rest.joints)
+        self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
         self._recordings = Recordings()
 
     @property
@@ -192,7 +192,7 @@ class Avatar:
         tensors = {
             "shape": self.shape,
             "surface_offsets": self.surface_offsets,
-            **{f"gaussians.{name}": value for name, value in gaussians._asdict().items()},
+            **{f"gaussians.{name}": value for name, value in gaussians._asdict().items() if value is not None},
             **{f"source_pose.{name}": value for name, value in pose._asdict().items()},
             "source_camera.viewmat": camera.viewmat,
             "source_camera.K": camera.K,

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
-from oasis_warp.avatar.densify import SINK, color_at, densify, parts_for_spacing
+from oasis_warp.avatar.densify import SINK, densify, parts_for_spacing, read_at
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.hand.skinning import rest_hand
@@ -116,7 +116,18 @@ def test_asking_for_no_parts_changes_nothing(dressed):
     gaussians = dressed[0]
     made = split(dressed, 1)
     assert made.n_new == 0
-    assert all(torch.equal(a, b) for a, b in zip(made.gaussians, gaussians, strict=True))
+    assert made.gaussians.shade is None
+    assert all(torch.equal(a, b) for a, b in zip(made.gaussians[:-1], gaussians[:-1], strict=True))
+
+
+def test_new_gaussians_have_the_shade_of_the_old_ones_there(dressed):
+    gaussians, vertices, faces, chosen = dressed
+    shaded = gaussians._replace(shade=gaussians.colors.flip(1).clamp_min(0.1))
+    made, flipped = (
+        densify(layer, vertices, faces, torch.where(chosen, 3, 1))
+        for layer in (shaded, gaussians._replace(colors=shaded.shade))
+    )
+    torch.testing.assert_close(made.gaussians.shade, flipped.gaussians.colors)
 
 
 def test_faces_can_be_split_again(dressed):
@@ -141,5 +152,5 @@ def test_the_fade_at_the_wrist_stays_faded(dressed):
 def test_the_colour_at_a_gaussian_of_an_even_hand_is_that_colour(dressed):
     gaussians, vertices, faces, _ = dressed
     even = gaussians._replace(colors=torch.tensor([0.2, 0.5, 0.8]).expand_as(gaussians.colors))
-    found = color_at(even, vertices, faces, vertices[::500])
+    found = read_at(even, even.colors, vertices, faces, vertices[::500])
     assert torch.allclose(found, torch.tensor([0.2, 0.5, 0.8]).expand_as(found), atol=1e-6)

@@ -132,7 +132,7 @@ def test_a_newer_version_is_refused_with_the_remedy(written):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"version": 0}, "expected version 1 to 3, got 0"),
+        ({"version": 0}, "expected version 1 to 4, got 0"),
         ({"version": "1"}, "expected 'version' of type int, got '1'"),
         ({"side": "both"}, "expected side 'left' or 'right', got 'both'"),
         ({"hand_model": None}, "expected 'hand_model' of type str, got None"),
@@ -223,7 +223,21 @@ def test_shade_comes_with_light_as_a_whole_or_not_at_all(tmp_path, tensors):
         save_avatar(tmp_path / "bad", {**tensors, **shade}, HEADER)
 
 
-@pytest.mark.parametrize("version", [1, 2])
+def test_shade_of_gaussians_comes_with_that_of_vertices(tmp_path, tensors):
+    n = len(tensors["surface_offsets"])
+    light = {name: torch.ones(entry.shape) for name, entry in LIGHT.items()}
+    light |= {"light.shade": torch.ones(n, 3), "light.facing": torch.eye(3)[torch.arange(n) % 3]}
+    fine = {"gaussians.shade": torch.full_like(tensors["gaussians.colors"], 0.9)}
+    save_avatar(tmp_path / "shaded", {**tensors, **light, **fine}, HEADER)
+    assert torch.equal(load_avatar(tmp_path / "shaded")[0]["gaussians.shade"], fine["gaussians.shade"])
+    for change in (0 * fine["gaussians.shade"], fine["gaussians.shade"][1:]):
+        with pytest.raises(ValueError, match=r"gaussians\.shade"):
+            save_avatar(tmp_path / "bad", {**tensors, **light, "gaussians.shade": change}, HEADER)
+    with pytest.raises(ValueError, match=r"missing light\.even"):
+        save_avatar(tmp_path / "bad", {**tensors, **fine}, HEADER)
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
 def test_an_older_file_is_read(written, version):
     rewrite(written, version=version)
     assert load_avatar(written)[1]["version"] == version

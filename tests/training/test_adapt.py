@@ -104,7 +104,7 @@ def test_a_gpu_finds_what_the_cpu_finds(hand, case):
     moved = Evidence(*(part.cuda() if isinstance(part, torch.Tensor) else there(part) for part in evidence))
     found = adapt(hand, MeanPrior(hand)(moved), moved, STEPS).gaussians
     assert found.colors.is_cuda
-    back = CanonicalGaussians(*(part.cpu() for part in found))
+    back = CanonicalGaussians(*(part if part is None else part.cpu() for part in found))
     pictures = [drawn(hand, gaussians, evidence).image for gaussians in (back, adapted.gaussians)]
     assert masked_psnr(*pictures, torch.ones_like(evidence.mask)) > 45
 

@@ -2,6 +2,7 @@ import pytest
 import torch
 from painted_truth import Chart, draw_truth, make_truth
 
+from oasis_warp.avatar.lighting import with_shade_on
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import BLACK
@@ -35,9 +36,8 @@ def run(truth, canvas, steps=25):
 
 def draw(truth, gaussians, pose, camera):
     posed = truth.avatar.mesh(pose).vertices
-    return render(
-        pose_gaussians(gaussians, truth.hand.faces, truth.avatar.rest.vertices, posed), camera, background=BLACK
-    )
+    shown = with_shade_on(gaussians)
+    return render(pose_gaussians(shown, truth.hand.faces, truth.avatar.rest.vertices, posed), camera, background=BLACK)
 
 
 def _face_ids(truth):
@@ -67,9 +67,17 @@ def test_gaussians_on_other_faces_are_the_same_bits(truth, tattoo):
     n = int(elsewhere.sum())
     first = len(made.gaussians.vertex_index)
     assert torch.equal(made.gaussians.face_index[:n], old.face_index[elsewhere])
-    on_faces = old.colors[len(old.vertex_index) :][elsewhere]
-    assert torch.equal(made.gaussians.colors[first : first + n], on_faces)
+    for name in ("colors", "shade"):
+        before = getattr(old, name)[len(old.vertex_index) :][elsewhere]
+        assert torch.equal(getattr(made.gaussians, name)[first : first + n], before)
     assert made.n_new == len(made.gaussians.face_index) - n
+
+
+def test_paint_is_in_no_shade(tattoo):
+    made = tattoo[2].gaussians
+    black = made.colors[-tattoo[2].n_new :].amax(1) < 0.2
+    assert int(black.sum()) > 100
+    torch.testing.assert_close(made.shade[-tattoo[2].n_new :][black].median(), torch.tensor(1.0), atol=1e-3, rtol=0)
 
 
 def test_away_from_the_paint_the_picture_stays(truth, tattoo):

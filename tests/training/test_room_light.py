@@ -7,7 +7,14 @@ import torch
 from synthetic import evidence_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.lighting import in_even_light, mirror_light, posed_normals, shading, turn_light
+from oasis_warp.avatar.lighting import (
+    apart_from_shade,
+    in_even_light,
+    mirror_light,
+    posed_normals,
+    shading,
+    turn_light,
+)
 from oasis_warp.avatar.observe import observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
@@ -103,27 +110,46 @@ def turn(pose, degrees):
     return pose._replace(orientation=by @ pose.orientation)
 
 
-def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene):
-    even, truth, pose, _ = scene
+def in_shade(hand, even, truth, of):
+    """Gaussians and light, with a shade of .9 of vertices or of Gaussians."""
     facing = posed_normals(even.rest.vertices, even.posed.vertices, hand.faces)
-    darker = LIGHT._replace(shade=torch.full_like(facing, 0.9), facing=facing)
-    plain, shaded = (avatar(truth, pose, even, light, hand) for light in (LIGHT, darker))
+    if of == "vertices":
+        return truth, LIGHT._replace(shade=torch.full_like(facing, 0.9), facing=facing)
+    light = LIGHT._replace(shade=torch.ones_like(facing), facing=facing)
+    return truth._replace(shade=torch.full_like(truth.colors, 0.9)), light
+
+
+@pytest.mark.parametrize("of", ["vertices", "gaussians"])
+def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene, of):
+    even, truth, pose, _ = scene
+    shady, light = in_shade(hand, even, truth, of)
+    plain, shaded = avatar(truth, pose, even, LIGHT, hand), avatar(shady, pose, even, light, hand)
 
     def ratio(degrees):
         there = turn(pose, degrees)
         return shaded.pose(there).colors / plain.pose(there).colors
 
     torch.testing.assert_close(ratio(0), torch.full_like(truth.colors, 0.9))
-    half = ratio(20)
+    half = ratio(12)
     assert bool((half > 0.9 - 1e-3).all()) and bool((half < 1 + 1e-3).all()) and float(half.std()) > 0.01
     turned = turn(pose, 180)
     away = (shaded.pose(turned).colors / plain.pose(turned).colors)[: len(truth.vertex_index)]
-    around = facing[truth.vertex_index, 0].abs() < 0.7  # others turn by less
+    around = light.facing[truth.vertex_index, 0].abs() < 0.7  # others turn by less
     torch.testing.assert_close(away[around], torch.ones_like(away[around]))
     torch.testing.assert_close(shaded.in_even_light().gaussians.colors, plain.in_even_light().gaussians.colors)
-    turned_light = turn_light(darker, rotation.from_axis_angle(torch.tensor([0.0, 1.0, 0.0]), torch.tensor(0.7)))
+    assert shaded.in_even_light().gaussians.shade is None
+    turned_light = turn_light(light, rotation.from_axis_angle(torch.tensor([0.0, 1.0, 0.0]), torch.tensor(0.7)))
     mirrored = mirror_light(mirror_light(turned_light))
     assert all(torch.equal(a, b) for a, b in zip(mirrored, turned_light, strict=True))
+
+
+def test_colours_and_shade_come_to_what_is_shown():
+    shown = torch.tensor([[0.9, 0.5, 0.0], [1.0, 1.0, 0.2]])
+    shade = torch.tensor([[0.5, 0.5, 0.5], [2.0, 0.5, 1.0]])
+    colors, left = apart_from_shade(shown, shade)
+    assert float(colors.min()) > 0 and float(colors.max()) == 1 and float(left.min()) > 0
+    torch.testing.assert_close(colors * left, shown, atol=2e-3, rtol=0)
+    torch.testing.assert_close(left[1], torch.tensor([2.0, 1.0, 1.0]))
 
 
 def test_where_a_photo_may_show_something_else_that_is_shade(hand, scene):
@@ -144,10 +170,11 @@ def test_where_a_photo_may_show_something_else_that_is_shade(hand, scene):
     assert left(stained._replace(mask=stained.mask * ~spot)) > 0.8
 
 
-def test_many_poses_are_lit_as_each_alone(hand, scene):
+@pytest.mark.parametrize("of", ["vertices", "gaussians"])
+def test_many_poses_are_lit_as_each_alone(hand, scene, of):
     even, truth, pose, _ = scene
-    facing = posed_normals(even.rest.vertices, even.posed.vertices, hand.faces)
-    lit = avatar(truth, pose, even, LIGHT._replace(shade=torch.full_like(facing, 0.9), facing=facing), hand)
+    shady, light = in_shade(hand, even, truth, of)
+    lit = avatar(shady, pose, even, light, hand)
     poses = [pose, pose._replace(angles=named_pose(hand, "fist"))]
     together = lit.pose(type(pose)(*map(torch.stack, zip(*poses, strict=True))))
     for k, one in enumerate(poses):
@@ -164,12 +191,12 @@ def test_a_left_hand_is_lit_in_the_mirror(hand, scene):
 
 def test_the_file_keeps_the_light(hand, scene, tmp_path):
     even, truth, pose, _ = scene
-    facing = posed_normals(even.rest.vertices, even.posed.vertices, hand.faces)
-    light = LIGHT._replace(shade=torch.full_like(facing, 0.9), facing=facing)
-    lit = avatar(truth, pose, even, light, hand)
+    shady, light = in_shade(hand, even, truth, "gaussians")
+    lit = avatar(shady, pose, even, light, hand)
     lit.save(tmp_path / "a.safetensors")
     back = Avatar.load(tmp_path / "a.safetensors")
     assert all(torch.equal(a, b) for a, b in zip(back.light, light, strict=True))
+    assert torch.equal(back.gaussians.shade, shady.shade)
     assert torch.equal(back.pose(pose).colors, lit.pose(pose).colors)
     plain = lit.in_even_light()
     assert plain.light is None

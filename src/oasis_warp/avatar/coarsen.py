@@ -1,7 +1,7 @@
 """Fewer Gaussians where little is to be seen: one a vertex, none a face."""
 
 from oasis_warp.avatar.anchors import place_anchors
-from oasis_warp.avatar.densify import color_at
+from oasis_warp.avatar.densify import read_at
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, PosedHand
 
@@ -15,12 +15,13 @@ def coarsen(hand: HandModel, gaussians: CanonicalGaussians, rest: PosedHand) -> 
 
     Args:
         hand: Whose surface it is.
-        gaussians: Of vertices and faces, on `rest`.
+        gaussians: Of vertices and faces, on `rest`, without shade.
         rest: The surface at rest.
     """
     anchors = place_anchors(hand, rest)
     index, n = anchors.vertex_index, len(anchors.vertex_index)
-    colors = color_at(gaussians, rest.vertices, hand.faces.to(index.device), rest.vertices[index])
+    faces = hand.faces.to(index.device)
+    colors = read_at(gaussians, gaussians.colors, rest.vertices, faces, rest.vertices[index])
     return CanonicalGaussians(
         index,
         rest.vertices.new_zeros(n, 3),

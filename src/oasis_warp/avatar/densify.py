@@ -26,7 +26,7 @@ GROUND_SPREAD = 1.4
 """Standard deviations of those discs over those of a vertex Gaussian. Parts are half transparent: with 1 the hand's
 other side shimmers through, at the wrist the background; with 1.8 the hand from afar is less like its photo."""
 NEIGHBOURS = 12
-"""Old Gaussians that a new one takes its colour from."""
+"""Old Gaussians that a new one takes its looks from."""
 
 
 class Densified(NamedTuple):
@@ -60,8 +60,8 @@ def densify(
 
     A face of n > 1 parts an edge is cut into n^2 triangles of its own shape, each with a Gaussian at its centre. The
     face's Gaussians go; vertex Gaussians all of whose faces are cut sink and become the ground under the new ones. A
-    new Gaussian has the colour that the old ones have there together. Faces without a Gaussian, in the fade at the
-    wrist, stay without.
+    new Gaussian has the colour and the shade that the old ones have there together. Faces without a Gaussian, in the
+    fade at the wrist, stay without.
 
     Args:
         gaussians: On the surface at rest.
@@ -87,11 +87,13 @@ def densify(
     long, short, across = (scales * (PART_SPREAD / FACE_SPREAD / parts[:, None])).unbind(1)
     scales = torch.stack([long, short, across.clamp_min(thickness)], 1)
     centers = (vertices[faces[face_index]] * barycentrics[..., None]).sum(1)
-    colors = color_at(gaussians, vertices, faces, centers)
 
     def joined(old: Tensor, ground: Tensor, fine: Tensor) -> Tensor:
         points = torch.where(sunk.view(-1, *[1] * (old.ndim - 1)), ground, old[:n_points])
         return torch.cat([points, old[n_points:][on_top], fine])
+
+    looks = gaussians.colors if gaussians.shade is None else torch.cat([gaussians.colors, gaussians.shade], 1)
+    looks = joined(looks, looks[:n_points], read_at(gaussians, looks, vertices, faces, centers))
 
     dense = CanonicalGaussians(
         index,
@@ -101,7 +103,8 @@ def densify(
         joined(gaussians.quats, disc_quats[index], quats[face_index]),
         joined(gaussians.scales, GROUND_SPREAD * disc_scales[index], scales[face_index]),
         joined(gaussians.opacities, disc_opacities, PART_OPACITY * (opacity[face_index] / SOLID).clamp(max=1)),
-        joined(gaussians.colors, gaussians.colors[:n_points], colors),
+        looks[:, :3],
+        None if gaussians.shade is None else looks[:, 3:],
     )
     n_new = len(face_index)
     changed = torch.cat([sunk, torch.zeros_like(on_top[on_top]), torch.ones_like(face_index, dtype=torch.bool)])
@@ -151,13 +154,14 @@ def _part_centers(n: int) -> Float[Tensor, "P 3"]:
     return torch.stack([1 - first - second, first, second], -1).double()
 
 
-def color_at(
+def read_at(
     gaussians: CanonicalGaussians,
+    values: Float[Tensor, "N D"],
     vertices: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
     points: Float[Tensor, "M 3"],
-) -> Float[Tensor, "M 3"]:
-    """Colour of the nearest Gaussians at `points` of the surface at rest [m], each weighted by what it covers there."""
+) -> Float[Tensor, "M D"]:
+    """Values of the nearest Gaussians at `points` of the surface at rest [m], each weighted by what it covers there."""
     on_vertices = vertices[gaussians.vertex_index] + gaussians.offsets
     on_faces = (vertices[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
     centers = torch.cat([on_vertices, on_faces])
@@ -169,4 +173,4 @@ def color_at(
     spread = gaussians.scales[:, :2].prod(1).sqrt()
     apart = (points[:, None] - centers[near]).square().sum(-1) / spread[near].square()
     weight = torch.softmax(-0.5 * apart, 1) * gaussians.opacities[near]
-    return (weight[..., None] * gaussians.colors[near]).sum(1) / weight.sum(1, keepdim=True).clamp_min(1e-12)
+    return (weight[..., None] * values[near]).sum(1) / weight.sum(1, keepdim=True).clamp_min(1e-12)

@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -14,23 +14,32 @@ from oasis_warp.ops import depth_map, face_rotations
 
 GAMMA = 2.2
 """Light is sRGB to this power, nearly."""
-AS_IN_PHOTO, TURNED_AWAY = math.cos(math.radians(5)), math.cos(math.radians(30))
+AS_IN_PHOTO, TURNED_AWAY = math.cos(math.radians(5)), math.cos(math.radians(20))
 """Cosines of the angle by which skin has turned from where the photo shows it, up to which its shade stays as it is and
 from which it is gone."""
+BLACK = 1e-3
+"""Least colour that has shade: it is a factor."""
 RIM = 1 / 32
 """Width over which light goes on beyond the surface's outline, over the picture's side."""
 
 
 def shading(light: HandLight, normals: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B V 3"]:
-    """Factor of the sRGB colours of vertices that face `normals` (unit, in the world of the photo's camera)."""
+    """Factor of the sRGB colours of vertices that face `normals` (unit, in the world of the photo's camera).
+
+    Without the shade of Gaussians.
+    """
     received = light.harmonics[0] + normals @ light.harmonics[1:]
     least, most = light.limits.unbind(0)
     factor = torch.minimum(torch.maximum(received, least), most).pow(1 / GAMMA)
     if light.shade is None or light.facing is None:
         return factor
-    cosine = (normals * light.facing).sum(-1, keepdim=True)
-    stays = ((cosine - TURNED_AWAY) / (AS_IN_PHOTO - TURNED_AWAY)).clamp(0, 1)
-    return factor * (1 + stays * (light.shade - 1))
+    return factor * (1 + _stays(light.facing, normals) * (light.shade - 1))
+
+
+def _stays(facing: Float[Tensor, "V 3"], normals: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B V 1"]:
+    """Share of shade that is left."""
+    cosine = (normals * facing).sum(-1, keepdim=True)
+    return ((cosine - TURNED_AWAY) / (AS_IN_PHOTO - TURNED_AWAY)).clamp(0, 1)
 
 
 def lit_colors(
@@ -51,15 +60,52 @@ def factors(
 ) -> Float[Tensor, "*B N 3"]:
     """What `light` multiplies the colours of Gaussians with, where the vertices face `normals`."""
     of_vertices = shading(light, normals)
+    if canonical.shade is None or light.facing is None:
+        return _at_gaussians(of_vertices, faces, canonical)
+    read = _at_gaussians(torch.cat([of_vertices, _stays(light.facing, normals)], -1), faces, canonical)
+    return read[..., :3] * (1 + read[..., 3:] * (canonical.shade - 1))
+
+
+def _at_gaussians(
+    of_vertices: Float[Tensor, "*B V D"], faces: Int[Tensor, "F 3"], canonical: CanonicalGaussians
+) -> Float[Tensor, "*B N D"]:
     if of_vertices.ndim == 2:
         return vertex_to_gaussians(of_vertices, faces, canonical)
     of_poses = vertex_to_gaussians(of_vertices.movedim(0, 1).flatten(1), faces, canonical)
-    return of_poses.unflatten(1, (-1, 3)).movedim(1, 0)
+    return of_poses.unflatten(1, (-1, of_vertices.shape[-1])).movedim(1, 0)
 
 
 def in_even_light(canonical: CanonicalGaussians, light: HandLight) -> CanonicalGaussians:
     """The same without light that depends on the direction."""
-    return canonical._replace(colors=(canonical.colors * light.even.pow(1 / GAMMA)).clamp(0, 1))
+    return canonical._replace(colors=(canonical.colors * light.even.pow(1 / GAMMA)).clamp(0, 1), shade=None)
+
+
+def with_shade_on(canonical: CanonicalGaussians) -> CanonicalGaussians:
+    """The same with shade for colour: what the photo shows, without its light."""
+    if canonical.shade is None:
+        return canonical
+    return canonical._replace(colors=canonical.colors * canonical.shade, shade=None)
+
+
+def apart_from_shade(
+    shown: Float[Tensor, "M 3"], shade: Float[Tensor, "M 3"]
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+    """Colours and shade that come to `shown` together; where colours would end at 1, with more shade than `shade`."""
+    colors = (shown / shade).clamp(BLACK, 1)
+    return colors, shown.clamp_min(BLACK) / colors
+
+
+def with_shown(
+    canonical: CanonicalGaussians, changed: Bool[Tensor, "N"], shown: Float[Tensor, "M 3"]
+) -> CanonicalGaussians:
+    """The same with other looks of some Gaussians in the photo, in the shade that they have there."""
+    if canonical.shade is None:
+        return canonical._replace(colors=canonical.colors.masked_scatter(changed[:, None], shown))
+    colors, shade = apart_from_shade(shown, canonical.shade[changed])
+    return canonical._replace(
+        colors=canonical.colors.masked_scatter(changed[:, None], colors),
+        shade=canonical.shade.masked_scatter(changed[:, None], shade),
+    )
 
 
 def posed_normals(

@@ -139,6 +139,8 @@ class CanonicalGaussians(NamedTuple):
     scales: Float[Tensor, "N 3"]
     opacities: Float[Tensor, "N"]
     colors: Float[Tensor, "N 3"]
+    shade: Float[Tensor, "N 3"] | None = None
+    """Factor of `colors` where skin faces as in the photo; gone where it has turned (`avatar.lighting`)."""
 
 
 class Render(NamedTuple):
@@ -152,8 +154,8 @@ class HandLight(NamedTuple):
     """Light that falls on a hand; it stays in the world when the hand turns.
 
     The light that skin reflects is multiplied with `[1, n] @ harmonics`, kept within `limits`, where n is the direction
-    in which skin faces in the world of the photo's camera. What that does not tell, soft shadows and gloss, stays on
-    skin for as long as it faces as in the photo.
+    in which skin faces in the world of the photo's camera. What that does not tell, shadows and gloss, stays on skin
+    for as long as it faces as in the photo: `shade` here and that of the Gaussians.
     """
 
     harmonics: Float[Tensor, "4 3"]
@@ -163,9 +165,9 @@ class HandLight(NamedTuple):
     even: Float[Tensor, "3"]
     """Light as bright as that on what the photo shows on average, from all around."""
     shade: Float[Tensor, "V 3"] | None = None
-    """Factor of the sRGB colours of vertices that face as in the photo, beyond all this."""
+    """Factor of the sRGB colours of vertices that face as in the photo, where that may show something else there."""
     facing: Float[Tensor, "V 3"] | None = None
-    """Where they faced there, unit; comes with `shade`."""
+    """Where they faced there, unit; comes with any shade."""
 
 
 class TrainingBatch(NamedTuple):

@@ -1,9 +1,9 @@
 """The avatar file: safetensors with a JSON header, so that loading one executes nothing.
 
-Tensors lie in the file as the tables `TENSORS`, `LIGHT` and `SHADE` say. Its metadata have one entry, "oasis-avatar":
-the header, a JSON object whose `version` is 3, or less in files from before there was light (1) or shade (2). A file of
-a newer version is refused. (One entry, because safetensors writes several in any order: the same avatar shall be the
-same bytes.)
+Tensors lie in the file as the tables `TENSORS`, `LIGHT`, `SHADE` and `FINE_SHADE` say. Its metadata have one entry,
+"oasis-avatar": the header, a JSON object whose `version` is 4, or less in files from before there was light (1), shade
+(2) or shade of single Gaussians (3). A file of a newer version is refused. (One entry, because safetensors writes
+several in any order: the same avatar shall be the same bytes.)
 """
 
 import json
@@ -22,7 +22,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.data.atomic import write_file
 
 FORMAT = "oasis-avatar"
-VERSION = 3
+VERSION = 4
 UNIT_TOLERANCE = 1e-3
 UNITS = {"length": "m", "angle": "rad", "quaternion": "wxyz", "color": "sRGB in [0, 1]", "camera": "OpenCV"}
 
@@ -66,6 +66,10 @@ SHADE = {
     "light.shade": Entry(torch.float32, ("V", 3)),
     "light.facing": Entry(torch.float32, ("V", 3)),
 }
+FINE_SHADE = {
+    # As SHADE, of each Gaussian: with it, or not at all.
+    "gaussians.shade": Entry(torch.float32, ("N", 3)),
+}
 HEADER = {"version": int, "side": str, "hand_model": str, "hand_licence": str, "source_camera": dict}
 """Keys that a header has at least, and their types; `source_camera` holds `width` and `height` [px]."""
 
@@ -75,8 +79,8 @@ def save_avatar(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping
 
     Args:
         path: Where to; an existing file is replaced.
-        tensors: One for every name of `TENSORS`, of `LIGHT` or none of them, and then of `SHADE` or none, on any
-            device.
+        tensors: One for every name of `TENSORS`, of `LIGHT` or none of them, then of `SHADE` or none, then of
+            `FINE_SHADE` or none, on any device.
         header: The keys of `HEADER` and any others; `version`, `units`, `counts` and `creator` are filled in.
 
     Raises:
@@ -161,10 +165,10 @@ def _check_header(header: Any) -> None:
 def _check_tensors(tensors: Mapping[str, Tensor]) -> dict[str, int]:
     """Check the tensors against the table; the size of each letter."""
     table = dict(TENSORS)
-    if tensors.keys() & (LIGHT.keys() | SHADE.keys()):
-        table |= LIGHT
-    if tensors.keys() & SHADE.keys():
-        table |= SHADE
+    parts = (LIGHT, SHADE, FINE_SHADE)
+    for k, part in enumerate(parts):  # each needs those before it
+        if tensors.keys() & set().union(*parts[k:]):
+            table |= part
     missing, unknown = table.keys() - tensors.keys(), tensors.keys() - table.keys()
     if missing or unknown:
         found = {"missing": missing, "unknown": unknown}
@@ -201,6 +205,8 @@ def _check_gaussians(tensors: Mapping[str, Tensor]) -> None:
     if "light.shade" in tensors:
         good["light.shade"] = (tensors["light.shade"] > 0).all(1), "factors above 0"
         good["light.facing"] = (tensors["light.facing"].norm(dim=1) - 1).abs() < UNIT_TOLERANCE, "unit vectors"
+    if "gaussians.shade" in tensors:
+        good["gaussians.shade"] = (tensors["gaussians.shade"] > 0).all(1), "factors above 0"
     for name, (ok, expected) in good.items():
         if not bool(ok.all()):
             raise ValueError(f"{name}: expected {expected}, got {int((~ok).sum())} bad rows of {len(ok)}")

@@ -125,7 +125,7 @@ def adapt(
         texture = learn_lora(trained, calibration, pictures, config, progress)
     gaussians = gaussians._replace(colors=texture.colors)
     if light is not None:
-        gaussians, light = skin_and_shade(hand, calibration.apply(prior.colors), gaussians, light)
+        gaussians = skin_and_shade(hand, calibration.apply(prior.colors), gaussians)
     return Adaptation(gaussians, calibration, texture.losses, light)
 
 

@@ -98,8 +98,7 @@ def fuse(
     if lights is not None and config.light == "even":
         made, lights = in_even_light(made, lights[0]), None
     elif lights is not None:
-        parted = [skin_and_shade(hand, calibrated, made, light) for light in lights]
-        made, lights = parted[0][0], tuple(light for _, light in parted)
+        made = skin_and_shade(hand, calibrated, made)
     return Fusion(made, guess, sightings, gains, shading, lights)
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from oasis_warp.avatar.densify import densify, parts_for_spacing
+from oasis_warp.avatar.lighting import with_shade_on, with_shown
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.camera import project
@@ -99,10 +100,10 @@ def repaint(
     parts = torch.where(around, parts_for_spacing(rest, faces, SPACING * pixel).clamp_min(2), 1)
     dense, changed, n_new = densify(gaussians, rest, faces, parts)
 
-    old, new = (pose_gaussians(layer, faces, rest, posed) for layer in (gaussians, dense))
+    old, new = (pose_gaussians(with_shade_on(layer), faces, rest, posed) for layer in (gaussians, dense))
     share, color = read(canvas, seen, new.means[changed])
-    start = torch.lerp(dense.colors[changed], color, share[:, None])
-    still = torch.where(changed[:, None], 0, dense.colors)
+    start = torch.lerp(new.colors[changed], color, share[:, None])
+    still = torch.where(changed[:, None], 0, new.colors)
     views = []
     for camera, weight in _cameras(canvas.camera, posed[faces[around]].flatten(0, 1)):
         before = blend_colors(freeze_view(old, camera), old.colors)
@@ -110,11 +111,14 @@ def repaint(
         weights = freeze_view(new, camera)
         views.append(View(weights, target - blend_colors(weights, still), weight))
     learned, losses = fit_colors(views, start, changed, steps, progress)
+    if dense.shade is not None:  # paint has none
+        lighter = torch.lerp(dense.shade[changed], torch.ones_like(learned), share[:, None])
+        dense = dense._replace(shade=dense.shade.masked_scatter(changed[:, None], lighter))
     _, areas = surface.face_normals(rest, faces)
     on = dense.face_index[-n_new:]
     on_hand = (canvas.mask * (seen.faces >= 0)).sum()
     return Repainted(
-        dense._replace(colors=still.masked_scatter(changed[:, None], learned)),
+        with_shown(dense, changed, learned),
         n_new,
         around,
         float((areas[on] / parts[on].square() * share[-n_new:]).sum()),

@@ -10,6 +10,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_to_gaussians
 from oasis_warp.avatar.densify import densify, parts_for_spacing
+from oasis_warp.avatar.lighting import with_shade_on, with_shown
 from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.camera import project
@@ -98,7 +99,7 @@ def sharpen(
     fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
     fading = with_neighbours(fading[faces].any(1), faces, len(rest))
     sources = [_source(e, faces, fading, own) for e, own in zip(evidences, believed, strict=True)]
-    old = [pose_gaussians(gaussians, faces, rest, source.posed) for source in sources]
+    old = [pose_gaussians(with_shade_on(gaussians), faces, rest, source.posed) for source in sources]
     spacing = torch.stack([
         _wanted_spacing(source, render(there, source.canvas.camera).image, faces)
         for source, there in zip(sources, old, strict=True)
@@ -110,9 +111,10 @@ def sharpen(
     # A face of one part would keep its vertices' Gaussians, which reach into the faces beside it.
     parts = torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
     dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
-    new = [pose_gaussians(dense, faces, rest, source.posed) for source in sources]
-    start = lay_over(dense.colors[changed], sources, [there.means[changed] for there in new])
-    colors = dense.colors.masked_scatter(changed[:, None], start)
+    shown = with_shade_on(dense)
+    new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
+    start = lay_over(shown.colors[changed], sources, [there.means[changed] for there in new])
+    colors = shown.colors.masked_scatter(changed[:, None], start)
     whose = vertex_to_gaussians(believed.T, faces, dense).argmax(1)
     whose_face = believed[:, faces].mean(-1).argmax(0)
     losses: list[float] = []
@@ -125,7 +127,7 @@ def sharpen(
         views = _views(sources, k, points, faces, old[k], new[k], still)
         learned, own = fit_colors(views, colors[mine], mine, STEPS, progress)
         colors, losses = still.masked_scatter(mine[:, None], learned), [*losses, *own]
-    return Sharpened(dense._replace(colors=colors), n_new, tuple(losses))
+    return Sharpened(with_shown(dense, changed, colors[changed]), n_new, tuple(losses))
 
 
 def _source(

@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import vertex_colors
-from oasis_warp.avatar.lighting import factors
+from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
+from oasis_warp.avatar.lighting import apart_from_shade
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import CanonicalGaussians, HandLight
+from oasis_warp.core.types import CanonicalGaussians
 from oasis_warp.training.room_light import DARK
 
 STAYS = 0.2
@@ -32,23 +32,20 @@ MOST = 1.5
 
 
 def skin_and_shade(
-    hand: HandModel, guess: Float[Tensor, "N 3"], learned: CanonicalGaussians, light: HandLight
-) -> tuple[CanonicalGaussians, HandLight]:
-    """The learned Gaussians without what is shade, and the light with it; together they look as before in the photo.
+    hand: HandModel, guess: Float[Tensor, "N 3"], learned: CanonicalGaussians
+) -> CanonicalGaussians:
+    """The learned Gaussians with part of their looks as shade; together colours and shade are as before.
 
     Args:
         hand: Whose surface it is.
         guess: Colours of the Gaussians before they were learned.
         learned: In even light.
-        light: Of the photo, with `facing`.
     """
-    faces = hand.faces.to(guess.device)
-    beyond = learned.colors.clamp_min(DARK).log() - guess.clamp_min(DARK).log()
-    of_vertices = vertex_colors(learned._replace(colors=beyond), len(hand.template)).clamp(-MOST, MOST)
-    fading = (1 - STAYS) * (1 - marks(of_vertices)) * of_vertices
-    shaded = light._replace(shade=fading.exp() if light.shade is None else light.shade * fading.exp())
-    before, after = (factors(learned, faces, known, light.facing) for known in (light, shaded))
-    return learned._replace(colors=(learned.colors * before / after).clamp(0, 1)), shaded
+    beyond = (learned.colors.clamp_min(DARK) / guess.clamp_min(DARK)).log().clamp(-MOST, MOST)
+    of_vertices = vertex_colors(learned._replace(colors=beyond), len(hand.template))
+    sure = vertex_to_gaussians(marks(of_vertices), hand.faces.to(guess.device), learned)
+    colors, shade = apart_from_shade(learned.colors, ((1 - STAYS) * (1 - sure) * beyond).exp())
+    return learned._replace(colors=colors, shade=shade)
 
 
 def marks(beyond: Float[Tensor, "V 3"]) -> Float[Tensor, "V 1"]:
