@@ -23,16 +23,17 @@ from torch.nn.functional import avg_pool2d
 from oasis_warp import __version__
 from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, TrainingBatch
+from oasis_warp.core.types import Camera, Evidence, TrainingBatch
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.claimed_folder import claim_folder
 from oasis_warp.evaluation.columns import COLORS, LIGHTS, markdown
 from oasis_warp.evaluation.held_out import FIRST_PERSON, Lighting, Shoot, as_estimated, photograph, true_targets
-from oasis_warp.evaluation.methods import prior_digest
+from oasis_warp.evaluation.methods import Made, prior_digest
 from oasis_warp.evaluation.metrics import Truth, match_colors, score
-from oasis_warp.evaluation.synthetic import evidence_of
+from oasis_warp.evaluation.synthetic import draw_targets, evidence_of
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.anchors import faces_of_vertices
@@ -120,28 +121,26 @@ class Bench(NamedTuple):
     hand: HandModel
     evidence: Evidence
     batch: TrainingBatch
+    turns: torch.Tensor | None
     truths: list[Truth]
     colors: str
 
 
-def own_psnr(bench: Bench, gaussians: CanonicalGaussians) -> float:
+def own_psnr(bench: Bench, made: Made) -> float:
     """Of the avatar over its photo, inside the outline [dB]."""
-    evidence = bench.evidence
-    posed = pose_gaussians(gaussians, bench.hand.faces, evidence.rest.vertices, evidence.posed.vertices)
-    image, alpha = render(posed, evidence.camera)
+    evidence, faces = bench.evidence, bench.hand.faces
+    rest = evidence.rest.vertices
+    light = None if made.light is None else (made.light, surface.vertex_normals(rest, faces))
+    image, alpha = render(pose_gaussians(made.gaussians, faces, rest, evidence.posed.vertices, light), evidence.camera)
     return masked_psnr(image + (1 - alpha)[..., None] * evidence.image, evidence.image, inner_mask(evidence.mask))
 
 
-def other_psnr(bench: Bench, gaussians: CanonicalGaussians) -> float:
+def other_psnr(bench: Bench, made: Made) -> float:
     """In other poses, from other sides, inside the outline: mean of the targets [dB]."""
-    batch, found = bench.batch, []
-    views = zip(batch.target_posed[0], batch.target_viewmats[0], batch.target_Ks[0], bench.truths, strict=True)
-    for posed, viewmat, K, truth in views:
-        there = pose_gaussians(gaussians, bench.hand.faces, batch.rest[0], posed)
-        image = render(there, Camera(viewmat, K, *reversed(truth.mask.shape))).image
-        if bench.colors == "matched":
-            image = match_colors(image, truth.image, truth.mask)
-        found.append(score(image, truth)["psnr_inner"])
+    found = []
+    for image, truth in zip(draw_targets(made, bench.hand, bench.batch, bench.turns), bench.truths, strict=True):
+        judged = match_colors(image, truth.image, truth.mask) if bench.colors == "matched" else image
+        found.append(score(judged, truth)["psnr_inner"])
     return statistics.fmean(value for value in found if value is not None)
 
 
@@ -157,7 +156,7 @@ def measure(prior: NetworkPrior, light: Lighting, number: int, options: argparse
     batch = as_estimated(hand, session, light, shoot, 1.0)
     exact = as_estimated(hand, session, light, shoot, 0.0)
     truths = true_targets(exact, hand, faces_of_vertices(hand.faces, len(hand.template)))
-    bench = Bench(hand, evidence_of(batch), batch, truths, COLORS[light])
+    bench = Bench(hand, evidence_of(batch), batch, session.turns[light], truths, COLORS[light])
     guess, heads = prior.with_heads(bench.evidence)
     for way in WAYS:  # kernels are loaded, and the photo's neighbours found, before anything is timed
         adapt(bundled_hand(), guess, bench.evidence, AdaptConfig(texture=way, texture_steps=2), heads=heads)
@@ -165,11 +164,12 @@ def measure(prior: NetworkPrior, light: Lighting, number: int, options: argparse
         evidence = shrink(bench.evidence, setting.size)
         start = seconds(device)
         made = adapt(bundled_hand(), guess, evidence, setting.config, heads=heads)
+        taken, worn = seconds(device) - start, Made(made.gaussians, made.light)
         found[setting.name()] = {
-            "seconds": seconds(device) - start,
+            "seconds": taken,
             "steps": len(made.losses),
-            "own": own_psnr(bench, made.gaussians),
-            "other": other_psnr(bench, made.gaussians),
+            "own": own_psnr(bench, worn),
+            "other": other_psnr(bench, worn),
         }
         write_file(place, json.dumps(found).encode())
         print(f"{light}, person {number}: {title}", file=sys.stderr)

@@ -6,8 +6,11 @@ import curve_one_shot as curve
 import torch
 from synthetic import evidence_of
 
+from oasis_warp.avatar.lighting import GAMMA
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.camera import project
+from oasis_warp.core.types import HandLight
+from oasis_warp.evaluation.methods import Made
 
 
 def test_a_smaller_photo_shows_the_same_from_the_same_side(hand):
@@ -36,3 +39,13 @@ def test_tables_are_of_what_has_been_measured_for_everybody(tmp_path):
     assert list(titles) == [title for title, setting in wanted.items() if (setting.config.texture_steps or 0) <= 84]
     assert titles["lora, 84 steps"]["time"] == 2 and titles["lora, 84 steps"]["own"] == 30.5
     assert "| default: the field until its loss is flat | 5 | 30.50 | 25.00 | 1.00 |" in curve.as_markdown(made)
+
+
+def test_avatars_are_drawn_in_the_light_of_their_photo(hand):
+    evidence, truth, _ = evidence_of(hand, MeanPrior(hand).vertex_colors(0.02), size=64)
+    dim = torch.tensor([0.5, 0.4, 0.3])
+    light = HandLight(torch.cat([dim[None], torch.zeros(3, 3)]), dim.repeat(2, 1), torch.ones(3))
+    shown = evidence._replace(image=evidence.image * dim.pow(1 / GAMMA))
+    bench = curve.Bench(hand, shown, None, None, [], "raw")
+    lit, unlit = (curve.own_psnr(bench, Made(truth, there)) for there in (light, None))
+    assert lit > unlit + 5

@@ -39,7 +39,7 @@ from oasis_warp.evaluation.held_out import (
     photograph,
     true_targets,
 )
-from oasis_warp.evaluation.methods import METHODS, Method, label, prior_digest, reconstructions
+from oasis_warp.evaluation.methods import METHODS, Made, Method, label, prior_digest, reconstructions
 from oasis_warp.evaluation.metrics import Truth, match_colors, score
 from oasis_warp.evaluation.pictures import (
     ATTENTION_COLUMNS,
@@ -231,26 +231,33 @@ def measure(bench: _Bench, folder: Path, device: torch.device, group: Group, num
 def draw(
     bench: _Bench, hand: HandModel, batch: TrainingBatch, turns: Float[Tensor, "T 3 3"] | None
 ) -> Iterator[tuple[Method, list[Tensor]]]:
-    """What each method makes of the one photo of `batch`, drawn as each target shows it, over black.
+    """What each method makes of the one photo of `batch`, drawn as each target shows it."""
+    methods = asked_methods(bench.priors, bench.config)
+    for method, made in reconstructions(
+        bundled_hand(), evidence_of(batch), bench.priors, methods, bench.config.adapt
+    ):
+        yield method, draw_targets(made, hand, batch, turns)
+
+
+def draw_targets(
+    made: Made, hand: HandModel, batch: TrainingBatch, turns: Float[Tensor, "T 3 3"] | None
+) -> list[Float[Tensor, "H H 3"]]:
+    """What was made of the one photo of `batch` as each target shows it, over black.
 
     `turns` says how the photo's light falls on targets (`Session.turns`); without, it does not.
     """
-    evidence, size = evidence_of(batch), batch.target_images.shape[2]
-    normals = surface.vertex_normals(evidence.rest.vertices, hand.faces)
-    for method, made in reconstructions(
-        bundled_hand(), evidence, bench.priors, asked_methods(bench.priors, bench.config), bench.config.adapt
+    rest, size = batch.rest[0], batch.target_images.shape[2]
+    normals, images = surface.vertex_normals(rest, hand.faces), []
+    for k, (posed, viewmat, K) in enumerate(
+        zip(batch.target_posed[0], batch.target_viewmats[0], batch.target_Ks[0], strict=True)
     ):
-        images = []
-        for k, (posed, viewmat, K) in enumerate(
-            zip(batch.target_posed[0], batch.target_viewmats[0], batch.target_Ks[0], strict=True)
-        ):
-            if made.light is None or turns is None:
-                there = pose_gaussians(made.without_light(), hand.faces, batch.rest[0], posed)
-            else:
-                light = turn_light(made.light, turns[k].to(normals)), normals
-                there = pose_gaussians(made.gaussians, hand.faces, batch.rest[0], posed, light)
-            images.append(render(there, Camera(viewmat, K, size, size)).image)
-        yield method, images
+        if made.light is None or turns is None:
+            there = pose_gaussians(made.without_light(), hand.faces, rest, posed)
+        else:
+            light = turn_light(made.light, turns[k].to(normals)), normals
+            there = pose_gaussians(made.gaussians, hand.faces, rest, posed, light)
+        images.append(render(there, Camera(viewmat, K, size, size)).image)
+    return images
 
 
 def score_all(images: list[Tensor], truths: list[Truth], perceptual: Perceptual | None) -> Iterator[Record]:
