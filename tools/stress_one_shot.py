@@ -46,7 +46,7 @@ def make(stressed: Stressed, config: ReconstructConfig, *, force: bool) -> Recon
 
 def is_sane(gaussians: CanonicalGaussians) -> bool:
     """Whether every number is finite, every colour a colour and no Gaussian larger than `LARGEST`."""
-    finite = all(bool(part.isfinite().all()) for part in gaussians)
+    finite = all(bool(part.isfinite().all()) for part in gaussians if part is not None)
     colors = gaussians.colors
     return finite and bool(((colors >= 0) & (colors <= 1)).all()) and float(gaussians.scales.max()) < LARGEST
 

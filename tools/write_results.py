@@ -32,9 +32,10 @@ at a time.
 ```
 
 *Reprojection*: mean distance of the 21 landmarks to the model's, in % of the longer side of their box. *PSNR*: the
-avatar in the photo's pose over black, against the photo, at 256 px, inside the mask above the wrist line; where the
-mask is wrong, black is compared with background. *Coverage*: share of the posed mesh's silhouette with alpha >= 0.9,
-the fading rim of the wrist left out. *Fit* includes both masks and the second looks.
+avatar in the photo's pose over black, against the photo at its own size (256 to 1024 px), inside the mask above the
+wrist line; where the mask is wrong, black is compared with background, and a pixel of the outline is half background in
+the photo and half black here. *Coverage*: share of the posed mesh's silhouette with alpha >= 0.9, the fading rim of the
+wrist left out. *Fit* includes both masks and the second looks.
 
 ## The estimator
 
@@ -46,7 +47,15 @@ With the learned prior, which is the default, and without it (`--prior none`).
 
 {avatar}
 
-Times are with the other core busy, by other work too.
+Times are with the other core busy, by other work too. With an H200 (`ReconstructConfig(device="cuda")`; `oasis
+reconstruct` prints the stages) the single photos took 2.4 to 4.0 s once the process was warm, 2.9 in the median, and
+when they were done again in the same process 2.9 to 4.4, 3.6 in the median; three of them on another day 2.2 to 2.9.
+Most of that waits for one core of the machine's processor:
+
+| median seconds | landmarks | fit | prior | outline | adaptation | detail | quality | total |
+|---|---|---|---|---|---|---|---|---|
+| first | 0.03 | 0.92 | 0.01 | 0.80 | 0.74 | 0.26 | 0.13 | 2.9 |
+| again | 0.03 | 1.15 | 0.01 | 1.08 | 0.88 | 0.26 | 0.14 | 3.6 |
 
 ## Single photos
 

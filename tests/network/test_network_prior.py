@@ -163,8 +163,9 @@ def test_a_prior_is_chosen_by_word_or_by_file(weights, bundle, network, evidence
     assert own.about == {"name": str(weights), "sha256": digest(weights), "step": 1200}
     assert none.about == {"name": "none"}
     assert isinstance(none, MeanPrior)
-    for field, ours, its in zip(learned(evidences[0])._fields, learned(evidences[0]), own(evidences[0]), strict=True):
-        assert torch.equal(ours, its), field
+    ours, its = learned(evidences[0]), own(evidences[0])
+    for field in ours._fields[:-1]:  # a guess has no shade
+        assert torch.equal(getattr(ours, field), getattr(its, field)), field
     assert choose_prior("learned") is learned  # read once a process
 
 
@@ -215,5 +216,5 @@ def test_the_prior_that_ships_is_small_says_how_it_was_trained_and_knows_the_bun
         assert path.stat().st_size <= 10_000_000
         assert json.loads(read_header(path)["notes"])["seed"] >= 0
     guess, mean = prior(evidences[0]), MeanPrior(hand)(evidences[0])
-    assert all(bool(part.isfinite().all()) for part in guess)
+    assert all(bool(part.isfinite().all()) for part in guess if part is not None)
     assert not torch.equal(guess.colors[:100], mean.colors[:100])

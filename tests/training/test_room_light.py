@@ -123,6 +123,7 @@ def in_shade(hand, even, truth, of):
 def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene, of):
     even, truth, pose, _ = scene
     shady, light = in_shade(hand, even, truth, of)
+    assert light.facing is not None
     plain, shaded = avatar(truth, pose, even, LIGHT, hand), avatar(shady, pose, even, light, hand)
 
     def ratio(degrees):
