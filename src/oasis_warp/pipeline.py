@@ -32,10 +32,9 @@ from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
-from oasis_warp.training.adapt import adapt
+from oasis_warp.training.adapt import adapt, detail_of
 from oasis_warp.training.outline import drawn_outline_offsets
 from oasis_warp.training.refine import refine
-from oasis_warp.training.room_light import without_light
 from oasis_warp.training.sharpen import sharpen
 
 CROP_MARGIN = 1.12
@@ -134,7 +133,7 @@ def reconstruct(
     if (size := finer_size(fit, config)) is not None:
         with stage("detail"):
             close = make_evidence(photo, fit, offsets, config, size)
-            plain = without_light(hand, close, light) if light else close
+            plain = detail_of(hand, gaussians, close, light)
             gaussians = sharpen(hand, gaussians, [plain], progress=progress).gaussians
     avatar = make_avatar(fit, offsets, evidence, gaussians, light)
     with stage("quality"):

@@ -3,7 +3,7 @@ import torch
 from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, evidence_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.observe import observe
+from oasis_warp.avatar.observe import inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, estimate_melanin
 from oasis_warp.core import surface
@@ -11,7 +11,7 @@ from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import CanonicalGaussians, Evidence
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.render.render import render
-from oasis_warp.training.adapt import adapt
+from oasis_warp.training.adapt import adapt, detail_of
 
 CAST = torch.tensor([0.90, 0.85, 0.80])  # a little dim and warm
 STEPS = AdaptConfig(texture_steps=60)
@@ -68,6 +68,22 @@ def test_the_side_that_was_not_seen_takes_the_light_of_the_photo(hand, regions, 
     on_back = back[adapted.gaussians.vertex_index]
     true, fitted = (g.colors[: len(on_back)][on_back].mean(0) for g in (truth, adapted.gaussians))
     assert float((fitted - true).norm()) < 0.15  # a palm alone leaves brown skin and warm light alike
+
+
+def test_detail_is_read_off_a_photo_only_where_it_surely_shows_the_skin(hand, case):
+    evidence, _, _, adapted = case
+    assert detail_of(hand, adapted.gaussians, evidence, None) is evidence
+    plain = detail_of(hand, adapted.gaussians, evidence, adapted.light)
+    outside = evidence.mask < 0.01
+    background = torch.tensor([0.1, 0.9, 0.2])
+    rim = (evidence.mask > 0.9) & (inner_mask(evidence.mask, 2) < 0.5)
+    stained = torch.where((outside | rim)[..., None], background, evidence.image)
+    found = detail_of(hand, adapted.gaussians, evidence._replace(image=stained), adapted.light)
+    inside = inner_mask(evidence.mask, 12) > 0.9
+    assert int(rim.sum()) > 100 and int(inside.sum()) > 100
+    assert float(found.mask[rim].mean()) < 0.3 < 0.7 < float(plain.mask[rim].mean())
+    torch.testing.assert_close(found.mask[inside], plain.mask[inside])
+    torch.testing.assert_close(found.image[inside], plain.image[inside])
 
 
 def test_there_is_no_seam_where_seen_meets_unseen(hand, case):

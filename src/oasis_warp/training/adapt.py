@@ -168,6 +168,21 @@ def light_on(
     return factors(gaussians, faces, light, posed_normals(rest, evidence.posed.vertices, faces))
 
 
+def detail_of(
+    hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence, light: HandLight | None
+) -> Evidence:
+    """What a photo, perhaps a larger one than was adapted to, shows of the skin of `gaussians`.
+
+    As `read_skin`: in even light, its mask where it surely shows what the surface has there. The photo itself where
+    there is no light apart.
+    """
+    if light is None:
+        return evidence
+    skin = in_photo(hand, gaussians, evidence).view
+    lit = lit_picture(hand, _drawn(skin, gaussians.colors), evidence, light._replace(shade=None))
+    return without_light(hand, surely_shown(hand, lit, evidence), light)
+
+
 def _complete(
     hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence, view: BlendWeights, config: AdaptConfig
 ) -> CanonicalGaussians:
