@@ -18,11 +18,12 @@ from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors, stack_weights
 from oasis_warp.render.cameras import orbit_camera
-from oasis_warp.training.adapt import MIN_ALPHA, Reading, adapt, detail_of, in_photo, light_on, read_skin
+from oasis_warp.training.adapt import MIN_ALPHA, Reading, adapt, in_photo, light_on, read_skin
 from oasis_warp.training.calibrate import calibrate
 from oasis_warp.training.complete import complete_field
 from oasis_warp.training.light import even_photo
 from oasis_warp.training.picture_fit import aim
+from oasis_warp.training.room_light import without_light
 from oasis_warp.training.sharpen import sharpen
 from oasis_warp.training.sightings import Sightings, look, photo_gains
 from oasis_warp.training.skin_or_shade import skin_and_shade
@@ -101,6 +102,15 @@ def fuse(
     return Fusion(made, guess, sightings, gains, shading, lights)
 
 
+def unlit(
+    hand: HandModel, evidences: Sequence[Evidence], lights: Sequence[HandLight] | None
+) -> Sequence[Evidence]:
+    """The photos without their lights, where these are known apart from the skin."""
+    if lights is None:
+        return evidences
+    return [without_light(hand, *pair) for pair in zip(evidences, lights, strict=True)]
+
+
 def add_detail(
     hand: HandModel,
     fusion: Fusion,
@@ -120,11 +130,7 @@ def add_detail(
             other photo gives any where it is the best.
         progress: Told of the colours' fit.
     """
-    lights = fusion.lights or (None,) * len(evidences)
-    evidences = [
-        detail_of(hand, fusion.gaussians._replace(colors=(fusion.gaussians.colors * gain).clamp(0, 1)), evidence, light)
-        for evidence, gain, light in zip(evidences, fusion.gains, lights, strict=True)
-    ]
+    evidences = unlit(hand, evidences, fusion.lights)
     share = look(hand, evidences, resolution).share ** DETAIL_SHARPNESS
     share = share / share.sum(0)
     finer = [k for k, evidence in enumerate(evidences) if len(evidence.image) > size]
