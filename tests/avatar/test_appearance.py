@@ -71,3 +71,9 @@ def test_skin_is_mottled_the_same_way_every_time(hand, regions):
     colors = region_colors(regions, 0.04)
     back = (regions.palm < 0.05) & (regions.nail < 0.1) & (regions.knuckle < 0.1)
     assert 0.005 < float(colors[back].std(0).mean()) < 0.04
+
+
+def test_labels_are_the_same_on_any_device(hand, regions, device):
+    found = label_regions(hand.to(device))
+    for name, want in regions._asdict().items():
+        torch.testing.assert_close(getattr(found, name).cpu(), want, rtol=0, atol=1e-5, msg=name)

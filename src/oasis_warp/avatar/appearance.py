@@ -39,7 +39,7 @@ class Regions(NamedTuple):
 
 
 def _mottle(n_vertices: int, edges: Tensor) -> Tensor:
-    noise = torch.randn(n_vertices, 1, generator=torch.Generator().manual_seed(0))
+    noise = torch.randn(n_vertices, 1, generator=torch.Generator().manual_seed(0)).to(edges.device)
     layers = [surface.smooth_over_mesh(noise, edges, passes)[:, 0] for passes in MOTTLE_PASSES]
     total = sum((layer - layer.mean()) / layer.std() for layer in layers)
     return total / total.std()
