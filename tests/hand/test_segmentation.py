@@ -76,6 +76,17 @@ def test_the_second_cut_takes_a_leak_away_and_fills_a_bite(drawing):
     assert iou((again > 0.5) & above, truth & above) > 0.97
 
 
+def test_fingers_that_touch_in_the_mesh_but_not_in_the_photo_stay_apart(drawing):
+    picture, xy, scale, truth = drawing
+    above = hand_side(xy, truth.shape) > 0
+    wide = int(0.012 * scale)
+    mesh = cv2.morphologyEx((truth & above).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((wide, wide))) * 255
+    slits = (mesh > 0) & ~truth & above
+    assert slits.sum() > 40
+    again = mask_from_fit(picture, xy, scale, truth.astype(np.float32), mesh)
+    assert (again[slits] > 0.5).mean() < 0.1
+
+
 def test_masks_are_repeatable(drawing):
     picture, xy, scale, _ = drawing
     np.testing.assert_array_equal(mask_from_landmarks(picture, xy, scale), mask_from_landmarks(picture, xy, scale))

@@ -106,7 +106,7 @@ def mask_from_fit(rgb: np.ndarray, xy: np.ndarray, scale: float, mask: np.ndarra
     below = _below(size, points, -0.01 * metre)  # the mesh ends at the wrist, the arm does not
     far = (outside < 0.007 * metre) | (below & _capsules(size, points, metre, 2.2, _WRIST_CUT + 0.02))
     sure = _capsules(size, points, metre, 0.45, 0.5 * _WRIST_CUT)
-    sure |= (inside > 0.006 * metre) & _capsules(size, points, metre, 0.8, 0.0)
+    sure |= (inside > 0.006 * metre) & _capsules(size, points, metre, 0.6, 0.0)  # fingers that touch leave slits free
     near = (window.part(mask) > 0.5) & far
     return window.back(_cut(window, points, metre, Seeds(sure & far, near, far)), rgb.shape[:2])
 
