@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from oasis_kernels import cuda_values
+from oasis_kernels.runtime import cuda_values
 from oasis_warp.ops._values import Look, check_finite
 from oasis_warp.ops.rasterization import rasterization
 

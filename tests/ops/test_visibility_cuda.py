@@ -17,7 +17,7 @@ from test_visibility_vectors import (
     unproject,
 )
 
-from oasis_kernels import cuda_depth_draw, cuda_depth_pull
+from oasis_kernels.depth import cuda_depth_draw, cuda_depth_pull
 from oasis_warp.ops import _depth_cuda, depth_map, depth_visibility
 
 

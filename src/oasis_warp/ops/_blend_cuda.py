@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_kernels import cuda_binning, cuda_draw, cuda_draw_backward, cuda_long_lists
+from oasis_kernels.rasterize import cuda_binning, cuda_draw, cuda_draw_backward, cuda_long_lists
 from oasis_warp.ops._launch import current_stream, run_cuda, wait_for
 from oasis_warp.ops._pair_counts import Counts, own_slot, remember, watching
 from oasis_warp.ops._records import Size

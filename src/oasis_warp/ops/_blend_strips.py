@@ -1,11 +1,11 @@
-"""Blend strip by strip with the vector kernels: float32 on the CPU. See `oasis_kernels/strips.py` for the layout."""
+"""Blend strip by strip with the vector kernels: float32 on the CPU. See `oasis_kernels/rasterize/strips.py` for the layout."""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from oasis_kernels import strips, strips_backward, strips_binning, strips_forward
+from oasis_kernels.rasterize import strips, strips_backward, strips_binning, strips_forward
 from oasis_warp.ops._launch import address, run_native
 from oasis_warp.ops._registration import hidden, hidden_like_fake, revealed
 from oasis_warp.ops._rules import current_rules

@@ -7,8 +7,8 @@ from torch import Tensor
 from warp import vec4i
 from warp.types import vector
 
-from oasis_kernels import rasterize_backward as backward_kernels
-from oasis_kernels import rasterize_forward as forward_kernels
+from oasis_kernels.rasterize import rasterize_backward as backward_kernels
+from oasis_kernels.rasterize import rasterize_forward as forward_kernels
 from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
 from oasis_warp.ops._registration import hidden_like_fake, revealed
 from oasis_warp.ops._rules import current_rules

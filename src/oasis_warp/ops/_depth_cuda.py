@@ -7,8 +7,8 @@ vertex.
 import torch
 from torch import Tensor
 
-from oasis_kernels import cuda_depth_draw, cuda_depth_pull, cuda_depth_resolve
-from oasis_kernels.cuda_depth import BLOCK
+from oasis_kernels.depth import cuda_depth_draw, cuda_depth_pull, cuda_depth_resolve
+from oasis_kernels.depth.cuda_depth import BLOCK
 from oasis_warp.ops._depth_scene import (
     Buffer,
     Query,

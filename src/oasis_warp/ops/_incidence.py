@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from oasis_kernels import incidence as kernels
+from oasis_kernels.posing import incidence as kernels
 from oasis_warp.core.checks import check_index
 from oasis_warp.ops._launch import even_cuts, launch_ranges, view
 

@@ -16,8 +16,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from oasis_kernels.cuda_native import CudaNative
-from oasis_kernels.native import Native
+from oasis_kernels.runtime.cuda_native import CudaNative
+from oasis_kernels.runtime.native import Native
 
 _start_lock = threading.Lock()
 _load_lock = threading.Lock()

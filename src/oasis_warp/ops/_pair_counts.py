@@ -15,8 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_kernels import cuda_draw, cuda_long_lists
-from oasis_kernels.cuda_binning import REPORT
+from oasis_kernels.rasterize import cuda_draw, cuda_long_lists
+from oasis_kernels.rasterize.cuda_binning import REPORT
 from oasis_warp.ops._tiles import MAX_PAIRS
 
 PAGE = 4096

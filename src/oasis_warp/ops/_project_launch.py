@@ -11,12 +11,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from oasis_kernels import cuda_projection, cuda_projection_backward
-from oasis_kernels import projection as generic
-from oasis_kernels import projection_vectors_backward as vector_backward
-from oasis_kernels import projection_vectors_forward as vector_forward
-from oasis_kernels.native import PHASE_WORDS
-from oasis_kernels.projection_vectors import CHUNK
+from oasis_kernels.rasterize import cuda_projection, cuda_projection_backward
+from oasis_kernels.rasterize import projection as generic
+from oasis_kernels.rasterize import projection_vectors_backward as vector_backward
+from oasis_kernels.rasterize import projection_vectors_forward as vector_forward
+from oasis_kernels.rasterize.projection_vectors import CHUNK
+from oasis_kernels.runtime.native import PHASE_WORDS
 from oasis_warp.core.checks import FINITE_LIMIT
 from oasis_warp.ops._launch import (
     SCALAR,

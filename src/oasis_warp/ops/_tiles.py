@@ -7,7 +7,7 @@ import warp as wp
 from jaxtyping import Int32, Int64
 from torch import Tensor
 
-from oasis_kernels import tiles
+from oasis_kernels.rasterize import tiles
 from oasis_warp.ops._launch import even_cuts, launch, launch_ranges, view
 from oasis_warp.ops._registration import hidden, revealed
 

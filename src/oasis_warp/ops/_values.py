@@ -5,8 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from oasis_kernels import cuda_values
-from oasis_kernels.finite import ALL_FINITE
+from oasis_kernels.runtime import cuda_values
+from oasis_kernels.runtime.finite import ALL_FINITE
 from oasis_warp.core import checks
 from oasis_warp.ops._launch import current_stream, has_vectors, run_cuda, run_native
 from oasis_warp.ops._pair_counts import slots

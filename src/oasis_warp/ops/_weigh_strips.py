@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from oasis_kernels import strips_weights
+from oasis_kernels.rasterize import strips_weights
 from oasis_warp.ops._blend_strips import count, cut_strips
 from oasis_warp.ops._launch import address, run_native
 from oasis_warp.ops._registration import revealed

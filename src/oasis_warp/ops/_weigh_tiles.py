@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from warp import vec4i
 
-from oasis_kernels import rasterize_weights as kernels
+from oasis_kernels.rasterize import rasterize_weights as kernels
 from oasis_warp.ops._blend_tiles import CUDA_LANES, lane_grid
 from oasis_warp.ops._launch import SCALAR, VEC4, launch_ranges, view
 from oasis_warp.ops._registration import revealed

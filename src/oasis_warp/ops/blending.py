@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels import constants
-from oasis_kernels.cuda_binning import INDEX_BITS
+from oasis_kernels.rasterize.cuda_binning import INDEX_BITS
 from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops import _blend_cuda, _blend_strips, _blend_tiles
 from oasis_warp.ops._launch import has_vectors

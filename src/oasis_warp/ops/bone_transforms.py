@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_kernels import kinematics as kernels
+from oasis_kernels.skinning import kinematics as kernels
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._launch import current_stream, run_cuda, run_native
 from oasis_warp.ops._poses import summed_over_poses

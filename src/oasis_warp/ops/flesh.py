@@ -5,7 +5,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_kernels import flesh as kernels
+from oasis_kernels.skinning import flesh as kernels
 from oasis_warp.core.checks import check_shape
 from oasis_warp.ops._launch import even_cuts, launch_ranges, view
 from oasis_warp.ops._registration import operator

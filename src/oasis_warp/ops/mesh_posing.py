@@ -5,7 +5,7 @@ from typing import Any, Literal, NamedTuple
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_kernels import barycentric as kernels
+from oasis_kernels.posing import barycentric as kernels
 from oasis_warp.core.checks import check_choice, check_float, check_shape
 from oasis_warp.ops._incidence import sum_at_items
 from oasis_warp.ops._launch import even_cuts, has_cuda_kernels, has_vectors, launch_ranges, view

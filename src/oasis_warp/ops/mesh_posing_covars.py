@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_kernels import face_stretch as kernels
+from oasis_kernels.posing import face_stretch as kernels
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._incidence import incidence, riders_at_vertices, sum_at_items
 from oasis_warp.ops._launch import even_cuts, launch_ranges, view

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_kernels import pixel_noise as kernels
+from oasis_kernels.scene import pixel_noise as kernels
 from oasis_warp.core.checks import check_shape
 from oasis_warp.ops._launch import even_cuts, launch_ranges, view
 from oasis_warp.ops._registration import operator

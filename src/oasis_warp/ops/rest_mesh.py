@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_kernels import cuda_posing_turn as cuda_kernels
-from oasis_kernels import face_rotation_vectors as vector_kernels
+from oasis_kernels.posing import cuda_posing_turn as cuda_kernels
+from oasis_kernels.posing import face_rotation_vectors as vector_kernels
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._incidence import incidence
 from oasis_warp.ops._launch import current_stream, has_cuda_kernels, has_vectors, run_cuda, run_native

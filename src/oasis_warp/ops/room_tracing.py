@@ -5,7 +5,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_kernels import rooms as kernels
+from oasis_kernels.scene import rooms as kernels
 from oasis_warp.core.checks import check_shape
 from oasis_warp.ops._launch import even_cuts, launch_ranges, view
 from oasis_warp.ops._registration import operator
@@ -70,7 +70,7 @@ def trace_rooms(
     """Linear light of rooms of solids, out of focus with their distance; nothing here carries a gradient.
 
     Args:
-        solids: float32 rows of `SOLID_WORDS` numbers in the camera's frame, laid out in `oasis_kernels.rooms`; rows
+        solids: float32 rows of `SOLID_WORDS` numbers in the camera's frame, laid out in `oasis_kernels.scene.rooms`; rows
             of shape 0 are none.
         focals: Of the camera [px], whose axis is the picture's middle.
         sky: Coefficients of the light from all around.

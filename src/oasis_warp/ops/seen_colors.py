@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_kernels import cuda_seen_colors as cuda_kernels
-from oasis_kernels import spherical_harmonics as kernels
+from oasis_kernels.rasterize import cuda_seen_colors as cuda_kernels
+from oasis_kernels.rasterize import spherical_harmonics as kernels
 from oasis_warp.ops._launch import (
     SCALAR,
     VEC3,

@@ -7,7 +7,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_kernels import skin_light, skin_shading
+from oasis_kernels.scene import skin_light, skin_shading
 from oasis_warp.core.checks import check_positive, check_shape
 from oasis_warp.ops._incidence import incidence
 from oasis_warp.ops._launch import even_cuts, launch_ranges, view

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_kernels import cuda_posing_skin as cuda_kernels
-from oasis_kernels import skinning as kernels
-from oasis_kernels import skinning_vectors as vector_kernels
+from oasis_kernels.posing import cuda_posing_skin as cuda_kernels
+from oasis_kernels.skinning import skinning as kernels
+from oasis_kernels.skinning import skinning_vectors as vector_kernels
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._launch import (
     current_stream,

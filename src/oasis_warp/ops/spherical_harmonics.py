@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_kernels import spherical_harmonics as kernels
+from oasis_kernels.rasterize import spherical_harmonics as kernels
 from oasis_warp.core.checks import check_float
 from oasis_warp.ops._launch import SCALAR, VEC3, even_cuts, launch_ranges, view
 from oasis_warp.ops._registration import adjoint, differentiable, operator

@@ -1,0 +1,1 @@
+"""Depth buffers of meshes, and which points they hide."""

@@ -1,0 +1,1 @@
+"""Gaussians on a posed mesh: face rotations, barycentric points, and everything fused."""

@@ -1,0 +1,1 @@
+"""Gaussians to pictures: projection, binning, blending, their adjoints, and spherical harmonics."""

@@ -1,0 +1,1 @@
+"""Kernels of the synthetic world only: rooms, skies, skin shading, surface patterns."""

@@ -1,0 +1,1 @@
+"""Joint transforms and linear blend skinning."""
