@@ -11,7 +11,7 @@ from oasis_warp.bench.operators import OPERATORS
 from oasis_warp.bench.rows import write_rows
 from oasis_warp.bench.scenes import equal_depths, hand_scenes, layered
 from oasis_warp.bench.torch_rasterizer import draw
-from oasis_warp.ops._rules import Rules
+from oasis_warp.ops._runtime.rules import Rules
 
 COARSE_STOP = Setting("stop", "0.01", Rules(transmittance_stop=1e-2))
 

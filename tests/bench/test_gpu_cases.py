@@ -13,7 +13,7 @@ from oasis_warp.bench.gpu_timing import Captured
 from oasis_warp.bench.operators import OPERATORS, Results
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
-from oasis_warp.ops._pair_counts import Overflow
+from oasis_warp.ops._runtime.pair_counts import Overflow
 
 SMALL = {
     "picture": picture(2_000, 64, 1, "forward"),

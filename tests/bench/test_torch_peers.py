@@ -9,7 +9,7 @@ from oasis_warp.bench import scenes
 from oasis_warp.bench.errors import psnr, relative_error
 from oasis_warp.bench.operators import OPERATORS, exact, forward, gradients
 from oasis_warp.bench.torch_rasterizer import draw
-from oasis_warp.ops._rules import Rules
+from oasis_warp.ops._runtime.rules import Rules
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,9 @@ from rasterization_scenes import ordinary_scene
 from test_strips import Guards
 
 from oasis_warp.certify.twins import rasterization as twin
-from oasis_warp.ops import _blend_strips, _weigh_strips, blend_colors, blend_weights, rasterization
+from oasis_warp.ops import blend_colors, blend_weights, rasterization
+from oasis_warp.ops._runtime import blend_strips as _blend_strips
+from oasis_warp.ops._runtime import weigh_strips as _weigh_strips
 
 
 def weights_and_image(device, dtype, **options):

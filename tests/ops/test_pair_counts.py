@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from oasis_warp.ops import _pair_counts
-from oasis_warp.ops._pair_counts import Counts
+from oasis_warp.ops._runtime import pair_counts as _pair_counts
+from oasis_warp.ops._runtime.pair_counts import Counts
 
 
 @pytest.fixture

@@ -9,15 +9,9 @@ import pytest
 import torch
 
 from oasis_warp.core.rotation import to_matrix
-from oasis_warp.ops import (
-    _launch,
-    _words,
-    bone_transforms,
-    face_rotations,
-    pose_on_mesh,
-    pose_on_mesh_covars,
-    skin,
-)
+from oasis_warp.ops import bone_transforms, face_rotations, pose_on_mesh, pose_on_mesh_covars, skin
+from oasis_warp.ops._runtime import launch as _launch
+from oasis_warp.ops._runtime import words as _words
 
 
 def mesh(seed, n, dtype):

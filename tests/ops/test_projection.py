@@ -14,8 +14,8 @@ from test_rasterization_stiff import CASES
 
 from oasis_kernels.constants import Rules
 from oasis_warp.ops import projection as module
-from oasis_warp.ops._records import Tables
-from oasis_warp.ops._rules import using
+from oasis_warp.ops._runtime.records import Tables
+from oasis_warp.ops._runtime.rules import using
 from oasis_warp.ops.projection import Projection, project
 
 # Both kernels compute in float64: what differs is the rounding of the stored float32, 6e-8 relative.

@@ -7,7 +7,7 @@ from rasterization_scenes import ordinary_scene
 from test_projection import DTYPES
 
 from oasis_warp.ops import projection as module
-from oasis_warp.ops._records import Tables
+from oasis_warp.ops._runtime.records import Tables
 from oasis_warp.ops.projection import Projection, project
 
 N = 19

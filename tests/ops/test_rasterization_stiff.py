@@ -10,8 +10,8 @@ from rasterization_scenes import frontal_scene, intrinsics, look_from, ordinary_
 from test_rasterization import assert_equals_twin, draw
 
 from oasis_warp.ops import rasterization
-from oasis_warp.ops._registration import revealed
-from oasis_warp.ops._tiles import MAX_PAIRS, bin_by_dealing, bin_by_sorting, bin_to_tiles
+from oasis_warp.ops._runtime.registration import revealed
+from oasis_warp.ops._runtime.tiles import MAX_PAIRS, bin_by_dealing, bin_by_sorting, bin_to_tiles
 from oasis_warp.ops.projection import project
 
 STIFF = 1e-5, 1e-4

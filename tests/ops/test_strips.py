@@ -13,10 +13,12 @@ from test_rasterization import GRADIENT_ERROR, INPUTS, VALUE_ERROR, draw, rel, s
 from test_rasterization_stiff import CASES
 
 from oasis_kernels.constants import Rules
-from oasis_warp.ops import _blend_strips, _tiles, blending, rasterization
-from oasis_warp.ops._registration import revealed
-from oasis_warp.ops._rules import using
-from oasis_warp.ops._splats import Frame, Splats, Wanted
+from oasis_warp.ops import blending, rasterization
+from oasis_warp.ops._runtime import blend_strips as _blend_strips
+from oasis_warp.ops._runtime import tiles as _tiles
+from oasis_warp.ops._runtime.registration import revealed
+from oasis_warp.ops._runtime.rules import using
+from oasis_warp.ops._runtime.splats import Frame, Splats, Wanted
 from oasis_warp.ops.projection import project
 
 SIZES = [(1, 1), (16, 16), (257, 2), (2, 65), (65, 63)]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from oasis_kernels.runtime import cuda_values
-from oasis_warp.ops._values import Look, check_finite
+from oasis_warp.ops._runtime.values import Look, check_finite
 from oasis_warp.ops.rasterization import rasterization
 
 POISON = float("nan"), float("inf"), -float("inf"), 1.1e15, -1e30

@@ -7,7 +7,8 @@ import torch
 
 from oasis_warp.certify.twins import visibility as twin
 from oasis_warp.core.rotation import to_matrix
-from oasis_warp.ops import _depth_buffer, depth_map, depth_visibility
+from oasis_warp.ops import depth_map, depth_visibility
+from oasis_warp.ops._runtime import depth_buffer as _depth_buffer
 
 WIDTH, HEIGHT = 37, 26
 TAU = 0.05

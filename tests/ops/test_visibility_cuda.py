@@ -18,7 +18,8 @@ from test_visibility_vectors import (
 )
 
 from oasis_kernels.depth import cuda_depth_draw, cuda_depth_pull
-from oasis_warp.ops import _depth_cuda, depth_map, depth_visibility
+from oasis_warp.ops import depth_map, depth_visibility
+from oasis_warp.ops._runtime import depth_cuda as _depth_cuda
 
 
 def on(device, arguments):

@@ -5,7 +5,8 @@ import torch
 from test_visibility import HEIGHT, TAU, WIDTH, some_points, soup, visible
 
 from oasis_warp.certify.twins import visibility as twin
-from oasis_warp.ops import _depth_buffer, depth_map, depth_visibility
+from oasis_warp.ops import depth_map, depth_visibility
+from oasis_warp.ops._runtime import depth_buffer as _depth_buffer
 
 
 @pytest.fixture(params=["vectors", "points"])

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from oasis_warp.core.hand_model import BACK_SIDE, PALM_SIDE
-from oasis_warp.ops import _depth_buffer, depth_map, depth_visibility
+from oasis_warp.ops import depth_map, depth_visibility
+from oasis_warp.ops._runtime import depth_buffer as _depth_buffer
 
 EYE = torch.eye(4, dtype=torch.float64)
 

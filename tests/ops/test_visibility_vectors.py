@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from oasis_warp.core.rotation import to_matrix
-from oasis_warp.ops import _depth_buffer, depth_map, depth_visibility
+from oasis_warp.ops import depth_map, depth_visibility
+from oasis_warp.ops._runtime import depth_buffer as _depth_buffer
 
 SIZES = ((1, 1), (1, 40), (33, 2), (64, 64), (130, 47))
 

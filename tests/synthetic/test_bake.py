@@ -135,7 +135,7 @@ def test_a_gpu_bakes_the_person_that_the_cpu_bakes(baked, monkeypatch):
 
 @pytest.mark.gpu
 def test_a_gpu_needs_no_kernel_for_the_cpu(monkeypatch):
-    from oasis_warp.ops import _launch
+    from oasis_warp.ops._runtime import launch as _launch
 
     people._known.clear()
     was = _launch.device_and_stream

@@ -26,7 +26,7 @@ from oasis_warp.bench.scenes import (
 from oasis_warp.bench.timing import Timed, Timing, peak_megabytes, time_together
 from oasis_warp.bench.yardstick import make_yardstick
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.ops._rules import using
+from oasis_warp.ops._runtime.rules import using
 
 SWEPT = ("rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "skin")
 """Operators that have knobs of their own: `blend_weights` draws by the rasterizer's, posing is two of these."""

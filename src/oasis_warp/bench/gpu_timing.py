@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 import torch
 
 from oasis_warp.bench.timing import synchronise
-from oasis_warp.ops._pair_counts import Overflow, watch_overflow
+from oasis_warp.ops._runtime.pair_counts import Overflow, watch_overflow
 
 STEPS_A_GRAPH = 10
 """Calls in the graph whose replays give the GPU time of one, so that the launch of the graph hardly counts."""

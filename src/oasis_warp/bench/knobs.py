@@ -10,7 +10,7 @@ from torch.nn.functional import interpolate
 
 from oasis_warp.bench.operators import Outputs
 from oasis_warp.bench.scenes import MeshScene, Scene
-from oasis_warp.ops._rules import Rules
+from oasis_warp.ops._runtime.rules import Rules
 
 RULES = Rules()
 

@@ -11,7 +11,7 @@ from unittest.mock import patch
 
 from torch import Tensor
 
-from oasis_warp.ops import _depth_buffer
+from oasis_warp.ops._runtime import depth_buffer as _depth_buffer
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from oasis_warp.bench.scenes import Scene
 from oasis_warp.core.rotation import to_matrix
-from oasis_warp.ops._rules import Rules
+from oasis_warp.ops._runtime.rules import Rules
 
 ALPHA_MAX = 0.9990000128746033
 EPS2D = 0.30000001192092896

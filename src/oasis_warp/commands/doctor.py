@@ -190,7 +190,7 @@ def check_kernels() -> str:
     """The rasterizer draws one Gaussian as the formula says, on every device."""
     import torch
 
-    from oasis_warp.ops._launch import kernel_cache
+    from oasis_warp.ops._runtime.launch import kernel_cache
 
     cache = kernel_cache()
     if not _can_write(cache):

@@ -1,8 +1,9 @@
 """Differentiable operators on torch tensors, computed by Warp kernels on the CPU or a CUDA device."""
 
-from oasis_warp.ops._pair_counts import watch_overflow as watch_overflow
-from oasis_warp.ops._values import Look as Look
-from oasis_warp.ops._values import check_finite as check_finite
+from oasis_warp.ops._runtime.pair_counts import watch_overflow as watch_overflow
+from oasis_warp.ops._runtime.values import Look as Look
+from oasis_warp.ops._runtime.values import check_finite as check_finite
+from oasis_warp.ops._runtime.warm_up import warm_up as warm_up
 from oasis_warp.ops.blend_weights import BlendWeights as BlendWeights
 from oasis_warp.ops.blend_weights import blend_colors as blend_colors
 from oasis_warp.ops.blend_weights import blend_weights as blend_weights
@@ -26,4 +27,3 @@ from oasis_warp.ops.skinning import skin as skin
 from oasis_warp.ops.spherical_harmonics import spherical_harmonics as spherical_harmonics
 from oasis_warp.ops.visibility import DepthVisibility as DepthVisibility
 from oasis_warp.ops.visibility import depth_visibility as depth_visibility
-from oasis_warp.ops.warm_up import warm_up as warm_up

@@ -11,11 +11,11 @@ from torch.autograd.function import once_differentiable
 
 from oasis_kernels import constants
 from oasis_warp.core.checks import check_float, check_shape
-from oasis_warp.ops._launch import has_vectors
-from oasis_warp.ops._scene_checks import check_cameras, check_gaussians
-from oasis_warp.ops._splats import Splats
-from oasis_warp.ops._weigh_strips import weigh as weigh_strips
-from oasis_warp.ops._weigh_tiles import weigh as weigh_tiles
+from oasis_warp.ops._runtime.launch import has_vectors
+from oasis_warp.ops._runtime.scene_checks import check_cameras, check_gaussians
+from oasis_warp.ops._runtime.splats import Splats
+from oasis_warp.ops._runtime.weigh_strips import weigh as weigh_strips
+from oasis_warp.ops._runtime.weigh_tiles import weigh as weigh_tiles
 from oasis_warp.ops.projection import project
 
 

@@ -10,11 +10,13 @@ from torch import Tensor
 from oasis_kernels import constants
 from oasis_kernels.rasterize.cuda_binning import INDEX_BITS
 from oasis_warp.core.tracing import is_traced
-from oasis_warp.ops import _blend_cuda, _blend_strips, _blend_tiles
-from oasis_warp.ops._launch import has_vectors
-from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
-from oasis_warp.ops._splats import Frame, Splats, Wanted
-from oasis_warp.ops._values import check_finite
+from oasis_warp.ops._runtime import blend_cuda as _blend_cuda
+from oasis_warp.ops._runtime import blend_strips as _blend_strips
+from oasis_warp.ops._runtime import blend_tiles as _blend_tiles
+from oasis_warp.ops._runtime.launch import has_vectors
+from oasis_warp.ops._runtime.registration import adjoint, differentiable, needs_gradient, operator
+from oasis_warp.ops._runtime.splats import Frame, Splats, Wanted
+from oasis_warp.ops._runtime.values import check_finite
 from oasis_warp.ops.projection import Projection
 
 

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from oasis_kernels.skinning import kinematics as kernels
 from oasis_warp.core.checks import check_float, check_shape
-from oasis_warp.ops._launch import current_stream, run_cuda, run_native
-from oasis_warp.ops._poses import summed_over_poses
-from oasis_warp.ops._registration import adjoint, differentiable, operator
-from oasis_warp.ops._values import check_finite
-from oasis_warp.ops._words import place, pointer
+from oasis_warp.ops._runtime.launch import current_stream, run_cuda, run_native
+from oasis_warp.ops._runtime.poses import summed_over_poses
+from oasis_warp.ops._runtime.registration import adjoint, differentiable, operator
+from oasis_warp.ops._runtime.values import check_finite
+from oasis_warp.ops._runtime.words import place, pointer
 
 SCALAR_NAMES = {torch.float32: "float", torch.float64: "double"}
 

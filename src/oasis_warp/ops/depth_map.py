@@ -8,10 +8,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_warp.core.checks import check_choice, check_float, check_positive, check_shape
-from oasis_warp.ops._depth_buffer import draw, plane_size
-from oasis_warp.ops._depth_scene import Scene, Wanted
-from oasis_warp.ops._incidence import incidence
-from oasis_warp.ops._registration import operator
+from oasis_warp.ops._runtime.depth_buffer import draw, plane_size
+from oasis_warp.ops._runtime.depth_scene import Scene, Wanted
+from oasis_warp.ops._runtime.incidence import incidence
+from oasis_warp.ops._runtime.registration import operator
 
 
 class DepthMap(NamedTuple):

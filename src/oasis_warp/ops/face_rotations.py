@@ -11,8 +11,8 @@ from oasis_kernels.posing import cuda_posing_turn as cuda_kernels
 from oasis_kernels.posing import face_rotation as kernels
 from oasis_kernels.posing import face_rotation_vectors as vector_kernels
 from oasis_warp.core.checks import check_float, check_shape
-from oasis_warp.ops._incidence import Incidence, incidence, sum_at_items
-from oasis_warp.ops._launch import (
+from oasis_warp.ops._runtime.incidence import Incidence, incidence, sum_at_items
+from oasis_warp.ops._runtime.launch import (
     current_stream,
     even_cuts,
     has_cuda_kernels,
@@ -22,10 +22,10 @@ from oasis_warp.ops._launch import (
     run_native,
     view,
 )
-from oasis_warp.ops._poses import at_pose, pose_by_pose, summed_over_poses
-from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
-from oasis_warp.ops._values import check_finite
-from oasis_warp.ops._words import aligned, place, pointer, task_count
+from oasis_warp.ops._runtime.poses import at_pose, pose_by_pose, summed_over_poses
+from oasis_warp.ops._runtime.registration import adjoint, differentiable, needs_gradient, operator
+from oasis_warp.ops._runtime.values import check_finite
+from oasis_warp.ops._runtime.words import aligned, place, pointer, task_count
 from oasis_warp.ops.rest_mesh import RestMesh
 
 

@@ -7,13 +7,20 @@ from torch import Tensor
 
 from oasis_kernels.posing import barycentric as kernels
 from oasis_warp.core.checks import check_choice, check_float, check_shape
-from oasis_warp.ops._incidence import sum_at_items
-from oasis_warp.ops._launch import even_cuts, has_cuda_kernels, has_vectors, launch_ranges, view
-from oasis_warp.ops._poses import at_pose, pose_by_pose
-from oasis_warp.ops._registration import adjoint, differentiable, operator
-from oasis_warp.ops._riders import SHARED, Floats, Riders, find_riders, pose_backward_vectorised, pose_vectorised
-from oasis_warp.ops._riders_cuda import pose_backward_on_cuda, pose_on_cuda
-from oasis_warp.ops._values import check_finite
+from oasis_warp.ops._runtime.incidence import sum_at_items
+from oasis_warp.ops._runtime.launch import even_cuts, has_cuda_kernels, has_vectors, launch_ranges, view
+from oasis_warp.ops._runtime.poses import at_pose, pose_by_pose
+from oasis_warp.ops._runtime.registration import adjoint, differentiable, operator
+from oasis_warp.ops._runtime.riders import (
+    SHARED,
+    Floats,
+    Riders,
+    find_riders,
+    pose_backward_vectorised,
+    pose_vectorised,
+)
+from oasis_warp.ops._runtime.riders_cuda import pose_backward_on_cuda, pose_on_cuda
+from oasis_warp.ops._runtime.values import check_finite
 
 HALF_POWERS = {"sqrt_area": 1, "area": 2, "none": 0}
 """Twice the exponent of the area ratio in each scale law."""

@@ -7,10 +7,10 @@ from torch import Tensor
 
 from oasis_kernels.posing import face_stretch as kernels
 from oasis_warp.core.checks import check_float, check_shape
-from oasis_warp.ops._incidence import incidence, riders_at_vertices, sum_at_items
-from oasis_warp.ops._launch import even_cuts, launch_ranges, view
-from oasis_warp.ops._registration import adjoint, differentiable, operator
-from oasis_warp.ops._values import check_finite
+from oasis_warp.ops._runtime.incidence import incidence, riders_at_vertices, sum_at_items
+from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._runtime.registration import adjoint, differentiable, operator
+from oasis_warp.ops._runtime.values import check_finite
 
 
 class PosedCovars(NamedTuple):

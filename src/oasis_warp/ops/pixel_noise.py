@@ -8,8 +8,8 @@ from torch import Tensor
 
 from oasis_kernels.scene import pixel_noise as kernels
 from oasis_warp.core.checks import check_shape
-from oasis_warp.ops._launch import even_cuts, launch_ranges, view
-from oasis_warp.ops._registration import operator
+from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._runtime.registration import operator
 
 
 def _noise(seeds: Tensor, shape: list[int]) -> Tensor:

@@ -10,8 +10,8 @@ from jaxtyping import Float, Float64, Int32, UInt8
 from torch import Tensor
 
 from oasis_warp.core.checks import check_finite
-from oasis_warp.ops._launch import has_cuda_kernels, has_vectors
-from oasis_warp.ops._project_launch import (
+from oasis_warp.ops._runtime.launch import has_cuda_kernels, has_vectors
+from oasis_warp.ops._runtime.project_launch import (
     Incoming,
     Limits,
     Outputs,
@@ -25,8 +25,8 @@ from oasis_warp.ops._project_launch import (
     project_generic,
     project_vectors,
 )
-from oasis_warp.ops._records import Tables, tables
-from oasis_warp.ops._registration import adjoint, differentiable, operator
+from oasis_warp.ops._runtime.records import Tables, tables
+from oasis_warp.ops._runtime.registration import adjoint, differentiable, operator
 
 INPUTS = "means", "quats", "scales", "covars", "viewmats"
 """Arguments that receive gradients."""

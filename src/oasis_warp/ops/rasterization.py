@@ -13,8 +13,8 @@ from oasis_kernels import constants
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.checks import check_choice
 from oasis_warp.core.tracing import is_traced
-from oasis_warp.ops._scene_checks import check_cameras, check_coefficients, check_colors, check_gaussians
-from oasis_warp.ops._values import Look, check_finite
+from oasis_warp.ops._runtime.scene_checks import check_cameras, check_coefficients, check_colors, check_gaussians
+from oasis_warp.ops._runtime.values import Look, check_finite
 from oasis_warp.ops.blending import blend
 from oasis_warp.ops.projection import project
 from oasis_warp.ops.seen_colors import seen_colors

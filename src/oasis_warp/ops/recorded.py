@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from oasis_warp.ops._launch import current_stream, wait_for
-from oasis_warp.ops._pair_counts import watch_overflow
+from oasis_warp.ops._runtime.launch import current_stream, wait_for
+from oasis_warp.ops._runtime.pair_counts import watch_overflow
 from oasis_warp.ops.rasterization import rasterization
 
 WARM_UPS = 2

@@ -6,7 +6,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from oasis_warp.ops._pair_counts import watch_overflow
+from oasis_warp.ops._runtime.pair_counts import watch_overflow
 
 Result = TypeVar("Result")
 

@@ -9,11 +9,11 @@ from torch import Tensor
 from oasis_kernels.posing import cuda_posing_turn as cuda_kernels
 from oasis_kernels.posing import face_rotation_vectors as vector_kernels
 from oasis_warp.core.checks import check_float, check_shape
-from oasis_warp.ops._incidence import incidence
-from oasis_warp.ops._launch import current_stream, has_cuda_kernels, has_vectors, run_cuda, run_native
-from oasis_warp.ops._registration import operator
-from oasis_warp.ops._values import check_finite
-from oasis_warp.ops._words import place, pointer, task_count
+from oasis_warp.ops._runtime.incidence import incidence
+from oasis_warp.ops._runtime.launch import current_stream, has_cuda_kernels, has_vectors, run_cuda, run_native
+from oasis_warp.ops._runtime.registration import operator
+from oasis_warp.ops._runtime.values import check_finite
+from oasis_warp.ops._runtime.words import place, pointer, task_count
 
 
 class RestMesh(NamedTuple):

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from oasis_kernels.scene import rooms as kernels
 from oasis_warp.core.checks import check_shape
-from oasis_warp.ops._launch import even_cuts, launch_ranges, view
-from oasis_warp.ops._registration import operator
+from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._runtime.registration import operator
 from oasis_warp.ops.skin_shading import Lamps
 
 SOLID_WORDS = int(kernels.SOLID_WORDS)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from oasis_kernels.rasterize import cuda_seen_colors as cuda_kernels
 from oasis_kernels.rasterize import spherical_harmonics as kernels
-from oasis_warp.ops._launch import (
+from oasis_warp.ops._runtime.launch import (
     SCALAR,
     VEC3,
     VEC4,
@@ -19,7 +19,7 @@ from oasis_warp.ops._launch import (
     run_cuda,
     view,
 )
-from oasis_warp.ops._registration import adjoint, differentiable, operator
+from oasis_warp.ops._runtime.registration import adjoint, differentiable, operator
 
 
 def _seen(means: Tensor, coefficients: Tensor, viewmats: Tensor, degree: int) -> Tensor:

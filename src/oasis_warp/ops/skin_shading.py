@@ -9,9 +9,9 @@ from torch import Tensor
 
 from oasis_kernels.scene import skin_light, skin_shading
 from oasis_warp.core.checks import check_positive, check_shape
-from oasis_warp.ops._incidence import incidence
-from oasis_warp.ops._launch import even_cuts, launch_ranges, view
-from oasis_warp.ops._registration import operator
+from oasis_warp.ops._runtime.incidence import incidence
+from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._runtime.registration import operator
 from oasis_warp.ops.depth_map import DepthMap
 
 LIGHT_WIDTHS = (1.25e-3, 0.45e-3, 0.25e-3)

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from oasis_kernels.rasterize import spherical_harmonics as kernels
 from oasis_warp.core.checks import check_float
-from oasis_warp.ops._launch import SCALAR, VEC3, even_cuts, launch_ranges, view
-from oasis_warp.ops._registration import adjoint, differentiable, operator
-from oasis_warp.ops._values import check_finite
+from oasis_warp.ops._runtime.launch import SCALAR, VEC3, even_cuts, launch_ranges, view
+from oasis_warp.ops._runtime.registration import adjoint, differentiable, operator
+from oasis_warp.ops._runtime.values import check_finite
 
 MAX_DEGREE = 3
 

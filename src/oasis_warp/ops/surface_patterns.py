@@ -10,8 +10,8 @@ from torch import Tensor
 
 from oasis_kernels.scene import surface_patterns as kernels
 from oasis_warp.core.checks import check_index, check_positive, check_shape
-from oasis_warp.ops._launch import even_cuts, launch, launch_ranges, view
-from oasis_warp.ops._registration import operator
+from oasis_warp.ops._runtime.launch import even_cuts, launch, launch_ranges, view
+from oasis_warp.ops._runtime.registration import operator
 
 
 class NoiseField(NamedTuple):

@@ -7,10 +7,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_warp.core.checks import check_float, check_positive, check_shape
-from oasis_warp.ops._depth_buffer import draw, gradients
-from oasis_warp.ops._depth_scene import Query, Scene, Wanted
-from oasis_warp.ops._incidence import incidence
-from oasis_warp.ops._registration import adjoint, differentiable, needs_gradient, operator
+from oasis_warp.ops._runtime.depth_buffer import draw, gradients
+from oasis_warp.ops._runtime.depth_scene import Query, Scene, Wanted
+from oasis_warp.ops._runtime.incidence import incidence
+from oasis_warp.ops._runtime.registration import adjoint, differentiable, needs_gradient, operator
 from oasis_warp.ops.depth_map import batched, check_batched, check_scene
 
 MARGIN_TAUS = 3.0

@@ -13,8 +13,8 @@ from oasis_kernels.depth import depth_buffer as kernels
 from oasis_kernels.depth import depth_buffer_vectors as vectors
 from oasis_kernels.depth.depth_buffer_job import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
 from oasis_warp.core.checks import check_index, check_positive
-from oasis_warp.ops import _depth_cuda
-from oasis_warp.ops._depth_scene import (
+from oasis_warp.ops._runtime import depth_cuda as _depth_cuda
+from oasis_warp.ops._runtime.depth_scene import (
     Buffer,
     Query,
     Scene,
@@ -25,10 +25,10 @@ from oasis_warp.ops._depth_scene import (
     only,
     shared,
 )
-from oasis_warp.ops._incidence import _transposed, sum_at_items
-from oasis_warp.ops._launch import launch, run_shared, view
-from oasis_warp.ops._pair_counts import own_slot
-from oasis_warp.ops._values import Look, check_finite
+from oasis_warp.ops._runtime.incidence import _transposed, sum_at_items
+from oasis_warp.ops._runtime.launch import launch, run_shared, view
+from oasis_warp.ops._runtime.pair_counts import own_slot
+from oasis_warp.ops._runtime.values import Look, check_finite
 
 C_TYPES = {torch.float32: "float", torch.float64: "double"}
 MAX_FRACTION_BITS = 22

@@ -9,7 +9,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from oasis_kernels.posing import incidence as kernels
 from oasis_warp.core.checks import check_index
-from oasis_warp.ops._launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
 
 
 class Incidence(NamedTuple):

@@ -8,8 +8,8 @@ from jaxtyping import Int32, Int64
 from torch import Tensor
 
 from oasis_kernels.rasterize import tiles
-from oasis_warp.ops._launch import even_cuts, launch, launch_ranges, view
-from oasis_warp.ops._registration import hidden, revealed
+from oasis_warp.ops._runtime.launch import even_cuts, launch, launch_ranges, view
+from oasis_warp.ops._runtime.registration import hidden, revealed
 
 MAX_PAIRS = 2**31 - 1
 """Pairs of a Gaussian and a tile that one call can hold."""

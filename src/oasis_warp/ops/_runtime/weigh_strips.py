@@ -4,12 +4,12 @@ import torch
 from torch import Tensor
 
 from oasis_kernels.rasterize import strips_weights
-from oasis_warp.ops._blend_strips import count, cut_strips
-from oasis_warp.ops._launch import address, run_native
-from oasis_warp.ops._registration import revealed
-from oasis_warp.ops._rules import current_rules
-from oasis_warp.ops._splats import Splats
-from oasis_warp.ops._weigh_tiles import SparseWeights, check_weights
+from oasis_warp.ops._runtime.blend_strips import count, cut_strips
+from oasis_warp.ops._runtime.launch import address, run_native
+from oasis_warp.ops._runtime.registration import revealed
+from oasis_warp.ops._runtime.rules import current_rules
+from oasis_warp.ops._runtime.splats import Splats
+from oasis_warp.ops._runtime.weigh_tiles import SparseWeights, check_weights
 
 
 def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeights:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from oasis_kernels.depth import cuda_depth_draw, cuda_depth_pull, cuda_depth_resolve
 from oasis_kernels.depth.cuda_depth import BLOCK
-from oasis_warp.ops._depth_scene import (
+from oasis_warp.ops._runtime.depth_scene import (
     Buffer,
     Query,
     Scene,
@@ -19,7 +19,7 @@ from oasis_warp.ops._depth_scene import (
     empty_scores,
     shared,
 )
-from oasis_warp.ops._launch import current_stream, run_cuda
+from oasis_warp.ops._runtime.launch import current_stream, run_cuda
 
 MOST_BLOCKS = 1 << 22
 """Of a launch: Warp counts threads in 32 bits. Kernels go round until all is done."""

@@ -18,7 +18,7 @@ from oasis_kernels.rasterize import projection_vectors_forward as vector_forward
 from oasis_kernels.rasterize.projection_vectors import CHUNK
 from oasis_kernels.runtime.native import PHASE_WORDS
 from oasis_warp.core.checks import FINITE_LIMIT
-from oasis_warp.ops._launch import (
+from oasis_warp.ops._runtime.launch import (
     SCALAR,
     VEC2,
     VEC3,
@@ -32,10 +32,10 @@ from oasis_warp.ops._launch import (
     view,
     wait_for,
 )
-from oasis_warp.ops._pair_counts import own_slot
-from oasis_warp.ops._records import counters_size, empty_records, table_words, tables
-from oasis_warp.ops._rules import current_rules
-from oasis_warp.ops._values import refuse_capture
+from oasis_warp.ops._runtime.pair_counts import own_slot
+from oasis_warp.ops._runtime.records import counters_size, empty_records, table_words, tables
+from oasis_warp.ops._runtime.rules import current_rules
+from oasis_warp.ops._runtime.values import refuse_capture
 
 CAMERA_SUM_BLOCK = 1024
 """Gaussians whose camera gradients one thread of the generic kernel adds up; fixed, so that threads change no sum."""

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from oasis_kernels.posing.posing_vectors import TASK
-from oasis_warp.ops._launch import address
+from oasis_warp.ops._runtime.launch import address
 
 
 def place(tensor: Tensor | None, size: int, dtype: torch.dtype = torch.float32) -> int:

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from oasis_kernels.posing import cuda_posing_riders as kernels
-from oasis_warp.ops._launch import current_stream, run_cuda
-from oasis_warp.ops._poses import summed_over_poses
-from oasis_warp.ops._riders import SHARED, Floats, Riders
-from oasis_warp.ops._words import aligned, pointer
+from oasis_warp.ops._runtime.launch import current_stream, run_cuda
+from oasis_warp.ops._runtime.poses import summed_over_poses
+from oasis_warp.ops._runtime.riders import SHARED, Floats, Riders
+from oasis_warp.ops._runtime.words import aligned, pointer
 
 
 def _blocks(n: int) -> int:

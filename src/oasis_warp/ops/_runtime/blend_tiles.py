@@ -9,11 +9,11 @@ from warp.types import vector
 
 from oasis_kernels.rasterize import rasterize_backward as backward_kernels
 from oasis_kernels.rasterize import rasterize_forward as forward_kernels
-from oasis_warp.ops._launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
-from oasis_warp.ops._registration import hidden_like_fake, revealed
-from oasis_warp.ops._rules import current_rules
-from oasis_warp.ops._splats import Frame, Gradients, Splats, Wanted
-from oasis_warp.ops._tiles import Tiles, bin_to_tiles, even_work
+from oasis_warp.ops._runtime.launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
+from oasis_warp.ops._runtime.registration import hidden_like_fake, revealed
+from oasis_warp.ops._runtime.rules import current_rules
+from oasis_warp.ops._runtime.splats import Frame, Gradients, Splats, Wanted
+from oasis_warp.ops._runtime.tiles import Tiles, bin_to_tiles, even_work
 
 CUDA_LANES = 16, 16
 """Lanes across and down a tile on CUDA: with the default tile of 16 pixels, one lane a pixel."""

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from oasis_kernels.rasterize import strips, strips_backward, strips_binning, strips_forward
-from oasis_warp.ops._launch import address, run_native
-from oasis_warp.ops._registration import hidden, hidden_like_fake, revealed
-from oasis_warp.ops._rules import current_rules
-from oasis_warp.ops._splats import Frame, Gradients, Splats, Wanted
-from oasis_warp.ops._tiles import check_pairs
+from oasis_warp.ops._runtime.launch import address, run_native
+from oasis_warp.ops._runtime.registration import hidden, hidden_like_fake, revealed
+from oasis_warp.ops._runtime.rules import current_rules
+from oasis_warp.ops._runtime.splats import Frame, Gradients, Splats, Wanted
+from oasis_warp.ops._runtime.tiles import check_pairs
 
 TILES_ACROSS, TILES_DOWN = 16, 2
 """Size of a strip in tiles: 256 x 32 pixels with tiles of 16."""

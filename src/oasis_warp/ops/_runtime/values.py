@@ -8,8 +8,8 @@ from torch import Tensor
 from oasis_kernels.runtime import cuda_values
 from oasis_kernels.runtime.finite import ALL_FINITE
 from oasis_warp.core import checks
-from oasis_warp.ops._launch import current_stream, has_vectors, run_cuda, run_native
-from oasis_warp.ops._pair_counts import slots
+from oasis_warp.ops._runtime.launch import current_stream, has_vectors, run_cuda, run_native
+from oasis_warp.ops._runtime.pair_counts import slots
 
 
 def check_finite(**tensors: Tensor | None) -> None:

@@ -7,12 +7,12 @@ from torch import Tensor
 from warp import vec4i
 
 from oasis_kernels.rasterize import rasterize_weights as kernels
-from oasis_warp.ops._blend_tiles import CUDA_LANES, lane_grid
-from oasis_warp.ops._launch import SCALAR, VEC4, launch_ranges, view
-from oasis_warp.ops._registration import revealed
-from oasis_warp.ops._rules import current_rules
-from oasis_warp.ops._splats import Splats
-from oasis_warp.ops._tiles import bin_to_tiles, even_work
+from oasis_warp.ops._runtime.blend_tiles import CUDA_LANES, lane_grid
+from oasis_warp.ops._runtime.launch import SCALAR, VEC4, launch_ranges, view
+from oasis_warp.ops._runtime.registration import revealed
+from oasis_warp.ops._runtime.rules import current_rules
+from oasis_warp.ops._runtime.splats import Splats
+from oasis_warp.ops._runtime.tiles import bin_to_tiles, even_work
 
 MAX_WEIGHTS = 2**31 - 1
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from oasis_kernels.rasterize import cuda_draw, cuda_long_lists
 from oasis_kernels.rasterize.cuda_binning import REPORT
-from oasis_warp.ops._tiles import MAX_PAIRS
+from oasis_warp.ops._runtime.tiles import MAX_PAIRS
 
 PAGE = 4096
 """Words of host memory that are taken at a time for reports."""

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from oasis_kernels.rasterize import cuda_binning, cuda_draw, cuda_draw_backward, cuda_long_lists
-from oasis_warp.ops._launch import current_stream, run_cuda, wait_for
-from oasis_warp.ops._pair_counts import Counts, own_slot, remember, watching
-from oasis_warp.ops._records import Size
-from oasis_warp.ops._registration import hidden, hidden_like_fake
-from oasis_warp.ops._rules import current_rules
-from oasis_warp.ops._splats import Frame, Gradients, Splats, Wanted
-from oasis_warp.ops._tiles import MAX_PAIRS, check_pairs
+from oasis_warp.ops._runtime.launch import current_stream, run_cuda, wait_for
+from oasis_warp.ops._runtime.pair_counts import Counts, own_slot, remember, watching
+from oasis_warp.ops._runtime.records import Size
+from oasis_warp.ops._runtime.registration import hidden, hidden_like_fake
+from oasis_warp.ops._runtime.rules import current_rules
+from oasis_warp.ops._runtime.splats import Frame, Gradients, Splats, Wanted
+from oasis_warp.ops._runtime.tiles import MAX_PAIRS, check_pairs
 
 MOST_CHECKPOINTS = 1 << 16
 """Tiles times numbers a pixel up to which lists are cut into segments: beyond, there are tiles enough to fill a device,

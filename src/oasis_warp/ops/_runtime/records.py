@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from oasis_kernels.rasterize.cuda_binning import COUNTERS, TILE, spread_of
-from oasis_warp.ops._launch import has_cuda_kernels
+from oasis_warp.ops._runtime.launch import has_cuda_kernels
 
 Size = int | torch.SymInt
 """A size, which is not known yet where torch traces."""

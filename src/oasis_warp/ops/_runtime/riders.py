@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from oasis_kernels.posing import barycentric_vectors as kernels
-from oasis_warp.ops._incidence import Incidence, incidence, riders_at_vertices
-from oasis_warp.ops._launch import run_native
-from oasis_warp.ops._poses import at_pose
-from oasis_warp.ops._words import place, task_count
+from oasis_warp.ops._runtime.incidence import Incidence, incidence, riders_at_vertices
+from oasis_warp.ops._runtime.launch import run_native
+from oasis_warp.ops._runtime.poses import at_pose
+from oasis_warp.ops._runtime.words import place, task_count
 
 
 class Floats(NamedTuple):

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from oasis_warp.ops._records import Tables, table_words, tables
+from oasis_warp.ops._runtime.records import Tables, table_words, tables
 
 
 class Splats(NamedTuple):

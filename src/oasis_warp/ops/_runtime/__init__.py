@@ -1,0 +1,1 @@
+"""The machinery behind the public operators: launching, registration, checks, back ends. Private to `ops`."""
