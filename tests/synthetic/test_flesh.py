@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from oasis_warp.ops.flesh import pose_flesh
+from oasis_warp.synthetic.ops.flesh import pose_flesh
 
 
 def _case(device, batch=3, n=50, joints=4, correctives=6, knuckles=5):

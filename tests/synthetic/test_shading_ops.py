@@ -5,11 +5,11 @@ import trimesh
 
 from oasis_warp.core import surface
 from oasis_warp.ops import depth_map
-from oasis_warp.ops.pixel_noise import pixel_noise
-from oasis_warp.ops.room_tracing import PATTERNS, SHAPES, SOLID_WORDS, trace_rooms
-from oasis_warp.ops.skin_shading import Lamps, sky_transfer, smooth_over_faces, surface_state
-from oasis_warp.ops.surface_patterns import NoiseField, point_grid, surface_dabs, surface_noise
 from oasis_warp.synthetic.illumination import look_at
+from oasis_warp.synthetic.ops.pixel_noise import pixel_noise
+from oasis_warp.synthetic.ops.room_tracing import PATTERNS, SHAPES, SOLID_WORDS, trace_rooms
+from oasis_warp.synthetic.ops.skin_shading import Lamps, sky_transfer, smooth_over_faces, surface_state
+from oasis_warp.synthetic.ops.surface_patterns import NoiseField, point_grid, surface_dabs, surface_noise
 from oasis_warp.synthetic.stage import sphere
 
 UNIFORM_SKY = torch.zeros(9, 3)

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.ops.surface_patterns import NoiseField, surface_dabs, surface_noise
 from oasis_warp.synthetic.body import body_on, smoothstep
 from oasis_warp.synthetic.canvas import Canvas, canvas_on
 from oasis_warp.synthetic.drawn_lines import draw_lines
 from oasis_warp.synthetic.identity import Identity
 from oasis_warp.synthetic.nails import grown_nails
+from oasis_warp.synthetic.ops.surface_patterns import NoiseField, surface_dabs, surface_noise
 from oasis_warp.synthetic.ornaments import ornamented
 from oasis_warp.synthetic.pigment import Marks, skin_color
 from oasis_warp.synthetic.skin_plan import SkinPlan

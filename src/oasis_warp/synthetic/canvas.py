@@ -8,10 +8,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from oasis_warp.ops.surface_patterns import PointGrid, point_grid
 from oasis_warp.synthetic.atlas import Atlas, bundled_atlas
 from oasis_warp.synthetic.body import FINGERS, smoothstep
 from oasis_warp.synthetic.hand_lines import THUMB
+from oasis_warp.synthetic.ops.surface_patterns import PointGrid, point_grid
 
 GRID_CELL = 2.0
 """Of the grid that lines are drawn on [mm]: about as wide as most lines reach."""

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.ops.surface_patterns import PointGrid, surface_dabs
+from oasis_warp.synthetic.ops.surface_patterns import PointGrid, surface_dabs
 from oasis_warp.synthetic.strokes import CORNER_WORDS, KINDS, LINE_WORDS, PLACE_CELL, STRENGTH_CELL, Lines
 
 _FAINT = 1e-3

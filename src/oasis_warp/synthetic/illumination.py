@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.ops import depth_map
-from oasis_warp.ops.skin_shading import Lamps, sky_transfer, smooth_over_faces
 from oasis_warp.synthetic.body import Body
+from oasis_warp.synthetic.ops.skin_shading import Lamps, sky_transfer, smooth_over_faces
 from oasis_warp.synthetic.planned import Numbers
 from oasis_warp.synthetic.posing import Posed
 from oasis_warp.synthetic.stage import sphere

@@ -11,8 +11,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_warp.ops import depth_map
-from oasis_warp.ops.room_tracing import trace_rooms
-from oasis_warp.ops.skin_shading import (
+from oasis_warp.synthetic.atlas import HEIGHT, WIDTH
+from oasis_warp.synthetic.backgrounds import cut_background
+from oasis_warp.synthetic.body import RING, Body, body_on, device_name
+from oasis_warp.synthetic.identity import Population
+from oasis_warp.synthetic.illumination import light_lamps, no_lamps, pinhole, see_sky
+from oasis_warp.synthetic.ops.room_tracing import trace_rooms
+from oasis_warp.synthetic.ops.skin_shading import (
     Lamps,
     Shaded,
     Texture,
@@ -21,11 +26,6 @@ from oasis_warp.ops.skin_shading import (
     smooth_over_faces,
     surface_state,
 )
-from oasis_warp.synthetic.atlas import HEIGHT, WIDTH
-from oasis_warp.synthetic.backgrounds import cut_background
-from oasis_warp.synthetic.body import RING, Body, body_on, device_name
-from oasis_warp.synthetic.identity import Population
-from oasis_warp.synthetic.illumination import light_lamps, no_lamps, pinhole, see_sky
 from oasis_warp.synthetic.people import Person, person
 from oasis_warp.synthetic.plan import PHOTOS, Scenery
 from oasis_warp.synthetic.planned import Numbers, Planned, numbers_of, plan_ahead, plan_table, send

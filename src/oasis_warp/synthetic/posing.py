@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.ops.flesh import pose_flesh
 from oasis_warp.synthetic.body import Body, arm_rows
+from oasis_warp.synthetic.ops.flesh import pose_flesh
 from oasis_warp.synthetic.people import Person
 from oasis_warp.synthetic.planned import Numbers
 from oasis_warp.synthetic.wardrobe import AWAY, bands, sleeves

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.ops.surface_patterns import NoiseField, surface_noise
 from oasis_warp.synthetic.body import body_on, bundled_body
 from oasis_warp.synthetic.identity import Identity
+from oasis_warp.synthetic.ops.surface_patterns import NoiseField, surface_noise
 
 _UP, _PAD, _BACK_OF_KNUCKLE = np.array([0.0, 8, 0]), np.array([-5.0, -12, 0]), np.array([1.5, 0, 0])
 _ACROSS = (1, 4, 10, 7)

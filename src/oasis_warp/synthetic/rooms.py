@@ -18,7 +18,7 @@ class Room(NamedTuple):
 
     kind: str
     solids: np.ndarray
-    """Rows for `ops.room_tracing.trace_rooms`, in the camera's frame (`solids.Builder.matrix`)."""
+    """Rows for `synthetic.ops.room_tracing.trace_rooms`, in the camera's frame (`solids.Builder.matrix`)."""
     aperture: float
     """Radius of the blur of things far off, over the width of the picture."""
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from oasis_warp.ops.room_tracing import PATTERNS, SHAPES, SOLID_WORDS
+from oasis_warp.synthetic.ops.room_tracing import PATTERNS, SHAPES, SOLID_WORDS
 from oasis_warp.synthetic.stage import Vector, rotation_about
 
 MAX_SOLIDS = 26

@@ -9,7 +9,7 @@ from oasis_kernels.scene import rooms as kernels
 from oasis_warp.core.checks import check_shape
 from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
 from oasis_warp.ops._runtime.registration import operator
-from oasis_warp.ops.skin_shading import Lamps
+from oasis_warp.synthetic.ops.skin_shading import Lamps
 
 SOLID_WORDS = int(kernels.SOLID_WORDS)
 SHAPES = ("nothing", "box", "ball", "cylinder")
