@@ -6,7 +6,7 @@ import torch
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.data.photo import read_photo
-from oasis_warp.hand.estimator import HandEstimator, choose_hand
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.skinning import hand21, mirror_pose, rest_hand, skin
 from oasis_warp.pipeline import carrier_offsets, landmarks_in_crop, make_evidence, reconstruct
 

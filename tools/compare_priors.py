@@ -19,7 +19,7 @@ from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8, write_picture
-from oasis_warp.hand.estimator import HandEstimator, choose_hand
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.prior import choose_prior

@@ -24,7 +24,7 @@ from oasis_warp.avatar.coarsen import coarsen
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Photo
 from oasis_warp.data.photo import read_photo
-from oasis_warp.hand.estimator import HandEstimator, choose_hand
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar

@@ -22,13 +22,13 @@ import torch
 
 from oasis_warp.core.types import HandFit, Landmarks, Photo
 from oasis_warp.data.photo import read_photo
-from oasis_warp.hand.estimator import HandEstimator
-from oasis_warp.hand.fit_quality import overlap
+from oasis_warp.estimation.estimator import HandEstimator
+from oasis_warp.estimation.fit_quality import overlap
+from oasis_warp.estimation.landmarks import FINGERS, box_size
+from oasis_warp.estimation.right_view import array, fitted_view, real
+from oasis_warp.estimation.silhouette import facing, silhouette, vertex_normals
+from oasis_warp.estimation.surface_offsets import outline_offsets
 from oasis_warp.hand.kinematics import Rig
-from oasis_warp.hand.landmarks import FINGERS, box_size
-from oasis_warp.hand.right_view import array, fitted_view, real
-from oasis_warp.hand.silhouette import facing, silhouette, vertex_normals
-from oasis_warp.hand.surface_offsets import outline_offsets
 from oasis_warp.hand.template import bundled_hand
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".webp"}

@@ -20,8 +20,8 @@ from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit
 from oasis_warp.data.photo import read_photo
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.fusion import fit_surfaces, fit_together, make_evidences, resolutions, with_detail
-from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import depth_map

@@ -30,6 +30,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, CanonicalGaussians, Landmarks, Photo, TrainingBatch
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.photo import read_photo
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.held_out import (
     FIRST_PERSON,
     HELD_OUT_SEED,
@@ -42,7 +43,6 @@ from oasis_warp.evaluation.photo_pairs import compare_with_photo, draw_as_photo
 from oasis_warp.evaluation.same_hand import photos_of_hands
 from oasis_warp.evaluation.synthetic import evidence_of
 from oasis_warp.fusion import fit_surfaces, fit_together, make_evidences, resolutions, settle_surfaces, with_detail
-from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.anchors import faces_of_vertices

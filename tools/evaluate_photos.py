@@ -26,9 +26,9 @@ import torch
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.coverage import coverage
 from oasis_warp.evaluation.photo_pairs import compare_pairs
-from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar

@@ -25,6 +25,8 @@ from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, TrainingBatch
+from oasis_warp.estimation.right_view import array
+from oasis_warp.estimation.surface_state import shape_of, state_of_surface
 from oasis_warp.evaluation.held_out import (
     ERROR_STREAM,
     FIRST_PERSON,
@@ -39,8 +41,6 @@ from oasis_warp.evaluation.held_out import (
 from oasis_warp.evaluation.metrics import Truth, match_colors, score
 from oasis_warp.evaluation.synthetic import evidence_of
 from oasis_warp.hand.kinematics import Rig
-from oasis_warp.hand.right_view import array
-from oasis_warp.hand.surface_state import shape_of, state_of_surface
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.prior import choose_prior

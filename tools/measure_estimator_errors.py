@@ -20,9 +20,9 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandFit, Photo
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.crop import resample_square, square_around
-from oasis_warp.hand.estimator import HandEstimator, choose_hand
-from oasis_warp.hand.outline import wrist_line
-from oasis_warp.hand.surface_offsets import outline_offsets
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand
+from oasis_warp.estimation.outline import wrist_line
+from oasis_warp.estimation.surface_offsets import outline_offsets
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.pipeline import CROP_MARGIN
 from oasis_warp.synthetic.picture import SyntheticBatch, render_batch

@@ -24,8 +24,8 @@ from oasis_warp.avatar.observe import observe
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.same_hand import photos_of_hands
-from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.pipeline import carrier_offsets, make_evidence

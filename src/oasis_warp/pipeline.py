@@ -20,12 +20,12 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, HandFit, HandLight, Landmarks, Photo, Render
 from oasis_warp.data.crop import resample_square, square_around
-from oasis_warp.hand.estimator import HandEstimator, choose_hand
-from oasis_warp.hand.keypoints_file import read_keypoints
-from oasis_warp.hand.moved_fit import no_more_doubtful, with_pose
-from oasis_warp.hand.outline import wrist_line
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand
+from oasis_warp.estimation.keypoints_file import read_keypoints
+from oasis_warp.estimation.moved_fit import no_more_doubtful, with_pose
+from oasis_warp.estimation.outline import wrist_line
+from oasis_warp.estimation.surface_offsets import outline_offsets
 from oasis_warp.hand.skinning import mirror_pose, rest_hand, skin
-from oasis_warp.hand.surface_offsets import outline_offsets
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr

@@ -12,10 +12,10 @@ from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.pictures import write_picture
+from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.evaluation import same_hand
 from oasis_warp.evaluation.photo_pairs import compare_pairs, compare_with_photo, draw_as_photo
 from oasis_warp.evaluation.same_hand import photos_of_hands, summarise_pairs
-from oasis_warp.hand.estimator import HandEstimator
 from oasis_warp.pipeline import make_evidence
 
 SMALL = ReconstructConfig(size=96)

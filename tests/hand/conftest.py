@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from oasis_warp.data.photo import read_photo
-from oasis_warp.hand.estimator import HandEstimator
+from oasis_warp.estimation.estimator import HandEstimator
 
 PHOTOS = Path(__file__).parents[1] / "data" / "photos"
 

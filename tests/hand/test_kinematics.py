@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from oasis_warp.core.types import HandPose
-from oasis_warp.hand.fit_state import FitState
+from oasis_warp.estimation.fit_state import FitState
 from oasis_warp.hand.kinematics import Rig
 from oasis_warp.hand.skinning import rest_hand, skin
 

@@ -164,7 +164,7 @@ def check_hand() -> str:
 
 def check_networks() -> str:
     """The landmark networks give known answers."""
-    from oasis_warp.hand.networks import check_networks
+    from oasis_warp.estimation.networks import check_networks
 
     check_networks()
     return "palm detection and hand landmarks give the known answers"

@@ -12,9 +12,9 @@ from oasis_warp.avatar.appearance import label_regions, region_masks
 from oasis_warp.avatar.observe import Observation, inner_mask, observe
 from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.types import Evidence, HandPose, Landmarks, Photo, Render
+from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.evaluation.coverage import COVERED
 from oasis_warp.evaluation.metrics import color_gain
-from oasis_warp.hand.estimator import HandEstimator
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr, ssim_map
 from oasis_warp.pipeline import make_evidence

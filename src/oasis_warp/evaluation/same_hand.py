@@ -15,11 +15,11 @@ from oasis_warp.core.types import Landmarks, Photo
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.claimed_folder import claim_folder
 from oasis_warp.data.photo import read_photo
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, label, prior_digest, reconstructions
 from oasis_warp.evaluation.photo_pairs import Pair, PairScore, compare_pairs
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, select
-from oasis_warp.hand.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.pipeline import carrier_offsets, make_avatar, make_evidence

@@ -1,6 +1,6 @@
 """Put the drawn outline onto the mask's: a second displacement of the surface, by pictures of Gaussians.
 
-`hand.surface_offsets` brings the mesh onto the mask. Gaussians reach beyond the mesh by their size and by a pixel's
+`estimation.surface_offsets` brings the mesh onto the mask. Gaussians reach beyond the mesh by their size and by a pixel's
 blur, more at the tip of a finger than along it, and across slits; so one depth below the skin leaves outlines too fat
 in one place and too thin in another. Here Gaussians are drawn, their outline is compared with the mask's, and the
 surface moves along its normals, smoothly, until the two agree.
@@ -22,7 +22,7 @@ from oasis_warp.core import surface
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Evidence
-from oasis_warp.hand.surface_offsets import ThinSheet, crossing
+from oasis_warp.estimation.surface_offsets import ThinSheet, crossing
 from oasis_warp.render.render import render
 
 BEYOND = 0.5

@@ -26,15 +26,15 @@ from oasis_warp.avatar.anchors import PICTURE, below_skin
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandPose, PosedHand
-from oasis_warp.hand.evidence import Evidence as FitEvidence
-from oasis_warp.hand.fit import FitSettings, Fitter
-from oasis_warp.hand.fit_state import FitState
+from oasis_warp.estimation.evidence import Evidence as FitEvidence
+from oasis_warp.estimation.fit import FitSettings, Fitter
+from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.landmarks import BONES
+from oasis_warp.estimation.outline import wrist_line
+from oasis_warp.estimation.right_view import array, real
+from oasis_warp.estimation.surface_state import shape_of, state_of_surface
 from oasis_warp.hand.kinematics import Rig, unit
-from oasis_warp.hand.landmarks import BONES
-from oasis_warp.hand.outline import wrist_line
-from oasis_warp.hand.right_view import array, real
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
-from oasis_warp.hand.surface_state import shape_of, state_of_surface
 from oasis_warp.training.shaded_hand import CERTAIN, Drawn, blur, detail_gap, draw, make_scene, outline_gap, solve_light
 
 SIZE = 96

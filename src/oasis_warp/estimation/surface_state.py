@@ -5,7 +5,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from oasis_warp.hand.fit_state import FitState
+from oasis_warp.estimation.fit_state import FitState
 from oasis_warp.hand.kinematics import Rig
 
 _EVERY = 16

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from oasis_warp.hand.fit import OutlinePairs
-from oasis_warp.hand.fit_state import FitState
+from oasis_warp.estimation.fit import OutlinePairs
+from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.landmarks import KNUCKLES, box_size
+from oasis_warp.estimation.silhouette import silhouette, vertex_normals
 from oasis_warp.hand.kinematics import Rig, unit
-from oasis_warp.hand.landmarks import KNUCKLES, box_size
-from oasis_warp.hand.silhouette import silhouette, vertex_normals
 
 WRIST_LINE = 0.10
 """The line across the arm above which outlines count: share of the way from the wrist point to the knuckles."""

@@ -6,11 +6,11 @@ import numpy as np
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
-from oasis_warp.hand.doubts import place_doubts
-from oasis_warp.hand.fit_quality import DOUBTFUL, draw, measure
+from oasis_warp.estimation.doubts import place_doubts
+from oasis_warp.estimation.fit_quality import DOUBTFUL, draw, measure
+from oasis_warp.estimation.right_view import RightView, mirror_points, real, right_state
+from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
 from oasis_warp.hand.kinematics import Rig
-from oasis_warp.hand.right_view import RightView, mirror_points, real, right_state
-from oasis_warp.hand.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
 
 
 def fit_of_pose(

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.hand import networks as module
-from oasis_warp.hand.networks import Networks, check_networks, drawn_hand, networks
+from oasis_warp.estimation import networks as module
+from oasis_warp.estimation.networks import Networks, check_networks, drawn_hand, networks
 
 
 def test_this_installation_computes_the_networks_rightly():

@@ -21,11 +21,11 @@ from torch import Tensor
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandFit
+from oasis_warp.estimation.landmarks import box_size
+from oasis_warp.estimation.outline import WRIST_LINE, wrist_line
+from oasis_warp.estimation.right_view import fitted_view
+from oasis_warp.estimation.silhouette import silhouette, vertex_normals
 from oasis_warp.hand.kinematics import Rig, unit
-from oasis_warp.hand.landmarks import box_size
-from oasis_warp.hand.outline import WRIST_LINE, wrist_line
-from oasis_warp.hand.right_view import fitted_view
-from oasis_warp.hand.silhouette import silhouette, vertex_normals
 
 LONGEST = 0.006
 """No vertex moves farther [m]."""

@@ -11,16 +11,23 @@ from torch import Tensor
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandFit, Landmarks, Photo
-from oasis_warp.hand.doubts import MANY_FINGERS, finger_doubts, other_side_cost, place_doubts, second_looks, side_doubts
-from oasis_warp.hand.fit import Fitter, Solution
-from oasis_warp.hand.fit_quality import DOUBTFUL, REFUSED, TINY_HAND, Quality, draw, measure
-from oasis_warp.hand.fit_state import FitState
+from oasis_warp.estimation.doubts import (
+    MANY_FINGERS,
+    finger_doubts,
+    other_side_cost,
+    place_doubts,
+    second_looks,
+    side_doubts,
+)
+from oasis_warp.estimation.fit import Fitter, Solution
+from oasis_warp.estimation.fit_quality import DOUBTFUL, REFUSED, TINY_HAND, Quality, draw, measure
+from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.landmarks import box_size, find_hands
+from oasis_warp.estimation.networks import networks
+from oasis_warp.estimation.outline import MaskOutline
+from oasis_warp.estimation.right_view import RightView, array, real
+from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
 from oasis_warp.hand.kinematics import Rig
-from oasis_warp.hand.landmarks import box_size, find_hands
-from oasis_warp.hand.networks import networks
-from oasis_warp.hand.outline import MaskOutline
-from oasis_warp.hand.right_view import RightView, array, real
-from oasis_warp.hand.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
 
 _NO_HAND = 16
 """Smaller hands are refused even by force [px]."""

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from oasis_warp.hand.evidence import Evidence
-from oasis_warp.hand.fit_state import FitState
+from oasis_warp.estimation.evidence import Evidence
+from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.landmarks import BONES, KNUCKLES
 from oasis_warp.hand.kinematics import Rig, unit
-from oasis_warp.hand.landmarks import BONES, KNUCKLES
 
 _PALM = [0, *KNUCKLES]
 

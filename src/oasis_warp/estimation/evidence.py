@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from oasis_warp.estimation.landmarks import BONES, box_size
 from oasis_warp.hand.kinematics import unit
-from oasis_warp.hand.landmarks import BONES, box_size
 
 
 @dataclass(frozen=True)

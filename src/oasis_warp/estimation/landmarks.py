@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from oasis_warp.hand.networks import HAND_SIZE, PALM_SIZE, Networks
+from oasis_warp.estimation.networks import HAND_SIZE, PALM_SIZE, Networks
 
 BONES = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (0, 5), (5, 6), (6, 7), (7, 8), (0, 9), (9, 10), (10, 11), (11, 12),
                   (0, 13), (13, 14), (14, 15), (15, 16), (0, 17), (17, 18), (18, 19), (19, 20)])  # fmt: skip

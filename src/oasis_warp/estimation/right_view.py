@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
-from oasis_warp.hand.evidence import Evidence, evidence_of
-from oasis_warp.hand.fit_state import FitState
+from oasis_warp.estimation.evidence import Evidence, evidence_of
+from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.landmarks import box_size
 from oasis_warp.hand.kinematics import Rig
-from oasis_warp.hand.landmarks import box_size
 
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 _LARGEST = 800.0

@@ -2,10 +2,10 @@
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandFit, HandPose
-from oasis_warp.hand.evidence import evidence_of
-from oasis_warp.hand.fit_quality import DOUBTFUL, measure
+from oasis_warp.estimation.evidence import evidence_of
+from oasis_warp.estimation.fit_quality import DOUBTFUL, measure
+from oasis_warp.estimation.right_view import fitted_view
 from oasis_warp.hand.kinematics import Rig
-from oasis_warp.hand.right_view import fitted_view
 
 
 def with_pose(hand: HandModel, fit: HandFit, pose: HandPose) -> HandFit:

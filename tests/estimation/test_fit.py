@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from oasis_warp.hand.evidence import evidence_of
-from oasis_warp.hand.fit import Fitter, OutlinePairs
-from oasis_warp.hand.fit_quality import draw, overlap
-from oasis_warp.hand.fit_state import FitState
+from oasis_warp.estimation.evidence import evidence_of
+from oasis_warp.estimation.fit import Fitter, OutlinePairs
+from oasis_warp.estimation.fit_quality import draw, overlap
+from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.outline import MaskOutline, wrist_line
 from oasis_warp.hand.kinematics import Rig
-from oasis_warp.hand.outline import MaskOutline, wrist_line
 
 SIZE = (480, 400)
 

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from oasis_warp.hand.evidence import Evidence
-from oasis_warp.hand.fit import Fitter, Solution
-from oasis_warp.hand.fit_quality import SMALL_HAND
+from oasis_warp.estimation.evidence import Evidence
+from oasis_warp.estimation.fit import Fitter, Solution
+from oasis_warp.estimation.fit_quality import SMALL_HAND
+from oasis_warp.estimation.landmarks import FINGERS, FoundHand, crop_of_landmarks, read_crop
+from oasis_warp.estimation.networks import Networks
+from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.hand.kinematics import Rig
-from oasis_warp.hand.landmarks import FINGERS, FoundHand, crop_of_landmarks, read_crop
-from oasis_warp.hand.networks import Networks
-from oasis_warp.hand.outline import wrist_line
 
 SIDE_RATIO = 1.15
 """The other side's cost over this one's: at least 1.3 on 63 right fits, so less is a doubt."""

@@ -1,7 +1,7 @@
 import torch
 
 from oasis_warp.core.rotation import from_axis_angle
-from oasis_warp.hand.moved_fit import no_more_doubtful, with_pose
+from oasis_warp.estimation.moved_fit import no_more_doubtful, with_pose
 
 
 def test_a_left_hand_that_was_not_moved_is_worth_what_it_was(hand, fitted):

@@ -3,11 +3,11 @@ import numpy as np
 import pytest
 import torch
 
-from oasis_warp.hand.fit_quality import overlap
+from oasis_warp.estimation.fit_quality import overlap
+from oasis_warp.estimation.right_view import fitted_view, mirror_points
+from oasis_warp.estimation.silhouette import silhouette, vertex_normals
+from oasis_warp.estimation.surface_offsets import LONGEST, outline_offsets
 from oasis_warp.hand.kinematics import Rig
-from oasis_warp.hand.right_view import fitted_view, mirror_points
-from oasis_warp.hand.silhouette import silhouette, vertex_normals
-from oasis_warp.hand.surface_offsets import LONGEST, outline_offsets
 
 RIGHT, LEFT = "victory_right_09.jpg", "ok_sign_left_10.jpg"
 

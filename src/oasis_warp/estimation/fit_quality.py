@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from oasis_warp.hand.evidence import Evidence
-from oasis_warp.hand.fit_state import FitState
+from oasis_warp.estimation.evidence import Evidence
+from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.outline import wrist_line
+from oasis_warp.estimation.silhouette import silhouette
 from oasis_warp.hand.kinematics import Rig
-from oasis_warp.hand.outline import wrist_line
-from oasis_warp.hand.silhouette import silhouette
 
 SMALL_HAND, TINY_HAND = 150, 80
 """Longer side of the landmarks' box [px] below which a hand is warned about, and refused."""

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
+from oasis_warp.estimation.surface_state import shape_of, state_of_surface
 from oasis_warp.hand.kinematics import Rig
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.surface_state import shape_of, state_of_surface
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from oasis_warp.estimation.landmarks import FINGERS, KNUCKLES
 from oasis_warp.hand.kinematics import unit
-from oasis_warp.hand.landmarks import FINGERS, KNUCKLES
 
 # Half widths of a finger at its four joints [m]: thumb, index, middle, ring, little.
 _RADII = np.array([[.016, .014, .0115, .0095], [.0115, .0105, .009, .0078], [.0115, .0105, .009, .0078],

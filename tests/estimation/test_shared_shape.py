@@ -1,6 +1,6 @@
 import torch
 
-from oasis_warp.hand.shared_shape import shared_shape
+from oasis_warp.estimation.shared_shape import shared_shape
 
 
 def shapes(count, noise, seed=0):

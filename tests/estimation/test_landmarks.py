@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from oasis_warp.data.photo import read_photo
-from oasis_warp.hand.landmarks import FINGERS, box_size, crop_of_landmarks, find_hands, read_crop
-from oasis_warp.hand.networks import networks
+from oasis_warp.estimation.landmarks import FINGERS, box_size, crop_of_landmarks, find_hands, read_crop
+from oasis_warp.estimation.networks import networks
 
 HANDS = {
     "palm_open_right_01.jpg": "right",

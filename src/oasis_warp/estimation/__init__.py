@@ -1,0 +1,1 @@
+"""Photo to hand fit: landmarks, mask, shape, pose, camera, outline, and warnings about the fit."""
