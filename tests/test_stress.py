@@ -8,14 +8,14 @@ from stress_one_shot import is_sane, likeness, make
 from stresses import STRESSES, Stressed, box
 from synthetic import evidence_of
 
+from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.adaptation.sharpen import sharpen
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.pipeline import reconstruct
-from oasis_warp.training.adapt import adapt
-from oasis_warp.training.sharpen import sharpen
 
 PHOTO = Path(__file__).parent / "data" / "photos" / "palm_open_left_02.png"
 FEW = ReconstructConfig(steps=20)

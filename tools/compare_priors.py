@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import torch
 
+from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
@@ -25,7 +26,6 @@ from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.pipeline import carrier_offsets, make_avatar, make_evidence
 from oasis_warp.render.cameras import orbit_camera
-from oasis_warp.training.adapt import adapt
 
 UNSEEN = (90, 180)
 """Where the hand is looked at from, beside the photo's own view [degrees]."""

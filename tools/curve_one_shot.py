@@ -21,6 +21,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from oasis_warp import __version__
+from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
@@ -39,7 +40,6 @@ from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.prior import NetworkPrior, choose_prior
 from oasis_warp.render.render import render
-from oasis_warp.training.adapt import adapt
 
 STEPS, RANKS, VIEWS, SIZES = (0, 10, 20, 40, 84, 200, 400, 1000), (1, 2, 4, 8, 16), (0, 1, 3, 7), (64, 128, 256)
 """Tried of each knob; sizes are the side of the crop that is adapted to [px], of which the prior reads the largest."""

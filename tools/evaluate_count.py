@@ -20,6 +20,8 @@ from evaluate_detail import file_bytes, frame_times
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.adaptation.views import freeze_view
 from oasis_warp.avatar.coarsen import coarsen
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Photo
@@ -32,8 +34,6 @@ from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.pipeline import carrier_offsets, crop_side, input_errors, make_avatar, make_evidence
 from oasis_warp.render.cameras import orbit_camera
-from oasis_warp.training.adapt import adapt
-from oasis_warp.training.views import freeze_view
 
 SIZES = (64, 96, 128, 192)
 POSES, ROUND, FAR, NEAR = ("open", "fist", "point"), 4, 256, 512

@@ -16,6 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from oasis_warp.adaptation.fuse import fuse
+from oasis_warp.adaptation.sightings import look
 from oasis_warp.avatar.observe import inner_mask
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit
@@ -26,8 +28,6 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import depth_map
 from oasis_warp.pipeline import make_avatar, over_photo
-from oasis_warp.training.fuse import fuse
-from oasis_warp.training.sightings import look
 
 RIM = 1 / 64
 """Share of the crop's side, at the outline, that is not judged."""

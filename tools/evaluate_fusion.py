@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from oasis_warp.adaptation.fuse import fuse
 from oasis_warp.avatar.lighting import in_even_light
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import Prior
@@ -48,13 +49,12 @@ from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.pipeline import make_avatar, make_evidence
+from oasis_warp.pretraining.photographed import training_batch
+from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
 from oasis_warp.render.render import render
 from oasis_warp.synthetic.picture import SyntheticBatch, render_planned
 from oasis_warp.synthetic.plan import PICTURES_EACH, Scenery, plan_shots
 from oasis_warp.synthetic.planned import tabulate
-from oasis_warp.training.fuse import fuse
-from oasis_warp.training.photographed import training_batch
-from oasis_warp.training.synthetic_source import ERROR_STREAM, SURROUNDINGS
 
 MOST = 4
 """Photos of one avatar, and targets of each synthetic person: half of a person's pictures each."""

@@ -20,6 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.adaptation.refine import refine
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.camera import project
@@ -45,10 +47,8 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import depth_map, depth_visibility
+from oasis_warp.pretraining.photographed import EstimatorNoise, training_batch
 from oasis_warp.render.render import render
-from oasis_warp.training.adapt import adapt
-from oasis_warp.training.photographed import EstimatorNoise, training_batch
-from oasis_warp.training.refine import refine
 
 MARGIN = 0.0015
 """Depth by which a vertex may lie behind the nearest surface and count as visible [m]."""

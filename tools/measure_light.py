@@ -1,4 +1,4 @@
-"""Measure what light is usual on hands in rooms: the constants of training/room_light.py.
+"""Measure what light is usual on hands in rooms: the constants of adaptation/room_light.py.
 
     python tools/measure_light.py --people 40
 
@@ -12,6 +12,8 @@ import argparse
 import torch
 from torch import Tensor
 
+from oasis_warp.adaptation.adapt import in_photo
+from oasis_warp.adaptation.calibrate import calibrate
 from oasis_warp.avatar.lighting import GAMMA, posed_normals
 from oasis_warp.avatar.observe import observe
 from oasis_warp.avatar.pose import pose_gaussians
@@ -23,8 +25,6 @@ from oasis_warp.evaluation.synthetic import evidence_of
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import NetworkPrior, bundled_prior
 from oasis_warp.render.render import render
-from oasis_warp.training.adapt import in_photo
-from oasis_warp.training.calibrate import calibrate
 
 OTHERS = 100
 """Numbers from those of the evaluation on, so that these are other people."""

@@ -18,6 +18,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from oasis_warp.adaptation.adapt import adapt, read_skin
+from oasis_warp.adaptation.complete import complete_field
+from oasis_warp.adaptation.room_light import DARK
+from oasis_warp.adaptation.skin_or_shade import MOST, marks
 from oasis_warp.avatar.anchors import vertex_colors
 from oasis_warp.avatar.lighting import with_shade_on
 from oasis_warp.avatar.observe import observe
@@ -29,10 +33,6 @@ from oasis_warp.evaluation.same_hand import photos_of_hands
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.pipeline import carrier_offsets, make_evidence
-from oasis_warp.training.adapt import adapt, read_skin
-from oasis_warp.training.complete import complete_field
-from oasis_warp.training.room_light import DARK
-from oasis_warp.training.skin_or_shade import MOST, marks
 
 ANGLES = (0, 15, 30, 45, 70, 180)
 """Between which the skin has turned [degrees]."""

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.camera import project
@@ -28,7 +29,6 @@ from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
 from oasis_warp.pipeline import make_evidence, reconstruct
 from oasis_warp.render.cameras import orbit_camera
-from oasis_warp.training.adapt import adapt
 
 KINDS = ("tattoo", "writing", "ring", "nail polish")
 SAMPLES = 4

@@ -11,11 +11,11 @@ from typing import Literal
 
 import torch
 
+from oasis_warp.pretraining.synthetic_source import SyntheticHands
 from oasis_warp.synthetic import picture
 from oasis_warp.synthetic.people import person
 from oasis_warp.synthetic.plan import EVERYBODY, PHOTOS, PICTURES_EACH
 from oasis_warp.synthetic.planned import plan_table
-from oasis_warp.training.synthetic_source import SyntheticHands
 
 STAGES = ("pose_people", "depth_map", "surface_state", "light_lamps", "see_sky", "_stretch", "shade_skin",
           "trace_rooms", "expose")  # fmt: skip
@@ -35,7 +35,7 @@ class Options:
     kernels: bool = False
     """List the GPU's time by kernel, too."""
     training: bool = False
-    """Time batches of `training.synthetic_source` in place of the stages; `size` is that of the crops then."""
+    """Time batches of `pretraining.synthetic_source` in place of the stages; `size` is that of the crops then."""
     hands: int = 16
     views: int = 2
     people: int = 64

@@ -5,7 +5,7 @@
 
 It writes assets/training/estimator_errors.safetensors, the tables between the markers of docs/estimator.md, and the
 numbers as JSON. The second table holds found surfaces beside those that training sees: each measured hand once more,
-with the error of another one (`training.estimator_errors`), so that none is compared with itself; the third does so for
+with the error of another one (`pretraining.estimator_errors`), so that none is compared with itself; the third does so for
 masks.
 """
 
@@ -27,12 +27,12 @@ from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map, depth_visibility
+from oasis_warp.pretraining.estimator_errors import ALIKE, MeasuredErrors, estimate, frames_of, looks, of_surface
+from oasis_warp.pretraining.mask_errors import NUMBERS, ended, wandering
+from oasis_warp.pretraining.photographed import as_right_hands, crop_to_mask
+from oasis_warp.pretraining.posed_hands import Posed, pose_hands
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.plan import PICTURES_EACH
-from oasis_warp.training.estimator_errors import ALIKE, MeasuredErrors, estimate, frames_of, looks, of_surface
-from oasis_warp.training.mask_errors import NUMBERS, ended, wandering
-from oasis_warp.training.photographed import as_right_hands, crop_to_mask
-from oasis_warp.training.posed_hands import Posed, pose_hands
 
 BEGIN, END = "<!-- errors -->", "<!-- end of errors -->"
 ASSET = Path(__file__).parents[1] / "src" / "oasis_warp" / "assets" / "training" / "estimator_errors.safetensors"

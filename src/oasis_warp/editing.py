@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.adaptation.carried import Canvas
+from oasis_warp.adaptation.repaint import repaint
 from oasis_warp.avatar.lighting import shading_picture
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
@@ -20,8 +22,6 @@ from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops._runtime import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
-from oasis_warp.training.carried import Canvas
-from oasis_warp.training.repaint import repaint
 
 OTHER_PHOTO = 0.06
 """Median colour difference between avatar and photo from which this is not the photo that the avatar was made from."""

@@ -7,6 +7,8 @@ from typing import NamedTuple
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.adaptation.fuse import Fusion, add_detail, fuse
+from oasis_warp.adaptation.sightings import Sightings
 from oasis_warp.avatar.coarsen import coarsen
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.avatar.quality import (
@@ -42,8 +44,6 @@ from oasis_warp.pipeline import (
     onto_drawn_outline,
     over_photo,
 )
-from oasis_warp.training.fuse import Fusion, add_detail, fuse
-from oasis_warp.training.sightings import Sightings
 
 OTHER_LIGHT = 1.6
 """Times by which a photo is brighter or darker than the first, in any channel, from which it is worth a warning."""

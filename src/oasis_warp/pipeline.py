@@ -9,6 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.adaptation.adapt import adapt, detail_of
+from oasis_warp.adaptation.outline import drawn_outline_offsets
+from oasis_warp.adaptation.refine import refine
+from oasis_warp.adaptation.sharpen import sharpen
 from oasis_warp.avatar.anchors import PICTURE, below_skin
 from oasis_warp.avatar.coarsen import coarsen
 from oasis_warp.avatar.observe import inner_mask
@@ -32,10 +36,6 @@ from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops._runtime import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
-from oasis_warp.training.adapt import adapt, detail_of
-from oasis_warp.training.outline import drawn_outline_offsets
-from oasis_warp.training.refine import refine
-from oasis_warp.training.sharpen import sharpen
 
 CROP_MARGIN = 1.12
 """Side of the crop over the longer extent of the mask."""

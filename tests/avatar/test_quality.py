@@ -3,6 +3,7 @@ import torch
 from synthetic import evidence_of
 from torch.nn.functional import avg_pool2d
 
+from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
@@ -18,7 +19,6 @@ from oasis_warp.avatar.quality import (
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.render.render import render
-from oasis_warp.training.adapt import adapt
 
 SIDE = 192.0
 SKIN = torch.tensor([0.75, 0.55, 0.45])

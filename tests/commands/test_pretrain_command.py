@@ -17,8 +17,8 @@ from oasis_warp.commands import pretrain as command
 from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
 from oasis_warp.network.config import COMPACT, PROFILES
 from oasis_warp.network.weights_file import load_network
+from oasis_warp.pretraining.pretrain import CHECKPOINT, METRICS, SHEET, WEIGHTS
 from oasis_warp.synthetic import people
-from oasis_warp.training.pretrain import CHECKPOINT, METRICS, SHEET, WEIGHTS
 
 TINY = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
 SMALL = ("--hands", "1", "--views", "1", "--people", "1", "--size", "32", "--steps", "2", "--workers", "0",

@@ -21,7 +21,7 @@ from oasis_warp.evaluation.summary import summarise
 from oasis_warp.network.config import COMPACT, PROFILES
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import save_network
-from oasis_warp.training.pretrain import CHECKPOINT, WEIGHTS
+from oasis_warp.pretraining.pretrain import CHECKPOINT, WEIGHTS
 
 TINY = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
 VARIANTS = {"full": ("full model", Method("full", "raw")), "less": ("w/o a part", Method("less", "raw"))}

@@ -5,6 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.adaptation.fuse import fuse
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
@@ -12,8 +14,6 @@ from oasis_warp.evaluation.methods import ask
 from oasis_warp.network.heads import FACE_OUTPUTS, TRUST, VERTEX_OUTPUTS, GaussianHead, decode_colors
 from oasis_warp.network.lora import cache_head, head_colors, zero_updates
 from oasis_warp.network.prior import NetworkPrior, guess_with_heads
-from oasis_warp.training.adapt import adapt
-from oasis_warp.training.fuse import fuse
 
 LORA = AdaptConfig(texture="lora", lora_rank=4, texture_steps=4, reference_views=2)
 

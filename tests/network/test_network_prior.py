@@ -9,6 +9,7 @@ from importlib import resources
 import pytest
 import torch
 
+from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import OPACITY, RIM_FADE
 from oasis_warp.avatar.pose import pose_gaussians
@@ -29,7 +30,6 @@ from oasis_warp.network.prior import (
 from oasis_warp.network.rim import FIRST, LAST, settle_rim, spread_to_rim
 from oasis_warp.network.weights_file import read_header, save_network
 from oasis_warp.render.render import render
-from oasis_warp.training.adapt import adapt
 
 
 def covariances(gaussians):

@@ -6,12 +6,12 @@ from oasis_warp.core.camera import project
 from oasis_warp.core.types import Camera, HandPose
 from oasis_warp.hand.skinning import hand21, mirror_points, mirror_pose, rest_hand, skin
 from oasis_warp.ops import depth_map
+from oasis_warp.pretraining.photographed import Photographed, training_batch
 from oasis_warp.synthetic import people
 from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.picture import render_batch, stream
 from oasis_warp.synthetic.plan import EVERYBODY, PHOTOS, PICTURES_EACH, Scenery, sample_shot
 from oasis_warp.synthetic.planned import joined, plan_ahead, plan_table
-from oasis_warp.training.photographed import Photographed, training_batch
 
 SIZE = 64
 SEED = 13

@@ -25,11 +25,11 @@ from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.dinov2 import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, read_config
+from oasis_warp.pretraining.distributed import Place, join_processes, wait_for_all
+from oasis_warp.pretraining.pretrain import CHECKPOINT, PretrainConfig, pretrain
+from oasis_warp.pretraining.synthetic_source import MULTIPLE, SyntheticHands
 from oasis_warp.synthetic.people import most_kept
 from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH
-from oasis_warp.training.distributed import Place, join_processes, wait_for_all
-from oasis_warp.training.pretrain import CHECKPOINT, PretrainConfig, pretrain
-from oasis_warp.training.synthetic_source import MULTIPLE, SyntheticHands
 
 SETTINGS, PEOPLE = "training.json", "people"
 """In the folder: with what the training began, and the people that a CPU has baked."""

@@ -15,6 +15,9 @@ from oasis_warp.evaluation.metrics import Truth
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.observation import sight
 from oasis_warp.ops import depth_map
+from oasis_warp.pretraining.photographed import EstimatorNoise, training_batch
+from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
+from oasis_warp.pretraining.targets import true_pictures
 from oasis_warp.synthetic.picture import SyntheticBatch, part, render_capture, render_planned
 from oasis_warp.synthetic.plan import (
     EVERYBODY,
@@ -28,9 +31,6 @@ from oasis_warp.synthetic.plan import (
 from oasis_warp.synthetic.planned import Planned, tabulate
 from oasis_warp.synthetic.stage import sample_light, soften_light
 from oasis_warp.synthetic.wardrobe import sample_clothes
-from oasis_warp.training.photographed import EstimatorNoise, training_batch
-from oasis_warp.training.synthetic_source import ERROR_STREAM, SURROUNDINGS
-from oasis_warp.training.targets import true_pictures
 
 Group = Literal["ordinary", "tattoo", "ring"]
 """Kinds of people. Their bodies and photos are the same: only the tattoo or the ring is more."""

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import torch
 
+from oasis_warp.adaptation.adapt import adapt, in_photo
+from oasis_warp.adaptation.calibrate import calibrate
 from oasis_warp.avatar.lighting import in_even_light
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core.config import AdaptConfig
@@ -17,8 +19,6 @@ from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.lora import ColorHeads
 from oasis_warp.network.prior import NetworkPrior, guess_with_heads
 from oasis_warp.network.weights_file import trained_state
-from oasis_warp.training.adapt import adapt, in_photo
-from oasis_warp.training.calibrate import calibrate
 
 RAW, CALIBRATED, EVEN, KEEP, ONE_SHOT = "raw", "calibrated", "even_one_shot", "keep_one_shot", "one_shot"
 STAGES = (RAW, CALIBRATED, EVEN, KEEP, ONE_SHOT)

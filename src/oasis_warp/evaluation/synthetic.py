@@ -55,9 +55,9 @@ from oasis_warp.losses.lpips import Lpips
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.prior import NetworkPrior
+from oasis_warp.pretraining.losses import Perceptual
 from oasis_warp.render.render import render
 from oasis_warp.synthetic.processes import worker_pool
-from oasis_warp.training.losses import Perceptual
 
 SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (
     "evaluation.json", "metrics.json", "sheet.png", "attention.png", "people"

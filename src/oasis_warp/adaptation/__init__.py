@@ -1,0 +1,1 @@
+"""Fitting an avatar to photos of one hand."""

@@ -1,0 +1,207 @@
+"""Bring the detail of photos into an avatar: finer Gaussians where they show more than the ones there can."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from oasis_warp.adaptation.carried import (
+    PHOTO_WEIGHT,
+    Canvas,
+    Source,
+    View,
+    beside,
+    carried,
+    cut,
+    fit_colors,
+    lay_over,
+    look,
+    with_neighbours,
+)
+from oasis_warp.adaptation.views import freeze_view
+from oasis_warp.avatar.anchors import RIM_FADE, vertex_to_gaussians
+from oasis_warp.avatar.densify import densify, parts_for_spacing
+from oasis_warp.avatar.lighting import with_shade_on, with_shown
+from oasis_warp.avatar.observe import inner_mask
+from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.core.camera import project
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, Gaussians
+from oasis_warp.ops import blend_colors
+from oasis_warp.render.render import render
+
+FACING = 0.3, 0.5
+"""Cosines between surface and view below which the photo's detail is left out, and above which it is taken whole."""
+RIM = 1 / 256
+"""Share of the photo's side, at the mask's border, that may hold background, and over which detail fades in."""
+FADE_REACH = 1.25
+"""Times the length of the fade at the wrist: nearer to its end faces stay as they are, since parts would not fade."""
+TOLERANCE = 3 / 255
+"""Colour difference, root mean square over 3 x 3 pixels, that nobody sees."""
+SPACINGS = (4.0, 3.0, 2.0)
+"""Distances between finer Gaussians to choose from [px]; at 1.5 and 1 they show no more."""
+MIN_SHARE = 0.5
+"""Of a pixel that counts, from which its face may be cut."""
+THICKNESS = 0.45e-3
+"""Standard deviation of finer Gaussians across the surface [m]. The surface that carries Gaussians lies below the skin,
+which coarse ones reach because they are thick: with thin ones fingers lose half a millimetre. With .6 mm none is lost,
+but outlines get rough."""
+MIN_ALPHA = 0.05
+"""Below it a pixel says nothing about the colour of the hand."""
+STEPS = 15
+"""Of the colours' fit, which starts at the colours of the photo; 40 come to the same."""
+SHRUNK = 2
+"""The pictures that are fitted are also fitted this many times smaller: from afar the rasterizer widens fine Gaussians,
+and those in front would hide more of the others than they do from near."""
+
+
+class Sharpened(NamedTuple):
+    """Gaussians with the photos' detail."""
+
+    gaussians: CanonicalGaussians
+    """Those that were not touched are the same bit for bit, in their order; the new ones are the last."""
+    n_new: int
+    losses: tuple[float, ...]
+    """Mean squared colour difference over all views, of every step, photo after photo; none where nothing was
+    missing."""
+
+
+@torch.no_grad()
+def sharpen(
+    hand: HandModel,
+    gaussians: CanonicalGaussians,
+    evidences: Sequence[Evidence],
+    believed: Float[Tensor, "K V"] | None = None,
+    progress: Progress = silent,
+) -> Sharpened:
+    """Replace Gaussians by finer ones where pictures of the hand show more than they do.
+
+    A face whose picture differs from the avatar's is cut into as many parts as it takes to show what is there; faces
+    around it are cut as well, so that finer Gaussians fade into coarser ones. The colours minimise the squared
+    difference of pictures that are linear in them: a photo in its own view, and what the surface carries of all photos
+    in four views beside, in both sizes; of several photos each the colours where it is believed most, one after the
+    other. At outlines, on a slant and where the wrist ends the avatar stays as it is.
+
+    Args:
+        hand: Whose surface it is.
+        gaussians: Fitted to the photos, perhaps in smaller pictures of them.
+        evidences: Of K photos, as large as their detail, with one surface at rest and in one light.
+        believed: How far to believe each at each vertex, at most 1 in all; a single photo wholly.
+        progress: Called as work goes on.
+    """
+    rest = evidences[0].rest.vertices
+    faces = hand.faces.to(rest.device)
+    believed = rest.new_ones(1, len(rest)) if believed is None else believed
+    fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
+    fading = with_neighbours(fading[faces].any(1), faces, len(rest))
+    sources = [_source(e, faces, fading, own) for e, own in zip(evidences, believed, strict=True)]
+    old = [pose_gaussians(with_shade_on(gaussians), faces, rest, source.posed) for source in sources]
+    spacing = torch.stack([
+        _wanted_spacing(source, render(there, source.canvas.camera).image, faces)
+        for source, there in zip(sources, old, strict=True)
+    ]).amin(0)  # fmt: skip
+    missing = spacing.isfinite()
+    if not bool(missing.any()):
+        return Sharpened(gaussians, 0, ())
+    around = with_neighbours(missing, faces, len(rest))
+    # A face of one part would keep its vertices' Gaussians, which reach into the faces beside it.
+    parts = torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
+    dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
+    shown = with_shade_on(dense)
+    new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
+    start = lay_over(shown.colors[changed], sources, [there.means[changed] for there in new])
+    colors = shown.colors.masked_scatter(changed[:, None], start)
+    whose = vertex_to_gaussians(believed.T, faces, dense).argmax(1)
+    whose_face = believed[:, faces].mean(-1).argmax(0)
+    losses: list[float] = []
+    for k, source in enumerate(sources):
+        mine = changed & (whose == k)
+        if not bool(mine.any()):
+            continue
+        still = torch.where(mine[:, None], 0, colors)
+        points = source.posed[faces[around & (whose_face == k)]].flatten(0, 1)
+        views = _views(sources, k, points, faces, old[k], new[k], still)
+        learned, own = fit_colors(views, colors[mine], mine, STEPS, progress)
+        colors, losses = still.masked_scatter(mine[:, None], learned), [*losses, *own]
+    return Sharpened(with_shown(dense, changed, colors[changed]), n_new, tuple(losses))
+
+
+def _source(
+    evidence: Evidence, faces: Tensor, fading: Bool[Tensor, "F"], believed: Float[Tensor, "V"]
+) -> Source:
+    """The photo on its surface, with nothing of it on `fading` faces and elsewhere as much as it is believed."""
+    posed, canvas = evidence.posed.vertices, Canvas(evidence.image, _faded_in(evidence.mask), evidence.camera)
+    seen = look(posed, faces, canvas, FACING)
+    ids = seen.faces.clamp_min(0)
+    trust = torch.where(fading[ids], 0, (believed[faces[ids]] * seen.barycentrics).sum(-1))
+    return Source(canvas, seen._replace(share=seen.share * trust), posed)
+
+
+def _views(
+    sources: Sequence[Source], k: int, points: Tensor, faces: Tensor, old: Gaussians, new: Gaussians, still: Tensor
+) -> list[View]:
+    """Pictures of `points` in the pose of source k: in the photo's view and beside it, in both sizes."""
+    camera, posed, views = sources[k].canvas.camera, sources[k].posed, []
+    for other, weight in ((camera, PHOTO_WEIGHT), *((other, 1.0) for other in beside(camera, points))):
+        near = _divisible(cut(other, points, 1.0))
+        image, alpha = render(old, near)
+        alpha = alpha.clamp_min(MIN_ALPHA)[..., None]
+        target = alpha * carried(image / alpha, sources, posed, faces, near)
+        small = _pooled(target) / _pooled(alpha)
+        for goal, shown, scale in ((target / alpha, near, 1), (small, _smaller(near), SHRUNK)):
+            weights = freeze_view(new, shown)
+            # Coverage is not to be fitted: in a small picture the rasterizer draws outlines wider.
+            goal = goal * weights.alphas - blend_colors(weights, still)
+            views.append(View(weights, goal, weight * scale**2))
+    return views
+
+
+def _faded_in(mask: Float[Tensor, "S S"]) -> Float[Tensor, "S S"]:
+    """Share of each pixel that is surely hand, growing from the border over a width of `RIM`."""
+    rim = max(1, round(RIM * len(mask)))
+    inner = inner_mask(mask, 2 * rim)
+    return avg_pool2d(inner[None, None], 2 * rim + 1, stride=1, padding=rim)[0, 0]
+
+
+def _wanted_spacing(source: Source, drawn: Float[Tensor, "S S 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F"]:
+    """Distance between Gaussians with which each face would show the picture [m]; infinite where it does already."""
+    (image, _, camera), seen = source.canvas, source.seen
+
+    def worst(error: Float[Tensor, "S S 3"]) -> Float[Tensor, "F"]:
+        local = avg_pool2d((error.square().mean(-1) * seen.share)[None, None], 3, stride=1, padding=1)[0, 0].sqrt()
+        counted = seen.share > MIN_SHARE
+        values = torch.zeros(len(faces), dtype=local.dtype, device=local.device)
+        return values.scatter_reduce_(0, seen.faces[counted], local[counted], "amax")
+
+    spacing = torch.full((len(faces),), torch.inf, device=drawn.device)
+    short = worst(drawn - image) > TOLERANCE
+    for finer in SPACINGS:
+        spacing = torch.where(short, finer, spacing)
+        short = short & (worst(_sampled(image, finer) - image) > TOLERANCE)
+    _, depth = project(camera, source.posed)
+    return spacing * depth[faces].mean(1) / camera.K[0, 0]
+
+
+def _sampled(image: Float[Tensor, "S S 3"], spacing: float) -> Float[Tensor, "S S 3"]:
+    """What is left of a picture that is known every `spacing` pixels only."""
+    planes = image.permute(2, 0, 1)[None]
+    few = interpolate(planes, size=[round(n / spacing) for n in image.shape[:2]], mode="bilinear", antialias=True)
+    return interpolate(few, size=list(image.shape[:2]), mode="bilinear")[0].permute(1, 2, 0)
+
+
+def _divisible(camera: Camera) -> Camera:
+    return camera._replace(width=camera.width // SHRUNK * SHRUNK, height=camera.height // SHRUNK * SHRUNK)
+
+
+def _pooled(picture: Float[Tensor, "H W C"]) -> Float[Tensor, "h w C"]:
+    return avg_pool2d(picture.permute(2, 0, 1)[None], SHRUNK)[0].permute(1, 2, 0).contiguous()
+
+
+def _smaller(camera: Camera) -> Camera:
+    K = camera.K.clone()
+    K[:2] /= SHRUNK
+    return Camera(camera.viewmat, K, camera.width // SHRUNK, camera.height // SHRUNK)

@@ -1,0 +1,192 @@
+"""The estimator's errors as they were measured: a hand is seen as wrongly as one that looks like it was.
+
+`tools/measure_estimator_errors.py` photographs synthetic hands, estimates them as `pipeline.reconstruct` does, and
+keeps the differences. One photo says where a hand lies in the picture but little of its depth, so errors of joints,
+turn, shape and focal length are large and hang together: drawn one by one they would carry the surface far off its
+picture. An error is therefore all of one measured hand's, of one of those that look most alike from the camera. What
+it does to this hand's landmarks in the picture is put right: they are off as that hand's were, and the surface follows.
+Last, as by `estimation.surface_offsets`, what forms the outline goes back to where it is.
+"""
+
+import functools
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from safetensors.torch import load
+from torch import Tensor
+from torch.nn.functional import normalize, pad
+
+from oasis_warp.assets import asset
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.rotation import from_axis_angle
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.pretraining.posed_hands import FINGERS, Posed, pose_hands
+
+ALIKE = 8
+"""Of so many measured hands that look most alike one lends its error."""
+_WRIST, _MIDDLE = 0, 9
+"""Landmarks between which a hand points upwards."""
+_BONES = (*((0, k) for k in range(1, 21, 4)), *((k, k + 1) for k in range(1, 20) if k % 4))
+"""First and last landmark of the bones that carry flesh along."""
+_FORESHORTENED = 0.1
+"""Share of the palm's length, as seen, below which a bone is taken to point as the palm does."""
+_GRAZING = 0.5
+"""Largest |normal . view| of a vertex that belongs to the outline, ever less up to there."""
+_SOFT = 0.004
+"""Bones that are nearer to a vertex than this share it evenly [m]."""
+
+
+class MeasuredErrors(NamedTuple):
+    """M hands, each turned about the camera's axis until it points upwards; distances in metres, angles in radians."""
+
+    looks: Float[Tensor, "M 63"]
+    """True landmarks about their mean, in the camera's frame."""
+    angles: Float[Tensor, "M 15 3"]
+    """Found less true."""
+    turn: Float[Tensor, "M 3"]
+    """From the true to the found orientation, about the camera's axes."""
+    shape: Float[Tensor, "M S"]
+    """Found coefficients less the share `kept` of the true ones."""
+    lens: Float[Tensor, "M 2"]
+    """Logarithms: found over true focal length; found over true size of what covers a pixel at the hand."""
+    place: Float[Tensor, "M 21 2"]
+    """Of landmarks in the picture, in metres at the hand's true distance."""
+    kept: Float[Tensor, "S"]
+    """Share of a shape coefficient that the estimator finds."""
+    shares: Float[Tensor, "V 21"]
+    """How much of each landmark's shift a vertex takes part in; rows sum to one."""
+    normals: Float[Tensor, "V 3"]
+    """Of the surface at rest."""
+
+    def times(self, strength: float) -> "MeasuredErrors":
+        """Larger or smaller errors; none for 0."""
+        if strength == 1:
+            return self
+        smaller = {name: strength * getattr(self, name) for name in ("angles", "turn", "shape", "lens", "place")}
+        return self._replace(**smaller, kept=1 - strength * (1 - self.kept))
+
+
+class Estimated(NamedTuple):
+    """What an estimator says of N hands."""
+
+    posed: Float[Tensor, "N V 3"]
+    K: Float[Tensor, "N 3 3"]
+
+
+@functools.cache
+def bundled_errors(device: torch.device) -> MeasuredErrors:
+    """The errors that ship with the package, of the bundled hand."""
+    stored = load(asset("training", "estimator_errors.safetensors").read_bytes())
+    tensors = {name: value.float() for name, value in stored.items()} | of_surface(bundled_hand())
+    return MeasuredErrors(**{name: value.to(device) for name, value in tensors.items()})
+
+
+def of_surface(hand: HandModel) -> dict[str, Tensor]:
+    """The fields of `MeasuredErrors` that are the hand's own."""
+    a, b, c = hand.template[hand.faces].unbind(1)
+    across = torch.linalg.cross(b - a, c - a)
+    normals = torch.zeros_like(hand.template).index_add_(0, hand.faces.flatten(), across.repeat_interleave(3, 0))
+    return {"shares": landmark_shares(hand), "normals": normalize(normals, dim=-1)}
+
+
+def landmark_shares(hand: HandModel) -> Float[Tensor, "V 21"]:
+    """Weights by which vertices follow landmarks: along the nearest bones, linearly from end to end."""
+    points = torch.cat([hand.joints, hand.tips])[hand.keypoint_index]
+    ends = torch.tensor(_BONES, device=points.device)
+    start, end = points[ends].unbind(1)
+    arm = end - start
+    along = (((hand.template[:, None] - start) * arm).sum(-1) / (arm * arm).sum(-1)).clamp(0, 1)
+    away = (hand.template[:, None] - start - along[..., None] * arm).norm(dim=-1)
+    near = 1 / (away**2 + _SOFT**2) ** 2
+    near = near / near.sum(1, keepdim=True)
+    shares = torch.zeros(len(hand.template), len(points), device=points.device)
+    shares.index_add_(1, ends[:, 0], near * (1 - along))
+    return shares.index_add_(1, ends[:, 1], near * along)
+
+
+class Frames(NamedTuple):
+    """Directions in the picture, as rotations about the camera's axis that turn upwards into them."""
+
+    hand: Float[Tensor, "N 3 3"]
+    """From wrist to middle knuckle."""
+    landmarks: Float[Tensor, "N 21 2 2"]
+    """Along the bone that ends at a landmark, for those beyond the knuckles."""
+
+
+def frames_of(landmarks: Float[Tensor, "N 21 3"]) -> Frames:
+    """How hands and their fingers lie in the picture; landmarks are in the camera's frame."""
+    seen = landmarks[..., :2] / landmarks[..., 2:]
+    up = seen[:, _MIDDLE] - seen[:, _WRIST]
+    fingers = seen[:, 1:].unflatten(1, (FINGERS, 4))
+    bones = fingers.diff(dim=2) + _FORESHORTENED * up[:, None, None]
+    knuckles = up[:, None, None].expand(-1, FINGERS, 1, -1)
+    along = torch.cat([up[:, None], torch.cat([knuckles, bones], 2).flatten(1, 2)], 1)
+    x, y = normalize(along, dim=-1).unbind(-1)
+    turns = torch.stack([-y, -x, x, -y], -1).unflatten(-1, (2, 2))
+    hand = pad(turns[:, 0], (0, 1, 0, 1))
+    hand[:, 2, 2] = 1
+    return Frames(hand, turns)
+
+
+def looks(landmarks: Float[Tensor, "N 21 3"], frames: Frames) -> Float[Tensor, "N 63"]:
+    """As `MeasuredErrors.looks`."""
+    return ((landmarks - landmarks.mean(1, keepdim=True)) @ frames.hand).flatten(1)
+
+
+def estimate(
+    hand: HandModel,
+    true: Posed,
+    shape: Float[Tensor, "N S"],
+    angles: Float[Tensor, "N 15 3"],
+    orientation: Float[Tensor, "N 3 3"],
+    K: Float[Tensor, "N 3 3"],
+    measured: MeasuredErrors,
+    choice: Int[Tensor, "N"],
+) -> Estimated:
+    """Surfaces and cameras with errors.
+
+    Args:
+        hand: That of `measured`.
+        true: Those hands, from `pose_hands` in the camera's frame.
+        shape: True coefficients.
+        angles: True angles.
+        orientation: True orientations.
+        K: True intrinsics [px].
+        measured: Errors.
+        choice: Which of the `ALIKE` measured hands lends its error.
+    """
+    frames = frames_of(true.landmarks)
+    alike = torch.cdist(looks(true.landmarks, frames), measured.looks).topk(ALIKE, largest=False).indices
+    row = alike.gather(1, choice[:, None])[:, 0]
+    turn = (frames.hand @ measured.turn[row][..., None])[..., 0]
+    by = turn.norm(dim=1)
+    wrong = from_axis_angle(turn / by.clamp_min(1e-12)[:, None], by)
+    found = pose_hands(
+        hand, measured.kept * shape + measured.shape[row], angles + measured.angles[row],
+        wrong @ orientation, torch.zeros_like(turn),
+    )  # fmt: skip
+    log_focal, log_size = measured.lens[row].unbind(1)
+    focal = log_focal.exp()[:, None, None]
+    depth = true.landmarks[..., 2:]
+    middle = depth.mean(1, keepdim=True)
+    across = (frames.landmarks @ measured.place[row][..., None])[..., 0]
+    rays = (true.landmarks[..., :2] / depth + across / middle) / focal
+    new_depth = found.landmarks[..., 2:]
+    new_depth = new_depth - new_depth.mean(1, keepdim=True) + middle * focal * log_size.exp()[:, None, None]
+    shift = torch.cat([rays * new_depth, new_depth], -1) - found.landmarks
+    K = K * torch.cat([focal, focal, torch.ones_like(focal)], dim=2)
+    posed = found.posed + measured.shares @ shift
+    return Estimated(_onto_outline(posed, focal, true, measured.normals), K)
+
+
+def _onto_outline(posed: Tensor, focal: Tensor, true: Posed, normals: Tensor) -> Tensor:
+    """`posed` with the vertices on the true outline moved onto it, across it; `focal` is over the true focal length."""
+    out = (true.turns @ normals[..., None])[..., 0]
+    view = normalize(true.posed, dim=-1)
+    rim = (1 - (normalize(out, dim=-1) * view).sum(-1, keepdim=True).abs() / _GRAZING).clamp(min=0)
+    out = normalize(out[..., :2], dim=-1)
+    depth = posed[..., 2:] / focal
+    gap = posed[..., :2] / depth - true.posed[..., :2] / true.posed[..., 2:]
+    back = rim * (gap * out).sum(-1, keepdim=True) * out * depth
+    return torch.cat([posed[..., :2] - back, posed[..., 2:]], dim=-1)

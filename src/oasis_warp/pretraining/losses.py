@@ -1,0 +1,97 @@
+"""What a prediction costs: the paper's training objective (appendix B.2)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.losses.detail import detail_difference
+from oasis_warp.losses.image import masked_dssim, masked_l1
+from oasis_warp.network.inputs import Prediction
+from oasis_warp.pretraining.targets import Pictures
+
+Perceptual = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Distance of N images and N targets inside N masks, one number each."""
+
+
+LEAST_AREA = 0.05
+"""Share of the picture that a mask counts as at least: little depends on a hand that hides behind its arm."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossConfig:
+    """Weights of the objective; the paper's."""
+
+    rgb: float = 10.0
+    """Of the mean absolute colour difference inside the mask."""
+    mask: float = 1.0
+    """Of the area by which the drawn alpha is wrong, over the area of the mask."""
+    ssim: float = 1.0
+    """Of 1 - SSIM."""
+    perceptual: float = 5.0
+    """Of LPIPS, or of the term in its place."""
+    position: float = 1.0
+    """Of how far vertex Gaussians stray beyond `offset_limit`, in units of it."""
+    scaling: float = 0.5
+    """Of how much more stretched than `stretch_limit` Gaussians are."""
+    offset_limit: float = 0.006
+    """Distance from its vertex that costs nothing [m]."""
+    stretch_limit: float = 5.0
+    """Longest over shortest axis that costs nothing, where the anchor has no larger one."""
+
+
+def objective(
+    prediction: Prediction,
+    drawn: Pictures,
+    true: Pictures,
+    config: LossConfig,
+    perceptual: Perceptual = detail_difference,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The weighted sum, and each term without its weight: means over pictures and Gaussians.
+
+    Inside the mask colours are compared over black, so that holes cost twice; the mask's term alone counts what is
+    drawn beyond it.
+    """
+    images, alphas = drawn
+    targets, masks = true
+    areas = masks.sum((1, 2)).clamp_min(LEAST_AREA * masks[0].numel())
+    terms = {
+        "rgb": torch.vmap(masked_l1)(images, targets, masks).mean(),
+        "mask": ((alphas - masks).abs().sum((1, 2)) / areas).mean(),
+        "ssim": torch.vmap(masked_dssim)(images, targets, masks).mean(),
+        "perceptual": perceptual(images, targets, masks).mean(),
+        "position": position_loss(prediction.offsets, config.offset_limit),
+        "scaling": scaling_loss(prediction.scales, prediction.anchor_scales, config.stretch_limit),
+    }
+    return sum((getattr(config, name) * term for name, term in terms.items()), images.new_zeros(())), terms
+
+
+def position_loss(offsets: Float[Tensor, "*batch 3"], limit: float) -> Tensor:
+    """Mean of max(|offset| - limit, 0), over `limit`."""
+    # off 0, where the root has no slope: an untrained network has no offsets
+    length = (offsets.square().sum(-1) + 1e-16).sqrt()
+    return (length / limit - 1).clamp_min(0).mean()
+
+
+def scaling_loss(
+    scales: Float[Tensor, "*batch 3"], anchors: Float[Tensor, "*batch 3"], limit: float
+) -> Tensor:
+    """Mean of max(longest / shortest - limit, 0), the limit of a Gaussian no smaller than its anchor has it.
+
+    Anchors are flat on purpose, and those of slivers long: the paper's limit alone would puff them up to where they
+    stand out of the surface.
+    """
+
+    def stretch(axes: Tensor) -> Tensor:
+        return axes.amax(-1) / axes.amin(-1)
+
+    return (stretch(scales) - stretch(anchors).clamp_min(limit)).clamp_min(0).mean()
+
+
+@torch.no_grad()
+def picture_psnr(drawn: Pictures, true: Pictures) -> Tensor:
+    """Peak signal-to-noise ratio inside the masks, mean of the pictures [dB]."""
+    error = ((drawn.images - true.images).square() * true.alphas[..., None]).sum((1, 2, 3))
+    return (-10 * (error / (3 * true.alphas.sum((1, 2)).clamp_min(1))).clamp_min(1e-12).log10()).mean()

@@ -1,0 +1,199 @@
+"""Pictures of posed hands as training batches: right hands, cropped as photos are, seen with an estimator's errors."""
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import TrainingBatch
+from oasis_warp.pretraining.estimator_errors import ALIKE, bundled_errors, estimate
+from oasis_warp.pretraining.mask_errors import NUMBERS, ended, wandering
+from oasis_warp.pretraining.posed_hands import Posed, pose_hands
+
+CROP_MARGIN = 1.12
+"""Side of a crop over the longer extent of its mask, as in `pipeline.reconstruct`."""
+
+
+@runtime_checkable
+class Photographed(Protocol):
+    """N pictures and the truth about them: what a renderer of hands hands over.
+
+    Camera frames throughout; the pose of a left hand describes the mirrored model (x -> -x).
+    """
+
+    @property
+    def image(self) -> Float[Tensor, "N H H 3"]:
+        """Colours (sRGB)."""
+        ...
+
+    @property
+    def alpha(self) -> Float[Tensor, "N H H"]:
+        """Share of each pixel that is not background."""
+        ...
+
+    @property
+    def mask(self) -> Float[Tensor, "N H H"]:
+        """Share of each pixel that is hand."""
+        ...
+
+    @property
+    def angles(self) -> Float[Tensor, "N 15 3"]:
+        """As `HandPose.angles`."""
+        ...
+
+    @property
+    def orientation(self) -> Float[Tensor, "N 3 3"]:
+        """From the hand's frame to the camera's."""
+        ...
+
+    @property
+    def translation(self) -> Float[Tensor, "N 3"]:
+        """Of the hand's origin [m]."""
+        ...
+
+    @property
+    def shape(self) -> Float[Tensor, "N S"]:
+        """Shape coefficients."""
+        ...
+
+    @property
+    def K(self) -> Float[Tensor, "N 3 3"]:
+        """Intrinsics [px]."""
+        ...
+
+    @property
+    def left(self) -> Int[Tensor, "N"]:
+        """1 for left hands."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimatorNoise:
+    """How much of the estimator's errors is in what the network is given; 1 as they were measured, 0 for none."""
+
+    surface: float = 1.0
+    """Of those of pose, shape and camera."""
+    mask: float = 1.0
+    """Of those of the mask, and so of the crop round it."""
+
+
+class Crops(NamedTuple):
+    """Square cuts, channels last."""
+
+    planes: Float[Tensor, "N s s C"]
+    K: Float[Tensor, "N 3 3"]
+
+
+def crop_to_mask(
+    planes: Float[Tensor, "N H H C"],
+    mask: Float[Tensor, "N H H"],
+    K: Float[Tensor, "N 3 3"],
+    size: int,
+) -> Crops:
+    """The squares round the masks as `size` pixels, bilinear.
+
+    An empty mask keeps the whole picture. Nothing waits for the device.
+    """
+    full = planes.shape[1]
+    inside = mask > 0.5
+    low, high = zip(*(_extent(inside.any(axis)) for axis in (1, 2)), strict=True)  # columns, then rows
+    low, high = torch.stack(low, 1), torch.stack(high, 1)
+    side = CROP_MARGIN * (high - low).amax(1, keepdim=True)
+    corner = (low + high - side) / 2
+    cells = (torch.arange(size, dtype=K.dtype, device=K.device) + 0.5) / size
+    x, y = (corner[:, k, None] + cells * side for k in range(2))
+    grid = torch.stack(torch.broadcast_tensors(x[:, None], y[:, :, None]), dim=-1) * 2 / full - 1
+    cut = grid_sample(planes.permute(0, 3, 1, 2), grid, align_corners=False).permute(0, 2, 3, 1)
+    scale = size / side[:, 0]
+    moved = K.clone()
+    moved[:, :2, 2] -= corner
+    moved[:, :2] *= scale[:, None, None]
+    return Crops(cut, moved)
+
+
+def _extent(touched: Tensor) -> tuple[Tensor, Tensor]:
+    """First and one past the last true place of each row, as floats; the whole row where none is."""
+    n = touched.shape[1]
+    first = touched.int().argmax(1)
+    last = n - touched.flip(1).int().argmax(1)
+    return first.float(), last.float()
+
+
+def as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Image, alpha, mask, orientation, translation and K, left hands seen in the mirror."""
+    left = pictures.left.bool()
+
+    def flip(planes: Tensor) -> Tensor:
+        return torch.where(left.view(-1, *[1] * (planes.dim() - 1)), planes.flip(2), planes)
+
+    like = pictures.translation
+    sign = torch.ones_like(like)
+    sign[:, 0] -= 2 * left
+    K = pictures.K.clone()
+    K[:, 0, 2] = torch.where(left, pictures.image.shape[2] - K[:, 0, 2], K[:, 0, 2])
+    orientation = sign[:, :, None] * pictures.orientation * sign[:, None]
+    return flip(pictures.image), flip(pictures.alpha), flip(pictures.mask), orientation, sign * like, K
+
+
+@torch.no_grad()
+def training_batch(
+    hand: HandModel,
+    photos: Photographed,
+    targets: Photographed,
+    size: int,
+    random: torch.Generator,
+    noise: EstimatorNoise = EstimatorNoise(),
+) -> TrainingBatch:
+    """B photos and T pictures of each one's hand, as the network is to be given them.
+
+    Args:
+        hand: On the device of the pictures.
+        photos: B of them, with everything that photos have.
+        targets: B T of them, those of the first hand first: what the avatar must look like, the hand alone over black.
+        size: Side of the crops [px].
+        random: On the CPU, of the estimator's errors; the same state gives the same batch.
+        noise: How large they are; they are in the photo's `posed`, `K`, `mask` and crop, nowhere else.
+    """
+    image, alpha, mask, orientation, translation, K = as_right_hands(photos)
+    count, like = len(image), translation
+
+    views = len(targets.image) // count
+    goal_image, goal_alpha, goal_mask, *place, goal_K = as_right_hands(targets)
+    both = pose_hands(
+        hand, torch.cat([photos.shape, targets.shape]), torch.cat([photos.angles, targets.angles]),
+        torch.cat([orientation, place[0]]), torch.cat([translation, place[1]]),
+    )  # fmt: skip
+    true = Posed(*(part[:count] for part in both))
+    errors = bundled_errors(like.device).times(noise.surface)
+    choice = torch.randint(ALIKE, (count,), generator=random).to(like.device, non_blocking=True)
+    seen = estimate(hand, true, photos.shape, photos.angles, orientation, K, errors, choice)
+    numbers = torch.randn(count, 1 + NUMBERS, generator=random).to(like, non_blocking=True)
+    mask = ended(mask, alpha, true.landmarks, K, numbers[:, 0], noise.mask)
+    crop = crop_to_mask(torch.cat([image, mask[..., None]], dim=-1), mask, seen.K, size)
+
+    alone = goal_image * (goal_mask / goal_alpha.clamp_min(1e-3)).clamp(0, 1)[..., None]  # over black already
+    hidden = (goal_alpha - goal_mask).clamp(0, 1)
+    cut = crop_to_mask(torch.cat([alone, torch.stack([goal_mask, hidden], -1)], dim=-1), goal_mask, goal_K, size)
+    still = torch.eye(4, dtype=like.dtype, device=like.device)
+
+    def by_hand(tensor: Tensor) -> Tensor:
+        return tensor.unflatten(0, (count, views))
+
+    return TrainingBatch(
+        image=crop.planes[..., :3].clamp(0, 1),
+        mask=wandering(crop.planes[..., 3].clamp(0, 1), numbers[:, 1:], noise.mask),
+        posed=seen.posed,
+        viewmat=still.expand(count, -1, -1),
+        K=crop.K,
+        rest=true.rest,
+        target_images=by_hand(cut.planes[..., :3].clamp(0, 1)),
+        target_masks=by_hand(cut.planes[..., 3].clamp(0, 1)),
+        target_known=by_hand(1 - cut.planes[..., 4].clamp(0, 1)),
+        target_posed=by_hand(both.posed[count:]),
+        target_viewmats=still.expand(count, views, -1, -1),
+        target_Ks=by_hand(cut.K),
+    )

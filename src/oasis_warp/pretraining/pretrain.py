@@ -1,0 +1,255 @@
+"""Train the prior network on many hands: paper, section 4.1 and appendix B.2."""
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.types import TrainingBatch
+from oasis_warp.data.atomic import write_file
+from oasis_warp.data.pictures import to_uint8, write_picture
+from oasis_warp.losses.detail import detail_difference
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.inputs import input_of_batch
+from oasis_warp.network.weights_file import save_network
+from oasis_warp.ops.recording import Recording
+from oasis_warp.pretraining.checkpoint import load_checkpoint, save_checkpoint
+from oasis_warp.pretraining.distributed import Place, any_process, average_gradients, mean_over_processes, share_weights
+from oasis_warp.pretraining.losses import LossConfig, Perceptual, objective, picture_psnr
+from oasis_warp.pretraining.targets import Pictures, draw_targets, true_pictures
+
+CHECKPOINT, WEIGHTS, METRICS, SHEET = "checkpoint.safetensors", "network.safetensors", "metrics.jsonl", "pictures.png"
+"""What training leaves in its folder."""
+SHEET_HANDS = 8
+EAGER_STEPS = 4
+"""Steps on CUDA before one is recorded: they load kernels, and show how many Gaussians pictures may show."""
+SLACK = 3.0
+"""Times the memory that a picture needed for its Gaussians: each hand and pose needs another."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PretrainConfig:
+    """How the prior is trained."""
+
+    steps: int = 20_000
+    """Batches that each process sees."""
+    learning_rate: float = 4e-4
+    """Of Adam, at its highest; the paper's."""
+    warmup: int = 200
+    """Steps over which the learning rate rises from nothing."""
+    decay: Literal["cosine", "none"] = "cosine"
+    """Down to nothing at the last step, which short trainings need, or constant as in the paper."""
+    precision: Literal["bfloat16", "float32"] = "bfloat16"
+    """Of attention and perceptrons; geometry, Gaussians and weights are float32."""
+    clip: float = 1.0
+    """Largest norm of the gradient of all weights together; a longer one is shortened."""
+    losses: LossConfig = field(default_factory=LossConfig)
+    checkpoint_every: int = 500
+    """Steps between two checkpoints."""
+    log_every: int = 20
+    """Steps between two lines of metrics."""
+
+
+@runtime_checkable
+class BatchSource(Protocol):
+    """Training data. Batch k of a process depends on k, rank and world alone, so that training can go on anywhere."""
+
+    def __call__(self, first_step: int, rank: int, world: int) -> Iterator[TrainingBatch]:
+        """Batches from step `first_step` on, on the device of the network."""
+        ...
+
+
+class StepResult(NamedTuple):
+    """What one step found; numbers are still on the device."""
+
+    loss: Tensor
+    terms: dict[str, Tensor]
+    psnr: Tensor
+    drawn: Pictures
+    true: Pictures
+
+
+def never() -> bool:
+    """Nobody asks to stop."""
+    return False
+
+
+def learning_rate(config: PretrainConfig, step: int) -> float:
+    """Of step `step`, counted from 0."""
+    rise = min(1.0, (step + 1) / max(config.warmup, 1))
+    fall = 0.5 + 0.5 * math.cos(math.pi * step / config.steps) if config.decay == "cosine" else 1.0
+    return config.learning_rate * rise * fall
+
+
+class Trainer:
+    """A network in training, and its optimiser; `step` counts the steps done."""
+
+    def __init__(
+        self,
+        network: HandNetwork,
+        config: PretrainConfig,
+        place: Place,
+        perceptual: Perceptual = detail_difference,
+    ):
+        self.network = network.to(place.device).train()
+        self.config, self.place, self.perceptual = config, place, perceptual
+        self.trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
+        share_weights(self.trained, place.world)
+        on_cuda = place.device.type == "cuda"
+        # a recorded step reads the learning rate where it lies on the device
+        rate = torch.tensor(config.learning_rate, device=place.device) if on_cuda else config.learning_rate
+        self.optimizer = torch.optim.Adam(self.trained, lr=rate, fused=on_cuda, capturable=on_cuda)
+        self.step = 0
+        self._recorded: Recording[StepResult] | None = None
+        self._eager_steps = 0
+
+    def advance(self, batch: TrainingBatch) -> StepResult:
+        """One step of Adam; no value is waited for.
+
+        On CUDA the result's tensors are those of a recorded step: the next one writes over them.
+        """
+        for group in self.optimizer.param_groups:
+            rate = learning_rate(self.config, self.step)
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+        if self._recorded is None and self.place.device.type == "cuda" and self._eager_steps >= EAGER_STEPS:
+            self._recorded = Recording(self._update, batch, SLACK)
+        if self._recorded is None:
+            self._eager_steps += 1
+            result = self._update(batch)
+        else:
+            result = self._recorded(batch)
+        self.step += 1
+        return result
+
+    def check_recording(self) -> None:
+        """Record anew where the last step had too little memory for its pictures; waits for the device."""
+        if self._recorded is not None and self._recorded.lacked_memory():
+            self._recorded, self._eager_steps = None, 0
+
+    def evaluate(self, batch: TrainingBatch) -> StepResult:
+        """Predict, draw every target and compare."""
+        half = self.config.precision == "bfloat16"
+        with torch.autocast(self.place.device.type, torch.bfloat16, enabled=half):
+            prediction = self.network(input_of_batch(batch))
+        drawn = draw_targets(prediction, batch, self.network)
+        true = true_pictures(batch, self.network.faces, self.network.rim)
+        loss, terms = objective(prediction, drawn, true, self.config.losses, self.perceptual)
+        return StepResult(loss, terms, picture_psnr(drawn, true), drawn, true)
+
+    def _update(self, batch: TrainingBatch) -> StepResult:
+        result = self.evaluate(batch)
+        gradients = torch.autograd.grad(result.loss, self.trained, allow_unused=True)
+        for parameter, gradient in zip(self.trained, gradients, strict=True):
+            if gradient is not None and gradient.stride() != parameter.stride():
+                gradient = torch.empty_like(parameter).copy_(gradient)  # the fused optimiser wants the same strides
+            parameter.grad = gradient
+        average_gradients(self.trained, self.place.world)
+        torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
+        self.optimizer.step()
+        return _without_history(result)
+
+
+def _without_history(result: StepResult) -> StepResult:
+    """The same numbers, that hold on to nothing they were computed from."""
+    terms = {name: term.detach() for name, term in result.terms.items()}
+    drawn, true = (Pictures(*(tensor.detach() for tensor in pictures)) for pictures in (result.drawn, result.true))
+    return StepResult(result.loss.detach(), terms, result.psnr.detach(), drawn, true)
+
+
+def pretrain(
+    network: HandNetwork,
+    source: BatchSource,
+    config: PretrainConfig,
+    folder: Path,
+    place: Place,
+    *,
+    perceptual: Perceptual = detail_difference,
+    about: Mapping[str, object] = MappingProxyType({}),
+    stop_asked: Callable[[], bool] = never,
+    progress: Progress = silent,
+) -> int:
+    """Train until `config.steps`, going on from the checkpoint in `folder` where there is one; the steps done in all.
+
+    Leaves there a checkpoint, the weights in half precision, a line of JSON every few steps and a sheet of pictures:
+    photo, target, drawn. Process 0 writes. A training that was stopped and taken up again ends, on the CPU, with the
+    bits of one that was not, as steps and batches count from the start and nothing else is random.
+
+    Args:
+        network: Changed in place.
+        source: Of batches.
+        config: How to train.
+        folder: Where files go.
+        place: This process.
+        perceptual: Term of the objective.
+        about: More to say in the notes of the weights file, beside `config`: what JSON can hold.
+        stop_asked: Asked after every step, by several processes when they write metrics: then this is the last step.
+        progress: Told of the steps to do from here on.
+
+    Raises:
+        InputError: a checkpoint of another network, a folder that cannot be written, or a loss that is not finite.
+    """
+    trainer = Trainer(network, config, place, perceptual)
+    if (folder / CHECKPOINT).is_file():
+        trainer.step = load_checkpoint(folder / CHECKPOINT, network, trainer.optimizer)
+    if place.rank == 0:
+        _forget_after(folder / METRICS, trainer.step)
+    began, first = time.perf_counter(), trainer.step
+    batches = source(trainer.step, place.rank, place.world)
+    notes = {**about, **asdict(config)}
+    stopping = trainer.step >= config.steps
+    progress("pretraining", 0, config.steps - first)
+    while not stopping:
+        batch = next(batches)
+        result = trainer.advance(batch)
+        progress("pretraining", trainer.step - first, config.steps - first)
+        log_here = trainer.step % config.log_every == 0
+        # several processes stop together or wait for each other for ever, and agreeing costs a wait for the device
+        asked = (place.world == 1 or log_here) and any_process(stop_asked(), place)
+        stopping = asked or trainer.step == config.steps
+        save_here = stopping or trainer.step % config.checkpoint_every == 0
+        if log_here or save_here:
+            names = ["loss", "psnr", *result.terms]
+            values = torch.stack([result.loss, result.psnr, *result.terms.values()])
+            numbers = dict(zip(names, mean_over_processes(values, place.world).tolist(), strict=True))
+            trainer.check_recording()
+            if not math.isfinite(numbers["loss"]):
+                raise InputError(f"{folder}: the loss is not finite at step {trainer.step}; lower the learning rate.")
+            if place.rank == 0:
+                pace = (time.perf_counter() - began) / (trainer.step - first)
+                line = {"step": trainer.step, "seconds_per_step": pace, **numbers}
+                with (folder / METRICS).open("a") as file:
+                    file.write(json.dumps(line) + "\n")
+        if place.rank == 0 and save_here:
+            save_checkpoint(folder / CHECKPOINT, network, trainer.optimizer, trainer.step)
+            save_network(folder / WEIGHTS, network, notes=json.dumps({"step": trainer.step, **notes}))
+            write_picture(folder / SHEET, to_uint8(_sheet(batch, result)))
+    return trainer.step
+
+
+def _forget_after(path: Path, step: int) -> None:
+    """Drop the lines of steps that will be done again."""
+    if path.is_file():
+        lines = [line for line in path.read_text().splitlines() if json.loads(line)["step"] <= step]
+        write_file(path, "".join(line + "\n" for line in lines).encode())
+
+
+def _sheet(batch: TrainingBatch, result: StepResult) -> Tensor:
+    """A row a hand: its photo, its first target, and what was drawn of it."""
+    targets = batch.target_images.shape[1]
+    size = batch.target_images.shape[2]
+    photos = batch.image.permute(0, 3, 1, 2)
+    photos = torch.nn.functional.interpolate(photos, size=(size, size), mode="bilinear").permute(0, 2, 3, 1)
+    columns = [photos, result.true.images[::targets], result.drawn.images.detach()[::targets]]
+    return torch.cat([column[:SHEET_HANDS].flatten(0, 1) for column in columns], dim=1)

@@ -1,0 +1,122 @@
+"""The synthetic world as the source of training: photos with everything, targets of the same hands in even light."""
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.types import TrainingBatch
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.pretraining.photographed import training_batch
+from oasis_warp.synthetic.identity import Population
+from oasis_warp.synthetic.people import bake_people
+from oasis_warp.synthetic.picture import SyntheticBatch, part, render_planned
+from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery
+from oasis_warp.synthetic.planned import joined, plan_ahead
+
+ERROR_STREAM = 3
+"""Tells the random numbers of the estimator's errors from those of identities and pictures with the same seed."""
+SURROUNDINGS = 1.25
+"""Side of a rendered picture over that of the crop round its hand."""
+EVEN_EVERY = 4
+"""Of so many batches, one has photos in the even light of its targets, as captures in a studio are."""
+WALL_STREAM = 4
+"""Of the colours of the walls behind them; beside `ERROR_STREAM`."""
+MULTIPLE = 16
+"""Of a crop's side [px]: the rendered picture and the scales that losses look at are whole pixels then."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticHands:
+    """A `BatchSource`. On the CPU a batch has the same bits wherever training was taken up."""
+
+    seed: int
+    """Of the world and of the estimator's errors."""
+    people: int
+    """How many there are, over and over again in other photos."""
+    hands: int
+    """Photos a batch, each of another person."""
+    views: int
+    """Targets a photo, up to `PICTURES_EACH`."""
+    size: int
+    """Side of photos and targets [px], a multiple of `MULTIPLE`."""
+    device: torch.device
+    """Where pictures are rendered."""
+    population: Population = EVERYBODY
+    """What they may have."""
+    workers: int = 0
+    """Processes that plan pictures ahead; 0 for none."""
+    ahead: int = 1
+    """Batches that are rendered together: several make better use of a GPU, and are the same batches."""
+
+    def __call__(self, first_step: int, rank: int, world: int) -> Iterator[TrainingBatch]:
+        """Batches without end. People that have not been baked make it wait, some seconds each."""
+        hand = bundled_hand().to(self.device)
+        photo = Scenery(people=self.people, population=self.population)
+        looks = photo, replace(photo, look="even")
+        rendered = int(self.size * SURROUNDINGS)
+
+        def numbers() -> Iterator[int]:
+            return itertools.count(first_step * world + rank, world)
+
+        def blocks() -> Iterator[tuple[list[int], Scenery]]:
+            for number in numbers():
+                yield from zip((self.photo_indices(number), self.target_indices(number)), looks, strict=True)
+
+        plans, batch_numbers = plan_ahead(self.seed, blocks(), self.workers), numbers()
+        while True:
+            together = list(itertools.islice(plans, len(looks) * self.ahead))
+            photos, targets = (
+                render_planned(self.seed, joined(together[k :: len(looks)]), rendered, self.device, scenery=scenery)
+                for k, scenery in enumerate(looks)
+            )
+            for k, number in enumerate(itertools.islice(batch_numbers, self.ahead)):
+                photo = part(photos, slice(k * self.hands, (k + 1) * self.hands))
+                target = part(targets, slice(k * self.hands * self.views, (k + 1) * self.hands * self.views))
+                if number % EVEN_EVERY == EVEN_EVERY - 1:
+                    photo = self.before_walls(part(target, slice(None, None, self.views)), number)
+                yield training_batch(hand, photo, target, self.size, self.errors(number))
+
+    def photo_indices(self, number: int) -> list[int]:
+        """Pictures that are the photos of batch `number`."""
+        return [PICTURES_EACH * (number * self.hands + k) for k in range(self.hands)]
+
+    def target_indices(self, number: int) -> list[int]:
+        """Pictures that are its targets, those of the first photo first; in the other look, so nothing comes twice."""
+        return [index + view for index in self.photo_indices(number) for view in range(self.views)]
+
+    def before_walls(self, pictures: SyntheticBatch, number: int) -> SyntheticBatch:
+        """Pictures over black in front of plain walls instead."""
+        like = pictures.image
+        random = np.random.default_rng([self.seed, WALL_STREAM, number])
+        walls = torch.tensor(random.uniform(0.1, 0.9, (len(like), 1, 1, 3)), dtype=like.dtype)
+        walls = walls.to(like.device, non_blocking=True)
+        return pictures._replace(image=like + (1 - pictures.alpha[..., None]) * walls)
+
+    def errors(self, number: int) -> torch.Generator:
+        """The random numbers of the estimator's errors in batch `number`."""
+        (state,) = np.random.SeedSequence([self.seed, ERROR_STREAM, number]).generate_state(1)
+        return torch.Generator().manual_seed(int(state))
+
+    def people_met(self, rank: int, world: int, steps: int) -> list[int]:
+        """Whom process `rank` of `world` meets in so many steps.
+
+        Processes that meet the same people find them in another order, so that they need not bake the same at once.
+        """
+        batches = range(rank, min(steps, self.people) * world, world)  # after that many steps they come again
+        met = sorted({(number * self.hands + k) % self.people for number in batches for k in range(self.hands)})
+        first = rank * len(met) // world
+        return met[first:] + met[:first]
+
+    def bake(self, met: list[int], folder: Path | None, jobs: int, progress: Progress = silent) -> None:
+        """Make the people of `people_met` ready, or read those that `folder`, if any, holds already.
+
+        Raises:
+            ValueError: more than `synthetic.people.most_kept`.
+            InputError: the folder cannot be written.
+        """
+        bake_people(self.seed, met, self.population, str(self.device), jobs=jobs, folder=folder, progress=progress)

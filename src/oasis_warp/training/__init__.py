@@ -1,1 +1,0 @@
-"""Fit an avatar to a photo."""

@@ -1,0 +1,212 @@
+"""The light of a photo is found, taken off it, and stays in the world when the hand turns."""
+
+import math
+
+import pytest
+import torch
+from synthetic import evidence_of
+
+from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.adaptation.room_light import fit_light, with_shade, without_light
+from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.lighting import (
+    apart_from_shade,
+    in_even_light,
+    mirror_light,
+    posed_normals,
+    shading,
+    turn_light,
+)
+from oasis_warp.avatar.observe import observe
+from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.prior import MeanPrior
+from oasis_warp.core import rotation, surface
+from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.types import HandLight
+from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand.skinning import mirror_points, mirror_pose
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.render.cameras import mirrored_camera
+from oasis_warp.render.render import render
+
+LIGHT = HandLight(
+    torch.tensor([[0.8, 0.8, 0.8], [0.3, 0.25, 0.2], [-0.2, -0.25, -0.3], [-0.15, -0.15, -0.15]]),
+    torch.tensor([[0.3, 0.3, 0.3], [1.3, 1.3, 1.3]]),
+    torch.ones(3),
+)
+
+
+@pytest.fixture(scope="module")
+def scene(hand):
+    """Evidence in even light, its Gaussians and pose, and the same evidence in `LIGHT`."""
+    even, truth, pose = evidence_of(hand, 0.8 * region_colors(label_regions(hand), 0.03))
+    normals = surface.vertex_normals(even.rest.vertices, hand.faces)
+    there = pose_gaussians(truth, hand.faces, even.rest.vertices, even.posed.vertices, (LIGHT, normals))
+    drawn = render(there, even.camera)
+    behind = (1 - drawn.alpha)[..., None]
+    return even, truth, pose, even._replace(image=drawn.image + behind * even.image)
+
+
+def avatar(truth, pose, evidence, light, hand, side="right"):
+    left = side == "left"
+    return Avatar(
+        side=side, shape=torch.zeros(len(hand.shape_names)), surface_offsets=torch.zeros_like(hand.template),
+        gaussians=truth, source_pose=mirror_pose(pose) if left else pose,
+        source_camera=mirrored_camera(evidence.camera) if left else evidence.camera, light=light,
+    )  # fmt: skip
+
+
+def test_light_is_found_and_taken_off(hand, scene):
+    even, _, _, lit = scene
+    found = fit_light(hand, even.image, lit)
+    normals = posed_normals(even.rest.vertices, even.posed.vertices, hand.faces)
+    seen = observe(hand, even).confidence > 0.5
+    ratio = (shading(found, normals) / shading(LIGHT, normals))[seen]
+    assert float((ratio / ratio.mean(0) - 1).abs().quantile(0.95)) < 0.05
+
+    before = observe(hand, even).colors[seen]
+    after, untouched = (observe(hand, e).colors[seen] for e in (without_light(hand, lit, found), lit))
+
+    def error(colors):
+        return float((colors * (before.mean(0) / colors.mean(0)) - before).square().mean().sqrt())
+
+    assert error(after) < 0.45 * error(untouched)
+
+
+def test_light_on_nothing_is_even(hand, scene):
+    even, *_ = scene
+    nothing = even._replace(mask=torch.zeros_like(even.mask))
+    found = fit_light(hand, even.image, nothing)
+    assert torch.equal(shading(found, torch.eye(3)), torch.ones(3, 3))
+
+
+def test_what_light_does_to_a_photo_is_drawn_again(hand, scene):
+    _, _, pose, lit = scene
+    adapted = adapt(hand, MeanPrior(hand)(lit), lit, AdaptConfig(texture_steps=20))
+    assert adapted.light is not None
+    drawn = avatar(adapted.gaussians, pose, lit, adapted.light, hand).render(lit.camera, pose)
+    kept = adapt(hand, MeanPrior(hand)(lit), lit, AdaptConfig(texture_steps=20, light="keep"))
+    assert kept.light is None
+    baked = avatar(kept.gaussians, pose, lit, None, hand).render(lit.camera, pose)
+    inside = lit.mask > 0.99
+    errors = [float((image - lit.image)[inside].square().mean().sqrt()) for image in (drawn.image, baked.image)]
+    assert errors[0] < 1.1 * errors[1]
+
+
+def test_light_stays_when_the_hand_turns(hand, scene):
+    even, truth, pose, _ = scene
+    lit = avatar(truth, pose, even, LIGHT, hand)
+    half = rotation.from_axis_angle(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(torch.pi))
+    turned = pose._replace(orientation=half @ pose.orientation)
+    before, after = lit.pose(pose).colors, lit.pose(turned).colors
+    assert float((before - after).abs().max()) > 0.1
+    follows = avatar(truth, pose, even, turn_light(LIGHT, half), hand)
+    torch.testing.assert_close(follows.pose(turned).colors, before, atol=1e-5, rtol=0)
+
+
+def turn(pose, degrees):
+    x_axis = torch.tensor([1.0, 0.0, 0.0])
+    by = rotation.from_axis_angle(x_axis, torch.tensor(math.radians(degrees)))
+    return pose._replace(orientation=by @ pose.orientation)
+
+
+def in_shade(hand, even, truth, of):
+    """Gaussians and light, with a shade of .9 of vertices or of Gaussians."""
+    facing = posed_normals(even.rest.vertices, even.posed.vertices, hand.faces)
+    if of == "vertices":
+        return truth, LIGHT._replace(shade=torch.full_like(facing, 0.9), facing=facing)
+    light = LIGHT._replace(shade=torch.ones_like(facing), facing=facing)
+    return truth._replace(shade=torch.full_like(truth.colors, 0.9)), light
+
+
+@pytest.mark.parametrize("of", ["vertices", "gaussians"])
+def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene, of):
+    even, truth, pose, _ = scene
+    shady, light = in_shade(hand, even, truth, of)
+    assert light.facing is not None
+    plain, shaded = avatar(truth, pose, even, LIGHT, hand), avatar(shady, pose, even, light, hand)
+
+    def ratio(degrees):
+        there = turn(pose, degrees)
+        return shaded.pose(there).colors / plain.pose(there).colors
+
+    torch.testing.assert_close(ratio(0), torch.full_like(truth.colors, 0.9))
+    half = ratio(12)
+    assert bool((half > 0.9 - 1e-3).all()) and bool((half < 1 + 1e-3).all()) and float(half.std()) > 0.01
+    turned = turn(pose, 180)
+    away = (shaded.pose(turned).colors / plain.pose(turned).colors)[: len(truth.vertex_index)]
+    around = light.facing[truth.vertex_index, 0].abs() < 0.7  # others turn by less
+    torch.testing.assert_close(away[around], torch.ones_like(away[around]))
+    torch.testing.assert_close(shaded.in_even_light().gaussians.colors, plain.in_even_light().gaussians.colors)
+    assert shaded.in_even_light().gaussians.shade is None
+    turned_light = turn_light(light, rotation.from_axis_angle(torch.tensor([0.0, 1.0, 0.0]), torch.tensor(0.7)))
+    mirrored = mirror_light(mirror_light(turned_light))
+    assert all(torch.equal(a, b) for a, b in zip(mirrored, turned_light, strict=True))
+
+
+def test_colours_and_shade_come_to_what_is_shown():
+    shown = torch.tensor([[0.9, 0.5, 0.0], [1.0, 1.0, 0.2]])
+    shade = torch.tensor([[0.5, 0.5, 0.5], [2.0, 0.5, 1.0]])
+    colors, left = apart_from_shade(shown, shade)
+    assert float(colors.min()) > 0 and float(colors.max()) == 1 and float(left.min()) > 0
+    torch.testing.assert_close(colors * left, shown, atol=2e-3, rtol=0)
+    torch.testing.assert_close(left[1], torch.tensor([2.0, 1.0, 1.0]))
+
+
+def test_where_a_photo_may_show_something_else_that_is_shade(hand, scene):
+    even, *_ = scene
+    light = fit_light(hand, even.image, even)
+    height, width = even.mask.shape
+    rows, columns = torch.arange(height)[:, None] / height, torch.arange(width) / width
+    from_middle = (rows - 0.6) ** 2 + (columns - 0.5) ** 2
+    spot, amid = (from_middle < limit for limit in (0.006, 0.002))
+    stained = even._replace(image=torch.where(spot[..., None], 0.3 * even.image, even.image))
+    plain = without_light(hand, even, light).image
+
+    def left(sure):
+        shaded = with_shade(hand, even.image, stained, sure, light)
+        return float((without_light(hand, stained, shaded).image / plain.clamp_min(1e-3))[amid].mean())
+
+    assert left(stained) < 0.36
+    assert left(stained._replace(mask=stained.mask * ~spot)) > 0.8
+
+
+@pytest.mark.parametrize("of", ["vertices", "gaussians"])
+def test_many_poses_are_lit_as_each_alone(hand, scene, of):
+    even, truth, pose, _ = scene
+    shady, light = in_shade(hand, even, truth, of)
+    lit = avatar(shady, pose, even, light, hand)
+    poses = [pose, pose._replace(angles=named_pose(hand, "fist"))]
+    together = lit.pose(type(pose)(*map(torch.stack, zip(*poses, strict=True))))
+    for k, one in enumerate(poses):
+        torch.testing.assert_close(together.colors[k], lit.pose(one).colors, atol=1e-6, rtol=0)
+
+
+def test_a_left_hand_is_lit_in_the_mirror(hand, scene):
+    even, truth, pose, _ = scene
+    right, left = (avatar(truth, pose, even, LIGHT, hand, side) for side in ("right", "left"))
+    torch.testing.assert_close(left.pose(left.source_pose).colors, right.pose(pose).colors, atol=1e-5, rtol=0)
+    direction = torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, 0.7]]), dim=1)
+    assert torch.equal(shading(mirror_light(LIGHT), mirror_points(direction)), shading(LIGHT, direction))
+
+
+def test_the_file_keeps_the_light(hand, scene, tmp_path):
+    even, truth, pose, _ = scene
+    shady, light = in_shade(hand, even, truth, "gaussians")
+    lit = avatar(shady, pose, even, light, hand)
+    lit.save(tmp_path / "a.safetensors")
+    back = Avatar.load(tmp_path / "a.safetensors")
+    assert all(torch.equal(a, b) for a, b in zip(back.light, light, strict=True))
+    assert torch.equal(back.gaussians.shade, shady.shade)
+    assert torch.equal(back.pose(pose).colors, lit.pose(pose).colors)
+    plain = lit.in_even_light()
+    assert plain.light is None
+    torch.testing.assert_close(plain.gaussians.colors, in_even_light(truth, LIGHT).colors)
+
+
+def test_gradients_go_through_the_light(hand, scene):
+    even, truth, pose, _ = scene
+    lit = avatar(truth, pose, even, LIGHT, hand)
+    orientation = pose.orientation.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(lit.pose(pose._replace(orientation=orientation)).colors.sum(), orientation)
+    assert bool(gradient.isfinite().all()) and float(gradient.abs().max()) > 1
