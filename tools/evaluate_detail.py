@@ -24,7 +24,7 @@ from named_photos import SYNTHETIC, photo_of
 from torch import Tensor
 
 from oasis_warp.avatar.observe import inner_mask
-from oasis_warp.commands.drawing import Panel, make_sheet, panel_side
+from oasis_warp.cli.drawing import Panel, make_sheet, panel_side
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.rotation import from_axis_angle

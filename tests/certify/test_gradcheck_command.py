@@ -11,8 +11,7 @@ import pytest
 
 from oasis_warp import ops
 from oasis_warp.certify.families import FAMILIES
-from oasis_warp.cli import main
-from oasis_warp.commands import gradcheck, options
+from oasis_warp.cli import gradcheck, main, options
 
 pytestmark = pytest.mark.usefixtures("as_shipped")
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from oasis_warp import cli
-from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli.exit_codes import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.synthetic import shards
@@ -162,6 +162,6 @@ def test_ctrl_c_keeps_what_is_whole_and_says_so(tmp_path, monkeypatch, capsys):
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("oasis_warp.commands.synthesize.write_shards", stopped)
+    monkeypatch.setattr("oasis_warp.cli.synthesize.write_shards", stopped)
     assert cli.main(["synthesize", str(tmp_path / "out")]) == INTERRUPTED
     assert "the same command goes on" in capsys.readouterr().err

@@ -4,8 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from oasis_warp.cli import main
-from oasis_warp.commands import doctor
+from oasis_warp.cli import doctor, main
 from oasis_warp.network import prior as home
 
 PYPROJECT = Path(__file__).parents[2] / "pyproject.toml"

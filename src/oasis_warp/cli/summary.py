@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from oasis_warp.commands.drawing import Panel, Pixels, draw_landmarks, draw_mesh, make_sheet, panel_side
+from oasis_warp.cli.drawing import Panel, Pixels, draw_landmarks, draw_mesh, make_sheet, panel_side
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import Camera, HandFit, HandPose, Photo, PosedHand

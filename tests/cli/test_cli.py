@@ -6,8 +6,7 @@ from typing import get_args
 import pytest
 
 from oasis_warp import __version__
-from oasis_warp.cli import main
-from oasis_warp.commands import options
+from oasis_warp.cli import main, options
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.hand.poses import POSE_NAMES
 
@@ -75,7 +74,7 @@ def test_bad_input_is_one_sentence_and_exits_with_two(capsys, tmp_path):
 
 
 def test_an_interrupt_is_told_and_exits_with_130(capsys, monkeypatch, avatar_file):
-    from oasis_warp.commands import render
+    from oasis_warp.cli import render
 
     def interrupt(*args):
         raise KeyboardInterrupt
@@ -87,7 +86,7 @@ def test_an_interrupt_is_told_and_exits_with_130(capsys, monkeypatch, avatar_fil
 
 
 def test_an_error_of_ours_is_not_dressed_up_as_bad_input(monkeypatch, avatar_file):
-    from oasis_warp.commands import render
+    from oasis_warp.cli import render
 
     def fail(*args):
         raise ValueError("a bug")

@@ -4,10 +4,10 @@ import math
 
 from rich.console import Console
 
-from oasis_warp.commands.film import pose_film, turntable
-from oasis_warp.commands.look import check_device, check_side, choose_pose, read_color
-from oasis_warp.commands.options import Animate
-from oasis_warp.commands.progress import show_progress
+from oasis_warp.cli.film import pose_film, turntable
+from oasis_warp.cli.look import check_device, check_side, choose_pose, read_color
+from oasis_warp.cli.options import Animate
+from oasis_warp.cli.progress import show_progress
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.pictures import check_suffix
 from oasis_warp.data.video import VIDEO_SUFFIXES, write_video

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from oasis_warp import __version__
-from oasis_warp.commands.report import about_hand, about_photo, print_warnings
+from oasis_warp.cli.report import about_hand, about_photo, print_warnings
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import Photo
 from oasis_warp.fusion import FusedReconstruction

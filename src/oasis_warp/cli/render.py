@@ -4,8 +4,8 @@ import math
 
 import torch
 
-from oasis_warp.commands.look import check_device, check_side, choose_pose, read_color
-from oasis_warp.commands.options import Render
+from oasis_warp.cli.look import check_device, check_side, choose_pose, read_color
+from oasis_warp.cli.options import Render
 from oasis_warp.core.config import BLACK
 from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, to_uint8, write_picture
 from oasis_warp.hand_avatar import Avatar

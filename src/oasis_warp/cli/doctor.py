@@ -16,8 +16,8 @@ from pathlib import Path
 from rich.console import Console
 
 from oasis_warp import __version__
-from oasis_warp.commands.exit_codes import FAULT
-from oasis_warp.commands.options import Doctor
+from oasis_warp.cli.exit_codes import FAULT
+from oasis_warp.cli.options import Doctor
 
 PACKAGES = {
     "warp-lang": ("1.19", "1.20"),

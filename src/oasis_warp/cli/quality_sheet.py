@@ -9,8 +9,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from oasis_warp.avatar.quality import SEEN, SurfaceQuality
-from oasis_warp.commands.drawing import Panel, Pixels, make_sheet, panel_side
-from oasis_warp.commands.summary import GROUND, WIDTH, shade_mesh
+from oasis_warp.cli.drawing import Panel, Pixels, make_sheet, panel_side
+from oasis_warp.cli.summary import GROUND, WIDTH, shade_mesh
 from oasis_warp.core.types import Camera, PosedHand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map

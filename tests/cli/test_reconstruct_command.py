@@ -4,9 +4,8 @@ import cv2
 import pytest
 from disk import full_disk
 
-from oasis_warp.cli import main
-from oasis_warp.commands import reconstruct as command
-from oasis_warp.commands import summary
+from oasis_warp.cli import main, summary
+from oasis_warp.cli import reconstruct as command
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.avatar_file import load_avatar
 from oasis_warp.data.photo import read_photo

@@ -10,8 +10,8 @@ from typing import Annotated
 import tyro
 
 from oasis_warp import __version__
-from oasis_warp.commands import options
-from oasis_warp.commands.exit_codes import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli import options
+from oasis_warp.cli.exit_codes import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.errors import InputError
 
 Command = (
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         # The command's module imports torch and Warp, which take seconds: only now.
-        command = importlib.import_module(f"oasis_warp.commands.{type(chosen).__name__.lower()}")
+        command = importlib.import_module(f"oasis_warp.cli.{type(chosen).__name__.lower()}")
         return command.run(chosen)
     except InputError as error:
         print(f"oasis: {error}", file=sys.stderr)
