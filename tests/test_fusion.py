@@ -15,7 +15,7 @@ from oasis_warp.core.types import Landmarks, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.fusion import check_sides, reconstruct_same_hand
 from oasis_warp.losses.image import masked_psnr
-from oasis_warp.pipeline import make_avatar, make_evidence, over_photo, reconstruct
+from oasis_warp.reconstruction import make_avatar, make_evidence, over_photo, reconstruct
 from oasis_warp.render.cameras import orbit_camera
 
 PHOTOS = Path(__file__).parent / "data" / "photos"

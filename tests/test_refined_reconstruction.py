@@ -8,7 +8,7 @@ from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.skinning import hand21, mirror_pose, rest_hand, skin
-from oasis_warp.pipeline import carrier_offsets, landmarks_in_crop, make_evidence, reconstruct
+from oasis_warp.reconstruction import carrier_offsets, landmarks_in_crop, make_evidence, reconstruct
 
 PHOTO = Path(__file__).parent / "data" / "photos" / "thumb_up_left_06.jpg"
 

@@ -15,7 +15,7 @@ from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
-from oasis_warp.pipeline import reconstruct
+from oasis_warp.reconstruction import reconstruct
 
 PHOTO = Path(__file__).parent / "data" / "photos" / "palm_open_left_02.png"
 FEW = ReconstructConfig(steps=20)

@@ -24,7 +24,7 @@ from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.prior import choose_prior
-from oasis_warp.pipeline import carrier_offsets, make_avatar, make_evidence
+from oasis_warp.reconstruction import carrier_offsets, make_avatar, make_evidence
 from oasis_warp.render.cameras import orbit_camera
 
 UNSEEN = (90, 180)

@@ -21,7 +21,7 @@ from oasis_warp.data.pictures import to_uint8, write_picture
 from oasis_warp.fusion import reconstruct_same_hand
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.pipeline import CROP_MARGIN, reconstruct
+from oasis_warp.reconstruction import CROP_MARGIN, reconstruct
 from oasis_warp.render.cameras import orbit_camera
 
 TILE = 224

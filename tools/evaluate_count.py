@@ -32,7 +32,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
-from oasis_warp.pipeline import carrier_offsets, crop_side, input_errors, make_avatar, make_evidence
+from oasis_warp.reconstruction import carrier_offsets, crop_side, input_errors, make_avatar, make_evidence
 from oasis_warp.render.cameras import orbit_camera
 
 SIZES = (64, 96, 128, 192)

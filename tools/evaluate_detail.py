@@ -35,7 +35,7 @@ from oasis_warp.data.pictures import to_uint8
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import depth_map
-from oasis_warp.pipeline import CROP_MARGIN, Reconstruction, detail_size, make_evidence, reconstruct
+from oasis_warp.reconstruction import CROP_MARGIN, Reconstruction, detail_size, make_evidence, reconstruct
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 
 PHOTOS = (

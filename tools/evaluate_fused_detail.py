@@ -27,7 +27,7 @@ from oasis_warp.fusion import fit_surfaces, fit_together, make_evidences, resolu
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import depth_map
-from oasis_warp.pipeline import make_avatar, over_photo
+from oasis_warp.reconstruction import make_avatar, over_photo
 
 RIM = 1 / 64
 """Share of the crop's side, at the outline, that is not judged."""

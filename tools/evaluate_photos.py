@@ -32,7 +32,7 @@ from oasis_warp.evaluation.photo_pairs import compare_pairs
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.pipeline import make_evidence, reconstruct
+from oasis_warp.reconstruction import make_evidence, reconstruct
 from oasis_warp.render.cameras import orbit_camera
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".webp"}

@@ -1,4 +1,4 @@
-"""Estimate synthetic hands as `pipeline.reconstruct` does, and keep what is true beside what was found.
+"""Estimate synthetic hands as `reconstruction.reconstruct` does, and keep what is true beside what was found.
 
     python tools/measure_estimator_errors.py out/estimates --count 224
 
@@ -24,7 +24,7 @@ from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.surface_offsets import outline_offsets
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.pipeline import CROP_MARGIN
+from oasis_warp.reconstruction import CROP_MARGIN
 from oasis_warp.synthetic.picture import SyntheticBatch, render_batch
 from oasis_warp.synthetic.plan import PICTURES_EACH
 

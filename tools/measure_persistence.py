@@ -32,7 +32,7 @@ from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.same_hand import photos_of_hands
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
-from oasis_warp.pipeline import carrier_offsets, make_evidence
+from oasis_warp.reconstruction import carrier_offsets, make_evidence
 
 ANGLES = (0, 15, 30, 45, 70, 180)
 """Between which the skin has turned [degrees]."""

@@ -27,7 +27,7 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
-from oasis_warp.pipeline import make_evidence, reconstruct
+from oasis_warp.reconstruction import make_evidence, reconstruct
 from oasis_warp.render.cameras import orbit_camera
 
 KINDS = ("tattoo", "writing", "ring", "nail polish")

@@ -28,7 +28,7 @@ from oasis_warp.evaluation.metrics import match_colors
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
-from oasis_warp.pipeline import Reconstruction, reconstruct
+from oasis_warp.reconstruction import Reconstruction, reconstruct
 from oasis_warp.render.cameras import orbit_camera
 
 SYNTHETIC_SIZE = 512

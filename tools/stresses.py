@@ -11,7 +11,7 @@ import torch
 from painted_truth import Chart, Truth, paint_photo
 
 from oasis_warp.core.types import Photo
-from oasis_warp.pipeline import Reconstruction
+from oasis_warp.reconstruction import Reconstruction
 
 SHARE = 0.05
 """By which masks and landmarks are off, of the longer side of the landmarks' box."""

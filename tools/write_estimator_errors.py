@@ -122,7 +122,7 @@ def leave_one_out(hand: HandModel, true: Hands, measured: MeasuredErrors, seed: 
 
 
 def with_offsets(hand: HandModel, rows: list[Row], found: Hands) -> Tensor:
-    """Found surfaces with the outline offsets of `pipeline.reconstruct`."""
+    """Found surfaces with the outline offsets of `reconstruction.reconstruct`."""
     surfaces = []
     for k, row in enumerate(rows):
         rest = rest_hand(hand, found.shape[k])

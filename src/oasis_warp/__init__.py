@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from oasis_warp.ops import rasterization as rasterization
     from oasis_warp.ops import skin as skin
     from oasis_warp.ops import spherical_harmonics as spherical_harmonics
-    from oasis_warp.pipeline import reconstruct as reconstruct
+    from oasis_warp.reconstruction import reconstruct as reconstruct
 
 # A name is imported when it is first used: torch and Warp take seconds, and `oasis --help` needs neither.
 _HOMES = {
@@ -43,7 +43,7 @@ _HOMES = {
     "pose_on_mesh_covars": "ops",
     "rasterization": "ops",
     "read_photo": "data.photo",
-    "reconstruct": "pipeline",
+    "reconstruct": "reconstruction",
     "reconstruct_same_hand": "fusion",
     "skin": "ops",
     "spherical_harmonics": "ops",

@@ -32,7 +32,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops._runtime import warm_up
-from oasis_warp.pipeline import (
+from oasis_warp.reconstruction import (
     COARSE_SIZE,
     carrier_offsets,
     crop_side,
@@ -220,7 +220,7 @@ class Surfaces(NamedTuple):
 
 
 def fit_surfaces(fits: Sequence[HandFit]) -> Surfaces:
-    """See `pipeline.carrier_offsets`, of all fits together and of each."""
+    """See `reconstruction.carrier_offsets`, of all fits together and of each."""
     hand = bundled_hand()
     own = [carrier_offsets(hand, fit) for fit in fits]
     return Surfaces(own[0] if len(own) == 1 else carrier_offsets(hand, *fits), own)
@@ -230,7 +230,7 @@ def settle_surfaces(
     photos: Sequence[Photo], fits: Sequence[HandFit], surfaces: Surfaces, guesses: Sequence[CanonicalGaussians],
     config: ReconstructConfig,
 ) -> Surfaces:  # fmt: skip
-    """See `pipeline.onto_drawn_outline`, of all photos together and of each."""
+    """See `reconstruction.onto_drawn_outline`, of all photos together and of each."""
     hand, each = bundled_hand(), zip(photos, fits, surfaces.own, guesses, strict=True)
     own = [
         onto_drawn_outline(hand, [photo], [fit], offsets, [guess], config) for photo, fit, offsets, guess in each
@@ -248,7 +248,7 @@ def make_evidences(
     *,
     finer: bool = False,
 ) -> list[Evidence]:
-    """As `pipeline.make_evidence`, each photo seen on its own surface, all with the shared one at rest.
+    """As `reconstruction.make_evidence`, each photo seen on its own surface, all with the shared one at rest.
 
     All of one size, or with `finer` each as large as its detail, if that is larger.
     """

@@ -14,7 +14,7 @@ from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import save_network
 from oasis_warp.ops import depth_map
-from oasis_warp.pipeline import Reconstruction
+from oasis_warp.reconstruction import Reconstruction
 
 SKIN, GROUND = (200, 150, 120), (30, 60, 90)
 

@@ -16,7 +16,7 @@ from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.evaluation import same_hand
 from oasis_warp.evaluation.photo_pairs import compare_pairs, compare_with_photo, draw_as_photo
 from oasis_warp.evaluation.same_hand import photos_of_hands, summarise_pairs
-from oasis_warp.pipeline import make_evidence
+from oasis_warp.reconstruction import make_evidence
 
 SMALL = ReconstructConfig(size=96)
 

@@ -130,7 +130,7 @@ def refine(
     """Move the posed surface of `evidence` to where the colours of `guess` explain the photo best.
 
     Args:
-        hand: On the CPU, as in `pipeline.reconstruct`.
+        hand: On the CPU, as in `reconstruction.reconstruct`.
         guess: What a prior makes of `evidence`; its colours should be those of even light.
         evidence: Camera with an identity viewmat; joints and tips are not asked for.
         landmarks: What was detected [px of the evidence]; the model's own at the start when not given.

@@ -29,7 +29,7 @@ from oasis_warp.data.video import write_video
 from oasis_warp.fusion import reconstruct_same_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.weights_file import read_header
-from oasis_warp.pipeline import reconstruct
+from oasis_warp.reconstruction import reconstruct
 
 CROP_SIDES = (64, 1024)
 """Sides of the crop that make sense [px]: fewer show no fingers, more take too long."""

@@ -13,7 +13,7 @@ from rich.table import Table
 from oasis_warp import __version__
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import HandFit, Photo
-from oasis_warp.pipeline import Reconstruction
+from oasis_warp.reconstruction import Reconstruction
 
 MEASURES = {
     "reprojection_percent": ("landmarks miss the model by", "{:.1f} % of the hand"),

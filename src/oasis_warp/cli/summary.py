@@ -19,7 +19,7 @@ from oasis_warp.fusion import FusedReconstruction
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
-from oasis_warp.pipeline import CROP_MARGIN, Reconstruction
+from oasis_warp.reconstruction import CROP_MARGIN, Reconstruction
 from oasis_warp.render.cameras import crop_camera, orbit_camera
 
 WIDTH = 1600

@@ -105,7 +105,7 @@ def reconstructions(
     """What every method of `wanted` makes whose prior is there; each prior is asked once.
 
     Args:
-        hand: On the CPU, as in `pipeline.reconstruct`.
+        hand: On the CPU, as in `reconstruction.reconstruct`.
         evidence: Of one photo.
         priors: By the names that methods have for them.
         wanted: What to make.

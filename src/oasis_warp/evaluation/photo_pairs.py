@@ -17,7 +17,7 @@ from oasis_warp.evaluation.coverage import COVERED
 from oasis_warp.evaluation.metrics import color_gain
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr, ssim_map
-from oasis_warp.pipeline import make_evidence
+from oasis_warp.reconstruction import make_evidence
 from oasis_warp.render.cameras import mirrored_camera
 
 QUARTER = 4

@@ -22,7 +22,7 @@ from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, select
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.pipeline import carrier_offsets, make_avatar, make_evidence
+from oasis_warp.reconstruction import carrier_offsets, make_avatar, make_evidence
 
 PHOTO_METHODS = (
     Method("mean", ONE_SHOT),

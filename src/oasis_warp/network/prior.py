@@ -1,4 +1,4 @@
-"""The trained network as a prior: what `pipeline.reconstruct` asks before it fits a photo."""
+"""The trained network as a prior: what `reconstruction.reconstruct` asks before it fits a photo."""
 
 import functools
 import hashlib

@@ -1,6 +1,6 @@
 """Masks as the estimator would cut them: another end at the wrist, gaps between fingers filled in, a wandering rim.
 
-`pipeline.reconstruct` has a mask from GrabCut where training knows the true one; docs/estimator.md says how they
+`reconstruction.reconstruct` has a mask from GrabCut where training knows the true one; docs/estimator.md says how they
 differ. Everything is on the pictures' device, batched, of fixed sizes.
 """
 

@@ -15,7 +15,7 @@ from oasis_warp.pretraining.mask_errors import NUMBERS, ended, wandering
 from oasis_warp.pretraining.posed_hands import Posed, pose_hands
 
 CROP_MARGIN = 1.12
-"""Side of a crop over the longer extent of its mask, as in `pipeline.reconstruct`."""
+"""Side of a crop over the longer extent of its mask, as in `reconstruction.reconstruct`."""
 
 
 @runtime_checkable
