@@ -1,4 +1,4 @@
-"""tools/write_model_card.py: numbers go where they belong, and nowhere else."""
+"""studies/write_model_card.py: numbers go where they belong, and nowhere else."""
 
 import json
 from dataclasses import replace

@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[1]
 OUTLINES = ROOT / "tests/data/masks/outlines.json"
 ENTRIES = json.loads(OUTLINES.read_text(encoding="utf-8"))
 
-_spec = importlib.util.spec_from_file_location("hand_drawn_masks", ROOT / "tools/hand_drawn_masks.py")
+_spec = importlib.util.spec_from_file_location("hand_drawn_masks", ROOT / "studies/hand_drawn_masks.py")
 assert _spec is not None and _spec.loader is not None
 hand_drawn_masks = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(hand_drawn_masks)

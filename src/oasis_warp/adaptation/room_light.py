@@ -18,7 +18,7 @@ SPREAD = (
     (-0.010, 0.0, 0.033, -0.006),
     (0.018, 0.0, -0.006, 0.064),
 )
-"""Their covariance. Both are those of synthetic rooms (tools/measure_light.py), made alike left and right."""
+"""Their covariance. Both are those of synthetic rooms (studies/measure_light.py), made alike left and right."""
 RIDGE = 0.001
 """Weight of what is usual, against a light of which every direction is seen."""
 SHOWN = 0.1

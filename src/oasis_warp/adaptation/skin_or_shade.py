@@ -2,7 +2,7 @@
 
 Two photos of one hand agree on little of it. Where skin faces as before, a third to a half of it is found again; where
 it has turned by more than 45 degrees, a tenth at most; of what is finer than 2 mm even less
-(tools/measure_persistence.py). The rest is soft and hard shadows, gloss,
+(studies/measure_persistence.py). The rest is soft and hard shadows, gloss,
 wrinkles of the pose, and what lies beside its place since the fit is some pixels off. So most of it is shade, which the
 photo's own view keeps and other poses lose. Only what no light does to skin is taken for a mark, and stays whole.
 """

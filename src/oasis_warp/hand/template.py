@@ -14,7 +14,7 @@ from oasis_warp.core.hand_model import HandModel
 def bundled_hand() -> HandModel:
     """The permissive hand that ships with the package: 12,337 vertices, 24,608 faces, 40 shapes, 30 pose correctives.
 
-    Made by `tools/build_hand.py` from CC0 data. Float tensors are float32 on the CPU.
+    Made by `asset_build/build_hand.py` from CC0 data. Float tensors are float32 on the CPU.
     """
     with asset("hand", "hand_right.npz").open("rb") as file, np.load(file, allow_pickle=False) as stored:
         arrays = {key: stored[key] for key in stored.files}

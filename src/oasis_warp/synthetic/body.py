@@ -116,7 +116,7 @@ class Body:
     """The first of `faces`: of hand and forearm."""
     coarse_vertices: Int[Tensor, "C"]
     """Some vertices of hand and forearm, and the faces between them: what hides the sky from others. Made by
-    `tools/build_coarse_body.py`."""
+    `asset_build/build_coarse_body.py`."""
     coarse_faces: Int[Tensor, "G 3"]
     knuckle_rise: Float[Tensor, "V 15"]
     """Displacement of the hand's vertices along their normals, for each joint of a finger bent by 90 degrees [m]."""
