@@ -3,8 +3,8 @@
     python studies/measure_estimator_errors.py out/estimates --count 224
 
 One file a picture, named by its number; those that are there already are left, so a run that was stopped goes on, and
-several may share the work by `--first`. `studies/write_estimator_errors.py` reads the folder. Left hands are kept as the
-right ones that they are in the mirror.
+several may share the work by `--first`. `studies/write_estimator_errors.py` reads the folder. Left hands are kept as
+the right ones that they are in the mirror.
 """
 
 import argparse

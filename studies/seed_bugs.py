@@ -2,10 +2,10 @@
 
     python studies/seed_bugs.py [--jobs 2] [--only WORD ...]
 
-A bug is an exact piece of source and what to put in its place; `studies/seeded_bugs.py` lists them. Each is planted in a
-copy of kernels/, src/ and tests/ under a temporary folder with a kernel cache of its own, and the tests of its operator
-are run until the first that fails. The exit code is 1 if a bug is missed, if a patch no longer applies, or if the tests
-fail without any bug.
+A bug is an exact piece of source and what to put in its place; `studies/seeded_bugs.py` lists them. Each is planted
+in a copy of kernels/, src/ and tests/ under a temporary folder with a kernel cache of its own, and the tests of its
+operator are run until the first that fails. The exit code is 1 if a bug is missed, if a patch no longer applies, or
+if the tests fail without any bug.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from typing import NamedTuple
 from seeded_bugs import BUGS, Bug
 
 ROOT = Path(__file__).resolve().parent.parent
-TREE = ("kernels/oasis_kernels", "src", "tests", "tools", "pyproject.toml")
+TREE = ("kernels/oasis_kernels", "src", "tests", "studies", "asset_build", "pyproject.toml")
 LIMIT = 240
 """Seconds that the tests of one bug may take: a kernel that never ends is caught by it."""
 

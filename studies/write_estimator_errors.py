@@ -5,8 +5,8 @@
 
 It writes assets/training/estimator_errors.safetensors, the tables between the markers of docs/estimator.md, and the
 numbers as JSON. The second table holds found surfaces beside those that training sees: each measured hand once more,
-with the error of another one (`pretraining.estimator_errors`), so that none is compared with itself; the third does so for
-masks.
+with the error of another one (`pretraining.estimator_errors`), so that none is compared with itself; the third does
+so for masks.
 """
 
 import argparse

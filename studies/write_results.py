@@ -67,8 +67,8 @@ on all, the two photos marked hard included.
 
 ![Each photo with the guesses of both priors and what adaptation makes of them](_static/priors.jpg)
 
-The sheet is made by `python studies/compare_priors.py docs/_static/priors.jpg tests/data/photos/*.*`: the photo, then for
-each prior its guess and the adapted hand, from the photo's view, the side and behind.
+The sheet is made by `python studies/compare_priors.py docs/_static/priors.jpg tests/data/photos/*.*`: the photo, then
+for each prior its guess and the adapted hand, from the photo's view, the side and behind.
 
 ## Masks and surfaces against hand-drawn outlines
 

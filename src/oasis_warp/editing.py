@@ -20,7 +20,7 @@ from oasis_warp.data.registration import Square, find_square
 from oasis_warp.hand.skinning import mirror_pose, skin
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
-from oasis_warp.ops._runtime import warm_up
+from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 
 OTHER_PHOTO = 0.06

@@ -31,7 +31,7 @@ from oasis_warp.hand.skinning import rest_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.prior import choose_prior
-from oasis_warp.ops._runtime import warm_up
+from oasis_warp.ops import warm_up
 from oasis_warp.reconstruction import (
     COARSE_SIZE,
     carrier_offsets,

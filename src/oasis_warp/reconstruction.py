@@ -34,7 +34,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
-from oasis_warp.ops._runtime import warm_up
+from oasis_warp.ops import warm_up
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 
 CROP_MARGIN = 1.12

@@ -35,7 +35,8 @@ from oasis_warp.cli import main
 avatar, folder = sys.argv[1:]
 assert main(["render", avatar, "-o", f"{folder}/picture.png", "--size", "32"]) == 0
 assert main(["animate", avatar, "-o", f"{folder}/film.gif", "--size", "32", "--seconds", "0.2"]) == 0
-once = ("oasis_warp.network", "oasis_warp.reconstruction", "oasis_warp.training", "oasis_warp.estimation.networks")
+rooms = "network", "reconstruction", "pretraining", "adaptation", "estimation.networks"
+once = tuple(f"oasis_warp.{room}" for room in rooms)
 print(*(name for name in sys.modules if name.startswith(once)))
 """
     arguments = [sys.executable, "-c", code, str(avatar_file), str(tmp_path)]

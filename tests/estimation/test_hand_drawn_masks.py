@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 OUTLINES = ROOT / "tests/data/masks/outlines.json"
 ENTRIES = json.loads(OUTLINES.read_text(encoding="utf-8"))
 

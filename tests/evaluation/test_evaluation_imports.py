@@ -3,7 +3,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-TOOLS = Path(__file__).parents[2] / "tools"
+TOOLS = Path(__file__).parents[2] / "studies"
 
 
 def test_a_machine_with_the_core_alone_can_evaluate_and_ablate():

@@ -13,7 +13,7 @@ from hand_build.asset import write_npz
 
 from oasis_warp.assets import asset
 
-TOOL = Path(__file__).parents[2] / "tools" / "build_hand.py"
+TOOL = Path(__file__).parents[2] / "asset_build" / "build_hand.py"
 
 
 def cube():

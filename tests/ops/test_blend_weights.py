@@ -5,8 +5,7 @@ from test_strips import Guards
 
 from oasis_warp.certify.twins import rasterization as twin
 from oasis_warp.ops import blend_colors, blend_weights, rasterization
-from oasis_warp.ops._runtime import blend_strips as _blend_strips
-from oasis_warp.ops._runtime import weigh_strips as _weigh_strips
+from oasis_warp.ops._runtime import blend_strips, weigh_strips
 
 
 def weights_and_image(device, dtype, **options):
@@ -114,10 +113,10 @@ def test_nothing_is_written_past_a_buffer_of_float32_weights(name, size, monkeyp
     expected = blend_weights(*scene.gaussians, scene.viewmats[0], scene.Ks[0], *size)
     guards = Guards()
     with monkeypatch.context() as patch:
-        for module in (_blend_strips, _weigh_strips):
+        for module in (blend_strips, weigh_strips):
             patch.setattr(module, "torch", guards)
             patch.setattr(module, "revealed", guards.revealed)
-        patch.setattr(_blend_strips, "hidden", guards.hidden)
+        patch.setattr(blend_strips, "hidden", guards.hidden)
         got = blend_weights(*scene.gaussians, scene.viewmats[0], scene.Ks[0], *size)
     guards.check()
     assert torch.equal(got.alphas, expected.alphas)

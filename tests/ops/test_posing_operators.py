@@ -10,7 +10,7 @@ import torch
 
 from oasis_warp.core.rotation import to_matrix
 from oasis_warp.ops import bone_transforms, face_rotations, pose_on_mesh, pose_on_mesh_covars, skin
-from oasis_warp.ops._runtime import launch as _launch
+from oasis_warp.ops._runtime import launch
 from oasis_warp.ops._runtime import words as _words
 
 
@@ -279,7 +279,7 @@ def test_kernels_stay_inside_their_memory(monkeypatch):
     checked = 0
 
     def guarded_address(tensor, dtype, size):
-        _launch.address(tensor, dtype, size)
+        launch.address(tensor, dtype, size)
         poison = torch.nan if tensor.is_floating_point() else torch.iinfo(dtype).max
         yard = torch.full((size + 2 * GUARD,), poison, dtype=dtype)
         inside = yard[GUARD : GUARD + size].view(tensor.shape)
@@ -289,7 +289,7 @@ def test_kernels_stay_inside_their_memory(monkeypatch):
 
     def guarded_run(native, words, n_tasks):
         nonlocal checked
-        _launch.run_native(native, words, n_tasks)
+        launch.run_native(native, words, n_tasks)
         while moved:
             yard, tensor, inside = moved.pop()
             guards = torch.cat([yard[:GUARD], yard[GUARD + tensor.numel() :]])

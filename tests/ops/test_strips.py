@@ -14,8 +14,7 @@ from test_rasterization_stiff import CASES
 
 from oasis_kernels.constants import Rules
 from oasis_warp.ops import blending, rasterization
-from oasis_warp.ops._runtime import blend_strips as _blend_strips
-from oasis_warp.ops._runtime import tiles as _tiles
+from oasis_warp.ops._runtime import blend_strips, tiles
 from oasis_warp.ops._runtime.registration import revealed
 from oasis_warp.ops._runtime.rules import using
 from oasis_warp.ops._runtime.splats import Frame, Splats, Wanted
@@ -168,12 +167,12 @@ def test_lists_hold_each_strips_gaussians_by_depth_and_then_by_index(n, distinct
         scene = scene.with_(means=means, viewmats=torch.eye(4).repeat(2, 1, 1))
         scene.means[:, 2] += 3
     p = projected(scene)
-    cut = _blend_strips.cut_strips(2, n, 80, 70, 8)
+    cut = blend_strips.cut_strips(2, n, 80, 70, 8)
     splats = Splats(
         p.records, scene.opacities.expand(2, n).contiguous(), scene.colors.expand(2, n, 3).contiguous(),
         scene.backgrounds,
     )  # fmt: skip
-    _, _, lists = _blend_strips.draw(splats, Frame(80, 70, 8), True)
+    _, _, lists = blend_strips.draw(splats, Frame(80, 70, 8), True)
     assert lists is not None
     ids = revealed(lists.ids)
     boxes, depths = p.tables().boxes.view(-1, 4), p.tables().sort_depths.view(-1)
@@ -191,7 +190,7 @@ def test_lists_hold_each_strips_gaussians_by_depth_and_then_by_index(n, distinct
 
 def test_more_pairs_than_can_be_numbered_are_refused_before_lists_are_made(monkeypatch):
     scene = frontal_scene(torch.tensor([[0.0, 0, 2]]).repeat(9, 1), 9.0, 0.5).to(torch.float32)
-    monkeypatch.setattr(_tiles, "MAX_PAIRS", 100)
+    monkeypatch.setattr(tiles, "MAX_PAIRS", 100)
     with pytest.raises(ValueError, match="at most 100 pairs of a Gaussian and a tile, got 288"):
         draw(scene, tile_size=1)
 
@@ -263,10 +262,10 @@ def test_nothing_is_written_past_a_buffer_nor_read_from_there(name, channels, ti
         splats = Splats(
             *map(copy, (p.records, opacities, colors, backgrounds))
         )
-        *plain, nothing = _blend_strips.draw(splats, frame, False)
-        *drawn, kept = _blend_strips.draw(splats, frame, True)
+        *plain, nothing = blend_strips.draw(splats, frame, False)
+        *drawn, kept = blend_strips.draw(splats, frame, True)
         assert nothing is None and kept is not None
-        back = _blend_strips.draw_backward(copy(g_image), copy(g_alpha), splats, frame, kept, wanted)
+        back = blend_strips.draw_backward(copy(g_image), copy(g_alpha), splats, frame, kept, wanted)
         return [*plain, *drawn, *back]
 
     expected = run(lambda t: t)
@@ -278,9 +277,9 @@ def test_nothing_is_written_past_a_buffer_nor_read_from_there(name, channels, ti
         return copy
 
     with monkeypatch.context() as patch:
-        patch.setattr(_blend_strips, "torch", guards)
-        patch.setattr(_blend_strips, "hidden", guards.hidden)
-        patch.setattr(_blend_strips, "revealed", guards.revealed)
+        patch.setattr(blend_strips, "torch", guards)
+        patch.setattr(blend_strips, "hidden", guards.hidden)
+        patch.setattr(blend_strips, "revealed", guards.revealed)
         got = run(guarded)
     guards.check()
     assert all(torch.equal(a, b) for a, b in zip(got, expected, strict=True))

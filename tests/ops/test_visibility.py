@@ -8,7 +8,7 @@ import torch
 from oasis_warp.certify.twins import visibility as twin
 from oasis_warp.core.rotation import to_matrix
 from oasis_warp.ops import depth_map, depth_visibility
-from oasis_warp.ops._runtime import depth_buffer as _depth_buffer
+from oasis_warp.ops._runtime import depth_buffer
 
 WIDTH, HEIGHT = 37, 26
 TAU = 0.05
@@ -56,7 +56,7 @@ def visible(points, vertices, faces, viewmat, K, **options):
 def way(request, monkeypatch):
     """Both ways to fill the buffer: the one for CUDA, a thread a face, runs on the CPU too."""
     if request.param == "faces":
-        monkeypatch.setattr(_depth_buffer, "draw_by_vectors", _depth_buffer.draw_by_faces)
+        monkeypatch.setattr(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -19,7 +19,7 @@ from test_visibility_vectors import (
 
 from oasis_kernels.depth import cuda_depth_draw, cuda_depth_pull
 from oasis_warp.ops import depth_map, depth_visibility
-from oasis_warp.ops._runtime import depth_cuda as _depth_cuda
+from oasis_warp.ops._runtime import depth_cuda
 
 
 def on(device, arguments):
@@ -67,7 +67,7 @@ def test_neither_a_full_queue_nor_few_blocks_lose_a_face(scene, monkeypatch):
     want = depth_map(*in_float64(arguments))
     for queue, blocks in ((0, 1 << 22), (3, 2), (1 << 17, 5)):
         monkeypatch.setattr(cuda_depth_draw, "QUEUE", queue)
-        monkeypatch.setattr(_depth_cuda, "MOST_BLOCKS", blocks)
+        monkeypatch.setattr(depth_cuda, "MOST_BLOCKS", blocks)
         assert_same_picture(depth_map(*arguments), want)
 
 
@@ -134,7 +134,7 @@ def test_repeats_and_few_blocks_give_the_same_bits(monkeypatch):
     arguments = on("cuda", scoring(1))
     first = graded(*arguments)
     for blocks in (1, 2, 1 << 22):
-        monkeypatch.setattr(_depth_cuda, "MOST_BLOCKS", blocks)
+        monkeypatch.setattr(depth_cuda, "MOST_BLOCKS", blocks)
         monkeypatch.setattr(cuda_depth_pull, "PEAKS", min(blocks, 1024))
         for _ in range(5):
             again = graded(*arguments)

@@ -6,14 +6,14 @@ from test_visibility import HEIGHT, TAU, WIDTH, some_points, soup, visible
 
 from oasis_warp.certify.twins import visibility as twin
 from oasis_warp.ops import depth_map, depth_visibility
-from oasis_warp.ops._runtime import depth_buffer as _depth_buffer
+from oasis_warp.ops._runtime import depth_buffer
 
 
 @pytest.fixture(params=["vectors", "points"])
 def backward_way(request, monkeypatch):
     """Both ways to sum up for the vertices: the one for CUDA runs on the CPU too."""
     if request.param == "points":
-        monkeypatch.setattr(_depth_buffer, "vertex_gradients_by_vectors", _depth_buffer.vertex_gradients_by_points)
+        monkeypatch.setattr(depth_buffer, "vertex_gradients_by_vectors", depth_buffer.vertex_gradients_by_points)
 
 
 def twin_gradients(points, vertices, faces, viewmat, K, weights):
@@ -127,8 +127,8 @@ def batch(n, dtype=torch.float64):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_batch_equals_its_parts_to_the_bit(dtype, way, monkeypatch):
     if way == "plain":
-        monkeypatch.setattr(_depth_buffer, "draw_by_vectors", _depth_buffer.draw_by_faces)
-        monkeypatch.setattr(_depth_buffer, "vertex_gradients_by_vectors", _depth_buffer.vertex_gradients_by_points)
+        monkeypatch.setattr(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces)
+        monkeypatch.setattr(depth_buffer, "vertex_gradients_by_vectors", depth_buffer.vertex_gradients_by_points)
     vertices, faces, viewmats, Ks, points = batch(3, dtype)
     known = torch.arange(37) - 1
 

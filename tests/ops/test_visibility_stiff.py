@@ -7,7 +7,7 @@ import torch
 
 from oasis_warp.core.hand_model import BACK_SIDE, PALM_SIDE
 from oasis_warp.ops import depth_map, depth_visibility
-from oasis_warp.ops._runtime import depth_buffer as _depth_buffer
+from oasis_warp.ops._runtime import depth_buffer
 
 EYE = torch.eye(4, dtype=torch.float64)
 
@@ -212,7 +212,7 @@ def test_the_kernel_for_cuda_fills_the_same_buffer_as_the_one_for_the_cpu(hand, 
     vertices, viewmat, K = palm_view(hand, 128)
     twice = torch.cat([hand.faces, hand.faces])  # every pixel is a tie
     vectors = depth_map(vertices, twice, viewmat, K, 128, 128)
-    monkeypatch.setattr(_depth_buffer, "draw_by_vectors", _depth_buffer.draw_by_faces)
+    monkeypatch.setattr(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces)
     faces = depth_map(vertices, twice, viewmat, K, 128, 128)
     assert (vectors.face_ids >= 0).any() and (vectors.face_ids < len(hand.faces)).all()
     assert all(torch.equal(a, b) for a, b in zip(vectors, faces, strict=True))

@@ -10,7 +10,7 @@ import torch
 
 from oasis_warp.core.rotation import to_matrix
 from oasis_warp.ops import depth_map, depth_visibility
-from oasis_warp.ops._runtime import depth_buffer as _depth_buffer
+from oasis_warp.ops._runtime import depth_buffer
 
 SIZES = ((1, 1), (1, 40), (33, 2), (64, 64), (130, 47))
 
@@ -134,7 +134,7 @@ def plainly(monkeypatch):
 
     def call(function, *args, **options):
         with monkeypatch.context() as patch:
-            patch.setattr(_depth_buffer, "draw_by_vectors", _depth_buffer.draw_by_faces)
+            patch.setattr(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces)
             return function(*args, **options)
 
     return call
@@ -171,7 +171,7 @@ def test_scores_are_those_of_the_plain_kernels(dtype, plainly):
 
 
 def test_neither_threads_nor_parts_of_the_mesh_change_a_bit(hand, with_threads, monkeypatch):
-    monkeypatch.setattr(_depth_buffer, "FACES_A_PART", 7)
+    monkeypatch.setattr(depth_buffer, "FACES_A_PART", 7)
     for scene in (small_faces, one_surface_triangulated_twice, across_the_near_plane):
         vertices, faces, viewmat, K, width, height = make(scene, 1, 130, 47, torch.float32)
 
@@ -201,8 +201,8 @@ def test_nothing_is_written_past_a_buffer(monkeypatch):
         guarded.append(memory)
         return memory[GUARD : GUARD + size].view(like.dtype).view(like.shape)
 
-    monkeypatch.setattr(_depth_buffer.Scene, "room", room)
-    monkeypatch.setattr(_depth_buffer, "FACES_A_PART", 20)
+    monkeypatch.setattr(depth_buffer.Scene, "room", room)
+    monkeypatch.setattr(depth_buffer, "FACES_A_PART", 20)
     for dtype in (torch.float32, torch.float64):
         for seed, (width, height) in enumerate(SIZES):
             for scene in SCENES:

@@ -135,16 +135,16 @@ def test_a_gpu_bakes_the_person_that_the_cpu_bakes(baked, monkeypatch):
 
 @pytest.mark.gpu
 def test_a_gpu_needs_no_kernel_for_the_cpu(monkeypatch):
-    from oasis_warp.ops._runtime import launch as _launch
+    from oasis_warp.ops._runtime import launch
 
     people._known.clear()
-    was = _launch.device_and_stream
+    was = launch.device_and_stream
 
     def refuse(tensor):
         assert tensor.is_cuda, "a kernel was launched on the CPU"
         return was(tensor)
 
-    monkeypatch.setattr(_launch, "device_and_stream", refuse)
+    monkeypatch.setattr(launch, "device_and_stream", refuse)
     for cached in (bundled_atlas, bundled_body, canvas_on):
         cached.cache_clear()
     people.person(SEED, 4, EVERYBODY, "cuda")

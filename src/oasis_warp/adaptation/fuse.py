@@ -148,8 +148,8 @@ def _adapt(
 ) -> tuple[CanonicalGaussians, Float[Tensor, "K V 3"], Float[Tensor, "N 3"]]:  # fmt: skip
     """The steps of `adaptation.adapt.adapt`, on all photos at once: their pictures stand below each other as one.
 
-    A pixel counts as much as its photo is to be believed there. `readings` are what `adaptation.adapt.read_skin` takes of
-    `photos`. With the Gaussians come `Fusion.shading` and the colours that the guess had after calibration.
+    A pixel counts as much as its photo is to be believed there. `readings` are what `adaptation.adapt.read_skin`
+    takes of `photos`. With the Gaussians come `Fusion.shading` and the colours that the guess had after calibration.
     """
     evidences = [reading.evidence for reading in readings]
     first = evidences[0]

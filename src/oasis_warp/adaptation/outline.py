@@ -1,9 +1,9 @@
 """Put the drawn outline onto the mask's: a second displacement of the surface, by pictures of Gaussians.
 
-`estimation.surface_offsets` brings the mesh onto the mask. Gaussians reach beyond the mesh by their size and by a pixel's
-blur, more at the tip of a finger than along it, and across slits; so one depth below the skin leaves outlines too fat
-in one place and too thin in another. Here Gaussians are drawn, their outline is compared with the mask's, and the
-surface moves along its normals, smoothly, until the two agree.
+`estimation.surface_offsets` brings the mesh onto the mask. Gaussians reach beyond the mesh by their size and by a
+pixel's blur, more at the tip of a finger than along it, and across slits; so one depth below the skin leaves outlines
+too fat in one place and too thin in another. Here Gaussians are drawn, their outline is compared with the mask's, and
+the surface moves along its normals, smoothly, until the two agree.
 """
 
 from collections.abc import Sequence

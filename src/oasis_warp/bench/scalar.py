@@ -11,7 +11,7 @@ from unittest.mock import patch
 
 from torch import Tensor
 
-from oasis_warp.ops._runtime import depth_buffer as _depth_buffer
+from oasis_warp.ops._runtime import depth_buffer
 
 
 @contextmanager
@@ -26,5 +26,5 @@ def generic_kernels() -> Iterator[None]:
         for module in modules:
             if hasattr(module, "has_vectors"):
                 patched.enter_context(patch.object(module, "has_vectors", no))
-        patched.enter_context(patch.object(_depth_buffer, "draw_by_vectors", _depth_buffer.draw_by_faces))
+        patched.enter_context(patch.object(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces))
         yield

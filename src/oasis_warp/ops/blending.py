@@ -10,9 +10,7 @@ from torch import Tensor
 from oasis_kernels import constants
 from oasis_kernels.rasterize.cuda_binning import INDEX_BITS
 from oasis_warp.core.tracing import is_traced
-from oasis_warp.ops._runtime import blend_cuda as _blend_cuda
-from oasis_warp.ops._runtime import blend_strips as _blend_strips
-from oasis_warp.ops._runtime import blend_tiles as _blend_tiles
+from oasis_warp.ops._runtime import blend_cuda, blend_strips, blend_tiles
 from oasis_warp.ops._runtime.launch import has_vectors
 from oasis_warp.ops._runtime.registration import adjoint, differentiable, needs_gradient, operator
 from oasis_warp.ops._runtime.splats import Frame, Splats, Wanted
@@ -23,10 +21,10 @@ from oasis_warp.ops.projection import Projection
 def _way(colors: Tensor) -> ModuleType:
     """How Gaussians with these colours [C, N, D] are drawn."""
     if has_vectors(colors):
-        return _blend_strips
+        return blend_strips
     if colors.is_cuda and colors.dtype == torch.float32 and colors.shape[1] <= 1 << INDEX_BITS:
-        return _blend_cuda
-    return _blend_tiles
+        return blend_cuda
+    return blend_tiles
 
 
 # Sizes and flags come in lists: torch takes time for every argument of an op.

@@ -1,11 +1,11 @@
 """The estimator's errors as they were measured: a hand is seen as wrongly as one that looks like it was.
 
-`studies/measure_estimator_errors.py` photographs synthetic hands, estimates them as `reconstruction.reconstruct` does, and
-keeps the differences. One photo says where a hand lies in the picture but little of its depth, so errors of joints,
-turn, shape and focal length are large and hang together: drawn one by one they would carry the surface far off its
-picture. An error is therefore all of one measured hand's, of one of those that look most alike from the camera. What
-it does to this hand's landmarks in the picture is put right: they are off as that hand's were, and the surface follows.
-Last, as by `estimation.surface_offsets`, what forms the outline goes back to where it is.
+`studies/measure_estimator_errors.py` photographs synthetic hands, estimates them as `reconstruction.reconstruct`
+does, and keeps the differences. One photo says where a hand lies in the picture but little of its depth, so errors of
+joints, turn, shape and focal length are large and hang together: drawn one by one they would carry the surface far
+off its picture. An error is therefore all of one measured hand's, of one of those that look most alike from the
+camera. What it does to this hand's landmarks in the picture is put right: they are off as that hand's were, and the
+surface follows. Last, as by `estimation.surface_offsets`, what forms the outline goes back to where it is.
 """
 
 import functools

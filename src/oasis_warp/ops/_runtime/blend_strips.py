@@ -1,4 +1,7 @@
-"""Blend strip by strip with the vector kernels: float32 on the CPU. See `oasis_kernels/rasterize/strips.py` for the layout."""
+"""Blend strip by strip with the vector kernels: float32 on the CPU.
+
+`oasis_kernels/rasterize/strips.py` describes the layout.
+"""
 
 from typing import NamedTuple
 

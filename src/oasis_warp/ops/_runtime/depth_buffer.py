@@ -1,6 +1,6 @@
 """Draw meshes into depth buffers and score points against them.
 
-On the CPU by vectorised kernels, on CUDA in float32 by those of `_depth_cuda`, in float64 by the plain ones.
+On the CPU by vectorised kernels, on CUDA in float32 by those of `depth_cuda`, in float64 by the plain ones.
 """
 
 import ctypes
@@ -13,7 +13,7 @@ from oasis_kernels.depth import depth_buffer as kernels
 from oasis_kernels.depth import depth_buffer_vectors as vectors
 from oasis_kernels.depth.depth_buffer_job import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
 from oasis_warp.core.checks import check_index, check_positive
-from oasis_warp.ops._runtime import depth_cuda as _depth_cuda
+from oasis_warp.ops._runtime import depth_cuda
 from oasis_warp.ops._runtime.depth_scene import (
     Buffer,
     Query,
@@ -157,12 +157,12 @@ def _run(stage: str, dtype: str, job: Job, tasks: int) -> None:
 def draw_by_keys(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
     """The way of CUDA in float32."""
     if not validate:
-        return _depth_cuda.draw(scene, query, wanted)
+        return depth_cuda.draw(scene, query, wanted)
     points = None if query is None else query.points
     with Look(vertices=scene.vertices, viewmat=scene.viewmats, K=scene.Ks, points=points):
         found = own_slot()
         found[0] = 0
-        drawn = _depth_cuda.draw(scene, query, wanted, found)
+        drawn = depth_cuda.draw(scene, query, wanted, found)
     # Values that are refused do no harm on the way.
     if found[0]:
         refuse_bad_values(scene, query)
@@ -253,7 +253,7 @@ def gradients(
     """
     on_cuda = slopes.device.type != "cpu"
     if on_cuda and slopes.dtype == torch.float32:
-        return _depth_cuda.gradients(scene, face_ids, grad_visibility, slopes, pixels, needs_points, needs_vertices)
+        return depth_cuda.gradients(scene, face_ids, grad_visibility, slopes, pixels, needs_points, needs_vertices)
     by_points, by_vertices = slopes.new_empty(0), slopes.new_empty(0)
     if needs_points:
         # The point's depth is the third row of the view.

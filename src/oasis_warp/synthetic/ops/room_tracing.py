@@ -70,8 +70,8 @@ def trace_rooms(
     """Linear light of rooms of solids, out of focus with their distance; nothing here carries a gradient.
 
     Args:
-        solids: float32 rows of `SOLID_WORDS` numbers in the camera's frame, laid out in `oasis_kernels.scene.rooms`; rows
-            of shape 0 are none.
+        solids: float32 rows of `SOLID_WORDS` numbers in the camera's frame, laid out in `oasis_kernels.scene.rooms`;
+            rows of shape 0 are none.
         focals: Of the camera [px], whose axis is the picture's middle.
         sky: Coefficients of the light from all around.
         lamps: With what they see of the hand.
