@@ -25,10 +25,10 @@ from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.fit_quality import overlap
 from oasis_warp.estimation.landmarks import FINGERS, box_size
-from oasis_warp.estimation.right_view import array, fitted_view, real
+from oasis_warp.estimation.mirrored_input import array, mirrored_fit, real
 from oasis_warp.estimation.silhouette import facing, silhouette, vertex_normals
 from oasis_warp.estimation.surface_offsets import outline_offsets
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.template import bundled_hand
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".webp"}
@@ -80,24 +80,24 @@ def measure(estimator: HandEstimator, path: Path, root: Path, drawn: dict[str, n
             cv2.imwrite(str(overlays / f"{name.replace('/', '_')}_{k}.png"), picture[..., ::-1])
 
 
-def covered_with(rig: Rig, fit: HandFit, offsets: np.ndarray) -> np.ndarray:
+def covered_with(rig: HandKinematics, fit: HandFit, offsets: np.ndarray) -> np.ndarray:
     """Pixels of the photo that the posed hand covers, its rest surface displaced by `offsets`."""
-    view = fitted_view(rig, fit)
+    view = mirrored_fit(rig, fit)
     image = view.state.project(posed(rig, fit, offsets))
     mask = silhouette(image, rig.faces, (fit.camera.width, fit.camera.height)) > 0
     return mask[:, ::-1] if fit.side == "left" else mask
 
 
-def posed(rig: Rig, fit: HandFit, offsets: np.ndarray) -> np.ndarray:
+def posed(rig: HandKinematics, fit: HandFit, offsets: np.ndarray) -> np.ndarray:
     """The surface in the (right) hand's frame."""
-    view = fitted_view(rig, fit)
+    view = mirrored_fit(rig, fit)
     rest = rig.rest_surface(view.state.shape) + rig.correctives(view.angles) + offsets
     return rig.pose_surface(rig.chain_of(view.angles, view.state.shape), rest)
 
 
-def overlay(rig: Rig, photo: Photo, fit: HandFit, offsets: np.ndarray) -> np.ndarray:
+def overlay(rig: HandKinematics, photo: Photo, fit: HandFit, offsets: np.ndarray) -> np.ndarray:
     """Photo with the outlines of mask (red) and mesh (blue), and the shaded mesh before and after the offsets, RGB."""
-    view, mirrored = fitted_view(rig, fit), fit.side == "left"
+    view, mirrored = mirrored_fit(rig, fit), fit.side == "left"
     rgb = photo.rgb.numpy()[:, ::-1] if mirrored else photo.rgb.numpy()
     low = np.maximum(view.xy.min(0) - 0.15 * box_size(view.xy), 0)
     high = np.minimum(view.xy.max(0) + 0.15 * box_size(view.xy), rgb.shape[1::-1])

@@ -21,13 +21,13 @@ import torch
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.adaptation.refine import refine
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, TrainingBatch
-from oasis_warp.estimation.right_view import array
+from oasis_warp.estimation.mirrored_input import array
+from oasis_warp.estimation.refine import refine
 from oasis_warp.estimation.surface_state import shape_of, state_of_surface
 from oasis_warp.evaluation.held_out import (
     ERROR_STREAM,
@@ -42,7 +42,7 @@ from oasis_warp.evaluation.held_out import (
 )
 from oasis_warp.evaluation.metrics import Truth, match_colors, score
 from oasis_warp.evaluation.synthetic import evidence_of
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.prior import choose_prior
@@ -73,7 +73,7 @@ class Bench:
 
     def __init__(self, device: torch.device):
         self.hand, self.device = bundled_hand(), device
-        self.there, self.rig = self.hand.to(device), Rig(self.hand)
+        self.there, self.rig = self.hand.to(device), HandKinematics(self.hand)
         self.vertex_faces = faces_of_vertices(self.there.faces, len(self.hand.template))
 
     def case(self, session: Session, light: Lighting, shoot: Shoot, factor: float) -> Case:

@@ -10,8 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import adapt, detail_of
-from oasis_warp.adaptation.outline import drawn_outline_offsets
-from oasis_warp.adaptation.refine import refine
 from oasis_warp.adaptation.sharpen import sharpen
 from oasis_warp.avatar.anchors import PICTURE, below_skin
 from oasis_warp.avatar.coarsen import coarsen
@@ -24,10 +22,12 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, HandFit, HandLight, Landmarks, Photo, Render
 from oasis_warp.data.crop import resample_square, square_around
+from oasis_warp.estimation.drawn_outline import drawn_outline_offsets
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
-from oasis_warp.estimation.keypoints_file import read_keypoints
-from oasis_warp.estimation.moved_fit import no_more_doubtful, with_pose
+from oasis_warp.estimation.keypoints import read_keypoints
+from oasis_warp.estimation.moved_fit import keeps_quality, with_pose
 from oasis_warp.estimation.outline import wrist_line
+from oasis_warp.estimation.refine import refine
 from oasis_warp.estimation.surface_offsets import outline_offsets
 from oasis_warp.hand.skinning import mirror_pose, rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
@@ -115,7 +115,7 @@ def reconstruct(
             refinement = refine(hand, guess, evidence, landmarks_in_crop(fit, evidence.camera), own_size(fit))
             pose = refinement.pose
             found = with_pose(hand, fit, mirror_pose(pose) if fit.side == "left" else pose)
-            if refinement.accepted and no_more_doubtful(found, fit):
+            if refinement.accepted and keeps_quality(found, fit):
                 fit, moved = found, refinement.moved
                 offsets = carrier_offsets(hand, fit)
                 evidence = make_evidence(photo, fit, offsets, config)

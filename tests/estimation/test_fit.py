@@ -4,19 +4,19 @@ import cv2
 import numpy as np
 import pytest
 
-from oasis_warp.estimation.evidence import evidence_of
 from oasis_warp.estimation.fit import Fitter, OutlinePairs
 from oasis_warp.estimation.fit_quality import draw, overlap
 from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.fit_target import evidence_of
 from oasis_warp.estimation.outline import MaskOutline, wrist_line
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 
 SIZE = (480, 400)
 
 
 @pytest.fixture(scope="module")
 def rig(hand):
-    return Rig(hand)
+    return HandKinematics(hand)
 
 
 def posed_hand(rig, seed):

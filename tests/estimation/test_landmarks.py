@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from oasis_warp.data.photo import read_photo
-from oasis_warp.estimation.landmarks import FINGERS, box_size, crop_of_landmarks, find_hands, read_crop
+from oasis_warp.estimation.landmarks import FINGERS, box_size, crop_of_landmarks, detect_hands, read_crop
 from oasis_warp.estimation.networks import networks
 
 HANDS = {
@@ -47,18 +47,18 @@ def test_no_hand_is_found_where_there_is_none(photos):
         np.zeros((1, 1, 3), np.uint8),
         np.full((3, 900, 3), 128, np.uint8),
     ]
-    assert [find_hands(picture, networks()) for picture in pictures] == [[], [], [], []]
+    assert [detect_hands(picture, networks()) for picture in pictures] == [[], [], [], []]
 
 
 def test_two_hands_are_told_apart(photos):
-    found = find_hands(pixels(photos, "backs_two_left_05.jpg"), networks())
+    found = detect_hands(pixels(photos, "backs_two_left_05.jpg"), networks())
     assert len(found) == 2
     assert abs(found[0].xy.mean(0)[0] - found[1].xy.mean(0)[0]) > 100
 
 
 def test_a_hand_in_the_dark_is_found_by_a_fallback_rung_in_its_own_place(photos):
     picture = pixels(photos, "backlit_victory_14.jpg")
-    (hand,) = find_hands(picture, networks())
+    (hand,) = detect_hands(picture, networks())
     assert hand.source == "network (margin, brightened)"
     assert (hand.xy > 0).all()
     assert (hand.xy < picture.shape[1::-1]).all()
@@ -67,8 +67,8 @@ def test_a_hand_in_the_dark_is_found_by_a_fallback_rung_in_its_own_place(photos)
 
 def test_landmarks_turn_with_the_photo(photos):
     picture = pixels(photos, "victory_right_09.jpg")
-    (upright,) = find_hands(picture, networks())
-    (turned,) = find_hands(np.ascontiguousarray(np.rot90(picture)), networks())
+    (upright,) = detect_hands(picture, networks())
+    (turned,) = detect_hands(np.ascontiguousarray(np.rot90(picture)), networks())
     back = np.stack([picture.shape[1] - turned.xy[:, 1], turned.xy[:, 0]], 1)
     assert np.linalg.norm(back - upright.xy, axis=1).mean() < 0.02 * box_size(upright.xy)
     # World points turn along: x to the right and y down in each photo.
@@ -79,7 +79,7 @@ def test_landmarks_turn_with_the_photo(photos):
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_another_crop_of_the_same_hand_gives_the_same_landmarks(photos, mirrored):
     picture = pixels(photos, "palm_open_left_02.png")
-    (hand,) = find_hands(picture, networks())
+    (hand,) = detect_hands(picture, networks())
     again = read_crop(picture, networks(), crop_of_landmarks(hand.xy), mirrored=mirrored)
     assert np.linalg.norm(again.xy - hand.xy, axis=1).max() < 0.05 * box_size(hand.xy)
     assert np.linalg.norm(again.world - hand.world, axis=1).mean() < 0.01
@@ -88,14 +88,14 @@ def test_another_crop_of_the_same_hand_gives_the_same_landmarks(photos, mirrored
 
 def test_a_photo_of_twice_the_size_gives_points_twice_as_far(photos):
     picture = pixels(photos, "victory_right_09.jpg")
-    (small,) = find_hands(picture, networks())
-    (large,) = find_hands(cv2.resize(picture, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC), networks())
+    (small,) = detect_hands(picture, networks())
+    (large,) = detect_hands(cv2.resize(picture, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC), networks())
     assert np.linalg.norm(large.xy / 4 - small.xy, axis=1).mean() < 0.01 * box_size(small.xy)
 
 
 def test_finding_is_repeatable(photos):
     picture = pixels(photos, "ok_sign_left_10.jpg")
-    first, second = (find_hands(picture, networks())[0] for _ in range(2))
+    first, second = (detect_hands(picture, networks())[0] for _ in range(2))
     np.testing.assert_array_equal(first.xy, second.xy)
     np.testing.assert_array_equal(first.world, second.world)
 

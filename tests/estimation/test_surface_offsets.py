@@ -4,17 +4,17 @@ import pytest
 import torch
 
 from oasis_warp.estimation.fit_quality import overlap
-from oasis_warp.estimation.right_view import fitted_view, mirror_points
+from oasis_warp.estimation.mirrored_input import mirror_points, mirrored_fit
 from oasis_warp.estimation.silhouette import silhouette, vertex_normals
 from oasis_warp.estimation.surface_offsets import LONGEST, outline_offsets
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 
 RIGHT, LEFT = "victory_right_09.jpg", "ok_sign_left_10.jpg"
 
 
 @pytest.fixture(scope="module")
 def rig(hand):
-    return Rig(hand)
+    return HandKinematics(hand)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def offsets(hand, fitted):
 
 
 def posed(rig, fit, shift):
-    view = fitted_view(rig, fit)
+    view = mirrored_fit(rig, fit)
     rest = rig.rest_surface(view.state.shape) + rig.correctives(view.angles) + shift
     return view.state, rest, rig.pose_surface(rig.chain_of(view.angles, view.state.shape), rest)
 
@@ -38,7 +38,7 @@ def posed(rig, fit, shift):
 def iou(rig, fit, shift):
     state, _, vertices = posed(rig, fit, shift)
     drawn = silhouette(state.project(vertices), rig.faces, (fit.camera.width, fit.camera.height)) > 0
-    view = fitted_view(rig, fit)
+    view = mirrored_fit(rig, fit)
     return overlap(drawn, view.mask > 0.5, view.xy)
 
 

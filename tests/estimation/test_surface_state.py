@@ -3,13 +3,13 @@ import pytest
 import torch
 
 from oasis_warp.estimation.surface_state import shape_of, state_of_surface
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.poses import named_pose
 
 
 @pytest.fixture(scope="module")
 def rig(hand):
-    return Rig(hand)
+    return HandKinematics(hand)
 
 
 @pytest.fixture(scope="module")

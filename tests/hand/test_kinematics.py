@@ -4,7 +4,7 @@ import torch
 
 from oasis_warp.core.types import HandPose
 from oasis_warp.estimation.fit_state import FitState
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.skinning import rest_hand, skin
 
 STEP = 1e-6
@@ -12,7 +12,7 @@ STEP = 1e-6
 
 @pytest.fixture(scope="module")
 def rig(hand):
-    return Rig(hand)
+    return HandKinematics(hand)
 
 
 @pytest.fixture

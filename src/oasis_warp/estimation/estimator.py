@@ -11,23 +11,23 @@ from torch import Tensor
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandFit, Landmarks, Photo
-from oasis_warp.estimation.doubts import (
-    MANY_FINGERS,
-    finger_doubts,
-    other_side_cost,
-    place_doubts,
-    second_looks,
-    side_doubts,
-)
 from oasis_warp.estimation.fit import Fitter, Solution
-from oasis_warp.estimation.fit_quality import DOUBTFUL, REFUSED, TINY_HAND, Quality, draw, measure
+from oasis_warp.estimation.fit_quality import REFUSE_BOUNDS, TINY_HAND, WARN_BOUNDS, Quality, draw, measure
 from oasis_warp.estimation.fit_state import FitState
-from oasis_warp.estimation.landmarks import box_size, find_hands
+from oasis_warp.estimation.fit_warnings import (
+    MANY_FINGERS,
+    finger_warnings,
+    framing_warnings,
+    other_side_cost,
+    second_detections,
+    side_warnings,
+)
+from oasis_warp.estimation.landmarks import box_size, detect_hands
+from oasis_warp.estimation.mirrored_input import MirroredInput, array, real
 from oasis_warp.estimation.networks import networks
 from oasis_warp.estimation.outline import MaskOutline
-from oasis_warp.estimation.right_view import RightView, array, real
 from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 
 _NO_HAND = 16
 """Smaller hands are refused even by force [px]."""
@@ -40,7 +40,7 @@ class HandEstimator:
 
     def __init__(self, hand: HandModel):
         self.hand = hand
-        self.rig = Rig(hand)
+        self.rig = HandKinematics(hand)
 
     def find(self, photo: Photo) -> list[Landmarks]:
         """The hands of a photo, best first; empty when there is none.
@@ -51,7 +51,7 @@ class HandEstimator:
         Raises:
             InputError: this installation cannot run the networks (see `networks.check_networks`).
         """
-        found = find_hands(photo.rgb.numpy(), networks())
+        found = detect_hands(photo.rgb.numpy(), networks())
         return [
             Landmarks(
                 xy=real(hand.xy),
@@ -92,19 +92,19 @@ class HandEstimator:
                 f"{photo.name}: the hand is {size:.0f} pixels large, at least {least} are needed; "
                 "give a closer or larger photo."
             )
-        view = RightView(photo, landmarks, focal)
+        view = MirroredInput(photo, landmarks, focal)
         known_shape = None if shape is None else array(shape)
         fitter = Fitter(self.rig, view.evidence, shape=known_shape)
         start = fitter.fit_landmarks()
         found, mask, doubts = self._refine(view, fitter, start)
         quality = measure(self.rig, view.evidence, found.state, mask, found.cost)
-        looks = second_looks(view.rgb, networks(), view.evidence.xy)
-        fingers = finger_doubts(view.evidence, looks)
-        doubts += place_doubts(view.evidence, mask) + fingers
+        looks = second_detections(view.rgb, networks(), view.evidence.xy)
+        fingers = finger_warnings(view.evidence, looks)
+        doubts += framing_warnings(view.evidence, mask) + fingers
         if landmarks.world is not None:  # 21 points in the plane alone do not tell a palm from the other hand's back
             other_cost = other_side_cost(self.rig, view.evidence, known_shape)
-            doubts += side_doubts(landmarks.side, start, other_cost, looks)
-        refused = quality.beyond(REFUSED)
+            doubts += side_warnings(landmarks.side, start, other_cost, looks)
+        refused = quality.beyond(REFUSE_BOUNDS)
         if len(fingers) >= MANY_FINGERS:
             refused.append("the network sees the hand elsewhere")
         if refused and not force:
@@ -114,7 +114,7 @@ class HandEstimator:
             )
         return self._report(view, landmarks, found.state, mask, quality, doubts)
 
-    def _refine(self, view: RightView, fitter: Fitter, start: Solution) -> tuple[Solution, np.ndarray, list[str]]:
+    def _refine(self, view: MirroredInput, fitter: Fitter, start: Solution) -> tuple[Solution, np.ndarray, list[str]]:
         """Fit to the mask's outline too: to a first mask, then to one that the fit has helped to cut."""
         doubts = []
         xy, scale = view.evidence.xy, start.state.focal / float(np.exp(start.state.place[2]))
@@ -133,9 +133,9 @@ class HandEstimator:
             found = fitter.refine(found.state, lambda state: outline.match(self.rig, state), _LAST_ROUNDS)
         return found, mask, doubts
 
-    def _report(self, view: RightView, landmarks: Landmarks, state: FitState, mask: np.ndarray, quality: Quality,
+    def _report(self, view: MirroredInput, landmarks: Landmarks, state: FitState, mask: np.ndarray, quality: Quality,
                 doubts: list[str]) -> HandFit:  # fmt: skip
-        warnings = [f"poor fit: {words}" for words in quality.beyond(DOUBTFUL)] + doubts
+        warnings = [f"poor fit: {words}" for words in quality.beyond(WARN_BOUNDS)] + doubts
         return HandFit(
             side=landmarks.side,
             shape=real(state.shape),

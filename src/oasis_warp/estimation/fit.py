@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from oasis_warp.estimation.evidence import Evidence
 from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.fit_target import Evidence
 from oasis_warp.estimation.landmarks import BONES, KNUCKLES
-from oasis_warp.hand.kinematics import Rig, unit
+from oasis_warp.hand.kinematics import HandKinematics, unit
 
 _PALM = [0, *KNUCKLES]
 
@@ -76,7 +76,7 @@ class Solution:
 class Fitter:
     """Fits one hand to the evidence of one photo; `shape` keeps a known person's shape."""
 
-    def __init__(self, rig: Rig, evidence: Evidence, *, settings: FitSettings | None = None,
+    def __init__(self, rig: HandKinematics, evidence: Evidence, *, settings: FitSettings | None = None,
                  shape: np.ndarray | None = None):  # fmt: skip
         self.rig, self.evidence = rig, evidence
         self.settings = s = settings or FitSettings()

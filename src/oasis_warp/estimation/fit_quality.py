@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from oasis_warp.estimation.evidence import Evidence
 from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.fit_target import Evidence
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.silhouette import silhouette
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 
 SMALL_HAND, TINY_HAND = 150, 80
 """Longer side of the landmarks' box [px] below which a hand is warned about, and refused."""
@@ -24,8 +24,8 @@ class Bounds:
     cost: float
 
 
-DOUBTFUL = Bounds(reprojection=2.3, worst_point=8.0, mask_iou=0.90, cost=170.0)
-REFUSED = Bounds(reprojection=4.0, worst_point=np.inf, mask_iou=0.85, cost=400.0)
+WARN_BOUNDS = Bounds(reprojection=2.3, worst_point=8.0, mask_iou=0.90, cost=170.0)
+REFUSE_BOUNDS = Bounds(reprojection=4.0, worst_point=np.inf, mask_iou=0.85, cost=400.0)
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ class Quality:
         return said
 
 
-def measure(rig: Rig, evidence: Evidence, state: FitState, mask: np.ndarray, cost: float) -> Quality:
+def measure(rig: HandKinematics, evidence: Evidence, state: FitState, mask: np.ndarray, cost: float) -> Quality:
     """Compare the model in `state` with the landmarks and the mask ([H, W], mirrored like the evidence)."""
     points = state.project(rig.landmarks(rig.chain(state.angles, state.shape), state.shape)[0])
     errors = np.linalg.norm(points - evidence.xy, axis=1) / evidence.box * 100
     return Quality(errors, overlap(draw(rig, state, evidence.size) > 0, mask > 0.5, evidence.xy), cost)
 
 
-def draw(rig: Rig, state: FitState, size: tuple[int, int]) -> np.ndarray:
+def draw(rig: HandKinematics, state: FitState, size: tuple[int, int]) -> np.ndarray:
     """Silhouette of the model in a photo of `size` (width, height), 0 or 255."""
     surface = rig.surface(rig.chain(state.angles, state.shape), state.angles, state.shape)
     return silhouette(state.project(surface), rig.faces, size)

@@ -6,11 +6,11 @@ import numpy as np
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
-from oasis_warp.estimation.doubts import place_doubts
-from oasis_warp.estimation.fit_quality import DOUBTFUL, draw, measure
-from oasis_warp.estimation.right_view import RightView, mirror_points, real, right_state
+from oasis_warp.estimation.fit_quality import WARN_BOUNDS, draw, measure
+from oasis_warp.estimation.fit_warnings import framing_warnings
+from oasis_warp.estimation.mirrored_input import MirroredInput, mirror_points, mirrored_state, real
 from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 
 
 def fit_of_pose(
@@ -27,14 +27,14 @@ def fit_of_pose(
         camera: Of the photo, its viewmat the identity.
         source: What to call the origin in `Landmarks.source`.
     """
-    rig = Rig(hand)
-    state = right_state(rig, side, shape, pose, camera)
+    rig = HandKinematics(hand)
+    state = mirrored_state(rig, side, shape, pose, camera)
     points = rig.landmarks(rig.chain(state.angles, state.shape), state.shape)[0]
     xy, world = state.project(points), state.in_camera(points)
     if side == "left":
         xy, world = mirror_points(xy, camera.width), world * [-1, 1, 1]
     landmarks = Landmarks(real(xy), real(world - world.mean(0)), side, 1.0, 1.0, source)
-    view = RightView(photo, landmarks, state.focal)
+    view = MirroredInput(photo, landmarks, state.focal)
     state = replace(state, focal=state.focal * float(view.scale[0]), centre=state.centre * view.scale)
     scale, seen = state.focal / float(np.exp(state.place[2])), view.evidence.xy
     mask = None if view.alpha is None else mask_from_alpha(view.alpha, seen, scale)
@@ -42,7 +42,7 @@ def fit_of_pose(
         first = mask_from_landmarks(view.rgb, seen, scale)
         mask = mask_from_fit(view.rgb, seen, scale, first, draw(rig, state, view.evidence.size))
     quality = measure(rig, view.evidence, state, mask, 0.0)
-    warnings = [f"poor fit: {words}" for words in quality.beyond(DOUBTFUL)] + place_doubts(view.evidence, mask)
+    warnings = [f"poor fit: {words}" for words in quality.beyond(WARN_BOUNDS)] + framing_warnings(view.evidence, mask)
     return HandFit(
         side=side,
         shape=real(shape),

@@ -25,7 +25,7 @@ _MARGIN = 0.35
 
 
 @dataclass(frozen=True)
-class FoundHand:
+class DetectedHand:
     """One hand in the pixels of the image that was searched."""
 
     xy: np.ndarray
@@ -54,7 +54,7 @@ class Crop:
     """From the image's upright to the crop's, clockwise as seen [rad]."""
 
 
-def find_hands(rgb: np.ndarray, nets: Networks, *, most: int = 8) -> list[FoundHand]:
+def detect_hands(rgb: np.ndarray, nets: Networks, *, most: int = 8) -> list[DetectedHand]:
     """Hands in an RGB image of bytes, best palm first; the fallback rungs are tried only when there is none."""
     hands = _search(rgb, nets, 0.5, most, "network")
     if hands:
@@ -72,12 +72,12 @@ def find_hands(rgb: np.ndarray, nets: Networks, *, most: int = 8) -> list[FoundH
         hands = [h for h in _search(image, nets, min_score, most, source)
                  if min(h.presence, h.side_score) >= _MIN_GUESS]  # fmt: skip
         if hands:
-            return [FoundHand(h.xy - margin, h.world, h.presence, h.right, h.palm_score, h.source) for h in hands]
+            return [DetectedHand(h.xy - margin, h.world, h.presence, h.right, h.palm_score, h.source) for h in hands]
     return []
 
 
-def _search(rgb: np.ndarray, nets: Networks, min_score: float, most: int, source: str) -> list[FoundHand]:
-    hands: list[FoundHand] = []
+def _search(rgb: np.ndarray, nets: Networks, min_score: float, most: int, source: str) -> list[DetectedHand]:
+    hands: list[DetectedHand] = []
     for score, box, points in palms(rgb, nets, min_score)[:most]:
         first = read_crop(rgb, nets, crop_of_palm(box, points), score, source)
         second = read_crop(rgb, nets, crop_of_landmarks(first.xy), score, source)
@@ -171,7 +171,7 @@ def _upright(direction: np.ndarray) -> float:
 def read_crop(
     rgb: np.ndarray, nets: Networks, crop: Crop, palm_score: float = 1.0, source: str = "network", *,
     mirrored: bool = False,
-) -> FoundHand:  # fmt: skip
+) -> DetectedHand:  # fmt: skip
     """Landmarks in a crop, in pixels of `rgb`; `mirrored` shows the network the crop's mirror image."""
     cos, sin = np.cos(crop.angle), np.sin(crop.angle)
     turn = np.array([[cos, -sin], [sin, cos]])  # crop -> image
@@ -195,4 +195,4 @@ def read_crop(
         right = 1 - right
     world[:, :2] = world[:, :2] @ turn.T
     xy = (seen.points - middle) @ to_image.T + crop.centre
-    return FoundHand(xy, world, seen.presence, right, palm_score, source)
+    return DetectedHand(xy, world, seen.presence, right, palm_score, source)

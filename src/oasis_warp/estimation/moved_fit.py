@@ -2,10 +2,10 @@
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandFit, HandPose
-from oasis_warp.estimation.evidence import evidence_of
-from oasis_warp.estimation.fit_quality import DOUBTFUL, measure
-from oasis_warp.estimation.right_view import fitted_view
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.estimation.fit_quality import WARN_BOUNDS, measure
+from oasis_warp.estimation.fit_target import evidence_of
+from oasis_warp.estimation.mirrored_input import mirrored_fit
+from oasis_warp.hand.kinematics import HandKinematics
 
 
 def with_pose(hand: HandModel, fit: HandFit, pose: HandPose) -> HandFit:
@@ -16,8 +16,8 @@ def with_pose(hand: HandModel, fit: HandFit, pose: HandPose) -> HandFit:
         fit: In the photo's own frame.
         pose: In that frame, too: a left hand's describes the mirrored model.
     """
-    rig, moved = Rig(hand), fit._replace(pose=pose)
-    view = fitted_view(rig, moved)
+    rig, moved = HandKinematics(hand), fit._replace(pose=pose)
+    view = mirrored_fit(rig, moved)
     evidence = evidence_of(view.xy, None, (fit.camera.width, fit.camera.height))
     quality = measure(rig, evidence, view.state, view.mask, fit.cost)
     return moved._replace(
@@ -25,10 +25,10 @@ def with_pose(hand: HandModel, fit: HandFit, pose: HandPose) -> HandFit:
     )
 
 
-def no_more_doubtful(moved: HandFit, fit: HandFit) -> bool:
+def keeps_quality(moved: HandFit, fit: HandFit) -> bool:
     """Whether no number of `moved` is beyond what is warned about, unless that of `fit` is, too."""
     return (
-        moved.reprojection <= max(DOUBTFUL.reprojection, fit.reprojection)
-        and moved.worst_point <= max(DOUBTFUL.worst_point, fit.worst_point)
-        and moved.mask_iou >= min(DOUBTFUL.mask_iou, fit.mask_iou)
+        moved.reprojection <= max(WARN_BOUNDS.reprojection, fit.reprojection)
+        and moved.worst_point <= max(WARN_BOUNDS.worst_point, fit.worst_point)
+        and moved.mask_iou >= min(WARN_BOUNDS.mask_iou, fit.mask_iou)
     )

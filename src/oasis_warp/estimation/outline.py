@@ -9,7 +9,7 @@ from oasis_warp.estimation.fit import OutlinePairs
 from oasis_warp.estimation.fit_state import FitState
 from oasis_warp.estimation.landmarks import KNUCKLES, box_size
 from oasis_warp.estimation.silhouette import silhouette, vertex_normals
-from oasis_warp.hand.kinematics import Rig, unit
+from oasis_warp.hand.kinematics import HandKinematics, unit
 
 WRIST_LINE = 0.10
 """The line across the arm above which outlines count: share of the way from the wrist point to the knuckles."""
@@ -64,7 +64,7 @@ class MaskOutline:
         self.points, self.normals = self.points[chosen], self.normals[chosen]
         self.trust = np.ones(len(chosen)) if trust is None else trust[tuple(self.points.astype(int).T[::-1])]
 
-    def match(self, rig: Rig, state: FitState) -> OutlinePairs:
+    def match(self, rig: HandKinematics, state: FitState) -> OutlinePairs:
         """Nearest pairs in both directions between these points and the rim of the mesh posed by `state`."""
         displacement = rig.correctives(rig.all_angles(state.angles))
         posed = rig.pose_surface(rig.chain(state.angles, state.shape), rig.rest_surface(state.shape) + displacement)
@@ -88,7 +88,7 @@ class MaskOutline:
         )
 
     def _rim(
-        self, rig: Rig, state: FitState, posed: np.ndarray
+        self, rig: HandKinematics, state: FitState, posed: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Points on the mesh's outline above the wrist: where, of which vertex, with which normal, how far outside it.
 

@@ -22,10 +22,10 @@ from torch import Tensor
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandFit
 from oasis_warp.estimation.landmarks import box_size
+from oasis_warp.estimation.mirrored_input import mirrored_fit
 from oasis_warp.estimation.outline import WRIST_LINE, wrist_line
-from oasis_warp.estimation.right_view import fitted_view
 from oasis_warp.estimation.silhouette import silhouette, vertex_normals
-from oasis_warp.hand.kinematics import Rig, unit
+from oasis_warp.hand.kinematics import HandKinematics, unit
 
 LONGEST = 0.006
 """No vertex moves farther [m]."""
@@ -76,8 +76,8 @@ class _View:
     """A posed hand before its camera, mirrored into a right one, and its mask."""
 
     def __init__(self, hand: HandModel, fit: HandFit):
-        self.rig = rig = Rig(hand)
-        state, table, xy, mask = fitted_view(rig, fit)
+        self.rig = rig = HandKinematics(hand)
+        state, table, xy, mask = mirrored_fit(rig, fit)
         chain = rig.chain_of(table, state.shape)
         self.rest = rig.rest_surface(state.shape) + rig.correctives(table)
         self.state, self.box, self.line = state, box_size(xy), wrist_line(xy)

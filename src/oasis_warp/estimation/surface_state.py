@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from oasis_warp.estimation.fit_state import FitState
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 
 _EVERY = 16
 """One vertex of so many speaks for the surface."""
@@ -29,7 +29,7 @@ class SurfaceState(NamedTuple):
     """Displacement of the model's rest surface that goes beyond shape and pose correctives [m], [V, 3]."""
 
 
-def shape_of(rig: Rig, rest: np.ndarray) -> np.ndarray:
+def shape_of(rig: HandKinematics, rest: np.ndarray) -> np.ndarray:
     """The shape coefficients whose surface at rest comes nearest to `rest` ([V, 3], metres)."""
     basis = rig.shape_basis.reshape(-1, rig.shape_basis.shape[2])
     held = _SILENT**2 * np.eye(basis.shape[1])
@@ -37,7 +37,7 @@ def shape_of(rig: Rig, rest: np.ndarray) -> np.ndarray:
 
 
 def state_of_surface(
-    rig: Rig, shape: np.ndarray, rest: np.ndarray, posed: np.ndarray, focal: float, centre: np.ndarray
+    rig: HandKinematics, shape: np.ndarray, rest: np.ndarray, posed: np.ndarray, focal: float, centre: np.ndarray
 ) -> SurfaceState:
     """The state of that shape in which `rest` comes nearest to `posed`.
 
@@ -76,7 +76,7 @@ def state_of_surface(
 class _System:
     """Weighted distances of some vertices from where they should be, and their derivatives."""
 
-    def __init__(self, rig: Rig, posed: np.ndarray, own: np.ndarray):
+    def __init__(self, rig: HandKinematics, posed: np.ndarray, own: np.ndarray):
         self.rig, self.own = rig, own
         self.index = np.arange(0, len(posed), _EVERY)
         self.goal = posed[self.index]
@@ -94,7 +94,7 @@ class _System:
 
 
 def _placed(
-    rig: Rig, rest: np.ndarray, posed: np.ndarray, shape: np.ndarray, focal: float, centre: np.ndarray
+    rig: HandKinematics, rest: np.ndarray, posed: np.ndarray, shape: np.ndarray, focal: float, centre: np.ndarray
 ) -> FitState:
     """The palm where it is, and every bone turned against its parent as the flesh around both is."""
     owned = rig.weights > _OWN * rig.weights.max(0)
@@ -111,7 +111,7 @@ def _turn_of(rest: np.ndarray, posed: np.ndarray) -> np.ndarray:
     return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
 
 
-def _detail(rig: Rig, state: FitState, posed: np.ndarray) -> np.ndarray:
+def _detail(rig: HandKinematics, state: FitState, posed: np.ndarray) -> np.ndarray:
     chain = rig.chain(state.angles, state.shape)
     turn = state.turn @ rig.blended(chain)
     gap = posed - state.in_camera(rig.surface(chain, state.angles, state.shape))

@@ -30,7 +30,7 @@ _LANDMARK_OFFSETS = np.array([
 
 
 @dataclass(frozen=True)
-class Chain:
+class PosedJoints:
     """The joints in one pose and shape."""
 
     rest: np.ndarray
@@ -45,7 +45,7 @@ class Chain:
     """Posed axes of flexion, abduction and twist, [16, 3, 3]."""
 
 
-class Rig:
+class HandKinematics:
     """A `HandModel` as float64 arrays, with what the derivatives need."""
 
     def __init__(self, hand: HandModel):
@@ -98,11 +98,11 @@ class Rig:
         table[self.dofs[:, 0], self.dofs[:, 1]] = angles
         return table
 
-    def chain(self, angles: np.ndarray, shape: np.ndarray) -> Chain:
+    def chain(self, angles: np.ndarray, shape: np.ndarray) -> PosedJoints:
         """Pose the joints by the 26 angles of the fit."""
         return self.chain_of(self.all_angles(angles), shape)
 
-    def chain_of(self, table: np.ndarray, shape: np.ndarray) -> Chain:
+    def chain_of(self, table: np.ndarray, shape: np.ndarray) -> PosedJoints:
         """Pose the joints by all angles, [16, 3]."""
         rest = self.joints + self.joint_basis @ shape
         rotation, position = np.zeros((16, 3, 3)), np.zeros((16, 3))
@@ -118,9 +118,9 @@ class Rig:
                 if table[j, a] != 0:
                     turn = turn @ cv2.Rodrigues(self.axes[j, a] * table[j, a])[0]
             rotation[j] = turn
-        return Chain(rest, rotation, position, by_shape, axes)
+        return PosedJoints(rest, rotation, position, by_shape, axes)
 
-    def landmarks(self, chain: Chain, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def landmarks(self, chain: PosedJoints, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The 21 points where the network would put them, [21, 3] metres, and d points / d (angles, shape)."""
         joint, dof_joint = self.point_joint, self.dofs[:, 0]
         local = self.points + self.points_basis @ shape - chain.rest[joint] + self.offsets
@@ -140,24 +140,24 @@ class Rig:
         strengths = corrective_coefficients(self.hand, torch.from_numpy(table[1:])).numpy()
         return (self.corrective_basis @ strengths).reshape(-1, 3)
 
-    def surface(self, chain: Chain, angles: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    def surface(self, chain: PosedJoints, angles: np.ndarray, shape: np.ndarray) -> np.ndarray:
         """The posed surface, correctives included [m], [V, 3]."""
         return self.pose_surface(chain, self.rest_surface(shape) + self.correctives(self.all_angles(angles)))
 
-    def bone_shifts(self, chain: Chain) -> np.ndarray:
+    def bone_shifts(self, chain: PosedJoints) -> np.ndarray:
         """Translations that go with `chain.rotation` to carry rest points, [16, 3]."""
         return chain.position - (chain.rotation @ chain.rest[..., None])[..., 0]
 
-    def blended(self, chain: Chain, index: np.ndarray | slice = slice(None)) -> np.ndarray:
+    def blended(self, chain: PosedJoints, index: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Blended bone rotation of each vertex, [V, 3, 3]."""
         return (self.weights[index] @ chain.rotation.reshape(16, 9)).reshape(-1, 3, 3)
 
-    def pose_surface(self, chain: Chain, rest: np.ndarray) -> np.ndarray:
+    def pose_surface(self, chain: PosedJoints, rest: np.ndarray) -> np.ndarray:
         """Linear blend skinning of the whole rest surface."""
         return (self.blended(chain) @ rest[..., None])[..., 0] + self.weights @ self.bone_shifts(chain)
 
     def vertices(
-        self, chain: Chain, shape: np.ndarray, index: np.ndarray, displacement: np.ndarray
+        self, chain: PosedJoints, shape: np.ndarray, index: np.ndarray, displacement: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Posed vertices `index`, and d vertices / d (angles, shape); the surface's `displacement` stays constant."""
         basis = self.shape_basis[index]

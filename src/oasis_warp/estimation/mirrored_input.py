@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
-from oasis_warp.estimation.evidence import Evidence, evidence_of
 from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.fit_target import Evidence, evidence_of
 from oasis_warp.estimation.landmarks import box_size
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 _LARGEST = 800.0
@@ -32,7 +32,7 @@ def real(values: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
-class RightView:
+class MirroredInput:
     """A photo and one hand in it, mirrored if the hand is a left one, and reduced if it is very large."""
 
     def __init__(self, photo: Photo, landmarks: Landmarks, focal: float | None):
@@ -66,7 +66,7 @@ class RightView:
             return mask
         return cv2.resize(np.ascontiguousarray(mask), self.photo_size, interpolation=cv2.INTER_LINEAR)
 
-    def pose(self, rig: Rig, state: FitState) -> HandPose:
+    def pose(self, rig: HandKinematics, state: FitState) -> HandPose:
         """The pose in the photo's own frame."""
         mirror = _MIRROR if self.mirrored else np.ones(3)
         return HandPose(
@@ -89,7 +89,7 @@ def mirror_points(xy: np.ndarray, width: int) -> np.ndarray:
     return np.array([width, 0]) + xy * [-1, 1]
 
 
-class FittedView(NamedTuple):
+class MirroredFit(NamedTuple):
     """A `HandFit` as a right hand."""
 
     state: FitState
@@ -99,7 +99,7 @@ class FittedView(NamedTuple):
     mask: np.ndarray
 
 
-def right_state(rig: Rig, side: Side, shape: np.ndarray, pose: HandPose, camera: Camera) -> FitState:
+def mirrored_state(rig: HandKinematics, side: Side, shape: np.ndarray, pose: HandPose, camera: Camera) -> FitState:
     """A pose and camera as the fit's state in the photo, which is mirrored for a left hand."""
     turn, translation, K = array(pose.orientation), array(pose.translation), array(camera.K)
     centre = K[:2, 2]
@@ -111,10 +111,10 @@ def right_state(rig: Rig, side: Side, shape: np.ndarray, pose: HandPose, camera:
     return FitState(turn, place, angles, shape, float(K[0, 0]), centre)
 
 
-def fitted_view(rig: Rig, fit: HandFit) -> FittedView:
+def mirrored_fit(rig: HandKinematics, fit: HandFit) -> MirroredFit:
     """A fit in the photo, which is mirrored for a left hand."""
-    state = right_state(rig, fit.side, array(fit.shape), fit.pose, fit.camera)
+    state = mirrored_state(rig, fit.side, array(fit.shape), fit.pose, fit.camera)
     xy, mask = array(fit.landmarks.xy), fit.mask.detach().cpu().numpy()
     if fit.side == "left":
         xy, mask = mirror_points(xy, fit.camera.width), np.ascontiguousarray(mask[:, ::-1])
-    return FittedView(state, np.concatenate([np.zeros((1, 3)), array(fit.pose.angles)]), xy, mask)
+    return MirroredFit(state, np.concatenate([np.zeros((1, 3)), array(fit.pose.angles)]), xy, mask)

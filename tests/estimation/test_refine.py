@@ -4,7 +4,6 @@ import pytest
 import torch
 from synthetic import PALM_TO_CAMERA
 
-from oasis_warp.adaptation.refine import refine
 from oasis_warp.avatar.anchors import below_skin, vertex_to_gaussians
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
@@ -12,6 +11,7 @@ from oasis_warp.core import surface
 from oasis_warp.core.camera import project
 from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.core.types import Camera, Evidence, HandPose
+from oasis_warp.estimation.refine import refine
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.render.render import render

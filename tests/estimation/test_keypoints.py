@@ -6,7 +6,7 @@ import torch
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandFit, Landmarks
-from oasis_warp.estimation.keypoints_file import read_keypoints
+from oasis_warp.estimation.keypoints import read_keypoints
 
 NAME = "ok_sign_left_10.jpg"
 

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from oasis_warp.estimation.evidence import Evidence
 from oasis_warp.estimation.fit import Fitter, Solution
 from oasis_warp.estimation.fit_quality import SMALL_HAND
-from oasis_warp.estimation.landmarks import FINGERS, FoundHand, crop_of_landmarks, read_crop
+from oasis_warp.estimation.fit_target import Evidence
+from oasis_warp.estimation.landmarks import FINGERS, DetectedHand, crop_of_landmarks, read_crop
 from oasis_warp.estimation.networks import Networks
 from oasis_warp.estimation.outline import wrist_line
-from oasis_warp.hand.kinematics import Rig
+from oasis_warp.hand.kinematics import HandKinematics
 
 SIDE_RATIO = 1.15
 """The other side's cost over this one's: at least 1.3 on 63 right fits, so less is a doubt."""
@@ -25,7 +25,7 @@ _BORDER = 0.08
 """Share of the box along which a hand may touch the photo's border."""
 
 
-def second_looks(rgb: np.ndarray, nets: Networks, xy: np.ndarray) -> list[FoundHand]:
+def second_detections(rgb: np.ndarray, nets: Networks, xy: np.ndarray) -> list[DetectedHand]:
     """What the landmark network sees in the same place in a turned crop, and in a mirrored one turned the other way.
 
     Landmarks that mean something move little; a look in which it sees no hand is left out.
@@ -36,7 +36,7 @@ def second_looks(rgb: np.ndarray, nets: Networks, xy: np.ndarray) -> list[FoundH
     return [look for look in (turned, mirrored) if look.presence >= _MIN_PRESENCE]
 
 
-def finger_doubts(evidence: Evidence, looks: list[FoundHand]) -> list[str]:
+def finger_warnings(evidence: Evidence, looks: list[DetectedHand]) -> list[str]:
     """Fingers that every second look sees somewhere else."""
     if not looks:
         return []
@@ -51,7 +51,7 @@ def finger_doubts(evidence: Evidence, looks: list[FoundHand]) -> list[str]:
     return said
 
 
-def other_side_cost(rig: Rig, evidence: Evidence, shape: np.ndarray | None) -> float:
+def other_side_cost(rig: HandKinematics, evidence: Evidence, shape: np.ndarray | None) -> float:
     """Cost of fitting the landmarks as a hand of the other side."""
     width = evidence.size[0]
     mirrored = replace(
@@ -62,7 +62,7 @@ def other_side_cost(rig: Rig, evidence: Evidence, shape: np.ndarray | None) -> f
     return Fitter(rig, mirrored, shape=shape).fit_landmarks().cost
 
 
-def side_doubts(side: str, start: Solution, other_cost: float, looks: list[FoundHand]) -> list[str]:
+def side_warnings(side: str, start: Solution, other_cost: float, looks: list[DetectedHand]) -> list[str]:
     """Whether the landmarks bend like a hand of the other side, or the network sees one on a second look.
 
     `looks` are in the right-handed view: a hand that they call left is of the other side.
@@ -79,7 +79,7 @@ def _other(side: str) -> str:
     return "left" if side == "right" else "right"
 
 
-def place_doubts(evidence: Evidence, mask: np.ndarray) -> list[str]:
+def framing_warnings(evidence: Evidence, mask: np.ndarray) -> list[str]:
     """Whether the hand is small, or cut by the photo's border."""
     said = []
     if evidence.box < SMALL_HAND:

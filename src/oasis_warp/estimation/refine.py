@@ -22,7 +22,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.shaded_hand import (
+from oasis_warp.avatar.anchors import PICTURE, below_skin
+from oasis_warp.core.camera import project
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import CanonicalGaussians, Evidence, HandPose, PosedHand
+from oasis_warp.estimation.fit import FitSettings, Fitter
+from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.fit_target import Evidence as FitTarget
+from oasis_warp.estimation.landmarks import BONES
+from oasis_warp.estimation.mirrored_input import array, real
+from oasis_warp.estimation.outline import wrist_line
+from oasis_warp.estimation.shaded_hand import (
     CERTAIN,
     Drawn,
     blur,
@@ -32,18 +42,8 @@ from oasis_warp.adaptation.shaded_hand import (
     outline_gap,
     solve_light,
 )
-from oasis_warp.avatar.anchors import PICTURE, below_skin
-from oasis_warp.core.camera import project
-from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import CanonicalGaussians, Evidence, HandPose, PosedHand
-from oasis_warp.estimation.evidence import Evidence as FitEvidence
-from oasis_warp.estimation.fit import FitSettings, Fitter
-from oasis_warp.estimation.fit_state import FitState
-from oasis_warp.estimation.landmarks import BONES
-from oasis_warp.estimation.outline import wrist_line
-from oasis_warp.estimation.right_view import array, real
 from oasis_warp.estimation.surface_state import shape_of, state_of_surface
-from oasis_warp.hand.kinematics import Rig, unit
+from oasis_warp.hand.kinematics import HandKinematics, unit
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 
 SIZE = 96
@@ -176,7 +176,7 @@ class _Problem:
     def __init__(
         self, hand: HandModel, guess: CanonicalGaussians, evidence: Evidence, landmarks: Tensor | None, picture: int
     ):
-        self.rig, camera = Rig(hand), evidence.camera
+        self.rig, camera = HandKinematics(hand), evidence.camera
         device = evidence.image.device
         self.hand = hand.to(device)
         K, carrier, sunk = array(camera.K), array(evidence.rest.vertices), array(below_skin(hand, picture))
@@ -322,13 +322,13 @@ class _Problem:
         return Explanation(float(loss.sum()) / PHOTO_WEIGHT, overlap, int((share > 0).sum()))
 
 
-def _anchor(rig: Rig, start: FitState, size: tuple[int, int], landmarks: Tensor | None) -> Fitter:
+def _anchor(rig: HandKinematics, start: FitState, size: tuple[int, int], landmarks: Tensor | None) -> Fitter:
     """The fit's terms, with its own landmarks and bones at the start for what was not detected."""
     points = rig.landmarks(rig.chain(start.angles, start.shape), start.shape)[0]
     xy, seen = start.project(points) if landmarks is None else array(landmarks), start.in_camera(points)
     bones = unit(seen[BONES[:, 1]] - seen[BONES[:, 0]])
     settings = UNKNOWN if landmarks is None else DETECTED
-    return Fitter(rig, FitEvidence(xy, bones, None, None, size, start.focal), settings=settings, shape=start.shape)
+    return Fitter(rig, FitTarget(xy, bones, None, None, size, start.focal), settings=settings, shape=start.shape)
 
 
 def _cauchy(squared: Tensor, scale: float) -> tuple[Tensor, Tensor]:

@@ -4,9 +4,9 @@ import pytest
 import torch
 from synthetic import evidence_of
 
-from oasis_warp.adaptation.outline import BEYOND, drawn_outline_offsets
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
+from oasis_warp.estimation.drawn_outline import BEYOND, drawn_outline_offsets
 from oasis_warp.render.render import render
 
 SIZE = 256

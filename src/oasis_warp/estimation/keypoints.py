@@ -11,7 +11,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
 from oasis_warp.estimation.given_pose import fit_of_pose
-from oasis_warp.estimation.right_view import real
+from oasis_warp.estimation.mirrored_input import real
 from oasis_warp.hand.template import bundled_hand
 
 _LANDMARK_KEYS = {"side", "xy", "world"}
