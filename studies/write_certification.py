@@ -27,7 +27,7 @@ machine has not built yet are built first, which takes a minute or two more.
 ## What is compared
 
 Every float argument holds numbers that float32 can hold, so that both precisions compute with the same. The twins
-(`oasis_warp.certify.twins`) are dense float64 torch, a formula a line, and share no code with the kernels.
+(`oasis_warp.reference`) are dense float64 torch, a formula a line, and share no code with the kernels.
 
 - **Finite differences**: gradients of the float64 operator against four-point differences of itself along random
   directions of each input, to {fd_bound}.

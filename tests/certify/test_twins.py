@@ -10,8 +10,8 @@ from scipy.special import sph_harm_y
 
 from oasis_warp.certify.case import Draw
 from oasis_warp.certify.families import FAMILIES
-from oasis_warp.certify.twins import face_rotations, harmonics, mesh_posing, rasterization, skinning, visibility
 from oasis_warp.core.rotation import from_axis_angle, from_matrix, to_matrix
+from oasis_warp.reference import face_rotations, harmonics, mesh_posing, rasterization, skinning, visibility
 
 DOUBLE = torch.float64
 EYE = torch.eye(4, dtype=DOUBLE)

@@ -3,9 +3,9 @@ import torch
 from rasterization_scenes import ordinary_scene
 from test_strips import Guards
 
-from oasis_warp.certify.twins import rasterization as twin
 from oasis_warp.ops import blend_colors, blend_weights, rasterization
 from oasis_warp.ops._runtime import blend_strips, weigh_strips
+from oasis_warp.reference import rasterization as twin
 
 
 def weights_and_image(device, dtype, **options):

@@ -5,12 +5,12 @@ import math
 import pytest
 import torch
 
-from oasis_warp.certify.twins import face_rotations as twin
 from oasis_warp.core.rotation import from_axis_angle, from_matrix, multiply, to_matrix
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.correctives import corrective_coefficients
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.ops import face_rotations
+from oasis_warp.reference import face_rotations as twin
 
 
 def sheet(seed, n=4, bend=0.4, dtype=torch.float64, device="cpu"):

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from oasis_warp.certify.twins import mesh_posing as twin
 from oasis_warp.core.rotation import from_axis_angle, to_matrix
 from oasis_warp.ops import pose_on_mesh_covars
+from oasis_warp.reference import mesh_posing as twin
 
 FLOATS = ("rest_vertices", "posed_vertices", "barycentrics", "quats", "scales")
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 from rasterization_scenes import frontal_scene, ordinary_scene
 
-from oasis_warp.certify.twins import rasterization as twin
 from oasis_warp.ops import rasterization
+from oasis_warp.reference import rasterization as twin
 
 # Rel-L2 of a careful float32 rasterizer against float64 is below 1e-6 in values and 2e-5 in gradients; of the float64
 # build against the twin it is the rounding of a few thousand operations.

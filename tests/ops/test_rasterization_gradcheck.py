@@ -9,8 +9,8 @@ import pytest
 import torch
 from rasterization_scenes import frontal_scene
 
-from oasis_warp.certify.twins import rasterization as twin
 from oasis_warp.ops import rasterization
+from oasis_warp.reference import rasterization as twin
 
 MARGIN = 1e-3
 pytestmark = pytest.mark.usefixtures("as_shipped")  # hundreds of calls, and the checks cost more than they do

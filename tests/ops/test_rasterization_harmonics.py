@@ -4,9 +4,9 @@ import pytest
 import torch
 from rasterization_scenes import ordinary_scene
 
-from oasis_warp.certify.twins.harmonics import seen_colors as expected_colors
 from oasis_warp.ops import rasterization
 from oasis_warp.ops.seen_colors import seen_colors
+from oasis_warp.reference.harmonics import seen_colors as expected_colors
 
 
 def scene_and_coefficients(degree=3, cameras=2, dtype=torch.float64, per_camera=False):

@@ -3,8 +3,8 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from oasis_warp.certify.twins import harmonics as twin
 from oasis_warp.ops import spherical_harmonics
+from oasis_warp.reference import harmonics as twin
 
 DEGREES = range(4)
 

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from oasis_warp.certify.twins import visibility as twin
 from oasis_warp.core.rotation import to_matrix
 from oasis_warp.ops import depth_map, depth_visibility
 from oasis_warp.ops._runtime import depth_buffer
+from oasis_warp.reference import visibility as twin
 
 WIDTH, HEIGHT = 37, 26
 TAU = 0.05

@@ -4,9 +4,9 @@ import pytest
 import torch
 from test_visibility import HEIGHT, TAU, WIDTH, some_points, soup, visible
 
-from oasis_warp.certify.twins import visibility as twin
 from oasis_warp.ops import depth_map, depth_visibility
 from oasis_warp.ops._runtime import depth_buffer
+from oasis_warp.reference import visibility as twin
 
 
 @pytest.fixture(params=["vectors", "points"])

@@ -10,7 +10,7 @@ from torch import Tensor
 from oasis_warp import ops
 from oasis_warp.certify import mesh_scenes, rasterization_scenes, skinning_scenes, surface_scenes
 from oasis_warp.certify.case import Case
-from oasis_warp.certify.twins import face_rotations, harmonics, mesh_posing, rasterization, skinning, visibility
+from oasis_warp.reference import face_rotations, harmonics, mesh_posing, rasterization, skinning, visibility
 
 Outputs = tuple[Tensor, ...]
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from oasis_warp.certify.case import LONG_NEEDLES, STIFF, Bounds, Case, Draw
-from oasis_warp.certify.twins.rasterization import NEAR
 from oasis_warp.core.rotation import to_matrix
+from oasis_warp.reference.rasterization import NEAR
 
 SIZES = ((1, 1), (1, 9), (11, 1), (5, 4), (16, 16), (17, 15), (31, 33), (37, 29), (65, 63), (257, 2))
 """Width and height: single pixels and rows, sizes that are no multiple of a tile, strip or vector."""

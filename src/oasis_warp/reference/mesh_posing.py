@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from oasis_warp.certify.twins.face_rotations import plane
 from oasis_warp.core.rotation import multiply, to_matrix
+from oasis_warp.reference.face_rotations import plane
 
 EXPONENTS = {"sqrt_area": 0.5, "area": 1.0, "none": 0.0}
 LIMIT = 1e4
