@@ -9,6 +9,9 @@ from torch import Tensor
 PALM_SIDE, BACK_SIDE, FLANK_SIDE = 0, 1, 2
 """Values of `HandModel.region`."""
 
+KNUCKLES = [5, 9, 13, 17]
+"""Rows of the 21 landmarks that are the knuckles of index, middle, ring and little finger."""
+
 
 @dataclass(frozen=True)
 class HandModel:

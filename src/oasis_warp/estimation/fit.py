@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from oasis_warp.core.hand_model import KNUCKLES
 from oasis_warp.estimation.fit_state import FitState
 from oasis_warp.estimation.fit_target import Evidence
-from oasis_warp.estimation.landmarks import BONES, KNUCKLES
+from oasis_warp.estimation.landmarks import BONES
 from oasis_warp.hand.kinematics import HandKinematics, unit
 
 _PALM = [0, *KNUCKLES]

@@ -13,7 +13,6 @@ from oasis_warp.estimation.networks import HAND_SIZE, PALM_SIZE, Networks
 BONES = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (0, 5), (5, 6), (6, 7), (7, 8), (0, 9), (9, 10), (10, 11), (11, 12),
                   (0, 13), (13, 14), (14, 15), (15, 16), (0, 17), (17, 18), (18, 19), (19, 20)])  # fmt: skip
 """Rows of landmarks that a bone joins, from the wrist outwards."""
-KNUCKLES = [5, 9, 13, 17]
 FINGERS = {"thumb": [1, 2, 3, 4], "index": [5, 6, 7, 8], "middle": [9, 10, 11, 12], "ring": [13, 14, 15, 16],
            "little": [17, 18, 19, 20]}  # fmt: skip
 

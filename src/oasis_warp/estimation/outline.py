@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from oasis_warp.core.hand_model import KNUCKLES
 from oasis_warp.estimation.fit import OutlinePairs
 from oasis_warp.estimation.fit_state import FitState
-from oasis_warp.estimation.landmarks import KNUCKLES, box_size
+from oasis_warp.estimation.landmarks import box_size
 from oasis_warp.estimation.silhouette import silhouette, vertex_normals
 from oasis_warp.hand.kinematics import HandKinematics, unit
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from oasis_warp.estimation.landmarks import FINGERS, KNUCKLES
+from oasis_warp.core.hand_model import KNUCKLES
+from oasis_warp.estimation.landmarks import FINGERS
 from oasis_warp.hand.kinematics import unit
 
 # Half widths of a finger at its four joints [m]: thumb, index, middle, ring, little.

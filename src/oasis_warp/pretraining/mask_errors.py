@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, normalize
 
-from oasis_warp.estimation.landmarks import KNUCKLES
+from oasis_warp.core.hand_model import KNUCKLES
 
 PATCHES = 8
 """Errors change over this part of a picture's side."""
