@@ -24,7 +24,7 @@ from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.prior import choose_prior
-from oasis_warp.reconstruction import carrier_offsets, make_avatar, make_evidence
+from oasis_warp.reconstruction import crop_hand, initial_offsets, make_avatar
 from oasis_warp.render.cameras import orbit_camera
 
 UNSEEN = (90, 180)
@@ -56,15 +56,15 @@ def row(path: Path, priors: list[str], side: int) -> torch.Tensor:
     hand, photo = bundled_hand(), read_photo(path)
     estimator, config = HandEstimator(hand), ReconstructConfig()
     fit = estimator.fit(photo, choose_hand(estimator.find(photo), config.hand, photo.name), force=True)
-    offsets = carrier_offsets(hand, fit)
-    evidence = make_evidence(photo, fit, offsets, config)
+    offsets = initial_offsets(hand, fit)
+    crop = crop_hand(photo, fit, offsets, config)
     gap = torch.full((side, GAP, 3), PAPER / 255)
-    parts = [shrink(evidence.image.flip(1) if fit.side == "left" else evidence.image, side)]
+    parts = [shrink(crop.image.flip(1) if fit.side == "left" else crop.image, side)]
     for name in priors:
-        guess = choose_prior(name if name in ("learned", "none") else Path(name))(evidence)
-        adapted = adapt(hand, guess, evidence)
+        guess = choose_prior(name if name in ("learned", "none") else Path(name))(crop)
+        adapted = adapt(hand, guess, crop)
         for gaussians, light in ((guess, None), (adapted.gaussians, adapted.light)):
-            parts += [gap, views(make_avatar(fit, offsets, evidence, gaussians, light), side)]
+            parts += [gap, views(make_avatar(fit, offsets, crop, gaussians, light), side)]
     return torch.cat(parts, dim=1)
 
 

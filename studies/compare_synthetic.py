@@ -18,9 +18,9 @@ import torch
 import tyro
 
 from oasis_warp.avatar.appearance import label_regions
-from oasis_warp.avatar.observe import observe
+from oasis_warp.avatar.observation import observe
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.types import Camera, Evidence, Photo
+from oasis_warp.core.types import Camera, HandCrop, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.hand.skinning import mirror_points, mirror_pose, rest_hand, skin
@@ -102,7 +102,7 @@ def measure(estimator: HandEstimator, photo: Photo, side: str | None, mask: torc
     camera = Camera(fit.camera.viewmat, fit.camera.K, side_length, side_length)
     # The mirrored surface keeps its winding, so its normals point inwards; observe wants them outwards.
     faces_out = hand if not left else _turned(hand)
-    seen = observe(faces_out, Evidence(square, inside, torch.ones_like(inside), camera, rest, posed))
+    seen = observe(faces_out, HandCrop(square, inside, torch.ones_like(inside), camera, rest, posed))
     regions = label_regions(hand)
     skin_only = (seen.confidence > TRUSTED) & (regions.nail < 0.2)
 

@@ -22,19 +22,19 @@ from torch.nn.functional import avg_pool2d
 
 from oasis_warp import __version__
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.avatar.observe import inner_mask
+from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import Camera, Evidence, TrainingBatch
+from oasis_warp.core.types import Camera, HandCrop, TrainingBatch
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.claimed_folder import claim_folder
 from oasis_warp.evaluation.columns import COLORS, LIGHTS, markdown
 from oasis_warp.evaluation.held_out import FIRST_PERSON, Lighting, Shoot, as_estimated, photograph, true_targets
 from oasis_warp.evaluation.methods import Made, prior_digest
 from oasis_warp.evaluation.metrics import Truth, match_colors, score
-from oasis_warp.evaluation.synthetic import draw_targets, evidence_of
+from oasis_warp.evaluation.synthetic import crop_of, draw_targets
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.anchors import faces_of_vertices
@@ -90,20 +90,20 @@ def settings(longest: int) -> dict[str, Setting]:
     return {title: setting for title, setting in rows.items() if (setting.config.texture_steps or 0) <= longest}
 
 
-def shrink(evidence: Evidence, size: int) -> Evidence:
+def shrink(crop: HandCrop, size: int) -> HandCrop:
     """The photo `size` pixels wide, a whole number of times smaller."""
-    factor = len(evidence.image) // size
+    factor = len(crop.image) // size
 
     def pooled(picture: torch.Tensor) -> torch.Tensor:
         return avg_pool2d(picture[None], factor)[0]
 
-    K = evidence.camera.K.clone()
+    K = crop.camera.K.clone()
     K[:2] /= factor
-    return evidence._replace(
-        image=pooled(evidence.image.permute(2, 0, 1)).permute(1, 2, 0).contiguous(),
-        mask=pooled(evidence.mask[None])[0],
-        above_wrist=pooled(evidence.above_wrist[None])[0],
-        camera=Camera(evidence.camera.viewmat, K, size, size),
+    return crop._replace(
+        image=pooled(crop.image.permute(2, 0, 1)).permute(1, 2, 0).contiguous(),
+        mask=pooled(crop.mask[None])[0],
+        above_wrist=pooled(crop.above_wrist[None])[0],
+        camera=Camera(crop.camera.viewmat, K, size, size),
     )
 
 
@@ -119,7 +119,7 @@ class Bench(NamedTuple):
     """One person in one light."""
 
     hand: HandModel
-    evidence: Evidence
+    crop: HandCrop
     batch: TrainingBatch
     turns: torch.Tensor | None
     truths: list[Truth]
@@ -128,11 +128,11 @@ class Bench(NamedTuple):
 
 def own_psnr(bench: Bench, made: Made) -> float:
     """Of the avatar over its photo, inside the outline [dB]."""
-    evidence, faces = bench.evidence, bench.hand.faces
-    rest = evidence.rest.vertices
+    crop, faces = bench.crop, bench.hand.faces
+    rest = crop.rest.vertices
     light = None if made.light is None else (made.light, surface.vertex_normals(rest, faces))
-    image, alpha = render(pose_gaussians(made.gaussians, faces, rest, evidence.posed.vertices, light), evidence.camera)
-    return masked_psnr(image + (1 - alpha)[..., None] * evidence.image, evidence.image, inner_mask(evidence.mask))
+    image, alpha = render(pose_gaussians(made.gaussians, faces, rest, crop.posed.vertices, light), crop.camera)
+    return masked_psnr(image + (1 - alpha)[..., None] * crop.image, crop.image, inner_mask(crop.mask))
 
 
 def other_psnr(bench: Bench, made: Made) -> float:
@@ -156,14 +156,14 @@ def measure(prior: NetworkPrior, light: Lighting, number: int, options: argparse
     batch = as_estimated(hand, session, light, shoot, 1.0)
     exact = as_estimated(hand, session, light, shoot, 0.0)
     truths = true_targets(exact, hand, faces_of_vertices(hand.faces, len(hand.template)))
-    bench = Bench(hand, evidence_of(batch), batch, session.turns[light], truths, COLORS[light])
-    guess, heads = prior.with_heads(bench.evidence)
+    bench = Bench(hand, crop_of(batch), batch, session.turns[light], truths, COLORS[light])
+    guess, heads = prior.with_heads(bench.crop)
     for way in WAYS:  # kernels are loaded, and the photo's neighbours found, before anything is timed
-        adapt(bundled_hand(), guess, bench.evidence, AdaptConfig(texture=way, texture_steps=2), heads=heads)
+        adapt(bundled_hand(), guess, bench.crop, AdaptConfig(texture=way, texture_steps=2), heads=heads)
     for setting, title in reversed(missing.items()):
-        evidence = shrink(bench.evidence, setting.size)
+        crop = shrink(bench.crop, setting.size)
         start = seconds(device)
-        made = adapt(bundled_hand(), guess, evidence, setting.config, heads=heads)
+        made = adapt(bundled_hand(), guess, crop, setting.config, heads=heads)
         taken, worn = seconds(device) - start, Made(made.gaussians, made.light)
         found[setting.name()] = {
             "seconds": taken,

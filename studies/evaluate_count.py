@@ -21,10 +21,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.adaptation.views import freeze_view
+from oasis_warp.adaptation.views import view_weights
 from oasis_warp.avatar.coarsen import coarsen
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
-from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Photo
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
@@ -32,7 +32,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
-from oasis_warp.reconstruction import carrier_offsets, crop_side, input_errors, make_avatar, make_evidence
+from oasis_warp.reconstruction import crop_hand, crop_side, initial_offsets, input_errors, make_avatar
 from oasis_warp.render.cameras import orbit_camera
 
 SIZES = (64, 96, 128, 192)
@@ -84,7 +84,7 @@ def most_seen(avatar: Avatar) -> Float[Tensor, "N"]:
         for k in range(UNSEEN_ROUND):
             for elevation in ELEVATIONS:
                 camera = orbit_camera(around, 2 * math.pi * k / UNSEEN_ROUND, elevation, UNSEEN_SIZE)
-                by_gaussian = freeze_view(posed, camera).transpose
+                by_gaussian = view_weights(posed, camera).transpose
                 rows = torch.repeat_interleave(torch.arange(len(most)), by_gaussian.crow_indices().long().diff())
                 most.scatter_reduce_(0, rows, by_gaussian.values(), "amax")
     return most
@@ -110,18 +110,18 @@ def main() -> None:
         for size in options.sizes:
             photo = scaled(large, size / side)
             fit = fitted(photo)
-            offsets = carrier_offsets(hand, fit)
-            evidence = make_evidence(photo, fit, offsets, config)
-            own = make_evidence(photo, fit, offsets, ReconstructConfig(size=round(crop_side(fit))))
+            offsets = initial_offsets(hand, fit)
+            crop = crop_hand(photo, fit, offsets, config)
+            own = crop_hand(photo, fit, offsets, ReconstructConfig(size=round(crop_side(fit))))
 
             def made(
-                guess: CanonicalGaussians, fit: HandFit = fit, offsets: Tensor = offsets, evidence: Evidence = evidence
+                guess: CanonicalGaussians, fit: HandFit = fit, offsets: Tensor = offsets, crop: HandCrop = crop
             ) -> Avatar:
-                adapted = adapt(hand, guess, evidence, AdaptConfig(texture_steps=options.steps))
-                return make_avatar(fit, offsets, evidence, adapted.gaussians)
+                adapted = adapt(hand, guess, crop, AdaptConfig(texture_steps=options.steps))
+                return make_avatar(fit, offsets, crop, adapted.gaussians)
 
-            guess = prior(evidence)
-            both = made(guess), made(coarsen(hand, guess, evidence.rest))
+            guess = prior(crop)
+            both = made(guess), made(coarsen(hand, guess, crop.rest))
             likeness = [f"{input_errors(avatar, own)['input_psnr_inner_db']:.1f}" for avatar in both]
             (far, _), (near, area) = alike(*both, FAR), alike(*both, NEAR)
             times = frame_times(list(both))

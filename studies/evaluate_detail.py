@@ -23,19 +23,19 @@ from jaxtyping import Float
 from named_photos import SYNTHETIC, photo_of
 from torch import Tensor
 
-from oasis_warp.avatar.observe import inner_mask
+from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.cli.drawing import Panel, make_sheet, panel_side
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.rotation import from_axis_angle
-from oasis_warp.core.types import Camera, Evidence
+from oasis_warp.core.types import Camera, HandCrop
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import depth_map
-from oasis_warp.reconstruction import CROP_MARGIN, Reconstruction, detail_size, make_evidence, reconstruct
+from oasis_warp.reconstruction import CROP_MARGIN, Reconstruction, crop_hand, detail_size, reconstruct
 from oasis_warp.render.cameras import crop_camera, mirrored_camera
 
 PHOTOS = (
@@ -63,24 +63,24 @@ def place(name: str, folder: Path) -> str:
 
 
 @torch.no_grad()
-def draw(avatar: Avatar, evidence: Evidence) -> Float[Tensor, "S S 3"]:
-    """The avatar over black as `evidence` shows the hand, a left hand mirrored."""
+def draw(avatar: Avatar, crop: HandCrop) -> Float[Tensor, "S S 3"]:
+    """The avatar over black as `crop` shows the hand, a left hand mirrored."""
     left = avatar.side == "left"
-    camera = mirrored_camera(evidence.camera) if left else evidence.camera
+    camera = mirrored_camera(crop.camera) if left else crop.camera
     image = avatar.render(camera, avatar.source_pose, BLACK).image
     return image.flip(1) if left else image
 
 
-def error(made: Reconstruction, evidence: Evidence) -> float:
+def error(made: Reconstruction, crop: HandCrop) -> float:
     """PSNR against the photo, away from the wrist and from outlines of mask and surface [dB].
 
     Between fingers that touch in the photo the surface may have a gap, which no Gaussian fills.
     """
-    camera, faces = evidence.camera, made.avatar.hand.faces
-    seen = depth_map(evidence.posed.vertices, faces, camera.viewmat, camera.K, camera.width, camera.height)
-    hand = evidence.mask * (seen.face_ids >= 0)
-    inside = inner_mask(hand, max(1, round(RIM * len(hand)))) * evidence.above_wrist
-    return masked_psnr(draw(made.avatar, evidence), evidence.image, (inside > 0.5).float())
+    camera, faces = crop.camera, made.avatar.hand.faces
+    seen = depth_map(crop.posed.vertices, faces, camera.viewmat, camera.K, camera.width, camera.height)
+    hand = crop.mask * (seen.face_ids >= 0)
+    inside = inner_mask(hand, max(1, round(RIM * len(hand)))) * crop.above_wrist
+    return masked_psnr(draw(made.avatar, crop), crop.image, (inside > 0.5).float())
 
 
 def file_bytes(avatar: Avatar) -> int:
@@ -112,13 +112,13 @@ def measure(name: str, folder: Path, config: ReconstructConfig) -> list[dict[str
     first = made[PLAIN]
     whole = detail_size(first.fit, config)
     close, far = (
-        make_evidence(photo, first.fit, first.avatar.surface_offsets.cpu(), config, size) for size in (whole, FAR)
+        crop_hand(photo, first.fit, first.avatar.surface_offsets.cpu(), config, size) for size in (whole, FAR)
     )
     times = frame_times([each.avatar for each in made.values()])
     return [
         {
             "photo": name,
-            "own_size": whole,
+            "native_size": whole,
             "size": size,
             "psnr_db": error(each, close),
             "psnr_far_db": error(each, far),
@@ -142,7 +142,7 @@ def table(rows: list[dict]) -> str:
     """The rows as Markdown."""
     lines = [f"| {' | '.join(COLUMNS)} |", f"|{'---|' * len(COLUMNS)}"]
     lines += [
-        f"| {Path(row['photo']).stem} | {row['own_size']} | {row['size']} | {row['psnr_db']:.1f} | "
+        f"| {Path(row['photo']).stem} | {row['native_size']} | {row['size']} | {row['psnr_db']:.1f} | "
         f"{row['psnr_far_db']:.1f} | {row['gaussians']} | {row['bytes'] / 1e6:.1f} | {row['frame']:.2f} | "
         f"{row['detail_s']:.1f} | {row['total_s']:.0f} |"
         for row in rows

@@ -18,16 +18,16 @@ from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.fuse import fuse
 from oasis_warp.adaptation.sightings import look
-from oasis_warp.avatar.observe import inner_mask
+from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
-from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
-from oasis_warp.fusion import fit_surfaces, fit_together, make_evidences, resolutions, with_detail
+from oasis_warp.fusion import crop_hands, fit_surfaces, fit_together, resolutions, with_detail
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import depth_map
-from oasis_warp.reconstruction import make_avatar, over_photo
+from oasis_warp.reconstruction import composite_over_photo, make_avatar
 
 RIM = 1 / 64
 """Share of the crop's side, at the outline, that is not judged."""
@@ -45,17 +45,17 @@ COLUMNS = (
 
 @torch.no_grad()
 def errors(
-    gaussians: CanonicalGaussians, fit: HandFit, offsets: Tensor, evidence: Evidence, gain: Tensor, best: Tensor
+    gaussians: CanonicalGaussians, fit: HandFit, offsets: Tensor, crop: HandCrop, gain: Tensor, best: Tensor
 ) -> list[float]:
     """Of fine structure [1/255]: wherever the photo shows the hand, and where it is `best` (a vertex each)."""
     lit = gaussians._replace(colors=(gaussians.colors * gain).clamp(0, 1))
-    picture = over_photo(make_avatar(fit, offsets, evidence, lit), evidence)
-    apart = (picture - evidence.image).permute(2, 0, 1)
+    picture = composite_over_photo(make_avatar(fit, offsets, crop, lit), crop)
+    apart = (picture - crop.image).permute(2, 0, 1)
     fine = (apart - avg_pool2d(apart, WINDOW, stride=1, padding=WINDOW // 2)).square().mean(0)
-    faces, camera = bundled_hand().faces, evidence.camera
-    seen = depth_map(evidence.posed.vertices, faces, camera.viewmat, camera.K, camera.width, camera.height)
-    hand = evidence.mask * (seen.face_ids >= 0)
-    inside = inner_mask(hand, max(1, round(RIM * len(hand)))) * evidence.above_wrist > 0.5
+    faces, camera = bundled_hand().faces, crop.camera
+    seen = depth_map(crop.posed.vertices, faces, camera.viewmat, camera.K, camera.width, camera.height)
+    hand = crop.mask * (seen.face_ids >= 0)
+    inside = inner_mask(hand, max(1, round(RIM * len(hand)))) * crop.above_wrist > 0.5
     own = best[faces[seen.face_ids.clamp_min(0).long()]].all(-1)
     return [_root_mean(fine[inside]), _root_mean(fine[inside & own])]
 
@@ -75,9 +75,9 @@ def main() -> None:
     photos = [read_photo(path) for path in options.photos]
     fits = fit_together(estimator, photos, [choose_hand(estimator.find(p), "largest", p.name) for p in photos])
     surfaces = fit_surfaces(fits)
-    evidences = make_evidences(photos, fits, surfaces, config)
+    crops = crop_hands(photos, fits, surfaces, config)
     start = time.perf_counter()
-    fusion = fuse(hand, evidences, resolutions(fits, evidences), prior, AdaptConfig(texture_steps=config.steps))
+    fusion = fuse(hand, crops, resolutions(fits, crops), prior, AdaptConfig(texture_steps=config.steps))
     fused = time.perf_counter()
     fine, close = with_detail(fusion, photos, fits, surfaces, config)
     took = (time.perf_counter() - fused) / (fused - start)

@@ -42,15 +42,15 @@ from oasis_warp.evaluation.held_out import (
 from oasis_warp.evaluation.metrics import Truth, match_colors, score
 from oasis_warp.evaluation.photo_pairs import compare_with_photo, draw_as_photo
 from oasis_warp.evaluation.same_hand import photos_of_hands
-from oasis_warp.evaluation.synthetic import evidence_of
-from oasis_warp.fusion import fit_surfaces, fit_together, make_evidences, resolutions, settle_surfaces, with_detail
+from oasis_warp.evaluation.synthetic import crop_of
+from oasis_warp.fusion import crop_hands, fit_surfaces, fit_together, resolutions, settle_surfaces, with_detail
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.pretraining.photographed import training_batch
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
-from oasis_warp.reconstruction import make_avatar, make_evidence
+from oasis_warp.reconstruction import crop_hand, make_avatar
 from oasis_warp.render.render import render
 from oasis_warp.synthetic.picture import SyntheticBatch, render_planned
 from oasis_warp.synthetic.plan import PICTURES_EACH, Scenery, plan_shots
@@ -109,11 +109,11 @@ def draw(gaussians: CanonicalGaussians, batch: TrainingBatch) -> list[torch.Tens
 def measure_person(number: int, look: str, prior: Prior, options: argparse.Namespace) -> Iterator[Row]:
     """Rows of avatars of each photo alone and of the first 2, 3, ..."""
     batches, truths = photograph(number, options.size, look, torch.device(options.device))
-    evidences = [evidence_of(batch) for batch in batches]
-    guesses, pixels = [prior(evidence) for evidence in evidences], [float(SURROUNDINGS) for _ in batches]
+    crops = [crop_of(batch) for batch in batches]
+    guesses, pixels = [prior(crop) for crop in crops], [float(SURROUNDINGS) for _ in batches]
     config = AdaptConfig(texture_steps=options.steps, light=options.light)
     for chosen in [(k,) for k in range(MOST)] + [tuple(range(n)) for n in range(2, MOST + 1)]:
-        shown = ([part[k] for k in chosen] for part in (evidences, pixels, guesses))
+        shown = ([part[k] for k in chosen] for part in (crops, pixels, guesses))
         fusion = fuse(bundled_hand(), *shown, config)
         seen = (fusion.sightings.confidence > 0.5).any(0).float().mean()
         fused = fusion.gaussians if fusion.lights is None else in_even_light(fusion.gaussians, fusion.lights[0])
@@ -140,15 +140,15 @@ def avatar_of(
     photos, landmarks = zip(*pairs, strict=True)
     fits = fit_together(estimator, photos, landmarks)
     surfaces = fit_surfaces(fits)
-    evidences = make_evidences(photos, fits, surfaces, config)
-    guesses = [prior(evidence) for evidence in evidences]
+    crops = crop_hands(photos, fits, surfaces, config)
+    guesses = [prior(crop) for crop in crops]
     surfaces = settle_surfaces(photos, fits, surfaces, guesses, config)
-    evidences = make_evidences(photos, fits, surfaces, config)
-    fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), guesses, adapt)
+    crops = crop_hands(photos, fits, surfaces, config)
+    fusion = fuse(estimator.hand, crops, resolutions(fits, crops), guesses, adapt)
     seen = float((fusion.sightings.confidence > 0.5).any(0).float().mean())
     gaussians, _ = with_detail(fusion, photos, fits, surfaces, config)
     light = fusion.lights[0] if fusion.lights else None
-    return make_avatar(fits[0], surfaces.shared, evidences[0], gaussians, light), seen
+    return make_avatar(fits[0], surfaces.shared, crops[0], gaussians, light), seen
 
 
 def measure_hand(name: str, paths: list[Path], prior: Prior, options: argparse.Namespace) -> Iterator[Row]:
@@ -176,8 +176,8 @@ def measure_hand(name: str, paths: list[Path], prior: Prior, options: argparse.N
         photo, landmarks = pairs[target]
         for chosen, (avatar, seen) in made:
             fit = estimator.fit(photo, landmarks, shape=avatar.shape.cpu(), force=True)
-            evidence = make_evidence(photo, fit, avatar.surface_offsets.cpu(), config)
-            found = compare_with_photo(avatar, draw_as_photo(avatar, evidence, fit.pose), evidence, fit.pose)
+            crop = crop_hand(photo, fit, avatar.surface_offsets.cpu(), config)
+            found = compare_with_photo(avatar, draw_as_photo(avatar, crop, fit.pose), crop, fit.pose)
             yield {
                 "who": f"{name}/{photo.name}", "photos": chosen, "stage": "one_shot", "seen": seen,
                 "psnr": found.psnr, "ssim_quarter": found.ssim_quarter, "overlap": found.overlap,

@@ -32,7 +32,7 @@ from oasis_warp.evaluation.photo_pairs import compare_pairs
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.reconstruction import make_evidence, reconstruct
+from oasis_warp.reconstruction import crop_hand, reconstruct
 from oasis_warp.render.cameras import orbit_camera
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".webp"}
@@ -76,8 +76,8 @@ def measure(path: Path, root: Path, out: Path, prior: str, seed: int, size: int 
         return {"photo": name, "result": str(error)}
     seconds = time.perf_counter() - start
     shares = coverage(made.avatar)
-    evidence = make_evidence(photo, made.fit, made.avatar.surface_offsets, config)
-    image = evidence.image.flip(1) if made.avatar.side == "left" else evidence.image
+    crop = crop_hand(photo, made.fit, made.avatar.surface_offsets, config)
+    image = crop.image.flip(1) if made.avatar.side == "left" else crop.image
     stem = out / name
     stem.parent.mkdir(parents=True, exist_ok=True)
     made.avatar.save(stem.with_suffix(".safetensors"))

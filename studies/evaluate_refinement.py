@@ -25,7 +25,7 @@ from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import AdaptConfig
-from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, TrainingBatch
+from oasis_warp.core.types import Camera, CanonicalGaussians, HandCrop, TrainingBatch
 from oasis_warp.estimation.mirrored_input import array
 from oasis_warp.estimation.refine import refine
 from oasis_warp.estimation.surface_state import shape_of, state_of_surface
@@ -41,7 +41,7 @@ from oasis_warp.evaluation.held_out import (
     true_targets,
 )
 from oasis_warp.evaluation.metrics import Truth, match_colors, score
-from oasis_warp.evaluation.synthetic import evidence_of
+from oasis_warp.evaluation.synthetic import crop_of
 from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.anchors import faces_of_vertices
@@ -63,8 +63,8 @@ MEASURES = {
 class Case:
     """One photo of a person, its estimated surface and its true one in the same crop."""
 
-    evidence: Evidence
-    truth: Evidence
+    crop: HandCrop
+    truth: HandCrop
     batch: TrainingBatch
 
 
@@ -85,9 +85,9 @@ class Bench:
         true = training_batch(
             self.there, session.photos[light], session.targets[light], shoot.size, random, noise
         )  # fmt: skip
-        return Case(evidence_of(batch), evidence_of(true), batch)
+        return Case(crop_of(batch), crop_of(true), batch)
 
-    def errors(self, found: Evidence, truth: Evidence) -> dict[str, float]:
+    def errors(self, found: HandCrop, truth: HandCrop) -> dict[str, float]:
         """How far the posed surface is from the true one; keys as in `MEASURES`."""
         a, b = found.posed.vertices, truth.posed.vertices
         gap = (project(found.camera, a)[0] - project(truth.camera, b)[0]).norm(dim=1)
@@ -103,28 +103,28 @@ class Bench:
             "iou": float((covered & true).sum() / (covered | true).sum()),
         }
 
-    def visible(self, evidence: Evidence) -> Tensor:
+    def visible(self, crop: HandCrop) -> Tensor:
         """Which vertices the photo shows."""
-        vertices, camera = evidence.posed.vertices, evidence.camera
+        vertices, camera = crop.posed.vertices, crop.camera
         every = torch.arange(len(vertices), device=self.device)
         return depth_visibility(
             vertices, vertices, self.there.faces, camera.K, camera.viewmat, camera.width, camera.height,
             margin=MARGIN, point_vertices=every,
         )[0] > 0.5  # fmt: skip
 
-    def outline(self, evidence: Evidence) -> Tensor:
+    def outline(self, crop: HandCrop) -> Tensor:
         """Pixels that the surface covers."""
-        camera = evidence.camera
+        camera = crop.camera
         seen = depth_map(
-            evidence.posed.vertices, self.there.faces, camera.viewmat, camera.K, camera.width, camera.height,
+            crop.posed.vertices, self.there.faces, camera.viewmat, camera.K, camera.width, camera.height,
             outputs=("face_ids",),
         )  # fmt: skip
         return seen.face_ids >= 0
 
-    def angles(self, evidence: Evidence) -> np.ndarray:
+    def angles(self, crop: HandCrop) -> np.ndarray:
         """The 26 angles of the model that is nearest to the surface."""
-        K, rest = array(evidence.camera.K), array(evidence.rest.vertices)
-        posed = array(evidence.posed.vertices)
+        K, rest = array(crop.camera.K), array(crop.rest.vertices)
+        posed = array(crop.posed.vertices)
         return state_of_surface(self.rig, shape_of(self.rig, rest), rest, posed, K[0, 0], K[:2, 2]).state.angles
 
     def pictures(self, guess: CanonicalGaussians, case: Case, light: Lighting, truths: list[Truth]) -> Iterator[float]:
@@ -151,18 +151,18 @@ def measure(bench: Bench, prior: Prior, options: argparse.Namespace) -> tuple[di
             truths = true_targets(exact.batch, bench.there, bench.vertex_faces) if options.avatars else []
             for factor in options.errors:
                 case = bench.case(session, light, shoot, factor)
-                guess = prior(case.evidence)
+                guess = prior(case.crop)
                 start = time.perf_counter()
-                refined = refine(bench.hand, guess, case.evidence)
+                refined = refine(bench.hand, guess, case.crop)
                 seconds = time.perf_counter() - start
-                before, after = (bench.errors(e, case.truth) for e in (case.evidence, refined.evidence))
+                before, after = (bench.errors(e, case.truth) for e in (case.crop, refined.crop))
                 surfaces[light, factor].append((before, after, refined.accepted, seconds))
                 if options.avatars:
-                    for name, evidence in (
-                        ("estimated", case.evidence), ("refined", refined.evidence), ("true", case.truth)
+                    for name, crop in (
+                        ("estimated", case.crop), ("refined", refined.crop), ("true", case.truth)
                     ):  # fmt: skip
-                        guess = prior(evidence)
-                        adapted = adapt(bench.hand, guess, evidence, AdaptConfig(light="keep")).gaussians
+                        guess = prior(crop)
+                        adapted = adapt(bench.hand, guess, crop, AdaptConfig(light="keep")).gaussians
                         for stage, gaussians in (("raw", guess), ("one-shot", adapted)):
                             found = bench.pictures(gaussians, case, light, truths)
                             avatars[light, factor, name, stage].append(float(np.mean(list(found))))

@@ -1,4 +1,4 @@
-"""Measure what light is usual on hands in rooms: the constants of adaptation/room_light.py.
+"""Measure what light is usual on hands in rooms: the constants of adaptation/sh_lighting.py.
 
     python studies/measure_light.py --people 40
 
@@ -15,13 +15,13 @@ from torch import Tensor
 from oasis_warp.adaptation.adapt import in_photo
 from oasis_warp.adaptation.calibrate import calibrate
 from oasis_warp.avatar.lighting import GAMMA, posed_normals
-from oasis_warp.avatar.observe import observe
+from oasis_warp.avatar.observation import observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera
 from oasis_warp.evaluation.held_out import FIRST_PERSON, Shoot, as_estimated, photograph
-from oasis_warp.evaluation.synthetic import evidence_of
+from oasis_warp.evaluation.synthetic import crop_of
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import NetworkPrior, bundled_prior
 from oasis_warp.render.render import render
@@ -39,13 +39,13 @@ def light_of(hand: HandModel, prior: NetworkPrior, number: int) -> Tensor:
     shoot = Shoot()
     session = photograph(shoot, "ordinary", FIRST_PERSON + OTHERS + number, torch.device("cpu"))
     batch = as_estimated(hand, session, "same", shoot, 1.0)
-    evidence, turns = evidence_of(batch), session.turns["same"]
-    guess = prior(evidence)
-    _, view, trusted = in_photo(hand, guess, evidence)
-    colors = calibrate(view, guess.colors, evidence.image, trusted, AdaptConfig()).apply(guess.colors)
+    crop, turns = crop_of(batch), session.turns["same"]
+    guess = prior(crop)
+    _, view, trusted = in_photo(hand, guess, crop)
+    colors = calibrate(view, guess.colors, crop.image, trusted, AdaptConfig()).apply(guess.colors)
     skin = guess._replace(colors=colors)
 
-    own = (evidence.posed.vertices, evidence.camera, evidence.image, evidence.mask, torch.eye(3))
+    own = (crop.posed.vertices, crop.camera, crop.image, crop.mask, torch.eye(3))
     pictures = [own] + [
         (posed, Camera(viewmat, K, shoot.size, shoot.size), image / mask.clamp_min(LEAST)[..., None], mask, turn)
         for posed, viewmat, K, image, mask, turn in zip(
@@ -55,14 +55,14 @@ def light_of(hand: HandModel, prior: NetworkPrior, number: int) -> Tensor:
     ]  # fmt: skip
     normal, right = torch.zeros(3, 4, 4), torch.zeros(3, 4, 1)
     for posed, camera, image, mask, turn in pictures:
-        there = evidence._replace(
-            posed=evidence.posed._replace(vertices=posed), camera=camera, image=image, mask=mask
+        there = crop._replace(
+            posed=crop.posed._replace(vertices=posed), camera=camera, image=image, mask=mask
         )
-        drawn, alpha = render(pose_gaussians(skin, hand.faces, evidence.rest.vertices, posed), camera)
+        drawn, alpha = render(pose_gaussians(skin, hand.faces, crop.rest.vertices, posed), camera)
         seen = observe(hand, there)
         known = observe(hand, there._replace(image=drawn / alpha.clamp_min(LEAST)[..., None])).colors
         known, light = known.clamp(0, 1) ** GAMMA, seen.colors.clamp(0, 1) ** GAMMA
-        directions = posed_normals(evidence.rest.vertices, posed, hand.faces) @ turn
+        directions = posed_normals(crop.rest.vertices, posed, hand.faces) @ turn
         basis = torch.cat([torch.ones_like(directions[:, :1]), directions], 1)
         terms = basis * known.T[..., None]
         weighted = terms * seen.confidence[:, None]

@@ -18,13 +18,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_warp.adaptation.adapt import adapt, read_skin
-from oasis_warp.adaptation.complete import complete_field
-from oasis_warp.adaptation.room_light import DARK
-from oasis_warp.adaptation.skin_or_shade import MOST, marks
+from oasis_warp.adaptation.adapt import adapt, remove_photo_light
+from oasis_warp.adaptation.albedo_shading import MOST, marks
+from oasis_warp.adaptation.inpainting import inpaint
+from oasis_warp.adaptation.sh_lighting import DARK
 from oasis_warp.avatar.anchors import vertex_colors
-from oasis_warp.avatar.lighting import with_shade_on
-from oasis_warp.avatar.observe import observe
+from oasis_warp.avatar.lighting import with_shade_baked
+from oasis_warp.avatar.observation import observe
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
@@ -32,7 +32,7 @@ from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.same_hand import photos_of_hands
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
-from oasis_warp.reconstruction import carrier_offsets, make_evidence
+from oasis_warp.reconstruction import crop_hand, initial_offsets
 
 ANGLES = (0, 15, 30, 45, 70, 180)
 """Between which the skin has turned [degrees]."""
@@ -64,17 +64,17 @@ def read_hand(paths: list[Path]) -> list[Beyond]:
         except InputError as error:
             print(f"left out: {error}")
             continue
-        evidence = make_evidence(photo, fit, carrier_offsets(hand, fit), config)
+        crop = crop_hand(photo, fit, initial_offsets(hand, fit), config)
         with torch.no_grad():
-            guess = prior(evidence)
-            sure, light = read_skin(hand, guess, evidence, settings)
-        made = adapt(hand, guess, evidence, settings)
+            guess = prior(crop)
+            sure, light = remove_photo_light(hand, guess, crop, settings)
+        made = adapt(hand, guess, crop, settings)
         assert light is not None and light.facing is not None
-        learned = vertex_colors(with_shade_on(made.gaussians), len(hand.template))
+        learned = vertex_colors(with_shade_baked(made.gaussians), len(hand.template))
         guessed = vertex_colors(guess._replace(colors=made.calibration.apply(guess.colors)), len(hand.template))
         whole = (learned.clamp_min(DARK) / guessed.clamp_min(DARK)).log().clamp(-MOST, MOST)
         confidence = observe(hand, sure).confidence
-        smooth = [complete_field(evidence.rest.vertices, hand.faces, whole, confidence, way) for way in WAYS]
+        smooth = [inpaint(crop.rest.vertices, hand.faces, whole, confidence, way) for way in WAYS]
         parts = [smooth[0], *(fine - coarse for coarse, fine in pairwise(smooth)), whole - smooth[-1]]
         found.append(Beyond(torch.stack(parts), confidence, light.facing))
     return found

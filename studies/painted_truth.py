@@ -27,7 +27,7 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
-from oasis_warp.reconstruction import make_evidence, reconstruct
+from oasis_warp.reconstruction import crop_hand, reconstruct
 from oasis_warp.render.cameras import orbit_camera
 
 KINDS = ("tattoo", "writing", "ring", "nail polish")
@@ -119,11 +119,11 @@ def make_truth(hand: HandModel, prior: Prior, *, back: bool, size: int, steps: i
     landmarks = Landmarks(xy, None, "right", 1.0, 1.0, "truth")
     fit = HandFit("right", shape, pose, camera, landmarks, drawn.alpha, 0.0, 0.0, 1.0, 0.0, ())
     still = torch.zeros_like(hand.template)
-    evidence = make_evidence(photo, fit, still, ReconstructConfig())
-    adapted = adapt(hand, prior(evidence), evidence, AdaptConfig(texture_steps=steps))
+    crop = crop_hand(photo, fit, still, ReconstructConfig())
+    adapted = adapt(hand, prior(crop), crop, AdaptConfig(texture_steps=steps))
     avatar = Avatar(
         side="right", shape=shape, surface_offsets=still, gaussians=adapted.gaussians, source_pose=pose,
-        source_camera=evidence.camera, light=adapted.light,
+        source_camera=crop.camera, light=adapted.light,
     )  # fmt: skip
     return Truth(hand, pose, camera, avatar, photo, waves)
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from oasis_warp.core.types import Evidence, HandPose
+from oasis_warp.core.types import HandCrop, HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
@@ -28,7 +28,7 @@ SIZE = 256
 """Side of the crop [px]; the default of `oasis reconstruct`."""
 
 
-def evidence_on(device: torch.device) -> Evidence:
+def evidence_on(device: torch.device) -> HandCrop:
     """An open hand in front of noise."""
     hand = bundled_hand().to(device)
     rest = rest_hand(hand, torch.zeros(len(hand.shape_names), device=device))
@@ -37,7 +37,7 @@ def evidence_on(device: torch.device) -> Evidence:
     posed = skin(hand, rest, pose)
     image = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0)).to(device)
     mask = torch.ones(SIZE, SIZE, device=device)
-    return Evidence(image, mask, mask, orbit_camera(posed.vertices, 0.0, size=SIZE), rest, posed)
+    return HandCrop(image, mask, mask, orbit_camera(posed.vertices, 0.0, size=SIZE), rest, posed)
 
 
 def measure(which: str | Path, device: torch.device, repeats: int) -> dict[str, object]:
@@ -55,15 +55,15 @@ def measure(which: str | Path, device: torch.device, repeats: int) -> dict[str, 
     if not isinstance(prior, NetworkPrior):
         raise SystemExit(f"{which}: expected a network, got the prior {prior.about['name']!r}.")
     loading, loading_busy = now() - start, time.process_time() - busy
-    evidence = evidence_on(device)
+    crop = evidence_on(device)
     for _ in range(WARM_UP):
-        prior(evidence)
+        prior(crop)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
     times, cpu_times = [], []
     for _ in range(repeats):
         start, busy = now(), time.process_time()
-        prior(evidence)
+        prior(crop)
         times.append(now() - start)
         cpu_times.append(time.process_time() - busy)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -26,7 +26,7 @@ from typing import Any
 import torch
 
 from oasis_warp.assets import asset
-from oasis_warp.avatar.anchors import SINK
+from oasis_warp.avatar.anchors import INSET
 from oasis_warp.core import surface
 from oasis_warp.evaluation.columns import COLORS, GROUPS, LIGHTS, SYNTHETIC, cells, markdown
 from oasis_warp.evaluation.held_out import FIRST_PERSON, Shoot, as_estimated, photograph
@@ -129,7 +129,7 @@ def gaussian_table(network: HandNetwork, photos: int) -> str:
         batch = as_estimated(hand, session, "wild", shoot, 1.0)
         found, rest = network(input_of_batch(batch)), batch.rest[0]
         n = found.offsets.shape[1]
-        deep = SINK - (found.offsets[0] * surface.vertex_normals(rest, hand.faces)).sum(-1)
+        deep = INSET - (found.offsets[0] * surface.vertex_normals(rest, hand.faces)).sum(-1)
         kinds["on vertices"].append(
             {**_shapes(found.opacities[0, :n], found.scales[0, :n]), "under the skin, mm": 1e3 * deep}
         )

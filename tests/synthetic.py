@@ -1,10 +1,10 @@
-"""A hand with known colours, seen by a known camera: evidence whose truth the tests know."""
+"""A hand with known colours, seen by a known camera: crop whose truth the tests know."""
 
 import torch
 
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.pose import pose_gaussians
-from oasis_warp.core.types import CanonicalGaussians, Evidence, HandPose
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.render.cameras import orbit_camera
@@ -20,11 +20,11 @@ def posed_hand(hand, pose_name="open", orientation=PALM_TO_CAMERA):
     return rest, pose, skin(hand, rest, pose)
 
 
-def evidence_of(hand, vertex_colors, size=96, **pose) -> tuple[Evidence, CanonicalGaussians, HandPose]:
+def crop_of(hand, vertex_colors, size=96, **pose) -> tuple[HandCrop, CanonicalGaussians, HandPose]:
     """What a camera sees of a hand with the given colours, the true Gaussians and the pose."""
     rest, hand_pose, posed = posed_hand(hand, **pose)
     anchors = place_anchors(hand, rest)
     truth = anchors.with_colors(vertex_to_gaussians(vertex_colors, hand.faces, anchors))
     camera = orbit_camera(posed.vertices, 0.0, size=size)
     drawn = render(pose_gaussians(truth, hand.faces, rest.vertices, posed.vertices), camera)
-    return Evidence(drawn.image, drawn.alpha, torch.ones_like(drawn.alpha), camera, rest, posed), truth, hand_pose
+    return HandCrop(drawn.image, drawn.alpha, torch.ones_like(drawn.alpha), camera, rest, posed), truth, hand_pose

@@ -8,14 +8,14 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from oasis_warp import fusion
-from oasis_warp.avatar.observe import inner_mask
+from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Landmarks, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.fusion import check_sides, reconstruct_same_hand
 from oasis_warp.losses.image import masked_psnr
-from oasis_warp.reconstruction import make_avatar, make_evidence, over_photo, reconstruct
+from oasis_warp.reconstruction import composite_over_photo, crop_hand, make_avatar, reconstruct
 from oasis_warp.render.cameras import orbit_camera
 
 PHOTOS = Path(__file__).parent / "data" / "photos"
@@ -82,7 +82,7 @@ def alone(palm):
 def test_even_light_is_asked_for_of_several_photos_as_of_one(palm, monkeypatch):
     asked = []
 
-    def stop(hand, evidences, resolution, prior, config, progress):
+    def stop(hand, crops, resolution, prior, config, progress):
         asked.append(config.light)
         raise InterruptedError
 
@@ -115,23 +115,23 @@ def test_the_detail_of_both_photos_is_in_the_avatar(palm):
     assert fine.errors["n_gaussians"] > coarse.errors["n_gaussians"] + 10_000
     assert fine.errors["back_seen_percent"] > 50 and fine.errors["palm_seen_percent"] > 50
     for k, (photo, own) in enumerate(zip(photos, fine.photos, strict=True)):
-        evidence = make_evidence(photo, own.fit, fine.avatar.surface_offsets, ReconstructConfig(), 448)
+        crop = crop_hand(photo, own.fit, fine.avatar.surface_offsets, ReconstructConfig(), 448)
         before, after = (
-            detail_error(over_photo(as_in(made.avatar, own, evidence), evidence), evidence) for made in (coarse, fine)
+            detail_error(composite_over_photo(as_in(made.avatar, own, crop), crop), crop) for made in (coarse, fine)
         )
         assert after < 0.9 * before, (k, before, after)
 
 
-def as_in(avatar, photo, evidence):
+def as_in(avatar, photo, crop):
     """The avatar as a photo shows it, in the first photo's light."""
-    return make_avatar(photo.fit, avatar.surface_offsets, evidence, avatar.gaussians)
+    return make_avatar(photo.fit, avatar.surface_offsets, crop, avatar.gaussians)
 
 
-def detail_error(picture, evidence):
+def detail_error(picture, crop):
     """Root mean square of what differs from the photo within a few pixels, light aside, away from the outline."""
-    apart = (picture - evidence.image).permute(2, 0, 1)
+    apart = (picture - crop.image).permute(2, 0, 1)
     fine = apart - avg_pool2d(apart, 9, stride=1, padding=4)
-    return float(fine[:, inner_mask(evidence.mask * evidence.above_wrist, 12) > 0.5].square().mean().sqrt())
+    return float(fine[:, inner_mask(crop.mask * crop.above_wrist, 12) > 0.5].square().mean().sqrt())
 
 
 @pytest.mark.slow

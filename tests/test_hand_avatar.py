@@ -2,7 +2,7 @@ import copy
 
 import pytest
 import torch
-from synthetic import PALM_TO_CAMERA, evidence_of
+from synthetic import PALM_TO_CAMERA, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
@@ -19,14 +19,14 @@ from oasis_warp.render.cameras import mirrored_camera
 
 @pytest.fixture(scope="module")
 def right(hand):
-    evidence, truth, pose = evidence_of(hand, region_colors(label_regions(hand), 0.03), size=64)
+    crop, truth, pose = crop_of(hand, region_colors(label_regions(hand), 0.03), size=64)
     return Avatar(
         side="right",
         shape=torch.zeros(len(hand.shape_names)),
         surface_offsets=torch.zeros_like(hand.template),
         gaussians=truth,
         source_pose=pose,
-        source_camera=evidence.camera,
+        source_camera=crop.camera,
     )
 
 

@@ -8,7 +8,7 @@ from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.hand.skinning import hand21, mirror_pose, rest_hand, skin
-from oasis_warp.reconstruction import carrier_offsets, landmarks_in_crop, make_evidence, reconstruct
+from oasis_warp.reconstruction import crop_hand, crop_landmarks, initial_offsets, reconstruct
 
 PHOTO = Path(__file__).parent / "data" / "photos" / "thumb_up_left_06.jpg"
 
@@ -16,9 +16,9 @@ PHOTO = Path(__file__).parent / "data" / "photos" / "thumb_up_left_06.jpg"
 def test_landmarks_of_a_left_hand_lie_on_the_mirrored_model(hand):
     photo, estimator = read_photo(PHOTO), HandEstimator(hand)
     fit = estimator.fit(photo, choose_hand(estimator.find(photo), "left", photo.name))
-    evidence = make_evidence(photo, fit, carrier_offsets(hand, fit), ReconstructConfig())
+    crop = crop_hand(photo, fit, initial_offsets(hand, fit), ReconstructConfig())
     model = hand21(skin(hand, rest_hand(hand, fit.shape), mirror_pose(fit.pose)), hand)
-    away = landmarks_in_crop(fit, evidence.camera) - project(evidence.camera, model)[0]
+    away = crop_landmarks(fit, crop.camera) - project(crop.camera, model)[0]
     assert away.norm(dim=1).median() < 8  # px of 256; the mirror image would be a hundred away
 
 

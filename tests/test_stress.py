@@ -6,7 +6,7 @@ import pytest
 import torch
 from stress_one_shot import is_sane, likeness, make
 from stresses import STRESSES, Stressed, box
-from synthetic import evidence_of
+from synthetic import crop_of
 
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.sharpen import sharpen
@@ -32,13 +32,13 @@ LIKE_IN_THE_DARK = 17.0
 
 
 @pytest.fixture(scope="module")
-def evidence(hand):
-    return evidence_of(hand, region_colors(label_regions(hand), 0.03), size=48)[0]
+def crop(hand):
+    return crop_of(hand, region_colors(label_regions(hand), 0.03), size=48)[0]
 
 
 @pytest.mark.parametrize("damage", ["black", "white", "no mask", "all mask", "one pixel", "noise"])
-def test_no_photo_and_no_mask_makes_colours_that_are_none(hand, evidence, damage):
-    image, mask = evidence.image, evidence.mask
+def test_no_photo_and_no_mask_makes_colours_that_are_none(hand, crop, damage):
+    image, mask = crop.image, crop.mask
     one = torch.zeros_like(mask)
     one[len(mask) // 2, len(mask) // 2] = 1
     image, mask = {
@@ -49,14 +49,14 @@ def test_no_photo_and_no_mask_makes_colours_that_are_none(hand, evidence, damage
         "one pixel": (image, one),
         "noise": (torch.rand(image.shape, generator=torch.Generator().manual_seed(0)), mask),
     }[damage]
-    damaged = evidence._replace(image=image, mask=mask)
+    damaged = crop._replace(image=image, mask=mask)
     few = AdaptConfig(calibration_steps=5, texture_steps=3, reference_views=1)
     adapted = adapt(hand, MeanPrior(hand)(damaged), damaged, few)
     assert is_sane(sharpen(hand, adapted.gaussians, [damaged]).gaussians)
 
 
-def test_gaussians_that_are_no_numbers_no_colours_or_too_large_are_told(hand, evidence):
-    gaussians = MeanPrior(hand)(evidence)
+def test_gaussians_that_are_no_numbers_no_colours_or_too_large_are_told(hand, crop):
+    gaussians = MeanPrior(hand)(crop)
     assert is_sane(gaussians)
     for name, value in (("colors", float("nan")), ("colors", 1.5), ("scales", 1.0), ("opacities", float("inf"))):
         broken = getattr(gaussians, name).clone()

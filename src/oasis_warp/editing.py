@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.carried import Canvas
 from oasis_warp.adaptation.repaint import repaint
+from oasis_warp.adaptation.reprojection import Canvas
 from oasis_warp.avatar.lighting import shading_picture
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError

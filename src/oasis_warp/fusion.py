@@ -8,23 +8,23 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.fuse import Fusion, add_detail, fuse
-from oasis_warp.adaptation.sightings import Sightings
+from oasis_warp.adaptation.sightings import VertexObservations
 from oasis_warp.avatar.coarsen import coarsen
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.avatar.quality import (
     SEEN,
     SurfaceQuality,
     assess_surface,
-    best_known,
-    photo_doubts,
+    combine_quality,
+    coverage_warnings,
+    photo_warnings,
     shares,
-    surface_doubts,
 )
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.types import CanonicalGaussians, Evidence, HandFit, Landmarks, Photo, PosedHand
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, Landmarks, Photo, PosedHand
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.shared_shape import shared_shape
 from oasis_warp.hand.skinning import rest_hand
@@ -34,15 +34,15 @@ from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
 from oasis_warp.reconstruction import (
     COARSE_SIZE,
-    carrier_offsets,
+    composite_over_photo,
+    crop_hand,
     crop_side,
     finer_size,
+    initial_offsets,
     input_errors,
-    is_small,
+    is_low_resolution,
     make_avatar,
-    make_evidence,
-    onto_drawn_outline,
-    over_photo,
+    refine_offsets,
 )
 
 OTHER_LIGHT = 1.6
@@ -125,33 +125,33 @@ def reconstruct_same_hand(
     with stage("kernels"):
         warm_up(config.device)
     with stage("crop"):
-        evidences = make_evidences(photos, fits, surfaces, config)
+        crops = crop_hands(photos, fits, surfaces, config)
     guesses = []
-    for evidence in evidences:
+    for crop in crops:
         with stage("guesses"):
-            guesses.append(prior(evidence))
+            guesses.append(prior(crop))
     with stage("outline"):
         surfaces = settle_surfaces(photos, fits, surfaces, guesses, config)
-        evidences = make_evidences(photos, fits, surfaces, config)
+        crops = crop_hands(photos, fits, surfaces, config)
     with stage("fusion"):
-        if is_small(config, *fits):
-            guesses = [coarsen(estimator.hand, guess, evidences[0].rest) for guess in guesses]
+        if is_low_resolution(config, *fits):
+            guesses = [coarsen(estimator.hand, guess, crops[0].rest) for guess in guesses]
         settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
-        fusion = fuse(estimator.hand, evidences, resolutions(fits, evidences), guesses, settings, progress)
+        fusion = fuse(estimator.hand, crops, resolutions(fits, crops), guesses, settings, progress)
     with stage("detail"):
         gaussians, close = with_detail(fusion, photos, fits, surfaces, config, progress)
     lights = fusion.lights or [None] * len(photos)
-    avatar = make_avatar(fits[0], surfaces.shared, evidences[0], gaussians, lights[0])
+    avatar = make_avatar(fits[0], surfaces.shared, crops[0], gaussians, lights[0])
     with stage("quality"):
         about, qualities = [], []
-        parts = zip(photos, fits, surfaces.own, evidences, close, fusion.gains, lights, strict=True)
-        for (photo, fit, own, evidence, near, gain, light), seen in zip(
-            parts, surface_shares(evidences[0], fusion.sightings), strict=True
+        parts = zip(photos, fits, surfaces.own, crops, close, fusion.gains, lights, strict=True)
+        for (photo, fit, own, crop, near, gain, light), seen in zip(
+            parts, surface_shares(crops[0], fusion.sightings), strict=True
         ):
             # in the photo's own light, and on the surface by which it was read
             in_its_light = gaussians._replace(colors=(gaussians.colors * gain).clamp(0, 1))
-            there = make_avatar(fit, own, evidence, in_its_light, light)
-            qualities.append(assess_surface(estimator.hand, evidence, over_photo(there, evidence)))
+            there = make_avatar(fit, own, crop, in_its_light, light)
+            qualities.append(assess_surface(estimator.hand, crop, composite_over_photo(there, crop)))
             errors = {
                 "reprojection_percent": fit.reprojection,
                 "worst_point_percent": fit.worst_point,
@@ -161,11 +161,11 @@ def reconstruct_same_hand(
             }
             red, green, blue = gain.tolist()
             about.append(PhotoOfHand(photo.name, fit, (red, green, blue), errors))
-        quality = best_known(qualities)
-        shown = shares(estimator.hand, evidences[0].rest.vertices, quality)
-        doubts = [photo_doubts(near.image, near.mask, crop_side(fit)) for near, fit in zip(close, fits, strict=True)]
+        quality = combine_quality(qualities)
+        shown = shares(estimator.hand, crops[0].rest.vertices, quality)
+        doubts = [photo_warnings(near.image, near.mask, crop_side(fit)) for near, fit in zip(close, fits, strict=True)]
     errors = {"n_gaussians": float(len(gaussians.opacities)), **shown}
-    said = (*_warnings(about, doubts), *surface_doubts(shown))
+    said = (*_warnings(about, doubts), *coverage_warnings(shown))
     return FusedReconstruction(avatar, tuple(about), prior.about, stages, errors, said, quality)
 
 
@@ -220,50 +220,50 @@ class Surfaces(NamedTuple):
 
 
 def fit_surfaces(fits: Sequence[HandFit]) -> Surfaces:
-    """See `reconstruction.carrier_offsets`, of all fits together and of each."""
+    """See `reconstruction.initial_offsets`, of all fits together and of each."""
     hand = bundled_hand()
-    own = [carrier_offsets(hand, fit) for fit in fits]
-    return Surfaces(own[0] if len(own) == 1 else carrier_offsets(hand, *fits), own)
+    own = [initial_offsets(hand, fit) for fit in fits]
+    return Surfaces(own[0] if len(own) == 1 else initial_offsets(hand, *fits), own)
 
 
 def settle_surfaces(
     photos: Sequence[Photo], fits: Sequence[HandFit], surfaces: Surfaces, guesses: Sequence[CanonicalGaussians],
     config: ReconstructConfig,
 ) -> Surfaces:  # fmt: skip
-    """See `reconstruction.onto_drawn_outline`, of all photos together and of each."""
+    """See `reconstruction.refine_offsets`, of all photos together and of each."""
     hand, each = bundled_hand(), zip(photos, fits, surfaces.own, guesses, strict=True)
     own = [
-        onto_drawn_outline(hand, [photo], [fit], offsets, [guess], config) for photo, fit, offsets, guess in each
+        refine_offsets(hand, [photo], [fit], offsets, [guess], config) for photo, fit, offsets, guess in each
     ]
     if len(own) == 1:
         return Surfaces(own[0], own)
-    return Surfaces(onto_drawn_outline(hand, photos, fits, surfaces.shared, guesses, config), own)
+    return Surfaces(refine_offsets(hand, photos, fits, surfaces.shared, guesses, config), own)
 
 
-def make_evidences(
+def crop_hands(
     photos: Sequence[Photo],
     fits: Sequence[HandFit],
     surfaces: Surfaces,
     config: ReconstructConfig,
     *,
     finer: bool = False,
-) -> list[Evidence]:
-    """As `reconstruction.make_evidence`, each photo seen on its own surface, all with the shared one at rest.
+) -> list[HandCrop]:
+    """As `reconstruction.crop_hand`, each photo seen on its own surface, all with the shared one at rest.
 
     All of one size, or with `finer` each as large as its detail, if that is larger.
     """
     plain = rest_hand(bundled_hand(), fits[0].shape)
     shared = plain._replace(vertices=plain.vertices + surfaces.shared)
-    evidences = []
+    crops = []
     for photo, fit, own in zip(photos, fits, surfaces.own, strict=True):
-        evidence = make_evidence(photo, fit, own, config, finer_size(fit, config) if finer else None)
-        evidences.append(evidence._replace(rest=PosedHand(*(part.to(evidence.image) for part in shared))))
-    return evidences
+        crop = crop_hand(photo, fit, own, config, finer_size(fit, config) if finer else None)
+        crops.append(crop._replace(rest=PosedHand(*(part.to(crop.image) for part in shared))))
+    return crops
 
 
-def resolutions(fits: Sequence[HandFit], evidences: Sequence[Evidence]) -> list[float]:
+def resolutions(fits: Sequence[HandFit], crops: Sequence[HandCrop]) -> list[float]:
     """Pixels of each photo a pixel of its crop, along a line."""
-    return [float(fit.camera.K[0, 0] / e.camera.K[0, 0]) for fit, e in zip(fits, evidences, strict=True)]
+    return [float(fit.camera.K[0, 0] / e.camera.K[0, 0]) for fit, e in zip(fits, crops, strict=True)]
 
 
 def with_detail(
@@ -273,31 +273,31 @@ def with_detail(
     surfaces: Surfaces,
     config: ReconstructConfig,
     progress: Progress = silent,
-) -> tuple[CanonicalGaussians, list[Evidence]]:
+) -> tuple[CanonicalGaussians, list[HandCrop]]:
     """The Gaussians of `fusion` with the detail that `config` asks for, and the crops that show it."""
-    close = make_evidences(photos, fits, surfaces, config, finer=True)
+    close = crop_hands(photos, fits, surfaces, config, finer=True)
     if all(finer_size(fit, config) is None for fit in fits):
         return fusion.gaussians, close
     resolution = resolutions(fits, close)
     return add_detail(bundled_hand(), fusion, close, resolution, COARSE_SIZE, progress), close
 
 
-def surface_shares(evidence: Evidence, sightings: Sightings) -> list[dict[str, float]]:
+def surface_shares(crop: HandCrop, sightings: VertexObservations) -> list[dict[str, float]]:
     """Of the hand's surface at rest [%]: what each photo shows, and what it shows best of all."""
     seen = sightings.confidence >= SEEN
     best = (sightings.confidence * sightings.share).argmax(0)
     return [
         {
-            "seen_percent": 100 * _area_share(evidence, shown),
-            "best_percent": 100 * _area_share(evidence, shown & (best == k)),
+            "seen_percent": 100 * _area_share(crop, shown),
+            "best_percent": 100 * _area_share(crop, shown & (best == k)),
         }
         for k, shown in enumerate(seen)
     ]
 
 
-def _area_share(evidence: Evidence, where: Tensor) -> float:
-    faces = bundled_hand().faces.to(evidence.image.device)
-    areas = surface.vertex_areas(evidence.rest.vertices, faces)
+def _area_share(crop: HandCrop, where: Tensor) -> float:
+    faces = bundled_hand().faces.to(crop.image.device)
+    areas = surface.vertex_areas(crop.rest.vertices, faces)
     return float((areas * where).sum() / areas.sum())
 
 

@@ -29,7 +29,7 @@ from oasis_warp.hand.skinning import mirror_hand, mirror_points, rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import Look, check_finite, rest_mesh
 from oasis_warp.render.render import render
-from oasis_warp.render.replay import Recording, Recordings, replayable, replayed
+from oasis_warp.render.replay import CapturedGraph, GraphCache, replayable, replayed
 
 
 class Avatar:
@@ -58,7 +58,7 @@ class Avatar:
         """Shape coefficients of the hand model [standard deviations]."""
         self.surface_offsets = surface_offsets
         """From the model's surface at rest to the one that carries Gaussians [m]: onto the photo's outline, below
-        the skin (`avatar.anchors.below_skin`), and by what the drawn outline still missed."""
+        the skin (`avatar.anchors.inset_offsets`), and by what the drawn outline still missed."""
         self._gaussians = gaussians
         self.source_pose = source_pose
         """The pose in the photo, in the frame of `source_camera`."""
@@ -85,7 +85,7 @@ class Avatar:
             normals = surface.vertex_normals(self.rest.vertices, self.hand.faces)
             self._light = (mirror_light(light), mirror_points(normals)) if left else (light, normals)
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
-        self._recordings = Recordings()
+        self._graphs = GraphCache()
 
     @property
     def gaussians(self) -> CanonicalGaussians:
@@ -176,7 +176,7 @@ class Avatar:
             check_finite(**named)
         size = camera.width, camera.height
         with Look(**named) if looking else nullcontext():
-            return Render(*replayed(self._recordings, size, lambda: Recording(draw, inputs, self.shape), draw, inputs))
+            return Render(*replayed(self._graphs, size, lambda: CapturedGraph(draw, inputs, self.shape), draw, inputs))
 
     def in_even_light(self) -> "Avatar":
         """The same hand without its photo's light, as far as that is known."""

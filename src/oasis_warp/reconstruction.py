@@ -11,18 +11,18 @@ from torch import Tensor
 
 from oasis_warp.adaptation.adapt import adapt, detail_of
 from oasis_warp.adaptation.sharpen import sharpen
-from oasis_warp.avatar.anchors import PICTURE, below_skin
+from oasis_warp.avatar.anchors import PRIOR_SIZE, inset_offsets
 from oasis_warp.avatar.coarsen import coarsen
-from oasis_warp.avatar.observe import inner_mask
+from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.prior import Prior
-from oasis_warp.avatar.quality import SurfaceQuality, assess_surface, photo_doubts, shares, surface_doubts
+from oasis_warp.avatar.quality import SurfaceQuality, assess_surface, coverage_warnings, photo_warnings, shares
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, HandFit, HandLight, Landmarks, Photo, Render
+from oasis_warp.core.types import Camera, CanonicalGaussians, HandCrop, HandFit, HandLight, Landmarks, Photo, Render
 from oasis_warp.data.crop import resample_square, square_around
-from oasis_warp.estimation.drawn_outline import drawn_outline_offsets
+from oasis_warp.estimation.drawn_outline import rendered_outline_offsets
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.keypoints import read_keypoints
 from oasis_warp.estimation.moved_fit import keeps_quality, with_pose
@@ -39,7 +39,7 @@ from oasis_warp.render.cameras import crop_camera, mirrored_camera
 
 CROP_MARGIN = 1.12
 """Side of the crop over the longer extent of the mask."""
-COARSE_SIZE = PICTURE
+COARSE_SIZE = PRIOR_SIZE
 """Side of the crop that the prior reads and the whole hand is fitted to [px]: as many pixels as it has Gaussians. What
 a larger one shows beyond it goes into finer Gaussians."""
 SMALL_SIZE = 128
@@ -102,44 +102,44 @@ def reconstruct(
     with stage("fit"):
         fit = estimator.fit(photo, given, force=config.force) if isinstance(given, Landmarks) else given
     with stage("outline"):
-        offsets = carrier_offsets(hand, fit)
+        offsets = initial_offsets(hand, fit)
     with stage("kernels"):  # compiled only once there is a hand to draw
         warm_up(config.device)
     with stage("crop"):
-        evidence = make_evidence(photo, fit, offsets, config)
+        crop = crop_hand(photo, fit, offsets, config)
     with stage("prior"):
-        guess = prior(evidence)
+        guess = prior(crop)
     moved = 0.0
     if config.refine == "on" and isinstance(given, Landmarks):  # a pose that was given is right as it is
         with stage("refinement"):
-            refinement = refine(hand, guess, evidence, landmarks_in_crop(fit, evidence.camera), own_size(fit))
+            refinement = refine(hand, guess, crop, crop_landmarks(fit, crop.camera), native_size(fit))
             pose = refinement.pose
             found = with_pose(hand, fit, mirror_pose(pose) if fit.side == "left" else pose)
             if refinement.accepted and keeps_quality(found, fit):
                 fit, moved = found, refinement.moved
-                offsets = carrier_offsets(hand, fit)
-                evidence = make_evidence(photo, fit, offsets, config)
-                guess = prior(evidence)
+                offsets = initial_offsets(hand, fit)
+                crop = crop_hand(photo, fit, offsets, config)
+                guess = prior(crop)
     with stage("outline"):
-        offsets = onto_drawn_outline(hand, [photo], [fit], offsets, [guess], config)
-        evidence = make_evidence(photo, fit, offsets, config)
+        offsets = refine_offsets(hand, [photo], [fit], offsets, [guess], config)
+        crop = crop_hand(photo, fit, offsets, config)
     with stage("adaptation"):
-        if is_small(config, fit):
-            guess = coarsen(hand, guess, evidence.rest)
+        if is_low_resolution(config, fit):
+            guess = coarsen(hand, guess, crop.rest)
         settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
-        adaptation = adapt(hand, guess, evidence, settings, progress)
-    gaussians, close = adaptation.gaussians, evidence
+        adaptation = adapt(hand, guess, crop, settings, progress)
+    gaussians, close = adaptation.gaussians, crop
     light = adaptation.light
     if (size := finer_size(fit, config)) is not None:
         with stage("detail"):
-            close = make_evidence(photo, fit, offsets, config, size)
+            close = crop_hand(photo, fit, offsets, config, size)
             plain = detail_of(hand, gaussians, close, light)
             gaussians = sharpen(hand, gaussians, [plain], progress=progress).gaussians
-    avatar = make_avatar(fit, offsets, evidence, gaussians, light)
+    avatar = make_avatar(fit, offsets, crop, gaussians, light)
     with stage("quality"):
-        quality = assess_surface(hand, evidence, over_photo(avatar, evidence))
-        shown = shares(hand, evidence.rest.vertices, quality)
-        doubts = (*surface_doubts(shown), *photo_doubts(close.image, close.mask, crop_side(fit)))
+        quality = assess_surface(hand, crop, composite_over_photo(avatar, crop))
+        shown = shares(hand, crop.rest.vertices, quality)
+        doubts = (*coverage_warnings(shown), *photo_warnings(close.image, close.mask, crop_side(fit)))
         errors = {
             "reprojection_percent": fit.reprojection,
             "worst_point_percent": fit.worst_point,
@@ -151,15 +151,15 @@ def reconstruct(
     return Reconstruction(avatar, fit, prior.about, stages, errors, (*fit.warnings, *doubts), quality)
 
 
-def carrier_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
+def initial_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
     """From the fitted rest surface to the one that carries Gaussians [m]: onto the photos' outlines, then inwards.
 
     How far inwards is right for pictures as fine as the finest of the photos.
     """
-    return outline_offsets(hand, *fits) + below_skin(hand, max(map(own_size, fits)))
+    return outline_offsets(hand, *fits) + inset_offsets(hand, max(map(native_size, fits)))
 
 
-def onto_drawn_outline(
+def refine_offsets(
     hand: HandModel,
     photos: Sequence[Photo],
     fits: Sequence[HandFit],
@@ -169,18 +169,18 @@ def onto_drawn_outline(
 ) -> Float[Tensor, "V 3"]:
     """`offsets`, moved until the prior's guesses are drawn with the outlines of their photos [m]."""
     views = [
-        make_evidence(photo, fit, offsets, config, detail_size(fit, config))
+        crop_hand(photo, fit, offsets, config, detail_size(fit, config))
         for photo, fit in zip(photos, fits, strict=True)
     ]
-    return offsets + drawn_outline_offsets(hand, guesses, views).cpu()
+    return offsets + rendered_outline_offsets(hand, guesses, views).cpu()
 
 
-def own_size(fit: HandFit) -> int:
+def native_size(fit: HandFit) -> int:
     """Side of the crop that shows all there is in the photo, within what is of use here [px]."""
     return min(max(round(crop_side(fit)), COARSE_SIZE), FINEST_SIZE)
 
 
-def is_small(config: ReconstructConfig, *fits: HandFit) -> bool:
+def is_low_resolution(config: ReconstructConfig, *fits: HandFit) -> bool:
     """Whether all photos are so small that fewer Gaussians do; not when `config` asks for a size."""
     return config.size == "auto" and max(map(crop_side, fits)) <= SMALL_SIZE
 
@@ -190,7 +190,7 @@ def crop_side(fit: HandFit) -> float:
     return float(square_around(fit.mask, CROP_MARGIN)[2])
 
 
-def landmarks_in_crop(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
+def crop_landmarks(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
     """The fit's landmarks as the crop of its hand shows them [px]; those of a left hand are mirrored."""
     xy, camera = fit.landmarks.xy, fit.camera
     if fit.side == "left":
@@ -201,7 +201,7 @@ def landmarks_in_crop(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
 
 def detail_size(fit: HandFit, config: ReconstructConfig) -> int:
     """Side of the crop with all the detail that `config` asks for [px]."""
-    return own_size(fit) if config.size == "auto" else config.size
+    return native_size(fit) if config.size == "auto" else config.size
 
 
 def finer_size(fit: HandFit, config: ReconstructConfig) -> int | None:
@@ -213,9 +213,9 @@ def finer_size(fit: HandFit, config: ReconstructConfig) -> int | None:
     return size if config.light != "even" and size > COARSE_SIZE else None
 
 
-def make_evidence(
+def crop_hand(
     photo: Photo, fit: HandFit, offsets: torch.Tensor, config: ReconstructConfig, size: int | None = None
-) -> Evidence:
+) -> HandCrop:
     """The square crop that avatars are fitted to, with the fitted surface in its camera; a left hand is mirrored.
 
     Its side is `size` [px], or else what `config` asks for, up to `COARSE_SIZE`.
@@ -245,7 +245,7 @@ def make_evidence(
     def cut(plane):
         return resample_square(plane.contiguous(), left, top, side, size).clamp(0, 1).to(device)
 
-    return Evidence(
+    return HandCrop(
         image=cut(image),
         mask=cut(mask),
         above_wrist=cut(above),
@@ -258,16 +258,16 @@ def make_evidence(
 def make_avatar(
     fit: HandFit,
     offsets: torch.Tensor,
-    evidence: Evidence,
+    crop: HandCrop,
     gaussians: CanonicalGaussians,
     light: HandLight | None = None,
 ) -> Avatar:
-    """The hand of `fit` with the looks of `gaussians` in `light`; `offsets` and `evidence` are those of its making."""
-    camera = evidence.camera
+    """The hand of `fit` with the looks of `gaussians` in `light`; `offsets` and `crop` are those of its making."""
+    camera = crop.camera
     return Avatar(
         side=fit.side,
-        shape=fit.shape.to(evidence.image),
-        surface_offsets=offsets.to(evidence.image),
+        shape=fit.shape.to(crop.image),
+        surface_offsets=offsets.to(crop.image),
         gaussians=gaussians,
         source_pose=fit.pose,
         source_camera=mirrored_camera(camera) if fit.side == "left" else camera,
@@ -275,32 +275,32 @@ def make_avatar(
     )
 
 
-def _input_view(avatar: Avatar, evidence: Evidence) -> Render:
-    """The avatar over black as `evidence` shows the hand; a left hand is mirrored."""
+def _input_view(avatar: Avatar, crop: HandCrop) -> Render:
+    """The avatar over black as `crop` shows the hand; a left hand is mirrored."""
     if avatar.side == "right":
-        return avatar.render(evidence.camera, avatar.source_pose, BLACK)
-    image, alpha = avatar.render(mirrored_camera(evidence.camera), avatar.source_pose, BLACK)
+        return avatar.render(crop.camera, avatar.source_pose, BLACK)
+    image, alpha = avatar.render(mirrored_camera(crop.camera), avatar.source_pose, BLACK)
     return Render(image.flip(1), alpha.flip(1))
 
 
 @torch.no_grad()
-def over_photo(avatar: Avatar, evidence: Evidence) -> Float[Tensor, "S S 3"]:
+def composite_over_photo(avatar: Avatar, crop: HandCrop) -> Float[Tensor, "S S 3"]:
     """The avatar drawn over its own photo."""
-    image, alpha = _input_view(avatar, evidence)
-    return image + (1 - alpha)[..., None] * evidence.image
+    image, alpha = _input_view(avatar, crop)
+    return image + (1 - alpha)[..., None] * crop.image
 
 
 @torch.no_grad()
-def input_errors(avatar: Avatar, evidence: Evidence) -> dict[str, float]:
+def input_errors(avatar: Avatar, crop: HandCrop) -> dict[str, float]:
     """How well the avatar explains its own photo: over black, inside the mask above the wrist line, in the crop."""
-    image, alpha = _input_view(avatar, evidence)
-    judged = evidence.above_wrist > 0.5
-    inside = ((evidence.mask > 0.5) & judged).to(image)
+    image, alpha = _input_view(avatar, crop)
+    judged = crop.above_wrist > 0.5
+    inside = ((crop.mask > 0.5) & judged).to(image)
     covered = (alpha > 0.5) & judged
     union = (covered | (inside > 0)).sum().clamp_min(1)
     return {
-        "input_psnr_db": masked_psnr(image, evidence.image, inside),
-        "input_psnr_inner_db": masked_psnr(image, evidence.image, inner_mask(inside)),
+        "input_psnr_db": masked_psnr(image, crop.image, inside),
+        "input_psnr_inner_db": masked_psnr(image, crop.image, inner_mask(inside)),
         "render_mask_iou": float((covered & (inside > 0)).sum() / union),
         "n_gaussians": float(len(avatar.gaussians.opacities)),
     }

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, evidence_of
+from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, crop_of
 
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.fuse import fuse
@@ -21,8 +21,8 @@ LIGHT = torch.tensor([0.75, 0.85, 1.1])
 """Of the photo of the back over that of the palm."""
 
 
-def lit(evidence, gain):
-    return evidence._replace(image=(evidence.image * gain).clamp(0, 1))
+def lit(crop, gain):
+    return crop._replace(image=(crop.image * gain).clamp(0, 1))
 
 
 @pytest.fixture(scope="module")
@@ -33,16 +33,16 @@ def colors(hand):
 
 @pytest.fixture(scope="module")
 def palm(hand, colors):
-    return evidence_of(hand, colors, orientation=PALM_TO_CAMERA)[0]
+    return crop_of(hand, colors, orientation=PALM_TO_CAMERA)[0]
 
 
 @pytest.fixture(scope="module")
 def back(hand, colors):
-    return evidence_of(hand, colors, orientation=BACK_TO_CAMERA)[0]
+    return crop_of(hand, colors, orientation=BACK_TO_CAMERA)[0]
 
 
-def fused_by_mean(hand, evidences, config):
-    return fuse(hand, evidences, [1.0] * len(evidences), [MeanPrior(hand)(one) for one in evidences], config)
+def fused_by_mean(hand, crops, config):
+    return fuse(hand, crops, [1.0] * len(crops), [MeanPrior(hand)(one) for one in crops], config)
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +55,11 @@ def alone(hand, palm):
     return adapt(hand, MeanPrior(hand)(palm), palm, STEPS)
 
 
-def likeness(hand, gaussians, evidence, light):
-    normals = surface.vertex_normals(evidence.rest.vertices, hand.faces)
-    posed = pose_gaussians(gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices, (light, normals))
-    image = render(posed, evidence.camera).image
-    return masked_psnr(image, evidence.image, (evidence.mask > 0.9).float())
+def likeness(hand, gaussians, crop, light):
+    normals = surface.vertex_normals(crop.rest.vertices, hand.faces)
+    posed = pose_gaussians(gaussians, hand.faces, crop.rest.vertices, crop.posed.vertices, (light, normals))
+    image = render(posed, crop.camera).image
+    return masked_psnr(image, crop.image, (crop.mask > 0.9).float())
 
 
 def test_two_photos_explain_palm_and_back_in_the_light_of_the_first(hand, palm, back, fused, alone):
@@ -70,7 +70,7 @@ def test_two_photos_explain_palm_and_back_in_the_light_of_the_first(hand, palm, 
 
 
 def test_the_light_of_photos_that_share_a_side_is_told_exactly(hand, colors, palm):
-    other = lit(evidence_of(hand, colors, pose_name="victory")[0], LIGHT)
+    other = lit(crop_of(hand, colors, pose_name="victory")[0], LIGHT)
     sightings = look(hand, [palm, other], [1.0, 1.0])
     found = photo_gains(sightings, torch.full_like(colors, 0.5))  # a guess that knows nothing
     assert torch.allclose(found[0], torch.ones(3))

@@ -2,13 +2,13 @@
 
 import pytest
 import torch
-from synthetic import evidence_of
+from synthetic import crop_of
 
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.light import SKIN_DEVIATION, weighted_deviation
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.observe import observe
+from oasis_warp.avatar.observation import observe
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig
 
@@ -25,12 +25,12 @@ def lines(hand, height, spacing):
 
 def adapted(hand, skin, shown, light):
     """Colours at the vertices that the photo shows well, and the true ones, after the one gain between them."""
-    evidence, _, _ = evidence_of(hand, shown.clamp(0, 1))
-    prior = MeanPrior(hand)(evidence)
+    crop, _, _ = crop_of(hand, shown.clamp(0, 1))
+    prior = MeanPrior(hand)(crop)
     prior = prior._replace(colors=vertex_to_gaussians(skin, hand.faces, prior))
-    made = adapt(hand, prior, evidence, AdaptConfig(light=light, texture_steps=0, reference_views=0)).gaussians
+    made = adapt(hand, prior, crop, AdaptConfig(light=light, texture_steps=0, reference_views=0)).gaussians
     index = made.vertex_index
-    seen = observe(hand, evidence).confidence[index] > 0.9
+    seen = observe(hand, crop).confidence[index] > 0.9
     found, true = made.colors[: len(index)][seen], skin[index][seen]
     return found * (true.mean(0) / found.mean(0)), true, index[seen]
 

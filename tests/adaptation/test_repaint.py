@@ -2,9 +2,9 @@ import pytest
 import torch
 from painted_truth import Chart, draw_truth, make_truth
 
-from oasis_warp.adaptation.carried import Canvas
 from oasis_warp.adaptation.repaint import repaint
-from oasis_warp.avatar.lighting import with_shade_on
+from oasis_warp.adaptation.reprojection import Canvas
+from oasis_warp.avatar.lighting import with_shade_baked
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import BLACK
@@ -36,7 +36,7 @@ def run(truth, canvas, steps=25):
 
 def draw(truth, gaussians, pose, camera):
     posed = truth.avatar.mesh(pose).vertices
-    shown = with_shade_on(gaussians)
+    shown = with_shade_baked(gaussians)
     return render(pose_gaussians(shown, truth.hand.faces, truth.avatar.rest.vertices, posed), camera, background=BLACK)
 
 

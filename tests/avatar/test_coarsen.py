@@ -1,11 +1,11 @@
 import pytest
 import torch
-from synthetic import evidence_of
+from synthetic import crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.coarsen import coarsen
 from oasis_warp.avatar.densify import densify
-from oasis_warp.avatar.observe import inner_mask
+from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
@@ -17,8 +17,8 @@ from oasis_warp.render.render import render
 
 @pytest.fixture(scope="module")
 def case(hand):
-    evidence, fine, _ = evidence_of(hand, region_colors(label_regions(hand), 0.03))
-    return evidence.rest, fine, coarsen(hand, fine, evidence.rest)
+    crop, fine, _ = crop_of(hand, region_colors(label_regions(hand), 0.03))
+    return crop.rest, fine, coarsen(hand, fine, crop.rest)
 
 
 def draw(hand, rest, gaussians, pose, size):

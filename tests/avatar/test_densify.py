@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
-from oasis_warp.avatar.densify import SINK, densify, parts_for_spacing, read_at
+from oasis_warp.avatar.densify import GROUND_DEPTH, densify, parts_for_spacing, read_at
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.hand.skinning import rest_hand
@@ -60,7 +60,7 @@ def test_vertex_gaussians_under_the_parts_sink_into_the_hand(dressed):
     normals = surface.vertex_normals(vertices, faces)[gaussians.vertex_index]
     depth = -((made.gaussians.offsets - gaussians.offsets) * normals).sum(1)
     assert sunk.sum() > 50
-    assert torch.allclose(depth, torch.where(sunk, SINK, 0.0), atol=1e-7)
+    assert torch.allclose(depth, torch.where(sunk, GROUND_DEPTH, 0.0), atol=1e-7)
 
 
 def test_parts_of_faint_faces_are_as_opaque_as_those_of_solid_ones(dressed):
@@ -77,7 +77,7 @@ def test_the_ground_is_the_same_whatever_lay_on_the_vertices(dressed):
     n, parts = len(gaussians.vertex_index), torch.where(chosen, 2, 1)
     normals = surface.vertex_normals(vertices, faces)[gaussians.vertex_index]
     wide = gaussians._replace(
-        offsets=-2 * SINK * normals,
+        offsets=-2 * GROUND_DEPTH * normals,
         scales=torch.cat([3 * gaussians.scales[:n], gaussians.scales[n:]]),
         opacities=torch.cat([0.6 * gaussians.opacities[:n], gaussians.opacities[n:]]),
     )

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from synthetic import evidence_of
+from synthetic import crop_of
 from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.adapt import adapt
@@ -11,10 +11,10 @@ from oasis_warp.avatar.quality import (
     REACH,
     SurfaceQuality,
     assess_surface,
-    best_known,
-    photo_doubts,
+    combine_quality,
+    coverage_warnings,
+    photo_warnings,
     shares,
-    surface_doubts,
 )
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
@@ -29,13 +29,13 @@ def case(hand):
     """An open palm with stripes that no prior knows, and how well it is known if all that is seen is explained."""
     stripes = 0.08 * torch.sin(hand.template[:, :1] * (2 * torch.pi / 0.012))
     colors = (region_colors(label_regions(hand), 0.03) + stripes).clamp(0, 1)
-    evidence, truth, _ = evidence_of(hand, colors)
-    return evidence, truth, assess_surface(hand, evidence, evidence.image)
+    crop, truth, _ = crop_of(hand, colors)
+    return crop, truth, assess_surface(hand, crop, crop.image)
 
 
 def test_the_side_towards_the_camera_is_seen_and_the_other_is_not(hand, case):
-    evidence, _, quality = case
-    toward = -surface.vertex_normals(evidence.posed.vertices, hand.faces)[:, 2]  # the camera looks along z
+    crop, _, quality = case
+    toward = -surface.vertex_normals(crop.posed.vertices, hand.faces)[:, 2]  # the camera looks along z
     assert quality.visibility[toward > 0.7].mean() > 0.8
     assert quality.visibility[toward < 0].max() == 0
     assert quality.uncertainty[toward > 0.7].mean() < 0.1
@@ -44,21 +44,21 @@ def test_the_side_towards_the_camera_is_seen_and_the_other_is_not(hand, case):
 
 
 def test_uncertainty_grows_no_faster_than_the_distance_along_the_surface(hand, case):
-    evidence, _, quality = case
+    crop, _, quality = case
     a, b = surface.mesh_edges(hand.faces).T
     lost = -torch.log(1 - quality.uncertainty.double())
-    length = (evidence.rest.vertices[a] - evidence.rest.vertices[b]).norm(dim=1)
+    length = (crop.rest.vertices[a] - crop.rest.vertices[b]).norm(dim=1)
     assert ((lost[a] - lost[b]).abs() <= length / REACH + 1e-3).all()
 
 
 def test_where_the_avatar_is_unlike_the_photo_it_is_less_certain(hand, case):
-    evidence, _, quality = case
-    left = torch.arange(evidence.image.shape[1]) < evidence.image.shape[1] // 2
-    wrong = torch.where(left[:, None], evidence.image * 0.6, evidence.image)
-    doubted = assess_surface(hand, evidence, wrong)
+    crop, _, quality = case
+    left = torch.arange(crop.image.shape[1]) < crop.image.shape[1] // 2
+    wrong = torch.where(left[:, None], crop.image * 0.6, crop.image)
+    doubted = assess_surface(hand, crop, wrong)
     change = doubted.uncertainty - quality.uncertainty
     assert change.min() >= -1e-6
-    uv = evidence.posed.vertices @ evidence.camera.viewmat[:3, :3].T + evidence.camera.viewmat[:3, 3]
+    uv = crop.posed.vertices @ crop.camera.viewmat[:3, :3].T + crop.camera.viewmat[:3, 3]
     on_left = uv[:, 0] / uv[:, 2] < -0.04
     seen = quality.visibility > 0.9
     assert change[seen & on_left].mean() > 0.3
@@ -66,12 +66,12 @@ def test_where_the_avatar_is_unlike_the_photo_it_is_less_certain(hand, case):
 
 
 def test_what_is_uncertain_is_more_often_wrong(hand, case):
-    evidence, truth, _ = case
-    adapted = adapt(hand, MeanPrior(hand)(evidence), evidence, AdaptConfig(texture_steps=20, reference_views=0))
+    crop, truth, _ = case
+    adapted = adapt(hand, MeanPrior(hand)(crop), crop, AdaptConfig(texture_steps=20, reference_views=0))
     assert adapted.light is not None
-    light = adapted.light, surface.vertex_normals(evidence.rest.vertices, hand.faces)
-    posed = pose_gaussians(adapted.gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices, light)
-    quality = assess_surface(hand, evidence, render(posed, evidence.camera).image)
+    light = adapted.light, surface.vertex_normals(crop.rest.vertices, hand.faces)
+    posed = pose_gaussians(adapted.gaussians, hand.faces, crop.rest.vertices, crop.posed.vertices, light)
+    quality = assess_surface(hand, crop, render(posed, crop.camera).image)
     n = len(truth.vertex_index)
     error = (posed.colors[:n] - truth.colors[:n]).abs().mean(1)
     uncertainty = quality.uncertainty[truth.vertex_index]
@@ -80,29 +80,29 @@ def test_what_is_uncertain_is_more_often_wrong(hand, case):
 
 
 def test_shares_of_the_surface_add_up(hand, case):
-    evidence, _, quality = case
-    found = shares(hand, evidence.rest.vertices, quality)
+    crop, _, quality = case
+    found = shares(hand, crop.rest.vertices, quality)
     assert sum(found[f"{kind}_percent"] for kind in ("seen", "grazed", "extrapolated")) == pytest.approx(100)
     assert found["palm_seen_percent"] > 60 and found["back_seen_percent"] < 10
     assert 0 < found["uncertainty_mean"] < 1
-    assert surface_doubts(found) == []
+    assert coverage_warnings(found) == []
 
 
 def test_of_several_photos_each_place_is_known_from_the_best():
     one = SurfaceQuality(torch.tensor([1.0, 0.2, 0.0]), torch.tensor([0.1, 0.6, 0.9]))
     other = SurfaceQuality(torch.tensor([0.0, 0.7, 0.0]), torch.tensor([0.8, 0.3, 1.0]))
-    together = best_known([one, other])
+    together = combine_quality([one, other])
     assert together.visibility.tolist() == pytest.approx([1.0, 0.7, 0.0])
     assert together.uncertainty.tolist() == pytest.approx([0.1, 0.3, 0.9])
 
 
 def test_a_hand_of_which_nothing_is_seen_is_guessed_throughout(hand, case):
-    evidence, _, _ = case
-    quality = assess_surface(hand, evidence._replace(mask=torch.zeros_like(evidence.mask)), evidence.image)
+    crop, _, _ = case
+    quality = assess_surface(hand, crop._replace(mask=torch.zeros_like(crop.mask)), crop.image)
     assert (quality.visibility == 0).all() and (quality.uncertainty == 1).all()
-    found = shares(hand, evidence.rest.vertices, quality)
+    found = shares(hand, crop.rest.vertices, quality)
     assert found["extrapolated_percent"] == 100
-    assert "little was seen" in surface_doubts(found)[0]
+    assert "little was seen" in coverage_warnings(found)[0]
 
 
 def photo(color=SKIN, blurs=0):
@@ -117,7 +117,7 @@ def photo(color=SKIN, blurs=0):
 
 
 def test_an_ordinary_photo_raises_no_doubt():
-    assert photo_doubts(*photo(), SIDE) == []
+    assert photo_warnings(*photo(), SIDE) == []
 
 
 @pytest.mark.parametrize(
@@ -130,10 +130,10 @@ def test_an_ordinary_photo_raises_no_doubt():
     ],
 )
 def test_what_ails_a_photo_is_said_and_nothing_else(pictured, said):
-    doubts = photo_doubts(*pictured, SIDE)
+    doubts = photo_warnings(*pictured, SIDE)
     assert len(doubts) == 1 and said in doubts[0]
 
 
 def test_a_mask_of_a_few_pixels_is_said_to_hold_the_background():
     image, mask = photo()
-    assert "background" in photo_doubts(image, mask * 0, SIDE)[0]
+    assert "background" in photo_warnings(image, mask * 0, SIDE)[0]

@@ -16,7 +16,7 @@ from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.evaluation import same_hand
 from oasis_warp.evaluation.photo_pairs import compare_pairs, compare_with_photo, draw_as_photo
 from oasis_warp.evaluation.same_hand import photos_of_hands, summarise_pairs
-from oasis_warp.reconstruction import make_evidence
+from oasis_warp.reconstruction import crop_hand
 
 SMALL = ReconstructConfig(size=96)
 
@@ -42,8 +42,8 @@ def in_light(photo, *gains):
 def score_in(scene, photo, avatar=None):
     _, fit, made = scene
     avatar = avatar or made
-    evidence = make_evidence(photo, fit, avatar.surface_offsets, SMALL)
-    return compare_with_photo(avatar, draw_as_photo(avatar, evidence, fit.pose), evidence, fit.pose)
+    crop = crop_hand(photo, fit, avatar.surface_offsets, SMALL)
+    return compare_with_photo(avatar, draw_as_photo(avatar, crop, fit.pose), crop, fit.pose)
 
 
 def test_an_avatar_is_like_the_photo_that_it_was_made_of(scene):
@@ -123,7 +123,7 @@ def hands(scene, tmp_path, monkeypatch):
         else:
             path.write_text("nothing to see")
     monkeypatch.setattr(same_hand, "HandEstimator", lambda hand: KnownEstimator(scene[1]))
-    monkeypatch.setattr(same_hand, "carrier_offsets", lambda hand, fit: torch.zeros_like(hand.template))
+    monkeypatch.setattr(same_hand, "initial_offsets", lambda hand, fit: torch.zeros_like(hand.template))
     return folder
 
 

@@ -6,7 +6,7 @@ from synthetic import evidence_of
 
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
-from oasis_warp.estimation.drawn_outline import BEYOND, drawn_outline_offsets
+from oasis_warp.estimation.drawn_outline import BEYOND, rendered_outline_offsets
 from oasis_warp.render.render import render
 
 SIZE = 256
@@ -15,34 +15,34 @@ SIZE = 256
 @pytest.fixture(scope="module")
 def case(hand):
     """A photo, and Gaussians too large for its outline on a surface that is too thin at the fingers."""
-    evidence, truth, _ = evidence_of(hand, torch.full_like(hand.template, 0.5), size=SIZE)
+    crop, truth, _ = evidence_of(hand, torch.full_like(hand.template, 0.5), size=SIZE)
     too_large = truth._replace(scales=1.4 * truth.scales)
-    return moved(hand, evidence, -0.001 * (hand.template[:, :1] < -0.09)), too_large
+    return moved(hand, crop, -0.001 * (hand.template[:, :1] < -0.09)), too_large
 
 
-def moved(hand, evidence, outwards):
-    normals = [surface.vertex_normals(part.vertices, hand.faces) for part in (evidence.rest, evidence.posed)]
+def moved(hand, crop, outwards):
+    normals = [surface.vertex_normals(part.vertices, hand.faces) for part in (crop.rest, crop.posed)]
     rest, posed = (
         part._replace(vertices=part.vertices + outwards * along)
-        for part, along in zip((evidence.rest, evidence.posed), normals, strict=True)
+        for part, along in zip((crop.rest, crop.posed), normals, strict=True)
     )
-    return evidence._replace(rest=rest, posed=posed)
+    return crop._replace(rest=rest, posed=posed)
 
 
 @pytest.fixture(scope="module")
 def offsets(hand, case):
-    evidence, gaussians = case
-    return drawn_outline_offsets(hand, [gaussians], [evidence])
+    crop, gaussians = case
+    return rendered_outline_offsets(hand, [gaussians], [crop])
 
 
-def moved_by(hand, evidence, offsets):
-    along = surface.vertex_normals(evidence.rest.vertices, hand.faces)
-    return moved(hand, evidence, (offsets * along).sum(1, keepdim=True))
+def moved_by(hand, crop, offsets):
+    along = surface.vertex_normals(crop.rest.vertices, hand.faces)
+    return moved(hand, crop, (offsets * along).sum(1, keepdim=True))
 
 
-def drawn(hand, gaussians, evidence):
-    posed = pose_gaussians(gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices)
-    return render(posed, evidence.camera).alpha
+def drawn(hand, gaussians, crop):
+    posed = pose_gaussians(gaussians, hand.faces, crop.rest.vertices, crop.posed.vertices)
+    return render(posed, crop.camera).alpha
 
 
 def away(alpha, mask):
@@ -53,21 +53,21 @@ def away(alpha, mask):
 
 
 def test_the_drawn_outline_comes_to_lie_just_outside_the_masks(hand, case, offsets):
-    evidence, gaussians = case
-    assert away(drawn(hand, gaussians, evidence), evidence.mask) < 0
-    settled = moved_by(hand, evidence, offsets)
-    assert away(drawn(hand, gaussians, settled), evidence.mask) == pytest.approx(BEYOND, abs=0.25)
+    crop, gaussians = case
+    assert away(drawn(hand, gaussians, crop), crop.mask) < 0
+    settled = moved_by(hand, crop, offsets)
+    assert away(drawn(hand, gaussians, settled), crop.mask) == pytest.approx(BEYOND, abs=0.25)
 
 
 def test_a_slit_that_the_photo_does_not_have_is_closed(hand):
-    evidence, gaussians, _ = evidence_of(hand, torch.full_like(hand.template, 0.5), size=SIZE)
-    solid = (evidence.mask > 0.5).numpy().astype(np.uint8)
+    crop, gaussians, _ = evidence_of(hand, torch.full_like(hand.template, 0.5), size=SIZE)
+    solid = (crop.mask > 0.5).numpy().astype(np.uint8)
     closed = torch.from_numpy(cv2.morphologyEx(solid, cv2.MORPH_CLOSE, np.ones((5, 5)))).float()
-    slit = (closed > 0.5) & (evidence.mask < 0.5)
+    slit = (closed > 0.5) & (crop.mask < 0.5)
     assert slit.sum() >= 30
-    without = evidence._replace(mask=closed)
-    closer = moved_by(hand, evidence, drawn_outline_offsets(hand, [gaussians], [without]))
-    before, after = (drawn(hand, gaussians, e)[slit].mean() for e in (evidence, closer))
+    without = crop._replace(mask=closed)
+    closer = moved_by(hand, crop, rendered_outline_offsets(hand, [gaussians], [without]))
+    before, after = (drawn(hand, gaussians, e)[slit].mean() for e in (crop, closer))
     assert before < 0.2
     assert after > 0.5  # .41 where only outlines are met
 
@@ -81,7 +81,7 @@ def test_what_lies_off_the_outline_stays(hand, offsets):
 
 
 def test_a_photo_without_an_outline_says_nothing(hand, case, offsets):
-    evidence, gaussians = case
-    nothing = evidence._replace(mask=torch.zeros_like(evidence.mask))
-    assert not drawn_outline_offsets(hand, [gaussians], [nothing]).any()
-    assert torch.equal(drawn_outline_offsets(hand, [gaussians] * 2, [nothing, evidence]), offsets)
+    crop, gaussians = case
+    nothing = crop._replace(mask=torch.zeros_like(crop.mask))
+    assert not rendered_outline_offsets(hand, [gaussians], [nothing]).any()
+    assert torch.equal(rendered_outline_offsets(hand, [gaussians] * 2, [nothing, crop]), offsets)

@@ -4,7 +4,7 @@ import json
 
 import curve_one_shot as curve
 import torch
-from synthetic import evidence_of
+from synthetic import crop_of
 
 from oasis_warp.avatar.lighting import GAMMA
 from oasis_warp.avatar.prior import MeanPrior
@@ -14,11 +14,11 @@ from oasis_warp.evaluation.methods import Made
 
 
 def test_a_smaller_photo_shows_the_same_from_the_same_side(hand):
-    evidence, _, _ = evidence_of(hand, MeanPrior(hand).vertex_colors(0.02), size=64)
-    small = curve.shrink(evidence, 32)
+    crop, _, _ = crop_of(hand, MeanPrior(hand).vertex_colors(0.02), size=64)
+    small = curve.shrink(crop, 32)
     assert small.image.shape == (32, 32, 3) and small.camera.width == small.camera.height == 32
-    torch.testing.assert_close(small.image.mean((0, 1)), evidence.image.mean((0, 1)))
-    (large_uv, _), (small_uv, _) = (project(e.camera, e.posed.vertices) for e in (evidence, small))
+    torch.testing.assert_close(small.image.mean((0, 1)), crop.image.mean((0, 1)))
+    (large_uv, _), (small_uv, _) = (project(e.camera, e.posed.vertices) for e in (crop, small))
     torch.testing.assert_close(2 * small_uv, large_uv)
 
 
@@ -42,10 +42,10 @@ def test_tables_are_of_what_has_been_measured_for_everybody(tmp_path):
 
 
 def test_avatars_are_drawn_in_the_light_of_their_photo(hand):
-    evidence, truth, _ = evidence_of(hand, MeanPrior(hand).vertex_colors(0.02), size=64)
+    crop, truth, _ = crop_of(hand, MeanPrior(hand).vertex_colors(0.02), size=64)
     dim = torch.tensor([0.5, 0.4, 0.3])
     light = HandLight(torch.cat([dim[None], torch.zeros(3, 3)]), dim.repeat(2, 1), torch.ones(3))
-    shown = evidence._replace(image=evidence.image * dim.pow(1 / GAMMA))
+    shown = crop._replace(image=crop.image * dim.pow(1 / GAMMA))
     bench = curve.Bench(hand, shown, None, None, [], "raw")
     lit, unlit = (curve.own_psnr(bench, Made(truth, there)) for there in (light, None))
     assert lit > unlit + 5

@@ -23,8 +23,8 @@ from oasis_warp.evaluation.synthetic import (
     _Bench,
     _packed,
     _unpacked,
+    crop_of,
     evaluate,
-    evidence_of,
 )
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
@@ -149,8 +149,8 @@ def test_a_place_that_is_no_folder_is_refused(tmp_path):
 def test_each_stage_goes_on_from_the_one_before(hand, network):
     session = photograph(CONFIG.shoot, "ordinary", FIRST_PERSON, CPU)
     batch = as_estimated(hand, session, "wild", CONFIG.shoot, 0.0)
-    evidence = evidence_of(batch)
-    made = dict(reconstructions(hand, evidence, usual_priors(network), METHODS, CONFIG.adapt))
+    crop = crop_of(batch)
+    made = dict(reconstructions(hand, crop, usual_priors(network), METHODS, CONFIG.adapt))
     assert tuple(made) == METHODS
     stages = ("raw", "calibrated", "one_shot")
     raw, calibrated, one_shot = (made[Method("learned", stage)].gaussians.colors for stage in stages)
@@ -158,5 +158,5 @@ def test_each_stage_goes_on_from_the_one_before(hand, network):
     clear = ((raw - raw.mean(0)).abs() > 0.02).all(1) & ((calibrated > 0) & (calibrated < 1)).all(1)
     assert float(gains[clear].std(0).max()) < 1e-2  # one gain and one offset a channel
     assert not torch.allclose(calibrated, one_shot, atol=0.01)
-    (alone,) = reconstructions(hand, evidence, usual_priors(network), METHODS[:1], CONFIG.adapt)
+    (alone,) = reconstructions(hand, crop, usual_priors(network), METHODS[:1], CONFIG.adapt)
     assert torch.equal(alone[1].gaussians.colors, made[METHODS[0]].gaussians.colors)

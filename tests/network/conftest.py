@@ -2,12 +2,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, evidence_of
+from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, crop_of
 
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.inputs import NetworkInput, input_of_evidence
+from oasis_warp.network.inputs import NetworkInput, input_of_crop
 
 
 @pytest.fixture(scope="session")
@@ -19,19 +19,19 @@ def tiny():
 
 
 @pytest.fixture(scope="session")
-def evidences(hand):
+def crops(hand):
     """A light palm and a dark back."""
     prior = MeanPrior(hand)
-    light, _, _ = evidence_of(hand, prior.vertex_colors(0.02), size=64, orientation=PALM_TO_CAMERA)
-    dark, _, _ = evidence_of(
+    light, _, _ = crop_of(hand, prior.vertex_colors(0.02), size=64, orientation=PALM_TO_CAMERA)
+    dark, _, _ = crop_of(
         hand, prior.vertex_colors(0.2), size=64, orientation=BACK_TO_CAMERA, pose_name="fist"
     )
     return light, dark
 
 
 @pytest.fixture(scope="session")
-def batch(evidences):
-    return NetworkInput(*(torch.cat(parts) for parts in zip(*map(input_of_evidence, evidences), strict=True)))
+def batch(crops):
+    return NetworkInput(*(torch.cat(parts) for parts in zip(*map(input_of_crop, crops), strict=True)))
 
 
 @pytest.fixture(scope="session")

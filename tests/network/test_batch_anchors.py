@@ -5,7 +5,7 @@ import torch
 
 from oasis_warp.avatar.anchors import OPACITY, place_anchors
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.observe import observe
+from oasis_warp.avatar.observation import observe
 from oasis_warp.avatar.prior import MeanPrior, estimate_melanin
 from oasis_warp.core import rotation
 from oasis_warp.hand.skinning import rest_hand
@@ -61,20 +61,20 @@ def test_those_that_place_anchors_leaves_out_are_too_faint_to_be_drawn(hand, han
     assert float(OPACITY * anchors.fade[0][out].max()) < 1 / 255
 
 
-def test_visibility_and_colours_are_those_of_observe(network, evidences, batch, hand):
+def test_visibility_and_colours_are_those_of_observe(network, crops, batch, hand):
     sighting = sight(batch, network.faces, network.vertex_faces, network.vertex_index)
-    for k, evidence in enumerate(evidences):
-        seen = observe(hand, evidence)
+    for k, crop in enumerate(crops):
+        seen = observe(hand, crop)
         torch.testing.assert_close(sighting.colors[k], seen.colors, atol=1e-5, rtol=0)
         torch.testing.assert_close(sighting.confidence[k], seen.confidence, atol=1e-4, rtol=0)
 
 
-def test_tones_are_those_of_the_mean_prior(hand, batch, evidences, network):
+def test_tones_are_those_of_the_mean_prior(hand, batch, crops, network):
     sighting = sight(batch, network.faces, network.vertex_faces, network.vertex_index)
     mean = MeanHands(hand)(sighting.colors, sighting.confidence)
     regions = label_regions(hand)
-    for k, evidence in enumerate(evidences):
-        melanin = estimate_melanin(regions, observe(hand, evidence))
+    for k, crop in enumerate(crops):
+        melanin = estimate_melanin(regions, observe(hand, crop))
         assert float(mean.log_melanin[k].exp()) == pytest.approx(melanin, rel=1e-3)
         torch.testing.assert_close(mean.colors[k], region_colors(regions, melanin), atol=2e-3, rtol=0)
 

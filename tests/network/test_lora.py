@@ -19,8 +19,8 @@ LORA = AdaptConfig(texture="lora", lora_rank=4, texture_steps=4, reference_views
 
 
 @pytest.fixture(scope="module")
-def case(network, evidences):
-    return evidences[0], *guess_with_heads(NetworkPrior(network), evidences[0])
+def case(network, crops):
+    return crops[0], *guess_with_heads(NetworkPrior(network), crops[0])
 
 
 def updates_of(heads, rank, random):
@@ -28,16 +28,16 @@ def updates_of(heads, rank, random):
 
 
 def test_asking_for_the_heads_changes_no_guess_and_they_say_its_colours(case, network, random):
-    evidence, guess, heads = case
-    for asked, alone in zip(guess[:-1], NetworkPrior(network)(evidence)[:-1], strict=True):
+    crop, guess, heads = case
+    for asked, alone in zip(guess[:-1], NetworkPrior(network)(crop)[:-1], strict=True):
         assert torch.equal(asked, alone)
     own = [head_colors(*pair) for pair in zip(heads, updates_of(heads, 3, random), strict=True)]
     torch.testing.assert_close(torch.cat(own).detach(), guess.colors, atol=2e-6, rtol=0)
 
 
 @pytest.mark.parametrize("switch", [{"fom": "off"}, {"point_evidence": "off"}])
-def test_networks_without_a_part_have_heads_too(make_network, tiny, evidences, random, switch):
-    guess, heads = guess_with_heads(NetworkPrior(make_network(replace(tiny, **switch))), evidences[0])
+def test_networks_without_a_part_have_heads_too(make_network, tiny, crops, random, switch):
+    guess, heads = guess_with_heads(NetworkPrior(make_network(replace(tiny, **switch))), crops[0])
     own = [head_colors(*pair) for pair in zip(heads, updates_of(heads, 3, random), strict=True)]
     torch.testing.assert_close(torch.cat(own).detach(), guess.colors, atol=2e-6, rtol=0)
 
@@ -67,43 +67,43 @@ def test_updates_are_those_of_the_layers_weights(random, outputs):
 
 
 def test_without_a_step_lora_is_the_calibrated_guess_and_with_steps_explains_the_photo_better(case, hand):
-    evidence, guess, heads = case
-    dark = torch.linspace(0.5, 1, len(evidence.image))[:, None, None]  # a gradient that no calibration explains
-    evidence = evidence._replace(image=evidence.image * dark)
-    start, end = (adapt(hand, guess, evidence, replace(LORA, texture_steps=steps), heads=heads) for steps in (0, 30))
+    crop, guess, heads = case
+    dark = torch.linspace(0.5, 1, len(crop.image))[:, None, None]  # a gradient that no calibration explains
+    crop = crop._replace(image=crop.image * dark)
+    start, end = (adapt(hand, guess, crop, replace(LORA, texture_steps=steps), heads=heads) for steps in (0, 30))
     torch.testing.assert_close(start.gaussians.colors, start.calibration.apply(guess.colors), atol=4e-6, rtol=0)
     assert all(torch.equal(a, b) for a, b in zip(end.gaussians[:-2], guess[:-2], strict=True))
     assert sum(end.losses[-5:]) < 0.9 * sum(end.losses[:5])
 
 
 def test_the_same_seed_gives_the_same_updates(case, hand):
-    evidence, guess, heads = case
+    crop, guess, heads = case
     first, again, other = (
-        adapt(hand, guess, evidence, replace(LORA, seed=seed), heads=heads).gaussians.colors for seed in (1, 1, 2)
+        adapt(hand, guess, crop, replace(LORA, seed=seed), heads=heads).gaussians.colors for seed in (1, 1, 2)
     )
     assert torch.equal(first, again) and not torch.equal(first, other)
 
 
 def test_in_every_step_all_reference_views_hold_the_guess_better_than_one_by_colour_alone(case, hand):
-    evidence, guess, heads = case
+    crop, guess, heads = case
     few = replace(LORA, texture_steps=6, reference_views=1, weight_ssim=0.0)
     turns, every = (
-        adapt(hand, guess, evidence, replace(few, references=how), heads=heads) for how in ("in_turn", "all")
+        adapt(hand, guess, crop, replace(few, references=how), heads=heads) for how in ("in_turn", "all")
     )
     assert turns.losses == pytest.approx(every.losses, rel=1e-6)  # of a single view, by colour alone, they are the same
     far = replace(few, texture_steps=12, reference_views=2, weight_ssim=1.0, weight_reference=100.0, references="all")
-    held = adapt(hand, guess, evidence, far, heads=heads)
-    free = adapt(hand, guess, evidence, replace(far, reference_views=0), heads=heads)
+    held = adapt(hand, guess, crop, far, heads=heads)
+    free = adapt(hand, guess, crop, replace(far, reference_views=0), heads=heads)
     calibrated = held.calibration.apply(guess.colors)
     moved = [float((made.gaussians.colors - calibrated).abs().mean()) for made in (held, free)]
     assert moved[0] < 0.5 * moved[1]
 
 
 def test_what_has_no_heads_is_refused(case, hand):
-    evidence, guess, _ = case
+    crop, guess, _ = case
     with pytest.raises(InputError, match="'none': has no heads"):
-        ask(MeanPrior(hand), evidence, LORA)
+        ask(MeanPrior(hand), crop, LORA)
     with pytest.raises(ValueError, match="expected the heads of the prior, got none"):
-        adapt(hand, guess, evidence, LORA)
+        adapt(hand, guess, crop, LORA)
     with pytest.raises(ValueError, match="is for one photo"):
-        fuse(hand, [evidence], [1.0], [guess], LORA)
+        fuse(hand, [crop], [1.0], [guess], LORA)

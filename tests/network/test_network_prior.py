@@ -19,7 +19,7 @@ from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network import prior as home
-from oasis_warp.network.inputs import input_of_evidence
+from oasis_warp.network.inputs import input_of_crop
 from oasis_warp.network.prior import (
     NetworkPrior,
     all_gaussians,
@@ -49,23 +49,23 @@ def on_gpu(value):
 
 
 @pytest.mark.gpu
-def test_a_prior_that_was_recorded_can_be_sent_to_other_processes(make_network, tiny, evidences):
-    prior, there = NetworkPrior(make_network(tiny), {"name": "tiny"}), on_gpu(evidences[0])
+def test_a_prior_that_was_recorded_can_be_sent_to_other_processes(make_network, tiny, crops):
+    prior, there = NetworkPrior(make_network(tiny), {"name": "tiny"}), on_gpu(crops[0])
     guess = [prior(there) for _ in range(3)][-1]
     torch.testing.assert_close(pickle.loads(pickle.dumps(prior))(there).colors, guess.colors)
 
 
 @pytest.mark.parametrize("which", [0, 1])
-def test_an_untrained_network_is_the_mean_prior(untrained, hand, evidences, which):
+def test_an_untrained_network_is_the_mean_prior(untrained, hand, crops, which):
     assert isinstance(untrained, Prior)
-    ours, mean = untrained(evidences[which]), MeanPrior(hand)(evidences[which])
+    ours, mean = untrained(crops[which]), MeanPrior(hand)(crops[which])
     for field in ("vertex_index", "face_index"):
         assert torch.equal(getattr(ours, field), getattr(mean, field))
     torch.testing.assert_close(ours.barycentrics, mean.barycentrics)
     assert not ours.offsets.any()
     torch.testing.assert_close(ours.scales, mean.scales, atol=1e-8, rtol=1e-4)
     torch.testing.assert_close(ours.opacities, mean.opacities, atol=1e-6, rtol=1e-5)
-    rest = evidences[which].rest.vertices
+    rest = crops[which].rest.vertices
     from_rim = torch.cdist(rest, rest[hand.rim]).amin(1)
     from_rim = torch.cat([from_rim[mean.vertex_index], from_rim[hand.faces[mean.face_index]].amin(1)])
     beyond = from_rim >= LAST * RIM_FADE
@@ -89,10 +89,10 @@ def test_the_rim_takes_over_the_colours_beyond_it(hand):
         assert float((spread[: len(rest)][near, 0] - wanted).abs().max()) < 0.05
 
 
-def test_at_the_wrists_end_gaussians_have_the_shapes_of_their_anchors(network, hand, evidences):
+def test_at_the_wrists_end_gaussians_have_the_shapes_of_their_anchors(network, hand, crops):
     with torch.no_grad():
-        prediction = network(input_of_evidence(evidences[0]))
-    rest = evidences[0].rest.vertices
+        prediction = network(input_of_crop(crops[0]))
+    rest = crops[0].rest.vertices
     settled = settle_rim(prediction, rest, network.faces, network.vertex_faces, network.rim)
     at_vertices = torch.cdist(rest, rest[hand.rim]).amin(1)
     from_rim = torch.cat([at_vertices, at_vertices[hand.faces].amin(1)])
@@ -106,29 +106,29 @@ def test_at_the_wrists_end_gaussians_have_the_shapes_of_their_anchors(network, h
     assert torch.equal(settled.offsets[0, far[: len(rest)]], prediction.offsets[0, far[: len(rest)]])
 
 
-def test_faint_gaussians_are_left_out_of_an_avatar_and_kept_for_training(untrained, hand, evidences):
+def test_faint_gaussians_are_left_out_of_an_avatar_and_kept_for_training(untrained, hand, crops):
     with torch.no_grad():
-        prediction = untrained.network(input_of_evidence(evidences[0]))
+        prediction = untrained.network(input_of_crop(crops[0]))
     few = canonical_gaussians(prediction, 0)
     every_vertex, every_face = torch.arange(len(hand.template)), torch.arange(len(hand.faces))
     everything = all_gaussians(prediction, 0, every_vertex, every_face)
     assert len(few.opacities) < len(everything.opacities) == 36_945
-    evidence = evidences[0]
+    crop = crops[0]
     pictures = [
-        render(pose_gaussians(g, hand.faces, evidence.rest.vertices, evidence.posed.vertices), evidence.camera).image
+        render(pose_gaussians(g, hand.faces, crop.rest.vertices, crop.posed.vertices), crop.camera).image
         for g in (few, everything)
     ]
     torch.testing.assert_close(*pictures, atol=1e-6, rtol=0)
 
 
-def test_its_guess_can_be_adapted_to_the_photo(network, hand, evidences):
-    evidence = evidences[0]
-    guess = NetworkPrior(network)(evidence)
-    done = adapt(hand, guess, evidence, AdaptConfig(calibration_steps=5, texture_steps=5))
+def test_its_guess_can_be_adapted_to_the_photo(network, hand, crops):
+    crop = crops[0]
+    guess = NetworkPrior(network)(crop)
+    done = adapt(hand, guess, crop, AdaptConfig(calibration_steps=5, texture_steps=5))
 
     def psnr(gaussians):
-        posed = pose_gaussians(gaussians, hand.faces, evidence.rest.vertices, evidence.posed.vertices)
-        return masked_psnr(render(posed, evidence.camera).image.clamp(0, 1), evidence.image, evidence.mask)
+        posed = pose_gaussians(gaussians, hand.faces, crop.rest.vertices, crop.posed.vertices)
+        return masked_psnr(render(posed, crop.camera).image.clamp(0, 1), crop.image, crop.mask)
 
     assert psnr(done.gaussians) > psnr(guess)
 
@@ -156,14 +156,14 @@ def digest(path):
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_a_prior_is_chosen_by_word_or_by_file(weights, bundle, network, evidences):
+def test_a_prior_is_chosen_by_word_or_by_file(weights, bundle, network, crops):
     bundle(weights)
     learned, none, own = choose_prior("learned"), choose_prior("none"), choose_prior(weights)
     assert learned.about == {"name": "learned", "sha256": digest(weights), "step": 1200}
     assert own.about == {"name": str(weights), "sha256": digest(weights), "step": 1200}
     assert none.about == {"name": "none"}
     assert isinstance(none, MeanPrior)
-    ours, its = learned(evidences[0]), own(evidences[0])
+    ours, its = learned(crops[0]), own(crops[0])
     for field in ours._fields[:-1]:  # a guess has no shade
         assert torch.equal(getattr(ours, field), getattr(its, field)), field
     assert choose_prior("learned") is learned  # read once a process
@@ -208,13 +208,13 @@ def test_a_word_that_names_no_prior_is_an_error(as_shipped):
         choose_prior("mean")
 
 
-def test_the_prior_that_ships_is_small_says_how_it_was_trained_and_knows_the_bundled_hand(hand, evidences):
+def test_the_prior_that_ships_is_small_says_how_it_was_trained_and_knows_the_bundled_hand(hand, crops):
     bundled_prior.cache_clear()
     prior = choose_prior("learned")
     assert int(prior.about["step"]) > 0
     with resources.as_file(asset(*home.BUNDLED)) as path:
         assert path.stat().st_size <= 10_000_000
         assert json.loads(read_header(path)["notes"])["seed"] >= 0
-    guess, mean = prior(evidences[0]), MeanPrior(hand)(evidences[0])
+    guess, mean = prior(crops[0]), MeanPrior(hand)(crops[0])
     assert all(bool(part.isfinite().all()) for part in guess if part is not None)
     assert not torch.equal(guess.colors[:100], mean.colors[:100])

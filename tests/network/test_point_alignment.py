@@ -7,7 +7,7 @@ from torch.nn.functional import grid_sample
 from oasis_warp.core.camera import project
 from oasis_warp.core.types import Camera
 from oasis_warp.network.features import ImageFeatures
-from oasis_warp.network.inputs import input_of_evidence
+from oasis_warp.network.inputs import input_of_crop
 from oasis_warp.network.observation import sight
 from oasis_warp.network.point_features import PointFeatures
 from oasis_warp.network.projection import Aggregation, project_batch, sample
@@ -69,12 +69,12 @@ def test_a_pixel_is_read_at_its_own_centre():
     torch.testing.assert_close(sample(planes, uv)[0, :, 0], torch.tensor([1.0, 0.5, 0.0, 0.0]))
 
 
-def test_points_project_as_the_camera_says(evidences):
-    evidence = evidences[0]
-    inputs = input_of_evidence(evidence)
+def test_points_project_as_the_camera_says(crops):
+    crop = crops[0]
+    inputs = input_of_crop(crop)
     uv, inside = project_batch(inputs.posed, inputs.viewmat, inputs.K, 64)
-    camera = Camera(evidence.camera.viewmat, evidence.camera.K, 64, 64)
-    expected, _ = project(camera, evidence.posed.vertices)
+    camera = Camera(crop.camera.viewmat, crop.camera.K, 64, 64)
+    expected, _ = project(camera, crop.posed.vertices)
     torch.testing.assert_close(uv[0] * 64, expected, atol=1e-4, rtol=0)
     assert bool(inside.all())
 
@@ -95,8 +95,8 @@ def test_what_lies_outside_the_frame_gets_no_feature(random):
     assert bool(read[:, :6].any(-1).all())
 
 
-def test_a_coloured_dot_speaks_to_the_points_that_project_onto_it(network, evidences):
-    inputs = input_of_evidence(evidences[0])
+def test_a_coloured_dot_speaks_to_the_points_that_project_onto_it(network, crops):
+    inputs = input_of_crop(crops[0])
     sighting = sight(inputs, network.faces, network.vertex_faces, network.vertex_index)
     target = int(sighting.confidence[0].argmax())
     place = (sighting.uv[0, target] * 64).long()

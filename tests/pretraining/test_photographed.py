@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import SINK, below_skin
+from oasis_warp.avatar.anchors import INSET, inset_offsets
 from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
@@ -72,7 +72,7 @@ def projected(batch):
 
 
 def overlap(hand, vertices, K, mask):
-    vertices = vertices + SINK * vertex_normals(vertices, hand.faces)
+    vertices = vertices + INSET * vertex_normals(vertices, hand.faces)
     drawn = depth_map(vertices, hand.faces, torch.eye(4), K, mask.shape[1], mask.shape[0]).face_ids >= 0
     return float((drawn & (mask > 0.5)).sum() / (drawn | (mask > 0.5)).sum())
 
@@ -83,7 +83,7 @@ def test_many_hands_are_posed_as_one_by_one(hand, pictures):
     out = pose_hands(hand, photos.shape, photos.angles, photos.orientation, photos.translation)
     for k in range(3):
         rest = rest_hand(hand, photos.shape[k])
-        rest = rest._replace(vertices=rest.vertices + below_skin(hand))
+        rest = rest._replace(vertices=rest.vertices + inset_offsets(hand))
         posed = skin(hand, rest, HandPose(photos.angles[k], photos.orientation[k], photos.translation[k]))
         torch.testing.assert_close(out.rest[k], rest.vertices, atol=1e-6, rtol=0)
         torch.testing.assert_close(out.posed[k], posed.vertices, atol=2e-6, rtol=0)

@@ -8,7 +8,7 @@ from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin_surface
 from oasis_warp.ops import rasterization
-from oasis_warp.render.replay import MOST, Recording, Recordings, replayable, replayed
+from oasis_warp.render.replay import MOST, CapturedGraph, GraphCache, replayable, replayed
 
 
 class Log:
@@ -31,21 +31,21 @@ class Log:
 
 
 def test_a_recording_is_made_once_for_each_key_and_used_for_every_call():
-    log, recordings = Log(), Recordings()
+    log, recordings = Log(), GraphCache()
     for key in ("a", "b", "a", "a", "b"):
         assert log.run(recordings, key, 3.0) == (torch.tensor([3.0]), torch.tensor([1.0]))
     assert log.made == ["a", "b"] and log.used == ["a", "b", "a", "a", "b"]
 
 
 def test_the_recording_unused_for_longest_makes_room():
-    log, recordings = Log(), Recordings()
+    log, recordings = Log(), GraphCache()
     for key in (*range(MOST), 0, MOST, 0, 1):
         log.run(recordings, key)
     assert log.made == [*range(MOST), MOST, 1]
 
 
 def test_where_memory_did_not_suffice_the_exact_result_comes_and_the_next_call_records_anew():
-    log, recordings = Log(), Recordings()
+    log, recordings = Log(), GraphCache()
     log.full.add("a")
     assert log.run(recordings, "a") == (torch.tensor([1.0]), torch.tensor([-1.0]))
     log.full.clear()
@@ -55,7 +55,7 @@ def test_where_memory_did_not_suffice_the_exact_result_comes_and_the_next_call_r
 
 
 def test_a_function_that_cannot_be_recorded_leaves_nothing_behind():
-    log, recordings = Log(), Recordings()
+    log, recordings = Log(), GraphCache()
 
     def fails():
         raise RuntimeError("no memory")
@@ -100,7 +100,7 @@ def test_a_recording_repeats_its_function_for_inputs_from_anywhere(places, dtype
         [torch.randn(*shape, generator=generator).to(p) for shape, p in zip(shapes, places.split(), strict=True)]
         for _ in range(20)
     ]
-    recording = Recording(squared, calls[0], like)
+    recording = CapturedGraph(squared, calls[0], like)
     found = [outputs_of(recording, inputs) for inputs in calls]  # none may touch another's memory
     for inputs, outputs in zip(calls, found, strict=True):
         wanted = squared(*(tensor.to(like) for tensor in inputs))
@@ -112,7 +112,7 @@ def test_a_recording_repeats_its_function_for_inputs_from_anywhere(places, dtype
 @pytest.mark.gpu
 def test_calls_on_different_streams_do_not_mix():
     like = torch.empty(0, device="cuda")
-    recording = Recording(lambda x: (x * 2,), [torch.zeros(1000)], like)
+    recording = CapturedGraph(lambda x: (x * 2,), [torch.zeros(1000)], like)
     found, streams = [], [torch.cuda.Stream() for _ in range(3)]
     for k in range(30):
         with torch.cuda.stream(streams[k % 3]):
@@ -137,11 +137,11 @@ def test_a_recording_says_when_its_memory_did_not_suffice():
         return (image,)
 
     small, large = ([torch.tensor([size]), torch.tensor([6.0])] for size in (0.01, 0.5))
-    recording = Recording(picture, small, means)
+    recording = CapturedGraph(picture, small, means)
     assert torch.equal(outputs_of(recording, small)[0], picture(*(part.cuda() for part in small))[0])
     assert recording(large) is None
     assert torch.equal(outputs_of(recording, small)[0], picture(*(part.cuda() for part in small))[0])
-    again = Recording(picture, large, means)
+    again = CapturedGraph(picture, large, means)
     assert torch.equal(outputs_of(again, large)[0], picture(*(part.cuda() for part in large))[0])
 
 
@@ -157,6 +157,6 @@ def test_a_replayed_hand_follows_its_pose(hand):
         HandPose(named_pose(hand, name), PALM_TO_CAMERA, torch.tensor([0.0, 0.1, 0.5]))
         for name in ("open", "fist", "pinch")
     ]
-    recording = Recording(surface, poses[0], rest.vertices)
+    recording = CapturedGraph(surface, poses[0], rest.vertices)
     for pose in poses:
         assert torch.equal(outputs_of(recording, pose)[0], surface(*(part.cuda() for part in pose))[0])

@@ -6,24 +6,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.adaptation.albedo_shading import split_albedo_shading
 from oasis_warp.adaptation.calibrate import Calibration, calibrate
-from oasis_warp.adaptation.complete import complete_field
+from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.light import even_photo
 from oasis_warp.adaptation.lora_texture import learn_lora
 from oasis_warp.adaptation.picture_fit import aim
-from oasis_warp.adaptation.room_light import fit_light, lit_picture, with_shade, without_light
-from oasis_warp.adaptation.skin_or_shade import skin_and_shade
-from oasis_warp.adaptation.surely_shown import surely_shown
+from oasis_warp.adaptation.reliability import mask_unreliable
+from oasis_warp.adaptation.sh_lighting import apply_light, fit_light, with_shade, without_light
 from oasis_warp.adaptation.texture import learn_texture
-from oasis_warp.adaptation.views import freeze_view, reference_azimuths
+from oasis_warp.adaptation.views import reference_azimuths, view_weights
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.lighting import factors, in_even_light, posed_normals
-from oasis_warp.avatar.observe import inner_mask, observe
+from oasis_warp.avatar.observation import inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import CanonicalGaussians, Evidence, Gaussians, HandLight
+from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandCrop, HandLight
 from oasis_warp.network.lora import ColorHeads
 from oasis_warp.ops import BlendWeights, blend_colors
 from oasis_warp.render.cameras import orbit_camera
@@ -52,22 +52,22 @@ class InPhoto(NamedTuple):
     """1 where the photo's colours are those of the hand."""
 
 
-def in_photo(hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence) -> InPhoto:
+def in_photo(hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop) -> InPhoto:
     """Pose `gaussians` as in the photo and blend them once."""
-    faces = hand.faces.to(evidence.image.device)
-    posed = pose_gaussians(gaussians, faces, evidence.rest.vertices, evidence.posed.vertices)
-    view = freeze_view(posed, evidence.camera)
-    return InPhoto(posed, view, _trusted(view, evidence))
+    faces = hand.faces.to(crop.image.device)
+    posed = pose_gaussians(gaussians, faces, crop.rest.vertices, crop.posed.vertices)
+    view = view_weights(posed, crop.camera)
+    return InPhoto(posed, view, _trusted(view, crop))
 
 
-def _trusted(view: BlendWeights, evidence: Evidence) -> Float[Tensor, "H W"]:
-    return inner_mask(evidence.mask, 1) * (view.alphas[..., 0] > 0.5)
+def _trusted(view: BlendWeights, crop: HandCrop) -> Float[Tensor, "H W"]:
+    return inner_mask(crop.mask, 1) * (view.alphas[..., 0] > 0.5)
 
 
 def adapt(
     hand: HandModel,
     prior: CanonicalGaussians,
-    evidence: Evidence,
+    crop: HandCrop,
     config: AdaptConfig = AdaptConfig(),  # noqa: B008 - frozen
     progress: Progress = silent,
     heads: ColorHeads | None = None,
@@ -84,7 +84,7 @@ def adapt(
     Args:
         hand: The model.
         prior: The whole hand, guessed.
-        evidence: The photo.
+        crop: The photo.
         config: What to do.
         progress: Called as work goes on.
         heads: Those that the colours of `prior` come from, for "lora": see `network.prior.guess_with_heads`.
@@ -95,29 +95,29 @@ def adapt(
     if config.texture == "lora" and heads is None:
         raise ValueError("texture 'lora': expected the heads of the prior, got none. Ask it with guess_with_heads.")
     trained = heads if config.texture == "lora" and config.light != "even" else None
-    faces = hand.faces.to(evidence.image.device)
-    posed, view, _ = in_photo(hand, prior, evidence)
+    faces = hand.faces.to(crop.image.device)
+    posed, view, _ = in_photo(hand, prior, crop)
 
     progress("calibration", 0, 1)
-    photo = evidence
-    evidence, light = _read(hand, prior, photo, view, config)
-    trusted = _trusted(view, evidence)
-    calibration = _calibration(prior, view, evidence, trusted, config)
+    photo = crop
+    crop, light = _read(hand, prior, photo, view, config)
+    trusted = _trusted(view, crop)
+    calibration = _calibration(prior, view, crop, trusted, config)
     gaussians = prior._replace(colors=calibration.apply(prior.colors))
     progress("calibration", 1, 1)
 
     if trained is None:
         progress("completion", 0, 1)
-        gaussians = _complete(hand, gaussians, evidence, view, config)
+        gaussians = _complete(hand, gaussians, crop, view, config)
         progress("completion", 1, 1)
     if config.light == "even":  # what is left to learn is the photo's light
         return Adaptation(in_even_light(gaussians, light) if light else gaussians, calibration, (), None)
     references = [
-        freeze_view(posed, orbit_camera(evidence.posed.vertices, azimuth, size=evidence.camera.width))
+        view_weights(posed, orbit_camera(crop.posed.vertices, azimuth, size=crop.camera.width))
         for azimuth in reference_azimuths(config.reference_views)
     ]
     shown = photo.mask * _trusted(view, photo)
-    shining = None if light is None else light_on(hand, gaussians, photo, light)[None]
+    shining = None if light is None else light_factors(hand, gaussians, photo, light)[None]
     pictures = aim(view, photo.image, shown, references, gaussians.colors, shining)
     if trained is None:
         texture = learn_texture(gaussians, faces, pictures, config, progress)
@@ -125,84 +125,84 @@ def adapt(
         texture = learn_lora(trained, calibration, pictures, config, progress)
     gaussians = gaussians._replace(colors=texture.colors)
     if light is not None:
-        gaussians = skin_and_shade(hand, calibration.apply(prior.colors), gaussians)
+        gaussians = split_albedo_shading(hand, calibration.apply(prior.colors), gaussians)
     return Adaptation(gaussians, calibration, texture.losses, light)
 
 
 class Reading(NamedTuple):
     """A photo as the skin is read from it."""
 
-    evidence: Evidence
+    crop: HandCrop
     """As in even light, its mask where it surely shows what the surface has there. The photo itself with "keep"."""
     light: HandLight | None
     """Of the photo; None where it is kept."""
 
 
-def read_skin(hand: HandModel, prior: CanonicalGaussians, evidence: Evidence, config: AdaptConfig) -> Reading:
+def remove_photo_light(hand: HandModel, prior: CanonicalGaussians, crop: HandCrop, config: AdaptConfig) -> Reading:
     """What `adapt` takes of a photo."""
-    return _read(hand, prior, evidence, in_photo(hand, prior, evidence).view, config)
+    return _read(hand, prior, crop, in_photo(hand, prior, crop).view, config)
 
 
 def _read(
-    hand: HandModel, prior: CanonicalGaussians, evidence: Evidence, view: BlendWeights, config: AdaptConfig
+    hand: HandModel, prior: CanonicalGaussians, crop: HandCrop, view: BlendWeights, config: AdaptConfig
 ) -> Reading:
-    def drawn(evidence: Evidence) -> Tensor:
-        calibration = _calibration(prior, view, evidence, _trusted(view, evidence), config)
+    def drawn(crop: HandCrop) -> Tensor:
+        calibration = _calibration(prior, view, crop, _trusted(view, crop), config)
         return _drawn(view, calibration.apply(prior.colors))
 
     if config.light == "keep":
-        return Reading(evidence, None)
+        return Reading(crop, None)
     # The shaded side of a hand before a dark wall is no wall: what is sure is judged in a first guess of the light.
-    picture = drawn(evidence)
-    sure = surely_shown(hand, lit_picture(hand, picture, evidence, fit_light(hand, picture, evidence)), evidence)
+    picture = drawn(crop)
+    sure = mask_unreliable(hand, apply_light(hand, picture, crop, fit_light(hand, picture, crop)), crop)
     light = fit_light(hand, drawn(sure), sure)
-    light = with_shade(hand, drawn(without_light(hand, sure, light)), evidence, sure, light)
+    light = with_shade(hand, drawn(without_light(hand, sure, light)), crop, sure, light)
     return Reading(without_light(hand, sure, light), light)
 
 
-def light_on(
-    hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence, light: HandLight
+def light_factors(
+    hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, light: HandLight
 ) -> Float[Tensor, "N 3"]:
     """What the light of a photo multiplies the colours of `gaussians` with in it."""
-    rest, faces = evidence.rest.vertices, hand.faces.to(evidence.image.device)
-    return factors(gaussians, faces, light, posed_normals(rest, evidence.posed.vertices, faces))
+    rest, faces = crop.rest.vertices, hand.faces.to(crop.image.device)
+    return factors(gaussians, faces, light, posed_normals(rest, crop.posed.vertices, faces))
 
 
 def detail_of(
-    hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence, light: HandLight | None
-) -> Evidence:
+    hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, light: HandLight | None
+) -> HandCrop:
     """What a photo, perhaps a larger one than was adapted to, shows of the skin of `gaussians`.
 
-    As `read_skin`: in even light, its mask where it surely shows what the surface has there. The photo itself where
-    there is no light apart.
+    As `remove_photo_light`: in even light, its mask where it surely shows what the surface has there. The photo itself
+    where there is no light apart.
     """
     if light is None:
-        return evidence
-    skin = in_photo(hand, gaussians, evidence).view
-    lit = lit_picture(hand, _drawn(skin, gaussians.colors), evidence, light._replace(shade=None))
-    return without_light(hand, surely_shown(hand, lit, evidence), light)
+        return crop
+    skin = in_photo(hand, gaussians, crop).view
+    lit = apply_light(hand, _drawn(skin, gaussians.colors), crop, light._replace(shade=None))
+    return without_light(hand, mask_unreliable(hand, lit, crop), light)
 
 
 def _complete(
-    hand: HandModel, gaussians: CanonicalGaussians, evidence: Evidence, view: BlendWeights, config: AdaptConfig
+    hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, view: BlendWeights, config: AdaptConfig
 ) -> CanonicalGaussians:
     """Calibrated Gaussians with what the photo shows of them, faded out around it."""
-    faces = hand.faces.to(evidence.image.device)
+    faces = hand.faces.to(crop.image.device)
     drawn = _drawn(view, gaussians.colors)  # not the Gaussians' own colours: those of a learned prior need not agree
-    missing = observe(hand, evidence._replace(image=evidence.image - drawn))
+    missing = observe(hand, crop._replace(image=crop.image - drawn))
     if config.light == "even":
-        even = even_photo(evidence.image, drawn, missing, view, gaussians, evidence.rest.vertices, faces)
-        missing = observe(hand, evidence._replace(image=even - drawn))
-    difference = complete_field(evidence.rest.vertices, faces, missing.colors, missing.confidence)
+        even = even_photo(crop.image, drawn, missing, view, gaussians, crop.rest.vertices, faces)
+        missing = observe(hand, crop._replace(image=even - drawn))
+    difference = inpaint(crop.rest.vertices, faces, missing.colors, missing.confidence)
     colors = (gaussians.colors + vertex_to_gaussians(difference, faces, gaussians)).clamp(0, 1)
     return gaussians._replace(colors=colors)
 
 
 def _calibration(
-    prior: CanonicalGaussians, view: BlendWeights, evidence: Evidence, trusted: Tensor, config: AdaptConfig
+    prior: CanonicalGaussians, view: BlendWeights, crop: HandCrop, trusted: Tensor, config: AdaptConfig
 ) -> Calibration:
     if config.calibration == "on":
-        return calibrate(view, prior.colors, evidence.image, trusted, config)
+        return calibrate(view, prior.colors, crop.image, trusted, config)
     return Calibration(torch.ones_like(prior.colors[0]), torch.zeros_like(prior.colors[0]))
 
 

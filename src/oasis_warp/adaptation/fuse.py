@@ -7,26 +7,26 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.adapt import MIN_ALPHA, Reading, adapt, in_photo, light_on, read_skin
+from oasis_warp.adaptation.adapt import MIN_ALPHA, Reading, adapt, in_photo, light_factors, remove_photo_light
+from oasis_warp.adaptation.albedo_shading import split_albedo_shading
 from oasis_warp.adaptation.calibrate import calibrate
-from oasis_warp.adaptation.complete import complete_field
+from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.light import even_photo
 from oasis_warp.adaptation.picture_fit import aim
-from oasis_warp.adaptation.room_light import without_light
+from oasis_warp.adaptation.sh_lighting import without_light
 from oasis_warp.adaptation.sharpen import sharpen
-from oasis_warp.adaptation.sightings import Sightings, look, photo_gains
-from oasis_warp.adaptation.skin_or_shade import skin_and_shade
+from oasis_warp.adaptation.sightings import VertexObservations, look, photo_gains
 from oasis_warp.adaptation.texture import learn_texture
-from oasis_warp.adaptation.views import freeze_view, reference_azimuths
+from oasis_warp.adaptation.views import reference_azimuths, view_weights
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.lighting import in_even_light
 from oasis_warp.avatar.mixture import mix_guesses
-from oasis_warp.avatar.observe import Observation, inner_mask, observe
+from oasis_warp.avatar.observation import Observation, inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import CanonicalGaussians, Evidence, HandLight
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors, stack_weights
 from oasis_warp.render.cameras import orbit_camera
 
@@ -49,7 +49,7 @@ class Fusion(NamedTuple):
     gaussians: CanonicalGaussians
     guess: CanonicalGaussians
     """Before adaptation: the prior's guesses of all photos, mixed."""
-    sightings: Sightings
+    sightings: VertexObservations
     gains: Float[Tensor, "K 3"]
     """How much brighter each photo is than the first."""
     shading: Float[Tensor, "K V 3"]
@@ -60,7 +60,7 @@ class Fusion(NamedTuple):
 
 def fuse(
     hand: HandModel,
-    evidences: Sequence[Evidence],
+    crops: Sequence[HandCrop],
     resolution: Sequence[float],
     guesses: Sequence[CanonicalGaussians],
     config: AdaptConfig = AdaptConfig(),  # noqa: B008 - frozen
@@ -70,7 +70,7 @@ def fuse(
 
     Args:
         hand: The model.
-        evidences: All with one surface at rest, on one device, of one size.
+        crops: All with one surface at rest, on one device, of one size.
         resolution: See `sightings.look`.
         guesses: What the prior makes of every photo.
         config: Of the adaptation.
@@ -82,39 +82,39 @@ def fuse(
     if config.texture == "lora":
         raise ValueError("texture 'lora': is for one photo, got several to fuse. Choose 'field'.")
     if len(guesses) == 1:
-        made = adapt(hand, guesses[0], evidences[0], config, progress)
-        sightings = look(hand, evidences, resolution)
+        made = adapt(hand, guesses[0], crops[0], config, progress)
+        sightings = look(hand, crops, resolution)
         gains, shading = torch.ones_like(sightings.colors[:, 0]), torch.zeros_like(sightings.colors)
         return Fusion(made.gaussians, guesses[0], sightings, gains, shading, made.light and (made.light,))
-    photos = evidences
-    readings = [read_skin(hand, guess, evidence, config) for guess, evidence in zip(guesses, evidences, strict=True)]
-    evidences = [reading.evidence for reading in readings]
+    photos = crops
+    readings = [remove_photo_light(hand, guess, crop, config) for guess, crop in zip(guesses, crops, strict=True)]
+    crops = [reading.crop for reading in readings]
     lights = tuple(reading.light for reading in readings if reading.light) or None
-    sightings = look(hand, evidences, resolution)
-    faces = hand.faces.to(evidences[0].image.device)
+    sightings = look(hand, crops, resolution)
+    faces = hand.faces.to(crops[0].image.device)
     guess = mix_guesses(guesses, sightings.confidence * sightings.share + UNSEEN, faces)
     gains = photo_gains(sightings, vertex_colors(guess, len(hand.template)))
     made, shading, calibrated = _adapt(hand, guess, photos, readings, sightings, gains, config, progress)
     if lights is not None and config.light == "even":
         made, lights = in_even_light(made, lights[0]), None
     elif lights is not None:
-        made = skin_and_shade(hand, calibrated, made)
+        made = split_albedo_shading(hand, calibrated, made)
     return Fusion(made, guess, sightings, gains, shading, lights)
 
 
 def unlit(
-    hand: HandModel, evidences: Sequence[Evidence], lights: Sequence[HandLight] | None
-) -> Sequence[Evidence]:
+    hand: HandModel, crops: Sequence[HandCrop], lights: Sequence[HandLight] | None
+) -> Sequence[HandCrop]:
     """The photos without their lights, where these are known apart from the skin."""
     if lights is None:
-        return evidences
-    return [without_light(hand, *pair) for pair in zip(evidences, lights, strict=True)]
+        return crops
+    return [without_light(hand, *pair) for pair in zip(crops, lights, strict=True)]
 
 
 def add_detail(
     hand: HandModel,
     fusion: Fusion,
-    evidences: Sequence[Evidence],
+    crops: Sequence[HandCrop],
     resolution: Sequence[float],
     size: int,
     progress: Progress = silent,
@@ -124,45 +124,45 @@ def add_detail(
     Args:
         hand: The model.
         fusion: Of these photos.
-        evidences: The photos again, as large as their detail.
+        crops: The photos again, as large as their detail.
         resolution: Of these; see `sightings.look`.
         size: Side of the crops that were fused [px]. A photo whose crop is no larger has no detail to give, and no
             other photo gives any where it is the best.
         progress: Told of the colours' fit.
     """
-    evidences = unlit(hand, evidences, fusion.lights)
-    share = look(hand, evidences, resolution).share ** DETAIL_SHARPNESS
+    crops = unlit(hand, crops, fusion.lights)
+    share = look(hand, crops, resolution).share ** DETAIL_SHARPNESS
     share = share / share.sum(0)
-    finer = [k for k, evidence in enumerate(evidences) if len(evidence.image) > size]
+    finer = [k for k, crop in enumerate(crops) if len(crop.image) > size]
     lit = []
     for k in finer:
-        view = in_photo(hand, fusion.gaussians, evidences[k]).view
-        image = _in_first_light(hand, evidences[k].image, view, fusion.gaussians, fusion.gains[k], fusion.shading[k])
-        lit.append(evidences[k]._replace(image=image))
+        view = in_photo(hand, fusion.gaussians, crops[k]).view
+        image = _in_first_light(hand, crops[k].image, view, fusion.gaussians, fusion.gains[k], fusion.shading[k])
+        lit.append(crops[k]._replace(image=image))
     return sharpen(hand, fusion.gaussians, lit, share[finer], progress).gaussians
 
 
 def _adapt(
-    hand: HandModel, guess: CanonicalGaussians, photos: Sequence[Evidence], readings: Sequence[Reading],
-    sightings: Sightings, gains: Tensor, config: AdaptConfig, progress: Progress,
+    hand: HandModel, guess: CanonicalGaussians, photos: Sequence[HandCrop], readings: Sequence[Reading],
+    sightings: VertexObservations, gains: Tensor, config: AdaptConfig, progress: Progress,
 ) -> tuple[CanonicalGaussians, Float[Tensor, "K V 3"], Float[Tensor, "N 3"]]:  # fmt: skip
     """The steps of `adaptation.adapt.adapt`, on all photos at once: their pictures stand below each other as one.
 
-    A pixel counts as much as its photo is to be believed there. `readings` are what `adaptation.adapt.read_skin`
+    A pixel counts as much as its photo is to be believed there. `readings` are what `remove_photo_light`
     takes of `photos`. With the Gaussians come `Fusion.shading` and the colours that the guess had after calibration.
     """
-    evidences = [reading.evidence for reading in readings]
-    first = evidences[0]
+    crops = [reading.crop for reading in readings]
+    first = crops[0]
     faces, rest = hand.faces.to(first.image.device), first.rest.vertices
-    posed = [pose_gaussians(guess, faces, e.rest.vertices, e.posed.vertices) for e in evidences]
-    views = [freeze_view(there, evidence.camera) for there, evidence in zip(posed, evidences, strict=True)]
-    lit = [evidence.image / gain for evidence, gain in zip(evidences, gains, strict=True)]
+    posed = [pose_gaussians(guess, faces, e.rest.vertices, e.posed.vertices) for e in crops]
+    views = [view_weights(there, crop.camera) for there, crop in zip(posed, crops, strict=True)]
+    lit = [crop.image / gain for crop, gain in zip(crops, gains, strict=True)]
     believed = []
     for view, share in zip(views, sightings.share, strict=True):
         drawn = blend_colors(view, vertex_to_gaussians(share[:, None], faces, guess))
         believed.append((drawn / view.alphas.clamp_min(MIN_ALPHA) * (view.alphas > 0.5))[..., 0])
     tall = stack_weights(views)
-    trust = torch.cat([inner_mask(e.mask, 1) * own for e, own in zip(evidences, believed, strict=True)])
+    trust = torch.cat([inner_mask(e.mask, 1) * own for e, own in zip(crops, believed, strict=True)])
 
     progress("calibration", 0, 1)
     if config.calibration == "on":
@@ -177,14 +177,14 @@ def _adapt(
 
     def differences() -> Tensor:
         return torch.stack([
-            observe(hand, evidence._replace(image=photo - picture)).colors
-            for evidence, photo, picture in zip(evidences, lit, drawn, strict=True)
+            observe(hand, crop._replace(image=photo - picture)).colors
+            for crop, photo, picture in zip(crops, lit, drawn, strict=True)
         ])  # fmt: skip
 
     shading = _other_shading(hand, rest, differences(), sightings.confidence)
     lit = [
-        _in_first_light(hand, evidence.image, view, guess, gain, other)
-        for evidence, view, gain, other in zip(evidences, views, gains, shading, strict=True)
+        _in_first_light(hand, crop.image, view, guess, gain, other)
+        for crop, view, gain, other in zip(crops, views, gains, shading, strict=True)
     ]
     if config.light == "even":
         lit = [
@@ -194,14 +194,14 @@ def _adapt(
             )
         ]
     missing = (weight[..., None] * differences()).sum(0) / weight.sum(0).clamp_min(1e-12)[:, None]
-    difference = complete_field(rest, faces, missing, weight.amax(0))
+    difference = inpaint(rest, faces, missing, weight.amax(0))
     guess = guess._replace(colors=(guess.colors + vertex_to_gaussians(difference, faces, guess)).clamp(0, 1))
     progress("completion", 1, 1)
     if config.light == "even":  # what is left to learn is the photos' light
         return guess, shading, calibrated
 
     references = [
-        freeze_view(posed[0], orbit_camera(first.posed.vertices, azimuth, size=first.camera.width))
+        view_weights(posed[0], orbit_camera(first.posed.vertices, azimuth, size=first.camera.width))
         for azimuth in reference_azimuths(config.reference_views)
     ]
     mask = torch.cat([e.mask * inner_mask(e.mask, 1) * own for e, own in zip(photos, believed, strict=True)])
@@ -209,7 +209,7 @@ def _adapt(
     lights, targets = [], []
     for photo, reading, gain, other, view in zip(photos, readings, gains, shading, views, strict=True):
         light = gain.expand_as(guess.colors)
-        light = light if reading.light is None else light * light_on(hand, guess, photo, reading.light)
+        light = light if reading.light is None else light * light_factors(hand, guess, photo, reading.light)
         lights.append(light)
         targets.append(photo.image + blend_colors(view, light * vertex_to_gaussians(other, faces, guess)))
     pictures = aim(tall, torch.cat(targets), mask, references, guess.colors, torch.stack(lights))
@@ -236,7 +236,7 @@ def _other_shading(
     best.
     """
     smooth = torch.stack([
-        complete_field(rest, hand.faces, own, seen, detail=SHADING_LENGTH, fade=REACH)
+        inpaint(rest, hand.faces, own, seen, detail=SHADING_LENGTH, fade=REACH)
         for own, seen in zip(differences, confidence, strict=True)
     ])  # fmt: skip
     mean = (confidence[..., None] * smooth).sum(0) / (confidence.sum(0) + GUESS_LIGHT)[:, None]

@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_warp.adaptation.complete import complete_field
+from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.avatar.anchors import vertex_to_gaussians
-from oasis_warp.avatar.observe import Observation
+from oasis_warp.avatar.observation import Observation
 from oasis_warp.core.types import CanonicalGaussians
 from oasis_warp.ops import BlendWeights, blend_colors
 
@@ -44,7 +44,7 @@ def even_photo(
         vertices: The surface at rest [m].
         faces: Corners.
     """
-    shading = complete_field(vertices, faces, missing.colors, missing.confidence, LIGHT_LENGTH, REACH)
+    shading = inpaint(vertices, faces, missing.colors, missing.confidence, LIGHT_LENGTH, REACH)
     detail = weighted_deviation(missing.colors - shading, missing.confidence)
     share = (SKIN_DEVIATION / detail.clamp_min(SKIN_DEVIATION)).square()
     light = blend_colors(view, vertex_to_gaussians(shading, faces, gaussians))

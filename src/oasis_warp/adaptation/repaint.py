@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from oasis_warp.adaptation.carried import (
+from oasis_warp.adaptation.reprojection import (
     PHOTO_WEIGHT,
     Canvas,
     Source,
@@ -19,9 +19,9 @@ from oasis_warp.adaptation.carried import (
     read,
     with_neighbours,
 )
-from oasis_warp.adaptation.views import freeze_view
+from oasis_warp.adaptation.views import view_weights
 from oasis_warp.avatar.densify import densify, parts_for_spacing
-from oasis_warp.avatar.lighting import with_shade_on, with_shown
+from oasis_warp.avatar.lighting import with_photo_colors, with_shade_baked
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.camera import project
@@ -100,15 +100,15 @@ def repaint(
     parts = torch.where(around, parts_for_spacing(rest, faces, SPACING * pixel).clamp_min(2), 1)
     dense, changed, n_new = densify(gaussians, rest, faces, parts)
 
-    old, new = (pose_gaussians(with_shade_on(layer), faces, rest, posed) for layer in (gaussians, dense))
+    old, new = (pose_gaussians(with_shade_baked(layer), faces, rest, posed) for layer in (gaussians, dense))
     share, color = read(canvas, seen, new.means[changed])
     start = torch.lerp(new.colors[changed], color, share[:, None])
     still = torch.where(changed[:, None], 0, new.colors)
     views = []
     for camera, weight in _cameras(canvas.camera, posed[faces[around]].flatten(0, 1)):
-        before = blend_colors(freeze_view(old, camera), old.colors)
+        before = blend_colors(view_weights(old, camera), old.colors)
         target = carried(before, [Source(canvas, seen, posed)], posed, faces, camera)
-        weights = freeze_view(new, camera)
+        weights = view_weights(new, camera)
         views.append(View(weights, target - blend_colors(weights, still), weight))
     learned, losses = fit_colors(views, start, changed, steps, progress)
     if dense.shade is not None:  # paint has none
@@ -118,7 +118,7 @@ def repaint(
     on = dense.face_index[-n_new:]
     on_hand = (canvas.mask * (seen.faces >= 0)).sum()
     return Repainted(
-        with_shown(dense, changed, learned),
+        with_photo_colors(dense, changed, learned),
         n_new,
         around,
         float((areas[on] / parts[on].square() * share[-n_new:]).sum()),

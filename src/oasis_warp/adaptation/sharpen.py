@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from oasis_warp.adaptation.carried import (
+from oasis_warp.adaptation.reprojection import (
     PHOTO_WEIGHT,
     Canvas,
     Source,
@@ -21,16 +21,16 @@ from oasis_warp.adaptation.carried import (
     look,
     with_neighbours,
 )
-from oasis_warp.adaptation.views import freeze_view
+from oasis_warp.adaptation.views import view_weights
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_to_gaussians
 from oasis_warp.avatar.densify import densify, parts_for_spacing
-from oasis_warp.avatar.lighting import with_shade_on, with_shown
-from oasis_warp.avatar.observe import inner_mask
+from oasis_warp.avatar.lighting import with_photo_colors, with_shade_baked
+from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import Camera, CanonicalGaussians, Evidence, Gaussians
+from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandCrop
 from oasis_warp.ops import blend_colors
 from oasis_warp.render.render import render
 
@@ -74,7 +74,7 @@ class Sharpened(NamedTuple):
 def sharpen(
     hand: HandModel,
     gaussians: CanonicalGaussians,
-    evidences: Sequence[Evidence],
+    crops: Sequence[HandCrop],
     believed: Float[Tensor, "K V"] | None = None,
     progress: Progress = silent,
 ) -> Sharpened:
@@ -89,17 +89,17 @@ def sharpen(
     Args:
         hand: Whose surface it is.
         gaussians: Fitted to the photos, perhaps in smaller pictures of them.
-        evidences: Of K photos, as large as their detail, with one surface at rest and in one light.
+        crops: Of K photos, as large as their detail, with one surface at rest and in one light.
         believed: How far to believe each at each vertex, at most 1 in all; a single photo wholly.
         progress: Called as work goes on.
     """
-    rest = evidences[0].rest.vertices
+    rest = crops[0].rest.vertices
     faces = hand.faces.to(rest.device)
     believed = rest.new_ones(1, len(rest)) if believed is None else believed
     fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
     fading = with_neighbours(fading[faces].any(1), faces, len(rest))
-    sources = [_source(e, faces, fading, own) for e, own in zip(evidences, believed, strict=True)]
-    old = [pose_gaussians(with_shade_on(gaussians), faces, rest, source.posed) for source in sources]
+    sources = [_source(e, faces, fading, own) for e, own in zip(crops, believed, strict=True)]
+    old = [pose_gaussians(with_shade_baked(gaussians), faces, rest, source.posed) for source in sources]
     spacing = torch.stack([
         _wanted_spacing(source, render(there, source.canvas.camera).image, faces)
         for source, there in zip(sources, old, strict=True)
@@ -111,7 +111,7 @@ def sharpen(
     # A face of one part would keep its vertices' Gaussians, which reach into the faces beside it.
     parts = torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
     dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
-    shown = with_shade_on(dense)
+    shown = with_shade_baked(dense)
     new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
     start = lay_over(shown.colors[changed], sources, [there.means[changed] for there in new])
     colors = shown.colors.masked_scatter(changed[:, None], start)
@@ -127,14 +127,14 @@ def sharpen(
         views = _views(sources, k, points, faces, old[k], new[k], still)
         learned, own = fit_colors(views, colors[mine], mine, STEPS, progress)
         colors, losses = still.masked_scatter(mine[:, None], learned), [*losses, *own]
-    return Sharpened(with_shown(dense, changed, colors[changed]), n_new, tuple(losses))
+    return Sharpened(with_photo_colors(dense, changed, colors[changed]), n_new, tuple(losses))
 
 
 def _source(
-    evidence: Evidence, faces: Tensor, fading: Bool[Tensor, "F"], believed: Float[Tensor, "V"]
+    crop: HandCrop, faces: Tensor, fading: Bool[Tensor, "F"], believed: Float[Tensor, "V"]
 ) -> Source:
     """The photo on its surface, with nothing of it on `fading` faces and elsewhere as much as it is believed."""
-    posed, canvas = evidence.posed.vertices, Canvas(evidence.image, _faded_in(evidence.mask), evidence.camera)
+    posed, canvas = crop.posed.vertices, Canvas(crop.image, _faded_in(crop.mask), crop.camera)
     seen = look(posed, faces, canvas, FACING)
     ids = seen.faces.clamp_min(0)
     trust = torch.where(fading[ids], 0, (believed[faces[ids]] * seen.barycentrics).sum(-1))
@@ -153,7 +153,7 @@ def _views(
         target = alpha * carried(image / alpha, sources, posed, faces, near)
         small = _pooled(target) / _pooled(alpha)
         for goal, shown, scale in ((target / alpha, near, 1), (small, _smaller(near), SHRUNK)):
-            weights = freeze_view(new, shown)
+            weights = view_weights(new, shown)
             # Coverage is not to be fitted: in a small picture the rasterizer draws outlines wider.
             goal = goal * weights.alphas - blend_colors(weights, still)
             views.append(View(weights, goal, weight * scale**2))

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.observe import VISIBILITY_MARGIN, facing, inner_mask, observe
+from oasis_warp.avatar.observation import VISIBILITY_MARGIN, facing, inner_mask, observe
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import Evidence
+from oasis_warp.core.types import HandCrop
 from oasis_warp.ops import depth_visibility
 
 SHARPNESS = 2.0
@@ -25,7 +25,7 @@ DARKEST, BRIGHTEST = 0.02, 0.98
 """Values beyond which a sensor is blind, or clips."""
 
 
-class Sightings(NamedTuple):
+class VertexObservations(NamedTuple):
     """What K photos show of the V vertices of one hand."""
 
     colors: Float[Tensor, "K V 3"]
@@ -35,29 +35,29 @@ class Sightings(NamedTuple):
     """How much a photo counts beside the one that shows a place best: 1 for that one, and where none shows it."""
 
 
-def look(hand: HandModel, evidences: Sequence[Evidence], resolution: Sequence[float]) -> Sightings:
+def look(hand: HandModel, crops: Sequence[HandCrop], resolution: Sequence[float]) -> VertexObservations:
     """What every photo shows, and which to believe: the one that spends most pixels on the skin there.
 
     Args:
         hand: The model.
-        evidences: Of K photos of one hand.
+        crops: Of K photos of one hand.
         resolution: Pixels of each photo a pixel of its crop, along a line; below 1 the crop is an enlargement.
     """
-    seen = [observe(hand, evidence) for evidence in evidences]
+    seen = [observe(hand, crop) for crop in crops]
     density = torch.stack([
-        min(1.0, scale) ** 2 * _pixel_density(hand, evidence)
-        for evidence, scale in zip(evidences, resolution, strict=True)
+        min(1.0, scale) ** 2 * _pixel_density(hand, crop)
+        for crop, scale in zip(crops, resolution, strict=True)
     ])  # fmt: skip
     best = density.amax(0)
     share = torch.where(best > 0, (density / best.clamp_min(1e-12)) ** SHARPNESS, 1.0)
-    return Sightings(
+    return VertexObservations(
         torch.stack([photo.colors for photo in seen]), torch.stack([photo.confidence for photo in seen]), share
     )
 
 
-def _pixel_density(hand: HandModel, evidence: Evidence) -> Float[Tensor, "V"]:
+def _pixel_density(hand: HandModel, crop: HandCrop) -> Float[Tensor, "V"]:
     """Pixels of the crop a square metre of the skin round each vertex; 0 where it is hidden, turned away or cut off."""
-    vertices, camera = evidence.posed.vertices, evidence.camera
+    vertices, camera = crop.posed.vertices, crop.camera
     faces = hand.faces.to(vertices.device)
     visible, _, _ = depth_visibility(
         vertices, vertices, faces, camera.K, camera.viewmat, camera.width, camera.height, margin=VISIBILITY_MARGIN,
@@ -65,11 +65,11 @@ def _pixel_density(hand: HandModel, evidence: Evidence) -> Float[Tensor, "V"]:
     )  # fmt: skip
     turned = facing(vertices, faces, camera).clamp(0, 1)
     _, depth = project(camera, vertices)
-    inside = observe(hand, evidence._replace(image=inner_mask(evidence.mask, 1)[..., None].expand(-1, -1, 3)))
+    inside = observe(hand, crop._replace(image=inner_mask(crop.mask, 1)[..., None].expand(-1, -1, 3)))
     return visible * turned * inside.colors[:, 0].clamp(0, 1) * (camera.K[0, 0] / depth.clamp_min(1e-3)) ** 2
 
 
-def photo_gains(sightings: Sightings, guess: Float[Tensor, "V 3"]) -> Float[Tensor, "K 3"]:
+def photo_gains(sightings: VertexObservations, guess: Float[Tensor, "V 3"]) -> Float[Tensor, "K 3"]:
     """How much brighter each photo shows each channel than the first one does.
 
     The least squares of all differences of the logarithms of colours that two photos show of one place, with one

@@ -6,7 +6,7 @@ from oasis_warp.core.types import Camera, Gaussians
 from oasis_warp.ops import BlendWeights, blend_weights
 
 
-def freeze_view(gaussians: Gaussians, camera: Camera) -> BlendWeights:
+def view_weights(gaussians: Gaussians, camera: Camera) -> BlendWeights:
     """The weights of every Gaussian in every pixel; afterwards a picture costs one sparse product."""
     like = gaussians.means
     return blend_weights(

@@ -25,10 +25,10 @@ MAX_ANISOTROPY = 3.0
 OPACITY = 0.95
 RIM_FADE = 0.008
 """The last stretch before the open wrist, over which opacity falls to nothing [m]."""
-SINK = 0.0008
-"""Distance from the skin to the surface that carries Gaussians, inwards, where a crop of the hand has `PICTURE` pixels
-a side [m]. A pixel's blur draws Gaussians beyond their size: on the skin itself outlines come out a pixel too fat."""
-PICTURE = 256
+INSET = 0.0008
+"""Distance of the surface that carries Gaussians below the skin, in crops of `PRIOR_SIZE` pixels [m]. Blur draws
+Gaussians larger than they are: on the skin itself outlines come out a pixel too wide."""
+PRIOR_SIZE = 256
 """Side of the crops that the prior reads, and of the pictures that it is trained on [px]."""
 MIN_OPACITY = 1 / 255
 """Fainter Gaussians are never drawn, so they are left out."""
@@ -91,9 +91,9 @@ def _rim_opacity(hand: HandModel, vertices: Tensor) -> Tensor:
     return OPACITY * fade * fade * (3 - 2 * fade)
 
 
-def below_skin(hand: HandModel, size: int = PICTURE) -> Float[Tensor, "V 3"]:
+def inset_offsets(hand: HandModel, size: int = PRIOR_SIZE) -> Float[Tensor, "V 3"]:
     """From the skin at rest to the surface that carries Gaussians in pictures of the hand of `size` pixels [m]."""
-    return -SINK * PICTURE / size * surface.vertex_normals(hand.template, hand.faces)
+    return -INSET * PRIOR_SIZE / size * surface.vertex_normals(hand.template, hand.faces)
 
 
 def place_anchors(hand: HandModel, rest: PosedHand) -> Anchors:

@@ -20,7 +20,7 @@ PART_OPACITY = 0.28
 the picture moves to the side that is nearer in the view at hand."""
 SOLID = 0.25
 """Opacity of an old Gaussian below which the surface itself is taken for fading, as at the wrist."""
-SINK = 0.001
+GROUND_DEPTH = 0.001
 """Depth at which the vertex Gaussians of cut faces go on, as discs that are the ground under the parts' [m]."""
 GROUND_SPREAD = 1.4
 """Standard deviations of those discs over those of a vertex Gaussian. Parts are half transparent: with 1 the hand's
@@ -74,7 +74,7 @@ def densify(
     cut = (parts > 1) & (opacity >= MIN_OPACITY)
     n_points, index = len(gaussians.vertex_index), gaussians.vertex_index
     sunk = _inside(cut, faces, len(vertices))[index]
-    depth = SINK * surface.vertex_normals(vertices, faces)[index]
+    depth = GROUND_DEPTH * surface.vertex_normals(vertices, faces)[index]
     disc_quats, disc_scales = vertex_shapes(vertices, faces)
     # Of the surface, not of the vertices' Gaussians alone: a learned prior lets faces cover where these are faint.
     solid = gaussians.opacities.new_zeros(len(vertices)).index_copy(0, index, gaussians.opacities[:n_points])

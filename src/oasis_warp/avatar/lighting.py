@@ -80,14 +80,14 @@ def in_even_light(canonical: CanonicalGaussians, light: HandLight) -> CanonicalG
     return canonical._replace(colors=(canonical.colors * light.even.pow(1 / GAMMA)).clamp(0, 1), shade=None)
 
 
-def with_shade_on(canonical: CanonicalGaussians) -> CanonicalGaussians:
+def with_shade_baked(canonical: CanonicalGaussians) -> CanonicalGaussians:
     """The same with shade for colour: what the photo shows, without its light."""
     if canonical.shade is None:
         return canonical
     return canonical._replace(colors=canonical.colors * canonical.shade, shade=None)
 
 
-def apart_from_shade(
+def split_shade(
     shown: Float[Tensor, "M 3"], shade: Float[Tensor, "M 3"]
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
     """Colours and shade that come to `shown` together; where colours would end at 1, with more shade than `shade`."""
@@ -95,13 +95,13 @@ def apart_from_shade(
     return colors, shown.clamp_min(BLACK) / colors
 
 
-def with_shown(
+def with_photo_colors(
     canonical: CanonicalGaussians, changed: Bool[Tensor, "N"], shown: Float[Tensor, "M 3"]
 ) -> CanonicalGaussians:
     """The same with other looks of some Gaussians in the photo, in the shade that they have there."""
     if canonical.shade is None:
         return canonical._replace(colors=canonical.colors.masked_scatter(changed[:, None], shown))
-    colors, shade = apart_from_shade(shown, canonical.shade[changed])
+    colors, shade = split_shade(shown, canonical.shade[changed])
     return canonical._replace(
         colors=canonical.colors.masked_scatter(changed[:, None], colors),
         shade=canonical.shade.masked_scatter(changed[:, None], shade),

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import Regions, label_regions, region_colors
-from oasis_warp.avatar.observe import Observation, observe
+from oasis_warp.avatar.observation import Observation, observe
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import CanonicalGaussians, Evidence
+from oasis_warp.core.types import CanonicalGaussians, HandCrop
 
 TONES = 25
 """Skin tones tried, evenly spaced in the logarithm of melanin."""
@@ -35,8 +35,8 @@ class Prior(Protocol):
         """Which prior this is, for reports: its name, and what else tells it from others."""
         ...
 
-    def __call__(self, evidence: Evidence) -> CanonicalGaussians:
-        """Guess the hand of `evidence`."""
+    def __call__(self, crop: HandCrop) -> CanonicalGaussians:
+        """Guess the hand of `crop`."""
         ...
 
 
@@ -71,11 +71,11 @@ class MeanPrior:
         self.hand = hand
         self.regions = label_regions(hand)
 
-    def __call__(self, evidence: Evidence) -> CanonicalGaussians:
+    def __call__(self, crop: HandCrop) -> CanonicalGaussians:
         """Gaussians on the fitted surface with evenly lit mean colours; the photo is only asked for the skin tone."""
-        seen = Observation(*(part.cpu() for part in observe(self.hand, evidence)))
-        colors = self.vertex_colors(estimate_melanin(self.regions, seen)).to(evidence.image)
-        anchors = place_anchors(self.hand, evidence.rest)
+        seen = Observation(*(part.cpu() for part in observe(self.hand, crop)))
+        colors = self.vertex_colors(estimate_melanin(self.regions, seen)).to(crop.image)
+        anchors = place_anchors(self.hand, crop.rest)
         faces = self.hand.faces.to(colors.device)
         return anchors.with_colors(vertex_to_gaussians(colors, faces, anchors))
 

@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from oasis_warp.avatar.appearance import label_regions, region_masks
-from oasis_warp.avatar.observe import inner_mask, observe
+from oasis_warp.avatar.observation import inner_mask, observe
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import Evidence
+from oasis_warp.core.types import HandCrop
 
 SEEN = 0.5
 """Confidence of an observation from which a place counts as seen; below it the photo only grazes it."""
@@ -46,7 +46,7 @@ class SurfaceQuality(NamedTuple):
 
 
 @torch.no_grad()
-def assess_surface(hand: HandModel, evidence: Evidence, drawn: Float[Tensor, "S S 3"]) -> SurfaceQuality:
+def assess_surface(hand: HandModel, crop: HandCrop, drawn: Float[Tensor, "S S 3"]) -> SurfaceQuality:
     """Where the surface is known from the photo, by a first guess that no truth is needed for.
 
     Trust in a vertex is the observation's confidence times exp(-|avatar - photo| / TOLERATED). It is handed on along
@@ -55,13 +55,13 @@ def assess_surface(hand: HandModel, evidence: Evidence, drawn: Float[Tensor, "S 
 
     Args:
         hand: Whose surface it is.
-        evidence: The photo.
+        crop: The photo.
         drawn: The avatar in the photo's view, over the photo.
     """
-    seen = observe(hand, evidence._replace(image=evidence.image - drawn))
+    seen = observe(hand, crop._replace(image=crop.image - drawn))
     residual = seen.colors.square().mean(-1).sqrt()
     trust = (seen.confidence * torch.exp(-residual / TOLERATED)).cpu().double().numpy()
-    vertices, edges = evidence.rest.vertices.cpu().double(), surface.mesh_edges(hand.faces.cpu())
+    vertices, edges = crop.rest.vertices.cpu().double(), surface.mesh_edges(hand.faces.cpu())
     lengths = (vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1).numpy()
     n, known = len(vertices), np.flatnonzero(trust > MIN_TRUST)
     # A source beside the graph, as far from each vertex as its trust has already fallen; an edge of 0 would be none.
@@ -73,7 +73,7 @@ def assess_surface(hand: HandModel, evidence: Evidence, drawn: Float[Tensor, "S 
     return SurfaceQuality(seen.confidence, uncertainty)
 
 
-def best_known(qualities: Sequence[SurfaceQuality]) -> SurfaceQuality:
+def combine_quality(qualities: Sequence[SurfaceQuality]) -> SurfaceQuality:
     """How well each vertex is known from several photos: as from the one that says most of it."""
     visibility, uncertainty = (torch.stack(values) for values in zip(*qualities, strict=True))
     return SurfaceQuality(visibility.amax(0), uncertainty.amin(0))
@@ -96,7 +96,7 @@ def shares(hand: HandModel, rest: Float[Tensor, "V 3"], quality: SurfaceQuality)
     return found
 
 
-def surface_doubts(found: dict[str, float]) -> list[str]:
+def coverage_warnings(found: dict[str, float]) -> list[str]:
     """What `shares` gives reason to warn about, in words."""
     if found["seen_percent"] >= LITTLE_SEEN:
         return []
@@ -105,7 +105,7 @@ def surface_doubts(found: dict[str, float]) -> list[str]:
 
 
 @torch.no_grad()
-def photo_doubts(image: Float[Tensor, "S S 3"], mask: Float[Tensor, "S S"], side: float) -> list[str]:
+def photo_warnings(image: Float[Tensor, "S S 3"], mask: Float[Tensor, "S S"], side: float) -> list[str]:
     """What ails the photo of a hand, in words: dark, over-exposed, not the colour of skin, blurred.
 
     Args:

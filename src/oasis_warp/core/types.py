@@ -97,7 +97,7 @@ class HandFit(NamedTuple):
     """What makes this fit doubtful, in words; empty when nothing does."""
 
 
-class Evidence(NamedTuple):
+class HandCrop(NamedTuple):
     """What a prior may look at to guess the whole hand; a left hand has been mirrored."""
 
     image: Float[Tensor, "S S 3"]

@@ -16,12 +16,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from oasis_warp.avatar.anchors import PICTURE
+from oasis_warp.avatar.anchors import PRIOR_SIZE
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import CanonicalGaussians, Evidence
+from oasis_warp.core.types import CanonicalGaussians, HandCrop
 from oasis_warp.estimation.surface_offsets import ThinSheet, crossing
 from oasis_warp.render.render import render
 
@@ -31,9 +31,9 @@ in the photo and half black in a picture over black, so what fits best is opaque
 _ROUNDS = 2
 _GRAZING = 0.5
 """Largest |normal . view| of a vertex that speaks for the rim."""
-_NEAR = 2.5 / PICTURE
+_NEAR = 2.5 / PRIOR_SIZE
 """Distance from what is not drawn within which a vertex speaks for the rim; this and the next as shares of the side."""
-_REJECT = 4 / PICTURE
+_REJECT = 4 / PRIOR_SIZE
 """A gap wider than this is the mask's fault and is left."""
 _BORDER = 2
 """Outlines nearer to the picture's border may be those of the picture [px]."""
@@ -49,8 +49,8 @@ class _Rim(NamedTuple):
 
 
 @torch.no_grad()
-def drawn_outline_offsets(
-    hand: HandModel, guesses: Sequence[CanonicalGaussians], evidences: Sequence[Evidence]
+def rendered_outline_offsets(
+    hand: HandModel, guesses: Sequence[CanonicalGaussians], crops: Sequence[HandCrop]
 ) -> Float[Tensor, "V 3"]:
     """Displacement of the rest surface that brings the outlines of Gaussians on it to the masks' [m].
 
@@ -59,23 +59,23 @@ def drawn_outline_offsets(
     Args:
         hand: The model.
         guesses: Gaussians as each photo shows them. Neither their colours nor the photos' are looked at.
-        evidences: Photos of one hand, as large as its pictures will be, with one surface at rest.
+        crops: Photos of one hand, as large as its pictures will be, with one surface at rest.
     """
-    faces = hand.faces.to(evidences[0].mask.device)
+    faces = hand.faces.to(crops[0].mask.device)
     along = [
         (surface.vertex_normals(e.rest.vertices, faces), surface.vertex_normals(e.posed.vertices, faces))
-        for e in evidences
+        for e in crops
     ]
     sheet = ThinSheet(hand.faces.cpu().numpy(), len(hand.template))
     outwards = np.zeros(len(hand.template))
     for _ in range(_ROUNDS):
-        step = torch.from_numpy(outwards).to(evidences[0].mask)[:, None]
+        step = torch.from_numpy(outwards).to(crops[0].mask)[:, None]
         parts = [
             _look(guess, faces, e._replace(
                 rest=e.rest._replace(vertices=e.rest.vertices + step * at_rest),
                 posed=e.posed._replace(vertices=e.posed.vertices + step * posed),
             ))
-            for guess, e, (at_rest, posed) in zip(guesses, evidences, along, strict=True)
+            for guess, e, (at_rest, posed) in zip(guesses, crops, along, strict=True)
         ]  # fmt: skip
         vertices, missing, weight = (np.concatenate(part) for part in zip(*parts, strict=True))
         if len(vertices) == 0:
@@ -85,12 +85,12 @@ def drawn_outline_offsets(
     return torch.from_numpy(outwards).to(along[0][0])[:, None] * along[0][0]
 
 
-def _look(gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"], evidence: Evidence) -> _Rim:
-    """Draw Gaussians on the surface of `evidence`, and compare their outline with the mask's at the vertices there."""
-    vertices, camera = evidence.posed.vertices, evidence.camera
-    posed = pose_gaussians(gaussians, faces, evidence.rest.vertices, vertices)
+def _look(gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"], crop: HandCrop) -> _Rim:
+    """Draw Gaussians on the surface of `crop`, and compare their outline with the mask's at the vertices there."""
+    vertices, camera = crop.posed.vertices, crop.camera
+    posed = pose_gaussians(gaussians, faces, crop.rest.vertices, vertices)
     alpha = render(posed, camera).alpha.cpu().numpy()
-    mask, side = evidence.mask.cpu().numpy(), len(alpha)
+    mask, side = crop.mask.cpu().numpy(), len(alpha)
 
     turn = camera.viewmat[:3, :3]
     normals = surface.vertex_normals(vertices, faces) @ turn.T
@@ -100,7 +100,7 @@ def _look(gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"], evidence: Ev
     pixel = np.clip(np.floor(uv).astype(int), 0, side - 1)
     inside = cv2.distanceTransform((alpha > 0.5).astype(np.uint8), cv2.DIST_L2, 3)
     near = inside[pixel[:, 1], pixel[:, 0]] < max(_NEAR * side, 1)
-    judged = evidence.above_wrist.cpu().numpy()[pixel[:, 1], pixel[:, 0]] > 0.5
+    judged = crop.above_wrist.cpu().numpy()[pixel[:, 1], pixel[:, 0]] > 0.5
     rim = np.flatnonzero(grazing & near & judged)
 
     across = normals.cpu().numpy()[rim, :2]

@@ -22,10 +22,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import PICTURE, below_skin
+from oasis_warp.avatar.anchors import PRIOR_SIZE, inset_offsets
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import CanonicalGaussians, Evidence, HandPose, PosedHand
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandPose, PosedHand
 from oasis_warp.estimation.fit import FitSettings, Fitter
 from oasis_warp.estimation.fit_state import FitState
 from oasis_warp.estimation.fit_target import Evidence as FitTarget
@@ -106,14 +106,14 @@ class Refinement(NamedTuple):
     """The refined pose, or the start where nothing better was found."""
 
     pose: HandPose
-    """In the frame of the evidence's camera; on the CPU, as fits are."""
-    evidence: Evidence
+    """In the frame of the crop's camera; on the CPU, as fits are."""
+    crop: HandCrop
     """With the surface in that pose."""
     accepted: bool
     before: Explanation
     after: Explanation
     moved: float
-    """Median over the vertices, in the picture [px of the evidence]."""
+    """Median over the vertices, in the picture [px of the crop]."""
     turned: float
     """Of the whole hand [rad]."""
     bent: float
@@ -123,20 +123,20 @@ class Refinement(NamedTuple):
 def refine(
     hand: HandModel,
     guess: CanonicalGaussians,
-    evidence: Evidence,
+    crop: HandCrop,
     landmarks: Float[Tensor, "21 2"] | None = None,
-    size: int = PICTURE,
+    size: int = PRIOR_SIZE,
 ) -> Refinement:
-    """Move the posed surface of `evidence` to where the colours of `guess` explain the photo best.
+    """Move the posed surface of `crop` to where the colours of `guess` explain the photo best.
 
     Args:
         hand: On the CPU, as in `reconstruction.reconstruct`.
-        guess: What a prior makes of `evidence`; its colours should be those of even light.
-        evidence: Camera with an identity viewmat; joints and tips are not asked for.
-        landmarks: What was detected [px of the evidence]; the model's own at the start when not given.
-        size: As of `avatar.anchors.below_skin`, by which the surface of `evidence` lies below the skin.
+        guess: What a prior makes of `crop`; its colours should be those of even light.
+        crop: Camera with an identity viewmat; joints and tips are not asked for.
+        landmarks: What was detected [px of the crop]; the model's own at the start when not given.
+        size: As of `avatar.anchors.inset_offsets`, by which the surface of `crop` lies below the skin.
     """
-    problem = _Problem(hand, guess, evidence, landmarks, size)
+    problem = _Problem(hand, guess, crop, landmarks, size)
     start = problem.start
     before = problem.explain(start)
     found, after = start, before
@@ -146,12 +146,12 @@ def refine(
     accepted = after.gap < (1 - LEAST_GAIN) * before.gap and after.mask_iou > before.mask_iou - MASK_SLACK
     if not accepted:
         found, after = start, before
-    posed = problem.posed_hand(found) if accepted else evidence.posed
-    places = [project(evidence.camera, vertices)[0] for vertices in (evidence.posed.vertices, posed.vertices)]
+    posed = problem.posed_hand(found) if accepted else crop.posed
+    places = [project(crop.camera, vertices)[0] for vertices in (crop.posed.vertices, posed.vertices)]
     change = problem.change(found)
     return Refinement(
         pose=HandPose(*(part.cpu() for part in problem.pose([found], batch=False))),
-        evidence=evidence._replace(posed=posed),
+        crop=crop._replace(posed=posed),
         accepted=accepted,
         before=before,
         after=after,
@@ -174,15 +174,15 @@ class _Problem:
     """One photo, and what it costs to explain it by a state."""
 
     def __init__(
-        self, hand: HandModel, guess: CanonicalGaussians, evidence: Evidence, landmarks: Tensor | None, picture: int
+        self, hand: HandModel, guess: CanonicalGaussians, crop: HandCrop, landmarks: Tensor | None, picture: int
     ):
-        self.rig, camera = HandKinematics(hand), evidence.camera
-        device = evidence.image.device
+        self.rig, camera = HandKinematics(hand), crop.camera
+        device = crop.image.device
         self.hand = hand.to(device)
-        K, carrier, sunk = array(camera.K), array(evidence.rest.vertices), array(below_skin(hand, picture))
+        K, carrier, sunk = array(camera.K), array(crop.rest.vertices), array(inset_offsets(hand, picture))
         shape = shape_of(self.rig, carrier - sunk)
         self.start, detail = state_of_surface(
-            self.rig, shape, carrier, array(evidence.posed.vertices), float(K[0, 0]), K[:2, 2]
+            self.rig, shape, carrier, array(crop.posed.vertices), float(K[0, 0]), K[:2, 2]
         )
         self.n = 6 + len(self.start.angles)
         bare = rest_hand(self.hand, real(shape).to(device))
@@ -192,8 +192,8 @@ class _Problem:
         self.fitter = _anchor(self.rig, self.start, size, landmarks)
         self.fit_weight = ANCHOR_WEIGHT if landmarks is None else FIT_WEIGHT
         above = wrist_line(self.fitter.evidence.xy).above_mask(size, WRIST)
-        judged = torch.from_numpy(above).to(evidence.mask) * evidence.above_wrist
-        self.scene = make_scene(self.hand, guess, evidence, judged, SIZE)
+        judged = torch.from_numpy(above).to(crop.mask) * crop.above_wrist
+        self.scene = make_scene(self.hand, guess, crop, judged, SIZE)
         area = float((self.scene.mask * self.scene.judged).sum().clamp_min(1))
         self.outline_pixels = OUTLINE_PIXELS * 4 * area**0.5
         self.sigmas = {blurs: self._photo_sigma(blurs) for blurs in LEVELS}

@@ -16,7 +16,7 @@ from torch.nn.functional import interpolate, normalize
 
 from oasis_warp.avatar.anchors import vertex_colors
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import CanonicalGaussians, Evidence
+from oasis_warp.core.types import CanonicalGaussians, HandCrop
 from oasis_warp.ops import depth_map
 
 DARKEST = 0.02
@@ -54,18 +54,18 @@ class Scene(NamedTuple):
 
 
 def make_scene(
-    hand: HandModel, guess: CanonicalGaussians, evidence: Evidence, judged: Float[Tensor, "s s"], size: int
+    hand: HandModel, guess: CanonicalGaussians, crop: HandCrop, judged: Float[Tensor, "s s"], size: int
 ) -> Scene:
-    """The photo of `evidence` with `size` pixels; `judged` is as large as its mask."""
+    """The photo of `crop` with `size` pixels; `judged` is as large as its mask."""
 
     def reduced(planes: Tensor) -> Tensor:
         return interpolate(planes[None], size=(size, size), mode="area")[0]
 
-    K = evidence.camera.K.clone()
-    K[:2] *= size / evidence.camera.width
-    mask, line = reduced(torch.stack([evidence.mask, judged]))
+    K = crop.camera.K.clone()
+    K[:2] *= size / crop.camera.width
+    mask, line = reduced(torch.stack([crop.mask, judged]))
     albedo = vertex_colors(guess, len(hand.template)).clamp_min(DARKEST)
-    return Scene(reduced(evidence.image.permute(2, 0, 1)), mask, line, K, hand.faces.to(mask.device), albedo)
+    return Scene(reduced(crop.image.permute(2, 0, 1)), mask, line, K, hand.faces.to(mask.device), albedo)
 
 
 def draw(scene: Scene, posed: Float[Tensor, "B V 3"]) -> Drawn:

@@ -13,7 +13,7 @@ from oasis_warp.avatar.lighting import in_even_light
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import CanonicalGaussians, Evidence, HandLight
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.lora import ColorHeads
@@ -86,18 +86,18 @@ def prior_digest(prior: Prior) -> str | None:
 
 
 @torch.no_grad()
-def ask(prior: Prior, evidence: Evidence, config: AdaptConfig) -> tuple[CanonicalGaussians, ColorHeads | None]:
+def ask(prior: Prior, crop: HandCrop, config: AdaptConfig) -> tuple[CanonicalGaussians, ColorHeads | None]:
     """The guess of `prior`, and its heads where `config` wants to train them.
 
     Raises:
         InputError: it wants to, and the prior is no network.
     """
-    return guess_with_heads(prior, evidence) if config.texture == "lora" else (prior(evidence), None)
+    return guess_with_heads(prior, crop) if config.texture == "lora" else (prior(crop), None)
 
 
 def reconstructions(
     hand: HandModel,
-    evidence: Evidence,
+    crop: HandCrop,
     priors: Mapping[str, Prior],
     wanted: Sequence[Method],
     config: AdaptConfig,
@@ -106,7 +106,7 @@ def reconstructions(
 
     Args:
         hand: On the CPU, as in `reconstruction.reconstruct`.
-        evidence: Of one photo.
+        crop: Of one photo.
         priors: By the names that methods have for them.
         wanted: What to make.
         config: Of the adaptation, whose light the stage decides on but for `ONE_SHOT`.
@@ -118,16 +118,16 @@ def reconstructions(
         stages = {method.stage for method in wanted if method.prior == name}
         if not stages:
             continue
-        guess, heads = ask(prior, evidence, config)
+        guess, heads = ask(prior, crop, config)
         if RAW in stages:
             yield Method(name, RAW), Made(guess)
         if CALIBRATED in stages:
-            _, view, trusted = in_photo(hand, guess, evidence)
-            calibration = calibrate(view, guess.colors, evidence.image, trusted, config)
+            _, view, trusted = in_photo(hand, guess, crop)
+            calibration = calibrate(view, guess.colors, crop.image, trusted, config)
             yield Method(name, CALIBRATED), Made(guess._replace(colors=calibration.apply(guess.colors)))
         for stage, settings in (
             (EVEN, replace(config, light="even")), (KEEP, replace(config, light="keep")), (ONE_SHOT, config)
         ):  # fmt: skip
             if stage in stages:
-                adapted = adapt(hand, guess, evidence, settings, heads=heads)
+                adapted = adapt(hand, guess, crop, settings, heads=heads)
                 yield Method(name, stage), Made(adapted.gaussians, adapted.light)

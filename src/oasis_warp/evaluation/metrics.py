@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from oasis_warp.avatar.observe import inner_mask
+from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.losses.image import ssim_map
 from oasis_warp.pretraining.losses import Perceptual
 

@@ -9,15 +9,15 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from oasis_warp.avatar.appearance import label_regions, region_masks
-from oasis_warp.avatar.observe import Observation, inner_mask, observe
+from oasis_warp.avatar.observation import Observation, inner_mask, observe
 from oasis_warp.core.config import BLACK, ReconstructConfig
-from oasis_warp.core.types import Evidence, HandPose, Landmarks, Photo, Render
+from oasis_warp.core.types import HandCrop, HandPose, Landmarks, Photo, Render
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.evaluation.coverage import COVERED
 from oasis_warp.evaluation.metrics import color_gain
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr, ssim_map
-from oasis_warp.reconstruction import make_evidence
+from oasis_warp.reconstruction import crop_hand
 from oasis_warp.render.cameras import mirrored_camera
 
 QUARTER = 4
@@ -74,37 +74,37 @@ def compare_pairs(
             fit = estimator.fit(photo, landmarks, shape=first.shape.cpu(), force=True)
             if fit.side != first.side:
                 continue
-            evidence = make_evidence(photo, fit, first.surface_offsets.cpu(), config)
-            drawn = {name: draw_as_photo(avatar, evidence, fit.pose) for name, avatar in made.items()}
+            crop = crop_hand(photo, fit, first.surface_offsets.cpu(), config)
+            drawn = {name: draw_as_photo(avatar, crop, fit.pose) for name, avatar in made.items()}
             scores = {
-                name: compare_with_photo(avatar, drawn[name], evidence, fit.pose) for name, avatar in made.items()
+                name: compare_with_photo(avatar, drawn[name], crop, fit.pose) for name, avatar in made.items()
             }
-            yield Pair(source, target, evidence.image, {name: what.image for name, what in drawn.items()}, scores)
+            yield Pair(source, target, crop.image, {name: what.image for name, what in drawn.items()}, scores)
 
 
 @torch.no_grad()
-def draw_as_photo(avatar: Avatar, evidence: Evidence, pose: HandPose) -> Render:
+def draw_as_photo(avatar: Avatar, crop: HandCrop, pose: HandPose) -> Render:
     """`avatar` in the `pose`, in its photo's own frame, and camera of another photo; a left hand is mirrored."""
     left = avatar.side == "left"
-    drawn = avatar.render(mirrored_camera(evidence.camera) if left else evidence.camera, pose, BLACK)
+    drawn = avatar.render(mirrored_camera(crop.camera) if left else crop.camera, pose, BLACK)
     return Render(drawn.image.flip(1), drawn.alpha.flip(1)) if left else drawn
 
 
 @torch.no_grad()
-def compare_with_photo(avatar: Avatar, drawn: Render, evidence: Evidence, pose: HandPose) -> PairScore:
-    """Compare what `draw_as_photo` drew of `avatar` in `pose` with the photo of `evidence`."""
+def compare_with_photo(avatar: Avatar, drawn: Render, crop: HandCrop, pose: HandPose) -> PairScore:
+    """Compare what `draw_as_photo` drew of `avatar` in `pose` with the photo of `crop`."""
     image, alpha = drawn
-    judged = evidence.above_wrist > 0.5
-    mask = (evidence.mask > 0.5) & judged
-    weight = ((inner_mask(evidence.mask) > 0.5) & (alpha >= COVERED) & judged).to(image)
-    gain = color_gain(image, evidence.image, weight)
+    judged = crop.above_wrist > 0.5
+    mask = (crop.mask > 0.5) & judged
+    weight = ((inner_mask(crop.mask) > 0.5) & (alpha >= COVERED) & judged).to(image)
+    gain = color_gain(image, crop.image, weight)
     matched = (image * gain).clamp(0, 1)
     covered = (alpha > 0.5) & judged
     return PairScore(
-        psnr=masked_psnr(matched, evidence.image, weight),
-        psnr_plain=masked_psnr(image, evidence.image, weight),
-        ssim_quarter=_small_ssim(matched, evidence.image, weight),
-        region_errors=_region_errors(avatar, avatar.pose(pose).colors, evidence, gain),
+        psnr=masked_psnr(matched, crop.image, weight),
+        psnr_plain=masked_psnr(image, crop.image, weight),
+        ssim_quarter=_small_ssim(matched, crop.image, weight),
+        region_errors=_region_errors(avatar, avatar.pose(pose).colors, crop, gain),
         overlap=float((covered & mask).sum() / (covered | mask).sum().clamp_min(1)),
     )
 
@@ -119,10 +119,10 @@ def _small_ssim(image: Tensor, target: Tensor, weight: Tensor) -> float:
 
 
 def _region_errors(
-    avatar: Avatar, lit: Float[Tensor, "N 3"], evidence: Evidence, gain: Tensor
+    avatar: Avatar, lit: Float[Tensor, "N 3"], crop: HandCrop, gain: Tensor
 ) -> dict[str, float]:
     hand, index = avatar.hand, avatar.gaussians.vertex_index
-    seen: Observation = observe(hand, evidence)
+    seen: Observation = observe(hand, crop)
     colors, present = torch.zeros_like(seen.colors), torch.zeros_like(seen.confidence)
     colors[index], present[index] = lit[: len(index)], 1
     errors = {}

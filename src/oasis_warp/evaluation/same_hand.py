@@ -22,7 +22,7 @@ from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, select
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.reconstruction import carrier_offsets, make_avatar, make_evidence
+from oasis_warp.reconstruction import crop_hand, initial_offsets, make_avatar
 
 PHOTO_METHODS = (
     Method("mean", ONE_SHOT),
@@ -155,14 +155,14 @@ def _make_avatars(
     """Avatars of one photo by the labels of methods, and its crop; the photo is fitted once."""
     hand = bundled_hand()
     fit = estimator.fit(photo, landmarks)
-    offsets = carrier_offsets(hand, fit)
-    evidence = make_evidence(photo, fit, offsets, config)
+    offsets = initial_offsets(hand, fit)
+    crop = crop_hand(photo, fit, offsets, config)
     settings = AdaptConfig(texture_steps=config.steps, seed=config.seed)
     avatars = {
-        label(method): make_avatar(fit, offsets, evidence, *made)
-        for method, made in reconstructions(hand, evidence, priors, methods, settings)
+        label(method): make_avatar(fit, offsets, crop, *made)
+        for method, made in reconstructions(hand, crop, priors, methods, settings)
     }
-    return avatars, evidence.image
+    return avatars, crop.image
 
 
 def _record(hand: str, pair: Pair, method: Method) -> Record:

@@ -27,7 +27,7 @@ from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import Camera, Evidence, PosedHand, TrainingBatch
+from oasis_warp.core.types import Camera, HandCrop, PosedHand, TrainingBatch
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.claimed_folder import claim_folder
 from oasis_warp.evaluation.held_out import (
@@ -234,7 +234,7 @@ def draw(
     """What each method makes of the one photo of `batch`, drawn as each target shows it."""
     methods = asked_methods(bench.priors, bench.config)
     for method, made in reconstructions(
-        bundled_hand(), evidence_of(batch), bench.priors, methods, bench.config.adapt
+        bundled_hand(), crop_of(batch), bench.priors, methods, bench.config.adapt
     ):
         yield method, draw_targets(made, hand, batch, turns)
 
@@ -277,11 +277,11 @@ def write_attention(path: Path, priors: Mapping[str, Prior], batch: TrainingBatc
         write_strip(path, [draw_attention(prior.network.to(batch.image.device), input_of_batch(batch))])
 
 
-def evidence_of(batch: TrainingBatch) -> Evidence:
+def crop_of(batch: TrainingBatch) -> HandCrop:
     """The one photo of `batch` as what priors and adaptation look at."""
     size = batch.image.shape[1]
     unknown = [batch.rest.new_full((n, 3), float("nan")) for n in (16, 5)]  # joints and tips: nobody asks for them
-    return Evidence(
+    return HandCrop(
         image=batch.image[0],
         mask=batch.mask[0],
         above_wrist=torch.ones_like(batch.mask[0]),

@@ -5,7 +5,7 @@ from typing import NamedTuple
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.core.types import Evidence, TrainingBatch
+from oasis_warp.core.types import HandCrop, TrainingBatch
 
 
 class NetworkInput(NamedTuple):
@@ -35,13 +35,13 @@ class Prediction(NamedTuple):
     """What `scales` started from."""
 
 
-def input_of_evidence(evidence: Evidence) -> NetworkInput:
+def input_of_crop(crop: HandCrop) -> NetworkInput:
     """One hand as a batch of one."""
-    camera = evidence.camera
+    camera = crop.camera
     parts = (
-        evidence.image, evidence.mask, evidence.posed.vertices, camera.viewmat, camera.K, evidence.rest.vertices,
+        crop.image, crop.mask, crop.posed.vertices, camera.viewmat, camera.K, crop.rest.vertices,
     )  # fmt: skip
-    return NetworkInput(*(part.to(evidence.image)[None] for part in parts))
+    return NetworkInput(*(part.to(crop.image)[None] for part in parts))
 
 
 def input_of_batch(batch: TrainingBatch) -> NetworkInput:

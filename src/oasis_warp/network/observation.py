@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
-from oasis_warp.avatar.observe import FACING, GRAZING, RIM_PIXELS, VISIBILITY_MARGIN
+from oasis_warp.avatar.observation import FACING, GRAZING, RIM_PIXELS, VISIBILITY_MARGIN
 from oasis_warp.network.inputs import NetworkInput
 from oasis_warp.network.projection import project_batch, sample
 from oasis_warp.ops import depth_visibility
@@ -35,7 +35,7 @@ def sight(
     vertex_faces: Int[Tensor, "V M"],
     vertex_index: Int[Tensor, "V"] | None,
 ) -> Sighting:
-    """Look at every vertex; `avatar.observe.observe` in batches.
+    """Look at every vertex; `avatar.observation.observe` in batches.
 
     Args:
         inputs: Photos and posed surfaces.

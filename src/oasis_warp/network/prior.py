@@ -17,10 +17,10 @@ from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import MIN_OPACITY
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.types import CanonicalGaussians, Evidence
+from oasis_warp.core.types import CanonicalGaussians, HandCrop
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import Described, HandNetwork
-from oasis_warp.network.inputs import Prediction, input_of_evidence
+from oasis_warp.network.inputs import Prediction, input_of_crop
 from oasis_warp.network.lora import ColorHeads, cache_head
 from oasis_warp.network.rim import color_sources, distance_from_rim, settle_rim
 from oasis_warp.network.weights_file import load_network, read_header
@@ -48,20 +48,20 @@ class NetworkPrior:
         return {**self.__dict__, "_recording": None, "_ready_for": None}  # a copy makes its own, where it is
 
     @torch.no_grad()
-    def __call__(self, evidence: Evidence) -> CanonicalGaussians:
+    def __call__(self, crop: HandCrop) -> CanonicalGaussians:
         """The whole hand, guessed from one photo; the network goes where the photo is."""
-        return self._gaussians(self._predict(evidence), evidence)
+        return self._gaussians(self._predict(crop), crop)
 
     @torch.no_grad()
-    def with_heads(self, evidence: Evidence) -> tuple[CanonicalGaussians, ColorHeads]:
+    def with_heads(self, crop: HandCrop) -> tuple[CanonicalGaussians, ColorHeads]:
         """The same, and the heads that its colours come from with all that they are asked: LoRA trains them."""
-        network, inputs = self.network.to(evidence.image.device), input_of_evidence(evidence)
+        network, inputs = self.network.to(crop.image.device), input_of_crop(crop)
         described = network.describe(inputs)
-        guess = self._gaussians(network.decode(*described, inputs.rest), evidence)
-        return guess, self._heads(guess, described, evidence)
+        guess = self._gaussians(network.decode(*described, inputs.rest), crop)
+        return guess, self._heads(guess, described, crop)
 
-    def _heads(self, guess: CanonicalGaussians, described: Described, evidence: Evidence) -> ColorHeads:
-        network, rest = self.network, evidence.rest.vertices
+    def _heads(self, guess: CanonicalGaussians, described: Described, crop: HandCrop) -> ColorHeads:
+        network, rest = self.network, crop.rest.vertices
         away = distance_from_rim(rest, network.faces, network.rim)
         rows, n = color_sources(rest, network.faces, away), len(rest)
         features, colors, seen = described.features[0], described.colors[0], described.seen
@@ -73,21 +73,21 @@ class NetworkPrior:
         seen = None if seen is None else seen[network.faces].mean(1)
         return on_vertices, cache_head(network.face_head, features, colors, seen, rows[n:][guess.face_index] - n)
 
-    def _gaussians(self, prediction: Prediction, evidence: Evidence) -> CanonicalGaussians:
-        network, rest = self.network, evidence.rest.vertices
+    def _gaussians(self, prediction: Prediction, crop: HandCrop) -> CanonicalGaussians:
+        network, rest = self.network, crop.rest.vertices
         return canonical_gaussians(settle_rim(prediction, rest, network.faces, network.vertex_faces, network.rim), 0)
 
-    def _predict(self, evidence: Evidence) -> Prediction:
-        device, inputs = evidence.image.device, input_of_evidence(evidence)
-        if device.type != "cuda" or self._ready_for != (device, len(evidence.image)):
-            self._ready_for, self._recording = (device, len(evidence.image)), None
+    def _predict(self, crop: HandCrop) -> Prediction:
+        device, inputs = crop.image.device, input_of_crop(crop)
+        if device.type != "cuda" or self._ready_for != (device, len(crop.image)):
+            self._ready_for, self._recording = (device, len(crop.image)), None
             return self.network.to(device)(inputs)
         if self._recording is None:
             self._recording = Recording(self.network, inputs)
         return self._recording(inputs)
 
 
-def guess_with_heads(prior: Prior, evidence: Evidence) -> tuple[CanonicalGaussians, ColorHeads]:
+def guess_with_heads(prior: Prior, crop: HandCrop) -> tuple[CanonicalGaussians, ColorHeads]:
     """What `prior` makes of one photo, and the heads behind it.
 
     Raises:
@@ -97,7 +97,7 @@ def guess_with_heads(prior: Prior, evidence: Evidence) -> tuple[CanonicalGaussia
         raise InputError(
             f"prior {prior.about['name']!r}: has no heads for LoRA to train; choose a learned one, or texture 'field'."
         )
-    return prior.with_heads(evidence)
+    return prior.with_heads(crop)
 
 
 def choose_prior(choice: Literal["learned", "none"] | Path, backbone_weights: Path | None = None) -> Prior:

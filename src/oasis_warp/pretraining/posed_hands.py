@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import below_skin
+from oasis_warp.avatar.anchors import inset_offsets
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.hand.correctives import corrective_coefficients
@@ -34,8 +34,8 @@ def pose_hands(
     orientation: Float[Tensor, "N 3 3"],
     translation: Float[Tensor, "N 3"],
 ) -> Posed:
-    """`hand.skinning.rest_hand`, moved by `avatar.anchors.below_skin`, `skin` and `hand21` for many hands."""
-    rest = hand.template + below_skin(hand) + torch.einsum("vds,ns->nvd", hand.shape_basis, shape)
+    """`hand.skinning.rest_hand`, moved by `avatar.anchors.inset_offsets`, `skin` and `hand21` for many hands."""
+    rest = hand.template + inset_offsets(hand) + torch.einsum("vds,ns->nvd", hand.shape_basis, shape)
     joints = hand.joints + torch.einsum("jds,ns->njd", hand.joint_basis, shape)
     tips = hand.tips + torch.einsum("tds,ns->ntd", hand.tip_basis, shape)
     rotation, origin = _bones(hand, joints, angles, orientation, translation)

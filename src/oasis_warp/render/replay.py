@@ -14,7 +14,7 @@ from oasis_warp.ops import watch_overflow
 
 Outputs = tuple[Tensor, ...]
 MOST = 8
-"""Recordings that are kept: each holds the memory of a whole picture."""
+"""GraphCache that are kept: each holds the memory of a whole picture."""
 
 
 def replayable(device: torch.device, inputs: Sequence[Tensor]) -> bool:
@@ -24,7 +24,7 @@ def replayable(device: torch.device, inputs: Sequence[Tensor]) -> bool:
     return not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs))
 
 
-class Recording:
+class CapturedGraph:
     """A function as a CUDA graph."""
 
     def __init__(self, function: Callable[..., Outputs], inputs: Sequence[Tensor], like: Tensor):
@@ -86,7 +86,7 @@ class Recording:
         return None if self._overflow.happened() else outputs
 
 
-class Recordings:
+class GraphCache:
     """The last few functions that were recorded, by what tells them apart."""
 
     def __init__(self) -> None:
@@ -94,8 +94,8 @@ class Recordings:
         """Held while one of them is in use: they are one caller's at a time."""
         self._kept: OrderedDict[Hashable, Callable[[Sequence[Tensor]], Outputs | None]] = OrderedDict()
 
-    def __reduce__(self) -> tuple[type["Recordings"], tuple[()]]:
-        return Recordings, ()  # a copy of what they belong to starts without any
+    def __reduce__(self) -> tuple[type["GraphCache"], tuple[()]]:
+        return GraphCache, ()  # a copy of what they belong to starts without any
 
     def find(
         self, key: Hashable, record: Callable[[], Callable[[Sequence[Tensor]], Outputs | None]]
@@ -114,7 +114,7 @@ class Recordings:
 
 
 def replayed(
-    recordings: Recordings,
+    recordings: GraphCache,
     key: Hashable,
     record: Callable[[], Callable[[Sequence[Tensor]], Outputs | None]],
     exact: Callable[..., Outputs],
@@ -125,7 +125,7 @@ def replayed(
     Args:
         recordings: Where recordings are kept.
         key: What the function depends on besides the values of `inputs`: sizes and precision.
-        record: Makes a `Recording`, if there is none under `key` or the last one's memory did not suffice.
+        record: Makes a `CapturedGraph`, if there is none under `key` or the last one's memory did not suffice.
         exact: The function itself.
         inputs: Small tensors, on any device.
     """

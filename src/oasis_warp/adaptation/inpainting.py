@@ -15,7 +15,7 @@ DEGENERATE = 1e-12
 """Doubled area of a triangle below which its angles mean nothing [m^2]: the hand's are over 100,000 times that."""
 
 
-def complete_field(
+def inpaint(
     vertices: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
     observed: Float[Tensor, "V D"],

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d
 
-from oasis_warp.avatar import observe
+from oasis_warp.avatar import observation as observe
 from oasis_warp.core.camera import project
 from oasis_warp.core.logging import Progress
 from oasis_warp.core.rotation import from_axis_angle

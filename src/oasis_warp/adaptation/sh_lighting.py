@@ -4,11 +4,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.complete import complete_field
+from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.avatar.lighting import GAMMA, posed_normals, shading, shading_picture
-from oasis_warp.avatar.observe import observe
+from oasis_warp.avatar.observation import observe
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import Evidence, HandLight
+from oasis_warp.core.types import HandCrop, HandLight
 
 USUAL = (1.0, 0.0, -0.12, -0.15)
 """Harmonics that light has in the mean where a photo's tone is even: more from above, and from the camera's side."""
@@ -35,7 +35,7 @@ DARKEST = 0.05
 """Least light, over the mean: colours are divided by it."""
 
 
-def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence) -> HandLight:
+def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) -> HandLight:
     """The light in which `drawn` looks most like the photo.
 
     Weighted least squares of photo = drawn (h_0 + h . n) over the vertices that the photo shows, a colour at a time, of
@@ -46,12 +46,12 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence
     Args:
         hand: Whose surface it is.
         drawn: What the hand looks like in even light, as the photo shows it; everywhere on it.
-        evidence: The photo.
+        crop: The photo.
     """
-    seen, known = observe(hand, evidence), observe(hand, evidence._replace(image=drawn)).colors.clamp(0, 1) ** GAMMA
+    seen, known = observe(hand, crop), observe(hand, crop._replace(image=drawn)).colors.clamp(0, 1) ** GAMMA
     light, weight = seen.colors.clamp(0, 1) ** GAMMA, seen.confidence
     faces = hand.faces.to(weight.device)
-    normals = posed_normals(evidence.rest.vertices, evidence.posed.vertices, faces)
+    normals = posed_normals(crop.rest.vertices, crop.posed.vertices, faces)
     basis = torch.cat([torch.ones_like(normals[:, :1]), normals], 1)
     # a system a colour: [3, V, 4]
     terms = basis * known.T[..., None]
@@ -77,39 +77,39 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence
 
 
 def with_shade(
-    hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence, sure: Evidence, light: HandLight
+    hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop, sure: HandCrop, light: HandLight
 ) -> HandLight:
     """`light` with what it misses where the photo may show something else than the skin there.
 
     Args:
         hand: Whose surface it is.
         drawn: What the hand looks like in even light, as the photo shows it; everywhere on it.
-        evidence: The photo.
-        sure: The same with the mask of `surely_shown`.
+        crop: The photo.
+        sure: The same with the mask of `mask_unreliable`.
         light: Of the photo.
     """
-    faces, rest = hand.faces.to(drawn.device), evidence.rest.vertices
-    lit = lit_picture(hand, drawn, evidence, light)
-    seen, known = observe(hand, evidence), observe(hand, evidence._replace(image=lit)).colors
+    faces, rest = hand.faces.to(drawn.device), crop.rest.vertices
+    lit = apply_light(hand, drawn, crop, light)
+    seen, known = observe(hand, crop), observe(hand, crop._replace(image=lit)).colors
     missing = (seen.colors.clamp_min(DARK) / known.clamp_min(DARK)).log()
     believed = observe(hand, sure).confidence
-    strange = complete_field(rest, faces, missing, seen.confidence - believed, STRANGE_FADE / 3, STRANGE_FADE)
-    facing = posed_normals(rest, evidence.posed.vertices, faces)
+    strange = inpaint(rest, faces, missing, seen.confidence - believed, STRANGE_FADE / 3, STRANGE_FADE)
+    facing = posed_normals(rest, crop.posed.vertices, faces)
     return light._replace(shade=strange.clamp(-STRANGE, STRANGE).exp(), facing=facing)
 
 
-def without_light(hand: HandModel, evidence: Evidence, light: HandLight) -> Evidence:
-    """The same evidence with the photo as in even light; far from the hand nothing changes."""
-    return evidence._replace(image=(evidence.image / _factor(hand, evidence, light)).clamp(0, 1))
+def without_light(hand: HandModel, crop: HandCrop, light: HandLight) -> HandCrop:
+    """The same crop with the photo as in even light; far from the hand nothing changes."""
+    return crop._replace(image=(crop.image / _factor(hand, crop, light)).clamp(0, 1))
 
 
-def lit_picture(
-    hand: HandModel, drawn: Float[Tensor, "H W 3"], evidence: Evidence, light: HandLight
+def apply_light(
+    hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop, light: HandLight
 ) -> Float[Tensor, "H W 3"]:
-    """`drawn`, a picture in even light of what `evidence` shows, as `light` shows it."""
-    return (drawn * _factor(hand, evidence, light)).clamp(0, 1)
+    """`drawn`, a picture in even light of what `crop` shows, as `light` shows it."""
+    return (drawn * _factor(hand, crop, light)).clamp(0, 1)
 
 
-def _factor(hand: HandModel, evidence: Evidence, light: HandLight) -> Float[Tensor, "H W 3"]:
-    rest, posed = evidence.rest.vertices, evidence.posed.vertices
-    return shading_picture(light, rest, posed, hand.faces.to(posed.device), evidence.camera)
+def _factor(hand: HandModel, crop: HandCrop, light: HandLight) -> Float[Tensor, "H W 3"]:
+    rest, posed = crop.rest.vertices, crop.posed.vertices
+    return shading_picture(light, rest, posed, hand.faces.to(posed.device), crop.camera)

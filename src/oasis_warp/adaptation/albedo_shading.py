@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.room_light import DARK
+from oasis_warp.adaptation.sh_lighting import DARK
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
-from oasis_warp.avatar.lighting import apart_from_shade
+from oasis_warp.avatar.lighting import split_shade
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians
 
@@ -31,7 +31,7 @@ MOST = 1.5
 """Largest logarithm of shade."""
 
 
-def skin_and_shade(
+def split_albedo_shading(
     hand: HandModel, guess: Float[Tensor, "N 3"], learned: CanonicalGaussians
 ) -> CanonicalGaussians:
     """The learned Gaussians with part of their looks as shade; together colours and shade are as before.
@@ -44,7 +44,7 @@ def skin_and_shade(
     beyond = (learned.colors.clamp_min(DARK) / guess.clamp_min(DARK)).log().clamp(-MOST, MOST)
     of_vertices = vertex_colors(learned._replace(colors=beyond), len(hand.template))
     sure = vertex_to_gaussians(marks(of_vertices), hand.faces.to(guess.device), learned)
-    colors, shade = apart_from_shade(learned.colors, ((1 - STAYS) * (1 - sure) * beyond).exp())
+    colors, shade = split_shade(learned.colors, ((1 - STAYS) * (1 - sure) * beyond).exp())
     return learned._replace(colors=colors, shade=shade)
 
 

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from synthetic import evidence_of
+from synthetic import crop_of
 
-from oasis_warp.adaptation.skin_or_shade import STAYS, marks, skin_and_shade
+from oasis_warp.adaptation.albedo_shading import STAYS, marks, split_albedo_shading
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.lighting import factors, posed_normals
@@ -18,10 +18,10 @@ INK, POLISH, HALF_INK = (0.19, 0.25, 0.36), (1.0, 0.22, 0.37), (0.6, 0.67, 0.74)
 
 @pytest.fixture(scope="module")
 def scene(hand):
-    evidence, _, _ = evidence_of(hand, region_colors(label_regions(hand), 0.03), size=48)
-    guess = MeanPrior(hand)(evidence)
+    crop, _, _ = crop_of(hand, region_colors(label_regions(hand), 0.03), size=48)
+    guess = MeanPrior(hand)(crop)
     guess = guess._replace(colors=0.6 * guess.colors)
-    facing = posed_normals(evidence.rest.vertices, evidence.posed.vertices, hand.faces)
+    facing = posed_normals(crop.rest.vertices, crop.posed.vertices, hand.faces)
     harmonics = torch.tensor([[1.0, 0.9, 0.8], [0.1, 0.1, 0.1], [-0.2, -0.2, -0.2], [-0.1, -0.1, -0.1]])
     limits = torch.stack([torch.full((3,), 0.3), torch.full((3,), 1.5)])
     return guess, HandLight(harmonics, limits, torch.ones(3), facing=facing)
@@ -39,7 +39,7 @@ def learned_on(hand, guess, factor):
 def test_the_photo_s_own_view_stays_as_it_is(hand, scene, factor):
     guess, light = scene
     learned, _ = learned_on(hand, guess, factor)
-    parted = skin_and_shade(hand, guess.colors, learned)
+    parted = split_albedo_shading(hand, guess.colors, learned)
     before = learned.colors * factors(learned, hand.faces, light, light.facing)
     after = parted.colors * factors(parted, hand.faces, light, light.facing)
     torch.testing.assert_close(after, before, atol=1e-5, rtol=0)
@@ -50,7 +50,7 @@ def test_a_shadow_goes_and_marks_stay(hand, scene):
 
     def share_that_stays(factor):
         learned, there = learned_on(hand, guess, factor)
-        parted = skin_and_shade(hand, guess.colors, learned)
+        parted = split_albedo_shading(hand, guess.colors, learned)
         there = there & (learned.colors > 0.03).all(1)
         before, after = ((g.colors / guess.colors).log()[there] for g in (learned, parted))
         return float(after.norm() / before.norm())
@@ -65,14 +65,14 @@ def test_what_is_finer_than_the_vertices_is_shade_too(hand, scene):
     n_vertices = len(guess.vertex_index)
     colors = guess.colors.clone()
     colors[n_vertices::2] *= 0.8
-    parted = skin_and_shade(hand, guess.colors, guess._replace(colors=colors))
+    parted = split_albedo_shading(hand, guess.colors, guess._replace(colors=colors))
     left = (parted.colors / guess.colors).log()[n_vertices::2]
     torch.testing.assert_close(left, torch.full_like(left, STAYS).mul(torch.tensor(0.8).log()), atol=1e-4, rtol=0)
 
 
 def test_what_was_not_learned_does_not_change(hand, scene):
     guess, _ = scene
-    parted = skin_and_shade(hand, guess.colors, guess)
+    parted = split_albedo_shading(hand, guess.colors, guess)
     torch.testing.assert_close(parted.colors, guess.colors)
     assert parted.shade is not None
     torch.testing.assert_close(parted.shade, torch.ones_like(parted.shade))

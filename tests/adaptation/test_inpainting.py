@@ -4,7 +4,7 @@ import pytest
 import torch
 import trimesh
 
-from oasis_warp.adaptation.complete import FADE_LENGTH, complete_field, laplacian_and_mass
+from oasis_warp.adaptation.inpainting import FADE_LENGTH, inpaint, laplacian_and_mass
 
 
 def hand_sized_sphere():
@@ -15,7 +15,7 @@ def hand_sized_sphere():
 def test_what_is_seen_is_kept_and_what_is_far_from_it_is_the_prior():
     vertices, faces = hand_sized_sphere()
     seen = (vertices[:, 2] > 0).double()
-    field = complete_field(vertices, faces, torch.full((len(vertices), 1), 0.3, dtype=torch.float64), seen)
+    field = inpaint(vertices, faces, torch.full((len(vertices), 1), 0.3, dtype=torch.float64), seen)
     assert float(field[vertices[:, 2] > 0.01].min()) > 0.29
     assert float(field[vertices[:, 2] < -0.045].abs().max()) < 0.3 * np.exp(-0.05 / FADE_LENGTH) * 3
 
@@ -23,7 +23,7 @@ def test_what_is_seen_is_kept_and_what_is_far_from_it_is_the_prior():
 def test_there_is_no_step_at_the_border_of_the_seen_region():
     vertices, faces = hand_sized_sphere()
     seen = (vertices[:, 2] > 0).double()
-    field = complete_field(vertices, faces, torch.full((len(vertices), 1), 0.3, dtype=torch.float64), seen)[:, 0]
+    field = inpaint(vertices, faces, torch.full((len(vertices), 1), 0.3, dtype=torch.float64), seen)[:, 0]
     edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     assert float((field[edges[:, 0]] - field[edges[:, 1]]).abs().max()) < 0.05
 
@@ -32,14 +32,14 @@ def test_the_field_never_leaves_the_range_of_what_was_seen():
     vertices, faces = hand_sized_sphere()
     generator = torch.Generator().manual_seed(0)
     observed = torch.rand(len(vertices), 3, generator=generator, dtype=torch.float64)
-    field = complete_field(vertices, faces, observed, (vertices[:, 0] > 0).double())
+    field = inpaint(vertices, faces, observed, (vertices[:, 0] > 0).double())
     assert float(field.min()) > -1e-3
     assert float(field.max()) < 1
 
 
 def test_nothing_seen_is_nothing_added():
     vertices, faces = hand_sized_sphere()
-    field = complete_field(vertices, faces, torch.ones(len(vertices), 3), torch.zeros(len(vertices)))
+    field = inpaint(vertices, faces, torch.ones(len(vertices), 3), torch.zeros(len(vertices)))
     assert float(field.abs().max()) == 0
 
 

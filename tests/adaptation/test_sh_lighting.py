@@ -4,20 +4,20 @@ import math
 
 import pytest
 import torch
-from synthetic import evidence_of
+from synthetic import crop_of
 
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.adaptation.room_light import fit_light, with_shade, without_light
+from oasis_warp.adaptation.sh_lighting import fit_light, with_shade, without_light
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.lighting import (
-    apart_from_shade,
     in_even_light,
     mirror_light,
     posed_normals,
     shading,
+    split_shade,
     turn_light,
 )
-from oasis_warp.avatar.observe import observe
+from oasis_warp.avatar.observation import observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import rotation, surface
@@ -38,8 +38,8 @@ LIGHT = HandLight(
 
 @pytest.fixture(scope="module")
 def scene(hand):
-    """Evidence in even light, its Gaussians and pose, and the same evidence in `LIGHT`."""
-    even, truth, pose = evidence_of(hand, 0.8 * region_colors(label_regions(hand), 0.03))
+    """HandCrop in even light, its Gaussians and pose, and the same crop in `LIGHT`."""
+    even, truth, pose = crop_of(hand, 0.8 * region_colors(label_regions(hand), 0.03))
     normals = surface.vertex_normals(even.rest.vertices, hand.faces)
     there = pose_gaussians(truth, hand.faces, even.rest.vertices, even.posed.vertices, (LIGHT, normals))
     drawn = render(there, even.camera)
@@ -47,12 +47,12 @@ def scene(hand):
     return even, truth, pose, even._replace(image=drawn.image + behind * even.image)
 
 
-def avatar(truth, pose, evidence, light, hand, side="right"):
+def avatar(truth, pose, crop, light, hand, side="right"):
     left = side == "left"
     return Avatar(
         side=side, shape=torch.zeros(len(hand.shape_names)), surface_offsets=torch.zeros_like(hand.template),
         gaussians=truth, source_pose=mirror_pose(pose) if left else pose,
-        source_camera=mirrored_camera(evidence.camera) if left else evidence.camera, light=light,
+        source_camera=mirrored_camera(crop.camera) if left else crop.camera, light=light,
     )  # fmt: skip
 
 
@@ -147,7 +147,7 @@ def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene, of):
 def test_colours_and_shade_come_to_what_is_shown():
     shown = torch.tensor([[0.9, 0.5, 0.0], [1.0, 1.0, 0.2]])
     shade = torch.tensor([[0.5, 0.5, 0.5], [2.0, 0.5, 1.0]])
-    colors, left = apart_from_shade(shown, shade)
+    colors, left = split_shade(shown, shade)
     assert float(colors.min()) > 0 and float(colors.max()) == 1 and float(left.min()) > 0
     torch.testing.assert_close(colors * left, shown, atol=2e-3, rtol=0)
     torch.testing.assert_close(left[1], torch.tensor([2.0, 1.0, 1.0]))

@@ -10,7 +10,7 @@ from torch.nn.functional import grid_sample, max_pool2d, normalize
 from oasis_warp.core import surface
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import Camera, Evidence
+from oasis_warp.core.types import Camera, HandCrop
 from oasis_warp.ops import depth_visibility
 
 RIM_PIXELS = 2
@@ -49,9 +49,9 @@ def facing(
     return (surface.vertex_normals(vertices, faces) * normalize(center - vertices, dim=-1)).sum(-1)
 
 
-def observe(hand: HandModel, evidence: Evidence) -> Observation:
+def observe(hand: HandModel, crop: HandCrop) -> Observation:
     """Read the photo at every vertex, by projection and the depth buffer of the posed surface."""
-    vertices, camera = evidence.posed.vertices, evidence.camera
+    vertices, camera = crop.posed.vertices, crop.camera
     faces = hand.faces.to(vertices.device)
     visible, _, _ = depth_visibility(
         vertices, vertices, faces, camera.K, camera.viewmat, camera.width, camera.height, margin=VISIBILITY_MARGIN,
@@ -59,6 +59,6 @@ def observe(hand: HandModel, evidence: Evidence) -> Observation:
     )  # fmt: skip
     uv, _ = project(camera, vertices)
     trust = ((facing(vertices, faces, camera) - GRAZING) / (FACING - GRAZING)).clamp(0, 1)
-    planes = torch.cat([evidence.image.permute(2, 0, 1), inner_mask(evidence.mask)[None]])
+    planes = torch.cat([crop.image.permute(2, 0, 1), inner_mask(crop.mask)[None]])
     sampled = _sample(planes, uv)
     return Observation(sampled[:, :3], visible * trust * sampled[:, 3].clamp(0, 1))
