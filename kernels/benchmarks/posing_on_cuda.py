@@ -22,7 +22,7 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.render.replay import Recording
+from oasis_warp.render.replay import CapturedGraph
 
 GROUPS, CALLS = 11, 50
 
@@ -106,7 +106,7 @@ def main() -> None:
     worst = max(float((a.cpu() - b).abs().max()) for a, b in zip(got, want, strict=True))
     assert worst < 1e-5, worst
     assert all(torch.equal(a, b) for a, b in zip(got, again, strict=True))
-    recording = Recording(lambda *parts: there.pose(HandPose(*parts), validate=False)[:3], fist, there.shape)
+    recording = CapturedGraph(lambda *parts: there.pose(HandPose(*parts), validate=False)[:3], fist, there.shape)
     replayed = recording(fist)
     assert replayed is not None and all(torch.equal(a, b) for a, b in zip(got, replayed, strict=True))
     print(f"{len(got[0])} Gaussians, {len(there.hand.template)} vertices; against the CPU {worst:.1e}, the same bits")
@@ -145,7 +145,7 @@ def main() -> None:
         print(f"in a graph: {name:32s} {spent / 10:8.2f} us")
     once = captured(pose, 1)
     print(f"in a graph of one: all {on_device({'all': once.replay})['all']:8.2f} us")
-    calls = steps | {"Recording": lambda: recording(fist)}
+    calls = steps | {"CapturedGraph": lambda: recording(fist)}
     for wait in (False, True):
         for name, spent in on_host(calls, wait).items():
             print(f"from Python{', waiting' if wait else '':9s}: {name:32s} {spent:8.2f} us")

@@ -27,7 +27,7 @@ from oasis_warp.core.types import (
 from oasis_warp.data.avatar_file import load_avatar, save_avatar
 from oasis_warp.hand.skinning import mirror_hand, mirror_points, rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.ops import Look, check_finite, rest_mesh
+from oasis_warp.ops import DeferredFiniteCheck, check_finite, rest_mesh
 from oasis_warp.render.render import render
 from oasis_warp.render.replay import CapturedGraph, GraphCache, replayable, replayed
 
@@ -175,7 +175,7 @@ class Avatar:
         if validate and not looking:
             check_finite(**named)
         size = camera.width, camera.height
-        with Look(**named) if looking else nullcontext():
+        with DeferredFiniteCheck(**named) if looking else nullcontext():
             return Render(*replayed(self._graphs, size, lambda: CapturedGraph(draw, inputs, self.shape), draw, inputs))
 
     def in_even_light(self) -> "Avatar":

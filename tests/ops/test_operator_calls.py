@@ -37,7 +37,7 @@ NAMES = tuple(cases())
 OPERATORS = {
     "spherical_harmonics": ["spherical_harmonics"],
     "rasterization": ["project", "blend"],
-    "rasterization_of_harmonics_and_covariances": ["seen_colors", "project", "blend"],
+    "rasterization_of_harmonics_and_covariances": ["sh_to_rgb", "project", "blend"],
     "visibility": ["depth_visibility"],
 } | {name: [name.split()[0]] for name in test_posing_operators.calls()}
 """The custom ops that a case calls, in this order."""

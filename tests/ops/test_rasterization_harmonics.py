@@ -5,8 +5,8 @@ import torch
 from rasterization_scenes import ordinary_scene
 
 from oasis_warp.ops import rasterization
-from oasis_warp.ops.seen_colors import seen_colors
-from oasis_warp.reference.harmonics import seen_colors as expected_colors
+from oasis_warp.ops.sh_to_rgb import sh_to_rgb
+from oasis_warp.reference.harmonics import sh_to_rgb as expected_colors
 
 
 def scene_and_coefficients(degree=3, cameras=2, dtype=torch.float64, per_camera=False):
@@ -68,7 +68,7 @@ def test_a_far_camera_sees_the_same_colours(device):
     moved = near.with_(means=near.means + shift.to(device), viewmats=far.to(torch.float32).to(device))
     exact = moved.to("cpu").to(torch.float64)
     truth = expected_colors(3, exact.means, coefficients.double(), exact.viewmats)
-    got = seen_colors(3, moved.means, coefficients.to(device), moved.viewmats).cpu()
+    got = sh_to_rgb(3, moved.means, coefficients.to(device), moved.viewmats).cpu()
     assert (got - truth).norm() <= 1e-6 * truth.norm()
 
 
@@ -94,7 +94,7 @@ def test_colours_and_their_gradients_are_those_of_the_twin(degree, per_camera, w
         for t, asked in zip((scene.means, coefficients, scene.viewmats), wanted, strict=True)
     ]
     leaves = [t for t in inputs if t.requires_grad]
-    got, expected = seen_colors(degree, *inputs), expected_colors(degree, *inputs)
+    got, expected = sh_to_rgb(degree, *inputs), expected_colors(degree, *inputs)
     assert (expected == 0).any() and (expected > 0).any()
     torch.testing.assert_close(got, expected, rtol=0, atol=1e-13)
     incoming = torch.randn(got.shape, generator=torch.Generator().manual_seed(3), dtype=got.dtype).to(device)
@@ -109,7 +109,7 @@ def test_nothing_to_see_has_no_colours_and_gradients_of_zero(device):
     scene, coefficients = scene_and_coefficients()
     none = scene.means[:0].to(device), coefficients[:0].to(device), scene.viewmats.to(device)
     inputs = [t.clone().requires_grad_() for t in none]
-    colors = seen_colors(3, *inputs)
+    colors = sh_to_rgb(3, *inputs)
     assert colors.shape == (2, 0, 3)
     gradients = torch.autograd.grad(colors.sum(), inputs)
     assert [g.shape for g in gradients] == [t.shape for t in inputs] and not gradients[2].any()
@@ -118,5 +118,5 @@ def test_nothing_to_see_has_no_colours_and_gradients_of_zero(device):
 def test_colours_that_are_no_numbers_stay_so(device):
     scene, coefficients = scene_and_coefficients(dtype=torch.float32)
     coefficients[3, 0, 1] = float("nan")
-    colors = seen_colors(3, scene.means.to(device), coefficients.to(device), scene.viewmats.to(device))
+    colors = sh_to_rgb(3, scene.means.to(device), coefficients.to(device), scene.viewmats.to(device))
     assert colors[:, 3, 1].isnan().all() and colors.isnan().sum() == 2

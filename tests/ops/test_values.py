@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from oasis_kernels.runtime import cuda_values
-from oasis_warp.ops._runtime.values import Look, check_finite
+from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 from oasis_warp.ops.rasterization import rasterization
 
 POISON = float("nan"), float("inf"), -float("inf"), 1.1e15, -1e30
@@ -48,15 +48,15 @@ def test_memory_of_any_layout_is_read_as_what_it_stands_for(device):
 @pytest.mark.gpu
 def test_a_look_says_at_its_end_what_it_saw_and_leaves_other_errors_alone():
     good, bad = torch.ones(5, device="cuda"), torch.full((5,), torch.nan, device="cuda")
-    with Look(good=good, nothing=None):
+    with DeferredFiniteCheck(good=good, nothing=None):
         pass
     reached = False
-    with pytest.raises(ValueError, match="^bad: expected finite values"), Look(good=good, bad=bad):
+    with pytest.raises(ValueError, match="^bad: expected finite values"), DeferredFiniteCheck(good=good, bad=bad):
         reached = True
     assert reached
-    with pytest.raises(KeyError), Look(bad=bad):
+    with pytest.raises(KeyError), DeferredFiniteCheck(bad=bad):
         raise KeyError
-    with Look(good=good), Look(good=good):
+    with DeferredFiniteCheck(good=good), DeferredFiniteCheck(good=good):
         check_finite(good=good)
 
 

@@ -67,7 +67,7 @@ def _rasterization(case: Case, arguments: dict[str, Any], slack: float) -> tuple
     given = {renamed.get(name, name): value for name, value in arguments.items()}
     degree = given.pop("sh_degree", None)
     if degree is not None:
-        given["colors"] = harmonics.seen_colors(degree, given["means"], given["colors"], given["viewmats"])
+        given["colors"] = harmonics.sh_to_rgb(degree, given["means"], given["colors"], given["viewmats"])
     image, alphas, sound = rasterization.drawn(**given, slack=slack)
     keep = sound[..., None].double()
     return (image, alphas), (keep, keep)

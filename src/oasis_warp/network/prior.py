@@ -24,7 +24,7 @@ from oasis_warp.network.inputs import Prediction, input_of_crop
 from oasis_warp.network.lora import ColorHeads, cache_head
 from oasis_warp.network.rim import color_sources, distance_from_rim, settle_rim
 from oasis_warp.network.weights_file import load_network, read_header
-from oasis_warp.ops.recording import Recording
+from oasis_warp.ops.cuda_graph import CapturedCall
 
 BUNDLED = ("prior", "compact.safetensors")
 """Where the weights that ship lie among the package's assets."""
@@ -40,7 +40,7 @@ class NetworkPrior:
     def __init__(self, network: HandNetwork, about: Mapping[str, str | int] = UNNAMED):
         self.network = network.eval()
         self.about = about
-        self._recording: Recording[Prediction] | None = None
+        self._recording: CapturedCall[Prediction] | None = None
         self._ready_for: tuple[torch.device, int] | None = None
         """Where and for which size of photos all kernels are loaded."""
 
@@ -83,7 +83,7 @@ class NetworkPrior:
             self._ready_for, self._recording = (device, len(crop.image)), None
             return self.network.to(device)(inputs)
         if self._recording is None:
-            self._recording = Recording(self.network, inputs)
+            self._recording = CapturedCall(self.network, inputs)
         return self._recording(inputs)
 
 

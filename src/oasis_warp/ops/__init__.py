@@ -1,7 +1,7 @@
 """Differentiable operators on torch tensors, computed by Warp kernels on the CPU or a CUDA device."""
 
 from oasis_warp.ops._runtime.pair_counts import watch_overflow as watch_overflow
-from oasis_warp.ops._runtime.values import Look as Look
+from oasis_warp.ops._runtime.values import DeferredFiniteCheck as DeferredFiniteCheck
 from oasis_warp.ops._runtime.values import check_finite as check_finite
 from oasis_warp.ops._runtime.warm_up import warm_up as warm_up
 from oasis_warp.ops.blend_weights import BlendWeights as BlendWeights
@@ -10,6 +10,7 @@ from oasis_warp.ops.blend_weights import blend_weights as blend_weights
 from oasis_warp.ops.blend_weights import stack_weights as stack_weights
 from oasis_warp.ops.bone_transforms import BoneTransforms as BoneTransforms
 from oasis_warp.ops.bone_transforms import bone_transforms as bone_transforms
+from oasis_warp.ops.cuda_graph import RecordedRasterization as RecordedRasterization
 from oasis_warp.ops.depth_map import DepthMap as DepthMap
 from oasis_warp.ops.depth_map import depth_map as depth_map
 from oasis_warp.ops.face_rotations import FaceRotations as FaceRotations
@@ -19,7 +20,6 @@ from oasis_warp.ops.mesh_posing import pose_on_mesh as pose_on_mesh
 from oasis_warp.ops.mesh_posing_covars import PosedCovars as PosedCovars
 from oasis_warp.ops.mesh_posing_covars import pose_on_mesh_covars as pose_on_mesh_covars
 from oasis_warp.ops.rasterization import rasterization as rasterization
-from oasis_warp.ops.recorded import RecordedRasterization as RecordedRasterization
 from oasis_warp.ops.rest_mesh import RestMesh as RestMesh
 from oasis_warp.ops.rest_mesh import rest_mesh as rest_mesh
 from oasis_warp.ops.skinning import Skinned as Skinned

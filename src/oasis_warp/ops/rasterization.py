@@ -14,10 +14,10 @@ from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.checks import check_choice
 from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime.scene_checks import check_cameras, check_coefficients, check_colors, check_gaussians
-from oasis_warp.ops._runtime.values import Look, check_finite
+from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 from oasis_warp.ops.blending import blend
 from oasis_warp.ops.projection import project
-from oasis_warp.ops.seen_colors import seen_colors
+from oasis_warp.ops.sh_to_rgb import sh_to_rgb
 
 UNSUPPORTED: dict[str, tuple[Any, str]] = {
     "sparse_grad": (False, "Gradients are dense."),
@@ -156,14 +156,14 @@ def rasterization(
     n_cameras = viewmats.shape[0]
     if sh_degree is not None:
         check_coefficients(colors, sh_degree, means, n_cameras)
-        colors = seen_colors(sh_degree, means, colors, viewmats)
+        colors = sh_to_rgb(sh_degree, means, colors, viewmats)
     check_colors(colors, backgrounds, means, n_cameras)
     if validate and render_mode in ("D", "ED") and not torch.compiler.is_compiling():
         check_finite(colors=colors, backgrounds=backgrounds)  # nobody draws them, who would see what is wrong
 
     # Projection waits for what it says of its own inputs: a look at the others costs next to nothing meanwhile.
     looking = validate and render_mode == "RGB" and means.is_cuda and not is_traced()
-    with Look(colors=colors, backgrounds=backgrounds) if looking else nullcontext():
+    with DeferredFiniteCheck(colors=colors, backgrounds=backgrounds) if looking else nullcontext():
         projection = project(
             means, quats, scales, opacities, viewmats, Ks, width, height, near_plane=near_plane, far_plane=far_plane,
             radius_clip=radius_clip, eps2d=eps2d, covars=covars, validate=validate,

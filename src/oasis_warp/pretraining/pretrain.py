@@ -21,7 +21,7 @@ from oasis_warp.losses.detail import detail_difference
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.weights_file import save_network
-from oasis_warp.ops.recording import Recording
+from oasis_warp.ops.cuda_graph import CapturedCall
 from oasis_warp.pretraining.checkpoint import load_checkpoint, save_checkpoint
 from oasis_warp.pretraining.distributed import Place, any_process, average_gradients, mean_over_processes, share_weights
 from oasis_warp.pretraining.losses import LossConfig, Perceptual, objective, picture_psnr
@@ -109,7 +109,7 @@ class Trainer:
         rate = torch.tensor(config.learning_rate, device=place.device) if on_cuda else config.learning_rate
         self.optimizer = torch.optim.Adam(self.trained, lr=rate, fused=on_cuda, capturable=on_cuda)
         self.step = 0
-        self._recorded: Recording[StepResult] | None = None
+        self._recorded: CapturedCall[StepResult] | None = None
         self._eager_steps = 0
 
     def advance(self, batch: TrainingBatch) -> StepResult:
@@ -124,7 +124,7 @@ class Trainer:
             else:
                 group["lr"] = rate
         if self._recorded is None and self.place.device.type == "cuda" and self._eager_steps >= EAGER_STEPS:
-            self._recorded = Recording(self._update, batch, SLACK)
+            self._recorded = CapturedCall(self._update, batch, SLACK)
         if self._recorded is None:
             self._eager_steps += 1
             result = self._update(batch)

@@ -33,7 +33,7 @@ def basis(degree: int, directions: Tensor) -> Tensor:
     return torch.stack(columns, -1)
 
 
-def seen_colors(degree: int, means: Tensor, coefficients: Tensor, viewmats: Tensor) -> Tensor:
+def sh_to_rgb(degree: int, means: Tensor, coefficients: Tensor, viewmats: Tensor) -> Tensor:
     """Colours [C, N, 3] of coefficients [N, K, 3] or [C, N, K, 3], seen from each camera."""
     centres = -(torch.linalg.inv(viewmats[:, :3, :3]) @ viewmats[:, :3, 3:])[..., 0]
     values = basis(degree, means - centres[:, None])

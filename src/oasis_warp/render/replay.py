@@ -14,7 +14,7 @@ from oasis_warp.ops import watch_overflow
 
 Outputs = tuple[Tensor, ...]
 MOST = 8
-"""GraphCache that are kept: each holds the memory of a whole picture."""
+"""Graphs that a cache keeps: each holds the memory of a whole picture."""
 
 
 def replayable(device: torch.device, inputs: Sequence[Tensor]) -> bool:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.synthetic.body import Body, arm_rows
-from oasis_warp.synthetic.ops.flesh import pose_flesh
+from oasis_warp.synthetic.ops.batched_lbs import batched_lbs
 from oasis_warp.synthetic.people import Person
 from oasis_warp.synthetic.planned import Numbers
 from oasis_warp.synthetic.wardrobe import AWAY, bands, sleeves
@@ -64,7 +64,7 @@ def pose_people(body: Body, people: Sequence[Person], numbers: Numbers) -> Posed
                                 for name in ("rest", "joints", "tips", "ring"))  # fmt: skip
     bend = 1 - torch.cos(numbers.angles[..., 0])
     correctives = torch.stack([bend, bend * bend], -1).flatten(1)  # `hand.correctives.corrective_coefficients`
-    skinned = pose_flesh(
+    skinned = batched_lbs(
         rest, hand.corrective_basis, correctives, body.normals[: body.n_hand], body.knuckle_rise, numbers.knuckles,
         hand.weights, numbers.rotations, numbers.shifts,
     )  # fmt: skip

@@ -28,7 +28,7 @@ from oasis_warp.ops._runtime.depth_scene import (
 from oasis_warp.ops._runtime.incidence import _transposed, sum_at_items
 from oasis_warp.ops._runtime.launch import launch, run_shared, view
 from oasis_warp.ops._runtime.pair_counts import own_slot
-from oasis_warp.ops._runtime.values import Look, check_finite
+from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 
 C_TYPES = {torch.float32: "float", torch.float64: "double"}
 MAX_FRACTION_BITS = 22
@@ -159,7 +159,7 @@ def draw_by_keys(scene: Scene, query: Query | None, wanted: Wanted, validate: bo
     if not validate:
         return depth_cuda.draw(scene, query, wanted)
     points = None if query is None else query.points
-    with Look(vertices=scene.vertices, viewmat=scene.viewmats, K=scene.Ks, points=points):
+    with DeferredFiniteCheck(vertices=scene.vertices, viewmat=scene.viewmats, K=scene.Ks, points=points):
         found = own_slot()
         found[0] = 0
         drawn = depth_cuda.draw(scene, query, wanted, found)

@@ -20,7 +20,7 @@ def check_finite(**tensors: Tensor | None) -> None:
     """
     given = {name: tensor.detach() for name, tensor in tensors.items() if tensor is not None}
     if given and all(t.is_cuda for t in given.values()):
-        with Look(**given):
+        with DeferredFiniteCheck(**given):
             return
     quick = [t for t in given.values() if has_vectors(t) and t.is_contiguous()]
     if quick:
@@ -46,7 +46,7 @@ def refuse_capture() -> None:
         )
 
 
-class Look:
+class DeferredFiniteCheck:
     """A look at CUDA tensors that the device takes while the host goes on to what stands in the `with` block.
 
     At the end of the block it waits for the device, and refuses as `check_finite` does.

@@ -1,10 +1,11 @@
-"""The rasterizer for pictures of one size as two CUDA graphs, one forward and one back, under torch's autograd.
+"""Functions captured as CUDA graphs: any function of a tuple of tensors, and the rasterizer under torch's autograd.
 
-An eager call is Python and a dozen launches, which take the host far longer than the pictures take the device. Here a
-call copies its arguments to where the graphs read them and replays.
+An eager call is Python and many launches, which take the host longer than the work takes the device. A captured call
+copies its arguments to the memory that the graph reads, and replays the graph.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -16,11 +17,45 @@ from oasis_warp.ops._runtime.pair_counts import watch_overflow
 from oasis_warp.ops.rasterization import rasterization
 
 WARM_UPS = 2
-"""Eager calls before a recording: they load kernels, and count the pairs that it takes memory for."""
+"""Eager calls before the capture: they load kernels and count the pairs that the graph needs memory for."""
+
+Result = TypeVar("Result")
 
 
-class _Recording:
-    """Both graphs for arguments like these."""
+class CapturedCall(Generic[Result]):
+    """A function that was captured once and is replayed for all inputs of the same shapes."""
+
+    def __init__(self, function: Callable[[Any], Result], inputs: tuple[Tensor, ...], slack: float = 1.5):
+        """Capture `function` without running it.
+
+        Args:
+            function: Has run before, which loads kernels, and never waits for the device. What it reads besides its
+                inputs must stay at the same place in memory.
+            inputs: A NamedTuple on a CUDA device, for the shapes.
+            slack: Memory for the pairs of a rasterization, relative to what the last eager one needed.
+        """
+        self._inputs: Any = type(inputs)(*(tensor.clone() for tensor in inputs))
+        self._graph = torch.cuda.CUDAGraph()
+        with watch_overflow(slack) as self._overflow:
+            with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+                self._result = function(self._inputs)
+
+    def __call__(self, inputs: tuple[Tensor, ...]) -> Result:
+        """The result of the function for `inputs`; the next call overwrites its tensors."""
+        torch._foreach_copy_(list[Tensor](self._inputs), list[Tensor](inputs))
+        self._graph.replay()
+        return self._result
+
+    def lacked_memory(self) -> bool:
+        """Whether images of the last call lack Gaussians because there were more pairs than memory.
+
+        Call it after the device has finished the call.
+        """
+        return self._overflow.happened()
+
+
+class _CapturedRasterization:
+    """The forward and backward graph for arguments of the same shapes."""
 
     def __init__(self, arguments: tuple[Tensor, ...], width: int, height: int, options: dict[str, Any]) -> None:
         device = arguments[0].device
@@ -36,16 +71,16 @@ class _Recording:
             return torch.autograd.grad(outputs, self._leaves, self.incoming, allow_unused=True)
 
         with torch.inference_mode(False), torch.enable_grad(), torch.cuda.device(device):
-            aside = torch.cuda.Stream()
-            aside.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(aside):
+            side_stream = torch.cuda.Stream()
+            side_stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(side_stream):
                 for _ in range(WARM_UPS):
                     outputs = draw()
                     self.incoming = [torch.zeros_like(output) for output in outputs]
                     self._zero = [True for _ in outputs]
                     if self._leaves:
                         back(outputs)
-            torch.cuda.current_stream().wait_stream(aside)
+            torch.cuda.current_stream().wait_stream(side_stream)
             self._forward, self._backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
             with watch_overflow() as self.overflow:
                 with torch.cuda.graph(self._forward, capture_error_mode="thread_local"):
@@ -56,23 +91,23 @@ class _Recording:
         self.outputs = [output.detach() for output in outputs]
 
     def fits(self, arguments: tuple[Tensor, ...]) -> bool:
-        """Whether it was made for arguments of these shapes, types and needs."""
+        """Whether the graphs are for arguments of these shapes, types and `requires_grad` flags."""
         return all(
-            new.shape == kept.shape and new.dtype == kept.dtype and new.device == kept.device
+            new.shape == captured.shape and new.dtype == captured.dtype and new.device == captured.device
             and new.requires_grad == needs
-            for new, kept, needs in zip(arguments, self.inputs, self.needs, strict=True)
+            for new, captured, needs in zip(arguments, self.inputs, self.needs, strict=True)
         )  # fmt: skip
 
     def draw(self, arguments: tuple[Tensor, ...]) -> bool:
-        """Replay the forward graph; False where it had too little memory."""
+        """Replay the forward graph; False if its memory did not suffice."""
         with torch.no_grad():
             torch._foreach_copy_(self.inputs, list(arguments))
             self._forward.replay()
-        wait_for(current_stream(self.inputs[0].device))  # only then is it known whether the picture is whole
+        wait_for(current_stream(self.inputs[0].device))  # only then is it known whether the image is whole
         return not self.overflow.happened()
 
     def back(self, incoming: tuple[Tensor | None, Tensor | None]) -> list[Tensor | None]:
-        """Replay the backward graph: gradients by those of the arguments that need one."""
+        """Replay the backward graph: one gradient for each argument, None where it needs none."""
         for k, gradient in enumerate(incoming):
             if gradient is not None:
                 self.incoming[k].copy_(gradient)
@@ -87,37 +122,37 @@ class _Recording:
 
 class _Replay(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, recording: _Recording, *_: Tensor) -> tuple[Tensor, ...]:
-        ctx.recording = recording
+    def forward(ctx: Any, captured: _CapturedRasterization, *_: Tensor) -> tuple[Tensor, ...]:
+        ctx.captured = captured
         ctx.set_materialize_grads(False)
-        return tuple(output.detach() for output in recording.outputs)
+        return tuple(output.detach() for output in captured.outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *incoming: Tensor | None) -> tuple[Any, ...]:
-        return None, *ctx.recording.back(incoming)
+        return None, *ctx.captured.back(incoming)
 
 
 class RecordedRasterization:
-    """`rasterization` for pictures of one size on CUDA, recorded at the first call and replayed by the others.
+    """`rasterization` for images of one size on CUDA, captured at the first call and replayed by the others.
 
-    For training from Python, where an eager call waits for Python. Results are the bits of `rasterization`. They lie in
-    memory of the recording, as do the gradients: the next call writes over both, so use or copy them before, and go
-    back before you draw again. Other shapes, or other arguments that need a gradient, are recorded anew; so is what met
-    more pairs of a Gaussian and a tile than the recording has memory for, after it was drawn without one.
+    For training from Python, where an eager call waits for Python. Results have the bits of `rasterization`. They lie
+    in memory of the graphs, as do the gradients: the next call overwrites both, so use or copy them first, and call
+    backward before you draw again. Other shapes, or other arguments that need a gradient, are captured anew. So is a
+    call with more pairs of a Gaussian and a tile than the graph has memory for, after it was drawn eagerly.
     """
 
     def __init__(self, width: int, height: int, **options: Any) -> None:
-        """Nothing is recorded yet.
+        """Nothing is captured yet.
 
         Args:
             width: Of the images [px].
             height: Of the images [px].
-            options: Of `rasterization`, that are no tensors and not `validate`.
+            options: Arguments of `rasterization` that are not tensors, except `validate`.
         """
         self._size = width, height
         self._options = options
-        self._recording: _Recording | None = None
+        self._captured: _CapturedRasterization | None = None
 
     def __call__(
         self,
@@ -136,17 +171,17 @@ class RecordedRasterization:
             ValueError: shapes, types or devices that do not belong together, or not float32 on CUDA.
         """
         arguments = means, quats, scales, opacities, colors, viewmats, Ks, backgrounds
-        recording = self._recording
-        if recording is None or not recording.fits(arguments):
+        captured = self._captured
+        if captured is None or not captured.fits(arguments):
             if not (means.is_cuda and means.dtype == torch.float32):
                 raise ValueError(
                     f"means: expected float32 on a CUDA device, got {means.dtype} on {means.device}. "
                     "Elsewhere call rasterization, which has nothing to record."
                 )
-            recording = self._recording = _Recording(arguments, *self._size, self._options)
-        if not recording.draw(arguments):
-            self._recording = None
-            *scene, behind = arguments
-            return rasterization(*scene, *self._size, backgrounds=behind, validate=False, **self._options)[:2]
-        image, alphas = _Replay.apply(recording, *arguments)
+            captured = self._captured = _CapturedRasterization(arguments, *self._size, self._options)
+        if not captured.draw(arguments):
+            self._captured = None
+            *scene, backgrounds = arguments
+            return rasterization(*scene, *self._size, backgrounds=backgrounds, validate=False, **self._options)[:2]
+        image, alphas = _Replay.apply(captured, *arguments)
         return image, alphas

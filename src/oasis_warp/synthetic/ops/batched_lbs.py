@@ -30,11 +30,11 @@ def _pose_fake(rest: Tensor, *_: Tensor) -> Tensor:
     return torch.empty_like(rest, memory_format=torch.contiguous_format)
 
 
-_op = operator("pose_flesh", _pose, _pose_fake)
+_op = operator("batched_lbs", _pose, _pose_fake)
 
 
 @torch.no_grad()
-def pose_flesh(
+def batched_lbs(
     rest: Float[Tensor, "B V 3"],
     displacements: Float[Tensor, "V 3 C"],
     strengths: Float[Tensor, "B C"],

@@ -136,8 +136,8 @@ def _gradients(
     return by_means, by_coefficients, by_viewmats
 
 
-_forward = operator("seen_colors", _seen, _colors_like)
-_adjoint = adjoint("seen_colors_backward", _seen_backward, _gradients)
+_forward = operator("sh_to_rgb", _seen, _colors_like)
+_adjoint = adjoint("sh_to_rgb_backward", _seen_backward, _gradients)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -157,7 +157,7 @@ def _back(ctx: Any, g_colors: Tensor) -> tuple[Tensor | None, ...]:
 differentiable(_forward, _back, _save)
 
 
-def seen_colors(
+def sh_to_rgb(
     sh_degree: int,
     means: Float[Tensor, "N 3"],
     coefficients: Float[Tensor, "N K 3"] | Float[Tensor, "C N K 3"],
