@@ -23,7 +23,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, HandCrop, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator
-from oasis_warp.hand.skinning import mirror_points, mirror_pose, rest_hand, skin
+from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.plan import PICTURES_EACH

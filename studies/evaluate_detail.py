@@ -27,6 +27,7 @@ from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.cli.drawing import Panel, make_sheet, panel_side
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import BLACK, ReconstructConfig
+from oasis_warp.core.mirror import mirror_camera
 from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.core.types import Camera, HandCrop
 from oasis_warp.data.atomic import write_file
@@ -36,7 +37,7 @@ from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import depth_map
 from oasis_warp.reconstruction import CROP_MARGIN, Reconstruction, crop_hand, detail_size, reconstruct
-from oasis_warp.render.cameras import crop_camera, mirrored_camera
+from oasis_warp.render.cameras import crop_camera
 
 PHOTOS = (
     "synthetic:2", "synthetic:7", "back_flat_right_04.jpg", "palm_open_left_02.png", "small_pointing_right_13.jpg"
@@ -66,7 +67,7 @@ def place(name: str, folder: Path) -> str:
 def draw(avatar: Avatar, crop: HandCrop) -> Float[Tensor, "S S 3"]:
     """The avatar over black as `crop` shows the hand, a left hand mirrored."""
     left = avatar.side == "left"
-    camera = mirrored_camera(crop.camera) if left else crop.camera
+    camera = mirror_camera(crop.camera) if left else crop.camera
     image = avatar.render(camera, avatar.source_pose, BLACK).image
     return image.flip(1) if left else image
 

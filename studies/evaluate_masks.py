@@ -13,12 +13,13 @@ from pathlib import Path
 import torch
 from hand_drawn_masks import read_masks
 
+from oasis_warp.core.mirror import mirror_points, mirror_pose
 from oasis_warp.core.types import HandFit, HandPose
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.surface_offsets import outline_offsets
-from oasis_warp.hand.skinning import mirror_points, mirror_pose, rest_hand, skin
+from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map
 

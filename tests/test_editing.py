@@ -10,11 +10,10 @@ from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.cli import main
 from oasis_warp.core.config import EditConfig
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.mirror import mirror_camera, mirror_pose
 from oasis_warp.core.types import Photo
 from oasis_warp.editing import edit
-from oasis_warp.hand.skinning import mirror_pose
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.render.cameras import mirrored_camera
 
 QUICK = EditConfig(steps=10)
 
@@ -85,7 +84,7 @@ def test_a_left_hand_is_the_mirror_image_of_a_right_one(truth, painted, made):
     avatar = truth.avatar
     left = Avatar(
         side="left", shape=avatar.shape, surface_offsets=avatar.surface_offsets, gaussians=avatar.gaussians,
-        source_pose=mirror_pose(avatar.source_pose), source_camera=mirrored_camera(avatar.source_camera),
+        source_pose=mirror_pose(avatar.source_pose), source_camera=mirror_camera(avatar.source_camera),
         light=avatar.light,
     )  # fmt: skip
     photos = (picture._replace(rgb=picture.rgb.flip(1).contiguous()) for picture in (painted, truth.photo))

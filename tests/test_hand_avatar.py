@@ -8,13 +8,12 @@ from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import rotation
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.mirror import mirror_camera, mirror_points, mirror_pose
 from oasis_warp.core.types import CanonicalGaussians, HandPose
 from oasis_warp.data.avatar_file import save_avatar
 from oasis_warp.evaluation.coverage import coverage
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.skinning import mirror_points, mirror_pose
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.render.cameras import mirrored_camera
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +37,7 @@ def left(right):
         surface_offsets=right.surface_offsets,
         gaussians=right.gaussians,
         source_pose=mirror_pose(right.source_pose),
-        source_camera=mirrored_camera(right.source_camera),
+        source_camera=mirror_camera(right.source_camera),
     )
 
 

@@ -5,9 +5,10 @@ import torch
 
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
-from oasis_warp.hand.skinning import hand21, mirror_pose, rest_hand, skin
+from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.reconstruction import crop_hand, crop_landmarks, initial_offsets, reconstruct
 
 PHOTO = Path(__file__).parent / "data" / "photos" / "thumb_up_left_06.jpg"

@@ -13,15 +13,16 @@ from oasis_warp.avatar.lighting import shading_picture
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
+from oasis_warp.core.mirror import mirror_camera, mirror_pose
 from oasis_warp.core.types import Photo
 from oasis_warp.data.crop import resample_square
 from oasis_warp.data.painted import find_paint, match_size, read_mask
 from oasis_warp.data.registration import Square, find_square
-from oasis_warp.hand.skinning import mirror_pose, skin
+from oasis_warp.hand.skinning import skin
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import warm_up
-from oasis_warp.render.cameras import crop_camera, mirrored_camera
+from oasis_warp.render.cameras import crop_camera
 
 OTHER_PHOTO = 0.06
 """Median colour difference between avatar and photo from which this is not the photo that the avatar was made from."""
@@ -154,7 +155,7 @@ def _right_handed(avatar: Avatar, image: Tensor, mask: Tensor, size: int) -> Can
     source = avatar.source_camera
     camera = crop_camera(source, 0.0, 0.0, float(source.width), size)
     if avatar.side == "left":
-        image, mask, camera = image.flip(1), mask.flip(1), mirrored_camera(camera)
+        image, mask, camera = image.flip(1), mask.flip(1), mirror_camera(camera)
     return Canvas(image.to(avatar.device), mask.to(avatar.device), camera)
 
 
@@ -167,7 +168,7 @@ def _without_light(avatar: Avatar, posed: Float[Tensor, "V 3"], canvas: Canvas) 
 
 
 def _errors(before: Avatar, after: Avatar, canvas: Canvas) -> dict[str, float]:
-    camera = mirrored_camera(canvas.camera) if before.side == "left" else canvas.camera
+    camera = mirror_camera(canvas.camera) if before.side == "left" else canvas.camera
     image, mask = (plane.flip(1) if before.side == "left" else plane for plane in canvas[:2])
     old, new = (avatar.render(camera, avatar.source_pose, BLACK) for avatar in (before, after))
     inside = ((mask > PAINTED) & (new.alpha > PAINTED)).to(image)

@@ -7,13 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.lighting import in_even_light, mirror_light
-from oasis_warp.avatar.pose import mirror_canonical, pose_gaussians
+from oasis_warp.avatar.lighting import in_even_light
+from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.checks import check_shape
 from oasis_warp.core.config import WHITE, Color
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.mirror import mirror_canonical, mirror_hand, mirror_light, mirror_points
 from oasis_warp.core.types import (
     Camera,
     CanonicalGaussians,
@@ -25,7 +26,7 @@ from oasis_warp.core.types import (
     Side,
 )
 from oasis_warp.data.avatar_file import load_avatar, save_avatar
-from oasis_warp.hand.skinning import mirror_hand, mirror_points, rest_hand, skin, skin_surface
+from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import DeferredFiniteCheck, check_finite, rest_mesh
 from oasis_warp.render.render import render

@@ -29,13 +29,13 @@ from oasis_warp.estimation.moved_fit import keeps_quality, with_pose
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.refine import refine
 from oasis_warp.estimation.surface_offsets import outline_offsets
-from oasis_warp.hand.skinning import mirror_pose, rest_hand, skin
+from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
-from oasis_warp.render.cameras import crop_camera, mirrored_camera
+from oasis_warp.render.cameras import crop_camera
 
 CROP_MARGIN = 1.12
 """Side of the crop over the longer extent of the mask."""
@@ -192,11 +192,9 @@ def crop_side(fit: HandFit) -> float:
 
 def crop_landmarks(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
     """The fit's landmarks as the crop of its hand shows them [px]; those of a left hand are mirrored."""
-    xy, camera = fit.landmarks.xy, fit.camera
-    if fit.side == "left":
-        xy, camera = torch.stack([camera.width - xy[:, 0], xy[:, 1]], 1), mirrored_camera(camera)
-    K = crop.K.cpu()
-    return (xy - camera.K[:2, 2]) * K.diagonal()[:2] / camera.K.diagonal()[:2] + K[:2, 2]
+    right, K = as_right_hand(fit), crop.K.cpu()
+    own = right.camera.K
+    return (right.landmarks.xy - own[:2, 2]) * K.diagonal()[:2] / own.diagonal()[:2] + K[:2, 2]
 
 
 def detail_size(fit: HandFit, config: ReconstructConfig) -> int:
@@ -223,19 +221,17 @@ def crop_hand(
     hand = bundled_hand()
     if size is None:
         size = COARSE_SIZE if config.size == "auto" else min(config.size, COARSE_SIZE)
-    image, mask, camera, pose = photo.rgb.float() / 255, fit.mask, fit.camera, fit.pose
-    if fit.side == "left":
-        image, mask = image.flip(1), mask.flip(1)
-        camera, pose = mirrored_camera(camera), mirror_pose(pose)
+    image, right = photo.rgb.float() / 255, as_right_hand(fit)
+    mask, camera = right.mask, right.camera
     if not bool((mask > 0.5).any()):
         raise InputError(f"{photo.name}: the mask of the hand is empty. Give --keypoints, or another photo.")
     above = torch.from_numpy(wrist_line(fit.landmarks.xy.numpy()).above_mask((camera.width, camera.height))).float()
     if fit.side == "left":
-        above = above.flip(1)
+        image, above = image.flip(1), above.flip(1)
     left, top, side = square_around(mask, CROP_MARGIN)
     rest = rest_hand(hand, fit.shape)
     rest = rest._replace(vertices=rest.vertices + offsets)
-    posed = skin(hand, rest, pose)
+    posed = skin(hand, rest, right.pose)
     crop = crop_camera(camera, left, top, side, size)
     device = torch.device(config.device)
 
@@ -270,7 +266,7 @@ def make_avatar(
         surface_offsets=offsets.to(crop.image),
         gaussians=gaussians,
         source_pose=fit.pose,
-        source_camera=mirrored_camera(camera) if fit.side == "left" else camera,
+        source_camera=mirror_camera(camera) if fit.side == "left" else camera,
         light=light,
     )
 
@@ -279,7 +275,7 @@ def _input_view(avatar: Avatar, crop: HandCrop) -> Render:
     """The avatar over black as `crop` shows the hand; a left hand is mirrored."""
     if avatar.side == "right":
         return avatar.render(crop.camera, avatar.source_pose, BLACK)
-    image, alpha = avatar.render(mirrored_camera(crop.camera), avatar.source_pose, BLACK)
+    image, alpha = avatar.render(mirror_camera(crop.camera), avatar.source_pose, BLACK)
     return Render(image.flip(1), alpha.flip(1))
 
 

@@ -9,24 +9,16 @@ from synthetic import crop_of
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.sh_lighting import fit_light, with_shade, without_light
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.lighting import (
-    in_even_light,
-    mirror_light,
-    posed_normals,
-    shading,
-    split_shade,
-    turn_light,
-)
+from oasis_warp.avatar.lighting import in_even_light, posed_normals, shading, split_shade, turn_light
 from oasis_warp.avatar.observation import observe
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.mirror import mirror_camera, mirror_light, mirror_points, mirror_pose
 from oasis_warp.core.types import HandLight
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.skinning import mirror_points, mirror_pose
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.render.cameras import mirrored_camera
 from oasis_warp.render.render import render
 
 LIGHT = HandLight(
@@ -52,7 +44,7 @@ def avatar(truth, pose, crop, light, hand, side="right"):
     return Avatar(
         side=side, shape=torch.zeros(len(hand.shape_names)), surface_offsets=torch.zeros_like(hand.template),
         gaussians=truth, source_pose=mirror_pose(pose) if left else pose,
-        source_camera=mirrored_camera(crop.camera) if left else crop.camera, light=light,
+        source_camera=mirror_camera(crop.camera) if left else crop.camera, light=light,
     )  # fmt: skip
 
 

@@ -2,9 +2,9 @@ import torch
 from synthetic import PALM_TO_CAMERA, posed_hand
 
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
-from oasis_warp.avatar.pose import mirror_canonical, pose_gaussians
+from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import rotation
-from oasis_warp.hand.skinning import mirror_points
+from oasis_warp.core.mirror import mirror_canonical, mirror_points
 from oasis_warp.ops import rest_mesh
 
 

@@ -4,12 +4,13 @@ import pytest
 import torch
 
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.mirror import mirror_points, mirror_pose
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import choose_hand
 from oasis_warp.estimation.fit_quality import overlap
 from oasis_warp.estimation.landmarks import FINGERS, box_size
 from oasis_warp.estimation.silhouette import silhouette
-from oasis_warp.hand.skinning import mirror_points, mirror_pose, rest_hand, skin
+from oasis_warp.hand.skinning import rest_hand, skin
 
 RIGHT, LEFT = "victory_right_09.jpg", "ok_sign_left_10.jpg"
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from oasis_warp.estimation.fit_quality import overlap
-from oasis_warp.estimation.mirrored_input import mirror_points, mirrored_fit
+from oasis_warp.estimation.mirrored_input import mirrored_fit
 from oasis_warp.estimation.silhouette import silhouette, vertex_normals
 from oasis_warp.estimation.surface_offsets import LONGEST, outline_offsets
 from oasis_warp.hand.kinematics import HandKinematics
@@ -109,7 +109,7 @@ def test_an_empty_mask_moves_nothing(hand, fitted):
 def test_a_left_hands_offsets_are_those_of_the_mirrored_photo(hand, fitted, offsets):
     fit = fitted(LEFT)[2]
     mirror = torch.tensor([-1.0, 1, 1])
-    xy = torch.from_numpy(mirror_points(fit.landmarks.xy.numpy(), fit.camera.width)).float()
+    xy = fit.landmarks.xy * mirror[:2] + torch.tensor([fit.camera.width, 0])
     mirrored = fit._replace(
         side="right",
         pose=fit.pose._replace(orientation=mirror[:, None] * fit.pose.orientation * mirror,

@@ -8,19 +8,10 @@ import pytest
 import torch
 
 from oasis_warp.core import rotation
+from oasis_warp.core.mirror import mirror_hand, mirror_points, mirror_pose
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.correctives import corrective_coefficients
-from oasis_warp.hand.skinning import (
-    bone_transforms,
-    clamp_angles,
-    hand21,
-    mirror_hand,
-    mirror_points,
-    mirror_pose,
-    rest_hand,
-    skin,
-    skin_surface,
-)
+from oasis_warp.hand.skinning import bone_transforms, clamp_angles, hand21, rest_hand, skin, skin_surface
 
 F64 = torch.float64
 

@@ -11,7 +11,7 @@ from oasis_warp.avatar.anchors import INSET, inset_offsets
 from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.skinning import hand21, mirror_pose, rest_hand, skin
+from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.photographed import (
     CROP_MARGIN,

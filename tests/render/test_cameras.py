@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from oasis_warp.core.camera import project
+from oasis_warp.core.mirror import mirror_camera
 from oasis_warp.core.types import Camera
-from oasis_warp.render.cameras import crop_camera, mirrored_camera, orbit_camera
+from oasis_warp.render.cameras import crop_camera, orbit_camera
 
 
 @pytest.fixture
@@ -52,7 +53,7 @@ def test_a_crop_shows_the_same_points_moved_and_scaled(points, camera):
 
 def test_the_mirrored_camera_sees_the_mirrored_world_mirrored(points, camera):
     uv, depth = project(camera, points)
-    mirrored, mirrored_depth = project(mirrored_camera(camera), points * torch.tensor([-1.0, 1, 1]))
+    mirrored, mirrored_depth = project(mirror_camera(camera), points * torch.tensor([-1.0, 1, 1]))
     torch.testing.assert_close(mirrored[:, 0], camera.width - uv[:, 0], atol=1e-3, rtol=0)
     torch.testing.assert_close(mirrored[:, 1], uv[:, 1], atol=1e-3, rtol=0)
     torch.testing.assert_close(mirrored_depth, depth)

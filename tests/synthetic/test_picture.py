@@ -3,8 +3,9 @@ import pytest
 import torch
 
 from oasis_warp.core.camera import project
+from oasis_warp.core.mirror import mirror_points, mirror_pose
 from oasis_warp.core.types import Camera, HandPose
-from oasis_warp.hand.skinning import hand21, mirror_points, mirror_pose, rest_hand, skin
+from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.photographed import Photographed, training_batch
 from oasis_warp.synthetic import people

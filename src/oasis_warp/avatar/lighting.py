@@ -138,13 +138,6 @@ def shading_picture(
     return torch.where(on_hand > 0, inside, beyond)
 
 
-def mirror_light(light: HandLight) -> HandLight:
-    """The same light in the mirrored world (x -> -x)."""
-    all_around, x, y, z = light.harmonics.unbind(0)
-    facing = None if light.facing is None else light.facing * light.facing.new_tensor([-1.0, 1.0, 1.0])
-    return light._replace(harmonics=torch.stack([all_around, -x, y, z]), facing=facing)
-
-
 def turn_light(light: HandLight, rotation: Float[Tensor, "3 3"]) -> HandLight:
     """The same light in a world that `rotation` leads to."""
     facing = None if light.facing is None else light.facing @ rotation.T

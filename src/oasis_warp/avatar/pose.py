@@ -45,11 +45,3 @@ def pose_gaussians(
         directions = rotation.rotate(turned.vertex_quats, normals.expand_as(posed_vertices))
         colors = lit_colors(canonical, faces, source, directions)
     return Gaussians(means, quats, scales, canonical.opacities, colors)
-
-
-def mirror_canonical(canonical: CanonicalGaussians) -> CanonicalGaussians:
-    """The same Gaussians on the mirror image (x -> -x) of their surface: a rotation (w, x, y, z) -> (w, x, -y, -z)."""
-    offsets, quats = canonical.offsets, canonical.quats
-    return canonical._replace(
-        offsets=offsets * offsets.new_tensor([-1.0, 1.0, 1.0]), quats=quats * quats.new_tensor([1.0, 1.0, -1.0, -1.0])
-    )

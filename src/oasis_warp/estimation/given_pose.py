@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.mirror import mirror_landmarks
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
 from oasis_warp.estimation.fit_quality import WARN_BOUNDS, draw, measure
 from oasis_warp.estimation.fit_warnings import framing_warnings
-from oasis_warp.estimation.mirrored_input import MirroredInput, mirror_points, mirrored_state, real
+from oasis_warp.estimation.mirrored_input import MirroredInput, mirrored_state, real
 from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
 from oasis_warp.hand.kinematics import HandKinematics
 
@@ -30,10 +32,11 @@ def fit_of_pose(
     rig = HandKinematics(hand)
     state = mirrored_state(rig, side, shape, pose, camera)
     points = rig.landmarks(rig.chain(state.angles, state.shape), state.shape)[0]
-    xy, world = state.project(points), state.in_camera(points)
+    xy, world = torch.from_numpy(state.project(points)), torch.from_numpy(state.in_camera(points))
+    landmarks = Landmarks(xy, world - world.mean(0), "right", 1.0, 1.0, source)
     if side == "left":
-        xy, world = mirror_points(xy, camera.width), world * [-1, 1, 1]
-    landmarks = Landmarks(real(xy), real(world - world.mean(0)), side, 1.0, 1.0, source)
+        landmarks = mirror_landmarks(landmarks, camera.width)
+    landmarks = landmarks._replace(xy=landmarks.xy.float(), world=landmarks.world.float())
     view = MirroredInput(photo, landmarks, state.focal)
     state = replace(state, focal=state.focal * float(view.scale[0]), centre=state.centre * view.scale)
     scale, seen = state.focal / float(np.exp(state.place[2])), view.evidence.xy

@@ -11,6 +11,7 @@ from torch.nn.functional import avg_pool2d
 from oasis_warp.avatar.appearance import label_regions, region_masks
 from oasis_warp.avatar.observation import Observation, inner_mask, observe
 from oasis_warp.core.config import BLACK, ReconstructConfig
+from oasis_warp.core.mirror import mirror_camera
 from oasis_warp.core.types import HandCrop, HandPose, Landmarks, Photo, Render
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.evaluation.coverage import COVERED
@@ -18,7 +19,6 @@ from oasis_warp.evaluation.metrics import color_gain
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr, ssim_map
 from oasis_warp.reconstruction import crop_hand
-from oasis_warp.render.cameras import mirrored_camera
 
 QUARTER = 4
 """Side of the blocks on which structure is compared [px]: a pose that is a little off moves all detail."""
@@ -86,7 +86,7 @@ def compare_pairs(
 def draw_as_photo(avatar: Avatar, crop: HandCrop, pose: HandPose) -> Render:
     """`avatar` in the `pose`, in its photo's own frame, and camera of another photo; a left hand is mirrored."""
     left = avatar.side == "left"
-    drawn = avatar.render(mirrored_camera(crop.camera) if left else crop.camera, pose, BLACK)
+    drawn = avatar.render(mirror_camera(crop.camera) if left else crop.camera, pose, BLACK)
     return Render(drawn.image.flip(1), drawn.alpha.flip(1)) if left else drawn
 
 

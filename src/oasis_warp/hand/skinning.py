@@ -1,6 +1,5 @@
-"""Pose the hand: shape and joint angles -> surface, joints and finger tips; clamp and mirror poses."""
+"""Pose the hand: shape and joint angles -> surface, joints and finger tips; clamp angles."""
 
-import dataclasses
 from collections.abc import Sequence
 
 import torch
@@ -88,45 +87,3 @@ def clamp_angles(hand: HandModel, angles: Float[Tensor, "15 3"]) -> Float[Tensor
     """`angles` [rad], each moved to the nearest value that its joint allows."""
     low, high = hand.pose_limits[1:].unbind(-1)
     return torch.minimum(torch.maximum(angles, low), high)
-
-
-def mirror_points(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Points seen in the mirror x -> -x, which turns right hands into left ones and back."""
-    return points * points.new_tensor([-1.0, 1.0, 1.0])
-
-
-def mirror_pose(pose: HandPose) -> HandPose:
-    """The pose whose right hand is the mirror image of this one's left hand, or the other way round.
-
-    With M = diag(-1, 1, 1), skinning the mirrored surface M v by (M R M, M t) gives M times skinning v by (R, t).
-    Joint angles stay: they turn about the model's own axes, which are mirrored with it.
-    """
-    mirror = pose.orientation.new_tensor([-1.0, 1.0, 1.0])
-    return HandPose(
-        angles=pose.angles,
-        orientation=mirror[:, None] * pose.orientation * mirror,
-        translation=mirror * pose.translation,
-    )
-
-
-def mirror_hand(hand: HandModel) -> HandModel:
-    """The other hand: posed like `hand` by the same angles, it is the mirror image of `hand` in the mirrored pose.
-
-    Points and displacements are mirrored, axes too, as what angles turn about (a mirror reverses turns). Faces keep
-    their corners, and so wind the other way.
-    """
-
-    def mirrored(displacements: Tensor) -> Tensor:
-        return mirror_points(displacements.mT).mT.contiguous()
-
-    return dataclasses.replace(
-        hand,
-        template=mirror_points(hand.template),
-        shape_basis=mirrored(hand.shape_basis),
-        joints=mirror_points(hand.joints),
-        joint_basis=mirrored(hand.joint_basis),
-        tips=mirror_points(hand.tips),
-        tip_basis=mirrored(hand.tip_basis),
-        pose_axes=-mirror_points(hand.pose_axes),
-        corrective_basis=mirrored(hand.corrective_basis),
-    )

@@ -23,14 +23,6 @@ def crop_camera(camera: Camera, left: float, top: float, side: float, size: int)
     return Camera(camera.viewmat, K, size, size)
 
 
-def mirrored_camera(camera: Camera) -> Camera:
-    """The camera that sees the mirrored world (x -> -x) as the mirror image of what `camera` sees."""
-    K = camera.K.clone()
-    K[0, 2] = camera.width - K[0, 2]
-    flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=K.dtype, device=K.device))
-    return Camera(flip @ camera.viewmat @ flip, K, camera.width, camera.height)
-
-
 def orbit_camera(
     vertices: Float[Tensor, "V 3"], azimuth: float, elevation: float = 0.0, size: int = 256
 ) -> Camera:
