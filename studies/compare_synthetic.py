@@ -20,6 +20,7 @@ import tyro
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.observation import observe
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.mirror import mirror_points, mirror_pose
 from oasis_warp.core.types import Camera, HandCrop, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator

@@ -20,6 +20,7 @@ from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
+from oasis_warp.core.mirror import as_right_hand, mirror_camera, mirror_pose
 from oasis_warp.core.types import Camera, CanonicalGaussians, HandCrop, HandFit, HandLight, Landmarks, Photo, Render
 from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.estimation.drawn_outline import rendered_outline_offsets

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import INSET, inset_offsets
+from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
