@@ -27,7 +27,7 @@ from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.synthetic.picture import render_batch
-from oasis_warp.synthetic.plan import PICTURES_EACH
+from oasis_warp.synthetic.shots import PICTURES_EACH
 from oasis_warp.synthetic.spectrum import linear_to_lab
 
 SUFFIXES = (".jpg", ".png")

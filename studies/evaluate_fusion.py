@@ -53,8 +53,8 @@ from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
 from oasis_warp.reconstruction import crop_hand, make_avatar
 from oasis_warp.render.render import render
 from oasis_warp.synthetic.picture import SyntheticBatch, render_planned
-from oasis_warp.synthetic.plan import PICTURES_EACH, Scenery, plan_shots
-from oasis_warp.synthetic.planned import tabulate
+from oasis_warp.synthetic.shot_table import tabulate
+from oasis_warp.synthetic.shots import PICTURES_EACH, Scenery, plan_shots
 
 MOST = 4
 """Photos of one avatar, and targets of each synthetic person: half of a person's pictures each."""

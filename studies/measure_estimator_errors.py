@@ -26,7 +26,7 @@ from oasis_warp.estimation.surface_offsets import outline_offsets
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.reconstruction import CROP_MARGIN
 from oasis_warp.synthetic.picture import SyntheticBatch, render_batch
-from oasis_warp.synthetic.plan import PICTURES_EACH
+from oasis_warp.synthetic.shots import PICTURES_EACH
 
 CROP = 256
 """Side of the masks that are kept [px]."""

@@ -14,8 +14,8 @@ import torch
 from oasis_warp.pretraining.synthetic_source import SyntheticHands
 from oasis_warp.synthetic import picture
 from oasis_warp.synthetic.people import person
-from oasis_warp.synthetic.plan import EVERYBODY, PHOTOS, PICTURES_EACH
-from oasis_warp.synthetic.planned import plan_table
+from oasis_warp.synthetic.shot_table import plan_table
+from oasis_warp.synthetic.shots import EVERYBODY, PHOTOS, PICTURES_EACH
 
 STAGES = ("pose_people", "depth_map", "surface_state", "light_lamps", "see_sky", "_stretch", "shade_skin",
           "trace_rooms", "expose")  # fmt: skip

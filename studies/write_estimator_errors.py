@@ -32,7 +32,7 @@ from oasis_warp.pretraining.mask_errors import NUMBERS, ended, wandering
 from oasis_warp.pretraining.photographed import as_right_hands, crop_to_mask
 from oasis_warp.pretraining.posed_hands import Posed, pose_hands
 from oasis_warp.synthetic.picture import render_batch
-from oasis_warp.synthetic.plan import PICTURES_EACH
+from oasis_warp.synthetic.shots import PICTURES_EACH
 
 BEGIN, END = "<!-- errors -->", "<!-- end of errors -->"
 ASSET = Path(__file__).parents[1] / "src" / "oasis_warp" / "assets" / "training" / "estimator_errors.safetensors"

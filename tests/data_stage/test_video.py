@@ -5,7 +5,7 @@ import torch
 from disk import full_disk
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.video import write_video
+from oasis_warp.data.pictures import write_video
 
 
 def moving_disc(n_frames=8, height=64, width=96):

@@ -9,7 +9,7 @@ import torch
 
 from oasis_warp.pretraining.pretrain import BatchSource
 from oasis_warp.pretraining.synthetic_source import EVEN_EVERY, SyntheticHands
-from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH
+from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH
 
 CPU = torch.device("cpu")
 

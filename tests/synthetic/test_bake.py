@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 import torch
 
+from oasis_warp.core.processes import worker_pool
 from oasis_warp.ops import depth_map
 from oasis_warp.synthetic import people
 from oasis_warp.synthetic.atlas import HEIGHT, WIDTH, bundled_atlas
-from oasis_warp.synthetic.bake import CHANNELS, paint
 from oasis_warp.synthetic.body import bundled_body, skin_mesh
-from oasis_warp.synthetic.canvas import canvas_on
-from oasis_warp.synthetic.drawn_lines import draw_lines
 from oasis_warp.synthetic.identity import Population
-from oasis_warp.synthetic.plan import EVERYBODY
-from oasis_warp.synthetic.processes import worker_pool
+from oasis_warp.synthetic.shots import EVERYBODY
 from oasis_warp.synthetic.skin_plan import plan_person
+from oasis_warp.synthetic.skin_texture import CHANNELS, paint
 from oasis_warp.synthetic.strokes import KINDS, Strokes
+from oasis_warp.synthetic.texels import canvas_on, draw_lines
 
 SEED = 13
 KINDS_OF_PAINT = ("freckles", "hair", "polish", "tattoo", "ring", "plaster")

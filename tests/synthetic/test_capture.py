@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from oasis_warp.synthetic.picture import render_batch, render_capture
-from oasis_warp.synthetic.plan import EVERYBODY, PHOTOS, PICTURES_EACH, Scenery, capture_shots, plan_shots, sample_shot
-from oasis_warp.synthetic.planned import arm_turns, tabulate
-from oasis_warp.synthetic.stage import (
+from oasis_warp.synthetic.shot_table import arm_turns, tabulate
+from oasis_warp.synthetic.shots import EVERYBODY, PHOTOS, PICTURES_EACH, Scenery, capture_shots, plan_shots, sample_shot
+from oasis_warp.synthetic.view_and_light import (
     ARM_CONE,
     View,
     clear_of_arm,

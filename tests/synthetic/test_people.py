@@ -5,7 +5,7 @@ import torch
 
 from oasis_warp.synthetic import people
 from oasis_warp.synthetic.body import device_name
-from oasis_warp.synthetic.plan import EVERYBODY
+from oasis_warp.synthetic.shots import EVERYBODY
 
 SEED = 13
 

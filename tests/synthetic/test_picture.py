@@ -11,8 +11,8 @@ from oasis_warp.pretraining.photographed import Photographed, training_batch
 from oasis_warp.synthetic import people
 from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.picture import render_batch, stream
-from oasis_warp.synthetic.plan import EVERYBODY, PHOTOS, PICTURES_EACH, Scenery, sample_shot
-from oasis_warp.synthetic.planned import joined, plan_ahead, plan_table
+from oasis_warp.synthetic.shot_table import joined, plan_ahead, plan_table
+from oasis_warp.synthetic.shots import EVERYBODY, PHOTOS, PICTURES_EACH, Scenery, sample_shot
 
 SIZE = 64
 SEED = 13

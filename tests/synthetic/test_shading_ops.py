@@ -10,7 +10,7 @@ from oasis_warp.synthetic.ops.pixel_noise import pixel_noise
 from oasis_warp.synthetic.ops.room_tracing import PATTERNS, SHAPES, SOLID_WORDS, trace_rooms
 from oasis_warp.synthetic.ops.skin_shading import Lamps, sky_transfer, smooth_over_faces, surface_state
 from oasis_warp.synthetic.ops.surface_patterns import NoiseField, point_grid, surface_dabs, surface_noise
-from oasis_warp.synthetic.stage import sphere
+from oasis_warp.synthetic.view_and_light import sphere
 
 UNIFORM_SKY = torch.zeros(9, 3)
 UNIFORM_SKY[0] = 0.5 / 0.2820948  # light of .5 from everywhere

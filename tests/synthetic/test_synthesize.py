@@ -9,13 +9,12 @@ import torch
 from oasis_warp import cli
 from oasis_warp.cli.exit_codes import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.pictures import write_picture
+from oasis_warp.data.pictures import contact_sheet, write_picture
 from oasis_warp.synthetic import shards
 from oasis_warp.synthetic.backgrounds import cut_background, list_backgrounds
 from oasis_warp.synthetic.picture import render_batch
-from oasis_warp.synthetic.plan import PHOTOS, Scenery
 from oasis_warp.synthetic.shards import write_shards
-from oasis_warp.synthetic.sheet import contact_sheet
+from oasis_warp.synthetic.shots import PHOTOS, Scenery
 
 SIZE = 32
 JOB = {"count": 5, "seed": 13, "size": SIZE, "device": "cpu", "scenery": PHOTOS, "settings": {}, "batch": 2}

@@ -9,8 +9,7 @@ from oasis_warp.cli.look import check_device, check_side, choose_pose, read_colo
 from oasis_warp.cli.options import Animate
 from oasis_warp.cli.progress import show_progress
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.pictures import check_suffix
-from oasis_warp.data.video import VIDEO_SUFFIXES, write_video
+from oasis_warp.data.pictures import VIDEO_SUFFIXES, check_suffix, write_video
 from oasis_warp.hand.poses import POSE_NAMES
 from oasis_warp.hand_avatar import Avatar
 

@@ -37,7 +37,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.lpips import load_lpips
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.pretraining.synthetic_source import MULTIPLE
-from oasis_warp.synthetic.plan import PICTURES_EACH
+from oasis_warp.synthetic.shots import PICTURES_EACH
 
 SIZES = range(64, 1025)
 TABLE_WIDTH = 120

@@ -29,7 +29,7 @@ from oasis_warp.pretraining.distributed import Place, join_processes, wait_for_a
 from oasis_warp.pretraining.pretrain import CHECKPOINT, PretrainConfig, pretrain
 from oasis_warp.pretraining.synthetic_source import MULTIPLE, SyntheticHands
 from oasis_warp.synthetic.people import most_kept
-from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH
+from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH
 
 SETTINGS, PEOPLE = "training.json", "people"
 """In the folder: with what the training began, and the people that a CPU has baked."""

@@ -24,8 +24,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, timed_stage
 from oasis_warp.data.atomic import output_folder
 from oasis_warp.data.photo import read_photo
-from oasis_warp.data.pictures import write_picture
-from oasis_warp.data.video import write_video
+from oasis_warp.data.pictures import write_picture, write_video
 from oasis_warp.fusion import reconstruct_same_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.weights_file import read_header

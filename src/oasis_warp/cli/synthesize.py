@@ -11,12 +11,11 @@ from oasis_warp.cli.options import Synthesize
 from oasis_warp.cli.progress import show_progress
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
-from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, to_uint8, write_picture
+from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, contact_sheet, to_uint8, write_picture
 from oasis_warp.synthetic.backgrounds import list_backgrounds
 from oasis_warp.synthetic.picture import render_batch
-from oasis_warp.synthetic.plan import PICTURES_EACH, Scenery
 from oasis_warp.synthetic.shards import write_shards
-from oasis_warp.synthetic.sheet import contact_sheet
+from oasis_warp.synthetic.shots import PICTURES_EACH, Scenery
 
 SHEET_COLUMNS = 8
 BATCH = {"cpu": 4, "cuda": 64}

@@ -19,7 +19,8 @@ from oasis_warp.pretraining.photographed import EstimatorNoise, training_batch
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
 from oasis_warp.pretraining.targets import true_pictures
 from oasis_warp.synthetic.picture import SyntheticBatch, part, render_capture, render_planned
-from oasis_warp.synthetic.plan import (
+from oasis_warp.synthetic.shot_table import Planned, tabulate
+from oasis_warp.synthetic.shots import (
     EVERYBODY,
     PICTURES_EACH,
     Scenery,
@@ -28,8 +29,7 @@ from oasis_warp.synthetic.plan import (
     capture_shots,
     plan_shots,
 )
-from oasis_warp.synthetic.planned import Planned, tabulate
-from oasis_warp.synthetic.stage import sample_light, soften_light
+from oasis_warp.synthetic.view_and_light import sample_light, soften_light
 from oasis_warp.synthetic.wardrobe import sample_clothes
 
 Group = Literal["ordinary", "tattoo", "ring"]

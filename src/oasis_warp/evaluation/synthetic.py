@@ -27,6 +27,7 @@ from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.processes import worker_pool
 from oasis_warp.core.types import Camera, HandCrop, PosedHand, TrainingBatch
 from oasis_warp.data.atomic import write_file
 from oasis_warp.data.claimed_folder import claim_folder
@@ -57,7 +58,6 @@ from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.pretraining.losses import Perceptual
 from oasis_warp.render.render import render
-from oasis_warp.synthetic.processes import worker_pool
 
 SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (
     "evaluation.json", "metrics.json", "sheet.png", "attention.png", "people"

@@ -15,8 +15,8 @@ from oasis_warp.pretraining.photographed import training_batch
 from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.people import bake_people
 from oasis_warp.synthetic.picture import SyntheticBatch, part, render_planned
-from oasis_warp.synthetic.plan import EVERYBODY, PICTURES_EACH, Scenery
-from oasis_warp.synthetic.planned import joined, plan_ahead
+from oasis_warp.synthetic.shot_table import joined, plan_ahead
+from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH, Scenery
 
 ERROR_STREAM = 3
 """Tells the random numbers of the estimator's errors from those of identities and pictures with the same seed."""

@@ -9,9 +9,9 @@ from torch import Tensor
 from oasis_warp.ops import depth_map
 from oasis_warp.synthetic.body import Body
 from oasis_warp.synthetic.ops.skin_shading import Lamps, sky_transfer, smooth_over_faces
-from oasis_warp.synthetic.planned import Numbers
 from oasis_warp.synthetic.posing import Posed
-from oasis_warp.synthetic.stage import sphere
+from oasis_warp.synthetic.shot_table import Numbers
+from oasis_warp.synthetic.view_and_light import sphere
 
 SKY_DIRECTIONS, SKY_SIZE = 40, 112
 """Depth buffers that sample the sky, and their side [px]."""

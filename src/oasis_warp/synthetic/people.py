@@ -16,15 +16,15 @@ from torch import Tensor
 
 from oasis_warp import __version__
 from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.processes import worker_pool
 from oasis_warp.data.atomic import write_file
-from oasis_warp.synthetic.bake import paint
 from oasis_warp.synthetic.body import ARM_ROWS, arm_rows, body_on, bundled_body, device_name
-from oasis_warp.synthetic.canvas import canvas_on
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
 from oasis_warp.synthetic.ops.skin_shading import surface_state
-from oasis_warp.synthetic.processes import worker_pool
 from oasis_warp.synthetic.relief import relief
 from oasis_warp.synthetic.skin_plan import SkinPlan, plan_person
+from oasis_warp.synthetic.skin_texture import paint
+from oasis_warp.synthetic.texels import canvas_on
 from oasis_warp.synthetic.wardrobe import ring_at_rest, ring_look
 
 PERSON_BYTES = 24_000_000

@@ -27,10 +27,10 @@ from oasis_warp.synthetic.ops.skin_shading import (
     surface_state,
 )
 from oasis_warp.synthetic.people import Person, person
-from oasis_warp.synthetic.plan import PHOTOS, Scenery
-from oasis_warp.synthetic.planned import Numbers, Planned, numbers_of, plan_ahead, plan_table, send
 from oasis_warp.synthetic.posing import Posed, pose_people
 from oasis_warp.synthetic.sensor import develop, expose, meter, srgb
+from oasis_warp.synthetic.shot_table import Numbers, Planned, numbers_of, plan_ahead, plan_table, send
+from oasis_warp.synthetic.shots import PHOTOS, Scenery
 
 SAMPLES = 2
 """Sub-pixels along a pixel's side."""

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from oasis_warp.synthetic.furniture import hang_on_wall, put_laptop, put_thing
-from oasis_warp.synthetic.solids import Builder
+from oasis_warp.synthetic.furniture import Builder, hang_on_wall, put_laptop, put_thing
 
 _KINDS = {"wall": 0.24, "desk": 0.24, "floor": 0.13, "room": 0.20, "cloth": 0.08, "garden": 0.05, "studio": 0.06}
 

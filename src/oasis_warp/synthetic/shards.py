@@ -18,7 +18,7 @@ from oasis_warp.core.logging import Progress, silent
 from oasis_warp.data.atomic import output_file
 from oasis_warp.data.claimed_folder import claim_folder
 from oasis_warp.synthetic.picture import SyntheticBatch, render_batch
-from oasis_warp.synthetic.plan import Scenery
+from oasis_warp.synthetic.shots import Scenery
 
 SHARD = 64
 """Pictures a file: a whole number of people."""

@@ -10,9 +10,8 @@ import numpy as np
 
 from oasis_warp.synthetic.atlas import bundled_atlas
 from oasis_warp.synthetic.body import FINGERS, bundled_body
-from oasis_warp.synthetic.hand_lines import draw_back, draw_fingers, draw_wrist
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
-from oasis_warp.synthetic.palm_lines import Palm
+from oasis_warp.synthetic.skin_lines import Palm, draw_back, draw_fingers, draw_wrist
 from oasis_warp.synthetic.strokes import Lines, Strokes
 
 STAR, BANDS = 2, 4

@@ -58,7 +58,7 @@ class Texture(NamedTuple):
 
     pages: list[Float[Tensor, "Y X 8"]]
     """One an image, float16, all of one size: linear RGB, height, fold, wrinkle [mm], roughness, oil (see
-    `oasis_warp.synthetic.bake`). They are read where they lie: images may share one."""
+    `oasis_warp.synthetic.skin_texture`). They are read where they lie: images may share one."""
     uv: Float[Tensor, "U 2"]
     """Texels, centres at .5."""
     uv_faces: Int[Tensor, "S 3"]

@@ -15,7 +15,7 @@ from oasis_warp.synthetic.gestures import sample_gesture
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
 from oasis_warp.synthetic.rooms import Room, sample_room
 from oasis_warp.synthetic.sensor import Sensor, sample_sensor
-from oasis_warp.synthetic.stage import (
+from oasis_warp.synthetic.view_and_light import (
     Light,
     Look,
     View,

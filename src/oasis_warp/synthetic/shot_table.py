@@ -12,15 +12,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.core.processes import worker_pool
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.synthetic.body import ARM_LENGTH, ARM_ROWS
 from oasis_warp.synthetic.contact import bundled_skeleton
+from oasis_warp.synthetic.furniture import MAX_SOLIDS, SOLID_WORDS
 from oasis_warp.synthetic.identity import Identity, Population
-from oasis_warp.synthetic.plan import Scenery, Shot, identity_of, plan_shots
-from oasis_warp.synthetic.processes import worker_pool
 from oasis_warp.synthetic.sensor import SENSOR_WORDS, sensor_row
-from oasis_warp.synthetic.solids import MAX_SOLIDS, SOLID_WORDS
-from oasis_warp.synthetic.stage import N_LAMPS
+from oasis_warp.synthetic.shots import Scenery, Shot, identity_of, plan_shots
+from oasis_warp.synthetic.view_and_light import N_LAMPS
 from oasis_warp.synthetic.wardrobe import SKIN_LOOK, ring_look
 
 AHEAD = 3
