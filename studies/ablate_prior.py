@@ -33,9 +33,15 @@ from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.network.weights_file import load_network, save_network
-from oasis_warp.pretraining.checkpoint import load_checkpoint, save_checkpoint
 from oasis_warp.pretraining.distributed import Place
-from oasis_warp.pretraining.pretrain import CHECKPOINT, WEIGHTS, PretrainConfig, Trainer
+from oasis_warp.pretraining.pretrain import (
+    CHECKPOINT,
+    WEIGHTS,
+    PretrainConfig,
+    Trainer,
+    load_checkpoint,
+    save_checkpoint,
+)
 from oasis_warp.pretraining.synthetic_source import SyntheticHands
 
 FULL = "full"

@@ -48,8 +48,8 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.prior import choose_prior
-from oasis_warp.pretraining.photographed import training_batch
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
+from oasis_warp.pretraining.training_batch import training_batch
 from oasis_warp.reconstruction import crop_hand, make_avatar
 from oasis_warp.render.render import render
 from oasis_warp.synthetic.picture import SyntheticBatch, render_planned

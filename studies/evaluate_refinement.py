@@ -47,7 +47,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import depth_map, depth_visibility
-from oasis_warp.pretraining.photographed import EstimatorNoise, training_batch
+from oasis_warp.pretraining.training_batch import EstimatorNoise, training_batch
 from oasis_warp.render.render import render
 
 MARGIN = 0.0015

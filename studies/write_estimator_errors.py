@@ -27,10 +27,19 @@ from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map, depth_visibility
-from oasis_warp.pretraining.estimator_errors import ALIKE, MeasuredErrors, estimate, frames_of, looks, of_surface
-from oasis_warp.pretraining.mask_errors import NUMBERS, ended, wandering
-from oasis_warp.pretraining.photographed import as_right_hands, crop_to_mask
-from oasis_warp.pretraining.posed_hands import Posed, pose_hands
+from oasis_warp.pretraining.estimator_errors import (
+    ALIKE,
+    NUMBERS,
+    MeasuredErrors,
+    ended,
+    estimate,
+    frames_of,
+    looks,
+    of_surface,
+    wandering,
+)
+from oasis_warp.pretraining.hand_batch import Posed, pose_hands
+from oasis_warp.pretraining.training_batch import as_right_hands, crop_to_mask
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shots import PICTURES_EACH
 

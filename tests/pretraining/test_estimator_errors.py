@@ -16,7 +16,7 @@ from oasis_warp.pretraining.estimator_errors import (
     looks,
     of_surface,
 )
-from oasis_warp.pretraining.posed_hands import pose_hands
+from oasis_warp.pretraining.hand_batch import pose_hands
 
 K = torch.tensor([[500.0, 0, 190], [0, 500, 200], [0, 0, 1]])
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from oasis_warp.pretraining.mask_errors import NUMBERS, ended, wandering
+from oasis_warp.pretraining.estimator_errors import NUMBERS, ended, wandering
 
 SIZE = 256
 FOCAL = 400.0

@@ -11,8 +11,16 @@ from oasis_warp.losses.image import masked_dssim, masked_l1
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.inputs import Prediction, input_of_batch
-from oasis_warp.pretraining.losses import LossConfig, objective, picture_psnr, position_loss, scaling_loss
-from oasis_warp.pretraining.targets import Pictures, draw_targets, true_pictures
+from oasis_warp.pretraining.objective import (
+    LossConfig,
+    Pictures,
+    draw_targets,
+    objective,
+    picture_psnr,
+    position_loss,
+    scaling_loss,
+    true_pictures,
+)
 from oasis_warp.render.render import render
 
 

@@ -14,14 +14,14 @@ from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.ops import depth_map
-from oasis_warp.pretraining.photographed import (
+from oasis_warp.pretraining.hand_batch import pose_hands
+from oasis_warp.pretraining.training_batch import (
     CROP_MARGIN,
     EstimatorNoise,
     Photographed,
     crop_to_mask,
     training_batch,
 )
-from oasis_warp.pretraining.posed_hands import pose_hands
 
 SIZE, CROP = 240, 160
 CROP_OF_DOCS = 256

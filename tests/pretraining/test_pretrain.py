@@ -17,7 +17,6 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, trained_state
-from oasis_warp.pretraining.checkpoint import load_checkpoint, save_checkpoint
 from oasis_warp.pretraining.distributed import Place
 from oasis_warp.pretraining.pretrain import (
     CHECKPOINT,
@@ -27,7 +26,9 @@ from oasis_warp.pretraining.pretrain import (
     PretrainConfig,
     Trainer,
     learning_rate,
+    load_checkpoint,
     pretrain,
+    save_checkpoint,
 )
 
 ALONE = Place(0, 1, torch.device("cpu"))

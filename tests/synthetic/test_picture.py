@@ -7,7 +7,7 @@ from oasis_warp.core.mirror import mirror_points, mirror_pose
 from oasis_warp.core.types import Camera, HandPose
 from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.ops import depth_map
-from oasis_warp.pretraining.photographed import Photographed, training_batch
+from oasis_warp.pretraining.training_batch import Photographed, training_batch
 from oasis_warp.synthetic import people
 from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.picture import render_batch, stream

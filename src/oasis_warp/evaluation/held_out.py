@@ -15,9 +15,9 @@ from oasis_warp.evaluation.metrics import Truth
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.observation import sight
 from oasis_warp.ops import depth_map
-from oasis_warp.pretraining.photographed import EstimatorNoise, training_batch
+from oasis_warp.pretraining.objective import true_pictures
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
-from oasis_warp.pretraining.targets import true_pictures
+from oasis_warp.pretraining.training_batch import EstimatorNoise, training_batch
 from oasis_warp.synthetic.picture import SyntheticBatch, part, render_capture, render_planned
 from oasis_warp.synthetic.shot_table import Planned, tabulate
 from oasis_warp.synthetic.shots import (

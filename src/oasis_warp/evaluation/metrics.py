@@ -9,7 +9,7 @@ from torch import Tensor
 
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.losses.image import ssim_map
-from oasis_warp.pretraining.losses import Perceptual
+from oasis_warp.pretraining.objective import Perceptual
 
 FEWEST_PIXELS = 50
 """Of a part of the hand, else nothing is said about it."""

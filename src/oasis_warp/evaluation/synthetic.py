@@ -56,7 +56,7 @@ from oasis_warp.losses.lpips import Lpips
 from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.prior import NetworkPrior
-from oasis_warp.pretraining.losses import Perceptual
+from oasis_warp.pretraining.objective import Perceptual
 from oasis_warp.render.render import render
 
 SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (

@@ -11,7 +11,7 @@ import torch
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.pretraining.photographed import training_batch
+from oasis_warp.pretraining.training_batch import training_batch
 from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.people import bake_people
 from oasis_warp.synthetic.picture import SyntheticBatch, part, render_planned

@@ -10,9 +10,8 @@ from torch.nn.functional import grid_sample
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import TrainingBatch
-from oasis_warp.pretraining.estimator_errors import ALIKE, bundled_errors, estimate
-from oasis_warp.pretraining.mask_errors import NUMBERS, ended, wandering
-from oasis_warp.pretraining.posed_hands import Posed, pose_hands
+from oasis_warp.pretraining.estimator_errors import ALIKE, NUMBERS, bundled_errors, ended, estimate, wandering
+from oasis_warp.pretraining.hand_batch import Posed, pose_hands
 
 CROP_MARGIN = 1.12
 """Side of a crop over the longer extent of its mask, as in `reconstruction.reconstruct`."""
