@@ -14,7 +14,7 @@ import torch
 
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 from oasis_warp.evaluation.ablation import ablation_table, as_markdown, heading
 from oasis_warp.evaluation.columns import COLORS
 from oasis_warp.evaluation.methods import ONE_SHOT, Method

@@ -21,8 +21,7 @@ from typing import NamedTuple
 import torch
 
 from oasis_warp.avatar.prior import MeanPrior
-from oasis_warp.data.atomic import write_file
-from oasis_warp.data.claimed_folder import claim_folder
+from oasis_warp.data.output_files import claim_folder, write_file
 from oasis_warp.evaluation.ablation import ablation_table, as_markdown, heading
 from oasis_warp.evaluation.held_out import POPULATIONS
 from oasis_warp.evaluation.methods import BASELINE, ONE_SHOT, RAW, Method

@@ -28,8 +28,7 @@ from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, HandCrop, TrainingBatch
-from oasis_warp.data.atomic import write_file
-from oasis_warp.data.claimed_folder import claim_folder
+from oasis_warp.data.output_files import claim_folder, write_file
 from oasis_warp.evaluation.columns import COLORS, LIGHTS, markdown
 from oasis_warp.evaluation.held_out import FIRST_PERSON, Lighting, Shoot, as_estimated, photograph, true_targets
 from oasis_warp.evaluation.methods import Made, prior_digest

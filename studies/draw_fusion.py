@@ -15,9 +15,9 @@ from torch import Tensor
 
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import HandPose
-from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8, write_picture
+from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.fusion import reconstruct_same_hand
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar

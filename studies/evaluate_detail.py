@@ -30,9 +30,9 @@ from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.mirror import mirror_camera
 from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.core.types import Camera, HandCrop
-from oasis_warp.data.atomic import write_file
-from oasis_warp.data.crop import resample_square, square_around
+from oasis_warp.data.output_files import write_file
 from oasis_warp.data.pictures import to_uint8
+from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import depth_map

@@ -36,8 +36,8 @@ from oasis_warp.cli.drawing import Panel, make_sheet, panel_side
 from oasis_warp.cli.summary import GROUND
 from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.types import Camera, HandPose, Photo
-from oasis_warp.data.crop import resample_square
 from oasis_warp.data.pictures import to_uint8
+from oasis_warp.data.square_crop import resample_square
 from oasis_warp.editing import edit
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand

@@ -29,7 +29,7 @@ from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, CanonicalGaussians, Landmarks, Photo, TrainingBatch
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.held_out import (

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandFit, Photo
-from oasis_warp.data.atomic import write_file
-from oasis_warp.data.crop import resample_square, square_around
+from oasis_warp.data.output_files import write_file
+from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.surface_offsets import outline_offsets

@@ -21,7 +21,7 @@ import torch
 
 from oasis_warp.bench import gpu_cases, gpu_speed, roofline, scaling
 from oasis_warp.bench.rows import json_text, to_record
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 
 PARTS = "kernels", "scaling", "roofline"
 SILENT = (

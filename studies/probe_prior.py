@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import torch
 
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 from oasis_warp.evaluation.ablation import ablation_table, as_markdown, heading
 from oasis_warp.evaluation.columns import COLORS
 from oasis_warp.evaluation.methods import RAW, Method

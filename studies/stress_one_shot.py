@@ -23,7 +23,7 @@ from stresses import STRESSES, Stressed, write_keypoints
 from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 from oasis_warp.evaluation.metrics import match_colors
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandPose
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand

@@ -20,7 +20,7 @@ from typing import Any
 import curve_one_shot
 import torch
 
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.evaluation.ablation import as_markdown, heading

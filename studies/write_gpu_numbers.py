@@ -21,7 +21,7 @@ from oasis_warp.bench.plots import plot_roofline, plot_scaling, plot_speed
 from oasis_warp.bench.roofline import RECORD, KernelRow
 from oasis_warp.bench.rows import read_json
 from oasis_warp.bench.scaling import ScalingRow, steepest
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 
 
 def table(heading: Sequence[str], lines: Iterable[Sequence[str]]) -> str:

@@ -15,9 +15,8 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_camera, mirror_pose
 from oasis_warp.core.types import Photo
-from oasis_warp.data.crop import resample_square
-from oasis_warp.data.painted import find_paint, match_size, read_mask
-from oasis_warp.data.registration import Square, find_square
+from oasis_warp.data.paint_mask import find_paint, match_size, read_mask
+from oasis_warp.data.square_crop import Square, find_square, resample_square
 from oasis_warp.hand.skinning import skin
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr

@@ -22,7 +22,7 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import as_right_hand, mirror_camera, mirror_pose
 from oasis_warp.core.types import Camera, CanonicalGaussians, HandCrop, HandFit, HandLight, Landmarks, Photo, Render
-from oasis_warp.data.crop import resample_square, square_around
+from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.estimation.drawn_outline import rendered_outline_offsets
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.keypoints import read_keypoints

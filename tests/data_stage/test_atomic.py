@@ -6,7 +6,7 @@ import pytest
 from disk import full_disk
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.atomic import output_file, output_folder, write_file
+from oasis_warp.data.output_files import output_file, output_folder, write_file
 
 
 def everything(folder: Path) -> dict[str, bytes | None]:

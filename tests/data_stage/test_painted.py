@@ -7,7 +7,7 @@ import torch
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Photo
-from oasis_warp.data.painted import find_paint, match_size, read_mask
+from oasis_warp.data.paint_mask import find_paint, match_size, read_mask
 from oasis_warp.data.photo import read_photo
 
 PHOTOS = Path(__file__).parents[1] / "data" / "photos"

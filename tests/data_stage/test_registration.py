@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from oasis_warp.data.crop import resample_square
 from oasis_warp.data.photo import read_photo
-from oasis_warp.data.registration import find_square
+from oasis_warp.data.square_crop import find_square, resample_square
 
 PHOTOS = Path(__file__).parents[1] / "data" / "photos"
 DISC = torch.from_numpy(cv2.circle(np.zeros((128, 128), np.float32), (64, 70), 48, 1.0, -1))

@@ -9,7 +9,7 @@ import torch
 
 from oasis_warp.bench.rows import Row
 from oasis_warp.bench.summary import Group, groups, non_dominated
-from oasis_warp.data.atomic import output_file
+from oasis_warp.data.output_files import output_file
 
 WORDS = {"forward": "error of values", "forward + backward": "error of values and gradients"}
 MISSING = "matplotlib is not installed, so no pictures are drawn; `pip install 'oasis-warp[bench]'` brings it."

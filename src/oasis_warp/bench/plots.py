@@ -8,7 +8,7 @@ from oasis_warp.bench.gpu_speed import GpuRow
 from oasis_warp.bench.roofline import KernelRow
 from oasis_warp.bench.scaling import ScalingRow
 from oasis_warp.bench.speed import SpeedRow
-from oasis_warp.data.atomic import output_file
+from oasis_warp.data.output_files import output_file
 
 UNITS = {"gaussians": ("Gaussian", 1e6, "ns"), "pixels": ("pixel", 1e6, "ns"), "views": ("view", 1e3, "us")}
 """Of an axis: what it counts, and how milliseconds for one of them are written."""

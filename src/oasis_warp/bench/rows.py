@@ -16,7 +16,7 @@ import torch
 
 from oasis_warp import __version__
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 
 Kind = TypeVar("Kind")
 

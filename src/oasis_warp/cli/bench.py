@@ -29,7 +29,7 @@ from oasis_warp.cli.look import check_device
 from oasis_warp.cli.options import Bench, ErrorTime, Kernels, Roofline, Scaling
 from oasis_warp.cli.progress import show_progress
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.atomic import output_file, output_folder
+from oasis_warp.data.output_files import output_file, output_folder
 
 TABLE_WIDTH = 200
 """Columns that the widest table takes."""

@@ -18,10 +18,10 @@ from oasis_warp.cli.summary import GROUND, WIDTH
 from oasis_warp.core.config import EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, HandPose
-from oasis_warp.data.atomic import write_file
-from oasis_warp.data.crop import resample_square
+from oasis_warp.data.output_files import write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8, write_picture
+from oasis_warp.data.square_crop import resample_square
 from oasis_warp.editing import Edit, edit
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar

@@ -20,7 +20,7 @@ from oasis_warp.cli.options import Gradcheck
 from oasis_warp.cli.progress import show_progress
 from oasis_warp.cli.report import to_json
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 
 SHOWN = 20
 """Failures that are printed one by one."""

@@ -19,7 +19,7 @@ from oasis_warp.cli.options import Pretrain
 from oasis_warp.cli.progress import show_progress
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.data.claimed_folder import claim_folder
+from oasis_warp.data.output_files import claim_folder
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.dinov2 import DinoV2Encoder

@@ -22,7 +22,7 @@ from oasis_warp.cli.summary import GROUND, draw_fused_summary, draw_summary
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, timed_stage
-from oasis_warp.data.atomic import output_folder
+from oasis_warp.data.output_files import output_folder
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture, write_video
 from oasis_warp.fusion import reconstruct_same_hand

@@ -13,8 +13,8 @@ from oasis_warp.cli.drawing import Panel, Pixels, draw_landmarks, draw_mesh, mak
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import Camera, HandFit, HandPose, Photo, PosedHand
-from oasis_warp.data.crop import resample_square, square_around
 from oasis_warp.data.pictures import to_uint8
+from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.fusion import FusedReconstruction
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar

@@ -19,7 +19,7 @@ from torch import Tensor
 from oasis_warp import __version__
 from oasis_warp.core.checks import check_finite, check_shape
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 
 FORMAT = "oasis-avatar"
 VERSION = 4

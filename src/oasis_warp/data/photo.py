@@ -14,8 +14,16 @@ import torch
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Photo
-from oasis_warp.data.exif import Exif, focal_pixels, read_exif
-from oasis_warp.data.image_header import READABLE, ImageHeader, foreign_format, looks_readable, read_header
+from oasis_warp.data.image_header import (
+    READABLE,
+    Exif,
+    ImageHeader,
+    focal_pixels,
+    foreign_format,
+    looks_readable,
+    read_exif,
+    read_header,
+)
 
 MAX_PIXELS = 24_000_000
 """Largest photo kept in memory; a hand in a larger one still has far more pixels than the crop that is fitted."""

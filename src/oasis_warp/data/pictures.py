@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.atomic import output_file, write_file
+from oasis_warp.data.output_files import output_file, write_file
 
 _ENCODINGS = {
     ".png": (),

@@ -12,8 +12,7 @@ from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import Landmarks, Photo
-from oasis_warp.data.atomic import write_file
-from oasis_warp.data.claimed_folder import claim_folder
+from oasis_warp.data.output_files import claim_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, label, prior_digest, reconstructions

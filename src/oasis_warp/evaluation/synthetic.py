@@ -29,8 +29,7 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.processes import worker_pool
 from oasis_warp.core.types import Camera, HandCrop, PosedHand, TrainingBatch
-from oasis_warp.data.atomic import write_file
-from oasis_warp.data.claimed_folder import claim_folder
+from oasis_warp.data.output_files import claim_folder, write_file
 from oasis_warp.evaluation.held_out import (
     FIRST_PERSON,
     Group,

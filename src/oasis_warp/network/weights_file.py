@@ -20,7 +20,7 @@ from torch import Tensor
 from oasis_warp import __version__
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 from oasis_warp.network.config import NetworkConfig
 from oasis_warp.network.dinov2 import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork

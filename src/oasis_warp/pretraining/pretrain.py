@@ -17,7 +17,7 @@ from torch import Tensor
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import TrainingBatch
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 from oasis_warp.data.pictures import to_uint8, write_picture
 from oasis_warp.losses.detail import detail_difference
 from oasis_warp.network.hand_network import HandNetwork

@@ -17,7 +17,7 @@ from torch import Tensor
 from oasis_warp import __version__
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.processes import worker_pool
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 from oasis_warp.synthetic.body import ARM_ROWS, arm_rows, body_on, bundled_body, device_name
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
 from oasis_warp.synthetic.ops.skin_shading import surface_state

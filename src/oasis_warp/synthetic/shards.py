@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.data.atomic import output_file
-from oasis_warp.data.claimed_folder import claim_folder
+from oasis_warp.data.output_files import claim_folder, output_file
 from oasis_warp.synthetic.picture import SyntheticBatch, render_batch
 from oasis_warp.synthetic.shots import Scenery
 
