@@ -24,7 +24,7 @@ from named_photos import SYNTHETIC, photo_of
 from torch import Tensor
 
 from oasis_warp.avatar.observation import inner_mask
-from oasis_warp.cli.drawing import Panel, make_sheet, panel_side
+from oasis_warp.cli.summary import Panel, make_sheet, panel_side
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.mirror import mirror_camera

@@ -32,8 +32,7 @@ from painted_truth import (
     photographed,
 )
 
-from oasis_warp.cli.drawing import Panel, make_sheet, panel_side
-from oasis_warp.cli.summary import GROUND
+from oasis_warp.cli.summary import GROUND, Panel, make_sheet, panel_side
 from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.types import Camera, HandPose, Photo
 from oasis_warp.data.pictures import to_uint8

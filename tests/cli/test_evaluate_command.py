@@ -8,7 +8,7 @@ import torch
 
 from oasis_warp.cli import evaluate as command
 from oasis_warp.cli import main
-from oasis_warp.cli.exit_codes import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.pictures import write_picture

@@ -14,7 +14,7 @@ from safetensors import safe_open
 
 from oasis_warp.cli import main
 from oasis_warp.cli import pretrain as command
-from oasis_warp.cli.exit_codes import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
 from oasis_warp.network.config import COMPACT, PROFILES
 from oasis_warp.network.weights_file import load_network
 from oasis_warp.pretraining.pretrain import CHECKPOINT, METRICS, SHEET, WEIGHTS

@@ -2,9 +2,7 @@ import numpy as np
 import torch
 
 from oasis_warp.avatar.quality import SurfaceQuality
-from oasis_warp.cli.drawing import panel_side
-from oasis_warp.cli.quality_sheet import draw_quality
-from oasis_warp.cli.summary import WIDTH
+from oasis_warp.cli.summary import WIDTH, draw_quality, panel_side
 
 
 def panels(made, visibility):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from oasis_warp.cli import main
-from oasis_warp.cli.film import pose_film, turntable
+from oasis_warp.cli.animate import pose_film, turntable
 from oasis_warp.core.logging import silent
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.render.cameras import orbit_camera

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from oasis_warp.cli.progress import line_progress, show_progress
+from oasis_warp.cli.console import line_progress, show_progress
 from oasis_warp.cli.report import make_report, print_report, to_json
 from oasis_warp.core.config import ReconstructConfig
 

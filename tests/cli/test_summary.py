@@ -1,8 +1,20 @@
 import numpy as np
 import torch
 
-from oasis_warp.cli.drawing import FINGER_COLORS, PAPER, Panel, draw_landmarks, draw_mesh, make_sheet, panel_side
-from oasis_warp.cli.summary import POSES, VIEWS, WIDTH, draw_summary, shade_mesh
+from oasis_warp.cli.summary import (
+    FINGER_COLORS,
+    PAPER,
+    POSES,
+    VIEWS,
+    WIDTH,
+    Panel,
+    draw_landmarks,
+    draw_mesh,
+    draw_summary,
+    make_sheet,
+    panel_side,
+    shade_mesh,
+)
 
 
 def test_the_summary_has_three_rows_of_panels_that_all_show_something(scene, made):

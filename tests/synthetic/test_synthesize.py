@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from oasis_warp import cli
-from oasis_warp.cli.exit_codes import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.pictures import contact_sheet, write_picture
 from oasis_warp.synthetic import shards

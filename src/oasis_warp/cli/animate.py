@@ -1,17 +1,62 @@
-"""`oasis animate`: a film of an avatar."""
+"""`oasis animate`: a video of an avatar."""
 
 import math
+from collections.abc import Iterator, Sequence
 
+import torch
+from jaxtyping import UInt8
 from rich.console import Console
+from torch import Tensor
 
-from oasis_warp.cli.film import pose_film, turntable
-from oasis_warp.cli.look import check_device, check_side, choose_pose, read_color
+from oasis_warp.cli.console import check_device, show_progress
 from oasis_warp.cli.options import Animate
-from oasis_warp.cli.progress import show_progress
+from oasis_warp.cli.render import check_side, choose_pose, read_color
+from oasis_warp.core.config import Color
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.pictures import VIDEO_SUFFIXES, check_suffix, write_video
-from oasis_warp.hand.poses import POSE_NAMES
+from oasis_warp.core.logging import Progress
+from oasis_warp.core.types import HandPose
+from oasis_warp.data.pictures import VIDEO_SUFFIXES, check_suffix, to_uint8, write_video
+from oasis_warp.hand.poses import POSE_NAMES, pose_sequence
 from oasis_warp.hand_avatar import Avatar
+from oasis_warp.render.cameras import orbit_camera
+from oasis_warp.render.render import render
+
+
+@torch.no_grad()
+def turntable(
+    avatar: Avatar, pose: HandPose, n_frames: int, size: int, *, elevation: float, background: Color, progress: Progress
+) -> Iterator[UInt8[Tensor, "size size 3"]]:
+    """`n_frames` views all around the hand in `pose`, the photo's own first, from `elevation` [rad] above."""
+    gaussians, vertices = avatar.pose(pose), avatar.mesh(pose).vertices
+    for frame in range(n_frames):
+        camera = orbit_camera(vertices, 2 * math.pi * frame / n_frames, elevation, size)
+        yield to_uint8(render(gaussians, camera, background=background).image)
+        progress("turntable", frame + 1, n_frames)
+
+
+@torch.no_grad()
+def pose_film(
+    avatar: Avatar,
+    names: Sequence[str],
+    n_frames: int,
+    size: int,
+    *,
+    elevation: float,
+    background: Color,
+    progress: Progress,
+) -> Iterator[UInt8[Tensor, "size size 3"]]:
+    """About `n_frames` frames through the named poses and back to the first, from where the photo was taken.
+
+    The camera stands still where it sees all of the poses whole.
+    """
+    steps = max(1, round(n_frames / len(names)))
+    poses = [avatar.source_pose._replace(angles=angles) for angles in pose_sequence(avatar.hand, names, steps)]
+    reach = torch.cat([avatar.mesh(pose).vertices for pose in poses[:: max(1, steps // 2)]])
+    camera = orbit_camera(reach, 0.0, elevation, size)
+    for frame, pose in enumerate(poses):
+        yield to_uint8(avatar.render(camera, pose, background).image)
+        progress("poses", frame + 1, len(poses))
+
 
 MAX_FRAMES = 10_000
 

@@ -11,7 +11,7 @@ import tyro
 
 from oasis_warp import __version__
 from oasis_warp.cli import options
-from oasis_warp.cli.exit_codes import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.errors import InputError
 
 Command = (

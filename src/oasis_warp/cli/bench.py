@@ -25,9 +25,8 @@ from oasis_warp.bench.tables import (
     speed_table,
 )
 from oasis_warp.bench.timing import using_threads
-from oasis_warp.cli.look import check_device
+from oasis_warp.cli.console import check_device, show_progress
 from oasis_warp.cli.options import Bench, ErrorTime, Kernels, Roofline, Scaling
-from oasis_warp.cli.progress import show_progress
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import output_file, output_folder
 

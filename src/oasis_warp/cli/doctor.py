@@ -16,7 +16,7 @@ from pathlib import Path
 from rich.console import Console
 
 from oasis_warp import __version__
-from oasis_warp.cli.exit_codes import FAULT
+from oasis_warp.cli.console import FAULT
 from oasis_warp.cli.options import Doctor
 
 PACKAGES = {

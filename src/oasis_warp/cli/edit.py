@@ -9,12 +9,10 @@ from rich.console import Console
 from rich.table import Table
 
 from oasis_warp import __version__
-from oasis_warp.cli.drawing import Panel, make_sheet, panel_side
-from oasis_warp.cli.look import check_device
+from oasis_warp.cli.console import check_device, show_progress
 from oasis_warp.cli.options import Edit as Options
-from oasis_warp.cli.progress import show_progress
 from oasis_warp.cli.report import to_json
-from oasis_warp.cli.summary import GROUND, WIDTH
+from oasis_warp.cli.summary import GROUND, WIDTH, Panel, make_sheet, panel_side
 from oasis_warp.core.config import EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, HandPose

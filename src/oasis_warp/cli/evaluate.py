@@ -8,10 +8,8 @@ from rich.console import Console
 from rich.table import Table
 
 from oasis_warp.avatar.prior import MeanPrior, Prior
-from oasis_warp.cli.exit_codes import INTERRUPTED
-from oasis_warp.cli.look import check_device
+from oasis_warp.cli.console import INTERRUPTED, check_device, show_progress
 from oasis_warp.cli.options import Evaluate
-from oasis_warp.cli.progress import show_progress
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress

@@ -15,9 +15,8 @@ from oasis_warp.certify.compare import Measurement
 from oasis_warp.certify.families import FAMILIES
 from oasis_warp.certify.grid import run_grid, scenes
 from oasis_warp.certify.verdict import Row, Verdict, as_table, by_condition, describe_machine
-from oasis_warp.cli.exit_codes import FAULT
+from oasis_warp.cli.console import FAULT, show_progress
 from oasis_warp.cli.options import Gradcheck
-from oasis_warp.cli.progress import show_progress
 from oasis_warp.cli.report import to_json
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import write_file

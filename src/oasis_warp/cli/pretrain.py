@@ -13,10 +13,8 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from oasis_warp.cli.exit_codes import INTERRUPTED
-from oasis_warp.cli.look import check_device
+from oasis_warp.cli.console import INTERRUPTED, check_device, show_progress
 from oasis_warp.cli.options import Pretrain
-from oasis_warp.cli.progress import show_progress
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.data.output_files import claim_folder

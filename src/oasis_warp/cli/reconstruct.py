@@ -10,15 +10,11 @@ from typing import Any
 
 from rich.console import Console
 
-from oasis_warp.cli.exit_codes import BAD_INPUT, INTERRUPTED
-from oasis_warp.cli.film import turntable
-from oasis_warp.cli.fused_report import make_fused_report, print_fused_report
-from oasis_warp.cli.look import check_device
+from oasis_warp.cli.animate import turntable
+from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED, check_device, show_progress
 from oasis_warp.cli.options import Reconstruct
-from oasis_warp.cli.progress import show_progress
-from oasis_warp.cli.quality_sheet import draw_quality
-from oasis_warp.cli.report import make_report, print_report, to_json
-from oasis_warp.cli.summary import GROUND, draw_fused_summary, draw_summary
+from oasis_warp.cli.report import make_fused_report, make_report, print_fused_report, print_report, to_json
+from oasis_warp.cli.summary import GROUND, draw_fused_summary, draw_quality, draw_summary
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, timed_stage

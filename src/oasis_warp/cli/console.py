@@ -1,4 +1,4 @@
-"""Show how far the work is: bars with the time left on a terminal, plain lines anywhere else."""
+"""What every command shares: exit codes, progress on the terminal, and the check of --device."""
 
 import contextlib
 import time
@@ -8,7 +8,16 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
+from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
+
+FAULT = 1
+"""`oasis doctor` found something broken, `oasis gradcheck` an error beyond its bound."""
+BAD_INPUT = 2
+"""Something the user gave cannot be used; one sentence on stderr says what. Also for a wrong command line."""
+INTERRUPTED = 130
+"""Stopped by Ctrl-C, as shells count: 128 + SIGINT."""
+
 
 LINE_EVERY = 5.0
 """Seconds between the lines of one stage where there is no terminal."""
@@ -55,3 +64,15 @@ def line_progress(write: Callable[[str], object], clock: Callable[[], float] = t
             write(f"{stage}: {done} of {total}, about {left:.0f} s left")
 
     return progress
+
+
+def check_device(device: str) -> None:
+    """Check that torch can compute on `device`.
+
+    Raises:
+        InputError: there is no CUDA device.
+    """
+    import torch  # takes seconds, which `oasis --help` saves
+
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: torch finds no CUDA device; use --device cpu, or see `oasis doctor`.")
