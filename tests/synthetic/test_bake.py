@@ -153,7 +153,8 @@ def test_baking_imports_nothing_that_is_not_needed_and_planning_still_less():
     code = f"""
 import sys
 sys.modules.update(dict.fromkeys({(*NEEDLESS, *NEEDLESS_TO_PLAN)}))
-from oasis_warp.synthetic import processes, skin_plan
+from oasis_warp.core import processes
+from oasis_warp.synthetic import skin_plan
 skin_plan.bundled_atlas()
 for name in {NEEDLESS_TO_PLAN}:
     del sys.modules[name]
