@@ -1,20 +1,38 @@
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported; xdist's workers inherit it:
+os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")  # processes run in parallel, so threads would only compete
+
 import jaxtyping
 import pytest
 import torch
+
+MOST_WORKERS = 8
+"""Each takes up to a gigabyte of memory."""
 
 
 def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the tests marked slow too")
 
 
+def pytest_xdist_auto_num_workers(config):
+    """A process per core for folders, none for single files, which would end before the workers have started."""
+    if any(".py" in argument for argument in config.args):
+        return 0
+    return min(len(os.sched_getaffinity(0)), MOST_WORKERS)
+
+
 def pytest_collection_modifyitems(config, items):
-    skip_slow = pytest.mark.skip(reason="slow: give --slow")
-    skip_gpu = pytest.mark.skip(reason="gpu: no CUDA device")
-    for item in items:
-        if "slow" in item.keywords and not config.getoption("--slow"):
-            item.add_marker(skip_slow)
-        if "gpu" in item.keywords and not torch.cuda.is_available():
-            item.add_marker(skip_gpu)
+    """Deselect slow tests unless --slow is given, and GPU tests on machines without CUDA."""
+    without = set()
+    if not config.getoption("--slow"):
+        without.add("slow")
+    if not torch.cuda.is_available():
+        without.add("gpu")
+    dropped = [item for item in items if without & item.keywords.keys()]
+    if dropped:
+        config.hook.pytest_deselected(items=dropped)
+        items[:] = [item for item in items if not without & item.keywords.keys()]
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
