@@ -11,7 +11,8 @@ from scipy.special import sph_harm_y
 from oasis_warp.certify.case import Draw
 from oasis_warp.certify.families import FAMILIES
 from oasis_warp.core.rotation import from_axis_angle, from_matrix, to_matrix
-from oasis_warp.reference import face_rotations, harmonics, mesh_posing, rasterization, skinning, visibility
+from oasis_warp.core.types import Camera
+from oasis_warp.reference import posing, rasterization, visibility
 
 DOUBLE = torch.float64
 EYE = torch.eye(4, dtype=DOUBLE)
@@ -29,7 +30,7 @@ def test_the_rasterizer_equals_its_naive_form(seed):
     given.pop("sh_degree", None)
     given["colors"] = given["colors"].reshape(-1, given["colors"].shape[-1])[:30, :3]
     K, viewmat = given["Ks"][0], given["viewmats"][0]
-    image, alphas = rasterization.rasterization(**given | {"backgrounds": None})
+    image, alphas, _ = rasterization.rasterization(**given | {"backgrounds": None}, dense=True)
     # The inverse of the covariance, layer after layer, pixel after pixel.
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     points = given["means"] @ R.T + t
@@ -43,13 +44,13 @@ def test_the_rasterizer_equals_its_naive_form(seed):
             u, v = (min(max(p / Z, low), high) for p, (low, high) in zip((X, Y), limits, strict=True))
             J = torch.tensor([[K[0, 0] / Z, 0, -K[0, 0] * u / Z], [0, K[1, 1] / Z, -K[1, 1] * v / Z]], dtype=DOUBLE)
             half = to_matrix(given["quats"][i]) @ torch.diag(given["scales"][i])
-            covariance = J @ R @ half @ half.T @ R.T @ J.T + rasterization.EPS2D * torch.eye(2)
+            covariance = J @ R @ half @ half.T @ R.T @ J.T + rasterization.GSPLAT.rounded()[2] * torch.eye(2)
             d = torch.tensor([x + 0.5 - K[0, 0] * X / Z - K[0, 2], y + 0.5 - K[1, 1] * Y / Z - K[1, 2]], dtype=DOUBLE)
             alpha = float(given["opacities"][i] * torch.exp(-0.5 * d @ torch.linalg.inv(covariance) @ d))
-            alpha = min(alpha, rasterization.CAP)
-            if alpha < rasterization.FAINTEST:
+            alpha = min(alpha, rasterization.ALPHA_MAX)
+            if alpha < rasterization.ALPHA_MIN:
                 continue
-            if left * (1 - alpha) <= rasterization.STOP:
+            if left * (1 - alpha) <= rasterization.TRANSMITTANCE_STOP:
                 break
             color += left * alpha * given["colors"][i]
             left *= 1 - alpha
@@ -59,16 +60,16 @@ def test_the_rasterizer_equals_its_naive_form(seed):
 
 def test_two_layers_have_their_closed_form():
     alpha = torch.tensor([[0.6, 0.3]], dtype=DOUBLE)
-    weights, left = rasterization.blend_weights(alpha)
+    weights, after = rasterization.blend(rasterization.Matrix(alpha))
     torch.testing.assert_close(weights, torch.tensor([[0.6, 0.12]], dtype=DOUBLE))
-    torch.testing.assert_close(left, torch.tensor([0.28], dtype=DOUBLE))
+    torch.testing.assert_close(after, torch.tensor([[0.4, 0.28]], dtype=DOUBLE))
 
 
 def test_the_layer_that_would_end_a_pixel_is_not_drawn_nor_any_behind_it():
     alpha = torch.tensor([[0.99, 0.98, 0.6, 0.5]], dtype=DOUBLE)  # T: 1e-2, 2e-4, 8e-5, ...
-    weights, left = rasterization.blend_weights(alpha)
+    weights, _ = rasterization.blend(rasterization.Matrix(alpha))
     assert weights[0, 1] > 0 and not weights[0, 2:].any()
-    torch.testing.assert_close(left, torch.tensor([2e-4], dtype=DOUBLE))
+    torch.testing.assert_close(1 - weights.sum(-1), torch.tensor([2e-4], dtype=DOUBLE))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -80,7 +81,7 @@ def test_face_rotations_are_the_polar_factors_of_an_svd(seed):
         normal = torch.linalg.cross(b - a, c - a)
         frames.append(torch.stack([b - a, c - a, normal / normal.norm(dim=-1, keepdim=True)], -1))
     u, _, vt = torch.linalg.svd(frames[1] @ torch.linalg.inv(frames[0]))
-    got = face_rotations.face_rotations(rest, posed, faces)[1]
+    got = posing.face_rotations(rest, posed, faces).face_quats
     torch.testing.assert_close(to_matrix(got), u @ vt, rtol=0, atol=1e-12)
     torch.testing.assert_close(got, from_matrix(u @ vt), rtol=0, atol=1e-12)
 
@@ -89,8 +90,8 @@ def test_vertex_rotations_are_close_to_the_mean_of_scipy():
     rest, _, faces = arguments("face_rotations", 1, side=4).values()
     draw = Draw(0)
     posed = rest + 0.03 * draw.normal(*rest.shape)
-    vertex_quats, face_quats, _ = face_rotations.face_rotations(rest, posed, faces)
-    areas = face_rotations.plane(rest, faces).area
+    vertex_quats, face_quats, *_ = posing.face_rotations(rest, posed, faces)
+    areas = posing.planes(rest, faces).area
     for v in range(len(rest)):
         around = (faces == v).any(1)
         turns = Rotation.from_quat(face_quats[around].numpy(), scalar_first=True)
@@ -109,7 +110,7 @@ def test_the_depth_buffer_sees_a_sphere_and_a_plane_where_they_are():
     faces = torch.cat([torch.stack([a, b, c], -1).view(-1, 3), torch.stack([a, c, d], -1).view(-1, 3)])
     vertices = ball.reshape(-1, 3) + torch.tensor([0.0, 0.0, 4.0])
     K = torch.tensor([[20.0, 0, 6], [0, 20, 5], [0, 0, 1]], dtype=DOUBLE)
-    depth = visibility.depth_map(vertices, faces, EYE, K, 12, 10)[0]
+    depth = visibility.depth_map(vertices, faces, Camera(EYE, K, 12, 10)).depth
     y, x = torch.meshgrid(torch.arange(10).double() + 0.5, torch.arange(12).double() + 0.5, indexing="ij")
     ray = torch.stack([(x - 6) / 20, (y - 5) / 20, torch.ones_like(x)], -1)
     # |z ray - centre| = 1
@@ -118,7 +119,7 @@ def test_the_depth_buffer_sees_a_sphere_and_a_plane_where_they_are():
     seen = root > 0.3
     torch.testing.assert_close(depth[seen], ((dot - root.clamp(min=0).sqrt()) / square)[seen], rtol=2e-3, atol=0)
     floor = torch.tensor([[-300.0, 0.5, -300], [300, 0.5, -300], [0, 0.5, 900]], dtype=DOUBLE)
-    depth = visibility.depth_map(floor, torch.tensor([[0, 1, 2]]), EYE, K, 12, 10)[0]
+    depth = visibility.depth_map(floor, torch.tensor([[0, 1, 2]]), Camera(EYE, K, 12, 10)).depth
     assert depth[:5].isinf().all()
     torch.testing.assert_close(depth[5:], (0.5 / ray[5:, :, 1]), rtol=1e-12, atol=0)
 
@@ -133,13 +134,13 @@ def test_harmonics_are_those_of_scipy(degree):
         for m in range(-n, n + 1):
             value = sph_harm_y(n, abs(m), polar, azimuth)
             columns.append(value.real if m == 0 else math.sqrt(2) * (value.imag if m < 0 else value.real))
-    torch.testing.assert_close(harmonics.basis(degree, directions), torch.from_numpy(np.stack(columns, -1)))
+    torch.testing.assert_close(rasterization.sh_basis(degree, directions), torch.from_numpy(np.stack(columns, -1)))
 
 
 def test_a_rotation_is_its_own_nearest_one_and_its_adjoint_is_finite():
     turns = from_axis_angle(torch.tensor([[0.6, 0.8, 0.0]] * 3, dtype=DOUBLE), torch.tensor([0.0, 1.0, 3.0]).double())
     leaf = turns.clone().requires_grad_()
-    nearest = skinning.nearest_rotations(leaf)
+    nearest = posing.nearest_rotations(leaf)
     torch.testing.assert_close(nearest.detach(), turns)
     assert torch.autograd.grad((nearest * torch.arange(9.0).view(3, 3)).sum(), leaf)[0].isfinite().all()
 
@@ -148,7 +149,7 @@ def test_posing_at_a_corner_follows_that_vertex():
     given = arguments("pose_on_mesh", 3, n=9)
     n = len(given["quats"]) - 9
     given["barycentrics"] = torch.eye(3, dtype=DOUBLE).repeat(3, 1)
-    means, quats, _ = mesh_posing.pose_on_mesh(**given)
+    means, quats, _ = posing.pose_on_mesh(**given)
     corner = given["faces"][given["face_index"], torch.arange(9) % 3]
     torch.testing.assert_close(means[n:], given["posed_vertices"][corner])
     expected = to_matrix(given["vertex_quats"][corner]) @ to_matrix(given["quats"][n:])

@@ -3,6 +3,7 @@ import torch
 from rasterization_scenes import ordinary_scene
 from test_strips import Guards
 
+from oasis_warp.core.types import Camera
 from oasis_warp.ops import blend_colors, blend_weights, rasterization
 from oasis_warp.ops._runtime import blend_strips, weigh_strips
 from oasis_warp.reference import rasterization as twin
@@ -27,11 +28,10 @@ def test_weights_times_colors_is_the_rasterized_image(device, dtype):
 
 def test_weights_equal_those_of_the_dense_twin(device):
     scene, weights, *_ = weights_and_image(device, torch.float64)
-    alpha, order = twin.layers(
-        *(g.cpu() for g in scene.gaussians), scene.viewmats[0].cpu(), scene.Ks[0].cpu(), scene.width, scene.height
-    )
+    camera = Camera(scene.viewmats[0].cpu(), scene.Ks[0].cpu(), scene.width, scene.height)
+    splats = twin.project(twin.Gaussians(*(g.cpu() for g in scene.gaussians)), camera)
     expected = torch.zeros(scene.width * scene.height, len(scene.means), dtype=torch.float64)
-    expected[:, order] = twin.blend_weights(alpha)[0]
+    expected[:, splats.index] = twin.blend(twin.dense_layers(splats, camera))[0]
     assert torch.allclose(weights.matrix.to_dense().cpu(), expected, rtol=0, atol=1e-12)
 
 

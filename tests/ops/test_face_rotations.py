@@ -10,7 +10,7 @@ from oasis_warp.core.types import HandPose
 from oasis_warp.hand.correctives import corrective_coefficients
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.ops import face_rotations
-from oasis_warp.reference import face_rotations as twin
+from oasis_warp.reference import posing as twin
 
 
 def sheet(seed, n=4, bend=0.4, dtype=torch.float64, device="cpu"):
@@ -56,7 +56,7 @@ def test_values_and_gradients_are_those_of_the_twin(seed, dtype, device):
     leaves = [rest.requires_grad_(), posed.requires_grad_()]
     got = face_rotations(rest, posed, faces)
     wide = [t.detach().cpu().double().requires_grad_() for t in leaves]
-    want = twin.face_rotations(*wide, faces.cpu())
+    want = twin.face_rotations(*wide, faces.cpu())[:3]
 
     tolerance = 2e-7 if dtype == torch.float32 else 1e-12
     assert angle_between(got.face_quats.detach(), want[1].detach()).max() < 10 * tolerance
@@ -188,7 +188,7 @@ def test_the_area_ratio_of_a_vertex_is_that_of_its_faces_together():
     rest, posed, faces = sheet(3)
     posed[faces[0]] = posed[faces[0]].mean(0)  # one collapses: it turns nothing but still counts
     got = face_rotations(rest, posed, faces).vertex_area_ratio
-    before, after = (twin.plane(vertices, faces).area for vertices in (rest, posed))
+    before, after = (twin.planes(vertices, faces).area for vertices in (rest, posed))
     around = torch.stack([(faces == v).any(1) for v in range(len(rest))]).double()
     # The damping pulls ratios to one by its share of the area, 1e-6 and more for thin faces.
     torch.testing.assert_close(got, (around @ after) / (around @ before), rtol=1e-5, atol=1e-5)

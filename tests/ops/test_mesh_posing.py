@@ -11,7 +11,7 @@ from oasis_warp.core.rotation import from_axis_angle, multiply, to_matrix
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.ops import face_rotations, pose_on_mesh
-from oasis_warp.reference import mesh_posing as twin
+from oasis_warp.reference import posing as twin
 
 LAWS = ["sqrt_area", "area", "none"]
 FLOATS = ("posed_vertices", "barycentrics", "vertex_quats", "area_ratio", "quats", "scales")

@@ -7,7 +7,7 @@ import torch
 
 from oasis_warp.core.rotation import from_axis_angle, to_matrix
 from oasis_warp.ops import pose_on_mesh_covars
-from oasis_warp.reference import mesh_posing as twin
+from oasis_warp.reference import posing as twin
 
 FLOATS = ("rest_vertices", "posed_vertices", "barycentrics", "quats", "scales")
 

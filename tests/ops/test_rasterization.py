@@ -1,9 +1,13 @@
 """The rasterizer against its dense float64 twin, and laws that any correct one obeys."""
 
+from functools import partial
+
 import pytest
 import torch
 from rasterization_scenes import frontal_scene, ordinary_scene
 
+from oasis_warp.core.rotation import to_matrix
+from oasis_warp.core.types import Camera
 from oasis_warp.ops import rasterization
 from oasis_warp.reference import rasterization as twin
 
@@ -43,22 +47,19 @@ def values_and_gradients(scene, function=rasterization, keep=None, seed=0, **opt
 
 def sound_pixels(scene, **options):
     """Pixels [C, H, W] where no decision hangs on rounding."""
-    keep = []
-    for viewmat, K in zip(scene.viewmats, scene.Ks, strict=True):
-        alpha, _ = twin.layers(*scene.gaussians, viewmat, K, scene.width, scene.height, decide=False, **options)
-        keep.append(~twin.fragile(alpha).reshape(scene.height, scene.width))
-    return torch.stack(keep)
+    views = scene.viewmats, scene.Ks, scene.width, scene.height
+    return ~twin.rasterization(*scene.gaussians, scene.colors, *views, dense=True, **options).fragile
 
 
 def assert_equals_twin(scene, dtype, device, value_error=None, gradient_error=None, max_fragile=0.02, **options):
     exact = scene.to("cpu", torch.float64)
     depth_options = {k: v for k, v in options.items() if k in ("near_plane", "far_plane", "eps2d")}
-    renamed = {{"near_plane": "near", "far_plane": "far"}.get(k, k): v for k, v in depth_options.items()}
     mode = {k: v for k, v in options.items() if k == "render_mode"}
-    keep = sound_pixels(exact, **renamed)
+    keep = sound_pixels(exact, **depth_options)
     assert (~keep).double().mean() <= max_fragile, "choose a scene with fewer fragile pixels"
     image, alphas, gradients = values_and_gradients(scene.to(device, dtype), keep=keep.to(device), **options)
-    image64, alphas64, gradients64 = values_and_gradients(exact, twin.rasterization, keep=keep, **mode, **renamed)
+    dense = partial(twin.rasterization, dense=True)
+    image64, alphas64, gradients64 = values_and_gradients(exact, dense, keep=keep, **mode, **depth_options)
     limit = VALUE_ERROR[dtype] if value_error is None else value_error
     for name, got, want in (("image", image, image64), ("alphas", alphas, alphas64)):
         assert torch.isfinite(got).all(), name
@@ -188,7 +189,7 @@ def test_gaussians_of_zero_opacity_change_nothing(device, dtype):
 def test_moving_scene_and_camera_together_changes_nothing(device):
     scene = ordinary_scene(28, device=device, dtype=torch.float64)
     turn = torch.tensor([[0.3, 0.8, -0.4, 0.2]], dtype=torch.float64)
-    R = twin.rotation_matrices(turn)[0].to(device)
+    R = to_matrix(turn)[0].to(device)
     w, x, y, z = (turn[0] / turn.norm()).to(device)
     left = torch.stack([
         torch.stack([w, -x, -y, -z]), torch.stack([x, w, -z, y]), torch.stack([y, z, w, -x]),
@@ -285,14 +286,15 @@ def test_meta_describes_the_projection(device):
     *_, meta = rasterization(*scene.gaussians, scene.colors, scene.viewmats, scene.Ks, scene.width, scene.height)
     cpu = scene.to("cpu")
     for c in range(2):
-        centre, p, q, z = twin.project(
-            *cpu.gaussians[:3], cpu.viewmats[c], cpu.Ks[c], scene.width, scene.height, 0.30000001192092896
+        splats = twin.project(
+            twin.Gaussians(*cpu.gaussians), Camera(cpu.viewmats[c], cpu.Ks[c], scene.width, scene.height)
         )
+        order = splats.index.argsort()
+        assert torch.equal(splats.index[order], torch.arange(60))
         drawn = (meta["radii"][c] > 0).all(-1).cpu()
-        assert torch.allclose(meta["means2d"][c].cpu()[drawn], centre[drawn], rtol=1e-13)
-        assert torch.allclose(meta["depths"][c].cpu(), z, rtol=1e-13)
-        eps = 0.30000001192092896
-        cov = torch.stack([(p * p).sum(-1) + eps, (p * q).sum(-1), (p * q).sum(-1), (q * q).sum(-1) + eps], -1)
+        assert torch.allclose(meta["means2d"][c].cpu()[drawn], splats.centers[order][drawn], rtol=1e-13)
+        assert torch.allclose(meta["depths"][c].cpu(), splats.depths[order], rtol=1e-13)
+        cov = splats.covars[order][:, [0, 1, 1, 2]]
         conic = torch.linalg.inv(cov.reshape(-1, 2, 2)).reshape(-1, 4)[:, [0, 1, 3]]
         assert torch.allclose(meta["conics"][c].cpu()[drawn], conic[drawn], rtol=1e-9)
         reach = torch.sqrt(2 * torch.log(255 * cpu.opacities))

@@ -9,6 +9,7 @@ import pytest
 import torch
 from rasterization_scenes import frontal_scene
 
+from oasis_warp.core.types import Camera
 from oasis_warp.ops import rasterization
 from oasis_warp.reference import rasterization as twin
 
@@ -17,16 +18,17 @@ pytestmark = pytest.mark.usefixtures("as_shipped")  # hundreds of calls, and the
 
 
 def is_safe(scene):
-    alpha, _ = twin.layers(*scene.gaussians, scene.viewmats[0], scene.Ks[0], scene.width, scene.height, decide=False)
-    after = torch.cumprod(1 - alpha.clamp(max=twin.CAP), -1)
+    camera = Camera(scene.viewmats[0], scene.Ks[0], scene.width, scene.height)
+    alpha = twin.dense_layers(twin.project(twin.Gaussians(*scene.gaussians), camera), camera).alphas
+    after = torch.cumprod(1 - alpha.clamp(max=twin.ALPHA_MAX), -1)
     u = scene.means[:, :2] / scene.means[:, 2:]
     focal, centre = scene.Ks[0, [0, 1], [0, 1]], scene.Ks[0, :2, 2]
     size = torch.tensor([scene.width, scene.height], dtype=torch.float64)
     edges = [-centre / focal - 0.15 * size / focal, (size - centre) / focal + 0.15 * size / focal]
     depths = scene.means[:, 2].sort().values
     return (
-        all(bool(((alpha - edge).abs() > MARGIN * edge).all()) for edge in (twin.FAINTEST, twin.CAP))
-        and bool((after > 2 * twin.STOP).all())
+        all(bool(((alpha - edge).abs() > MARGIN * edge).all()) for edge in (twin.ALPHA_MIN, twin.ALPHA_MAX))
+        and bool((after > 2 * twin.TRANSMITTANCE_STOP).all())
         and all(bool(((u - edge).abs() > MARGIN).all()) for edge in edges)
         and bool((depths.diff() > MARGIN).all())
     )
@@ -96,7 +98,7 @@ def test_a_capped_layer_gives_no_gradient_to_opacity_or_shape(device):
     image, *_ = rasterization(*inputs, scene.viewmats, scene.Ks, 5, 5)
     *shape, colors = torch.autograd.grad(image.sum(), inputs)
     assert not any(g.any() for g in shape)
-    assert torch.allclose(colors, torch.full_like(colors, 25 * twin.CAP), rtol=1e-12)
+    assert torch.allclose(colors, torch.full_like(colors, 25 * twin.ALPHA_MAX), rtol=1e-12)
 
 
 def test_a_second_derivative_is_refused(device):

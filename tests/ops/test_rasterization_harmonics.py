@@ -6,7 +6,7 @@ from rasterization_scenes import ordinary_scene
 
 from oasis_warp.ops import rasterization
 from oasis_warp.ops.sh_to_rgb import sh_to_rgb
-from oasis_warp.reference.harmonics import sh_to_rgb as expected_colors
+from oasis_warp.reference.rasterization import sh_to_rgb as expected_colors
 
 
 def scene_and_coefficients(degree=3, cameras=2, dtype=torch.float64, per_camera=False):

@@ -8,7 +8,7 @@ import torch
 
 from oasis_warp.core.rotation import from_axis_angle, to_matrix
 from oasis_warp.ops import skinning
-from oasis_warp.reference import skinning as twin
+from oasis_warp.reference import posing as twin
 
 
 def skin(*args, **options) -> Any:

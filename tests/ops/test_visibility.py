@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from oasis_warp.core.rotation import to_matrix
+from oasis_warp.core.types import Camera
 from oasis_warp.ops import depth_map, depth_visibility
 from oasis_warp.ops._runtime import depth_buffer
 from oasis_warp.reference import visibility as twin
@@ -59,13 +60,17 @@ def way(request, monkeypatch):
         monkeypatch.setattr(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces)
 
 
+def seen_by_twin(vertices, faces, viewmat, K):
+    return twin.depth_map(vertices, faces, Camera(viewmat, K, WIDTH, HEIGHT))
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("near", [False, True])
 @pytest.mark.parametrize("seed", range(4))
 def test_depths_faces_and_barycentrics_are_those_of_the_twin(seed, near, dtype, device, way):
     scene = soup(seed, near=near, dtype=dtype, device=device)
     got = depth_map(*scene, WIDTH, HEIGHT)
-    want = twin.depth_map(*map(wide, scene), WIDTH, HEIGHT)
+    want = seen_by_twin(*map(wide, scene))
     assert got.depth.dtype == dtype
     assert torch.equal(got.face_ids.cpu().long(), want[1])
     # Both sides are exact to float64 rounding of the float inputs: what is left is the rounding of the output. The
@@ -91,10 +96,9 @@ def test_visibility_and_its_gradient_are_those_of_the_twin(seed, known, dtype, d
     (grad,) = torch.autograd.grad(got.visibility.sum(), points)
 
     twin_points = wide(points).requires_grad_()
-    depth, face_ids, _ = twin.depth_map(*map(wide, (vertices, faces, viewmat, K)), WIDTH, HEIGHT)
-    want = twin.depth_visibility(
-        twin_points, depth, face_ids, faces.cpu(), wide(K), wide(viewmat), TAU, 3 * TAU, point_vertices
-    )
+    hits = seen_by_twin(*map(wide, (vertices, faces, viewmat, K)))
+    camera = Camera(wide(viewmat), wide(K), WIDTH, HEIGHT)
+    want = twin.score_points(twin_points, hits, faces.cpu(), camera, TAU, 3 * TAU, point_vertices)
     (twin_grad,) = torch.autograd.grad(want.sum(), twin_points)
     tolerance = 1e-6 if dtype == torch.float32 else 1e-9
     torch.testing.assert_close(wide(got.visibility), want.detach(), rtol=0, atol=tolerance)

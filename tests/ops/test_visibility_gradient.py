@@ -4,6 +4,7 @@ import pytest
 import torch
 from test_visibility import HEIGHT, TAU, WIDTH, some_points, soup, visible
 
+from oasis_warp.core.types import Camera
 from oasis_warp.ops import depth_map, depth_visibility
 from oasis_warp.ops._runtime import depth_buffer
 from oasis_warp.reference import visibility as twin
@@ -18,10 +19,8 @@ def backward_way(request, monkeypatch):
 
 def twin_gradients(points, vertices, faces, viewmat, K, weights):
     points, vertices = (t.detach().double().requires_grad_() for t in (points, vertices))
-    viewmat, K = viewmat.double(), K.double()
-    hits = twin.cast(vertices, faces, viewmat, K, WIDTH, HEIGHT)
-    depth, face_ids = hits.depth.view(HEIGHT, WIDTH), hits.face_ids.view(HEIGHT, WIDTH)
-    scores = twin.depth_visibility(points, depth, face_ids, faces, K, viewmat, TAU, 3 * TAU)
+    camera = Camera(viewmat.double(), K.double(), WIDTH, HEIGHT)
+    scores = twin.depth_visibility(points, vertices, faces, camera, tau=TAU, margin=3 * TAU)
     return torch.autograd.grad((scores * weights).sum(), [points, vertices])
 
 

@@ -10,7 +10,8 @@ from torch import Tensor
 from oasis_warp import ops
 from oasis_warp.certify import mesh_scenes, rasterization_scenes, skinning_scenes, surface_scenes
 from oasis_warp.certify.case import Case
-from oasis_warp.reference import face_rotations, harmonics, mesh_posing, rasterization, skinning, visibility
+from oasis_warp.core.types import Camera
+from oasis_warp.reference import posing, rasterization, visibility
 
 Outputs = tuple[Tensor, ...]
 
@@ -55,7 +56,7 @@ def squares(quats: Tensor) -> Tensor:
 
 def bounded(ratios: Tensor) -> Tensor:
     """Area ratios as they act on scales: of a face that was flat at rest, all further digits are rounding."""
-    return ratios.clamp(1 / mesh_posing.LIMIT, mesh_posing.LIMIT)
+    return ratios.clamp(1 / posing.LIMIT, posing.LIMIT)
 
 
 def _read_rasterization(answer: Any) -> Outputs:
@@ -63,13 +64,8 @@ def _read_rasterization(answer: Any) -> Outputs:
 
 
 def _rasterization(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    renamed = {"near_plane": "near", "far_plane": "far"}
-    given = {renamed.get(name, name): value for name, value in arguments.items()}
-    degree = given.pop("sh_degree", None)
-    if degree is not None:
-        given["colors"] = harmonics.sh_to_rgb(degree, given["means"], given["colors"], given["viewmats"])
-    image, alphas, sound = rasterization.drawn(**given, slack=slack)
-    keep = sound[..., None].double()
+    image, alphas, fragile = rasterization.rasterization(**arguments, dense=True, slack=slack)
+    keep = (~fragile)[..., None].double()
     return (image, alphas), (keep, keep)
 
 
@@ -79,13 +75,23 @@ def _read_depth_map(answer: Any) -> Outputs:
 
 
 def _depth_map(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    shape = arguments["height"], arguments["width"]
     outputs, keep = [], []
     for single in singles(arguments):
-        hits = visibility.cast(**single, slack=slack)
-        outputs.append((1 / hits.depth.view(shape), hits.weights.view(*shape, 3)))
-        keep.append((hits.sound.view(shape).double(), hits.clear.view(*shape, 1).double()))
+        hits, known = _cast(single, slack)
+        outputs.append((1 / hits.depth, hits.barycentrics))
+        keep.append((known.sound.double(), known.clear[..., None].double()))
     return together(outputs, arguments), together(keep, arguments)
+
+
+def _cast(arguments: dict[str, Any], slack: float) -> tuple[visibility.Hits, visibility.Certainty]:
+    camera, near = _camera(arguments), arguments["near_plane"]
+    rays = visibility.cast(arguments["vertices"], arguments["faces"], camera, near)
+    hits = visibility.nearest_hits(rays, camera, near)
+    return hits, visibility.certainty(rays, hits, arguments["faces"], camera, near, slack)
+
+
+def _camera(arguments: dict[str, Any]) -> Camera:
+    return Camera(*(arguments[name] for name in Camera._fields))
 
 
 BATCHED = {"points": 2, "vertices": 2, "viewmat": 2, "K": 2}
@@ -95,9 +101,7 @@ BATCHED = {"points": 2, "vertices": 2, "viewmat": 2, "K": 2}
 def singles(arguments: dict[str, Any]) -> list[dict[str, Any]]:
     """The arguments for each entry of a batch."""
     n = max(len(v) if v.dim() > BATCHED[k] else 1 for k, v in arguments.items() if k in BATCHED)
-    return [
-        {k: v[i] if k in BATCHED and v.dim() > BATCHED[k] else v for k, v in arguments.items()} for i in range(n)
-    ]
+    return [{k: v[i] if k in BATCHED and v.dim() > BATCHED[k] else v for k, v in arguments.items()} for i in range(n)]
 
 
 def together(parts: list[Outputs], arguments: dict[str, Any]) -> Outputs:
@@ -117,16 +121,14 @@ def _depth_visibility(case: Case, arguments: dict[str, Any], slack: float) -> tu
 
 
 def _single_visibility(arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    points, vertices, faces, viewmat, K = (arguments[k] for k in ("points", "vertices", "faces", "viewmat", "K"))
-    size, near, tau = (arguments["width"], arguments["height"]), arguments["near_plane"], arguments["tau"]
+    camera, near, tau = _camera(arguments), arguments["near_plane"], arguments["tau"]
     literal = arguments.get("literal", False)
     named = None if literal else arguments.get("point_vertices")
-    margin = 0.0 if literal else arguments.get("margin", 3 * tau)
-    hits = visibility.cast(vertices, faces, viewmat, K, *size, near, slack)
-    shape = size[::-1]
-    depth, face_ids = hits.depth.view(shape), hits.face_ids.view(shape)
-    scores = visibility.depth_visibility(points, depth, face_ids, faces, K, viewmat, tau, margin, named, near)
-    keep = visibility.sound_points(points, hits, K, viewmat, *size, named is not None, near, slack)
+    margin = 0.0 if literal else arguments.get("margin")
+    hits, known = _cast(arguments, slack)
+    points = arguments["points"]
+    scores = visibility.score_points(points, hits, arguments["faces"], camera, tau, margin, named, near)
+    keep = visibility.sound_points(points, known, camera, named is not None, near, slack)
     return (scores,), (keep.double(),)
 
 
@@ -136,7 +138,7 @@ def _read_face_rotations(answer: Any) -> Outputs:
 
 
 def _face_rotations(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    vertex_quats, face_quats, *ratios, sound = face_rotations.turned(*arguments.values())
+    vertex_quats, face_quats, *ratios, sound = posing.face_rotations(*arguments.values())
     every = torch.ones(()).double()
     keep = sound.double()[:, None, None], every, every, every
     return (squares(vertex_quats), squares(face_quats), *map(bounded, ratios)), keep
@@ -148,10 +150,10 @@ def _read_pose_on_mesh(answer: Any) -> Outputs:
 
 
 def _pose_on_mesh(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    means, quats, scales = mesh_posing.pose_on_mesh(**arguments)
+    means, quats, scales = posing.pose_on_mesh(**arguments)
     with torch.no_grad():
         corners = arguments["faces"][arguments["face_index"]]
-        dots = mesh_posing.dots_with_leading(arguments["vertex_quats"][corners], arguments["barycentrics"])
+        dots = posing.dots_with_heaviest(arguments["vertex_quats"][corners], arguments["barycentrics"])
         aligned = (dots.abs() > slack * 1e-5).all(-1).double()
         aligned = torch.cat([torch.ones(len(quats) - len(aligned)), aligned])[:, None, None]
     every = torch.ones(()).double()
@@ -164,7 +166,7 @@ def _read_pose_on_mesh_covars(answer: Any) -> Outputs:
 
 def _pose_on_mesh_covars(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
     every = torch.ones(()).double()
-    return mesh_posing.pose_on_mesh_covars(**arguments), (every, every)
+    return posing.pose_on_mesh_covars(**arguments), (every, every)
 
 
 def _read_skin(answer: Any) -> Outputs:
@@ -172,7 +174,7 @@ def _read_skin(answer: Any) -> Outputs:
 
 
 def _skin(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    return skinning.skin(**arguments), tuple(torch.ones(()).double() for _ in range(1 + ("covars" in case.floats)))
+    return posing.skin(**arguments), tuple(torch.ones(()).double() for _ in range(1 + ("covars" in case.floats)))
 
 
 LARGE_MESH = {"n": 1500, "size": (160, 120)}

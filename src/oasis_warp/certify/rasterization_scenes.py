@@ -3,13 +3,15 @@
 import dataclasses
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from oasis_warp.certify.case import LONG_NEEDLES, STIFF, Bounds, Case, Draw
 from oasis_warp.core.rotation import to_matrix
-from oasis_warp.reference.rasterization import NEAR
 
+NEAR = float(np.float32(0.01))
+"""Near plane by default [m]."""
 SIZES = ((1, 1), (1, 9), (11, 1), (5, 4), (16, 16), (17, 15), (31, 33), (37, 29), (65, 63), (257, 2))
 """Width and height: single pixels and rows, sizes that are no multiple of a tile, strip or vector."""
 COUNTS = (0, 1, 2, 7, 20, 60, 150, 300)
