@@ -21,7 +21,7 @@ from typing import NamedTuple
 import torch
 
 from oasis_warp.avatar.prior import MeanPrior
-from oasis_warp.data.output_files import claim_folder, write_file
+from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.evaluation.ablation import ablation_table, as_markdown, heading
 from oasis_warp.evaluation.held_out import POPULATIONS
 from oasis_warp.evaluation.methods import BASELINE, ONE_SHOT, RAW, Method
@@ -32,7 +32,7 @@ from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.network.weights_file import load_network, save_network
-from oasis_warp.pretraining.distributed import Place
+from oasis_warp.pretraining.distributed import ProcessInfo
 from oasis_warp.pretraining.pretrain import (
     CHECKPOINT,
     WEIGHTS,
@@ -98,7 +98,7 @@ def make_trainer(name: str, options: argparse.Namespace, folder: Path) -> Traine
         torch.manual_seed(options.seed)
         network = HandNetwork(config_of(name, options), bundled_hand())
     config = PretrainConfig(steps=options.steps, precision=options.precision)
-    trainer = Trainer(network, config, Place(0, 1, torch.device(options.device)))
+    trainer = Trainer(network, config, ProcessInfo(0, 1, torch.device(options.device)))
     if (folder / CHECKPOINT).is_file():
         trainer.step = load_checkpoint(folder / CHECKPOINT, network, trainer.optimizer)
     return trainer
@@ -195,7 +195,9 @@ def main() -> None:
     if unknown := set(names) - set(everything):
         parser.error(f"--only: expected some of {', '.join(everything)}, got {', '.join(sorted(unknown))}")
     fixed = ("steps", "hands", "views", "people", "size", "seed", "profile", "evidence", "precision")
-    claim_folder(options.out, "ablation_settings.json", {name: getattr(options, name) for name in fixed}, "ablations")
+    open_resumable_folder(
+        options.out, "ablation_settings.json", {name: getattr(options, name) for name in fixed}, "ablations"
+    )
     for k in range(0, len(names), options.together):
         if not train_together(names[k : k + options.together], options, deadline):
             print("stopped for lack of time; the same command goes on.", file=sys.stderr)

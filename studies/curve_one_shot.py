@@ -28,7 +28,7 @@ from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, HandCrop, TrainingBatch
-from oasis_warp.data.output_files import claim_folder, write_file
+from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.evaluation.columns import COLORS, LIGHTS, markdown
 from oasis_warp.evaluation.held_out import FIRST_PERSON, Lighting, Shoot, as_estimated, photograph, true_targets
 from oasis_warp.evaluation.methods import Made, prior_digest
@@ -226,7 +226,7 @@ def main() -> None:
     if not isinstance(prior, NetworkPrior):
         raise SystemExit(f"--prior {options.prior}: has no heads to train; name a learned one.")
     about = {"version": __version__, "weights": prior_digest(prior), "device": options.device}
-    claim_folder(options.out, "settings.json", about, "a curve")
+    open_resumable_folder(options.out, "settings.json", about, "a curve")
     wanted = settings(options.longest)
     for light in options.lights:
         for number in range(FIRST_PERSON, FIRST_PERSON + options.people):

@@ -54,7 +54,7 @@ from oasis_warp.reconstruction import crop_hand, make_avatar
 from oasis_warp.render.render import render
 from oasis_warp.synthetic.picture import SyntheticBatch, render_planned
 from oasis_warp.synthetic.shot_table import tabulate
-from oasis_warp.synthetic.shots import PICTURES_EACH, Scenery, plan_shots
+from oasis_warp.synthetic.shots import PICTURES_EACH, SceneConfig, sample_shots
 
 MOST = 4
 """Photos of one avatar, and targets of each synthetic person: half of a person's pictures each."""
@@ -72,11 +72,11 @@ def photograph(number: int, size: int, look: str, device: torch.device) -> tuple
     What photos show of the targets is not asked: those of one photo only would be wrong for several.
     """
     first, rendered = PICTURES_EACH * number, int(size * SURROUNDINGS)
-    even = Scenery(population=POPULATIONS["ordinary"], look="even")
-    scenery = even if look == "studio" else Scenery(population=POPULATIONS["ordinary"])
+    even = SceneConfig(population=POPULATIONS["ordinary"], look="even")
+    scenery = even if look == "studio" else SceneConfig(population=POPULATIONS["ordinary"])
 
-    def shown(indices: range, scenery: Scenery) -> SyntheticBatch:
-        shots = plan_shots(HELD_OUT_SEED, indices, scenery)
+    def shown(indices: range, scenery: SceneConfig) -> SyntheticBatch:
+        shots = sample_shots(HELD_OUT_SEED, indices, scenery)
         table = tabulate(HELD_OUT_SEED, shots, scenery)
         return render_planned(HELD_OUT_SEED, table, rendered, device, scenery=scenery)
 

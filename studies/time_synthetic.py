@@ -14,7 +14,7 @@ import torch
 from oasis_warp.pretraining.synthetic_source import SyntheticHands
 from oasis_warp.synthetic import picture
 from oasis_warp.synthetic.people import person
-from oasis_warp.synthetic.shot_table import plan_table
+from oasis_warp.synthetic.shot_table import sample_table
 from oasis_warp.synthetic.shots import EVERYBODY, PHOTOS, PICTURES_EACH
 
 STAGES = ("pose_people", "depth_map", "surface_state", "light_lamps", "see_sky", "_stretch", "shade_skin",
@@ -118,7 +118,7 @@ def time_stages(options: Options) -> None:
     for number in range(-(-options.batch // PICTURES_EACH)):
         person(options.seed, number, EVERYBODY, options.device)
     print(f"people: {clock() - start:.2f} s")
-    planned = plan_table(options.seed, indices, PHOTOS)
+    planned = sample_table(options.seed, indices, PHOTOS)
 
     def render() -> float:
         wait()
@@ -132,7 +132,7 @@ def time_stages(options: Options) -> None:
     planning = []
     for _ in range(options.repeats):
         start = clock()
-        plan_table(options.seed, indices, PHOTOS)
+        sample_table(options.seed, indices, PHOTOS)
         planning.append(clock() - start)
     print(f"first batch, kernels built or loaded: {first:.2f} s")
     print(f"planning, on one core: {min(planning) / options.batch * 1e3:.2f} ms a picture")

@@ -29,17 +29,17 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map, depth_visibility
 from oasis_warp.pretraining.estimator_errors import (
     ALIKE,
-    NUMBERS,
+    MASK_NUMBERS,
     MeasuredErrors,
-    ended,
-    estimate,
-    frames_of,
+    cut_at_wrist,
     looks,
-    of_surface,
-    wandering,
+    perturb_outline,
+    picture_frames,
+    simulate_estimate,
+    surface_fields,
 )
-from oasis_warp.pretraining.hand_batch import Posed, pose_hands
-from oasis_warp.pretraining.training_batch import as_right_hands, crop_to_mask
+from oasis_warp.pretraining.hand_batch import PosedHands, pose_hands
+from oasis_warp.pretraining.training_batch import crop_to_mask, mirror_left_hands
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shots import PICTURES_EACH
 
@@ -89,7 +89,7 @@ def turn_vectors(matrices: Tensor) -> Tensor:
 
 def measured_errors(hand: HandModel, true: Hands, found: Hands) -> MeasuredErrors:
     """What training draws from; see the fields of `MeasuredErrors`."""
-    frames = frames_of(true.posed.landmarks)
+    frames = picture_frames(true.posed.landmarks)
     metre = (true.distance / true.focal)[:, None, None]
     moved = (project(found.posed.landmarks, found.K) - project(true.posed.landmarks, true.K)) * metre
     turn = turn_vectors(found.orientation @ true.orientation.transpose(1, 2))
@@ -102,7 +102,7 @@ def measured_errors(hand: HandModel, true: Hands, found: Hands) -> MeasuredError
         lens=torch.stack([(found.focal / true.focal).log(), log_size(true, found)], 1),
         place=(frames.landmarks.transpose(2, 3) @ moved[..., None])[..., 0],
         kept=kept,
-        **of_surface(hand),
+        **surface_fields(hand),
     )
 
 
@@ -121,9 +121,9 @@ def leave_one_out(hand: HandModel, true: Hands, measured: MeasuredErrors, seed: 
             name: getattr(measured, name)[others] for name in ("looks", "angles", "turn", "shape", "lens", "place")
         })  # fmt: skip
         one = slice(k, k + 1)
-        made = estimate(
-            hand, Posed(*(part[one] for part in true.posed)), true.shape[one], true.angles[one], true.orientation[one],
-            true.K[one], rest, choice[one],
+        made = simulate_estimate(
+            hand, PosedHands(*(part[one] for part in true.posed)), true.shape[one], true.angles[one],
+            true.orientation[one], true.K[one], rest, choice[one],
         )  # fmt: skip
         surfaces.append(made.posed)
         cameras.append(made.K)
@@ -232,12 +232,12 @@ def masks_in_training(hand: HandModel, seed: int, count: int) -> Masks:
     parts = []
     for k in range(count):
         photo = render_batch(seed, [PICTURES_EACH * k], RENDERED)
-        _, alpha, mask, orientation, translation, K = as_right_hands(photo)
+        _, alpha, mask, orientation, translation, K = mirror_left_hands(photo)
         landmarks = pose_hands(hand, photo.shape, photo.angles, orientation, translation).landmarks
-        numbers = torch.randn(1, 1 + NUMBERS, generator=random)
-        made = ended(mask, alpha, landmarks, K, numbers[:, 0])
+        numbers = torch.randn(1, 1 + MASK_NUMBERS, generator=random)
+        made = cut_at_wrist(mask, alpha, landmarks, K, numbers[:, 0])
         crop = crop_to_mask(torch.stack([mask, made], -1), made, K, CROP)
-        found = wandering(crop.planes[..., 1], numbers[:, 1:])
+        found = perturb_outline(crop.planes[..., 1], numbers[:, 1:])
         seen = project(landmarks, crop.K)[0].numpy()
         above = torch.from_numpy(wrist_line(seen).above_mask((CROP, CROP)))[None]
         side = crop_to_mask(mask[..., None], mask, K, CROP).K[:, 0, 0] / crop.K[:, 0, 0]
@@ -313,7 +313,7 @@ def main() -> None:
     size = int(rows[0]["size"])
     true, found = Hands(hand, rows, "true"), Hands(hand, rows, "found")
     measured = measured_errors(hand, true, found)
-    of_hand = of_surface(hand)
+    of_hand = surface_fields(hand)
     stored = {name: part.half().contiguous() for name, part in measured._asdict().items() if name not in of_hand}
     write_file(options.asset, save(stored))
     scale = CROP / torch.tensor([float(row["square"][2]) for row in rows])

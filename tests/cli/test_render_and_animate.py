@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from oasis_warp.cli import main
-from oasis_warp.cli.animate import pose_film, turntable
+from oasis_warp.cli.animate import pose_frames, turntable
 from oasis_warp.core.logging import silent
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.render.cameras import orbit_camera
@@ -60,7 +60,7 @@ def test_a_turntable_turns_once_and_starts_at_the_photo(scene):
 
 
 def test_a_pose_film_keeps_every_pose_in_the_picture(scene):
-    frames = list(pose_film(scene[2], ["open", "fist"], 8, 64, **LOOK))
+    frames = list(pose_frames(scene[2], ["open", "fist"], 8, 64, **LOOK))
     assert len(frames) == 8
     for frame in frames:
         border = torch.cat([frame[0], frame[-1], frame[:, 0], frame[:, -1]])

@@ -59,9 +59,7 @@ class PaintedHands:
         name = POSES[int(torch.randint(len(POSES), (), generator=random))]
         pose = HandPose(named_pose(self.hand, name), torch.eye(3), torch.zeros(3))
         posed = skin(self.hand, rest, pose).vertices
-        camera = orbit_camera(
-            posed, self._uniform(random, 0, 2 * math.pi), self._uniform(random, -1.5, 1.5), self.size
-        )
+        camera = orbit_camera(posed, self._uniform(random, 0, 2 * math.pi), self._uniform(random, -1.5, 1.5), self.size)
         with torch.no_grad():
             drawn = render(pose_gaussians(truth, self.hand.faces, rest.vertices, posed), camera)
         return drawn.image, drawn.alpha, posed, camera.viewmat, camera.K

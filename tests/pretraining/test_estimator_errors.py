@@ -10,11 +10,11 @@ from oasis_warp.pretraining.estimator_errors import (
     ALIKE,
     MeasuredErrors,
     bundled_errors,
-    estimate,
-    frames_of,
     landmark_shares,
     looks,
-    of_surface,
+    picture_frames,
+    simulate_estimate,
+    surface_fields,
 )
 from oasis_warp.pretraining.hand_batch import pose_hands
 
@@ -43,7 +43,7 @@ def people(hand, names=("open", "fist", "pinch"), turn=0.0):
 def seen(hand, given, measured, choice):
     parts = [given[key] for key in ("shape", "angles", "orientation")]
     true = pose_hands(hand, *parts, given["translation"])
-    return true, estimate(hand, true, *parts, given["K"], measured, choice)
+    return true, simulate_estimate(hand, true, *parts, given["K"], measured, choice)
 
 
 def project(points, K):
@@ -58,7 +58,7 @@ def errors():
 
 def test_without_errors_hands_are_where_they_are(hand, errors):
     given = people(hand)
-    true, found = seen(hand, given, errors.times(0.0), torch.tensor([0, 1, 2]))
+    true, found = seen(hand, given, errors.scaled(0.0), torch.tensor([0, 1, 2]))
     torch.testing.assert_close(found.posed, true.posed, atol=2e-6, rtol=0)
     torch.testing.assert_close(found.K, given["K"])
 
@@ -86,7 +86,7 @@ def test_landmarks_are_off_in_the_picture_as_those_of_the_measured_hand(hand, er
     table = one_error(errors, hand, given)
     true, found = seen(hand, given, table, torch.zeros(3, dtype=torch.long))
     metre = true.landmarks[..., 2].mean(1) / K[0, 0]
-    wanted = (frames_of(true.landmarks).landmarks @ table.place[:3, :, :, None])[..., 0] / metre[:, None, None]
+    wanted = (picture_frames(true.landmarks).landmarks @ table.place[:3, :, :, None])[..., 0] / metre[:, None, None]
     moved = project(found.posed, found.K) - project(true.posed, given["K"])
     tips = torch.tensor([4, 8, 12, 16, 20])
     nearest = torch.cdist(true.landmarks[:, tips], true.posed).argmin(2)
@@ -107,7 +107,7 @@ def test_a_hand_turned_in_the_picture_is_seen_as_wrongly(hand, errors):
 def test_a_hand_borrows_from_hands_that_look_alike(hand, errors):
     given = people(hand)
     true = pose_hands(hand, *(given[key] for key in ("shape", "angles", "orientation", "translation")))
-    far = looks(true.landmarks, frames_of(true.landmarks)) + 1.0
+    far = looks(true.landmarks, picture_frames(true.landmarks)) + 1.0
 
     def table(near):
         """The hands themselves with one lens, `ALIKE` strangers with another."""
@@ -115,7 +115,7 @@ def test_a_hand_borrows_from_hands_that_look_alike(hand, errors):
         rows = torch.cat([far[near].expand(ALIKE, -1) - 1.0, far[near].expand(ALIKE, -1)])
         nothing = {name: getattr(errors, name)[:1].expand(2 * ALIKE, *getattr(errors, name).shape[1:]) * 0
                    for name in ("angles", "turn", "shape", "place")}  # fmt: skip
-        return MeasuredErrors(looks=rows, lens=lens, **of_surface(hand), kept=errors.kept, **nothing)
+        return MeasuredErrors(looks=rows, lens=lens, **surface_fields(hand), kept=errors.kept, **nothing)
 
     for near in range(3):
         found = seen(hand, given, table(near), torch.full((3,), ALIKE - 1))[1]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from oasis_warp.pretraining.estimator_errors import NUMBERS, ended, wandering
+from oasis_warp.pretraining.estimator_errors import MASK_NUMBERS, cut_at_wrist, perturb_outline
 
 SIZE = 256
 FOCAL = 400.0
@@ -35,12 +35,12 @@ def comb():
 
 
 def numbers(count, seed=0):
-    return torch.randn(count, NUMBERS, generator=torch.Generator().manual_seed(seed))
+    return torch.randn(count, MASK_NUMBERS, generator=torch.Generator().manual_seed(seed))
 
 
 def test_masks_end_on_the_arm_or_before_it_at_a_straight_line(comb):
     mask, alpha = (plane.expand(3, -1, -1) for plane in comb)
-    made = ended(mask, alpha, upright_landmarks(3), camera(3), torch.tensor([-2.0, 0.0, 1.0]))
+    made = cut_at_wrist(mask, alpha, upright_landmarks(3), camera(3), torch.tensor([-2.0, 0.0, 1.0]))
     ends = [int(torch.nonzero(plane.sum(1) > 10).max()) + 1 for plane in made]
     wrist = SIZE / 2 + 0.06 * FOCAL / 0.4
     metre = FOCAL / 0.4
@@ -52,15 +52,15 @@ def test_masks_end_on_the_arm_or_before_it_at_a_straight_line(comb):
 
 def test_no_strength_no_error(comb):
     mask, alpha = comb
-    assert torch.equal(ended(mask, alpha, upright_landmarks(1), camera(1), torch.ones(1), 0.0), mask)
-    assert torch.equal(wandering(mask, numbers(1), 0.0), mask)
+    assert torch.equal(cut_at_wrist(mask, alpha, upright_landmarks(1), camera(1), torch.ones(1), 0.0), mask)
+    assert torch.equal(perturb_outline(mask, numbers(1), 0.0), mask)
 
 
 def test_rims_wander_by_some_pixels_and_no_farther(comb):
     mask = comb[0].expand(32, -1, -1)
-    made = wandering(mask, numbers(32))
+    made = perturb_outline(mask, numbers(32))
     for strength in (1.0, 2.0):
-        shares = wandering(mask, numbers(32), strength)
+        shares = perturb_outline(mask, numbers(32), strength)
         assert float(shares.min()) >= 0 and float(shares.max()) <= 1
     wrong = (made - mask).abs() > 0.5
     assert not wrong[:, 115:195, 65:155].any(), "the middle of the palm"
@@ -71,7 +71,7 @@ def test_rims_wander_by_some_pixels_and_no_farther(comb):
 
 def test_some_gaps_between_fingers_are_filled_in(comb):
     mask = comb[0].expand(64, -1, -1)
-    gap = wandering(mask, numbers(64))[:, 40:105, 81:85].mean((1, 2))
+    gap = perturb_outline(mask, numbers(64))[:, 40:105, 81:85].mean((1, 2))
     assert float((gap > 0.5).float().mean()) > 0.1, "filled in"
     assert float((gap < 0.1).float().mean()) > 0.2, "left open"
 
@@ -79,7 +79,7 @@ def test_some_gaps_between_fingers_are_filled_in(comb):
 def test_masks_depend_on_their_own_numbers_alone(comb):
     mask = comb[0].expand(4, -1, -1)
     drawn = numbers(4)
-    together = wandering(mask, drawn)
+    together = perturb_outline(mask, drawn)
     for k in range(4):
-        assert torch.equal(wandering(mask[k : k + 1], drawn[k : k + 1])[0], together[k])
+        assert torch.equal(perturb_outline(mask[k : k + 1], drawn[k : k + 1])[0], together[k])
     assert not torch.equal(together[0], together[1])

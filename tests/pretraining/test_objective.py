@@ -13,7 +13,7 @@ from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.inputs import Prediction, input_of_batch
 from oasis_warp.pretraining.objective import (
     LossConfig,
-    Pictures,
+    RenderBatch,
     draw_targets,
     objective,
     picture_psnr,
@@ -36,9 +36,7 @@ def prediction(**changed):
 @pytest.fixture
 def network_of(hand):
     """Draw the targets of a batch by an untrained network."""
-    config = replace(
-        COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8
-    )
+    config = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
 
     def draw(batch):
         network = HandNetwork(config, hand)
@@ -51,11 +49,11 @@ def network_of(hand):
 @pytest.fixture
 def pair():
     random = torch.Generator().manual_seed(0)
-    true = Pictures(torch.rand(3, 24, 24, 3, generator=random), torch.zeros(3, 24, 24))
+    true = RenderBatch(torch.rand(3, 24, 24, 3, generator=random), torch.zeros(3, 24, 24))
     true.alphas[:, 4:20, 4:20] = 1
     true = true._replace(images=true.images * true.alphas[..., None])
     noise = 0.1 * torch.randn(3, 24, 24, 3, generator=random)
-    return Pictures(true.images + noise, (true.alphas + 0.1).clamp(0, 1)), true
+    return RenderBatch(true.images + noise, (true.alphas + 0.1).clamp(0, 1)), true
 
 
 def test_the_truth_costs_nothing(pair):

@@ -17,7 +17,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, trained_state
-from oasis_warp.pretraining.distributed import Place
+from oasis_warp.pretraining.distributed import ProcessInfo
 from oasis_warp.pretraining.pretrain import (
     CHECKPOINT,
     METRICS,
@@ -31,7 +31,7 @@ from oasis_warp.pretraining.pretrain import (
     save_checkpoint,
 )
 
-ALONE = Place(0, 1, torch.device("cpu"))
+ALONE = ProcessInfo(0, 1, torch.device("cpu"))
 SMALL = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
 CONFIG = PretrainConfig(steps=4, warmup=2, precision="float32", checkpoint_every=2, log_every=1)
 

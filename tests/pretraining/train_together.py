@@ -17,12 +17,12 @@ from oasis_warp.pretraining.pretrain import pretrain
 def main(folder: Path):
     hand = bundled_hand()
     torch.set_num_threads(1)
-    with join_processes("cpu") as place:
+    with join_processes("cpu") as process:
         network = small_network(hand)
         source = PaintedHands(hand, hands=1, targets=1, size=32)
-        pretrain(network, source, replace(CONFIG, steps=1, clip=1e9), folder, place)
+        pretrain(network, source, replace(CONFIG, steps=1, clip=1e9), folder, process)
         state = {name: parameter.detach() for name, parameter in network.named_parameters()}
-        save_file(state, folder / f"rank{place.rank}.safetensors")
+        save_file(state, folder / f"rank{process.rank}.safetensors")
 
 
 if __name__ == "__main__":

@@ -16,9 +16,9 @@ from oasis_warp.synthetic.body import bundled_body, skin_mesh
 from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.shots import EVERYBODY
 from oasis_warp.synthetic.skin_plan import plan_person
-from oasis_warp.synthetic.skin_texture import CHANNELS, paint
+from oasis_warp.synthetic.skin_texture import CHANNELS, bake_texture
 from oasis_warp.synthetic.strokes import KINDS, Strokes
-from oasis_warp.synthetic.texels import canvas_on, draw_lines
+from oasis_warp.synthetic.texels import draw_lines, texels_on
 
 SEED = 13
 KINDS_OF_PAINT = ("freckles", "hair", "polish", "tattoo", "ring", "plaster")
@@ -30,7 +30,7 @@ NEEDLESS_TO_PLAN = ("warp", "oasis_kernels", "scipy.ndimage")
 @pytest.fixture(scope="module")
 def baked(hand):
     """Somebody with everything that is painted, and the same skin bare of it."""
-    return [people._born(SEED, 4, population, "cpu") for population in (PAINTED, BARE)]
+    return [people._bake_person(SEED, 4, population, "cpu") for population in (PAINTED, BARE)]
 
 
 def test_the_atlas_shows_what_a_depth_buffer_shows():
@@ -44,9 +44,9 @@ def test_the_atlas_shows_what_a_depth_buffer_shows():
 
 
 def test_values_spread_from_vertices_to_texels(device):
-    canvas = canvas_on(str(device))
+    texels = texels_on(str(device))
     rest = bundled_body().rest.to(device)
-    torch.testing.assert_close(canvas.spread(rest.T.contiguous()).T, canvas.points, atol=1e-4, rtol=0)
+    torch.testing.assert_close(texels.spread(rest.T.contiguous()).T, texels.points, atol=1e-4, rtol=0)
 
 
 def test_the_coarse_mesh_is_the_one_that_its_tool_builds(hand):
@@ -58,7 +58,7 @@ def test_the_coarse_mesh_is_the_one_that_its_tool_builds(hand):
 
 
 def test_a_line_is_drawn_where_it_was_added(device):
-    grid = canvas_on(str(device)).grid
+    grid = texels_on(str(device)).grid
     rows = bundled_atlas().snap(np.linspace([-60.0, 0, -8], [-30.0, 0, 6], 30), "palm")
     strokes = Strokes(np.random.default_rng(0))
     strokes.add("main", rows, 1.0, 0.8, taper=0.1, wobble=0.0)
@@ -75,7 +75,7 @@ def test_a_line_is_drawn_where_it_was_added(device):
 
 def test_where_no_line_was_added_none_is_drawn(device):
     lines = Strokes(np.random.default_rng(0)).lines()
-    assert not any(bool(drawn.any()) for drawn in draw_lines(lines, canvas_on(str(device)).grid).values())
+    assert not any(bool(drawn.any()) for drawn in draw_lines(lines, texels_on(str(device)).grid).values())
 
 
 def test_what_is_put_on_skin_shows_in_its_colour(baked):
@@ -100,7 +100,7 @@ def test_the_tone_is_the_mean_of_the_texture(baked):
 def test_a_plan_travels_and_is_painted_the_same_again(baked):
     sent = pickle.dumps(plan_person(SEED, 4, PAINTED))
     assert len(sent) < 2e6
-    assert torch.equal(paint(pickle.loads(sent), "cpu"), baked[0].texture)
+    assert torch.equal(bake_texture(pickle.loads(sent), "cpu"), baked[0].texture)
 
 
 @pytest.mark.slow
@@ -116,10 +116,10 @@ def test_processes_plan_the_same_skin():
 
 @pytest.mark.gpu
 def test_a_gpu_bakes_the_person_that_the_cpu_bakes(baked, monkeypatch):
-    monkeypatch.setattr(people, "_known", type(people._known)())
-    monkeypatch.setattr(people, "PLANNED_HERE", 0)
+    monkeypatch.setattr(people, "_cache", type(people._cache)())
+    monkeypatch.setattr(people, "MAX_PLANNED_HERE", 0)
     people.bake_people(SEED, [4], PAINTED, "cuda", jobs=1)
-    ((_, there),) = people._known.items()
+    ((_, there),) = people._cache.items()
     assert people.person(SEED, 4, PAINTED, "cuda:0") is there
     here = baked[0]
     for name in ("rest", "joints", "tips", "ring"):
@@ -136,7 +136,7 @@ def test_a_gpu_bakes_the_person_that_the_cpu_bakes(baked, monkeypatch):
 def test_a_gpu_needs_no_kernel_for_the_cpu(monkeypatch):
     from oasis_warp.ops._runtime import launch
 
-    people._known.clear()
+    people._cache.clear()
     was = launch.device_and_stream
 
     def refuse(tensor):
@@ -144,7 +144,7 @@ def test_a_gpu_needs_no_kernel_for_the_cpu(monkeypatch):
         return was(tensor)
 
     monkeypatch.setattr(launch, "device_and_stream", refuse)
-    for cached in (bundled_atlas, bundled_body, canvas_on):
+    for cached in (bundled_atlas, bundled_body, texels_on):
         cached.cache_clear()
     people.person(SEED, 4, EVERYBODY, "cuda")
 

@@ -6,7 +6,15 @@ import torch
 
 from oasis_warp.synthetic.picture import render_batch, render_capture
 from oasis_warp.synthetic.shot_table import arm_turns, tabulate
-from oasis_warp.synthetic.shots import EVERYBODY, PHOTOS, PICTURES_EACH, Scenery, capture_shots, plan_shots, sample_shot
+from oasis_warp.synthetic.shots import (
+    EVERYBODY,
+    PHOTOS,
+    PICTURES_EACH,
+    SceneConfig,
+    capture_shots,
+    sample_shot,
+    sample_shots,
+)
 from oasis_warp.synthetic.view_and_light import (
     ARM_CONE,
     View,
@@ -71,7 +79,7 @@ def test_no_view_is_blocked_by_the_forearm():
         turned += view is not drawn
         assert (view is drawn) == (toward_elbow(drawn, bend) < np.cos(ARM_CONE))
     assert 10 < turned < 60  # of a cone of 35 degrees round the arm 9 %
-    shots = [sample_shot(SEED, index, Scenery(look="even")) for index in range(100)]
+    shots = [sample_shot(SEED, index, SceneConfig(look="even")) for index in range(100)]
     assert max(toward_elbow(shot.view, shot.bend) for shot in shots) < np.cos(ARM_CONE)
 
 
@@ -83,8 +91,8 @@ def test_a_view_of_a_straight_arm_turns_round_the_upright_axis():
 
 @pytest.fixture(scope="module")
 def capture():
-    (photo,) = plan_shots(SEED, [0], PHOTOS)
-    others = capture_shots(SEED, photo, plan_shots(SEED, [0, 1], Scenery(look="even")))
+    (photo,) = sample_shots(SEED, [0], PHOTOS)
+    others = capture_shots(SEED, photo, sample_shots(SEED, [0, 1], SceneConfig(look="even")))
     plans = [tabulate(SEED, shots, PHOTOS) for shots in ([photo], others)]
     return photo, others, render_capture(SEED, *plans, SIZE, "cpu", scenery=PHOTOS)
 
@@ -109,7 +117,7 @@ def test_twice_the_light_is_the_same_picture_since_the_photo_was_exposed_for_it(
         sky=2 * photo.light.sky, colors=2 * photo.light.colors, incident=2 * photo.light.incident
     ), sensor=photo.sensor._replace(metering=0.0))  # fmt: skip
     plain = photo._replace(sensor=bright.sensor)
-    goals = plan_shots(SEED, [1], Scenery(look="even"))
+    goals = sample_shots(SEED, [1], SceneConfig(look="even"))
     made = []
     for shot in (plain, bright):
         plans = [tabulate(SEED, shots, PHOTOS) for shots in ([shot], capture_shots(SEED, shot, goals))]
@@ -120,6 +128,6 @@ def test_twice_the_light_is_the_same_picture_since_the_photo_was_exposed_for_it(
 def test_a_capture_of_one_person_comes_again(capture):
     photo, others, _ = capture
     assert {shot.person for shot in (photo, *others)} == {0} and PICTURES_EACH > 1
-    again = capture_shots(SEED, photo, plan_shots(SEED, [0, 1], Scenery(population=EVERYBODY, look="even")))
+    again = capture_shots(SEED, photo, sample_shots(SEED, [0, 1], SceneConfig(population=EVERYBODY, look="even")))
     for one, two in zip(others, again, strict=True):
         np.testing.assert_array_equal(one.light.sky, two.light.sky)

@@ -12,21 +12,21 @@ SEED = 13
 
 @pytest.fixture(autouse=True)
 def nobody_known(monkeypatch):
-    monkeypatch.setattr(people, "_known", type(people._known)())
+    monkeypatch.setattr(people, "_cache", type(people._cache)())
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     made = tmp_path_factory.mktemp("people")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(people, "_known", type(people._known)())
+        patch.setattr(people, "_cache", type(people._cache)())
         people.bake_people(SEED, [2], EVERYBODY, "cpu", jobs=0, folder=made)
     return made
 
 
 def test_a_person_that_was_written_is_read_and_not_baked(folder, monkeypatch):
-    baked = people._born(SEED, 2, EVERYBODY, "cpu")
-    monkeypatch.setattr(people, "_born", None)
+    baked = people._bake_person(SEED, 2, EVERYBODY, "cpu")
+    monkeypatch.setattr(people, "_bake_person", None)
     told = []
     people.bake_people(SEED, [2], EVERYBODY, "cpu", jobs=0, folder=folder, progress=lambda *what: told.append(what))
     read = people.person(SEED, 2, EVERYBODY, "cpu")
@@ -51,6 +51,6 @@ def test_a_file_that_is_damaged_or_of_somebody_else_is_made_again(folder, tmp_pa
     (tmp_path / f"{number:06d}.safetensors").write_bytes(data[:1000] if damage == "cut short" else data)
     asked = []
     there = people._read(folder / "000002.safetensors", SEED, 2, EVERYBODY)
-    monkeypatch.setattr(people, "_born", lambda *who: asked.append(who) or there)
+    monkeypatch.setattr(people, "_bake_person", lambda *who: asked.append(who) or there)
     people.bake_people(SEED, [number], EVERYBODY, "cpu", jobs=0, folder=tmp_path)
     assert asked == [(SEED, number, EVERYBODY, "cpu")]

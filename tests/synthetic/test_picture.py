@@ -7,12 +7,12 @@ from oasis_warp.core.mirror import mirror_points, mirror_pose
 from oasis_warp.core.types import Camera, HandPose
 from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.ops import depth_map
-from oasis_warp.pretraining.training_batch import Photographed, training_batch
+from oasis_warp.pretraining.training_batch import LabelledPictures, training_batch
 from oasis_warp.synthetic import people
 from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.picture import render_batch, stream
-from oasis_warp.synthetic.shot_table import joined, plan_ahead, plan_table
-from oasis_warp.synthetic.shots import EVERYBODY, PHOTOS, PICTURES_EACH, Scenery, sample_shot
+from oasis_warp.synthetic.shot_table import concatenate_tables, sample_table, sample_tables_ahead
+from oasis_warp.synthetic.shots import EVERYBODY, PHOTOS, PICTURES_EACH, SceneConfig, sample_shot
 
 SIZE = 64
 SEED = 13
@@ -103,7 +103,7 @@ def test_angles_respect_the_joint_limits(batch):
 
 
 def test_even_looks_show_the_same_person_on_black_without_clothes(batch):
-    even = render_batch(SEED, INDICES[:2], SIZE, scenery=Scenery(look="even"))
+    even = render_batch(SEED, INDICES[:2], SIZE, scenery=SceneConfig(look="even"))
     torch.testing.assert_close(even.shape, batch.shape[:2])
     assert float(even.image[even.alpha == 0].abs().max()) == 0
     lit = even.image[even.mask > 0.99]
@@ -114,8 +114,8 @@ def test_even_looks_show_the_same_person_on_black_without_clothes(batch):
 def test_photos_and_even_looks_make_a_training_batch(batch, hand):
     photos = render_batch(SEED, [0, PICTURES_EACH], SIZE)
     indices = [1, 2, PICTURES_EACH + 1, PICTURES_EACH + 2]
-    targets = render_batch(SEED, indices, SIZE, scenery=Scenery(look="even"))
-    assert isinstance(photos, Photographed)
+    targets = render_batch(SEED, indices, SIZE, scenery=SceneConfig(look="even"))
+    assert isinstance(photos, LabelledPictures)
     made = training_batch(hand, photos, targets, SIZE, torch.Generator().manual_seed(0))
     assert made.target_images.shape == (2, 2, SIZE, SIZE, 3)
     # The surface of the truth, drawn by the truth's camera, is where the true picture shows the hand.
@@ -152,7 +152,7 @@ def test_a_gpu_shows_what_the_cpu_shows(batch):
 
 def test_lights_and_views_are_finite_over_many_seeds():
     for index in range(60):
-        shot = sample_shot(3, index, Scenery(look="even" if index % 2 else "photo"))
+        shot = sample_shot(3, index, SceneConfig(look="even" if index % 2 else "photo"))
         assert np.isfinite(shot.light.sky).all()
         assert (shot.room is None) == (shot.sensor is None) == bool(index % 2)
         assert shot.room is None or np.isfinite(shot.room.solids).all()
@@ -161,14 +161,14 @@ def test_lights_and_views_are_finite_over_many_seeds():
 
 
 def test_people_come_again_where_there_are_few():
-    few = [sample_shot(0, k * PICTURES_EACH, Scenery(people=3)).person for k in range(7)]
+    few = [sample_shot(0, k * PICTURES_EACH, SceneConfig(people=3)).person for k in range(7)]
     assert few == [0, 1, 2, 0, 1, 2, 0]
 
 
 def test_processes_that_plan_ahead_plan_the_same():
     blocks = [(range(k, k + 2), PHOTOS) for k in (0, 2, 4)]
-    together = plan_table(SEED, range(6), PHOTOS)
-    ahead = joined(list(plan_ahead(SEED, blocks, workers=1)))
+    together = sample_table(SEED, range(6), PHOTOS)
+    ahead = concatenate_tables(list(sample_tables_ahead(SEED, blocks, workers=1)))
     assert ahead.gestures == together.gestures
     np.testing.assert_array_equal(ahead.whole, together.whole)
     np.testing.assert_array_equal(ahead.numbers, together.numbers)
@@ -177,9 +177,9 @@ def test_processes_that_plan_ahead_plan_the_same():
 @pytest.mark.slow
 def test_people_baked_by_other_processes_are_the_same(monkeypatch):
     here = people.person(SEED, 0, EVERYBODY, "cpu")
-    monkeypatch.setattr(people, "_known", people.OrderedDict())
+    monkeypatch.setattr(people, "_cache", people.OrderedDict())
     people.bake_people(SEED, [0], EVERYBODY, "cpu", jobs=1)
-    ((_, there),) = people._known.items()
+    ((_, there),) = people._cache.items()
     for name in ("texture", "rest", "areas", "ring"):
         assert torch.equal(getattr(there, name), getattr(here, name))
 

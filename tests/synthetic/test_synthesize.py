@@ -14,7 +14,7 @@ from oasis_warp.synthetic import shards
 from oasis_warp.synthetic.backgrounds import cut_background, list_backgrounds
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shards import write_shards
-from oasis_warp.synthetic.shots import PHOTOS, Scenery
+from oasis_warp.synthetic.shots import PHOTOS, SceneConfig
 
 SIZE = 32
 JOB = {"count": 5, "seed": 13, "size": SIZE, "device": "cpu", "scenery": PHOTOS, "settings": {}, "batch": 2}
@@ -102,7 +102,7 @@ def _folder_of_pictures(tmp_path):
 
 def test_a_folder_of_pictures_stands_behind_the_hands(tmp_path):
     paths = list_backgrounds(_folder_of_pictures(tmp_path))
-    batch = render_batch(13, [1], SIZE, scenery=Scenery(backgrounds=paths))
+    batch = render_batch(13, [1], SIZE, scenery=SceneConfig(backgrounds=paths))
     behind = batch.image[0][batch.alpha[0] == 0]
     assert float((behind[:, 1] - behind[:, [0, 2]].amax(1)).median()) > 0.1
 

@@ -35,7 +35,7 @@ def turntable(
 
 
 @torch.no_grad()
-def pose_film(
+def pose_frames(
     avatar: Avatar,
     names: Sequence[str],
     n_frames: int,
@@ -81,7 +81,7 @@ def run(options: Animate) -> int:
         if options.motion == "turntable":
             frames = turntable(avatar, choose_pose(avatar, options.pose), n_frames, options.size, **look)
         else:
-            frames = pose_film(avatar, names, n_frames, options.size, **look)
+            frames = pose_frames(avatar, names, n_frames, options.size, **look)
         write_video(options.out, frames, options.fps)
     return 0
 

@@ -132,9 +132,7 @@ def noise_table(summary: Sequence[Record], config: SyntheticEvaluation) -> Table
 def on_photos(options: Evaluate, priors: dict[str, Prior], progress: Progress) -> list[Table]:
     """One table: medians over all ordered pairs."""
     assert options.folder is not None  # checked with the other options
-    config = ReconstructConfig(
-        steps=options.steps, seed=options.seed, size=options.size, device=options.device
-    )
+    config = ReconstructConfig(steps=options.steps, seed=options.seed, size=options.size, device=options.device)
     found = evaluate_photos(priors, options.folder, options.out, config, progress)
     rows, n_out = found["summary"], len(found["left_out"])
     table = make_table(f"{rows[0]['pairs']} ordered pairs of photos of the same hand", rows, PHOTOS)

@@ -17,16 +17,16 @@ from oasis_warp.cli.console import INTERRUPTED, check_device, show_progress
 from oasis_warp.cli.options import Pretrain
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.data.output_files import claim_folder
+from oasis_warp.data.output_files import open_resumable_folder
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.dinov2 import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, read_config
-from oasis_warp.pretraining.distributed import Place, join_processes, wait_for_all
+from oasis_warp.pretraining.distributed import ProcessInfo, join_processes, wait_for_all
 from oasis_warp.pretraining.pretrain import CHECKPOINT, PretrainConfig, pretrain
 from oasis_warp.pretraining.synthetic_source import MULTIPLE, SyntheticHands
-from oasis_warp.synthetic.people import most_kept
+from oasis_warp.synthetic.people import max_people_cached
 from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH
 
 SETTINGS, PEOPLE = "training.json", "people"
@@ -45,16 +45,16 @@ def run(options: Pretrain) -> int:
     """
     check_device(options.device)
     check_options(options)
-    with join_processes(options.device) as place:
-        shown = show_progress(Console(stderr=True)) if place.rank == 0 else nullcontext(silent)
+    with join_processes(options.device) as process:
+        shown = show_progress(Console(stderr=True)) if process.rank == 0 else nullcontext(silent)
         try:
             with shown as progress:
-                done = train(options, place, progress)
+                done = train(options, process, progress)
         except KeyboardInterrupt:
             done = 0
     if done == options.steps:
         return 0
-    if place.rank == 0:
+    if process.rank == 0:
         print(f"oasis: stopped; what is done stays in {options.out}, the same command goes on.", file=sys.stderr)
     return INTERRUPTED
 
@@ -93,7 +93,7 @@ def check_options(options: Pretrain) -> None:
         raise InputError(f"--start {options.start}: of another network than --profile {options.profile}.")
 
 
-def train(options: Pretrain, place: Place, progress: Progress) -> int:
+def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
     """This process's share of the training; how many steps are done in all.
 
     Raises:
@@ -101,34 +101,32 @@ def train(options: Pretrain, place: Place, progress: Progress) -> int:
     """
     hands = SyntheticHands(
         seed=options.seed, people=options.people, hands=options.hands, views=options.views, size=options.size,
-        device=place.device, population=replace(EVERYBODY, **dict.fromkeys(options.hold_out, 0.0)),
-        workers=options.workers, ahead=AHEAD if place.device.type == "cuda" else 1,
+        device=process.device, population=replace(EVERYBODY, **dict.fromkeys(options.hold_out, 0.0)),
+        workers=options.workers, ahead=AHEAD if process.device.type == "cuda" else 1,
     )  # fmt: skip
-    met = hands.people_met(place.rank, place.world, options.steps)
-    most = most_kept(str(place.device))
+    met = hands.people_met(process.rank, process.world, options.steps)
+    most = max_people_cached(str(process.device))
     if len(met) > most:
         raise InputError(
-            f"--people: expected at most {most} that one {place.device.type} device meets, got {len(met)}; "
+            f"--people: expected at most {most} that one {process.device.type} device meets, got {len(met)}; "
             "each takes 23 MB there."
         )
     network = make_network(PROFILES[options.profile], options.seed, options.backbone_weights, options.start)
-    settings = settings_of(options, place.world)
-    if place.rank == 0:
+    settings = settings_of(options, process.world)
+    if process.rank == 0:
         claim(options.out, settings)
-        if place.device.type == "cpu":
+        if process.device.type == "cpu":
             (options.out / PEOPLE).mkdir(exist_ok=True)
-    wait_for_all(place)
+    wait_for_all(process)
     hands.bake(met, options.out / PEOPLE, options.workers, progress)
     config = PretrainConfig(steps=options.steps, precision=PRECISIONS[options.precision])
-    with stop_signals(can_force=place.world == 1) as stop_asked:
+    with stop_signals(can_force=process.world == 1) as should_stop:
         return pretrain(
-            network, hands, config, options.out, place, about=settings, stop_asked=stop_asked, progress=progress
+            network, hands, config, options.out, process, about=settings, should_stop=should_stop, progress=progress
         )
 
 
-def make_network(
-    config: NetworkConfig, seed: int, backbone_weights: Path | None, start: Path | None
-) -> HandNetwork:
+def make_network(config: NetworkConfig, seed: int, backbone_weights: Path | None, start: Path | None) -> HandNetwork:
     """A network that knows nothing yet, or what `start` knows.
 
     Raises:
@@ -164,7 +162,7 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
     """
     if (folder / CHECKPOINT).exists() and not (folder / SETTINGS).exists():
         raise InputError(f"{folder}: holds a checkpoint but no {SETTINGS} that says of what; choose another folder.")
-    claim_folder(folder, SETTINGS, settings, "a training")
+    open_resumable_folder(folder, SETTINGS, settings, "a training")
 
 
 @contextmanager

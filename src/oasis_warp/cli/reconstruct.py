@@ -114,9 +114,7 @@ def _shared_folder(path: Path) -> Iterator[None]:
             path.rmdir()
 
 
-def _reconstruct_one(
-    path: Path, folder: Path, config: ReconstructConfig, keypoints: Path | None
-) -> dict[str, Any]:
+def _reconstruct_one(path: Path, folder: Path, config: ReconstructConfig, keypoints: Path | None) -> dict[str, Any]:
     """Write one avatar's folder; its report."""
     seconds: dict[str, float] = {}
     with output_folder(folder) as part, show_progress(Console(stderr=True)) as progress:

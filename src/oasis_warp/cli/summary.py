@@ -173,9 +173,7 @@ def photo_row(
     ]
 
 
-def shade_mesh(
-    posed: PosedHand, faces: Tensor, camera: Camera
-) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+def shade_mesh(posed: PosedHand, faces: Tensor, camera: Camera) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
     """Brightness of the posed surface under a light at the camera, and where it is (1 inside, 0 outside)."""
     vertices = posed.vertices.cpu()
     faces = faces.cpu()

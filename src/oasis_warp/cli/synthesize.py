@@ -13,7 +13,7 @@ from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, contact_she
 from oasis_warp.synthetic.backgrounds import list_backgrounds
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shards import write_shards
-from oasis_warp.synthetic.shots import PICTURES_EACH, Scenery
+from oasis_warp.synthetic.shots import PICTURES_EACH, SceneConfig
 
 SHEET_COLUMNS = 8
 BATCH = {"cpu": 4, "cuda": 64}
@@ -34,7 +34,7 @@ def run(options: Synthesize) -> int:
     if options.seed < 0:
         raise InputError(f"--seed: expected 0 or more, got {options.seed}; choose another seed.")
     folder = () if options.backgrounds is None else list_backgrounds(options.backgrounds)
-    scenery = Scenery(look=options.look, backgrounds=folder)
+    scenery = SceneConfig(look=options.look, backgrounds=folder)
     console = Console(stderr=True)
     with show_progress(console) as progress:
         if options.sheet:
@@ -54,7 +54,7 @@ def run(options: Synthesize) -> int:
     return 0
 
 
-def _sheet(options: Synthesize, scenery: Scenery, progress: Progress) -> torch.Tensor:
+def _sheet(options: Synthesize, scenery: SceneConfig, progress: Progress) -> torch.Tensor:
     """One picture of each of the first `count` people."""
     images = []
     for k in range(options.count):

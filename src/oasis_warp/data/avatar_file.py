@@ -195,8 +195,10 @@ def _check_gaussians(tensors: Mapping[str, Tensor]) -> None:
         "gaussians.face_index": (tensors["gaussians.face_index"] >= 0, "no negative index"),
         "gaussians.quats": (tensors["gaussians.quats"].norm(dim=1) > 1e-6, "no zero quaternion"),
         "gaussians.scales": ((tensors["gaussians.scales"] > 0).all(1), "positive scales"),
-        "gaussians.opacities": (tensors["gaussians.opacities"].clamp(0, 1) == tensors["gaussians.opacities"],
-                                "opacities in [0, 1]"),
+        "gaussians.opacities": (
+            tensors["gaussians.opacities"].clamp(0, 1) == tensors["gaussians.opacities"],
+            "opacities in [0, 1]",
+        ),
     }
     if "light.limits" in tensors:
         limits = tensors["light.limits"]

@@ -114,7 +114,7 @@ def looks_readable(data: bytes) -> bool:
     )
 
 
-def foreign_format(data: bytes) -> str | None:
+def unsupported_format(data: bytes) -> str | None:
     """The name of a well-known format that cannot be read here, to say something more useful than "not an image"."""
     if data[4:8] == b"ftyp":
         return "HEIC" if data[8:12] in _HEIF_BRANDS else "video"

@@ -121,7 +121,7 @@ def _explain(path: Path | str, error: OSError) -> InputError:
     return InputError(f"{path}: cannot be written ({error.strerror}); check the permissions of its folder.")
 
 
-def claim_folder(folder: Path, name: str, settings: dict[str, Any], made: str) -> None:
+def open_resumable_folder(folder: Path, name: str, settings: dict[str, Any], made: str) -> None:
     """Make `folder` and note `settings` in its file `name`, or check that the same are noted there.
 
     Args:

@@ -19,10 +19,10 @@ from oasis_warp.data.image_header import (
     Exif,
     ImageHeader,
     focal_pixels,
-    foreign_format,
     looks_readable,
     read_exif,
     read_header,
+    unsupported_format,
 )
 
 MAX_PIXELS = 24_000_000
@@ -118,7 +118,7 @@ def _read_bytes(path: Path) -> bytes:
 def _not_an_image(path: Path, data: bytes) -> InputError:
     if looks_readable(data):
         return _cut_short(path, len(data))
-    if name := foreign_format(data):
+    if name := unsupported_format(data):
         return InputError(f"{path}: expected {READABLE}, got {name}; save the photo as JPEG or PNG first.")
     return InputError(f"{path}: expected {READABLE}, got something that is no image; give the photo itself.")
 

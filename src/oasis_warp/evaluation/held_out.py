@@ -18,16 +18,16 @@ from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.objective import true_pictures
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
 from oasis_warp.pretraining.training_batch import EstimatorNoise, training_batch
-from oasis_warp.synthetic.picture import SyntheticBatch, part, render_capture, render_planned
-from oasis_warp.synthetic.shot_table import Planned, tabulate
+from oasis_warp.synthetic.picture import SyntheticBatch, render_capture, render_planned, slice_batch
+from oasis_warp.synthetic.shot_table import ShotTable, tabulate
 from oasis_warp.synthetic.shots import (
     EVERYBODY,
     PICTURES_EACH,
-    Scenery,
+    SceneConfig,
     Shot,
     camera_turn,
     capture_shots,
-    plan_shots,
+    sample_shots,
 )
 from oasis_warp.synthetic.view_and_light import sample_light, soften_light
 from oasis_warp.synthetic.wardrobe import sample_clothes
@@ -81,16 +81,16 @@ class Session(NamedTuple):
 def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) -> Session:
     """Render the photos and targets of person `number`."""
     seed, size, first = shoot.seed, int(shoot.size * SURROUNDINGS), PICTURES_EACH * number
-    wild = Scenery(population=POPULATIONS[group])
+    wild = SceneConfig(population=POPULATIONS[group])
     even = replace(wild, look="even")
-    (photo,) = plan_shots(seed, [first], wild)
-    goals = plan_shots(seed, range(first, first + shoot.targets), even)
+    (photo,) = sample_shots(seed, [first], wild)
+    goals = sample_shots(seed, range(first, first + shoot.targets), even)
 
-    def planned(shots: list[Shot]) -> Planned:
+    def planned(shots: list[Shot]) -> ShotTable:
         return tabulate(seed, shots, wild)
 
     plain = render_planned(seed, planned([_evenly_lit(photo), *goals]), size, device, scenery=even)
-    studio, even_goals = part(plain, slice(1)), part(plain, slice(1, None))
+    studio, even_goals = slice_batch(plain, slice(1)), slice_batch(plain, slice(1, None))
     wall = torch.tensor(np.random.default_rng([seed, WALL_STREAM, number]).uniform(0.1, 0.9, 3)).to(studio.image)
     studio = studio._replace(image=studio.image + (1 - studio.alpha[..., None]) * wall)
     soft = photo._replace(light=soften_light(photo.light, DIRECTED))

@@ -12,7 +12,7 @@ from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import Landmarks, Photo
-from oasis_warp.data.output_files import claim_folder, write_file
+from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, label, prior_digest, reconstructions
@@ -97,7 +97,7 @@ def evaluate_photos(
         "photos": {name: [path.name for path in paths] for name, paths in hands.items()},
         **{name: getattr(config, name) for name in ("steps", "seed", "size")},
     }
-    claim_folder(out, SETTINGS, settings, "an evaluation")
+    open_resumable_folder(out, SETTINGS, settings, "an evaluation")
     (out / HANDS).mkdir(exist_ok=True)
     for name, paths in hands.items():
         place = out / HANDS / f"{name}.json"

@@ -29,7 +29,7 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.processes import worker_pool
 from oasis_warp.core.types import Camera, HandCrop, PosedHand, TrainingBatch
-from oasis_warp.data.output_files import claim_folder, write_file
+from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.evaluation.held_out import (
     FIRST_PERSON,
     Group,
@@ -120,7 +120,7 @@ def evaluate(
         **asdict(config),
     }
     settings = json.loads(json.dumps(settings))  # tuples become lists, as a file has them
-    claim_folder(folder, SETTINGS, settings, "an evaluation")
+    open_resumable_folder(folder, SETTINGS, settings, "an evaluation")
     (folder / PEOPLE).mkdir(exist_ok=True)
     everybody = [(group, FIRST_PERSON + k) for group in config.groups for k in range(config.people)]
     missing = [who for who in everybody if not _place(folder, *who).exists()]

@@ -12,7 +12,7 @@ from torch import Tensor
 from oasis_warp.core.errors import InputError
 
 
-class Place(NamedTuple):
+class ProcessInfo(NamedTuple):
     """This process among all."""
 
     rank: int
@@ -21,7 +21,7 @@ class Place(NamedTuple):
 
 
 @contextmanager
-def join_processes(device: str) -> Iterator[Place]:
+def join_processes(device: str) -> Iterator[ProcessInfo]:
     """Join the processes that torchrun started, over NCCL on CUDA and gloo on the CPU; a process alone joins none.
 
     Raises:
@@ -37,11 +37,11 @@ def join_processes(device: str) -> Iterator[Place]:
             )
         torch.cuda.set_device(here)
     if world == 1:
-        yield Place(0, 1, here)
+        yield ProcessInfo(0, 1, here)
         return
     dist.init_process_group("nccl" if device == "cuda" else "gloo")
     try:
-        yield Place(dist.get_rank(), world, here)
+        yield ProcessInfo(dist.get_rank(), world, here)
     finally:
         dist.destroy_process_group()
 
@@ -73,15 +73,15 @@ def average_gradients(parameters: Sequence[Tensor], world: int) -> None:
     torch._foreach_copy_(gradients, [part.view_as(g) for part, g in zip(parts, gradients, strict=True)])
 
 
-def any_process(says_so: bool, place: Place) -> bool:
+def any_process(flag: bool, process: ProcessInfo) -> bool:
     """Whether one of the processes says so: the same answer in all, which all must ask for."""
-    if place.world == 1:
-        return says_so
-    votes = torch.tensor(float(says_so), device=place.device)
+    if process.world == 1:
+        return flag
+    votes = torch.tensor(float(flag), device=process.device)
     dist.all_reduce(votes)
     return bool(votes > 0)
 
 
-def wait_for_all(place: Place) -> None:
+def wait_for_all(process: ProcessInfo) -> None:
     """Go on when every process has come here."""
-    any_process(False, place)
+    any_process(False, process)

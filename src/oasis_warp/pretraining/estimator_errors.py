@@ -21,7 +21,7 @@ from oasis_warp.assets import asset
 from oasis_warp.core.hand_model import KNUCKLES, HandModel
 from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.pretraining.hand_batch import FINGERS, Posed, pose_hands
+from oasis_warp.pretraining.hand_batch import FINGERS, PosedHands, pose_hands
 
 ALIKE = 8
 """Of so many measured hands that look most alike one lends its error."""
@@ -59,7 +59,7 @@ class MeasuredErrors(NamedTuple):
     normals: Float[Tensor, "V 3"]
     """Of the surface at rest."""
 
-    def times(self, strength: float) -> "MeasuredErrors":
+    def scaled(self, strength: float) -> "MeasuredErrors":
         """Larger or smaller errors; none for 0."""
         if strength == 1:
             return self
@@ -67,7 +67,7 @@ class MeasuredErrors(NamedTuple):
         return self._replace(**smaller, kept=1 - strength * (1 - self.kept))
 
 
-class Estimated(NamedTuple):
+class EstimatedHands(NamedTuple):
     """What an estimator says of N hands."""
 
     posed: Float[Tensor, "N V 3"]
@@ -78,11 +78,11 @@ class Estimated(NamedTuple):
 def bundled_errors(device: torch.device) -> MeasuredErrors:
     """The errors that ship with the package, of the bundled hand."""
     stored = load(asset("training", "estimator_errors.safetensors").read_bytes())
-    tensors = {name: value.float() for name, value in stored.items()} | of_surface(bundled_hand())
+    tensors = {name: value.float() for name, value in stored.items()} | surface_fields(bundled_hand())
     return MeasuredErrors(**{name: value.to(device) for name, value in tensors.items()})
 
 
-def of_surface(hand: HandModel) -> dict[str, Tensor]:
+def surface_fields(hand: HandModel) -> dict[str, Tensor]:
     """The fields of `MeasuredErrors` that are the hand's own."""
     a, b, c = hand.template[hand.faces].unbind(1)
     across = torch.linalg.cross(b - a, c - a)
@@ -114,7 +114,7 @@ class Frames(NamedTuple):
     """Along the bone that ends at a landmark, for those beyond the knuckles."""
 
 
-def frames_of(landmarks: Float[Tensor, "N 21 3"]) -> Frames:
+def picture_frames(landmarks: Float[Tensor, "N 21 3"]) -> Frames:
     """How hands and their fingers lie in the picture; landmarks are in the camera's frame."""
     seen = landmarks[..., :2] / landmarks[..., 2:]
     up = seen[:, _MIDDLE] - seen[:, _WRIST]
@@ -134,16 +134,16 @@ def looks(landmarks: Float[Tensor, "N 21 3"], frames: Frames) -> Float[Tensor, "
     return ((landmarks - landmarks.mean(1, keepdim=True)) @ frames.hand).flatten(1)
 
 
-def estimate(
+def simulate_estimate(
     hand: HandModel,
-    true: Posed,
+    true: PosedHands,
     shape: Float[Tensor, "N S"],
     angles: Float[Tensor, "N 15 3"],
     orientation: Float[Tensor, "N 3 3"],
     K: Float[Tensor, "N 3 3"],
     measured: MeasuredErrors,
     choice: Int[Tensor, "N"],
-) -> Estimated:
+) -> EstimatedHands:
     """Surfaces and cameras with errors.
 
     Args:
@@ -156,7 +156,7 @@ def estimate(
         measured: Errors.
         choice: Which of the `ALIKE` measured hands lends its error.
     """
-    frames = frames_of(true.landmarks)
+    frames = picture_frames(true.landmarks)
     alike = torch.cdist(looks(true.landmarks, frames), measured.looks).topk(ALIKE, largest=False).indices
     row = alike.gather(1, choice[:, None])[:, 0]
     turn = (frames.hand @ measured.turn[row][..., None])[..., 0]
@@ -177,10 +177,10 @@ def estimate(
     shift = torch.cat([rays * new_depth, new_depth], -1) - found.landmarks
     K = K * torch.cat([focal, focal, torch.ones_like(focal)], dim=2)
     posed = found.posed + measured.shares @ shift
-    return Estimated(_onto_outline(posed, focal, true, measured.normals), K)
+    return EstimatedHands(_onto_outline(posed, focal, true, measured.normals), K)
 
 
-def _onto_outline(posed: Tensor, focal: Tensor, true: Posed, normals: Tensor) -> Tensor:
+def _onto_outline(posed: Tensor, focal: Tensor, true: PosedHands, normals: Tensor) -> Tensor:
     """`posed` with the vertices on the true outline moved onto it, across it; `focal` is over the true focal length."""
     out = (true.turns @ normals[..., None])[..., 0]
     view = normalize(true.posed, dim=-1)
@@ -194,8 +194,8 @@ def _onto_outline(posed: Tensor, focal: Tensor, true: Posed, normals: Tensor) ->
 
 PATCHES = 8
 """Errors change over this part of a picture's side."""
-NUMBERS = 2 + 2 * PATCHES * PATCHES
-"""Standard normal numbers that `wandering` needs for a mask."""
+MASK_NUMBERS = 2 + 2 * PATCHES * PATCHES
+"""Standard normal numbers that `perturb_outline` needs for a mask."""
 _END = (0.007, 0.0065)
 """Mean and spread of where masks end past the wrist point [m]."""
 _GAP = 0.025
@@ -208,7 +208,7 @@ _BLUR = 5
 """Pixels over which a rim is blurred, and at most half of which it wanders."""
 
 
-def ended(
+def cut_at_wrist(
     mask: Float[Tensor, "N H H"],
     alpha: Float[Tensor, "N H H"],
     landmarks: Float[Tensor, "N 21 3"],
@@ -237,10 +237,10 @@ def ended(
     return (mask + strength * (alpha * above - mask)).clamp(0, 1)
 
 
-def wandering(
+def perturb_outline(
     mask: Float[Tensor, "N s s"], numbers: Float[Tensor, "N M"], strength: float = 1.0
 ) -> Float[Tensor, "N s s"]:
-    """Masks of crops with some gaps filled in and rims that are off by up to some pixels; `NUMBERS` a mask."""
+    """Masks of crops with some gaps filled in and rims that are off by up to some pixels; `MASK_NUMBERS` a mask."""
     size = mask.shape[-1]
     fields = numbers[:, 2:].unflatten(1, (2, PATCHES, PATCHES))
     gaps, rim = interpolate(fields, size=(size, size), mode="bicubic", align_corners=False).unbind(1)

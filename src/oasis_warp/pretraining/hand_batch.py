@@ -16,7 +16,7 @@ FINGERS, BONES = 5, 3
 """A finger's bones follow each other in `HandModel`: all five are posed together, from the palm outwards."""
 
 
-class Posed(NamedTuple):
+class PosedHands(NamedTuple):
     """N right hands [m]; surfaces are those that carry Gaussians."""
 
     rest: Float[Tensor, "N V 3"]
@@ -33,7 +33,7 @@ def pose_hands(
     angles: Float[Tensor, "N 15 3"],
     orientation: Float[Tensor, "N 3 3"],
     translation: Float[Tensor, "N 3"],
-) -> Posed:
+) -> PosedHands:
     """`hand.skinning.rest_hand`, moved by `avatar.anchors.inset_offsets`, `skin` and `hand21` for many hands."""
     rest = hand.template + inset_offsets(hand) + torch.einsum("vds,ns->nvd", hand.shape_basis, shape)
     joints = hand.joints + torch.einsum("jds,ns->njd", hand.joint_basis, shape)
@@ -47,7 +47,7 @@ def pose_hands(
     posed = (turns * flesh[:, :, None]).sum(-1) + blended[..., 9:]
     last = [torch.stack([part[:, bone] for bone in TIP_BONES], 1) for part in (rotation, offset)]
     ends = (last[0] @ tips[..., None])[..., 0] + last[1]
-    return Posed(rest, posed, torch.cat([origin, ends], 1)[:, hand.keypoint_index], turns)
+    return PosedHands(rest, posed, torch.cat([origin, ends], 1)[:, hand.keypoint_index], turns)
 
 
 def _bones(

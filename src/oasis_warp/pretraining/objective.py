@@ -19,14 +19,14 @@ from oasis_warp.network.prior import all_gaussians
 from oasis_warp.ops import depth_map, rasterization
 
 
-class Pictures(NamedTuple):
+class RenderBatch(NamedTuple):
     """N = B T pictures over black; what their targets say nothing about is black, too."""
 
     images: Float[Tensor, "N H H 3"]
     alphas: Float[Tensor, "N H H"]
 
 
-def draw_targets(prediction: Prediction, batch: TrainingBatch, network: HandNetwork) -> Pictures:
+def draw_targets(prediction: Prediction, batch: TrainingBatch, network: HandNetwork) -> RenderBatch:
     """Pose and draw the Gaussians of every hand in the pose and camera of each of its targets."""
     size = batch.target_images.shape[2]
     images, alphas = [], []
@@ -41,11 +41,11 @@ def draw_targets(prediction: Prediction, batch: TrainingBatch, network: HandNetw
             images.append(image[0])
             alphas.append(alpha[0, ..., 0])
     known = batch.target_known.flatten(0, 1)
-    return Pictures(torch.stack(images) * known[..., None], torch.stack(alphas) * known)
+    return RenderBatch(torch.stack(images) * known[..., None], torch.stack(alphas) * known)
 
 
 @torch.no_grad()
-def true_pictures(batch: TrainingBatch, faces: Int[Tensor, "F 3"], rim: Int[Tensor, "R"]) -> Pictures:
+def true_pictures(batch: TrainingBatch, faces: Int[Tensor, "F 3"], rim: Int[Tensor, "R"]) -> RenderBatch:
     """The targets, faded out at the wrist as the Gaussians are: what these may not cover they must not be asked for."""
     size = batch.target_images.shape[2]
     seen = depth_map(
@@ -57,7 +57,7 @@ def true_pictures(batch: TrainingBatch, faces: Int[Tensor, "F 3"], rim: Int[Tens
     at_corners = at_vertices.gather(1, corners.flatten(1)).view(corners.shape)
     fade = torch.where(seen.face_ids >= 0, (at_corners * seen.barycentrics).sum(-1), 1)
     share = fade * batch.target_known.flatten(0, 1)
-    return Pictures(batch.target_images.flatten(0, 1) * share[..., None], batch.target_masks.flatten(0, 1) * share)
+    return RenderBatch(batch.target_images.flatten(0, 1) * share[..., None], batch.target_masks.flatten(0, 1) * share)
 
 
 Perceptual = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -92,8 +92,8 @@ class LossConfig:
 
 def objective(
     prediction: Prediction,
-    drawn: Pictures,
-    true: Pictures,
+    drawn: RenderBatch,
+    true: RenderBatch,
     config: LossConfig,
     perceptual: Perceptual = detail_difference,
 ) -> tuple[Tensor, dict[str, Tensor]]:
@@ -123,9 +123,7 @@ def position_loss(offsets: Float[Tensor, "*batch 3"], limit: float) -> Tensor:
     return (length / limit - 1).clamp_min(0).mean()
 
 
-def scaling_loss(
-    scales: Float[Tensor, "*batch 3"], anchors: Float[Tensor, "*batch 3"], limit: float
-) -> Tensor:
+def scaling_loss(scales: Float[Tensor, "*batch 3"], anchors: Float[Tensor, "*batch 3"], limit: float) -> Tensor:
     """Mean of max(longest / shortest - limit, 0), the limit of a Gaussian no smaller than its anchor has it.
 
     Anchors are flat on purpose, and those of slivers long: the paper's limit alone would puff them up to where they
@@ -139,7 +137,7 @@ def scaling_loss(
 
 
 @torch.no_grad()
-def picture_psnr(drawn: Pictures, true: Pictures) -> Tensor:
+def picture_psnr(drawn: RenderBatch, true: RenderBatch) -> Tensor:
     """Peak signal-to-noise ratio inside the masks, mean of the pictures [dB]."""
     error = ((drawn.images - true.images).square() * true.alphas[..., None]).sum((1, 2, 3))
     return (-10 * (error / (3 * true.alphas.sum((1, 2)).clamp_min(1))).clamp_min(1e-12).log10()).mean()

@@ -24,11 +24,17 @@ from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.weights_file import save_network
 from oasis_warp.ops.cuda_graph import CapturedCall
-from oasis_warp.pretraining.distributed import Place, any_process, average_gradients, mean_over_processes, share_weights
+from oasis_warp.pretraining.distributed import (
+    ProcessInfo,
+    any_process,
+    average_gradients,
+    mean_over_processes,
+    share_weights,
+)
 from oasis_warp.pretraining.objective import (
     LossConfig,
     Perceptual,
-    Pictures,
+    RenderBatch,
     draw_targets,
     objective,
     picture_psnr,
@@ -134,11 +140,11 @@ class StepResult(NamedTuple):
     loss: Tensor
     terms: dict[str, Tensor]
     psnr: Tensor
-    drawn: Pictures
-    true: Pictures
+    drawn: RenderBatch
+    true: RenderBatch
 
 
-def never() -> bool:
+def never_stop() -> bool:
     """Nobody asks to stop."""
     return False
 
@@ -157,16 +163,16 @@ class Trainer:
         self,
         network: HandNetwork,
         config: PretrainConfig,
-        place: Place,
+        process: ProcessInfo,
         perceptual: Perceptual = detail_difference,
     ):
-        self.network = network.to(place.device).train()
-        self.config, self.place, self.perceptual = config, place, perceptual
+        self.network = network.to(process.device).train()
+        self.config, self.process, self.perceptual = config, process, perceptual
         self.trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
-        share_weights(self.trained, place.world)
-        on_cuda = place.device.type == "cuda"
+        share_weights(self.trained, process.world)
+        on_cuda = process.device.type == "cuda"
         # a recorded step reads the learning rate where it lies on the device
-        rate = torch.tensor(config.learning_rate, device=place.device) if on_cuda else config.learning_rate
+        rate = torch.tensor(config.learning_rate, device=process.device) if on_cuda else config.learning_rate
         self.optimizer = torch.optim.Adam(self.trained, lr=rate, fused=on_cuda, capturable=on_cuda)
         self.step = 0
         self._recorded: CapturedCall[StepResult] | None = None
@@ -183,7 +189,7 @@ class Trainer:
                 group["lr"].fill_(rate)
             else:
                 group["lr"] = rate
-        if self._recorded is None and self.place.device.type == "cuda" and self._eager_steps >= EAGER_STEPS:
+        if self._recorded is None and self.process.device.type == "cuda" and self._eager_steps >= EAGER_STEPS:
             self._recorded = CapturedCall(self._update, batch, SLACK)
         if self._recorded is None:
             self._eager_steps += 1
@@ -201,7 +207,7 @@ class Trainer:
     def evaluate(self, batch: TrainingBatch) -> StepResult:
         """Predict, draw every target and compare."""
         half = self.config.precision == "bfloat16"
-        with torch.autocast(self.place.device.type, torch.bfloat16, enabled=half):
+        with torch.autocast(self.process.device.type, torch.bfloat16, enabled=half):
             prediction = self.network(input_of_batch(batch))
         drawn = draw_targets(prediction, batch, self.network)
         true = true_pictures(batch, self.network.faces, self.network.rim)
@@ -215,7 +221,7 @@ class Trainer:
             if gradient is not None and gradient.stride() != parameter.stride():
                 gradient = torch.empty_like(parameter).copy_(gradient)  # the fused optimiser wants the same strides
             parameter.grad = gradient
-        average_gradients(self.trained, self.place.world)
+        average_gradients(self.trained, self.process.world)
         torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
         self.optimizer.step()
         return _without_history(result)
@@ -224,7 +230,7 @@ class Trainer:
 def _without_history(result: StepResult) -> StepResult:
     """The same numbers, that hold on to nothing they were computed from."""
     terms = {name: term.detach() for name, term in result.terms.items()}
-    drawn, true = (Pictures(*(tensor.detach() for tensor in pictures)) for pictures in (result.drawn, result.true))
+    drawn, true = (RenderBatch(*(tensor.detach() for tensor in pictures)) for pictures in (result.drawn, result.true))
     return StepResult(result.loss.detach(), terms, result.psnr.detach(), drawn, true)
 
 
@@ -233,11 +239,11 @@ def pretrain(
     source: BatchSource,
     config: PretrainConfig,
     folder: Path,
-    place: Place,
+    process: ProcessInfo,
     *,
     perceptual: Perceptual = detail_difference,
     about: Mapping[str, object] = MappingProxyType({}),
-    stop_asked: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     progress: Progress = silent,
 ) -> int:
     """Train until `config.steps`, going on from the checkpoint in `folder` where there is one; the steps done in all.
@@ -251,22 +257,22 @@ def pretrain(
         source: Of batches.
         config: How to train.
         folder: Where files go.
-        place: This process.
+        process: This process.
         perceptual: Term of the objective.
         about: More to say in the notes of the weights file, beside `config`: what JSON can hold.
-        stop_asked: Asked after every step, by several processes when they write metrics: then this is the last step.
+        should_stop: Asked after every step, by several processes when they write metrics: then this is the last step.
         progress: Told of the steps to do from here on.
 
     Raises:
         InputError: a checkpoint of another network, a folder that cannot be written, or a loss that is not finite.
     """
-    trainer = Trainer(network, config, place, perceptual)
+    trainer = Trainer(network, config, process, perceptual)
     if (folder / CHECKPOINT).is_file():
         trainer.step = load_checkpoint(folder / CHECKPOINT, network, trainer.optimizer)
-    if place.rank == 0:
+    if process.rank == 0:
         _forget_after(folder / METRICS, trainer.step)
     began, first = time.perf_counter(), trainer.step
-    batches = source(trainer.step, place.rank, place.world)
+    batches = source(trainer.step, process.rank, process.world)
     notes = {**about, **asdict(config)}
     stopping = trainer.step >= config.steps
     progress("pretraining", 0, config.steps - first)
@@ -276,22 +282,22 @@ def pretrain(
         progress("pretraining", trainer.step - first, config.steps - first)
         log_here = trainer.step % config.log_every == 0
         # several processes stop together or wait for each other for ever, and agreeing costs a wait for the device
-        asked = (place.world == 1 or log_here) and any_process(stop_asked(), place)
+        asked = (process.world == 1 or log_here) and any_process(should_stop(), process)
         stopping = asked or trainer.step == config.steps
         save_here = stopping or trainer.step % config.checkpoint_every == 0
         if log_here or save_here:
             names = ["loss", "psnr", *result.terms]
             values = torch.stack([result.loss, result.psnr, *result.terms.values()])
-            numbers = dict(zip(names, mean_over_processes(values, place.world).tolist(), strict=True))
+            numbers = dict(zip(names, mean_over_processes(values, process.world).tolist(), strict=True))
             trainer.check_recording()
             if not math.isfinite(numbers["loss"]):
                 raise InputError(f"{folder}: the loss is not finite at step {trainer.step}; lower the learning rate.")
-            if place.rank == 0:
+            if process.rank == 0:
                 pace = (time.perf_counter() - began) / (trainer.step - first)
                 line = {"step": trainer.step, "seconds_per_step": pace, **numbers}
                 with (folder / METRICS).open("a") as file:
                     file.write(json.dumps(line) + "\n")
-        if place.rank == 0 and save_here:
+        if process.rank == 0 and save_here:
             save_checkpoint(folder / CHECKPOINT, network, trainer.optimizer, trainer.step)
             save_network(folder / WEIGHTS, network, notes=json.dumps({"step": trainer.step, **notes}))
             write_picture(folder / SHEET, to_uint8(_sheet(batch, result)))

@@ -14,9 +14,9 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.pretraining.training_batch import training_batch
 from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.people import bake_people
-from oasis_warp.synthetic.picture import SyntheticBatch, part, render_planned
-from oasis_warp.synthetic.shot_table import joined, plan_ahead
-from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH, Scenery
+from oasis_warp.synthetic.picture import SyntheticBatch, render_planned, slice_batch
+from oasis_warp.synthetic.shot_table import concatenate_tables, sample_tables_ahead
+from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH, SceneConfig
 
 ERROR_STREAM = 3
 """Tells the random numbers of the estimator's errors from those of identities and pictures with the same seed."""
@@ -56,29 +56,31 @@ class SyntheticHands:
     def __call__(self, first_step: int, rank: int, world: int) -> Iterator[TrainingBatch]:
         """Batches without end. People that have not been baked make it wait, some seconds each."""
         hand = bundled_hand().to(self.device)
-        photo = Scenery(people=self.people, population=self.population)
+        photo = SceneConfig(people=self.people, population=self.population)
         looks = photo, replace(photo, look="even")
         rendered = int(self.size * SURROUNDINGS)
 
         def numbers() -> Iterator[int]:
             return itertools.count(first_step * world + rank, world)
 
-        def blocks() -> Iterator[tuple[list[int], Scenery]]:
+        def blocks() -> Iterator[tuple[list[int], SceneConfig]]:
             for number in numbers():
                 yield from zip((self.photo_indices(number), self.target_indices(number)), looks, strict=True)
 
-        plans, batch_numbers = plan_ahead(self.seed, blocks(), self.workers), numbers()
+        plans, batch_numbers = sample_tables_ahead(self.seed, blocks(), self.workers), numbers()
         while True:
             together = list(itertools.islice(plans, len(looks) * self.ahead))
             photos, targets = (
-                render_planned(self.seed, joined(together[k :: len(looks)]), rendered, self.device, scenery=scenery)
+                render_planned(
+                    self.seed, concatenate_tables(together[k :: len(looks)]), rendered, self.device, scenery=scenery
+                )
                 for k, scenery in enumerate(looks)
             )
             for k, number in enumerate(itertools.islice(batch_numbers, self.ahead)):
-                photo = part(photos, slice(k * self.hands, (k + 1) * self.hands))
-                target = part(targets, slice(k * self.hands * self.views, (k + 1) * self.hands * self.views))
+                photo = slice_batch(photos, slice(k * self.hands, (k + 1) * self.hands))
+                target = slice_batch(targets, slice(k * self.hands * self.views, (k + 1) * self.hands * self.views))
                 if number % EVEN_EVERY == EVEN_EVERY - 1:
-                    photo = self.before_walls(part(target, slice(None, None, self.views)), number)
+                    photo = self.before_walls(slice_batch(target, slice(None, None, self.views)), number)
                 yield training_batch(hand, photo, target, self.size, self.errors(number))
 
     def photo_indices(self, number: int) -> list[int]:
@@ -116,7 +118,7 @@ class SyntheticHands:
         """Make the people of `people_met` ready, or read those that `folder`, if any, holds already.
 
         Raises:
-            ValueError: more than `synthetic.people.most_kept`.
+            ValueError: more than `synthetic.people.max_people_cached`.
             InputError: the folder cannot be written.
         """
         bake_people(self.seed, met, self.population, str(self.device), jobs=jobs, folder=folder, progress=progress)

@@ -10,15 +10,22 @@ from torch.nn.functional import grid_sample
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import TrainingBatch
-from oasis_warp.pretraining.estimator_errors import ALIKE, NUMBERS, bundled_errors, ended, estimate, wandering
-from oasis_warp.pretraining.hand_batch import Posed, pose_hands
+from oasis_warp.pretraining.estimator_errors import (
+    ALIKE,
+    MASK_NUMBERS,
+    bundled_errors,
+    cut_at_wrist,
+    perturb_outline,
+    simulate_estimate,
+)
+from oasis_warp.pretraining.hand_batch import PosedHands, pose_hands
 
 CROP_MARGIN = 1.12
 """Side of a crop over the longer extent of its mask, as in `reconstruction.reconstruct`."""
 
 
 @runtime_checkable
-class Photographed(Protocol):
+class LabelledPictures(Protocol):
     """N pictures and the truth about them: what a renderer of hands hands over.
 
     Camera frames throughout; the pose of a left hand describes the mirrored model (x -> -x).
@@ -122,7 +129,7 @@ def _extent(touched: Tensor) -> tuple[Tensor, Tensor]:
     return first.float(), last.float()
 
 
-def as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+def mirror_left_hands(pictures: LabelledPictures) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image, alpha, mask, orientation, translation and K, left hands seen in the mirror."""
     left = pictures.left.bool()
 
@@ -141,8 +148,8 @@ def as_right_hands(pictures: Photographed) -> tuple[Tensor, Tensor, Tensor, Tens
 @torch.no_grad()
 def training_batch(
     hand: HandModel,
-    photos: Photographed,
-    targets: Photographed,
+    photos: LabelledPictures,
+    targets: LabelledPictures,
     size: int,
     random: torch.Generator,
     noise: EstimatorNoise = EstimatorNoise(),
@@ -157,21 +164,21 @@ def training_batch(
         random: On the CPU, of the estimator's errors; the same state gives the same batch.
         noise: How large they are; they are in the photo's `posed`, `K`, `mask` and crop, nowhere else.
     """
-    image, alpha, mask, orientation, translation, K = as_right_hands(photos)
+    image, alpha, mask, orientation, translation, K = mirror_left_hands(photos)
     count, like = len(image), translation
 
     views = len(targets.image) // count
-    goal_image, goal_alpha, goal_mask, *place, goal_K = as_right_hands(targets)
+    goal_image, goal_alpha, goal_mask, *place, goal_K = mirror_left_hands(targets)
     both = pose_hands(
         hand, torch.cat([photos.shape, targets.shape]), torch.cat([photos.angles, targets.angles]),
         torch.cat([orientation, place[0]]), torch.cat([translation, place[1]]),
     )  # fmt: skip
-    true = Posed(*(part[:count] for part in both))
-    errors = bundled_errors(like.device).times(noise.surface)
+    true = PosedHands(*(part[:count] for part in both))
+    errors = bundled_errors(like.device).scaled(noise.surface)
     choice = torch.randint(ALIKE, (count,), generator=random).to(like.device, non_blocking=True)
-    seen = estimate(hand, true, photos.shape, photos.angles, orientation, K, errors, choice)
-    numbers = torch.randn(count, 1 + NUMBERS, generator=random).to(like, non_blocking=True)
-    mask = ended(mask, alpha, true.landmarks, K, numbers[:, 0], noise.mask)
+    seen = simulate_estimate(hand, true, photos.shape, photos.angles, orientation, K, errors, choice)
+    numbers = torch.randn(count, 1 + MASK_NUMBERS, generator=random).to(like, non_blocking=True)
+    mask = cut_at_wrist(mask, alpha, true.landmarks, K, numbers[:, 0], noise.mask)
     crop = crop_to_mask(torch.cat([image, mask[..., None]], dim=-1), mask, seen.K, size)
 
     alone = goal_image * (goal_mask / goal_alpha.clamp_min(1e-3)).clamp(0, 1)[..., None]  # over black already
@@ -184,7 +191,7 @@ def training_batch(
 
     return TrainingBatch(
         image=crop.planes[..., :3].clamp(0, 1),
-        mask=wandering(crop.planes[..., 3].clamp(0, 1), numbers[:, 1:], noise.mask),
+        mask=perturb_outline(crop.planes[..., 3].clamp(0, 1), numbers[:, 1:], noise.mask),
         posed=seen.posed,
         viewmat=still.expand(count, -1, -1),
         K=crop.K,

@@ -9,8 +9,8 @@ from torch import Tensor
 from oasis_warp.ops import depth_map
 from oasis_warp.synthetic.body import Body
 from oasis_warp.synthetic.ops.skin_shading import Lamps, sky_transfer, smooth_over_faces
-from oasis_warp.synthetic.posing import Posed
-from oasis_warp.synthetic.shot_table import Numbers
+from oasis_warp.synthetic.posing import PosedPeople
+from oasis_warp.synthetic.shot_table import ShotTensors
 from oasis_warp.synthetic.view_and_light import sphere
 
 SKY_DIRECTIONS, SKY_SIZE = 40, 112
@@ -58,7 +58,7 @@ def _directions(device: torch.device) -> Tensor:
     return torch.from_numpy(sphere(SKY_DIRECTIONS)).float().to(device)
 
 
-def see_sky(body: Body, posed: Posed, normals: Tensor) -> Float[Tensor, "B V 10"]:
+def see_sky(body: Body, posed: PosedPeople, normals: Tensor) -> Float[Tensor, "B V 10"]:
     """Hidden-sky transfer of every vertex, smoothed once."""
     directions = _directions(posed.vertices.device)
     radius = posed.radius * 1.02
@@ -72,7 +72,7 @@ def see_sky(body: Body, posed: Posed, normals: Tensor) -> Float[Tensor, "B V 10"
     return smooth_over_faces(transfer, body.faces)
 
 
-def light_lamps(body: Body, posed: Posed, numbers: Numbers) -> Lamps:
+def light_lamps(body: Body, posed: PosedPeople, numbers: ShotTensors) -> Lamps:
     """The lamps of each picture, with what they see of the hand."""
     distances = numbers.lamp_distances
     center = posed.center[:, None].expand_as(numbers.lamp_directions)

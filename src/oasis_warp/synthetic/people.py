@@ -23,8 +23,8 @@ from oasis_warp.synthetic.identity import Identity, Population, sample_identity
 from oasis_warp.synthetic.ops.skin_shading import surface_state
 from oasis_warp.synthetic.relief import relief
 from oasis_warp.synthetic.skin_plan import SkinPlan, plan_person
-from oasis_warp.synthetic.skin_texture import paint
-from oasis_warp.synthetic.texels import canvas_on
+from oasis_warp.synthetic.skin_texture import bake_texture
+from oasis_warp.synthetic.texels import texels_on
 from oasis_warp.synthetic.wardrobe import ring_at_rest, ring_look
 
 PERSON_BYTES = 24_000_000
@@ -32,7 +32,7 @@ PERSON_BYTES = 24_000_000
 CPU_KEPT = 48
 CUDA_SHARE = 0.5
 """Of a GPU's memory that people may fill: an H200 keeps 3,000."""
-PLANNED_HERE = 48
+MAX_PLANNED_HERE = 48
 """So few people are planned sooner by this process than by others, which take seconds to start."""
 PLANS_AT_ONCE = 8
 """That a process hands over."""
@@ -57,20 +57,20 @@ class Person(NamedTuple):
     ring_look: tuple[float, ...]
 
 
-_known: OrderedDict[tuple[int, int, Population, str], Person] = OrderedDict()
+_cache: OrderedDict[tuple[int, int, Population, str], Person] = OrderedDict()
 
 
 def person(seed: int, number: int, population: Population, device: torch.device | str) -> Person:
     """Person `number` of the world `seed`; a second on a CPU the first time, then kept until many others have come."""
     key = (seed, number, population, device_name(device))
-    if key in _known:
-        _known.move_to_end(key)
-        return _known[key]
-    return _keep(key, _born(*key))
+    if key in _cache:
+        _cache.move_to_end(key)
+        return _cache[key]
+    return _remember(key, _bake_person(*key))
 
 
 @functools.cache
-def most_kept(device: str) -> int:
+def max_people_cached(device: str) -> int:
     """People that can be kept on a device."""
     if torch.device(device).type == "cpu":
         return CPU_KEPT
@@ -99,12 +99,12 @@ def bake_people(
         InputError: the folder cannot be written.
     """
     device = device_name(device)
-    most = most_kept(device)
+    most = max_people_cached(device)
     if len(numbers) > most:
         raise ValueError(
             f"numbers: expected at most {most} people on {device}, got {len(numbers)}. Others are forgotten."
         )
-    missing = [n for n in numbers if (seed, n, population, device) not in _known]
+    missing = [n for n in numbers if (seed, n, population, device) not in _cache]
     count = len(missing)
     if missing:
         progress("people", 0, count)
@@ -114,45 +114,45 @@ def bake_people(
             if isinstance(found, Path):
                 found = _read(found, seed, number, population)
             elif isinstance(found, SkinPlan):
-                found = _painted(found, device)
-            _keep((seed, number, population, device), found)
+                found = _finish_person(found, device)
+            _remember((seed, number, population, device), found)
             progress("people", k + 1, count)
 
     on_cpu = device == "cpu"
     what = ([seed] * count, missing, [population] * count)
-    work, what = (_make, (*what, [folder] * count)) if on_cpu else (plan_person, what)
-    if jobs < 1 or (not on_cpu and count <= PLANNED_HERE):
+    work, what = (_bake_or_find, (*what, [folder] * count)) if on_cpu else (plan_person, what)
+    if jobs < 1 or (not on_cpu and count <= MAX_PLANNED_HERE):
         keep(map(work, *what))
         return
     with worker_pool(jobs) as pool:
         try:
             made = pool.map(work, *what, chunksize=1 if on_cpu else PLANS_AT_ONCE)
             if not on_cpu:
-                canvas_on(device)  # seconds, in which the processes start
+                texels_on(device)  # seconds, in which the processes start
             keep(made)
         except BaseException:
             pool.shutdown(cancel_futures=True)  # or hundreds of people would still be baked
             raise
 
 
-def _make(seed: int, number: int, population: Population, folder: Path | None) -> Person | Path:
+def _bake_or_find(seed: int, number: int, population: Population, folder: Path | None) -> Person | Path:
     """A person made on the CPU, or with a folder its file, which may be there already."""
     if folder is None:
-        return _born(seed, number, population, "cpu")
+        return _bake_person(seed, number, population, "cpu")
     path = folder / f"{number:06d}.safetensors"
-    if not _is_there(path, _about(seed, number, population)):
-        found = _born(seed, number, population, "cpu")
+    if not _is_whole(path, _describe(seed, number, population)):
+        found = _bake_person(seed, number, population, "cpu")
         tensors = {name: value.contiguous() for name, value in found._asdict().items() if isinstance(value, Tensor)}
-        write_file(path, save(tensors, {FORMAT: _about(seed, number, population)}))
+        write_file(path, save(tensors, {FORMAT: _describe(seed, number, population)}))
     return path
 
 
-def _about(seed: int, number: int, population: Population) -> str:
+def _describe(seed: int, number: int, population: Population) -> str:
     """Tells a person from all others, and from the same one as another version baked it."""
     return json.dumps([__version__, seed, number, asdict(population)], sort_keys=True)
 
 
-def _is_there(path: Path, about: str) -> bool:
+def _is_whole(path: Path, about: str) -> bool:
     if not path.is_file():
         return False
     try:
@@ -163,27 +163,27 @@ def _is_there(path: Path, about: str) -> bool:
 
 
 def _read(path: Path, seed: int, number: int, population: Population) -> Person:
-    """What `_make` has written."""
+    """What `_bake_or_find` has written."""
     identity = sample_identity(bundled_body().hand, seed, number, population)
     return Person(identity=identity, ring_look=ring_look(identity), **load_file(path))
 
 
-def _keep(key: tuple[int, int, Population, str], found: Person) -> Person:
+def _remember(key: tuple[int, int, Population, str], found: Person) -> Person:
     """Remember a person, and forget the one on the same device that was not met for longest."""
     device = key[3]
-    _known[key] = found
-    if sum(k[3] == device for k in _known) > most_kept(device):
-        del _known[next(k for k in _known if k[3] == device)]
+    _cache[key] = found
+    if sum(k[3] == device for k in _cache) > max_people_cached(device):
+        del _cache[next(k for k in _cache if k[3] == device)]
     return found
 
 
-def _born(seed: int, number: int, population: Population, device: str) -> Person:
+def _bake_person(seed: int, number: int, population: Population, device: str) -> Person:
     """Made on the device."""
-    return _painted(plan_person(seed, number, population), device)
+    return _finish_person(plan_person(seed, number, population), device)
 
 
 @torch.no_grad()
-def _painted(plan: SkinPlan, device: str) -> Person:
+def _finish_person(plan: SkinPlan, device: str) -> Person:
     """What is left to do of a person once the skin is planned."""
     body, identity = body_on(device), plan.identity
     hand = body.hand
@@ -191,7 +191,7 @@ def _painted(plan: SkinPlan, device: str) -> Person:
     smooth = hand.template + hand.shape_basis @ shape
     rest = smooth + body.normals[: body.n_hand] * relief(identity, device)[:, None]
     joints, tips = hand.joints + hand.joint_basis @ shape, hand.tips + hand.tip_basis @ shape
-    texture = paint(plan, device)
+    texture = bake_texture(plan, device)
     still = torch.eye(3, device=device).expand(1, ARM_ROWS, 3, 3)
     arm = arm_rows(rest[hand.rim][None], still, torch.tensor([identity.arm_girth], device=device))
     whole = torch.cat([rest, arm.reshape(-1, 3)])[None]

@@ -27,10 +27,17 @@ from oasis_warp.synthetic.ops.skin_shading import (
     surface_state,
 )
 from oasis_warp.synthetic.people import Person, person
-from oasis_warp.synthetic.posing import Posed, pose_people
+from oasis_warp.synthetic.posing import PosedPeople, pose_people
 from oasis_warp.synthetic.sensor import develop, expose, meter, srgb
-from oasis_warp.synthetic.shot_table import Numbers, Planned, numbers_of, plan_ahead, plan_table, send
-from oasis_warp.synthetic.shots import PHOTOS, Scenery
+from oasis_warp.synthetic.shot_table import (
+    ShotTable,
+    ShotTensors,
+    sample_table,
+    sample_tables_ahead,
+    send,
+    shot_tensors,
+)
+from oasis_warp.synthetic.shots import PHOTOS, SceneConfig
 
 SAMPLES = 2
 """Sub-pixels along a pixel's side."""
@@ -87,36 +94,36 @@ def render_batch(
     size: int = 256,
     device: torch.device | str = "cpu",
     *,
-    scenery: Scenery = PHOTOS,
+    scenery: SceneConfig = PHOTOS,
 ) -> SyntheticBatch:
     """Pictures `indices` of the world `seed`, each `size` pixels wide and high.
 
     A picture depends on seed, index, size and scenery alone: not on its batch, nor on the device, up to
     rounding. Indices 8 n to 8 n + 7 show one person, whose texture is baked when first met (seconds) and kept.
     """
-    return render_planned(seed, plan_table(seed, indices, scenery), size, device, scenery=scenery)
+    return render_planned(seed, sample_table(seed, indices, scenery), size, device, scenery=scenery)
 
 
 @torch.no_grad()
 def render_planned(
-    seed: int, planned: Planned, size: int, device: torch.device | str, *, scenery: Scenery
+    seed: int, planned: ShotTable, size: int, device: torch.device | str, *, scenery: SceneConfig
 ) -> SyntheticBatch:
-    """The second half of `render_batch`: pictures of what `plan_table` has drawn for the same seed and scenery.
+    """The second half of `render_batch`: pictures of what `sample_table` has drawn for the same seed and scenery.
 
     Nothing waits for the device.
     """
     even = scenery.look == "even"
-    staged = _stage(seed, planned, size, torch.device(device), scenery.population, lamps=not even)
+    scene = _shade_batch(seed, planned, size, torch.device(device), scenery.population, lamps=not even)
     if even:
-        image = _alone(staged.shaded, lambda linear: srgb(linear.clamp(max=1)))
+        image = _over_black(scene.shaded, lambda linear: srgb(linear.clamp(max=1)))
     else:
-        image = _photo(staged, _seen_light(staged, planned, size, scenery))
-    return _with_truth(staged, image, planned, size)
+        image = _photo(scene, _scene_light(scene, planned, size, scenery))
+    return _with_ground_truth(scene, image, planned, size)
 
 
 @torch.no_grad()
 def render_capture(
-    seed: int, photo: Planned, others: Planned, size: int, device: torch.device | str, *, scenery: Scenery
+    seed: int, photo: ShotTable, others: ShotTable, size: int, device: torch.device | str, *, scenery: SceneConfig
 ) -> tuple[SyntheticBatch, SyntheticBatch]:
     """One photo, and pictures of the hand alone in the same light and exposure, over black, as a clean camera sees it.
 
@@ -129,33 +136,33 @@ def render_capture(
         scenery: Of the photo.
     """
     device = torch.device(device)
-    staged = _stage(seed, photo, size, device, scenery.population, lamps=True)
-    light = _seen_light(staged, photo, size, scenery)
-    again = _stage(seed, others, size, device, scenery.population, lamps=True)
+    scene = _shade_batch(seed, photo, size, device, scenery.population, lamps=True)
+    light = _scene_light(scene, photo, size, scenery)
+    again = _shade_batch(seed, others, size, device, scenery.population, lamps=True)
     count = len(others.numbers)
-    gains = meter(light, staged.shaded.alpha, staged.numbers.sensor, staged.numbers.incident).expand(count, -1)
-    sensors = staged.numbers.sensor.expand(count, -1)
-    image = _alone(again.shaded, lambda linear: develop(linear, gains, sensors))
-    return _with_truth(staged, _photo(staged, light), photo, size), _with_truth(again, image, others, size)
+    gains = meter(light, scene.shaded.alpha, scene.numbers.sensor, scene.numbers.incident).expand(count, -1)
+    sensors = scene.numbers.sensor.expand(count, -1)
+    image = _over_black(again.shaded, lambda linear: develop(linear, gains, sensors))
+    return _with_ground_truth(scene, _photo(scene, light), photo, size), _with_ground_truth(again, image, others, size)
 
 
-class _Staged(NamedTuple):
+class _ShadedBatch(NamedTuple):
     """A batch posed, lit and shaded, before any camera makes a picture of it."""
 
-    numbers: Numbers
+    numbers: ShotTensors
     whole: Int[Tensor, "B 4"]
-    posed: Posed
+    posed: PosedPeople
     lamps: Lamps
     shaded: Shaded
 
 
-def _stage(
-    seed: int, planned: Planned, size: int, device: torch.device, population: Population, *, lamps: bool
-) -> _Staged:
+def _shade_batch(
+    seed: int, planned: ShotTable, size: int, device: torch.device, population: Population, *, lamps: bool
+) -> _ShadedBatch:
     name = device_name(device)
     device, body = torch.device(name), body_on(name)
     people = [person(seed, number, population, name) for number in planned.whole[:, 1].tolist()]
-    numbers = numbers_of(planned, device)
+    numbers = shot_tensors(planned, device)
     whole = send(torch.from_numpy(planned.whole), device)
     posed = pose_people(body, people, numbers)
     fine = size * SAMPLES
@@ -171,40 +178,40 @@ def _stage(
         numbers.view_distance / (posed.focal * fine) / TEXEL, numbers.sky, lit, whole[:, 3],
         n_hand_faces=body.n_hand_faces, ring=RING,
     )  # fmt: skip
-    return _Staged(numbers, whole, posed, lit, shaded)
+    return _ShadedBatch(numbers, whole, posed, lit, shaded)
 
 
-def _alone(shaded: Shaded, camera: Callable[[Tensor], Tensor]) -> Float[Tensor, "B H W 3"]:
+def _over_black(shaded: Shaded, camera: Callable[[Tensor], Tensor]) -> Float[Tensor, "B H W 3"]:
     """What the camera makes of the linear light of hand and arm, over black, as splats are drawn."""
     share = shaded.alpha[..., None]
     return share * camera((shaded.color / share.clamp_min(1e-3)).clamp_min(0))
 
 
-def _seen_light(staged: _Staged, planned: Planned, size: int, scenery: Scenery) -> Float[Tensor, "B H W 3"]:
+def _scene_light(scene: _ShadedBatch, planned: ShotTable, size: int, scenery: SceneConfig) -> Float[Tensor, "B H W 3"]:
     """The linear light of hand, arm and what is behind them."""
-    numbers, shaded = staged.numbers, staged.shaded
+    numbers, shaded = scene.numbers, scene.shaded
     if scenery.backgrounds:
         behind = send(_cut_backgrounds(scenery, planned, size), shaded.color.device)
     else:
         behind = trace_rooms(
-            numbers.solids, staged.posed.focal * size, numbers.sky, staged.lamps, shaded.alpha, numbers.view_distance,
+            numbers.solids, scene.posed.focal * size, numbers.sky, scene.lamps, shaded.alpha, numbers.view_distance,
             numbers.aperture,
         )  # fmt: skip
     return shaded.color + (1 - shaded.alpha[..., None]) * behind
 
 
-def _photo(staged: _Staged, light: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:
+def _photo(scene: _ShadedBatch, light: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:
     """What the sensor makes of the light."""
-    numbers = staged.numbers
-    return expose(light, staged.shaded.alpha, numbers.sensor, numbers.incident, staged.whole[:, 3])
+    numbers = scene.numbers
+    return expose(light, scene.shaded.alpha, numbers.sensor, numbers.incident, scene.whole[:, 3])
 
 
-def _with_truth(
-    staged: _Staged, image: Float[Tensor, "B H W 3"], planned: Planned, size: int
+def _with_ground_truth(
+    scene: _ShadedBatch, image: Float[Tensor, "B H W 3"], planned: ShotTable, size: int
 ) -> SyntheticBatch:
     """The pictures and what is known about them, left hands mirrored."""
-    numbers, posed, shaded = staged.numbers, staged.posed, staged.shaded
-    index, number, left, _ = staged.whole.unbind(1)
+    numbers, posed, shaded = scene.numbers, scene.posed, scene.shaded
+    index, number, left, _ = scene.whole.unbind(1)
     K = pinhole(posed.focal * size, size)
     marks = posed.landmarks @ K.transpose(1, 2)
     batch = SyntheticBatch(
@@ -227,27 +234,27 @@ def _with_truth(
     return _mirror_left(batch, size)
 
 
-def part(batch: SyntheticBatch, rows: slice) -> SyntheticBatch:
+def slice_batch(batch: SyntheticBatch, rows: slice) -> SyntheticBatch:
     """Some of the pictures."""
     return SyntheticBatch(*(field[rows] for field in batch))
 
 
 def stream(
     seed: int, batch: int, size: int = 256, device: torch.device | str = "cpu", *, start: int = 0,
-    scenery: Scenery = PHOTOS, workers: int = 0,
+    scenery: SceneConfig = PHOTOS, workers: int = 0,
 ) -> Iterator[SyntheticBatch]:  # fmt: skip
     """Pictures from `start` on in batches, without end: `render_batch`, for training on the fly.
 
     Drawing a shot takes a CPU some milliseconds; with `workers`, so many processes draw ahead while a GPU renders.
     """
     blocks = ((range(first, first + batch), scenery) for first in itertools.count(start, batch))
-    for planned in plan_ahead(seed, blocks, workers):
+    for planned in sample_tables_ahead(seed, blocks, workers):
         yield render_planned(seed, planned, size, device, scenery=scenery)
 
 
-def _cut_backgrounds(scenery: Scenery, planned: Planned, size: int) -> Tensor:
+def _cut_backgrounds(scenery: SceneConfig, planned: ShotTable, size: int) -> Tensor:
     """A picture of the folder for each plan, as bright as the light on the hand; on the CPU."""
-    numbers, cuts = numbers_of(planned, torch.device("cpu")), []
+    numbers, cuts = shot_tensors(planned, torch.device("cpu")), []
     for aperture, light, seed in zip(numbers.aperture, numbers.incident, planned.whole[:, 3], strict=True):
         random = np.random.default_rng([int(seed)])
         cuts.append(cut_background(scenery.backgrounds, random, size, float(aperture) * size) * light.mean())

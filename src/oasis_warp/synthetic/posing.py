@@ -11,14 +11,14 @@ from torch import Tensor
 from oasis_warp.synthetic.body import Body, arm_rows
 from oasis_warp.synthetic.ops.batched_lbs import batched_lbs
 from oasis_warp.synthetic.people import Person
-from oasis_warp.synthetic.shot_table import Numbers
+from oasis_warp.synthetic.shot_table import ShotTensors
 from oasis_warp.synthetic.wardrobe import AWAY, bands, sleeves
 
 _LAST_JOINTS = (15, 3, 6, 12, 9)
 """Of thumb, index, middle, ring, little: they carry the tips."""
 
 
-class Posed(NamedTuple):
+class PosedPeople(NamedTuple):
     """A batch of dressed hands in the frames of their cameras [m]."""
 
     vertices: Float[Tensor, "B V 3"]
@@ -51,7 +51,7 @@ def _moved(rotations: Tensor, points: Tensor) -> Tensor:
     return (rotations * points[:, :, None]).sum(-1)
 
 
-def pose_people(body: Body, people: Sequence[Person], numbers: Numbers) -> Posed:
+def pose_people(body: Body, people: Sequence[Person], numbers: ShotTensors) -> PosedPeople:
     """Skin the hands with their pose correctives, grow arms, lay clothes on, and fit the cameras.
 
     Args:
@@ -94,7 +94,7 @@ def pose_people(body: Body, people: Sequence[Person], numbers: Numbers) -> Posed
     carriers = _carriers(rest.device)[hand.keypoint_index]
     carried = torch.cat([joints, tips], 1)[:, hand.keypoint_index]
     marks = _moved(numbers.rotations[:, carriers], carried) + numbers.shifts[:, carriers]
-    return Posed(
+    return PosedPeople(
         torch.cat(parts, 1),
         move(marks),
         translation,

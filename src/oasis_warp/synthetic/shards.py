@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.data.output_files import claim_folder, output_file
+from oasis_warp.data.output_files import open_resumable_folder, output_file
 from oasis_warp.synthetic.picture import SyntheticBatch, render_batch
-from oasis_warp.synthetic.shots import Scenery
+from oasis_warp.synthetic.shots import SceneConfig
 
 SHARD = 64
 """Pictures a file: a whole number of people."""
@@ -33,7 +33,7 @@ def shard_name(number: int) -> str:
 
 
 def write_shards(
-    folder: Path, *, count: int, seed: int, size: int, device: str, scenery: Scenery, settings: dict[str, Any],
+    folder: Path, *, count: int, seed: int, size: int, device: str, scenery: SceneConfig, settings: dict[str, Any],
     batch: int, progress: Progress = silent,
 ) -> int:  # fmt: skip
     """Render pictures 0 to `count` - 1 into shards of `folder`; those that are there already stay. How many were new.
@@ -55,7 +55,7 @@ def write_shards(
         InputError: the folder holds other pictures, or cannot be written.
     """
     described = {"seed": seed, "size": size, "shard": SHARD, **settings}
-    claim_folder(folder, DESCRIPTION, described, "pictures")
+    open_resumable_folder(folder, DESCRIPTION, described, "pictures")
     n_shards = -(-count // SHARD)
     made = 0
     for number in range(n_shards):

@@ -19,7 +19,7 @@ from oasis_warp.synthetic.contact import bundled_skeleton
 from oasis_warp.synthetic.furniture import MAX_SOLIDS, SOLID_WORDS
 from oasis_warp.synthetic.identity import Identity, Population
 from oasis_warp.synthetic.sensor import SENSOR_WORDS, sensor_row
-from oasis_warp.synthetic.shots import Scenery, Shot, identity_of, plan_shots
+from oasis_warp.synthetic.shots import SceneConfig, Shot, identity_of, sample_shots
 from oasis_warp.synthetic.view_and_light import N_LAMPS
 from oasis_warp.synthetic.wardrobe import SKIN_LOOK, ring_look
 
@@ -29,17 +29,17 @@ ARM_BEND = 0.15
 """Share of the forearm over which it bends at the wrist."""
 
 
-class Planned(NamedTuple):
+class ShotTable(NamedTuple):
     """B plans, as processes hand them over."""
 
     numbers: np.ndarray
-    """float32, a row a picture: see `Numbers`."""
+    """float32, a row a picture: see `ShotTensors`."""
     whole: np.ndarray
     """int64, [B, 4]: index, person, 1 for left hands, seed of whatever is drawn a pixel at a time."""
     gestures: tuple[str, ...]
 
 
-class Numbers(NamedTuple):
+class ShotTensors(NamedTuple):
     """What pictures are rendered from. A picture in even light has no room and no sensor: there all is 0."""
 
     angles: Float[Tensor, "B 15 3"]
@@ -84,7 +84,7 @@ class Numbers(NamedTuple):
 
 @functools.cache
 def _places() -> dict[str, tuple[slice, tuple[int, ...]]]:
-    """Columns and shape of each of `Numbers`."""
+    """Columns and shape of each of `ShotTensors`."""
     shapes: dict[str, tuple[int, ...]] = {
         "angles": (15, 3),
         "rotations": (16, 3, 3),
@@ -109,48 +109,50 @@ def _places() -> dict[str, tuple[slice, tuple[int, ...]]]:
         "sensor": (SENSOR_WORDS,),
     }
     places, start = {}, 0
-    for name in Numbers._fields:
+    for name in ShotTensors._fields:
         shape = shapes.get(name, ())
         end = start + math.prod(shape)
         places[name], start = (slice(start, end), shape), end
     return places
 
 
-def plan_table(seed: int, indices: Sequence[int], scenery: Scenery) -> Planned:
-    """`plan_shots` as tables."""
-    return tabulate(seed, plan_shots(seed, indices, scenery), scenery)
+def sample_table(seed: int, indices: Sequence[int], scenery: SceneConfig) -> ShotTable:
+    """`sample_shots` as tables."""
+    return tabulate(seed, sample_shots(seed, indices, scenery), scenery)
 
 
-def tabulate(seed: int, shots: Sequence[Shot], scenery: Scenery) -> Planned:
+def tabulate(seed: int, shots: Sequence[Shot], scenery: SceneConfig) -> ShotTable:
     """Shots as tables."""
     identities = [identity_of(seed, shot.person, scenery.population) for shot in shots]
     joints = np.stack([_joints(seed, shot.person, scenery.population) for shot in shots])
     columns = _columns(shots, identities, joints)
     places = _places()
-    numbers = np.empty((len(shots), places[Numbers._fields[-1]][0].stop), np.float32)
+    numbers = np.empty((len(shots), places[ShotTensors._fields[-1]][0].stop), np.float32)
     for name, (place, _) in places.items():
         numbers[:, place] = np.reshape(columns[name], (len(shots), -1)) if name in columns else 0
     whole = np.array([(s.index, s.person, s.side == "left", s.seed) for s in shots], np.int64)
-    return Planned(numbers, whole, tuple(s.gesture for s in shots))
+    return ShotTable(numbers, whole, tuple(s.gesture for s in shots))
 
 
-def joined(plans: Sequence[Planned]) -> Planned:
+def concatenate_tables(plans: Sequence[ShotTable]) -> ShotTable:
     """Several plans as one."""
     numbers, whole = (np.concatenate(tables) for tables in list(zip(*plans, strict=True))[:2])
-    return Planned(numbers, whole, tuple(itertools.chain.from_iterable(p.gestures for p in plans)))
+    return ShotTable(numbers, whole, tuple(itertools.chain.from_iterable(p.gestures for p in plans)))
 
 
-def plan_ahead(seed: int, blocks: Iterable[tuple[Sequence[int], Scenery]], workers: int) -> Iterator[Planned]:
-    """`plan_table` of each of `blocks` in turn, drawn ahead by `workers` processes where there are any."""
+def sample_tables_ahead(
+    seed: int, blocks: Iterable[tuple[Sequence[int], SceneConfig]], workers: int
+) -> Iterator[ShotTable]:
+    """`sample_table` of each of `blocks` in turn, drawn ahead by `workers` processes where there are any."""
     if workers < 1:
         for indices, scenery in blocks:
-            yield plan_table(seed, indices, scenery)
+            yield sample_table(seed, indices, scenery)
         return
     with worker_pool(workers) as pool:
         waiting: deque = deque()
         try:
             for indices, scenery in blocks:
-                waiting.append(pool.submit(plan_table, seed, indices, scenery))
+                waiting.append(pool.submit(sample_table, seed, indices, scenery))
                 if len(waiting) >= AHEAD * workers:
                     yield waiting.popleft().result()
             while waiting:
@@ -166,10 +168,10 @@ def send(tensor: Tensor, device: torch.device) -> Tensor:
     return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor.to(device)
 
 
-def numbers_of(planned: Planned, device: torch.device) -> Numbers:
+def shot_tensors(planned: ShotTable, device: torch.device) -> ShotTensors:
     """The numbers of `planned` on `device`, in one copy."""
     table = send(torch.from_numpy(planned.numbers), device)
-    return Numbers(**{name: table[:, place].view(-1, *shape) if shape else table[:, place.start]
+    return ShotTensors(**{name: table[:, place].view(-1, *shape) if shape else table[:, place.start]
                       for name, (place, shape) in _places().items()})  # fmt: skip
 
 
@@ -193,7 +195,7 @@ def arm_turns(bends: np.ndarray) -> np.ndarray:
 
 
 def _columns(shots: Sequence[Shot], identities: Sequence[Identity], joints: np.ndarray) -> dict[str, Any]:
-    """The fields of `Numbers` that are not 0."""
+    """The fields of `ShotTensors` that are not 0."""
     angles = np.stack([s.angles for s in shots])
     rotations, shifts = bundled_skeleton().transforms(angles, joints)
     flexion = angles[:, 1:, 0] + bundled_hand().rest_bend[1:].numpy()

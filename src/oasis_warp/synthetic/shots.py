@@ -41,7 +41,7 @@ EVERYBODY = Population()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scenery:
+class SceneConfig:
     """What pictures show, besides what the seed decides."""
 
     look: Look = "photo"
@@ -52,7 +52,7 @@ class Scenery:
     """Pictures to stand behind the hands (see `backgrounds.list_backgrounds`); rooms when empty."""
 
 
-PHOTOS = Scenery()
+PHOTOS = SceneConfig()
 
 
 class Shot(NamedTuple):
@@ -75,7 +75,7 @@ class Shot(NamedTuple):
     """Of whatever is drawn a pixel at a time."""
 
 
-def sample_shot(seed: int, index: int, scenery: Scenery = PHOTOS) -> Shot:
+def sample_shot(seed: int, index: int, scenery: SceneConfig = PHOTOS) -> Shot:
     """Draw picture `index` of the world `seed`; fingers may still sink in."""
     look, even = scenery.look, scenery.look == "even"
     rng = np.random.default_rng([seed, PICTURE_STREAM, index, even])
@@ -107,7 +107,7 @@ def identity_of(seed: int, number: int, population: Population) -> Identity:
     return sample_identity(bundled_body().hand, seed, number, population)
 
 
-def plan_shots(seed: int, indices: Sequence[int], scenery: Scenery = PHOTOS) -> list[Shot]:
+def sample_shots(seed: int, indices: Sequence[int], scenery: SceneConfig = PHOTOS) -> list[Shot]:
     """Pictures `indices` of the world `seed`, their fingers kept apart: each as if it were alone."""
     hand = bundled_body().hand
     shots = [sample_shot(seed, int(index), scenery) for index in indices]

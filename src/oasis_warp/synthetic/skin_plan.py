@@ -44,7 +44,7 @@ class Plaster(NamedTuple):
 
 
 class SkinPlan(NamedTuple):
-    """All that `bake.paint` needs to know of a person."""
+    """All that `skin_texture.bake_texture` needs to know of a person."""
 
     identity: Identity
     lines: Lines

@@ -15,13 +15,13 @@ from oasis_warp.synthetic.ops.surface_patterns import NoiseField, surface_dabs, 
 from oasis_warp.synthetic.skin_lines import THUMB
 from oasis_warp.synthetic.skin_plan import STAR, SkinPlan, Tattoo
 from oasis_warp.synthetic.spectrum import Tint, skin_colors
-from oasis_warp.synthetic.texels import Canvas, canvas_on, draw_lines
+from oasis_warp.synthetic.texels import Texels, draw_lines, texels_on
 
 _NEAR = 2.0
 """Distance to the outline up to which a nail shows in anything [mm]."""
 
 
-class Nails(NamedTuple):
+class NailMaps(NamedTuple):
     """Each texel's share, [N]."""
 
     plate: Tensor
@@ -59,8 +59,8 @@ def _labelled() -> np.ndarray:
     return np.array(rows)
 
 
-def grown_nails(canvas: Canvas, identity: Identity, shifts: np.ndarray) -> Nails:
-    """Nails as the identity has them, the root of each moved along its finger by `shifts` [5], in millimetres."""
+def nail_maps(texels: Texels, identity: Identity, shifts: np.ndarray) -> NailMaps:
+    """The nails as the identity has them, the root of each moved along its finger by `shifts` [5], in millimetres."""
     start, end, left, right = _labelled().T
     low = start - 1.2 + shifts
     high = end + 0.2 + 0.5 * identity.nail_length
@@ -69,9 +69,9 @@ def grown_nails(canvas: Canvas, identity: Identity, shifts: np.ndarray) -> Nails
         low, high, (right + left) / 2, (right - left) / 2 + identity.nail_width, np.where(size > 0.8, 1.3 * size, 0),
         high - max(0.45, 0.5 * identity.nail_length + 0.5),
     ])  # fmt: skip
-    device = canvas.points.device
-    of = _Outline(*torch.from_numpy(outline).float().to(device)[:, canvas.nail_fingers])
-    t, x = canvas.nail_places.unbind(1)
+    device = texels.points.device
+    of = _Outline(*torch.from_numpy(outline).float().to(device)[:, texels.nail_fingers])
+    t, x = texels.nail_places.unbind(1)
     center, reach, x = (of.high + of.low) / 2, (of.high - of.low) / 2, x - of.middle
     power = identity.nail_shape
     round_ = (x.abs() / of.half) ** power + ((t - center).abs() / reach) ** power
@@ -79,22 +79,22 @@ def grown_nails(canvas: Canvas, identity: Identity, shifts: np.ndarray) -> Nails
     plate = smoothstep(0.12, -0.12, distance)
     moon = torch.hypot(x * 0.75, t - of.low + reach * 0.1) - of.moon
     near = distance < _NEAR
-    values = torch.zeros(len(Nails._fields), len(canvas.points), device=device)
-    values[:, canvas.nails] = torch.stack([
+    values = torch.zeros(len(NailMaps._fields), len(texels.points), device=device)
+    values[:, texels.nails] = torch.stack([
         plate,
         (of.moon > 0) * plate * smoothstep(0.5, -0.3, moon),
         plate * smoothstep(-0.15, 0.3, t - of.edge + 0.03 * x**2),
         near * x / of.half,
         near * torch.exp(-(((distance - 0.15) / 0.3) ** 2)),
     ])  # fmt: skip
-    return Nails(*values)
+    return NailMaps(*values)
 
 
 OPAL, HORN, LUNULA = (0.75, 0.62, 0.52), (0.74, 0.68, 0.56), (0.72, 0.60, 0.53)
 """What shines in a nail's plate, its free edge, its moon: linear RGB."""
 
 
-class Marks(NamedTuple):
+class SkinMaps(NamedTuple):
     """What is on the skin of one person, [N] each."""
 
     palm: Float[Tensor, "N"]
@@ -103,7 +103,7 @@ class Marks(NamedTuple):
     """Strength of each of `strokes.KINDS`."""
     groove: Float[Tensor, "N"]
     """Of the lines in which blood shows and oil gathers."""
-    nails: Nails
+    nails: NailMaps
     spots: Float[Tensor, "N"]
     noise: dict[str, Tensor]
     """Fields of `bake`."""
@@ -114,11 +114,11 @@ def column(values: tuple[float, ...], like: Tensor) -> Float[Tensor, "3 1"]:
     return like.new_tensor(values)[:, None]
 
 
-def _pigments(canvas: Canvas, identity: Identity, marks: Marks) -> tuple[Tensor, Tensor]:
+def _pigments(texels: Texels, identity: Identity, maps: SkinMaps) -> tuple[Tensor, Tensor]:
     """Shares of melanin and blood."""
-    noise, line, palm = marks.noise, marks.line, marks.palm
+    noise, line, palm = maps.noise, maps.line, maps.palm
     back, m = 1 - palm, identity.melanin
-    knuckles = canvas.knuckle * back
+    knuckles = texels.knuckle * back
     palm_melanin = min(0.6 * m, 0.006 + 0.33 * m)
     melanin = m * (1 + (identity.tan - 1) * back) * back + palm_melanin * palm
     lattice = (noise["lattice_a"].abs() + noise["lattice_b"].abs()).clamp(0, 1)
@@ -127,23 +127,23 @@ def _pigments(canvas: Canvas, identity: Identity, marks: Marks) -> tuple[Tensor,
     melanin = melanin * (1 + (0.35 + 0.18 * identity.knuckles) * knuckles + 0.25 * line["fold"])
     pigmented = line["main"] + line["crease"] + 0.6 * line["minor"]  # dark palms have darker lines
     melanin = melanin + palm * pigmented * (0.05 * m + 0.35 * max(0.0, m - 0.06))
-    inner_arm = smoothstep(0.45, 0.75, canvas.palm) * (1 - canvas.hand)
-    melanin = melanin * (1 - 0.3 * inner_arm) + marks.spots * back * (0.03 + 0.5 * m)
+    inner_arm = smoothstep(0.45, 0.75, texels.palm) * (1 - texels.hand)
+    melanin = melanin * (1 - 0.3 * inner_arm) + maps.spots * back * (0.03 + 0.5 * m)
 
     blood = identity.blood * (
-        1 + 0.55 * palm + 1.1 * canvas.tip * (0.5 + 0.5 * palm) + 0.9 * knuckles + 0.35 * canvas.on_finger
+        1 + 0.55 * palm + 1.1 * texels.tip * (0.5 + 0.5 * palm) + 0.9 * knuckles + 0.35 * texels.on_finger
     )
-    pad = palm * (1 - canvas.on_finger)
+    pad = palm * (1 - texels.on_finger)
     blood = blood * (1 + identity.mottle * (0.42 * noise["flush"] + 0.45 * palm * noise["palm_flush"]) + 0.15 * pad)
     vein = line["vein"] * identity.veins
-    blood = blood * (1 + 0.55 * marks.groove.clamp(max=1.2) * (0.8 * palm + 0.2) + 0.2 * line["halo"])
+    blood = blood * (1 + 0.55 * maps.groove.clamp(max=1.2) * (0.8 * palm + 0.2) + 0.2 * line["halo"])
     return melanin, (blood * (1 - 0.25 * vein)).clamp_min(0.002)
 
 
-def skin_color(canvas: Canvas, identity: Identity, marks: Marks) -> Float[Tensor, "3 N"]:
+def skin_color(texels: Texels, identity: Identity, maps: SkinMaps) -> Float[Tensor, "3 N"]:
     """Linear reflectance of skin and bare nails."""
-    line, palm, m = marks.line, marks.palm, identity.melanin
-    melanin, blood = _pigments(canvas, identity, marks)
+    line, palm, m = maps.line, maps.palm, identity.melanin
+    melanin, blood = _pigments(texels, identity, maps)
     yellow, oxygen = 0.5 * identity.carotene, identity.oxygen
     horny = identity.carotene + 0.12 * (m < 0.08)
     color, palm_color = skin_colors(
@@ -153,15 +153,17 @@ def skin_color(canvas: Canvas, identity: Identity, marks: Marks) -> Float[Tensor
     (deep,) = skin_colors(melanin, 0.9 * blood, [Tint(0.15, identity.epidermis, yellow)])
     deep = deep * column((0.8, 0.95, 1.05), deep)
     color = color + (deep - color) * (0.5 * identity.veins * line["vein"] * (1 - palm)).clamp(0, 1)
-    color[:, canvas.nails] = _with_nails(color[:, canvas.nails], canvas, identity, marks)
+    color[:, texels.nails] = _with_nails(color[:, texels.nails], texels, identity, maps)
     dark = 0.40 * line["crease"] + 0.38 * line["main"] + 0.20 * line["minor"] + 0.09 * line["halo"]
     return color * torch.exp(-dark * column((0.75, 1.1, 1.15), dark))  # cavities: dark and warm
 
 
-def _with_nails(color: Float[Tensor, "3 M"], canvas: Canvas, identity: Identity, marks: Marks) -> Float[Tensor, "3 M"]:
-    """Colours of `Canvas.nails` with the nails on them."""
-    nails, m = Nails(*(share[canvas.nails] for share in marks.nails)), identity.melanin
-    blood = identity.blood * (1.6 + 0.3 * marks.noise["dry"][canvas.nails])
+def _with_nails(
+    color: Float[Tensor, "3 M"], texels: Texels, identity: Identity, maps: SkinMaps
+) -> Float[Tensor, "3 M"]:
+    """Colours of `Texels.nails` with the nails on them."""
+    nails, m = NailMaps(*(share[texels.nails] for share in maps.nails)), identity.melanin
+    blood = identity.blood * (1.6 + 0.3 * maps.noise["dry"][texels.nails])
     melanin = torch.full_like(blood, 0.62 * m + 0.004)
     (bed,) = skin_colors(melanin, blood, [Tint(identity.oxygen, identity.epidermis, 0.0)])
     bed = 0.94 * bed + 0.05 * column(OPAL, bed)
@@ -177,11 +179,11 @@ PLASTER, HAIR = (0.62, 0.42, 0.28), (0.30, 0.18, 0.09)
 """Linear RGB of a plaster, and of fair hair."""
 
 
-def ornamented(color: Float[Tensor, "3 N"], canvas: Canvas, plan: SkinPlan, marks: Marks) -> Float[Tensor, "3 N"]:
+def add_ornaments(color: Float[Tensor, "3 N"], texels: Texels, plan: SkinPlan, maps: SkinMaps) -> Float[Tensor, "3 N"]:
     """Tattoo, plaster, polish, hair, and the fold around the nails."""
-    plate, identity = marks.nails.plate, plan.identity
+    plate, identity = maps.nails.plate, plan.identity
     if plan.tattoo is not None:
-        ink = _ink(canvas.points, plan.tattoo, marks.noise["tattoo"]) * smoothstep(0.5, 0.3, canvas.palm)
+        ink = _ink(texels.points, plan.tattoo, maps.noise["tattoo"]) * smoothstep(0.5, 0.3, texels.palm)
         color = color * (1 - ink * column(INK, color))
     if identity.polish is not None:
         coat = column(identity.polish, color) * 0.8 + 0.02
@@ -189,16 +191,16 @@ def ornamented(color: Float[Tensor, "3 N"], canvas: Canvas, plan: SkinPlan, mark
     if plan.plaster is not None:
         finger, place, middle, shade = plan.plaster
         bone = bundled_body().bones[finger][place]
-        points = canvas.points
+        points = texels.points
         t = (points - points.new_tensor(bone.origin)) @ points.new_tensor(bone.along) - middle
         holes = torch.sin(points[:, 0] * 2.6) * torch.sin(points[:, 1] * 2.6 + points[:, 2] * 2.6) > 0.55
-        strip = (canvas.finger == finger) * smoothstep(9.2, 8.8, t.abs()) * (1 - 0.3 * holes)
+        strip = (texels.finger == finger) * smoothstep(9.2, 8.8, t.abs()) * (1 - 0.3 * holes)
         tan = column(PLASTER, color) * shade
         color = color + (tan - color) * strip
     if identity.hairs:
         hair = column(HAIR, color) * (1 - identity.hair_melanin) ** 1.5 + 0.02
-        color = color + (hair - color) * (0.75 * marks.line["hair"] * (1 - plate)).clamp(0, 1)
-    color = color * (1 - 0.30 * marks.nails.rim * column((0.7, 1.0, 1.05), color))
+        color = color + (hair - color) * (0.75 * maps.line["hair"] * (1 - plate)).clamp(0, 1)
+    color = color * (1 - 0.30 * maps.nails.rim * column((0.7, 1.0, 1.05), color))
     return color.clamp(0.003, 0.9)
 
 
@@ -241,62 +243,62 @@ PALM_NOISES = ("palm_flush", "ridge")
 """Of the fine ones: shown on the palm alone, 0 where nobody has it."""
 
 
-def _noises(canvas: Canvas, rest: Float[Tensor, "K 3"], identity: Identity) -> dict[str, Tensor]:
+def _noises(texels: Texels, rest: Float[Tensor, "K 3"], identity: Identity) -> dict[str, Tensor]:
     def fields(table: dict[str, tuple[float, int]], names: Sequence[str], seed: int) -> list[NoiseField]:
         numbers = {name: k for k, name in enumerate(table)}
         return [NoiseField(table[name][0], seed + 97 * numbers[name], table[name][1]) for name in names]
 
     seed = identity.seed
-    coarse = canvas.spread(surface_noise(rest, fields(COARSE_NOISES, tuple(COARSE_NOISES), seed)))
+    coarse = texels.spread(surface_noise(rest, fields(COARSE_NOISES, tuple(COARSE_NOISES), seed)))
     everywhere = [n for n in FINE_NOISES if n not in PALM_NOISES and (n != "tattoo" or identity.tattoo)]
-    fine = surface_noise(canvas.points, fields(FINE_NOISES, everywhere, seed + 5000))
-    palmar = torch.zeros(len(PALM_NOISES), len(canvas.points), device=canvas.points.device)
-    palmar[:, canvas.palmar] = surface_noise(canvas.palmar_points, fields(FINE_NOISES, PALM_NOISES, seed + 5000))
+    fine = surface_noise(texels.points, fields(FINE_NOISES, everywhere, seed + 5000))
+    palmar = torch.zeros(len(PALM_NOISES), len(texels.points), device=texels.points.device)
+    palmar[:, texels.palmar] = surface_noise(texels.palmar_points, fields(FINE_NOISES, PALM_NOISES, seed + 5000))
     return dict(zip((*COARSE_NOISES, *everywhere, *PALM_NOISES), (*coarse, *fine, *palmar), strict=True))
 
 
-def _spots(canvas: Canvas, plan: SkinPlan) -> Float[Tensor, "N"]:
+def _spots(texels: Texels, plan: SkinPlan) -> Float[Tensor, "N"]:
     """Freckles and moles: strength of pigment."""
     if not len(plan.spots):
-        return torch.zeros_like(canvas.palm)
-    spots = torch.from_numpy(plan.spots).float().to(canvas.points.device)
+        return torch.zeros_like(texels.palm)
+    spots = torch.from_numpy(plan.spots).float().to(texels.points.device)
     kinds = torch.zeros(len(spots), dtype=torch.int32, device=spots.device)
-    return surface_dabs(canvas.grid, spots[:, :3], spots[:, 3], spots[:, 4], kinds, 1, flat=True)[0]
+    return surface_dabs(texels.grid, spots[:, :3], spots[:, 3], spots[:, 4], kinds, 1, flat=True)[0]
 
 
-def _marks(canvas: Canvas, plan: SkinPlan, noise: dict[str, Tensor]) -> Marks:
+def _marks(texels: Texels, plan: SkinPlan, noise: dict[str, Tensor]) -> SkinMaps:
     """Everything that random numbers decide but paint."""
-    line = draw_lines(plan.lines, canvas.grid)
-    nails = grown_nails(canvas, plan.identity, plan.nail_shifts)
-    palm = smoothstep(0.28, 0.80, canvas.palm + 0.08 * noise["palm_edge"])
-    palm = palm * smoothstep(9.0, -9.0, canvas.points[:, 0] + 3 * noise["wrist_edge"])
-    line["crease"] = line["crease"] * smoothstep(0.28, 0.5, canvas.palm + 0.1 * canvas.hand)
+    line = draw_lines(plan.lines, texels.grid)
+    nails = nail_maps(texels, plan.identity, plan.nail_shifts)
+    palm = smoothstep(0.28, 0.80, texels.palm + 0.08 * noise["palm_edge"])
+    palm = palm * smoothstep(9.0, -9.0, texels.points[:, 0] + 3 * noise["wrist_edge"])
+    line["crease"] = line["crease"] * smoothstep(0.28, 0.5, texels.palm + 0.1 * texels.hand)
     for kind in ("main", "minor", "halo", "wrinkle"):
         line[kind] = line[kind] * palm
     line["fold"] = line["fold"] * (1 - palm) * (1 - nails.plate)
     groove = line["crease"] + line["main"] + 0.7 * line["minor"]
-    return Marks(palm, line, groove, nails, _spots(canvas, plan), noise)
+    return SkinMaps(palm, line, groove, nails, _spots(texels, plan), noise)
 
 
 @torch.no_grad()
-def paint(plan: SkinPlan, device: str) -> Float[Tensor, "H W 8"]:
+def bake_texture(plan: SkinPlan, device: str) -> Float[Tensor, "H W 8"]:
     """The texture of the person that was planned, `CHANNELS`, float16, made on the device."""
-    canvas, identity = canvas_on(device), plan.identity
-    noise = _noises(canvas, body_on(device).rest, identity)
-    marks = _marks(canvas, plan, noise)
-    color = ornamented(skin_color(canvas, identity, marks), canvas, plan, marks)
-    palm, plate, gloss = marks.palm, marks.nails.plate, noise["gloss"]
-    roughness = identity.roughness + 0.05 * gloss + 0.04 * palm - 0.06 * canvas.tip * palm
+    texels, identity = texels_on(device), plan.identity
+    noise = _noises(texels, body_on(device).rest, identity)
+    maps = _marks(texels, plan, noise)
+    color = add_ornaments(skin_color(texels, identity, maps), texels, plan, maps)
+    palm, plate, gloss = maps.palm, maps.nails.plate, noise["gloss"]
+    roughness = identity.roughness + 0.05 * gloss + 0.04 * palm - 0.06 * texels.tip * palm
     shine = 0.16 + 0.2 * identity.gloss if identity.polish is not None else 0.32
     roughness = roughness * (1 - plate) + plate * shine
-    oil = identity.oil * (1 + 0.25 * gloss) * (1 - 0.35 * marks.groove.clamp(0, 1)) * (1 - plate) + plate * 1.15
-    channels = [*color, *_relief(canvas, identity, marks), roughness.clamp(0.12, 0.9), oil.clamp(0.05, 1.5)]
-    return canvas.image(torch.stack([channel.half() for channel in channels], 1))
+    oil = identity.oil * (1 + 0.25 * gloss) * (1 - 0.35 * maps.groove.clamp(0, 1)) * (1 - plate) + plate * 1.15
+    channels = [*color, *_relief(texels, identity, maps), roughness.clamp(0.12, 0.9), oil.clamp(0.05, 1.5)]
+    return texels.image(torch.stack([channel.half() for channel in channels], 1))
 
 
-def _relief(canvas: Canvas, identity: Identity, marks: Marks) -> tuple[Tensor, Tensor, Tensor]:
+def _relief(texels: Texels, identity: Identity, maps: SkinMaps) -> tuple[Tensor, Tensor, Tensor]:
     """Heights [mm]: what stays, what flattens under stretch, what rises when squeezed."""
-    palm, line, nails, noise = marks.palm, marks.line, marks.nails, marks.noise
+    palm, line, nails, noise = maps.palm, maps.line, maps.nails, maps.noise
     back, plate = 1 - palm, nails.plate
     bare = 1 - plate
     lattice = (noise["lattice_a"].abs() + 0.7 * noise["lattice_b"].abs()).clamp(0, 1)
@@ -304,7 +306,7 @@ def _relief(canvas: Canvas, identity: Identity, marks: Marks) -> tuple[Tensor, T
     height = -(0.50 * line["crease"] + 0.48 * line["main"] + 0.28 * line["minor"]) - 0.28 * line["halo"]
     height = height + texture + 0.13 * noise["lumps"] * (1 - 0.6 * plate)
     height = height + (0.03 + 0.04 * identity.dryness) * noise["dry"] * bare
-    toward_wrist = 0.25 + 0.75 * (canvas.on_finger < 0.5)
+    toward_wrist = 0.25 + 0.75 * (texels.on_finger < 0.5)
     height = height + back * toward_wrist * (
         0.15 * identity.tendons * line["tendon"] + 0.6 * identity.veins * line["vein"]
     )

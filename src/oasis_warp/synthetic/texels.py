@@ -22,7 +22,7 @@ WRIST_EDGE = 14.0
 """Distance behind the wrist beyond which none does [mm]."""
 
 
-class Canvas(NamedTuple):
+class Texels(NamedTuple):
     """The N texels that show skin; lengths in millimetres. Shares are 0 to 1."""
 
     points: Float[Tensor, "N 3"]
@@ -48,9 +48,9 @@ class Canvas(NamedTuple):
     fill: Int[Tensor, "H W"]
     grid: PointGrid
 
-    def to(self, device: torch.device | str) -> "Canvas":
-        """The same canvas on another device."""
-        return Canvas(*(value.to(device) for value in self))
+    def to(self, device: torch.device | str) -> "Texels":
+        """The same texels on another device."""
+        return Texels(*(value.to(device) for value in self))
 
     def spread(self, values: Float[Tensor, "C K"]) -> Float[Tensor, "C N"]:
         """Values of the vertices of hand and forearm, interpolated at the texels."""
@@ -62,7 +62,7 @@ class Canvas(NamedTuple):
         return values[self.fill]
 
 
-def _canvas(atlas: Atlas) -> Canvas:
+def _build_texels(atlas: Atlas) -> Texels:
     points, finger = atlas.points, atlas.finger
     tip, knuckle = torch.zeros(len(points)), torch.zeros(len(points))
     nails, places = [], []
@@ -85,7 +85,7 @@ def _canvas(atlas: Atlas) -> Canvas:
                 places.append(local[nails[-1], :2])
     x = points[:, 0]
     palmar = torch.nonzero((atlas.palm > PALM_EDGE) & (x < WRIST_EDGE))[:, 0]
-    return Canvas(
+    return Texels(
         points=points,
         palm=atlas.palm,
         hand=smoothstep(6.0, -6.0, x),
@@ -106,9 +106,9 @@ def _canvas(atlas: Atlas) -> Canvas:
 
 
 @functools.cache
-def canvas_on(device: str) -> Canvas:
-    """The canvas of `bundled_atlas` on a device: seconds the first time."""
-    return _canvas(bundled_atlas()) if device == "cpu" else canvas_on("cpu").to(device)
+def texels_on(device: str) -> Texels:
+    """The texels of `bundled_atlas` on a device: seconds the first time."""
+    return _build_texels(bundled_atlas()) if device == "cpu" else texels_on("cpu").to(device)
 
 
 _FAINT = 1e-3

@@ -18,7 +18,7 @@ from oasis_warp.pretraining.hand_batch import pose_hands
 from oasis_warp.pretraining.training_batch import (
     CROP_MARGIN,
     EstimatorNoise,
-    Photographed,
+    LabelledPictures,
     crop_to_mask,
     training_batch,
 )
@@ -80,7 +80,7 @@ def overlap(hand, vertices, K, mask):
 
 def test_many_hands_are_posed_as_one_by_one(hand, pictures):
     photos, _ = pictures
-    assert isinstance(photos, Photographed)
+    assert isinstance(photos, LabelledPictures)
     out = pose_hands(hand, photos.shape, photos.angles, photos.orientation, photos.translation)
     for k in range(3):
         rest = rest_hand(hand, photos.shape[k])
