@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
@@ -25,7 +26,6 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.reconstruction import crop_hand, initial_offsets, make_avatar
-from oasis_warp.render.cameras import orbit_camera
 
 UNSEEN = (90, 180)
 """Where the hand is looked at from, beside the photo's own view [degrees]."""

@@ -22,6 +22,7 @@ from torch.nn.functional import avg_pool2d
 
 from oasis_warp import __version__
 from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.avatar.anchors import faces_of_vertices
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
@@ -36,7 +37,6 @@ from oasis_warp.evaluation.metrics import Truth, match_colors, score
 from oasis_warp.evaluation.synthetic import crop_of, draw_targets
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.image import masked_psnr
-from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.prior import NetworkPrior, choose_prior
 from oasis_warp.render.render import render
 

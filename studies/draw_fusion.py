@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import HandPose
 from oasis_warp.data.photo import read_photo
@@ -22,7 +23,6 @@ from oasis_warp.fusion import reconstruct_same_hand
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.reconstruction import CROP_MARGIN, reconstruct
-from oasis_warp.render.cameras import orbit_camera
 
 TILE = 224
 """Side of a picture [px]."""

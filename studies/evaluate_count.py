@@ -3,7 +3,7 @@
     python studies/evaluate_count.py tests/data/photos/back_flat_right_04.jpg tests/data/photos/palm_open_left_02.png
 
 Each photo is scaled down until the square around its hand has 64, 96, ... pixels, and made into an avatar with a
-Gaussian on every vertex and face, and with those of vertices alone (`avatar.coarsen`). Prints the table of
+Gaussian on every vertex and face, and with those of vertices alone (`avatar.densify`). Prints the table of
 docs/detail.md: likeness to the photo at its own size, away from the outline; likeness of the second avatar to the first
 in other poses, and the area that it covers more than that; frames of 512 px in times of the first's. Then, of the last
 usual avatar, how many Gaussians never count for more than so much of any pixel of 384 px in all named poses from 24
@@ -21,8 +21,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.adaptation.views import view_weights
-from oasis_warp.avatar.coarsen import coarsen
+from oasis_warp.avatar.densify import coarsen
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, Photo
 from oasis_warp.data.photo import read_photo
@@ -33,7 +33,7 @@ from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.reconstruction import crop_hand, crop_side, initial_offsets, input_errors, make_avatar
-from oasis_warp.render.cameras import orbit_camera
+from oasis_warp.render.render import view_weights
 
 SIZES = (64, 96, 128, 192)
 POSES, ROUND, FAR, NEAR = ("open", "fist", "point"), 4, 256, 512

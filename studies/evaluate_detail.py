@@ -25,7 +25,7 @@ from torch import Tensor
 
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.cli.summary import Panel, make_sheet, panel_side
-from oasis_warp.core.camera import project
+from oasis_warp.core.camera import crop_camera, project
 from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.mirror import mirror_camera
 from oasis_warp.core.rotation import from_axis_angle
@@ -37,7 +37,6 @@ from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import depth_map
 from oasis_warp.reconstruction import CROP_MARGIN, Reconstruction, crop_hand, detail_size, reconstruct
-from oasis_warp.render.cameras import crop_camera
 
 PHOTOS = (
     "synthetic:2", "synthetic:7", "back_flat_right_04.jpg", "palm_open_left_02.png", "small_pointing_right_13.jpg"

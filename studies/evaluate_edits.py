@@ -33,6 +33,7 @@ from painted_truth import (
 )
 
 from oasis_warp.cli.summary import GROUND, Panel, make_sheet, panel_side
+from oasis_warp.core.camera import crop_camera, orbit_camera
 from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.types import Camera, HandPose, Photo
 from oasis_warp.data.pictures import to_uint8
@@ -43,7 +44,6 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
-from oasis_warp.render.cameras import crop_camera, orbit_camera
 
 AROUND = 0.002
 """What is edited with the paint: Gaussians are replaced a face beyond it [m]."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.fuse import fuse
-from oasis_warp.adaptation.sightings import look
+from oasis_warp.adaptation.reliability import look
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit

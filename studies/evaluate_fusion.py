@@ -23,8 +23,8 @@ import numpy as np
 import torch
 
 from oasis_warp.adaptation.fuse import fuse
-from oasis_warp.avatar.lighting import in_even_light
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.anchors import faces_of_vertices
+from oasis_warp.avatar.pose import in_even_light, pose_gaussians
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
@@ -46,7 +46,6 @@ from oasis_warp.evaluation.synthetic import crop_of
 from oasis_warp.fusion import crop_hands, fit_surfaces, fit_together, resolutions, settle_surfaces, with_detail
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
 from oasis_warp.pretraining.training_batch import training_batch

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 import torch
 
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
@@ -33,7 +34,6 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.reconstruction import crop_hand, reconstruct
-from oasis_warp.render.cameras import orbit_camera
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".webp"}
 TILE = 192

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.avatar.anchors import faces_of_vertices
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.camera import project
@@ -44,7 +45,6 @@ from oasis_warp.evaluation.metrics import Truth, match_colors, score
 from oasis_warp.evaluation.synthetic import crop_of
 from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import depth_map, depth_visibility
 from oasis_warp.pretraining.training_batch import EstimatorNoise, training_batch

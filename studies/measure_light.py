@@ -14,9 +14,8 @@ from torch import Tensor
 
 from oasis_warp.adaptation.adapt import in_photo
 from oasis_warp.adaptation.calibrate import calibrate
-from oasis_warp.avatar.lighting import GAMMA, posed_normals
 from oasis_warp.avatar.observation import observe
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.pose import GAMMA, pose_gaussians, posed_normals
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera

@@ -1,4 +1,4 @@
-"""What of that which a photo shows of a hand is found again on other photos of it: the constants of skin_or_shade.
+"""What of that which a photo shows of a hand is found again on other photos of it: the constants of sh_lighting.
 
     python studies/measure_persistence.py tests/data/photos/same_hand --jobs 2
 
@@ -19,12 +19,11 @@ import torch
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import adapt, remove_photo_light
-from oasis_warp.adaptation.albedo_shading import MOST, marks
 from oasis_warp.adaptation.inpainting import inpaint
-from oasis_warp.adaptation.sh_lighting import DARK
+from oasis_warp.adaptation.sh_lighting import DARK, MOST, marks
 from oasis_warp.avatar.anchors import vertex_colors
-from oasis_warp.avatar.lighting import with_shade_baked
 from oasis_warp.avatar.observation import observe
+from oasis_warp.avatar.pose import with_shade_baked
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo

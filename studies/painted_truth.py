@@ -18,7 +18,7 @@ from torch.nn.functional import grid_sample
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.prior import Prior
-from oasis_warp.core.camera import project
+from oasis_warp.core.camera import orbit_camera, project
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo
@@ -28,7 +28,6 @@ from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
 from oasis_warp.reconstruction import crop_hand, reconstruct
-from oasis_warp.render.cameras import orbit_camera
 
 KINDS = ("tattoo", "writing", "ring", "nail polish")
 SAMPLES = 4

@@ -23,9 +23,9 @@ from oasis_warp.evaluation.ablation import ablation_table, as_markdown, heading
 from oasis_warp.evaluation.columns import COLORS
 from oasis_warp.evaluation.methods import RAW, Method
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate
+from oasis_warp.network.attention import VisibilityAttention
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior, choose_prior
-from oasis_warp.network.vpia import VisibilityAttention
 
 FULL = "full"
 LIGHT = "studio"

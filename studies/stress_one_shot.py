@@ -20,6 +20,7 @@ import torch
 from named_photos import photo_of
 from stresses import STRESSES, Stressed, write_keypoints
 
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians
@@ -29,7 +30,6 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.reconstruction import Reconstruction, reconstruct
-from oasis_warp.render.cameras import orbit_camera
 
 SYNTHETIC_SIZE = 512
 VIEW_SIZE = 256

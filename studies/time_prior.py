@@ -16,12 +16,12 @@ from pathlib import Path
 
 import torch
 
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.types import HandCrop, HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import NetworkPrior, choose_prior
-from oasis_warp.render.cameras import orbit_camera
 
 WARM_UP = 3
 SIZE = 256

@@ -27,12 +27,12 @@ import torch
 
 from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import INSET
+from oasis_warp.avatar.observation import input_of_batch
 from oasis_warp.core import surface
 from oasis_warp.evaluation.columns import COLORS, GROUPS, LIGHTS, SYNTHETIC, cells, markdown
 from oasis_warp.evaluation.held_out import FIRST_PERSON, Shoot, as_estimated, photograph
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.prior import BUNDLED
 from oasis_warp.network.weights_file import load_network, read_header
 

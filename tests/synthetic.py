@@ -4,10 +4,10 @@ import torch
 
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
-from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.render.render import render
 
 PALM_TO_CAMERA = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # fingers up, thumb to the right

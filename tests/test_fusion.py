@@ -9,6 +9,7 @@ from torch.nn.functional import avg_pool2d
 
 from oasis_warp import fusion
 from oasis_warp.avatar.observation import inner_mask
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Landmarks, Photo
@@ -16,7 +17,6 @@ from oasis_warp.data.photo import read_photo
 from oasis_warp.fusion import check_sides, reconstruct_same_hand
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.reconstruction import composite_over_photo, crop_hand, make_avatar, reconstruct
-from oasis_warp.render.cameras import orbit_camera
 
 PHOTOS = Path(__file__).parent / "data" / "photos"
 WOOD = PHOTOS / "same_hand" / "a1_wood_right"

@@ -17,9 +17,9 @@ from typing import Any
 import torch
 from torch.profiler import ProfilerActivity, profile
 
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map, depth_visibility
-from oasis_warp.render.cameras import orbit_camera
 
 CALLS, REPLAYS, GROUPS = 10, 20, 9
 SIZES = (224, 448, 1024, 4096)

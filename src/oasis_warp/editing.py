@@ -9,7 +9,8 @@ from torch import Tensor
 
 from oasis_warp.adaptation.repaint import repaint
 from oasis_warp.adaptation.reprojection import Canvas
-from oasis_warp.avatar.lighting import shading_picture
+from oasis_warp.avatar.pose import shading_picture
+from oasis_warp.core.camera import crop_camera
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
@@ -21,7 +22,6 @@ from oasis_warp.hand.skinning import skin
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import warm_up
-from oasis_warp.render.cameras import crop_camera
 
 OTHER_PHOTO = 0.06
 """Median colour difference between avatar and photo from which this is not the photo that the avatar was made from."""

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.fuse import Fusion, add_detail, fuse
-from oasis_warp.adaptation.sightings import VertexObservations
-from oasis_warp.avatar.coarsen import coarsen
+from oasis_warp.adaptation.reliability import VertexObservations
+from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.avatar.quality import (
     SEEN,

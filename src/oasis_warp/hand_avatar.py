@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.lighting import in_even_light
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.pose import in_even_light, pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.checks import check_shape

@@ -12,10 +12,11 @@ from torch import Tensor
 from oasis_warp.adaptation.adapt import adapt, detail_of
 from oasis_warp.adaptation.sharpen import sharpen
 from oasis_warp.avatar.anchors import PRIOR_SIZE, inset_offsets
-from oasis_warp.avatar.coarsen import coarsen
+from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.avatar.quality import SurfaceQuality, assess_surface, coverage_warnings, photo_warnings, shares
+from oasis_warp.core.camera import crop_camera
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
@@ -36,7 +37,6 @@ from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
-from oasis_warp.render.cameras import crop_camera
 
 CROP_MARGIN = 1.12
 """Side of the crop over the longer extent of the mask."""

@@ -4,10 +4,10 @@ import pytest
 import torch
 from synthetic import crop_of
 
-from oasis_warp.adaptation.albedo_shading import STAYS, marks, split_albedo_shading
+from oasis_warp.adaptation.sh_lighting import STAYS, marks, split_albedo_shading
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.lighting import factors, posed_normals
+from oasis_warp.avatar.pose import factors, posed_normals
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.types import HandLight
 

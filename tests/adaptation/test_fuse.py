@@ -6,7 +6,7 @@ from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, crop_of
 
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.fuse import fuse
-from oasis_warp.adaptation.sightings import look, photo_gains
+from oasis_warp.adaptation.reliability import look, photo_gains
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.mixture import mix_guesses
 from oasis_warp.avatar.pose import pose_gaussians

@@ -5,7 +5,7 @@ import torch
 from synthetic import crop_of
 
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.adaptation.light import SKIN_DEVIATION, weighted_deviation
+from oasis_warp.adaptation.sh_lighting import SKIN_DEVIATION, weighted_deviation
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import observe

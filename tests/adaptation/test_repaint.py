@@ -4,8 +4,7 @@ from painted_truth import Chart, draw_truth, make_truth
 
 from oasis_warp.adaptation.repaint import repaint
 from oasis_warp.adaptation.reprojection import Canvas
-from oasis_warp.avatar.lighting import with_shade_baked
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.pose import pose_gaussians, with_shade_baked
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.types import Camera

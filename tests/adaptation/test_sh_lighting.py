@@ -9,9 +9,8 @@ from synthetic import crop_of
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.sh_lighting import fit_light, with_shade, without_light
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.lighting import in_even_light, posed_normals, shading, split_shade, turn_light
 from oasis_warp.avatar.observation import observe
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.pose import in_even_light, pose_gaussians, posed_normals, shading, split_shade, turn_light
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.config import AdaptConfig

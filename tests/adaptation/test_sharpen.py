@@ -8,15 +8,14 @@ from torch.nn.functional import avg_pool2d
 from oasis_warp.adaptation.reprojection import Canvas, look
 from oasis_warp.adaptation.sharpen import FACING, sharpen
 from oasis_warp.avatar.anchors import RIM_FADE
-from oasis_warp.avatar.lighting import with_shade_baked
 from oasis_warp.avatar.observation import inner_mask
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.pose import pose_gaussians, with_shade_baked
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import surface
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.types import Camera, HandCrop
 from oasis_warp.hand.skinning import skin
 from oasis_warp.losses.image import masked_psnr
-from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.render.render import render
 
 SIZE, WRIST = 512, 0.03

@@ -1,8 +1,15 @@
 import pytest
 import torch
 
-from oasis_warp.avatar.appearance import REGION_NAMES, label_regions, region_colors, region_masks
-from oasis_warp.avatar.skin_tone import BLOOD, MELANIN, skin_color
+from oasis_warp.avatar.appearance import (
+    BLOOD,
+    MELANIN,
+    REGION_NAMES,
+    label_regions,
+    region_colors,
+    region_masks,
+    skin_color,
+)
 
 
 def luminance(colors):

@@ -3,15 +3,14 @@ import torch
 from synthetic import crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.coarsen import coarsen
-from oasis_warp.avatar.densify import densify
+from oasis_warp.avatar.densify import coarsen, densify
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import skin
 from oasis_warp.losses.image import masked_psnr
-from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.render.render import render
 
 

@@ -5,9 +5,9 @@ from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.densify import GROUND_DEPTH, densify, parts_for_spacing, read_at
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.hand.skinning import rest_hand
 from oasis_warp.losses.image import masked_psnr
-from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.render.render import render
 
 

@@ -5,9 +5,9 @@ import torch
 
 from oasis_warp.cli import main
 from oasis_warp.cli.animate import pose_frames, turntable
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.logging import silent
 from oasis_warp.data.pictures import to_uint8
-from oasis_warp.render.cameras import orbit_camera
 
 LOOK = {"elevation": 0.0, "background": (1.0, 1.0, 1.0), "progress": silent}
 

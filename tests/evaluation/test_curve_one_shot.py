@@ -6,7 +6,7 @@ import curve_one_shot as curve
 import torch
 from synthetic import crop_of
 
-from oasis_warp.avatar.lighting import GAMMA
+from oasis_warp.avatar.pose import GAMMA
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.camera import project
 from oasis_warp.core.types import HandLight

@@ -6,6 +6,8 @@ import pytest
 import torch
 from synthetic import posed_hand
 
+from oasis_warp.avatar.anchors import faces_of_vertices
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.evaluation.held_out import (
     FIRST_PERSON,
@@ -17,9 +19,7 @@ from oasis_warp.evaluation.held_out import (
     photograph,
     true_targets,
 )
-from oasis_warp.network.anchors import faces_of_vertices
 from oasis_warp.ops import depth_map
-from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.synthetic.identity import sample_identity
 
 CPU = torch.device("cpu")

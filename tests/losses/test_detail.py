@@ -1,6 +1,6 @@
 import torch
 
-from oasis_warp.losses.detail import detail_difference
+from oasis_warp.losses.image import detail_difference
 
 
 def pictures(seed=0):

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import torch
 
+from oasis_warp.avatar.observation import NetworkInput
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.inputs import NetworkInput
 
 
 def main():

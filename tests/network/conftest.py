@@ -4,10 +4,10 @@ import pytest
 import torch
 from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, crop_of
 
+from oasis_warp.avatar.observation import NetworkInput, input_of_crop
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.inputs import NetworkInput, input_of_crop
 
 
 @pytest.fixture(scope="session")

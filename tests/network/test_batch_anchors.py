@@ -3,15 +3,12 @@
 import pytest
 import torch
 
-from oasis_warp.avatar.anchors import OPACITY, place_anchors
+from oasis_warp.avatar.anchors import OPACITY, batch_anchors, faces_of_vertices, place_anchors
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.observation import observe
-from oasis_warp.avatar.prior import MeanPrior, estimate_melanin
+from oasis_warp.avatar.observation import observe, sight
+from oasis_warp.avatar.prior import MeanHands, MeanPrior, estimate_melanin
 from oasis_warp.core import rotation
 from oasis_warp.hand.skinning import rest_hand
-from oasis_warp.network.anchors import batch_anchors, faces_of_vertices
-from oasis_warp.network.mean_hand import MeanHands
-from oasis_warp.network.observation import sight
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from oasis_warp.core import surface
-from oasis_warp.network.coarse import place_coarse_points, to_coarse, to_fine
-from oasis_warp.network.refinement import CoarseLevel, Refinement
+from oasis_warp.network.refinement import CoarseLevel, Refinement, place_coarse_points, to_coarse, to_fine
 
 
 @pytest.fixture(scope="module")

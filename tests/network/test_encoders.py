@@ -5,9 +5,7 @@ import torch
 from safetensors.torch import save_file
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.network import dinov2
-from oasis_warp.network.convolutional import ConvolutionalEncoder
-from oasis_warp.network.dinov2 import DinoV2Encoder, Size
+from oasis_warp.network.encoders import SIZES, ConvolutionalEncoder, DinoV2Encoder, Size
 
 
 @pytest.fixture
@@ -19,7 +17,7 @@ def photo(random):
 
 @pytest.fixture
 def small_dino(monkeypatch):
-    monkeypatch.setitem(dinov2.SIZES, "dinov2-small", Size(32, 2, 2))
+    monkeypatch.setitem(SIZES, "dinov2-small", Size(32, 2, 2))
     torch.manual_seed(0)
     return DinoV2Encoder("dinov2-small", 56)
 

@@ -7,13 +7,13 @@ import torch
 
 from oasis_warp.avatar.anchors import OPACITY
 from oasis_warp.core import rotation
-from oasis_warp.network.feature_on_mesh import FeatureOnMesh
 from oasis_warp.network.heads import (
     FACE_LIMITS,
     FACE_OUTPUTS,
     MAX_OFFSET,
     VERTEX_LIMITS,
     VERTEX_OUTPUTS,
+    FeatureOnMesh,
     GaussianHead,
     decode,
     decode_offsets,

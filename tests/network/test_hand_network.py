@@ -10,10 +10,9 @@ from typing import NamedTuple
 import pytest
 import torch
 
+from oasis_warp.avatar.observation import NetworkInput, sight
 from oasis_warp.network.config import COMPACT, PAPER, NetworkConfig
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.inputs import NetworkInput
-from oasis_warp.network.observation import sight
 
 SWITCHES = {
     "vet": ("no_aggr", "mlp", "off"),

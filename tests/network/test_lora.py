@@ -11,8 +11,16 @@ from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.evaluation.methods import ask
-from oasis_warp.network.heads import FACE_OUTPUTS, TRUST, VERTEX_OUTPUTS, GaussianHead, decode_colors
-from oasis_warp.network.lora import cache_head, head_colors, zero_updates
+from oasis_warp.network.heads import (
+    FACE_OUTPUTS,
+    TRUST,
+    VERTEX_OUTPUTS,
+    GaussianHead,
+    cache_head,
+    decode_colors,
+    head_colors,
+    zero_updates,
+)
 from oasis_warp.network.prior import NetworkPrior, guess_with_heads
 
 LORA = AdaptConfig(texture="lora", lora_rank=4, texture_steps=4, reference_views=2)

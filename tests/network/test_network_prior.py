@@ -12,6 +12,7 @@ import torch
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import OPACITY, RIM_FADE
+from oasis_warp.avatar.observation import input_of_crop
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core import rotation
@@ -19,15 +20,17 @@ from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network import prior as home
-from oasis_warp.network.inputs import input_of_crop
 from oasis_warp.network.prior import (
+    RIM_FIRST,
+    RIM_LAST,
     NetworkPrior,
     all_gaussians,
     bundled_prior,
     canonical_gaussians,
     choose_prior,
+    settle_rim,
+    spread_to_rim,
 )
-from oasis_warp.network.rim import FIRST, LAST, settle_rim, spread_to_rim
 from oasis_warp.network.weights_file import read_header, save_network
 from oasis_warp.render.render import render
 
@@ -68,7 +71,7 @@ def test_an_untrained_network_is_the_mean_prior(untrained, hand, crops, which):
     rest = crops[which].rest.vertices
     from_rim = torch.cdist(rest, rest[hand.rim]).amin(1)
     from_rim = torch.cat([from_rim[mean.vertex_index], from_rim[hand.faces[mean.face_index]].amin(1)])
-    beyond = from_rim >= LAST * RIM_FADE
+    beyond = from_rim >= RIM_LAST * RIM_FADE
     torch.testing.assert_close(ours.colors[beyond], mean.colors[beyond], atol=2e-3, rtol=0)
     error = (covariances(ours) - covariances(mean)).abs().amax((1, 2)) / covariances(mean).abs().amax((1, 2))
     assert float(error.max()) < 2e-5
@@ -83,7 +86,7 @@ def test_the_rim_takes_over_the_colours_beyond_it(hand):
         away = torch.cat([from_rim, from_rim[hand.faces].amin(1)])[:count]
         spread = spread_to_rim(colors[:count], rest, hand.faces, away)
         assert float(spread.min()) > 0.38
-        near = from_rim < LAST * RIM_FADE
+        near = from_rim < RIM_LAST * RIM_FADE
         assert torch.equal(spread[: len(rest)][~near], colors[: len(rest)][~near])
         wanted = 0.5 + 0.1 * rest[near, 2] / rest[:, 2].abs().amax()
         assert float((spread[: len(rest)][near, 0] - wanted).abs().max()) < 0.05
@@ -96,7 +99,7 @@ def test_at_the_wrists_end_gaussians_have_the_shapes_of_their_anchors(network, h
     settled = settle_rim(prediction, rest, network.faces, network.vertex_faces, network.rim)
     at_vertices = torch.cdist(rest, rest[hand.rim]).amin(1)
     from_rim = torch.cat([at_vertices, at_vertices[hand.faces].amin(1)])
-    near, far = from_rim <= FIRST * RIM_FADE, from_rim >= LAST * RIM_FADE
+    near, far = from_rim <= RIM_FIRST * RIM_FADE, from_rim >= RIM_LAST * RIM_FADE
     torch.testing.assert_close(settled.scales[0, near], prediction.anchor_scales[0, near])
     assert not settled.offsets[0, near[: len(rest)]].any()
     assert float(settled.opacities[0, near].max()) <= OPACITY + 1e-6

@@ -4,13 +4,11 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample
 
+from oasis_warp.avatar.observation import input_of_crop, project_batch, sample, sight
 from oasis_warp.core.camera import project
 from oasis_warp.core.types import Camera
-from oasis_warp.network.features import ImageFeatures
-from oasis_warp.network.inputs import input_of_crop
-from oasis_warp.network.observation import sight
-from oasis_warp.network.point_features import PointFeatures
-from oasis_warp.network.projection import Aggregation, project_batch, sample
+from oasis_warp.network.encoders import ImageFeatures
+from oasis_warp.network.tokens import Aggregation, PointFeatures
 
 
 def literal_aggregation(planes, uv, sigma, reach):

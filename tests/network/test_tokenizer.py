@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from oasis_warp.network.encoding import encode
-from oasis_warp.network.tokenizer import PlaceEncoding, Tokenizer, grid_places
+from oasis_warp.network.tokens import PlaceEncoding, Tokenizer, encode, grid_places
 
 
 @pytest.fixture(params=[False, True], ids=["learned", "literal"])

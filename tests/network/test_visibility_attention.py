@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from oasis_warp.network.vpia import JointAttention, VisibilityAttention
+from oasis_warp.network.attention import JointAttention, VisibilityAttention
 
 N_LOCAL = 12
 

@@ -8,9 +8,8 @@ import torch
 from safetensors.torch import load_file, save, save_file
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.network import dinov2
 from oasis_warp.network.config import COMPACT
-from oasis_warp.network.dinov2 import Size
+from oasis_warp.network.encoders import SIZES, Size
 from oasis_warp.network.weights_file import FORMAT, load_network, save_network, trained_state
 
 
@@ -69,7 +68,7 @@ def test_the_compact_weights_fit_into_the_wheel(make_network, tmp_path):
 
 
 def test_a_frozen_backbone_stays_in_its_own_file(monkeypatch, make_network, tiny, tmp_path, hand):
-    monkeypatch.setitem(dinov2.SIZES, "dinov2-small", Size(32, 1, 2))
+    monkeypatch.setitem(SIZES, "dinov2-small", Size(32, 1, 2))
     network = make_network(replace(tiny, backbone="dinov2-small", image_size=56))
     path = tmp_path / "paper.safetensors"
     save_network(path, network)

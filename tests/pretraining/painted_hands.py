@@ -8,10 +8,10 @@ import torch
 from oasis_warp.avatar.anchors import OPACITY, place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.types import HandPose, TrainingBatch
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
-from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.render.render import render
 
 POSES = ("rest", "open", "pinch", "point")

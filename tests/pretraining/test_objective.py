@@ -6,11 +6,11 @@ import pytest
 import torch
 from painted_hands import PaintedHands
 
+from oasis_warp.avatar.observation import input_of_batch
 from oasis_warp.core.types import Camera
 from oasis_warp.losses.image import masked_dssim, masked_l1
 from oasis_warp.network.config import COMPACT
-from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.inputs import Prediction, input_of_batch
+from oasis_warp.network.hand_network import HandNetwork, Prediction
 from oasis_warp.pretraining.objective import (
     LossConfig,
     RenderBatch,

@@ -3,10 +3,9 @@ import math
 import pytest
 import torch
 
-from oasis_warp.core.camera import project
+from oasis_warp.core.camera import crop_camera, orbit_camera, project
 from oasis_warp.core.mirror import mirror_camera
 from oasis_warp.core.types import Camera
-from oasis_warp.render.cameras import crop_camera, orbit_camera
 
 
 @pytest.fixture

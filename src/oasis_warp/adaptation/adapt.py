@@ -6,27 +6,29 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.albedo_shading import split_albedo_shading
 from oasis_warp.adaptation.calibrate import Calibration, calibrate
 from oasis_warp.adaptation.inpainting import inpaint
-from oasis_warp.adaptation.light import even_photo
-from oasis_warp.adaptation.lora_texture import learn_lora
-from oasis_warp.adaptation.picture_fit import aim
 from oasis_warp.adaptation.reliability import mask_unreliable
-from oasis_warp.adaptation.sh_lighting import apply_light, fit_light, with_shade, without_light
-from oasis_warp.adaptation.texture import learn_texture
-from oasis_warp.adaptation.views import reference_azimuths, view_weights
+from oasis_warp.adaptation.sh_lighting import (
+    apply_light,
+    even_photo,
+    fit_light,
+    split_albedo_shading,
+    with_shade,
+    without_light,
+)
+from oasis_warp.adaptation.texture import aim, learn_lora, learn_texture, reference_azimuths
 from oasis_warp.avatar.anchors import vertex_to_gaussians
-from oasis_warp.avatar.lighting import factors, in_even_light, posed_normals
 from oasis_warp.avatar.observation import inner_mask, observe
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.pose import factors, in_even_light, pose_gaussians, posed_normals
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandCrop, HandLight
-from oasis_warp.network.lora import ColorHeads
+from oasis_warp.network.heads import ColorHeads
 from oasis_warp.ops import BlendWeights, blend_colors
-from oasis_warp.render.cameras import orbit_camera
+from oasis_warp.render.render import view_weights
 
 MIN_ALPHA = 0.05
 """Below it a pixel says nothing about the colour of the hand."""

@@ -8,27 +8,23 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import MIN_ALPHA, Reading, adapt, in_photo, light_factors, remove_photo_light
-from oasis_warp.adaptation.albedo_shading import split_albedo_shading
 from oasis_warp.adaptation.calibrate import calibrate
 from oasis_warp.adaptation.inpainting import inpaint
-from oasis_warp.adaptation.light import even_photo
-from oasis_warp.adaptation.picture_fit import aim
-from oasis_warp.adaptation.sh_lighting import without_light
+from oasis_warp.adaptation.reliability import VertexObservations, look, photo_gains
+from oasis_warp.adaptation.sh_lighting import even_photo, split_albedo_shading, without_light
 from oasis_warp.adaptation.sharpen import sharpen
-from oasis_warp.adaptation.sightings import VertexObservations, look, photo_gains
-from oasis_warp.adaptation.texture import learn_texture
-from oasis_warp.adaptation.views import reference_azimuths, view_weights
+from oasis_warp.adaptation.texture import aim, learn_texture, reference_azimuths
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
-from oasis_warp.avatar.lighting import in_even_light
 from oasis_warp.avatar.mixture import mix_guesses
 from oasis_warp.avatar.observation import Observation, inner_mask, observe
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.pose import in_even_light, pose_gaussians
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors, stack_weights
-from oasis_warp.render.cameras import orbit_camera
+from oasis_warp.render.render import view_weights
 
 SHADING_LENGTH = 0.01
 """What changes over a longer way along the skin may be light, and photos meet halfway in it [m]."""

@@ -19,15 +19,14 @@ from oasis_warp.adaptation.reprojection import (
     read,
     with_neighbours,
 )
-from oasis_warp.adaptation.views import view_weights
 from oasis_warp.avatar.densify import densify, parts_for_spacing
-from oasis_warp.avatar.lighting import with_photo_colors, with_shade_baked
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.pose import pose_gaussians, with_photo_colors, with_shade_baked
 from oasis_warp.core import surface
 from oasis_warp.core.camera import project
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import Camera, CanonicalGaussians
 from oasis_warp.ops import blend_colors
+from oasis_warp.render.render import view_weights
 
 FACING = 0.04, 0.12
 """Cosines between surface and view below which paint says nothing, and above which it is taken as it is."""

@@ -21,18 +21,16 @@ from oasis_warp.adaptation.reprojection import (
     look,
     with_neighbours,
 )
-from oasis_warp.adaptation.views import view_weights
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_to_gaussians
 from oasis_warp.avatar.densify import densify, parts_for_spacing
-from oasis_warp.avatar.lighting import with_photo_colors, with_shade_baked
 from oasis_warp.avatar.observation import inner_mask
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.pose import pose_gaussians, with_photo_colors, with_shade_baked
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandCrop
 from oasis_warp.ops import blend_colors
-from oasis_warp.render.render import render
+from oasis_warp.render.render import render, view_weights
 
 FACING = 0.3, 0.5
 """Cosines between surface and view below which the photo's detail is left out, and above which it is taken whole."""

@@ -1,12 +1,147 @@
-"""Carry canonical Gaussians into a pose; no network, no image."""
+"""Canonical Gaussians in a pose and in a light; no network, no image."""
 
-from jaxtyping import Float, Int
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
-from oasis_warp.avatar.lighting import lit_colors
-from oasis_warp.core import rotation
-from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
-from oasis_warp.ops import RestMesh, face_rotations, pose_on_mesh
+from oasis_warp.avatar.anchors import vertex_to_gaussians
+from oasis_warp.core import rotation, surface
+from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandLight
+from oasis_warp.ops import RestMesh, depth_map, face_rotations, pose_on_mesh
+
+GAMMA = 2.2
+"""Light is sRGB to this power, nearly."""
+AS_IN_PHOTO, TURNED_AWAY = math.cos(math.radians(5)), math.cos(math.radians(20))
+"""Cosines of the angle by which skin has turned from where the photo shows it, up to which its shade stays as it is and
+from which it is gone."""
+MIN_COLOR = 1e-3
+"""Least colour that has shade: it is a factor."""
+RIM = 1 / 32
+"""Width over which light goes on beyond the surface's outline, over the picture's side."""
+
+
+def shading(light: HandLight, normals: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B V 3"]:
+    """Factor of the sRGB colours of vertices that face `normals` (unit, in the world of the photo's camera).
+
+    Without the shade of Gaussians.
+    """
+    received = light.harmonics[0] + normals @ light.harmonics[1:]
+    least, most = light.limits.unbind(0)
+    factor = torch.minimum(torch.maximum(received, least), most).pow(1 / GAMMA)
+    if light.shade is None or light.facing is None:
+        return factor
+    return factor * (1 + _stays(light.facing, normals) * (light.shade - 1))
+
+
+def _stays(facing: Float[Tensor, "V 3"], normals: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B V 1"]:
+    """Share of shade that is left."""
+    cosine = (normals * facing).sum(-1, keepdim=True)
+    return ((cosine - TURNED_AWAY) / (AS_IN_PHOTO - TURNED_AWAY)).clamp(0, 1)
+
+
+def lit_colors(
+    canonical: CanonicalGaussians,
+    faces: Int[Tensor, "F 3"],
+    light: HandLight,
+    normals: Float[Tensor, "*B V 3"],
+) -> Float[Tensor, "*B N 3"]:
+    """Colours of Gaussians in `light`, where the vertices face `normals`."""
+    return (canonical.colors * factors(canonical, faces, light, normals)).clamp(0, 1)
+
+
+def factors(
+    canonical: CanonicalGaussians,
+    faces: Int[Tensor, "F 3"],
+    light: HandLight,
+    normals: Float[Tensor, "*B V 3"],
+) -> Float[Tensor, "*B N 3"]:
+    """What `light` multiplies the colours of Gaussians with, where the vertices face `normals`."""
+    of_vertices = shading(light, normals)
+    if canonical.shade is None or light.facing is None:
+        return _at_gaussians(of_vertices, faces, canonical)
+    read = _at_gaussians(torch.cat([of_vertices, _stays(light.facing, normals)], -1), faces, canonical)
+    return read[..., :3] * (1 + read[..., 3:] * (canonical.shade - 1))
+
+
+def _at_gaussians(
+    of_vertices: Float[Tensor, "*B V D"], faces: Int[Tensor, "F 3"], canonical: CanonicalGaussians
+) -> Float[Tensor, "*B N D"]:
+    if of_vertices.ndim == 2:
+        return vertex_to_gaussians(of_vertices, faces, canonical)
+    of_poses = vertex_to_gaussians(of_vertices.movedim(0, 1).flatten(1), faces, canonical)
+    return of_poses.unflatten(1, (-1, of_vertices.shape[-1])).movedim(1, 0)
+
+
+def in_even_light(canonical: CanonicalGaussians, light: HandLight) -> CanonicalGaussians:
+    """The same without light that depends on the direction."""
+    return canonical._replace(colors=(canonical.colors * light.even.pow(1 / GAMMA)).clamp(0, 1), shade=None)
+
+
+def with_shade_baked(canonical: CanonicalGaussians) -> CanonicalGaussians:
+    """The same with shade for colour: what the photo shows, without its light."""
+    if canonical.shade is None:
+        return canonical
+    return canonical._replace(colors=canonical.colors * canonical.shade, shade=None)
+
+
+def split_shade(
+    shown: Float[Tensor, "M 3"], shade: Float[Tensor, "M 3"]
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+    """Colours and shade that come to `shown` together; where colours would end at 1, with more shade than `shade`."""
+    colors = (shown / shade).clamp(MIN_COLOR, 1)
+    return colors, shown.clamp_min(MIN_COLOR) / colors
+
+
+def with_photo_colors(
+    canonical: CanonicalGaussians, changed: Bool[Tensor, "N"], shown: Float[Tensor, "M 3"]
+) -> CanonicalGaussians:
+    """The same with other looks of some Gaussians in the photo, in the shade that they have there."""
+    if canonical.shade is None:
+        return canonical._replace(colors=canonical.colors.masked_scatter(changed[:, None], shown))
+    colors, shade = split_shade(shown, canonical.shade[changed])
+    return canonical._replace(
+        colors=canonical.colors.masked_scatter(changed[:, None], colors),
+        shade=canonical.shade.masked_scatter(changed[:, None], shade),
+    )
+
+
+def posed_normals(
+    rest: Float[Tensor, "V 3"], posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+) -> Float[Tensor, "V 3"]:
+    """The normals of the rest surface, turned as Gaussians are."""
+    turned = face_rotations(rest, posed, faces, validate=False)
+    return rotation.rotate(turned.vertex_quats, surface.vertex_normals(rest, faces))
+
+
+def shading_picture(
+    light: HandLight,
+    rest: Float[Tensor, "V 3"],
+    posed: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    camera: Camera,
+) -> Float[Tensor, "H W 3"]:
+    """What `light` multiplies the colours of a picture of the hand with; goes on a little beyond it, then 1."""
+    factor = shading(light, posed_normals(rest, posed, faces))
+    seen = depth_map(posed, faces, camera.viewmat, camera.K, camera.width, camera.height, validate=False)
+    on_hand = (seen.face_ids >= 0).to(factor)[..., None]
+    inside = (factor[faces[seen.face_ids.clamp_min(0).long()]] * seen.barycentrics[..., None]).sum(-2)
+    # the outlines of picture and surface may differ by a few pixels
+    window = 2 * round(RIM * camera.width) + 1
+    planes = torch.cat([inside * on_hand, on_hand], -1).permute(2, 0, 1)[None]
+    for size in ((1, window), (window, 1)):  # rows, then columns: the same mean
+        planes = avg_pool2d(planes, size, stride=1, padding=(size[0] // 2, size[1] // 2))
+    spread = planes[0].permute(1, 2, 0)
+    beyond = torch.where(spread[..., 3:] > 0, spread[..., :3] / spread[..., 3:].clamp_min(1e-6), 1)
+    return torch.where(on_hand > 0, inside, beyond)
+
+
+def turn_light(light: HandLight, rotation: Float[Tensor, "3 3"]) -> HandLight:
+    """The same light in a world that `rotation` leads to."""
+    facing = None if light.facing is None else light.facing @ rotation.T
+    return light._replace(harmonics=torch.cat([light.harmonics[:1], rotation @ light.harmonics[1:]]), facing=facing)
 
 
 def pose_gaussians(

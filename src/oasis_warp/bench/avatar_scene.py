@@ -11,13 +11,13 @@ from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.bench import torch_rasterizer
 from oasis_warp.bench.operators import Results
 from oasis_warp.bench.scenes import Scene, hand_parts
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandPose, PosedHand
 from oasis_warp.hand.skinning import skin_surface
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_l1
 from oasis_warp.ops import RestMesh, rest_mesh
-from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.render.render import render
 
 CONTRAST = 0.2

@@ -15,13 +15,13 @@ from torch.nn.functional import normalize
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, CanonicalGaussians, HandPose, PosedHand
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import bone_transforms, rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import face_rotations
-from oasis_warp.render.cameras import orbit_camera
 
 PALM_TO_CAMERA = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """Orientation of the hand, fingers up."""

@@ -11,6 +11,7 @@ from torch import Tensor
 from oasis_warp.cli.console import check_device, show_progress
 from oasis_warp.cli.options import Animate
 from oasis_warp.cli.render import check_side, choose_pose, read_color
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import Color
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
@@ -18,7 +19,6 @@ from oasis_warp.core.types import HandPose
 from oasis_warp.data.pictures import VIDEO_SUFFIXES, check_suffix, to_uint8, write_video
 from oasis_warp.hand.poses import POSE_NAMES, pose_sequence
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.render.cameras import orbit_camera
 from oasis_warp.render.render import render
 
 

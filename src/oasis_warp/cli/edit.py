@@ -13,6 +13,7 @@ from oasis_warp.cli.console import check_device, show_progress
 from oasis_warp.cli.options import Edit as Options
 from oasis_warp.cli.report import to_json
 from oasis_warp.cli.summary import GROUND, WIDTH, Panel, make_sheet, panel_side
+from oasis_warp.core.camera import crop_camera, orbit_camera
 from oasis_warp.core.config import EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, HandPose
@@ -23,7 +24,6 @@ from oasis_warp.data.square_crop import resample_square
 from oasis_warp.editing import Edit, edit
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.render.cameras import crop_camera, orbit_camera
 
 SIDES = (64, 4096)
 """Of the painted picture's square around the hand [px]."""

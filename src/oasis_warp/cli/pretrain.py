@@ -20,7 +20,7 @@ from oasis_warp.core.logging import Progress, silent
 from oasis_warp.data.output_files import open_resumable_folder
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PROFILES, NetworkConfig
-from oasis_warp.network.dinov2 import DinoV2Encoder
+from oasis_warp.network.encoders import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, read_config
 from oasis_warp.pretraining.distributed import ProcessInfo, join_processes, wait_for_all

@@ -6,13 +6,13 @@ import torch
 
 from oasis_warp.cli.console import check_device
 from oasis_warp.cli.options import Render
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandPose
 from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, to_uint8, write_picture
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.render.cameras import orbit_camera
 
 MAX_SIDE = 8192
 """Of a picture [px]."""

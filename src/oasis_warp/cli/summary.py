@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from oasis_warp.avatar.quality import SEEN, SurfaceQuality
+from oasis_warp.core.camera import crop_camera, orbit_camera
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import Camera, HandFit, HandPose, Photo, PosedHand
@@ -23,7 +24,6 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
 from oasis_warp.reconstruction import CROP_MARGIN, Reconstruction
-from oasis_warp.render.cameras import crop_camera, orbit_camera
 
 Pixels = np.ndarray
 """RGB, uint8, shape [H, W, 3]."""

@@ -1,5 +1,8 @@
-"""Pinhole projection."""
+"""Pinhole cameras: projection, crops, mirror images, and orbits around a posed hand."""
 
+import math
+
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -11,3 +14,41 @@ def project(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor,
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     image = local @ camera.K.T
     return image[:, :2] / image[:, 2:], local[:, 2]
+
+
+ORBIT_FIELD_OF_VIEW = math.radians(30)
+ORBIT_MARGIN = 1.08
+"""Of the distance at which the hand's bounding sphere just fills the picture."""
+
+
+def crop_camera(camera: Camera, left: float, top: float, side: float, size: int) -> Camera:
+    """The camera of the square that starts at (`left`, `top`) [px], `side` wide, resampled to `size` pixels."""
+    scale = size / side
+    K = camera.K.clone()
+    K[0, 2] -= left
+    K[1, 2] -= top
+    K[:2] *= scale
+    return Camera(camera.viewmat, K, size, size)
+
+
+def orbit_camera(
+    vertices: Float[Tensor, "V 3"], azimuth: float, elevation: float = 0.0, size: int = 256
+) -> Camera:
+    """A camera that looks at the middle of `vertices` from any side and frames all of them.
+
+    At `azimuth` 0 and `elevation` 0 [rad] it looks along the world's z axis with y down, as the camera of a fitted
+    photo does; a growing azimuth moves it to the left around the hand, a growing elevation above it.
+    """
+    center = (vertices.amin(0) + vertices.amax(0)) / 2
+    radius = (vertices - center).norm(dim=-1).amax()
+    ca, sa, ce, se = math.cos(azimuth), math.sin(azimuth), math.cos(elevation), math.sin(elevation)
+    turn = torch.tensor([[ca, 0, sa], [0, 1, 0], [-sa, 0, ca]], dtype=vertices.dtype)
+    tilt = torch.tensor([[1, 0, 0], [0, ce, se], [0, -se, ce]], dtype=vertices.dtype)
+    axes = (turn @ tilt).to(vertices.device)  # columns: the camera's x, y, z in the world
+    position = center - axes[:, 2] * radius * (ORBIT_MARGIN / math.sin(ORBIT_FIELD_OF_VIEW / 2))
+    viewmat = torch.eye(4, dtype=vertices.dtype, device=vertices.device)
+    viewmat[:3, :3] = axes.T
+    viewmat[:3, 3] = -axes.T @ position
+    focal = size / 2 / math.tan(ORBIT_FIELD_OF_VIEW / 2)
+    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], dtype=vertices.dtype)
+    return Camera(viewmat, K.to(vertices.device), size, size)

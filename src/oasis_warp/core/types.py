@@ -140,7 +140,7 @@ class CanonicalGaussians(NamedTuple):
     opacities: Float[Tensor, "N"]
     colors: Float[Tensor, "N 3"]
     shade: Float[Tensor, "N 3"] | None = None
-    """Factor of `colors` where skin faces as in the photo; gone where it has turned (`avatar.lighting`)."""
+    """Factor of `colors` where skin faces as in the photo; gone where it has turned (`avatar.pose`)."""
 
 
 class Render(NamedTuple):

@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import OPACITY, place_anchors
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
-from oasis_warp.render.cameras import orbit_camera
 
 COVERED = 0.9
 """Alpha from which a pixel counts as covered."""

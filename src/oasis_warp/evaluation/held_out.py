@@ -8,12 +8,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from oasis_warp.avatar.observation import input_of_batch, sight
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.evaluation.metrics import Truth
-from oasis_warp.network.inputs import input_of_batch
-from oasis_warp.network.observation import sight
 from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.objective import true_pictures
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
@@ -143,7 +142,7 @@ def true_targets(
     Args:
         batch: With the photo's true pose.
         hand: On the device of the batch.
-        vertex_faces: From `network.anchors.faces_of_vertices`.
+        vertex_faces: From `avatar.anchors.faces_of_vertices`.
     """
     pictures = true_pictures(batch, hand.faces, hand.rim)
     size, vertices = batch.target_images.shape[2], batch.target_posed[0]

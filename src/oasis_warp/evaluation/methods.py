@@ -9,14 +9,14 @@ import torch
 
 from oasis_warp.adaptation.adapt import adapt, in_photo
 from oasis_warp.adaptation.calibrate import calibrate
-from oasis_warp.avatar.lighting import in_even_light
+from oasis_warp.avatar.pose import in_even_light
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.lora import ColorHeads
+from oasis_warp.network.heads import ColorHeads
 from oasis_warp.network.prior import NetworkPrior, guess_with_heads
 from oasis_warp.network.weights_file import trained_state
 

@@ -11,16 +11,16 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from oasis_warp.avatar.observation import NetworkInput
 from oasis_warp.core import surface
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.types import Camera
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8, write_picture
+from oasis_warp.network.attention import VisibilityAttention
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.inputs import NetworkInput
-from oasis_warp.network.point_features import seen_difference
-from oasis_warp.network.vpia import VisibilityAttention
+from oasis_warp.network.tokens import seen_difference
 from oasis_warp.ops import depth_map
-from oasis_warp.render.cameras import orbit_camera
 
 TILE = 160
 """Side of a picture on a sheet [px]."""

@@ -20,8 +20,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp import __version__
-from oasis_warp.avatar.lighting import turn_light
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.anchors import faces_of_vertices
+from oasis_warp.avatar.observation import input_of_batch
+from oasis_warp.avatar.pose import pose_gaussians, turn_light
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
@@ -52,8 +53,6 @@ from oasis_warp.evaluation.pictures import (
 from oasis_warp.evaluation.summary import Record, summarise
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.lpips import Lpips
-from oasis_warp.network.anchors import faces_of_vertices
-from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.pretraining.objective import Perceptual
 from oasis_warp.render.render import render

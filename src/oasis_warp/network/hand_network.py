@@ -6,32 +6,52 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from oasis_warp.avatar.anchors import batch_anchors, faces_of_vertices
+from oasis_warp.avatar.observation import NetworkInput, Sighting, sight
+from oasis_warp.avatar.prior import MeanHand, MeanHands
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.network.anchors import batch_anchors, faces_of_vertices
-from oasis_warp.network.attention import Perceptron
+from oasis_warp.network.attention import JointAttention, Perceptron, VisibilityAttention
 from oasis_warp.network.config import NetworkConfig
-from oasis_warp.network.convolutional import ConvolutionalEncoder
-from oasis_warp.network.dinov2 import DinoV2Encoder
-from oasis_warp.network.encoding import encode
-from oasis_warp.network.feature_on_mesh import FeatureOnMesh
-from oasis_warp.network.features import ImageFeatures
+from oasis_warp.network.encoders import ConvolutionalEncoder, DinoV2Encoder, ImageFeatures
 from oasis_warp.network.heads import (
     FACE_LIMITS,
     FACE_OUTPUTS,
     TRUST,
     VERTEX_LIMITS,
     VERTEX_OUTPUTS,
+    FeatureOnMesh,
     GaussianHead,
     decode,
     decode_offsets,
 )
-from oasis_warp.network.inputs import NetworkInput, Prediction
-from oasis_warp.network.mean_hand import MeanHand, MeanHands
-from oasis_warp.network.observation import Sighting, sight
-from oasis_warp.network.point_features import PointEvidence, PointFeatures, seen_difference
 from oasis_warp.network.refinement import CoarseLevel, Refinement
-from oasis_warp.network.tokenizer import PlaceEncoding, Tokenizer, VisualTokens, grid_places
-from oasis_warp.network.vpia import JointAttention, VisibilityAttention
+from oasis_warp.network.tokens import (
+    PlaceEncoding,
+    PointEvidence,
+    PointFeatures,
+    Tokenizer,
+    VisualTokens,
+    encode,
+    grid_places,
+    seen_difference,
+)
+
+
+class Prediction(NamedTuple):
+    """Canonical Gaussians of B hands, one for each of V vertices and then one for each of F faces; N = V + F.
+
+    Those that the wrist's fade hides are still there, so that all hands have equally many. Without FoM F is 0.
+    """
+
+    offsets: Float[Tensor, "B V 3"]
+    barycentrics: Float[Tensor, "B F 3"]
+    quats: Float[Tensor, "B N 4"]
+    scales: Float[Tensor, "B N 3"]
+    opacities: Float[Tensor, "B N"]
+    colors: Float[Tensor, "B N 3"]
+    anchor_scales: Float[Tensor, "B N 3"]
+    """What `scales` started from."""
+
 
 HAND_LENGTH = 0.2
 """Scale of template coordinates for their encoding [m]: they lie in [-1, 1] then."""

@@ -22,7 +22,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.data.output_files import write_file
 from oasis_warp.network.config import NetworkConfig
-from oasis_warp.network.dinov2 import DinoV2Encoder
+from oasis_warp.network.encoders import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
 
 FORMAT = "oasis-network"

@@ -8,13 +8,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from oasis_warp.avatar.anchors import rim_fade
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.types import TrainingBatch
-from oasis_warp.losses.detail import detail_difference
-from oasis_warp.losses.image import masked_dssim, masked_l1
-from oasis_warp.network.anchors import rim_fade
-from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.inputs import Prediction
+from oasis_warp.losses.image import detail_difference, masked_dssim, masked_l1
+from oasis_warp.network.hand_network import HandNetwork, Prediction
 from oasis_warp.network.prior import all_gaussians
 from oasis_warp.ops import depth_map, rasterization
 

@@ -14,14 +14,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from oasis_warp.avatar.observation import input_of_batch
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.data.output_files import write_file
 from oasis_warp.data.pictures import to_uint8, write_picture
-from oasis_warp.losses.detail import detail_difference
+from oasis_warp.losses.image import detail_difference
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.inputs import input_of_batch
 from oasis_warp.network.weights_file import save_network
 from oasis_warp.ops.cuda_graph import CapturedCall
 from oasis_warp.pretraining.distributed import (

@@ -1,11 +1,11 @@
-"""Draw Gaussians."""
+"""Draw Gaussians: an image, or the weight of every Gaussian in every pixel."""
 
 from torch import Tensor
 
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.config import BLACK, Color
 from oasis_warp.core.types import Camera, Gaussians, Render
-from oasis_warp.ops import rasterization
+from oasis_warp.ops import BlendWeights, blend_weights, rasterization
 
 
 def render(gaussians: Gaussians, camera: Camera, *, background: Color = BLACK) -> Render:
@@ -32,3 +32,12 @@ def render(gaussians: Gaussians, camera: Camera, *, background: Color = BLACK) -
         validate=False,
     )
     return Render(images[0], alphas[0, ..., 0])
+
+
+def view_weights(gaussians: Gaussians, camera: Camera) -> BlendWeights:
+    """The weights of every Gaussian in every pixel; afterwards a picture costs one sparse product."""
+    like = gaussians.means
+    return blend_weights(
+        like, gaussians.quats, gaussians.scales, gaussians.opacities,
+        camera.viewmat.to(like), camera.K.to(like), camera.width, camera.height,
+    )  # fmt: skip
