@@ -73,7 +73,8 @@ def main(arguments: list[str]) -> int:
         options = tyro.cli(study.Options, prog=f"python -m studies {name}", description=study.__doc__, args=rest)
         rows = study.run(options)
         for section in study.SECTIONS:
-            print(f"{section.page}, {section.marker}:\n\n{section.text(rows)}\n")
+            if text := section.text(rows):
+                print(f"{section.marker}:\n\n{text}\n")
         return int(any(row.get("failed") for row in rows))
     else:
         raise SystemExit(f"expected list, render or the name of a study, got {name}; `list` names them.")

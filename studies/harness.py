@@ -1,6 +1,6 @@
 """What all studies share: their options, and cases that are measured side by side and kept as they come.
 
-A study is a module of this package. The first line of its docstring describes it in `python -m studies list`, and it has
+A study is a module of this package. The first line of its docstring describes it in `python -m studies list`. It has
 
 - `Options`, a dataclass derived from `harness.Options`: its fields are the flags of the command;
 - `run(options)`, which measures and returns rows, dictionaries that JSON can hold;
@@ -27,7 +27,7 @@ import torch
 from oasis_warp.bench.rows import commit
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.claimed_folder import claim_folder
+from oasis_warp.data.output_files import open_resumable_folder
 
 Row = dict[str, Any]
 """One line of results. Rows of `measured` also hold their "case" and the "commit" that they were measured at; a case
@@ -100,7 +100,7 @@ def measured(
     """
     folder = options.out / name
     options.out.mkdir(parents=True, exist_ok=True)
-    claim_folder(folder, SETTINGS, options.settings(), "results")
+    open_resumable_folder(folder, SETTINGS, options.settings(), "results")
     done = {row["case"] for row in read_rows(folder / ROWS)}
     missing = {case: arguments for case, arguments in cases.items() if case not in done}
     with (folder / ROWS).open("a") as file:

@@ -1,5 +1,6 @@
 """What studies measure with: photos by name, folders of photos, synthetic people and hand-drawn masks."""
 
+import functools
 import json
 from pathlib import Path
 
@@ -9,10 +10,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.types import HandFit, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.held_out import FIRST_PERSON, Shoot, photograph
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.network.prior import choose_prior
+from studies.harness import prior_choice
 
 PHOTOS = Path("tests/data/photos")
 SAME_HAND = PHOTOS / "same_hand"
@@ -52,13 +57,25 @@ def synthetic_photo(image: Tensor, name: str) -> Photo:
     return Photo((image * 255).round().to(torch.uint8), None, None, name, 1.0)
 
 
-def fit_largest(estimator: HandEstimator, photo: Photo, *, force: bool = True, **more: object) -> HandFit:
+@functools.cache
+def estimator() -> HandEstimator:
+    """The estimator of the bundled hand, made once per process."""
+    return HandEstimator(bundled_hand())
+
+
+@functools.cache
+def prior_named(name: str) -> Prior:
+    """A prior by "learned", "none" or the path of its weights, loaded once per process."""
+    return choose_prior(prior_choice(name))
+
+
+def fit_largest(photo: Photo, *, force: bool = True) -> HandFit:
     """Fit the largest hand of a photo.
 
     Raises:
         InputError: it shows none, or, unless `force`, the fit is poor.
     """
-    return estimator.fit(photo, choose_hand(estimator.find(photo), "largest", photo.name), force=force, **more)
+    return estimator().fit(photo, choose_hand(estimator().find(photo), "largest", photo.name), force=force)
 
 
 def people(count: int, first: int = 0) -> range:

@@ -31,7 +31,7 @@ from oasis_warp.reconstruction import crop_hand, reconstruct
 
 KINDS = ("tattoo", "writing", "ring", "nail polish")
 SAMPLES = 4
-"""Sub-pixels along a pixel's side, of every picture of the truth."""
+"""Sub-pixels along a pixel's side, of every true picture."""
 MELANIN = 0.03
 GROUND = (0.32, 0.42, 0.38)
 WAVES, WAVE_LENGTHS, WAVE_SIZE = 24, (0.002, 0.02), 0.006
@@ -49,7 +49,7 @@ class Surface(NamedTuple):
     barycentrics: Float[Tensor, "*P 3"]
 
 
-class Truth(NamedTuple):
+class KnownHand(NamedTuple):
     """A hand, how its photo was taken, and what is painted on it."""
 
     hand: HandModel
@@ -63,7 +63,7 @@ class Truth(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """A picture of the truth."""
+    """A true picture."""
 
     image: Float[Tensor, "H W 3"]
     """Over black."""
@@ -92,7 +92,7 @@ def _look(vertices: Tensor, faces: Tensor, camera: Camera) -> Surface:
     return Surface(seen.face_ids, seen.barycentrics)
 
 
-def make_truth(hand: HandModel, prior: Prior, *, back: bool, size: int, steps: int | None = None) -> Truth:
+def make_truth(hand: HandModel, prior: Prior, *, back: bool, size: int, steps: int | None = None) -> KnownHand:
     """An open hand seen from its palm or back on a photo of `size` pixels, and the avatar made from that photo."""
     shape = torch.zeros(hand.shape_basis.shape[-1])
     # Fingers up; the hand's -x is the picture's -y, its -y or +y looks to the camera.
@@ -124,14 +124,14 @@ def make_truth(hand: HandModel, prior: Prior, *, back: bool, size: int, steps: i
         side="right", shape=shape, surface_offsets=still, gaussians=adapted.gaussians, source_pose=pose,
         source_camera=crop.camera, light=adapted.light,
     )  # fmt: skip
-    return Truth(hand, pose, camera, avatar, photo, waves)
+    return KnownHand(hand, pose, camera, avatar, photo, waves)
 
 
-def photographed(path: Path) -> Truth:
+def photographed(path: Path) -> KnownHand:
     """A real photo's hand as it was estimated, to paint on; its skin is not known."""
     photo = read_photo(path)
     made = reconstruct(photo)
-    return Truth(made.avatar.hand, made.fit.pose, made.fit.camera, made.avatar, photo, None)
+    return KnownHand(made.avatar.hand, made.fit.pose, made.fit.camera, made.avatar, photo, None)
 
 
 def _skin(hand: HandModel, waves: tuple[Tensor, Tensor, Tensor], on: Surface) -> Float[Tensor, "H W 3"]:
@@ -148,14 +148,14 @@ def _skin(hand: HandModel, waves: tuple[Tensor, Tensor, Tensor], on: Surface) ->
 class Chart:
     """Paint as a picture in the photo's view, `SAMPLES` times as fine, that the surface carries elsewhere."""
 
-    def __init__(self, truth: Truth, kind: str):
-        self.posed = truth.avatar.mesh(truth.pose).vertices
-        self.camera, self.faces = truth.camera, truth.hand.faces
-        fine = _fine(truth.camera)
+    def __init__(self, known: KnownHand, kind: str):
+        self.posed = known.avatar.mesh(known.pose).vertices
+        self.camera, self.faces = known.camera, known.hand.faces
+        fine = _fine(known.camera)
         seen = depth_map(self.posed, self.faces, fine.viewmat, fine.K, fine.width, fine.height)
         self.front = seen.depth.clamp_max(1e3)
         self.on = Surface(seen.face_ids, seen.barycentrics)
-        self.rgba = _paint(truth, kind, self)
+        self.rgba = _paint(known, kind, self)
         """Not multiplied by its alpha, shape [H, W, 4]."""
 
     def at(self, on: Surface) -> Float[Tensor, "H W 4"]:
@@ -170,10 +170,10 @@ class Chart:
         return torch.where((shown & (depth - front < 0.002))[:, None], found, 0.0).view(*on.face_ids.shape, 4)
 
 
-def _paint(truth: Truth, kind: str, chart: Chart) -> Float[Tensor, "H W 4"]:
-    hand = truth.hand
+def _paint(known: KnownHand, kind: str, chart: Chart) -> Float[Tensor, "H W 4"]:
+    hand = known.hand
     if kind == "ring":
-        rest = truth.avatar.rest
+        rest = known.avatar.rest
         start, end = rest.joints[RING_FINGER], rest.joints[RING_FINGER + 1]
         along = (rest.vertices - start) @ (end - start) / (end - start).norm()
         on_finger = hand.weights[:, RING_FINGER : RING_FINGER + 3].sum(1)
@@ -186,8 +186,8 @@ def _paint(truth: Truth, kind: str, chart: Chart) -> Float[Tensor, "H W 4"]:
     if kind == "nail polish":
         inside = (_at(hand.nail[:, None], hand.faces, chart.on)[..., 0] > 0.5) & (chart.on.face_ids >= 0)
         return torch.cat([torch.tensor(POLISH).expand(*inside.shape, 3), inside[..., None].float()], -1)
-    uv, depth = project(truth.camera, chart.posed[hand.segment == 0].mean(0, keepdim=True))
-    millimetre = SAMPLES * float(truth.camera.K[0, 0] / depth[0]) * 1e-3
+    uv, depth = project(known.camera, chart.posed[hand.segment == 0].mean(0, keepdim=True))
+    millimetre = SAMPLES * float(known.camera.K[0, 0] / depth[0]) * 1e-3
     x, y = (SAMPLES * uv[0]).tolist()
     size = chart.on.face_ids.shape
     drawing = _draw_tattoo if kind == "tattoo" else _draw_writing
@@ -233,28 +233,28 @@ def _draw(
     return Drawn(image[..., :3], image[..., 3], image[..., 4])
 
 
-def draw_truth(truth: Truth, chart: Chart | None, pose: HandPose, camera: Camera) -> Drawn:
+def draw_truth(known: KnownHand, chart: Chart | None, pose: HandPose, camera: Camera) -> Drawn:
     """What the hand with the paint of `chart` looks like."""
-    assert truth.waves is not None
-    return _draw(truth.hand, truth.waves, chart, truth.avatar.mesh(pose).vertices, camera)
+    assert known.waves is not None
+    return _draw(known.hand, known.waves, chart, known.avatar.mesh(pose).vertices, camera)
 
 
-def paint_photo(truth: Truth, chart: Chart) -> Photo:
+def paint_photo(known: KnownHand, chart: Chart) -> Photo:
     """The photo with the paint on it, as an editor would save it."""
     drawn = _averaged(torch.cat([chart.rgba[..., :3] * chart.rgba[..., 3:], chart.rgba[..., 3:]], -1))
-    pixels = truth.photo.rgb.float() / 255 * (1 - drawn[..., 3:]) + drawn[..., :3]
-    return truth.photo._replace(rgb=(pixels.clamp(0, 1) * 255).round().to(torch.uint8), name="painted.png")
+    pixels = known.photo.rgb.float() / 255 * (1 - drawn[..., 3:]) + drawn[..., :3]
+    return known.photo._replace(rgb=(pixels.clamp(0, 1) * 255).round().to(torch.uint8), name="painted.png")
 
 
-def edited_area(truth: Truth, paint: Float[Tensor, "H W"], camera: Camera, reach: float) -> Float[Tensor, "H W"]:
-    """1 where there is paint, and up to `reach` [m] around it, in a picture of the truth."""
-    depth = float((camera.viewmat[:3, :3] @ truth.pose.translation + camera.viewmat[:3, 3])[2])
+def edited_area(known: KnownHand, paint: Float[Tensor, "H W"], camera: Camera, reach: float) -> Float[Tensor, "H W"]:
+    """1 where there is paint, and up to `reach` [m] around it, in a true picture."""
+    depth = float((camera.viewmat[:3, :3] @ known.pose.translation + camera.viewmat[:3, 3])[2])
     radius = max(1, round(reach * float(camera.K[0, 0]) / depth))
     around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     return torch.from_numpy(cv2.dilate((paint.numpy() > 0).astype(np.uint8), around)).float()
 
 
-def other_views(truth: Truth, size: int) -> dict[str, tuple[HandPose, Camera]]:
+def other_views(known: KnownHand, size: int) -> dict[str, tuple[HandPose, Camera]]:
     """Poses and views that the photo does not show, but the paint can be seen in."""
     angles = {
         "turned left": ("open", 0.5, 0.0), "turned right": ("open", -0.4, 0.3), "fist": ("fist", 0.2, 0.0),
@@ -262,6 +262,6 @@ def other_views(truth: Truth, size: int) -> dict[str, tuple[HandPose, Camera]]:
     }  # fmt: skip
     views = {}
     for name, (gesture, azimuth, elevation) in angles.items():
-        pose = truth.pose._replace(angles=named_pose(truth.hand, gesture))
-        views[name] = pose, orbit_camera(truth.avatar.mesh(pose).vertices, azimuth, elevation, size)
+        pose = known.pose._replace(angles=named_pose(known.hand, gesture))
+        views[name] = pose, orbit_camera(known.avatar.mesh(pose).vertices, azimuth, elevation, size)
     return views

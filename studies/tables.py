@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from oasis_warp.data.atomic import write_file
+from oasis_warp.data.output_files import write_file
 from studies.harness import Row
 
 Text = Callable[[list[Row]], str | None]
@@ -37,8 +37,8 @@ class Column(NamedTuple):
 class Section(NamedTuple):
     """A part of a page that a study fills."""
 
-    page: str
-    """File name below docs."""
+    page: str | None
+    """File name below docs; None for what is only printed."""
     marker: str
     text: Text
     """What stands there, made of the study's rows; None leaves the page as it is."""
@@ -87,6 +87,11 @@ def markdown(headings: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (headings, ["---"] * len(headings), *lines))
 
 
+def percent(key: str) -> Callable[[Row], str | None]:
+    """The value of a column that shows a share as "12 %"."""
+    return lambda row: None if row.get(key) is None else f"{100 * row[key]:.0f} %"
+
+
 def power(value: float | None, digits: int = 0) -> str:
     """A positive number as a power of ten, with so many digits after the first; "" for None."""
     if not value:
@@ -126,7 +131,8 @@ def fill(page: str, marker: str, text: str, commit: str = "") -> str:
     Raises:
         SystemExit: the page has no such section.
     """
-    parts = re.compile(rf"<!-- {re.escape(marker)}(?: \([^)]*\))? -->\n.*?<!-- end of {re.escape(marker)} -->", re.DOTALL)
+    name = re.escape(marker)
+    parts = re.compile(rf"<!-- {name}(?: \([^)]*\))? -->\n.*?<!-- end of {name} -->", re.DOTALL)
     begin = f"<!-- {marker} ({commit}) -->" if commit else f"<!-- {marker} -->"
     if not parts.search(page):
         raise SystemExit(f"expected <!-- {marker} --> and <!-- end of {marker} --> in the page; put them there.")
@@ -138,8 +144,8 @@ def render(sections: Sequence[Section], rows: list[Row], docs: Path) -> list[str
     commits = dict.fromkeys(str(row["commit"]) for row in rows if row.get("commit"))
     filled = []
     for page, marker, text in sections:
-        made = text(rows)
-        if made is None:
+        made = text(rows) if page else None
+        if page is None or made is None:
             continue
         path = docs / page
         write_file(path, fill(path.read_text(), marker, made, ", ".join(commits)).encode())

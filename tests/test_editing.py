@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from painted_truth import Chart, make_truth, paint_photo
 
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.cli import main
@@ -14,6 +13,7 @@ from oasis_warp.core.mirror import mirror_camera, mirror_pose
 from oasis_warp.core.types import Photo
 from oasis_warp.editing import edit
 from oasis_warp.hand_avatar import Avatar
+from studies.painted_truth import Chart, make_truth, paint_photo
 
 QUICK = EditConfig(steps=10)
 

@@ -4,8 +4,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from stress_one_shot import is_sane, likeness, make
-from stresses import STRESSES, Stressed, box
 from synthetic import crop_of
 
 from oasis_warp.adaptation.adapt import adapt
@@ -16,6 +14,8 @@ from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.reconstruction import reconstruct
+from studies.damage import DAMAGES, DamagedInput, hand_size
+from studies.stress import is_sane, likeness, make
 
 PHOTO = Path(__file__).parent / "data" / "photos" / "palm_open_left_02.png"
 FEW = ReconstructConfig(steps=20)
@@ -71,11 +71,11 @@ def whole():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", STRESSES)
+@pytest.mark.parametrize("name", DAMAGES)
 def test_a_damaged_photo_makes_a_hand_and_the_report_says_what_ails_it(whole, name):
     photo, base = whole
     assert base.warnings == ()
-    made = make(STRESSES[name](photo, base), FEW, force=True)
+    made = make(DAMAGES[name](photo, base), FEW, force=True)
     assert is_sane(made.avatar.gaussians)
     assert likeness(base.avatar, made.avatar) > (LIKE_IN_THE_DARK if name == "dark" else LIKE)
     assert SAID[name] in "; ".join(made.warnings)
@@ -84,10 +84,10 @@ def test_a_damaged_photo_makes_a_hand_and_the_report_says_what_ails_it(whole, na
 @pytest.mark.slow
 def test_a_tiny_hand_is_refused_unless_forced(whole):
     photo, base = whole
-    stressed = STRESSES["tiny"](photo, base)
-    assert isinstance(stressed, Stressed) and box(base) > 200
+    damaged = DAMAGES["tiny"](photo, base)
+    assert isinstance(damaged, DamagedInput) and hand_size(base) > 200
     with pytest.raises(InputError, match="pixels large"):
-        make(stressed, FEW, force=False)
+        make(damaged, FEW, force=False)
 
 
 @pytest.mark.slow

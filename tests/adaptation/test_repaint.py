@@ -1,6 +1,5 @@
 import pytest
 import torch
-from painted_truth import Chart, draw_truth, make_truth
 
 from oasis_warp.adaptation.repaint import repaint
 from oasis_warp.adaptation.reprojection import Canvas
@@ -11,6 +10,7 @@ from oasis_warp.core.types import Camera
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import depth_map
 from oasis_warp.render.render import render
+from studies.painted_truth import Chart, draw_truth, make_truth
 
 SIZE = 256
 

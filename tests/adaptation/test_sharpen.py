@@ -2,7 +2,6 @@ import itertools
 
 import pytest
 import torch
-from painted_truth import make_truth
 from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.reprojection import Canvas, look
@@ -17,6 +16,7 @@ from oasis_warp.core.types import Camera, HandCrop
 from oasis_warp.hand.skinning import skin
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.render.render import render
+from studies.painted_truth import make_truth
 
 SIZE, WRIST = 512, 0.03
 

@@ -1,19 +1,14 @@
-import importlib.util
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from studies.inputs import read_masks
+
 ROOT = Path(__file__).parents[2]
 OUTLINES = ROOT / "tests/data/masks/outlines.json"
 ENTRIES = json.loads(OUTLINES.read_text(encoding="utf-8"))
-
-_spec = importlib.util.spec_from_file_location("hand_drawn_masks", ROOT / "studies/hand_drawn_masks.py")
-assert _spec is not None and _spec.loader is not None
-hand_drawn_masks = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(hand_drawn_masks)
-read_masks = hand_drawn_masks.read_masks
 
 every_photo = pytest.mark.parametrize("entry", ENTRIES, ids=lambda e: Path(e["file"]).stem)
 
@@ -83,7 +78,7 @@ def test_an_outline_stays_within_its_photo(entry):
 def test_holes_lie_inside_the_outline_and_are_uncovered(name, masks):
     (entry,) = (e for e in ENTRIES if Path(e["file"]).stem == name)
     (outer,), (hole,) = (
-        [hand_drawn_masks._fill(points, masks[name].shape) for points in polygons_of(entry, kind)]
+        [_filled(points, masks[name].shape) for points in polygons_of(entry, kind)]
         for kind in ("outer", "hole")
     )
     assert hole.sum() > 100 and outer[hole].all()

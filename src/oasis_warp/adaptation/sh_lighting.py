@@ -1,7 +1,7 @@
 """The light of a photo: fitted spherical harmonics; what the photo shows beyond them, split in albedo and shade.
 
 Two photos of one hand agree on little of what they show beyond the prior. Where skin faces as before, a third to a half
-of it is found again; where it has turned by more than 45 degrees, a tenth at most (studies/measure_persistence.py). The
+of it is found again; where it has turned by more than 45 degrees, a tenth at most (studies/light.py). The
 rest is shadows, gloss, wrinkles of the pose, and detail beside its place. So most of it is shade, which the photo's own
 view keeps and other poses lose. Only what no light does to skin is taken for a mark, and stays whole.
 """
@@ -26,7 +26,7 @@ SPREAD = (
     (-0.010, 0.0, 0.033, -0.006),
     (0.018, 0.0, -0.006, 0.064),
 )
-"""Their covariance. Both are those of synthetic rooms (studies/measure_light.py), made alike left and right."""
+"""Their covariance. Both are those of synthetic rooms (studies/light.py), made alike left and right."""
 RIDGE = 0.001
 """Weight of what is usual, against a light of which every direction is seen."""
 SHOWN = 0.1

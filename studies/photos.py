@@ -1,0 +1,279 @@
+"""What is measured of the avatars of all photos of the tests, with the learned prior and without.
+
+Fills docs/results.md (estimator, avatar, single, pairs) and docs/prior.md (photos). Avatars stay in OUT/photos/avatars.
+`--sheet` draws docs/_static/priors.jpg instead: each single photo, and for every prior its guess and what adaptation
+makes of it, from the photo's view, from the side and from behind.
+"""
+
+import math
+import resource
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.cli.summary import Panel, make_sheet, panel_side
+from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.data.photo import read_photo
+from oasis_warp.estimation.estimator import choose_hand
+from oasis_warp.evaluation.coverage import coverage
+from oasis_warp.evaluation.photo_pairs import compare_pairs
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.reconstruction import crop_hand, initial_offsets, make_avatar, reconstruct
+from studies.harness import Options as Base
+from studies.harness import Row, measured, prior_choice
+from studies.inputs import PHOTOS, SAME_HAND, estimator, fit_largest, photos_below, photos_in, prior_named
+from studies.tables import Column, Section, complete, groups, markdown, mean, percentiles, table, write_jpeg
+
+ESTIMATOR = {
+    "reprojection_percent": ("reprojection, % of the box", ".2f"),
+    "mask_iou": ("fitted mesh against mask, IoU above the wrist", ".3f"),
+    "landmarks_s": ("seconds: landmarks", ".2f"),
+    "fit_s": ("seconds: fit", ".2f"),
+    "outline_s": ("seconds: outline", ".2f"),
+}
+AVATAR = {
+    "input_psnr_db": ("PSNR inside the mask, dB", ".1f"),
+    "input_psnr_inner_db": ("PSNR 2 px inside the mask, dB", ".1f"),
+    "coverage_worst": ("coverage, worst of 4 poses x 8 views", ".4f"),
+    "prior_s": ("seconds: prior", ".2f"),
+    "adaptation_s": ("seconds: adaptation", ".1f"),
+    "total_s": ("seconds: photo to avatar, warm", ".1f"),
+    "peak_gib": ("peak memory of the process, GiB", ".2f"),
+}
+PAIRS = {
+    "psnr_db": ("PSNR with one gain a channel, dB", ".1f"),
+    "psnr_plain_db": ("PSNR without it, dB", ".1f"),
+    "overlap": ("overlap (IoU) of drawn hand and mask", ".3f"),
+    "error_palm": ("colour error of the palm [sRGB]", ".3f"),
+    "error_back": ("colour error of the back [sRGB]", ".3f"),
+    "error_nail": ("colour error of the nails [sRGB]", ".3f"),
+}
+SINGLE = {
+    "input_psnr_db": ("PSNR dB", ".1f"),
+    "input_psnr_inner_db": ("2 px inside, dB", ".1f"),
+    "coverage_worst": ("coverage", ".3f"),
+}
+AZIMUTHS = (90, 180)
+"""Of the views on the sheet beside the photo's own [degrees]."""
+SHEET_WIDTH = 1800
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Base):
+    """Options of this study."""
+
+    selecting: ClassVar[frozenset[str]] = frozenset({"priors", "folders", "sheet"})
+    priors: tuple[str, ...] = ("none", "learned")
+    """none, learned, or weights files."""
+    folders: tuple[Path, ...] = (PHOTOS, SAME_HAND)
+    """Folders of photos; where a folder holds none itself, its subfolders show one hand each, and photos of one hand
+    are compared with each other."""
+    seed: int = 0
+    size: int | None = None
+    """Side of the crop [px]; that of the photo by default."""
+    sheet: Path | None = None
+    """JPEG to draw instead."""
+
+
+def avatar_file(options: Options, prior: str, path: Path) -> Path:
+    """Where the avatar of a photo is kept."""
+    return options.out / "photos" / "avatars" / Path(prior).stem / path.parent.name / f"{path.stem}.safetensors"
+
+
+def measure(path: Path, prior: str, options: Options) -> Row:
+    """One photo's row; writes its avatar."""
+    start = time.perf_counter()
+    config = ReconstructConfig(
+        prior=prior_choice(prior), seed=options.seed, size=options.size or "auto", device=options.device
+    )
+    about = {"photo": path.stem, "folder": path.parent.name, "prior": prior}
+    try:
+        made = reconstruct(read_photo(path), config)
+    except InputError as error:
+        return {**about, "result": str(error)}
+    total_s, shares, file = time.perf_counter() - start, coverage(made.avatar), avatar_file(options, prior, path)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    made.avatar.save(file)
+    return {
+        **about, "result": "ok", "side": made.fit.side, **made.errors, "coverage_worst": float(shares.min()),
+        "coverage_mean": float(shares.mean()), **{f"{stage}_s": value for stage, value in made.stages.items()},
+        "total_s": total_s, "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        "warnings": list(made.warnings),
+    }  # fmt: skip
+
+
+def measure_pairs(folder: Path, prior: str, options: Options) -> Iterator[Row]:
+    """A row for every ordered pair of photos in `folder`."""
+    photos, avatars = {}, {}
+    for path in photos_in(folder):
+        photo = read_photo(path)
+        photos[path.stem] = photo, choose_hand(estimator().find(photo), "largest", photo.name)
+        if (file := avatar_file(options, prior, path)).exists():
+            avatars[path.stem] = {"avatar": Avatar.load(file)}
+    for pair in compare_pairs(estimator(), photos, avatars, ReconstructConfig()):
+        found = pair.scores["avatar"]
+        yield {
+            "prior": prior, "source": f"{folder.name}/{pair.source}", "target": f"{folder.name}/{pair.target}",
+            "psnr_db": found.psnr, "psnr_plain_db": found.psnr_plain, "overlap": found.overlap,
+            **{f"error_{name}": value for name, value in found.region_errors.items()},
+        }  # fmt: skip
+
+
+def run(options: Options) -> list[Row]:
+    """Measure every photo with every prior, and pairs of photos of one hand; or draw the sheet."""
+    if options.sheet is not None:
+        draw_sheet(photos_in(options.folders[0]), options.priors, options.sheet)
+        return []
+    paths = [path for folder in options.folders for path in photos_in(folder) or photos_below(folder)]
+    cases = {f"{path}, {prior}": (path, prior, options) for prior in options.priors for path in paths}
+    rows = measured("photos", cases, measure, options)
+    of_hands = (folder for folder in options.folders if not photos_in(folder))
+    hands = sorted({path.parent for folder in of_hands for path in photos_below(folder)})
+    pairs = {f"pairs of {folder}, {prior}": (folder, prior, options) for prior in options.priors for folder in hands}
+    return rows + measured("photos", pairs, measure_pairs, options)
+
+
+def draw_sheet(paths: list[Path], priors: tuple[str, ...], sheet: Path) -> None:
+    """A row for each photo: the photo, then for each prior its guess and the adapted hand, in three views each."""
+    side, rows = panel_side(1 + 6 * len(priors), SHEET_WIDTH), []
+
+    def panel(image: Tensor, caption: str) -> Panel:
+        small = cv2.resize(image.detach().numpy(), (side, side), interpolation=cv2.INTER_AREA)
+        return Panel(np.asarray(small.clip(0, 1) * 255).round().astype(np.uint8), caption)
+
+    for path in paths:
+        photo = read_photo(path)
+        try:
+            fit = fit_largest(photo)
+        except InputError as error:
+            print(f"left out: {error}")
+            continue
+        offsets = initial_offsets(bundled_hand(), fit)
+        crop = crop_hand(photo, fit, offsets, ReconstructConfig())
+        row = [panel(crop.image.flip(1) if fit.side == "left" else crop.image, "photo")]
+        for name in priors:
+            guess = prior_named(name)(crop)
+            adapted = adapt(bundled_hand(), guess, crop)
+            for words, gaussians, light in (("guess", guess, None), ("adapted", adapted.gaussians, adapted.light)):
+                avatar = make_avatar(fit, offsets, crop, gaussians, light)
+                vertices = avatar.mesh(avatar.source_pose).vertices
+                cameras = [orbit_camera(vertices, math.radians(azimuth), size=256) for azimuth in AZIMUTHS]
+                for camera in (avatar.source_camera, *cameras):
+                    row.append(panel(avatar.render(camera, avatar.source_pose).image, f"{Path(name).stem}: {words}"))
+        rows.append(row)
+    write_jpeg(sheet, make_sheet("Priors", "their guesses, and what adaptation makes of them", rows, SHEET_WIDTH))
+
+
+# ---- tables
+
+
+def reconstructed(rows: list[Row], prior: str | None = None) -> list[Row]:
+    """The rows of avatars, of one prior."""
+    return [row for row in complete(rows) if row.get("result") == "ok" and prior in (None, row["prior"])]
+
+
+def spread(rows: list[Row], measures: dict[str, tuple[str, str]], title: str, by_prior: bool = True) -> str | None:
+    """Percentiles and extremes of some measures, a line for each prior."""
+    by = groups(rows, "prior") if by_prior else {(): rows}
+    lines = []
+    for key, (words, form) in measures.items():
+        for prior, own in by.items():
+            values = [row[key] for row in own if row.get(key) is not None]
+            if values:
+                numbers = [*percentiles(values), min(values), max(values)]
+                lines.append([words, *prior, *(format(number, form) for number in numbers)])
+    headings = [title, *(["prior"] if by_prior else []), "10 %", "median", "90 %", "least", "most"]
+    return markdown(headings, lines) if lines else None
+
+
+def estimator_text(rows: list[Row]) -> str | None:
+    """The estimator's measures over all hands."""
+    found = reconstructed(rows, "none")
+    return spread(found, ESTIMATOR, f"all {len(found)} hands", by_prior=False)
+
+
+def avatar_text(rows: list[Row]) -> str | None:
+    """The avatars' measures over all hands."""
+    return spread(reconstructed(rows), AVATAR, f"all {len(reconstructed(rows, 'none'))} hands")
+
+
+def pairs_text(rows: list[Row]) -> str | None:
+    """The pairs' measures, and on which share of them the learned prior is better."""
+    pairs = [row for row in complete(rows) if "target" in row]
+    psnr = {
+        prior: {(row["source"], row["target"]): row["psnr_db"] for row in own}
+        for (prior,), own in groups(pairs, "prior").items()
+    }
+    made = spread(pairs, PAIRS, f"{len(psnr.get('none', ()))} ordered pairs")
+    if {"none", "learned"} <= set(psnr):
+        both = psnr["none"].keys() & psnr["learned"].keys()
+        won = mean(psnr["learned"][pair] > psnr["none"][pair] for pair in both)
+        made = (
+            f"{made}\n\nOf two avatars of one photo, the one made with the learned prior is nearer to photo B on "
+            f"{won:.0%} of the pairs, by\nPSNR with one gain a channel."
+        )
+    return made
+
+
+def single_rows(rows: list[Row]) -> list[Row]:
+    """A row for each single photo, with the measures of every prior."""
+    found = []
+    singles = [row for row in complete(rows) if row.get("folder") == PHOTOS.name]
+    for (name,), own in groups(singles, "photo").items():
+        if own[0]["result"] != "ok":
+            found.append({"photo": name, "side": f"refused: {own[0]['result'].split(': ')[1].split(';')[0]}"})
+            continue
+        measures = {f"{key} {row['prior']}": row.get(key) for row in own for key in SINGLE}
+        found.append({**own[0], **measures})
+    return sorted(found, key=lambda row: row["photo"])
+
+
+def by_prior_rows(rows: list[Row]) -> list[Row]:
+    """Medians over the single photos of which both priors made an avatar."""
+    own = [row for row in reconstructed(rows) if row["folder"] == PHOTOS.name]
+    by_prior = {prior: {row["photo"]: row for row in part} for (prior,), part in groups(own, "prior").items()}
+    if not {"none", "learned"} <= set(by_prior):
+        return []
+    both = by_prior["none"].keys() & by_prior["learned"].keys()
+    keys = ("input_psnr_db", "coverage_worst", "render_mask_iou")
+    return [
+        {"name": words, "count": len(both),
+         **{key: percentiles((by_prior[prior][photo][key] for photo in both), (50,))[0] for key in keys}}
+        for prior, words in (("none", "no prior"), ("learned", "the prior"))
+    ]  # fmt: skip
+
+
+SECTIONS = (
+    Section("results.md", "estimator", estimator_text),
+    Section("results.md", "avatar", avatar_text),
+    Section("results.md", "single", table(
+        (
+            Column("photo", "photo"), Column("side", "side"), Column("reprojection %", "reprojection_percent", ".2f"),
+            Column("mask IoU", "mask_iou", ".3f"),
+            *(
+                Column(f"{words}, {prior}", f"{key} {prior}", form)
+                for key, (words, form) in SINGLE.items() for prior in ("none", "learned")
+            ),
+        ),
+        single_rows,
+    )),
+    Section("results.md", "pairs", pairs_text),
+    Section("prior.md", "photos", table(
+        (
+            Column("", "name"), Column("PSNR of the input view, dB", "input_psnr_db", ".1f"),
+            Column("coverage, the worst of 32 views", "coverage_worst", ".3f"),
+            Column("overlap with the mask", "render_mask_iou", ".3f"),
+        ),
+        by_prior_rows, after=lambda rows: f"{by_prior_rows(rows)[0]['count']} photos, medians.",
+    )),
+)  # fmt: skip
