@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from studies.inputs import read_masks
+from studies.inputs import _filled, read_masks
 
 ROOT = Path(__file__).parents[2]
 OUTLINES = ROOT / "tests/data/masks/outlines.json"
