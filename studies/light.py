@@ -16,10 +16,9 @@ import torch
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import adapt, in_photo, remove_photo_light
-from oasis_warp.adaptation.albedo_shading import MOST
 from oasis_warp.adaptation.calibrate import calibrate
 from oasis_warp.adaptation.inpainting import inpaint
-from oasis_warp.adaptation.sh_lighting import DARK, marks
+from oasis_warp.adaptation.sh_lighting import DARK, MOST, marks
 from oasis_warp.avatar.anchors import vertex_colors
 from oasis_warp.avatar.observation import observe
 from oasis_warp.avatar.pose import GAMMA, pose_gaussians, posed_normals, with_shade_baked

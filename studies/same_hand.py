@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.fuse import fuse
-from oasis_warp.adaptation.sightings import look
+from oasis_warp.adaptation.reliability import look
 from oasis_warp.avatar.anchors import faces_of_vertices
 from oasis_warp.avatar.pose import in_even_light
 from oasis_warp.core.camera import orbit_camera
