@@ -41,7 +41,54 @@ def _in(module: str, operator: str, *bugs: tuple[str, str, str]) -> list[Bug]:
     return [Bug(f"{module}: {name}", f"{KERNELS}/{module}.py", old, new, tests) for name, old, new in bugs]
 
 
+def _of(room: str, tests: str, only: str, name: str, old: str, new: str) -> Bug:
+    """A bug in the pipeline: `tests` is a file, `only` words of its test's name."""
+    return Bug(f"{room}: {name}", f"src/oasis_warp/{room}.py", old, new, (f"tests/{tests}.py", "-k", only))
+
+
+PIPELINE = [
+    _of("avatar/observation", "avatar/test_observation", "projects_to", "the photo read half a pixel off",
+        "grid, align_corners=False)[0, :, 0].T", "grid, align_corners=True)[0, :, 0].T"),
+    _of("data/square_crop", "data_stage/test_square_crop", "resampled or sees", "the crop half a pixel off in y",
+        "-top * scale + 0.5 * scale - 0.5]", "-top * scale + 0.5 * scale]"),
+    _of("estimation/segmentation", "estimation/test_segmentation", "sticks_out", "the mask reaches 70 mm out",
+        "outside < 0.007 * metre", "outside < 0.07 * metre"),
+    _of("estimation/fit", "estimation/test_fit", "beyond_its_limits", "no lower pose limits",
+        "np.maximum(state.angles - self.high, 0) + np.minimum(state.angles - self.low, 0)",
+        "np.maximum(state.angles - self.high, 0)"),
+    _of("estimation/refine", "estimation/test_refine", "step_that_was_taken", "the turn backwards",
+        "state.turn @ self.start.turn.T", "self.start.turn @ state.turn.T"),
+    _of("adaptation/sh_lighting", "adaptation/test_albedo_shading", "single_gaussians", "marks judged per Gaussian",
+        "vertex_to_gaussians(marks(of_vertices), hand.faces.to(guess.device), learned)", "marks(beyond)"),
+    _of("adaptation/fuse", "adaptation/test_fuse", "more_pixels", "fused without resolution",
+        "    sightings = look(hand, crops, resolution)\n    faces",
+        "    sightings = look(hand, crops, [1.0] * len(crops))\n    faces"),
+    _of("avatar/mixture", "adaptation/test_fuse", "different_light", "the guesses' gains forgotten",
+        "_in_one_light([table.colors for table in tables], present)", "[table.colors for table in tables]"),
+    _of("editing", "test_editing", "worn_as", "paint under the photo's light",
+        "_without_light(avatar, posed, canvas),\n", "canvas,\n"),
+    _of("avatar/quality", "avatar/test_quality", "shares_of_area", "shares of regions count vertices",
+        "100 * mean(seen, area * weight)", "100 * mean(seen, weight)"),
+    _of("network/heads", "network/test_lora", "layers_weights", "the last layer's update halved",
+        "_updated(hidden, cache.last, last)", "_updated(hidden, cache.last, (0.5 * last[0], last[1]))"),
+    _of("network/heads", "network/test_lora", "updates_start", "updates as wide as their outputs ask",
+        "/ math.sqrt(inputs)", "/ math.sqrt(outputs)"),
+    _of("estimation/keypoints", "estimation/test_keypoints", "camera_of_a_pose", "the centre not shrunk with the photo",
+        '"centre", (2,)) * photo.shrink', '"centre", (2,))'),
+    _of("synthetic/skin_lines", "synthetic/test_bake", "lie_on_the_palm", "creases on the back",
+        's[:, None], "palm")', 's[:, None], "back")'),
+    _of("cli/animate", "cli/test_render_and_animate", "film_in_even_light", "--light even ignored",
+        'options.light == "even"', 'options.light == "none"'),
+    _of("core/camera", "render/test_cameras", "horizon", "azimuth and elevation exchanged",
+        "(turn @ tilt)", "(tilt @ turn)"),
+    _of("estimation/fit_warnings", "estimation/test_fit_warnings", "reaches_a_border", "the right border not looked at",
+        "hand[:, 0], hand[:, -1])", "hand[:, 0])"),
+    _of("reconstruction", "test_crop_hand", "mirrored_photo or wrist_line", "a left hand's wrist line not mirrored",
+        "image, above = image.flip(1), above.flip(1)", "image = image.flip(1)"),
+]  # fmt: skip
+
 BUGS = [
+    *PIPELINE,
     *_in(
         "rasterize_forward", "rasterization",
         ("pixel centre without 0.5", "type(whole)(0.5) - remainder", "type(whole)(0.0) - remainder"),

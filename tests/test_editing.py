@@ -7,10 +7,11 @@ import torch
 
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.cli import main
-from oasis_warp.core.config import EditConfig
+from oasis_warp.core.camera import project
+from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_camera, mirror_pose
-from oasis_warp.core.types import Photo
+from oasis_warp.core.types import HandLight, Photo
 from oasis_warp.editing import edit
 from oasis_warp.hand_avatar import Avatar
 from studies.painted_truth import Chart, make_truth, paint_photo
@@ -162,3 +163,38 @@ def test_nothing_is_overwritten_without_being_told(files, capsys):
 def test_wrong_options_get_one_sentence(files, capsys, more, said):
     assert command(files, *more) == 2
     assert said in capsys.readouterr().err
+
+
+def test_paint_is_worn_as_it_was_painted_whatever_the_light_of_the_photo(truth):
+    """In the photo's view the edit shows the paint, in even light the paint without the photo's light."""
+    bare = truth.avatar
+    light = HandLight(torch.tensor([[0.45, 0.4, 0.35], *[[0.0] * 3] * 3]), torch.tensor([[0.1] * 3, [1.0] * 3]),
+                      torch.ones(3))  # fmt: skip
+    avatar = Avatar(
+        side=bare.side, shape=bare.shape, surface_offsets=bare.surface_offsets, gaussians=bare.gaussians,
+        source_pose=bare.source_pose, source_camera=bare.source_camera, light=light,
+    )  # fmt: skip
+    image, alpha = avatar.render(avatar.source_camera, avatar.source_pose, BLACK)
+    ground = torch.tensor([0.3, 0.4, 0.35])
+    before = image + (1 - alpha)[..., None] * ground
+    size = len(before)
+    patch = torch.zeros(size, size, dtype=torch.bool)
+    palm = avatar.mesh(avatar.source_pose).vertices[avatar.hand.segment == 0]
+    x, y = project(avatar.source_camera, palm)[0].mean(0).int()
+    patch[y - 12 : y + 12, x - 12 : x + 12] = True
+    paint = torch.tensor([0.2, 0.5, 0.3])
+
+    def photo(picture, name):
+        return Photo((255 * picture).round().to(torch.uint8), None, None, name, 1.0)
+
+    after = edit(
+        avatar, photo(torch.where(patch[..., None], paint, before), "painted.png"), photo=photo(before, "photo.png"),
+        config=QUICK,
+    ).avatar  # fmt: skip
+    inner = torch.zeros_like(patch)
+    inner[y - 7 : y + 7, x - 7 : x + 7] = True
+    worn = after.render(avatar.source_camera, avatar.source_pose, BLACK).image[inner]
+    torch.testing.assert_close(worn.median(0).values, paint, atol=0.02, rtol=0)
+    even = after.in_even_light().render(avatar.source_camera, avatar.source_pose, BLACK).image[inner]
+    expected = paint / torch.tensor([0.45, 0.4, 0.35]) ** (1 / 2.2)
+    torch.testing.assert_close(even.median(0).values, expected, atol=0.03, rtol=0)

@@ -84,3 +84,18 @@ def test_marks_are_told_from_light_by_what_lies_across():
     assert float(marks(torch.tensor([[-1.0, -0.6, -0.1]]))) == 1
     assert float(marks(torch.tensor([[0.65, 0.75, 0.85]]))) == 1  # white paint on skin that is not pale
     assert float(marks(torch.zeros(1, 3))) == 0
+
+
+def test_ink_on_single_gaussians_is_no_mark(hand, scene):
+    guess, _ = scene
+    n_vertices = len(guess.vertex_index)
+    colors = guess.colors.clone()
+    colors[n_vertices::2] *= torch.tensor(INK)
+    learned = guess._replace(colors=colors.clamp_min(0.03))
+    parted = split_albedo_shading(hand, guess.colors, learned)
+    clear = (learned.colors > 0.031).all(1)
+    clear[:n_vertices] = False
+    ratio = ((parted.colors / guess.colors).log().norm(dim=1) / (learned.colors / guess.colors).log().norm(dim=1))
+    there = clear & (torch.arange(len(clear)) % 2 == n_vertices % 2)
+    assert int(there.sum()) > 100
+    assert ratio[there].max() < STAYS + 0.1

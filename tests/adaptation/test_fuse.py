@@ -135,3 +135,23 @@ def test_a_gaussian_that_one_guess_lacks_is_fainter(hand, palm):
     ratio = mixed.opacities[n:] / guess.opacities[n:]
     assert torch.allclose(ratio[0::2], torch.tensor(1.0)) and torch.allclose(ratio[1::2], torch.tensor(0.5))
     torch.testing.assert_close(mixed.scales, guess.scales)
+
+
+def test_the_photo_that_has_more_pixels_of_a_place_is_believed_there(hand, colors):
+    """Two photos in one view that agree on nothing: the one that was enlarged counts for less."""
+    photo = crop_of(hand, colors, size=48)[0]
+    other = photo._replace(image=photo.image.flip(-1))
+    guess = MeanPrior(hand)(photo)
+    guesses = [guess, guess._replace(opacities=0.5 * guess.opacities)]
+    quick = AdaptConfig(texture_steps=1, calibration_steps=1, reference_views=0)
+    made = fuse(hand, [photo, other], [1.0, 0.5], guesses, quick)
+    shown = made.sightings.confidence.amin(0) > 0
+    torch.testing.assert_close(made.sightings.share[:, shown].mean(1), torch.tensor([1.0, 0.5**4]), atol=1e-3, rtol=0)
+
+
+def test_guesses_in_different_light_mix_to_one_in_the_light_of_the_first(hand, palm):
+    guess = MeanPrior(hand)(palm)
+    tinted = guess._replace(colors=(guess.colors * LIGHT).clamp(0, 1))
+    made = mix_guesses([guess, tinted], torch.ones(2, len(hand.template)), hand.faces)
+    same = mix_guesses([guess, guess], torch.ones(2, len(hand.template)), hand.faces)
+    torch.testing.assert_close(made.colors, same.colors, atol=0.01, rtol=0)

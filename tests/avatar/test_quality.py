@@ -4,7 +4,7 @@ from synthetic import crop_of
 from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.appearance import label_regions, region_colors, region_masks
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.avatar.quality import (
@@ -137,3 +137,16 @@ def test_what_ails_a_photo_is_said_and_nothing_else(pictured, said):
 def test_a_mask_of_a_few_pixels_is_said_to_hold_the_background():
     image, mask = photo()
     assert "background" in photo_warnings(image, mask * 0, SIDE)[0]
+
+
+@pytest.mark.parametrize("name", ["palm", "back"])
+def test_shares_are_shares_of_area(hand, case, name):
+    rest = case[0].rest.vertices
+    area, region = surface.vertex_areas(rest, hand.faces), region_masks(label_regions(hand))[name]
+    seen = (area > area[region > 0.5].median()).float()  # the larger half of the region's vertices
+    found = shares(hand, rest, SurfaceQuality(seen, 1 - seen))
+    of_area = float((area * region * seen).sum() / (area * region).sum())
+    assert of_area > float((region * seen).sum() / region.sum()) + 0.05, "vertices are unlike enough to tell"
+    assert found[f"{name}_seen_percent"] == pytest.approx(100 * of_area, abs=0.01)
+    assert found["seen_percent"] == pytest.approx(100 * float((area * seen).sum() / area.sum()), abs=0.01)
+    assert found["uncertainty_mean"] == pytest.approx(1 - found["seen_percent"] / 100, abs=1e-4)

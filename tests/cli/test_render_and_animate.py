@@ -7,7 +7,9 @@ from oasis_warp.cli import main
 from oasis_warp.cli.animate import pose_frames, turntable
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.logging import silent
+from oasis_warp.core.types import HandLight
 from oasis_warp.data.pictures import to_uint8
+from oasis_warp.hand_avatar import Avatar
 
 LOOK = {"elevation": 0.0, "background": (1.0, 1.0, 1.0), "progress": silent}
 
@@ -112,3 +114,23 @@ def test_a_wrong_option_is_refused_in_one_sentence(avatar_file, arguments, expec
 def test_a_device_that_is_not_there_is_refused(avatar_file, capsys):
     assert main(["render", str(avatar_file), "-o", "x.png", "--device", "cuda"]) == 2
     assert "torch finds no CUDA device" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("motion", ["turntable", "poses"])
+def test_a_film_in_even_light_is_without_the_light_of_the_photo(scene, tmp_path, monkeypatch, motion):
+    dark = HandLight(torch.tensor([[0.05] * 3, *[[0.0] * 3] * 3]), torch.tensor([[0.01] * 3, [1.0] * 3]), torch.ones(3))
+    kept, path = {}, tmp_path / "avatar.safetensors"
+    plain = scene[2]
+    Avatar(
+        side=plain.side, shape=plain.shape, surface_offsets=plain.surface_offsets, gaussians=plain.gaussians,
+        source_pose=plain.source_pose, source_camera=plain.source_camera, light=dark,
+    ).save(path)  # fmt: skip
+    monkeypatch.setattr("oasis_warp.cli.animate.write_video", lambda out, frames, fps: kept.update({how: list(frames)}))
+    given = ["--motion", motion, "--poses", "open", "--seconds", "0.2", "--fps", "10", "--size", "48"]
+    for how in ("photo", "even"):
+        assert main(["animate", str(path), "-o", str(tmp_path / "x.mp4"), "--light", how, *given]) == 0
+    film = {"turntable": lambda: turntable(plain, plain.source_pose, 2, 48, **LOOK),
+            "poses": lambda: pose_frames(plain, ["open"], 2, 48, **LOOK)}[motion]()  # fmt: skip
+    for even, photo, wanted in zip(kept["even"], kept["photo"], film, strict=True):
+        assert torch.equal(even, wanted)
+        assert photo.float().mean() < even.float().mean() - 5

@@ -155,3 +155,20 @@ def test_a_fit_is_repeatable(rig):
     first, second = (Fitter(rig, evidence).fit_landmarks() for _ in range(2))
     assert first.cost == second.cost
     np.testing.assert_array_equal(first.state.angles, second.state.angles)
+
+
+@pytest.mark.parametrize("beyond", [-1, 1])
+def test_a_pose_beyond_its_limits_costs_alike_on_both_sides(rig, beyond):
+    truth = posed_hand(rig, 0)
+    fitter = Fitter(rig, seen(rig, truth))
+    bound = fitter.low if beyond < 0 else fitter.high
+    flat = replace(fitter.settings, angle=((1e6, 1e6),) * 3, coupling=1e6)  # of the priors, only the limits count
+
+    def cost(angles):
+        free = Fitter(rig, fitter.evidence, settings=replace(flat, landmark=1e6, bone=1e6), shape=truth.shape)
+        return free.system(replace(truth, angles=angles, focal=free.focal))[2]
+
+    for k in range(len(bound)):
+        angles = np.clip(truth.angles, fitter.low, fitter.high)
+        angles[k] = bound[k] + 0.1 * beyond
+        assert cost(angles) == pytest.approx((0.1 / fitter.settings.limit) ** 2, rel=1e-3)

@@ -140,3 +140,14 @@ def test_a_missing_file_is_named(fitted, tmp_path):
     photo, _, _ = fitted(NAME)
     with pytest.raises(InputError, match=r"gone\.json: cannot be read"):
         read_keypoints(tmp_path / "gone.json", photo)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_camera_of_a_pose_is_scaled_to_a_photo_that_was_shrunk(fitted, tmp_path, side):
+    photo, _, fit = fitted(NAME)
+    K = fit.camera.K
+    data = pose_data(fit) | {"side": side, "focal": 4 * float(K[0, 0]), "centre": (4 * K[:2, 2] + 12).tolist()}
+    read = read_keypoints(write(tmp_path / "k.json", data), photo._replace(shrink=0.25))
+    assert isinstance(read, HandFit)
+    torch.testing.assert_close(read.camera.K[:2, 2], K[:2, 2] + 3)
+    torch.testing.assert_close(read.camera.K[0, 0], K[0, 0])

@@ -1,17 +1,18 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from synthetic import PALM_TO_CAMERA
 
-from oasis_warp.avatar.anchors import inset_offsets, vertex_to_gaussians
+from oasis_warp.avatar.anchors import PRIOR_SIZE, inset_offsets, vertex_to_gaussians
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import surface
 from oasis_warp.core.camera import project
 from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.core.types import Camera, HandCrop, HandPose
-from oasis_warp.estimation.refine import refine
+from oasis_warp.estimation.refine import _Problem, refine
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.render.render import render
@@ -117,3 +118,9 @@ def test_the_same_photo_gives_the_same_bits(hand, photo, wrong, refined):
     again = refine(hand, photo[1], wrong)
     assert torch.equal(again.crop.posed.vertices, refined.crop.posed.vertices)
     assert again.after == refined.after
+
+
+def test_a_change_is_the_step_that_was_taken(hand, photo, wrong):
+    problem = _Problem(hand, photo[1], wrong, None, PRIOR_SIZE)
+    step = 0.05 * np.random.default_rng(0).normal(size=problem.n)
+    np.testing.assert_allclose(problem.change(problem.moved(problem.start, step)), step, atol=1e-12)

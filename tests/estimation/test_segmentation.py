@@ -108,3 +108,17 @@ def test_a_cut_out_that_is_not_of_this_hand_is_left_aside(drawing, case):
     left = np.arange(truth.shape[1]) < xy[9, 0]
     alpha = {"a whole person": np.ones_like(truth), "half of the hand": truth & left, "nothing": truth & False}[case]
     assert mask_from_alpha(alpha.astype(np.float32), xy, scale) is None
+
+
+def test_skin_that_sticks_out_of_the_fitted_mesh_is_no_hand(drawing):
+    picture, xy, scale, truth = drawing
+    mesh = (truth & (hand_side(xy, truth.shape) > 0)).astype(np.uint8) * 255
+    x, y = xy[KNUCKLES].mean(0).astype(int)
+    bar = np.zeros_like(truth)
+    bar[y - 8 : y + 8, x:] = True  # somebody else's finger beside the palm
+    joined = picture.copy()
+    joined[bar] = np.median(picture[truth], axis=0)
+    away = cv2.distanceTransform((mesh == 0).astype(np.uint8), cv2.DIST_L2, 5) / scale  # [m]
+    assert (bar & (away > 0.02)).sum() > 200
+    again = mask_from_fit(joined, xy, scale, (truth | bar).astype(np.float32), mesh)
+    assert again[bar & (away > 0.012)].max() < 0.1

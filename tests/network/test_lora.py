@@ -115,3 +115,14 @@ def test_what_has_no_heads_is_refused(case, hand):
         adapt(hand, guess, crop, LORA)
     with pytest.raises(ValueError, match="is for one photo"):
         fuse(hand, [crop], [1.0], [guess], LORA)
+
+
+def test_updates_start_at_nothing_and_as_wide_as_their_layers_inputs_ask(random):
+    head, rows = GaussianHead(12, 40, VERTEX_OUTPUTS), torch.arange(9)
+    cache = cache_head(head, torch.rand(9, 12, generator=random), torch.rand(9, 3, generator=random), None, rows)
+    for inputs, outputs, (down, up) in zip((12, 40, 40), (40, 40, 3), zero_updates(cache, 64, random), strict=True):
+        assert down.shape == (64, inputs) and up.shape == (64, outputs)
+        assert not up.any()
+        bound = inputs**-0.5
+        assert 0.95 * bound < down.abs().max() <= bound
+        assert float(down.detach().std()) == pytest.approx(bound / 3**0.5, rel=0.1)

@@ -56,3 +56,17 @@ def test_the_mirrored_camera_sees_the_mirrored_world_mirrored(points, camera):
     torch.testing.assert_close(mirrored[:, 0], camera.width - uv[:, 0], atol=1e-3, rtol=0)
     torch.testing.assert_close(mirrored[:, 1], uv[:, 1], atol=1e-3, rtol=0)
     torch.testing.assert_close(mirrored_depth, depth)
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 0.7, 2.0, -1.3])
+@pytest.mark.parametrize("elevation", [-0.6, 0.4])
+def test_an_orbit_keeps_its_height_and_its_horizon_all_the_way_round(points, azimuth, elevation):
+    camera = orbit_camera(points, azimuth, elevation)
+    middle = (points.amin(0) + points.amax(0)) / 2
+    position = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3] - middle
+    direction = position / position.norm()
+    expected = torch.tensor([
+        -math.sin(azimuth) * math.cos(elevation), -math.sin(elevation), -math.cos(azimuth) * math.cos(elevation),
+    ])  # fmt: skip
+    torch.testing.assert_close(direction, expected, atol=1e-5, rtol=0)
+    assert abs(float(camera.viewmat[0, 1])) < 1e-6  # the picture's x axis is level

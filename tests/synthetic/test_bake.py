@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from oasis_warp.core.processes import worker_pool
 from oasis_warp.ops import depth_map
@@ -15,9 +16,10 @@ from oasis_warp.synthetic.atlas import HEIGHT, WIDTH, bundled_atlas
 from oasis_warp.synthetic.body import bundled_body, skin_mesh
 from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.shots import EVERYBODY
+from oasis_warp.synthetic.skin_lines import Palm
 from oasis_warp.synthetic.skin_plan import plan_person
 from oasis_warp.synthetic.skin_texture import CHANNELS, bake_texture
-from oasis_warp.synthetic.strokes import KINDS, Strokes
+from oasis_warp.synthetic.strokes import CORNER_WORDS, KINDS, LINE_WORDS, Strokes
 from oasis_warp.synthetic.texels import draw_lines, texels_on
 
 SEED = 13
@@ -161,3 +163,16 @@ for name in {NEEDLESS_TO_PLAN}:
 import oasis_warp.synthetic.picture
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_lines_of_the_palm_lie_on_the_palm():
+    atlas, rng = bundled_atlas(), np.random.default_rng(5)
+    strokes = Strokes(rng)
+    Palm(atlas, strokes, plan_person(SEED, 4, BARE).identity).draw()
+    drawn = strokes.lines()
+    rows = drawn.numbers[: drawn.n_lines * LINE_WORDS].reshape(-1, LINE_WORDS)
+    corners = drawn.numbers[drawn.n_lines * LINE_WORDS :][: drawn.n_corners * CORNER_WORDS].reshape(-1, CORNER_WORDS)
+    kind = np.repeat(rows[:, 6].astype(int), rows[:, 0].astype(int))
+    texel = cKDTree(atlas.positions).query(corners[:, :3])[1]
+    outward = atlas.normals.numpy()[texel, 1]  # of a hand at rest the palm faces -y
+    assert (outward < 0).all(), {KINDS[k] for k in kind[outward >= 0]}
