@@ -52,7 +52,7 @@ from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
 from oasis_warp.pretraining.training_batch import training_batch
 from oasis_warp.reconstruction import CROP_MARGIN, composite_over_photo, crop_hand, make_avatar, reconstruct
-from oasis_warp.synthetic.picture import SyntheticBatch, render_planned
+from oasis_warp.synthetic.picture import SyntheticBatch, render_table
 from oasis_warp.synthetic.shot_table import tabulate
 from oasis_warp.synthetic.shots import PICTURES_EACH, SceneConfig, sample_shots
 from studies.detail import inside_outline
@@ -113,14 +113,14 @@ def photograph(
     """
     first, rendered = PICTURES_EACH * number, int(size * SURROUNDINGS)
     even = SceneConfig(population=POPULATIONS["ordinary"], look="even")
-    scenery = even if light == "studio" else SceneConfig(population=POPULATIONS["ordinary"])
+    scene = even if light == "studio" else SceneConfig(population=POPULATIONS["ordinary"])
 
-    def shown(indices: range, scenery: SceneConfig) -> SyntheticBatch:
-        shots = sample_shots(HELD_OUT_SEED, indices, scenery)
-        planned = tabulate(HELD_OUT_SEED, shots, scenery)
-        return render_planned(HELD_OUT_SEED, planned, rendered, device, scenery=scenery)
+    def shown(indices: range, scene: SceneConfig) -> SyntheticBatch:
+        shots = sample_shots(HELD_OUT_SEED, indices, scene)
+        table = tabulate(HELD_OUT_SEED, shots, scene)
+        return render_table(HELD_OUT_SEED, table, rendered, device, scene=scene)
 
-    targets, taken = shown(range(first, first + MOST), even), shown(range(first + MOST, first + 2 * MOST), scenery)
+    targets, taken = shown(range(first, first + MOST), even), shown(range(first + MOST, first + 2 * MOST), scene)
     if light == "studio":
         taken = taken._replace(image=taken.image + 0.5 * (1 - taken.alpha[..., None]))  # a grey wall
     hand = bundled_hand().to(device)

@@ -123,7 +123,7 @@ def time_stages(options: Options) -> None:
     def render() -> float:
         wait()
         start = clock()
-        picture.render_planned(options.seed, planned, options.size, options.device, scenery=PHOTOS)
+        picture.render_table(options.seed, planned, options.size, options.device, scene=PHOTOS)
         wait()
         return clock() - start
 

@@ -50,7 +50,7 @@ def unbroken(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unbroken") / "prior"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PROFILES, "compact", TINY)
-        patch.setattr(people, "_known", type(people._known)())  # as in a process of its own
+        patch.setattr(people, "_cache", type(people._cache)())  # as in a process of its own
         assert main(["pretrain", str(folder), *SMALL]) == 0
     return folder
 

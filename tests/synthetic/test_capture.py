@@ -18,13 +18,13 @@ from oasis_warp.synthetic.shots import (
 from oasis_warp.synthetic.view_and_light import (
     ARM_CONE,
     View,
-    clear_of_arm,
+    avoid_forearm,
+    diffuse_light,
+    rotate_light,
     rotation_about,
     sample_light,
     sample_view,
-    soften_light,
     sphere,
-    turn_light,
 )
 
 SEED, SIZE = 5, 48
@@ -46,15 +46,15 @@ def light():
 
 def test_a_turned_camera_sees_the_same_light_from_turned_directions(light):
     rotation = rotation_about([1, 2, -1], 1.1)
-    turned, directions = turn_light(light, rotation), sphere(50)
+    turned, directions = rotate_light(light, rotation), sphere(50)
     np.testing.assert_allclose(seen(turned, directions @ rotation.T), seen(light, directions), atol=1e-9)
     np.testing.assert_allclose(turned.directions, light.directions @ rotation.T)
-    back = turn_light(turned, rotation.T)
+    back = rotate_light(turned, rotation.T)
     np.testing.assert_allclose(back.sky, light.sky, atol=1e-9)
 
 
 def test_softened_light_is_as_much_of_the_same_colour(light):
-    soft = soften_light(light, 0.25)
+    soft = diffuse_light(light, 0.25)
     for found in (light, soft):
         np.testing.assert_allclose(0.2820948 * found.sky[0] + 0.65 * found.colors.sum(0), light.incident)
     directions = sphere(200)
@@ -72,7 +72,7 @@ def test_no_view_is_blocked_by_the_forearm():
     for _ in range(300):
         bend = np.array([0.0, random.normal(0, 0.15), random.normal(0, 0.3)])
         drawn = sample_view(random, "even", closed=False)
-        view = clear_of_arm(drawn, bend)
+        view = avoid_forearm(drawn, bend)
         assert toward_elbow(view, bend) < np.cos(ARM_CONE)
         np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(view.rotation) > 0
@@ -85,7 +85,7 @@ def test_no_view_is_blocked_by_the_forearm():
 
 def test_a_view_of_a_straight_arm_turns_round_the_upright_axis():
     down_the_arm = View(np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]]), 0.5, 0.8, np.zeros(2))
-    view = clear_of_arm(down_the_arm, np.array([0.0, 0.0, 1e-9]))
+    view = avoid_forearm(down_the_arm, np.array([0.0, 0.0, 1e-9]))
     np.testing.assert_allclose(view.rotation, np.diag([-1, 1, -1]) @ down_the_arm.rotation)
 
 
@@ -94,7 +94,7 @@ def capture():
     (photo,) = sample_shots(SEED, [0], PHOTOS)
     others = capture_shots(SEED, photo, sample_shots(SEED, [0, 1], SceneConfig(look="even")))
     plans = [tabulate(SEED, shots, PHOTOS) for shots in ([photo], others)]
-    return photo, others, render_capture(SEED, *plans, SIZE, "cpu", scenery=PHOTOS)
+    return photo, others, render_capture(SEED, *plans, SIZE, "cpu", scene=PHOTOS)
 
 
 def test_the_photo_of_a_capture_is_the_picture_that_it_would_be_alone(capture):
@@ -121,7 +121,7 @@ def test_twice_the_light_is_the_same_picture_since_the_photo_was_exposed_for_it(
     made = []
     for shot in (plain, bright):
         plans = [tabulate(SEED, shots, PHOTOS) for shots in ([shot], capture_shots(SEED, shot, goals))]
-        made.append(render_capture(SEED, *plans, SIZE, "cpu", scenery=PHOTOS)[1].image)
+        made.append(render_capture(SEED, *plans, SIZE, "cpu", scene=PHOTOS)[1].image)
     torch.testing.assert_close(*made, atol=2e-3, rtol=0)
 
 

@@ -103,7 +103,7 @@ def test_angles_respect_the_joint_limits(batch):
 
 
 def test_even_looks_show_the_same_person_on_black_without_clothes(batch):
-    even = render_batch(SEED, INDICES[:2], SIZE, scenery=SceneConfig(look="even"))
+    even = render_batch(SEED, INDICES[:2], SIZE, scene=SceneConfig(look="even"))
     torch.testing.assert_close(even.shape, batch.shape[:2])
     assert float(even.image[even.alpha == 0].abs().max()) == 0
     lit = even.image[even.mask > 0.99]
@@ -114,7 +114,7 @@ def test_even_looks_show_the_same_person_on_black_without_clothes(batch):
 def test_photos_and_even_looks_make_a_training_batch(batch, hand):
     photos = render_batch(SEED, [0, PICTURES_EACH], SIZE)
     indices = [1, 2, PICTURES_EACH + 1, PICTURES_EACH + 2]
-    targets = render_batch(SEED, indices, SIZE, scenery=SceneConfig(look="even"))
+    targets = render_batch(SEED, indices, SIZE, scene=SceneConfig(look="even"))
     assert isinstance(photos, LabelledPictures)
     made = training_batch(hand, photos, targets, SIZE, torch.Generator().manual_seed(0))
     assert made.target_images.shape == (2, 2, SIZE, SIZE, 3)

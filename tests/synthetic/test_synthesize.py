@@ -17,7 +17,7 @@ from oasis_warp.synthetic.shards import write_shards
 from oasis_warp.synthetic.shots import PHOTOS, SceneConfig
 
 SIZE = 32
-JOB = {"count": 5, "seed": 13, "size": SIZE, "device": "cpu", "scenery": PHOTOS, "settings": {}, "batch": 2}
+JOB = {"count": 5, "seed": 13, "size": SIZE, "device": "cpu", "scene": PHOTOS, "batch": 2}
 
 
 @pytest.fixture(autouse=True)
@@ -102,7 +102,7 @@ def _folder_of_pictures(tmp_path):
 
 def test_a_folder_of_pictures_stands_behind_the_hands(tmp_path):
     paths = list_backgrounds(_folder_of_pictures(tmp_path))
-    batch = render_batch(13, [1], SIZE, scenery=SceneConfig(backgrounds=paths))
+    batch = render_batch(13, [1], SIZE, scene=SceneConfig(backgrounds=paths))
     behind = batch.image[0][batch.alpha[0] == 0]
     assert float((behind[:, 1] - behind[:, [0, 2]].amax(1)).median()) > 0.1
 

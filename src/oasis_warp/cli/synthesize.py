@@ -34,19 +34,18 @@ def run(options: Synthesize) -> int:
     if options.seed < 0:
         raise InputError(f"--seed: expected 0 or more, got {options.seed}; choose another seed.")
     folder = () if options.backgrounds is None else list_backgrounds(options.backgrounds)
-    scenery = SceneConfig(look=options.look, backgrounds=folder)
+    scene = SceneConfig(look=options.look, backgrounds=folder)
     console = Console(stderr=True)
     with show_progress(console) as progress:
         if options.sheet:
             check_suffix(options.out, PICTURE_SUFFIXES)
-            sheet = _sheet(options, scenery, progress)
+            sheet = _sheet(options, scene, progress)
             write_picture(options.out, to_uint8(sheet))
             return 0
-        settings = {"look": options.look, "backgrounds": [path.name for path in folder]}
         try:
             write_shards(
                 options.out, count=options.count, seed=options.seed, size=options.size, device=options.device,
-                scenery=scenery, settings=settings, batch=BATCH[options.device], progress=progress,
+                scene=scene, batch=BATCH[options.device], progress=progress,
             )  # fmt: skip
         except KeyboardInterrupt:
             print(f"oasis: stopped; what is whole stays in {options.out}, the same command goes on.", file=sys.stderr)
@@ -54,11 +53,11 @@ def run(options: Synthesize) -> int:
     return 0
 
 
-def _sheet(options: Synthesize, scenery: SceneConfig, progress: Progress) -> torch.Tensor:
+def _sheet(options: Synthesize, scene: SceneConfig, progress: Progress) -> torch.Tensor:
     """One picture of each of the first `count` people."""
     images = []
     for k in range(options.count):
-        batch = render_batch(options.seed, [k * PICTURES_EACH], options.size, options.device, scenery=scenery)
+        batch = render_batch(options.seed, [k * PICTURES_EACH], options.size, options.device, scene=scene)
         images.append(batch.image[0].cpu())
         progress("pictures", k + 1, options.count)
     return contact_sheet(torch.stack(images), min(SHEET_COLUMNS, options.count))

@@ -17,18 +17,18 @@ from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.objective import true_pictures
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
 from oasis_warp.pretraining.training_batch import EstimatorNoise, training_batch
-from oasis_warp.synthetic.picture import SyntheticBatch, render_capture, render_planned, slice_batch
+from oasis_warp.synthetic.picture import SyntheticBatch, render_capture, render_table, slice_batch
 from oasis_warp.synthetic.shot_table import ShotTable, tabulate
 from oasis_warp.synthetic.shots import (
     EVERYBODY,
     PICTURES_EACH,
     SceneConfig,
     Shot,
-    camera_turn,
+    camera_rotation,
     capture_shots,
     sample_shots,
 )
-from oasis_warp.synthetic.view_and_light import sample_light, soften_light
+from oasis_warp.synthetic.view_and_light import diffuse_light, sample_light
 from oasis_warp.synthetic.wardrobe import sample_clothes
 
 Group = Literal["ordinary", "tattoo", "ring"]
@@ -88,18 +88,18 @@ def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) ->
     def planned(shots: list[Shot]) -> ShotTable:
         return tabulate(seed, shots, wild)
 
-    plain = render_planned(seed, planned([_evenly_lit(photo), *goals]), size, device, scenery=even)
+    plain = render_table(seed, planned([_evenly_lit(photo), *goals]), size, device, scene=even)
     studio, even_goals = slice_batch(plain, slice(1)), slice_batch(plain, slice(1, None))
     wall = torch.tensor(np.random.default_rng([seed, WALL_STREAM, number]).uniform(0.1, 0.9, 3)).to(studio.image)
     studio = studio._replace(image=studio.image + (1 - studio.alpha[..., None]) * wall)
-    soft = photo._replace(light=soften_light(photo.light, DIRECTED))
+    soft = photo._replace(light=diffuse_light(photo.light, DIRECTED))
     same, same_goals = render_capture(
-        seed, planned([soft]), planned(capture_shots(seed, soft, goals)), size, device, scenery=wild
+        seed, planned([soft]), planned(capture_shots(seed, soft, goals)), size, device, scene=wild
     )
-    turns = torch.from_numpy(np.stack([camera_turn(seed, goal.index) for goal in goals])).float()
+    turns = torch.from_numpy(np.stack([camera_rotation(seed, goal.index) for goal in goals])).float()
     return Session(
         number,
-        {"studio": studio, "same": same, "wild": render_planned(seed, planned([photo]), size, device, scenery=wild)},
+        {"studio": studio, "same": same, "wild": render_table(seed, planned([photo]), size, device, scene=wild)},
         {"studio": even_goals, "same": same_goals, "wild": even_goals},
         {"studio": torch.eye(3).expand(shoot.targets, 3, 3), "same": turns, "wild": None},
     )

@@ -14,7 +14,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.pretraining.training_batch import training_batch
 from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.people import bake_people
-from oasis_warp.synthetic.picture import SyntheticBatch, render_planned, slice_batch
+from oasis_warp.synthetic.picture import SyntheticBatch, render_table, slice_batch
 from oasis_warp.synthetic.shot_table import concatenate_tables, sample_tables_ahead
 from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH, SceneConfig
 
@@ -71,10 +71,10 @@ class SyntheticHands:
         while True:
             together = list(itertools.islice(plans, len(looks) * self.ahead))
             photos, targets = (
-                render_planned(
-                    self.seed, concatenate_tables(together[k :: len(looks)]), rendered, self.device, scenery=scenery
+                render_table(
+                    self.seed, concatenate_tables(together[k :: len(looks)]), rendered, self.device, scene=scene
                 )
-                for k, scenery in enumerate(looks)
+                for k, scene in enumerate(looks)
             )
             for k, number in enumerate(itertools.islice(batch_numbers, self.ahead)):
                 photo = slice_batch(photos, slice(k * self.hands, (k + 1) * self.hands))

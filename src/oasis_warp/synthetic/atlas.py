@@ -1,9 +1,8 @@
-"""The texture atlas: which point of the resting surface each texel shows, and what is known of that point.
+"""The texture atlas: the point of the rest surface that each texel shows, and the labels of that point.
 
-Everything that is painted is a function of these points, so it has no seams. Lengths are millimetres of the mean hand.
-An atlas is made and asked by numpy on the CPU, whatever device is painted on: lines are drawn over its points one after
-the other, each with random numbers that depend on how long the one before became, so that a texel more or less would
-change all of a person.
+Every texture is a function of these points, so it has no seams. Lengths are millimetres of the mean hand. The atlas is
+computed with numpy on the CPU, whatever the device of the textures: lines are drawn over its points one after another,
+and the random numbers of each depend on the length of the one before, so one texel more would change the whole person.
 """
 
 import functools
@@ -20,7 +19,7 @@ from oasis_warp.synthetic.body import FINGERS, Body, bundled_body
 WIDTH, HEIGHT = 1024, 1408
 """Texels of the atlas: .34 mm each on the hand, enough for a hand that fills 512 pixels."""
 _FACES_AT_ONCE, _TEXELS_AT_ONCE = 1024, 1 << 15
-"""So many, for their numbers to stay in the processor's cache."""
+"""Block sizes that fit in the processor's cache."""
 
 
 class Atlas:
@@ -30,15 +29,15 @@ class Atlas:
     normals: Float[Tensor, "N 3"]
     palm: Float[Tensor, "N"]
     finger: Tensor
-    """int64 [N]: place in `body.FINGERS`, -1 on palm and arm."""
+    """int64 [N]: index into `body.FINGERS`, -1 on palm and arm."""
     finger_weight: Float[Tensor, "N"]
     corners: Tensor
-    """int64 [N, 3]: vertices round the texel."""
+    """int64 [N, 3]: the vertices of the texel's face."""
     weights: Float[Tensor, "N 3"]
-    """Of those vertices."""
+    """Barycentric coordinates in that face."""
 
     def __init__(self, body: Body):
-        faces, weights = _drawn((body.uv * torch.tensor([WIDTH, HEIGHT])).double().numpy(), body.uv_faces.numpy())
+        faces, weights = _rasterize((body.uv * torch.tensor([WIDTH, HEIGHT])).double().numpy(), body.uv_faces.numpy())
         self._shown = shown = faces >= 0
         self.body, self.corners = body, body.skin_faces[torch.from_numpy(faces[shown])]
         self.weights = torch.from_numpy(weights[shown]).float()
@@ -52,29 +51,29 @@ class Atlas:
 
     @functools.cached_property
     def fill(self) -> Int[Tensor, "H W"]:
-        """The texel shown at each place; beyond the islands the nearest, so that interpolation does not bleed."""
-        from scipy.ndimage import distance_transform_edt  # a third of a second that those who only plan save
+        """Index of each texel; outside the islands that of the nearest one, so that interpolation does not bleed."""
+        from scipy.ndimage import distance_transform_edt  # 0.3 s, which planning alone does not need
 
         nearest = np.asarray(distance_transform_edt(~self._shown, return_distances=False, return_indices=True))
         number = np.cumsum(self._shown).reshape(self._shown.shape) - 1
         return torch.from_numpy(number[nearest[0], nearest[1]])
 
     def _spread(self, values: Float[Tensor, "K C"]) -> Float[Tensor, "N C"]:
-        """Values of the vertices of hand and forearm, interpolated at the texels."""
+        """Interpolate vertex values of hand and forearm at the texels."""
         parts = zip(self.corners.split(_TEXELS_AT_ONCE), self.weights.split(_TEXELS_AT_ONCE), strict=True)
         return torch.cat([(values[corners] * weights[..., None]).sum(1) for corners, weights in parts])
 
     def snap(self, points: np.ndarray, region: str) -> np.ndarray:
-        """The nearest surface points [mm] of a named region: a finger's name, "palm", "back" or "wrist".
+        """The nearest surface points [mm] in a region: a finger's name, "palm", "back" or "wrist".
 
-        Off the fingers nearness is judged in the plane of the palm, so that the height of `points` does not matter.
+        Except on fingers, distance is measured in the plane of the palm: the height of `points` does not matter.
         """
         if region not in self._trees:
             keep, axes = self._region(region)
-            there = self.positions[keep]
-            self._trees[region] = there, cKDTree(there[:, axes]), axes
-        there, tree, axes = self._trees[region]
-        return there[tree.query(points[:, axes])[1]]
+            positions = self.positions[keep]
+            self._trees[region] = positions, cKDTree(positions[:, axes]), axes
+        positions, tree, axes = self._trees[region]
+        return positions[tree.query(points[:, axes])[1]]
 
     def _region(self, region: str) -> tuple[np.ndarray, list[int]]:
         if region in FINGERS:
@@ -89,8 +88,8 @@ class Atlas:
         return keep[region](), [0, 2]
 
 
-def _drawn(uv: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The face at each texel's centre, -1 where there is none, and the weights of its corners; the first of several.
+def _rasterize(uv: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first face that covers each texel's centre, -1 where there is none, and the barycentric coordinates.
 
     Args:
         uv: Texels, centres at .5, [U, 2].
@@ -102,8 +101,7 @@ def _drawn(uv: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     columns, rows = (high - low + 1).clip(0).T
     counts = columns * rows
     found, weights = np.full((HEIGHT, WIDTH), -1), np.zeros((HEIGHT, WIDTH, 3))
-    # Some at a time, column by column: whole arrays cost most of a second in pages that are touched once. The first
-    # face is written last.
+    # In blocks: whole arrays would cost most of a second in page faults. In reverse: the first face is written last.
     for first in reversed(range(0, len(faces), _FACES_AT_ONCE)):
         count = counts[first : first + _FACES_AT_ONCE]
         face = np.repeat(np.arange(first, first + len(count)), count)  # of each pair with a texel of its box
@@ -122,5 +120,5 @@ def _drawn(uv: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.cache
 def bundled_atlas() -> Atlas:
-    """The atlas of `bundled_body`: half a second the first time."""
+    """The atlas of `bundled_body`; takes half a second the first time."""
     return Atlas(bundled_body())

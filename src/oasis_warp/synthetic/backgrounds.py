@@ -1,4 +1,4 @@
-"""Pictures from a folder, to stand behind the hands instead of rooms."""
+"""Pictures from a folder as backgrounds instead of rooms."""
 
 import functools
 from pathlib import Path
@@ -13,17 +13,17 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif")
-KEPT = 64
-"""Decoded pictures kept in memory."""
+CACHED = 64
+"""Decoded pictures that are cached."""
 MAX_PIXELS = 1_000_000
-"""Larger pictures are scaled down: behind a hand there are never more pixels."""
+"""Larger pictures are scaled down: no background shows more pixels."""
 
 
 def list_backgrounds(folder: Path) -> tuple[Path, ...]:
-    """The pictures of a folder, sorted by name, each opened once to see that it can be read.
+    """The pictures of a folder, sorted by name. Each is opened once to check that it can be read.
 
     Raises:
-        InputError: no folder, no pictures in it, or one that cannot be read.
+        InputError: the folder does not exist or holds no pictures, or a picture cannot be read.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of pictures, found none; give one that exists.")
@@ -37,7 +37,7 @@ def list_backgrounds(folder: Path) -> tuple[Path, ...]:
     return paths
 
 
-@functools.lru_cache(KEPT)
+@functools.lru_cache(CACHED)
 def _picture(path: Path) -> np.ndarray:
     """Linear RGB."""
     rgb = read_photo(path, max_pixels=MAX_PIXELS).rgb.numpy().astype(np.float32) / 255
@@ -45,7 +45,7 @@ def _picture(path: Path) -> np.ndarray:
 
 
 def cut_background(paths: tuple[Path, ...], rng: np.random.Generator, size: int, blur: float) -> Float[Tensor, "H W 3"]:
-    """A square cut from one of the pictures, mirrored or not, in linear light of mean .3; `blur` is in pixels."""
+    """A random square of a random picture, maybe mirrored, in linear light with mean 0.3; `blur` is in pixels."""
     picture = _picture(paths[rng.integers(len(paths))])
     height, width = picture.shape[:2]
     side = max(1, int(min(height, width) * rng.uniform(0.5, 1.0)))

@@ -1,6 +1,6 @@
-"""The mesh that is photographed: the hand, a forearm, and what can be worn: sleeve, wristband and ring.
+"""The mesh that is rendered: the hand, a forearm, a sleeve, a wristband and a ring.
 
-The topology never changes, so that pictures share batches: what an image does not wear is folded up to a point.
+The topology never changes, so that all pictures can share a batch: what an image does not wear collapses to a point.
 Vertices are those of the hand, then of the rows of the forearm (towards the elbow), sleeve, wristband and ring.
 """
 
@@ -20,6 +20,7 @@ from oasis_warp.hand.template import bundled_hand
 
 FINGERS = ("index", "middle", "little", "ring", "thumb")
 """In the order of their joints: finger k has joints 3 k + 1 to 3 k + 3."""
+THUMB = FINGERS.index("thumb")
 _TIP_OF_FINGER = (1, 2, 4, 3, 0)
 """Row of `HandModel.tips` of each of `FINGERS`."""
 
@@ -30,12 +31,12 @@ RING_COLUMNS, RING_ROWS = 48, 8
 ATLAS_HAND_SHARE = 1024 / 1408
 """Share of the atlas's height that the hand's texture coordinates fill; the forearm lies above."""
 ATLAS_ARM_BIAS = 0.7
-"""The forearm's rows are denser at the wrist by 1 + this, sparser at the elbow by 1 - this."""
+"""The forearm's rows are denser by 1 + this at the wrist and by 1 - this at the elbow."""
 
 SKIN, SLEEVE, BAND, RING = range(4)
 """Materials of faces."""
 KNUCKLE_RISE = (2.0, 1.7, 0.8)
-"""How far a knuckle stands out of a finger bent by 90 degrees, from the hand outwards [mm]."""
+"""How far each knuckle of a finger stands out when bent by 90 degrees, from the palm outwards [mm]."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def _bone(hand: HandModel, finger: int, place: int) -> Bone:
 
 
 def _knuckle_rise(points: np.ndarray, normals: np.ndarray, bones: tuple[tuple[Bone, ...], ...]) -> Tensor:
-    """Blend skinning rounds a bent joint off; bone does not. Arguments in millimetres; [V, 15] in metres."""
+    """Displacements that keep bent knuckles pointed, which blend skinning rounds off: [V, 15] in metres, of [mm]."""
     out = np.zeros((len(points), 15))
     for finger, of_finger in enumerate(bones):
         for place, bone in enumerate(of_finger):
@@ -83,24 +84,29 @@ def _knuckle_rise(points: np.ndarray, normals: np.ndarray, bones: tuple[tuple[Bo
 
 
 def _tube_faces(rows: np.ndarray) -> np.ndarray:
-    """Two triangles for each cell between rows [R, C] of vertex numbers that close to rings."""
+    """Two triangles for each cell between rows of vertex indices [R, C], each row closed to a ring."""
+    return _grid_faces(np.concatenate([rows, rows[:, :1]], 1))
+
+
+def _grid_faces(rows: np.ndarray) -> np.ndarray:
+    """Two triangles for each cell between rows of vertex indices [R, C]."""
     a, b = rows[:-1], rows[1:]
-    quad = np.stack([a, b, np.roll(b, -1, 1), np.roll(a, -1, 1)], -1).reshape(-1, 4)
-    return np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]], 1).reshape(-1, 3)
+    quads = np.stack([a[:, :-1], b[:, :-1], b[:, 1:], a[:, 1:]], -1).reshape(-1, 4)
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]], 1).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
 class Body:
-    """Topology, texture coordinates and labels; `bundled_body` makes the one that is used."""
+    """Topology, texture coordinates and labels. See `bundled_body`."""
 
     hand: HandModel
     faces: Int[Tensor, "F 3"]
     materials: Int[Tensor, "F"]
     """int32: SKIN, SLEEVE, BAND or RING."""
     uv: Float[Tensor, "U 2"]
-    """In [0, 1]; the hand's and the forearm's."""
+    """Of hand and forearm, in [0, 1]."""
     uv_faces: Int[Tensor, "S 3"]
-    """For the faces of skin, which come first."""
+    """Of the faces of skin, which come first."""
     n_hand_faces: int
     n_vertices: int
     rest: Float[Tensor, "K 3"]
@@ -113,9 +119,9 @@ class Body:
     bones: tuple[tuple[Bone, ...], ...]
     """[finger][place]."""
     skin_faces: Int[Tensor, "S 3"]
-    """The first of `faces`: of hand and forearm."""
+    """Faces of hand and forearm: the first of `faces`."""
     coarse_vertices: Int[Tensor, "C"]
-    """Some vertices of hand and forearm, and the faces between them: what hides the sky from others. Made by
+    """Vertices of a coarse mesh of hand and forearm, which occludes the sky. Built by
     `asset_build/build_coarse_body.py`."""
     coarse_faces: Int[Tensor, "G 3"]
     knuckle_rise: Float[Tensor, "V 15"]
@@ -127,7 +133,7 @@ class Body:
         return len(self.hand.template)
 
     def to(self, device: torch.device | str) -> "Body":
-        """The same body on another device; its bones, which are numpy's, stay."""
+        """The same body on another device; the bones stay numpy arrays."""
         moved = {f.name: getattr(self, f.name) for f in fields(self)}
         return replace(self, **{k: v.to(device) for k, v in moved.items() if isinstance(v, Tensor | HandModel)})
 
@@ -135,17 +141,17 @@ class Body:
 def arm_rows(
     rim: Float[Tensor, "B C 3"], turns: Float[Tensor, "B R 3 3"], girth: Float[Tensor, "B"]
 ) -> Float[Tensor, "B R C 3"]:
-    """Rings that carry the wrist's rim on to the elbow, +x without a bend; lengths in metres.
+    """The rings of the forearm from the wrist's rim to the elbow, along +x when straight [m].
 
     Args:
         rim: The hand's open end.
         turns: Rotation of each ring about the middle of the rim.
-        girth: Growth of the forearm's thickest place over the wrist, 0.35 or so.
+        girth: How much thicker the forearm is than the wrist, about 0.35.
     """
     center = rim.mean(1, keepdim=True)
     s = torch.linspace(0, 1, ARM_ROWS + 1, device=rim.device)[1:, None]
     swell = smoothstep(0.02, 0.75, s)
-    flat = 1 - smoothstep(0.0, 0.4, s)  # the rim is not plane
+    flat = 1 - smoothstep(0.0, 0.4, s)  # the rim is not planar
     around = (rim - center)[:, None]
     grow = girth[:, None, None] * swell
     rows = torch.stack(
@@ -171,15 +177,13 @@ class SkinMesh(NamedTuple):
 
 
 def skin_mesh(hand: HandModel) -> SkinMesh:
-    """A hand with a forearm, and where each is on the atlas."""
+    """The hand with a forearm, and their texture coordinates."""
     n, rim = len(hand.template), hand.rim.numpy()
     columns = len(rim)
     arm = n + np.arange(ARM_ROWS * columns).reshape(ARM_ROWS, columns)
     arm_faces = _tube_faces(np.concatenate([rim[None], arm]))
     grid = len(hand.uv) + np.arange((ARM_ROWS + 1) * (columns + 1)).reshape(ARM_ROWS + 1, columns + 1)
-    a, b = grid[:-1], grid[1:]
-    quad = np.stack([a[:, :-1], b[:, :-1], b[:, 1:], a[:, 1:]], -1).reshape(-1, 4)
-    arm_uv_faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]], 1).reshape(-1, 3)
+    arm_uv_faces = _grid_faces(grid)
     s = np.linspace(0, 1, ARM_ROWS + 1)
     rise = 0.006 + (1 - ATLAS_HAND_SHARE - 0.012) * (s + ATLAS_ARM_BIAS * s * (1 - s))
     u, v = np.meshgrid(np.linspace(0.01, 0.99, columns + 1), ATLAS_HAND_SHARE + rise)
@@ -202,7 +206,7 @@ def skin_mesh(hand: HandModel) -> SkinMesh:
 
 @functools.cache
 def bundled_body() -> Body:
-    """The bundled hand with its forearm and its wardrobe, on the CPU."""
+    """The bundled hand with forearm and clothes, on the CPU."""
     hand = bundled_hand()
     n, columns = len(hand.template), len(hand.rim)
     rest, skin, uv, uv_faces = skin_mesh(hand)
@@ -248,7 +252,7 @@ def bundled_body() -> Body:
 
 
 def device_name(device: torch.device | str) -> str:
-    """The one name of a device: that of the current GPU for "cuda"."""
+    """The canonical name of a device: "cuda" becomes the name of the current GPU."""
     device = torch.device(device)
     if device.type == "cuda" and device.index is None:
         device = torch.device("cuda", torch.cuda.current_device())
@@ -257,5 +261,5 @@ def device_name(device: torch.device | str) -> str:
 
 @functools.cache
 def body_on(device: str) -> Body:
-    """`bundled_body` on a device, by its `device_name`; the same object each time."""
+    """`bundled_body` on the device with this `device_name`; always the same object."""
     return bundled_body().to(device)

@@ -1,7 +1,7 @@
-"""Keep fingers out of each other and out of the palm: the hand as a set of balls, pushed apart in joint angles.
+"""Resolve self-collisions: the hand as a set of balls, pushed apart by changing joint angles.
 
-Where a gesture would sink one finger into another, neighbours spread, fingers open and the thumb draws back until they
-touch, as flesh does. Everything is elementwise over a batch, so a pose does not depend on its company.
+Where one finger would penetrate another or the palm, neighbours spread, fingers open and the thumb draws back until
+they only touch. Everything is elementwise over a batch, so a pose does not depend on the others.
 """
 
 import functools
@@ -10,17 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from oasis_warp.synthetic.body import FINGERS, Body, bundled_body
+from oasis_warp.synthetic.body import FINGERS, THUMB, Body, bundled_body
 
-THUMB = FINGERS.index("thumb")
 FLESH = 1.0
-"""Depth by which soft parts may sink into each other [mm]."""
+"""Penetration that soft tissue allows [mm]."""
 ROUNDS = 22
 _PLACES = (0.12, 0.37, 0.63, 0.88)
-"""Of the balls along a bone."""
+"""Positions of the balls along a bone, as shares of its length."""
 _OPEN_THUMB = np.radians([-10.0, 16.0, 0.0])
 PALM = 5
-"""The group of the balls of the palm, after the fingers."""
+"""The group number of the palm's balls; those of the fingers come first."""
 _ORDER = ("index", "middle", "ring", "little")
 
 
@@ -34,18 +33,18 @@ class Balls(NamedTuple):
     group: np.ndarray
     """Finger, or PALM."""
     pairs: np.ndarray
-    """Which two may meet, [P, 2]; sorted by their groups."""
+    """Balls that may collide, [P, 2]; sorted by their groups."""
     starts: np.ndarray
-    """First pair of each two groups."""
+    """First pair of each two groups that may collide."""
     column: np.ndarray
-    """Place in `starts` of two groups, [6, 6]."""
+    """Index into `starts` for two groups, [6, 6]."""
     allowed: np.ndarray
-    """Depth that each pair overlaps at rest, and flesh, [P]."""
+    """Allowed penetration of each pair: that at rest plus `FLESH` [mm], [P]."""
 
 
 @functools.cache
 def bundled_balls() -> Balls:
-    """Of the mean hand."""
+    """The balls of the mean hand."""
     body = bundled_body()
     rows = []
     for finger in range(5):
@@ -81,7 +80,7 @@ def bundled_balls() -> Balls:
 
 
 def _sections(body: Body, finger: int, place: int) -> list[tuple[np.ndarray, float]]:
-    """Middle and radius of slices across a bone."""
+    """Centre and radius of cross-sections of a bone's surface."""
     bone = body.bones[finger][place]
     hand = body.hand
     of_bone = hand.weights[:, 3 * finger + 1 + place].numpy() > 0.4
@@ -98,7 +97,7 @@ def _sections(body: Body, finger: int, place: int) -> list[tuple[np.ndarray, flo
 
 
 class Skeleton:
-    """Forward kinematics of a batch of hands in float64: elementwise, one hand does not know of the next."""
+    """Forward kinematics of a batch of hands in float64, elementwise over the batch."""
 
     def __init__(self, body: Body):
         hand = body.hand
@@ -110,7 +109,7 @@ class Skeleton:
         self._square = self._cross @ self._cross
 
     def transforms(self, angles: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation [B, 16, 3, 3] and shift [B, 16, 3] that carry the rest points of each bone, wrist fixed.
+        """Rotation [B, 16, 3, 3] and translation [B, 16, 3] from rest to pose of each bone, with the wrist fixed.
 
         Args:
             angles: About the pose axes [rad], [B, 16, 3].
@@ -131,12 +130,12 @@ class Skeleton:
 
 @functools.cache
 def bundled_skeleton() -> Skeleton:
-    """Of the bundled hand."""
+    """The kinematics of the bundled hand."""
     return Skeleton(bundled_body())
 
 
 def overlaps(angles: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """How deep each pair of balls sinks in beyond what it may [mm], [B, P]; joints in millimetres, [B, 16, 3]."""
+    """Penetration of each pair of balls beyond what is allowed [mm], [B, P]; `joints` are in mm, [B, 16, 3]."""
     balls = bundled_balls()
     rest = bundled_body().hand.joints.double().numpy() * 1e3
     rotation, shift = bundled_skeleton().transforms(angles, joints)
@@ -150,7 +149,7 @@ def overlaps(angles: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 def separate(angles: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Angles near `angles` at which nothing sinks in, and what depth remains [mm], [B].
+    """Angles near `angles` without penetration, and the largest penetration that remains [mm], [B].
 
     Args:
         angles: Within the joints' limits [rad], [B, 16, 3].
@@ -171,7 +170,7 @@ def separate(angles: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _eased(angles: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """One step away from the overlaps: neighbours spread, fingers open, the thumb draws back."""
+    """One step that reduces penetration: neighbours spread, fingers open, the thumb draws back."""
     balls, hand = bundled_balls(), bundled_body().hand
     rest_bend = hand.rest_bend.double().numpy()
     angles, between = angles.copy(), np.maximum.reduceat(depth, balls.starts, axis=1)

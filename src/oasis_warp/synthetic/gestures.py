@@ -1,6 +1,6 @@
-"""A grammar of gestures and grasps: what each finger does, what the thumb does, and how far all of it is jittered.
+"""A grammar of gestures and grasps: the states of fingers and thumb, and how much they vary.
 
-Angles are degrees: flexion counts from a straight finger, abduction is towards the thumb from rest.
+Angles are degrees: flexion is measured from a straight finger, abduction from rest towards the thumb.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ FINGER_STATES = MappingProxyType({
     "table": (72, 12, 6),
     "curled": (80, 98, 62),
 })  # fmt: skip
-"""Flexion of the three joints."""
+"""Flexion of a finger's three joints."""
 THUMBS = MappingProxyType({
     "out": (-10, 16, 0, 2, 0),
     "aside": (-2, 4, 0, 6, 4),
@@ -35,21 +35,21 @@ THUMBS = MappingProxyType({
     "pinch": (35, 10, -10, 2, 5),
     "grasp": (22, 18, -12, 10, 22),
 })  # fmt: skip
-"""Flexion, abduction and twist of the base, flexion of the two outer joints."""
+"""Flexion, abduction and twist of the base joint, then the flexion of the two outer joints."""
 SPREAD = MappingProxyType({"index": 8.0, "middle": 1.5, "ring": -4.5, "little": -11.0})
-"""Abduction of fingers that are spread."""
+"""Abduction of spread fingers."""
 
 
 @dataclass(frozen=True)
 class Gesture:
-    """One sentence of the grammar."""
+    """States of all fingers, and how they vary."""
 
     fingers: tuple[str, str, str, str]
-    """States of index, middle, ring, little; "a>b" for any mixture of two states."""
+    """States of index, middle, ring, little; "a>b" means a random mixture of two states."""
     thumb: str
     weight: float = 1.0
     spread: tuple[float, float] = (0.1, 1.0)
-    """Range of the share of `SPREAD`."""
+    """Range of the factor of `SPREAD`."""
     jitter: float = 1.0
 
 
@@ -87,13 +87,13 @@ GESTURES = MappingProxyType({
     "table": Gesture(("table", "table", "table", "table"), "relaxed", 1.0, (-0.1, 0.3)),
     "any": Gesture(("any", "any", "any", "any"), "any", 3.0, (-0.2, 1.4)),
 })  # fmt: skip
-"""By name; the names stand in the description of every picture."""
+"""By the names that every picture's ground truth uses."""
 GESTURE_NAMES = tuple(GESTURES)
 _WEIGHTS = np.array([gesture.weight for gesture in GESTURES.values()])
 
 
 def _state(rng: np.random.Generator, words: str) -> np.ndarray:
-    """Angles of a finger state, or of a mixture of two."""
+    """Angles of a finger state or of a mixture of two."""
     if words == "any":
         low, high = rng.choice(list(FINGER_STATES), 2)
     else:
@@ -103,15 +103,15 @@ def _state(rng: np.random.Generator, words: str) -> np.ndarray:
 
 
 def sample_gesture(rng: np.random.Generator, hand: HandModel) -> tuple[str, np.ndarray]:
-    """A gesture's name and its angles [rad] about `hand.pose_axes`, 0 at rest, [16, 3], inside the joints' limits.
+    """A gesture's name and its angles [rad] about `hand.pose_axes`, 0 at rest, [16, 3], within the joint limits.
 
-    Fingers may still touch each other or sink in: see `contact`.
+    Fingers may still penetrate each other; see `contact.separate`.
     """
     name = GESTURE_NAMES[rng.choice(len(_WEIGHTS), p=_WEIGHTS / _WEIGHTS.sum())]
     gesture = GESTURES[name]
     degrees = np.zeros((16, 3))
     spread = rng.uniform(*gesture.spread)
-    follow = rng.normal(0, 1, 3)  # neighbours move alike
+    follow = rng.normal(0, 1, 3)  # neighbouring fingers move alike
     for finger, words in zip(("index", "middle", "ring", "little"), gesture.fingers, strict=True):
         first = 3 * FINGERS.index(finger) + 1
         state = _state(rng, words)

@@ -1,4 +1,4 @@
-"""Who the hand belongs to: the numbers that describe one person's hand, drawn from a seed."""
+"""The parameters of one person's hand, drawn from a seed."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -8,17 +8,17 @@ import numpy as np
 from oasis_warp.core.hand_model import HandModel
 
 IDENTITY_STREAM = 1
-"""Tells the random numbers of identities from those of pictures with the same seed."""
+"""Stream number that separates the random numbers of identities from those of pictures with the same seed."""
 PCA_SPREAD = (0.5, 0.8, 0.8, 0.8, 0.6, 0.6, 0.3, 0.3, 0.3, 0.3)
 """Standard deviations of the first ten shapes: size, proportions, width, thickness, wrist."""
 ANATOMY_SPREAD = 0.8
-"""Of the other shapes: lengths and girths of single bones."""
+"""Standard deviation of the other shapes: lengths and girths of single bones."""
 SHAPE_LIMIT = 2.2
 
 
 @dataclass(frozen=True, kw_only=True)
 class Population:
-    """How often things occur among the people; a kind that training must never see gets 0."""
+    """How often things occur among people; 0 for a kind that training must never see."""
 
     freckles: float = 0.4
     hair: float = 0.5
@@ -27,17 +27,17 @@ class Population:
     ring: float = 0.14
     plaster: float = 0.04
     melanin: tuple[float, float] = (0.006, 0.34)
-    """Lightest and darkest skin: volume shares of melanosomes, log-uniform between."""
+    """Lightest and darkest skin: volume fractions of melanosomes, log-uniform between them."""
 
 
 class Identity(NamedTuple):
-    """One person's hand. Shares and amounts are 0 to 1 unless said otherwise."""
+    """One person's hand. Amounts are in [0, 1] unless said otherwise."""
 
     shape: np.ndarray
-    """Coefficients of the hand model, in standard deviations."""
+    """Shape coefficients of the hand model, in standard deviations."""
     arm_girth: float
     melanin: float
-    """Volume share of melanosomes on the back of the hand."""
+    """Volume fraction of melanosomes on the back of the hand."""
     blood: float
     oxygen: float
     epidermis: float
@@ -72,21 +72,21 @@ class Identity(NamedTuple):
     """Linear RGB."""
     gloss: float
     tattoo: int
-    """Number of the pattern, 0 for none."""
+    """The pattern's number, 0 for none."""
     plaster: bool
     ring_finger: int
-    """Place in `body.FINGERS`, -1 for none."""
+    """Index into `body.FINGERS`, -1 for none."""
     ring_place: float
-    """Along the first phalanx, as a share of its length."""
+    """Position along the first phalanx, as a share of its length."""
     ring_width: float
     """[mm]."""
     ring_metal: tuple[float, float, float]
     seed: int
-    """Of all patterns on the skin."""
+    """Seed of all patterns on the skin."""
 
 
 def sample_identity(hand: HandModel, seed: int, number: int, population: Population) -> Identity:
-    """Person `number` of the world `seed`; every number draws the same random values whatever the population."""
+    """Person `number` of the world `seed`. The same random values are drawn for any population."""
     rng = np.random.default_rng([seed, IDENTITY_STREAM, number])
     u = rng.uniform
     spread = np.full(len(hand.shape_names), ANATOMY_SPREAD)
@@ -143,7 +143,7 @@ def sample_identity(hand: HandModel, seed: int, number: int, population: Populat
 
 
 def _polish(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Reds and pinks mostly, then nudes and dark colours, some of any colour."""
+    """A nail polish: red or pink mostly, then nude or dark, sometimes any colour."""
     kind = rng.choice(4, p=[0.4, 0.25, 0.15, 0.2])
     value = rng.random(3)
     color = [

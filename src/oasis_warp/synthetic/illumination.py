@@ -1,4 +1,4 @@
-"""Light on a batch of posed hands: depth buffers from the lamps and from all around."""
+"""Visibility of lamps and sky on a batch of posed hands, from depth buffers."""
 
 import functools
 
@@ -14,16 +14,16 @@ from oasis_warp.synthetic.shot_table import ShotTensors
 from oasis_warp.synthetic.view_and_light import sphere
 
 SKY_DIRECTIONS, SKY_SIZE = 40, 112
-"""Depth buffers that sample the sky, and their side [px]."""
+"""Number of depth buffers that sample the sky, and their side [px]."""
 SKY_DISTANCE = 20.0
-"""Of their cameras, in radii of the hand: nearly parallel."""
+"""Distance of their cameras in radii of the hand: the rays are nearly parallel."""
 LAMP_SIZE = 256
 LAMP_MARGIN = 1.35
-"""Radius that a lamp's buffer covers, in radii of the hand: some of the arm casts shadows, too."""
+"""Radius that a lamp's buffer covers, in radii of the hand: a part of the arm casts shadows, too."""
 
 
 def look_at(positions: Float[Tensor, "*batch 3"], targets: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
-    """World to the camera at `positions` whose axis goes through `targets`; roll is arbitrary."""
+    """View matrices of cameras at `positions` that look at `targets`, with arbitrary roll."""
     z = torch.nn.functional.normalize(targets - positions, dim=-1)
     least = torch.nn.functional.one_hot(z.abs().argmin(-1), 3).to(z)
     x = torch.nn.functional.normalize(torch.linalg.cross(least, z), dim=-1)
@@ -35,7 +35,7 @@ def look_at(positions: Float[Tensor, "*batch 3"], targets: Float[Tensor, "*batch
 
 
 def pinhole(focal: Float[Tensor, "*batch"], size: int) -> Float[Tensor, "*batch 3 3"]:
-    """Intrinsics of square pictures of `size` pixels whose axis is their middle."""
+    """Intrinsics of square pictures of `size` pixels with a centred principal point."""
     K = torch.zeros(*focal.shape, 3, 3, device=focal.device)
     K[..., 0, 0] = K[..., 1, 1] = focal
     K[..., 0, 2] = K[..., 1, 2] = size / 2
@@ -48,9 +48,8 @@ def _depths(vertices: Tensor, faces: Tensor, viewmats: Tensor, focals: Tensor, s
     batch, n = focals.shape
     vertices = vertices[:, None].expand(-1, n, -1, -1).flatten(0, 1)
     K = pinhole(focals.flatten(), size)
-    return depth_map(vertices, faces, viewmats.flatten(0, 1), K, size, size, validate=False).depth.unflatten(
-        0, (batch, n)
-    )
+    seen = depth_map(vertices, faces, viewmats.flatten(0, 1), K, size, size, validate=False)
+    return seen.depth.unflatten(0, (batch, n))
 
 
 @functools.cache
@@ -59,7 +58,7 @@ def _directions(device: torch.device) -> Tensor:
 
 
 def see_sky(body: Body, posed: PosedPeople, normals: Tensor) -> Float[Tensor, "B V 10"]:
-    """Hidden-sky transfer of every vertex, smoothed once."""
+    """Radiance transfer from the sky to every vertex, with occlusion, smoothed once."""
     directions = _directions(posed.vertices.device)
     radius = posed.radius * 1.02
     away = posed.center[:, None] + directions * (SKY_DISTANCE * radius)[:, None, None]
@@ -73,7 +72,7 @@ def see_sky(body: Body, posed: PosedPeople, normals: Tensor) -> Float[Tensor, "B
 
 
 def light_lamps(body: Body, posed: PosedPeople, numbers: ShotTensors) -> Lamps:
-    """The lamps of each picture, with what they see of the hand."""
+    """The lamps of each picture with their depth buffers of the hand."""
     distances = numbers.lamp_distances
     center = posed.center[:, None].expand_as(numbers.lamp_directions)
     positions = center + numbers.lamp_directions * distances[..., None]
@@ -84,7 +83,7 @@ def light_lamps(body: Body, posed: PosedPeople, numbers: ShotTensors) -> Lamps:
 
 
 def no_lamps(like: Tensor) -> Lamps:
-    """For pictures without any."""
+    """No lamps for each picture of a batch."""
     none = like.new_empty((len(like), 0))
     points, views = like.new_empty((len(like), 0, 3)), like.new_empty((len(like), 0, 4, 4))
     return Lamps(points, points, none, none, views, none, like.new_empty((len(like), 0, 1, 1)))

@@ -1,4 +1,4 @@
-"""People of a world, baked once and kept: texture, resting surface and what goes with them."""
+"""The people of a world: texture, rest surface and accessories, baked once and cached."""
 
 import functools
 import json
@@ -28,29 +28,30 @@ from oasis_warp.synthetic.texels import texels_on
 from oasis_warp.synthetic.wardrobe import ring_at_rest, ring_look
 
 PERSON_BYTES = 24_000_000
-"""Of a person that is kept, nearly all of it texture."""
-CPU_KEPT = 48
+"""Size of a cached person, nearly all of it texture."""
+CPU_CACHED = 48
+"""People that are cached on the CPU."""
 CUDA_SHARE = 0.5
-"""Of a GPU's memory that people may fill: an H200 keeps 3,000."""
+"""Share of a GPU's memory that people may fill: 3,000 people on an H200."""
 MAX_PLANNED_HERE = 48
-"""So few people are planned sooner by this process than by others, which take seconds to start."""
+"""Up to this number people are planned faster by this process than by workers, which take seconds to start."""
 PLANS_AT_ONCE = 8
-"""That a process hands over."""
+"""Plans that a worker returns together."""
 FORMAT = "oasis-person"
 
 
 class Person(NamedTuple):
-    """Ready to be photographed; metres, the hand's frame."""
+    """All that rendering needs of a person; metres, in the hand's frame."""
 
     identity: Identity
     texture: Float[Tensor, "Y X 8"]
-    """float16, see `bake.CHANNELS`."""
+    """float16, see `skin_texture.CHANNELS`."""
     rest: Float[Tensor, "V 3"]
     """The hand's vertices: shape and relief."""
     joints: Float[Tensor, "16 3"]
     tips: Float[Tensor, "5 3"]
     areas: Float[Tensor, "K"]
-    """Of hand and forearm at rest, as `ops.surface_state` gives them."""
+    """Vertex areas of hand and forearm at rest, see `ops.skin_shading.surface_state`."""
     tone: Float[Tensor, "3"]
     """Mean reflectance."""
     ring: Float[Tensor, "R 3"]
@@ -61,7 +62,7 @@ _cache: OrderedDict[tuple[int, int, Population, str], Person] = OrderedDict()
 
 
 def person(seed: int, number: int, population: Population, device: torch.device | str) -> Person:
-    """Person `number` of the world `seed`; a second on a CPU the first time, then kept until many others have come."""
+    """Person `number` of the world `seed`, from the cache or baked in a second on a CPU."""
     key = (seed, number, population, device_name(device))
     if key in _cache:
         _cache.move_to_end(key)
@@ -71,9 +72,9 @@ def person(seed: int, number: int, population: Population, device: torch.device 
 
 @functools.cache
 def max_people_cached(device: str) -> int:
-    """People that can be kept on a device."""
+    """Number of people that the cache of a device holds."""
     if torch.device(device).type == "cpu":
-        return CPU_KEPT
+        return CPU_CACHED
     return int(CUDA_SHARE * torch.cuda.get_device_properties(device).total_memory / PERSON_BYTES)
 
 
@@ -81,28 +82,28 @@ def bake_people(
     seed: int, numbers: Sequence[int], population: Population, device: torch.device | str, *, jobs: int,
     folder: Path | None = None, progress: Progress = silent,
 ) -> None:  # fmt: skip
-    """Make `person` ready for each of `numbers`: before training, so that it never waits.
+    """Bake people into the cache, so that training never waits for them.
 
     Args:
-        seed: Of the world.
-        numbers: Of the people.
-        population: What they may have.
-        device: Where they are made and kept.
-        jobs: Processes that help; 0 for none. On the CPU they bake. For a CUDA device they plan more than a few
-            people's skin, which this process paints.
-        folder: Where a CPU writes each person to, 23 MB, and reads from when it has been made before; no files when
-            None. A CUDA device bakes about as fast as a disk reads.
-        progress: Told of every person.
+        seed: Seed of the world.
+        numbers: Numbers of the people.
+        population: What people may have.
+        device: Where people are baked and cached.
+        jobs: Number of worker processes, or 0. On the CPU they bake; for a CUDA device they plan the skin, which this
+            process bakes, unless people are few.
+        folder: Folder of files with people baked on the CPU, 23 MB each, which are read when they exist; None for no
+            files. A CUDA device bakes about as fast as a disk reads.
+        progress: Called for every person.
 
     Raises:
-        ValueError: more people than are kept on the device.
+        ValueError: more people than the cache holds.
         InputError: the folder cannot be written.
     """
     device = device_name(device)
     most = max_people_cached(device)
     if len(numbers) > most:
         raise ValueError(
-            f"numbers: expected at most {most} people on {device}, got {len(numbers)}. Others are forgotten."
+            f"numbers: expected at most {most} people on {device}, got {len(numbers)}. The cache holds no more."
         )
     missing = [n for n in numbers if (seed, n, population, device) not in _cache]
     count = len(missing)
@@ -128,15 +129,15 @@ def bake_people(
         try:
             made = pool.map(work, *what, chunksize=1 if on_cpu else PLANS_AT_ONCE)
             if not on_cpu:
-                texels_on(device)  # seconds, in which the processes start
+                texels_on(device)  # takes seconds, in which the processes start
             keep(made)
         except BaseException:
-            pool.shutdown(cancel_futures=True)  # or hundreds of people would still be baked
+            pool.shutdown(cancel_futures=True)  # else hundreds of people would still be baked
             raise
 
 
 def _bake_or_find(seed: int, number: int, population: Population, folder: Path | None) -> Person | Path:
-    """A person made on the CPU, or with a folder its file, which may be there already."""
+    """A person baked on the CPU, or with a folder the path of its file, which may exist already."""
     if folder is None:
         return _bake_person(seed, number, population, "cpu")
     path = folder / f"{number:06d}.safetensors"
@@ -148,7 +149,7 @@ def _bake_or_find(seed: int, number: int, population: Population, folder: Path |
 
 
 def _describe(seed: int, number: int, population: Population) -> str:
-    """Tells a person from all others, and from the same one as another version baked it."""
+    """A text that identifies a person and the version of this package that baked it."""
     return json.dumps([__version__, seed, number, asdict(population)], sort_keys=True)
 
 
@@ -158,18 +159,18 @@ def _is_whole(path: Path, about: str) -> bool:
     try:
         with safe_open(path, framework="pt") as file:
             return (file.metadata() or {}).get(FORMAT) == about
-    except SafetensorError:  # cut short: baked again
+    except SafetensorError:  # truncated: bake it again
         return False
 
 
 def _read(path: Path, seed: int, number: int, population: Population) -> Person:
-    """What `_bake_or_find` has written."""
+    """Read a file that `_bake_or_find` has written."""
     identity = sample_identity(bundled_body().hand, seed, number, population)
     return Person(identity=identity, ring_look=ring_look(identity), **load_file(path))
 
 
 def _remember(key: tuple[int, int, Population, str], found: Person) -> Person:
-    """Remember a person, and forget the one on the same device that was not met for longest."""
+    """Cache a person; drop the least recently used one on the same device when the cache is full."""
     device = key[3]
     _cache[key] = found
     if sum(k[3] == device for k in _cache) > max_people_cached(device):
@@ -178,13 +179,13 @@ def _remember(key: tuple[int, int, Population, str], found: Person) -> Person:
 
 
 def _bake_person(seed: int, number: int, population: Population, device: str) -> Person:
-    """Made on the device."""
+    """Plan and bake a person on the device."""
     return _finish_person(plan_person(seed, number, population), device)
 
 
 @torch.no_grad()
 def _finish_person(plan: SkinPlan, device: str) -> Person:
-    """What is left to do of a person once the skin is planned."""
+    """Bake the texture and surface of a planned person."""
     body, identity = body_on(device), plan.identity
     hand = body.hand
     shape = torch.from_numpy(identity.shape).float().to(device)

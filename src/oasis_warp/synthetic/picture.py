@@ -1,4 +1,4 @@
-"""Pictures of synthetic hands. Any one is a function of (seed, index), whatever the batch it is made in."""
+"""Render pictures of synthetic hands. Each is a function of seed and index, whatever its batch."""
 
 import functools
 import itertools
@@ -32,9 +32,9 @@ from oasis_warp.synthetic.sensor import develop, expose, meter, srgb
 from oasis_warp.synthetic.shot_table import (
     ShotTable,
     ShotTensors,
+    copy_to,
     sample_table,
     sample_tables_ahead,
-    send,
     shot_tensors,
 )
 from oasis_warp.synthetic.shots import PHOTOS, SceneConfig
@@ -48,16 +48,16 @@ MIRROR = (-1.0, 1.0, 1.0)
 
 
 class SyntheticBatch(NamedTuple):
-    """Pictures and the truth about them. A left hand's pose describes the mirrored model (x -> -x)."""
+    """Pictures with ground truth. A left hand's pose describes the mirrored model (x -> -x)."""
 
     image: Float[Tensor, "B H W 3"]
     """sRGB in [0, 1]."""
     alpha: Float[Tensor, "B H W"]
     """Share of each pixel that is hand, arm or clothes."""
     mask: Float[Tensor, "B H W"]
-    """Share that is hand, with its ring, without arm and clothes."""
+    """Share that is hand or ring, without arm and clothes."""
     depth: Float[Tensor, "B H W"]
-    """Along the camera's axis [m]; +inf off the hand, its arm and clothes."""
+    """Depth along the camera's axis [m]; +inf on the background."""
     landmarks: Float[Tensor, "B 21 2"]
     """Projections of the 21 joints and tips [px]."""
     landmarks_3d: Float[Tensor, "B 21 3"]
@@ -78,7 +78,7 @@ class SyntheticBatch(NamedTuple):
 
 @functools.cache
 def _texels(device: torch.device) -> tuple[Tensor, Tensor]:
-    """Texture coordinates, and the corners of the faces among them."""
+    """Texture coordinates in texels, and their faces."""
     body = body_on(str(device))
     return body.uv * torch.tensor([WIDTH, HEIGHT], device=device), body.uv_faces.to(torch.int32)
 
@@ -94,60 +94,57 @@ def render_batch(
     size: int = 256,
     device: torch.device | str = "cpu",
     *,
-    scenery: SceneConfig = PHOTOS,
+    scene: SceneConfig = PHOTOS,
 ) -> SyntheticBatch:
-    """Pictures `indices` of the world `seed`, each `size` pixels wide and high.
+    """Render pictures `indices` of the world `seed`, each `size` pixels wide and high.
 
-    A picture depends on seed, index, size and scenery alone: not on its batch, nor on the device, up to
-    rounding. Indices 8 n to 8 n + 7 show one person, whose texture is baked when first met (seconds) and kept.
+    A picture depends on seed, index, size and scene only: not on its batch nor, up to rounding, on the device.
+    Indices 8 n to 8 n + 7 show one person, whose texture is baked at first use (seconds) and cached.
     """
-    return render_planned(seed, sample_table(seed, indices, scenery), size, device, scenery=scenery)
+    return render_table(seed, sample_table(seed, indices, scene), size, device, scene=scene)
 
 
 @torch.no_grad()
-def render_planned(
-    seed: int, planned: ShotTable, size: int, device: torch.device | str, *, scenery: SceneConfig
+def render_table(
+    seed: int, table: ShotTable, size: int, device: torch.device | str, *, scene: SceneConfig
 ) -> SyntheticBatch:
-    """The second half of `render_batch`: pictures of what `sample_table` has drawn for the same seed and scenery.
-
-    Nothing waits for the device.
-    """
-    even = scenery.look == "even"
-    scene = _shade_batch(seed, planned, size, torch.device(device), scenery.population, lamps=not even)
+    """Render the shots that `sample_table` has drawn for the same seed and scene, without waiting for the device."""
+    even = scene.look == "even"
+    batch = _shade_batch(seed, table, size, torch.device(device), scene.population, lamps=not even)
     if even:
-        image = _over_black(scene.shaded, lambda linear: srgb(linear.clamp(max=1)))
+        image = _over_black(batch.shaded, lambda linear: srgb(linear.clamp(max=1)))
     else:
-        image = _photo(scene, _scene_light(scene, planned, size, scenery))
-    return _with_ground_truth(scene, image, planned, size)
+        image = _photo(batch, _scene_light(batch, table, size, scene))
+    return _with_ground_truth(batch, image, table, size)
 
 
 @torch.no_grad()
 def render_capture(
-    seed: int, photo: ShotTable, others: ShotTable, size: int, device: torch.device | str, *, scenery: SceneConfig
+    seed: int, photo: ShotTable, others: ShotTable, size: int, device: torch.device | str, *, scene: SceneConfig
 ) -> tuple[SyntheticBatch, SyntheticBatch]:
-    """One photo, and pictures of the hand alone in the same light and exposure, over black, as a clean camera sees it.
+    """Render one photo, and pictures of the bare hand over black in its light and exposure, by an ideal camera.
 
     Args:
         seed: Of the world.
-        photo: One plan, with everything.
-        others: Of `plan.capture_shots` with this photo.
+        photo: One shot with background and sensor.
+        others: Shots of `shots.capture_shots` with this photo.
         size: Side of all pictures [px].
         device: Where to render.
-        scenery: Of the photo.
+        scene: Scene of the photo.
     """
     device = torch.device(device)
-    scene = _shade_batch(seed, photo, size, device, scenery.population, lamps=True)
-    light = _scene_light(scene, photo, size, scenery)
-    again = _shade_batch(seed, others, size, device, scenery.population, lamps=True)
+    batch = _shade_batch(seed, photo, size, device, scene.population, lamps=True)
+    light = _scene_light(batch, photo, size, scene)
+    again = _shade_batch(seed, others, size, device, scene.population, lamps=True)
     count = len(others.numbers)
-    gains = meter(light, scene.shaded.alpha, scene.numbers.sensor, scene.numbers.incident).expand(count, -1)
-    sensors = scene.numbers.sensor.expand(count, -1)
+    gains = meter(light, batch.shaded.alpha, batch.numbers.sensor, batch.numbers.incident).expand(count, -1)
+    sensors = batch.numbers.sensor.expand(count, -1)
     image = _over_black(again.shaded, lambda linear: develop(linear, gains, sensors))
-    return _with_ground_truth(scene, _photo(scene, light), photo, size), _with_ground_truth(again, image, others, size)
+    return _with_ground_truth(batch, _photo(batch, light), photo, size), _with_ground_truth(again, image, others, size)
 
 
 class _ShadedBatch(NamedTuple):
-    """A batch posed, lit and shaded, before any camera makes a picture of it."""
+    """A batch of posed, lit and shaded hands, in linear light and without background."""
 
     numbers: ShotTensors
     whole: Int[Tensor, "B 4"]
@@ -157,13 +154,13 @@ class _ShadedBatch(NamedTuple):
 
 
 def _shade_batch(
-    seed: int, planned: ShotTable, size: int, device: torch.device, population: Population, *, lamps: bool
+    seed: int, table: ShotTable, size: int, device: torch.device, population: Population, *, lamps: bool
 ) -> _ShadedBatch:
     name = device_name(device)
     device, body = torch.device(name), body_on(name)
-    people = [person(seed, number, population, name) for number in planned.whole[:, 1].tolist()]
-    numbers = shot_tensors(planned, device)
-    whole = send(torch.from_numpy(planned.whole), device)
+    people = [person(seed, number, population, name) for number in table.whole[:, 1].tolist()]
+    numbers = shot_tensors(table, device)
+    whole = copy_to(torch.from_numpy(table.whole), device)
     posed = pose_people(body, people, numbers)
     fine = size * SAMPLES
     K = pinhole(posed.focal * fine, fine)
@@ -182,36 +179,36 @@ def _shade_batch(
 
 
 def _over_black(shaded: Shaded, camera: Callable[[Tensor], Tensor]) -> Float[Tensor, "B H W 3"]:
-    """What the camera makes of the linear light of hand and arm, over black, as splats are drawn."""
+    """Apply the camera to the light of hand and arm and composite over black, as splats are rendered."""
     share = shaded.alpha[..., None]
     return share * camera((shaded.color / share.clamp_min(1e-3)).clamp_min(0))
 
 
-def _scene_light(scene: _ShadedBatch, planned: ShotTable, size: int, scenery: SceneConfig) -> Float[Tensor, "B H W 3"]:
-    """The linear light of hand, arm and what is behind them."""
-    numbers, shaded = scene.numbers, scene.shaded
-    if scenery.backgrounds:
-        behind = send(_cut_backgrounds(scenery, planned, size), shaded.color.device)
+def _scene_light(batch: _ShadedBatch, table: ShotTable, size: int, scene: SceneConfig) -> Float[Tensor, "B H W 3"]:
+    """The linear light of hand, arm and background."""
+    numbers, shaded = batch.numbers, batch.shaded
+    if scene.backgrounds:
+        behind = copy_to(_cut_backgrounds(scene, table, size), shaded.color.device)
     else:
         behind = trace_rooms(
-            numbers.solids, scene.posed.focal * size, numbers.sky, scene.lamps, shaded.alpha, numbers.view_distance,
+            numbers.solids, batch.posed.focal * size, numbers.sky, batch.lamps, shaded.alpha, numbers.view_distance,
             numbers.aperture,
         )  # fmt: skip
     return shaded.color + (1 - shaded.alpha[..., None]) * behind
 
 
-def _photo(scene: _ShadedBatch, light: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:
-    """What the sensor makes of the light."""
-    numbers = scene.numbers
-    return expose(light, scene.shaded.alpha, numbers.sensor, numbers.incident, scene.whole[:, 3])
+def _photo(batch: _ShadedBatch, light: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:
+    """The photo that the sensors take of the light."""
+    numbers = batch.numbers
+    return expose(light, batch.shaded.alpha, numbers.sensor, numbers.incident, batch.whole[:, 3])
 
 
 def _with_ground_truth(
-    scene: _ShadedBatch, image: Float[Tensor, "B H W 3"], planned: ShotTable, size: int
+    batch: _ShadedBatch, image: Float[Tensor, "B H W 3"], table: ShotTable, size: int
 ) -> SyntheticBatch:
-    """The pictures and what is known about them, left hands mirrored."""
-    numbers, posed, shaded = scene.numbers, scene.posed, scene.shaded
-    index, number, left, _ = scene.whole.unbind(1)
+    """The pictures with their ground truth; left hands are mirrored."""
+    numbers, posed, shaded = batch.numbers, batch.posed, batch.shaded
+    index, number, left, _ = batch.whole.unbind(1)
     K = pinhole(posed.focal * size, size)
     marks = posed.landmarks @ K.transpose(1, 2)
     batch = SyntheticBatch(
@@ -229,40 +226,40 @@ def _with_ground_truth(
         left=left,
         person=number,
         index=index,
-        gestures=planned.gestures,
+        gestures=table.gestures,
     )
     return _mirror_left(batch, size)
 
 
 def slice_batch(batch: SyntheticBatch, rows: slice) -> SyntheticBatch:
-    """Some of the pictures."""
+    """Rows of a batch."""
     return SyntheticBatch(*(field[rows] for field in batch))
 
 
 def stream(
     seed: int, batch: int, size: int = 256, device: torch.device | str = "cpu", *, start: int = 0,
-    scenery: SceneConfig = PHOTOS, workers: int = 0,
+    scene: SceneConfig = PHOTOS, workers: int = 0,
 ) -> Iterator[SyntheticBatch]:  # fmt: skip
-    """Pictures from `start` on in batches, without end: `render_batch`, for training on the fly.
+    """Endless batches of `render_batch` from picture `start` on, for training on the fly.
 
-    Drawing a shot takes a CPU some milliseconds; with `workers`, so many processes draw ahead while a GPU renders.
+    Sampling a shot takes some milliseconds of CPU time; `workers` processes sample ahead while a GPU renders.
     """
-    blocks = ((range(first, first + batch), scenery) for first in itertools.count(start, batch))
-    for planned in sample_tables_ahead(seed, blocks, workers):
-        yield render_planned(seed, planned, size, device, scenery=scenery)
+    blocks = ((range(first, first + batch), scene) for first in itertools.count(start, batch))
+    for table in sample_tables_ahead(seed, blocks, workers):
+        yield render_table(seed, table, size, device, scene=scene)
 
 
-def _cut_backgrounds(scenery: SceneConfig, planned: ShotTable, size: int) -> Tensor:
-    """A picture of the folder for each plan, as bright as the light on the hand; on the CPU."""
-    numbers, cuts = shot_tensors(planned, torch.device("cpu")), []
-    for aperture, light, seed in zip(numbers.aperture, numbers.incident, planned.whole[:, 3], strict=True):
+def _cut_backgrounds(scene: SceneConfig, table: ShotTable, size: int) -> Tensor:
+    """A background for each shot, as bright as the light on the hand; on the CPU."""
+    numbers, cuts = shot_tensors(table, torch.device("cpu")), []
+    for aperture, light, seed in zip(numbers.aperture, numbers.incident, table.whole[:, 3], strict=True):
         random = np.random.default_rng([int(seed)])
-        cuts.append(cut_background(scenery.backgrounds, random, size, float(aperture) * size) * light.mean())
+        cuts.append(cut_background(scene.backgrounds, random, size, float(aperture) * size) * light.mean())
     return torch.stack(cuts)
 
 
 def _mirror_left(batch: SyntheticBatch, size: int) -> SyntheticBatch:
-    """Everything is made with right hands; the mirror image of one is a left hand in a mirrored world."""
+    """Mirror the pictures of left hands: everything is rendered with right hands."""
     left = batch.left.bool()
 
     def flip(images: Tensor) -> Tensor:
@@ -284,7 +281,7 @@ def _mirror_left(batch: SyntheticBatch, size: int) -> SyntheticBatch:
 
 
 def _stretch(body: Body, people: list[Person], areas: Tensor) -> Tensor:
-    """Area of the posed over that of the resting skin round each vertex; 1 for clothes."""
+    """Ratio of the posed to the rest area of the skin around each vertex; 1 for clothes."""
     rest = torch.stack([p.areas for p in people])
     stretch = torch.ones_like(areas)
     n = rest.shape[1]

@@ -1,4 +1,4 @@
-"""Pose a batch of people, dress them, and put them before their cameras."""
+"""Pose and dress a batch of people, and place them in front of their cameras."""
 
 import functools
 from collections.abc import Sequence
@@ -15,23 +15,23 @@ from oasis_warp.synthetic.shot_table import ShotTensors
 from oasis_warp.synthetic.wardrobe import AWAY, bands, sleeves
 
 _LAST_JOINTS = (15, 3, 6, 12, 9)
-"""Of thumb, index, middle, ring, little: they carry the tips."""
+"""The last joints of thumb, index, middle, ring and little finger, which move the tips."""
 
 
 class PosedPeople(NamedTuple):
-    """A batch of dressed hands in the frames of their cameras [m]."""
+    """A batch of posed and dressed hands in the frames of their cameras [m]."""
 
     vertices: Float[Tensor, "B V 3"]
-    """In the order of `Body`."""
+    """In the order of `body.Body`."""
     landmarks: Float[Tensor, "B 21 3"]
     translation: Float[Tensor, "B 3"]
-    """Of the hand's frame: with the view's rotation it is the pose."""
+    """Of the hand's frame; with the view's rotation the hand's pose."""
     focal: Float[Tensor, "B"]
-    """For a picture one unit wide."""
+    """Focal length over the width of the picture."""
     center: Float[Tensor, "B 3"]
     """Middle of the hand."""
     radius: Float[Tensor, "B"]
-    """Of a ball round it that holds the hand."""
+    """Radius of a ball around it that contains the hand."""
 
 
 @functools.cache
@@ -41,23 +41,23 @@ def _away(device: torch.device) -> Tensor:
 
 @functools.cache
 def _carriers(device: torch.device) -> Tensor:
-    """Joints that carry the joints and tips."""
+    """The joints that move the 16 joints and 5 tips."""
     return torch.tensor([*range(16), *_LAST_JOINTS], device=device)
 
 
-def _moved(rotations: Tensor, points: Tensor) -> Tensor:
-    """Points [B, N, 3], turned by rotations [B, 3, 3] or [B, N, 3, 3]."""
+def _rotate(rotations: Tensor, points: Tensor) -> Tensor:
+    """Rotate points [B, N, 3] by [B, 3, 3] or [B, N, 3, 3]."""
     rotations = rotations[:, None] if rotations.dim() == 3 else rotations
     return (rotations * points[:, :, None]).sum(-1)
 
 
 def pose_people(body: Body, people: Sequence[Person], numbers: ShotTensors) -> PosedPeople:
-    """Skin the hands with their pose correctives, grow arms, lay clothes on, and fit the cameras.
+    """Skin the hands with pose correctives, add forearms and clothes, and fit the cameras.
 
     Args:
         body: On the people's device.
-        people: One an image.
-        numbers: Of the images.
+        people: One per image.
+        numbers: Of the same images.
     """
     hand = body.hand
     rest, joints, tips, ring = (torch.stack([getattr(p, name) for p in people])
@@ -75,25 +75,25 @@ def pose_people(body: Body, people: Sequence[Person], numbers: ShotTensors) -> P
     worn = [
         sleeves(rows, numbers.sleeve_start, numbers.sleeve_gap, numbers.sleeve_phases).flatten(1, 2),
         bands(rows, numbers.band_start, numbers.band_width, numbers.band_thickness).flatten(1, 2),
-        _moved(numbers.ring_rotation, ring) + numbers.ring_shift[:, None],
+        _rotate(numbers.ring_rotation, ring) + numbers.ring_shift[:, None],
     ]
 
     turn, distance, fill = numbers.view_rotation, numbers.view_distance, numbers.view_fill
-    seen = _moved(turn, skinned)
+    seen = _rotate(turn, skinned)
     low, high = seen.aminmax(dim=1)
     middle = (low + high) / 2
     extent = (high - low)[:, :2].amax(1)
     focal = fill * distance / extent
     off = torch.cat([numbers.view_shift * (extent / fill)[:, None], distance[:, None]], 1)
     translation = off - middle
-    move = lambda points: _moved(turn, points) + translation[:, None]  # noqa: E731
+    move = lambda points: _rotate(turn, points) + translation[:, None]  # noqa: E731
     parts = [seen + translation[:, None], move(arm.flatten(1, 2))]
     for k, points in enumerate(worn):
         parts.append(torch.where(numbers.wears[:, k, None, None] > 0, move(points), _away(points.device)))
 
     carriers = _carriers(rest.device)[hand.keypoint_index]
     carried = torch.cat([joints, tips], 1)[:, hand.keypoint_index]
-    marks = _moved(numbers.rotations[:, carriers], carried) + numbers.shifts[:, carriers]
+    marks = _rotate(numbers.rotations[:, carriers], carried) + numbers.shifts[:, carriers]
     return PosedPeople(
         torch.cat(parts, 1),
         move(marks),

@@ -1,4 +1,4 @@
-"""Low-frequency form that the template lacks: pads, knuckles, tendons and hollows, one displacement a vertex."""
+"""Low-frequency shape that the template lacks: pads, knuckles, tendons and hollows, as vertex displacements."""
 
 import functools
 
@@ -13,7 +13,7 @@ from oasis_warp.synthetic.ops.surface_patterns import NoiseField, surface_noise
 
 _UP, _PAD, _BACK_OF_KNUCKLE = np.array([0.0, 8, 0]), np.array([-5.0, -12, 0]), np.array([1.5, 0, 0])
 _ACROSS = (1, 4, 10, 7)
-"""First joints of index, middle, ring, little: as they lie side by side."""
+"""First joints of index, middle, ring and little finger, in anatomical order."""
 
 
 def _step(low: float, high: float, x: np.ndarray) -> np.ndarray:
@@ -23,7 +23,7 @@ def _step(low: float, high: float, x: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _forms() -> np.ndarray:
-    """Heights [mm] of the hand's vertices: what all have, and what grows with bony, tendons, bony x tendons; [V, 4]."""
+    """Heights of the hand's vertices [mm], [V, 4]: constant, and per unit of bony, tendons, and bony x tendons."""
     body = bundled_body()
     n = body.n_hand
     points, normals = body.rest[:n].double().numpy(), body.normals[:n].double().numpy()

@@ -1,4 +1,4 @@
-"""What a phone makes of light: exposure, white balance, lens, noise, tone curve, sharpening, JPEG."""
+"""Simulate a phone's camera: exposure, white balance, lens, noise, tone curve, sharpening, JPEG."""
 
 import functools
 import math
@@ -17,13 +17,14 @@ _PLACES = {
     "exposure": 0, "metering": 1, "balance": 2, "tint": slice(3, 6), "vignette": 6, "blur": 7, "noise": 8, "grain": 9,
     "filmic": 10, "contrast": 11, "saturation": 12, "sharpening": 13, "quality": 14,
 }  # fmt: skip
-"""Of a sensor's fields in its row."""
+"""Columns of a sensor's fields in its row."""
 SENSOR_WORDS = 15
+"""Length of a row."""
 _SHARPENED = 1.2
-"""Blur that sharpening compares with [px]."""
+"""Blur of the unsharp mask [px]."""
 _TAPS = 4
-"""Pixels on either side that a blur reaches."""
-# Annex K of the JPEG standard (ITU-T T.81), and the JFIF colour transform.
+"""Radius of blur kernels [px]."""
+# Quantisation tables of the JPEG standard (ITU-T T.81, annex K), and the JFIF colour transform.
 _LUMA_STEPS = (
     16, 11, 10, 16, 24, 40, 51, 61, 12, 12, 14, 19, 26, 58, 60, 55, 14, 13, 16, 24, 40, 57, 69, 56, 14, 17, 22, 29, 51,
     87, 80, 62, 18, 22, 37, 56, 68, 109, 103, 77, 24, 35, 55, 64, 81, 104, 113, 92, 49, 64, 78, 87, 103, 121, 120, 101,
@@ -37,32 +38,32 @@ _TO_YCC = ((0.299, 0.587, 0.114), (-0.168736, -0.331264, 0.5), (0.5, -0.418688, 
 
 
 class Sensor(NamedTuple):
-    """One camera and its mood."""
+    """One camera and its settings."""
 
     exposure: float
-    """Exposed value of a grey card of 18 % in mean light."""
+    """Exposed value of an 18 % grey card in mean light."""
     metering: float
-    """0: for the light that falls in, 1: for what the picture throws back, which turns pale and dark hands grey."""
+    """0 meters incident light; 1 meters the picture, which turns pale and dark hands grey."""
     balance: float
-    """Share of the light's colour that white balance takes out."""
+    """Share of the light's colour that white balance removes."""
     tint: np.ndarray
-    """Its error, a factor a colour, [3]."""
+    """Its error: a factor per channel, [3]."""
     vignette: float
     blur: float
-    """Of the lens: standard deviation [px at a side of 256]."""
+    """Standard deviation of the lens blur [px at a side of 256]."""
     noise: float
     grain: float
-    """Blur of the noise [px]."""
+    """Standard deviation of the noise's blur [px]."""
     filmic: bool
     contrast: float
     saturation: float
     sharpening: float
     quality: int
-    """Of JPEG."""
+    """JPEG quality."""
 
 
 def sample_sensor(rng: np.random.Generator) -> Sensor:
-    """Phones mostly: near daylight balance, some contrast, some sharpening, JPEG 60 to 95."""
+    """Sample a phone: near daylight balance, some contrast, some sharpening, JPEG quality 60 to 95."""
     u = rng.uniform
     return Sensor(
         exposure=float(np.exp(rng.normal(-1.72, 0.30))),
@@ -82,7 +83,7 @@ def sample_sensor(rng: np.random.Generator) -> Sensor:
 
 
 def sensor_row(sensor: Sensor) -> list[float]:
-    """The numbers of a sensor in a row."""
+    """A sensor as `SENSOR_WORDS` numbers."""
     return [float(number) for value in sensor for number in np.atleast_1d(value)]
 
 
@@ -92,13 +93,13 @@ def _constant(values: tuple, device: torch.device) -> Tensor:
 
 
 def _blur(images: Tensor, sigmas: Tensor) -> Tensor:
-    """Gaussian blur of each of [B, C, H, W] by its own width, edges repeated."""
+    """Gaussian blur of each image [B, C, H, W] by its own sigma, with edges replicated."""
     batch, channels = images.shape[:2]
     at = torch.arange(-_TAPS, _TAPS + 1, device=images.device)
     kernel = torch.exp(-0.5 * (at / sigmas[:, None].clamp_min(0.05)) ** 2)
     kernel = (kernel / kernel.sum(1, keepdim=True)).repeat_interleave(channels, 0)[:, None]
     flat = images.reshape(1, batch * channels, *images.shape[2:])
-    with torch.backends.cudnn.flags(deterministic=True, allow_tf32=False):  # the same picture as on the CPU
+    with torch.backends.cudnn.flags(deterministic=True, allow_tf32=False):  # as on the CPU
         flat = conv2d(pad(flat, (_TAPS, _TAPS, 0, 0), mode="replicate"), kernel[:, :, None], groups=batch * channels)
         flat = conv2d(pad(flat, (0, 0, _TAPS, _TAPS), mode="replicate"), kernel[..., None], groups=batch * channels)
     return flat.view_as(images)
@@ -106,6 +107,7 @@ def _blur(images: Tensor, sigmas: Tensor) -> Tensor:
 
 @functools.cache
 def _dct(device: torch.device) -> Tensor:
+    """Matrix of the 8-point discrete cosine transform."""
     k = torch.arange(8, dtype=torch.float64)
     basis = torch.cos(math.pi * (2 * k + 1) * k[:, None] / 16) / 2
     basis[0] /= math.sqrt(2)
@@ -114,13 +116,13 @@ def _dct(device: torch.device) -> Tensor:
 
 @functools.cache
 def _color_transforms(device: torch.device) -> tuple[Tensor, Tensor]:
-    """From RGB to luma and chroma, and back."""
-    there = torch.tensor(_TO_YCC)
-    return there.to(device), torch.linalg.inv(there).to(device)
+    """Matrices from RGB to luma and chroma, and back."""
+    to_ycc = torch.tensor(_TO_YCC)
+    return to_ycc.to(device), torch.linalg.inv(to_ycc).to(device)
 
 
 def _quantised(planes: Tensor, steps: Tensor) -> Tensor:
-    """Planes [B, C, H, W] of whole 8 x 8 blocks, their cosine coefficients rounded to multiples of [B, 8, 8]."""
+    """Round the cosine coefficients of planes [B, C, H, W] of whole 8 x 8 blocks to multiples of [B, 8, 8]."""
     dct = _dct(planes.device)
     blocks = planes.unflatten(3, (-1, 8)).unflatten(2, (-1, 8)).transpose(3, 4)
     steps = steps[:, None, None, None]
@@ -129,7 +131,7 @@ def _quantised(planes: Tensor, steps: Tensor) -> Tensor:
 
 
 def jpeg(images: Float[Tensor, "B 3 H W"], qualities: Float[Tensor, "B"]) -> Float[Tensor, "B 3 H W"]:
-    """What JPEG with chroma at half size leaves of sRGB images in [0, 1]: the loss, without the file."""
+    """Compress and decompress sRGB images in [0, 1] as JPEG does with half-size chroma."""
     device, (height, width) = images.device, images.shape[2:]
     scale = torch.where(qualities < 50, 5000 / qualities, 200 - 2 * qualities)[:, None]
 
@@ -148,7 +150,7 @@ def jpeg(images: Float[Tensor, "B 3 H W"], qualities: Float[Tensor, "B"]) -> Flo
 
 
 def srgb(linear: Tensor) -> Tensor:
-    """SRGB of linear light."""
+    """Convert linear light to sRGB."""
     return torch.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(1e-8) ** (1 / 2.4) - 0.055)
 
 
@@ -158,21 +160,19 @@ def meter(
     sensors: Float[Tensor, "B 15"],
     incident: Float[Tensor, "B 3"],
 ) -> Float[Tensor, "B 3"]:
-    """By what the channels of linear light are multiplied: exposure and white balance. Arguments as of `expose`."""
+    """Gains of the channels of linear light: exposure and white balance. See `expose` for the arguments."""
     luma = _constant(_LUMA, light.device)
     weight = alpha * 0.7 + 0.25
     mirrored = ((light * luma).sum(3).clamp(max=2.0) * weight).sum((1, 2)) / weight.sum((1, 2))
     falling = 0.18 * (incident * luma).sum(1)
-    exposure, share, tint, balance = (
-        sensors[:, _PLACES[name]] for name in ("exposure", "metering", "tint", "balance")
-    )  # fmt: skip
+    exposure, share, tint, balance = (sensors[:, _PLACES[k]] for k in ("exposure", "metering", "tint", "balance"))
     gain = exposure / (falling.clamp_min(1e-3) ** (1 - share) * mirrored.clamp_min(1e-3) ** share)
     white = incident / incident.mean(1, keepdim=True)
     return gain[:, None] * tint / white ** balance[:, None]
 
 
 def _toned(x: Float[Tensor, "B 3 H W"], sensors: Float[Tensor, "B 15"]) -> Float[Tensor, "B 3 H W"]:
-    """What a camera makes of exposed linear light: its curve, contrast and saturation, in sRGB."""
+    """Apply tone curve, contrast and saturation to exposed linear light; the result is sRGB."""
 
     def cast(name: str) -> Tensor:
         return sensors[:, _PLACES[name]][:, None, None, None]
@@ -188,7 +188,7 @@ def _toned(x: Float[Tensor, "B 3 H W"], sensors: Float[Tensor, "B 15"]) -> Float
 def develop(
     light: Float[Tensor, "B H W 3"], gains: Float[Tensor, "B 3"], sensors: Float[Tensor, "B 15"]
 ) -> Float[Tensor, "B H W 3"]:
-    """`expose` with the exposure given (see `meter`), through a camera without blur, noise, vignette or JPEG."""
+    """`expose` with given gains (see `meter`) and without vignette, blur, noise, sharpening and JPEG."""
     x = light.permute(0, 3, 1, 2) * gains[:, :, None, None]
     return _toned(x.clamp_min(0), sensors).clamp(0, 1).permute(0, 2, 3, 1)
 
@@ -200,14 +200,14 @@ def expose(
     incident: Float[Tensor, "B 3"],
     seeds: Int[Tensor, "B"],
 ) -> Float[Tensor, "B H W 3"]:
-    """Photos in [0, 1], sRGB, of linear light.
+    """Take photos of linear light; sRGB in [0, 1].
 
     Args:
-        light: Of the scene.
-        alpha: Where the hand is: it is metered first.
-        sensors: A `sensor_row` an image.
+        light: Linear light of the scene.
+        alpha: Share of each pixel that is hand, on which metering concentrates.
+        sensors: A `sensor_row` per image.
         incident: Irradiance over pi on the hand, linear RGB.
-        seeds: Of the noise.
+        seeds: Seeds of the noise.
     """
     device, size = light.device, light.shape[2]
 

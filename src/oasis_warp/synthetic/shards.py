@@ -1,14 +1,13 @@
-"""Write pictures for others: tar files in the WebDataset layout, whole or not there, the same bytes every time.
+"""Write data sets of pictures: tar files in the WebDataset layout, atomic and reproducible to the byte.
 
-Picture i is four members: `i.jpg`, `i.mask.png` (share of the pixel that is hand), `i.depth.png` (16 bits, tenths of a
-millimetre, 0 for none) and `i.json` with the truth.
+Picture i has four members: `i.jpg`, `i.mask.png` (share of the pixel that is hand), `i.depth.png` (16 bits, tenths of a
+millimetre, 0 for none) and `i.json` with the ground truth.
 """
 
 import io
 import json
 import tarfile
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,10 +19,10 @@ from oasis_warp.synthetic.picture import SyntheticBatch, render_batch
 from oasis_warp.synthetic.shots import SceneConfig
 
 SHARD = 64
-"""Pictures a file: a whole number of people."""
+"""Pictures per file: a whole number of people."""
 JPEG_QUALITY = 95
 DEPTH_UNIT = 1e-4
-"""Of depth pictures [m]."""
+"""Unit of the depth images [m]."""
 DESCRIPTION = "dataset.json"
 
 
@@ -33,41 +32,41 @@ def shard_name(number: int) -> str:
 
 
 def write_shards(
-    folder: Path, *, count: int, seed: int, size: int, device: str, scenery: SceneConfig, settings: dict[str, Any],
-    batch: int, progress: Progress = silent,
+    folder: Path, *, count: int, seed: int, size: int, device: str, scene: SceneConfig, batch: int,
+    progress: Progress = silent,
 ) -> int:  # fmt: skip
-    """Render pictures 0 to `count` - 1 into shards of `folder`; those that are there already stay. How many were new.
+    """Render pictures 0 to `count` - 1 into shards of `folder`, and return the number of new ones.
 
-    A run that was stopped goes on where it was, and ends with the same files.
+    Shards that exist already stay. A stopped run continues where it was, and ends with the same files.
 
     Args:
-        folder: Made if need be; its parent must exist.
-        count: Pictures in all.
-        seed: Of the world.
+        folder: Created if needed; its parent must exist.
+        count: Number of pictures.
+        seed: Seed of the world.
         size: Side of the pictures [px].
         device: Where to compute.
-        scenery: What they show.
-        settings: What else decides on the pictures, for `dataset.json`; a folder with others is refused.
+        scene: What the pictures show.
         batch: Pictures rendered together.
-        progress: Told of every batch.
+        progress: Called after every batch.
 
     Raises:
         InputError: the folder holds other pictures, or cannot be written.
     """
-    described = {"seed": seed, "size": size, "shard": SHARD, **settings}
-    open_resumable_folder(folder, DESCRIPTION, described, "pictures")
+    backgrounds = [path.name for path in scene.backgrounds]
+    settings = {"seed": seed, "size": size, "shard": SHARD, "look": scene.look, "backgrounds": backgrounds}
+    open_resumable_folder(folder, DESCRIPTION, settings, "pictures")
     n_shards = -(-count // SHARD)
     made = 0
     for number in range(n_shards):
         first, end = number * SHARD, min((number + 1) * SHARD, count)
         path = folder / shard_name(number)
-        if path.is_file() and _holds(path) == end - first:
+        if path.is_file() and _count_pictures(path) == end - first:
             progress("pictures", end, count)
             continue
         with output_file(path) as part, tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar:
             for start in range(first, end, batch):
                 indices = range(start, min(start + batch, end))
-                rendered = render_batch(seed, indices, size, device, scenery=scenery)
+                rendered = render_batch(seed, indices, size, device, scene=scene)
                 for k in range(len(indices)):
                     for name, data in encode(rendered, k).items():
                         member = tarfile.TarInfo(f"{indices[k]:08d}.{name}")
@@ -78,14 +77,14 @@ def write_shards(
     return made
 
 
-def _holds(path: Path) -> int:
-    """Pictures in a shard."""
+def _count_pictures(path: Path) -> int:
+    """Number of pictures in a shard."""
     with tarfile.open(path) as tar:
         return sum(name.endswith(".json") for name in tar.getnames())
 
 
 def encode(batch: SyntheticBatch, k: int) -> dict[str, bytes]:
-    """Picture `k` of a batch as files, by the end of their names."""
+    """Picture `k` of a batch as files, by the suffix of their names."""
     rgb = (batch.image[k].cpu() * 255).round().to(torch.uint8).numpy()
     mask = (batch.mask[k].cpu() * 255).round().to(torch.uint8).numpy()
     depth = batch.depth[k].cpu().numpy().astype(np.float64)

@@ -1,4 +1,4 @@
-"""Plans as tables: the numbers that pictures are rendered from, a row a picture, so that they travel in one copy."""
+"""Shots as tables of numbers, one row per picture, so that a batch is copied to the device at once."""
 
 import functools
 import itertools
@@ -19,42 +19,42 @@ from oasis_warp.synthetic.contact import bundled_skeleton
 from oasis_warp.synthetic.furniture import MAX_SOLIDS, SOLID_WORDS
 from oasis_warp.synthetic.identity import Identity, Population
 from oasis_warp.synthetic.sensor import SENSOR_WORDS, sensor_row
-from oasis_warp.synthetic.shots import SceneConfig, Shot, identity_of, sample_shots
+from oasis_warp.synthetic.shots import SceneConfig, Shot, cached_identity, sample_shots
 from oasis_warp.synthetic.view_and_light import N_LAMPS
 from oasis_warp.synthetic.wardrobe import SKIN_LOOK, ring_look
 
 AHEAD = 3
-"""Batches a worker that are planned ahead."""
+"""Batches that are sampled ahead per worker."""
 ARM_BEND = 0.15
 """Share of the forearm over which it bends at the wrist."""
 
 
 class ShotTable(NamedTuple):
-    """B plans, as processes hand them over."""
+    """B shots, as processes exchange them."""
 
     numbers: np.ndarray
-    """float32, a row a picture: see `ShotTensors`."""
+    """float32, one row per picture with the fields of `ShotTensors`."""
     whole: np.ndarray
-    """int64, [B, 4]: index, person, 1 for left hands, seed of whatever is drawn a pixel at a time."""
+    """int64, [B, 4]: index, person, 1 for left hands, seed of the random numbers per pixel."""
     gestures: tuple[str, ...]
 
 
 class ShotTensors(NamedTuple):
-    """What pictures are rendered from. A picture in even light has no room and no sensor: there all is 0."""
+    """What pictures are rendered from. Those in even light have no room and no sensor: these fields are 0."""
 
     angles: Float[Tensor, "B 15 3"]
     """As `HandPose.angles`."""
     rotations: Float[Tensor, "B 16 3 3"]
-    """With `shifts` [m] they carry the rest points of each bone, the wrist fixed."""
+    """With `shifts` [m] the transform of each bone from rest to pose, with the wrist fixed."""
     shifts: Float[Tensor, "B 16 3"]
     knuckles: Float[Tensor, "B 15"]
-    """How far each stands out, in `Body.knuckle_rise`."""
+    """Factor of `Body.knuckle_rise` for each joint."""
     shape: Float[Tensor, "B S"]
     arm_turns: Float[Tensor, "B R 3 3"]
-    """Of the forearm's rings."""
+    """Rotations of the forearm's rings."""
     arm_girth: Float[Tensor, "B"]
     ring_rotation: Float[Tensor, "B 3 3"]
-    """With `ring_shift` it carries the ring."""
+    """With `ring_shift` the transform of the ring from rest to pose."""
     ring_shift: Float[Tensor, "B 3"]
     wears: Float[Tensor, "B 3"]
     """1 for a sleeve, a wristband, a ring."""
@@ -79,12 +79,12 @@ class ShotTensors(NamedTuple):
     solids: Float[Tensor, "B N 27"]
     aperture: Float[Tensor, "B"]
     sensor: Float[Tensor, "B 15"]
-    """`sensor.sensor_row`."""
+    """See `sensor.sensor_row`."""
 
 
 @functools.cache
 def _places() -> dict[str, tuple[slice, tuple[int, ...]]]:
-    """Columns and shape of each of `ShotTensors`."""
+    """Columns and shape of each field of `ShotTensors`."""
     shapes: dict[str, tuple[int, ...]] = {
         "angles": (15, 3),
         "rotations": (16, 3, 3),
@@ -116,15 +116,15 @@ def _places() -> dict[str, tuple[slice, tuple[int, ...]]]:
     return places
 
 
-def sample_table(seed: int, indices: Sequence[int], scenery: SceneConfig) -> ShotTable:
-    """`sample_shots` as tables."""
-    return tabulate(seed, sample_shots(seed, indices, scenery), scenery)
+def sample_table(seed: int, indices: Sequence[int], scene: SceneConfig) -> ShotTable:
+    """`sample_shots` as a table."""
+    return tabulate(seed, sample_shots(seed, indices, scene), scene)
 
 
-def tabulate(seed: int, shots: Sequence[Shot], scenery: SceneConfig) -> ShotTable:
-    """Shots as tables."""
-    identities = [identity_of(seed, shot.person, scenery.population) for shot in shots]
-    joints = np.stack([_joints(seed, shot.person, scenery.population) for shot in shots])
+def tabulate(seed: int, shots: Sequence[Shot], scene: SceneConfig) -> ShotTable:
+    """Shots as a table."""
+    identities = [cached_identity(seed, shot.person, scene.population) for shot in shots]
+    joints = np.stack([_joints(seed, shot.person, scene.population) for shot in shots])
     columns = _columns(shots, identities, joints)
     places = _places()
     numbers = np.empty((len(shots), places[ShotTensors._fields[-1]][0].stop), np.float32)
@@ -135,7 +135,7 @@ def tabulate(seed: int, shots: Sequence[Shot], scenery: SceneConfig) -> ShotTabl
 
 
 def concatenate_tables(plans: Sequence[ShotTable]) -> ShotTable:
-    """Several plans as one."""
+    """Several tables as one."""
     numbers, whole = (np.concatenate(tables) for tables in list(zip(*plans, strict=True))[:2])
     return ShotTable(numbers, whole, tuple(itertools.chain.from_iterable(p.gestures for p in plans)))
 
@@ -143,16 +143,16 @@ def concatenate_tables(plans: Sequence[ShotTable]) -> ShotTable:
 def sample_tables_ahead(
     seed: int, blocks: Iterable[tuple[Sequence[int], SceneConfig]], workers: int
 ) -> Iterator[ShotTable]:
-    """`sample_table` of each of `blocks` in turn, drawn ahead by `workers` processes where there are any."""
+    """`sample_table` of each of `blocks`, in order, computed ahead by `workers` processes if there are any."""
     if workers < 1:
-        for indices, scenery in blocks:
-            yield sample_table(seed, indices, scenery)
+        for indices, scene in blocks:
+            yield sample_table(seed, indices, scene)
         return
     with worker_pool(workers) as pool:
         waiting: deque = deque()
         try:
-            for indices, scenery in blocks:
-                waiting.append(pool.submit(sample_table, seed, indices, scenery))
+            for indices, scene in blocks:
+                waiting.append(pool.submit(sample_table, seed, indices, scene))
                 if len(waiting) >= AHEAD * workers:
                     yield waiting.popleft().result()
             while waiting:
@@ -162,29 +162,29 @@ def sample_tables_ahead(
                 future.cancel()
 
 
-def send(tensor: Tensor, device: torch.device) -> Tensor:
-    """A copy of a CPU tensor on `device`, for which nobody waits."""
-    # Only from page-locked memory does a copy to a GPU not wait for all work before it.
+def copy_to(tensor: Tensor, device: torch.device) -> Tensor:
+    """Copy a CPU tensor to `device` without waiting for it."""
+    # A copy to a GPU waits for all work before it, unless the source is in page-locked memory.
     return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor.to(device)
 
 
-def shot_tensors(planned: ShotTable, device: torch.device) -> ShotTensors:
-    """The numbers of `planned` on `device`, in one copy."""
-    table = send(torch.from_numpy(planned.numbers), device)
+def shot_tensors(table: ShotTable, device: torch.device) -> ShotTensors:
+    """The numbers of a table on `device`, in one copy."""
+    table = copy_to(torch.from_numpy(table.numbers), device)
     return ShotTensors(**{name: table[:, place].view(-1, *shape) if shape else table[:, place.start]
                       for name, (place, shape) in _places().items()})  # fmt: skip
 
 
 @functools.lru_cache(4096)
 def _joints(seed: int, number: int, population: Population) -> np.ndarray:
-    """Of a person at rest [m], rounded as `people.Person` has them."""
+    """Rest joints of a person [m], with the rounding of `people.Person`."""
     hand = bundled_hand()
-    shape = torch.from_numpy(identity_of(seed, number, population).shape).float()
+    shape = torch.from_numpy(cached_identity(seed, number, population).shape).float()
     return (hand.joints + hand.joint_basis @ shape).double().numpy()
 
 
 def arm_turns(bends: np.ndarray) -> np.ndarray:
-    """Rotations of the arm's rings, [B, R, 3, 3], for bends at the wrist about axes with lengths [rad], [B, 3]."""
+    """Rotations of the forearm's rings, [B, R, 3, 3], for bends at the wrist as rotation vectors [rad], [B, 3]."""
     share = np.minimum(1.0, np.linspace(0, 1, ARM_ROWS + 1)[1:] / ARM_BEND)
     lengths = np.linalg.norm(bends, axis=1)
     x, y, z = (bends / np.maximum(lengths, 1e-12)[:, None]).T
@@ -195,7 +195,7 @@ def arm_turns(bends: np.ndarray) -> np.ndarray:
 
 
 def _columns(shots: Sequence[Shot], identities: Sequence[Identity], joints: np.ndarray) -> dict[str, Any]:
-    """The fields of `ShotTensors` that are not 0."""
+    """The fields of `ShotTensors`, without those that are 0."""
     angles = np.stack([s.angles for s in shots])
     rotations, shifts = bundled_skeleton().transforms(angles, joints)
     flexion = angles[:, 1:, 0] + bundled_hand().rest_bend[1:].numpy()

@@ -1,4 +1,4 @@
-"""Plan pictures: all that is drawn at random, before anything is rendered. On the CPU, a few milliseconds each."""
+"""Sample shots: all random choices of a picture, before it is rendered. On the CPU, a few milliseconds each."""
 
 import functools
 from collections.abc import Sequence
@@ -17,74 +17,75 @@ from oasis_warp.synthetic.rooms import Room, sample_room
 from oasis_warp.synthetic.sensor import Sensor, sample_sensor
 from oasis_warp.synthetic.view_and_light import (
     Light,
-    Look,
+    PictureStyle,
     View,
-    clear_of_arm,
+    avoid_forearm,
+    rotate_light,
     rotation_about,
     sample_light,
     sample_view,
-    turn_light,
 )
 from oasis_warp.synthetic.wardrobe import Clothes, sample_clothes
 
 PICTURES_EACH = 8
-"""Consecutive indices that show one person: a texture is baked once for so many."""
+"""Number of consecutive indices that show one person, so that each texture is baked once for all of them."""
 PICTURE_STREAM = 2
-"""Tells the random numbers of pictures from those of identities with the same seed."""
+"""Stream number that separates the random numbers of pictures from those of identities with the same seed."""
 CAMERA_STREAM = 4
-"""And those of a camera that moves between pictures of one capture."""
+"""Stream number of the camera that moves between pictures of one capture."""
 CAMERA_YAW, CAMERA_PITCH = 0.9, 0.3
-"""How far it moves round the hand at most [rad]; the rest of a new view is the hand's turning."""
+"""How far it moves around the hand at most [rad]; the rest of a new view comes from the hand's rotation."""
 HAND_REACH = 0.11
-"""Of a hand beyond its middle, roughly: rooms begin behind it [m]."""
+"""Rough extent of a hand beyond its middle [m]; rooms begin behind it."""
 EVERYBODY = Population()
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneConfig:
-    """What pictures show, besides what the seed decides."""
+    """What pictures show, apart from the seed's random choices."""
 
-    look: Look = "photo"
+    look: PictureStyle = "photo"
     population: Population = EVERYBODY
     people: int | None = None
-    """How many people there are: then the first comes again, in other pictures. No end when None."""
+    """Number of people, who come again in other pictures; unlimited when None."""
     backgrounds: tuple[Path, ...] = ()
-    """Pictures to stand behind the hands (see `backgrounds.list_backgrounds`); rooms when empty."""
+    """Pictures to use as backgrounds (see `backgrounds.list_backgrounds`); rooms when empty."""
 
 
 PHOTOS = SceneConfig()
 
 
 class Shot(NamedTuple):
-    """All that is drawn for one picture, before anything is rendered."""
+    """All random choices of one picture."""
 
     index: int
     person: int
     side: Side
     gesture: str
     angles: np.ndarray
-    """Of all joints about the pose axes, 0 at rest, [16, 3] [rad]."""
+    """Of all joints about the pose axes [rad], 0 at rest, [16, 3]."""
     bend: np.ndarray
+    """Of the forearm at the wrist: an axis with the angle as its length [rad], [3]."""
     view: View
     light: Light
     clothes: Clothes
     room: Room | None
-    """As the sensor, none in even light."""
+    """None in even light, like the sensor."""
     sensor: Sensor | None
     seed: int
-    """Of whatever is drawn a pixel at a time."""
+    """Seed of all random numbers per pixel."""
 
 
-def sample_shot(seed: int, index: int, scenery: SceneConfig = PHOTOS) -> Shot:
-    """Draw picture `index` of the world `seed`; fingers may still sink in."""
-    look, even = scenery.look, scenery.look == "even"
+def sample_shot(seed: int, index: int, scene: SceneConfig = PHOTOS) -> Shot:
+    """Sample picture `index` of the world `seed`; fingers may still penetrate each other."""
+    look, even = scene.look, scene.look == "even"
     rng = np.random.default_rng([seed, PICTURE_STREAM, index, even])
     name, angles = sample_gesture(rng, bundled_body().hand)
     bend = np.array([0.0, rng.normal(0, 0.15), rng.normal(0, 0.30)])
     number = index // PICTURES_EACH
-    if scenery.people is not None:
-        number %= scenery.people
-    view = clear_of_arm(sample_view(rng, look, closed=bool((angles[[1, 4, 7, 10], 0] > 0.9).sum() >= 3)), bend)
+    if scene.people is not None:
+        number %= scene.people
+    view = avoid_forearm(sample_view(rng, look, closed=bool((angles[[1, 4, 7, 10], 0] > 0.9).sum() >= 3)), bend)
     return Shot(
         index=index,
         person=number,
@@ -102,36 +103,35 @@ def sample_shot(seed: int, index: int, scenery: SceneConfig = PHOTOS) -> Shot:
 
 
 @functools.lru_cache(4096)
-def identity_of(seed: int, number: int, population: Population) -> Identity:
-    """Person `number` of the world `seed`, remembered."""
+def cached_identity(seed: int, number: int, population: Population) -> Identity:
+    """`sample_identity`, cached."""
     return sample_identity(bundled_body().hand, seed, number, population)
 
 
-def sample_shots(seed: int, indices: Sequence[int], scenery: SceneConfig = PHOTOS) -> list[Shot]:
-    """Pictures `indices` of the world `seed`, their fingers kept apart: each as if it were alone."""
+def sample_shots(seed: int, indices: Sequence[int], scene: SceneConfig = PHOTOS) -> list[Shot]:
+    """Sample pictures `indices` of the world `seed`, without self-collisions; each is the same in any batch."""
     hand = bundled_body().hand
-    shots = [sample_shot(seed, int(index), scenery) for index in indices]
-    shapes = np.stack([identity_of(seed, shot.person, scenery.population).shape for shot in shots])
+    shots = [sample_shot(seed, int(index), scene) for index in indices]
+    shapes = np.stack([cached_identity(seed, shot.person, scene.population).shape for shot in shots])
     joints, basis = hand.joints.double().numpy(), hand.joint_basis.double().numpy()
     at_rest = joints + (basis * shapes[:, None, None]).sum(-1)
     angles, _ = separate(np.stack([shot.angles for shot in shots]), at_rest * 1e3)
     return [shot._replace(angles=a) for shot, a in zip(shots, angles, strict=True)]
 
 
-def camera_turn(seed: int, index: int) -> np.ndarray:
-    """How the camera has moved round the hand in picture `index` of a capture, from the photo's frame to its own."""
+def camera_rotation(seed: int, index: int) -> np.ndarray:
+    """Rotation from the photo's camera frame to that of picture `index` of the same capture."""
     random = np.random.default_rng([seed, CAMERA_STREAM, index])
     yaw, pitch = random.uniform(-1, 1, 2) * (CAMERA_YAW, CAMERA_PITCH)
     return rotation_about([1, 0, 0], pitch) @ rotation_about([0, 1, 0], yaw)
 
 
 def capture_shots(seed: int, photo: Shot, others: Sequence[Shot]) -> list[Shot]:
-    """`others`, drawn in even light, as pictures of the capture that `photo` is of: in its light, with its sensor.
+    """Put `others`, sampled in even light, into the light of `photo` and before its sensor.
 
-    Lamps and walls stay; the hand turns before them, and the camera moves round it.
+    Lamps and walls stay; the hand rotates in front of them, and the camera moves around it.
     """
-    shots = []
-    for shot in others:
-        light = turn_light(photo.light, camera_turn(seed, shot.index))
-        shots.append(shot._replace(light=light, sensor=photo.sensor))
-    return shots
+    return [
+        shot._replace(light=rotate_light(photo.light, camera_rotation(seed, shot.index)), sensor=photo.sensor)
+        for shot in others
+    ]

@@ -7,16 +7,17 @@ from oasis_warp.synthetic.body import FINGERS, Bone
 from oasis_warp.synthetic.identity import Identity
 from oasis_warp.synthetic.strokes import Strokes, through
 
-THUMB = FINGERS.index("thumb")
 _KNUCKLES = (1, 4, 7, 10)
-"""First joints of the four fingers."""
+"""First joints of index, middle, little and ring finger."""
 _CREASES = {1: (-1.8, 1.4), 2: (0.3,)}
-"""Places of the flexion creases along the bone before joints 1 and 2 of a finger [mm]."""
+"""Positions of the flexion creases along bones 1 and 2 of a finger [mm]."""
 _THUMB_CREASES = {0: (), 1: (1.0,), 2: (-1.1, 1.3)}
+SINGLE_CREASE = 0.05
+"""Share of people whose head and heart lines are one."""
 
 
 def draw_fingers(atlas: Atlas, strokes: Strokes, identity: Identity) -> None:
-    """Flexion creases on the palm's side, folds over the joints on the back."""
+    """Draw flexion creases on the palmar side, and folds over the joints on the back."""
     for finger, name in enumerate(FINGERS):
         for place in range(3):
             bone = atlas.body.bones[finger][place]
@@ -26,7 +27,7 @@ def draw_fingers(atlas: Atlas, strokes: Strokes, identity: Identity) -> None:
 
 
 def _arc(atlas: Atlas, name: str, bone: Bone, t: float, angles: np.ndarray, radius: float, bow: float) -> np.ndarray:
-    """Points of a finger around its bone at `t` [mm]; angle 0 is the back, `bow` bends the arc along the bone."""
+    """Surface points around a bone at `t` [mm]; angle 0 is the back, `bow` bends the arc along the bone."""
     around = np.cos(angles)[:, None] * bone.back + np.sin(angles)[:, None] * bone.side
     middle = angles - angles.mean()
     return atlas.snap(bone.origin + bone.along * (t + bow * middle**2)[:, None] + radius * around, name)
@@ -61,7 +62,7 @@ def _creases(atlas: Atlas, strokes: Strokes, identity: Identity, name: str, plac
 
 
 def _folds(atlas: Atlas, strokes: Strokes, identity: Identity, name: str, place: int, bone: Bone) -> None:
-    """An eye of arcs that bend away from the joint, and broken wrinkles between them."""
+    """Draw arcs that bend away from the joint, and broken wrinkles between them."""
     rng, thumb = strokes.rng, name == "thumb"
     u = rng.uniform
     count = ({1: 4, 2: 8} if thumb else {1: 9, 2: 5})[place] + rng.integers(-1, 2)
@@ -82,7 +83,7 @@ def _folds(atlas: Atlas, strokes: Strokes, identity: Identity, name: str, place:
 
 
 def draw_wrist(atlas: Atlas, strokes: Strokes) -> None:
-    """One to three lines across the inner side of the wrist."""
+    """Draw one to three lines across the inner side of the wrist."""
     rng = strokes.rng
     for x in (1.0, 5.5, 11.0)[: rng.integers(1, 4)]:
         z = np.linspace(-26, 26, 40)
@@ -91,7 +92,7 @@ def draw_wrist(atlas: Atlas, strokes: Strokes) -> None:
 
 
 def draw_back(atlas: Atlas, strokes: Strokes, identity: Identity) -> None:
-    """Tendons to the knuckles, veins as random walks towards the wrist, hairs, fine cross lines."""
+    """Draw tendons to the knuckles, veins as random walks towards the wrist, fine cross lines and hairs."""
     rng = strokes.rng
     knuckles = atlas.body.hand.joints[list(_KNUCKLES)].double().numpy() * 1e3
     for knuckle in knuckles:
@@ -114,7 +115,7 @@ def draw_back(atlas: Atlas, strokes: Strokes, identity: Identity) -> None:
 
 
 def _hairs(atlas: Atlas, strokes: Strokes, identity: Identity, knuckles: np.ndarray) -> None:
-    """Bent hairs that lean towards the little finger's side, on the arm, the back and the first phalanges."""
+    """Draw bent hairs that lean towards the little finger, on the arm, the back and the first phalanges."""
     rng, n = strokes.rng, identity.hairs
     if not n:
         return
@@ -129,27 +130,25 @@ def _hairs(atlas: Atlas, strokes: Strokes, identity: Identity, knuckles: np.ndar
     steps = np.stack([np.cos(turn), 0 * turn, np.sin(turn)], -1) * (length[:, None] / 8)[..., None]
     lines = atlas.snap((roots[:, None] + np.cumsum(steps, 1)).reshape(-1, 3), "back").reshape(n, 9, 3)
     for line, root in zip(lines, roots, strict=True):
-        if np.abs(line[0] - root)[[0, 2]].max() < 4:  # not one that fell beside the arm
+        if np.abs(line[0] - root)[[0, 2]].max() < 4:  # else it fell beside the arm
             strokes.add("hair", line, 0.27, rng.uniform(0.35, 0.75), taper=0.4, wobble=0.08)
 
 
-_INDEX_KNUCKLE, _LITTLE_KNUCKLE = 1, 7
-"""Joints."""
-SINGLE_CREASE = 0.05
-"""Share of people whose head and heart lines are one."""
-
-
 class Palm:
-    """Draws on the palm of one person."""
+    """Draws the lines of one palm.
+
+    Positions on the palm are (u, s): u is 0 below the index finger and 1 below the little finger, s is 0 at the wrist
+    and 1 at the row of knuckles. Each line's course, length, breaks and branches are random.
+    """
 
     def __init__(self, atlas: Atlas, strokes: Strokes, identity: Identity):
         self.atlas, self.strokes, self.identity, self.rng = atlas, strokes, identity, strokes.rng
         joints = atlas.body.hand.joints.double().numpy() * 1e3
-        self.index, self.little = joints[_INDEX_KNUCKLE], joints[_LITTLE_KNUCKLE]
+        self.index, self.little = joints[_KNUCKLES[0]], joints[_KNUCKLES[2]]
         self.thumb = joints[13], joints[14]
 
     def place(self, us: np.ndarray) -> np.ndarray:
-        """Points of the skin [mm] at rows of (u, s)."""
+        """Surface points [mm] at rows of (u, s)."""
         u, s = np.asarray(us, float).T
         arch = np.array([-6.0, 0, 0]) * np.sin(np.pi * u.clip(0, 1))[:, None]
         top = self.index + (self.little - self.index) * u[:, None] + arch
@@ -158,7 +157,7 @@ class Palm:
 
     def line(self, kind: str, controls: np.ndarray, width: float, strength: float, *, branches: int = 0,
              gap: float = 0.0, wobble: float = 0.5) -> np.ndarray:  # fmt: skip
-        """A line with side branches; with probability `gap` it breaks off and goes on beside itself."""
+        """Draw a line with side branches; with probability `gap` it breaks and continues beside itself."""
         rng, curve = self.rng, through(controls, 48)
         if rng.random() < gap:
             cut, shift = rng.integers(14, 36), rng.normal(0, 0.035, 2)
@@ -177,7 +176,7 @@ class Palm:
         return curve
 
     def draw(self) -> None:
-        """All lines of the palm."""
+        """Draw all lines of the palm."""
         life = self._main_lines()
         self._thenar(life)
         self._fine_lines()
@@ -230,7 +229,7 @@ class Palm:
         return life
 
     def _thenar(self, life: np.ndarray) -> None:
-        """Wrinkles of the ball of the thumb: along the life line and across it, deep where the thumb squeezes it."""
+        """Draw the wrinkles of the thenar: along the life line and across it."""
         rng, u, age = self.rng, self.rng.uniform, self.identity.age
         root = np.array([-0.42, 0.22]) + rng.normal(0, 0.03, 2)  # middle of the thumb's side, in (u, s)
         for _ in range(int(rng.integers(9, 17) + 10 * age)):
@@ -278,7 +277,7 @@ class Palm:
                              rng.uniform(0.12, 0.6) * identity.line_depth, taper=0.5, wobble=0.5)  # fmt: skip
 
     def _finger_roots(self) -> None:
-        """Short lines that run from the fingers' roots into the palm."""
+        """Draw short lines from the roots of the fingers into the palm."""
         rng = self.rng
         for middle in (0.0, 0.33, 0.67, 1.0):
             for _ in range(rng.integers(0, 4)):

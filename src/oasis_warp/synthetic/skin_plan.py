@@ -1,7 +1,7 @@
-"""What is on one person's skin, drawn from the person's seed before any of it is painted.
+"""Sample everything on one person's skin before it is baked into a texture.
 
-Host numbers alone, less than a megabyte, made without a device and without Warp: processes plan people for one that
-paints them. Lengths are millimetres.
+A plan is less than a megabyte of numbers, sampled without a device and without Warp, so that worker processes can plan
+people for the process that bakes them. Lengths are millimetres.
 """
 
 from typing import NamedTuple
@@ -15,41 +15,41 @@ from oasis_warp.synthetic.skin_lines import Palm, draw_back, draw_fingers, draw_
 from oasis_warp.synthetic.strokes import Lines, Strokes
 
 STAR, BANDS = 2, 4
-"""Patterns of tattoos that take a number of their own."""
+"""Tattoo patterns with a parameter of their own."""
 
 
 class Tattoo(NamedTuple):
-    """A picture in ink."""
+    """Parameters of a tattoo."""
 
     pattern: int
     x: float
     z: float
     radius: float
     points: int
-    """Of a star, else 0."""
+    """Number of a star's points, else 0."""
     band: float
-    """Place along the forearm of bands, else 0."""
+    """Position of bands along the forearm, else 0."""
     strength: float
 
 
 class Plaster(NamedTuple):
-    """A strip round a finger."""
+    """A strip around a finger."""
 
     finger: int
     place: int
-    """Number of the bone."""
+    """Index of the bone."""
     middle: float
-    """Along the bone."""
+    """Position along the bone."""
     shade: float
 
 
 class SkinPlan(NamedTuple):
-    """All that `skin_texture.bake_texture` needs to know of a person."""
+    """All that `skin_texture.bake_texture` needs of a person."""
 
     identity: Identity
     lines: Lines
     nail_shifts: np.ndarray
-    """How far each nail's root lies from its usual place, [5]."""
+    """Shift of each nail's root along its finger, [5]."""
     spots: np.ndarray
     """Freckles and moles: centre, radius, strength of pigment, [S, 5]."""
     tattoo: Tattoo | None
@@ -57,14 +57,14 @@ class SkinPlan(NamedTuple):
 
 
 def plan_skin(identity: Identity) -> SkinPlan:
-    """The skin of one person: a tenth of a second of one CPU core, most of it the courses of lines."""
+    """Plan the skin of one person: 0.1 s on one CPU core, mostly for the courses of lines."""
     rng = np.random.default_rng([identity.seed])
     atlas, strokes = bundled_atlas(), Strokes(rng)
     draw_fingers(atlas, strokes, identity)
     Palm(atlas, strokes, identity).draw()
     draw_wrist(atlas, strokes)
     draw_back(atlas, strokes, identity)
-    return SkinPlan(  # in the order in which random numbers are drawn
+    return SkinPlan(  # the order decides on the random numbers
         identity=identity,
         lines=strokes.lines(),
         nail_shifts=rng.normal(0, 0.3, len(FINGERS)),
@@ -75,7 +75,7 @@ def plan_skin(identity: Identity) -> SkinPlan:
 
 
 def plan_person(seed: int, number: int, population: Population) -> SkinPlan:
-    """The skin of person `number` of the world `seed`."""
+    """Plan the skin of person `number` of the world `seed`."""
     return plan_skin(sample_identity(bundled_body().hand, seed, number, population))
 
 

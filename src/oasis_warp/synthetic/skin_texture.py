@@ -1,4 +1,8 @@
-"""Bake one person's skin into the texture atlas: reflectance, relief and gloss."""
+"""Bake one person's skin into the texture atlas: reflectance, relief and gloss. Lengths are millimetres.
+
+Random numbers and the courses of lines come from the CPU, as a `SkinPlan`; all work per texel runs on the device of the
+texels. Nails are superellipses in the frames of the last bones, fitted to the nail labels of the hand model.
+"""
 
 import functools
 from collections.abc import Sequence
@@ -9,33 +13,38 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.synthetic.body import FINGERS, body_on, bundled_body, smoothstep
+from oasis_warp.synthetic.body import FINGERS, THUMB, body_on, bundled_body, smoothstep
 from oasis_warp.synthetic.identity import Identity
 from oasis_warp.synthetic.ops.surface_patterns import NoiseField, surface_dabs, surface_noise
-from oasis_warp.synthetic.skin_lines import THUMB
 from oasis_warp.synthetic.skin_plan import STAR, SkinPlan, Tattoo
 from oasis_warp.synthetic.spectrum import Tint, skin_colors
 from oasis_warp.synthetic.texels import Texels, draw_lines, texels_on
 
 _NEAR = 2.0
-"""Distance to the outline up to which a nail shows in anything [mm]."""
+"""Distance from its outline up to which a nail affects the skin [mm]."""
+OPAL, HORN, LUNULA = (0.75, 0.62, 0.52), (0.74, 0.68, 0.56), (0.72, 0.60, 0.53)
+"""Colours of a nail's plate, its free edge and its lunula, linear RGB."""
+INK = (0.86, 0.80, 0.70)
+"""Share of red, green and blue light that ink absorbs."""
+PLASTER, HAIR = (0.62, 0.42, 0.28), (0.30, 0.18, 0.09)
+"""Colours of a plaster and of fair hair, linear RGB."""
 
 
 class NailMaps(NamedTuple):
-    """Each texel's share, [N]."""
+    """Share of each texel that is this part of a nail, [N]."""
 
     plate: Tensor
     lunula: Tensor
     free: Tensor
-    """Edge beyond the bed."""
+    """The free edge beyond the bed."""
     across: Tensor
-    """-1 to 1 over the plate."""
+    """Position across the plate, -1 to 1."""
     rim: Tensor
-    """The fold round the plate."""
+    """The fold around the plate."""
 
 
 class _Outline(NamedTuple):
-    """Of the nail of each finger, or of a texel's finger [mm]."""
+    """The nail of each finger, or of each texel's finger [mm]."""
 
     low: Tensor
     high: Tensor
@@ -49,7 +58,7 @@ class _Outline(NamedTuple):
 
 @functools.cache
 def _labelled() -> np.ndarray:
-    """Ends of the labelled vertices along and across each last bone [mm], [5, 4]."""
+    """Extent of the nail labels along and across each last bone [mm], [5, 4]."""
     body, rows = bundled_body(), []
     hand = body.hand
     for finger in range(len(FINGERS)):
@@ -60,7 +69,7 @@ def _labelled() -> np.ndarray:
 
 
 def nail_maps(texels: Texels, identity: Identity, shifts: np.ndarray) -> NailMaps:
-    """The nails as the identity has them, the root of each moved along its finger by `shifts` [5], in millimetres."""
+    """The nails of a person; the root of each is moved along its finger by `shifts` [mm], [5]."""
     start, end, left, right = _labelled().T
     low = start - 1.2 + shifts
     high = end + 0.2 + 0.5 * identity.nail_length
@@ -90,32 +99,28 @@ def nail_maps(texels: Texels, identity: Identity, shifts: np.ndarray) -> NailMap
     return NailMaps(*values)
 
 
-OPAL, HORN, LUNULA = (0.75, 0.62, 0.52), (0.74, 0.68, 0.56), (0.72, 0.60, 0.53)
-"""What shines in a nail's plate, its free edge, its moon: linear RGB."""
-
-
 class SkinMaps(NamedTuple):
-    """What is on the skin of one person, [N] each."""
+    """Features of one person's skin at every texel, [N] each."""
 
     palm: Float[Tensor, "N"]
-    """Share of each texel."""
+    """Share of each texel that is palm."""
     line: dict[str, Tensor]
     """Strength of each of `strokes.KINDS`."""
     groove: Float[Tensor, "N"]
-    """Of the lines in which blood shows and oil gathers."""
+    """Strength of the lines in which blood shows and oil gathers."""
     nails: NailMaps
     spots: Float[Tensor, "N"]
     noise: dict[str, Tensor]
-    """Fields of `bake`."""
+    """The fields of `COARSE_NOISES` and `FINE_NOISES`."""
 
 
 def column(values: tuple[float, ...], like: Tensor) -> Float[Tensor, "3 1"]:
-    """A colour beside planes of colours."""
+    """A colour that broadcasts over `like`."""
     return like.new_tensor(values)[:, None]
 
 
 def _pigments(texels: Texels, identity: Identity, maps: SkinMaps) -> tuple[Tensor, Tensor]:
-    """Shares of melanin and blood."""
+    """Volume fractions of melanin and blood."""
     noise, line, palm = maps.noise, maps.line, maps.palm
     back, m = 1 - palm, identity.melanin
     knuckles = texels.knuckle * back
@@ -141,7 +146,7 @@ def _pigments(texels: Texels, identity: Identity, maps: SkinMaps) -> tuple[Tenso
 
 
 def skin_color(texels: Texels, identity: Identity, maps: SkinMaps) -> Float[Tensor, "3 N"]:
-    """Linear reflectance of skin and bare nails."""
+    """Linear reflectance of skin and unpolished nails."""
     line, palm, m = maps.line, maps.palm, identity.melanin
     melanin, blood = _pigments(texels, identity, maps)
     yellow, oxygen = 0.5 * identity.carotene, identity.oxygen
@@ -161,7 +166,7 @@ def skin_color(texels: Texels, identity: Identity, maps: SkinMaps) -> Float[Tens
 def _with_nails(
     color: Float[Tensor, "3 M"], texels: Texels, identity: Identity, maps: SkinMaps
 ) -> Float[Tensor, "3 M"]:
-    """Colours of `Texels.nails` with the nails on them."""
+    """Blend the nails into the colours of `Texels.nails`."""
     nails, m = NailMaps(*(share[texels.nails] for share in maps.nails)), identity.melanin
     blood = identity.blood * (1.6 + 0.3 * maps.noise["dry"][texels.nails])
     melanin = torch.full_like(blood, 0.62 * m + 0.004)
@@ -173,14 +178,8 @@ def _with_nails(
     return color + (bed - color) * nails.plate
 
 
-INK = (0.86, 0.80, 0.70)
-"""Share of each light that ink swallows."""
-PLASTER, HAIR = (0.62, 0.42, 0.28), (0.30, 0.18, 0.09)
-"""Linear RGB of a plaster, and of fair hair."""
-
-
 def add_ornaments(color: Float[Tensor, "3 N"], texels: Texels, plan: SkinPlan, maps: SkinMaps) -> Float[Tensor, "3 N"]:
-    """Tattoo, plaster, polish, hair, and the fold around the nails."""
+    """Add tattoo, polish, plaster, hair and the folds around the nails."""
     plate, identity = maps.nails.plate, plan.identity
     if plan.tattoo is not None:
         ink = _ink(texels.points, plan.tattoo, maps.noise["tattoo"]) * smoothstep(0.5, 0.3, texels.palm)
@@ -205,7 +204,7 @@ def add_ornaments(color: Float[Tensor, "3 N"], texels: Texels, plan: SkinPlan, m
 
 
 def _ink(points: Tensor, tattoo: Tattoo, noise: Tensor) -> Tensor:
-    """Ink, 0 to 1: scrollwork, a star, rows of script, or bands round the forearm."""
+    """Amount of ink in [0, 1]: scrollwork, a star, rows of script, or bands around the forearm."""
     pattern, r = tattoo.pattern, tattoo.radius
     x, z = points[:, 0] - tattoo.x, points[:, 2] - tattoo.z
     d, angle = torch.hypot(x, z), torch.atan2(z, x)
@@ -227,8 +226,8 @@ def _ink(points: Tensor, tattoo: Tattoo, noise: Tensor) -> Tensor:
 
 
 CHANNELS = ("red", "green", "blue", "height", "fold", "wrinkle", "roughness", "oil")
-"""Of the texture: linear reflectance; relief, folds (negative: grooves) that flatten when stretched, wrinkles that
-appear when squeezed [mm]; GGX roughness; strength of the specular reflection."""
+"""Channels of the texture: linear reflectance; relief, folds (negative) that flatten when stretched, wrinkles that
+appear when compressed [mm]; GGX roughness; strength of the specular reflection."""
 
 COARSE_NOISES = {
     "palm_edge": (7.0, 2), "wrist_edge": (8.0, 1), "blotch": (14.0, 3), "flush": (11.0, 3), "lumps": (11.0, 3),
@@ -238,9 +237,9 @@ FINE_NOISES = {
     "grain": (2.2, 2), "palm_flush": (3.2, 2), "dry": (2.5, 1), "lattice_a": (1.5, 1), "lattice_b": (0.95, 1),
     "ridge": (0.8, 1), "tattoo": (9.0, 2),
 }  # fmt: skip
-"""Cell of the largest octave [mm], and octaves. Coarse ones are evaluated at the vertices, 2 mm apart."""
+"""Cell of the largest octave [mm], and number of octaves. Coarse ones are evaluated at the vertices, 2 mm apart."""
 PALM_NOISES = ("palm_flush", "ridge")
-"""Of the fine ones: shown on the palm alone, 0 where nobody has it."""
+"""Fine noises that appear on the palm only; 0 elsewhere."""
 
 
 def _noises(texels: Texels, rest: Float[Tensor, "K 3"], identity: Identity) -> dict[str, Tensor]:
@@ -258,7 +257,7 @@ def _noises(texels: Texels, rest: Float[Tensor, "K 3"], identity: Identity) -> d
 
 
 def _spots(texels: Texels, plan: SkinPlan) -> Float[Tensor, "N"]:
-    """Freckles and moles: strength of pigment."""
+    """Strength of pigment in freckles and moles."""
     if not len(plan.spots):
         return torch.zeros_like(texels.palm)
     spots = torch.from_numpy(plan.spots).float().to(texels.points.device)
@@ -266,8 +265,8 @@ def _spots(texels: Texels, plan: SkinPlan) -> Float[Tensor, "N"]:
     return surface_dabs(texels.grid, spots[:, :3], spots[:, 3], spots[:, 4], kinds, 1, flat=True)[0]
 
 
-def _marks(texels: Texels, plan: SkinPlan, noise: dict[str, Tensor]) -> SkinMaps:
-    """Everything that random numbers decide but paint."""
+def _skin_maps(texels: Texels, plan: SkinPlan, noise: dict[str, Tensor]) -> SkinMaps:
+    """Lines, nails, spots and the border of the palm."""
     line = draw_lines(plan.lines, texels.grid)
     nails = nail_maps(texels, plan.identity, plan.nail_shifts)
     palm = smoothstep(0.28, 0.80, texels.palm + 0.08 * noise["palm_edge"])
@@ -282,10 +281,10 @@ def _marks(texels: Texels, plan: SkinPlan, noise: dict[str, Tensor]) -> SkinMaps
 
 @torch.no_grad()
 def bake_texture(plan: SkinPlan, device: str) -> Float[Tensor, "H W 8"]:
-    """The texture of the person that was planned, `CHANNELS`, float16, made on the device."""
+    """The texture of a planned person: `CHANNELS` in float16 on the device."""
     texels, identity = texels_on(device), plan.identity
     noise = _noises(texels, body_on(device).rest, identity)
-    maps = _marks(texels, plan, noise)
+    maps = _skin_maps(texels, plan, noise)
     color = add_ornaments(skin_color(texels, identity, maps), texels, plan, maps)
     palm, plate, gloss = maps.palm, maps.nails.plate, noise["gloss"]
     roughness = identity.roughness + 0.05 * gloss + 0.04 * palm - 0.06 * texels.tip * palm
@@ -297,7 +296,7 @@ def bake_texture(plan: SkinPlan, device: str) -> Float[Tensor, "H W 8"]:
 
 
 def _relief(texels: Texels, identity: Identity, maps: SkinMaps) -> tuple[Tensor, Tensor, Tensor]:
-    """Heights [mm]: what stays, what flattens under stretch, what rises when squeezed."""
+    """Heights [mm]: constant, flattening under stretch, and rising under compression."""
     palm, line, nails, noise = maps.palm, maps.line, maps.nails, maps.noise
     back, plate = 1 - palm, nails.plate
     bare = 1 - plate

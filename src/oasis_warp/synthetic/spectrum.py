@@ -3,8 +3,8 @@
 Melanin absorbs in the epidermis, crossed twice along uneven paths; haemoglobin in the dermis, whose diffuse
 reflectance is a dipole (Jacques 2013; Prahl's haemoglobin spectra); CIE 1931 by the fits of Wyman et al. 2013, under
 D65. Three free constants (the spread of paths, the slope of melanin, the gain of the dermis) are fitted to measured
-skin colours from CIELAB L 72 to L 30. Those were measured with the mirrored light in, 4 % of it above the melanin; here
-half of that is left to the gloss, which is rendered for itself: with both, dark skin would be chalky.
+skin colours from CIELAB L 72 to L 30. The measurements include specular reflection, of which 4 % stands for light that
+never meets melanin; here half of that is left to the gloss, which is rendered separately, or dark skin would be chalky.
 """
 
 from collections.abc import Sequence
@@ -34,16 +34,16 @@ _XYZ_TO_RGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [
 _WHITE = np.array([0.9505, 1.0, 1.089])
 
 ABOVE_MELANIN = 0.018
-"""Share of light that comes back before it meets melanin, mirrored light left out."""
+"""Share of light that returns before it meets melanin, without specular reflection."""
 REFLECTANCE_RANGE = (0.002, 0.95)
 MELANIN_RANGE = (0.002, 0.8)
 BLOOD_RANGE = (0.001, 0.15)
 _TABLE = (48, 40)
-"""Knots of the table over melanin and blood."""
+"""Size of the table over melanin and blood."""
 
 
 def _matching() -> np.ndarray:
-    """Rows X, Y, Z of the observer under D65, each summing to the white point."""
+    """The CIE observer's X, Y and Z under D65, each row summing to the white point."""
 
     def lobe(mean: float, left: float, right: float) -> np.ndarray:
         return np.exp(-0.5 * ((_NM - mean) / np.where(_NM < mean, left, right)) ** 2)
@@ -64,9 +64,9 @@ def skin_reflectance(
     """Linear sRGB reflectance [..., 3] of skin under D65.
 
     Args:
-        melanin: Volume share of melanosomes in the epidermis.
-        blood: Volume share of blood in the dermis.
-        oxygen: Share of the haemoglobin that carries oxygen.
+        melanin: Volume fraction of melanosomes in the epidermis.
+        blood: Volume fraction of blood in the dermis.
+        oxygen: Oxygen saturation of the haemoglobin.
         epidermis: Thickness of the epidermis [um].
         carotene: Amount of yellow (carotene and a thick horn layer), 0 to about 0.4.
     """
@@ -80,9 +80,9 @@ def skin_reflectance(
 def _layers(
     melanin: np.ndarray, blood: np.ndarray, oxygen: float, epidermis: float, carotene: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Share of light that the epidermis lets through, forth and back, and that the dermis returns, a wavelength each.
+    """Transmittance of the epidermis, both ways, and reflectance of the dermis at each wavelength, [..., 31].
 
-    Arguments [..., 1] as in `skin_reflectance`; both results [..., 31].
+    Arguments are those of `skin_reflectance`, [..., 1].
     """
     bloodless = 0.244 + 85.3 * np.exp(-(_NM - 154) / 66.2)
     absorbed = blood * 2.303 * 150 / 64500 * (oxygen * _OXYGENATED + (1 - oxygen) * _BARE) + bloodless
@@ -96,7 +96,7 @@ def _layers(
 
 
 class Tint(NamedTuple):
-    """What is the same all over a part of one person's skin: see `skin_reflectance`."""
+    """Parameters that are constant over a part of one person's skin: see `skin_reflectance`."""
 
     oxygen: float
     epidermis: float
@@ -104,10 +104,10 @@ class Tint(NamedTuple):
 
 
 def _table(tint: Tint) -> np.ndarray:
-    """`skin_reflectance` at the knots of melanin and blood, [3, melanin, blood]."""
+    """`skin_reflectance` on a grid, [3, melanin, blood]."""
     melanin, blood = (np.geomspace(*r, n) for r, n in zip((MELANIN_RANGE, BLOOD_RANGE), _TABLE, strict=True))
     crossed, dermis = _layers(melanin[:, None], blood[:, None], *tint)
-    # What comes back is a product of the two layers at each wavelength, so a colour is a matrix product.
+    # At each wavelength the layers multiply, so a colour is a matrix product.
     deep = (_TO_RGB[:, None] * crossed) @ dermis.T
     return (ABOVE_MELANIN * _TO_RGB.sum(1)[:, None, None] + (1 - ABOVE_MELANIN) * deep).clip(*REFLECTANCE_RANGE)
 
@@ -115,9 +115,9 @@ def _table(tint: Tint) -> np.ndarray:
 def skin_colors(
     melanin: Float[Tensor, "N"], blood: Float[Tensor, "N"], tints: Sequence[Tint]
 ) -> tuple[Float[Tensor, "3 N"], ...]:
-    """Linear sRGB of skin for each of `tints`, from tables over the logarithms of melanin and blood.
+    """Linear sRGB of skin for each of `tints`, interpolated in tables over log melanin and log blood.
 
-    Shares beyond `MELANIN_RANGE` and `BLOOD_RANGE` are clamped.
+    Melanin and blood are clamped to `MELANIN_RANGE` and `BLOOD_RANGE`.
     """
     tables = torch.from_numpy(np.concatenate([_table(tint) for tint in tints])).float().to(melanin.device)
 

@@ -1,6 +1,6 @@
-"""Lines on the skin, collected one by one with the random numbers of each; `drawn_lines` draws them all at once.
+"""Collect lines on the skin with their random numbers; `texels.draw_lines` draws them all at once.
 
-Nothing here needs a device: processes that plan people import it.
+This module needs no device, so that processes that plan people can import it.
 """
 
 from typing import NamedTuple
@@ -12,23 +12,23 @@ KINDS = ("crease", "main", "minor", "fold", "wrinkle", "vein", "tendon", "hair",
 wrinkles; vessels; tendons; hairs; the soft valley along main lines."""
 _LONG = ("crease", "main", "halo")
 _SPACING = 0.25
-"""Between samples of one line, and of hairs [mm]."""
 _HAIR_SPACING = 0.14
+"""Distance between the samples of a line, and of a hair [mm]."""
 PLACE_CELL, STRENGTH_CELL = 5.0, 4.0
-"""Distances between the values that a line's place and width, and its strength, wander through [mm]."""
+"""Distance between the random values of a line's position and width, and of its strength [mm]."""
 _WALKS = 5
-"""Of one line: three of its place, one of its strength, one of its width."""
+"""Random walks of one line: three of its position, one of its strength, one of its width."""
 LINE_WORDS, CORNER_WORDS = 15, 4
 """Numbers in `Lines` for each line and for each of its corners."""
 
 
 class Lines(NamedTuple):
-    """Lines in one array, so that they travel in one copy."""
+    """Lines in one array, which is copied to the device at once."""
 
     numbers: np.ndarray
-    """float64: `n_lines` rows of the fields of `_Line`, the number of the line's samples, the sums over the lines
-    before it of samples, corners, lengths + 1 and knots, and by how much its strength wanders; `n_corners` rows of
-    x, y, z and distance from the line's start; the knots of the walks, line after line."""
+    """float64. First `n_lines` rows: the fields of `_Line`, the number of samples, the sums over all lines before of
+    samples, corners, lengths + 1 and knots, and the amplitude of the strength's walk. Then `n_corners` rows: x, y, z,
+    distance from the line's start. Then the knots of the random walks, line after line."""
     n_lines: int
     n_corners: int
     n_samples: int
@@ -45,12 +45,12 @@ class _Line(NamedTuple):
     wobble: float
     kind: int
     place_knots: int
-    """Random values of each walk but that of the strength."""
+    """Random values of each walk except the strength's."""
     strength_knots: int
 
 
 class Strokes:
-    """A growing collection of lines; lengths in millimetres."""
+    """A collection of lines; lengths in millimetres."""
 
     def __init__(self, rng: np.random.Generator):
         self.rng = rng
@@ -60,15 +60,15 @@ class Strokes:
 
     def add(self, kind: str, points: np.ndarray, width: float, strength: float, *, taper: float = 0.25,
             wobble: float = 0.3) -> None:  # fmt: skip
-        """A line through `points` [n, 3].
+        """Add a line through `points` [n, 3].
 
         Args:
             kind: One of `KINDS`.
             points: On the surface, in order.
-            width: Of the Gaussian profile.
-            strength: In the middle; it wanders by up to a quarter, that of fine lines by twice as much.
-            taper: Share of the length over which either end fades.
-            wobble: Amplitude of the line's own wander.
+            width: Width of the Gaussian profile.
+            strength: Strength in the middle; it varies by up to a quarter, that of fine lines by up to a half.
+            taper: Share of the length over which each end fades.
+            wobble: Amplitude of the random walk of the position.
         """
         steps = points[1:] - points[:-1]
         corners = np.empty((len(points), CORNER_WORDS))
@@ -86,7 +86,7 @@ class Strokes:
         )
 
     def lines(self) -> Lines:
-        """All that has been added so far."""
+        """All lines so far."""
         table = np.array(self._lines, float).reshape(-1, len(_Line._fields))
         line = dict(zip(_Line._fields, table.T, strict=True))
         spacing = np.where(line["kind"] == KINDS.index("hair"), _HAIR_SPACING, _SPACING)
@@ -101,7 +101,7 @@ class Strokes:
 
 
 def through(controls: np.ndarray, n: int = 40) -> np.ndarray:
-    """A smooth curve of n points through 2 to 4 control points (polynomial)."""
+    """A smooth polynomial curve of n points through 2 to 4 control points."""
     controls = np.asarray(controls, float)
     k, t = np.linspace(0, 1, len(controls)), np.linspace(0, 1, n)
     powers = np.polyfit(k, controls, min(3, len(controls) - 1))

@@ -1,4 +1,4 @@
-"""The texels of the atlas on a device, what is known of each of them, and lines drawn on them."""
+"""The texels of the atlas on a device, their labels, and lines drawn on them. Lengths are millimetres."""
 
 import functools
 from typing import NamedTuple
@@ -9,21 +9,22 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from oasis_warp.synthetic.atlas import Atlas, bundled_atlas
-from oasis_warp.synthetic.body import FINGERS, smoothstep
+from oasis_warp.synthetic.body import FINGERS, THUMB, smoothstep
 from oasis_warp.synthetic.ops.surface_patterns import PointGrid, point_grid, surface_dabs
-from oasis_warp.synthetic.skin_lines import THUMB
 from oasis_warp.synthetic.strokes import CORNER_WORDS, KINDS, LINE_WORDS, PLACE_CELL, STRENGTH_CELL, Lines
 
 GRID_CELL = 2.0
-"""Of the grid that lines are drawn on [mm]: about as wide as most lines reach."""
+"""Cell of the grid that lines are drawn on [mm]: about the reach of most lines."""
 PALM_EDGE = 0.09
-"""`Atlas.palm` up to which no noise makes a texel belong to the palm."""
+"""Texels with `Atlas.palm` up to this never belong to the palm, whatever the noise."""
 WRIST_EDGE = 14.0
-"""Distance behind the wrist beyond which none does [mm]."""
+"""Nor do texels farther than this behind the wrist [mm]."""
+_FAINT = 1e-3
+"""Lines up to this strength are not drawn."""
 
 
 class Texels(NamedTuple):
-    """The N texels that show skin; lengths in millimetres. Shares are 0 to 1."""
+    """The N texels that show skin."""
 
     points: Float[Tensor, "N 3"]
     palm: Float[Tensor, "N"]
@@ -36,7 +37,7 @@ class Texels(NamedTuple):
     finger: Int[Tensor, "N"]
     """As `Atlas.finger`."""
     palmar: Int[Tensor, "P"]
-    """Texels that may belong to somebody's palm."""
+    """Texels that belong to the palm of some people."""
     palmar_points: Float[Tensor, "P 3"]
     nails: Int[Tensor, "M"]
     """Texels on the back of the fingers' last bones."""
@@ -53,12 +54,12 @@ class Texels(NamedTuple):
         return Texels(*(value.to(device) for value in self))
 
     def spread(self, values: Float[Tensor, "C K"]) -> Float[Tensor, "C N"]:
-        """Values of the vertices of hand and forearm, interpolated at the texels."""
+        """Interpolate vertex values of hand and forearm at the texels."""
         spread = embedding_bag(self.corners, values.T.contiguous(), per_sample_weights=self.weights, mode="sum")
         return spread.T.contiguous()
 
     def image(self, values: Float[Tensor, "N C"]) -> Float[Tensor, "H W C"]:
-        """Values of the texels as a picture of the atlas."""
+        """Texel values as an image of the atlas."""
         return values[self.fill]
 
 
@@ -74,7 +75,7 @@ def _build_texels(atlas: Atlas) -> Texels:
                 continue
             local = torch.from_numpy(bone.local(atlas.positions)).float()
             t, side, back = local.unbind(1)
-            # The first knuckle lies on the hand, too.
+            # The first knuckle lies partly on the palm's segment.
             where = here if place else (t.abs() < 16) & (side.abs() < 18)
             long = (6.5, 6.5, 4.0)[place]
             bump = torch.exp(-(((t - float(place == 0)) / long) ** 2) - (side / 8) ** 2) * smoothstep(0.0, 3.0, back)
@@ -107,21 +108,17 @@ def _build_texels(atlas: Atlas) -> Texels:
 
 @functools.cache
 def texels_on(device: str) -> Texels:
-    """The texels of `bundled_atlas` on a device: seconds the first time."""
+    """The texels of `bundled_atlas` on a device; takes seconds the first time."""
     return _build_texels(bundled_atlas()) if device == "cpu" else texels_on("cpu").to(device)
 
 
-_FAINT = 1e-3
-"""Strength up to which nothing is drawn."""
-
-
 def draw_lines(lines: Lines, grid: PointGrid) -> dict[str, Float[Tensor, "N"]]:
-    """The profile of each kind at the points of a surface [mm]: the strongest line near by."""
+    """The profile of the strongest nearby line of each kind, at the points of a surface."""
     numbers = torch.from_numpy(lines.numbers).to(grid.points.device)
     first_corner = lines.n_lines * LINE_WORDS
     first_knot = first_corner + lines.n_corners * CORNER_WORDS
     rows, corners = numbers[:first_corner].view(-1, LINE_WORDS), numbers[first_corner:first_knot]
-    samples = _sampled(rows, corners.view(-1, CORNER_WORDS), numbers[first_knot:], lines.n_samples)
+    samples = _sample_lines(rows, corners.view(-1, CORNER_WORDS), numbers[first_knot:], lines.n_samples)
     return dict(zip(KINDS, surface_dabs(grid, *samples, len(KINDS)).unbind(0), strict=True))
 
 
@@ -132,13 +129,13 @@ class _Samples(NamedTuple):
     kinds: Tensor
 
 
-def _sampled(lines: Tensor, corners: Tensor, knots: Tensor, total: int) -> _Samples:
+def _sample_lines(lines: Tensor, corners: Tensor, knots: Tensor, total: int) -> _Samples:
     """Points along all lines, evenly spaced on each.
 
     Args:
-        lines: [L, 15], the first of `Lines.numbers`.
-        corners: [C, 4], those after them.
-        knots: The last ones.
+        lines: The first rows of `Lines.numbers`, [L, 15].
+        corners: The rows after them, [C, 4].
+        knots: The rest of the numbers.
         total: Number of samples.
     """
     device = lines.device
@@ -148,7 +145,7 @@ def _sampled(lines: Tensor, corners: Tensor, knots: Tensor, total: int) -> _Samp
     u = (torch.arange(total, device=device) - first) / (count - 1)
     t = u * length
 
-    # All lines laid end to end, with gaps, are one: one search finds the corners that each sample lies between.
+    # All lines are laid end to end, with gaps, so that one search finds the corners around every sample.
     whole = torch.repeat_interleave(
         torch.arange(len(lines), device=device), lines[:, 0].long(), output_size=len(corners)
     )

@@ -1,6 +1,6 @@
-"""What stands round the hand in one picture: camera, light, clothes. Drawn with numpy, in the camera's frame.
+"""Sample the camera's view and the light of one picture, with numpy.
 
-The camera looks along +z, x right, y down, metres; colours are linear RGB.
+In the camera's frame, which looks along +z with x right and y down; metres; colours are linear RGB.
 """
 
 import functools
@@ -11,8 +11,8 @@ import numpy as np
 
 N_LAMPS = 3
 Vector = np.ndarray | Sequence[float | int]
-Look = Literal["photo", "even"]
-"""A photo with everything, or the hand alone in even light, as training wants its targets."""
+PictureStyle = Literal["photo", "even"]
+"""A photo with everything, or the bare hand in even light, as training needs its targets."""
 
 _FACING = {
     "palm": np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]),
@@ -20,66 +20,66 @@ _FACING = {
     "thumb": np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, -1]]),
     "little": np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]),
 }
-"""Rotations from the hand's frame to a camera that sees this side, fingers up."""
+"""Rotations from the hand's frame to a camera that sees this side of the hand, fingers up."""
 _VIEW_SHARES = {"palm": 0.40, "back": 0.32, "thumb": 0.11, "little": 0.03, "any": 0.14}
 _STILL = np.eye(3)
 _TO_ELBOW = np.array([1.0, 0.0, 0.0])
-"""In the hand's frame, as long as the wrist is straight."""
+"""Direction of a straight forearm in the hand's frame."""
 _TURNED_ROUND = np.diag([-1.0, 1.0, -1.0])
 ARM_CONE = np.radians(35)
-"""Of directions round the forearm's from which it hides the hand, half of it on average [rad]."""
+"""Opening angle of the views along the forearm, from which it hides half of the hand on average [rad]."""
 _TO_CAMERA = np.array([0.0, 0.0, -1.0])
 DIRECTIONS = 400
-"""Of the sky, when its harmonics are summed."""
+"""Directions that sample the sky for its spherical harmonics."""
 
 
 class Light(NamedTuple):
-    """Sky and lamps."""
+    """The light of one picture: sky and lamps."""
 
     sky: np.ndarray
-    """Harmonics up to degree 2, [9, 3]."""
+    """Spherical harmonics of the radiance up to degree 2, [9, 3]."""
     directions: np.ndarray
     """Unit vectors from the hand to the lamps, [L, 3]."""
     distances: np.ndarray
     """[m], [L]."""
     colors: np.ndarray
-    """Irradiance over pi at the hand, [L, 3]; black where there is no lamp."""
+    """Irradiance over pi at the hand, [L, 3]; black for no lamp."""
     spreads: np.ndarray
     """Radius over distance, [L]."""
     incident: np.ndarray
-    """Irradiance over pi on the hand, roughly, [3]: what a camera is balanced and exposed for."""
+    """Approximate irradiance over pi on the hand, [3]; decides on exposure and white balance."""
 
 
 class View(NamedTuple):
-    """Where the hand is seen from."""
+    """The pose of the hand relative to the camera."""
 
     rotation: np.ndarray
     """From the hand's frame to the camera's, [3, 3]."""
     distance: float
-    """Of the hand's middle [m]."""
+    """From the camera to the hand's middle [m]."""
     fill: float
-    """Longer side of the hand's box over that of the picture."""
+    """Longer side of the hand's bounding box over the side of the picture."""
     shift: np.ndarray
-    """Of the box's middle, in sides of the picture, [2]."""
+    """Offset of the box's middle, over the side of the picture, [2]."""
 
 
 def rotation_about(axis: Vector, angle: float) -> np.ndarray:
-    """Rotation matrix (Rodrigues)."""
+    """Rotation matrix (Rodrigues); the axis need not be a unit vector."""
     cross = _cross(*map(float, axis))
     return _STILL + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 @functools.lru_cache(16)
 def _cross(x: float, y: float, z: float) -> np.ndarray:
-    """Matrix of the vector product with the unit vector along an axis; few axes are asked for, over and over."""
+    """Matrix of the cross product with the unit vector along an axis; cached, since few axes occur."""
     x, y, z = np.array([x, y, z], float) / np.linalg.norm([x, y, z])
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-def sample_view(rng: np.random.Generator, look: Look, closed: bool) -> View:
-    """A camera: palms and backs mostly, upright mostly, any side sometimes; even looks come from all around.
+def sample_view(rng: np.random.Generator, look: PictureStyle, closed: bool) -> View:
+    """Sample a camera: mostly upright, of palm or back; from any side in even light.
 
-    A `closed` hand shows its fingers rather than its back, as people hold fists up.
+    A `closed` hand shows its fingers rather than its back, as people hold up fists.
     """
     u = rng.uniform
     side = rng.choice(list(_VIEW_SHARES), p=list(_VIEW_SHARES.values()))
@@ -108,12 +108,12 @@ def sample_view(rng: np.random.Generator, look: Look, closed: bool) -> View:
     return View(rotation, float(np.exp(u(np.log(0.32), np.log(0.85)))), fill, rng.normal(0, 0.05, 2))
 
 
-def clear_of_arm(view: View, bend: np.ndarray) -> View:
-    """The view, or where the forearm would stand before the hand, that from the opposite side.
+def avoid_forearm(view: View, bend: np.ndarray) -> View:
+    """The view, or the one from the opposite side if the forearm would hide the hand.
 
     Args:
-        view: Any.
-        bend: Of the forearm at the wrist, an axis with its angle as length [rad], [3].
+        view: Any view.
+        bend: Rotation vector of the forearm at the wrist [rad], [3].
     """
     arm = rotation_about(bend, float(np.linalg.norm(bend))) @ _TO_ELBOW
     if -(view.rotation @ arm)[2] < np.cos(ARM_CONE):
@@ -122,11 +122,12 @@ def clear_of_arm(view: View, bend: np.ndarray) -> View:
 
 
 def warmth(t: float) -> np.ndarray:
-    """Colour of light from bluish (negative) over white (0) to lamp-like (1), mean about 1."""
+    """Colour of light from bluish (negative) over white (0) to incandescent (1), with mean about 1."""
     return np.array([1.0, 1 - 0.18 * t, 1 - 0.42 * t]) / (1 - 0.16 * t)
 
 
 def _harmonics(d: np.ndarray) -> np.ndarray:
+    """Real spherical harmonics up to degree 2 at unit vectors, [n, 9]."""
     x, y, z = d.T
     return np.stack([
         0 * x + 0.2820948, 0.4886025 * y, 0.4886025 * z, 0.4886025 * x, 1.0925484 * x * y, 1.0925484 * y * z,
@@ -135,7 +136,7 @@ def _harmonics(d: np.ndarray) -> np.ndarray:
 
 
 def sphere(n: int) -> np.ndarray:
-    """N unit vectors spread evenly (Fibonacci's spiral), [n, 3]."""
+    """Evenly spread unit vectors (Fibonacci spiral), [n, 3]."""
     k = np.arange(n) + 0.5
     z, turn = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
     r = np.sqrt(1 - z * z)
@@ -146,15 +147,15 @@ _SPHERE = sphere(DIRECTIONS)
 _SPHERE_HARMONICS = _harmonics(_SPHERE) * (4 * np.pi / DIRECTIONS)
 
 
-def turn_light(light: Light, rotation: np.ndarray) -> Light:
-    """The same light as a camera sees it whose frame is the old one's, turned: `rotation` leads from the old to it."""
+def rotate_light(light: Light, rotation: np.ndarray) -> Light:
+    """The same light in another camera's frame; `rotation` maps the old frame to the new one."""
     spread = _harmonics(_SPHERE @ rotation) @ light.sky
-    sky = np.linalg.lstsq(_harmonics(_SPHERE), spread, rcond=None)[0]  # exact: turned harmonics are of the same degree
+    sky = np.linalg.lstsq(_harmonics(_SPHERE), spread, rcond=None)[0]  # exact: rotation keeps the degree
     return light._replace(sky=sky, directions=light.directions @ rotation.T)
 
 
-def soften_light(light: Light, share: float) -> Light:
-    """As much light of the same colour, of which `share` comes as it did and the rest from all around."""
+def diffuse_light(light: Light, share: float) -> Light:
+    """The same amount and colour of light, of which `share` keeps its directions and the rest is uniform."""
     sky = share * light.sky
     sky[0] = light.sky[0] + 0.65 * (1 - share) * light.colors.sum(0) / 0.2820948
     return light._replace(sky=sky, colors=share * light.colors)
@@ -169,8 +170,8 @@ def _even_light() -> Light:
     return Light(sky, none + _TO_CAMERA, np.ones(N_LAMPS), none, np.full(N_LAMPS, 0.1), np.ones(3))
 
 
-def sample_light(rng: np.random.Generator, look: Look) -> Light:
-    """Environment and soft lamps of a room, a window, the open air, or a flash; even looks get a bright plain sky."""
+def sample_light(rng: np.random.Generator, look: PictureStyle) -> Light:
+    """Sample sky and soft lamps of a room, a window, the open air or a flash; a bright plain sky for "even"."""
     if look == "even":
         return _even_light()
     u, d = rng.uniform, _SPHERE

@@ -1,4 +1,4 @@
-"""What a hand wears: the meshes of sleeves, wristbands and rings on a posed hand, and how they look."""
+"""Clothes: the meshes of sleeves, wristbands and rings on a posed hand, and their materials."""
 
 import functools
 from typing import NamedTuple
@@ -12,34 +12,35 @@ from oasis_warp.synthetic.body import ARM_LENGTH, ARM_ROWS, BAND_ROWS, RING_COLU
 from oasis_warp.synthetic.identity import Identity
 
 BAND_PLACES = (0.0, 0.02, 0.15, 0.5, 0.85, 0.98, 1.0)
-"""Of a wristband's rows over its width."""
+"""Positions of a wristband's rows over its width."""
 BAND_PROFILE = (-0.6, 0.7, 1.0, 1.0, 1.0, 0.7, -0.6)
-"""Height of a wristband's rows over the skin, in its thickness."""
+"""Heights of a wristband's rows over the skin, over its thickness."""
 RING_ROUNDNESS = 0.6
 """Half thickness of a ring [mm]."""
 SKIN_LOOK = (0.0, 0.0, 0.0, 0.5, 0.0, 0.0)
+"""Material of skin: see `ops.skin_shading`. Its colour comes from the texture."""
 AWAY = (0.0, 0.0, -1.0)
-"""Where vertices wait that an image does not show, in the camera's frame: behind it."""
+"""Position of vertices that an image does not show, in the camera's frame: behind it."""
 
 
 class Clothes(NamedTuple):
-    """Of one picture; lengths in metres."""
+    """The clothes of one picture; lengths in metres."""
 
     sleeve_start: float
-    """Distance of its edge from the wrist; beyond the arm where there is none."""
+    """Distance of its edge from the wrist; beyond the arm for none."""
     sleeve_gap: float
     sleeve_phases: np.ndarray
-    """Of the wrinkles, [4]."""
+    """Phases of the wrinkles, [4]."""
     sleeve_look: tuple[float, ...]
     band_start: float
-    """Beyond the arm where there is none."""
+    """Distance from the wrist; beyond the arm for none."""
     band_width: float
     band_thickness: float
     band_look: tuple[float, ...]
 
 
 def sample_clothes(rng: np.random.Generator, bare: bool) -> Clothes:
-    """A sleeve on a third of the arms, a wristband or strap on an eighth, none if `bare`."""
+    """Sample clothes: a sleeve on a third of the arms, a wristband on an eighth, none if `bare`."""
     u = rng.uniform
 
     def cloth_color() -> tuple[float, float, float]:
@@ -65,7 +66,7 @@ def sample_clothes(rng: np.random.Generator, bare: bool) -> Clothes:
 
 
 def _along_arm(rows: Tensor, s: Tensor) -> Tensor:
-    """Rings of the arm at places `s` [B, R] (0 wrist, 1 elbow) of rows [B, ARM_ROWS + 1, C, 3]."""
+    """Interpolate the arm's rows [B, ARM_ROWS + 1, C, 3] at positions `s` [B, R], 0 at the wrist, 1 at the elbow."""
     place = s.clamp(0, 1) * ARM_ROWS
     low = place.floor().clamp(max=ARM_ROWS - 1)
     index = low.long()[..., None, None].expand(-1, -1, *rows.shape[2:])
@@ -74,13 +75,14 @@ def _along_arm(rows: Tensor, s: Tensor) -> Tensor:
 
 
 def _outward(rings: Tensor) -> Tensor:
+    """Unit vectors from the centre of each ring to its points."""
     return torch.nn.functional.normalize(rings - rings.mean(2, keepdim=True), dim=-1)
 
 
 def sleeves(
     rows: Float[Tensor, "B R C 3"], start: Float[Tensor, "B"], gap: Float[Tensor, "B"], phases: Float[Tensor, "B 4"]
 ) -> Float[Tensor, "B K C 3"]:
-    """Wrinkled tubes round arms, whose rows start with the wrist's rim; rows of absent ones are not to be used."""
+    """Wrinkled tubes around arms, whose rows start with the wrist's rim. The sleeves of bare arms are undefined."""
     start, gap = start[:, None] / ARM_LENGTH, gap[:, None]
     share = torch.linspace(0, 1, SLEEVE_ROWS - 2, device=rows.device)
     s = torch.cat([start, start, start + (1 - start) * share], 1)
@@ -103,7 +105,7 @@ def sleeves(
 
 @functools.cache
 def _band_profile(device: torch.device) -> tuple[Tensor, Tensor]:
-    """Place of a wristband's rows over its width, and their height over its thickness."""
+    """`BAND_PLACES` and `BAND_PROFILE` on a device."""
     assert len(BAND_PLACES) == len(BAND_PROFILE) == BAND_ROWS
     return torch.tensor(BAND_PLACES, device=device), torch.tensor(BAND_PROFILE, device=device)
 
@@ -111,7 +113,7 @@ def _band_profile(device: torch.device) -> tuple[Tensor, Tensor]:
 def bands(
     rows: Float[Tensor, "B R C 3"], start: Float[Tensor, "B"], width: Float[Tensor, "B"], thickness: Float[Tensor, "B"]
 ) -> Float[Tensor, "B K C 3"]:
-    """Flat bands round wrists."""
+    """Flat bands around wrists. The bands of bare arms are undefined."""
     share, profile = _band_profile(rows.device)
     rings = _along_arm(rows, (start[:, None] + width[:, None] * share) / ARM_LENGTH)
     lift = thickness[:, None] * profile
@@ -121,7 +123,7 @@ def bands(
 def ring_at_rest(
     body: Body, rest: Float[Tensor, "V 3"], joints: Float[Tensor, "16 3"], identity: Identity
 ) -> Float[Tensor, "K 3"]:
-    """A band that fits the identity's finger, in the hand's frame at rest [m]; nothing to be used if it has none."""
+    """A ring that fits the person's finger, in the hand's frame at rest [m]; undefined for people without ring."""
     finger = max(identity.ring_finger, 0)
     bone = body.bones[finger][0]
     joint = 3 * finger + 1
@@ -147,5 +149,5 @@ def ring_at_rest(
 
 
 def ring_look(identity: Identity) -> tuple[float, ...]:
-    """Metal."""
+    """The material of a ring: metal."""
     return (*identity.ring_metal, 0.18 + 0.2 * identity.gloss, 1.0, 0.0)
