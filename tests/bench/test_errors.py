@@ -2,7 +2,7 @@ import math
 
 import torch
 
-from oasis_warp.bench.errors import largest_error, psnr, relative_error, same_bits
+from oasis_warp.reference.errors import largest_error, psnr, relative_error, same_bits
 
 
 def test_relative_error_is_norm_over_norm_where_judged():

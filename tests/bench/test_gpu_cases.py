@@ -6,7 +6,6 @@ import torch
 
 from oasis_warp.bench import gpu_speed, gpu_timing
 from oasis_warp.bench.avatar_scene import Learning, avatar_scene, draw, make_avatar, many_poses, pose
-from oasis_warp.bench.errors import same_bits
 from oasis_warp.bench.gpu_cases import CASES, OURS, avatar_case, choose, picture, visibility
 from oasis_warp.bench.gpu_speed import errors, measure, measure_case, most_error
 from oasis_warp.bench.gpu_timing import Captured
@@ -14,6 +13,7 @@ from oasis_warp.bench.operators import OPERATORS, Results
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
 from oasis_warp.ops._runtime.pair_counts import Overflow
+from oasis_warp.reference.errors import same_bits
 
 SMALL = {
     "picture": picture(2_000, 64, 1, "forward"),

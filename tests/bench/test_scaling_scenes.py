@@ -2,12 +2,12 @@ import pytest
 import torch
 
 from oasis_warp.bench.counts import count, count_mesh
-from oasis_warp.bench.errors import largest_error
 from oasis_warp.bench.operators import OPERATORS, forward
 from oasis_warp.bench.scaling_scenes import TILE, crop, giants, one_tile, points_on, surface, turned_about_z
 from oasis_warp.bench.scenes import HAND_GAUSSIANS, frontal, hand, hand_scenes
 from oasis_warp.core.rotation import to_matrix
 from oasis_warp.ops import rasterization
+from oasis_warp.reference.errors import largest_error
 
 MAKERS = {
     "surface": lambda seed: surface(500, 32, 2, seed),

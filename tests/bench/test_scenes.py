@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from oasis_warp.bench import scenes
-from oasis_warp.bench.errors import relative_error
 from oasis_warp.bench.torch_rasterizer import draw
+from oasis_warp.reference.errors import relative_error
 
 MAKERS = {
     "hand": lambda seed: scenes.hand(32, seed),

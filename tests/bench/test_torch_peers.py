@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from oasis_warp.bench import scenes
-from oasis_warp.bench.errors import psnr, relative_error
 from oasis_warp.bench.operators import OPERATORS, exact, forward, gradients
 from oasis_warp.bench.torch_rasterizer import draw
 from oasis_warp.ops._runtime.rules import Rules
+from oasis_warp.reference.errors import psnr, relative_error
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""300 scenes of the seeded grid against the float64 twins, and what a scene is."""
+"""300 scenes of the seeded grid against the float64 references, and what a scene is."""
 
 import math
 
@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from oasis_warp import ops
-from oasis_warp.certify import grid
-from oasis_warp.certify.certification import EXACT_STIFF
+from oasis_warp.certify.certification import EXACT_STIFF, check_scene, grid_scenes, run_grid
 from oasis_warp.certify.compare import LAYER, Measurement, compare
 from oasis_warp.certify.families import FAMILIES
 
@@ -18,7 +17,7 @@ A_FAMILY = SCENES // len(FAMILIES)
 @pytest.mark.parametrize("part", range(PARTS))
 @pytest.mark.parametrize("name", FAMILIES)
 def test_float32_operators_keep_their_bounds_on_the_first_scenes_of_the_grid(name, part, device):
-    measured = [m for seed in range(part, A_FAMILY, PARTS) for m in grid.check_scene(name, seed, device)]
+    measured = [m for seed in range(part, A_FAMILY, PARTS) for m in check_scene(name, seed, device)]
     assert len(measured) > A_FAMILY // PARTS
     assert not [m for m in measured if not m.passed]
 
@@ -30,7 +29,7 @@ SMALL = {"rasterization": {"n": 40, "size": (17, 15), "channels": 3, "mode": "RG
     "dtype", [torch.float32, pytest.param(torch.float64, marks=pytest.mark.slow)], ids=["float32", "float64"]
 )
 @pytest.mark.parametrize("name", FAMILIES)
-def test_small_scenes_of_every_condition_equal_the_twins(name, dtype, device):
+def test_small_scenes_of_every_condition_equal_the_references(name, dtype, device):
     family = FAMILIES[name]
     for condition in family.conditions:
         for seed in (0, 1):
@@ -56,7 +55,11 @@ def test_a_scene_is_a_function_of_its_seed_alone(name):
         before = torch.get_rng_state()
         torch.manual_seed(1)
         second = FAMILIES[name].scene(seed)
-        assert str(first) == str(second) and first.wanted == second.wanted and first.bounds == second.bounds
+        assert (
+            str(first) == str(second)
+            and first.differentiable == second.differentiable
+            and first.bounds == second.bounds
+        )
         assert first.floats.keys() == second.floats.keys()
         assert all(torch.equal(first.floats[k], second.floats[k]) for k in first.floats)
         assert all(torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
@@ -76,7 +79,7 @@ def test_scenes_hold_float32_numbers_and_every_condition_has_its_turn(name):
 
 
 def test_scenes_are_shared_out_over_the_operators_with_consecutive_seeds():
-    got = grid.scenes(("a", "b"), 5, seed=7)
+    got = grid_scenes(("a", "b"), 5, seed=7)
     assert got == [("a", 7), ("b", 7), ("a", 8), ("b", 8), ("a", 9)]
 
 
@@ -85,7 +88,7 @@ def test_an_operator_that_raises_is_a_failure_and_not_the_end(monkeypatch):
         raise RuntimeError("no such kernel")
 
     monkeypatch.setattr(ops, "face_rotations", broken)
-    (found,) = grid.check_scene("face_rotations", 4, torch.device("cpu"))
+    (found,) = check_scene("face_rotations", 4, torch.device("cpu"))
     assert not found.passed and "any unit of length, seed 4: RuntimeError: no such kernel" in found.scene
 
 
@@ -119,9 +122,9 @@ def test_nan_fails_every_bound():
 
 @pytest.mark.slow
 def test_processes_measure_what_one_process_measures():
-    todo = grid.scenes(("pose_on_mesh", "face_rotations"), 44, 0)
+    todo = grid_scenes(("pose_on_mesh", "face_rotations"), 44, 0)
     cpu = torch.device("cpu")
-    alone = sorted(m for _, part in grid.run_grid(todo, cpu, 1) for m in part)
-    shared = list(grid.run_grid(todo, cpu, 2))
+    alone = sorted(m for _, part in run_grid(todo, cpu, 1) for m in part)
+    shared = list(run_grid(todo, cpu, 2))
     assert sum(n for n, _ in shared) == 44
     assert sorted(m for _, part in shared for m in part) == alone

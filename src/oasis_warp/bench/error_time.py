@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from oasis_warp.bench import knobs
-from oasis_warp.bench.errors import largest_error, psnr, relative_error, same_bits
 from oasis_warp.bench.knobs import Setting
 from oasis_warp.bench.operators import OPERATORS, Exact, Operator, Outputs, Pass, exact, forward, gradients
 from oasis_warp.bench.rows import Row, commit, device_name, versions
@@ -27,6 +26,7 @@ from oasis_warp.bench.timing import Timed, Timing, peak_megabytes, time_together
 from oasis_warp.bench.yardstick import make_yardstick
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.ops._runtime.rules import using
+from oasis_warp.reference.errors import largest_error, psnr, relative_error, same_bits
 
 SWEPT = ("rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "skin")
 """Operators that have knobs of their own: `blend_weights` draws by the rasterizer's, posing is two of these."""

@@ -7,7 +7,6 @@ from importlib.util import find_spec
 import torch
 from torch import Tensor
 
-from oasis_warp.bench.errors import largest_error, relative_error, same_bits
 from oasis_warp.bench.gpu_cases import Case, Draw, Named, Way
 from oasis_warp.bench.gpu_profile import kernel_times
 from oasis_warp.bench.gpu_timing import STEPS_A_GRAPH, Captured, NotCaptured, Probe, Sample, capture, time_groups
@@ -17,6 +16,7 @@ from oasis_warp.bench.scenes import Scene
 from oasis_warp.bench.timing import peak_megabytes, synchronise
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
+from oasis_warp.reference.errors import largest_error, relative_error, same_bits
 
 MOST = 0.9999
 """Share of the pixels that `GpuRow.most_abs` is the largest error of."""

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.bench.counts import Counts, count
-from oasis_warp.bench.errors import same_bits
 from oasis_warp.bench.gpu_cases import TRUSTED
 from oasis_warp.bench.gpu_speed import most_error
 from oasis_warp.bench.gpu_timing import STEPS_A_GRAPH, NotCaptured, Probe, capture, time_groups
@@ -23,6 +22,7 @@ from oasis_warp.bench.scenes import Scene
 from oasis_warp.bench.timing import peak_megabytes, synchronise
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.ops import rasterization
+from oasis_warp.reference.errors import same_bits
 
 GROUPS = 9
 CALM = 1.5

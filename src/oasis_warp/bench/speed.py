@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import torch
 
-from oasis_warp.bench.errors import relative_error
 from oasis_warp.bench.operators import Exact, Operator, Outputs, Pass, exact, forward, gradients
 from oasis_warp.bench.rows import commit, device_name, versions
 from oasis_warp.bench.scalar import generic_kernels
@@ -14,6 +13,7 @@ from oasis_warp.bench.scenes import MeshScene, Scene, hand_scenes, surfels
 from oasis_warp.bench.timing import Timed, peak_megabytes, time_together
 from oasis_warp.bench.yardstick import make_yardstick
 from oasis_warp.core.logging import Progress, silent
+from oasis_warp.reference.errors import relative_error
 
 
 @dataclass(frozen=True, kw_only=True)

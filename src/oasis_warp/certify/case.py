@@ -1,4 +1,4 @@
-"""One call of an operator, drawn from a seed, and the limits its answer has to keep."""
+"""One call of an operator, drawn from a seed, and the limits that its answer has to keep."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,12 +12,12 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Bounds:
-    """Largest errors of the float32 operator against the float64 twin on the same numbers."""
+    """Largest errors of the float32 operator against the float64 reference on the same numbers."""
 
     values: float = 5e-6
     """Relative L2 of each output."""
     gradients: float = 5e-5
-    """Relative L2 of each input's gradient."""
+    """Relative L2 of the gradient of each input."""
     peak: float = 1e-4
     """Largest difference of a single element, relative to the largest element of the output."""
 
@@ -35,23 +35,22 @@ class Case:
     seed: int
     floats: dict[str, Tensor]
     """Tensor arguments in float64, which are converted to the precision of the call."""
-    wanted: tuple[str, ...]
+    differentiable: tuple[str, ...]
     """Those of them that get a gradient."""
     others: dict[str, Any] = field(default_factory=dict)
     """Index tensors, sizes, modes."""
     bounds: Bounds = ORDINARY
     floors: dict[str, float] = field(default_factory=dict)
-    """Size of the elements of an output or of an input's gradient that counts as little: errors of smaller ones are
-    relative to this number."""
+    """Least element size of an output or of the gradient of an input: errors of smaller ones are relative to it."""
 
     def __post_init__(self):
         for name, tensor in self.floats.items():
             self.floats[name] = tensor.float().double()
 
     def arguments(self, dtype: torch.dtype, device: torch.device) -> dict[str, Any]:
-        """Everything as keywords, fresh tensors of that precision on that device; those wanted require a gradient."""
+        """All arguments by keyword, fresh tensors of that precision on that device, which require their gradients."""
         made = {name: tensor.to(device, dtype, copy=True) for name, tensor in self.floats.items()}
-        for name in self.wanted:
+        for name in self.differentiable:
             made[name].requires_grad_()
         return made | {k: v.to(device) if isinstance(v, Tensor) else v for k, v in self.others.items()}
 
@@ -59,8 +58,8 @@ class Case:
         return f"{self.condition}, seed {self.seed}"
 
 
-class Draw:
-    """Random numbers of one scene; nothing outside it is read or changed."""
+class Sampler:
+    """Random numbers of one scene; it neither reads nor changes a global generator."""
 
     def __init__(self, seed: int):
         self.generator = torch.Generator().manual_seed(seed)
@@ -73,6 +72,11 @@ class Draw:
         """Float64 numbers of mean 0 and variance 1."""
         return torch.randn(*shape, generator=self.generator, dtype=torch.float64)
 
+    def units(self, *shape: int) -> Tensor:
+        """Random unit vectors along the last axis."""
+        vectors = self.normal(*shape)
+        return vectors / vectors.norm(dim=-1, keepdim=True)
+
     def integers(self, end: int, *shape: int) -> Tensor:
         """Whole numbers in [0, end)."""
         return torch.randint(end, shape, generator=self.generator)
@@ -84,3 +88,12 @@ class Draw:
     def signs(self, *shape: int) -> Tensor:
         """-1 or 1."""
         return 2.0 * self.integers(2, *shape).double() - 1
+
+
+def sheet(side: int) -> tuple[Tensor, Tensor]:
+    """Vertices and faces of a plane of 2 side^2 triangles at z = 0, x and y from 0 to `side`."""
+    ticks = torch.arange(side + 1, dtype=torch.float64)
+    y, x = torch.meshgrid(ticks, ticks, indexing="ij")
+    a = (torch.arange(side)[:, None] * (side + 1) + torch.arange(side)).reshape(-1)
+    faces = torch.cat([torch.stack([a, a + 1, a + side + 2], 1), torch.stack([a, a + side + 2, a + side + 1], 1)])
+    return torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3), faces

@@ -1,6 +1,9 @@
-"""Everything that `oasis gradcheck` measures without options, as a list of small steps."""
+"""What `oasis gradcheck` measures: a list of small steps, or with `--scenes` a grid of seeded scenes on all cores."""
 
-from collections.abc import Callable, Iterator
+import math
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import as_completed
 from functools import partial
 from itertools import count, islice
 from typing import Any
@@ -8,11 +11,10 @@ from typing import Any
 import torch
 
 from oasis_warp.certify.case import Case
-from oasis_warp.certify.compare import Measurement, agree, compare
-from oasis_warp.certify.determinism import differing
-from oasis_warp.certify.differences import finite_differences
+from oasis_warp.certify.checks import bit_differences, finite_differences, refusals
+from oasis_warp.certify.compare import CPU, Measurement, agree, compare
 from oasis_warp.certify.families import FAMILIES, Family
-from oasis_warp.certify.refusals import refusals
+from oasis_warp.core.processes import worker_pool
 
 Step = Callable[[], list[Measurement]]
 
@@ -42,51 +44,29 @@ SMALL: dict[str, list[dict[str, Any]]] = {
 }  # fmt: skip
 """Scenes for finite differences, a hundred calls each."""
 SMALL_SIZES: dict[str, dict[str, Any]] = {
-    "rasterization": {"n": 9, "size": (11, 8)},
+    "rasterization": {"n": 9, "size": (11, 8), "n_cameras": 1},
     "depth_visibility": {"n": 25, "size": (16, 12), "n_points": 30},
     "face_rotations": {"side": 2},
     "pose_on_mesh": {"n": 7},
     "pose_on_mesh_covars": {"side": 2, "n": 7},
     "skin": {"n": 7, "n_joints": 4},
 }
-EXACT_STIFF = (1e-9, 1e-7)
 STIFF_SEEDS = 3
 ORDINARY_SEEDS = 8
 REPEATS = 10
 FULL_AMONG = 200
 EXACT = (1e-9, 1e-8)
 """Values and gradients of the float64 operator: rounding, magnified where a scene divides by little."""
+EXACT_STIFF = (1e-9, 1e-7)
+CHUNK = 20
+"""Scenes that a process gets at a time."""
 
 
 def small_scenes(family: Family, seed: int) -> Iterator[Case]:
     """The scenes for finite differences: for each kind the first that is smooth."""
     for kind in SMALL.get(family.name, []):
-        wanted = {"n_cameras": 1} if family.name == "rasterization" else {}
-        drawn = (family.case(seed=s, **SMALL_SIZES[family.name] | wanted | kind) for s in count(seed))
-        yield next(case for case in islice(drawn, 1000) if family.smooth(case))
-
-
-def steps(family: Family, device: torch.device, seed: int) -> Iterator[Step]:
-    """All measurements of one operator."""
-    cpu = torch.device("cpu")
-    for case in small_scenes(family, seed):
-        yield partial(finite_differences, family, case, device)
-    for s in range(seed, seed + ORDINARY_SEEDS):
-        yield partial(compare, family, family.case("ordinary", s), torch.float64, device, EXACT)
-        yield partial(compare, family, family.case("ordinary", s), torch.float32, device)
-    for name in family.conditions:
-        if name != "ordinary":
-            for s in range(seed, seed + STIFF_SEEDS):
-                yield partial(compare, family, family.case(name, s), torch.float32, device)
-            yield partial(compare, family, family.case(name, seed), torch.float64, device, EXACT_STIFF)
-    large = family.case("ordinary", seed, **family.large)
-    yield partial(agree, family, large, "float32 to float64", torch.float64, device, device)
-    if device.type != "cpu":
-        for s in range(seed, seed + ORDINARY_SEEDS):
-            other = family.case("ordinary", s, **family.large)
-            yield partial(agree, family, other, f"{device.type} against cpu", torch.float32, cpu, device)
-    yield partial(differing, family, large, device, REPEATS)
-    yield partial(refusals, family, full_scene(family, seed), device)
+        cases = (family.case(seed=s, **SMALL_SIZES[family.name] | kind) for s in count(seed))
+        yield next(case for case in islice(cases, 1000) if family.smooth(case))
 
 
 def full_scene(family: Family, seed: int) -> Case:
@@ -102,6 +82,65 @@ def full_scene(family: Family, seed: int) -> Case:
     raise AssertionError(f"{family.name}: no full scene among {FULL_AMONG}")
 
 
-def all_steps(names: tuple[str, ...], device: torch.device, seed: int) -> list[tuple[str, Step]]:
-    """(operator, measurement) for the operators of these names."""
-    return [(name, step) for name in names for step in steps(FAMILIES[name], device, seed)]
+def steps(family: Family, device: torch.device, seed: int) -> Iterator[Step]:
+    """All measurements of one operator."""
+    for case in small_scenes(family, seed):
+        yield partial(finite_differences, family, case, device)
+    for s in range(seed, seed + ORDINARY_SEEDS):
+        yield partial(compare, family, family.case("ordinary", s), torch.float64, device, EXACT)
+        yield partial(compare, family, family.case("ordinary", s), torch.float32, device)
+    for name in family.conditions:
+        if name != "ordinary":
+            for s in range(seed, seed + STIFF_SEEDS):
+                yield partial(compare, family, family.case(name, s), torch.float32, device)
+            yield partial(compare, family, family.case(name, seed), torch.float64, device, EXACT_STIFF)
+    large = family.case("ordinary", seed, **family.large)
+    yield partial(agree, family, large, "float32 to float64", (torch.float64, device), device)
+    if device.type != "cpu":
+        for s in range(seed, seed + ORDINARY_SEEDS):
+            other = family.case("ordinary", s, **family.large)
+            yield partial(agree, family, other, f"{device.type} against cpu", (torch.float32, CPU), device)
+    yield partial(bit_differences, family, large, device, REPEATS)
+    yield partial(refusals, family, full_scene(family, seed), device)
+
+
+def grid_scenes(names: Sequence[str], n: int, seed: int) -> list[tuple[str, int]]:
+    """`n` pairs (operator, seed), the operators in turn and each with consecutive seeds."""
+    return [(names[i % len(names)], seed + i // len(names)) for i in range(n)]
+
+
+def check_scene(name: str, seed: int, device: torch.device) -> list[Measurement]:
+    """Measurements of one scene of the grid; an exception is a failed one."""
+    family = FAMILIES[name]
+    case = family.scene(seed)
+    try:
+        return compare(family, case, torch.float32, device)
+    except Exception as error:  # any way to fail is what the grid looks for
+        what = f"{case}: {type(error).__name__}: {error}"
+        return [Measurement(name, "calls that end in an error", what, math.inf, 0.0)]
+
+
+def check_scenes(scenes: Sequence[tuple[str, int]], device: str) -> tuple[int, list[Measurement]]:
+    """How many scenes there are, and all their measurements."""
+    return len(scenes), [m for name, seed in scenes for m in check_scene(name, seed, torch.device(device))]
+
+
+def run_grid(
+    scenes: Sequence[tuple[str, int]], device: torch.device, n_processes: int
+) -> Iterator[tuple[int, list[Measurement]]]:
+    """How many scenes were checked and what was measured, chunk after chunk as they are done."""
+    chunks = [scenes[i : i + CHUNK] for i in range(0, len(scenes), CHUNK)]
+    if n_processes == 1:
+        for chunk in chunks:
+            yield check_scenes(chunk, str(device))
+        return
+    pool = worker_pool(n_processes)
+    try:
+        for done in as_completed([pool.submit(check_scenes, chunk, str(device)) for chunk in chunks]):
+            yield done.result()
+    except BaseException:  # Ctrl-C above all: do not wait for what is being measured
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)

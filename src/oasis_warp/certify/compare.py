@@ -1,4 +1,4 @@
-"""Values and gradients of one scene, here and there, and how far apart they are."""
+"""Values and gradients of an operator on one scene, and how far they are from those of its reference."""
 
 import math
 from typing import Any, NamedTuple
@@ -9,11 +9,16 @@ from torch import Tensor
 from oasis_warp.certify.case import Case
 from oasis_warp.certify.families import Family, Outputs
 
-LONE = 3
-"""A scene with so few rows in an input is weighed `WEIGHINGS` times: one random sum may cancel to nothing."""
-WEIGHINGS = 4
+FEW_ROWS = 3
+"""A scene with so few rows in an input gets `LOSSES` random losses: the gradient of one may cancel to nothing."""
+LOSSES = 4
 LAYER = 6e-3
-"""Largest error of a value that hangs on rounding, of 1: one layer of 1/255, and a little."""
+"""Largest error of a value that depends on rounding, of 1: one layer of 1/255, and a little."""
+NEARLY = 2e-5
+"""Difference of two pixels that rounding explains, over the largest element."""
+SHARE = 1e-4
+"""Of elements that may differ by more: those where rounding decides what is drawn."""
+CPU = torch.device("cpu")
 
 
 class Measurement(NamedTuple):
@@ -32,59 +37,62 @@ class Measurement(NamedTuple):
 
     @property
     def load(self) -> float:
-        """Error over bound; infinite where there is none to divide by, or no error to speak of."""
+        """Error over bound; infinite for NaN and for any error where the bound is 0."""
         if math.isnan(self.error):
             return math.inf
         return self.error / self.bound if self.bound > 0 else (math.inf if self.error > 0 else 0.0)
 
 
 class Answer(NamedTuple):
-    """What an operator or a twin said to one scene."""
+    """What an operator or its reference computes on one scene."""
 
     outputs: Outputs
     gradients: list[dict[str, Tensor]]
-    """For each weighing, by input."""
+    """By input, for each loss."""
+
+    def n_not_finite(self) -> int:
+        """How many numbers are NaN or infinite."""
+        tensors = [*self.outputs, *(g for by_input in self.gradients for g in by_input.values())]
+        return sum(int((~t.isfinite()).sum()) for t in tensors)
 
 
-def weighings(case: Case, outputs: Outputs, keep: Outputs) -> list[list[Tensor]]:
-    """Random signs for every kept element of every output, one list a gradient to take."""
-    few = any(0 < len(case.floats[name]) <= LONE for name in case.wanted)
+def loss_weights(case: Case, outputs: Outputs, mask: Outputs) -> list[list[Tensor]]:
+    """For each loss, random signs for every unmasked element of every output."""
+    few = any(0 < len(case.floats[name]) <= FEW_ROWS for name in case.differentiable)
     g = torch.Generator().manual_seed(case.seed)
     return [
-        [(2.0 * torch.randint(2, out.shape, generator=g) - 1) * mask for out, mask in zip(outputs, keep, strict=True)]
-        for _ in range(WEIGHINGS if few else 1)
+        [(2.0 * torch.randint(2, out.shape, generator=g) - 1) * m for out, m in zip(outputs, mask, strict=True)]
+        for _ in range(LOSSES if few else 1)
     ]
 
 
 def gradients(case: Case, arguments: dict[str, Any], outputs: Outputs, weights: list[list[Tensor]]) -> list[dict]:
-    """Of the weighted sums of the outputs by the wanted inputs; zeros where the answer does not depend on one."""
-    inputs = [arguments[name] for name in case.wanted]
+    """Of the weighted sums of the outputs, by input; zeros where the outputs do not depend on one."""
+    inputs = [arguments[name] for name in case.differentiable]
     taken = []
     for signs in weights if inputs else []:
         terms = [(out * sign.to(out.device)).sum() for out, sign in zip(outputs, signs, strict=True)]
         loss = torch.stack(terms).sum()
+        found = [torch.zeros_like(tensor) for tensor in inputs]
         if loss.requires_grad:
-            found = torch.autograd.grad(loss, inputs, retain_graph=True, allow_unused=True)
-        else:
-            found = [None] * len(inputs)
-        filled = (torch.zeros_like(t) if g is None else g for t, g in zip(inputs, found, strict=True))
-        taken.append({name: g.detach().double().cpu() for name, g in zip(case.wanted, filled, strict=True)})
+            found = torch.autograd.grad(loss, inputs, retain_graph=True, allow_unused=True, materialize_grads=True)
+        taken.append({k: g.detach().double().cpu() for k, g in zip(case.differentiable, found, strict=True)})
     return taken
 
 
-def ask_twin(family: Family, case: Case, slack: float = 1.0) -> tuple[Answer, Outputs, list[list[Tensor]]]:
-    """The twin's answer, what of it is kept, and the weighings to ask the operator with."""
-    arguments = case.arguments(torch.float64, torch.device("cpu"))
-    outputs, keep = family.twin(case, arguments, slack)
-    weights = weighings(case, outputs, keep)
+def run_reference(family: Family, case: Case) -> tuple[Answer, Outputs, list[list[Tensor]]]:
+    """The answer of the reference, the mask of what counts of it, and the weights of the losses."""
+    arguments = case.arguments(torch.float64, CPU)
+    outputs, mask = family.reference(arguments, 1.0)
+    weights = loss_weights(case, outputs, mask)
     answer = Answer(tuple(o.detach() for o in outputs), gradients(case, arguments, outputs, weights))
-    return answer, keep, weights
+    return answer, mask, weights
 
 
-def ask_operator(
+def run_operator(
     family: Family, case: Case, weights: list[list[Tensor]], dtype: torch.dtype, device: torch.device
 ) -> Answer:
-    """The operator's answer."""
+    """The answer of the operator."""
     arguments = case.arguments(dtype, device)
     outputs = family.read(family.call(arguments))
     return Answer(tuple(o.detach().cpu() for o in outputs), gradients(case, arguments, outputs, weights))
@@ -97,47 +105,45 @@ def relative(got: Tensor, want: Tensor, floor: float = 0.0) -> float:
     return distance / size if size > 0 else distance
 
 
+def largest(tensor: Tensor) -> float:
+    """Magnitude of the largest element; 0 where there is none."""
+    return float(tensor.abs().max()) if tensor.numel() else 0.0
+
+
 def value_errors(
-    family: Family, case: Case, got: Outputs, want: Outputs, keep: Outputs
+    family: Family, case: Case, got: Outputs, want: Outputs, mask: Outputs
 ) -> dict[str, tuple[float, float]]:
     """For each output the relative L2 distance and the largest single difference, over the largest element."""
     errors = {}
-    for name, a, b, mask in zip(family.outputs, got, want, keep, strict=False):  # some outputs are optional
-        a, b = a * mask, b * mask
+    for name, a, b, m in zip(family.outputs, got, want, mask, strict=False):  # some outputs are optional
+        a, b = a * m, b * m
         floor = case.floors.get(name, 0.0)
         size = max(largest(b), floor)
         errors[name] = relative(a, b, floor), largest(a - b) / size if size > 0 else largest(a - b)
     return errors
 
 
-def largest(tensor: Tensor) -> float:
-    """Magnitude of the largest element; 0 where there is none."""
-    return float(tensor.abs().max()) if tensor.numel() else 0.0
-
-
 def gradient_errors(case: Case, got: Answer, want: Answer) -> dict[str, float]:
-    """Relative L2 distance for each input, over all weighings."""
-    return {
-        name: relative(
-            torch.stack([g[name] for g in got.gradients]),
-            torch.stack([g[name] for g in want.gradients]),
-            case.floors.get(name, 0.0),
-        )
-        for name in (case.wanted if want.gradients else ())
-    }
+    """Relative L2 distance for each input, over all losses."""
+
+    def stacked(answer: Answer, name: str) -> Tensor:
+        return torch.stack([by_input[name] for by_input in answer.gradients])
+
+    names = case.differentiable if want.gradients else ()
+    return {name: relative(stacked(got, name), stacked(want, name), case.floors.get(name, 0.0)) for name in names}
 
 
 def compare(
     family: Family, case: Case, dtype: torch.dtype, device: torch.device, limits: tuple[float, float] | None = None
 ) -> list[Measurement]:
-    """The operator against its twin on one scene: values, peaks, gradients, and what hangs on rounding.
+    """The operator against its reference on one scene: values, peaks, gradients, and what depends on rounding.
 
-    `limits` of values and gradients stand in for the case's own, which are for float32.
+    `limits` of values and gradients replace those of the case, which are for float32.
     """
     precision = str(dtype).removeprefix("torch.")
     kind = "" if case.condition == "ordinary" else ", stiff"
-    want, keep, weights = ask_twin(family, case)
-    got = ask_operator(family, case, weights, dtype, device)
+    want, mask, weights = run_reference(family, case)
+    got = run_operator(family, case, weights, dtype, device)
     bounds = case.bounds
     values_bound, gradients_bound = limits or (bounds.values, bounds.gradients)
 
@@ -145,42 +151,30 @@ def compare(
         return Measurement(family.name, f"{precision} {check}{kind}", f"{case}: {what}", error, bound)
 
     found = []
-    for name, (rel, peak) in value_errors(family, case, got.outputs, want.outputs, keep).items():
-        found.append(measured("values", name, rel, values_bound))
+    for name, (error, peak) in value_errors(family, case, got.outputs, want.outputs, mask).items():
+        found.append(measured("values", name, error, values_bound))
         if limits is None:
             found.append(measured("single elements", name, peak, bounds.peak))
     for name, error in gradient_errors(case, got, want).items():
         found.append(measured("gradients", name, error, gradients_bound))
-    found.append(measured("not finite", "all", float(unfinished(got)), 0.0))
+    found.append(measured("not finite", "all", float(got.n_not_finite()), 0.0))
     if family.name == "rasterization":
         error = max(
             float(((a - b).abs() * (1 - m)).max()) / (1 + float(b.abs().max()))
-            for a, b, m in zip(got.outputs, want.outputs, keep, strict=True)
+            for a, b, m in zip(got.outputs, want.outputs, mask, strict=True)
         )
         found.append(measured("pixels on an edge", "image", error, LAYER))
     return found
 
 
-def unfinished(answer: Answer) -> int:
-    """How many numbers are NaN or infinite."""
-    tensors = [*answer.outputs, *(g for taken in answer.gradients for g in taken.values())]
-    return sum(int((~t.isfinite()).sum()) for t in tensors)
-
-
-NEARLY = 2e-5
-"""Difference of two pixels that rounding explains, over the largest element."""
-SHARE = 1e-4
-"""Of elements that may differ by more: those on the edge of a decision."""
-
-
 def agree(
-    family: Family, case: Case, check: str, dtype: torch.dtype, there: torch.device, here: torch.device
+    family: Family, case: Case, check: str, other: tuple[torch.dtype, torch.device], device: torch.device
 ) -> list[Measurement]:
-    """The float32 operator `here` against the operator in `dtype` `there`, on a scene of any size."""
-    shapes = tuple(out.detach() for out in family.read(family.call(case.arguments(dtype, there))))
-    weights = weighings(case, shapes, tuple(torch.ones(()) for _ in shapes))
-    want = ask_operator(family, case, weights, dtype, there)
-    got = ask_operator(family, case, weights, torch.float32, here)
+    """The float32 operator against the operator in another precision or on another device, on a scene of any size."""
+    shapes = tuple(out.detach() for out in family.read(family.call(case.arguments(*other))))
+    weights = loss_weights(case, shapes, tuple(torch.ones(()) for _ in shapes))
+    want = run_operator(family, case, weights, *other)
+    got = run_operator(family, case, weights, torch.float32, device)
     bound = 2 * case.bounds.gradients  # both sides may be off
     found = []
     for name, a, b in zip(family.outputs, got.outputs, want.outputs, strict=False):

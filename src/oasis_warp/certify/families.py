@@ -1,4 +1,4 @@
-"""The operators under certification: how each is called, what of its answer counts, and its float64 twin."""
+"""The operators under certification: how to read their results, their float64 references, and their scenes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,12 +8,18 @@ import torch
 from torch import Tensor
 
 from oasis_warp import ops
-from oasis_warp.certify import mesh_scenes, rasterization_scenes, skinning_scenes, surface_scenes
+from oasis_warp.certify import mesh_scenes, posing_scenes, rasterization_scenes
 from oasis_warp.certify.case import Case
 from oasis_warp.core.types import Camera
 from oasis_warp.reference import posing, rasterization, visibility
 
 Outputs = tuple[Tensor, ...]
+Arguments = dict[str, Any]
+ALL = torch.ones((), dtype=torch.float64)
+"""The mask of an output of which every element counts."""
+SIGN_TIE = 1e-5
+"""Dot product of two quaternions below which rounding may decide the sign of one."""
+LARGE_MESH = {"n": 1500, "size": (160, 120)}
 
 
 @dataclass(frozen=True)
@@ -24,24 +30,23 @@ class Family:
     outputs: tuple[str, ...]
     """Names of what `read` returns."""
     read: Callable[[Any], Outputs]
-    """The operator's answer in a form whose error means something: float64, finite, the same for q and -q."""
-    twin: Callable[[Case, dict[str, Any], float], tuple[Outputs, Outputs]]
-    """The same from the twin, and for each output the elements (1 or 0, broadcast) that do not hang on rounding.
+    """From results to float64 tensors whose error means something: finite, the same for q and -q."""
+    reference: Callable[[Arguments, float], tuple[Outputs, Outputs]]
+    """The same from the reference, and for each output a mask (1 or 0, broadcast) of what does not depend on rounding.
 
-    Takes the case, its arguments in float64, and how much wider than for float32 rounding that is to be understood.
-    """
+    Takes the arguments in float64, and how much wider than float32 rounding to understand that."""
     case: Callable[..., Case]
     """(condition, seed, ...) to a scene."""
     conditions: tuple[str, ...]
     large: dict[str, Any]
-    """Arguments of `case` for a scene that work is shared out for, too large for the twin."""
+    """Arguments of `case` for a scene that is shared out over threads, too large for the reference."""
     indices: dict[str, tuple[str, int]] = field(default_factory=dict)
     """Index arguments: the argument whose rows each names, and the least index."""
     smooth: Callable[[Case], bool] = bool
-    """Whether a small step changes no decision of a scene but those that `twin` leaves out."""
+    """Whether a small step changes no decision in a scene but those that the mask leaves out."""
 
-    def call(self, arguments: dict[str, Any]) -> Any:
-        """The operator, found at the time of the call."""
+    def call(self, arguments: Arguments) -> Any:
+        """The operator, looked up at the time of the call."""
         return getattr(ops, self.name)(**arguments)
 
     def scene(self, seed: int) -> Case:
@@ -50,7 +55,7 @@ class Family:
 
 
 def squares(quats: Tensor) -> Tensor:
-    """The products q q^T of quaternions [..., 4], which does not know their sign."""
+    """The products q q^T of quaternions [..., 4], which do not depend on their sign."""
     return quats[..., :, None] * quats[..., None, :]
 
 
@@ -59,164 +64,144 @@ def bounded(ratios: Tensor) -> Tensor:
     return ratios.clamp(1 / posing.LIMIT, posing.LIMIT)
 
 
-def _read_rasterization(answer: Any) -> Outputs:
-    return answer[0].double(), answer[1].double()
+def read_all(answer: Any) -> Outputs:
+    """The results that are there, in float64."""
+    return tuple(t.double() for t in answer if isinstance(t, Tensor))
 
 
-def _rasterization(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
+def reference_rasterization(arguments: Arguments, slack: float) -> tuple[Outputs, Outputs]:
+    """Image and alphas, without fragile pixels."""
     image, alphas, fragile = rasterization.rasterization(**arguments, dense=True, slack=slack)
-    keep = (~fragile)[..., None].double()
-    return (image, alphas), (keep, keep)
-
-
-def _read_depth_map(answer: Any) -> Outputs:
-    # 1 / depth is 0 over the background; barycentrics are compared where the face is beyond doubt.
-    return 1 / answer.depth.double(), answer.barycentrics.double()
-
-
-def _depth_map(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    outputs, keep = [], []
-    for single in singles(arguments):
-        hits, known = _cast(single, slack)
-        outputs.append((1 / hits.depth, hits.barycentrics))
-        keep.append((known.sound.double(), known.clear[..., None].double()))
-    return together(outputs, arguments), together(keep, arguments)
-
-
-def _cast(arguments: dict[str, Any], slack: float) -> tuple[visibility.Hits, visibility.Certainty]:
-    camera, near = _camera(arguments), arguments["near_plane"]
-    rays = visibility.cast(arguments["vertices"], arguments["faces"], camera, near)
-    hits = visibility.nearest_hits(rays, camera, near)
-    return hits, visibility.certainty(rays, hits, arguments["faces"], camera, near, slack)
-
-
-def _camera(arguments: dict[str, Any]) -> Camera:
-    return Camera(*(arguments[name] for name in Camera._fields))
+    mask = (~fragile)[..., None].double()
+    return (image, alphas), (mask, mask)
 
 
 BATCHED = {"points": 2, "vertices": 2, "viewmat": 2, "K": 2}
-"""Arguments of the depth buffer that may have a batch axis before so many others."""
+"""Arguments of the depth buffer that may have a batch axis, and the number of their other axes."""
 
 
-def singles(arguments: dict[str, Any]) -> list[dict[str, Any]]:
-    """The arguments for each entry of a batch."""
-    n = max(len(v) if v.dim() > BATCHED[k] else 1 for k, v in arguments.items() if k in BATCHED)
-    return [{k: v[i] if k in BATCHED and v.dim() > BATCHED[k] else v for k, v in arguments.items()} for i in range(n)]
+def each_of_batch(
+    reference: Callable[[Arguments, float], tuple[Outputs, Outputs]], arguments: Arguments, slack: float
+) -> tuple[Outputs, Outputs]:
+    """`reference` of every entry of a batch, stacked where an argument has a batch axis."""
+    batched = {k: v for k, v in arguments.items() if k in BATCHED and v.dim() > BATCHED[k]}
+    n = max((len(v) for v in batched.values()), default=1)
+    parts = [reference(arguments | {k: v[i] for k, v in batched.items()}, slack) for i in range(n)]
+    if not batched:
+        return parts[0]
+    outputs, masks = (tuple(map(torch.stack, zip(*both, strict=True))) for both in zip(*parts, strict=True))
+    return outputs, masks
 
 
-def together(parts: list[Outputs], arguments: dict[str, Any]) -> Outputs:
-    """What the entries of a batch gave, with a batch axis where an argument had one."""
-    if any(arguments[k].dim() > n for k, n in BATCHED.items() if k in arguments):
-        return tuple(torch.stack(same) for same in zip(*parts, strict=True))
-    return parts[0]
+def cast(arguments: Arguments, slack: float) -> tuple[Camera, visibility.Hits, visibility.Certainty]:
+    """The camera, what its rays hit, and what of that does not depend on rounding."""
+    camera, near = Camera(*(arguments[name] for name in Camera._fields)), arguments["near_plane"]
+    rays = visibility.cast(arguments["vertices"], arguments["faces"], camera, near)
+    hits = visibility.nearest_hits(rays, camera, near)
+    return camera, hits, visibility.certainty(rays, hits, arguments["faces"], camera, near, slack)
 
 
-def _read_depth_visibility(answer: Any) -> Outputs:
-    return (answer.visibility.double(),)
+def read_depth_map(answer: Any) -> Outputs:
+    """1 / depth, which is 0 over the background, and barycentrics, compared where the face is beyond doubt."""
+    return 1 / answer.depth.double(), answer.barycentrics.double()
 
 
-def _depth_visibility(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    parts = [_single_visibility(single, slack) for single in singles(arguments)]
-    return together([out for out, _ in parts], arguments), together([keep for _, keep in parts], arguments)
+def reference_depth_map(arguments: Arguments, slack: float) -> tuple[Outputs, Outputs]:
+    """As `read_depth_map`, of one mesh and camera."""
+    _, hits, known = cast(arguments, slack)
+    return (1 / hits.depth, hits.barycentrics), (known.sound.double(), known.clear[..., None].double())
 
 
-def _single_visibility(arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    camera, near, tau = _camera(arguments), arguments["near_plane"], arguments["tau"]
+def reference_visibility(arguments: Arguments, slack: float) -> tuple[Outputs, Outputs]:
+    """Scores of points, of one mesh and camera."""
+    camera, hits, known = cast(arguments, slack)
+    points, near = arguments["points"], arguments["near_plane"]
     literal = arguments.get("literal", False)
     named = None if literal else arguments.get("point_vertices")
     margin = 0.0 if literal else arguments.get("margin")
-    hits, known = _cast(arguments, slack)
-    points = arguments["points"]
-    scores = visibility.score_points(points, hits, arguments["faces"], camera, tau, margin, named, near)
-    keep = visibility.sound_points(points, known, camera, named is not None, near, slack)
-    return (scores,), (keep.double(),)
+    scores = visibility.score_points(points, hits, arguments["faces"], camera, arguments["tau"], margin, named, near)
+    return (scores,), (visibility.sound_points(points, known, camera, named is not None, near, slack).double(),)
 
 
-def _read_face_rotations(answer: Any) -> Outputs:
+def read_face_rotations(answer: Any) -> Outputs:
+    """Rotations without sign, and bounded ratios."""
     vertex_quats, face_quats, *ratios = (t.double() for t in answer)
     return squares(vertex_quats), squares(face_quats), *map(bounded, ratios)
 
 
-def _face_rotations(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    vertex_quats, face_quats, *ratios, sound = posing.face_rotations(*arguments.values())
-    every = torch.ones(()).double()
-    keep = sound.double()[:, None, None], every, every, every
-    return (squares(vertex_quats), squares(face_quats), *map(bounded, ratios)), keep
+def reference_face_rotations(arguments: Arguments, slack: float) -> tuple[Outputs, Outputs]:
+    """As `read_face_rotations`, without vertex rotations whose sum has a sign that rounding decides."""
+    *answer, sound = posing.face_rotations(**arguments)
+    return read_face_rotations(answer), (sound.double()[:, None, None], ALL, ALL, ALL)
 
 
-def _read_pose_on_mesh(answer: Any) -> Outputs:
+def read_pose_on_mesh(answer: Any) -> Outputs:
+    """Means, rotations without sign, and scales."""
     means, quats, scales = (t.double() for t in answer)
     return means, squares(quats), scales
 
 
-def _pose_on_mesh(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
+def reference_pose_on_mesh(arguments: Arguments, slack: float) -> tuple[Outputs, Outputs]:
+    """As `read_pose_on_mesh`, without rotations whose mean has a sign that rounding decides."""
     means, quats, scales = posing.pose_on_mesh(**arguments)
     with torch.no_grad():
         corners = arguments["faces"][arguments["face_index"]]
         dots = posing.dots_with_heaviest(arguments["vertex_quats"][corners], arguments["barycentrics"])
-        aligned = (dots.abs() > slack * 1e-5).all(-1).double()
+        aligned = (dots.abs() > slack * SIGN_TIE).all(-1).double()
         aligned = torch.cat([torch.ones(len(quats) - len(aligned)), aligned])[:, None, None]
-    every = torch.ones(()).double()
-    return (means, squares(quats), scales), (every, aligned, every)
+    return (means, squares(quats), scales), (ALL, aligned, ALL)
 
 
-def _read_pose_on_mesh_covars(answer: Any) -> Outputs:
-    return answer.means.double(), answer.covars.double()
+def reference_pose_on_mesh_covars(arguments: Arguments, slack: float) -> tuple[Outputs, Outputs]:
+    """Means and covariances."""
+    return posing.pose_on_mesh_covars(**arguments), (ALL, ALL)
 
 
-def _pose_on_mesh_covars(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    every = torch.ones(()).double()
-    return posing.pose_on_mesh_covars(**arguments), (every, every)
+def reference_skin(arguments: Arguments, slack: float) -> tuple[Outputs, Outputs]:
+    """Means and, where given, covariances."""
+    outputs = posing.skin(**arguments)
+    return outputs, (ALL,) * len(outputs)
 
-
-def _read_skin(answer: Any) -> Outputs:
-    return tuple(t.double() for t in answer if t is not None)
-
-
-def _skin(case: Case, arguments: dict[str, Any], slack: float) -> tuple[Outputs, Outputs]:
-    return posing.skin(**arguments), tuple(torch.ones(()).double() for _ in range(1 + ("covars" in case.floats)))
-
-
-LARGE_MESH = {"n": 1500, "size": (160, 120)}
 
 FAMILIES = {
     family.name: family
     for family in (
         Family(
-            "rasterization", ("image", "alphas"), _read_rasterization, _rasterization,
+            "rasterization", ("image", "alphas"), lambda answer: read_all(answer[:2]), reference_rasterization,
             rasterization_scenes.rasterization_case, tuple(rasterization_scenes.CONDITIONS),
             {"n": 5000, "size": (128, 96), "n_cameras": 2, "channels": 3, "mode": "RGB+ED", "spread": 0.25},
             smooth=rasterization_scenes.is_smooth,
         ),
         Family(
-            "depth_map", ("1 / depth", "barycentrics"), _read_depth_map, _depth_map,
+            "depth_map", ("1 / depth", "barycentrics"), read_depth_map,
+            lambda arguments, slack: each_of_batch(reference_depth_map, arguments, slack),
             mesh_scenes.depth_map_case, tuple(mesh_scenes.CONDITIONS), LARGE_MESH, {"faces": ("vertices", 0)},
         ),
         Family(
-            "depth_visibility", ("visibility",), _read_depth_visibility, _depth_visibility,
+            "depth_visibility", ("visibility",), lambda answer: (answer.visibility.double(),),
+            lambda arguments, slack: each_of_batch(reference_visibility, arguments, slack),
             mesh_scenes.depth_visibility_case, tuple(mesh_scenes.CONDITIONS),
             LARGE_MESH | {"n_points": 5000}, {"faces": ("vertices", 0), "point_vertices": ("vertices", -1)},
         ),
         Family(
             "face_rotations", ("vertex_quats", "face_quats", "area_ratio", "vertex_area_ratio"),
-            _read_face_rotations, _face_rotations,
-            surface_scenes.face_rotations_case, tuple(surface_scenes.CONDITIONS), {"side": 50},
+            read_face_rotations, reference_face_rotations,
+            posing_scenes.face_rotations_case, tuple(posing_scenes.BENDS), {"side": 50},
             {"faces": ("rest_vertices", 0)},
         ),
         Family(
-            "pose_on_mesh", ("means", "quats", "scales"), _read_pose_on_mesh, _pose_on_mesh,
-            surface_scenes.pose_on_mesh_case, tuple(surface_scenes.RIDERS),
-            {"n": 10_000},
+            "pose_on_mesh", ("means", "quats", "scales"), read_pose_on_mesh, reference_pose_on_mesh,
+            posing_scenes.pose_on_mesh_case, tuple(posing_scenes.ON_MESH), {"n": 10_000},
             {"faces": ("posed_vertices", 0), "face_index": ("area_ratio", 0), "vertex_index": ("posed_vertices", 0)},
         ),
         Family(
-            "pose_on_mesh_covars", ("means", "covars"), _read_pose_on_mesh_covars, _pose_on_mesh_covars,
-            surface_scenes.pose_on_mesh_covars_case, tuple(surface_scenes.CONDITIONS), {"side": 20, "n": 10_000},
+            "pose_on_mesh_covars", ("means", "covars"), read_all, reference_pose_on_mesh_covars,
+            posing_scenes.pose_on_mesh_covars_case, tuple(posing_scenes.BENDS), {"side": 20, "n": 10_000},
             {"faces": ("rest_vertices", 0)},
         ),
         Family(
-            "skin", ("means", "covars"), _read_skin, _skin,
-            skinning_scenes.skin_case, tuple(skinning_scenes.CONDITIONS), {"n": 10_000, "n_joints": 16},
+            "skin", ("means", "covars"), read_all, reference_skin,
+            posing_scenes.skin_case, tuple(posing_scenes.SKINNING), {"n": 10_000, "n_joints": 16},
         ),
     )
 }  # fmt: skip

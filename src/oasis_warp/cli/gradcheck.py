@@ -10,10 +10,9 @@ from rich.console import Console
 from rich.table import Table
 
 from oasis_warp import __version__
-from oasis_warp.certify.certification import all_steps
+from oasis_warp.certify.certification import grid_scenes, run_grid, steps
 from oasis_warp.certify.compare import Measurement
 from oasis_warp.certify.families import FAMILIES
-from oasis_warp.certify.grid import run_grid, scenes
 from oasis_warp.certify.verdict import Row, Verdict, as_table, by_condition, describe_machine
 from oasis_warp.cli.console import FAULT, show_progress
 from oasis_warp.cli.options import Gradcheck
@@ -61,13 +60,13 @@ def measurements(
     """(stage, how much of it is done, of how much, what was measured)."""
     if options.scenes is None:
         for name in names:
-            steps = all_steps((name,), device, options.seed)
-            for i, (_, step) in enumerate(steps):
-                yield name, i + 1, len(steps), step()
+            todo = list(steps(FAMILIES[name], device, options.seed))
+            for i, step in enumerate(todo):
+                yield name, i + 1, len(todo), step()
         return
     n_processes = options.jobs or (1 if device.type == "cuda" else os.cpu_count() or 1)
     done = 0
-    for count, measured in run_grid(scenes(names, options.scenes, options.seed), device, n_processes):
+    for count, measured in run_grid(grid_scenes(names, options.scenes, options.seed), device, n_processes):
         done += count
         yield "scenes", done, options.scenes, measured
 

@@ -1,8 +1,10 @@
-"""Worker processes that draw and bake ahead."""
+"""Worker processes, and the threads of this one."""
 
 import multiprocessing
 import signal
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 
 import torch
 
@@ -19,3 +21,14 @@ def worker_pool(workers: int) -> ProcessPoolExecutor:
 def _start() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
+
+
+@contextmanager
+def using_threads(threads: int) -> Iterator[None]:
+    """Let torch and our kernels use this many CPU threads inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,4 +1,4 @@
-"""The twins against second oracles: closed forms, the SVD, SciPy, and the same formulas written naively."""
+"""The references against second oracles: closed forms, the SVD, SciPy, and the same formulas written naively."""
 
 import math
 
@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from oasis_warp.certify.case import Draw
+from oasis_warp.certify.case import Sampler
 from oasis_warp.certify.families import FAMILIES
 from oasis_warp.core.rotation import from_axis_angle, from_matrix, to_matrix
 from oasis_warp.core.types import Camera
@@ -88,7 +88,7 @@ def test_face_rotations_are_the_polar_factors_of_an_svd(seed):
 
 def test_vertex_rotations_are_close_to_the_mean_of_scipy():
     rest, _, faces = arguments("face_rotations", 1, side=4).values()
-    draw = Draw(0)
+    draw = Sampler(0)
     posed = rest + 0.03 * draw.normal(*rest.shape)
     vertex_quats, face_quats, *_ = posing.face_rotations(rest, posed, faces)
     areas = posing.planes(rest, faces).area
@@ -126,7 +126,7 @@ def test_the_depth_buffer_sees_a_sphere_and_a_plane_where_they_are():
 
 @pytest.mark.parametrize("degree", range(4))
 def test_harmonics_are_those_of_scipy(degree):
-    directions = Draw(2).normal(50, 3)
+    directions = Sampler(2).normal(50, 3)
     x, y, z = (directions / directions.norm(dim=-1, keepdim=True)).numpy().T
     polar, azimuth = np.arccos(z), np.arctan2(y, x)
     columns = []
