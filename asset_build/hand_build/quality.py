@@ -2,7 +2,7 @@
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
+from igl.predicates import find_self_intersections
 
 from hand_build.anatomy import Array, Index
 
@@ -25,18 +25,14 @@ def signed_volume(vertices: Array, faces: Index) -> float:
 
 def self_crossings(vertices: Array, faces: Index) -> int:
     """Number of edges that pass through a face they share no corner with (Moller and Trumbore 1997)."""
-    corners = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.unique(np.sort(corners, 1), axis=0)
-    start, along = vertices[edges[:, 0]], vertices[edges[:, 1]] - vertices[edges[:, 0]]
-    centres = vertices[faces].mean(1)
-    face_radius = np.linalg.norm(vertices[faces] - centres[:, None], axis=2).max()
-    reach = np.linalg.norm(along, axis=1) / 2 + face_radius
-    near = cKDTree(centres).query_ball_point(start + along / 2, reach)
-    edge = np.repeat(np.arange(len(edges)), [len(found) for found in near])
-    face = np.concatenate([np.asarray(found, int) for found in near])
-    apart = (faces[face][:, :, None] != edges[edge][:, None, :]).all((1, 2))
-    edge, face = edge[apart], face[apart]
-    origin, way = start[edge], along[edge]
+    pairs = np.asarray(find_self_intersections(np.ascontiguousarray(vertices), np.ascontiguousarray(faces))[1])
+    pairs = np.vstack([pairs, pairs[:, ::-1]])
+    edges = np.sort(faces[pairs[:, 0]][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
+    face = np.repeat(pairs[:, 1], 3)
+    apart = (faces[face][:, :, None] != edges[:, None, :]).all((1, 2))
+    edges, face = edges[apart], face[apart]
+    origin = vertices[edges[:, 0]]
+    way = vertices[edges[:, 1]] - origin
     a, b, c = vertices[faces[face]].transpose(1, 0, 2)
     ab, ac = b - a, c - a
     across = np.cross(way, ac)
@@ -49,7 +45,7 @@ def self_crossings(vertices: Array, faces: Index) -> int:
     v = (way * turned).sum(1) / slope
     place = (ac * turned).sum(1) / slope
     hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (place >= 0) & (place <= 1)
-    return len(np.unique(edge[hit]))
+    return len(np.unique(edges[hit], axis=0))
 
 
 def section_girth(vertices: Array, faces: Index, point: Array, normal: Array) -> float:
