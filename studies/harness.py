@@ -27,7 +27,7 @@ import torch
 from oasis_warp.bench.rows import commit
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.output_files import open_resumable_folder
+from oasis_warp.data.output_files import open_resumable_folder, write_file
 
 Row = dict[str, Any]
 """One line of results. Rows of `measured` also hold their "case" and the "commit" that they were measured at; a case
@@ -154,11 +154,12 @@ def read_rows(path: Path) -> list[Row]:
     return rows
 
 
-def write_rows(folder: Path, rows: Iterable[Row]) -> None:
-    """Write all rows of a study that measures them in one go."""
+def write_rows(folder: Path, rows: Iterable[Row]) -> list[Row]:
+    """Write and return all rows of a study that makes them in one go."""
     folder.mkdir(parents=True, exist_ok=True)
-    made = {"commit": commit()}
-    (folder / ROWS).write_text("".join(json.dumps({**made, **row}) + "\n" for row in rows))
+    made = [{"commit": commit(), **row} for row in rows]
+    write_file(folder / ROWS, "".join(json.dumps(row) + "\n" for row in made).encode())
+    return made
 
 
 def seconds(device: torch.device) -> float:

@@ -1,14 +1,11 @@
-"""Seed bugs into a copy of the tree, one at a time, and see whether the tests catch them.
+"""Whether the tests catch bugs that are planted, one at a time, in a copy of the tree.
 
-    python studies/seed_bugs.py [--jobs 2] [--only WORD ...]
-
-A bug is an exact piece of source and what to put in its place; `studies/seeded_bugs.py` lists them. Each is planted
-in a copy of kernels/, src/ and tests/ under a temporary folder with a kernel cache of its own, and the tests of its
-operator are run until the first that fails. The exit code is 1 if a bug is missed, if a patch no longer applies, or
-if the tests fail without any bug.
+A bug is an exact piece of source and what to put in its place; `seeded_bugs` lists them. Each is planted in a copy of
+kernels/, src/ and tests/ under a temporary folder with a kernel cache of its own, and the tests of its operator are run
+until the first that fails. The exit code is 1 if a bug is missed, if a patch no longer applies, or if the tests fail
+without any bug. Fills docs/certification.md (bugs).
 """
 
-import argparse
 import os
 import re
 import shutil
@@ -18,10 +15,13 @@ import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
-from seeded_bugs import BUGS, Bug
+from studies.harness import Options as Base
+from studies.harness import Row, write_rows
+from studies.seeded_bugs import BUGS, Bug
+from studies.tables import Section
 
 ROOT = Path(__file__).resolve().parent.parent
 TREE = ("kernels/oasis_kernels", "src", "tests", "studies", "asset_build", "pyproject.toml")
@@ -29,14 +29,14 @@ LIMIT = 240
 """Seconds that the tests of one bug may take: a kernel that never ends is caught by it."""
 
 
-class Outcome(NamedTuple):
-    """What the tests said to one bug."""
+@dataclass(frozen=True, kw_only=True)
+class Options(Base):
+    """Options of this study."""
 
-    bug: Bug
-    verdict: str
-    """caught, missed, or stale: the piece of source is not there exactly once."""
-    test: str
-    seconds: float
+    workers: int = 2
+    """Copies of the tree that are worked on at once."""
+    only: tuple[str, ...] = ()
+    """Only bugs with one of these words in their names."""
 
 
 def copy_tree(folder: Path) -> Path:
@@ -70,54 +70,56 @@ def run_tests(folder: Path, cache: Path, tests: Sequence[str]) -> tuple[bool, st
     return False, first[1] if first else f"pytest ended with {done.returncode}: {(done.stdout + done.stderr)[-300:]}"
 
 
-def plant(bug: Bug, folder: Path, cache: Path) -> Outcome:
+def plant(bug: Bug, folder: Path, cache: Path) -> Row:
     """Run the tests with one bug in place; the copy is as before afterwards."""
     start = time.monotonic()
     file = folder / bug.path
     source = file.read_text()
+
+    def outcome(verdict: str, test: str, seconds: float) -> Row:
+        print(f"{verdict:7} {seconds:5.1f} s  {bug.name}: {test}", flush=True)
+        failed = verdict != "caught"
+        return {"bug": bug.name, "verdict": verdict, "test": test, "seconds": seconds, "failed": failed}
+
     if source.count(bug.old) != 1:
-        return Outcome(bug, "stale", f"{source.count(bug.old)} times in {bug.path}", 0.0)
+        return outcome("stale", f"{source.count(bug.old)} times in {bug.path}", 0.0)
     file.write_text(source.replace(bug.old, bug.new))
     try:
         passed, test = run_tests(folder, cache, bug.tests)
     finally:
         file.write_text(source)
-    return Outcome(bug, "missed" if passed else "caught", test, time.monotonic() - start)
+    return outcome("missed" if passed else "caught", test, time.monotonic() - start)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Plant every bug; the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=int, default=2, help="copies of the tree that are worked on at once")
-    parser.add_argument("--only", nargs="*", default=[], help="only bugs with one of these words in their names")
-    options = parser.parse_args(arguments)
+def run(options: Options) -> list[Row]:
+    """Plant every bug."""
     bugs = [bug for bug in BUGS if not options.only or any(word in bug.name for word in options.only)]
     with tempfile.TemporaryDirectory(prefix="seeded_bugs_") as place:
         cache = Path(place) / "kernels"
-        copies = [copy_tree(Path(place) / f"copy_{i}") for i in range(options.jobs)]
+        free = [copy_tree(Path(place) / f"copy_{k}") for k in range(options.workers)]
         for tests in dict.fromkeys(bug.tests for bug in bugs):
-            passed, test = run_tests(copies[0], cache, tests)  # which also builds the kernels without bugs
+            passed, test = run_tests(free[0], cache, tests)  # which also builds the kernels without bugs
             if not passed:
                 print(f"{' '.join(tests)}: fails without a bug: {test}")
-                return 1
-        free = list(copies)
+                return [{"bug": "none", "verdict": "fails", "test": test, "failed": True}]
 
-        def work(bug: Bug) -> Outcome:
+        def work(bug: Bug) -> Row:
             folder = free.pop()
             try:
                 return plant(bug, folder, cache)
             finally:
                 free.append(folder)
 
-        outcomes = []
-        with ThreadPoolExecutor(options.jobs) as pool:
-            for outcome in pool.map(work, bugs):
-                outcomes.append(outcome)
-                print(f"{outcome.verdict:7} {outcome.seconds:5.1f} s  {outcome.bug.name}: {outcome.test}", flush=True)
-    bad = [outcome for outcome in outcomes if outcome.verdict != "caught"]
-    print(f"{len(outcomes) - len(bad)} of {len(outcomes)} bugs caught.")
-    return 1 if bad or not outcomes else 0
+        with ThreadPoolExecutor(options.workers) as pool:
+            rows = list(pool.map(work, bugs))
+    return write_rows(options.out / "seed_bugs", rows) if rows else [{"bug": "none", "verdict": "none", "failed": True}]
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def summary(rows: list[Row]) -> str:
+    """How many were caught."""
+    caught = sum(row["verdict"] == "caught" for row in rows)
+    words = "plants one mistake at a time in a copy of the tree"
+    return f"`python -m studies seed_bugs` {words}: {caught} of {len(rows)} bugs caught."
+
+
+SECTIONS = (Section("certification.md", "bugs", summary),)

@@ -1,6 +1,6 @@
 """The estimator's errors as they were measured: a hand is seen as wrongly as one that looks like it was.
 
-`studies/measure_estimator_errors.py` photographs synthetic hands, estimates them as `reconstruction.reconstruct`
+`studies/estimator_errors.py` photographs synthetic hands, estimates them as `reconstruction.reconstruct`
 does, and keeps the differences. One photo says where a hand lies in the picture but little of its depth, so errors of
 joints, turn, shape and focal length are large and hang together: drawn one by one they would carry the surface far
 off its picture. An error is therefore all of one measured hand's, of one of those that look most alike from the

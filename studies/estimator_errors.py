@@ -1,18 +1,17 @@
-"""Tabulate what `studies/measure_estimator_errors.py` left in a folder, and make the asset that training draws from.
+"""How wrong the estimator is on synthetic hands, and the errors that training gives the network after it.
 
-    python studies/measure_estimator_errors.py out/estimates --count 224
-    python studies/write_estimator_errors.py out/estimates --json out/estimator_errors.json
-
-It writes assets/training/estimator_errors.safetensors, the tables between the markers of docs/estimator.md, and the
-numbers as JSON. The second table holds found surfaces beside those that training sees: each measured hand once more,
-with the error of another one (`pretraining.estimator_errors`), so that none is compared with itself; the third does
-so for masks.
+Synthetic pictures are estimated as `reconstruction.reconstruct` does, and what is true is kept beside what was found,
+in OUT/estimator_errors/pictures; left hands are kept as the right ones that they are in the mirror. From these come
+assets/training/estimator_errors.safetensors (with `--asset`), which training draws from, and docs/estimator.md
+(errors): tables of the estimate's parts; of found surfaces beside those that training sees, where each measured hand
+comes once more with the error of another one, so that none is compared with itself; and of masks, likewise.
 """
 
-import argparse
+import io
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,10 +19,14 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
+from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandPose
 from oasis_warp.data.output_files import write_file
+from oasis_warp.data.square_crop import resample_square, square_around
+from oasis_warp.estimation.estimator import choose_hand
 from oasis_warp.estimation.outline import wrist_line
+from oasis_warp.estimation.surface_offsets import outline_offsets
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map, depth_visibility
@@ -40,36 +43,110 @@ from oasis_warp.pretraining.estimator_errors import (
 )
 from oasis_warp.pretraining.hand_batch import PosedHands, pose_hands
 from oasis_warp.pretraining.training_batch import crop_to_mask, mirror_left_hands
+from oasis_warp.reconstruction import CROP_MARGIN
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shots import PICTURES_EACH
+from studies.harness import ROWS, Row, measured, read_rows
+from studies.harness import Options as Base
+from studies.inputs import estimator, synthetic_photo
+from studies.tables import Section, markdown, percentiles
 
-BEGIN, END = "<!-- errors -->", "<!-- end of errors -->"
-ASSET = Path(__file__).parents[1] / "src" / "oasis_warp" / "assets" / "training" / "estimator_errors.safetensors"
 CROP = 256
-"""Pixel errors are given in a crop of this side."""
-PERCENTILES = (10, 50, 90)
+"""Side of the crop whose pixels errors are given in, and of the masks that are kept [px]."""
 RENDERED = 320
 """Side of the pictures whose masks are made [px]: that of training."""
 MARGIN = 0.0015
 """Of visibility, as the network sees it [m]."""
-Row = dict[str, Any]
-_PARTS = ("angles", "orientation", "translation", "shape", "K")
+PARTS = ("angles", "orientation", "translation", "shape", "K")
+Arrays = dict[str, Any]
 
 
-def read(folder: Path) -> list[Row]:
-    """One dictionary a picture."""
-    rows = []
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path, allow_pickle=False) as stored:
-            rows.append({name: stored[name] for name in stored.files})
-    return rows
+@dataclass(frozen=True, kw_only=True)
+class Options(Base):
+    """Options of this study."""
+
+    selecting: ClassVar[frozenset[str]] = frozenset({"count", "first", "asset", "masks", "mask_seed"})
+    count: int = 224
+    first: int = 0
+    """Number of the first picture; several runs may share the work."""
+    each: int = 2
+    """Pictures of each person."""
+    seed: int = 7001
+    """Of a world that is not the training's."""
+    size: int = 384
+    """Side of the pictures [px]."""
+    masks: int = 64
+    """Masks of training to compare with."""
+    asset: Path | None = None
+    """Where to write the asset that training draws from."""
+    threads: int | None = 1
+
+
+# ---- estimates
+
+
+def mirrored(values: Arrays, width: int) -> Arrays:
+    """Pose and camera of the mirrored picture."""
+    mirror, K = np.array([-1.0, 1.0, 1.0]), values["K"].copy()
+    K[0, 2] = width - K[0, 2]
+    orientation = mirror[:, None] * values["orientation"] * mirror
+    return values | {"orientation": orientation, "translation": mirror * values["translation"], "K": K}
+
+
+def doubles(**tensors: Tensor) -> Arrays:
+    """Arrays in double precision."""
+    return {name: tensor.double().numpy() for name, tensor in tensors.items()}
+
+
+def measure(number: int, options: Options) -> Row:
+    """Estimate one picture; writes what is true and what was found."""
+    index = PICTURES_EACH * (number // options.each) + number % options.each
+    batch, size = render_batch(options.seed, [index], options.size), options.size
+    side = "left" if int(batch.left[0]) else "right"
+    photo = synthetic_photo(batch.image[0], f"picture {index}")
+    hands = estimator().find(photo)
+    if not hands:
+        return {"result": "not found"}
+    landmarks = choose_hand(hands, "largest", photo.name)
+    if landmarks.side != side:
+        return {"result": "wrong side"}
+    try:
+        fit = estimator().fit(photo, landmarks)
+    except InputError:
+        return {"result": "refused"}
+    true = doubles(**{name: getattr(batch, name)[0] for name in PARTS})
+    found = doubles(**fit.pose._asdict(), shape=fit.shape, K=fit.camera.K)
+    above = torch.from_numpy(wrist_line(fit.landmarks.xy.numpy()).above_mask((size, size))).float()
+    masks = {"true_mask": batch.mask[0], "found_mask": fit.mask, "above": above}
+    if side == "left":
+        true, found = mirrored(true, size), mirrored(found, size)
+        masks = {name: mask.flip(1) for name, mask in masks.items()}
+    square = square_around(masks["found_mask"], CROP_MARGIN)
+    arrays: Arrays = {
+        "size": size, "offsets": outline_offsets(bundled_hand(), fit).half().numpy(), "square": np.array(square),
+        "true_square": np.array(square_around(masks["true_mask"], CROP_MARGIN)),
+        **{f"true_{name}": value for name, value in true.items()},
+        **{f"found_{name}": value for name, value in found.items()},
+    }  # fmt: skip
+    for name, mask in masks.items():
+        cut = resample_square(mask.contiguous(), *square, CROP).clamp(0, 1)
+        arrays[name] = (255 * cut).round().to(torch.uint8).numpy()
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    folder = options.out / "estimator_errors" / "pictures"
+    folder.mkdir(exist_ok=True)
+    write_file(folder / f"{number:05d}.npz", buffer.getvalue())
+    return {"result": "fitted", "picture": f"{number:05d}.npz", "warned": len(fit.warnings) > 0}
+
+
+# ---- what they say
 
 
 class Hands:
     """Fitted pictures, true or found, as batches of right hands."""
 
-    def __init__(self, hand: HandModel, rows: list[Row], which: str):
-        parts = {name: torch.from_numpy(np.stack([row[f"{which}_{name}"] for row in rows])).float() for name in _PARTS}
+    def __init__(self, hand: HandModel, rows: list[Arrays], which: str):
+        parts = {name: torch.from_numpy(np.stack([row[f"{which}_{name}"] for row in rows])).float() for name in PARTS}
         self.shape, self.angles, self.orientation = parts["shape"], parts["angles"], parts["orientation"]
         self.translation, self.K = parts["translation"], parts["K"]
         self.posed = pose_hands(hand, self.shape, self.angles, self.orientation, self.translation)
@@ -130,7 +207,7 @@ def leave_one_out(hand: HandModel, true: Hands, measured: MeasuredErrors, seed: 
     return torch.cat(surfaces), torch.cat(cameras)
 
 
-def with_offsets(hand: HandModel, rows: list[Row], found: Hands) -> Tensor:
+def with_offsets(hand: HandModel, rows: list[Arrays], found: Hands) -> Tensor:
     """Found surfaces with the outline offsets of `reconstruction.reconstruct`."""
     surfaces = []
     for k, row in enumerate(rows):
@@ -219,7 +296,7 @@ class Masks(NamedTuple):
     """Of the crop, over that of the true mask's."""
 
 
-def found_masks(rows: list[Row]) -> Masks:
+def found_masks(rows: list[Arrays]) -> Masks:
     """Those that the estimator cut."""
     true, found, above = (torch.from_numpy(np.stack([row[name] for row in rows])) > 127
                           for name in ("true_mask", "found_mask", "above"))  # fmt: skip
@@ -276,79 +353,71 @@ def correlations(true: Hands, found: Hands) -> dict[str, float]:
     return {name: float(torch.corrcoef(torch.stack(pair))[0, 1]) for name, pair in pairs.items()}
 
 
-def percentiles(values: dict[str, Tensor]) -> dict[str, list[float]]:
-    """Of each row's numbers."""
-    return {name: [float(x) for x in np.percentile(v.double().numpy(), PERCENTILES)] for name, v in values.items()}
-
-
 def number(value: float) -> str:
     """Three digits."""
     return f"{value:.3f}" if abs(value) < 1 else f"{value:.3g}"
 
 
-def table(columns: dict[str, dict[str, list[float]]]) -> str:
-    """Rows of percentiles, three for each column."""
-    heads = [f"{name} {q} %".strip() for name in columns for q in ("10", "50", "90")]
-    lines = ["| | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
-    for name in next(iter(columns.values())):
-        cells = [number(value) for column in columns.values() for value in column[name]]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+def spread(columns: dict[str, dict[str, Tensor]]) -> str:
+    """A table of percentiles of measures, three for each column."""
+    headings = [f"{name} {share} %".strip() for name in columns for share in (10, 50, 90)]
+    lines = [
+        [measure, *(number(x) for each in columns.values() for x in percentiles(each[measure].double().tolist()))]
+        for measure in next(iter(columns.values()))
+    ]
+    return markdown(["", *headings], lines)
 
 
-def main() -> None:
-    """Read the folder, write asset, page and numbers."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--page", type=Path, default=Path("docs/estimator.md"))
-    parser.add_argument("--asset", type=Path, default=ASSET)
-    parser.add_argument("--masks", type=int, default=64, help="masks of training to compare with")
-    parser.add_argument("--seed", type=int, default=7001, help="of the world that they are of")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    every, hand = read(options.folder), bundled_hand()
-    results = [str(row["result"]).split(":")[0] for row in every]
-    rows = [row for row, result in zip(every, results, strict=True) if result == "fitted"]
-    size = int(rows[0]["size"])
+def text(every: list[Row], rows: list[Arrays], options: Options) -> str:
+    """The section; with `--asset` the asset is written, too."""
+    hand, size = bundled_hand(), int(rows[0]["size"])
     true, found = Hands(hand, rows, "true"), Hands(hand, rows, "found")
     measured = measured_errors(hand, true, found)
-    of_hand = surface_fields(hand)
-    stored = {name: part.half().contiguous() for name, part in measured._asdict().items() if name not in of_hand}
-    write_file(options.asset, save(stored))
+    if options.asset is not None:
+        fixed = surface_fields(hand)
+        stored = {name: part.half().contiguous() for name, part in measured._asdict().items() if name not in fixed}
+        write_file(options.asset, save(stored))
     scale = CROP / torch.tensor([float(row["square"][2]) for row in rows])
     truth = Surfaces(hand, true.posed.posed, true.K, size)
-    seen = {
+    surfaces = {
         "found": Surfaces(hand, with_offsets(hand, rows, found), found.K, size),
         "in training": Surfaces(hand, *leave_one_out(hand, true, measured, 0), size),
     }
     masks = {"found": found_masks(rows), "in training": masks_in_training(hand, options.seed, options.masks)}
-    numbers = {
-        "pictures": len(every),
-        "results": {name: results.count(name) for name in sorted(set(results))},
-        "warned": sum(len(row["warnings"]) > 0 for row in rows),
-        "parts": percentiles(errors_of_parts(true, found, scale)),
-        "masks": {name: percentiles(errors_of_masks(those)) for name, those in masks.items()},
-        "correlations": correlations(true, found),
-        "surfaces": {name: percentiles(compare(truth, those, scale)) for name, those in seen.items()},
-    }
-    write_file(options.json, (json.dumps(numbers, indent=1) + "\n").encode())
-    outcome = ", ".join(f"{count} {name}" for name, count in numbers["results"].items())
-    hang = "; ".join(f"{name} {value:.2f}" for name, value in numbers["correlations"].items())
-    text = "\n\n".join([
-        f"{len(every)} pictures: {outcome}; {numbers['warned']} fits are warned about. Pixels are those of the "
-        f"{CROP} px crop.",
-        table({"": numbers["parts"]}),
+    results = [row["result"] for row in every]
+    outcome = ", ".join(f"{results.count(name)} {name}" for name in sorted(set(results)))
+    hang = "; ".join(f"{name} {value:.2f}" for name, value in correlations(true, found).items())
+    return "\n\n".join([
+        f"{len(every)} pictures: {outcome}; {sum(row.get('warned', False) for row in every)} fits are warned about. "
+        f"Pixels are those of the {CROP} px crop.",
+        spread({"": errors_of_parts(true, found, scale)}),
         f"Correlations: {hang}.",
         "Surfaces, and those that training gives the network:",
-        table(numbers["surfaces"]),
+        spread({name: compare(truth, those, scale) for name, those in surfaces.items()}),
         f"Masks, and {options.masks} that training gives it:",
-        table(numbers["masks"]),
+        spread({name: errors_of_masks(those) for name, those in masks.items()}),
     ])  # fmt: skip
-    head, rest = options.page.read_text().split(BEGIN)
-    options.page.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}")
-    print(text)
 
 
-if __name__ == "__main__":
-    main()
+def run(options: Options) -> list[Row]:
+    """Estimate what is missing, and write the text of the section."""
+    numbers = range(options.first, options.first + options.count)
+    measured("estimator_errors", {f"picture {k}": (k, options) for k in numbers}, measure, options)
+    folder = options.out / "estimator_errors"
+    every, rows = read_rows(folder / ROWS), []
+    for row in every:
+        if row["result"] == "fitted":
+            with np.load(folder / "pictures" / row["picture"], allow_pickle=False) as stored:
+                rows.append({name: stored[name] for name in stored.files})
+    made = {"text": text(every, rows, options), "commit": every[-1]["commit"]}
+    write_file(folder / "tables.json", json.dumps(made).encode())
+    return load(options.out)
+
+
+def load(out: Path) -> list[Row]:
+    """The text that the last run has made."""
+    path = out / "estimator_errors" / "tables.json"
+    return [json.loads(path.read_text())] if path.is_file() else []
+
+
+SECTIONS = (Section("estimator.md", "errors", lambda rows: rows[0]["text"]),)

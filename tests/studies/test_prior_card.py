@@ -1,25 +1,16 @@
-"""studies/write_model_card.py: numbers go where they belong, and nowhere else."""
+"""What the prior's page is filled with: its file, its training and measurements of it."""
 
 import json
 from dataclasses import replace
 
 import pytest
-import write_model_card
-from write_model_card import (
-    METHODS,
-    SECTIONS,
-    file_table,
-    gaussian_table,
-    measurement_tables,
-    photo_table,
-    put,
-    speed_table,
-    training_text,
-)
 
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, save_network
+from studies import photos, timing
+from studies.evaluation import METHODS, measurements
+from studies.prior_card import file_table, gaussian_table, training_text
 
 NOTES = {
     "step": 1234, "steps": 2000, "hands": 16, "people": 512, "seed": 3, "precision": "bfloat16", "profile": "compact",
@@ -62,23 +53,20 @@ def test_the_command_that_retrains_is_one_that_the_command_line_takes(weights):
     assert options.hold_out == ("tattoo", "ring")
 
 
-def test_measurements_are_those_with_estimated_poses_and_matched_colours(tmp_path):
+def test_measurements_are_those_with_estimated_poses_and_matched_colours():
     rows = [row(method, psnr=20.0 + number) for number, method in enumerate(METHODS)]
     others = [row(("learned", "raw"), psnr=99.0, **other) for other in ({"noise": 0.0}, {"colors": "raw"})]
-    (tmp_path / "metrics.json").write_text(json.dumps({"summary": rows + others}))
-    text = measurement_tables(tmp_path / "metrics.json")
+    text = measurements({"summary": rows + others})
     assert "4 people, 16 pictures" in text and "99" not in text
     assert "| the prior, one-shot | 26.00 | +3.25 | 0.50 | 75% | 21.00 |  | 0.9000 |" in text
     assert text.count("| no prior") == 2
 
 
-def test_speed_names_the_device(tmp_path):
-    found = {"device": "CPU, 2 threads", "torch": "2.9", "load_cpu_seconds": 0.5, "encode_seconds_fastest": 0.6,
-             "encode_seconds_median": 0.7, "encode_cpu_seconds_fastest": 0.55, "grown_gib": 0.3,
-             "device_gib": None}  # fmt: skip
-    (tmp_path / "cpu.json").write_text(json.dumps(found))
-    line = "| CPU, 2 threads | 0.50 s | 600.0 ms | 700.0 ms | 550.0 ms | 0.30 GiB | 2.9 |"
-    assert line in speed_table([tmp_path / "cpu.json"])
+def test_speed_names_the_device():
+    row = {"case": "prior on cpu", "device": "CPU, 2 threads", "torch": "2.9", "load_s": 0.5, "fastest_ms": 600,
+           "median_ms": 700, "cpu_ms": 550, "gib": 0.3}  # fmt: skip
+    text = timing.SECTIONS[-1].text([row, {"case": "pictures on cpu", "stage": "room", "ms": 154.2}])
+    assert "| CPU, 2 threads | 0.50 s | 600.0 ms | 700.0 ms | 550.0 ms | 0.30 GiB | 2.9 |" in (text or "")
 
 
 def test_an_untrained_prior_has_the_gaussians_of_the_mean_hand(weights, hand):
@@ -92,24 +80,16 @@ def test_an_untrained_prior_has_the_gaussians_of_the_mean_hand(weights, hand):
     assert 0.1 < low < middle < high < 2
 
 
-def test_real_photos_are_compared_where_both_priors_made_an_avatar(tmp_path):
-    heading = "photo,result,input_psnr_db,coverage_worst,render_mask_iou\n"
-    (tmp_path / "none.csv").write_text(heading + "a,ok,30,1,0.9\nb,ok,34,0.98,0.94\nc,ok,99,1,1\n")
-    (tmp_path / "learned.csv").write_text(heading + "a,ok,31,1,0.92\nb,ok,32,1,0.96\nc,found no hand,,,\n")
-    text = photo_table(tmp_path / "none.csv", tmp_path / "learned.csv")
+def test_real_photos_are_compared_where_both_priors_made_an_avatar():
+    def rows(prior, *found):
+        return [
+            {"photo": photo, "folder": "photos", "prior": prior, "result": "ok" if numbers else "found no hand",
+             **dict(zip(("input_psnr_db", "coverage_worst", "render_mask_iou"), numbers, strict=False))}
+            for photo, *numbers in found
+        ]  # fmt: skip
+
+    none = rows("none", ("a", 30, 1, 0.9), ("b", 34, 0.98, 0.94), ("c", 99, 1, 1))
+    text = photos.SECTIONS[-1].text(none + rows("learned", ("a", 31, 1, 0.92), ("b", 32, 1, 0.96), ("c",))) or ""
     assert "| no prior | 32.0 | 0.990 | 0.920 |" in text and "| the prior | 31.5 | 1.000 | 0.940 |" in text
     assert text.endswith("2 photos, medians.")
-
-
-def test_a_section_is_replaced_and_the_prose_stays():
-    page = "".join(f"prose {name}\n<!-- {name} -->\nold\n<!-- end of {name} -->\n" for name in SECTIONS)
-    once = put(page, "training", "new")
-    assert once == page.replace("<!-- training -->\nold", "<!-- training -->\nnew")
-    assert put(once, "training", "new") == once
-    with pytest.raises(SystemExit, match="expected <!-- speed --> and <!-- end of speed --> in the page"):
-        put("no markers", "speed", "text")
-
-
-def test_the_card_has_every_section():
-    card = (write_model_card.Path(__file__).parents[1] / "docs" / "prior.md").read_text()
-    assert all(put(card, name, "x") for name in SECTIONS)
+    assert photos.SECTIONS[-1].text(none) is None

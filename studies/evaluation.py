@@ -1,0 +1,168 @@
+"""What `oasis evaluate` measures: synthetic people, poses that are off, and photos of the same hands.
+
+Fills docs/evaluation.md (synthetic, noise, same-hand; and the sheets beside them) and docs/prior.md (measurements) from
+OUT/evaluation and OUT/same_hand_photos, where these commands leave their results:
+
+    oasis evaluate --dataset synthetic --seed 1 --device cuda --workers 8 --out out/evaluation
+    oasis evaluate --dataset same-hand tests/data/photos/same_hand --out out/same_hand_photos
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from oasis_warp.data.photo import read_photo
+from oasis_warp.evaluation.columns import (
+    COLORS,
+    GROUPS,
+    LIGHTS,
+    PHOTOS,
+    SYNTHETIC,
+    cells,
+    noise_rows,
+    number_words,
+    pose_words,
+    present,
+)
+from oasis_warp.evaluation.methods import Method, label
+from oasis_warp.evaluation.summary import Record, select
+from studies.harness import Options as Base
+from studies.harness import Row
+from studies.tables import Section, markdown, write_jpeg
+
+FOLDERS = {"synthetic": "evaluation", "same-hand": "same_hand_photos"}
+PICTURES = {"evaluation_sheet": "evaluation/sheet.png", "evaluation_attention": "evaluation/attention.png",
+            "same_hand_sheet": "same_hand_photos/sheet.png"}  # fmt: skip
+"""Pictures of docs/_static and where they come from."""
+ROWS_SHOWN = 1300
+"""Of a picture [px]."""
+METHODS = {
+    ("mean", "calibrated"): "no prior: colour-matched mean hand",
+    ("mean", "one_shot"): "no prior, one-shot",
+    ("learned", "raw"): "the prior's guess",
+    ("learned", "calibrated"): "its guess, colours matched",
+    ("learned", "even_one_shot"): "the prior, one-shot without the photo's light",
+    ("learned", "keep_one_shot"): "the prior, one-shot with the photo's light on the skin",
+    ("learned", "one_shot"): "the prior, one-shot",
+}
+"""As docs/prior.md calls them."""
+MEASURES = {
+    name: SYNTHETIC[name]
+    for name in ("psnr", "gain", "gain_error", "better", "psnr_visible", "psnr_hidden", "ssim_mask")
+}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Base):
+    """Options of this study."""
+
+    people: int = 16
+    seed: int = 1
+
+
+def run(options: Options) -> list[Row]:
+    """Run both commands."""
+    from oasis_warp.cli import main
+
+    options.out.mkdir(parents=True, exist_ok=True)
+    common = ["--device", options.device]
+    main(["evaluate", "--dataset", "synthetic", "--people", str(options.people), "--seed", str(options.seed),
+          "--workers", str(options.workers), "--out", str(options.out / FOLDERS["synthetic"]), *common])  # fmt: skip
+    main(["evaluate", "--dataset", "same-hand", "tests/data/photos/same_hand", "--out",
+          str(options.out / FOLDERS["same-hand"]), *common])  # fmt: skip
+    return load(options.out)
+
+
+def load(out: Path) -> list[Row]:
+    """What the commands left, a row for each of them."""
+    paths = {dataset: out / folder / "metrics.json" for dataset, folder in FOLDERS.items()}
+    return [
+        {"dataset": dataset, "out": str(out), "found": json.loads(path.read_text())}
+        for dataset, path in paths.items() if path.is_file()
+    ]  # fmt: skip
+
+
+def draw(rows: list[Row], static: Path) -> None:
+    """The upper part of each sheet."""
+    for name, file in PICTURES.items():
+        path = Path(rows[0]["out"]) / file
+        if path.is_file():
+            write_jpeg(static / f"{name}.jpg", read_photo(path).rgb[:ROWS_SHOWN].numpy())
+
+
+def name_of(row: Record) -> str:
+    """The label of the row's method."""
+    return label(Method(row["prior"], row["stage"]))
+
+
+def synthetic(found: dict[str, Any]) -> str:
+    """A table for each group and light."""
+    settings, parts = found["settings"], []
+    for group in settings["groups"]:
+        for light in settings["lights"]:
+            rows = [
+                row for row in select(found["summary"], group=group, light=light, colors=COLORS[light])
+                if row["noise"] in settings["noise"]
+            ]  # fmt: skip
+            shown = present(rows, SYNTHETIC)
+            lines = [[name_of(row), pose_words(row["noise"]), *cells(row, shown)] for row in rows]
+            headings = ["method", "pose", *(column.words for column in shown.values())]
+            parts.append(f"{GROUPS[group]}, {LIGHTS[light]}:\n\n{markdown(headings, lines)}")
+    shoot, weights = settings["shoot"], str(settings["priors"].get("learned"))[:12]
+    about = f"{settings['people']} people, {shoot['targets']} targets each, {shoot['size']} px. Weights {weights}."
+    return "\n\n".join([*parts, about + ("" if settings["lpips"] else " LPIPS: its weights were not at hand.")])
+
+
+def noise(found: dict[str, Any]) -> str:
+    """PSNR by how wrong the pose is, for the first group and light."""
+    settings = found["settings"]
+    group, light, factors = settings["groups"][0], settings["lights"][0], sorted(settings["noise"] + settings["curve"])
+    rows = noise_rows(found["summary"], group, light, factors)
+    lines = [[label(Method(*method)), *(number_words(psnr, ".2f") for psnr in of)] for method, of in rows.items()]
+    title = f"PSNR, {GROUPS[group][0].lower()}{GROUPS[group][1:]}, {LIGHTS[light]}:"
+    return f"{title}\n\n{markdown(['method', *map(pose_words, factors)], lines)}"
+
+
+def photos(found: dict[str, Any]) -> str:
+    """Medians over pairs."""
+    rows = found["summary"]
+    words = f"{rows[0]['pairs']} ordered pairs of {len(found['settings']['photos'])} sets, medians."
+    if found["left_out"]:
+        words += f" Photos left out: {len(found['left_out'])}."
+    shown = present(rows, PHOTOS)
+    headings = ["method", *(column.words for column in shown.values())]
+    return f"{markdown(headings, [[name_of(row), *cells(row, shown)] for row in rows])}\n\n{words}"
+
+
+def measurements(found: dict[str, Any]) -> str:
+    """For the prior's card: a table for each light and group, with estimated poses."""
+    parts = []
+    for light, words in LIGHTS.items():
+        for group in dict.fromkeys(row["group"] for row in found["summary"]):
+            rows = select(found["summary"], group=group, light=light, noise=1, colors=COLORS[light])
+            if not rows:
+                continue
+            by_method, first = {(row["prior"], row["stage"]): row for row in rows}, rows[0]
+            title = f"**{GROUPS[group]}, {words}**: {first['people']} people, {first['pictures']} pictures"
+            lines = [[name, *cells(by_method[key], MEASURES)] for key, name in METHODS.items() if key in by_method]
+            parts.append(f"{title}\n\n{markdown(['', *(column.words for column in MEASURES.values())], lines)}")
+    return "\n\n".join(parts)
+
+
+def section(page: str, marker: str, dataset: str, text) -> Section:
+    """A section that is made of what one of the commands left."""
+
+    def filled(rows: list[Row]) -> str | None:
+        found = next((row["found"] for row in rows if row["dataset"] == dataset), None)
+        return found and text(found)
+
+    return Section(page, marker, filled)
+
+
+SECTIONS = (
+    section("evaluation.md", "synthetic", "synthetic", synthetic),
+    section("evaluation.md", "noise", "synthetic", noise),
+    section("evaluation.md", "same-hand", "same-hand", photos),
+    section("prior.md", "measurements", "synthetic", measurements),
+)

@@ -1,0 +1,252 @@
+"""What each part of adaptation, and of the trained network, is worth: synthetic people without one part at a time.
+
+Fills docs/evaluation.md: "one-shot" (adaptation with one part removed at a time: the paper's table 4) and "probe" (the
+network with one part changed at a time). A probe trains nothing: unlike `network_parts` it does not say what the other
+parts would have learned without the changed one, but it takes minutes. A run that was stopped goes on.
+"""
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import torch
+
+from oasis_warp.avatar.prior import MeanPrior
+from oasis_warp.core.config import AdaptConfig
+from oasis_warp.evaluation.columns import COLORS, LIGHTS, SYNTHETIC, Column
+from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
+from oasis_warp.evaluation.summary import Record, difference, mean, select
+from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.network.attention import VisibilityAttention
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.prior import NetworkPrior, choose_prior
+from studies.harness import Options as Base
+from studies.harness import Row, prior_choice, report, write_rows
+from studies.tables import Section, groups, markdown
+
+FULL = "full"
+ADAPTATIONS = {
+    FULL: AdaptConfig(),
+    "calibration": AdaptConfig(calibration="off"),
+    "texture": AdaptConfig(texture_steps=0),
+    "references": AdaptConfig(reference_views=0),
+    "light": AdaptConfig(light="even"),
+    "schedule": AdaptConfig(calibration_steps=100, texture_steps=400),
+    "paper": AdaptConfig(calibration_steps=100, texture="lora", texture_steps=400, references="all"),
+}
+"""How the learned prior's guess is adapted; "full" is done for the mean prior too."""
+TITLES = {
+    FULL: "full model", "prior": "w/o learned prior", "calibration": "w/o colour calibration",
+    "texture": "w/o texture learning", "references": "w/o reference views", "light": "w/o the photo's light",
+    "schedule": "100 + 400 steps of the field", "paper": "the paper's 100 + 400 steps of LoRA",
+}  # fmt: skip
+PROBED_LIGHT = "studio"
+WEAK = 1e-3
+"""Of the bias: next to none."""
+CONTRASTS = {"hidden_more": ("psnr_hidden", "psnr_visible"), "stretched_more": ("psnr_stretched", "psnr_unchanged")}
+"""How much better one part of a picture's hand is than the other. What is gained everywhere cancels."""
+COLUMNS = {
+    **{
+        name: SYNTHETIC[name]
+        for name in ("psnr", "psnr_inner", "psnr_visible", "psnr_hidden", "psnr_stretched", "psnr_unchanged")
+    },
+    "hidden_more": Column("hidden above visible", ".2f"),
+    "stretched_more": Column("stretched above unchanged", ".2f"),
+    **{name: SYNTHETIC[name] for name in ("ssim", "ssim_mask", "lpips")},
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Base):
+    """Options of this study."""
+
+    selecting: ClassVar[frozenset[str]] = frozenset({"of"})
+    of: tuple[Literal["adaptation", "network"], ...] = ("adaptation", "network")
+    prior: str = "learned"
+    """learned, or a weights file."""
+    people: int = 16
+
+
+# ---- tables of ablations, also of `network_parts`
+
+
+def ablation_rows(
+    records: Sequence[Record], light: str, colors: str, stage: str, variants: Mapping[str, tuple[str, Method]],
+    whole: str,
+) -> list[Row]:  # fmt: skip
+    """A row for each variant: means, and how they differ from those of the variant `whole`, with errors over people.
+
+    Args:
+        records: Of single pictures.
+        light: Of photos and targets.
+        colors: "raw", or "matched" to the target.
+        stage: How far avatars were adapted.
+        variants: Title, and method in the records, by name.
+        whole: The variant with all parts.
+    """
+    seen = [_contrasted(record) for record in select(records, light=light, colors=colors)]
+    own = {name: select(seen, **method._asdict()) for name, (_, method) in variants.items()}
+    rows = []
+    for name, (title, _) in variants.items():
+        if own[name]:
+            changes = {measure: difference(own[name], own[whole], measure) for measure in COLUMNS}
+            rows.append({
+                "light": light, "colors": colors, "stage": stage, "whole": whole, "variant": name, "title": title,
+                "people": len({record["person"] for record in own[name]}),
+                **{measure: mean(own[name], measure) for measure in COLUMNS},
+                "change": {measure: change and change._asdict() for measure, change in changes.items()},
+            })  # fmt: skip
+    return rows
+
+
+def _contrasted(record: Record) -> Record:
+    pairs = {name: (record[part], record[rest]) for name, (part, rest) in CONTRASTS.items()}
+    return record | {name: None if None in pair else pair[0] - pair[1] for name, pair in pairs.items()}
+
+
+def ablation_text(rows: list[Row]) -> str | None:
+    """The tables, a heading above each, and how they were made."""
+    parts = []
+    for table in groups(rows, "light", "colors", "stage", "whole").values():
+        shown = {name: column for name, column in COLUMNS.items() if any(row[name] is not None for row in table)}
+        lines = [[row["title"], *(_cell(row, name, column) for name, column in shown.items())] for row in table]
+        made = markdown(["", *(column.words for column in shown.values())], lines)
+        parts.append(f"{heading(table[0])}:\n\n{made}")
+    settings = ", ".join(f"{name} {value}" for name, value in rows[0].get("settings", {}).items()) if rows else ""
+    return "\n\n".join([*parts, *([f"Settings: {settings}."] if settings else [])]) or None
+
+
+def heading(row: Row) -> str:
+    """What the table of `row` is of."""
+    light = LIGHTS[row["light"]]
+    colors = ", colours matched" if row["colors"] == "matched" and "matched" not in light else ""
+    return f"{light[0].upper()}{light[1:]}{colors}; {row['stage'].replace('_', '-')}, {row['people']} people"
+
+
+def _cell(row: Row, measure: str, column: Column) -> str:
+    """The mean of the whole, and the difference from it with its standard error over people."""
+    change = row["change"][measure]
+    if row[measure] is None:
+        return ""
+    if row["variant"] == row["whole"]:
+        return format(row[measure], column.form)
+    if change is None:
+        return ""
+    error = "" if change["error"] is None else f" ± {format(change['error'], column.form)}"
+    return f"{format(change['mean'], '+' + column.form)}{error}"
+
+
+# ---- adaptation
+
+
+def measure_adaptation(name: str, prior: NetworkPrior, options: Options) -> list[Record]:
+    """The records of one setting; its methods are called after it, or "prior" for that of the mean hand."""
+    priors: dict[str, Any] = {"learned": prior, **({"mean": MeanPrior(bundled_hand())} if name == FULL else {})}
+    config = SyntheticEvaluation(
+        groups=("ordinary",), people=options.people, noise=(1.0,), curve=(), adapt=ADAPTATIONS[name],
+        methods=tuple(Method(prior, ONE_SHOT) for prior in priors),
+    )  # fmt: skip
+    found = run_evaluation(priors, config, f"{name}_{options.people}", options)
+    titles = {"learned": name, "mean": "prior"}
+    return [{**record, "prior": titles[record["prior"]]} for record in found]
+
+
+def run_evaluation(
+    priors: Mapping[str, Any], config: SyntheticEvaluation, folder: str, options: Options
+) -> list[Record]:
+    """`evaluate` in a folder of this study; the records of all pictures."""
+    place = options.out / "parts" / folder
+    place.parent.mkdir(parents=True, exist_ok=True)
+    device = torch.device(options.device)
+    found = evaluate(
+        priors, config, place, device, workers=options.workers,
+        progress=lambda stage, done, total: report(f"{folder}, {stage}", done, total),
+    )  # fmt: skip
+    return found["pictures"]
+
+
+def adaptation_rows(prior: NetworkPrior, options: Options) -> list[Row]:
+    """Of every setting, in every light."""
+    records = [record for name in ADAPTATIONS for record in measure_adaptation(name, prior, options)]
+    variants = {name: (title, Method(name, ONE_SHOT)) for name, title in TITLES.items()}
+    return [
+        row for light in COLORS for row in ablation_rows(records, light, COLORS[light], ONE_SHOT, variants, FULL)
+    ]
+
+
+# ---- probes of the network
+
+
+def scaled_bias(share: float) -> Callable[[HandNetwork], None]:
+    """A change of the strength of VPIA's bias (equation 6)."""
+
+    def change(network: HandNetwork) -> None:
+        if not isinstance(network.fusion, VisibilityAttention) or network.fusion.log_beta is None:
+            raise SystemExit("expected a network whose attention has a bias; probe another.")
+        network.fusion.log_beta.data += math.log(share)
+
+    return change
+
+
+def mix_evenly(network: HandNetwork) -> None:
+    """Features of faces become the mean of their corners' (equation 7 without what it learns)."""
+    network.feature_on_mesh.logits.data.zero_()
+
+
+def _zeroed(network: HandNetwork, output: str) -> None:
+    start = 0
+    for name, width in network.face_head.outputs.items():
+        if name == output:
+            network.face_head.last.weight.data[start : start + width] = 0
+            network.face_head.last.bias.data[start : start + width] = 0
+        start += width
+
+
+PROBES: dict[str, tuple[str, Callable[[HandNetwork], None]]] = {
+    FULL: ("as trained", lambda network: None),
+    "no_bias": ("VPIA's bias off", scaled_bias(WEAK)),
+    "twice": ("VPIA's bias twice as strong", scaled_bias(2.0)),
+    "mixing": ("features of faces mixed evenly", mix_evenly),
+    "places": ("Gaussians in the middle of faces", lambda network: _zeroed(network, "barycentrics")),
+    "colors": ("no colours of faces' own", lambda network: _zeroed(network, "colors")),
+}
+"""Title and change."""
+
+
+def probe_rows(prior: NetworkPrior, options: Options) -> list[Row]:
+    """Of every probe."""
+    if prior.network.config.fom == "off":
+        raise SystemExit("--prior: expected a network with Gaussians on faces.")
+    priors = {}
+    for name, (_, change) in PROBES.items():
+        network = copy.deepcopy(prior.network)
+        change(network)
+        priors[name] = NetworkPrior(network)
+    config = SyntheticEvaluation(
+        groups=("ordinary",), people=options.people, lights=(PROBED_LIGHT,), noise=(1.0,), curve=(),
+        methods=tuple(Method(name, RAW) for name in PROBES),
+    )  # fmt: skip
+    records = run_evaluation(priors, config, f"probes_{options.people}", options)
+    variants = {name: (title, Method(name, RAW)) for name, (title, _) in PROBES.items()}
+    return ablation_rows(records, PROBED_LIGHT, COLORS[PROBED_LIGHT], RAW, variants, FULL)
+
+
+def run(options: Options) -> list[Row]:
+    """Evaluate every variant."""
+    prior = choose_prior(prior_choice(options.prior))
+    if not isinstance(prior, NetworkPrior):
+        raise SystemExit("--prior: expected a network.")
+    measure = {"adaptation": adaptation_rows, "network": probe_rows}
+    settings = {"people": options.people, "prior": options.prior}
+    rows = [{"of": of, "settings": settings, **row} for of in options.of for row in measure[of](prior, options)]
+    return write_rows(options.out / "parts", rows)
+
+
+def _section(marker: str, of: str) -> Section:
+    return Section("evaluation.md", marker, lambda rows: ablation_text([row for row in rows if row["of"] == of]))
+
+
+SECTIONS = (_section("one-shot", "adaptation"), _section("probe", "network"))

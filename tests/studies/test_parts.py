@@ -1,0 +1,174 @@
+"""Tables of ablations, and the studies that train and adapt without one part."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from oasis_warp.evaluation.methods import Method
+from oasis_warp.evaluation.metrics import MEASURES
+from oasis_warp.network.config import COMPACT, PROFILES
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.weights_file import save_network
+from oasis_warp.pretraining.pretrain import CHECKPOINT, WEIGHTS
+from studies import network_parts, parts
+from studies.harness import ROWS, read_rows
+from studies.parts import COLUMNS, ablation_rows, ablation_text, heading
+
+TINY = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
+VARIANTS = {"full": ("full model", Method("full", "raw")), "less": ("w/o a part", Method("less", "raw"))}
+
+
+def picture(method, person, target, psnr, light="studio", colors="raw", noise=1.0):
+    return {
+        "group": "ordinary", "light": light, "noise": noise, "colors": colors, "person": person, "target": target,
+        **method._asdict(), **dict.fromkeys(MEASURES, 0.5), "lpips": None, "psnr": psnr,
+    }  # fmt: skip
+
+
+@pytest.fixture
+def tables():
+    full, less = (method for _, method in VARIANTS.values())
+    records = [
+        picture(full, 1, 0, 24.0), picture(full, 1, 1, 26.0), picture(full, 2, 0, 30.0),
+        picture(less, 1, 0, 23.0), picture(less, 1, 1, 25.0), picture(less, 2, 0, 27.0),
+        picture(full, 1, 0, 99.0, light="wild"), picture(full, 1, 0, 20.0, light="wild", colors="matched"),
+    ]  # fmt: skip
+    return {
+        light: ablation_rows(records, light, colors, "raw", VARIANTS, "full")
+        for light, colors in (("studio", "raw"), ("wild", "matched"))
+    }
+
+
+def test_a_part_is_worth_what_is_lost_without_it_on_the_same_pictures(tables):
+    full, less = tables["studio"]
+    assert full["psnr"] == pytest.approx(80 / 3) and full["people"] == 2
+    assert less["change"]["psnr"] == {"mean": -2.0, "error": pytest.approx(1.0), "better": 0.0}
+    assert less["change"]["psnr_hidden"]["mean"] == 0
+    assert less["change"]["lpips"] is None
+
+
+def test_what_is_gained_everywhere_is_no_gain_of_one_part():
+    (_, full), (_, less) = VARIANTS.values()
+    records = [
+        picture(full, person, 0, 20.0) | {"psnr_hidden": 20.0 + person, "psnr_visible": 25.0, "psnr_stretched": None}
+        for person in (1, 2)
+    ] + [
+        picture(less, person, 0, 19.0) | {"psnr_hidden": 18.0 + person, "psnr_visible": 24.0} for person in (1, 2)
+    ]  # fmt: skip
+    full, less = ablation_rows(records, "studio", "raw", "raw", VARIANTS, "full")
+    assert full["hidden_more"] == pytest.approx(-3.5) and full["stretched_more"] is None
+    assert less["change"]["hidden_more"] == {"mean": -1.0, "error": 0.0, "better": 0.0}
+    assert less["change"]["psnr_hidden"]["mean"] == -2 and less["change"]["stretched_more"] is None
+
+
+def test_a_table_is_of_one_light_and_says_so(tables):
+    (full,) = tables["wild"]
+    assert full["psnr"] == 20
+    assert heading(full).endswith("targets in even light, colours matched; raw, 1 people")
+    assert heading(tables["studio"][0]) == "Photo and targets in even light; raw, 2 people"
+
+
+def test_a_table_shows_differences_and_leaves_out_what_was_not_measured(tables):
+    _, _, names, _, full, less = (ablation_text(tables["studio"]) or "").splitlines()
+    assert names.count("|") == 2 + len(COLUMNS) - 1 and "LPIPS" not in names
+    assert full.startswith("| full model | 26.67 |")
+    assert less.startswith("| w/o a part | -2.00 ± 1.00 | +0.00 ± 0.00 |")
+
+
+def test_a_probe_changes_its_part_alone(hand):
+    network = HandNetwork(TINY, hand)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter)
+    before = {name: value.clone() for name, value in network.named_parameters()}
+    touched = {
+        "full": set(), "no_bias": {"fusion.log_beta"}, "twice": {"fusion.log_beta"},
+        "mixing": {"feature_on_mesh.logits"}, "places": {"face_head.last.weight", "face_head.last.bias"},
+        "colors": {"face_head.last.weight", "face_head.last.bias"},
+    }  # fmt: skip
+    assert list(touched) == list(parts.PROBES)
+    for name, (_, change) in parts.PROBES.items():
+        changed = copy.deepcopy(network)
+        change(changed)
+        after = dict(changed.named_parameters())
+        assert {key for key, value in before.items() if not torch.equal(value, after[key])} == touched[name]
+        still = (after["face_head.last.weight"] == 0).all(1).sum()
+        assert int(still) == {"places": 3, "colors": 3}.get(name, 0)
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    monkeypatch.setitem(PROFILES, "compact", TINY)
+
+
+def test_networks_are_trained_with_and_without_point_evidence(tiny):
+    options = network_parts.Options()
+    names = network_parts.network_names(options)
+    assert len(names) == len(set(names)) == 2 * len(network_parts.VARIANTS)
+    configs = [network_parts.network_config(name, options) for name in names]
+    assert [config.point_evidence for config in configs] == ["off"] * 9 + ["on"] * 9
+    assert len(set(configs)) == len(configs) and configs[9] == replace(TINY, point_evidence="on")
+    without, having = (network_parts.row_titles(names, ending) for ending in ("", network_parts.WITH))
+    assert list(without.values())[0::9] == ["full model", "with point evidence"] and len(having) == 9
+    assert set(without) | set(having) == set(names)
+
+
+@pytest.mark.slow
+def test_variants_are_trained_alike_and_go_on_where_they_were_stopped(tiny, tmp_path, monkeypatch, capsys):
+    few = {name: network_parts.VARIANTS[name] for name in ("full", "no_bias", "vet_off")}
+    monkeypatch.setattr(network_parts, "VARIANTS", few)
+    monkeypatch.setattr(network_parts, "CHECKPOINT_EVERY", 1)
+    whole = network_parts.Options(
+        steps=3, hands=1, people=1, views=1, size=32, precision="float32", held_out=1, evidence="off",
+        out=tmp_path / "whole",
+    )  # fmt: skip
+    rows = network_parts.run(whole)
+    kinds = dict.fromkeys((row["light"], row["colors"]) for row in rows)
+    assert list(kinds) == [("studio", "raw"), ("studio", "matched"), ("wild", "matched")] and len(rows) == 9
+    text = ablation_text(rows) or ""
+    assert "w/o bias" in text and "full model" in text and "Settings: " in text
+
+    advance = network_parts.Trainer.advance
+
+    def until_stopped(trainer, batch):
+        if trainer.step == 2 and trainer.network.config.vet == "off":
+            raise KeyboardInterrupt
+        return advance(trainer, batch)
+
+    part = replace(whole, out=tmp_path / "parts")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(network_parts.Trainer, "advance", until_stopped)
+        network_parts.run(replace(part, only=("full", "vet_off")))
+    network_parts.run(replace(part, only=("no_bias",), minutes=0))
+    assert "the same command goes on" in capsys.readouterr().err
+    folder = tmp_path / "parts" / "network_parts"
+    assert (folder / "no_bias" / CHECKPOINT).exists()
+    assert not (folder / "no_bias" / WEIGHTS).exists()
+    network_parts.run(replace(part, only=("vet_off",)))
+    network_parts.run(replace(part, only=("full", "no_bias")))
+    for name in few:
+        ours, theirs = (load_file(place / "network_parts" / name / CHECKPOINT) for place in (whole.out, part.out))
+        assert all(torch.equal(ours[key], theirs[key]) for key in ours), name
+        assert (folder / name / WEIGHTS).exists()
+
+
+@pytest.mark.slow
+def test_adaptation_is_measured_without_its_parts(tiny, tmp_path, monkeypatch, hand):
+    assert parts.TITLES.keys() == parts.ADAPTATIONS.keys() | {"prior"}
+    shown = ("full", "prior", "light")
+    monkeypatch.setattr(parts, "TITLES", {name: parts.TITLES[name] for name in shown})
+    few = {
+        name: replace(made, texture_steps=1, calibration_steps=1)
+        for name, made in parts.ADAPTATIONS.items() if name in shown
+    }  # fmt: skip
+    monkeypatch.setattr(parts, "ADAPTATIONS", few)
+    save_network(tmp_path / "network.safetensors", HandNetwork(TINY, hand))
+    weights = str(tmp_path / "network.safetensors")
+    rows = parts.run(parts.Options(prior=weights, people=1, of=("adaptation",), out=tmp_path / "out"))
+    assert read_rows(tmp_path / "out" / "parts" / ROWS) == rows
+    assert list(dict.fromkeys(row["light"] for row in rows)) == ["same", "studio", "wild"]
+    assert [row["variant"] for row in rows] == 3 * list(parts.TITLES)
+    one_shot, probe = parts.SECTIONS
+    assert all(title in (one_shot.text(rows) or "") for title in parts.TITLES.values()) and probe.text(rows) is None
