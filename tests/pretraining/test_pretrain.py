@@ -51,7 +51,7 @@ def source(hand):
 def unbroken(hand, source, tmp_path_factory):
     folder = tmp_path_factory.mktemp("unbroken")
     network = small_network(hand)
-    pretrain(network, source, CONFIG, folder, ALONE)
+    pretrain(Trainer(network, CONFIG, ALONE), source, folder)
     return folder, network
 
 
@@ -65,9 +65,9 @@ def test_a_training_that_was_killed_ends_with_the_same_bits(hand, source, unbrok
         raise Killed
 
     with pytest.raises(Killed):
-        pretrain(small_network(hand), until_killed, CONFIG, tmp_path, ALONE)
+        pretrain(Trainer(small_network(hand), CONFIG, ALONE), until_killed, tmp_path)
     assert [json.loads(line)["step"] for line in (tmp_path / METRICS).read_text().splitlines()] == [1, 2, 3]
-    pretrain(small_network(hand), source, CONFIG, tmp_path, ALONE)
+    pretrain(Trainer(small_network(hand), CONFIG, ALONE), source, tmp_path)
     for name in (CHECKPOINT, WEIGHTS, SHEET):
         assert (tmp_path / name).read_bytes() == (unbroken[0] / name).read_bytes(), name
 
@@ -88,14 +88,14 @@ def test_a_finished_training_is_left_as_it_is(hand, source, unbroken):
     folder, network = unbroken
     before = (folder / CHECKPOINT).read_bytes()
     again = small_network(hand)
-    pretrain(again, source, CONFIG, folder, ALONE)
+    pretrain(Trainer(again, CONFIG, ALONE), source, folder)
     assert (folder / CHECKPOINT).read_bytes() == before
     assert all(torch.equal(a, b) for a, b in zip(again.parameters(), network.parameters(), strict=True))
 
 
 def test_the_checkpoint_of_another_network_is_refused(hand, source, unbroken):
     with pytest.raises(InputError, match="the checkpoint of a network with other sizes or switches"):
-        pretrain(small_network(hand, vpia="no_bias"), source, CONFIG, unbroken[0], ALONE)
+        pretrain(Trainer(small_network(hand, vpia="no_bias"), CONFIG, ALONE), source, unbroken[0])
 
 
 def test_the_learning_rate_rises_and_falls_or_stays():
@@ -115,7 +115,7 @@ def test_a_loss_that_is_not_finite_ends_the_training(hand, source, tmp_path):
             yield batch._replace(target_images=batch.target_images * float("nan"))
 
     with pytest.raises(InputError, match="the loss is not finite at step 1; lower the learning rate"):
-        pretrain(small_network(hand), poisoned, CONFIG, tmp_path, ALONE)
+        pretrain(Trainer(small_network(hand), CONFIG, ALONE), poisoned, tmp_path)
     assert not (tmp_path / CHECKPOINT).exists()
 
 

@@ -1,4 +1,4 @@
-"""Several processes, one model: what torchrun set up, or a process alone."""
+"""Train one model with several processes, as set up by torchrun, or with one."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,7 @@ from oasis_warp.core.errors import InputError
 
 
 class ProcessInfo(NamedTuple):
-    """This process among all."""
+    """This process among all processes."""
 
     rank: int
     world: int
@@ -22,7 +22,7 @@ class ProcessInfo(NamedTuple):
 
 @contextmanager
 def join_processes(device: str) -> Iterator[ProcessInfo]:
-    """Join the processes that torchrun started, over NCCL on CUDA and gloo on the CPU; a process alone joins none.
+    """Join the processes that torchrun started, over NCCL on CUDA and gloo on the CPU; without torchrun there is one.
 
     Raises:
         InputError: fewer CUDA devices than processes.
@@ -47,7 +47,7 @@ def join_processes(device: str) -> Iterator[ProcessInfo]:
 
 
 def mean_over_processes(values: Tensor, world: int) -> Tensor:
-    """The mean of `values` of all processes."""
+    """The mean of `values` over all processes."""
     if world > 1:
         dist.all_reduce(values)
         values = values / world
@@ -55,14 +55,14 @@ def mean_over_processes(values: Tensor, world: int) -> Tensor:
 
 
 def share_weights(parameters: Sequence[Tensor], world: int) -> None:
-    """All processes start with the weights of process 0."""
+    """Copy the weights of process 0 to all processes."""
     if world > 1:
         for parameter in parameters:
             dist.broadcast(parameter.data, 0)
 
 
 def average_gradients(parameters: Sequence[Tensor], world: int) -> None:
-    """Every gradient becomes its mean over the processes, in one exchange; a CUDA graph can record it."""
+    """Replace gradients by their means over the processes, in one all-reduce that a CUDA graph can capture."""
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     if world == 1 or not gradients:
         return
@@ -74,7 +74,7 @@ def average_gradients(parameters: Sequence[Tensor], world: int) -> None:
 
 
 def any_process(flag: bool, process: ProcessInfo) -> bool:
-    """Whether one of the processes says so: the same answer in all, which all must ask for."""
+    """Whether `flag` is set in any process: the same answer in all, and all must call this."""
     if process.world == 1:
         return flag
     votes = torch.tensor(float(flag), device=process.device)
@@ -83,5 +83,5 @@ def any_process(flag: bool, process: ProcessInfo) -> bool:
 
 
 def wait_for_all(process: ProcessInfo) -> None:
-    """Go on when every process has come here."""
+    """Wait until every process has called this."""
     any_process(False, process)

@@ -1,11 +1,14 @@
-"""The estimator's errors as they were measured: a hand is seen as wrongly as one that looks like it was.
+"""Errors of the estimator as measured: hands are perturbed like similar hands were when they were estimated.
 
-`studies/estimator_errors.py` photographs synthetic hands, estimates them as `reconstruction.reconstruct`
-does, and keeps the differences. One photo says where a hand lies in the picture but little of its depth, so errors of
-joints, turn, shape and focal length are large and hang together: drawn one by one they would carry the surface far
-off its picture. An error is therefore all of one measured hand's, of one of those that look most alike from the
-camera. What it does to this hand's landmarks in the picture is put right: they are off as that hand's were, and the
-surface follows. Last, as by `estimation.surface_offsets`, what forms the outline goes back to where it is.
+`studies/estimator_errors.py` renders synthetic hands, estimates them as `reconstruction.reconstruct` does, and
+keeps the differences. One photo determines the hand in the picture but hardly its depth, so errors of joints,
+orientation, shape and focal length are large and correlated: sampled independently they would move the surface far off
+its picture. An error is therefore taken as a whole from one measured hand, one of those that look most similar from the
+camera. Then its effect on the landmarks in the picture is corrected: they are off as that hand's were, and the surface
+follows. Last, as in `estimation.surface_offsets`, the outline moves back to its true place.
+
+Masks get the errors that the estimator's GrabCut makes (docs/estimator.md): another end at the wrist, filled gaps
+between fingers, and a wandering outline. They are computed in batches of fixed sizes on the device of the pictures.
 """
 
 import functools
@@ -24,43 +27,43 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.pretraining.hand_batch import FINGERS, PosedHands, pose_hands
 
 ALIKE = 8
-"""Of so many measured hands that look most alike one lends its error."""
+"""Number of most similar measured hands of which one provides the error."""
 _WRIST, _MIDDLE = 0, 9
-"""Landmarks between which a hand points upwards."""
+"""Landmarks that define the direction of a hand."""
 _BONES = (*((0, k) for k in range(1, 21, 4)), *((k, k + 1) for k in range(1, 20) if k % 4))
-"""First and last landmark of the bones that carry flesh along."""
+"""First and last landmark of each bone."""
 _FORESHORTENED = 0.1
-"""Share of the palm's length, as seen, below which a bone is taken to point as the palm does."""
+"""Projected length of a bone, over that of the palm, below which it is taken to point like the palm."""
 _GRAZING = 0.5
-"""Largest |normal . view| of a vertex that belongs to the outline, ever less up to there."""
+"""Largest |normal . view| at the outline; vertices belong to it less and less up to there."""
 _SOFT = 0.004
-"""Bones that are nearer to a vertex than this share it evenly [m]."""
+"""Distance below which bones influence a vertex equally [m]."""
 
 
 class MeasuredErrors(NamedTuple):
-    """M hands, each turned about the camera's axis until it points upwards; distances in metres, angles in radians."""
+    """Errors of M hands, each rotated about the camera's axis until it points upwards; metres and radians."""
 
     looks: Float[Tensor, "M 63"]
-    """True landmarks about their mean, in the camera's frame."""
+    """True landmarks minus their mean, in the camera's frame."""
     angles: Float[Tensor, "M 15 3"]
-    """Found less true."""
+    """Estimated minus true angles."""
     turn: Float[Tensor, "M 3"]
-    """From the true to the found orientation, about the camera's axes."""
+    """Rotation vector from the true to the estimated orientation, about the camera's axes."""
     shape: Float[Tensor, "M S"]
-    """Found coefficients less the share `kept` of the true ones."""
+    """Estimated coefficients minus `kept` times the true ones."""
     lens: Float[Tensor, "M 2"]
-    """Logarithms: found over true focal length; found over true size of what covers a pixel at the hand."""
+    """Logarithms of estimated over true focal length, and of estimated over true size of a pixel at the hand."""
     place: Float[Tensor, "M 21 2"]
-    """Of landmarks in the picture, in metres at the hand's true distance."""
+    """Error of landmarks in the picture, in metres at the hand's true distance."""
     kept: Float[Tensor, "S"]
-    """Share of a shape coefficient that the estimator finds."""
+    """Share of each shape coefficient that the estimator recovers."""
     shares: Float[Tensor, "V 21"]
-    """How much of each landmark's shift a vertex takes part in; rows sum to one."""
+    """Weights with which a vertex follows the landmarks; rows sum to one."""
     normals: Float[Tensor, "V 3"]
-    """Of the surface at rest."""
+    """Vertex normals of the surface at rest."""
 
     def scaled(self, strength: float) -> "MeasuredErrors":
-        """Larger or smaller errors; none for 0."""
+        """The errors times `strength`; 0 for none."""
         if strength == 1:
             return self
         smaller = {name: strength * getattr(self, name) for name in ("angles", "turn", "shape", "lens", "place")}
@@ -68,7 +71,7 @@ class MeasuredErrors(NamedTuple):
 
 
 class EstimatedHands(NamedTuple):
-    """What an estimator says of N hands."""
+    """Estimates of N hands: surfaces in the camera's frame [m], and intrinsics [px]."""
 
     posed: Float[Tensor, "N V 3"]
     K: Float[Tensor, "N 3 3"]
@@ -76,14 +79,14 @@ class EstimatedHands(NamedTuple):
 
 @functools.cache
 def bundled_errors(device: torch.device) -> MeasuredErrors:
-    """The errors that ship with the package, of the bundled hand."""
+    """The errors that ship with the package, for the bundled hand."""
     stored = load(asset("training", "estimator_errors.safetensors").read_bytes())
     tensors = {name: value.float() for name, value in stored.items()} | surface_fields(bundled_hand())
     return MeasuredErrors(**{name: value.to(device) for name, value in tensors.items()})
 
 
 def surface_fields(hand: HandModel) -> dict[str, Tensor]:
-    """The fields of `MeasuredErrors` that are the hand's own."""
+    """The fields of `MeasuredErrors` that depend on the hand model only."""
     a, b, c = hand.template[hand.faces].unbind(1)
     across = torch.linalg.cross(b - a, c - a)
     normals = torch.zeros_like(hand.template).index_add_(0, hand.faces.flatten(), across.repeat_interleave(3, 0))
@@ -91,7 +94,7 @@ def surface_fields(hand: HandModel) -> dict[str, Tensor]:
 
 
 def landmark_shares(hand: HandModel) -> Float[Tensor, "V 21"]:
-    """Weights by which vertices follow landmarks: along the nearest bones, linearly from end to end."""
+    """Weights with which vertices follow landmarks: those of the nearest bones, linear along each bone."""
     points = torch.cat([hand.joints, hand.tips])[hand.keypoint_index]
     ends = torch.tensor(_BONES, device=points.device)
     start, end = points[ends].unbind(1)
@@ -106,16 +109,16 @@ def landmark_shares(hand: HandModel) -> Float[Tensor, "V 21"]:
 
 
 class Frames(NamedTuple):
-    """Directions in the picture, as rotations about the camera's axis that turn upwards into them."""
+    """Directions in the picture, as rotations about the camera's axis from the upward direction."""
 
     hand: Float[Tensor, "N 3 3"]
     """From wrist to middle knuckle."""
     landmarks: Float[Tensor, "N 21 2 2"]
-    """Along the bone that ends at a landmark, for those beyond the knuckles."""
+    """Along the bone that ends at a landmark; for wrist and knuckles along the palm."""
 
 
 def picture_frames(landmarks: Float[Tensor, "N 21 3"]) -> Frames:
-    """How hands and their fingers lie in the picture; landmarks are in the camera's frame."""
+    """Directions of hands and their fingers in the picture, from landmarks in the camera's frame."""
     seen = landmarks[..., :2] / landmarks[..., 2:]
     up = seen[:, _MIDDLE] - seen[:, _WRIST]
     fingers = seen[:, 1:].unflatten(1, (FINGERS, 4))
@@ -130,7 +133,7 @@ def picture_frames(landmarks: Float[Tensor, "N 21 3"]) -> Frames:
 
 
 def looks(landmarks: Float[Tensor, "N 21 3"], frames: Frames) -> Float[Tensor, "N 63"]:
-    """As `MeasuredErrors.looks`."""
+    """Landmarks as in `MeasuredErrors.looks`."""
     return ((landmarks - landmarks.mean(1, keepdim=True)) @ frames.hand).flatten(1)
 
 
@@ -144,17 +147,17 @@ def simulate_estimate(
     measured: MeasuredErrors,
     choice: Int[Tensor, "N"],
 ) -> EstimatedHands:
-    """Surfaces and cameras with errors.
+    """Surfaces and cameras with the estimator's errors.
 
     Args:
-        hand: That of `measured`.
-        true: Those hands, from `pose_hands` in the camera's frame.
+        hand: The hand model of `measured`.
+        true: The true hands in the camera's frame, from `pose_hands`.
         shape: True coefficients.
         angles: True angles.
         orientation: True orientations.
         K: True intrinsics [px].
-        measured: Errors.
-        choice: Which of the `ALIKE` measured hands lends its error.
+        measured: Measured errors.
+        choice: Which of the `ALIKE` most similar measured hands provides the error.
     """
     frames = picture_frames(true.landmarks)
     alike = torch.cdist(looks(true.landmarks, frames), measured.looks).topk(ALIKE, largest=False).indices
@@ -181,7 +184,7 @@ def simulate_estimate(
 
 
 def _onto_outline(posed: Tensor, focal: Tensor, true: PosedHands, normals: Tensor) -> Tensor:
-    """`posed` with the vertices on the true outline moved onto it, across it; `focal` is over the true focal length."""
+    """Move the vertices of the outline back onto the true outline; `focal` is over the true focal length."""
     out = (true.turns @ normals[..., None])[..., 0]
     view = normalize(true.posed, dim=-1)
     rim = (1 - (normalize(out, dim=-1) * view).sum(-1, keepdim=True).abs() / _GRAZING).clamp(min=0)
@@ -193,19 +196,19 @@ def _onto_outline(posed: Tensor, focal: Tensor, true: PosedHands, normals: Tenso
 
 
 PATCHES = 8
-"""Errors change over this part of a picture's side."""
+"""Number of patches along a picture's side in which mask errors vary."""
 MASK_NUMBERS = 2 + 2 * PATCHES * PATCHES
-"""Standard normal numbers that `perturb_outline` needs for a mask."""
+"""Standard normal numbers per mask for `perturb_outline`."""
 _END = (0.007, 0.0065)
-"""Mean and spread of where masks end past the wrist point [m]."""
+"""Mean and standard deviation of the masks' end beyond the wrist point [m]."""
 _GAP = 0.025
-"""Half the width of the widest gap that is filled in, over the picture's side."""
+"""Half the width of the widest gap that is filled, over the picture's side."""
 _GAPS = (-0.8, 1.3)
-"""Mean and spread of how readily gaps are filled in: some patches of most hands are, all of few."""
+"""Mean and standard deviation of the tendency to fill gaps: in some patches of most hands, in all of few."""
 _RIM = (-2.2, 0.9)
-"""Mean and spread of the logarithm of how far a rim wanders, over the width of its blur."""
+"""Mean and standard deviation of the logarithm of the outline's displacement, over the width of its blur."""
 _BLUR = 5
-"""Pixels over which a rim is blurred, and at most half of which it wanders."""
+"""Width of the outline's blur [px]; it moves by at most half of that."""
 
 
 def cut_at_wrist(
@@ -216,15 +219,15 @@ def cut_at_wrist(
     numbers: Float[Tensor, "N"],
     strength: float = 1.0,
 ) -> Float[Tensor, "N H H"]:
-    """Masks that end at a line across the arm, as `segmentation` cuts it, somewhere beyond the wrist.
+    """End masks at a line across the arm beyond the wrist, as `estimation.segmentation` does.
 
     Args:
         mask: Share of each pixel that is hand.
         alpha: Share that is hand, arm or clothes.
         landmarks: In the camera's frame [m].
         K: Intrinsics [px].
-        numbers: Standard normal ones, of where.
-        strength: 1 for errors as they were measured, 0 for none, more for fuller ones.
+        numbers: Standard normal numbers that decide on the place.
+        strength: 1 for errors as measured, 0 for none.
     """
     seen = landmarks @ K.transpose(1, 2)
     pixels = seen[..., :2] / seen[..., 2:]
@@ -240,13 +243,13 @@ def cut_at_wrist(
 def perturb_outline(
     mask: Float[Tensor, "N s s"], numbers: Float[Tensor, "N M"], strength: float = 1.0
 ) -> Float[Tensor, "N s s"]:
-    """Masks of crops with some gaps filled in and rims that are off by up to some pixels; `MASK_NUMBERS` a mask."""
+    """Fill some gaps in masks of crops, and move their outlines by up to some pixels; `MASK_NUMBERS` per mask."""
     size = mask.shape[-1]
     fields = numbers[:, 2:].unflatten(1, (2, PATCHES, PATCHES))
     gaps, rim = interpolate(fields, size=(size, size), mode="bicubic", align_corners=False).unbind(1)
     filled, far = (numbers[:, k, None, None] for k in range(2))
     reach = int(_GAP * size)
-    closed = -_grown(-_grown(mask, reach), reach)
+    closed = -_dilate(-_dilate(mask, reach), reach)
     made = mask + (_GAPS[0] + _GAPS[1] * filled + gaps).clamp(0, 1) * (closed - mask)
     soft = avg_pool2d(made[:, None], _BLUR, 1, _BLUR // 2, count_include_pad=False)[:, 0]
     shift = ((_RIM[0] + _RIM[1] * far).exp() * rim).clamp(-0.45, 0.45)
@@ -254,8 +257,8 @@ def perturb_outline(
     return (mask + strength * (made - mask)).clamp(0, 1)
 
 
-def _grown(mask: Tensor, reach: int) -> Tensor:
-    """The largest value of a square of 2 `reach` + 1 pixels round each pixel; first columns, then rows."""
+def _dilate(mask: Tensor, reach: int) -> Tensor:
+    """Dilate by a square of 2 `reach` + 1 pixels."""
     for along in ((reach, 0), (0, reach)):
         mask = max_pool2d(mask[:, None], [2 * k + 1 for k in along], 1, along)[:, 0]
     return mask

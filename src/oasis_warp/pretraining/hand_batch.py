@@ -1,4 +1,4 @@
-"""Many hands posed at once, each with a shape of its own, in a fixed and small number of launches."""
+"""Pose many hands of different shapes at once, in a fixed and small number of launches."""
 
 from typing import NamedTuple
 
@@ -13,18 +13,18 @@ from oasis_warp.hand.correctives import corrective_coefficients
 from oasis_warp.hand.skinning import TIP_BONES
 
 FINGERS, BONES = 5, 3
-"""A finger's bones follow each other in `HandModel`: all five are posed together, from the palm outwards."""
+"""The bones of a finger follow each other in `HandModel`. All fingers are posed together, from the palm outwards."""
 
 
 class PosedHands(NamedTuple):
-    """N right hands [m]; surfaces are those that carry Gaussians."""
+    """N right hands [m]; their surfaces are those that Gaussians are bound to."""
 
     rest: Float[Tensor, "N V 3"]
     posed: Float[Tensor, "N V 3"]
     landmarks: Float[Tensor, "N 21 3"]
-    """As `hand.skinning.hand21`, posed."""
+    """See `hand.skinning.hand21`."""
     turns: Float[Tensor, "N V 3 3"]
-    """From rest to pose, blended as skinning does: nearly rotations."""
+    """Blended linear parts of the skinning transforms from rest to pose: nearly rotations."""
 
 
 def pose_hands(
@@ -53,7 +53,7 @@ def pose_hands(
 def _bones(
     hand: HandModel, joints: Tensor, angles: Tensor, orientation: Tensor, translation: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Rotations and places of all bones, [N, 16, 3, 3] and [N, 16, 3]."""
+    """Rotations and positions of all bones, [N, 16, 3, 3] and [N, 16, 3]."""
     turns = from_axis_angle(hand.pose_axes[1:].expand(len(angles), -1, -1, -1), angles)
     local = (turns[:, :, 0] @ turns[:, :, 1] @ turns[:, :, 2]).unflatten(1, (FINGERS, BONES))
     at_rest = joints[:, 1:].unflatten(1, (FINGERS, BONES))

@@ -1,4 +1,4 @@
-"""The training objective (paper, appendix B.2): draw a prediction as its targets show it, and compare."""
+"""The training objective (paper, appendix B.2): render a prediction in the views of its targets, and compare."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ from oasis_warp.ops import depth_map, rasterization
 
 
 class RenderBatch(NamedTuple):
-    """N = B T pictures over black; what their targets say nothing about is black, too."""
+    """N = B T pictures over black; pixels that the targets leave unknown are black, too."""
 
     images: Float[Tensor, "N H H 3"]
     alphas: Float[Tensor, "N H H"]
 
 
 def draw_targets(prediction: Prediction, batch: TrainingBatch, network: HandNetwork) -> RenderBatch:
-    """Pose and draw the Gaussians of every hand in the pose and camera of each of its targets."""
+    """Pose and render the Gaussians of every hand in the pose and camera of each of its targets."""
     size = batch.target_images.shape[2]
     images, alphas = [], []
     for hand in range(len(batch.rest)):
@@ -44,7 +44,7 @@ def draw_targets(prediction: Prediction, batch: TrainingBatch, network: HandNetw
 
 @torch.no_grad()
 def true_pictures(batch: TrainingBatch, faces: Int[Tensor, "F 3"], rim: Int[Tensor, "R"]) -> RenderBatch:
-    """The targets, faded out at the wrist as the Gaussians are: what these may not cover they must not be asked for."""
+    """The targets, faded out at the wrist like the Gaussians, which must not cover the skin beyond it."""
     size = batch.target_images.shape[2]
     seen = depth_map(
         batch.target_posed.flatten(0, 1), faces, batch.target_viewmats.flatten(0, 1), batch.target_Ks.flatten(0, 1),
@@ -63,7 +63,7 @@ Perceptual = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 LEAST_AREA = 0.05
-"""Share of the picture that a mask counts as at least: little depends on a hand that hides behind its arm."""
+"""Least area of a mask as a share of the picture: limits the weight of hands hidden behind their arms."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,21 +71,21 @@ class LossConfig:
     """Weights of the objective; the paper's."""
 
     rgb: float = 10.0
-    """Of the mean absolute colour difference inside the mask."""
+    """Weight of the mean absolute colour difference inside the mask."""
     mask: float = 1.0
-    """Of the area by which the drawn alpha is wrong, over the area of the mask."""
+    """Weight of the absolute error of alpha, over the area of the mask."""
     ssim: float = 1.0
-    """Of 1 - SSIM."""
+    """Weight of 1 - SSIM."""
     perceptual: float = 5.0
-    """Of LPIPS, or of the term in its place."""
+    """Weight of LPIPS, or of the term in its place."""
     position: float = 1.0
-    """Of how far vertex Gaussians stray beyond `offset_limit`, in units of it."""
+    """Weight of `position_loss`."""
     scaling: float = 0.5
-    """Of how much more stretched than `stretch_limit` Gaussians are."""
+    """Weight of `scaling_loss`."""
     offset_limit: float = 0.006
-    """Distance from its vertex that costs nothing [m]."""
+    """Distance of a vertex Gaussian from its vertex that costs nothing [m]."""
     stretch_limit: float = 5.0
-    """Longest over shortest axis that costs nothing, where the anchor has no larger one."""
+    """Ratio of longest to shortest axis that costs nothing, unless the anchor's ratio is larger."""
 
 
 def objective(
@@ -95,10 +95,10 @@ def objective(
     config: LossConfig,
     perceptual: Perceptual = detail_difference,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The weighted sum, and each term without its weight: means over pictures and Gaussians.
+    """The weighted sum of all terms, and each term without its weight: means over pictures and Gaussians.
 
-    Inside the mask colours are compared over black, so that holes cost twice; the mask's term alone counts what is
-    drawn beyond it.
+    Colours are compared inside the mask and over black, so holes cost twice; only the mask term counts what is rendered
+    outside.
     """
     images, alphas = drawn
     targets, masks = true
@@ -116,16 +116,16 @@ def objective(
 
 def position_loss(offsets: Float[Tensor, "*batch 3"], limit: float) -> Tensor:
     """Mean of max(|offset| - limit, 0), over `limit`."""
-    # off 0, where the root has no slope: an untrained network has no offsets
+    # Away from 0, where the root has no derivative: an untrained network predicts zero offsets.
     length = (offsets.square().sum(-1) + 1e-16).sqrt()
     return (length / limit - 1).clamp_min(0).mean()
 
 
 def scaling_loss(scales: Float[Tensor, "*batch 3"], anchors: Float[Tensor, "*batch 3"], limit: float) -> Tensor:
-    """Mean of max(longest / shortest - limit, 0), the limit of a Gaussian no smaller than its anchor has it.
+    """Mean of max(longest / shortest - limit, 0), where the limit is at least the ratio of the anchor.
 
-    Anchors are flat on purpose, and those of slivers long: the paper's limit alone would puff them up to where they
-    stand out of the surface.
+    Anchors are flat on purpose, and long on sliver faces: the paper's limit alone would inflate them until they stick
+    out of the surface.
     """
 
     def stretch(axes: Tensor) -> Tensor:
@@ -136,6 +136,6 @@ def scaling_loss(scales: Float[Tensor, "*batch 3"], anchors: Float[Tensor, "*bat
 
 @torch.no_grad()
 def picture_psnr(drawn: RenderBatch, true: RenderBatch) -> Tensor:
-    """Peak signal-to-noise ratio inside the masks, mean of the pictures [dB]."""
+    """Peak signal-to-noise ratio inside the masks, averaged over the pictures [dB]."""
     error = ((drawn.images - true.images).square() * true.alphas[..., None]).sum((1, 2, 3))
     return (-10 * (error / (3 * true.alphas.sum((1, 2)).clamp_min(1))).clamp_min(1e-12).log10()).mean()

@@ -46,12 +46,12 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 def save_checkpoint(path: Path, network: HandNetwork, optimizer: torch.optim.Adam, step: int) -> None:
-    """Write the state after `step` steps, all or nothing, in full precision."""
+    """Write weights, Adam's moments and a JSON header after `step` steps as one safetensors file, atomically."""
     tensors: dict[str, Tensor] = {}
     for name, parameter in _trained(network).items():
         tensors[f"weights.{name}"] = parameter
         for moment in MOMENTS:
-            # a switch may leave a part without gradients, and Adam without moments for it
+            # A switch may leave a part without gradients, for which Adam has no moments.
             tensors[f"{moment}.{name}"] = optimizer.state[parameter].get(moment, torch.zeros_like(parameter))
     header = {"step": step, "config": asdict(network.config), "hand_model": network.hand_name}
     stored = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
@@ -59,10 +59,10 @@ def save_checkpoint(path: Path, network: HandNetwork, optimizer: torch.optim.Ada
 
 
 def load_checkpoint(path: Path, network: HandNetwork, optimizer: torch.optim.Adam) -> int:
-    """Fill in what `save_checkpoint` wrote; the number of steps done.
+    """Load a file of `save_checkpoint` into network and optimizer; the number of steps done.
 
     Raises:
-        InputError: another format, or the training of another network.
+        InputError: another format, or a checkpoint of another network.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -94,12 +94,12 @@ def _read_header(path: Path, metadata: dict[str, str] | None, network: HandNetwo
 
 
 CHECKPOINT, WEIGHTS, METRICS, SHEET = "checkpoint.safetensors", "network.safetensors", "metrics.jsonl", "pictures.png"
-"""What training leaves in its folder."""
+"""Files in the folder of a training."""
 SHEET_HANDS = 8
 EAGER_STEPS = 4
-"""Steps on CUDA before one is recorded: they load kernels, and show how many Gaussians pictures may show."""
+"""Steps on CUDA before one is captured: they load the kernels, and show how much memory the pictures need."""
 SLACK = 3.0
-"""Times the memory that a picture needed for its Gaussians: each hand and pose needs another."""
+"""Factor of the memory that pictures needed for their Gaussians, since each hand and pose needs another amount."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,17 +107,17 @@ class PretrainConfig:
     """How the prior is trained."""
 
     steps: int = 20_000
-    """Batches that each process sees."""
+    """Batches per process."""
     learning_rate: float = 4e-4
-    """Of Adam, at its highest; the paper's."""
+    """Highest learning rate of Adam; the paper's."""
     warmup: int = 200
-    """Steps over which the learning rate rises from nothing."""
+    """Steps over which the learning rate rises from 0."""
     decay: Literal["cosine", "none"] = "cosine"
-    """Down to nothing at the last step, which short trainings need, or constant as in the paper."""
+    """Decay to 0 at the last step, which short trainings need, or constant as in the paper."""
     precision: Literal["bfloat16", "float32"] = "bfloat16"
     """Of attention and perceptrons; geometry, Gaussians and weights are float32."""
     clip: float = 1.0
-    """Largest norm of the gradient of all weights together; a longer one is shortened."""
+    """Norm to which the gradient of all weights is clipped."""
     losses: LossConfig = field(default_factory=LossConfig)
     checkpoint_every: int = 500
     """Steps between two checkpoints."""
@@ -127,7 +127,7 @@ class PretrainConfig:
 
 @runtime_checkable
 class BatchSource(Protocol):
-    """Training data. Batch k of a process depends on k, rank and world alone, so that training can go on anywhere."""
+    """Training data. Batch k of a process depends on k, rank and world only, so that training can resume anywhere."""
 
     def __call__(self, first_step: int, rank: int, world: int) -> Iterator[TrainingBatch]:
         """Batches from step `first_step` on, on the device of the network."""
@@ -135,7 +135,7 @@ class BatchSource(Protocol):
 
 
 class StepResult(NamedTuple):
-    """What one step found; numbers are still on the device."""
+    """Results of one step; numbers are still on the device."""
 
     loss: Tensor
     terms: dict[str, Tensor]
@@ -144,20 +144,15 @@ class StepResult(NamedTuple):
     true: RenderBatch
 
 
-def never_stop() -> bool:
-    """Nobody asks to stop."""
-    return False
-
-
 def learning_rate(config: PretrainConfig, step: int) -> float:
-    """Of step `step`, counted from 0."""
+    """Learning rate of step `step`, counted from 0."""
     rise = min(1.0, (step + 1) / max(config.warmup, 1))
     fall = 0.5 + 0.5 * math.cos(math.pi * step / config.steps) if config.decay == "cosine" else 1.0
     return config.learning_rate * rise * fall
 
 
 class Trainer:
-    """A network in training, and its optimiser; `step` counts the steps done."""
+    """A network in training and its optimizer; `step` counts the steps done."""
 
     def __init__(
         self,
@@ -171,7 +166,7 @@ class Trainer:
         self.trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
         share_weights(self.trained, process.world)
         on_cuda = process.device.type == "cuda"
-        # a recorded step reads the learning rate where it lies on the device
+        # A captured step reads the learning rate from device memory.
         rate = torch.tensor(config.learning_rate, device=process.device) if on_cuda else config.learning_rate
         self.optimizer = torch.optim.Adam(self.trained, lr=rate, fused=on_cuda, capturable=on_cuda)
         self.step = 0
@@ -179,9 +174,9 @@ class Trainer:
         self._eager_steps = 0
 
     def advance(self, batch: TrainingBatch) -> StepResult:
-        """One step of Adam; no value is waited for.
+        """Take one step of Adam, without waiting for the device.
 
-        On CUDA the result's tensors are those of a recorded step: the next one writes over them.
+        On CUDA the result's tensors belong to a captured step, which overwrites them the next time.
         """
         for group in self.optimizer.param_groups:
             rate = learning_rate(self.config, self.step)
@@ -200,12 +195,12 @@ class Trainer:
         return result
 
     def check_recording(self) -> None:
-        """Record anew where the last step had too little memory for its pictures; waits for the device."""
+        """Capture anew if the last step had too little memory for its pictures; waits for the device."""
         if self._recorded is not None and self._recorded.lacked_memory():
             self._recorded, self._eager_steps = None, 0
 
     def evaluate(self, batch: TrainingBatch) -> StepResult:
-        """Predict, draw every target and compare."""
+        """Predict, render every target and compute the loss."""
         half = self.config.precision == "bfloat16"
         with torch.autocast(self.process.device.type, torch.bfloat16, enabled=half):
             prediction = self.network(input_of_batch(batch))
@@ -219,7 +214,7 @@ class Trainer:
         gradients = torch.autograd.grad(result.loss, self.trained, allow_unused=True)
         for parameter, gradient in zip(self.trained, gradients, strict=True):
             if gradient is not None and gradient.stride() != parameter.stride():
-                gradient = torch.empty_like(parameter).copy_(gradient)  # the fused optimiser wants the same strides
+                gradient = torch.empty_like(parameter).copy_(gradient)  # the fused optimizer needs the same strides
             parameter.grad = gradient
         average_gradients(self.trained, self.process.world)
         torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
@@ -228,91 +223,89 @@ class Trainer:
 
 
 def _without_history(result: StepResult) -> StepResult:
-    """The same numbers, that hold on to nothing they were computed from."""
+    """The result, detached from the graph."""
     terms = {name: term.detach() for name, term in result.terms.items()}
     drawn, true = (RenderBatch(*(tensor.detach() for tensor in pictures)) for pictures in (result.drawn, result.true))
     return StepResult(result.loss.detach(), terms, result.psnr.detach(), drawn, true)
 
 
 def pretrain(
-    network: HandNetwork,
+    trainer: Trainer,
     source: BatchSource,
-    config: PretrainConfig,
     folder: Path,
-    process: ProcessInfo,
     *,
-    perceptual: Perceptual = detail_difference,
     about: Mapping[str, object] = MappingProxyType({}),
-    should_stop: Callable[[], bool] = never_stop,
+    should_stop: Callable[[], bool] = lambda: False,
     progress: Progress = silent,
 ) -> int:
-    """Train until `config.steps`, going on from the checkpoint in `folder` where there is one; the steps done in all.
+    """Train until `trainer.config.steps`, from the checkpoint in `folder` if there is one; the number of steps done.
 
-    Leaves there a checkpoint, the weights in half precision, a line of JSON every few steps and a sheet of pictures:
-    photo, target, drawn. Process 0 writes. A training that was stopped and taken up again ends, on the CPU, with the
-    bits of one that was not, as steps and batches count from the start and nothing else is random.
+    Writes a checkpoint, the weights in half precision, a line of JSON every few steps, and a sheet of pictures: photo,
+    target, rendered. Only process 0 writes. On the CPU, a training that was stopped and resumed ends with the same bits
+    as one that was not, because steps and batches count from the start and nothing else is random.
 
     Args:
-        network: Changed in place.
-        source: Of batches.
-        config: How to train.
+        trainer: The network in training; changed in place.
+        source: Source of batches.
         folder: Where files go.
-        process: This process.
-        perceptual: Term of the objective.
-        about: More to say in the notes of the weights file, beside `config`: what JSON can hold.
-        should_stop: Asked after every step, by several processes when they write metrics: then this is the last step.
-        progress: Told of the steps to do from here on.
+        about: Further notes for the weights file, beside the config, as JSON values.
+        should_stop: Called after every step, with several processes only when metrics are written; True ends training.
+        progress: Called for every step from here on.
 
     Raises:
         InputError: a checkpoint of another network, a folder that cannot be written, or a loss that is not finite.
     """
-    trainer = Trainer(network, config, process, perceptual)
+    config, process = trainer.config, trainer.process
     if (folder / CHECKPOINT).is_file():
-        trainer.step = load_checkpoint(folder / CHECKPOINT, network, trainer.optimizer)
+        trainer.step = load_checkpoint(folder / CHECKPOINT, trainer.network, trainer.optimizer)
     if process.rank == 0:
-        _forget_after(folder / METRICS, trainer.step)
-    began, first = time.perf_counter(), trainer.step
+        _drop_lines_after(folder / METRICS, trainer.step)
+    start, first = time.perf_counter(), trainer.step
     batches = source(trainer.step, process.rank, process.world)
-    notes = {**about, **asdict(config)}
     stopping = trainer.step >= config.steps
     progress("pretraining", 0, config.steps - first)
     while not stopping:
         batch = next(batches)
         result = trainer.advance(batch)
         progress("pretraining", trainer.step - first, config.steps - first)
-        log_here = trainer.step % config.log_every == 0
-        # several processes stop together or wait for each other for ever, and agreeing costs a wait for the device
-        asked = (process.world == 1 or log_here) and any_process(should_stop(), process)
-        stopping = asked or trainer.step == config.steps
-        save_here = stopping or trainer.step % config.checkpoint_every == 0
-        if log_here or save_here:
-            names = ["loss", "psnr", *result.terms]
-            values = torch.stack([result.loss, result.psnr, *result.terms.values()])
-            numbers = dict(zip(names, mean_over_processes(values, process.world).tolist(), strict=True))
+        log_now = trainer.step % config.log_every == 0
+        # All processes must stop at the same step, and to agree on it they wait for the device.
+        stop_now = (process.world == 1 or log_now) and any_process(should_stop(), process)
+        stopping = stop_now or trainer.step == config.steps
+        save_now = stopping or trainer.step % config.checkpoint_every == 0
+        if log_now or save_now:
+            numbers = _mean_metrics(result, process.world)
             trainer.check_recording()
             if not math.isfinite(numbers["loss"]):
                 raise InputError(f"{folder}: the loss is not finite at step {trainer.step}; lower the learning rate.")
             if process.rank == 0:
-                pace = (time.perf_counter() - began) / (trainer.step - first)
-                line = {"step": trainer.step, "seconds_per_step": pace, **numbers}
+                seconds = (time.perf_counter() - start) / (trainer.step - first)
                 with (folder / METRICS).open("a") as file:
-                    file.write(json.dumps(line) + "\n")
-        if process.rank == 0 and save_here:
-            save_checkpoint(folder / CHECKPOINT, network, trainer.optimizer, trainer.step)
-            save_network(folder / WEIGHTS, network, notes=json.dumps({"step": trainer.step, **notes}))
+                    file.write(json.dumps({"step": trainer.step, "seconds_per_step": seconds, **numbers}) + "\n")
+        if process.rank == 0 and save_now:
+            save_checkpoint(folder / CHECKPOINT, trainer.network, trainer.optimizer, trainer.step)
+            notes = {"step": trainer.step, **about, **asdict(config)}
+            save_network(folder / WEIGHTS, trainer.network, notes=json.dumps(notes))
             write_picture(folder / SHEET, to_uint8(_sheet(batch, result)))
     return trainer.step
 
 
-def _forget_after(path: Path, step: int) -> None:
-    """Drop the lines of steps that will be done again."""
+def _mean_metrics(result: StepResult, world: int) -> dict[str, float]:
+    """Loss, PSNR and terms of a step, averaged over the processes."""
+    names = ["loss", "psnr", *result.terms]
+    values = torch.stack([result.loss, result.psnr, *result.terms.values()])
+    return dict(zip(names, mean_over_processes(values, world).tolist(), strict=True))
+
+
+def _drop_lines_after(path: Path, step: int) -> None:
+    """Drop the lines of steps that will be repeated."""
     if path.is_file():
         lines = [line for line in path.read_text().splitlines() if json.loads(line)["step"] <= step]
         write_file(path, "".join(line + "\n" for line in lines).encode())
 
 
 def _sheet(batch: TrainingBatch, result: StepResult) -> Tensor:
-    """A row a hand: its photo, its first target, and what was drawn of it."""
+    """One row per hand: its photo, its first target and the rendering."""
     targets = batch.target_images.shape[1]
     size = batch.target_images.shape[2]
     photos = batch.image.permute(0, 3, 1, 2)

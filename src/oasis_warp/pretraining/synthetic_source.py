@@ -1,4 +1,4 @@
-"""The synthetic world as the source of training: photos with everything, targets of the same hands in even light."""
+"""The synthetic world as a source of training batches: photos, and targets of the same hands in even light."""
 
 import itertools
 from collections.abc import Iterator
@@ -19,42 +19,42 @@ from oasis_warp.synthetic.shot_table import concatenate_tables, sample_tables_ah
 from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH, SceneConfig
 
 ERROR_STREAM = 3
-"""Tells the random numbers of the estimator's errors from those of identities and pictures with the same seed."""
+"""Stream number of the estimator's errors, beside those of identities and pictures with the same seed."""
 SURROUNDINGS = 1.25
-"""Side of a rendered picture over that of the crop round its hand."""
+"""Side of a rendered picture over that of the crop around its hand."""
 EVEN_EVERY = 4
-"""Of so many batches, one has photos in the even light of its targets, as captures in a studio are."""
+"""One in this number of batches has photos in the even light of its targets, as studio captures have."""
 WALL_STREAM = 4
-"""Of the colours of the walls behind them; beside `ERROR_STREAM`."""
+"""Stream number of the colours of the walls behind them."""
 MULTIPLE = 16
-"""Of a crop's side [px]: the rendered picture and the scales that losses look at are whole pixels then."""
+"""Divisor of a crop's side [px]: the rendered picture and the scales of the losses are whole pixels then."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SyntheticHands:
-    """A `BatchSource`. On the CPU a batch has the same bits wherever training was taken up."""
+    """A `BatchSource`. On the CPU a batch has the same bits wherever training was resumed."""
 
     seed: int
-    """Of the world and of the estimator's errors."""
+    """Seed of the world and of the estimator's errors."""
     people: int
-    """How many there are, over and over again in other photos."""
+    """Number of people, who come again and again in other photos."""
     hands: int
-    """Photos a batch, each of another person."""
+    """Photos per batch, each of another person."""
     views: int
-    """Targets a photo, up to `PICTURES_EACH`."""
+    """Targets per photo, up to `PICTURES_EACH`."""
     size: int
     """Side of photos and targets [px], a multiple of `MULTIPLE`."""
     device: torch.device
     """Where pictures are rendered."""
     population: Population = EVERYBODY
-    """What they may have."""
+    """What people may have."""
     workers: int = 0
-    """Processes that plan pictures ahead; 0 for none."""
+    """Processes that sample shots ahead, or 0."""
     ahead: int = 1
-    """Batches that are rendered together: several make better use of a GPU, and are the same batches."""
+    """Batches that are rendered together, which uses a GPU better and gives the same batches."""
 
     def __call__(self, first_step: int, rank: int, world: int) -> Iterator[TrainingBatch]:
-        """Batches without end. People that have not been baked make it wait, some seconds each."""
+        """Endless batches. People that have not been baked cost some seconds each."""
         hand = bundled_hand().to(self.device)
         photo = SceneConfig(people=self.people, population=self.population)
         looks = photo, replace(photo, look="even")
@@ -84,15 +84,15 @@ class SyntheticHands:
                 yield training_batch(hand, photo, target, self.size, self.errors(number))
 
     def photo_indices(self, number: int) -> list[int]:
-        """Pictures that are the photos of batch `number`."""
+        """Indices of the pictures that are the photos of batch `number`."""
         return [PICTURES_EACH * (number * self.hands + k) for k in range(self.hands)]
 
     def target_indices(self, number: int) -> list[int]:
-        """Pictures that are its targets, those of the first photo first; in the other look, so nothing comes twice."""
+        """Indices of its targets in even light, those of the first photo first."""
         return [index + view for index in self.photo_indices(number) for view in range(self.views)]
 
     def before_walls(self, pictures: SyntheticBatch, number: int) -> SyntheticBatch:
-        """Pictures over black in front of plain walls instead."""
+        """Replace the black background of pictures by plain walls."""
         like = pictures.image
         random = np.random.default_rng([self.seed, WALL_STREAM, number])
         walls = torch.tensor(random.uniform(0.1, 0.9, (len(like), 1, 1, 3)), dtype=like.dtype)
@@ -100,22 +100,22 @@ class SyntheticHands:
         return pictures._replace(image=like + (1 - pictures.alpha[..., None]) * walls)
 
     def errors(self, number: int) -> torch.Generator:
-        """The random numbers of the estimator's errors in batch `number`."""
+        """The random generator of the estimator's errors in batch `number`."""
         (state,) = np.random.SeedSequence([self.seed, ERROR_STREAM, number]).generate_state(1)
         return torch.Generator().manual_seed(int(state))
 
     def people_met(self, rank: int, world: int, steps: int) -> list[int]:
-        """Whom process `rank` of `world` meets in so many steps.
+        """The people that process `rank` of `world` shows in a number of steps.
 
-        Processes that meet the same people find them in another order, so that they need not bake the same at once.
+        Each process gets them in another order, so that processes do not bake the same person at the same time.
         """
-        batches = range(rank, min(steps, self.people) * world, world)  # after that many steps they come again
+        batches = range(rank, min(steps, self.people) * world, world)  # after that people repeat
         met = sorted({(number * self.hands + k) % self.people for number in batches for k in range(self.hands)})
         first = rank * len(met) // world
         return met[first:] + met[:first]
 
     def bake(self, met: list[int], folder: Path | None, jobs: int, progress: Progress = silent) -> None:
-        """Make the people of `people_met` ready, or read those that `folder`, if any, holds already.
+        """Bake the people of `people_met`, or read those that `folder` holds already.
 
         Raises:
             ValueError: more than `synthetic.people.max_people_cached`.

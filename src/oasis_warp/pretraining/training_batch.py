@@ -1,4 +1,4 @@
-"""Pictures of posed hands as training batches: right hands, cropped as photos are, seen with an estimator's errors."""
+"""Training batches from pictures of posed hands: mirrored to right hands, cropped, with the estimator's errors."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -26,9 +26,9 @@ CROP_MARGIN = 1.12
 
 @runtime_checkable
 class LabelledPictures(Protocol):
-    """N pictures and the truth about them: what a renderer of hands hands over.
+    """N pictures with ground truth, from any renderer of hands.
 
-    Camera frames throughout; the pose of a left hand describes the mirrored model (x -> -x).
+    Poses are in the camera's frame; that of a left hand describes the mirrored model (x -> -x).
     """
 
     @property
@@ -58,7 +58,7 @@ class LabelledPictures(Protocol):
 
     @property
     def translation(self) -> Float[Tensor, "N 3"]:
-        """Of the hand's origin [m]."""
+        """Position of the hand's origin [m]."""
         ...
 
     @property
@@ -79,16 +79,16 @@ class LabelledPictures(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorNoise:
-    """How much of the estimator's errors is in what the network is given; 1 as they were measured, 0 for none."""
+    """Strength of the estimator's errors in the network's input: 1 as measured, 0 for none."""
 
     surface: float = 1.0
-    """Of those of pose, shape and camera."""
+    """Of errors in pose, shape and camera."""
     mask: float = 1.0
-    """Of those of the mask, and so of the crop round it."""
+    """Of errors in the mask, and so in the crop around it."""
 
 
 class Crops(NamedTuple):
-    """Square cuts, channels last."""
+    """Square crops, channels last."""
 
     planes: Float[Tensor, "N s s C"]
     K: Float[Tensor, "N 3 3"]
@@ -100,9 +100,9 @@ def crop_to_mask(
     K: Float[Tensor, "N 3 3"],
     size: int,
 ) -> Crops:
-    """The squares round the masks as `size` pixels, bilinear.
+    """Crop the squares around the masks to `size` pixels, bilinearly and without waiting for the device.
 
-    An empty mask keeps the whole picture. Nothing waits for the device.
+    An empty mask keeps the whole picture.
     """
     full = planes.shape[1]
     inside = mask > 0.5
@@ -122,7 +122,7 @@ def crop_to_mask(
 
 
 def _extent(touched: Tensor) -> tuple[Tensor, Tensor]:
-    """First and one past the last true place of each row, as floats; the whole row where none is."""
+    """Index of the first true value of each row, and one past the last, as floats; the whole row if none is true."""
     n = touched.shape[1]
     first = touched.int().argmax(1)
     last = n - touched.flip(1).int().argmax(1)
@@ -130,7 +130,7 @@ def _extent(touched: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def mirror_left_hands(pictures: LabelledPictures) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Image, alpha, mask, orientation, translation and K, left hands seen in the mirror."""
+    """Image, alpha, mask, orientation, translation and K, with left hands mirrored to right ones."""
     left = pictures.left.bool()
 
     def flip(planes: Tensor) -> Tensor:
@@ -154,15 +154,15 @@ def training_batch(
     random: torch.Generator,
     noise: EstimatorNoise = EstimatorNoise(),
 ) -> TrainingBatch:
-    """B photos and T pictures of each one's hand, as the network is to be given them.
+    """B photos and T target pictures of each hand as a training batch.
 
     Args:
-        hand: On the device of the pictures.
-        photos: B of them, with everything that photos have.
-        targets: B T of them, those of the first hand first: what the avatar must look like, the hand alone over black.
+        hand: Hand model on the device of the pictures.
+        photos: B photos.
+        targets: B T pictures of the hands over black, those of the first hand first.
         size: Side of the crops [px].
-        random: On the CPU, of the estimator's errors; the same state gives the same batch.
-        noise: How large they are; they are in the photo's `posed`, `K`, `mask` and crop, nowhere else.
+        random: Generator on the CPU of the estimator's errors; the same state gives the same batch.
+        noise: Strength of these errors, which affect only the photo's `posed`, `K`, `mask` and crop.
     """
     image, alpha, mask, orientation, translation, K = mirror_left_hands(photos)
     count, like = len(image), translation
@@ -186,7 +186,7 @@ def training_batch(
     cut = crop_to_mask(torch.cat([alone, torch.stack([goal_mask, hidden], -1)], dim=-1), goal_mask, goal_K, size)
     still = torch.eye(4, dtype=like.dtype, device=like.device)
 
-    def by_hand(tensor: Tensor) -> Tensor:
+    def per_hand(tensor: Tensor) -> Tensor:
         return tensor.unflatten(0, (count, views))
 
     return TrainingBatch(
@@ -196,10 +196,10 @@ def training_batch(
         viewmat=still.expand(count, -1, -1),
         K=crop.K,
         rest=true.rest,
-        target_images=by_hand(cut.planes[..., :3].clamp(0, 1)),
-        target_masks=by_hand(cut.planes[..., 3].clamp(0, 1)),
-        target_known=by_hand(1 - cut.planes[..., 4].clamp(0, 1)),
-        target_posed=by_hand(both.posed[count:]),
+        target_images=per_hand(cut.planes[..., :3].clamp(0, 1)),
+        target_masks=per_hand(cut.planes[..., 3].clamp(0, 1)),
+        target_known=per_hand(1 - cut.planes[..., 4].clamp(0, 1)),
+        target_posed=per_hand(both.posed[count:]),
         target_viewmats=still.expand(count, views, -1, -1),
-        target_Ks=by_hand(cut.K),
+        target_Ks=per_hand(cut.K),
     )
