@@ -11,12 +11,13 @@ from oasis_warp.avatar.pose import in_even_light, pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.checks import check_shape
-from oasis_warp.core.config import WHITE, Color
+from oasis_warp.core.config import WHITE
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_canonical, mirror_hand, mirror_light, mirror_points
 from oasis_warp.core.types import (
     Camera,
     CanonicalGaussians,
+    Color,
     Gaussians,
     HandLight,
     HandPose,

@@ -12,10 +12,9 @@ from oasis_warp.cli.console import check_device, show_progress
 from oasis_warp.cli.options import Animate
 from oasis_warp.cli.render import check_side, choose_pose, read_color
 from oasis_warp.core.camera import orbit_camera
-from oasis_warp.core.config import Color
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
-from oasis_warp.core.types import HandPose
+from oasis_warp.core.types import Color, HandPose
 from oasis_warp.data.pictures import VIDEO_SUFFIXES, check_suffix, to_uint8, write_video
 from oasis_warp.hand.poses import POSE_NAMES, pose_sequence
 from oasis_warp.hand_avatar import Avatar

@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="oasis",
         description=f"One photo of a hand in, an animatable 3D Gaussian avatar out. oasis_warp {__version__}",
         args=arguments,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     logging.basicConfig(format="oasis: %(message)s")
     # A batch system's SIGTERM ends the work as Ctrl-C does: what is half-written is taken away.

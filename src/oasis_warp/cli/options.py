@@ -7,9 +7,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
+from tyro.conf import Positional, arg, subcommand
 
+from oasis_warp.core.config import EditConfig, ReconstructConfig
+
+# Options that several commands share, with their help.
 Output = Annotated[Path, arg(aliases=["-o"], metavar="PATH")]
+OutputFolder = Annotated[
+    Path, arg(aliases=["-o"], metavar="PATH", help="Folder for the results; its parent must exist.")
+]
+AvatarFile = Positional[Annotated[Path, arg(help="avatar.safetensors of `oasis reconstruct`.")]]
+BackboneWeights = Annotated[
+    Path | None, arg(help="DINOv2's model.safetensors, for a network of your own in the paper's profile.")
+]
+JsonFile = Annotated[Path | None, arg(help="File to write the numbers to as well.")]
+CsvFile = Annotated[Path | None, arg(help="The same as a table.")]
+Device = Annotated[Literal["cpu", "cuda"], arg(help="Where to compute.")]
+Threads = Annotated[int, arg(help="CPU threads.")]
+Elevation = Annotated[float, arg(help="Degrees above the hand.")]
+Light = Annotated[
+    Literal["photo", "even"],
+    arg(help="The photo's light, as far as it is known apart from the skin, or even light."),
+]
 FamilyName = Literal[
     "rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "skin"
 ]
@@ -18,7 +37,18 @@ PoseName = Literal["photo", "rest", "open", "relaxed", "fist", "pinch", "thumbs_
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reconstruct:
+class _Photos:
+    photos: Positional[tuple[Path, ...]]
+    """JPEG, PNG, WebP, AVIF, BMP or TIFF files."""
+    out: OutputFolder
+    same_hand: bool = False
+    """All photos show one hand: make one avatar of them, in the first one's light."""
+    keypoints: Path | None = None
+    """JSON file with 21 landmarks, or with pose and camera, to use instead of the networks; for one photo only."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct(ReconstructConfig, _Photos):
     """Turn photos of a hand into avatars: avatar.safetensors, summary.png, quality.png, turntable.mp4 and report.json.
 
     One photo's files go into the folder --out itself, those of several into a folder each, --out/NAME for NAME.jpg.
@@ -26,69 +56,32 @@ class Reconstruct:
     files in the folder stay.
     """
 
-    photos: Positional[tuple[Path, ...]]
-    """JPEG, PNG, WebP, AVIF, BMP or TIFF files."""
-    out: Output
-    """Folder for the results; its parent must exist."""
-    same_hand: FlagCreatePairsOff[bool] = False
-    """All photos show one hand: make one avatar of them, in the first one's light."""
-    hand: Literal["left", "right", "largest"] | int = "largest"
-    """Which hand of the photo: a side, the largest, or a number from 0 for the best found, 1 for the next."""
-    keypoints: Path | None = None
-    """JSON file with 21 landmarks, or with pose and camera, to use instead of the networks; for one photo only."""
-    prior: Literal["learned", "none"] | Path = "learned"
-    """What to assume of the hand before the photo is fitted: what the bundled network sees in the photo, only mean
-    colours in its skin tone, or what your own network sees: network.safetensors of `oasis pretrain`."""
-    backbone_weights: Path | None = None
-    """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
-    refine: Literal["on", "off"] = "off"
-    """Move the fitted hand to where what the prior saw in the photo explains it better, and look again; or leave it."""
-    light: Literal["fit", "keep", "even"] = "fit"
-    """The photo's light: fit it, so that it stays where it is when the hand turns; keep it on the skin, shadows too; or
-    leave it out wherever one can tell."""
-    steps: int | None = None
-    """Steps of texture learning; stops by itself when not given."""
-    seed: int = 0
-    """The same seed gives the same avatar."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
-    size: int | Literal["auto"] = "auto"
-    """Side of the square crop whose detail the avatar shows [px], 64 to 1024; by itself the photo's own, from 256 to
-    1024."""
-    force: FlagCreatePairsOff[bool] = False
-    """Go on with a fit that is too poor to be trusted."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
     """Draw an avatar: one picture of any pose from any side."""
 
-    avatar: Positional[Path]
-    """avatar.safetensors of `oasis reconstruct`."""
+    avatar: AvatarFile
     out: Output
     """Picture to write: .png, .webp or .jpg."""
     pose: PoseName = "photo"
     """Pose of the hand; "photo" is the one in the photo."""
     azimuth: float = 0.0
     """Degrees around the hand; 0 is where the photo was taken from."""
-    elevation: float = 0.0
-    """Degrees above the hand."""
+    elevation: Elevation = 0.0
     size: int = 512
     """Side of the picture [px]."""
-    light: Literal["photo", "even"] = "photo"
-    """The photo's light, as far as it is known apart from the skin, or even light."""
+    light: Light = "photo"
     background: str = "white"
     """white, black, transparent, or a colour as rrggbb."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
+    device: Device = "cpu"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Animate:
     """Make a film of an avatar: a turn around it, or a walk through poses. Both loop."""
 
-    avatar: Positional[Path]
-    """avatar.safetensors of `oasis reconstruct`."""
+    avatar: AvatarFile
     out: Output
     """Film to write: .mp4 or .gif."""
     motion: Literal["turntable", "poses"] = "turntable"
@@ -101,16 +94,13 @@ class Animate:
     """Length of the film."""
     fps: float = 24.0
     """Frames a second."""
-    elevation: float = 0.0
-    """Degrees above the hand."""
+    elevation: Elevation = 0.0
     size: int = 384
     """Side of the picture [px]."""
-    light: Literal["photo", "even"] = "photo"
-    """The photo's light, as far as it is known apart from the skin, or even light."""
+    light: Light = "photo"
     background: str = "white"
     """white, black, or a colour as rrggbb."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
+    device: Device = "cpu"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,9 +133,8 @@ class ErrorTime:
     the float64 kernels with the default rules; times are medians of calls timed in turns.
     """
 
-    out: Output
-    """Folder for the results; its parent must exist."""
-    quick: FlagCreatePairsOff[bool] = False
+    out: OutputFolder
+    quick: bool = False
     """The bundled hand only, and few repeats: for a look, not for a verdict."""
     repeats: int | None = None
     """Timed calls of each setting: 20 when not given, 5 with --quick."""
@@ -153,8 +142,7 @@ class ErrorTime:
     """Side of the pictures of the hand [px]; a multiple of 4."""
     seed: int = 0
     """Of the scenes and the gradients' weights."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
+    device: Device = "cpu"
     threads: int = 1
     """CPU threads of the default setting; the knob "threads" tries other numbers up to that of the cores."""
 
@@ -167,10 +155,8 @@ class Kernels:
     visibility, an avatar's frame and a step of learning, on the host's clock and in CUDA graphs.
     """
 
-    json: Path | None = None
-    """File to write the numbers to as well."""
-    csv: Path | None = None
-    """The same as a table."""
+    json: JsonFile = None
+    csv: CsvFile = None
     plot: Path | None = None
     """Picture of the times: .png or .svg; needs matplotlib."""
     only: str = ""
@@ -181,10 +167,8 @@ class Kernels:
     """Side of the picture [px], 256 when not given; on CUDA every case has its own."""
     gaussians: int | None = None
     """Gaussians drawn of the bundled hand's 36,881, 20,000 when not given; on CUDA every case has its own."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
-    threads: int = 1
-    """CPU threads."""
+    device: Device = "cpu"
+    threads: Threads = 1
     peer: Literal["gsplat"] | None = None
     """Time another rasterizer too, in turns with ours; on CUDA only."""
 
@@ -197,28 +181,23 @@ class Scaling:
     Every picture is compared with the float64 kernels, all of it or, where that would take long, a part.
     """
 
-    out: Output
-    """Folder for the results; its parent must exist."""
-    quick: FlagCreatePairsOff[bool] = False
+    out: OutputFolder
+    quick: bool = False
     """Small scenes only, in a minute on a CPU."""
     seconds: float | None = None
     """For timing each point: 2 when not given, 1 with --quick."""
     seed: int = 0
     """Of the scenes."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
-    threads: int = 1
-    """CPU threads."""
+    device: Device = "cpu"
+    threads: Threads = 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Roofline:
     """How near each CUDA kernel comes to what the GPU can do, which is measured first."""
 
-    json: Path | None = None
-    """File to write the numbers to as well."""
-    csv: Path | None = None
-    """The same as a table."""
+    json: JsonFile = None
+    csv: CsvFile = None
     plot: Path | None = None
     """Picture: .png or .svg; needs matplotlib."""
     seed: int = 0
@@ -264,10 +243,9 @@ class Synthesize:
     """Photos with everything, or hands alone in even light on black."""
     backgrounds: Path | None = None
     """Folder of pictures to put behind the hands, instead of rooms."""
-    sheet: FlagCreatePairsOff[bool] = False
+    sheet: bool = False
     """One contact sheet instead of shards."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
+    device: Device = "cpu"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -297,8 +275,7 @@ class Pretrain:
     """Side of photos and targets [px], a multiple of 16."""
     seed: int = 0
     """Of the weights, the people, the pictures and the estimator's errors."""
-    device: Literal["cpu", "cuda"] = "cuda"
-    """Where to compute."""
+    device: Device = "cuda"
     precision: Literal["bf16", "float32"] = "bf16"
     """Of attention and perceptrons; all else is float32."""
     workers: int = 8
@@ -320,14 +297,12 @@ class Evaluate:
 
     folder: Positional[Path | None] = None
     """With a subfolder of photos for each hand, or with photos of one, for same-hand."""
-    out: Output
-    """Folder for the results; its parent must exist."""
+    out: OutputFolder
     dataset: Literal["synthetic", "same-hand"] = "synthetic"
     """What to measure on."""
     prior: Literal["learned", "none"] | Path = "learned"
     """The learned prior to hold against the mean hand, as for `oasis reconstruct`; none for the mean hand alone."""
-    backbone_weights: Path | None = None
-    """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
+    backbone_weights: BackboneWeights = None
     people: int = 16
     """Synthetic people without tattoo or ring, and as many with each."""
     targets: int = 4
@@ -340,22 +315,14 @@ class Evaluate:
     """Of people, pictures and adaptation."""
     lpips: tuple[Path, Path] | None = None
     """Weights of LPIPS: alexnet-owt-7be5be79.pth of torchvision and alex.pth of LPIPS; no LPIPS without them."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
+    device: Device = "cpu"
     workers: int = 0
     """Processes that measure synthetic people side by side; 0 for none."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Edit:
-    """Bring what was painted on an avatar's photo into the avatar.
-
-    Paint on the photo in any program, save the whole picture under another name, and give both. Writes the new avatar,
-    NAME.png with before and after, and NAME.json with what was measured.
-    """
-
-    avatar: Positional[Path]
-    """avatar.safetensors of `oasis reconstruct`."""
+class _Painting:
+    avatar: AvatarFile
     painted: Positional[Path]
     """The painted photo; scaled or saved as JPEG is fine, cut or turned is not."""
     photo: Path | None = None
@@ -364,11 +331,15 @@ class Edit:
     """Picture that is white where there is paint, instead of the difference."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="PATH")] = None
     """Avatar file to write, NAME.safetensors: AVATAR-PAINTED.safetensors beside the avatar when not given."""
-    overwrite: FlagCreatePairsOff[bool] = False
+    overwrite: bool = False
     """Replace files of an earlier edit."""
-    steps: int = 40
-    """Steps of the colours' fit."""
-    size: int = 1024
-    """Side of the square around the hand above which the painted picture is scaled down [px]."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
+    device: Device = "cpu"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edit(EditConfig, _Painting):
+    """Bring what was painted on an avatar's photo into the avatar.
+
+    Paint on the photo in any program, save the whole picture under another name, and give both. Writes the new avatar,
+    NAME.png with before and after, and NAME.json with what was measured.
+    """

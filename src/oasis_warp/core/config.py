@@ -1,11 +1,11 @@
-"""Every option of the pipeline as a frozen dataclass; the text under a field is its `--help`."""
+"""The options of the pipeline as frozen dataclasses; the text under a field is its `--help`.
+
+The command line imports this module, so that it must stay free of torch: `oasis --help` answers at once.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
-
-from jaxtyping import Float
-from torch import Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +52,10 @@ class ReconstructConfig:
     hand: Literal["left", "right", "largest"] | int = "largest"
     """Which hand of the photo: a side, the largest, or a number from 0 for the best found, 1 for the next."""
     prior: Literal["learned", "none"] | Path = "learned"
-    """What to assume of a hand before its photo is fitted: what the bundled network sees in the photo, nothing but mean
-    colours in its skin tone, or what a network of your own sees, of which this is the weights file."""
+    """What to assume of the hand before the photo is fitted: what the bundled network sees in the photo, only mean
+    colours in its skin tone, or what your own network sees: network.safetensors of `oasis pretrain`."""
     backbone_weights: Path | None = None
-    """DINOv2's model.safetensors, for a network of your own that reads photos with it."""
+    """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
     refine: Literal["on", "off"] = "off"
     """Move the fitted hand to where what the prior saw in the photo explains it better, and look again; or leave it."""
     light: Literal["fit", "keep", "even"] = "fit"
@@ -68,7 +68,8 @@ class ReconstructConfig:
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""
     size: int | Literal["auto"] = "auto"
-    """Side of the square crop whose detail the avatar shows [px]; by itself the photo's own, from 256 to 1024."""
+    """Side of the square crop whose detail the avatar shows [px], 64 to 1024; by itself the photo's own, from 256 to
+    1024."""
     force: bool = False
     """Go on with a fit that is too poor to be trusted."""
 
@@ -83,6 +84,5 @@ class EditConfig:
     """Side of the square around the hand above which the painted picture is scaled down [px]."""
 
 
-Color = tuple[float, float, float] | Float[Tensor, "3"]
 WHITE = (1.0, 1.0, 1.0)
 BLACK = (0.0, 0.0, 0.0)

@@ -10,6 +10,8 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 Side = Literal["left", "right"]
+Color = tuple[float, float, float] | Float[Tensor, "3"]
+"""sRGB in [0, 1]."""
 
 
 class Photo(NamedTuple):

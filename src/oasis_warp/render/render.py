@@ -3,8 +3,8 @@
 from torch import Tensor
 
 from oasis_warp.core.backgrounds import plain_background
-from oasis_warp.core.config import BLACK, Color
-from oasis_warp.core.types import Camera, Gaussians, Render
+from oasis_warp.core.config import BLACK
+from oasis_warp.core.types import Camera, Color, Gaussians, Render
 from oasis_warp.ops import BlendWeights, blend_weights, rasterization
 
 
