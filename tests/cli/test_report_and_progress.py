@@ -12,7 +12,7 @@ from oasis_warp.core.config import ReconstructConfig
 
 def test_a_report_holds_the_run(scene, made):
     made = made._replace(warnings=("the thumb is hidden",))
-    report = json.loads(to_json(make_report(scene[0], made, ReconstructConfig(seed=3), {"fit": 0.25, "save": 0.5})))
+    report = json.loads(to_json(make_report([scene[0]], made, ReconstructConfig(seed=3), {"fit": 0.25, "save": 0.5})))
     assert report["photo"]["name"] == "known.png"
     assert report["hand"] == {"side": "right", "side_score": 0.99, "presence": 0.98, "landmarks_from": "network"}
     assert report["config"]["seed"] == 3
@@ -29,14 +29,14 @@ def test_numbers_that_json_does_not_know_become_null():
 
 def test_a_path_is_written_as_text(scene, made):
     config = ReconstructConfig(prior=Path("own") / "network.safetensors")
-    report = json.loads(to_json(make_report(scene[0], made, config, {})))
+    report = json.loads(to_json(make_report([scene[0]], made, config, {})))
     assert report["config"]["prior"] == str(Path("own") / "network.safetensors")
 
 
 def test_the_table_says_everything_in_words(scene, made):
     made = made._replace(errors={**made.errors, "new_measure": 0.123456}, warnings=("the thumb is hidden",))
     out = io.StringIO()
-    print_report(Console(file=out, width=100), make_report(scene[0], made, ReconstructConfig(), {"fit": 1.234}))
+    print_report(Console(file=out, width=100), make_report([scene[0]], made, ReconstructConfig(), {"fit": 1.234}))
     text = out.getvalue()
     said = ("fit", "1.23 s", "total", "likeness to the photo", "30.0 dB", "new_measure", "0.1235")
     for part in ("prior learned", *said):

@@ -19,7 +19,7 @@ from oasis_warp.cli.summary import (
 
 def test_the_summary_has_three_rows_of_panels_that_all_show_something(scene, made):
     reports = []
-    sheet = draw_summary(scene[0], made, progress=lambda *report: reports.append(report)).numpy()
+    sheet = draw_summary([scene[0]], made, progress=lambda *report: reports.append(report)).numpy()
     assert sheet.shape[1] == WIDTH
     total = 1 + VIEWS + len(POSES)
     assert reports == [("summary", n, total) for n in range(1, total + 1)]
@@ -30,7 +30,7 @@ def test_the_summary_has_three_rows_of_panels_that_all_show_something(scene, mad
 
 
 def test_the_avatars_panel_matches_the_photos(scene, made):
-    sheet = draw_summary(scene[0], made).numpy().astype(int)
+    sheet = draw_summary([scene[0]], made).numpy().astype(int)
     side, top = panel_side(4, WIDTH), 24 + 44
     photo, _, mask, avatar = (sheet[top : top + side, 24 + k * (side + 12) :][:, :side] for k in range(4))
     hand = mask[..., 0] > 250
@@ -40,7 +40,7 @@ def test_the_avatars_panel_matches_the_photos(scene, made):
 
 
 def test_doubts_are_mentioned(scene, made):
-    sure, doubtful = (draw_summary(scene[0], made._replace(warnings=w)) for w in ((), ("a finger is hidden",)))
+    sure, doubtful = (draw_summary([scene[0]], made._replace(warnings=w)) for w in ((), ("a finger is hidden",)))
     assert (sure[:68] != doubtful[:68]).any()
     assert torch.equal(sure[68:], doubtful[68:])
 

@@ -25,7 +25,7 @@ from oasis_warp.render.render import render
 def turntable(
     avatar: Avatar, pose: HandPose, n_frames: int, size: int, *, elevation: float, background: Color, progress: Progress
 ) -> Iterator[UInt8[Tensor, "size size 3"]]:
-    """`n_frames` views all around the hand in `pose`, the photo's own first, from `elevation` [rad] above."""
+    """`n_frames` views around the hand in `pose`, from the photo's view on, `elevation` [rad] above the hand."""
     gaussians, vertices = avatar.pose(pose), avatar.mesh(pose).vertices
     for frame in range(n_frames):
         camera = orbit_camera(vertices, 2 * math.pi * frame / n_frames, elevation, size)
@@ -44,9 +44,9 @@ def pose_frames(
     background: Color,
     progress: Progress,
 ) -> Iterator[UInt8[Tensor, "size size 3"]]:
-    """About `n_frames` frames through the named poses and back to the first, from where the photo was taken.
+    """About `n_frames` frames through the named poses and back to the first, from the direction of the photo.
 
-    The camera stands still where it sees all of the poses whole.
+    The camera does not move and sees all poses completely.
     """
     steps = max(1, round(n_frames / len(names)))
     poses = [avatar.source_pose._replace(angles=angles) for angles in pose_sequence(avatar.hand, names, steps)]
@@ -61,7 +61,7 @@ MAX_FRAMES = 10_000
 
 
 def run(options: Animate) -> int:
-    """Make the film.
+    """Write the video.
 
     Raises:
         InputError: a wrong avatar file, option or output.
@@ -86,10 +86,10 @@ def run(options: Animate) -> int:
 
 
 def count_frames(seconds: float, fps: float) -> int:
-    """Frames of a film.
+    """Number of frames of a video.
 
     Raises:
-        InputError: a rate or length that makes no film.
+        InputError: a rate or length out of range.
     """
     if not 1 <= fps <= 120:
         raise InputError(f"--fps {fps:g}: expected 1 to 120 frames a second; choose another rate.")
@@ -99,7 +99,7 @@ def count_frames(seconds: float, fps: float) -> int:
 
 
 def read_names(text: str) -> list[str]:
-    """The pose names in `text`, which has commas between them.
+    """Split `text` at commas into pose names.
 
     Raises:
         InputError: none, or an unknown one.

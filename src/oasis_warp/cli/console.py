@@ -20,12 +20,12 @@ INTERRUPTED = 130
 
 
 LINE_EVERY = 5.0
-"""Seconds between the lines of one stage where there is no terminal."""
+"""Seconds between two lines of one stage without a terminal."""
 
 
 @contextlib.contextmanager
 def show_progress(console: Console) -> Iterator[Progress]:
-    """A `Progress` that shows itself on `console` for as long as the block runs."""
+    """Show a `Progress` on `console` while the block runs: bars on a terminal, else lines."""
     if not console.is_terminal:
         yield line_progress(lambda line: console.print(line, highlight=False, soft_wrap=True))
         return
@@ -35,7 +35,7 @@ def show_progress(console: Console) -> Iterator[Progress]:
 
 
 def bar_progress(bars: Bars) -> Progress:
-    """A bar a stage."""
+    """A `Progress` with one bar per stage."""
     tasks = {}
 
     def progress(stage: str, done: int, total: int) -> None:
@@ -47,7 +47,7 @@ def bar_progress(bars: Bars) -> Progress:
 
 
 def line_progress(write: Callable[[str], object], clock: Callable[[], float] = time.monotonic) -> Progress:
-    """A line when a stage ends, and every `LINE_EVERY` seconds while it lasts."""
+    """A `Progress` that writes a line at the end of each stage, and every `LINE_EVERY` seconds before."""
     started: dict[str, float] = {}
     written: dict[str, float] = {}
 

@@ -1,4 +1,4 @@
-"""`oasis edit`: a painted photo in, an avatar that wears the paint out."""
+"""`oasis edit`: bring what was painted on a photo into the avatar."""
 
 import math
 from pathlib import Path
@@ -6,12 +6,11 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from rich.table import Table
 
 from oasis_warp import __version__
 from oasis_warp.cli.console import check_device, show_progress
 from oasis_warp.cli.options import Edit as Options
-from oasis_warp.cli.report import to_json
+from oasis_warp.cli.report import measures_table, print_warnings, to_json
 from oasis_warp.cli.summary import GROUND, WIDTH, Panel, make_sheet, panel_side
 from oasis_warp.core.camera import crop_camera, orbit_camera
 from oasis_warp.core.config import EditConfig
@@ -26,9 +25,9 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 
 SIDES = (64, 4096)
-"""Of the painted picture's square around the hand [px]."""
-TURN = 0.5
-"""Of the views beside the photo's in the summary [rad]."""
+"""Smallest and largest side of the square around the hand [px]."""
+ANGLE = 0.5
+"""Angle of the other views in the summary [rad]."""
 POSES = ("open", "fist", "point")
 MEASURES = {
     "painted_mm2": ("skin painted", "{:.0f} mm²"),
@@ -38,7 +37,7 @@ MEASURES = {
     "input_psnr_db": ("likeness to the painted photo", "{:.1f} dB"),
     "unchanged_psnr_db": ("likeness to before, elsewhere", "{:.1f} dB"),
 }
-"""Words and unit for what `Edit.measures` holds."""
+"""Name and unit of the measures in `Edit.measures`."""
 
 
 def run(options: Options) -> int:
@@ -95,23 +94,15 @@ def _report(options: Options, made: Edit) -> dict[str, Any]:
 
 
 def _print(console: Console, report: dict[str, Any], out: Path) -> None:
-    table = Table(title=f"{report['painted']} on {report['avatar']}", show_header=False)
-    table.add_column()
-    table.add_column(justify="right")
-    for stage, seconds in report["seconds"].items():
-        table.add_row(stage, f"{seconds:.2f} s", end_section=stage == "total")
-    for name, value in report["measures"].items():
-        words, unit = MEASURES[name]
-        table.add_row(words, unit.format(value))
-    console.print(table)
+    title = f"{report['painted']} on {report['avatar']}"
+    console.print(measures_table(title, report["seconds"], report["measures"], MEASURES))
     console.print(f"written: {out}", highlight=False, soft_wrap=True)
-    for warning in report["warnings"]:
-        console.print(f"Warning: {warning}", style="yellow", highlight=False, soft_wrap=True)
+    print_warnings(console, report["warnings"])
 
 
 @torch.no_grad()
 def draw_edit(before: Avatar, made: Edit, title: str) -> torch.Tensor:
-    """Painted photo, mask, the avatar before and after in the photo's view; then other views and poses."""
+    """Draw the painted photo, the mask, the avatar before and after in the photo's view, and other views and poses."""
     side, after = panel_side(4, WIDTH), made.avatar
     n = len(made.image)
 
@@ -133,9 +124,9 @@ def draw_edit(before: Avatar, made: Edit, title: str) -> torch.Tensor:
     ]
     side = panel_side(2 + len(POSES), WIDTH)
     around = after.mesh(pose).vertices
-    views = [(turn, pose, around) for turn in (TURN, -TURN)]
+    views = [(angle, pose, around) for angle in (ANGLE, -ANGLE)]
     second = [
-        Panel(draw(after, orbit_camera(v, turn, 0.0, side), p), f"{math.degrees(turn):.0f}°") for turn, p, v in views
+        Panel(draw(after, orbit_camera(v, angle, 0.0, side), p), f"{math.degrees(angle):.0f}°") for angle, p, v in views
     ]
     for name in POSES:
         held = pose._replace(angles=named_pose(after.hand, name))

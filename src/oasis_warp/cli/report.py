@@ -1,4 +1,4 @@
-"""What a run did, how long it took and how well it went: as JSON for programs, as a table for people."""
+"""The report of a run: inputs, times and measures, as JSON for programs and as a table for people."""
 
 import json
 import math
@@ -33,17 +33,40 @@ MEASURES = {
     "uncertainty_mean": ("mean uncertainty", "{:.2f}"),
     "n_gaussians": ("Gaussians", "{:.0f}"),
 }
-"""Words and unit for what `Reconstruction.errors` holds; a measure without an entry is shown under its own name."""
+"""Name and unit of the measures in `Reconstruction.errors`; others are shown under their keys."""
+COLUMNS = {
+    "seen_percent": ("shows", "{:.0f} %"),
+    "best_percent": ("best in", "{:.0f} %"),
+    "reprojection_percent": ("landmarks off", "{:.1f} %"),
+    "mask_iou": ("fit and mask", "{:.3f}"),
+    "input_psnr_db": ("likeness", "{:.1f} dB"),
+}
+"""Heading and unit of the columns for several photos; shares are of the hand's surface."""
 
 
 def make_report(
-    photo: Photo, made: Reconstruction, config: ReconstructConfig, stages: Mapping[str, float]
+    photos: Sequence[Photo],
+    made: Reconstruction | FusedReconstruction,
+    config: ReconstructConfig,
+    stages: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Everything about a run that JSON can hold; `stages` [s] replaces `made.stages`."""
+    """All results of a run that JSON can hold; `stages` [s] replaces `made.stages`."""
+    if isinstance(made, Reconstruction):
+        inputs = {"photo": describe_photo(photos[0]), "hand": describe_hand(made.fit)}
+    else:
+        each = [
+            {
+                "photo": describe_photo(photo),
+                "hand": describe_hand(own.fit),
+                "gain": list(own.gain),
+                "errors": own.errors,
+            }
+            for photo, own in zip(photos, made.photos, strict=True)
+        ]
+        inputs = {"photos": each, "hand": {"side": made.avatar.side}}
     return {
         "creator": f"oasis_warp {__version__}",
-        "photo": about_photo(photo),
-        "hand": about_hand(made.fit),
+        **inputs,
         "prior": dict(made.prior),
         "config": asdict(config),
         "seconds": {**stages, "total": sum(stages.values())},
@@ -52,8 +75,8 @@ def make_report(
     }
 
 
-def about_photo(photo: Photo) -> dict[str, Any]:
-    """What was read."""
+def describe_photo(photo: Photo) -> dict[str, Any]:
+    """The photo as it was read."""
     height, width = photo.rgb.shape[:2]
     return {
         "name": photo.name,
@@ -65,8 +88,8 @@ def about_photo(photo: Photo) -> dict[str, Any]:
     }
 
 
-def about_hand(fit: HandFit) -> dict[str, Any]:
-    """What was found."""
+def describe_hand(fit: HandFit) -> dict[str, Any]:
+    """The hand as it was found."""
     landmarks = fit.landmarks
     return {
         "side": fit.side,
@@ -77,7 +100,7 @@ def about_hand(fit: HandFit) -> dict[str, Any]:
 
 
 def to_json(report: Mapping[str, Any]) -> str:
-    """`report` as JSON; a number that is not finite becomes null, a path its text."""
+    """`report` as JSON; numbers that are not finite become null, paths become text."""
 
     def clean(value: Any) -> Any:
         if isinstance(value, Mapping):
@@ -92,63 +115,32 @@ def to_json(report: Mapping[str, Any]) -> str:
 
 
 def print_report(console: Console, report: Mapping[str, Any]) -> None:
-    """Print the stages with their times, the measures and the warnings in words."""
-    title = f"{report['photo']['name']}: {report['hand']['side']} hand, prior {report['prior']['name']}"
-    table = Table(title=title, show_header=False)
-    table.add_column()
-    table.add_column(justify="right")
-    for stage, seconds in report["seconds"].items():
-        table.add_row(stage, f"{seconds:.2f} s", end_section=stage == "total")
-    for name, value in report["errors"].items():
-        words, unit = MEASURES.get(name, (name, "{:.4g}"))
-        table.add_row(words, unit.format(value))
+    """Print times and measures, or for several photos a line for each, and the warnings."""
+    hand = f"{report['hand']['side']} hand, prior {report['prior']['name']}"
+    if "photo" in report:
+        table = measures_table(f"{report['photo']['name']}: {hand}", report["seconds"], report["errors"], MEASURES)
+    else:
+        table = _photos_table(f"{len(report['photos'])} photos of a {hand}", report)
     console.print(table)
     print_warnings(console, report["warnings"])
 
 
-def print_warnings(console: Console, warnings: Sequence[str]) -> None:
-    """A line each."""
-    for warning in warnings:
-        console.print(f"Warning: {warning}", style="yellow", highlight=False, soft_wrap=True)
+def measures_table(
+    title: str, seconds: Mapping[str, float], measures: Mapping[str, float], names: Mapping[str, tuple[str, str]]
+) -> Table:
+    """A table of the times of stages and of measures, with name and unit of each from `names`."""
+    table = Table(title=title, show_header=False)
+    table.add_column()
+    table.add_column(justify="right")
+    for stage, duration in seconds.items():
+        table.add_row(stage, f"{duration:.2f} s", end_section=stage == "total")
+    for key, value in measures.items():
+        name, unit = names.get(key, (key, "{:.4g}"))
+        table.add_row(name, unit.format(value))
+    return table
 
 
-COLUMNS = {
-    "seen_percent": ("shows", "{:.0f} %"),
-    "best_percent": ("best in", "{:.0f} %"),
-    "reprojection_percent": ("landmarks off", "{:.1f} %"),
-    "mask_iou": ("fit and mask", "{:.3f}"),
-    "input_psnr_db": ("likeness", "{:.1f} dB"),
-}
-"""Heading and unit of what the table says of each photo; shares are of the hand's surface."""
-
-
-def make_fused_report(
-    photos: Sequence[Photo], made: FusedReconstruction, config: ReconstructConfig, stages: Mapping[str, float]
-) -> dict[str, Any]:
-    """Everything about a run that JSON can hold; `stages` [s] replaces `made.stages`."""
-    return {
-        "creator": f"oasis_warp {__version__}",
-        "photos": [
-            {
-                "photo": about_photo(photo),
-                "hand": about_hand(own.fit),
-                "gain": list(own.gain),
-                "errors": own.errors,
-            }
-            for photo, own in zip(photos, made.photos, strict=True)
-        ],
-        "hand": {"side": made.avatar.side},
-        "prior": dict(made.prior),
-        "config": asdict(config),
-        "seconds": {**stages, "total": sum(stages.values())},
-        "errors": made.errors,
-        "warnings": list(made.warnings),
-    }
-
-
-def print_fused_report(console: Console, report: Mapping[str, Any]) -> None:
-    """Print a line for every photo, and the warnings in words."""
-    title = f"{len(report['photos'])} photos of a {report['hand']['side']} hand, prior {report['prior']['name']}"
+def _photos_table(title: str, report: Mapping[str, Any]) -> Table:
     seen, seconds = report["errors"]["seen_percent"], report["seconds"]["total"]
     table = Table(title=title, caption=f"together {seen:.0f} % of the surface, {seconds:.1f} s")
     table.add_column("photo")
@@ -156,5 +148,10 @@ def print_fused_report(console: Console, report: Mapping[str, Any]) -> None:
         table.add_column(heading, justify="right")
     for own in report["photos"]:
         table.add_row(own["photo"]["name"], *(unit.format(own["errors"][name]) for name, (_, unit) in COLUMNS.items()))
-    console.print(table)
-    print_warnings(console, report["warnings"])
+    return table
+
+
+def print_warnings(console: Console, warnings: Sequence[str]) -> None:
+    """Print a line for each warning."""
+    for warning in warnings:
+        console.print(f"Warning: {warning}", style="yellow", highlight=False, soft_wrap=True)

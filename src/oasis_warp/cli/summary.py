@@ -1,4 +1,4 @@
-"""The picture that tells at a glance whether a reconstruction is good."""
+"""Draw summary.png and quality.png, which show at a glance whether a reconstruction is good; with OpenCV."""
 
 import itertools
 import math
@@ -33,7 +33,14 @@ OUTLINE = (255, 255, 255)
 FINGER_COLORS = ((236, 112, 99), (244, 176, 66), (98, 186, 112), (82, 152, 222), (166, 118, 214))
 """Thumb to little finger."""
 MARGIN, GAP, CAPTION, TITLE = 24, 12, 26, 44
-"""Of a sheet [px]."""
+"""Spacing of a sheet [px]."""
+WIDTH = 1600
+"""Width of a summary [px]."""
+GROUND = (0.93, 0.93, 0.92)
+"""Colour behind the avatar."""
+VIEWS = 6
+POSES = ("open", "fist", "victory", "point", "ok")
+SEEN_COLOR, GRAZED_COLOR, UNSEEN_COLOR = (0.30, 0.66, 0.42), (0.95, 0.76, 0.27), (0.62, 0.64, 0.68)
 
 
 class Panel(NamedTuple):
@@ -49,7 +56,7 @@ def write_text(sheet: Pixels, text: str, x: int, y: int, size: int, color: tuple
 
 
 def draw_landmarks(pixels: Pixels, points: np.ndarray) -> Pixels:
-    """The 21 points (wrist, then thumb to little finger), a line of one colour for each finger."""
+    """Draw the 21 landmarks and lines between them, with one colour per finger."""
     drawn = pixels.copy()
     width = max(1, round(pixels.shape[0] / 180))
 
@@ -67,7 +74,7 @@ def draw_landmarks(pixels: Pixels, points: np.ndarray) -> Pixels:
 
 
 def draw_mesh(pixels: Pixels, shade: np.ndarray, inside: np.ndarray, opacity: float = 0.55) -> Pixels:
-    """A shaded surface (`shade` in [0, 1] where `inside`) laid over a picture, with its outline."""
+    """Blend a shaded surface (`shade` in [0, 1] where `inside`) over a picture, with its outline."""
     grey = (np.array((150, 178, 210)) * shade[..., None]).clip(0, 255)
     blend = np.where(inside[..., None], opacity * grey + (1 - opacity) * pixels, pixels).round().astype(np.uint8)
     edges, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -75,12 +82,12 @@ def draw_mesh(pixels: Pixels, shade: np.ndarray, inside: np.ndarray, opacity: fl
 
 
 def panel_side(n_panels: int, width: int) -> int:
-    """Side of each of `n_panels` in one row of a sheet `width` pixels wide."""
+    """Side of each of `n_panels` panels in a row of a sheet that is `width` pixels wide."""
     return (width - 2 * MARGIN - GAP * (n_panels - 1)) // n_panels
 
 
 def make_sheet(title: str, subtitle: str, rows: Sequence[Sequence[Panel]], width: int) -> Pixels:
-    """Rows of panels on plain paper; the panels of a row have the `panel_side` of their number."""
+    """Arrange rows of square panels on a sheet; see `panel_side` for their sizes."""
     sides = [panel_side(len(row), width) for row in rows]
     height = 2 * MARGIN + TITLE + sum(side + CAPTION + GAP for side in sides) - GAP
     sheet = np.full((height, width, 3), PAPER, np.uint8)
@@ -98,35 +105,20 @@ def make_sheet(title: str, subtitle: str, rows: Sequence[Sequence[Panel]], width
     return sheet
 
 
-WIDTH = 1600
-GROUND = (0.93, 0.93, 0.92)
-"""Behind the avatar."""
-VIEWS = 6
-POSES = ("open", "fist", "victory", "point", "ok")
-
-
-def draw_summary(photo: Photo, made: Reconstruction, *, progress: Progress = silent) -> UInt8[Tensor, "H W 3"]:
-    """Photo, fit, mask and avatar in the photo's view; six views around; other poses. `WIDTH` pixels wide."""
-    fit = made.fit
-    measures = [f"landmarks {fit.reprojection:.1f} % off", f"mask overlap {fit.mask_iou:.2f}"]
-    if "input_psnr_db" in made.errors:
-        measures.append(f"{made.errors['input_psnr_db']:.1f} dB to the photo")
-    return _draw(made.avatar, [(photo, fit)], measures, bool(made.warnings), progress)
-
-
-def draw_fused_summary(
-    photos: Sequence[Photo], made: FusedReconstruction, *, progress: Progress = silent
-) -> UInt8[Tensor, "H W 3"]:
-    """The same with a row for every photo; the avatar is in the light of the first."""
-    fits = [photo.fit for photo in made.photos]
-    measures = [f"{made.errors['seen_percent']:.0f} % of the surface seen"]
-    return _draw(made.avatar, list(zip(photos, fits, strict=True)), measures, bool(made.warnings), progress)
-
-
 @torch.no_grad()
-def _draw(
-    avatar: Avatar, photos: Sequence[tuple[Photo, HandFit]], measures: list[str], doubtful: bool, progress: Progress
+def draw_summary(
+    photos: Sequence[Photo], made: Reconstruction | FusedReconstruction, *, progress: Progress = silent
 ) -> UInt8[Tensor, "H W 3"]:
+    """A row for every photo with fit, mask and avatar, then views around the avatar, then other poses."""
+    avatar = made.avatar
+    if isinstance(made, Reconstruction):
+        fits, fit = [made.fit], made.fit
+        measures = [f"landmarks {fit.reprojection:.1f} % off", f"mask overlap {fit.mask_iou:.2f}"]
+        if "input_psnr_db" in made.errors:
+            measures.append(f"{made.errors['input_psnr_db']:.1f} dB to the photo")
+    else:
+        fits = [photo.fit for photo in made.photos]
+        measures = [f"{made.errors['seen_percent']:.0f} % of the surface seen"]
     drawn, total = itertools.count(1), len(photos) + VIEWS + len(POSES)
 
     def draw(camera: Camera, pose: HandPose) -> Pixels:
@@ -134,28 +126,29 @@ def _draw(
         progress("summary", next(drawn), total)
         return picture
 
-    first = photos[0][1]
+    first = fits[0]
     side, around = panel_side(VIEWS, WIDTH), avatar.mesh(first.pose).vertices
     views = [
         Panel(draw(orbit_camera(around, 2 * math.pi * k / VIEWS, 0.0, side), first.pose), f"{360 * k // VIEWS}°")
         for k in range(VIEWS)
     ]
     held = {name: avatar.source_pose._replace(angles=named_pose(avatar.hand, name)) for name in POSES}
-    reach = torch.cat([avatar.mesh(pose).vertices for pose in held.values()])  # one camera: the poses compare
+    # All poses share one camera, so that they can be compared.
+    reach = torch.cat([avatar.mesh(pose).vertices for pose in held.values()])
     camera = orbit_camera(reach, 0.0, 0.0, panel_side(len(POSES), WIDTH))
     poses = [Panel(draw(camera, pose), name) for name, pose in held.items()]
-    rows = [photo_row(photo, avatar, fit, draw, panel_side(4, WIDTH)) for photo, fit in photos]
-    if doubtful:
+    side = panel_side(4, WIDTH)
+    rows = [photo_row(photo, avatar, fit, draw, side) for photo, fit in zip(photos, fits, strict=True)]
+    if made.warnings:
         measures = [*measures, "doubtful: see the warnings in report.json"]
-    names = ", ".join(photo.name for photo, _ in photos)
-    title = f"{names}, {first.side} hand"
+    title = f"{', '.join(photo.name for photo in photos)}, {first.side} hand"
     return torch.from_numpy(make_sheet(title, ", ".join(measures), [*rows, views, poses], WIDTH))
 
 
 def photo_row(
     photo: Photo, avatar: Avatar, fit: HandFit, draw: Callable[[Camera, HandPose], Pixels], size: int
 ) -> list[Panel]:
-    """Crop, fit over it, mask and avatar, all in the photo's view."""
+    """Panels in the photo's view: the crop, the fit over it, the mask and the avatar."""
     left, top, side = square_around(fit.mask, CROP_MARGIN)
     camera = crop_camera(fit.camera, left, top, side, size)
     rgb = photo.rgb.float() / 255
@@ -174,7 +167,7 @@ def photo_row(
 
 
 def shade_mesh(posed: PosedHand, faces: Tensor, camera: Camera) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """Brightness of the posed surface under a light at the camera, and where it is (1 inside, 0 outside)."""
+    """Brightness of the posed surface under a light at the camera, and its mask (1 inside, 0 outside)."""
     vertices = posed.vertices.cpu()
     faces = faces.cpu()
     seen = depth_map(vertices, faces, camera.viewmat.to(vertices), camera.K.to(vertices), camera.width, camera.height)
@@ -185,12 +178,9 @@ def shade_mesh(posed: PosedHand, faces: Tensor, camera: Camera) -> tuple[Float[T
     return torch.where(inside, 0.35 + 0.65 * facing, 0.0), inside.to(vertices)
 
 
-SEEN_COLOR, GRAZED_COLOR, UNSEEN_COLOR = (0.30, 0.66, 0.42), (0.95, 0.76, 0.27), (0.62, 0.64, 0.68)
-
-
 @torch.no_grad()
 def draw_quality(title: str, avatar: Avatar, quality: SurfaceQuality) -> UInt8[Tensor, "H W 3"]:
-    """Visibility and uncertainty on the hand in the (first) photo's pose, from that photo's side and from behind."""
+    """Draw visibility and uncertainty on the hand in the first photo's pose, from its side and from behind."""
     side = panel_side(4, WIDTH)
     posed = PosedHand(*(part.cpu() for part in avatar.mesh(avatar.source_pose)))
     faces, visibility = avatar.hand.faces.cpu(), quality.visibility.cpu()
@@ -202,8 +192,8 @@ def draw_quality(title: str, avatar: Avatar, quality: SurfaceQuality) -> UInt8[T
         for what, colors in (("seen (green), grazed (yellow)", shown), ("uncertainty", _heat(quality.uncertainty)))
         for where, azimuth in (("from the photo's side", 0.0), ("from behind", math.pi))
     ]  # fmt: skip
-    said = "uncertainty: blue is as the photo shows it, yellow is guessed"
-    return torch.from_numpy(make_sheet(title, said, [panels], WIDTH))
+    subtitle = "uncertainty: blue is as the photo shows it, yellow is guessed"
+    return torch.from_numpy(make_sheet(title, subtitle, [panels], WIDTH))
 
 
 def _heat(values: Float[Tensor, "V"]) -> Float[Tensor, "V 3"]:
@@ -212,7 +202,7 @@ def _heat(values: Float[Tensor, "V"]) -> Float[Tensor, "V 3"]:
 
 
 def _paint(posed: PosedHand, faces: Tensor, colors: Float[Tensor, "V 3"], camera: Camera) -> Pixels:
-    """The surface in the `colors` of its vertices, lit a little so that its shape can be seen."""
+    """Render the surface with vertex colours and weak shading that shows its shape."""
     seen = depth_map(posed.vertices, faces, camera.viewmat, camera.K, camera.width, camera.height)
     shade, inside = shade_mesh(posed, faces, camera)
     own = (colors[faces[seen.face_ids.clamp_min(0).long()]] * seen.barycentrics[..., None]).sum(-2)
