@@ -1,9 +1,9 @@
-"""The avatar file: safetensors with a JSON header, so that loading one executes nothing.
+"""The avatar file: safetensors with a JSON header, so that loading one executes no code.
 
-Tensors lie in the file as the tables `TENSORS`, `LIGHT`, `SHADE` and `FINE_SHADE` say. Its metadata have one entry,
-"oasis-avatar": the header, a JSON object whose `version` is 4, or less in files from before there was light (1), shade
-(2) or shade of single Gaussians (3). A file of a newer version is refused. (One entry, because safetensors writes
-several in any order: the same avatar shall be the same bytes.)
+The tables `TENSORS`, `LIGHT`, `SHADE` and `FINE_SHADE` describe the tensors. The metadata have one entry,
+"oasis-avatar": the header, a JSON object whose `version` is 4, or less in files without light (1), shade (2) or shade
+per Gaussian (3). Files of newer versions are refused. There is only one entry because safetensors writes several in any
+order, and the same avatar must give the same bytes.
 """
 
 import json
@@ -28,7 +28,7 @@ UNITS = {"length": "m", "angle": "rad", "quaternion": "wxyz", "color": "sRGB in 
 
 
 class Entry(NamedTuple):
-    """What a tensor of the file must look like."""
+    """Type and shape of a tensor of the file."""
 
     dtype: torch.dtype
     shape: tuple[int | str, ...]
@@ -71,14 +71,14 @@ FINE_SHADE = {
     "gaussians.shade": Entry(torch.float32, ("N", 3)),
 }
 HEADER = {"version": int, "side": str, "hand_model": str, "hand_licence": str, "source_camera": dict}
-"""Keys that a header has at least, and their types; `source_camera` holds `width` and `height` [px]."""
+"""Required keys of a header and their types; `source_camera` holds `width` and `height` [px]."""
 
 
 def save_avatar(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Write an avatar file, all or nothing.
+    """Write an avatar file atomically.
 
     Args:
-        path: Where to; an existing file is replaced.
+        path: Path of the file; an existing one is replaced.
         tensors: One for every name of `TENSORS`, of `LIGHT` or none of them, then of `SHADE` or none, then of
             `FINE_SHADE` or none, on any device.
         header: The keys of `HEADER` and any others; `version`, `units`, `counts` and `creator` are filled in.
@@ -100,8 +100,8 @@ def load_avatar(path: Path | str) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors of an avatar file, on the CPU, and its header.
 
     Raises:
-        InputError: missing, no avatar, of a newer version, cut short, or with tensors or header keys that are missing,
-            unknown or out of bounds.
+        InputError: the file is missing, no avatar, of a newer version or truncated, or a tensor or header key is
+            missing, unknown or out of bounds.
     """
     path = Path(path)
     if not path.is_file():
@@ -135,7 +135,7 @@ def _read_header(path: Path, text: str) -> dict[str, Any]:
     try:
         header = json.loads(text)
         version = header.get("version") if isinstance(header, dict) else None
-        if isinstance(version, int) and version > VERSION:  # whatever else it holds, this is what to say
+        if isinstance(version, int) and version > VERSION:  # before any other check
             raise InputError(
                 f"{path}: avatar file of version {version}, but {VERSION} is the last known here; update oasis-warp."
             )
@@ -163,7 +163,7 @@ def _check_header(header: Any) -> None:
 
 
 def _check_tensors(tensors: Mapping[str, Tensor]) -> dict[str, int]:
-    """Check the tensors against the table; the size of each letter."""
+    """Check the tensors against the tables; the size of each letter."""
     table = dict(TENSORS)
     parts = (LIGHT, SHADE, FINE_SHADE)
     for k, part in enumerate(parts):  # each needs those before it
@@ -187,7 +187,7 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> dict[str, int]:
 
 
 def _check_gaussians(tensors: Mapping[str, Tensor]) -> None:
-    """Refuse values that a renderer would turn into a blank or frozen picture."""
+    """Refuse values for which rendering would fail or give an empty picture."""
     n_vertices = len(tensors["surface_offsets"])
     vertices = tensors["gaussians.vertex_index"]
     good = {

@@ -12,20 +12,24 @@ FILM_DIAGONAL = 43.2666
 """Of a 36 x 24 mm frame [mm]."""
 
 
+READABLE = "JPEG, PNG, WebP, AVIF, BMP or TIFF"
+_AVIF_BRANDS = (b"avif", b"avis")
+_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
+
+
 class Exif(NamedTuple):
-    """What a camera says about its picture."""
+    """EXIF tags of a photo."""
 
     orientation: int
-    """1 to 8 as in TIFF 6.0: where row 0 and column 0 belong; 1 is upright."""
+    """1 to 8 as in TIFF 6.0; 1 is upright."""
     focal_35mm: int | None
     """Focal length of the 35 mm film camera with the same angle of view [mm]."""
 
 
 def read_tags(tiff: bytes) -> dict[int, int]:
-    """First value of every whole-number tag of the first directory and of the EXIF directory it points to.
+    """First value of every integer tag in the first directory and its EXIF directory.
 
-    Cameras and editors write broken EXIF often, and a photo is worth reading without it: what cannot be read is left
-    out, so this never raises.
+    Never raises: EXIF is often broken, so tags that cannot be read are left out.
     """
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(tiff[:4])
     if order is None or len(tiff) < 8:
@@ -44,16 +48,16 @@ def _read_directory(tiff: bytes, start: int, order: str) -> dict[int, int]:
             if kind not in _LAYOUTS:
                 continue
             layout, place = order + _LAYOUTS[kind], entry + 8
-            if n_values * struct.calcsize(layout) > 4:  # too long for the entry itself: it holds the place instead
+            if n_values * struct.calcsize(layout) > 4:  # the entry holds an offset instead of the values
                 (place,) = struct.unpack_from(order + "I", tiff, place)
             (tags[tag],) = struct.unpack_from(layout, tiff, place)
     except struct.error:
-        pass  # the directory runs past the end: keep what came before
+        pass  # the directory is truncated: keep the tags before
     return tags
 
 
 def read_exif(tiff: bytes) -> Exif:
-    """Orientation and focal length; upright and unknown where the data do not say or say nonsense."""
+    """Orientation and focal length; upright and unknown where tags are missing or invalid."""
     tags = read_tags(tiff)
     orientation, focal = tags.get(ORIENTATION, 1), tags.get(FOCAL_35MM, 0)
     return Exif(orientation if 1 <= orientation <= 8 else 1, focal if 5 <= focal <= 2000 else None)
@@ -70,22 +74,17 @@ def focal_pixels(focal_35mm: int, width: int, height: int) -> float:
 
 
 class ImageHeader(NamedTuple):
-    """What an image file says about itself."""
+    """Format and size of an image file."""
 
     format: str
     width: int
     height: int
     pixel_bytes: int
-    """Memory of one decoded pixel, at most."""
-
-
-READABLE = "JPEG, PNG, WebP, AVIF, BMP or TIFF"
-_AVIF_BRANDS = (b"avif", b"avis")
-_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
+    """Upper bound of the memory of one decoded pixel [bytes]."""
 
 
 def read_header(data: bytes) -> ImageHeader | None:
-    """The header of a JPEG, PNG, WebP, AVIF, BMP or TIFF file; None for anything else and for a header cut short."""
+    """The header of a JPEG, PNG, WebP, AVIF, BMP or TIFF file; None for other formats and truncated headers."""
     try:
         if data.startswith(b"\xff\xd8\xff"):
             return _jpeg(data)
@@ -101,12 +100,12 @@ def read_header(data: bytes) -> ImageHeader | None:
         if data[:4] in (b"II*\0", b"MM\0*"):
             return _tiff(data)
     except (struct.error, KeyError, IndexError):
-        pass  # cut short
+        pass  # truncated
     return None
 
 
 def looks_readable(data: bytes) -> bool:
-    """Whether `data` begins like a file that can be read here, whatever follows."""
+    """Whether `data` begins like a file in a supported format."""
     return (
         data.startswith((b"\xff\xd8\xff", b"\x89PNG", b"BM", b"II*\0", b"MM\0*"))
         or (data.startswith(b"RIFF") and data[8:12] == b"WEBP")
@@ -115,7 +114,7 @@ def looks_readable(data: bytes) -> bool:
 
 
 def unsupported_format(data: bytes) -> str | None:
-    """The name of a well-known format that cannot be read here, to say something more useful than "not an image"."""
+    """The name of a known but unsupported format, for messages."""
     if data[4:8] == b"ftyp":
         return "HEIC" if data[8:12] in _HEIF_BRANDS else "video"
     magics = {b"GIF8": "GIF", b"%PDF": "PDF", b"\x1aE\xdf\xa3": "video", b"\xff\x0a": "JPEG XL", b"<svg": "SVG"}
@@ -125,7 +124,7 @@ def unsupported_format(data: bytes) -> str | None:
 def _jpeg(data: bytes) -> ImageHeader:
     place = 2
     while True:
-        while data[place] == 0xFF:  # any number of fill bytes may stand before a marker
+        while data[place] == 0xFF:  # fill bytes before a marker
             place += 1
         marker = data[place]
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
@@ -147,7 +146,7 @@ def _webp_size(data: bytes) -> tuple[int, int]:
 
 
 def _avif(data: bytes) -> ImageHeader:
-    # A picture made of tiles has one "ispe" box a tile and one for the whole.
+    # A tiled picture has one "ispe" box per tile and one for the whole.
     sizes, place = [], data.index(b"ispe") if b"ispe" in data else -1
     while place >= 0:
         sizes.append(struct.unpack_from(">II", data, place + 8))

@@ -1,7 +1,7 @@
-"""Write files and folders so that they are whole or not there: a hidden sibling is filled, then renamed.
+"""Write files and folders atomically: a hidden sibling is written, then renamed.
 
-A rename inside one folder is atomic on every file system worth the name, so a reader, a full disk, Ctrl-C or a crash
-never sees half an output.
+A rename inside one folder is atomic on all common file systems, so a full disk, Ctrl-C or a crash never leaves half an
+output. Folders of long work instead note the settings with which it started, so that it can be resumed.
 """
 
 import contextlib
@@ -22,12 +22,12 @@ _DISK = (*_NO_ROOM, errno.EIO, errno.EROFS)
 
 @contextlib.contextmanager
 def output_file(path: Path | str) -> Iterator[Path]:
-    """A place to write the file `path`: moved there when the block ends, removed when it fails or is interrupted.
+    """Yield a temporary path for the file `path`: moved there when the block ends, removed when it fails.
 
-    The place is a sibling of `path` with the same suffix. An existing file is replaced, through a link too.
+    The temporary file is a sibling of `path` with the same suffix. An existing file is replaced, also through a link.
 
     Raises:
-        InputError: the folder is missing or closed, something that is no file stands there, the disk is full.
+        InputError: the folder is missing or not writable, `path` exists and is no file, or the disk is full.
     """
     final = Path(os.path.realpath(path))
     if final.is_dir():
@@ -37,7 +37,7 @@ def output_file(path: Path | str) -> Iterator[Path]:
     _check_parent(path, final.parent)
     part = final.with_name(f".{final.stem}.{secrets.token_hex(4)}{final.suffix}")
     try:
-        part.touch(exist_ok=False)  # now, and not after minutes of work, is the time to learn that it cannot be written
+        part.touch(exist_ok=False)  # fails now and not after minutes of work
         yield part
         _flush(part)
         os.replace(part, final)
@@ -50,10 +50,10 @@ def output_file(path: Path | str) -> Iterator[Path]:
 
 
 def write_file(path: Path | str, data: bytes) -> None:
-    """Write `data` to `path`, all or nothing.
+    """Write `data` to `path` atomically.
 
     Raises:
-        InputError: as for `output_file`.
+        InputError: see `output_file`.
     """
     with output_file(path) as part:
         part.write_bytes(data)
@@ -61,19 +61,17 @@ def write_file(path: Path | str, data: bytes) -> None:
 
 @contextlib.contextmanager
 def output_folder(path: Path | str) -> Iterator[Path]:
-    """A place to write the files of the folder `path`: they appear there when the block ends, or none of them does.
+    """Yield a temporary folder for the files of `path`: they all appear there when the block ends, or none if it fails.
 
-    Where `path` exists already, each new file replaces its namesake and every other file in it stays: running again
-    into the same folder updates it. The files move one by one then, in the order of their names.
+    In an existing folder, new files replace those of the same name and other files stay, so running again updates the
+    folder. The files are then moved one by one, in the order of their names.
 
     Raises:
-        InputError: the parent is missing or closed, a file stands at `path`, the disk is full.
+        InputError: the parent is missing or not writable, `path` is a file, or the disk is full.
     """
     final = Path(os.path.realpath(path))
-    if final.exists() and not final.is_dir():
-        raise InputError(f"{path}: expected a folder to write to, found a file; choose another name.")
-    _check_parent(path, final.parent)
-    # An existing folder may be the only one we may write to, so the new files are gathered inside it.
+    _check_folder(path, final)
+    # The temporary folder lies inside an existing folder, which may be the only writable place.
     home = final if final.is_dir() else final.parent
     part = home / f".{final.name}.{secrets.token_hex(4)}"
     try:
@@ -86,7 +84,7 @@ def output_folder(path: Path | str) -> Iterator[Path]:
                 os.replace(file, final / file.name)
         else:
             os.replace(part, final)
-    except InputError as error:  # from a writer inside, which knows the file by its hidden place only
+    except InputError as error:  # from a writer inside, which only knows the temporary path
         raise InputError(str(error).replace(str(part), str(path))) from error
     except OSError as error:
         if _is_about(part, error):
@@ -96,6 +94,12 @@ def output_folder(path: Path | str) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
 
 
+def _check_folder(path: Path | str, final: Path) -> None:
+    if final.exists() and not final.is_dir():
+        raise InputError(f"{path}: expected a folder to write to, found a file; choose another name.")
+    _check_parent(path, final.parent)
+
+
 def _check_parent(path: Path | str, parent: Path) -> None:
     if not parent.is_dir():
         found = "a file" if parent.exists() else "no such folder"
@@ -103,13 +107,13 @@ def _check_parent(path: Path | str, parent: Path) -> None:
 
 
 def _flush(file: Path) -> None:
-    """Have the system write `file` out: a full disk may only show now."""
+    """Flush `file` to the disk: a full disk may only be reported now."""
     with file.open("rb+") as stream:
         os.fsync(stream.fileno())
 
 
 def _is_about(part: Path, error: OSError) -> bool:
-    """Whether `error` comes from writing `part`, and not from something else that the block did."""
+    """Whether `error` comes from writing `part`, and not from something else in the block."""
     return error.errno in _DISK or (
         isinstance(error.filename, str | Path) and Path(error.filename).is_relative_to(part)
     )
@@ -121,22 +125,19 @@ def _explain(path: Path | str, error: OSError) -> InputError:
     return InputError(f"{path}: cannot be written ({error.strerror}); check the permissions of its folder.")
 
 
-def open_resumable_folder(folder: Path, name: str, settings: dict[str, Any], made: str) -> None:
-    """Make `folder` and note `settings` in its file `name`, or check that the same are noted there.
+def open_resumable_folder(folder: Path, name: str, settings: dict[str, Any], content: str) -> None:
+    """Create `folder` and write `settings` to its file `name`, or check that the same settings stand there.
 
     Args:
-        folder: Its parent must exist.
-        name: Of the JSON file.
-        settings: What JSON can hold.
-        made: What the folder holds, as its owner calls it.
+        folder: Folder whose parent exists.
+        name: Name of the JSON file.
+        settings: Settings as JSON values.
+        content: What the folder holds, for messages.
 
     Raises:
-        InputError: something that is no folder stands there, the parent is missing, or the settings are others.
+        InputError: `folder` is a file, its parent is missing, or it holds other settings.
     """
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder to write to, found a file; choose another name.")
-    if not folder.parent.is_dir():
-        raise InputError(f"{folder}: expected the folder {folder.parent} to write to, found none; make it first.")
+    _check_folder(folder, folder)
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
@@ -147,7 +148,7 @@ def open_resumable_folder(folder: Path, name: str, settings: dict[str, Any], mad
         write_file(file, text.encode())
     elif (noted := file.read_text()) != text:
         raise InputError(
-            f"{folder}: holds {made} made with other settings{_first_difference(noted, settings)} (see {name}); "
+            f"{folder}: holds {content} made with other settings{_first_difference(noted, settings)} (see {name}); "
             "choose another folder."
         )
 

@@ -1,4 +1,4 @@
-"""What somebody painted on a photo: the difference of two pictures, with the noise of saving and scaling left out."""
+"""Find what was painted on a photo: the difference of two pictures without the noise of saving and scaling."""
 
 import cv2
 import numpy as np
@@ -10,30 +10,30 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Photo
 
 ASPECT_PIXELS = 1.5
-"""By which a scaled copy may miss the photo's proportions, since sides are rounded [px]."""
+"""Tolerance of a scaled copy's proportions, since sides are rounded [px]."""
 CERTAIN, POSSIBLE = 0.1, 0.03
-"""Colour differences from which a pixel is paint, and from which it is if it touches such a one."""
+"""Colour difference above which a pixel is paint, and above which it is if connected to such a pixel."""
 CERTAIN_NOISE, POSSIBLE_NOISE = 12.0, 4.0
-"""The same as multiples of the noise, where that says more."""
+"""The same thresholds in units of the noise, where these are larger."""
 BUSY_SHARES = (0.25, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
-"""Shares of the pixels that part them by how busy the photo is around them: compression changes edges most."""
+"""Quantiles of local contrast that divide the pixels into bins: compression changes edges most."""
 BUSY_WINDOW = 9
-"""Side of the square that is looked at for that, about a block of JPEG [px]."""
+"""Window of local contrast, about a JPEG block [px]."""
 QUIET_SHARE = 0.3
-"""Of a bin's pixels that nobody has painted on, whatever the drawing; their differences tell the noise."""
+"""Share of a bin's pixels that are unpainted in any drawing; their differences determine the noise."""
 HALO_SHARE, HALO_WINDOW = 0.2, 17
-"""Of the largest difference nearby [px], below which a difference is no paint but the halo that compression spreads."""
+"""Differences below this share of the largest one in this window [px] are halos of compression, not paint."""
 SMALLEST = 4
-"""Certain pixels that a stroke or dot has at least."""
+"""Fewest certain pixels of a stroke or dot."""
 RIM = 2
-"""Pixels around the paint that its smooth edge may reach."""
+"""Width of the soft edge of paint [px]."""
 
 
 def match_size(photo: Photo, width: int, height: int, name: str) -> Float[Tensor, "H W 3"]:
-    """`photo` as a picture of another size that `name` has, in [0, 1].
+    """Scale `photo` to the size of the picture `name`, in [0, 1].
 
     Raises:
-        InputError: the size has other proportions.
+        InputError: the sizes have different proportions.
     """
     rows, columns = photo.rgb.shape[:2]
     if abs(columns * height / rows - width) > ASPECT_PIXELS and abs(rows * width / columns - height) > ASPECT_PIXELS:
@@ -53,40 +53,40 @@ def _scaled(picture: Tensor, width: int, height: int) -> Tensor:
 
 
 def read_mask(mask: Photo, width: int, height: int) -> Float[Tensor, "H W"]:
-    """A mask that a user drew, white or opaque where there is paint, as a picture of another size.
+    """Scale a user's mask, white or opaque where there is paint, to another size.
 
     Raises:
-        InputError: it has other proportions.
+        InputError: the sizes have different proportions.
     """
     same = match_size(mask, width, height, "the painted picture")
     return same.mean(-1) if mask.alpha is None else _scaled(mask.alpha, width, height)
 
 
 def find_paint(photo: Float[Tensor, "H W 3"], painted: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
-    """Share of each pixel of `painted` that is paint, by its difference from the `photo`; 0 if there is none.
+    """Share of each pixel of `painted` that is paint, from its difference to `photo`.
 
-    The noise of compression and scaling is measured on the pair itself, for each degree of busyness of the photo.
-    Paint has pixels well above it, and every pixel that hangs together with these and is above it at all.
+    The noise of compression and scaling is measured on the pair itself, for each bin of local contrast. Paint consists
+    of pixels far above the noise and of pixels above the noise that are connected to them.
     """
     apart = np.abs(photo.numpy() - painted.numpy()).max(-1)
     noise = _noise(photo.numpy(), cv2.GaussianBlur(apart, (0, 0), 1.0))
     near = HALO_SHARE * cv2.dilate(apart, np.ones((HALO_WINDOW, HALO_WINDOW), np.uint8))
     possible = (apart > np.maximum(np.maximum(POSSIBLE, near), POSSIBLE_NOISE * noise)).astype(np.uint8)
     certain = apart > np.maximum(CERTAIN, CERTAIN_NOISE * noise)
-    # Strokes are joined over the gap that a pixel of the photo's own colour leaves in them.
+    # Close gaps in strokes where the paint has the colour of the photo.
     joined = cv2.morphologyEx(possible, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     count, labels = cv2.connectedComponents(joined, connectivity=8)
     sure = np.bincount(labels[certain], minlength=count)
-    kept = sure >= SMALLEST
-    kept[0] = False
-    paint = kept[labels].astype(np.uint8)
+    is_paint = sure >= SMALLEST
+    is_paint[0] = False
+    paint = is_paint[labels].astype(np.uint8)
     size = 2 * RIM + 1
     grown = cv2.dilate(paint, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
     return torch.from_numpy(cv2.GaussianBlur(grown.astype(np.float32), (0, 0), RIM / 3))
 
 
 def _noise(photo: np.ndarray, apart: np.ndarray) -> np.ndarray:
-    """Size of the differences that are no paint, at each pixel."""
+    """Typical difference without paint at each pixel."""
     window = np.ones((BUSY_WINDOW, BUSY_WINDOW), np.uint8)
     busy = (cv2.dilate(photo, window) - cv2.erode(photo, window)).max(-1)
     bins = np.searchsorted(np.quantile(busy, BUSY_SHARES), busy)

@@ -1,4 +1,4 @@
-"""Read a photo: any common file in, upright 8-bit RGB out, or one sentence about what is wrong with it."""
+"""Read a photo in any common format as upright 8-bit RGB, or raise one sentence about what is wrong."""
 
 import contextlib
 import os
@@ -26,16 +26,16 @@ from oasis_warp.data.image_header import (
 )
 
 MAX_PIXELS = 24_000_000
-"""Largest photo kept in memory; a hand in a larger one still has far more pixels than the crop that is fitted."""
+"""Largest photo kept in memory; larger ones are scaled down and still show a hand in enough pixels."""
 MAX_FILE_PIXELS = 250_000_000
 """Largest photo that is opened at all."""
 MAX_DECODED_BYTES = 1 << 30
-"""Largest picture that is decoded whole: anything but JPEG cannot be decoded at a fraction of its size."""
+"""Largest decoded picture; only JPEG can be decoded at a fraction of its size."""
 MAX_FILE_BYTES = 1 << 29
 MIN_SIDE = 32
 """Fewer pixels than this cannot show a hand with fingers."""
 OPAQUE = 0.99
-"""An alpha channel that nowhere falls below this says nothing."""
+"""An alpha channel that is nowhere below this is ignored."""
 
 _JPEG_PARTS = {
     1: cv2.IMREAD_UNCHANGED,
@@ -52,12 +52,12 @@ def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> Photo:
     EXIF orientation is applied; 16-bit values are rounded to 8; grey, palette and CMYK become RGB; alpha is kept where
     some pixel is transparent. `Photo.focal` comes from EXIF (see `exif.focal_pixels`). Colour profiles are ignored.
 
-    A photo of more than `max_pixels` is scaled down by a whole factor, averaging. In memory there are, for a moment,
-    the file, and of a JPEG at most four times `max_pixels`, of other formats the whole picture, `MAX_DECODED_BYTES` at
-    most. (The decoder of progressive JPEG keeps 3 bytes a pixel of the file on top.)
+    A photo of more than `max_pixels` is averaged down by an integer factor. Peak memory is the file plus, for JPEG, up
+    to four times `max_pixels`, or for other formats the whole picture, up to `MAX_DECODED_BYTES`. (The decoder of
+    progressive JPEG needs 3 more bytes per pixel of the file.)
 
     Raises:
-        InputError: missing, unreadable, no image, cut short, damaged, too small or too large.
+        InputError: the file is missing, unreadable, no image, truncated, damaged, too small or too large.
     """
     path = Path(path)
     data = _read_bytes(path)
@@ -68,7 +68,7 @@ def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> Photo:
     factor = 1
     while header.width * header.height > max_pixels * factor**2:
         factor += 1
-    # A JPEG can be decoded at a half, a quarter or an eighth of its size right away.
+    # A JPEG can be decoded directly at a half, a quarter or an eighth of its size.
     part = max(n for n in _JPEG_PARTS if n <= factor) if header.format == "JPEG" else 1
     pixels, exif = _decode(path, data, header.format, _JPEG_PARTS[part])
     del data
@@ -79,7 +79,7 @@ def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> Photo:
     alpha = None
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         alpha = torch.from_numpy(np.ascontiguousarray(pixels[..., 3])).float() / 255
-        if bool(alpha.min() >= OPAQUE) or bool(alpha.max() < 1 - OPAQUE):  # all there, or all hidden
+        if bool(alpha.min() >= OPAQUE) or bool(alpha.max() < 1 - OPAQUE):  # all opaque, or all transparent
             alpha = None
     codes = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
     rgb = cv2.cvtColor(pixels, codes[2 if pixels.ndim == 2 else pixels.shape[2]])
@@ -141,25 +141,25 @@ def _check_size(path: Path, header: ImageHeader) -> None:
 
 
 def _decode(path: Path, data: bytes, format: str, flags: int) -> tuple[np.ndarray, Exif]:
-    """The pixels as the file stores them (BGR order, not yet upright) and what the camera says about them."""
-    with _captured_stderr() as complaints:
+    """The pixels as stored in the file (BGR, not yet upright) and the EXIF tags."""
+    with _captured_stderr() as captured:
         try:
             pixels, kinds, chunks = cv2.imdecodeWithMetadata(np.frombuffer(data, np.uint8), flags)
         except cv2.error:
             pixels, kinds, chunks = None, (), ()
-        complaints.seek(0)
-        said = complaints.read()
-    # libjpeg fills what is missing of a closed file with grey and only mentions it.
-    if pixels is None or b"premature end" in said:
+        captured.seek(0)
+        messages = captured.read()
+    # libjpeg fills the missing part of a truncated file with grey and only prints a warning.
+    if pixels is None or b"premature end" in messages:
         raise _cut_short(path, len(data))
-    if format == "TIFF":  # OpenCV turns a TIFF upright whatever the flags
+    if format == "TIFF":  # OpenCV always rotates a TIFF upright
         return pixels, read_exif(data)._replace(orientation=1)
     blobs = [bytes(chunk) for kind, chunk in zip(kinds, chunks, strict=True) if kind == cv2.IMAGE_METADATA_EXIF]
     return pixels, read_exif(blobs[0].removeprefix(b"Exif\0\0")) if blobs else Exif(1, None)
 
 
 def _turn_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    if orientation >= 5:  # rows and columns are exchanged
+    if orientation >= 5:  # rows and columns are swapped
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
         pixels = pixels[::-1]
@@ -178,15 +178,15 @@ def _to_uint8(path: Path, pixels: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _captured_stderr() -> Iterator[IO[bytes]]:
-    """Catch what image libraries write to the process's own stderr: noise to the user, evidence to us."""
+    """Capture what image libraries write to the process's stderr, which tells about damage."""
     with _stderr_lock, tempfile.TemporaryFile() as caught:
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        kept = os.dup(2)
+        original = os.dup(2)
         os.dup2(caught.fileno(), 2)
         try:
             yield caught
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(original, 2)
+            os.close(original)
             cv2.utils.logging.setLogLevel(level)

@@ -22,7 +22,7 @@ PICTURE_SUFFIXES = tuple(_ENCODINGS)
 
 
 def to_uint8(image: Float[Tensor, "H W C"]) -> UInt8[Tensor, "H W C"]:
-    """Colours in [0, 1] as bytes on the CPU, rounded; values beyond are clipped."""
+    """Colours in [0, 1] as bytes on the CPU, clipped and rounded."""
     return (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8)
 
 
@@ -30,14 +30,14 @@ def check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
     """Check that `path` ends in one of `suffixes`, before any work is spent on it.
 
     Raises:
-        InputError: it does not.
+        InputError: another suffix.
     """
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{path}: expected a name that ends in {' or '.join(suffixes)}; rename the output.")
 
 
 def write_picture(path: Path | str, image: UInt8[Tensor, "H W C"]) -> None:
-    """Write RGB or RGBA pixels as PNG, WebP (both exact) or JPEG, by the suffix of `path`; all or nothing.
+    """Write RGB or RGBA pixels as PNG, WebP (both exact) or JPEG, by the suffix of `path`, atomically.
 
     Raises:
         InputError: another suffix, transparency in a JPEG, or `path` cannot be written.
@@ -55,16 +55,16 @@ def write_picture(path: Path | str, image: UInt8[Tensor, "H W C"]) -> None:
 
 VIDEO_SUFFIXES = (".mp4", ".gif")
 _CODECS = ("vp09", "mp4v")
-"""Tried in turn. OpenCV's wheel has no H.264 encoder. The second, MPEG-4 part 2, plays in players but in no browser."""
+"""In order of preference. OpenCV's wheel has no H.264 encoder. Browsers do not play the second, MPEG-4 part 2."""
 _GIF_PALETTE = (cv2.IMWRITE_GIF_DITHER, 3)
-"""256 colours chosen by octree: 41 dB on a photo. OpenCV's default is one fixed palette: 17 dB."""
+"""Choose 256 colours by octree: 41 dB on a photo. OpenCV's default, a fixed palette, has 17 dB."""
 
 
 def write_video(path: Path | str, frames: Iterable[UInt8[Tensor, "H W 3"]], fps: float) -> int:
-    """Write RGB frames of one size as MP4 or GIF, by the suffix of `path`; all or nothing. The number of frames.
+    """Write RGB frames of one size as MP4 or GIF, by the suffix of `path`, atomically; the number of frames.
 
-    An odd width or height of an MP4 is padded by one pixel, since its colours come in pairs. A GIF holds every frame
-    for whole hundredths of a second: 24 frames a second come out as 25.
+    An odd width or height of an MP4 is padded by one pixel, since its chroma is subsampled. A GIF rounds frame times
+    to hundredths of a second: 24 frames per second become 25.
 
     Raises:
         InputError: another suffix, or `path` cannot be written.
@@ -85,7 +85,7 @@ def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
     if not animation.frames:
         return 0
     animation.durations = [max(2, round(100 / fps)) * 10] * len(animation.frames)
-    animation.loop_count = 0  # for ever
+    animation.loop_count = 0  # loop forever
     _, data = cv2.imencodeanimation(".gif", animation, _GIF_PALETTE)
     write_file(path, data.tobytes())
     return len(animation.frames)
@@ -106,7 +106,7 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
                 first = next(frames, None)
         finally:
             writer.release()
-        # The writer keeps every error to itself, so look at what came out.
+        # The writer reports no errors, so check the file.
         if _count_frames(part) != n_frames:
             raise InputError(f"{path}: the video could not be written whole; free some space or choose another disk.")
     return n_frames
@@ -130,7 +130,7 @@ def _count_frames(path: Path) -> int:
 
 
 def contact_sheet(images: Float[Tensor, "N H W 3"], columns: int, gap: int = 2) -> Float[Tensor, "R C 3"]:
-    """Pictures side by side in rows of `columns`, white between them."""
+    """Arrange pictures in rows of `columns`, with white gaps."""
     n, height, width = images.shape[:3]
     rows = -(-n // columns)
     sheet = torch.ones(rows * (height + gap) - gap, columns * (width + gap) - gap, 3)

@@ -1,4 +1,4 @@
-"""Cut a square out of a photo and resample it; find where a square was cut out."""
+"""Crop and resample a square of a photo; find the square of a photo that a picture shows."""
 
 import math
 from typing import NamedTuple
@@ -21,10 +21,10 @@ def square_around(mask: Float[Tensor, "H W"], margin: float) -> tuple[float, flo
 def resample_square(
     image: Float[Tensor, "H W *C"], left: float, top: float, side: float, size: int
 ) -> Float[Tensor, "size size *C"]:
-    """The square as `size` pixels: averaged where it shrinks, bilinear where it grows; black beyond the photo."""
+    """Resample the square to `size` pixels: filtered when shrinking, else bilinear; black outside the photo."""
     scale = size / side
     pixels = image.numpy()
-    if scale < 1:  # blur to the new pixel size first: a plain lookup would alias
+    if scale < 1:  # blur to the new pixel size first, against aliasing
         sigma = 0.5 * (1 / scale**2 - 1) ** 0.5
         pixels = cv2.GaussianBlur(pixels, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     matrix = np.array([[scale, 0, -left * scale + 0.5 * scale - 0.5], [0, scale, -top * scale + 0.5 * scale - 0.5]])
@@ -32,20 +32,20 @@ def resample_square(
 
 
 SEARCH_SIDE = 128
-"""Longer side of the photo in the search over all places and sizes [px]."""
+"""Longer side of the photo in the search over all positions and sizes [px]."""
 SIZES = (0.12, 1.6)
-"""Smallest and largest square that is looked for, over the photo's longer side."""
+"""Smallest and largest square of the search, over the photo's longer side."""
 SIZE_STEP = 1.05
 BLURS = (4.0, 2.0)
-"""Of both pictures while the place is refined, from coarse to fine [px]; without, an avatar's own noise pulls."""
+"""Blurs of both pictures during refinement, from coarse to fine [px]; they suppress an avatar's noise."""
 RIM = 2
-"""Pixels inside the outline that are left out: there the avatar may differ most."""
+"""Width of the band inside the outline that is ignored, where the avatar differs most [px]."""
 ROUNDS = 8
-"""Of refinement for each blur."""
+"""Iterations of refinement for each blur."""
 MAX_GROWTH = 0.1
-"""Of the side in one round."""
+"""Largest relative change of the side in one iteration."""
 OUTLIER = 0.08
-"""Colour difference above which a pixel hardly counts: there is paint, or background."""
+"""Colour difference above which a pixel is down-weighted, as paint or background."""
 
 
 class Square(NamedTuple):
@@ -60,15 +60,15 @@ class Square(NamedTuple):
 
 
 def find_square(picture: Float[Tensor, "S S 3"], alpha: Float[Tensor, "S S"], photo: Float[Tensor, "H W 3"]) -> Square:
-    """The square of `photo` that `picture` shows where its `alpha` is above a half.
+    """The square of `photo` that `picture` shows where its `alpha` is above 0.5.
 
-    The best of all places and sizes in small copies, then Gauss-Newton on place and size with Geman-McClure weights.
+    A search over all positions and sizes in small copies, then Gauss-Newton with Geman-McClure weights.
     """
     inside = cv2.erode((alpha.numpy() > 0.5).astype(np.float32), np.ones((3, 3), np.uint8), iterations=RIM)
     square = _search(picture.numpy(), inside, photo.numpy())
     for blur in BLURS:
         goal = cv2.GaussianBlur(picture.numpy(), (0, 0), blur)
-        # Blurring brings the picture's background in over the outline.
+        # Blurring mixes the background across the outline.
         deep = cv2.erode(inside, np.ones((3, 3), np.uint8), iterations=round(2 * blur))
         for _ in range(ROUNDS):
             square = _refine(goal, deep, photo, square, blur)
@@ -80,7 +80,7 @@ def _search(picture: np.ndarray, inside: np.ndarray, photo: np.ndarray) -> tuple
     height, width = photo.shape[:2]
     scale = SEARCH_SIDE / max(height, width)
     small = cv2.resize(photo, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
-    border = SEARCH_SIDE // 3  # the square may reach over the photo's edge, but not the hand
+    border = SEARCH_SIDE // 3  # the square may extend beyond the photo, the hand may not
     small = cv2.copyMakeBorder(small, border, border, border, border, cv2.BORDER_REPLICATE)
     best, found = -np.inf, (0.0, 0.0, float(max(height, width)))
     side = SIZES[0] * SEARCH_SIDE
@@ -98,21 +98,21 @@ def _search(picture: np.ndarray, inside: np.ndarray, photo: np.ndarray) -> tuple
 
 
 def _candidates(photo: np.ndarray, picture: np.ndarray, mask: np.ndarray) -> list[tuple[int, int]]:
-    """Where in the photo a picture of the same scale may lie: most correlated, and least different."""
+    """Candidate positions of a picture in the photo: highest correlation, and smallest difference."""
     if not mask.any():
         return []
     weights = np.dstack([mask.astype(np.float32)] * 3)
     alike = cv2.matchTemplate(photo, picture, cv2.TM_CCOEFF_NORMED, mask=weights)
-    alike[~(np.abs(alike) <= 1.001)] = -1  # over plain ground it is undefined
+    alike[~(np.abs(alike) <= 1.001)] = -1  # undefined over uniform areas
     apart = cv2.matchTemplate(photo, picture, cv2.TM_SQDIFF, mask=weights)
     (x, y), (left, top) = cv2.minMaxLoc(alike)[3], cv2.minMaxLoc(apart)[2]
     return [(x, y), (left, top)]
 
 
 def _likeness(crop: np.ndarray, picture: np.ndarray, mask: np.ndarray) -> float:
-    """Correlation over the pixels whose colours are near, times their share.
+    """Correlation over the pixels with similar colours, times their share.
 
-    Paint drops out. Differences alone would be smallest for a tiny hand on a patch of plain skin.
+    This ignores paint. Differences alone would be smallest for a tiny hand on a patch of plain skin.
     """
     near = mask & (np.abs(crop - picture).mean(-1) < OUTLIER)
     if not near.any():
@@ -132,8 +132,7 @@ def _refine(
     error = crop - goal
     weight = inside / (1 + np.square(error).mean(-1) / OUTLIER**2) ** 2
     across, down = (cv2.Sobel(crop, cv2.CV_32F, *axis, ksize=3, scale=1 / 8) for axis in ((1, 0), (0, 1)))
-    # Moving the square by one pixel of its own moves what it shows by as much; growing it moves what lies off its
-    # top left corner.
+    # Derivatives with respect to a shift by one pixel of the square, and to growth about its top left corner.
     place = np.arange(n, dtype=np.float32) + 0.5
     grown = across * place[None, :, None] + down * place[:, None, None]
     slopes = np.stack([across, down, grown], -1)
