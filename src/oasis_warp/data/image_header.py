@@ -1,4 +1,4 @@
-"""Format and size of an image file from its first bytes, so that a huge one is turned away before it is decoded."""
+"""Read format, size, orientation and focal length from the first bytes of an image file, before decoding it."""
 
 import struct
 from typing import NamedTuple
@@ -9,9 +9,7 @@ _LAYOUTS = {1: "B", 3: "H", 4: "I"}
 """TIFF field types read here: BYTE, SHORT, LONG."""
 
 FILM_DIAGONAL = 43.2666
-"""Of a 36 x 24 mm frame [mm]."""
-
-
+"""Diagonal of a 36 x 24 mm frame [mm]."""
 READABLE = "JPEG, PNG, WebP, AVIF, BMP or TIFF"
 _AVIF_BRANDS = (b"avif", b"avis")
 _HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")

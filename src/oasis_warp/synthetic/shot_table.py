@@ -16,9 +16,9 @@ from oasis_warp.core.processes import worker_pool
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.synthetic.body import ARM_LENGTH, ARM_ROWS
 from oasis_warp.synthetic.contact import bundled_skeleton
-from oasis_warp.synthetic.furniture import MAX_SOLIDS, SOLID_WORDS
+from oasis_warp.synthetic.furniture import MAX_SOLIDS
 from oasis_warp.synthetic.identity import Identity, Population
-from oasis_warp.synthetic.sensor import SENSOR_WORDS, sensor_row
+from oasis_warp.synthetic.sensor import sensor_row
 from oasis_warp.synthetic.shots import SceneConfig, Shot, cached_identity, sample_shots
 from oasis_warp.synthetic.view_and_light import N_LAMPS
 from oasis_warp.synthetic.wardrobe import SKIN_LOOK, ring_look
@@ -84,33 +84,11 @@ class ShotTensors(NamedTuple):
 
 @functools.cache
 def _places() -> dict[str, tuple[slice, tuple[int, ...]]]:
-    """Columns and shape of each field of `ShotTensors`."""
-    shapes: dict[str, tuple[int, ...]] = {
-        "angles": (15, 3),
-        "rotations": (16, 3, 3),
-        "shifts": (16, 3),
-        "knuckles": (15,),
-        "shape": (len(bundled_hand().shape_names),),
-        "arm_turns": (ARM_ROWS, 3, 3),
-        "ring_rotation": (3, 3),
-        "ring_shift": (3,),
-        "wears": (3,),
-        "sleeve_phases": (4,),
-        "looks": (4, len(SKIN_LOOK)),
-        "view_rotation": (3, 3),
-        "view_shift": (2,),
-        "sky": (9, 3),
-        "lamp_directions": (N_LAMPS, 3),
-        "lamp_distances": (N_LAMPS,),
-        "lamp_colors": (N_LAMPS, 3),
-        "lamp_spreads": (N_LAMPS,),
-        "incident": (3,),
-        "solids": (MAX_SOLIDS, SOLID_WORDS),
-        "sensor": (SENSOR_WORDS,),
-    }
+    """Columns and shape of each field of `ShotTensors`, from its annotation."""
+    sizes = {"S": len(bundled_hand().shape_names), "R": ARM_ROWS, "L": N_LAMPS, "N": MAX_SOLIDS}
     places, start = {}, 0
-    for name in ShotTensors._fields:
-        shape = shapes.get(name, ())
+    for name, annotation in ShotTensors.__annotations__.items():
+        shape = tuple(sizes.get(axis) or int(axis) for axis in annotation.dim_str.split()[1:])
         end = start + math.prod(shape)
         places[name], start = (slice(start, end), shape), end
     return places

@@ -58,31 +58,17 @@ def _matching() -> np.ndarray:
 _TO_RGB = _XYZ_TO_RGB @ _matching()
 
 
-def skin_reflectance(
-    melanin: np.ndarray, blood: np.ndarray, *, oxygen: float = 0.7, epidermis: float = 80.0, carotene: float = 0.0
-) -> np.ndarray:
-    """Linear sRGB reflectance [..., 3] of skin under D65.
-
-    Args:
-        melanin: Volume fraction of melanosomes in the epidermis.
-        blood: Volume fraction of blood in the dermis.
-        oxygen: Oxygen saturation of the haemoglobin.
-        epidermis: Thickness of the epidermis [um].
-        carotene: Amount of yellow (carotene and a thick horn layer), 0 to about 0.4.
-    """
-    crossed, dermis = _layers(
-        np.asarray(melanin, float)[..., None], np.asarray(blood, float)[..., None], oxygen, epidermis, carotene
-    )
-    returned = ABOVE_MELANIN + (1 - ABOVE_MELANIN) * crossed * dermis
-    return np.clip(returned @ _TO_RGB.T, *REFLECTANCE_RANGE)
-
-
 def _layers(
     melanin: np.ndarray, blood: np.ndarray, oxygen: float, epidermis: float, carotene: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Transmittance of the epidermis, both ways, and reflectance of the dermis at each wavelength, [..., 31].
 
-    Arguments are those of `skin_reflectance`, [..., 1].
+    Args:
+        melanin: Volume fraction of melanosomes in the epidermis, [..., 1].
+        blood: Volume fraction of blood in the dermis, [..., 1].
+        oxygen: See `Tint`.
+        epidermis: See `Tint`.
+        carotene: See `Tint`.
     """
     bloodless = 0.244 + 85.3 * np.exp(-(_NM - 154) / 66.2)
     absorbed = blood * 2.303 * 150 / 64500 * (oxygen * _OXYGENATED + (1 - oxygen) * _BARE) + bloodless
@@ -96,15 +82,18 @@ def _layers(
 
 
 class Tint(NamedTuple):
-    """Parameters that are constant over a part of one person's skin: see `skin_reflectance`."""
+    """Parameters that are constant over a part of one person's skin."""
 
     oxygen: float
+    """Oxygen saturation of the haemoglobin."""
     epidermis: float
+    """Thickness of the epidermis [um]."""
     carotene: float
+    """Amount of yellow (carotene and a thick horn layer), 0 to about 0.4."""
 
 
 def _table(tint: Tint) -> np.ndarray:
-    """`skin_reflectance` on a grid, [3, melanin, blood]."""
+    """Linear sRGB reflectance of skin under D65 on a grid, [3, melanin, blood]."""
     melanin, blood = (np.geomspace(*r, n) for r, n in zip((MELANIN_RANGE, BLOOD_RANGE), _TABLE, strict=True))
     crossed, dermis = _layers(melanin[:, None], blood[:, None], *tint)
     # At each wavelength the layers multiply, so a colour is a matrix product.
@@ -128,10 +117,3 @@ def skin_colors(
     where = torch.stack([place(blood, BLOOD_RANGE), place(melanin, MELANIN_RANGE)], -1)
     colors = grid_sample(tables[None], where[None, None], padding_mode="border", align_corners=True)[0, :, 0]
     return colors.split(3)
-
-
-def linear_to_lab(linear: np.ndarray) -> np.ndarray:
-    """CIELAB (D65) of linear sRGB, [..., 3]."""
-    xyz = np.asarray(linear) @ np.linalg.inv(_XYZ_TO_RGB).T / _WHITE
-    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
-    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], -1)
