@@ -1,6 +1,6 @@
-"""`oasis doctor`: one line for each thing that the rest relies on, and what to do about those that fail.
+"""`oasis doctor`: check everything that the package relies on, and say what to do about failures.
 
-Packages are imported inside the checks: a broken one is a line of the answer, not the end of it.
+Packages are imported inside the checks, so that a broken one fails its own check only.
 """
 
 import importlib.metadata
@@ -32,17 +32,17 @@ PACKAGES = {
     "tyro": ("0.9", None),
     "rich": ("13", None),
 }
-"""Lowest version that works, and the first that is not known to; as in pyproject.toml."""
+"""Lowest supported version and upper bound, as in pyproject.toml."""
 OTHER_OPENCVS = ("opencv-python", "opencv-python-headless", "opencv-contrib-python")
-"""Distributions that put another `cv2` into the same folder: which of them is imported is chance."""
+"""Distributions that install another `cv2` into the same folder."""
 HAND_SIZE = (12_337, 24_608)
 """Vertices and faces of the bundled hand."""
 TOLERANCE = 5e-6
-"""Of colours in float32: a handful of roundings of numbers below 1."""
+"""Tolerance of float32 colours: a few roundings of numbers below 1."""
 
 
 class FaultError(Exception):
-    """A check failed; the message says what is wrong, `remedy` what to do."""
+    """A failed check: the message says what is wrong, `remedy` what to do."""
 
     def __init__(self, message: str, remedy: str):
         super().__init__(message)
@@ -50,18 +50,18 @@ class FaultError(Exception):
 
 
 Check = Callable[[], str]
-"""What a check found, in a few words; raises `FaultError`, or whatever a broken package raises."""
+"""Returns a short description; raises `FaultError`, or any error of a broken package."""
 
 
 def run(options: Doctor) -> int:
     """Print a line for every check; the exit code."""
-    del options  # there are none
+    del options
     console, faults, to_do = Console(), 0, checks()
     width = max(map(len, to_do))
     for name, check in to_do.items():
         try:
             mark, text = "[green]ok  [/]", check()
-        except Exception as error:  # whatever a broken installation raises is what the user came to learn
+        except Exception as error:  # a broken installation may raise anything
             remedy = error.remedy if isinstance(error, FaultError) else "reinstall with `pip install -e .`"
             mark, text = "[red]FAIL[/]", f"{error or type(error).__name__}; {remedy}"
             faults += 1
@@ -72,7 +72,7 @@ def run(options: Doctor) -> int:
 
 
 def checks() -> dict[str, Check]:
-    """Every check by its name, in the order in which they are made."""
+    """All checks by name, in order."""
     packages = {name: lambda name=name: check_package(name) for name in PACKAGES}
     return {
         "oasis_warp": check_python,
@@ -99,7 +99,7 @@ def parse_version(text: str) -> tuple[int, ...]:
 
 
 def check_package(name: str) -> str:
-    """The installed version of a package, which must be in the range that works."""
+    """The installed version of a package is supported."""
     low, high = PACKAGES[name]
     wanted = f">={low}" + (f",<{high}" if high else "")
     try:
@@ -113,7 +113,7 @@ def check_package(name: str) -> str:
 
 
 def check_single_opencv() -> str:
-    """No second OpenCV stands in the way of the right one."""
+    """There is no second OpenCV."""
     import cv2
 
     others = []
@@ -131,7 +131,7 @@ def check_single_opencv() -> str:
 
 
 def check_cpu() -> str:
-    """What torch computes with."""
+    """Threads and instruction set of torch."""
     import torch
 
     features = torch.backends.cpu.get_cpu_capability()
@@ -139,7 +139,7 @@ def check_cpu() -> str:
 
 
 def check_cuda() -> str:
-    """The CUDA devices; none is fine."""
+    """CUDA devices, if any."""
     import torch
 
     if not torch.cuda.is_available():
@@ -149,7 +149,7 @@ def check_cuda() -> str:
 
 
 def check_hand() -> str:
-    """The bundled hand loads and has the size that avatars count on."""
+    """The bundled hand loads and has the expected size."""
     import hashlib
 
     from oasis_warp.assets import asset
@@ -163,7 +163,7 @@ def check_hand() -> str:
 
 
 def check_networks() -> str:
-    """The landmark networks give known answers."""
+    """The landmark networks give the known results."""
     from oasis_warp.estimation.networks import check_networks
 
     check_networks()
@@ -187,7 +187,7 @@ def check_prior() -> str:
 
 
 def check_kernels() -> str:
-    """The rasterizer draws one Gaussian as the formula says, on every device."""
+    """The rasterizer draws one Gaussian according to its formula, on every device."""
     import torch
 
     from oasis_warp.ops._runtime.launch import kernel_cache
@@ -231,7 +231,7 @@ def gaussian_error(device: str) -> float:
     offset = torch.arange(size, device=device, dtype=torch.float64) - size // 2
     squared = offset[:, None] ** 2 + offset[None, :] ** 2
     expected = opacity * torch.exp(-squared / 2 / variance)
-    inside = squared < 4 * variance  # two standard deviations: well inside the cut at 1/255
+    inside = squared < 4 * variance  # two standard deviations: well inside the cut-off at 1/255
     drawn = torch.cat([image[0], alpha[0]], -1).double()
     formula = torch.cat([expected[..., None] * color.double(), expected[..., None]], -1)
     return float((drawn - formula)[inside].abs().max())
@@ -247,7 +247,7 @@ def _can_write(folder: Path) -> bool:
 
 
 def check_videos() -> str:
-    """A film of each kind can be written and read back."""
+    """Videos of each format can be written and read."""
     import torch
 
     from oasis_warp.data.pictures import VIDEO_SUFFIXES, write_video

@@ -30,7 +30,7 @@ from oasis_warp.synthetic.people import max_people_cached
 from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH
 
 SETTINGS, PEOPLE = "training.json", "people"
-"""In the folder: with what the training began, and the people that a CPU has baked."""
+"""Names in the folder: the settings of the training, and the folder of people baked on a CPU."""
 PRECISIONS = {"bf16": "bfloat16", "float32": "float32"}
 AHEAD = 4
 """Batches that a GPU renders together."""
@@ -38,7 +38,7 @@ SIZES = range(32, 1025, MULTIPLE)
 
 
 def run(options: Pretrain) -> int:
-    """Train, or go on; Ctrl-C keeps what is done.
+    """Start or resume a training; Ctrl-C keeps what is done.
 
     Raises:
         InputError: a wrong option or folder, weights that do not fit, or a loss that is not finite.
@@ -60,19 +60,15 @@ def run(options: Pretrain) -> int:
 
 
 def check_options(options: Pretrain) -> None:
-    """Refuse what can be refused before anything is made.
+    """Check the options before any work.
 
     Raises:
-        InputError: a number out of its range, or weights for a network that reads none.
+        InputError: a number out of range, or weights that the network does not need or lacks.
     """
-    for name in ("steps", "hands", "people"):
+    for name, least in {"steps": 1, "hands": 1, "people": 1, "seed": 0, "workers": 0}.items():
         value = getattr(options, name)
-        if value < 1:
-            raise InputError(f"--{name}: expected 1 or more, got {value}.")
-    for name in ("seed", "workers"):
-        value = getattr(options, name)
-        if value < 0:
-            raise InputError(f"--{name}: expected 0 or more, got {value}.")
+        if value < least:
+            raise InputError(f"--{name}: expected {least} or more, got {value}.")
     if not 1 <= options.views <= PICTURES_EACH:
         raise InputError(f"--views: expected 1 to {PICTURES_EACH}, got {options.views}; more hands do the same.")
     if options.size not in SIZES:
@@ -94,7 +90,7 @@ def check_options(options: Pretrain) -> None:
 
 
 def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
-    """This process's share of the training; how many steps are done in all.
+    """Train as one of the processes; the number of steps done.
 
     Raises:
         InputError: a folder that cannot be used, weights that do not fit, or a loss that is not finite.
@@ -126,7 +122,7 @@ def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
 
 
 def make_network(config: NetworkConfig, seed: int, backbone_weights: Path | None, start: Path | None) -> HandNetwork:
-    """A network that knows nothing yet, or what `start` knows.
+    """A new network, or the one in the file `start`.
 
     Raises:
         InputError: weights do not fit.
@@ -142,7 +138,7 @@ def make_network(config: NetworkConfig, seed: int, backbone_weights: Path | None
 
 
 def settings_of(options: Pretrain, processes: int) -> dict[str, Any]:
-    """All that decides on the weights; where and with how many workers they are computed does not."""
+    """All settings that the resulting weights depend on, unlike the device and the number of workers."""
     names = ("profile", "steps", "hands", "views", "people", "size", "seed", "precision")
     settings = {name: getattr(options, name) for name in names} | {"processes": processes}
     settings["hold_out"] = sorted(options.hold_out)
@@ -154,10 +150,10 @@ def settings_of(options: Pretrain, processes: int) -> dict[str, Any]:
 
 
 def claim(folder: Path, settings: dict[str, Any]) -> None:
-    """Make the folder, or check that the training in it is this one.
+    """Create the folder, or check that it holds the same training.
 
     Raises:
-        InputError: it is not, or no folder can be made there.
+        InputError: it holds another training, or cannot be created.
     """
     if (folder / CHECKPOINT).exists() and not (folder / SETTINGS).exists():
         raise InputError(f"{folder}: holds a checkpoint but no {SETTINGS} that says of what; choose another folder.")
@@ -166,14 +162,14 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
 
 @contextmanager
 def stop_signals(*, can_force: bool) -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C or SIGTERM has come in this block; where `can_force`, a second Ctrl-C ends the work at once."""
+    """Yield a function that tells whether Ctrl-C or SIGTERM came; if `can_force`, a second Ctrl-C stops at once."""
     asked = False
 
     def ask(number: int, frame: object) -> None:
         nonlocal asked
         if asked and can_force and number == signal.SIGINT:
             raise KeyboardInterrupt
-        if not asked:  # print may not be called from here: it could have been interrupted itself
+        if not asked:  # print is not reentrant, and may have been interrupted
             os.write(2, b"\noasis: stopping after this step.\n")
         asked = True
 

@@ -15,7 +15,7 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 
 MAX_SIDE = 8192
-"""Of a picture [px]."""
+"""Largest side of a picture [px]."""
 COLORS = {"white": WHITE, "black": BLACK}
 
 
@@ -30,10 +30,10 @@ def check_side(size: int) -> None:
 
 
 def read_color(text: str) -> tuple[float, float, float]:
-    """The colour that `text` names or spells as rrggbb.
+    """The colour with the name or hex code `text`.
 
     Raises:
-        InputError: neither.
+        InputError: `text` is neither.
     """
     if text in COLORS:
         return COLORS[text]
@@ -45,7 +45,7 @@ def read_color(text: str) -> tuple[float, float, float]:
 
 
 def choose_pose(avatar: Avatar, name: str) -> HandPose:
-    """The avatar's hand in the named pose, held as in the photo; "photo" is the photo's own pose."""
+    """The named pose with the orientation and position of the photo; "photo" is the pose in the photo."""
     if name == "photo":
         return avatar.source_pose
     return avatar.source_pose._replace(angles=named_pose(avatar.hand, name))
@@ -53,7 +53,7 @@ def choose_pose(avatar: Avatar, name: str) -> HandPose:
 
 @torch.no_grad()
 def run(options: Render) -> int:
-    """Draw the picture.
+    """Write the picture.
 
     Raises:
         InputError: a wrong avatar file, option or output.
@@ -71,7 +71,7 @@ def run(options: Render) -> int:
         avatar.mesh(pose).vertices, math.radians(options.azimuth), math.radians(options.elevation), options.size
     )
     image, alpha = avatar.render(camera, pose, background)
-    if transparent:  # drawn over black, so the colours have alpha multiplied in; picture files want them without
+    if transparent:  # convert premultiplied to straight alpha
         image = torch.cat([image / alpha.clamp_min(1e-6)[..., None], alpha[..., None]], -1)
     write_picture(options.out, to_uint8(image))
     return 0

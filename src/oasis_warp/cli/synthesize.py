@@ -1,4 +1,4 @@
-"""`oasis synthesize`: pictures of synthetic hands, as shards for training or as one sheet to look at."""
+"""`oasis synthesize`: pictures of synthetic hands, as shards for training or as one contact sheet."""
 
 import sys
 
@@ -21,7 +21,7 @@ SIZES = range(32, 1025)
 
 
 def run(options: Synthesize) -> int:
-    """Write the pictures; Ctrl-C keeps the shards that are whole.
+    """Write the pictures; Ctrl-C keeps complete shards.
 
     Raises:
         InputError: a wrong option, folder or output.

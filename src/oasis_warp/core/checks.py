@@ -1,4 +1,4 @@
-"""Checks of tensor arguments at the public border: one message form, `argument: expected X, got Y. Hint`."""
+"""Checks of arguments of public functions, with messages of the form `argument: expected X, got Y. Hint`."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 FLOATS = torch.float32, torch.float64
 FINITE_LIMIT = 1e15
-"""Magnitude above which a finite number is refused as absurd: squares of it still fit in float32."""
+"""Largest accepted magnitude: its square still fits in float32."""
 
 
 def _sentence(name: str, expected: str, got: str, hint: str) -> str:
@@ -17,11 +17,11 @@ def _sentence(name: str, expected: str, got: str, hint: str) -> str:
 def check_shape(
     name: str, tensor: Tensor, *shape: int | str, sizes: dict[str, int] | None = None, hint: str = ""
 ) -> None:
-    """Check that `tensor` has `shape`; a letter stands for any size, one size a letter over all calls with `sizes`.
+    """Check that `tensor` has `shape`; a letter is any size, but the same over all calls with `sizes`.
 
     Raises:
         TypeError: `tensor` is no tensor.
-        ValueError: another number of axes, or a size that differs.
+        ValueError: another shape.
     """
     if not isinstance(tensor, Tensor):
         raise TypeError(_sentence(name, "a torch.Tensor", type(tensor).__name__, hint))
@@ -41,7 +41,7 @@ def check_shape(
 
 
 def check_float(name: str, tensor: Tensor, like: Tensor | None = None) -> None:
-    """Check that `tensor` is float32 or float64 and, where `like` is given, of its dtype and device.
+    """Check that `tensor` is float32 or float64 and, if `like` is given, of its dtype and device.
 
     Raises:
         ValueError: another dtype or device.
@@ -56,7 +56,7 @@ def check_float(name: str, tensor: Tensor, like: Tensor | None = None) -> None:
 
 
 def check_like(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor, hint: str = "") -> None:
-    """`check_shape` and `check_float` in one look, for sizes that are known; `like` is a checked tensor.
+    """`check_shape` and `check_float` in one call, for known sizes; `like` is a checked tensor.
 
     Raises:
         TypeError: `tensor` is no tensor.
@@ -70,15 +70,15 @@ def check_like(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor, 
 
 
 def check_finite(**tensors: Tensor | None) -> None:
-    """Refuse NaN, infinities and absurd magnitudes: kernels would hide them in a plausible picture.
+    """Refuse NaN, infinities and huge magnitudes, which kernels could hide in a plausible picture.
 
     Raises:
-        ValueError: names the argument and how many of its values are bad.
+        ValueError: some values are bad.
     """
     for name, tensor in tensors.items():
         if tensor is None or tensor.numel() == 0:
             continue
-        low, high = torch.aminmax(tensor.detach())  # one pass; NaN comes out as NaN and fails both comparisons
+        low, high = torch.aminmax(tensor.detach())  # one pass; NaN stays NaN and fails both comparisons
         if not bool((low >= -FINITE_LIMIT) & (high <= FINITE_LIMIT)):
             bad = int((~(tensor.detach().abs() <= FINITE_LIMIT)).sum())
             raise ValueError(

@@ -1,8 +1,8 @@
-"""The one error a user is meant to read."""
+"""The error for users."""
 
 
 class InputError(ValueError):
-    """Something the user gave cannot be used; the message is one sentence: what, where, what to do.
+    """Invalid input of the user; the message is one sentence: where, what is wrong, what to do.
 
     The command line prints it without a traceback and exits with code 2.
     """

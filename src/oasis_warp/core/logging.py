@@ -11,7 +11,7 @@ logger = logging.getLogger("oasis_warp")
 
 @runtime_checkable
 class Progress(Protocol):
-    """What long work calls: the stage's name, how much of it is done and out of how much."""
+    """Callback of long work."""
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Report that `done` of `total` steps of `stage` are finished."""
@@ -23,7 +23,7 @@ def silent(stage: str, done: int, total: int) -> None:
 
 @contextmanager
 def timed_stage(stage: str, seconds: dict[str, float], progress: Progress = silent) -> Iterator[None]:
-    """Add the seconds of this block to those of `stage`, which becomes the last one, and report its start and end."""
+    """Add the time of the block to `seconds[stage]`, which becomes the last entry, and report start and end."""
     progress(stage, 0, 1)
     start = time.perf_counter()
     yield

@@ -10,11 +10,11 @@ import torch
 
 
 def worker_pool(workers: int) -> ProcessPoolExecutor:
-    """So many processes, of one thread each.
+    """A pool of processes with one thread each.
 
-    They leave Ctrl-C, which a terminal sends to all, to the process that started them: it ends them in its own time.
+    They ignore Ctrl-C, which a terminal sends to all processes: the one that started them ends them.
     """
-    # A forked child of a process with a CUDA context or threads may hang, a spawned one does not.
+    # A forked child of a process with a CUDA context or threads may hang; a spawned one does not.
     return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_start)
 
 

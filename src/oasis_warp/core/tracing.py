@@ -1,12 +1,12 @@
-"""Whether torch merely follows what is called, so that tensors may be stand-ins."""
+"""Detect whether torch is tracing, so that tensors may be fake."""
 
 import torch
 
 
 def is_traced() -> bool:
-    """Whether torch.compile, a dispatch or function mode (fake tensors, make_fx), functorch or a tracer is at work.
+    """Whether torch.compile, a dispatch or function mode (fake tensors, make_fx), functorch or a tracer is active.
 
-    Then a call may see no memory, and has to leave its trace; else it may take any short way. Costs half a microsecond.
+    Then tensors may have no memory, and calls must be recorded; else shortcuts are allowed. Takes 0.5 us.
     """
     return bool(
         torch.compiler.is_compiling()
