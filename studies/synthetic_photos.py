@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -23,7 +24,6 @@ from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shots import PICTURES_EACH
-from oasis_warp.synthetic.spectrum import linear_to_lab
 from studies.harness import Options as Base
 from studies.harness import Row, measured
 from studies.inputs import PHOTOS, estimator, iou, photos_below, synthetic_photo
@@ -52,7 +52,7 @@ class Options(Base):
 
 def lab(rgb: np.ndarray) -> np.ndarray:
     """CIELAB of sRGB."""
-    return linear_to_lab(np.where(rgb < 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4))
+    return cv2.cvtColor(np.float32(rgb).reshape(-1, 1, 3), cv2.COLOR_RGB2Lab).reshape(rgb.shape)
 
 
 def measure_photo(photo: Photo, side: str | None = None, mask: Tensor | None = None) -> Row:
