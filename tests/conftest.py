@@ -7,19 +7,21 @@ import jaxtyping
 import pytest
 import torch
 
-MOST_WORKERS = 8
-"""Each takes up to a gigabyte of memory."""
+MOST_WORKERS, MOST_ON_GPU = 8, 2
+"""Each takes up to a gigabyte of memory, and one on the device."""
 
 
 def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the tests marked slow too")
 
 
+@pytest.hookimpl(wrapper=True)
 def pytest_xdist_auto_num_workers(config):
     """A process per core for folders, none for single files, which would end before the workers have started."""
+    cores = yield
     if any(".py" in argument for argument in config.args):
         return 0
-    return min(len(os.sched_getaffinity(0)), MOST_WORKERS)
+    return min(cores, MOST_ON_GPU if torch.cuda.is_available() else MOST_WORKERS)
 
 
 def pytest_collection_modifyitems(config, items):
