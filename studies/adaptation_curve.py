@@ -12,16 +12,15 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.avatar.anchors import faces_of_vertices
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import Camera, CanonicalGaussians, HandCrop, TrainingBatch
 from oasis_warp.evaluation.columns import COLORS, LIGHTS
-from oasis_warp.evaluation.held_out import Lighting, Shoot, as_estimated, photograph, true_targets
-from oasis_warp.evaluation.methods import Made, prior_digest
-from oasis_warp.evaluation.metrics import Truth, match_colors, score
+from oasis_warp.evaluation.held_out import CaptureConfig, Lighting, capture_person, estimated_batch, target_truths
+from oasis_warp.evaluation.methods import LitGaussians, prior_digest
+from oasis_warp.evaluation.metrics import TargetTruth, match_colors, score
 from oasis_warp.evaluation.synthetic import crop_of, draw_targets
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.image import masked_psnr
@@ -104,7 +103,7 @@ def shrink(crop: HandCrop, size: int) -> HandCrop:
     )
 
 
-def own_psnr(crop: HandCrop, made: Made) -> float:
+def own_psnr(crop: HandCrop, made: LitGaussians) -> float:
     """PSNR of the avatar over its photo, inside the outline [dB]."""
     faces, rest = bundled_hand().faces.to(crop.image.device), crop.rest.vertices
     light = None if made.light is None else (made.light, surface.vertex_normals(rest, faces))
@@ -117,10 +116,10 @@ class Targets(NamedTuple):
 
     batch: TrainingBatch
     rotations: torch.Tensor | None
-    truths: list[Truth]
+    truths: list[TargetTruth]
     colors: str
 
-    def psnr(self, made: Made) -> float | None:
+    def psnr(self, made: LitGaussians) -> float | None:
         """Of an avatar, inside the outline: mean of the targets [dB]."""
         found, hand = [], bundled_hand().to(self.batch.rest.device)
         for image, truth in zip(draw_targets(made, hand, self.batch, self.rotations), self.truths, strict=True):
@@ -142,18 +141,18 @@ class Subject(NamedTuple):
 @functools.lru_cache(1)
 def subject(light: Lighting, number: int, options: Options) -> Subject:
     """Photograph a person, and load all kernels before anything is timed."""
-    prior, device, shoot = prior_named(options.prior), torch.device(options.device), Shoot(size=SIZES[-1])
+    prior, device, capture = prior_named(options.prior), torch.device(options.device), CaptureConfig(size=SIZES[-1])
     if not isinstance(prior, NetworkPrior):
         raise SystemExit(f"--prior {options.prior}: has no heads to train; name a learned one.")
     hand = bundled_hand().to(device)
-    session = photograph(shoot, "ordinary", number, device)
-    batch, exact = (as_estimated(hand, session, light, shoot, factor) for factor in (1.0, 0.0))
-    truths = true_targets(exact, hand, faces_of_vertices(hand.faces, len(hand.template)))
+    person = capture_person(capture, "ordinary", number, device)
+    batch, exact = (estimated_batch(hand, person, light, capture, factor) for factor in (1.0, 0.0))
+    truths = target_truths(exact, hand)
     crop = crop_of(batch)
     guess, heads = prior.with_heads(crop)
     for texture in TEXTURES:
         adapt(bundled_hand(), guess, crop, AdaptConfig(texture=texture, texture_steps=2), heads=heads)
-    targets = Targets(batch, session.turns[light], truths, COLORS[light])
+    targets = Targets(batch, person.light_rotations[light], truths, COLORS[light])
     return Subject(crop, guess, heads, targets, prior_digest(prior))
 
 
@@ -164,7 +163,7 @@ def measure(light: Lighting, number: int, title: str, options: Options) -> Row:
     device, small = torch.device(options.device), shrink(crop, size)
     start = seconds(device)
     made = adapt(bundled_hand(), guess, small, config, heads=heads)
-    taken, adapted = seconds(device) - start, Made(made.gaussians, made.light)
+    taken, adapted = seconds(device) - start, LitGaussians(made.gaussians, made.light)
     return {
         "light": light, "person": number, "title": title, "seconds": taken, "steps": len(made.losses),
         "own": own_psnr(crop, adapted), "other": targets.psnr(adapted), "weights": weights, "device": options.device,

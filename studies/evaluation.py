@@ -20,12 +20,12 @@ from oasis_warp.evaluation.columns import (
     PHOTOS,
     SYNTHETIC,
     cells,
+    format_number,
     noise_rows,
-    number_words,
-    pose_words,
-    present,
+    pose_name,
+    with_values,
 )
-from oasis_warp.evaluation.methods import Method, label
+from oasis_warp.evaluation.methods import Method, method_name
 from oasis_warp.evaluation.summary import Record, select
 from studies.harness import Options as Base
 from studies.harness import Row
@@ -93,7 +93,7 @@ def draw(rows: list[Row], static: Path) -> None:
 
 def name_of(row: Record) -> str:
     """The label of the row's method."""
-    return label(Method(row["prior"], row["stage"]))
+    return method_name(Method(row["prior"], row["stage"]))
 
 
 def synthetic(found: dict[str, Any]) -> str:
@@ -105,12 +105,12 @@ def synthetic(found: dict[str, Any]) -> str:
                 row for row in select(found["summary"], group=group, light=light, colors=COLORS[light])
                 if row["noise"] in settings["noise"]
             ]  # fmt: skip
-            shown = present(rows, SYNTHETIC)
-            lines = [[name_of(row), pose_words(row["noise"]), *cells(row, shown)] for row in rows]
-            headings = ["method", "pose", *(column.words for column in shown.values())]
+            shown = with_values(rows, SYNTHETIC)
+            lines = [[name_of(row), pose_name(row["noise"]), *cells(row, shown)] for row in rows]
+            headings = ["method", "pose", *(column.heading for column in shown.values())]
             parts.append(f"{GROUPS[group]}, {LIGHTS[light]}:\n\n{markdown(headings, lines)}")
-    shoot, weights = settings["shoot"], str(settings["priors"].get("learned"))[:12]
-    about = f"{settings['people']} people, {shoot['targets']} targets each, {shoot['size']} px. Weights {weights}."
+    capture, weights = settings["capture"], str(settings["priors"].get("learned"))[:12]
+    about = f"{settings['people']} people, {capture['targets']} targets each, {capture['size']} px. Weights {weights}."
     return "\n\n".join([*parts, about + ("" if settings["lpips"] else " LPIPS: its weights were not at hand.")])
 
 
@@ -119,9 +119,9 @@ def noise(found: dict[str, Any]) -> str:
     settings = found["settings"]
     group, light, factors = settings["groups"][0], settings["lights"][0], sorted(settings["noise"] + settings["curve"])
     rows = noise_rows(found["summary"], group, light, factors)
-    lines = [[label(Method(*method)), *(number_words(psnr, ".2f") for psnr in of)] for method, of in rows.items()]
+    lines = [[method_name(Method(*key)), *(format_number(psnr, ".2f") for psnr in of)] for key, of in rows.items()]
     title = f"PSNR, {GROUPS[group][0].lower()}{GROUPS[group][1:]}, {LIGHTS[light]}:"
-    return f"{title}\n\n{markdown(['method', *map(pose_words, factors)], lines)}"
+    return f"{title}\n\n{markdown(['method', *map(pose_name, factors)], lines)}"
 
 
 def photos(found: dict[str, Any]) -> str:
@@ -130,8 +130,8 @@ def photos(found: dict[str, Any]) -> str:
     words = f"{rows[0]['pairs']} ordered pairs of {len(found['settings']['photos'])} sets, medians."
     if found["left_out"]:
         words += f" Photos left out: {len(found['left_out'])}."
-    shown = present(rows, PHOTOS)
-    headings = ["method", *(column.words for column in shown.values())]
+    shown = with_values(rows, PHOTOS)
+    headings = ["method", *(column.heading for column in shown.values())]
     return f"{markdown(headings, [[name_of(row), *cells(row, shown)] for row in rows])}\n\n{words}"
 
 
@@ -146,7 +146,7 @@ def measurements(found: dict[str, Any]) -> str:
             by_method, first = {(row["prior"], row["stage"]): row for row in rows}, rows[0]
             title = f"**{GROUPS[group]}, {words}**: {first['people']} people, {first['pictures']} pictures"
             lines = [[name, *cells(by_method[key], MEASURES)] for key, name in METHODS.items() if key in by_method]
-            parts.append(f"{title}\n\n{markdown(['', *(column.words for column in MEASURES.values())], lines)}")
+            parts.append(f"{title}\n\n{markdown(['', *(column.heading for column in MEASURES.values())], lines)}")
     return "\n\n".join(parts)
 
 

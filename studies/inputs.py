@@ -14,7 +14,7 @@ from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.types import HandFit, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
-from oasis_warp.evaluation.held_out import FIRST_PERSON, Shoot, photograph
+from oasis_warp.evaluation.held_out import FIRST_PERSON, CaptureConfig, capture_person
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
 from studies.harness import prior_choice
@@ -48,8 +48,8 @@ def photo_named(name: str, folder: Path = PHOTOS, size: int = 512, device: str =
     if not name.startswith(SYNTHETIC):
         return read_photo(folder / name if (folder / name).is_file() else Path(name))
     number = FIRST_PERSON + int(name.removeprefix(SYNTHETIC))
-    session = photograph(Shoot(size=size, targets=1), "ordinary", number, torch.device(device))
-    return synthetic_photo(session.photos["studio"].image[0].cpu(), name)
+    person = capture_person(CaptureConfig(size=size, targets=1), "ordinary", number, torch.device(device))
+    return synthetic_photo(person.photos["studio"].image[0].cpu(), name)
 
 
 def synthetic_photo(image: Tensor, name: str) -> Photo:

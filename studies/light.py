@@ -26,7 +26,7 @@ from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera
 from oasis_warp.data.photo import read_photo
-from oasis_warp.evaluation.held_out import Shoot, as_estimated, photograph
+from oasis_warp.evaluation.held_out import CaptureConfig, capture_person, estimated_batch
 from oasis_warp.evaluation.same_hand import photos_of_hands
 from oasis_warp.evaluation.synthetic import crop_of
 from oasis_warp.hand.template import bundled_hand
@@ -65,10 +65,10 @@ class Options(AvatarOptions):
 @torch.no_grad()
 def measure_light(number: int, prior: str) -> Row:
     """Harmonics of the light on one person, [4, 3]."""
-    hand, shoot = bundled_hand(), Shoot()
-    session = photograph(shoot, "ordinary", number, torch.device("cpu"))
-    batch = as_estimated(hand, session, "same", shoot, 1.0)
-    crop, rotations = crop_of(batch), session.turns["same"]
+    hand, capture = bundled_hand(), CaptureConfig()
+    person = capture_person(capture, "ordinary", number, torch.device("cpu"))
+    batch = estimated_batch(hand, person, "same", capture, 1.0)
+    crop, rotations = crop_of(batch), person.light_rotations["same"]
     guess = prior_named(prior)(crop)
     _, view, trusted = in_photo(hand, guess, crop)
     colors = calibrate(view, guess.colors, crop.image, trusted, AdaptConfig()).apply(guess.colors)
@@ -76,7 +76,7 @@ def measure_light(number: int, prior: str) -> Row:
 
     own = (crop.posed.vertices, crop.camera, crop.image, crop.mask, torch.eye(3))
     pictures = [own] + [
-        (posed, Camera(viewmat, K, shoot.size, shoot.size), image / mask.clamp_min(LEAST)[..., None], mask, rotation)
+        (posed, Camera(viewmat, K, *image.shape[1::-1]), image / mask.clamp_min(LEAST)[..., None], mask, rotation)
         for posed, viewmat, K, image, mask, rotation in zip(
             batch.target_posed[0], batch.target_viewmats[0], batch.target_Ks[0], batch.target_images[0],
             batch.target_masks[0], rotations, strict=True,

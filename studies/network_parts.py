@@ -22,7 +22,7 @@ from oasis_warp.data.output_files import open_resumable_folder
 from oasis_warp.evaluation.held_out import POPULATIONS
 from oasis_warp.evaluation.methods import BASELINE, ONE_SHOT, RAW, Method
 from oasis_warp.evaluation.summary import Record
-from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate
+from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate_people
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.hand_network import HandNetwork
@@ -186,7 +186,7 @@ def evaluate_all(names: list[str], folder: Path, options: Options) -> list[Recor
     )  # fmt: skip
     place, device = folder / f"evaluation_{options.held_out}_{stages[-1]}", torch.device(options.device)
     priors = {"mean": MeanPrior(hand), **priors}
-    return evaluate(priors, config, place, device, workers=options.workers, progress=report)["pictures"]
+    return evaluate_people(priors, config, place, device, workers=options.workers, progress=report)["pictures"]
 
 
 def run(options: Options) -> list[Row]:

@@ -56,7 +56,7 @@ class KnownHand(NamedTuple):
     pose: HandPose
     camera: Camera
     avatar: Avatar
-    """Made from the photo without paint, on the true surface."""
+    """LitGaussians from the photo without paint, on the true surface."""
     photo: Photo
     waves: tuple[Tensor, Tensor, Tensor] | None
     """Of the skin's detail; None where it is not known."""

@@ -15,10 +15,10 @@ import torch
 
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig
-from oasis_warp.evaluation.columns import COLORS, LIGHTS, SYNTHETIC, Column
+from oasis_warp.evaluation.columns import COLORS, LIGHTS, SYNTHETIC, Measure
 from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
 from oasis_warp.evaluation.summary import Record, difference, mean, select
-from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate
+from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate_people
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.attention import VisibilityAttention
 from oasis_warp.network.hand_network import HandNetwork
@@ -53,8 +53,8 @@ COLUMNS = {
         name: SYNTHETIC[name]
         for name in ("psnr", "psnr_inner", "psnr_visible", "psnr_hidden", "psnr_stretched", "psnr_unchanged")
     },
-    "hidden_more": Column("hidden above visible", ".2f"),
-    "stretched_more": Column("stretched above unchanged", ".2f"),
+    "hidden_more": Measure("hidden above visible", ".2f"),
+    "stretched_more": Measure("stretched above unchanged", ".2f"),
     **{name: SYNTHETIC[name] for name in ("ssim", "ssim_mask", "lpips")},
 }
 
@@ -113,7 +113,7 @@ def ablation_text(rows: list[Row]) -> str | None:
     for table in groups(rows, "light", "colors", "stage", "whole").values():
         shown = {name: column for name, column in COLUMNS.items() if any(row[name] is not None for row in table)}
         lines = [[row["title"], *(_cell(row, name, column) for name, column in shown.items())] for row in table]
-        made = markdown(["", *(column.words for column in shown.values())], lines)
+        made = markdown(["", *(column.heading for column in shown.values())], lines)
         parts.append(f"{heading(table[0])}:\n\n{made}")
     settings = ", ".join(f"{name} {value}" for name, value in rows[0].get("settings", {}).items()) if rows else ""
     return "\n\n".join([*parts, *([f"Settings: {settings}."] if settings else [])]) or None
@@ -126,7 +126,7 @@ def heading(row: Row) -> str:
     return f"{light[0].upper()}{light[1:]}{colors}; {row['stage'].replace('_', '-')}, {row['people']} people"
 
 
-def _cell(row: Row, measure: str, column: Column) -> str:
+def _cell(row: Row, measure: str, column: Measure) -> str:
     """The mean of the whole, and the difference from it with its standard error over people."""
     change = row["change"][measure]
     if row[measure] is None:
@@ -161,7 +161,7 @@ def run_evaluation(
     place = options.out / "parts" / folder
     place.parent.mkdir(parents=True, exist_ok=True)
     device = torch.device(options.device)
-    found = evaluate(
+    found = evaluate_people(
         priors, config, place, device, workers=options.workers,
         progress=lambda stage, done, total: report(f"{folder}, {stage}", done, total),
     )  # fmt: skip

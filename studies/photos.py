@@ -24,8 +24,8 @@ from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import choose_hand
-from oasis_warp.evaluation.coverage import coverage
-from oasis_warp.evaluation.photo_pairs import compare_pairs
+from oasis_warp.evaluation.metrics import coverage
+from oasis_warp.evaluation.same_hand import compare_pairs
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.reconstruction import crop_hand, initial_offsets, make_avatar, reconstruct

@@ -16,7 +16,7 @@ from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import INSET
 from oasis_warp.avatar.observation import input_of_batch
 from oasis_warp.core import surface
-from oasis_warp.evaluation.held_out import Shoot, as_estimated, photograph
+from oasis_warp.evaluation.held_out import CaptureConfig, capture_person, estimated_batch
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import BUNDLED
@@ -86,7 +86,7 @@ def gaussian_table(network: HandNetwork, photos: int) -> str:
     The distance under the skin is along its normal. A face's Gaussian may leave the middle of its face, and the face's
     features need not be the mean of its corners' (the paper's Feature-on-Mesh, equation 7).
     """
-    hand, shoot = bundled_hand(), Shoot(targets=1)
+    hand, capture = bundled_hand(), CaptureConfig(targets=1)
     found: dict[str, list[torch.Tensor]] = {}
 
     def add(kind: str, values: dict[str, torch.Tensor]) -> None:
@@ -94,8 +94,8 @@ def gaussian_table(network: HandNetwork, photos: int) -> str:
             found.setdefault(f"{kind}: {name}", []).append(each)
 
     for number in people(photos):
-        session = photograph(shoot, "ordinary", number, torch.device("cpu"))
-        batch = as_estimated(hand, session, "wild", shoot, 1.0)
+        person = capture_person(capture, "ordinary", number, torch.device("cpu"))
+        batch = estimated_batch(hand, person, "wild", capture, 1.0)
         guess, rest = network(input_of_batch(batch)), batch.rest[0]
         n = guess.offsets.shape[1]
         deep = INSET - (guess.offsets[0] * surface.vertex_normals(rest, hand.faces)).sum(-1)

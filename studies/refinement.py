@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.avatar.anchors import faces_of_vertices
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import HandCrop
@@ -24,15 +23,15 @@ from oasis_warp.estimation.refine import refine
 from oasis_warp.estimation.surface_state import shape_of, state_of_surface
 from oasis_warp.evaluation.held_out import (
     ERROR_STREAM,
+    CaptureConfig,
+    CapturedPerson,
     Lighting,
-    Session,
-    Shoot,
-    as_estimated,
+    capture_person,
+    estimated_batch,
     estimator_noise,
-    photograph,
-    true_targets,
+    target_truths,
 )
-from oasis_warp.evaluation.methods import Made
+from oasis_warp.evaluation.methods import LitGaussians
 from oasis_warp.evaluation.metrics import match_colors, score
 from oasis_warp.evaluation.synthetic import crop_of, draw_targets
 from oasis_warp.hand.kinematics import HandKinematics
@@ -68,13 +67,13 @@ class Options(AvatarOptions):
     """Reconstruct, too."""
 
 
-def true_crop(session: Session, light: Lighting, shoot: Shoot, factor: float) -> HandCrop:
-    """The true surface in the crop of the wrong mask: the same random numbers as of `as_estimated`."""
-    (state,) = np.random.SeedSequence([shoot.seed, ERROR_STREAM, session.number]).generate_state(1)
+def true_crop(person: CapturedPerson, light: Lighting, capture: CaptureConfig, factor: float) -> HandCrop:
+    """The true surface in the crop of the wrong mask: the same random numbers as of `estimated_batch`."""
+    (state,) = np.random.SeedSequence([capture.seed, ERROR_STREAM, person.number]).generate_state(1)
     noise = EstimatorNoise(surface=0.0, mask=estimator_noise(factor).mask)
-    random, photo = torch.Generator().manual_seed(int(state)), session.photos[light]
+    random, photo = torch.Generator().manual_seed(int(state)), person.photos[light]
     hand = bundled_hand().to(photo.image.device)
-    return crop_of(training_batch(hand, photo, session.targets[light], shoot.size, random, noise))
+    return crop_of(training_batch(hand, photo, person.targets[light], capture.size, random, noise))
 
 
 def errors(found: HandCrop, truth: HandCrop) -> Row:
@@ -119,15 +118,15 @@ def joint_angles(crop: HandCrop) -> np.ndarray:
 
 def measure(number: int, options: Options) -> Iterator[Row]:
     """Rows of one person: one for each light and factor, and with avatars one for each surface and stage, too."""
-    shoot, device = Shoot(), torch.device(options.device)
+    capture, device = CaptureConfig(), torch.device(options.device)
     hand, on_device, prior = bundled_hand(), bundled_hand().to(device), prior_named(options.prior)
-    session = photograph(shoot, "ordinary", number, device)
-    for light in session.photos:
-        exact = as_estimated(on_device, session, light, shoot, 0.0)
-        truths = true_targets(exact, on_device, faces_of_vertices(on_device.faces, len(hand.template)))
+    person = capture_person(capture, "ordinary", number, device)
+    for light in person.photos:
+        exact = estimated_batch(on_device, person, light, capture, 0.0)
+        truths = target_truths(exact, on_device)
         for factor in options.errors:
-            batch = as_estimated(on_device, session, light, shoot, factor)
-            crop, truth = crop_of(batch), true_crop(session, light, shoot, factor)
+            batch = estimated_batch(on_device, person, light, capture, factor)
+            crop, truth = crop_of(batch), true_crop(person, light, capture, factor)
             start = time.perf_counter()
             refined = refine(hand, prior(crop), crop)
             about = {"person": number, "light": light, "factor": factor}
@@ -140,7 +139,7 @@ def measure(number: int, options: Options) -> Iterator[Row]:
                 guess = prior(each)
                 config = AdaptConfig(light="keep", texture_steps=options.steps)
                 for stage, gaussians in (("raw", guess), ("one-shot", adapt(hand, guess, each, config).gaussians)):
-                    images = draw_targets(Made(gaussians), on_device, batch, None)
+                    images = draw_targets(LitGaussians(gaussians), on_device, batch, None)
                     psnr = [
                         score(match_colors(i, t.image, t.mask) if light == "wild" else i, t)["psnr"]
                         for i, t in zip(images, truths, strict=True)

@@ -21,7 +21,6 @@ from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.fuse import fuse
 from oasis_warp.adaptation.reliability import look
-from oasis_warp.avatar.anchors import faces_of_vertices
 from oasis_warp.avatar.pose import in_even_light
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
@@ -31,11 +30,10 @@ from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.estimation.estimator import choose_hand
-from oasis_warp.evaluation.held_out import HELD_OUT_SEED, POPULATIONS, estimator_noise, true_targets
-from oasis_warp.evaluation.methods import Made
-from oasis_warp.evaluation.metrics import Truth, match_colors, score
-from oasis_warp.evaluation.photo_pairs import compare_with_photo, draw_as_photo
-from oasis_warp.evaluation.same_hand import photos_of_hands
+from oasis_warp.evaluation.held_out import HELD_OUT_SEED, POPULATIONS, estimator_noise, target_truths
+from oasis_warp.evaluation.methods import LitGaussians
+from oasis_warp.evaluation.metrics import TargetTruth, match_colors, score
+from oasis_warp.evaluation.same_hand import compare_with_photo, draw_as_photo, photos_of_hands
 from oasis_warp.evaluation.synthetic import crop_of, draw_targets
 from oasis_warp.fusion import (
     crop_hands,
@@ -104,9 +102,9 @@ class Options(AvatarOptions):
 # ---- synthetic people
 
 
-def photograph(
+def capture(
     number: int, size: int, light: str, device: torch.device
-) -> tuple[list[TrainingBatch], list[Truth]]:
+) -> tuple[list[TrainingBatch], list[TargetTruth]]:
     """`MOST` photos of a person as the estimator has them, with the same targets, and the truth of those.
 
     Which places of targets the photos show is of no use: what one photo shows would be wrong for several.
@@ -129,12 +127,12 @@ def photograph(
     photos = [SyntheticBatch(*(part[k : k + 1] for part in taken)) for k in range(MOST)]
     batches = [training_batch(hand, photo, targets, size, random, estimator_noise(1.0)) for photo in photos]
     exact = training_batch(hand, photos[0], targets, size, torch.Generator(), estimator_noise(0.0))
-    return batches, true_targets(exact, hand, faces_of_vertices(hand.faces, len(hand.template)))
+    return batches, target_truths(exact, hand)
 
 
 def measure_person(number: int, light: str, options: Options) -> Iterator[Row]:
     """Rows of avatars of each photo alone and of the first 2, 3, ..."""
-    batches, truths = photograph(number, options.size, light, torch.device(options.device))
+    batches, truths = capture(number, options.size, light, torch.device(options.device))
     hand, prior = bundled_hand().to(options.device), prior_named(options.prior)
     crops = [crop_of(batch) for batch in batches]
     guesses, pixels = [prior(crop) for crop in crops], [float(SURROUNDINGS) for _ in batches]
@@ -145,10 +143,8 @@ def measure_person(number: int, light: str, options: Options) -> Iterator[Row]:
         seen = (fusion.sightings.confidence > 0.5).any(0).float().mean()
         fused = fusion.gaussians if fusion.lights is None else in_even_light(fusion.gaussians, fusion.lights[0])
         for stage, gaussians in zip(STAGES, (fusion.guess, fused), strict=True):
-            found = [
-                score(match_colors(image, truth.image, truth.mask), truth)
-                for image, truth in zip(draw_targets(Made(gaussians), hand, batches[0], None), truths, strict=True)
-            ]
+            images = draw_targets(LitGaussians(gaussians), hand, batches[0], None)
+            found = [score(match_colors(i, t.image, t.mask), t) for i, t in zip(images, truths, strict=True)]
             numbers = {name: mean(row[name] for row in found) for name in ("psnr", "psnr_inner", "ssim_mask")}
             yield {"who": str(number), "of": light, "stage": stage, "photos": chosen, "seen": float(seen), **numbers}
 

@@ -11,7 +11,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_camera, mirror_points, mirror_pose
 from oasis_warp.core.types import CanonicalGaussians, HandPose
 from oasis_warp.data.avatar_file import save_avatar
-from oasis_warp.evaluation.coverage import coverage
+from oasis_warp.evaluation.metrics import coverage
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 

@@ -14,8 +14,13 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.evaluation import same_hand
-from oasis_warp.evaluation.photo_pairs import compare_pairs, compare_with_photo, draw_as_photo
-from oasis_warp.evaluation.same_hand import photos_of_hands, summarise_pairs
+from oasis_warp.evaluation.same_hand import (
+    compare_pairs,
+    compare_with_photo,
+    draw_as_photo,
+    photos_of_hands,
+    summarise_pairs,
+)
 from oasis_warp.reconstruction import crop_hand
 
 SMALL = ReconstructConfig(size=96)
@@ -193,7 +198,7 @@ def test_ctrl_c_keeps_what_is_whole(tmp_path, monkeypatch, capsys):
     def stopped(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "evaluate", stopped)
+    monkeypatch.setattr(command, "evaluate_people", stopped)
     assert main(["evaluate", "--out", str(tmp_path / "found"), "--prior", "none"]) == INTERRUPTED
     assert "what is whole stays in" in capsys.readouterr().err
 
@@ -216,10 +221,10 @@ def test_synthetic_hands_are_measured_and_printed(tmp_path, monkeypatch, capsys)
     asked = []
 
     def found(priors, config, out, device, **options):
-        asked.append((list(priors), config.people, config.shoot.size, config.adapt.texture_steps, str(device)))
+        asked.append((list(priors), config.people, config.capture.size, config.adapt.texture_steps, str(device)))
         return {"summary": rows}
 
-    monkeypatch.setattr(command, "evaluate", found)
+    monkeypatch.setattr(command, "evaluate_people", found)
     options = ["--people", "3", "--size", "128", "--steps", "5", "--prior", "none"]
     assert main(["evaluate", "--out", str(tmp_path / "found"), *options]) == 0
     said = capsys.readouterr().out

@@ -2,7 +2,7 @@
 
 import pytest
 
-from oasis_warp.evaluation.methods import BASELINE, METHODS, Method, label
+from oasis_warp.evaluation.methods import BASELINE, METHODS, Method, method_name
 from oasis_warp.evaluation.metrics import MEASURES
 from oasis_warp.evaluation.summary import difference, mean, select, summarise
 
@@ -56,5 +56,5 @@ def test_without_the_baseline_there_is_no_gain():
 
 
 def test_methods_have_names_of_their_own():
-    assert len({label(method) for method in METHODS}) == len(METHODS)
-    assert label(METHODS[-1]) == "learned one-shot"
+    assert len({method_name(method) for method in METHODS}) == len(METHODS)
+    assert method_name(METHODS[-1]) == "learned one-shot"

@@ -6,7 +6,6 @@ import pytest
 import torch
 from synthetic import posed_hand
 
-from oasis_warp.avatar.anchors import faces_of_vertices
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.evaluation.held_out import (
@@ -14,16 +13,16 @@ from oasis_warp.evaluation.held_out import (
     HELD_OUT_SEED,
     POPULATIONS,
     STRETCH,
-    Shoot,
-    as_estimated,
-    photograph,
-    true_targets,
+    CaptureConfig,
+    capture_person,
+    estimated_batch,
+    target_truths,
 )
 from oasis_warp.ops import depth_map
 from oasis_warp.synthetic.identity import sample_identity
 
 CPU = torch.device("cpu")
-SHOOT = Shoot(targets=2, size=64)
+CAPTURE = CaptureConfig(targets=2, size=64)
 
 
 def seen_from(hand, azimuths, target_vertices=None, size=96):
@@ -45,7 +44,7 @@ def labels(hand, batch):
     """Pixels of the hand in each target; hidden, stretched and squeezed ones."""
     size, vertices = batch.target_images.shape[2], batch.target_posed[0]
     ids = depth_map(vertices, hand.faces, batch.target_viewmats[0], batch.target_Ks[0], size, size).face_ids
-    truths = true_targets(batch, hand, faces_of_vertices(hand.faces, len(hand.template)))
+    truths = target_truths(batch, hand)
     return [
         tuple(int(part.sum()) for part in (seen >= 0, truth.hidden, truth.stretched, truth.squeezed))
         for seen, truth in zip(ids, truths, strict=True)
@@ -68,23 +67,23 @@ def test_skin_is_stretched_or_squeezed_from_a_ratio_of_areas_on(hand, growth):
 
 
 @pytest.fixture(scope="module")
-def session():
-    return photograph(SHOOT, "ordinary", FIRST_PERSON, CPU)
+def person():
+    return capture_person(CAPTURE, "ordinary", FIRST_PERSON, CPU)
 
 
-def test_both_photos_show_the_same_hand_in_the_same_pose(session):
-    studio, wild = session.photos["studio"], session.photos["wild"]
+def test_both_photos_show_the_same_hand_in_the_same_pose(person):
+    studio, wild = person.photos["studio"], person.photos["wild"]
     for name in ("angles", "orientation", "shape", "left", "person"):
         assert torch.equal(getattr(studio, name), getattr(wild, name)), name
     torch.testing.assert_close(studio.translation, wild.translation)
     assert not torch.allclose(studio.image, wild.image, atol=0.05)
-    for targets in session.targets.values():
+    for targets in person.targets.values():
         assert targets.image.shape == (2, 80, 80, 3)
         assert torch.equal(targets.shape[0], wild.shape[0])
 
 
-def test_targets_of_one_capture_are_the_even_ones_in_other_light(session):
-    same, even = session.targets["same"], session.targets["studio"]
+def test_targets_of_one_capture_are_the_even_ones_in_other_light(person):
+    same, even = person.targets["same"], person.targets["studio"]
     for name in ("angles", "orientation", "translation", "mask", "depth"):
         torch.testing.assert_close(getattr(same, name), getattr(even, name), atol=1e-4, rtol=1e-4, msg=name)
     hand, black = same.mask[..., None] > 0.99, same.alpha == 0
@@ -92,15 +91,15 @@ def test_targets_of_one_capture_are_the_even_ones_in_other_light(session):
     assert float((same.image - even.image)[hand.expand_as(same.image)].std()) > 0.02
 
 
-def test_a_studios_wall_is_plain_and_the_hand_before_it_lit_as_its_targets(session):
-    studio = session.photos["studio"]
+def test_a_studios_wall_is_plain_and_the_hand_before_it_lit_as_its_targets(person):
+    studio = person.photos["studio"]
     wall = studio.image[studio.alpha == 0]
     assert len(wall) > 500 and torch.equal(wall, wall[:1].expand_as(wall))
 
 
-def test_the_same_picture_comes_again(session):
-    again = photograph(SHOOT, "ordinary", FIRST_PERSON, CPU)
-    for light, photo in session.photos.items():
+def test_the_same_picture_comes_again(person):
+    again = capture_person(CAPTURE, "ordinary", FIRST_PERSON, CPU)
+    for light, photo in person.photos.items():
         assert torch.equal(photo.image, again.photos[light].image)
 
 
@@ -115,9 +114,9 @@ def test_groups_are_the_same_people_with_one_thing_more(hand):
     assert bare.melanin == tattooed.melanin == ringed.melanin and bare.seed == ringed.seed
 
 
-def test_estimated_poses_are_off_by_as_much_as_the_factor_says(hand, session):
+def test_estimated_poses_are_off_by_as_much_as_the_factor_says(hand, person):
     def posed(factor):
-        return as_estimated(hand, session, "studio", SHOOT, factor)
+        return estimated_batch(hand, person, "studio", CAPTURE, factor)
 
     true, once, twice = posed(0.0), posed(1.0), posed(2.0)
     near, far = ((batch.posed - true.posed).norm(dim=-1).mean() for batch in (once, twice))

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from oasis_warp.evaluation.metrics import ERROR_FLOOR, FEWEST_PIXELS, MEASURES, Truth, match_colors, score
+from oasis_warp.evaluation.metrics import ERROR_FLOOR, FEWEST_PIXELS, MEASURES, TargetTruth, match_colors, score
 from oasis_warp.losses.image import SSIM_C1
 
 SIZE, LOW, HIGH = 64, 16, 48
@@ -15,7 +15,7 @@ def square(value=0.5, hidden=None, stretched=None, squeezed=None):
     mask = torch.zeros(SIZE, SIZE)
     mask[LOW:HIGH, LOW:HIGH] = 1
     nowhere = torch.zeros(SIZE, SIZE, dtype=torch.bool)
-    return Truth(
+    return TargetTruth(
         value * mask[..., None].expand(-1, -1, 3), mask, torch.ones_like(mask),
         *(nowhere if part is None else part for part in (hidden, stretched, squeezed)),
     )  # fmt: skip
@@ -88,7 +88,7 @@ def test_ssim_is_the_formula_in_the_mask_and_rises_with_the_black_round_it():
     a, b = 0.5, 0.7
     truth = square(a)
     image = truth.image * (b / a)
-    inside = Truth(truth.image, torch.zeros(SIZE, SIZE), *truth[2:])
+    inside = TargetTruth(truth.image, torch.zeros(SIZE, SIZE), *truth[2:])
     inside.mask[26:38, 26:38] = 1  # further from the edge than the window reaches: no structure, luminance alone
     expected = (2 * a * b + SSIM_C1) / (a * a + b * b + SSIM_C1)
     assert score(image, inside)["ssim_mask"] == pytest.approx(expected, abs=1e-4)

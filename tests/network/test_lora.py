@@ -10,7 +10,7 @@ from oasis_warp.adaptation.fuse import fuse
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
-from oasis_warp.evaluation.methods import ask
+from oasis_warp.evaluation.methods import prior_guess
 from oasis_warp.network.heads import (
     FACE_OUTPUTS,
     TRUST,
@@ -110,7 +110,7 @@ def test_in_every_step_all_reference_views_hold_the_guess_better_than_one_by_col
 def test_what_has_no_heads_is_refused(case, hand):
     crop, guess, _ = case
     with pytest.raises(InputError, match="'none': has no heads"):
-        ask(MeanPrior(hand), crop, LORA)
+        prior_guess(MeanPrior(hand), crop, LORA)
     with pytest.raises(ValueError, match="expected the heads of the prior, got none"):
         adapt(hand, guess, crop, LORA)
     with pytest.raises(ValueError, match="is for one photo"):

@@ -7,7 +7,7 @@ from oasis_warp.avatar.pose import GAMMA
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.camera import project
 from oasis_warp.core.types import HandLight
-from oasis_warp.evaluation.methods import Made
+from oasis_warp.evaluation.methods import LitGaussians
 from studies import adaptation_curve as curve
 
 
@@ -40,5 +40,5 @@ def test_avatars_are_drawn_in_the_light_of_their_photo(hand):
     dim = torch.tensor([0.5, 0.4, 0.3])
     light = HandLight(torch.cat([dim[None], torch.zeros(3, 3)]), dim.repeat(2, 1), torch.ones(3))
     shown = crop._replace(image=crop.image * dim.pow(1 / GAMMA))
-    lit, unlit = (curve.own_psnr(shown, Made(truth, there)) for there in (light, None))
+    lit, unlit = (curve.own_psnr(shown, LitGaussians(truth, there)) for there in (light, None))
     assert lit > unlit + 5

@@ -175,7 +175,7 @@ def test_evaluations_fill_their_pages(tmp_path):
     ]  # fmt: skip
     settings = {
         "groups": ["ordinary"], "lights": ["studio", "wild"], "noise": [0.0, 1.0], "curve": [2.0], "people": 2,
-        "shoot": {"targets": 1, "size": 64}, "priors": {"mean": None}, "lpips": False,
+        "capture": {"targets": 1, "size": 64}, "priors": {"mean": None}, "lpips": False,
     }  # fmt: skip
     (tmp_path / "evaluation").mkdir()
     found = {"settings": settings, "summary": summarise(records)}

@@ -19,18 +19,18 @@ from oasis_warp.evaluation.columns import (
     LIGHTS,
     PHOTOS,
     SYNTHETIC,
-    Column,
+    Measure,
     cells,
+    format_number,
     noise_rows,
-    number_words,
-    pose_words,
-    present,
+    pose_name,
+    with_values,
 )
-from oasis_warp.evaluation.held_out import HELD_OUT_SEED, Shoot
-from oasis_warp.evaluation.methods import Method, label
+from oasis_warp.evaluation.held_out import HELD_OUT_SEED, CaptureConfig
+from oasis_warp.evaluation.methods import Method, method_name
 from oasis_warp.evaluation.same_hand import METRICS, evaluate_photos
 from oasis_warp.evaluation.summary import Record, select
-from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate
+from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate_people
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.lpips import load_lpips
 from oasis_warp.network.prior import choose_prior
@@ -98,12 +98,12 @@ def on_synthetic_hands(options: Evaluate, priors: dict[str, Prior], progress: Pr
     """A table for each group of people and light of the photo, and the curve of quality against wrong poses."""
     config = SyntheticEvaluation(
         people=options.people,
-        shoot=Shoot(targets=options.targets, size=options.size, seed=HELD_OUT_SEED + options.seed),
+        capture=CaptureConfig(targets=options.targets, size=options.size, seed=HELD_OUT_SEED + options.seed),
         adapt=AdaptConfig(texture_steps=options.steps, seed=options.seed),
     )
     device = torch.device(options.device)
     perceptual = None if options.lpips is None else load_lpips(*options.lpips)
-    found = evaluate(
+    found = evaluate_people(
         priors, config, options.out, device, perceptual=perceptual, workers=options.workers, progress=progress
     )
     summary: list[Record] = found["summary"]
@@ -123,9 +123,9 @@ def noise_table(summary: Sequence[Record], config: SyntheticEvaluation) -> Table
     table = Table(title=f"PSNR against wrong poses; {GROUPS[group]}, {LIGHTS[light]}")
     table.add_column("method", no_wrap=True)
     for factor in factors:
-        table.add_column(pose_words(factor), justify="right")
+        table.add_column(pose_name(factor), justify="right")
     for method, found in noise_rows(summary, group, light, factors).items():
-        table.add_row(label(Method(*method)), *(number_words(psnr, ".2f") for psnr in found))
+        table.add_row(method_name(Method(*method)), *(format_number(psnr, ".2f") for psnr in found))
     return table
 
 
@@ -141,19 +141,19 @@ def on_photos(options: Evaluate, priors: dict[str, Prior], progress: Progress) -
     return [table]
 
 
-def make_table(title: str, rows: Sequence[Record], columns: Mapping[str, Column]) -> Table:
+def make_table(title: str, rows: Sequence[Record], columns: Mapping[str, Measure]) -> Table:
     """A line a row of a summary; the pose's errors, where there are several, in a column of their own."""
     table = Table(title=title)
     factors = {row["noise"] for row in rows if "noise" in row}
     table.add_column("method", no_wrap=True)
     if factors:
         table.add_column("pose")
-    shown = present(rows, columns)
+    shown = with_values(rows, columns)
     for column in shown.values():
-        table.add_column(column.words, justify="right")
+        table.add_column(column.heading, justify="right")
     for row in rows:
-        pose = [pose_words(row["noise"])] if factors else []
-        table.add_row(label(Method(row["prior"], row["stage"])), *pose, *cells(row, shown))
+        pose = [pose_name(row["noise"])] if factors else []
+        table.add_row(method_name(Method(row["prior"], row["stage"])), *pose, *cells(row, shown))
     if "lpips" in columns and "lpips" not in shown:
         table.caption = "LPIPS: no weights given (--lpips)"
     return table

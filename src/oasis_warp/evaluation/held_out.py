@@ -1,18 +1,19 @@
-"""Synthetic people that no training has met, photographed for evaluation: who, in which light, how well estimated."""
+"""Synthetic people that training never meets, photographed for evaluation, with the errors of the estimator."""
 
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.avatar.anchors import faces_of_vertices
 from oasis_warp.avatar.observation import input_of_batch, sight
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import TrainingBatch
-from oasis_warp.evaluation.metrics import Truth
+from oasis_warp.evaluation.metrics import TargetTruth
 from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.objective import true_pictures
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
@@ -32,58 +33,58 @@ from oasis_warp.synthetic.view_and_light import diffuse_light, sample_light
 from oasis_warp.synthetic.wardrobe import sample_clothes
 
 Group = Literal["ordinary", "tattoo", "ring"]
-"""Kinds of people. Their bodies and photos are the same: only the tattoo or the ring is more."""
+"""Kinds of people: the same bodies and photos, with a tattoo or a ring added."""
 Lighting = Literal["studio", "same", "wild"]
-"""Of photo and targets: "same", of one capture, with the soft light, the colours and the exposure of a room and its
-cheap camera; "studio", both in even light, the photo before a plain wall; "wild", the photo in whatever light comes,
-with hard shadows, and targets in even light."""
+"""Light of photo and targets. "same": both of one capture, with the soft light, colours and exposure of a room and a
+cheap camera; "studio": both in even light, the photo before a plain wall; "wild": the photo in any light, hard shadows
+included, targets in even light."""
 
 _BARE = replace(EVERYBODY, tattoo=0.0, ring=0.0)
 POPULATIONS = {"ordinary": _BARE, "tattoo": replace(_BARE, tattoo=1.0), "ring": replace(_BARE, ring=1.0)}
 HELD_OUT_SEED, FIRST_PERSON = 20_261_121, 1_000_000
-"""A world and numbers of people that training does not reach."""
+"""Seed of the world and number of the first person, both out of the reach of training."""
 WALL_STREAM = 5
-"""Tells the random numbers of walls from those of everything else with the same seed."""
+"""Stream of the random numbers of walls."""
 DIRECTED = 0.25
-"""Share of a capture's light that keeps its direction. All of it is a test of relighting: a side that is lit in the
-photo and dark in a target, or the other way round, hides whatever else is told of the hand."""
+"""Share of a capture's light that keeps its direction. With all of it the evaluation would test relighting alone: a
+side that is lit in the photo and dark in a target, or vice versa, would hide all else."""
 STRETCH = 1.25
-"""Area of a face in the pose over that at rest from which skin counts as stretched, a twentieth of all that is shown;
-the inverse for squeezed skin, another twentieth."""
+"""Area of a face in the pose over that at rest from which skin counts as stretched (a twentieth of what is shown); the
+inverse for squeezed skin (another twentieth)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shoot:
-    """How everybody is photographed."""
+class CaptureConfig:
+    """How people are photographed."""
 
     targets: int = 4
-    """Pictures of each hand in other poses, from other sides; up to `PICTURES_EACH`."""
+    """Pictures of each hand in other poses and views, at most `PICTURES_EACH`."""
     size: int = 256
     """Side of photos and targets [px], a multiple of 16."""
     seed: int = HELD_OUT_SEED
     """Of people, pictures and the estimator's errors."""
 
 
-class Session(NamedTuple):
-    """One person's pictures."""
+class CapturedPerson(NamedTuple):
+    """The pictures of one person."""
 
     number: int
     photos: dict[Lighting, SyntheticBatch]
-    """One each, in the same pose from the same side."""
+    """All in the same pose and view."""
     targets: dict[Lighting, SyntheticBatch]
-    """The same poses from the same sides; "studio" and "wild" share them."""
-    turns: dict[Lighting, Float[Tensor, "T 3 3"] | None]
-    """From the photo's frame to that of each target as the light turns; None where it is not the photo's light. All
-    are rendered as right hands, so this holds for left ones in the mirror."""
+    """All in the same poses and views; "studio" and "wild" share them."""
+    light_rotations: dict[Lighting, Float[Tensor, "T 3 3"] | None]
+    """Rotations of the light from the photo's frame to that of each target; None where targets have another light.
+    All hands are rendered as right ones, so they hold for left hands mirrored."""
 
 
-def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) -> Session:
+def capture_person(capture: CaptureConfig, group: Group, number: int, device: torch.device) -> CapturedPerson:
     """Render the photos and targets of person `number`."""
-    seed, size, first = shoot.seed, int(shoot.size * SURROUNDINGS), PICTURES_EACH * number
+    seed, size, first = capture.seed, int(capture.size * SURROUNDINGS), PICTURES_EACH * number
     wild = SceneConfig(population=POPULATIONS[group])
     even = replace(wild, look="even")
     (photo,) = sample_shots(seed, [first], wild)
-    goals = sample_shots(seed, range(first, first + shoot.targets), even)
+    goals = sample_shots(seed, range(first, first + capture.targets), even)
 
     def planned(shots: list[Shot]) -> ShotTable:
         return tabulate(seed, shots, wild)
@@ -96,12 +97,12 @@ def photograph(shoot: Shoot, group: Group, number: int, device: torch.device) ->
     same, same_goals = render_capture(
         seed, planned([soft]), planned(capture_shots(seed, soft, goals)), size, device, scene=wild
     )
-    turns = torch.from_numpy(np.stack([camera_rotation(seed, goal.index) for goal in goals])).float()
-    return Session(
+    rotations = torch.from_numpy(np.stack([camera_rotation(seed, goal.index) for goal in goals])).float()
+    return CapturedPerson(
         number,
         {"studio": studio, "same": same, "wild": render_table(seed, planned([photo]), size, device, scene=wild)},
         {"studio": even_goals, "same": same_goals, "wild": even_goals},
-        {"studio": torch.eye(3).expand(shoot.targets, 3, 3), "same": turns, "wild": None},
+        {"studio": torch.eye(3).expand(capture.targets, 3, 3), "same": rotations, "wild": None},
     )
 
 
@@ -112,38 +113,31 @@ def _evenly_lit(shot: Shot) -> Shot:
 
 
 def estimator_noise(factor: float) -> EstimatorNoise:
-    """Errors of pose, shape and camera `factor` times as large as the estimator's; 0 is the truth.
+    """Errors of pose, shape and camera `factor` times as large as the estimator's, none with 0.
 
-    Those of the mask come with them, but no larger than they are: a mask has no twice.
+    Errors of the mask are scaled up to 1 only: they cannot be doubled.
     """
     return EstimatorNoise(surface=factor, mask=min(factor, 1.0))
 
 
-def as_estimated(
-    hand: HandModel, session: Session, light: Lighting, shoot: Shoot, factor: float
+def estimated_batch(
+    hand: HandModel, person: CapturedPerson, light: Lighting, capture: CaptureConfig, factor: float
 ) -> TrainingBatch:
-    """One photo and its targets as training sees them, with `estimator_noise`; of any size it points the same way.
+    """One photo and its targets as training sees them, with `estimator_noise` of the same direction for any factor.
 
-    They are in where the photo is read. Targets are drawn on the true surface, or else the outline of a wrong one
-    would drown what is asked for.
+    Errors affect where the photo is read. Targets are drawn on the true surface, since the outline of a wrong one would
+    outweigh all else.
     """
-    (state,) = np.random.SeedSequence([shoot.seed, ERROR_STREAM, session.number]).generate_state(1)
+    (state,) = np.random.SeedSequence([capture.seed, ERROR_STREAM, person.number]).generate_state(1)
     random = torch.Generator().manual_seed(int(state))
     return training_batch(
-        hand, session.photos[light], session.targets[light], shoot.size, random, estimator_noise(factor)
+        hand, person.photos[light], person.targets[light], capture.size, random, estimator_noise(factor)
     )
 
 
-def true_targets(
-    batch: TrainingBatch, hand: HandModel, vertex_faces: Int[Tensor, "V M"]
-) -> list[Truth]:
-    """What must come out of the one hand of `batch`, in which nothing is off.
-
-    Args:
-        batch: With the photo's true pose.
-        hand: On the device of the batch.
-        vertex_faces: From `avatar.anchors.faces_of_vertices`.
-    """
+def target_truths(batch: TrainingBatch, hand: HandModel) -> list[TargetTruth]:
+    """The true targets of the one hand of `batch`, which has the photo's true pose; `hand` is on its device."""
+    vertex_faces = faces_of_vertices(hand.faces, len(hand.template))
     pictures = true_pictures(batch, hand.faces, hand.rim)
     size, vertices = batch.target_images.shape[2], batch.target_posed[0]
     seen = depth_map(
@@ -159,7 +153,7 @@ def true_targets(
         ratio = (_face_areas(vertices[k], hand.faces) / at_rest)[face]
         on_hand = seen.face_ids[k] >= 0
         truths.append(
-            Truth(
+            TargetTruth(
                 image,
                 mask,
                 batch.target_known[0, k],

@@ -1,4 +1,4 @@
-"""How near a drawn picture comes to the true one: the paper's columns, and the parts of a hand apart."""
+"""Metrics: rendered pictures against true ones, as a whole and by parts of the hand, and coverage from all sides."""
 
 import math
 from typing import NamedTuple
@@ -7,46 +7,54 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from oasis_warp.avatar.anchors import OPACITY, place_anchors
 from oasis_warp.avatar.observation import inner_mask
+from oasis_warp.core.camera import orbit_camera
+from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import ssim_map
+from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.objective import Perceptual
 
+COVERED = 0.9
+"""Alpha from which a pixel counts as covered."""
+COVERAGE_POSES = ("rest", "fist", "pinch", "point")
+COVERAGE_VIEWS = 8
 FEWEST_PIXELS = 50
-"""Of a part of the hand, else nothing is said about it."""
+"""Fewest pixels of a part of the hand that is measured."""
 ERROR_FLOOR = 1e-12
-"""Mean squared error that counts as none: 120 dB."""
+"""Smallest mean squared error: PSNR ends at 120 dB."""
 
 Scores = dict[str, float | None]
-"""By name of the measure; None where there is nothing to measure, or nothing to measure it with."""
+"""By name of the measure; None where it cannot be measured."""
 MEASURES = (
     "psnr", "psnr_inner", "ssim", "ssim_box", "ssim_mask", "lpips", "psnr_visible", "psnr_hidden", "psnr_stretched",
     "psnr_squeezed", "psnr_unchanged",
 )  # fmt: skip
 
 
-class Truth(NamedTuple):
-    """One target as it must come out."""
+class TargetTruth(NamedTuple):
+    """One true target."""
 
     image: Float[Tensor, "H W 3"]
     """Over black, times `mask`."""
     mask: Float[Tensor, "H W"]
     """Share of each pixel that is hand."""
     known: Float[Tensor, "H W"]
-    """0 where something else may hide the hand: a drawn picture is not judged there."""
+    """0 where something else may hide the hand, which is not compared."""
     hidden: Bool[Tensor, "H W"]
-    """Whether the photo does not show this place of the surface."""
+    """Surface that the photo does not show."""
     stretched: Bool[Tensor, "H W"]
-    """Whether the pose has stretched the skin there."""
+    """Skin that the pose has stretched."""
     squeezed: Bool[Tensor, "H W"]
-    """Or squeezed it, as inside bent joints: folds, darker than any colour that skin has at rest."""
+    """Skin that the pose has squeezed, as inside bent joints: its folds are darker than skin at rest."""
 
 
-def score(image: Float[Tensor, "H W 3"], truth: Truth, perceptual: Perceptual | None = None) -> Scores:
+def score(image: Float[Tensor, "H W 3"], truth: TargetTruth, perceptual: Perceptual | None = None) -> Scores:
     """Measure `image`, drawn over black, by every one of `MEASURES`.
 
-    PSNR [dB] weighs pixels by the mask; the inner one, and those of parts, leave out two pixels at the outline, where
-    shape decides and not skin. SSIM is the mean over the whole picture, over the mask's box, and over the mask. LPIPS
-    is of the hand alone.
+    PSNR [dB] weighs pixels by the mask. The inner PSNR and those of parts leave out two pixels at the outline, which
+    depend on the shape. SSIM is the mean over the whole picture, the mask's box, and the mask. LPIPS is of the hand.
     """
     drawn = image.clamp(0, 1) * truth.known[..., None]
     mask, error = truth.mask, (drawn - truth.image).square().mean(-1)
@@ -87,9 +95,9 @@ def _psnr(error: Tensor, weight: Tensor) -> float | None:
 def color_gain(
     image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], mask: Float[Tensor, "H W"]
 ) -> Float[Tensor, "3"]:
-    """The gain of each channel that brings `image` nearest to `target` inside `mask` (least squares).
+    """The least-squares gain of each channel from `image` to `target` inside `mask`.
 
-    A photo does not tell a coloured hand from coloured light, and what it is compared with stands in another light.
+    A photo does not tell a coloured hand from coloured light, and the target has another light.
     """
     weighted = image * mask[..., None]
     return (weighted * target).sum((0, 1)) / (weighted * image).sum((0, 1)).clamp_min(1e-6)
@@ -100,3 +108,27 @@ def match_colors(
 ) -> Float[Tensor, "H W 3"]:
     """`image` after `color_gain`, kept in [0, 1]."""
     return (image * color_gain(image, target, mask)).clamp(0, 1)
+
+
+@torch.no_grad()
+def coverage(avatar: Avatar, size: int = 256) -> Float[Tensor, "P C"]:
+    """Share of the posed mesh's silhouette with alpha >= 0.9, for each pose and each of 8 views around it.
+
+    The wrist's rim, where opacity fades out on purpose, is not part of the silhouette; where a learned prior made
+    Gaussians fainter, it is.
+    """
+    faces, anchors = avatar.hand.faces, place_anchors(avatar.hand, avatar.rest)
+    solid = torch.zeros(len(avatar.rest.vertices), device=avatar.device)
+    solid[anchors.vertex_index] = anchors.opacities[: len(anchors.vertex_index)]
+    solid_faces = (solid[faces] >= OPACITY - 1e-4).all(1)
+    shares = torch.zeros(len(COVERAGE_POSES), COVERAGE_VIEWS)
+    for p, name in enumerate(COVERAGE_POSES):
+        pose = avatar.source_pose._replace(angles=named_pose(avatar.hand, name))
+        vertices = avatar.mesh(pose).vertices
+        for c in range(COVERAGE_VIEWS):
+            camera = orbit_camera(vertices, 2 * math.pi * c / COVERAGE_VIEWS, size=size)
+            ids = depth_map(vertices, faces, camera.viewmat, camera.K, size, size).face_ids
+            inside = (ids >= 0) & solid_faces[ids.clamp_min(0).long()]
+            alpha = avatar.render(camera, pose).alpha
+            shares[p, c] = (alpha[inside] >= COVERED).float().mean()
+    return shares

@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: what every method makes of a photo, and where the network looks (the paper's figures)."""
+"""Pictures of an evaluation: the result of each method, and the attention of the network (the paper's figures)."""
 
 import math
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ ATTENTION_COLUMNS = ("photo", "visibility", "other side", "global attention", "o
 
 
 def tile(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "t t 3"]:
-    """The picture at the size of a sheet's tiles, on the CPU."""
+    """The picture, resized to a tile of a sheet, on the CPU."""
     small = interpolate(image.permute(2, 0, 1)[None], size=(TILE, TILE), mode="area")
     return small[0].permute(1, 2, 0).cpu()
 
@@ -42,7 +42,7 @@ def write_strip(path: Path, rows: Sequence[Sequence[Float[Tensor, "t t 3"]]]) ->
 
 
 def write_sheet(path: Path, strips: Sequence[Path], columns: Sequence[str]) -> None:
-    """Write the pictures `strips`, equally wide, one below the other, under the names of their columns."""
+    """Write the equally wide pictures `strips` below each other under the names of their columns."""
     parts = [read_photo(strip).rgb for strip in strips]
     heading = np.full((HEADING, parts[0].shape[1], 3), PAPER, np.uint8)
     for k, name in enumerate(columns):
@@ -80,7 +80,7 @@ def draw_attention(network: HandNetwork, inputs: NetworkInput) -> list[Float[Ten
 
 
 def _draw_field(field: Float[Tensor, "V"], vertices: Tensor, faces: Tensor, camera: Camera) -> Tensor:
-    """A number a vertex as a colour on the shaded surface."""
+    """One value per vertex as a colour on the shaded surface."""
     seen = depth_map(vertices, faces, camera.viewmat, camera.K, camera.width, camera.height, validate=False)
     corners, on_hand = faces[seen.face_ids.clamp_min(0).long()], seen.face_ids >= 0
     value = (field[corners] * seen.barycentrics).sum(-1)

@@ -1,26 +1,35 @@
-"""Evaluate avatars on real photos of the same hands: the looks from one photo, the pose from another."""
+"""Evaluate avatars on photos of the same hands: appearance from one photo, pose from another."""
 
 import json
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from oasis_warp import __version__
+from oasis_warp.avatar.appearance import label_regions, region_masks
+from oasis_warp.avatar.observation import Observation, inner_mask, observe
 from oasis_warp.avatar.prior import Prior
-from oasis_warp.core.config import AdaptConfig, ReconstructConfig
+from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import Landmarks, Photo
+from oasis_warp.core.mirror import mirror_camera
+from oasis_warp.core.types import HandCrop, HandPose, Landmarks, Photo, Render
 from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
-from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, label, prior_digest, reconstructions
-from oasis_warp.evaluation.photo_pairs import Pair, PairScore, compare_pairs
+from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, method_name, prior_digest, reconstructions
+from oasis_warp.evaluation.metrics import COVERED, color_gain
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, select
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
+from oasis_warp.losses.image import masked_psnr, ssim_map
 from oasis_warp.reconstruction import crop_hand, initial_offsets, make_avatar
 
 PHOTO_METHODS = (
@@ -30,13 +39,130 @@ PHOTO_METHODS = (
     Method("learned", KEEP),
     Method("learned", ONE_SHOT),
 )
-"""No prior, no adaptation, and both."""
+"""Methods of the table."""
 SETTINGS, METRICS, SHEET, HANDS = "evaluation.json", "metrics.json", "sheet.png", "hands"
-"""What an evaluation leaves in its folder; the last is a folder of what was found of each hand."""
+"""Files that an evaluation writes; the last is a folder with the results of each hand."""
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 SHOWN = 2
 """Pairs of each hand on the sheet."""
 DIGITS = 5
+MEASURES = (
+    "psnr", "psnr_plain", "ssim_quarter", "overlap", "error", "error_palm", "error_back", "error_nail"
+)  # fmt: skip
+"""Measures of a pair; a colour error is missing where too little of the region is seen."""
+QUARTER = 4
+"""Side of the blocks on which structure is compared [px]: a small pose error moves all detail."""
+FEWEST_VERTICES = 20
+"""Fewest vertices of a region whose colour is compared."""
+
+
+class PairScore(NamedTuple):
+    """An avatar, drawn in the pose and view of another photo of the same hand, compared inside both masks."""
+
+    psnr: float
+    """After one gain per channel, since exposure and white balance differ between photos [dB]."""
+    psnr_plain: float
+    """Without it [dB]."""
+    ssim_quarter: float
+    """At a quarter of the size, after the gain."""
+    region_errors: dict[str, float]
+    """Distance of the mean colours of each region that the other photo shows [sRGB], after the gain."""
+    overlap: float
+    """Intersection over union of the drawn hand and the other photo's mask."""
+
+
+class Pair(NamedTuple):
+    """Avatars of the photo `source` beside the photo `target`; pictures of left hands are mirrored."""
+
+    source: str
+    target: str
+    photo: Float[Tensor, "S S 3"]
+    drawn: dict[str, Float[Tensor, "S S 3"]]
+    scores: dict[str, PairScore]
+    """By name of the avatar, as `drawn`."""
+
+
+def compare_pairs(
+    estimator: HandEstimator,
+    photos: Mapping[str, tuple[Photo, Landmarks]],
+    avatars: Mapping[str, Mapping[str, Avatar]],
+    config: ReconstructConfig,
+) -> Iterator[Pair]:
+    """Every ordered pair of different photos that show the same side; pose and camera of the second are estimated.
+
+    Args:
+        estimator: Fits the second photo, with the shape of the first one's avatars.
+        photos: Of one hand, and where it is in each.
+        avatars: By photo and then by a name, all of one photo with the same surface; photos without are targets only.
+        config: Size of the pictures and device.
+    """
+    for target, (photo, landmarks) in photos.items():
+        for source, made in avatars.items():
+            if source == target or not made:
+                continue
+            first = next(iter(made.values()))
+            fit = estimator.fit(photo, landmarks, shape=first.shape.cpu(), force=True)
+            if fit.side != first.side:
+                continue
+            crop = crop_hand(photo, fit, first.surface_offsets.cpu(), config)
+            drawn = {name: draw_as_photo(avatar, crop, fit.pose) for name, avatar in made.items()}
+            scores = {
+                name: compare_with_photo(avatar, drawn[name], crop, fit.pose) for name, avatar in made.items()
+            }
+            yield Pair(source, target, crop.image, {name: what.image for name, what in drawn.items()}, scores)
+
+
+@torch.no_grad()
+def draw_as_photo(avatar: Avatar, crop: HandCrop, pose: HandPose) -> Render:
+    """`avatar` in the `pose`, in its photo's own frame, and camera of another photo; a left hand is mirrored."""
+    left = avatar.side == "left"
+    drawn = avatar.render(mirror_camera(crop.camera) if left else crop.camera, pose, BLACK)
+    return Render(drawn.image.flip(1), drawn.alpha.flip(1)) if left else drawn
+
+
+@torch.no_grad()
+def compare_with_photo(avatar: Avatar, drawn: Render, crop: HandCrop, pose: HandPose) -> PairScore:
+    """Compare what `draw_as_photo` drew of `avatar` in `pose` with the photo of `crop`."""
+    image, alpha = drawn
+    judged = crop.above_wrist > 0.5
+    mask = (crop.mask > 0.5) & judged
+    weight = ((inner_mask(crop.mask) > 0.5) & (alpha >= COVERED) & judged).to(image)
+    gain = color_gain(image, crop.image, weight)
+    matched = (image * gain).clamp(0, 1)
+    covered = (alpha > 0.5) & judged
+    return PairScore(
+        psnr=masked_psnr(matched, crop.image, weight),
+        psnr_plain=masked_psnr(image, crop.image, weight),
+        ssim_quarter=_small_ssim(matched, crop.image, weight),
+        region_errors=_region_errors(avatar, avatar.pose(pose).colors, crop, gain),
+        overlap=float((covered & mask).sum() / (covered | mask).sum().clamp_min(1)),
+    )
+
+
+def _small_ssim(image: Tensor, target: Tensor, weight: Tensor) -> float:
+    """Of the mean colours of blocks, over black beyond `weight`."""
+    planes = torch.cat([image * weight[..., None], target * weight[..., None], weight[..., None]], -1)
+    small = avg_pool2d(planes.permute(2, 0, 1), QUARTER).permute(1, 2, 0)
+    share = small[..., 6]
+    similarity = ssim_map(small[..., :3], small[..., 3:6])
+    return float((similarity * share).sum() / share.sum().clamp_min(1e-6))
+
+
+def _region_errors(
+    avatar: Avatar, lit: Float[Tensor, "N 3"], crop: HandCrop, gain: Tensor
+) -> dict[str, float]:
+    hand, index = avatar.hand, avatar.gaussians.vertex_index
+    seen: Observation = observe(hand, crop)
+    colors, present = torch.zeros_like(seen.colors), torch.zeros_like(seen.confidence)
+    colors[index], present[index] = lit[: len(index)], 1
+    errors = {}
+    for name, where in region_masks(label_regions(hand)).items():
+        weight = (where * seen.confidence * present)[:, None]
+        if float(weight.sum()) < FEWEST_VERTICES:
+            continue
+        difference = ((colors * gain - seen.colors) * weight).sum(0) / weight.sum()
+        errors[name] = float(difference.norm())
+    return errors
 
 
 def photos_of_hands(folder: Path) -> dict[str, list[Path]]:
@@ -74,17 +200,17 @@ def evaluate_photos(
     config: ReconstructConfig,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Make avatars of every photo and hold each against the other photos of its hand; what METRICS then holds.
+    """Make avatars of every photo, compare each with the other photos of its hand, and return the contents of METRICS.
 
-    A run that was stopped goes on with the hands that are missing. Photos that show no hand, or that no pose fits, are
-    named and left out.
+    An interrupted run goes on with the hands that are missing. Photos that show no hand, or that no pose fits, are left
+    out and named in METRICS.
 
     Args:
-        priors: By the names that methods have for them: "mean", and "learned" where there is one.
+        priors: By the names of methods' priors: "mean" and, if there is one, "learned".
         folder: See `photos_of_hands`.
-        out: Where files go; its parent must exist.
+        out: Output folder; its parent must exist.
         config: Its steps, seed, size and device are used.
-        progress: Told of photos and pairs.
+        progress: Called for photos and pairs.
 
     Raises:
         InputError: a folder that cannot be used, or no photo of which an avatar can be made.
@@ -108,7 +234,7 @@ def evaluate_photos(
     if not pairs:
         raise InputError(f"{folder}: of no hand are there two photos that avatars can be made of; see {out / HANDS}.")
     strips = [path for name in hands if (path := out / HANDS / f"{name}.png").exists()]
-    write_sheet(out / SHEET, strips, ["looks of", "pose of", *map(label, methods)])
+    write_sheet(out / SHEET, strips, ["looks of", "pose of", *map(method_name, methods)])
     left_out = {name: why for hand in found for name, why in hand["left_out"].items()}
     whole = {"settings": settings, "summary": summarise_pairs(pairs), "left_out": left_out, "pairs": pairs}
     write_file(out / METRICS, json.dumps(whole, allow_nan=False).encode())
@@ -119,7 +245,7 @@ def _measure_hand(
     name: str, paths: Sequence[Path], priors: Mapping[str, Prior], methods: Sequence[Method],
     config: ReconstructConfig, place: Path, progress: Progress,
 ) -> None:  # fmt: skip
-    """Write the records of one hand, and pictures of a few pairs; the records last."""
+    """Write pictures of a few pairs, then the records of one hand."""
     estimator = HandEstimator(bundled_hand())
     photos: dict[str, tuple[Photo, Landmarks]] = {}
     avatars: dict[str, dict[str, Avatar]] = {}
@@ -139,7 +265,7 @@ def _measure_hand(
     for k, pair in enumerate(compare_pairs(estimator, photos, avatars, config)):
         records += [_record(name, pair, method) for method in methods]
         if len(rows) < SHOWN and pair.source not in [shown for shown, _ in rows]:
-            drawn = [pair.drawn[label(method)] for method in methods]
+            drawn = [pair.drawn[method_name(method)] for method in methods]
             rows.append((pair.source, [tile(picture) for picture in (crops[pair.source], pair.photo, *drawn)]))
         progress(f"pairs of {name}", k + 1, total)
     if rows:
@@ -158,14 +284,14 @@ def _make_avatars(
     crop = crop_hand(photo, fit, offsets, config)
     settings = AdaptConfig(texture_steps=config.steps, seed=config.seed)
     avatars = {
-        label(method): make_avatar(fit, offsets, crop, *made)
+        method_name(method): make_avatar(fit, offsets, crop, *made)
         for method, made in reconstructions(hand, crop, priors, methods, settings)
     }
     return avatars, crop.image
 
 
 def _record(hand: str, pair: Pair, method: Method) -> Record:
-    score: PairScore = pair.scores[label(method)]
+    score: PairScore = pair.scores[method_name(method)]
     numbers = {name: getattr(score, name) for name in ("psnr", "psnr_plain", "ssim_quarter", "overlap")}
     errors = score.region_errors
     numbers |= {f"error_{region}": value for region, value in errors.items()}
@@ -180,14 +306,8 @@ def _record(hand: str, pair: Pair, method: Method) -> Record:
     }
 
 
-MEASURES = (
-    "psnr", "psnr_plain", "ssim_quarter", "overlap", "error", "error_palm", "error_back", "error_nail"
-)  # fmt: skip
-"""Of a pair; an error of colours is missing where too little of the region is seen."""
-
-
 def summarise_pairs(pairs: Sequence[Record]) -> list[Record]:
-    """A row a method: medians over pairs, and on which share of them the last method does better than this one."""
+    """A row for each method: medians over pairs, and the share of pairs on which the last method is better."""
     rows, best = [], PHOTO_METHODS[-1]
     of_best = {_who(pair): pair for pair in select(pairs, **best._asdict())}
     for method in PHOTO_METHODS:

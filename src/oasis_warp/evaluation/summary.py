@@ -1,4 +1,4 @@
-"""From numbers of single pictures to those of tables."""
+"""Aggregate the scores of single pictures into the rows of tables."""
 
 import statistics
 from collections import defaultdict
@@ -9,13 +9,13 @@ from oasis_warp.evaluation.methods import BASELINE, STAGES
 from oasis_warp.evaluation.metrics import MEASURES
 
 Record = dict[str, Any]
-"""One drawn picture: what it is (`KEYS`, person, target), and `MEASURES`."""
+"""One rendered picture: `KEYS`, person, target and `MEASURES`."""
 KEYS = ("group", "light", "noise", "colors", "prior", "stage")
-"""What makes a row of the summary; `colors` are "raw", or "matched" to the target by one gain a channel."""
+"""Keys of a row of the summary; `colors` are "raw", or "matched" to the target by one gain per channel."""
 
 
 class Difference(NamedTuple):
-    """Of one measure between two methods on the same pictures."""
+    """Difference of one measure between two methods on the same pictures."""
 
     mean: float
     error: float | None
@@ -25,20 +25,20 @@ class Difference(NamedTuple):
 
 
 def select(records: Iterable[Record], **wanted: object) -> list[Record]:
-    """The records that say so."""
+    """The records with these values."""
     return [record for record in records if all(record[key] == value for key, value in wanted.items())]
 
 
 def mean(records: Iterable[Record], measure: str) -> float | None:
-    """Over the pictures that have it."""
+    """Mean of a measure over the pictures that have it."""
     values = [record[measure] for record in records if record[measure] is not None]
     return statistics.fmean(values) if values else None
 
 
 def difference(records: Sequence[Record], reference: Sequence[Record], measure: str) -> Difference | None:
-    """How far `records` are above `reference`; None where they have no picture in common.
+    """Difference of `records` from `reference`; None if they have no picture in common.
 
-    A person counts once: pictures of one hand are no independent trials.
+    Each person counts once, since pictures of one hand are not independent.
     """
     before = {_place(record): record[measure] for record in reference}
     by_person = defaultdict(list)
