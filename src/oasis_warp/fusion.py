@@ -25,8 +25,7 @@ from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, Landmarks, Photo, PosedHand
-from oasis_warp.estimation.estimator import HandEstimator, choose_hand
-from oasis_warp.estimation.shared_shape import shared_shape
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand, shared_shape
 from oasis_warp.hand.skinning import rest_hand
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar

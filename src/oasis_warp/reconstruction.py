@@ -24,13 +24,12 @@ from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import as_right_hand, mirror_camera, mirror_pose
 from oasis_warp.core.types import Camera, CanonicalGaussians, HandCrop, HandFit, HandLight, Landmarks, Photo, Render
 from oasis_warp.data.square_crop import resample_square, square_around
-from oasis_warp.estimation.drawn_outline import rendered_outline_offsets
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
+from oasis_warp.estimation.fit_quality import keeps_quality, with_pose
 from oasis_warp.estimation.keypoints import read_keypoints
-from oasis_warp.estimation.moved_fit import keeps_quality, with_pose
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.refine import refine
-from oasis_warp.estimation.surface_offsets import outline_offsets
+from oasis_warp.estimation.surface_offsets import outline_offsets, rendered_outline_offsets
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar

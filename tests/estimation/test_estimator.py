@@ -6,10 +6,10 @@ import torch
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_points, mirror_pose
 from oasis_warp.data.photo import read_photo
-from oasis_warp.estimation.estimator import choose_hand
-from oasis_warp.estimation.fit_quality import overlap
+from oasis_warp.estimation.estimator import choose_hand, shared_shape
+from oasis_warp.estimation.fit_quality import iou_above_wrist
 from oasis_warp.estimation.landmarks import FINGERS, box_size
-from oasis_warp.estimation.silhouette import silhouette
+from oasis_warp.estimation.outline import silhouette
 from oasis_warp.hand.skinning import rest_hand, skin
 
 RIGHT, LEFT = "victory_right_09.jpg", "ok_sign_left_10.jpg"
@@ -35,7 +35,7 @@ def test_the_posed_hand_lies_on_the_hand_in_the_photo(hand, fitted, name):
     assert fit.worst_point < 4
     assert fit.mask_iou > 0.93
     assert fit.mask.shape == photo.rgb.shape[:2]
-    iou = overlap(covered(hand, fit), fit.mask.numpy() > 0.5, landmarks.xy.numpy())
+    iou = iou_above_wrist(covered(hand, fit), fit.mask.numpy() > 0.5, landmarks.xy.numpy())
     assert iou == pytest.approx(fit.mask_iou, abs=0.003), "the numbers are those of the pose that is handed out"
 
 
@@ -105,7 +105,7 @@ def test_a_large_photo_gives_the_same_hand_at_its_own_size(estimator, fitted, na
     torch.testing.assert_close(again.camera.K[:2] / 4, fit.camera.K[:2], rtol=0.05, atol=0)
     torch.testing.assert_close(again.pose.angles, fit.pose.angles, atol=0.15, rtol=0)
     small = cv2.resize(again.mask.numpy(), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-    assert overlap(small > 0.5, fit.mask.numpy() > 0.5, landmarks.xy.numpy()) > 0.97
+    assert iou_above_wrist(small > 0.5, fit.mask.numpy() > 0.5, landmarks.xy.numpy()) > 0.97
     assert again.mask_iou == pytest.approx(fit.mask_iou, abs=0.02)
 
 
@@ -127,7 +127,7 @@ def test_points_that_are_no_hand_are_refused_even_by_force(estimator, fitted):
 def test_a_cut_out_is_its_own_mask(fitted):
     photo, landmarks, fit = fitted("thumb_up_cutout_right_07.png")
     alpha = photo.alpha.numpy()
-    assert overlap(fit.mask.numpy() > 0.5, alpha > 0.5, landmarks.xy.numpy()) == 1.0
+    assert iou_above_wrist(fit.mask.numpy() > 0.5, alpha > 0.5, landmarks.xy.numpy()) == 1.0
     assert fit.mask.sum() < 0.95 * alpha.sum(), "the arm is cut"
     assert not any("cut-out" in warning for warning in fit.warnings)
 
@@ -215,6 +215,37 @@ def test_a_hand_that_was_not_found_is_asked_for_in_vain(fitted, which, words):
 def test_a_photo_without_hands_says_so():
     with pytest.raises(InputError, match=r"p\.jpg: found no hand; give a photo"):
         choose_hand([], "largest", "p.jpg")
+
+
+# ---- several photos
+
+
+def shapes(count, noise, seed=0):
+    """A true shape of 40 coefficients, and what `count` photos say of it."""
+    random = torch.Generator().manual_seed(seed)
+    true = torch.randn(40, generator=random)
+    return true, [true + noise * torch.randn(40, generator=random) for _ in range(count)]
+
+
+def test_shapes_that_agree_are_kept():
+    true, _ = shapes(0, 0.0)
+    for count in (1, 2, 5):
+        assert torch.allclose(shared_shape([true] * count), true, atol=1e-6)
+
+
+def test_the_shared_shape_is_nearer_to_the_truth_than_one_photo_and_than_their_mean():
+    alone, mean, shared = [], [], []
+    for seed in range(20):
+        true, said = shapes(3, 1.5, seed)
+        alone.append((said[0] - true).norm())
+        mean.append((torch.stack(said).mean(0) - true).norm())
+        shared.append((shared_shape(said) - true).norm())
+    assert sum(shared) < 0.95 * sum(mean) < 0.8 * sum(alone)
+
+
+def test_shapes_that_contradict_each_other_leave_the_mean_hand():
+    true, _ = shapes(0, 0.0)
+    assert torch.equal(shared_shape([true, -0.9 * true]), torch.zeros(40))
 
 
 # ---- the whole set

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from oasis_warp.estimation.fit import Fitter, OutlinePairs
-from oasis_warp.estimation.fit_quality import draw, overlap
-from oasis_warp.estimation.fit_state import FitState
-from oasis_warp.estimation.fit_target import evidence_of
+from oasis_warp.estimation.fit_problem import FitState, fit_target
+from oasis_warp.estimation.fit_quality import draw_silhouette, iou_above_wrist
 from oasis_warp.estimation.outline import MaskOutline, wrist_line
 from oasis_warp.hand.kinematics import HandKinematics
 
@@ -15,47 +14,48 @@ SIZE = (480, 400)
 
 
 @pytest.fixture(scope="module")
-def rig(hand):
+def kinematics(hand):
     return HandKinematics(hand)
 
 
-def posed_hand(rig, seed):
+def posed_hand(kinematics, seed):
     """A right hand in an ordinary pose before a camera: palm or back, tilted a little."""
     rng = np.random.default_rng(seed)
-    fitter = Fitter(rig, evidence_of(np.zeros((21, 2)), None, SIZE, 500.0))
+    fitter = Fitter(kinematics, fit_target(np.zeros((21, 2)), None, SIZE, 500.0))
     angles = np.clip(fitter.relaxed + 0.25 * rng.normal(size=26) * fitter.angle_sigma, fitter.low, fitter.high)
     shape = 0.7 * rng.normal(size=40)
     shape[6:10] = 0
     facing = cv2.Rodrigues(np.array([np.pi / 2 + np.pi * rng.integers(2), 0, 0]))[0]
-    turn = cv2.Rodrigues(rng.normal(size=3) * 0.3)[0] @ cv2.Rodrigues(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))[0]
-    state = FitState(turn @ facing, np.array([0, 0, np.log(0.45)]), angles, shape, 500.0, np.array(SIZE) / 2)
-    middle = state.project(landmarks(rig, state)).mean(0)
-    return replace(state, place=state.place - np.array([*((middle - state.centre) / state.focal), 0]))
+    tilt = cv2.Rodrigues(rng.normal(size=3) * 0.3)[0]
+    rotation = tilt @ cv2.Rodrigues(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))[0]
+    state = FitState(rotation @ facing, np.array([0, 0, np.log(0.45)]), angles, shape, 500.0, np.array(SIZE) / 2)
+    middle = state.project(landmarks(kinematics, state)).mean(0)
+    return replace(state, position=state.position - np.array([*((middle - state.centre) / state.focal), 0]))
 
 
-def landmarks(rig, state):
-    return rig.landmarks(rig.chain(state.angles, state.shape), state.shape)[0]
+def landmarks(kinematics, state):
+    return kinematics.landmarks(kinematics.pose_joints(state.angles, state.shape))[0]
 
 
-def seen(rig, state, **kwargs):
-    points = landmarks(rig, state)
-    return evidence_of(state.project(points), state.in_camera(points), SIZE, **kwargs)
+def seen(kinematics, state, **kwargs):
+    points = landmarks(kinematics, state)
+    return fit_target(state.project(points), state.in_camera(points), SIZE, **kwargs)
 
 
-def error(rig, fitter, state):
+def error(kinematics, fitter, state):
     """Mean distance of the points, share of the box."""
-    gaps = np.linalg.norm(state.project(landmarks(rig, state)) - fitter.evidence.xy, axis=1)
-    return gaps.mean() / fitter.evidence.box
+    gaps = np.linalg.norm(state.project(landmarks(kinematics, state)) - fitter.target.xy, axis=1)
+    return gaps.mean() / fitter.target.box
 
 
-def test_derivatives_of_all_terms_are_those_of_differences(rig):
-    state = posed_hand(rig, 0)
-    fitter = Fitter(rig, seen(rig, posed_hand(rig, 1)))
+def test_derivatives_of_all_terms_are_those_of_differences(kinematics):
+    state = posed_hand(kinematics, 0)
+    fitter = Fitter(kinematics, seen(kinematics, posed_hand(kinematics, 1)))
     rng = np.random.default_rng(0)
-    index = rng.integers(0, len(rig.template), 30)
+    index = rng.integers(0, len(kinematics.template), 30)
     normal = np.stack([np.cos(index), np.sin(index)], 1)
     target = rng.uniform(100, 300, (30, 2))
-    pairs = OutlinePairs(index, target, normal, np.ones(30), np.zeros_like(rig.template))
+    pairs = OutlinePairs(index, target, normal, np.ones(30), np.zeros_like(kinematics.template))
     _, slope, _ = fitter.system(state, pairs=pairs)
     # Reweighting makes the gradient of the robust cost 2 J^T r, whatever the loss.
     residual = fitter.system(state, pairs=pairs)[0]
@@ -72,75 +72,76 @@ def test_derivatives_of_all_terms_are_those_of_differences(rig):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_perfect_landmarks_are_explained(rig, seed):
-    truth = posed_hand(rig, seed)
-    fitter = Fitter(rig, seen(rig, truth))
+def test_perfect_landmarks_are_explained(kinematics, seed):
+    truth = posed_hand(kinematics, seed)
+    fitter = Fitter(kinematics, seen(kinematics, truth))
     found = fitter.fit_landmarks().state
-    assert error(rig, fitter, found) < 0.0075, "what the priors cost"
-    aligned = landmarks(rig, found) @ found.turn.T
-    true = landmarks(rig, truth) @ truth.turn.T
+    assert error(kinematics, fitter, found) < 0.0075, "what the priors cost"
+    aligned = landmarks(kinematics, found) @ found.rotation.T
+    true = landmarks(kinematics, truth) @ truth.rotation.T
     aligned, true = aligned - aligned[0], true - true[0]
     scale = (true * aligned).sum() / (aligned**2).sum()
     assert np.linalg.norm(scale * aligned - true, axis=1).mean() < 0.008, "metres, up to the size no photo shows"
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_landmarks_without_world_points_are_explained(rig, seed):
-    truth = posed_hand(rig, seed)
-    fitter = Fitter(rig, evidence_of(seen(rig, truth).xy, None, SIZE))
+def test_landmarks_without_world_points_are_explained(kinematics, seed):
+    truth = posed_hand(kinematics, seed)
+    fitter = Fitter(kinematics, fit_target(seen(kinematics, truth).xy, None, SIZE))
     found = fitter.fit_landmarks()
-    assert error(rig, fitter, found.state) < 0.01
+    assert error(kinematics, fitter, found.state) < 0.01
 
 
-def test_one_wild_landmark_does_not_carry_the_hand_away(rig):
-    truth = posed_hand(rig, 2)
-    evidence = seen(rig, truth)
-    spoilt = evidence.xy.copy()
-    spoilt[8] += 0.3 * evidence.box
-    fitter = Fitter(rig, replace(evidence, xy=spoilt))
+def test_one_wild_landmark_does_not_carry_the_hand_away(kinematics):
+    truth = posed_hand(kinematics, 2)
+    target = seen(kinematics, truth)
+    spoilt = target.xy.copy()
+    spoilt[8] += 0.3 * target.box
+    fitter = Fitter(kinematics, replace(target, xy=spoilt))
     found = fitter.fit_landmarks().state
     others = np.delete(np.arange(21), [5, 6, 7, 8])
-    gaps = np.linalg.norm(found.project(landmarks(rig, found)) - evidence.xy, axis=1)[others] / evidence.box
+    gaps = np.linalg.norm(found.project(landmarks(kinematics, found)) - target.xy, axis=1)[others] / target.box
     assert gaps.mean() < 0.02
 
 
-def test_joints_stay_near_their_limits(rig):
-    evidence = seen(rig, posed_hand(rig, 3))
-    wild = evidence.xy + np.random.default_rng(0).normal(size=(21, 2)) * 0.1 * evidence.box
-    fitter = Fitter(rig, replace(evidence, xy=wild))
+def test_joints_stay_near_their_limits(kinematics):
+    target = seen(kinematics, posed_hand(kinematics, 3))
+    wild = target.xy + np.random.default_rng(0).normal(size=(21, 2)) * 0.1 * target.box
+    fitter = Fitter(kinematics, replace(target, xy=wild))
     angles = fitter.fit_landmarks().state.angles
     assert np.maximum(angles - fitter.high, fitter.low - angles).max() < np.radians(15)
 
 
-def test_a_known_focal_length_and_shape_are_kept(rig):
-    truth = posed_hand(rig, 1)
+def test_a_known_focal_length_and_shape_are_kept(kinematics):
+    truth = posed_hand(kinematics, 1)
     shape = np.linspace(-1, 1, 40)
-    fitter = Fitter(rig, seen(rig, truth, focal=777.0), shape=shape)
+    fitter = Fitter(kinematics, seen(kinematics, truth, focal=777.0), shape=shape)
     found = fitter.fit_landmarks().state
     assert found.focal == 777.0
     np.testing.assert_allclose(found.shape, shape, atol=1e-5)
 
 
-def test_principal_components_that_no_photo_shows_stay_zero(rig):
-    found = Fitter(rig, seen(rig, posed_hand(rig, 0))).fit_landmarks().state
+def test_principal_components_that_no_photo_shows_stay_zero(kinematics):
+    found = Fitter(kinematics, seen(kinematics, posed_hand(kinematics, 0))).fit_landmarks().state
     np.testing.assert_allclose(found.shape[6:10], 0, atol=1e-5)
 
 
-def test_the_outline_brings_the_mesh_onto_the_mask(rig):
-    truth = posed_hand(rig, 0)
-    mask = (draw(rig, truth, SIZE) > 0).astype(np.float32)
-    evidence = seen(rig, truth)
-    noisy = evidence.xy + np.random.default_rng(1).normal(size=(21, 2)) * 0.008 * evidence.box
-    fitter = Fitter(rig, replace(evidence, xy=noisy))
+def test_the_outline_brings_the_mesh_onto_the_mask(kinematics):
+    truth = posed_hand(kinematics, 0)
+    mask = (draw_silhouette(kinematics, truth, SIZE) > 0).astype(np.float32)
+    target = seen(kinematics, truth)
+    noisy = target.xy + np.random.default_rng(1).normal(size=(21, 2)) * 0.008 * target.box
+    fitter = Fitter(kinematics, replace(target, xy=noisy))
     start = fitter.fit_landmarks()
     outline = MaskOutline(mask, noisy)
-    found = fitter.refine(start.state, lambda state: outline.match(rig, state), 4)
-    before, after = (overlap(draw(rig, s, SIZE) > 0, mask > 0, noisy) for s in (start.state, found.state))
+    found = fitter.refine(start.state, lambda state: outline.match(kinematics, state), 4)
+    drawn = [draw_silhouette(kinematics, solution.state, SIZE) > 0 for solution in (start, found)]
+    before, after = (iou_above_wrist(silhouette, mask > 0, noisy) for silhouette in drawn)
     assert 1 - after < min(0.7 * (1 - before), 0.035)
 
 
-def test_the_wrist_line_separates_hand_from_arm(rig):
-    xy = seen(rig, posed_hand(rig, 2)).xy
+def test_the_wrist_line_separates_hand_from_arm(kinematics):
+    xy = seen(kinematics, posed_hand(kinematics, 2)).xy
     line = wrist_line(xy)
     arm = xy[0] - (xy[9] - xy[0])
     np.testing.assert_array_equal(line.above(np.stack([xy[9], xy[5], xy[0], arm])), [True, True, False, False])
@@ -150,22 +151,22 @@ def test_the_wrist_line_separates_hand_from_arm(rig):
         assert where[y, x] == line.above(np.array([[x + 0.5, y + 0.5]]))[0]
 
 
-def test_a_fit_is_repeatable(rig):
-    evidence = seen(rig, posed_hand(rig, 1))
-    first, second = (Fitter(rig, evidence).fit_landmarks() for _ in range(2))
+def test_a_fit_is_repeatable(kinematics):
+    target = seen(kinematics, posed_hand(kinematics, 1))
+    first, second = (Fitter(kinematics, target).fit_landmarks() for _ in range(2))
     assert first.cost == second.cost
     np.testing.assert_array_equal(first.state.angles, second.state.angles)
 
 
 @pytest.mark.parametrize("beyond", [-1, 1])
-def test_a_pose_beyond_its_limits_costs_alike_on_both_sides(rig, beyond):
-    truth = posed_hand(rig, 0)
-    fitter = Fitter(rig, seen(rig, truth))
+def test_a_pose_beyond_its_limits_costs_alike_on_both_sides(kinematics, beyond):
+    truth = posed_hand(kinematics, 0)
+    fitter = Fitter(kinematics, seen(kinematics, truth))
     bound = fitter.low if beyond < 0 else fitter.high
     flat = replace(fitter.settings, angle=((1e6, 1e6),) * 3, coupling=1e6)  # of the priors, only the limits count
 
     def cost(angles):
-        free = Fitter(rig, fitter.evidence, settings=replace(flat, landmark=1e6, bone=1e6), shape=truth.shape)
+        free = Fitter(kinematics, fitter.target, settings=replace(flat, landmark=1e6, bone=1e6), shape=truth.shape)
         return free.system(replace(truth, angles=angles, focal=free.focal))[2]
 
     for k in range(len(bound)):

@@ -122,5 +122,5 @@ def test_the_same_photo_gives_the_same_bits(hand, photo, wrong, refined):
 
 def test_a_change_is_the_step_that_was_taken(hand, photo, wrong):
     problem = _Problem(hand, photo[1], wrong, None, PRIOR_SIZE)
-    step = 0.05 * np.random.default_rng(0).normal(size=problem.n)
+    step = 0.05 * np.random.default_rng(0).normal(size=problem.n_unknowns)
     np.testing.assert_allclose(problem.change(problem.moved(problem.start, step)), step, atol=1e-12)

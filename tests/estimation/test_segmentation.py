@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from oasis_warp.core.hand_model import KNUCKLES
-from oasis_warp.estimation.fit_target import pixels_per_metre
+from oasis_warp.estimation.fit_problem import pixels_per_metre
 from oasis_warp.estimation.landmarks import Crop, read_crop
 from oasis_warp.estimation.networks import drawn_hand, networks
 from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks

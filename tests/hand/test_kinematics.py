@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from oasis_warp.core.types import HandPose
-from oasis_warp.estimation.fit_state import FitState
+from oasis_warp.estimation.fit_problem import FitState
 from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.skinning import rest_hand, skin
 
@@ -11,59 +11,59 @@ STEP = 1e-6
 
 
 @pytest.fixture(scope="module")
-def rig(hand):
+def kinematics(hand):
     return HandKinematics(hand)
 
 
 @pytest.fixture
-def bent(rig):
+def bent(kinematics):
     rng = np.random.default_rng(3)
-    return rng.uniform(-0.3, 1.2, len(rig.dofs)), rng.normal(size=rig.shape_basis.shape[2])
+    return rng.uniform(-0.3, 1.2, len(kinematics.dofs)), rng.normal(size=kinematics.shape_basis.shape[2])
 
 
-def test_surface_is_that_of_skinning_with_its_correctives(hand, rig, bent):
+def test_surface_is_that_of_skinning_with_its_correctives(hand, kinematics, bent):
     angles, shape = bent
-    table = rig.all_angles(angles)
+    table = kinematics.all_angles(angles)
     pose = HandPose(torch.from_numpy(table[1:]).float(), torch.eye(3), torch.zeros(3))
     posed = skin(hand, rest_hand(hand, torch.from_numpy(shape).float()), pose)
-    chain = rig.chain(angles, shape)
+    joints = kinematics.pose_joints(angles, shape)
     # float32 of a hand of 0.2 m
-    np.testing.assert_allclose(rig.surface(chain, angles, shape), posed.vertices, atol=3e-7)
-    np.testing.assert_allclose(chain.position, posed.joints, atol=3e-7)
+    np.testing.assert_allclose(kinematics.surface(joints), posed.vertices, atol=3e-7)
+    np.testing.assert_allclose(joints.position, posed.joints, atol=3e-7)
 
 
-def test_landmark_derivatives_are_those_of_differences(rig, bent):
+def test_landmark_derivatives_are_those_of_differences(kinematics, bent):
     angles, shape = bent
 
     def points(step):
-        chain = rig.chain(angles + step[:26], shape + step[26:])
-        return rig.landmarks(chain, shape + step[26:])
+        joints = kinematics.pose_joints(angles + step[:26], shape + step[26:])
+        return kinematics.landmarks(joints)
 
     _, slope = points(np.zeros(slope_size(bent)))
     check_slope(lambda step: points(step)[0], slope)
 
 
-def test_vertex_derivatives_are_those_of_differences(rig, bent):
+def test_vertex_derivatives_are_those_of_differences(kinematics, bent):
     angles, shape = bent
-    index = np.random.default_rng(1).integers(0, len(rig.template), 40)
-    fixed = rig.correctives(rig.all_angles(angles))
+    index = np.random.default_rng(1).integers(0, len(kinematics.template), 40)
+    fixed = kinematics.correctives(kinematics.all_angles(angles))
 
     def points(step):
-        chain = rig.chain(angles + step[:26], shape + step[26:])
-        return rig.vertices(chain, shape + step[26:], index, fixed)
+        joints = kinematics.pose_joints(angles + step[:26], shape + step[26:])
+        return kinematics.vertices(joints, index, fixed)
 
     _, slope = points(np.zeros(slope_size(bent)))
     check_slope(lambda step: points(step)[0], slope)
 
 
-def test_image_derivatives_are_those_of_differences(rig, bent):
+def test_image_derivatives_are_those_of_differences(kinematics, bent):
     angles, shape = bent
     turn = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
     turn *= np.linalg.det(turn)
     state = FitState(turn, np.array([0.1, -0.2, -0.5]), angles, shape, 600.0, np.array([200.0, 150.0]))
 
     def seen(state):
-        return state.linearize(*rig.landmarks(rig.chain(state.angles, state.shape), state.shape))
+        return state.linearize(*kinematics.landmarks(kinematics.pose_joints(state.angles, state.shape)))
 
     slope = seen(state).d_image
     check_slope(lambda step: seen(state.moved(step)).image, slope, scale=1e3)

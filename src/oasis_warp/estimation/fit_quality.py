@@ -1,22 +1,41 @@
-"""How good a fit is: its numbers, what to warn about, and when to refuse it."""
+"""How good a fit is: its numbers, the warnings about it, and when it is refused.
 
-from dataclasses import dataclass
+Numbers compare the model with landmarks and mask. Further warnings come from a second detection in rotated crops, which
+checks the fingers and the side of the hand, and from the hand's place in the photo.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from oasis_warp.estimation.fit_state import FitState
-from oasis_warp.estimation.fit_target import Evidence
-from oasis_warp.estimation.outline import wrist_line
-from oasis_warp.estimation.silhouette import silhouette
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.mirror import MIRROR
+from oasis_warp.core.types import HandFit, HandPose
+from oasis_warp.estimation.fit import Fitter
+from oasis_warp.estimation.fit_problem import FitState, FitTarget, fit_target, mirrored_fit
+from oasis_warp.estimation.landmarks import FINGERS, DetectedHand, crop_of_landmarks, read_crop
+from oasis_warp.estimation.networks import Networks
+from oasis_warp.estimation.outline import silhouette, wrist_line
 from oasis_warp.hand.kinematics import HandKinematics
 
 SMALL_HAND, TINY_HAND = 150, 80
-"""Longer side of the landmarks' box [px] below which a hand is warned about, and refused."""
+"""Longer side of the landmarks' box [px] below which a hand gets a warning, and is refused."""
+MANY_FINGERS = 4
+"""A hand with this many doubtful fingers is somewhere else."""
+_SIDE_RATIO = 1.15
+"""Ratio of the other side's cost to this one's below which the side is doubtful; at least 1.3 on 63 correct fits."""
+_FINGER_GAP = 0.06
+"""Distance of a finger in the second detection, as a fraction of the box; at most .04 where it is correct."""
+_CROP_ROTATION = 0.3
+"""Angle by which the crop of the second detection is rotated [rad]."""
+_MIN_PRESENCE = 0.5
+_BORDER = 0.08
+"""Length along which a hand may touch the photo's border, as a fraction of the box."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Numbers that a fit should keep: above 63 correct fits, below most damaged ones."""
+    """Bounds of the numbers of a fit. 63 correct fits keep them, most damaged ones do not."""
 
     reprojection: float
     worst_point: float
@@ -29,54 +48,140 @@ REFUSE_BOUNDS = Bounds(reprojection=4.0, worst_point=np.inf, mask_iou=0.85, cost
 
 
 @dataclass(frozen=True)
-class Quality:
-    """What a fit leaves unexplained."""
+class FitQuality:
+    """The numbers of a fit, named as in `HandFit`."""
 
-    point_errors: np.ndarray
-    """Distance of each landmark to the model's [% of the box]."""
+    reprojection: float
+    """Mean distance of the landmarks from the model's [% of the box]."""
+    worst_point: float
+    """Largest of these distances [%]."""
     mask_iou: float
     """Of mesh and mask, above the wrist line."""
     cost: float
 
-    @property
-    def reprojection(self) -> float:
-        """Mean of the point errors [%]."""
-        return float(self.point_errors.mean())
-
-    @property
-    def worst_point(self) -> float:
-        """Largest of the point errors [%]."""
-        return float(self.point_errors.max())
-
     def beyond(self, bounds: Bounds) -> list[str]:
         """The numbers that break `bounds`, in words."""
-        said = []
+        broken = []
         if self.reprojection > bounds.reprojection:
-            said.append(f"the landmarks lie {self.reprojection:.1f} % of the hand's size from the model's")
+            broken.append(f"the landmarks lie {self.reprojection:.1f} % of the hand's size from the model's")
         if self.worst_point > bounds.worst_point:
-            said.append(f"one landmark lies {self.worst_point:.1f} % of the hand's size from the model's")
+            broken.append(f"one landmark lies {self.worst_point:.1f} % of the hand's size from the model's")
         if self.mask_iou < bounds.mask_iou:
-            said.append(f"the model covers the hand's outline badly (IoU {self.mask_iou:.2f})")
+            broken.append(f"the model covers the hand's outline badly (IoU {self.mask_iou:.2f})")
         if self.cost > bounds.cost:
-            said.append(f"the landmarks and the outline contradict a plausible hand (cost {self.cost:.0f})")
-        return said
+            broken.append(f"the landmarks and the outline contradict a plausible hand (cost {self.cost:.0f})")
+        return broken
+
+    def warnings(self) -> list[str]:
+        """What to tell the user about these numbers; empty for a good fit."""
+        return [f"poor fit: {words}" for words in self.beyond(WARN_BOUNDS)]
 
 
-def measure(rig: HandKinematics, evidence: Evidence, state: FitState, mask: np.ndarray, cost: float) -> Quality:
-    """Compare the model in `state` with the landmarks and the mask ([H, W], mirrored like the evidence)."""
-    points = state.project(rig.landmarks(rig.chain(state.angles, state.shape), state.shape)[0])
-    errors = np.linalg.norm(points - evidence.xy, axis=1) / evidence.box * 100
-    return Quality(errors, overlap(draw(rig, state, evidence.size) > 0, mask > 0.5, evidence.xy), cost)
+def fit_quality(
+    kinematics: HandKinematics, target: FitTarget, state: FitState, mask: np.ndarray, cost: float
+) -> FitQuality:
+    """Compare the model in `state` with the landmarks and the mask ([H, W], mirrored as the target is)."""
+    points = state.project(kinematics.landmarks(kinematics.pose_joints(state.angles, state.shape))[0])
+    errors = np.linalg.norm(points - target.xy, axis=1) / target.box * 100
+    drawn = draw_silhouette(kinematics, state, target.size)
+    return FitQuality(
+        float(errors.mean()), float(errors.max()), iou_above_wrist(drawn > 0, mask > 0.5, target.xy), cost
+    )
 
 
-def draw(rig: HandKinematics, state: FitState, size: tuple[int, int]) -> np.ndarray:
+def draw_silhouette(kinematics: HandKinematics, state: FitState, size: tuple[int, int]) -> np.ndarray:
     """Silhouette of the model in a photo of `size` (width, height), 0 or 255."""
-    surface = rig.surface(rig.chain(state.angles, state.shape), state.angles, state.shape)
-    return silhouette(state.project(surface), rig.faces, size)
+    surface = kinematics.surface(kinematics.pose_joints(state.angles, state.shape))
+    return silhouette(state.project(surface), kinematics.faces, size)
 
 
-def overlap(drawn: np.ndarray, mask: np.ndarray, xy: np.ndarray) -> float:
+def iou_above_wrist(drawn: np.ndarray, mask: np.ndarray, xy: np.ndarray) -> float:
     """Intersection over union of two masks above the wrist line of the landmarks."""
     hand = wrist_line(xy).above_mask((mask.shape[1], mask.shape[0]))
     union = int(((drawn | mask) & hand).sum())
     return int((drawn & mask & hand).sum()) / max(union, 1)
+
+
+def with_pose(hand: HandModel, fit: HandFit, pose: HandPose) -> HandFit:
+    """`fit` in another pose, with its numbers computed again; cost and warnings stay those of the fit.
+
+    Args:
+        hand: The model.
+        fit: In the photo's own frame.
+        pose: In the same frame: a left hand's pose describes the mirrored model.
+    """
+    kinematics, moved = HandKinematics(hand), fit._replace(pose=pose)
+    view = mirrored_fit(kinematics, moved)
+    target = fit_target(view.xy, None, (fit.camera.width, fit.camera.height))
+    return moved._replace(**vars(fit_quality(kinematics, target, view.state, view.mask, fit.cost)))
+
+
+def keeps_quality(moved: HandFit, fit: HandFit) -> bool:
+    """Whether each number of `moved` is within the bounds of warnings, or no worse than that of `fit`."""
+    return (
+        moved.reprojection <= max(WARN_BOUNDS.reprojection, fit.reprojection)
+        and moved.worst_point <= max(WARN_BOUNDS.worst_point, fit.worst_point)
+        and moved.mask_iou >= min(WARN_BOUNDS.mask_iou, fit.mask_iou)
+    )
+
+
+def second_detections(rgb: np.ndarray, nets: Networks, xy: np.ndarray) -> list[DetectedHand]:
+    """Detections in a rotated crop, and in a mirrored one rotated the other way; those without a hand are left out.
+
+    Reliable landmarks move little.
+    """
+    crop = crop_of_landmarks(xy)
+    rotated = read_crop(rgb, nets, replace(crop, angle=crop.angle + _CROP_ROTATION))
+    mirrored = read_crop(rgb, nets, replace(crop, angle=crop.angle - _CROP_ROTATION), mirrored=True)
+    return [detection for detection in (rotated, mirrored) if detection.presence >= _MIN_PRESENCE]
+
+
+def finger_warnings(target: FitTarget, detections: list[DetectedHand]) -> list[str]:
+    """Fingers that every second detection finds somewhere else."""
+    warnings = []
+    for finger, rows in FINGERS.items():
+        gaps = [np.linalg.norm(found.xy[rows] - target.xy[rows], axis=1).mean() / target.box for found in detections]
+        if gaps and min(gaps) > _FINGER_GAP:
+            warnings.append(
+                f"{finger} {'' if finger == 'thumb' else 'finger '}doubtful: on a second look it lies "
+                f"{100 * min(gaps):.0f} % of the hand's size elsewhere"
+            )
+    return warnings
+
+
+def other_side_cost(kinematics: HandKinematics, target: FitTarget, shape: np.ndarray | None) -> float:
+    """Cost of fitting the landmarks as a hand of the other side."""
+    mirrored = replace(
+        target,
+        xy=np.array([target.size[0], 0]) + target.xy * [-1, 1],
+        directions=None if target.directions is None else target.directions * MIRROR,
+    )
+    return Fitter(kinematics, mirrored, shape=shape).fit_landmarks().cost
+
+
+def side_warnings(side: str, cost: float, other_cost: float, detections: list[DetectedHand]) -> list[str]:
+    """Whether the landmarks bend like a hand of the other side, or every second detection finds one.
+
+    The detections are those of a right hand's view: one that is called left is of the other side.
+    """
+    ratio, warnings = other_cost / max(cost, 1e-9), []
+    other = "left" if side == "right" else "right"
+    if ratio < _SIDE_RATIO:
+        warnings.append(f"side doubtful: the landmarks of a {other} hand would cost {ratio:.2f} times as much")
+    if detections and max(found.right for found in detections) < 0.5:
+        warnings.append(f"side doubtful: on a second look the network sees a {other} hand")
+    return warnings
+
+
+def framing_warnings(target: FitTarget, mask: np.ndarray) -> list[str]:
+    """Whether the hand is small, or cut by the photo's border."""
+    warnings = []
+    if target.box < SMALL_HAND:
+        warnings.append(f"small hand: {target.box:.0f} pixels, the avatar will be blurred below {SMALL_HAND}")
+    width, height = target.size
+    hand = (mask > 0.5) & wrist_line(target.xy).above_mask(target.size)
+    touching = sum(int(line.sum()) for line in (hand[0], hand[-1], hand[:, 0], hand[:, -1]))
+    outside = bool(((target.xy < 0) | (target.xy > [width, height])).any())
+    if outside or touching > _BORDER * target.box:
+        warnings.append("the hand is cut by the photo's border: what lies outside is guessed")
+    return warnings

@@ -1,6 +1,7 @@
-"""Read landmarks, or a pose and camera, that another tool found: one JSON object a hand (docs/estimator.md)."""
+"""Read landmarks, or a pose and camera, from another tool's JSON file: one object per hand (docs/estimator.md)."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,12 @@ import torch
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.mirror import mirror_landmarks
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
-from oasis_warp.estimation.given_pose import fit_of_pose
-from oasis_warp.estimation.mirrored_input import real
+from oasis_warp.estimation.fit_problem import MirroredInput, mirrored_state, real
+from oasis_warp.estimation.fit_quality import draw_silhouette, fit_quality, framing_warnings
+from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
+from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.template import bundled_hand
 
 _LANDMARK_KEYS = {"side", "xy", "world"}
@@ -53,8 +57,8 @@ def _landmarks(path: Path, data: dict[str, Any], side: Side, photo: Photo) -> La
 
 def _pose(path: Path, data: dict[str, Any], side: Side, photo: Photo, hand: HandModel) -> HandFit:
     height, width = photo.rgb.shape[:2]
-    turn = _numbers(path, data, "orientation", (3, 3))
-    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
+    rotation = _numbers(path, data, "orientation", (3, 3))
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise InputError(f'{path}: "orientation" must be a rotation matrix (orthonormal, determinant 1); correct it.')
     translation = _numbers(path, data, "translation", (3,))
     if translation[2] <= 0.02:
@@ -67,9 +71,52 @@ def _pose(path: Path, data: dict[str, Any], side: Side, photo: Photo, hand: Hand
     centre = np.array([width, height]) / 2
     if "centre" in data:
         centre = _numbers(path, data, "centre", (2,)) * photo.shrink
-    pose = HandPose(real(_numbers(path, data, "angles", (15, 3))), real(turn), real(translation))
+    pose = HandPose(real(_numbers(path, data, "angles", (15, 3))), real(rotation), real(translation))
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
-    return fit_of_pose(hand, photo, side, shape, pose, Camera(torch.eye(4), real(K), width, height), "file")
+    return fit_of_pose(hand, photo, side, shape, pose, Camera(torch.eye(4), real(K), width, height))
+
+
+def fit_of_pose(
+    hand: HandModel, photo: Photo, side: Side, shape: np.ndarray, pose: HandPose, camera: Camera
+) -> HandFit:
+    """The fit of a given pose: only the mask is estimated from the photo.
+
+    The landmarks are the model's own, so their error is zero.
+
+    Args:
+        hand: The model that `shape` and `pose` belong to.
+        photo: The photo.
+        side: Of the hand; a left hand's pose describes the mirrored model.
+        shape: Coefficients, [S].
+        pose: In the camera's frame.
+        camera: Of the photo, with an identity viewmat.
+    """
+    kinematics = HandKinematics(hand)
+    state = mirrored_state(kinematics, side, shape, pose, camera)
+    points = kinematics.landmarks(kinematics.pose_joints(state.angles, state.shape))[0]
+    xy, world = torch.from_numpy(state.project(points)), torch.from_numpy(state.in_camera(points))
+    landmarks = Landmarks(xy, world - world.mean(0), "right", 1.0, 1.0, "file")
+    if side == "left":
+        landmarks = mirror_landmarks(landmarks, camera.width)
+    landmarks = landmarks._replace(xy=landmarks.xy.float(), world=landmarks.world.float())
+    view = MirroredInput(photo, landmarks, state.focal)
+    state = replace(state, focal=state.focal * float(view.scale[0]), centre=state.centre * view.scale)
+    scale, xy = state.pixels_per_metre(), view.target.xy
+    mask = None if view.alpha is None else mask_from_alpha(view.alpha, xy, scale)
+    if mask is None:
+        first = mask_from_landmarks(view.rgb, xy, scale)
+        mask = mask_from_fit(view.rgb, xy, scale, first, draw_silhouette(kinematics, state, view.target.size))
+    quality = fit_quality(kinematics, view.target, state, mask, 0.0)
+    return HandFit(
+        side=side,
+        shape=real(shape),
+        pose=pose,
+        camera=camera,
+        landmarks=landmarks,
+        mask=real(view.in_photo(mask)),
+        **vars(quality),
+        warnings=(*quality.warnings(), *framing_warnings(view.target, mask)),
+    )
 
 
 def _read_object(path: Path) -> dict[str, Any]:
@@ -87,13 +134,13 @@ def _read_object(path: Path) -> dict[str, Any]:
 
 
 def _numbers(path: Path, data: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    wanted = " x ".join(map(str, shape)) + " numbers" if shape else "a number"
+    expected = " x ".join(map(str, shape)) + " numbers" if shape else "a number"
     if key not in data:
-        raise InputError(f'{path}: the key "{key}" is missing; add {wanted}.')
+        raise InputError(f'{path}: the key "{key}" is missing; add {expected}.')
     try:
         values = np.array(data[key])
     except ValueError:
         values = np.array(None)
     if values.dtype.kind not in "iuf" or values.shape != shape or not np.isfinite(values).all():
-        raise InputError(f'{path}: "{key}" must be {wanted}, all finite; correct it.')
+        raise InputError(f'{path}: "{key}" must be {expected}, all finite; correct it.')
     return values.astype(np.float64)

@@ -1,189 +1,266 @@
-"""Close the last gap between the fitted hand and its mask: a smooth displacement of the rest surface.
+"""Smooth displacements of the rest surface that bring outlines onto masks: those of the mesh, then those of Gaussians.
 
-Where the outline of the posed mesh misses the mask's, the vertices on the rim are told how far to move along their
-normal in the image. The whole surface follows by a screened bi-Laplacian: it minimises
+First the outline of the posed mesh is compared with the mask's. The vertices on it get targets along their normals in
+the image, and the surface follows as a thin sheet: the displacement D minimises
 
-    sum over the rim of w |D - target|^2 + BEND |L D|^2 + STAY |D|^2
+    sum over the targets of w |D - target|^2 + BEND |L D|^2 + STAY |D|^2
 
-with the umbrella operator L, so that neighbours follow and the far side stays.
+with the umbrella operator L. So neighbours follow, and the far side stays.
+
+Gaussians reach beyond the mesh by their size and by a pixel's blur, more at the tip of a finger than along it, and
+across slits. One depth below the skin would leave outlines too wide in one place and too narrow in another. So a second
+displacement along the normals is found in the same way, from the outlines of rendered Gaussians.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 from torch import Tensor
+from torch.nn.functional import normalize
 
+from oasis_warp.avatar.anchors import PRIOR_SIZE
+from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.core import surface
+from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import HandFit
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit
+from oasis_warp.estimation.fit_problem import mirrored_fit
 from oasis_warp.estimation.landmarks import box_size
-from oasis_warp.estimation.mirrored_input import mirrored_fit
-from oasis_warp.estimation.outline import WRIST_LINE, wrist_line
-from oasis_warp.estimation.silhouette import silhouette, vertex_normals
+from oasis_warp.estimation.outline import WRIST_LINE, is_grazing, window, wrist_line
 from oasis_warp.hand.kinematics import HandKinematics, unit
+from oasis_warp.render.render import render
 
 LONGEST = 0.006
-"""No vertex moves farther [m]."""
-_REJECT = 0.04
-"""A gap wider than this share of the box is the mask's fault and is left."""
-_ROUNDS = 4
-_BEND, _STAY = 100.0, 0.02
-"""Weights against one observation a vertex. With edges of 2 mm an observation is shared along about 3 mm, and its
-effect ends after about 12 mm: (BEND / STAY / 16)^(1/4) edges."""
-_SETTLED = 1e-6
-"""Step of the displacement at which it is found [m]."""
-_MOST_STEPS = 100
-_TINY = 1e-300
-"""Where a column is solved, nothing is divided by 0."""
+"""Largest displacement of a vertex by outlines of the mesh [m]."""
+BEYOND = 0.5
+"""Distance of the outline of Gaussians, at half opacity, outside the mask's [px]. A pixel on the outline is half
+background in the photo and half black in an image over black, so what fits best is opaque there: see docs/avatar.md."""
+_ROUNDS, _RENDERED_ROUNDS = 4, 2
+_REJECT, _RENDERED_REJECT = 0.04, 4 / PRIOR_SIZE
+"""Gaps beyond this are faults of the mask and ignored, as fractions of the landmarks' box and of the crop's side."""
 _GRAZING = 0.5
-"""Largest |normal . view| of a vertex that speaks for the rim."""
+"""Largest |normal . view| of a vertex on the outline."""
+_WINDOW = 1000
+"""Longer side of the image in which outlines of the mesh are compared [px]."""
+_NEAR, _RENDERED_NEAR = 0.008 * _WINDOW, 2.5 / PRIOR_SIZE
+"""Largest distance of a vertex from the outline, in pixels of the window and as a fraction of the crop's side."""
+_BORDER = 2
+"""Outlines nearer to the border of the image may be cut by it [px]."""
+_BEND, _STAY = 100.0, 0.02
+"""Weights relative to one target per vertex. With edges of 2 mm a target is shared along about 3 mm, and its effect
+ends after about 12 mm: (BEND / STAY / 16)^(1/4) edges."""
+_TOLERANCE, _MOST_STEPS = 1e-4, 100
+"""Relative residual at which conjugate gradients end: no vertex is then off by more than 1e-7 m."""
 _STEP = 0.25
 """Spacing of the samples across the outline, in pixels of the window."""
-_WINDOW = 1000
-"""Longer side of the picture in which outlines are compared [px]."""
 
 
 def outline_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
-    """Displacement of the rest surface that brings the posed outlines onto the masks' [m].
+    """Displacement of the rest surface that brings the outlines of the posed mesh onto the masks' [m].
 
     Add it to the vertices at rest (`skinning.rest_hand`) before skinning; for a left hand, before mirroring, as the
-    pose is. Zero where no outline says anything: at the wrist, at a photo's border, across gaps wider than 4 % of
-    the hand, and towards the far side of the hand.
+    pose is. It is zero where no outline is seen: at the wrist, at a photo's border, across gaps wider than 4 % of the
+    hand, and towards the far side of the hand.
 
     Args:
         hand: The model.
-        fits: One photo of a hand, or several of the same hand, all with one shape: then one displacement for all.
+        fits: One photo of a hand, or several photos of one hand with one shape, which share the displacement.
     """
     views = [_View(hand, fit) for fit in fits]
-    sheet = ThinSheet(views[0].rig.faces, len(views[0].rig.template))
-    moved = np.zeros_like(views[0].rest)
+    sheet = ThinSheet(views[0].kinematics.faces, len(views[0].kinematics.template))
+    offsets = np.zeros_like(views[0].rest)
     for _ in range(_ROUNDS):
-        seen = zip(*(view.observe(moved) for view in views), strict=True)
-        vertices, target, weight = (np.concatenate(part) for part in seen)
+        vertices, target, weight = _joined([view.observe(offsets) for view in views])
         if len(vertices) == 0:
             break
-        moved = sheet.drawn(vertices, target, weight)
-        moved *= np.minimum(1, LONGEST / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-12))
-    return torch.from_numpy(moved.astype(np.float32))
+        offsets = sheet.solve(vertices, target, weight)
+        offsets *= np.minimum(1, LONGEST / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12))
+    return torch.from_numpy(offsets.astype(np.float32))
+
+
+@torch.no_grad()
+def rendered_outline_offsets(
+    hand: HandModel, guesses: Sequence[CanonicalGaussians], crops: Sequence[HandCrop]
+) -> Float[Tensor, "V 3"]:
+    """Displacement of the rest surface that brings the outlines of Gaussians on it onto the masks' [m].
+
+    Args:
+        hand: The model.
+        guesses: Gaussians for each photo. Colours play no part, neither theirs nor the photos'.
+        crops: Photos of one hand with one surface at rest, at the size of the images that will be rendered.
+    """
+    faces, like = hand.faces.to(crops[0].mask.device), crops[0].rest.vertices
+    normals = [
+        [surface.vertex_normals(part.vertices, faces) for part in (crop.rest, crop.posed)] for crop in crops
+    ]
+    sheet = ThinSheet(hand.faces.cpu().numpy(), len(hand.template))
+    outward = np.zeros(len(hand.template))
+    for _ in range(_RENDERED_ROUNDS):
+        step = torch.from_numpy(outward).to(like)[:, None]
+        observed = []
+        for guess, crop, (at_rest, posed) in zip(guesses, crops, normals, strict=True):
+            moved = crop._replace(
+                rest=crop.rest._replace(vertices=crop.rest.vertices + step * at_rest),
+                posed=crop.posed._replace(vertices=crop.posed.vertices + step * posed),
+            )
+            observed.append(_compare_rendered(guess, faces, moved))
+        vertices, gap, weight = _joined(observed)
+        if len(vertices) == 0:
+            break
+        outward = sheet.solve(vertices, (outward[vertices] + gap)[:, None], weight)[:, 0]
+    return torch.from_numpy(outward).to(like)[:, None] * normals[0][0]
+
+
+def _joined(observed: Sequence[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
+    return [np.concatenate(part) for part in zip(*observed, strict=True)]
 
 
 class _View:
-    """A posed hand before its camera, mirrored into a right one, and its mask."""
+    """A posed hand, as a right hand, in front of its camera, and its mask."""
 
     def __init__(self, hand: HandModel, fit: HandFit):
-        self.rig = rig = HandKinematics(hand)
-        state, table, xy, mask = mirrored_fit(rig, fit)
-        chain = rig.chain_of(table, state.shape)
-        self.rest = rig.rest_surface(state.shape) + rig.correctives(table)
-        self.state, self.box, self.line = state, box_size(xy), wrist_line(xy)
-        self.turn = state.turn @ rig.blended(chain)
+        self.kinematics = kinematics = HandKinematics(hand)
+        self.state, table, xy, mask = mirrored_fit(kinematics, fit)
+        joints = kinematics.pose_all_joints(table, self.state.shape)
+        self.rest = kinematics.rest_surface(joints.shape) + kinematics.correctives(table)
+        self.box, self.line = box_size(xy), wrist_line(xy)
+        self.rotation = self.state.rotation @ kinematics.blended(joints)
         """Rest frame to camera, [V, 3, 3]."""
-        self.seen = state.in_camera(rig.pose_surface(chain, self.rest))
+        self.seen = self.state.in_camera(kinematics.pose_surface(joints, self.rest))
         self.photo = np.array(mask.shape[::-1])
         reach = 1.5 * _REJECT * self.box
         image = self._image(self.seen)
-        self.low = np.maximum(image.min(0) - reach, -reach)
-        high = np.minimum(image.max(0) + reach, self.photo + reach)
-        self.scale = _WINDOW / float((high - self.low).max())
-        self.size = (int(np.ceil((high - self.low)[0] * self.scale)), int(np.ceil((high - self.low)[1] * self.scale)))
-        # Window pixel (centre) -> mask pixel (centre).
-        shift = self.low + 0.5 / self.scale - 0.5
-        affine = np.array([[1 / self.scale, 0, shift[0]], [0, 1 / self.scale, shift[1]]])
-        self.mask = cv2.warpAffine(mask, affine, self.size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        low, high = np.maximum(image.min(0) - reach, -reach), np.minimum(image.max(0) + reach, self.photo + reach)
+        self.window = window(low, high, _WINDOW)
+        # Pixel centres of the window to pixel centres of the mask.
+        scale, shift = 1 / self.window.scale, low + 0.5 / self.window.scale - 0.5
+        affine = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
+        self.mask = cv2.warpAffine(mask, affine, self.window.size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
     def _image(self, seen: np.ndarray) -> np.ndarray:
         return self.state.focal * seen[:, :2] / seen[:, 2:] + self.state.centre
 
-    def observe(self, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Vertices on the rim, where in the rest frame they should be moved to [m], and how far to trust that."""
-        seen = self.seen + (self.turn @ moved[..., None])[..., 0]
+    def observe(self, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices on the outline, their targets in the rest frame [m], and the weights of these."""
+        seen, window = self.seen + (self.rotation @ offsets[..., None])[..., 0], self.window
         image = self._image(seen)
-        drawn = silhouette(image, self.rig.faces, self.size, self.low, self.scale)
-        depth = cv2.distanceTransform(drawn, cv2.DIST_L2, 3)
-        pixel = np.clip(np.floor((image - self.low) * self.scale).astype(int), 0, np.array(self.size) - 1)
-        normals = vertex_normals(seen, self.rig.faces)
-        grazing = np.abs((normals * unit(seen)).sum(1)) < _GRAZING
-        rim = np.flatnonzero(grazing & (depth[pixel[:, 1], pixel[:, 0]] <= 0.008 * _WINDOW) & self.line.above(image))
-        out = unit(normals[rim, :2])
-        start, reach = (image[rim] - self.low) * self.scale, 1.5 * _REJECT * self.box * self.scale
-        mesh_edge = crossing(drawn.astype(np.float32) / 255, start, out, reach)
-        gap = (crossing(self.mask, start, out, reach) - mesh_edge) / self.scale
-        edge = image[rim] + out * (mesh_edge / self.scale + gap)[:, None]
-        on_photo = ((edge > 2) & (edge < self.photo - 2)).all(1)
-        good = np.isfinite(gap) & (np.abs(np.nan_to_num(gap)) < _REJECT * self.box) & on_photo
-        rim, out, gap = rim[good], out[good], gap[good]
-        shift = np.zeros((len(rim), 3))
-        shift[:, :2] = out * (gap * seen[rim, 2] / self.state.focal)[:, None]
-        target = moved[rim] + (self.turn[rim].transpose(0, 2, 1) @ shift[..., None])[..., 0]
-        # A wide gap is more often a fault of the mask; the weight fades in above the wrist line.
-        weight = 1 / (1 + (gap / (0.4 * _REJECT * self.box)) ** 2)
-        weight *= np.clip(((image[rim] - self.line.wrist) @ self.line.up / self.line.length - WRIST_LINE) / 0.15, 0, 1)
-        return rim, target, weight
+        drawn = window.silhouette(image, self.kinematics.faces)
+        depth = window.sample(cv2.distanceTransform(drawn, cv2.DIST_L2, 3), image)
+        normals = self.kinematics.vertex_normals(seen)
+        vertex = np.flatnonzero(is_grazing(seen, normals, _GRAZING) & (depth <= _NEAR) & self.line.above(image))
+        outward = unit(normals[vertex, :2])
+        start, reach = (image[vertex] - window.low) * window.scale, 1.5 * _REJECT * self.box * window.scale
+        mesh_edge = crossing(drawn.astype(np.float32) / 255, start, outward, reach)
+        gap = (crossing(self.mask, start, outward, reach) - mesh_edge) / window.scale
+        edge = image[vertex] + outward * (mesh_edge / window.scale + gap)[:, None]
+        on_photo = ((edge > _BORDER) & (edge < self.photo - _BORDER)).all(1)
+        good = on_photo & (np.abs(np.nan_to_num(gap, nan=np.inf)) < _REJECT * self.box)
+        vertex, outward, gap = vertex[good], outward[good], gap[good]
+        shift = np.zeros((len(vertex), 3))
+        shift[:, :2] = outward * (gap * seen[vertex, 2] / self.state.focal)[:, None]
+        target = offsets[vertex] + (self.rotation[vertex].transpose(0, 2, 1) @ shift[..., None])[..., 0]
+        fade_in = np.clip((self.line.height(image[vertex]) - WRIST_LINE) / 0.15, 0, 1)
+        return vertex, target, _gap_weight(gap, _REJECT * self.box) * fade_in
 
 
-def crossing(picture: np.ndarray, start: np.ndarray, out: np.ndarray, reach: float) -> np.ndarray:
-    """Signed way from each `start` along `out` to the nearest place where `picture` falls through a half; else NaN."""
+def _gap_weight(gap: np.ndarray, reject: float) -> np.ndarray:
+    """Weights of gaps: the wider one is, the more likely it is a fault of the mask."""
+    return 1 / (1 + (gap / (0.4 * reject)) ** 2)
+
+
+def _compare_rendered(
+    gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"], crop: HandCrop
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices on the outline of rendered Gaussians, their distances from the mask's outline [m], and weights."""
+    vertices, camera = crop.posed.vertices, crop.camera
+    posed = pose_gaussians(gaussians, faces, crop.rest.vertices, vertices)
+    alpha = render(posed, camera).alpha.cpu().numpy()
+    mask, side = crop.mask.cpu().numpy(), len(alpha)
+
+    rotation = camera.viewmat[:3, :3]
+    normals = surface.vertex_normals(vertices, faces) @ rotation.T
+    seen = vertices @ rotation.T + camera.viewmat[:3, 3]
+    grazing = ((normals * normalize(seen, dim=-1)).sum(-1).abs() < _GRAZING).cpu().numpy()
+    uv, depth = (part.cpu().numpy() for part in project(camera, vertices))
+    x, y = np.clip(np.floor(uv).astype(int), 0, side - 1).T
+    inside = cv2.distanceTransform((alpha > 0.5).astype(np.uint8), cv2.DIST_L2, 3)
+    near = inside[y, x] < max(_RENDERED_NEAR * side, 1)
+    vertex = np.flatnonzero(grazing & near & (crop.above_wrist.cpu().numpy()[y, x] > 0.5))
+
+    across = normals.cpu().numpy()[vertex, :2]
+    steepness = np.linalg.norm(across, axis=1)
+    reject = _RENDERED_REJECT * side
+    outward, start, reach = across / steepness[:, None], uv[vertex], 1.5 * reject
+    drawn, shown = crossing(alpha, start, outward, reach), crossing(mask, start, outward, reach)
+    gap = shown + BEYOND - drawn
+    edge = start + outward * np.nan_to_num(drawn)[:, None]
+    # A slit that the photo does not have: the opacity falls and rises again where the mask stays.
+    width = np.nan_to_num(crossing(1 - alpha, edge, outward, reach))
+    slit = np.isfinite(drawn) & (width > 0)
+    for share in (0.0, 0.5, 1.0):
+        x, y = np.clip(np.floor(edge + share * outward * width[:, None]).astype(int), 0, side - 1).T
+        slit &= mask[y, x] > 0.5
+    gap = np.where(slit, width / 2, gap)
+    on_photo = ((edge > _BORDER) & (edge < side - _BORDER)).all(1)
+    good = on_photo & (np.abs(np.nan_to_num(gap, nan=np.inf)) < reject)
+    vertex, gap = vertex[good], gap[good]
+    pixel_size = depth[vertex] / float(camera.K[0, 0])
+    return vertex, gap * pixel_size / steepness[good], _gap_weight(gap, reject)
+
+
+def crossing(image: np.ndarray, start: np.ndarray, outward: np.ndarray, reach: float) -> np.ndarray:
+    """Signed distance from each `start` along `outward` to the nearest place where `image` falls through .5, or NaN."""
     t = np.arange(-reach, reach + _STEP, _STEP)
-    x, y = (start[:, k, None] + out[:, k, None] * t - 0.5 for k in (0, 1))
-    values = cv2.remap(picture, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+    x, y = (start[:, k, None] + outward[:, k, None] * t - 0.5 for k in (0, 1))
+    values = cv2.remap(image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
     before, after = values[:, :-1], values[:, 1:]
     falls = (before >= 0.5) & (after < 0.5)
-    away = np.where(falls, np.abs(t[:-1]), np.inf)
-    row, nearest = np.arange(len(start)), away.argmin(1)
+    distance = np.where(falls, np.abs(t[:-1]), np.inf)
+    row, nearest = np.arange(len(start)), distance.argmin(1)
     a, b = before[row, nearest], after[row, nearest]
     place = t[nearest] + _STEP * (a - 0.5) / np.maximum(a - b, 1e-6)
-    return np.where(np.isfinite(away[row, nearest]), place, np.nan)
+    return np.where(np.isfinite(distance[row, nearest]), place, np.nan)
 
 
 class ThinSheet:
-    """The surface as a sheet that resists bending, and is drawn to where its vertices are wanted."""
+    """The surface as a sheet that resists bending, and is drawn to targets at some of its vertices."""
 
     def __init__(self, faces: np.ndarray, n_vertices: int):
         self._stiffness = _bending(np.ascontiguousarray(faces, np.int64).tobytes(), n_vertices)
-        self._solve: Callable[[np.ndarray], np.ndarray] | None = None
+        self._factors: SuperLU | None = None
 
-    def drawn(self, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """The displacement [V, D] that comes nearest to the targets [K, D] of some vertices.
+    def solve(self, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """The displacement [V, D] that comes nearest to the targets [K, D] of some vertices [K].
 
-        The first is exact. For those that follow its factors serve as preconditioner of conjugate gradients: nearly the
-        same vertices are drawn again, so that a few steps take less than factors of their own.
+        The first system is factorised. Its factors precondition conjugate gradients for later ones, which have targets
+        at nearly the same vertices: a few iterations take less time than another factorisation.
         """
-        n_vertices = len(self._stiffness.diagonal())
+        n_vertices = self._stiffness.shape[0]
         diagonal, right = np.zeros(n_vertices), np.zeros((n_vertices, target.shape[1]))
         np.add.at(diagonal, vertices, weight)
         np.add.at(right, vertices, weight[:, None] * target)
         system = (self._stiffness + sparse.diags_array(diagonal)).tocsc()
-        if self._solve is None:
+        if self._factors is None:
             options = {"SymmetricMode": True}
-            factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-            self._solve = factors.solve
-            return factors.solve(right)
-        return _conjugate_gradients(system, right, self._solve)
+            self._factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            return self._factors.solve(right)
+        solution, _ = cg(
+            _operator(system.dot, right.shape), right.ravel(), M=_operator(self._factors.solve, right.shape),
+            rtol=_TOLERANCE, maxiter=_MOST_STEPS,
+        )  # fmt: skip
+        return solution.reshape(right.shape)
 
 
-def _conjugate_gradients(
-    system: sparse.csc_array, right: np.ndarray, precondition: Callable[[np.ndarray], np.ndarray]
-) -> np.ndarray:
-    """The solution of each column of `right`, until no vertex moves by more than `_SETTLED` in a step."""
-    solution, residual = np.zeros_like(right), right
-    direction = preconditioned = precondition(residual)
-    product = (residual * preconditioned).sum(0)
-    for _ in range(_MOST_STEPS):
-        image = system @ direction
-        length = product / np.maximum((direction * image).sum(0), _TINY)
-        step = length * direction
-        solution, residual = solution + step, residual - length * image
-        if np.abs(step).max() < _SETTLED:
-            break
-        preconditioned = precondition(residual)
-        product, before = (residual * preconditioned).sum(0), product
-        direction = preconditioned + product / np.maximum(before, _TINY) * direction
-    return solution
+def _operator(function: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int]) -> LinearOperator:
+    """A linear function of matrices of `shape`, as an operator on flat vectors."""
+    size = shape[0] * shape[1]
+    return LinearOperator((size, size), matvec=lambda x: function(x.reshape(shape)).ravel(), dtype=np.float64)
 
 
 @functools.lru_cache(1)

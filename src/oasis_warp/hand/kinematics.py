@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import torch
 
+from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.hand.correctives import corrective_coefficients
 
@@ -33,6 +34,10 @@ _LANDMARK_OFFSETS = np.array([
 class PosedJoints:
     """The joints in one pose and shape."""
 
+    angles: np.ndarray
+    """All angles [rad], [16, 3]."""
+    shape: np.ndarray
+    """Shape coefficients, [S]."""
     rest: np.ndarray
     """Joints of the unposed hand, [16, 3]."""
     rotation: np.ndarray
@@ -98,11 +103,11 @@ class HandKinematics:
         table[self.dofs[:, 0], self.dofs[:, 1]] = angles
         return table
 
-    def chain(self, angles: np.ndarray, shape: np.ndarray) -> PosedJoints:
+    def pose_joints(self, angles: np.ndarray, shape: np.ndarray) -> PosedJoints:
         """Pose the joints by the 26 angles of the fit."""
-        return self.chain_of(self.all_angles(angles), shape)
+        return self.pose_all_joints(self.all_angles(angles), shape)
 
-    def chain_of(self, table: np.ndarray, shape: np.ndarray) -> PosedJoints:
+    def pose_all_joints(self, table: np.ndarray, shape: np.ndarray) -> PosedJoints:
         """Pose the joints by all angles, [16, 3]."""
         rest = self.joints + self.joint_basis @ shape
         rotation, position = np.zeros((16, 3, 3)), np.zeros((16, 3))
@@ -118,17 +123,17 @@ class HandKinematics:
                 if table[j, a] != 0:
                     turn = turn @ cv2.Rodrigues(self.axes[j, a] * table[j, a])[0]
             rotation[j] = turn
-        return PosedJoints(rest, rotation, position, by_shape, axes)
+        return PosedJoints(table, shape, rest, rotation, position, by_shape, axes)
 
-    def landmarks(self, chain: PosedJoints, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def landmarks(self, joints: PosedJoints) -> tuple[np.ndarray, np.ndarray]:
         """The 21 points where the network would put them, [21, 3] metres, and d points / d (angles, shape)."""
         joint, dof_joint = self.point_joint, self.dofs[:, 0]
-        local = self.points + self.points_basis @ shape - chain.rest[joint] + self.offsets
-        turn = chain.rotation[joint]
-        points = (turn @ local[..., None])[..., 0] + chain.position[joint]
-        arm = points[:, None] - chain.position[dof_joint]
-        by_angle = np.cross(chain.axes[tuple(self.dofs.T)], arm) * self.below[dof_joint][:, joint].T[..., None]
-        by_shape = turn @ (self.points_basis - self.joint_basis[joint]) + chain.position_by_shape[joint]
+        local = self.points + self.points_basis @ joints.shape - joints.rest[joint] + self.offsets
+        turn = joints.rotation[joint]
+        points = (turn @ local[..., None])[..., 0] + joints.position[joint]
+        arm = points[:, None] - joints.position[dof_joint]
+        by_angle = np.cross(joints.axes[tuple(self.dofs.T)], arm) * self.below[dof_joint][:, joint].T[..., None]
+        by_shape = turn @ (self.points_basis - self.joint_basis[joint]) + joints.position_by_shape[joint]
         return points, np.concatenate([by_angle.transpose(0, 2, 1), by_shape], 2)
 
     def rest_surface(self, shape: np.ndarray) -> np.ndarray:
@@ -140,38 +145,42 @@ class HandKinematics:
         strengths = corrective_coefficients(self.hand, torch.from_numpy(table[1:])).numpy()
         return (self.corrective_basis @ strengths).reshape(-1, 3)
 
-    def surface(self, chain: PosedJoints, angles: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    def surface(self, joints: PosedJoints) -> np.ndarray:
         """The posed surface, correctives included [m], [V, 3]."""
-        return self.pose_surface(chain, self.rest_surface(shape) + self.correctives(self.all_angles(angles)))
+        return self.pose_surface(joints, self.rest_surface(joints.shape) + self.correctives(joints.angles))
 
-    def bone_shifts(self, chain: PosedJoints) -> np.ndarray:
-        """Translations that go with `chain.rotation` to carry rest points, [16, 3]."""
-        return chain.position - (chain.rotation @ chain.rest[..., None])[..., 0]
+    def bone_shifts(self, joints: PosedJoints) -> np.ndarray:
+        """Translations that go with `joints.rotation` to carry rest points, [16, 3]."""
+        return joints.position - (joints.rotation @ joints.rest[..., None])[..., 0]
 
-    def blended(self, chain: PosedJoints, index: np.ndarray | slice = slice(None)) -> np.ndarray:
+    def blended(self, joints: PosedJoints, index: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Blended bone rotation of each vertex, [V, 3, 3]."""
-        return (self.weights[index] @ chain.rotation.reshape(16, 9)).reshape(-1, 3, 3)
+        return (self.weights[index] @ joints.rotation.reshape(16, 9)).reshape(-1, 3, 3)
 
-    def pose_surface(self, chain: PosedJoints, rest: np.ndarray) -> np.ndarray:
+    def pose_surface(self, joints: PosedJoints, rest: np.ndarray) -> np.ndarray:
         """Linear blend skinning of the whole rest surface."""
-        return (self.blended(chain) @ rest[..., None])[..., 0] + self.weights @ self.bone_shifts(chain)
+        return (self.blended(joints) @ rest[..., None])[..., 0] + self.weights @ self.bone_shifts(joints)
+
+    def vertex_normals(self, vertices: np.ndarray) -> np.ndarray:
+        """Unit area-weighted normals of the vertices, [V, 3]."""
+        return surface.vertex_normals(torch.from_numpy(vertices), self.hand.faces).numpy()
 
     def vertices(
-        self, chain: PosedJoints, shape: np.ndarray, index: np.ndarray, displacement: np.ndarray
+        self, joints: PosedJoints, index: np.ndarray, displacement: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Posed vertices `index`, and d vertices / d (angles, shape); the surface's `displacement` stays constant."""
         basis = self.shape_basis[index]
-        start, weights = self.template[index] + basis @ shape + displacement[index], self.weights[index]
-        shifts, turn = self.bone_shifts(chain), self.blended(chain, index)
+        start, weights = self.template[index] + basis @ joints.shape + displacement[index], self.weights[index]
+        shifts, turn = self.bone_shifts(joints), self.blended(joints, index)
         points = (turn @ start[..., None])[..., 0] + weights @ shifts
         dof_joint = self.dofs[:, 0]
         below = self.below[dof_joint].T  # bone, angle
         # Each bone's share of the vertex turns about the joint of the angle when the bone hangs on it.
-        shares = weights[:, :, None] * ((chain.rotation @ start.T).transpose(2, 0, 1) + shifts)
+        shares = weights[:, :, None] * ((joints.rotation @ start.T).transpose(2, 0, 1) + shifts)
         moved = np.einsum("nja,jd->nda", shares, below, optimize=True)
-        arm = moved - (weights @ below)[..., None] * chain.position[dof_joint]
-        by_angle = np.cross(chain.axes[tuple(self.dofs.T)], arm)
-        shift_by_shape = chain.position_by_shape - chain.rotation @ self.joint_basis
+        arm = moved - (weights @ below)[..., None] * joints.position[dof_joint]
+        by_angle = np.cross(joints.axes[tuple(self.dofs.T)], arm)
+        shift_by_shape = joints.position_by_shape - joints.rotation @ self.joint_basis
         by_shape = turn @ basis + np.tensordot(weights, shift_by_shape, 1)
         return points, np.concatenate([by_angle.transpose(0, 2, 1), by_shape], 2)
 

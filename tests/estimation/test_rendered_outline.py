@@ -2,11 +2,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from synthetic import evidence_of
+from synthetic import crop_of
 
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
-from oasis_warp.estimation.drawn_outline import BEYOND, rendered_outline_offsets
+from oasis_warp.estimation.surface_offsets import BEYOND, rendered_outline_offsets
 from oasis_warp.render.render import render
 
 SIZE = 256
@@ -15,7 +15,7 @@ SIZE = 256
 @pytest.fixture(scope="module")
 def case(hand):
     """A photo, and Gaussians too large for its outline on a surface that is too thin at the fingers."""
-    crop, truth, _ = evidence_of(hand, torch.full_like(hand.template, 0.5), size=SIZE)
+    crop, truth, _ = crop_of(hand, torch.full_like(hand.template, 0.5), size=SIZE)
     too_large = truth._replace(scales=1.4 * truth.scales)
     return moved(hand, crop, -0.001 * (hand.template[:, :1] < -0.09)), too_large
 
@@ -60,7 +60,7 @@ def test_the_drawn_outline_comes_to_lie_just_outside_the_masks(hand, case, offse
 
 
 def test_a_slit_that_the_photo_does_not_have_is_closed(hand):
-    crop, gaussians, _ = evidence_of(hand, torch.full_like(hand.template, 0.5), size=SIZE)
+    crop, gaussians, _ = crop_of(hand, torch.full_like(hand.template, 0.5), size=SIZE)
     solid = (crop.mask > 0.5).numpy().astype(np.uint8)
     closed = torch.from_numpy(cv2.morphologyEx(solid, cv2.MORPH_CLOSE, np.ones((5, 5)))).float()
     slit = (closed > 0.5) & (crop.mask < 0.5)
