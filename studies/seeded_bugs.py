@@ -75,7 +75,7 @@ PIPELINE = [
         "/ math.sqrt(inputs)", "/ math.sqrt(outputs)"),
     _of("estimation/keypoints", "estimation/test_keypoints", "camera_of_a_pose", "the centre not shrunk with the photo",
         '"centre", (2,)) * photo.shrink', '"centre", (2,))'),
-    _of("synthetic/skin_lines", "synthetic/test_bake", "lie_on_the_palm", "creases on the back",
+    _of("synthetic/skin_lines", "synthetic/test_people", "lie_on_the_palm", "creases on the back",
         's[:, None], "palm")', 's[:, None], "back")'),
     _of("cli/animate", "cli/test_render_and_animate", "film_in_even_light", "--light even ignored",
         'options.light == "even"', 'options.light == "none"'),

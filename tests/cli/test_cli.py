@@ -1,4 +1,3 @@
-import dataclasses
 import subprocess
 import sys
 from typing import get_args
@@ -7,7 +6,6 @@ import pytest
 
 from oasis_warp import __version__
 from oasis_warp.cli import main, options
-from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.hand.poses import POSE_NAMES
 
 LIST_IMPORTS = """
@@ -95,14 +93,6 @@ def test_an_error_of_ours_is_not_dressed_up_as_bad_input(monkeypatch, avatar_fil
     monkeypatch.setattr(render, "orbit_camera", fail)
     with pytest.raises(ValueError, match="a bug"):
         main(["render", str(avatar_file), "-o", str(avatar_file.with_name("x.png"))])
-
-
-def test_the_command_line_offers_the_options_of_the_config_with_its_defaults():
-    offered = {field.name: (field.default, field.type) for field in dataclasses.fields(options.Reconstruct)}
-    for field in dataclasses.fields(ReconstructConfig):
-        default, kind = offered[field.name]
-        assert default == field.default
-        assert kind == field.type or bool in get_args(kind)
 
 
 def test_the_command_line_offers_every_pose():

@@ -15,7 +15,7 @@ CPU = torch.device("cpu")
 
 
 def source(**changes):
-    return SyntheticHands(**{"seed": 3, "people": 1, "hands": 1, "views": 2, "size": 32, "device": CPU} | changes)
+    return SyntheticHands(**{"seed": 13, "people": 1, "hands": 1, "views": 2, "size": 32, "device": CPU} | changes)
 
 
 def test_a_batch_is_the_same_wherever_training_is_taken_up():
@@ -46,7 +46,7 @@ def test_targets_show_the_hands_of_the_photos():
 
 
 def test_now_and_then_photos_are_in_the_even_light_of_their_targets_before_a_plain_wall():
-    batches = source()(EVEN_EVERY - 2, 0, 1)
+    batches = source()(2 * EVEN_EVERY - 2, 0, 1)
     in_a_room, evenly_lit = next(batches), next(batches)
 
     def alike(batch):
@@ -82,7 +82,7 @@ def test_each_process_meets_whom_its_batches_show(people, hands, world, steps):
 
 
 def test_the_errors_of_an_estimator_differ_from_batch_to_batch_and_seed_to_seed():
-    drawn = [float(torch.rand((), generator=s.errors(n))) for s in (source(), source(seed=4)) for n in (0, 1)]
+    drawn = [float(torch.rand((), generator=s.errors(n))) for s in (source(), source(seed=14)) for n in (0, 1)]
     assert len(set(drawn)) == 4
     assert drawn[0] == float(torch.rand((), generator=source().errors(0)))
 
