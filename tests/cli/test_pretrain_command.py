@@ -52,6 +52,8 @@ def unbroken(tmp_path_factory):
         patch.setitem(PROFILES, "compact", TINY)
         patch.setattr(people, "_cache", type(people._cache)())  # as in a process of its own
         assert main(["pretrain", str(folder), *SMALL]) == 0
+        baked = people._cache
+    people._cache.update(baked)  # for the other trainings
     return folder
 
 

@@ -89,6 +89,6 @@ def test_the_errors_of_an_estimator_differ_from_batch_to_batch_and_seed_to_seed(
 
 def test_a_kind_that_is_held_out_is_not_shown_and_nothing_else_changes():
     bare, ringed = (replace(EVERYBODY, tattoo=0.0, ring=share) for share in (0.0, 1.0))
-    without, with_ring = (next(source(population=population)(0, 0, 1)) for population in (bare, ringed))
+    without, with_ring = (next(source(population=kinds, views=1)(0, 0, 1)) for kinds in (bare, ringed))
     assert torch.equal(without.rest, with_ring.rest) and torch.equal(without.target_posed, with_ring.target_posed)
     assert not torch.equal(without.target_images, with_ring.target_images)
