@@ -27,8 +27,7 @@ from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.heads import ColorHeads
 from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.render.render import render
-from studies.harness import Options as Base
-from studies.harness import Row, measured, seconds
+from studies.harness import Row, StudyOptions, measured, seconds
 from studies.inputs import people, prior_named
 from studies.tables import Section, complete, groups, markdown, mean
 
@@ -75,7 +74,7 @@ def all_settings(longest: int = STEPS[-1]) -> dict[str, Setting]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     selecting: ClassVar[frozenset[str]] = frozenset({"people", "lights", "longest"})

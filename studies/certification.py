@@ -11,15 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from studies.harness import Options as Base
-from studies.harness import Row
-from studies.tables import Section, markdown
+from studies.harness import Row, StudyOptions
+from studies.tables import markdown, section_of
 
 REPORTS = ("certification", "grid")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     scenes: int = 5000
@@ -83,15 +82,7 @@ def conditions(report: dict[str, Any]) -> str:
     return f"{about}\n\n{markdown(headings, lines)}"
 
 
-def _section(marker: str, report: str, text) -> Section:
-    def filled(rows: list[Row]) -> str | None:
-        found = next((row for row in rows if row["report"] == report), None)
-        return found and text(found)
-
-    return Section("certification.md", marker, filled)
-
-
 SECTIONS = (
-    _section("checks", "certification", checks),
-    _section("grid", "grid", conditions),
+    section_of("certification.md", "checks", checks, report="certification"),
+    section_of("certification.md", "grid", conditions, report="grid"),
 )

@@ -15,15 +15,14 @@ from oasis_warp.bench.pareto import plot_operator
 from oasis_warp.bench.rows import Row as Measurement
 from oasis_warp.bench.rows import read_csv
 from oasis_warp.bench.summary import BUDGETS, Group, fastest, groups
-from studies.harness import Options as Base
-from studies.harness import Row
+from studies.harness import Row, StudyOptions
 from studies.tables import Section, markdown, power
 
 FORWARD, BOTH = "forward", "forward + backward"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
 

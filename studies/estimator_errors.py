@@ -11,7 +11,7 @@ import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -46,8 +46,7 @@ from oasis_warp.pretraining.training_batch import crop_to_mask, mirror_left_hand
 from oasis_warp.reconstruction import CROP_MARGIN
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shots import PICTURES_EACH
-from studies.harness import ROWS, Row, measured, read_rows
-from studies.harness import Options as Base
+from studies.harness import ROWS, Row, StudyOptions, measured, read_rows
 from studies.inputs import estimator, synthetic_photo
 from studies.tables import Section, markdown, percentiles
 
@@ -62,7 +61,7 @@ Arrays = dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     selecting: ClassVar[frozenset[str]] = frozenset({"count", "first", "asset", "masks", "mask_seed"})
@@ -93,11 +92,6 @@ def mirrored(values: Arrays, width: int) -> Arrays:
     return values | {"orientation": orientation, "translation": mirror * values["translation"], "K": K}
 
 
-def doubles(**tensors: Tensor) -> Arrays:
-    """Arrays in double precision."""
-    return {name: tensor.double().numpy() for name, tensor in tensors.items()}
-
-
 def measure(number: int, options: Options) -> Row:
     """Estimate one picture; writes what is true and what was found."""
     index = PICTURES_EACH * (number // options.each) + number % options.each
@@ -114,8 +108,9 @@ def measure(number: int, options: Options) -> Row:
         fit = estimator().fit(photo, landmarks)
     except InputError:
         return {"result": "refused"}
-    true = doubles(**{name: getattr(batch, name)[0] for name in PARTS})
-    found = doubles(**fit.pose._asdict(), shape=fit.shape, K=fit.camera.K)
+    true = {name: getattr(batch, name)[0].double().numpy() for name in PARTS}
+    estimate = {**fit.pose._asdict(), "shape": fit.shape, "K": fit.camera.K}
+    found = {name: tensor.double().numpy() for name, tensor in estimate.items()}
     above = torch.from_numpy(wrist_line(fit.landmarks.xy.numpy()).above_mask((size, size))).float()
     masks = {"true_mask": batch.mask[0], "found_mask": fit.mask, "above": above}
     if side == "left":
@@ -285,26 +280,28 @@ def errors_of_parts(true: Hands, found: Hands, scale: Tensor) -> dict[str, Tenso
     }
 
 
-class Masks(NamedTuple):
-    """True masks and others, in the crops of the latter."""
+def mask_errors(true: Tensor, found: Tensor, above: Tensor, side: Tensor) -> dict[str, Tensor]:
+    """Errors of whole masks, of what is `above` the wrist line, and of the crops, `side` times the true ones."""
+    hand = (true & above).flatten(1).sum(1)
+    return {
+        "IoU with the true mask": iou(true, found),
+        "the same above the wrist line": iou(true & above, found & above),
+        "of the hand above it, left out [%]": 100 * (true & ~found & above).flatten(1).sum(1) / hand,
+        "as much of what is not hand, taken in [%]": 100 * (found & ~true & above).flatten(1).sum(1) / hand,
+        "side of the crop, over that of the true one [%]": 100 * (side - 1),
+    }
 
-    true: Tensor
-    found: Tensor
-    above: Tensor
-    """The hand's side of the wrist line."""
-    side: Tensor
-    """Of the crop, over that of the true mask's."""
 
-
-def found_masks(rows: list[Arrays]) -> Masks:
-    """Those that the estimator cut."""
+def found_mask_errors(rows: list[Arrays]) -> dict[str, Tensor]:
+    """Of the masks that the estimator cut."""
     true, found, above = (torch.from_numpy(np.stack([row[name] for row in rows])) > 127
                           for name in ("true_mask", "found_mask", "above"))  # fmt: skip
-    return Masks(true, found, above, torch.tensor([float(row["square"][2] / row["true_square"][2]) for row in rows]))
+    sides = torch.tensor([float(row["square"][2] / row["true_square"][2]) for row in rows])
+    return mask_errors(true, found, above, sides)
 
 
-def masks_in_training(hand: HandModel, seed: int, count: int) -> Masks:
-    """Those of `training_batch`, of one picture of each person of a world."""
+def training_mask_errors(hand: HandModel, seed: int, count: int) -> dict[str, Tensor]:
+    """Of the masks of `training_batch`, for one picture of each person of a world."""
     random = torch.Generator().manual_seed(seed)
     parts = []
     for k in range(count):
@@ -318,21 +315,8 @@ def masks_in_training(hand: HandModel, seed: int, count: int) -> Masks:
         seen = project(landmarks, crop.K)[0].numpy()
         above = torch.from_numpy(wrist_line(seen).above_mask((CROP, CROP)))[None]
         side = crop_to_mask(mask[..., None], mask, K, CROP).K[:, 0, 0] / crop.K[:, 0, 0]
-        parts.append(Masks(crop.planes[..., 0] > 0.5, found > 0.5, above, side))
-    return Masks(*(torch.cat(part) for part in zip(*parts, strict=True)))
-
-
-def errors_of_masks(masks: Masks) -> dict[str, Tensor]:
-    """Of whole masks, of what is above the wrist line, and of the crops that come from them."""
-    true, found, above, side = masks
-    hand = (true & above).flatten(1).sum(1)
-    return {
-        "IoU with the true mask": iou(true, found),
-        "the same above the wrist line": iou(true & above, found & above),
-        "of the hand above it, left out [%]": 100 * (true & ~found & above).flatten(1).sum(1) / hand,
-        "as much of what is not hand, taken in [%]": 100 * (found & ~true & above).flatten(1).sum(1) / hand,
-        "side of the crop, over that of the true one [%]": 100 * (side - 1),
-    }
+        parts.append((crop.planes[..., 0] > 0.5, found > 0.5, above, side))
+    return mask_errors(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
 
 def correlations(true: Hands, found: Hands) -> dict[str, float]:
@@ -383,7 +367,7 @@ def text(every: list[Row], rows: list[Arrays], options: Options) -> str:
         "found": Surfaces(hand, with_offsets(hand, rows, found), found.K, size),
         "in training": Surfaces(hand, *leave_one_out(hand, true, measured, 0), size),
     }
-    masks = {"found": found_masks(rows), "in training": masks_in_training(hand, options.seed, options.masks)}
+    masks = {"found": found_mask_errors(rows), "in training": training_mask_errors(hand, options.seed, options.masks)}
     results = [row["result"] for row in every]
     outcome = ", ".join(f"{results.count(name)} {name}" for name in sorted(set(results)))
     hang = "; ".join(f"{name} {value:.2f}" for name, value in correlations(true, found).items())
@@ -395,7 +379,7 @@ def text(every: list[Row], rows: list[Arrays], options: Options) -> str:
         "Surfaces, and those that training gives the network:",
         spread({name: compare(truth, those, scale) for name, those in surfaces.items()}),
         f"Masks, and {options.masks} that training gives it:",
-        spread({name: errors_of_masks(those) for name, those in masks.items()}),
+        spread(masks),
     ])  # fmt: skip
 
 

@@ -27,9 +27,8 @@ from oasis_warp.evaluation.columns import (
 )
 from oasis_warp.evaluation.methods import Method, method_name
 from oasis_warp.evaluation.summary import Record, select
-from studies.harness import Options as Base
-from studies.harness import Row
-from studies.tables import Section, markdown, write_jpeg
+from studies.harness import Row, StudyOptions
+from studies.tables import markdown, section_of, write_jpeg
 
 FOLDERS = {"synthetic": "evaluation", "same-hand": "same_hand_photos"}
 PICTURES = {"evaluation_sheet": "evaluation/sheet.png", "evaluation_attention": "evaluation/attention.png",
@@ -54,7 +53,7 @@ MEASURES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     people: int = 16
@@ -150,19 +149,9 @@ def measurements(found: dict[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def section(page: str, marker: str, dataset: str, text) -> Section:
-    """A section that is made of what one of the commands left."""
-
-    def filled(rows: list[Row]) -> str | None:
-        found = next((row["found"] for row in rows if row["dataset"] == dataset), None)
-        return found and text(found)
-
-    return Section(page, marker, filled)
-
-
 SECTIONS = (
-    section("evaluation.md", "synthetic", "synthetic", synthetic),
-    section("evaluation.md", "noise", "synthetic", noise),
-    section("evaluation.md", "same-hand", "same-hand", photos),
-    section("prior.md", "measurements", "synthetic", measurements),
+    section_of("evaluation.md", "synthetic", lambda row: synthetic(row["found"]), dataset="synthetic"),
+    section_of("evaluation.md", "noise", lambda row: noise(row["found"]), dataset="synthetic"),
+    section_of("evaluation.md", "same-hand", lambda row: photos(row["found"]), dataset="same-hand"),
+    section_of("prior.md", "measurements", lambda row: measurements(row["found"]), dataset="synthetic"),
 )

@@ -24,8 +24,7 @@ from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map
 from studies.damage import FAULTS, FaultyInput
-from studies.harness import Options as Base
-from studies.harness import Row, measured
+from studies.harness import Row, StudyOptions, measured
 from studies.inputs import OUTLINES, PHOTOS, estimator, iou, photos_below, read_masks
 from studies.tables import Column, Section, groups, mean, medians, percent, percentiles, table
 
@@ -44,7 +43,7 @@ WARNINGS = {"any warning": "", "the fit's numbers": "poor fit", "second look": "
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     selecting: ClassVar[frozenset[str]] = frozenset({"parts", "every", "overlays"})

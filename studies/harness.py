@@ -2,7 +2,7 @@
 
 A study is a module of this package. The first line of its docstring describes it in `python -m studies list`. It has
 
-- `Options`, a dataclass derived from `harness.Options`: its fields are the flags of the command;
+- `Options`, a dataclass derived from `StudyOptions`: its fields are the flags of the command;
 - `run(options)`, which measures and returns rows, dictionaries that JSON can hold;
 - `SECTIONS`, what it fills in the pages of docs (see `tables`);
 - where its rows do not come from `run`, `load(out)`, which reads them from the files that another command has left;
@@ -36,7 +36,7 @@ ROWS, SETTINGS = "rows.jsonl", "settings.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class StudyOptions:
     """Options of every study."""
 
     selecting: ClassVar[frozenset[str]] = frozenset()
@@ -58,7 +58,7 @@ class Options:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AvatarOptions(Options):
+class AvatarOptions(StudyOptions):
     """Options of studies that make avatars."""
 
     prior: str = "learned"
@@ -85,7 +85,7 @@ def report(stage: str, done: int, total: int) -> None:
 
 
 def measured(
-    name: str, cases: Mapping[str, tuple], measure: Callable[..., Sequence[Row] | Row], options: Options
+    name: str, cases: Mapping[str, tuple], measure: Callable[..., Sequence[Row] | Row], options: StudyOptions
 ) -> list[Row]:
     """Measure the cases that have no rows yet, keep each as it comes, and return the rows of all.
 
@@ -115,7 +115,7 @@ def measured(
 
 
 def _each(
-    cases: Mapping[str, tuple], measure: Callable[..., Sequence[Row] | Row], options: Options
+    cases: Mapping[str, tuple], measure: Callable[..., Sequence[Row] | Row], options: StudyOptions
 ) -> Iterable[tuple[str, Sequence[Row], float]]:
     threads = options.threads or max(1, (os.cpu_count() or 1) // max(1, options.workers))
     if not options.workers:

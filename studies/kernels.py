@@ -31,13 +31,12 @@ from oasis_warp.bench.roofline import RECORD, KernelRow
 from oasis_warp.bench.rows import json_text, read_json
 from oasis_warp.bench.scaling import ScalingRow, steepest
 from oasis_warp.data.output_files import write_file
-from studies.harness import Options as Base
-from studies.harness import Row, report
-from studies.tables import Section, markdown, power, short
+from studies.harness import Row, StudyOptions, report
+from studies.tables import Section, markdown, power, section_of, short
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     parts: tuple[Literal["kernels", "scaling", "roofline"], ...] = ("kernels", "scaling", "roofline")
@@ -317,19 +316,19 @@ PARTS = {
 }  # fmt: skip
 
 
-def _section(part: str, marker: str, text: Callable[..., str]) -> Section:
-    def filled(rows: list[Row]) -> str | None:
-        found = next((row["rows"] for row in rows if row["part"] == part), None)
-        return found and text(found)
-
-    return Section("gpu.md", marker, filled)
+def picture_link(row: Row) -> str:
+    """The picture of a part."""
+    return f"![{PARTS[row['part']].caption}](_static/gpu_{row['part']}.png)"
 
 
 SECTIONS = (
     Section("kernels.md", "speed", speed_text),
-    *(_section(part, marker, text) for part in PARTS for marker, text in PARTS[part].tables.items()),
     *(
-        _section(name, f"picture of {name}", lambda _, name=name: f"![{PARTS[name].caption}](_static/gpu_{name}.png)")
+        section_of("gpu.md", marker, lambda row, text=text: text(row["rows"]), part=name)
+        for name, part in PARTS.items() for marker, text in part.tables.items()
+    ),
+    *(
+        section_of("gpu.md", f"picture of {name}", picture_link, part=name)
         for name in PARTS
     ),
 )

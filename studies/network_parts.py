@@ -38,8 +38,7 @@ from oasis_warp.pretraining.pretrain import (
     save_checkpoint,
 )
 from oasis_warp.pretraining.synthetic_source import SyntheticHands
-from studies.harness import SETTINGS, Row, report, write_rows
-from studies.harness import Options as Base
+from studies.harness import SETTINGS, Row, StudyOptions, report, write_rows
 from studies.parts import FULL, ablation_rows, ablation_text
 from studies.tables import Section
 
@@ -71,7 +70,7 @@ CHECKPOINT_EVERY, LOG_EVERY = 250, 25
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     selecting: ClassVar[frozenset[str]] = frozenset(

@@ -23,8 +23,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.attention import VisibilityAttention
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior, choose_prior
-from studies.harness import Options as Base
-from studies.harness import Row, prior_choice, report, write_rows
+from studies.harness import Row, StudyOptions, prior_choice, report, write_rows
 from studies.tables import Section, groups, markdown
 
 FULL = "full"
@@ -60,7 +59,7 @@ COLUMNS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     selecting: ClassVar[frozenset[str]] = frozenset({"of"})

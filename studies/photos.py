@@ -29,8 +29,7 @@ from oasis_warp.evaluation.same_hand import compare_pairs
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.reconstruction import crop_hand, initial_offsets, make_avatar, reconstruct
-from studies.harness import Options as Base
-from studies.harness import Row, measured, prior_choice
+from studies.harness import Row, StudyOptions, measured, prior_choice
 from studies.inputs import PHOTOS, SAME_HAND, estimator, fit_largest, photos_below, photos_in, prior_named
 from studies.tables import Column, Section, complete, groups, markdown, mean, percentiles, table, write_jpeg
 
@@ -69,7 +68,7 @@ SHEET_WIDTH = 1800
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     selecting: ClassVar[frozenset[str]] = frozenset({"priors", "folders", "sheet"})

@@ -21,10 +21,9 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import BUNDLED
 from oasis_warp.network.weights_file import load_network, read_header
-from studies.harness import Options as Base
-from studies.harness import Row, write_rows
+from studies.harness import Row, StudyOptions, write_rows
 from studies.inputs import people
-from studies.tables import Section, markdown
+from studies.tables import markdown, section_of
 
 QUANTILES = (0.1, 0.5, 0.9)
 RETRAIN = ("steps", "hands", "views", "people", "size", "seed", "precision", "profile")
@@ -32,7 +31,7 @@ RETRAIN = ("steps", "hands", "views", "people", "size", "seed", "precision", "pr
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     people: int = 8
@@ -131,10 +130,6 @@ def run(options: Options) -> list[Row]:
     return write_rows(options.out / "prior_card", [{"section": name, "text": text} for name, text in texts.items()])
 
 
-def _section(name: str) -> Section:
-    return Section(
-        "prior.md", name, lambda rows: next((row["text"] for row in rows if row["section"] == name), None)
-    )
-
-
-SECTIONS = tuple(_section(name) for name in ("file", "training", "gaussians"))
+SECTIONS = tuple(
+    section_of("prior.md", name, lambda row: row["text"], section=name) for name in ("file", "training", "gaussians")
+)

@@ -18,8 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from studies.harness import Options as Base
-from studies.harness import Row, write_rows
+from studies.harness import Row, StudyOptions, write_rows
 from studies.seeded_bugs import BUGS, Bug
 from studies.tables import Section
 
@@ -30,7 +29,7 @@ LIMIT = 240
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     workers: int = 2

@@ -24,8 +24,7 @@ from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shots import PICTURES_EACH
-from studies.harness import Options as Base
-from studies.harness import Row, measured
+from studies.harness import Row, StudyOptions, measured
 from studies.inputs import PHOTOS, estimator, iou, photos_below, synthetic_photo
 from studies.tables import Column, Section, percentiles, table
 
@@ -37,7 +36,7 @@ MEASURES = {"reprojection": "reprojection [%]", "mask_iou": "mask IoU", "true_io
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     selecting: ClassVar[frozenset[str]] = frozenset({"count", "photos"})

@@ -44,6 +44,16 @@ class Section(NamedTuple):
     """What stands there, made of the study's rows; None leaves the page as it is."""
 
 
+def section_of(page: str | None, marker: str, text: Callable[[Row], str], **values: object) -> Section:
+    """A section made of the one row of a study that has these `values`; left as it is where there is none."""
+
+    def filled(rows: list[Row]) -> str | None:
+        found = next((row for row in rows if values.items() <= row.items()), None)
+        return None if found is None else text(found)
+
+    return Section(page, marker, filled)
+
+
 def complete(rows: Iterable[Row]) -> list[Row]:
     """The rows of cases that were not refused."""
     return [row for row in rows if "refused" not in row]

@@ -26,8 +26,7 @@ from oasis_warp.synthetic import picture
 from oasis_warp.synthetic.people import person
 from oasis_warp.synthetic.shot_table import sample_table
 from oasis_warp.synthetic.shots import EVERYBODY, PHOTOS, PICTURES_EACH
-from studies.harness import Options as Base
-from studies.harness import Row, measured, prior_choice
+from studies.harness import Row, StudyOptions, measured, prior_choice
 from studies.tables import Column, Section, table
 
 GEOMETRY = "posing, depth buffers of camera and lamps, normals, stretch"
@@ -40,7 +39,7 @@ WARM_UP, CROP = 3, 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Base):
+class Options(StudyOptions):
     """Options of this study."""
 
     selecting: ClassVar[frozenset[str]] = frozenset({"of", "device", "kernels"})

@@ -15,7 +15,7 @@ from oasis_warp.evaluation.methods import METHODS
 from oasis_warp.evaluation.summary import summarise
 from studies import __main__ as command
 from studies import evaluation, tables
-from studies.harness import ROWS, Options, measured, read_rows, write_rows
+from studies.harness import ROWS, StudyOptions, measured, read_rows, write_rows
 from studies.tables import Column, Section, fill, markdown, medians, power, short, table
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -23,7 +23,7 @@ NAMES = sorted(command.studies())
 
 
 @dataclass(frozen=True, kw_only=True)
-class Counted(Options):
+class Counted(StudyOptions):
     selecting: ClassVar[frozenset[str]] = frozenset({"people"})
     people: int = 2
     size: int = 256
@@ -42,7 +42,7 @@ def cases(options):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_study_can_be_run_and_fills_sections_that_its_pages_have(name):
     study = importlib.import_module(f"studies.{name}")
-    assert issubclass(study.Options, Options) and callable(study.run)
+    assert issubclass(study.Options, StudyOptions) and callable(study.run)
     study.Options().settings()
     for section in study.SECTIONS:
         if section.page:
