@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 import torch
 from safetensors.torch import save
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from oasis_warp.core.errors import InputError
@@ -156,7 +156,7 @@ def project(points: Tensor, K: Tensor) -> Tensor:
 
 def turn_vectors(matrices: Tensor) -> Tensor:
     """Axes times angles of rotations."""
-    return torch.from_numpy(np.stack([cv2.Rodrigues(m.double().numpy())[0][:, 0] for m in matrices])).float()
+    return torch.from_numpy(Rotation.from_matrix(matrices.double().numpy()).as_rotvec()).float()
 
 
 def measured_errors(hand: HandModel, true: Hands, found: Hands) -> MeasuredErrors:

@@ -26,18 +26,15 @@ from oasis_warp.ops import depth_map
 from studies.damage import FAULTS, FaultyInput
 from studies.harness import Row, StudyOptions, measured
 from studies.inputs import OUTLINES, PHOTOS, estimator, iou, photos_below, read_masks
-from studies.tables import Column, Section, groups, mean, medians, percent, percentiles, table
+from studies.tables import Column, Section, complete, distribution, groups, mean, medians, percent, table
 
-MEASURES = {
-    "reprojection": ("reprojection, % of the box", ".2f"),
-    "worst_point": ("worst point, % of the box", ".1f"),
-    "mesh_mask": ("mesh against mask, IoU above the wrist", ".3f"),
-    "moved_mask": ("the same after the outline offsets", ".3f"),
-    "mask_drawn": ("mask against ten hand-drawn ones", ".3f"),
-    "find_s": ("seconds: landmarks", ".2f"),
-    "fit_s": ("seconds: fit", ".2f"),
-    "offsets_s": ("seconds: offsets", ".2f"),
-}
+MEASURES = (
+    Column("reprojection, % of the box", "reprojection", ".2f"),
+    Column("worst point, % of the box", "worst_point", ".1f"),
+    Column("mesh against mask, IoU above the wrist", "mesh_mask", ".3f"),
+    Column("the same after the outline offsets", "moved_mask", ".3f"),
+    Column("mask against ten hand-drawn ones", "mask_drawn", ".3f"),
+)
 WARNINGS = {"any warning": "", "the fit's numbers": "poor fit", "second look": "second look", "side": "side doubtful"}
 """Columns of the table of faults, and the words by which their warnings are told."""
 
@@ -139,17 +136,6 @@ def run(options: Options) -> list[Row]:
     return rows
 
 
-def spread(rows: list[Row]) -> list[Row]:
-    """Percentiles of each measure."""
-    found = []
-    for key, (words, form) in MEASURES.items():
-        values = [row[key] for row in rows if key in row]
-        if values:
-            low, middle, high = (format(value, form) for value in percentiles(values))
-            found.append({"measure": words, "low": low, "middle": middle, "high": high})
-    return found
-
-
 def shares(rows: list[Row]) -> list[Row]:
     """Of each fault, the share of fits with a warning of each kind."""
     found = []
@@ -168,9 +154,7 @@ def drawn(rows: list[Row]) -> list[Row]:
 
 
 SECTIONS = (
-    Section("estimator.md", "fit", table(
-        (Column("", "measure"), Column("10 %", "low"), Column("median", "middle"), Column("90 %", "high")), spread
-    )),
+    Section("estimator.md", "fit", lambda rows: distribution(complete(rows), MEASURES)),
     Section("estimator.md", "faults", table(
         (Column("fault", "fault"), *(Column(heading, percent(heading)) for heading in WARNINGS)), shares
     )),

@@ -31,37 +31,37 @@ from oasis_warp.hand_avatar import Avatar
 from oasis_warp.reconstruction import crop_hand, initial_offsets, make_avatar, reconstruct
 from studies.harness import Row, StudyOptions, measured, prior_choice
 from studies.inputs import PHOTOS, SAME_HAND, estimator, fit_largest, photos_below, photos_in, prior_named
-from studies.tables import Column, Section, complete, groups, markdown, mean, percentiles, table, write_jpeg
+from studies.tables import Column, Section, complete, distribution, groups, mean, percentiles, table, write_jpeg
 
-ESTIMATOR = {
-    "reprojection_percent": ("reprojection, % of the box", ".2f"),
-    "mask_iou": ("fitted mesh against mask, IoU above the wrist", ".3f"),
-    "landmarks_s": ("seconds: landmarks", ".2f"),
-    "fit_s": ("seconds: fit", ".2f"),
-    "outline_s": ("seconds: outline", ".2f"),
-}
-AVATAR = {
-    "input_psnr_db": ("PSNR inside the mask, dB", ".1f"),
-    "input_psnr_inner_db": ("PSNR 2 px inside the mask, dB", ".1f"),
-    "coverage_worst": ("coverage, worst of 4 poses x 8 views", ".4f"),
-    "prior_s": ("seconds: prior", ".2f"),
-    "adaptation_s": ("seconds: adaptation", ".1f"),
-    "total_s": ("seconds: photo to avatar, warm", ".1f"),
-    "peak_gib": ("peak memory of the process, GiB", ".2f"),
-}
-PAIRS = {
-    "psnr_db": ("PSNR with one gain a channel, dB", ".1f"),
-    "psnr_plain_db": ("PSNR without it, dB", ".1f"),
-    "overlap": ("overlap (IoU) of drawn hand and mask", ".3f"),
-    "error_palm": ("colour error of the palm [sRGB]", ".3f"),
-    "error_back": ("colour error of the back [sRGB]", ".3f"),
-    "error_nail": ("colour error of the nails [sRGB]", ".3f"),
-}
-SINGLE = {
-    "input_psnr_db": ("PSNR dB", ".1f"),
-    "input_psnr_inner_db": ("2 px inside, dB", ".1f"),
-    "coverage_worst": ("coverage", ".3f"),
-}
+ESTIMATOR = (
+    Column("reprojection, % of the box", "reprojection_percent", ".2f"),
+    Column("fitted mesh against mask, IoU above the wrist", "mask_iou", ".3f"),
+    Column("seconds: landmarks", "landmarks_s", ".2f"),
+    Column("seconds: fit", "fit_s", ".2f"),
+    Column("seconds: outline", "outline_s", ".2f"),
+)
+AVATAR = (
+    Column("PSNR inside the mask, dB", "input_psnr_db", ".1f"),
+    Column("PSNR 2 px inside the mask, dB", "input_psnr_inner_db", ".1f"),
+    Column("coverage, worst of 4 poses x 8 views", "coverage_worst", ".4f"),
+    Column("seconds: prior", "prior_s", ".2f"),
+    Column("seconds: adaptation", "adaptation_s", ".1f"),
+    Column("seconds: photo to avatar, warm", "total_s", ".1f"),
+    Column("peak memory of the process, GiB", "peak_gib", ".2f"),
+)
+PAIRS = (
+    Column("PSNR with one gain a channel, dB", "psnr_db", ".1f"),
+    Column("PSNR without it, dB", "psnr_plain_db", ".1f"),
+    Column("overlap (IoU) of drawn hand and mask", "overlap", ".3f"),
+    Column("colour error of the palm [sRGB]", "error_palm", ".3f"),
+    Column("colour error of the back [sRGB]", "error_back", ".3f"),
+    Column("colour error of the nails [sRGB]", "error_nail", ".3f"),
+)
+SINGLE = (
+    Column("PSNR dB", "input_psnr_db", ".1f"),
+    Column("2 px inside, dB", "input_psnr_inner_db", ".1f"),
+    Column("coverage", "coverage_worst", ".3f"),
+)
 AZIMUTHS = (90, 180)
 """Of the views on the sheet beside the photo's own [degrees]."""
 SHEET_WIDTH = 1800
@@ -181,29 +181,16 @@ def reconstructed(rows: list[Row], prior: str | None = None) -> list[Row]:
     return [row for row in complete(rows) if row.get("result") == "ok" and prior in (None, row["prior"])]
 
 
-def spread(rows: list[Row], measures: dict[str, tuple[str, str]], title: str, by_prior: bool = True) -> str | None:
-    """Percentiles and extremes of some measures, a line for each prior."""
-    by = groups(rows, "prior") if by_prior else {(): rows}
-    lines = []
-    for key, (words, form) in measures.items():
-        for prior, own in by.items():
-            values = [row[key] for row in own if row.get(key) is not None]
-            if values:
-                numbers = [*percentiles(values), min(values), max(values)]
-                lines.append([words, *prior, *(format(number, form) for number in numbers)])
-    headings = [title, *(["prior"] if by_prior else []), "10 %", "median", "90 %", "least", "most"]
-    return markdown(headings, lines) if lines else None
-
-
 def estimator_text(rows: list[Row]) -> str | None:
     """The estimator's measures over all hands."""
     found = reconstructed(rows, "none")
-    return spread(found, ESTIMATOR, f"all {len(found)} hands", by_prior=False)
+    return distribution(found, ESTIMATOR, f"all {len(found)} hands", extremes=True)
 
 
 def avatar_text(rows: list[Row]) -> str | None:
     """The avatars' measures over all hands."""
-    return spread(reconstructed(rows), AVATAR, f"all {len(reconstructed(rows, 'none'))} hands")
+    title = f"all {len(reconstructed(rows, 'none'))} hands"
+    return distribution(reconstructed(rows), AVATAR, title, by="prior", extremes=True)
 
 
 def pairs_text(rows: list[Row]) -> str | None:
@@ -213,7 +200,7 @@ def pairs_text(rows: list[Row]) -> str | None:
         prior: {(row["source"], row["target"]): row["psnr_db"] for row in own}
         for (prior,), own in groups(pairs, "prior").items()
     }
-    made = spread(pairs, PAIRS, f"{len(psnr.get('none', ()))} ordered pairs")
+    made = distribution(pairs, PAIRS, f"{len(psnr.get('none', ()))} ordered pairs", by="prior", extremes=True)
     if {"none", "learned"} <= set(psnr):
         both = psnr["none"].keys() & psnr["learned"].keys()
         won = mean(psnr["learned"][pair] > psnr["none"][pair] for pair in both)
@@ -232,7 +219,7 @@ def single_rows(rows: list[Row]) -> list[Row]:
         if own[0]["result"] != "ok":
             found.append({"photo": name, "side": f"refused: {own[0]['result'].split(': ')[1].split(';')[0]}"})
             continue
-        measures = {f"{key} {row['prior']}": row.get(key) for row in own for key in SINGLE}
+        measures = {f"{each.value} {row['prior']}": row.get(each.value) for row in own for each in SINGLE}
         found.append({**own[0], **measures})
     return sorted(found, key=lambda row: row["photo"])
 
@@ -260,8 +247,8 @@ SECTIONS = (
             Column("photo", "photo"), Column("side", "side"), Column("reprojection %", "reprojection_percent", ".2f"),
             Column("mask IoU", "mask_iou", ".3f"),
             *(
-                Column(f"{words}, {prior}", f"{key} {prior}", form)
-                for key, (words, form) in SINGLE.items() for prior in ("none", "learned")
+                Column(f"{each.heading}, {prior}", f"{each.value} {prior}", each.form)
+                for each in SINGLE for prior in ("none", "learned")
             ),
         ),
         single_rows,

@@ -44,13 +44,13 @@ from studies.tables import Column, Section, complete, groups, mean, percentiles,
 
 MARGIN = 0.0015
 """Depth by which a vertex may lie behind the nearest surface and count as visible [m]."""
-MEASURES = {
-    "px": ("visible vertices, median [px of 256]", ".2f"),
-    "px90": ("the same, 90 % of a hand [px]", ".1f"),
-    "mm": ("all vertices about their mean [mm]", ".2f"),
-    "degrees": ("finger joints [deg]", ".2f"),
-    "iou": ("outline against the true one, IoU", ".3f"),
-}
+MEASURES = (
+    Column("visible vertices, median [px of 256]", "px", ".2f"),
+    Column("the same, 90 % of a hand [px]", "px90", ".1f"),
+    Column("all vertices about their mean [mm]", "mm", ".2f"),
+    Column("finger joints [deg]", "degrees", ".2f"),
+    Column("outline against the true one, IoU", "iou", ".3f"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,9 +168,9 @@ def table_rows(rows: list[Row]) -> list[Row]:
     if "studio" not in by_light:
         return []
     lines = [
-        {"measure": words, "before": format(median(by_light["studio"], "before", key), form),
+        {"measure": name, "before": format(median(by_light["studio"], "before", key), form),
          **{light: format(median(own, "after", key), form) for light, own in by_light.items()}}
-        for key, (words, form) in MEASURES.items()
+        for name, key, form in MEASURES
     ]  # fmt: skip
     gain = {light: mean(r["after"]["px"] < r["before"]["px"] for r in own) for light, own in by_light.items()}
     shares = {light: f"{100 * (share or 0):.0f} %" for light, share in gain.items()}

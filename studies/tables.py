@@ -127,6 +127,22 @@ def percentiles(values: Iterable[float | None], shares: Sequence[float] = (10, 5
     return [float(x) for x in np.percentile([value for value in values if value is not None], shares)]
 
 
+def distribution(
+    rows: list[Row], measures: Sequence[Column], title: str = "", by: str | None = None, extremes: bool = False
+) -> str | None:
+    """A table of percentiles, a line for each measure, and for each value of the key `by`; None of no rows."""
+    parts = groups(rows, by) if by else {(): rows}
+    lines = []
+    for measure in measures:
+        for name, own in parts.items():
+            values = [row[measure.value] for row in own if row.get(measure.value) is not None]
+            if values:
+                numbers = percentiles(values) + ([min(values), max(values)] if extremes else [])
+                lines.append([measure.heading, *name, *(format(number, measure.form) for number in numbers)])
+    headings = [title, *([by] if by else []), "10 %", "median", "90 %", *(["least", "most"] if extremes else [])]
+    return markdown(headings, lines) if lines else None
+
+
 def groups(rows: Iterable[Row], *keys: str) -> dict[tuple, list[Row]]:
     """Rows by the values of some of their columns, in the order of their first appearance."""
     found: dict[tuple, list[Row]] = {}
