@@ -1,6 +1,6 @@
 """How well hands are fitted to photos, against hand-drawn masks too, and which faults of its input the fit notices.
 
-Fills docs/estimator.md (fit, faults) and docs/results.md (masks). `--overlays` writes a picture of every hand.
+Fills docs/estimator.md (fit, faults) and docs/results.md (masks).
 """
 
 import time
@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from oasis_warp.core.mirror import mirror_points, mirror_pose
-from oasis_warp.core.types import HandFit, Photo
+from oasis_warp.core.types import HandFit
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.landmarks import box_size
 from oasis_warp.estimation.outline import wrist_line
@@ -43,7 +42,7 @@ WARNINGS = {"any warning": "", "the fit's numbers": "poor fit", "second look": "
 class Options(StudyOptions):
     """Options of this study."""
 
-    selecting: ClassVar[frozenset[str]] = frozenset({"parts", "every", "overlays"})
+    selecting: ClassVar[frozenset[str]] = frozenset({"parts", "every"})
     photos: Path = PHOTOS
     """Folder of photos; its subfolders are searched, too."""
     drawn: Path = OUTLINES
@@ -51,8 +50,6 @@ class Options(StudyOptions):
     parts: tuple[Literal["fit", "faults"], ...] = ("fit", "faults")
     every: int = 4
     """Every so manieth photo gets faults."""
-    overlays: Path | None = None
-    """Folder for a picture of each hand, with the outlines of mask (red) and mesh (blue)."""
 
 
 def surface_mask(fit: HandFit, offsets: Tensor) -> Tensor:
@@ -65,16 +62,7 @@ def surface_mask(fit: HandFit, offsets: Tensor) -> Tensor:
     return depth_map(vertices, hand.faces, camera.viewmat, camera.K, camera.width, camera.height).face_ids >= 0
 
 
-def overlay(photo: Photo, mask: Tensor, surface: Tensor) -> np.ndarray:
-    """The photo with two outlines, BGR."""
-    picture = photo.rgb.numpy()[..., ::-1].copy()
-    for inside, color in ((mask, (0, 0, 255)), (surface, (255, 160, 0))):
-        lines, _ = cv2.findContours(inside.numpy().astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(picture, lines, -1, color, 1)
-    return picture
-
-
-def measure(path: Path, drawn: Path, overlays: Path | None) -> Iterator[Row]:
+def measure(path: Path, drawn: Path) -> Iterator[Row]:
     """A row for each hand of a photo."""
     photo, start = read_photo(path), time.perf_counter()
     found = estimator().find(photo)
@@ -99,9 +87,6 @@ def measure(path: Path, drawn: Path, overlays: Path | None) -> Iterator[Row]:
             true = torch.from_numpy(truth) > 0.5
             masks = {"mask": mask, "mesh": mesh, "moved": moved}
             row |= {f"{name}_drawn": iou(each, true, where) for name, each in masks.items()}
-        if overlays is not None:
-            overlays.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(overlays / f"{path.parent.name}_{path.stem}_{number}.png"), overlay(photo, mask, moved))
         yield row
 
 
@@ -124,7 +109,7 @@ def run(options: Options) -> list[Row]:
     """Measure every photo."""
     paths, rows = photos_below(options.photos), []
     if "fit" in options.parts:
-        cases = {str(path.relative_to(options.photos)): (path, options.drawn, options.overlays) for path in paths}
+        cases = {str(path.relative_to(options.photos)): (path, options.drawn) for path in paths}
         rows += measured("fit", cases, measure, options)
     if "faults" in options.parts:
         some = paths[:: options.every]

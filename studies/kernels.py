@@ -34,6 +34,9 @@ from oasis_warp.data.output_files import write_file
 from studies.harness import Row, StudyOptions, report
 from studies.tables import Section, markdown, power, section_of, short
 
+GROUPS, SECONDS = 11, 2.0
+"""Groups of calls of each case, and seconds for each point of the scaling: those of `oasis bench`."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options(StudyOptions):
@@ -41,16 +44,8 @@ class Options(StudyOptions):
 
     parts: tuple[Literal["kernels", "scaling", "roofline"], ...] = ("kernels", "scaling", "roofline")
     """Of the GPU's."""
-    only: str = ""
-    """Kernels of the GPU: cases whose name or pass holds this."""
     peer: Literal["none", "gsplat"] = "none"
     """Another rasterizer to time beside the kernels."""
-    groups: int = 11
-    """Kernels of the GPU: groups of calls."""
-    quick: bool = False
-    """Scaling: small scenes only."""
-    seconds: float = 2.0
-    """Scaling: for timing each point."""
 
 
 class Part(NamedTuple):
@@ -68,11 +63,9 @@ def measure_part(part: str, options: Options) -> Sequence[Any]:
     device = torch.device(options.device)
     if part == "kernels":
         peers = {"gsplat": gpu_speed.gsplat_draw()} if options.peer == "gsplat" else {}
-        cases = gpu_cases.choose(options.only)
-        return gpu_speed.measure(cases, device, groups=options.groups, peers=peers, progress=report)
+        return gpu_speed.measure(gpu_cases.choose(""), device, groups=GROUPS, peers=peers, progress=report)
     if part == "scaling":
-        points = scaling.points(options.quick)
-        return scaling.measure(points, device, seconds=options.seconds, progress=report)
+        return scaling.measure(scaling.points(quick=False), device, seconds=SECONDS, progress=report)
     return roofline.measure(device, progress=report)
 
 
@@ -83,7 +76,7 @@ def measure_gpu(options: Options) -> list[Row]:
     for part in options.parts:
         rows = measure_part(part, options)
         if not rows:
-            raise SystemExit(f"{part}: nothing to measure: no case holds --only, or no kernels are traced here.")
+            raise SystemExit(f"{part}: nothing was measured: no kernels are traced on this device.")
         write_file(folder / f"{part}.json", json_text(rows).encode())
         print(f"{part}: {len(rows)} rows, {rows[0].device}, {rows[0].versions}, {rows[0].commit}")
     return load(options.out)
