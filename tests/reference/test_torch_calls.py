@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from oasis_warp.bench import scenes
-from oasis_warp.bench.operators import OPERATORS, exact, forward, gradients
-from oasis_warp.bench.torch_rasterizer import draw
-from oasis_warp.ops._runtime.rules import Rules
+from oasis_warp.bench.operators import OPERATORS, draw_in_torch, exact, forward, with_gradients
 from oasis_warp.reference.errors import psnr, relative_error
+from oasis_warp.reference.rasterization import Rules
 
 
 @pytest.fixture(scope="module")
@@ -20,11 +19,11 @@ def hand():
 def agree(name, scene, values=1e-12, slopes=1e-11):
     operator, truth = OPERATORS[name], exact(OPERATORS[name], scene)
     wide = operator.prepare(scene.to(dtype=torch.float64))
-    outputs = operator.comparable(forward(operator.torch_peer, wide, {}))
-    for ours, theirs in zip(truth.outputs, outputs, strict=True):
+    outputs = operator.comparable(forward(operator.torch_call, wide, {}))
+    for ours, theirs in zip(truth.values, outputs, strict=True):
         assert relative_error(theirs, ours) <= values
     if operator.leaves:
-        found = gradients(operator, operator.torch_peer, wide, {}, truth.weights)
+        found = with_gradients(operator, operator.torch_call, wide, {}, truth.weights)().gradients
         for ours, theirs in zip(truth.gradients, found, strict=True):
             assert relative_error(theirs, ours) <= slopes
 
@@ -68,7 +67,7 @@ def test_a_coarser_threshold_costs_what_theory_says(rules, decibels):
     # A layer below the cut has at most alpha 4/255; the tail beyond k sigma at most exp(-k^2/2): 1 to 14 % of a layer.
     scene = scenes.layered().to(dtype=torch.float64)
     low, high = decibels
-    assert low <= psnr(draw(scene, rules).image, draw(scene).image) <= high
+    assert low <= psnr(draw_in_torch(scene, rules).image, draw_in_torch(scene).image) <= high
 
 
 def test_fragile_pixels_are_those_where_float32_may_decide_otherwise():
@@ -77,17 +76,17 @@ def test_fragile_pixels_are_those_where_float32_may_decide_otherwise():
         torch.tensor([1.0]), torch.ones(1, 3), 32,
     ).to(dtype=torch.float64)  # fmt: skip
     # The opacity is chosen so that the alpha of one pixel lies on the cut, and then a hundredth beside it.
-    alpha = draw(replace(scene, opacities=scene.opacities * 0.5)).alpha[10, 10, 0] * 2
+    alpha = draw_in_torch(replace(scene, opacities=scene.opacities * 0.5)).alphas[0, 10, 10, 0] * 2
     on_the_cut = float(Rules().alpha_min / alpha)
     for factor, fragile in ((1.0, True), (1.01, False), (0.99, False)):
-        drawn = draw(replace(scene, opacities=scene.opacities * on_the_cut * factor))
-        assert bool(drawn.fragile[10, 10]) == fragile
+        drawn = draw_in_torch(replace(scene, opacities=scene.opacities * on_the_cut * factor))
+        assert bool(drawn.fragile[0, 10, 10]) == fragile
 
 
 def test_an_empty_view_is_background():
     scene = scenes.layered(n=5, size=16)
     behind = replace(scene, means=-scene.means)
-    drawn = draw(behind)
-    assert torch.equal(drawn.image, scene.backgrounds[0].expand(16, 16, 3))
-    assert not drawn.alpha.any()
+    drawn = draw_in_torch(behind)
+    assert torch.equal(drawn.image, scene.backgrounds[0].expand(1, 16, 16, 3))
+    assert not drawn.alphas.any()
     assert not drawn.fragile.any()
