@@ -77,7 +77,7 @@ PIPELINE = [
         '"centre", (2,)) * photo.shrink', '"centre", (2,))'),
     _of("synthetic/skin_lines", "synthetic/test_people", "lie_on_the_palm", "creases on the back",
         's[:, None], "palm")', 's[:, None], "back")'),
-    _of("cli/animate", "cli/test_render_and_animate", "film_in_even_light", "--light even ignored",
+    _of("cli/render", "cli/test_render_and_animate", "film_in_even_light", "--light even ignored",
         'options.light == "even"', 'options.light == "none"'),
     _of("core/camera", "render/test_cameras", "horizon", "azimuth and elevation exchanged",
         "(turn @ tilt)", "(tilt @ turn)"),
