@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from oasis_kernels.constants import EPS2D
-from oasis_kernels.rasterize.cuda_binning import TILE
+from oasis_kernels.rasterize.tiles_cuda import TILE
 from oasis_warp.bench.avatar_scene import AvatarScene
 from oasis_warp.bench.scenes import GaussianScene, MeshScene
 from oasis_warp.ops.projection import project

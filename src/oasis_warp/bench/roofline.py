@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from oasis_kernels.rasterize.cuda_draw_backward import record_size
+from oasis_kernels.rasterize.tiles_cuda import record_size
 from oasis_warp.bench.avatar_scene import avatar_scene
 from oasis_warp.bench.counts import Counts, MeshCounts, count, count_avatar, count_mesh
 from oasis_warp.bench.cuda import KernelTime, kernel_times
