@@ -150,7 +150,7 @@ def subject(light: Lighting, number: int, options: Options) -> Subject:
     crop = crop_of(batch)
     guess, heads = prior.with_heads(crop)
     for texture in TEXTURES:
-        adapt(bundled_hand(), guess, crop, AdaptConfig(texture=texture, texture_steps=2), heads=heads)
+        adapt(bundled_hand(), [guess], [crop], AdaptConfig(texture=texture, texture_steps=2), heads=heads)
     targets = Targets(batch, person.light_rotations[light], truths, COLORS[light])
     return Subject(crop, guess, heads, targets, prior_digest(prior))
 
@@ -161,7 +161,7 @@ def measure(light: Lighting, number: int, title: str, options: Options) -> Row:
     config, size = all_settings()[title]
     device, small = torch.device(options.device), shrink(crop, size)
     start = seconds(device)
-    made = adapt(bundled_hand(), guess, small, config, heads=heads)
+    made = adapt(bundled_hand(), [guess], [small], config, heads=heads)
     taken, adapted = seconds(device) - start, LitGaussians(made.gaussians, made.light)
     return {
         "light": light, "person": number, "title": title, "seconds": taken, "steps": len(made.losses),

@@ -29,22 +29,13 @@ from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.core.types import Camera, HandCrop
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.data.square_crop import resample_square, square_around
+from oasis_warp.estimation.hand_crop import CROP_MARGIN, crop_hand, crop_side, detail_size, initial_offsets
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import depth_map
-from oasis_warp.reconstruction import (
-    CROP_MARGIN,
-    Reconstruction,
-    crop_hand,
-    crop_side,
-    detail_size,
-    initial_offsets,
-    input_errors,
-    make_avatar,
-    reconstruct,
-)
+from oasis_warp.reconstruction import Reconstruction, input_errors, make_avatar, reconstruct
 from oasis_warp.render.render import view_weights
 from studies.harness import AvatarOptions, Row, measured
 from studies.inputs import fit_largest, photo_named, prior_named, scaled
@@ -187,7 +178,7 @@ def measure_count(name: str, options: Options) -> Iterator[Row]:
         crop = crop_hand(photo, fit, offsets, ReconstructConfig(force=True))
         own = crop_hand(photo, fit, offsets, ReconstructConfig(size=round(crop_side(fit))))
         guess, config = prior_named(options.prior)(crop), AdaptConfig(texture_steps=options.steps)
-        adapted = (adapt(hand, each, crop, config) for each in (guess, coarsen(hand, guess, crop.rest)))
+        adapted = (adapt(hand, [each], [crop], config) for each in (guess, coarsen(hand, guess, crop.rest)))
         avatars = [make_avatar(fit, offsets, crop, each.gaussians, each.light) for each in adapted]
         psnr, fewer_psnr = (input_errors(avatar, own)["input_psnr_inner_db"] for avatar in avatars)
         (far, _), (near, area) = likeness(*avatars, FAR), likeness(*avatars, FRAME_SIZE)

@@ -25,6 +25,7 @@ from oasis_warp.core.types import HandPose
 from oasis_warp.data.output_files import write_file
 from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.estimation.estimator import choose_hand
+from oasis_warp.estimation.hand_crop import CROP_MARGIN
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.surface_offsets import outline_offsets
 from oasis_warp.hand.skinning import rest_hand, skin
@@ -43,7 +44,6 @@ from oasis_warp.pretraining.estimator_errors import (
 )
 from oasis_warp.pretraining.hand_batch import PosedHands, pose_hands
 from oasis_warp.pretraining.training_batch import crop_to_mask, mirror_left_hands
-from oasis_warp.reconstruction import CROP_MARGIN
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shots import PICTURES_EACH
 from studies.harness import ROWS, Row, StudyOptions, measured, read_rows

@@ -15,7 +15,7 @@ from typing import ClassVar, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_warp.adaptation.adapt import adapt, in_photo, remove_photo_light
+from oasis_warp.adaptation.adapt import adapt, remove_photo_light, view_in_photo
 from oasis_warp.adaptation.calibrate import calibrate
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.sh_lighting import DARK, MOST, marks
@@ -26,11 +26,11 @@ from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera
 from oasis_warp.data.photo import read_photo
+from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
 from oasis_warp.evaluation.held_out import CaptureConfig, capture_person, estimated_batch
 from oasis_warp.evaluation.same_hand import photos_of_hands
 from oasis_warp.evaluation.synthetic import crop_of
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.reconstruction import crop_hand, initial_offsets
 from oasis_warp.render.render import render
 from studies.harness import AvatarOptions, Row, measured
 from studies.inputs import SAME_HAND, fit_largest, people, prior_named
@@ -70,7 +70,7 @@ def measure_light(number: int, prior: str) -> Row:
     batch = estimated_batch(hand, person, "same", capture, 1.0)
     crop, rotations = crop_of(batch), person.light_rotations["same"]
     guess = prior_named(prior)(crop)
-    _, view, trusted = in_photo(hand, guess, crop)
+    _, view, trusted = view_in_photo(hand, guess, crop)
     colors = calibrate(view, guess.colors, crop.image, trusted, AdaptConfig()).apply(guess.colors)
     skin = guess._replace(colors=colors)
 
@@ -115,8 +115,8 @@ def read_photo_beyond(path: Path, options: Options) -> Beyond:
     crop = crop_hand(photo, fit, initial_offsets(hand, fit), ReconstructConfig(size=256))
     with torch.no_grad():
         guess = prior_named(options.prior)(crop)
-        sure, light = remove_photo_light(hand, guess, crop, config)
-    made = adapt(hand, guess, crop, config)
+        sure, light = remove_photo_light(hand, guess, crop, view_in_photo(hand, guess, crop).weights, config)
+    made = adapt(hand, [guess], [crop], config)
     assert light is not None and light.facing is not None
     learned = vertex_colors(with_shade_baked(made.gaussians), len(hand.template))
     guessed = vertex_colors(guess._replace(colors=made.calibration.apply(guess.colors)), len(hand.template))

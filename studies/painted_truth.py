@@ -23,11 +23,12 @@ from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo
 from oasis_warp.data.photo import read_photo
+from oasis_warp.estimation.hand_crop import crop_hand
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
-from oasis_warp.reconstruction import crop_hand, reconstruct
+from oasis_warp.reconstruction import reconstruct
 
 KINDS = ("tattoo", "writing", "ring", "nail polish")
 SAMPLES = 4
@@ -119,7 +120,7 @@ def make_truth(hand: HandModel, prior: Prior, *, back: bool, size: int, steps: i
     fit = HandFit("right", shape, pose, camera, landmarks, drawn.alpha, 0.0, 0.0, 1.0, 0.0, ())
     still = torch.zeros_like(hand.template)
     crop = crop_hand(photo, fit, still, ReconstructConfig())
-    adapted = adapt(hand, prior(crop), crop, AdaptConfig(texture_steps=steps))
+    adapted = adapt(hand, [prior(crop)], [crop], AdaptConfig(texture_steps=steps))
     avatar = Avatar(
         side="right", shape=shape, surface_offsets=still, gaussians=adapted.gaussians, source_pose=pose,
         source_camera=crop.camera, light=adapted.light,

@@ -24,11 +24,12 @@ from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import choose_hand
+from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
 from oasis_warp.evaluation.metrics import coverage
 from oasis_warp.evaluation.same_hand import compare_pairs
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.reconstruction import crop_hand, initial_offsets, make_avatar, reconstruct
+from oasis_warp.reconstruction import make_avatar, reconstruct
 from studies.harness import Row, StudyOptions, measured, prior_choice
 from studies.inputs import PHOTOS, SAME_HAND, estimator, fit_largest, photos_below, photos_in, prior_named
 from studies.tables import Column, Section, complete, distribution, groups, mean, percentiles, table, write_jpeg
@@ -162,7 +163,7 @@ def draw_sheet(paths: list[Path], priors: tuple[str, ...], sheet: Path) -> None:
         row = [panel(crop.image.flip(1) if fit.side == "left" else crop.image, "photo")]
         for name in priors:
             guess = prior_named(name)(crop)
-            adapted = adapt(bundled_hand(), guess, crop)
+            adapted = adapt(bundled_hand(), [guess], [crop])
             for words, gaussians, light in (("guess", guess, None), ("adapted", adapted.gaussians, adapted.light)):
                 avatar = make_avatar(fit, offsets, crop, gaussians, light)
                 vertices = avatar.mesh(avatar.source_pose).vertices

@@ -14,7 +14,7 @@ import torch
 
 from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import INSET
-from oasis_warp.avatar.observation import input_of_batch
+from oasis_warp.avatar.observation import source_photos
 from oasis_warp.core import surface
 from oasis_warp.evaluation.held_out import CaptureConfig, capture_person, estimated_batch
 from oasis_warp.hand.template import bundled_hand
@@ -95,7 +95,7 @@ def gaussian_table(network: HandNetwork, photos: int) -> str:
     for number in people(photos):
         person = capture_person(capture, "ordinary", number, torch.device("cpu"))
         batch = estimated_batch(hand, person, "wild", capture, 1.0)
-        guess, rest = network(input_of_batch(batch)), batch.rest[0]
+        guess, rest = network(source_photos(batch)), batch.rest[0]
         n = guess.offsets.shape[1]
         deep = INSET - (guess.offsets[0] * surface.vertex_normals(rest, hand.faces)).sum(-1)
         shapes = _shapes(guess.opacities[0, :n], guess.scales[0, :n])

@@ -138,7 +138,7 @@ def measure(number: int, options: Options) -> Iterator[Row]:
             for surface, each in surfaces.items():
                 guess = prior(each)
                 config = AdaptConfig(light="keep", texture_steps=options.steps)
-                for stage, gaussians in (("raw", guess), ("one-shot", adapt(hand, guess, each, config).gaussians)):
+                for stage, gaussians in (("raw", guess), ("one-shot", adapt(hand, [guess], [each], config).gaussians)):
                     images = draw_targets(LitGaussians(gaussians), on_device, batch, None)
                     psnr = [
                         score(match_colors(i, t.image, t.mask) if light == "wild" else i, t)["psnr"]

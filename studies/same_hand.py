@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from oasis_warp.adaptation.fuse import fuse
-from oasis_warp.adaptation.reliability import look
+from oasis_warp.adaptation.adapt import adapt, add_detail
+from oasis_warp.adaptation.reliability import observe_photos
 from oasis_warp.avatar.pose import in_even_light
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
@@ -29,27 +29,27 @@ from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, HandPos
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.data.square_crop import resample_square, square_around
-from oasis_warp.estimation.estimator import choose_hand
+from oasis_warp.estimation.estimator import choose_hand, fit_together
+from oasis_warp.estimation.hand_crop import (
+    COARSE_SIZE,
+    CROP_MARGIN,
+    crop_hand,
+    crop_hands,
+    initial_surfaces,
+    resolutions,
+)
 from oasis_warp.evaluation.held_out import HELD_OUT_SEED, POPULATIONS, estimator_noise, target_truths
 from oasis_warp.evaluation.methods import LitGaussians
 from oasis_warp.evaluation.metrics import TargetTruth, match_colors, score
 from oasis_warp.evaluation.same_hand import compare_with_photo, draw_as_photo, photos_of_hands
 from oasis_warp.evaluation.synthetic import crop_of, draw_targets
-from oasis_warp.fusion import (
-    crop_hands,
-    fit_surfaces,
-    fit_together,
-    reconstruct_same_hand,
-    resolutions,
-    with_detail,
-)
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
 from oasis_warp.pretraining.training_batch import training_batch
-from oasis_warp.reconstruction import CROP_MARGIN, composite_over_photo, crop_hand, make_avatar, reconstruct
+from oasis_warp.reconstruction import composite_over_photo, make_avatar, reconstruct, reconstruct_same_hand
 from oasis_warp.synthetic.picture import SyntheticBatch, render_table
 from oasis_warp.synthetic.shot_table import tabulate
 from oasis_warp.synthetic.shots import PICTURES_EACH, SceneConfig, sample_shots
@@ -138,9 +138,9 @@ def measure_person(number: int, light: str, options: Options) -> Iterator[Row]:
     guesses, pixels = [prior(crop) for crop in crops], [float(SURROUNDINGS) for _ in batches]
     config = AdaptConfig(texture_steps=options.steps, light=options.light)
     for chosen in [(k,) for k in range(MOST)] + [tuple(range(n)) for n in range(2, MOST + 1)]:
-        shown = ([part[k] for k in chosen] for part in (crops, pixels, guesses))
-        fusion = fuse(bundled_hand(), *shown, config)
-        seen = (fusion.sightings.confidence > 0.5).any(0).float().mean()
+        own, shown, scales = ([part[k] for k in chosen] for part in (guesses, crops, pixels))
+        fusion = adapt(bundled_hand(), [own], [shown], config, resolutions=scales)
+        seen = (fusion.observations.confidence > 0.5).any(0).float().mean()
         fused = fusion.gaussians if fusion.lights is None else in_even_light(fusion.gaussians, fusion.lights[0])
         for stage, gaussians in zip(STAGES, (fusion.guess, fused), strict=True):
             images = draw_targets(LitGaussians(gaussians), hand, batches[0], None)
@@ -209,15 +209,17 @@ def measure_detail(name: str, paths: list[Path], options: Options) -> Iterator[R
     photos = [read_photo(path) for path in paths]
     landmarks = [choose_hand(estimator().find(photo), "largest", photo.name) for photo in photos]
     fits = fit_together(estimator(), photos, landmarks)
-    surfaces = fit_surfaces(fits)
+    surfaces = initial_surfaces(bundled_hand(), fits)
     crops = crop_hands(photos, fits, surfaces, config)
     start = time.perf_counter()
     guesses = [prior(crop) for crop in crops]
-    fusion = fuse(hand, crops, resolutions(fits, crops), guesses, AdaptConfig(texture_steps=config.steps))
+    settings = AdaptConfig(texture_steps=config.steps)
+    fusion = adapt(hand, guesses, crops, settings, resolutions=resolutions(fits, crops))
     fused = time.perf_counter()
-    fine, close = with_detail(fusion, photos, fits, surfaces, config)
+    close = crop_hands(photos, fits, surfaces, config, finer=True)
+    fine = add_detail(hand, fusion, close, resolutions(fits, close), COARSE_SIZE).gaussians
     ratio = (time.perf_counter() - fused) / (fused - start)
-    best = look(hand, close, resolutions(fits, close)).share == 1
+    best = observe_photos(hand, close, resolutions(fits, close)).share == 1
     for k, path in enumerate(paths):
         row: Row = {"photo": f"{name}: {path.stem}", "side": len(close[k].image), "time": ratio}
         for label, gaussians in (("without", fusion.gaussians), ("with", fine)):

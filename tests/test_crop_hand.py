@@ -8,8 +8,8 @@ from oasis_warp.core.camera import project
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.mirror import as_right_hand, mirror_camera, mirror_landmarks, mirror_pose
 from oasis_warp.core.types import Camera, HandFit, Landmarks, Photo
+from oasis_warp.estimation.hand_crop import crop_hand, crop_landmarks
 from oasis_warp.hand.skinning import hand21
-from oasis_warp.reconstruction import crop_hand, crop_landmarks
 
 WIDTH, HEIGHT = 237, 301
 ABOVE = 0.10

@@ -51,7 +51,7 @@ def test_no_photo_and_no_mask_makes_colours_that_are_none(hand, crop, damage):
     }[damage]
     damaged = crop._replace(image=image, mask=mask)
     few = AdaptConfig(calibration_steps=5, texture_steps=3, reference_views=1)
-    adapted = adapt(hand, MeanPrior(hand)(damaged), damaged, few)
+    adapted = adapt(hand, [MeanPrior(hand)(damaged)], [damaged], few)
     assert is_sane(sharpen(hand, adapted.gaussians, [damaged]).gaussians)
 
 

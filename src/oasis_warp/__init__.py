@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from oasis_warp.core.types import HandPose as HandPose
     from oasis_warp.data.photo import read_photo as read_photo
     from oasis_warp.editing import edit as edit
-    from oasis_warp.fusion import reconstruct_same_hand as reconstruct_same_hand
     from oasis_warp.hand_avatar import Avatar as Avatar
     from oasis_warp.ops import depth_map as depth_map
     from oasis_warp.ops import depth_visibility as depth_visibility
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from oasis_warp.ops import skin as skin
     from oasis_warp.ops import spherical_harmonics as spherical_harmonics
     from oasis_warp.reconstruction import reconstruct as reconstruct
+    from oasis_warp.reconstruction import reconstruct_same_hand as reconstruct_same_hand
 
 # A name is imported when it is first used: torch and Warp take seconds, and `oasis --help` needs neither.
 _HOMES = {
@@ -44,7 +44,7 @@ _HOMES = {
     "rasterization": "ops",
     "read_photo": "data.photo",
     "reconstruct": "reconstruction",
-    "reconstruct_same_hand": "fusion",
+    "reconstruct_same_hand": "reconstruction",
     "skin": "ops",
     "spherical_harmonics": "ops",
 }

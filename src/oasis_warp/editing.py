@@ -7,15 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.repaint import repaint
+from oasis_warp.adaptation.repaint import RepaintResult, repaint
 from oasis_warp.adaptation.reprojection import Canvas
-from oasis_warp.avatar.pose import shading_picture
+from oasis_warp.adaptation.sh_lighting import without_light
 from oasis_warp.core.camera import crop_camera
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_camera, mirror_pose
-from oasis_warp.core.types import Photo
+from oasis_warp.core.types import HandCrop, Photo
 from oasis_warp.data.paint_mask import find_paint, match_size, read_mask
 from oasis_warp.data.square_crop import Square, find_square, resample_square
 from oasis_warp.hand.skinning import skin
@@ -97,32 +97,17 @@ def edit(
         size = min(config.size, round(square.side))
         shown, share = (resample_square(plane, *square[:3], size).clamp(0, 1) for plane in (image, paint))
         canvas = _right_handed(avatar, shown, share, size)
-        pose = mirror_pose(avatar.source_pose) if avatar.side == "left" else avatar.source_pose
-        posed = skin(avatar.hand, avatar.rest, pose).vertices
         try:
-            made = repaint(
-                avatar.gaussians, avatar.hand.faces, avatar.rest.vertices, posed, _without_light(avatar, posed, canvas),
-                steps=config.steps, progress=progress,
-            )  # fmt: skip
+            painting = _repaint(avatar, canvas, config.steps, progress)
         except ValueError as error:
             where = "on the hand" if mask else "on the hand that differs from the photo"
-            raise InputError(
-                f"{painted.name}: there is no paint {where}; paint on the hand, or give a mask."
-            ) from error
-    edited = Avatar(
-        side=avatar.side, shape=avatar.shape, surface_offsets=avatar.surface_offsets, gaussians=made.gaussians,
-        source_pose=avatar.source_pose, source_camera=avatar.source_camera, light=avatar.light,
-    )  # fmt: skip
-    measures = {
-        "painted_mm2": 1e6 * made.area,
-        "new_gaussians": float(made.n_new),
-        "n_gaussians": float(len(made.gaussians.opacities)),
-        "left_out_percent": 100 * made.left_out,
-        **_errors(avatar, edited, canvas),
-    }
-    warnings = () if made.left_out < MUCH_LEFT_OUT else (
-        f"{100 * made.left_out:.0f} % of the paint lies on a slant or beside an edge and was left out; paint where the "
-        "photo shows the skin from the front.",
+            message = f"{painted.name}: there is no paint {where}; paint on the hand, or give a mask."
+            raise InputError(message) from error
+    edited = avatar.with_looks(painting.gaussians, avatar.light)
+    measures = _measure(avatar, edited, painting, canvas)
+    warnings = () if painting.left_out < MUCH_LEFT_OUT else (
+        f"{100 * painting.left_out:.0f} % of the paint lies on a slant or beside an edge and was left out; paint where "
+        "the photo shows the skin from the front.",
     )  # fmt: skip
     return Edit(edited, square, shown, share, stages, measures, warnings)
 
@@ -158,20 +143,27 @@ def _right_handed(avatar: Avatar, image: Tensor, mask: Tensor, size: int) -> Can
     return Canvas(image.to(avatar.device), mask.to(avatar.device), camera)
 
 
-def _without_light(avatar: Avatar, posed: Float[Tensor, "V 3"], canvas: Canvas) -> Canvas:
-    """The canvas as the avatar's own colours are, which its light is laid over."""
-    if avatar.light is None:
-        return canvas
-    factor = shading_picture(avatar.light, avatar.rest.vertices, posed, avatar.hand.faces, canvas.camera)
-    return canvas._replace(image=(canvas.image / factor).clamp(0, 1))
+def _repaint(avatar: Avatar, canvas: Canvas, steps: int, progress: Progress) -> RepaintResult:
+    """The avatar's Gaussians with the paint of `canvas`, which is taken off the avatar's light first."""
+    pose = mirror_pose(avatar.source_pose) if avatar.side == "left" else avatar.source_pose
+    posed = skin(avatar.hand, avatar.rest, pose)
+    if avatar.light is not None:
+        crop = HandCrop(*canvas[:2], torch.ones_like(canvas.mask), canvas.camera, avatar.rest, posed)
+        canvas = canvas._replace(image=without_light(avatar.hand, crop, avatar.light).image)
+    rest, faces = avatar.rest.vertices, avatar.hand.faces
+    return repaint(avatar.gaussians, faces, rest, posed.vertices, canvas, steps=steps, progress=progress)
 
 
-def _errors(before: Avatar, after: Avatar, canvas: Canvas) -> dict[str, float]:
+def _measure(before: Avatar, after: Avatar, painting: RepaintResult, canvas: Canvas) -> dict[str, float]:
     camera = mirror_camera(canvas.camera) if before.side == "left" else canvas.camera
     image, mask = (plane.flip(1) if before.side == "left" else plane for plane in canvas[:2])
     old, new = (avatar.render(camera, avatar.source_pose, BLACK) for avatar in (before, after))
     inside = ((mask > PAINTED) & (new.alpha > PAINTED)).to(image)
     return {
+        "painted_mm2": 1e6 * painting.area,
+        "new_gaussians": float(painting.n_new),
+        "n_gaussians": float(len(painting.gaussians.opacities)),
+        "left_out_percent": 100 * painting.left_out,
         "input_psnr_db": masked_psnr(new.image, image, inside),
         "unchanged_psnr_db": masked_psnr(new.image, old.image, (mask == 0).to(image)),
     }

@@ -181,10 +181,13 @@ class Avatar:
 
     def in_even_light(self) -> "Avatar":
         """The same hand without its photo's light, as far as that is known."""
+        return self.with_looks(in_even_light(self.gaussians, self.light) if self.light else self.gaussians, None)
+
+    def with_looks(self, gaussians: CanonicalGaussians, light: HandLight | None) -> "Avatar":
+        """The same hand with other Gaussians, in `light`."""
         return Avatar(
-            side=self.side, shape=self.shape, surface_offsets=self.surface_offsets,
-            gaussians=in_even_light(self.gaussians, self.light) if self.light else self.gaussians,
-            source_pose=self.source_pose, source_camera=self.source_camera,
+            side=self.side, shape=self.shape, surface_offsets=self.surface_offsets, gaussians=gaussians,
+            source_pose=self.source_pose, source_camera=self.source_camera, light=light,
         )  # fmt: skip
 
     def save(self, path: Path | str) -> None:

@@ -1,7 +1,10 @@
-"""`reconstruct`: one photo in, an avatar out. The only file that knows the order of the stages."""
+"""`reconstruct` and `reconstruct_same_hand`: photos of one hand in, an avatar out; one photo is the case K = 1.
 
+The only file that knows the order of the stages: see `_run`.
+"""
+
+import functools
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,53 +12,62 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.adapt import adapt, detail_of
-from oasis_warp.adaptation.sharpen import sharpen
-from oasis_warp.avatar.anchors import PRIOR_SIZE, inset_offsets
+from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
+from oasis_warp.adaptation.reliability import VertexObservations
 from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.prior import Prior
-from oasis_warp.avatar.quality import SurfaceQuality, assess_surface, coverage_warnings, photo_warnings, shares
-from oasis_warp.core.camera import crop_camera
+from oasis_warp.avatar.quality import (
+    SEEN,
+    SurfaceQuality,
+    assess_surface,
+    combine_quality,
+    coverage_percent,
+    coverage_warnings,
+    photo_warnings,
+)
+from oasis_warp.core import surface
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
-from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.mirror import as_right_hand, mirror_camera, mirror_pose
-from oasis_warp.core.types import Camera, CanonicalGaussians, HandCrop, HandFit, HandLight, Landmarks, Photo, Render
-from oasis_warp.data.square_crop import resample_square, square_around
-from oasis_warp.estimation.estimator import HandEstimator, choose_hand
+from oasis_warp.core.mirror import mirror_camera, mirror_pose
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, HandLight, Landmarks, Photo, Render
+from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_hand, fit_together
 from oasis_warp.estimation.fit_quality import keeps_quality, with_pose
+from oasis_warp.estimation.hand_crop import (
+    COARSE_SIZE,
+    Surfaces,
+    crop_hands,
+    crop_landmarks,
+    crop_side,
+    initial_surfaces,
+    is_low_resolution,
+    native_size,
+    refine_surfaces,
+    resolutions,
+)
 from oasis_warp.estimation.keypoints import read_keypoints
-from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.refine import refine
-from oasis_warp.estimation.surface_offsets import outline_offsets, rendered_outline_offsets
-from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
 
-CROP_MARGIN = 1.12
-"""Side of the crop over the longer extent of the mask."""
-COARSE_SIZE = PRIOR_SIZE
-"""Side of the crop that the prior reads and the whole hand is fitted to [px]: as many pixels as it has Gaussians. What
-a larger one shows beyond it goes into finer Gaussians."""
-SMALL_SIZE = 128
-"""Side of the photo's own crop up to which a third of the Gaussians is as like the photo, or more so [px]."""
-FINEST_SIZE = 1024
-"""Side that is chosen for a photo at most [px]."""
+OTHER_LIGHT = 1.6
+"""Times by which a photo is brighter or darker than the first, in any channel, from which it is worth a warning."""
+NOTHING_NEW = 0.5
+"""Share of the surface [%] that a photo must show better than all others, or it was not needed."""
 
 
 class Reconstruction(NamedTuple):
-    """An avatar and how it came about."""
+    """An avatar of one photo and how it came about."""
 
     avatar: Avatar
     fit: HandFit
     """In the photo's own frame."""
     prior: Mapping[str, str | int]
-    """Which prior was asked: its `about`."""
+    """Which prior was used: its `about`."""
     stages: dict[str, float]
     """Seconds of each stage."""
     errors: dict[str, float]
@@ -64,6 +76,45 @@ class Reconstruction(NamedTuple):
     """Of the fit, the photo and what it shows, in words; empty when nothing is doubtful."""
     quality: SurfaceQuality
     """How well each place of the surface is known."""
+
+
+class PhotoOfHand(NamedTuple):
+    """One of the photos and its part in the avatar."""
+
+    name: str
+    fit: HandFit
+    """In the photo's own frame, with the shape that all photos share."""
+    gain: tuple[float, float, float]
+    """How much brighter it is than the first, channel by channel."""
+    errors: dict[str, float]
+    """As `Reconstruction.errors`, in the photo's own light; and of the surface [%] seen_percent, what it shows, and
+    best_percent, what it shows better than the others."""
+
+
+class FusedReconstruction(NamedTuple):
+    """An avatar of several photos and how it came about."""
+
+    avatar: Avatar
+    """In the light of the first photo, whose pose and camera are its source."""
+    photos: tuple[PhotoOfHand, ...]
+    prior: Mapping[str, str | int]
+    """Which prior was used: its `about`."""
+    stages: dict[str, float]
+    """Seconds of each stage."""
+    errors: dict[str, float]
+    """What any of the photos shows of the surface: as `avatar.quality.coverage_percent`; n_gaussians."""
+    warnings: tuple[str, ...]
+    quality: SurfaceQuality
+    """How well each place of the surface is known."""
+
+
+class _Outcome(NamedTuple):
+    """What the stages make of K photos."""
+
+    fused: FusedReconstruction
+    """Without warnings."""
+    photo_warnings: list[list[str]]
+    coverage_warnings: list[str]
 
 
 def reconstruct(
@@ -86,169 +137,117 @@ def reconstruct(
     Raises:
         InputError: no such hand in the photo, a fit too poor to go on (see `ReconstructConfig.force`), a wrong file.
     """
+    fused, (of_photo,), of_coverage = _run([photo], config, keypoints, prior, progress)
+    (own,) = fused.photos
+    errors = {name: value for name, value in own.errors.items() if name != "best_percent"} | fused.errors
+    warnings = (*own.fit.warnings, *of_coverage, *of_photo)
+    return Reconstruction(fused.avatar, own.fit, fused.prior, fused.stages, errors, warnings, fused.quality)
+
+
+def reconstruct_same_hand(
+    photos: Sequence[Photo],
+    config: ReconstructConfig = ReconstructConfig(),  # noqa: B008 - frozen
+    *,
+    prior: Prior | None = None,
+    progress: Progress = silent,
+) -> FusedReconstruction:
+    """Make one avatar of one hand of which there are several photos, of any poses.
+
+    Args:
+        photos: From `oasis_warp.read_photo`. The first decides on exposure and white balance, the source pose and the
+            source camera. One photo alone gives the avatar of `reconstruct`; shading of several is evened out.
+        config: Options, for every photo.
+        prior: What to assume of a hand before its photos are fitted; the one that `config.prior` names when not given.
+        progress: Called as work goes on.
+
+    Raises:
+        ValueError: no photo.
+        InputError: a photo without such a hand, with a hand of the other side, or with a fit too poor to go on (see
+            `ReconstructConfig.force`); the message names it. Or a wrong file.
+    """
+    if not photos:
+        raise ValueError("photos: expected at least one, got none. Read them with oasis_warp.read_photo.")
+    fused, of_photos, of_coverage = _run(photos, config, None, prior, progress)
+    return fused._replace(warnings=(*_name_warnings(fused.photos, of_photos), *of_coverage))
+
+
+def _run(
+    photos: Sequence[Photo], config: ReconstructConfig, keypoints: Path | None, prior: Prior | None, progress: Progress
+) -> _Outcome:
+    """All stages, in their order. `keypoints` are those of a single photo."""
     stages: dict[str, float] = {}
-
-    def stage(name: str) -> AbstractContextManager[None]:
-        return timed_stage(name, stages, progress)
-
+    stage = functools.partial(timed_stage, seconds=stages, progress=progress)
     hand = bundled_hand()
     estimator = HandEstimator(hand)
-    with stage("prior"):  # a wrong file is told before the long work, not after it
+    with stage("prior"):  # first, because a wrong file must fail before the long work
         prior = prior or choose_prior(config.prior, config.backbone_weights)
     with stage("landmarks"):
-        given = read_keypoints(keypoints, photo) if keypoints else choose_hand(
-            estimator.find(photo), config.hand, photo.name
-        )  # fmt: skip
+        found = [
+            read_keypoints(keypoints, p) if keypoints else choose_hand(estimator.find(p), config.hand, p.name)
+            for p in photos
+        ]
+        check_sides(photos, found)
     with stage("fit"):
-        fit = estimator.fit(photo, given, force=config.force) if isinstance(given, Landmarks) else given
+        fits = fit_together(estimator, photos, found, force=config.force, progress=progress)
     with stage("outline"):
-        offsets = initial_offsets(hand, fit)
+        surfaces = initial_surfaces(hand, fits)
     with stage("kernels"):  # compiled only once there is a hand to draw
         warm_up(config.device)
     with stage("crop"):
-        crop = crop_hand(photo, fit, offsets, config)
+        crops = crop_hands(photos, fits, surfaces, config)
     with stage("prior"):
-        guess = prior(crop)
-    moved = 0.0
-    if config.refine == "on" and isinstance(given, Landmarks):  # a pose that was given is right as it is
+        guesses = [prior(crop) for crop in crops]
+    moved = [0.0] * len(photos)
+    if config.refine == "on" and isinstance(found[0], Landmarks):  # a given pose is right as it is
         with stage("refinement"):
-            refinement = refine(hand, guess, crop, crop_landmarks(fit, crop.camera), native_size(fit))
-            pose = refinement.pose
-            found = with_pose(hand, fit, mirror_pose(pose) if fit.side == "left" else pose)
-            if refinement.accepted and keeps_quality(found, fit):
-                fit, moved = found, refinement.moved
-                offsets = initial_offsets(hand, fit)
-                crop = crop_hand(photo, fit, offsets, config)
-                guess = prior(crop)
+            fits, moved = _refine_fits(hand, guesses, crops, fits)
+            if any(moved):
+                surfaces = initial_surfaces(hand, fits)
+                crops = crop_hands(photos, fits, surfaces, config)
+                guesses = [prior(crop) for crop in crops]
     with stage("outline"):
-        offsets = refine_offsets(hand, [photo], [fit], offsets, [guess], config)
-        crop = crop_hand(photo, fit, offsets, config)
+        surfaces = refine_surfaces(hand, photos, fits, surfaces, guesses, config)
+        crops = crop_hands(photos, fits, surfaces, config)
     with stage("adaptation"):
-        if is_low_resolution(config, fit):
-            guess = coarsen(hand, guess, crop.rest)
+        if is_low_resolution(config, *fits):
+            guesses = [coarsen(hand, guess, crops[0].rest) for guess in guesses]
         settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
-        adaptation = adapt(hand, guess, crop, settings, progress)
-    gaussians, close = adaptation.gaussians, crop
-    light = adaptation.light
-    if (size := finer_size(fit, config)) is not None:
-        with stage("detail"):
-            close = crop_hand(photo, fit, offsets, config, size)
-            plain = detail_of(hand, gaussians, close, light)
-            gaussians = sharpen(hand, gaussians, [plain], progress=progress).gaussians
-    avatar = make_avatar(fit, offsets, crop, gaussians, light)
+        adaptation = adapt(
+            hand, guesses, crops, settings, resolutions=resolutions(fits, crops), progress=progress
+        )
+    with stage("detail"):
+        close = crop_hands(photos, fits, surfaces, config, finer=True)
+        adaptation = add_detail(hand, adaptation, close, resolutions(fits, close), COARSE_SIZE, progress)
+    avatar = make_avatar(fits[0], surfaces.shared, crops[0], adaptation.gaussians, adaptation.light)
     with stage("quality"):
-        quality = assess_surface(hand, crop, composite_over_photo(avatar, crop))
-        shown = shares(hand, crop.rest.vertices, quality)
-        doubts = (*coverage_warnings(shown), *photo_warnings(close.image, close.mask, crop_side(fit)))
-        errors = {
-            "reprojection_percent": fit.reprojection,
-            "worst_point_percent": fit.worst_point,
-            "mask_iou": fit.mask_iou,
-            "refined_px": moved,
-            **input_errors(avatar, close),
-            **shown,
-        }
-    return Reconstruction(avatar, fit, prior.about, stages, errors, (*fit.warnings, *doubts), quality)
+        parts = [_assess(hand, adaptation, k, fits[k], surfaces, crops[k], close[k]) for k in range(len(photos))]
+        quality = combine_quality([part[0] for part in parts])
+        coverage = coverage_percent(hand, crops[0].rest.vertices, quality)
+        shares = surface_shares(hand, crops[0], adaptation.observations)
+        doubts = [photo_warnings(near.image, near.mask, crop_side(fit)) for near, fit in zip(close, fits, strict=True)]
+    measured = [{"refined_px": px} | part[1] | own for px, part, own in zip(moved, parts, shares, strict=True)]
+    about = tuple(map(PhotoOfHand, (photo.name for photo in photos), fits, _tuples(adaptation.gains), measured))
+    coverage["n_gaussians"] = float(len(avatar.gaussians.opacities))
+    fused = FusedReconstruction(avatar, about, prior.about, stages, coverage, (), quality)
+    return _Outcome(fused, doubts, coverage_warnings(coverage))
 
 
-def initial_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
-    """From the fitted rest surface to the one that carries Gaussians [m]: onto the photos' outlines, then inwards.
-
-    How far inwards is right for pictures as fine as the finest of the photos.
-    """
-    return outline_offsets(hand, *fits) + inset_offsets(hand, max(map(native_size, fits)))
+def _tuples(gains: Float[Tensor, "K 3"]) -> list[tuple[float, float, float]]:
+    return [(red, green, blue) for red, green, blue in gains.tolist()]
 
 
-def refine_offsets(
-    hand: HandModel,
-    photos: Sequence[Photo],
-    fits: Sequence[HandFit],
-    offsets: Float[Tensor, "V 3"],
-    guesses: Sequence[CanonicalGaussians],
-    config: ReconstructConfig,
-) -> Float[Tensor, "V 3"]:
-    """`offsets`, moved until the prior's guesses are drawn with the outlines of their photos [m]."""
-    views = [
-        crop_hand(photo, fit, offsets, config, detail_size(fit, config))
-        for photo, fit in zip(photos, fits, strict=True)
-    ]
-    return offsets + rendered_outline_offsets(hand, guesses, views).cpu()
-
-
-def native_size(fit: HandFit) -> int:
-    """Side of the crop that shows all there is in the photo, within what is of use here [px]."""
-    return min(max(round(crop_side(fit)), COARSE_SIZE), FINEST_SIZE)
-
-
-def is_low_resolution(config: ReconstructConfig, *fits: HandFit) -> bool:
-    """Whether all photos are so small that fewer Gaussians do; not when `config` asks for a size."""
-    return config.size == "auto" and max(map(crop_side, fits)) <= SMALL_SIZE
-
-
-def crop_side(fit: HandFit) -> float:
-    """Of the square around the hand in the photo [px]."""
-    return float(square_around(fit.mask, CROP_MARGIN)[2])
-
-
-def crop_landmarks(fit: HandFit, crop: Camera) -> Float[Tensor, "21 2"]:
-    """The fit's landmarks as the crop of its hand shows them [px]; those of a left hand are mirrored."""
-    right, K = as_right_hand(fit), crop.K.cpu()
-    own = right.camera.K
-    return (right.landmarks.xy - own[:2, 2]) * K.diagonal()[:2] / own.diagonal()[:2] + K[:2, 2]
-
-
-def detail_size(fit: HandFit, config: ReconstructConfig) -> int:
-    """Side of the crop with all the detail that `config` asks for [px]."""
-    return native_size(fit) if config.size == "auto" else config.size
-
-
-def finer_size(fit: HandFit, config: ReconstructConfig) -> int | None:
-    """Side of the crop whose detail goes into finer Gaussians [px]; None where the coarse ones do.
-
-    In even light there is none: what the photo shows beyond the prior is not taken over as it is.
-    """
-    size = detail_size(fit, config)
-    return size if config.light != "even" and size > COARSE_SIZE else None
-
-
-def crop_hand(
-    photo: Photo, fit: HandFit, offsets: torch.Tensor, config: ReconstructConfig, size: int | None = None
-) -> HandCrop:
-    """The square crop that avatars are fitted to, with the fitted surface in its camera; a left hand is mirrored.
-
-    Its side is `size` [px], or else what `config` asks for, up to `COARSE_SIZE`.
-    """
-    hand = bundled_hand()
-    if size is None:
-        size = COARSE_SIZE if config.size == "auto" else min(config.size, COARSE_SIZE)
-    image, right = photo.rgb.float() / 255, as_right_hand(fit)
-    mask, camera = right.mask, right.camera
-    if not bool((mask > 0.5).any()):
-        raise InputError(f"{photo.name}: the mask of the hand is empty. Give --keypoints, or another photo.")
-    above = torch.from_numpy(wrist_line(fit.landmarks.xy.numpy()).above_mask((camera.width, camera.height))).float()
-    if fit.side == "left":
-        image, above = image.flip(1), above.flip(1)
-    left, top, side = square_around(mask, CROP_MARGIN)
-    rest = rest_hand(hand, fit.shape)
-    rest = rest._replace(vertices=rest.vertices + offsets)
-    posed = skin(hand, rest, right.pose)
-    crop = crop_camera(camera, left, top, side, size)
-    device = torch.device(config.device)
-
-    def there(nouns):
-        return type(nouns)(*(part.to(device) for part in nouns))
-
-    def cut(plane):
-        return resample_square(plane.contiguous(), left, top, side, size).clamp(0, 1).to(device)
-
-    return HandCrop(
-        image=cut(image),
-        mask=cut(mask),
-        above_wrist=cut(above),
-        camera=crop._replace(viewmat=crop.viewmat.to(device), K=crop.K.to(device)),
-        rest=there(rest),
-        posed=there(posed),
-    )
+def _refine_fits(
+    hand: HandModel, guesses: Sequence[CanonicalGaussians], crops: Sequence[HandCrop], fits: Sequence[HandFit]
+) -> tuple[list[HandFit], list[float]]:
+    """Fits in the poses that explain their photos best, and how far each hand moved [px]; 0 where it is left."""
+    refined, moved = [], []
+    for guess, crop, fit in zip(guesses, crops, fits, strict=True):
+        found = refine(hand, guess, crop, crop_landmarks(fit, crop.camera), native_size(fit))
+        candidate = with_pose(hand, fit, mirror_pose(found.pose) if fit.side == "left" else found.pose)
+        accepted = found.accepted and keeps_quality(candidate, fit)
+        refined.append(candidate if accepted else fit)
+        moved.append(found.moved if accepted else 0.0)
+    return refined, moved
 
 
 def make_avatar(
@@ -269,6 +268,23 @@ def make_avatar(
         source_camera=mirror_camera(camera) if fit.side == "left" else camera,
         light=light,
     )
+
+
+def _assess(
+    hand: HandModel, adaptation: Adaptation, k: int, fit: HandFit, surfaces: Surfaces, crop: HandCrop, close: HandCrop
+) -> tuple[SurfaceQuality, dict[str, float]]:
+    """How well photo k is explained, in its own light and on the surface by which it was read."""
+    gaussians = adaptation.gaussians
+    as_bright = gaussians._replace(colors=(gaussians.colors * adaptation.gains[k]).clamp(0, 1))
+    light = adaptation.lights[k] if adaptation.lights else None
+    avatar = make_avatar(fit, surfaces.own[k], crop, as_bright, light)
+    errors = {
+        "reprojection_percent": fit.reprojection,
+        "worst_point_percent": fit.worst_point,
+        "mask_iou": fit.mask_iou,
+        **input_errors(avatar, close),
+    }
+    return assess_surface(hand, crop, composite_over_photo(avatar, crop)), errors
 
 
 def _input_view(avatar: Avatar, crop: HandCrop) -> Render:
@@ -298,5 +314,35 @@ def input_errors(avatar: Avatar, crop: HandCrop) -> dict[str, float]:
         "input_psnr_db": masked_psnr(image, crop.image, inside),
         "input_psnr_inner_db": masked_psnr(image, crop.image, inner_mask(inside)),
         "render_mask_iou": float((covered & (inside > 0)).sum() / union),
-        "n_gaussians": float(len(avatar.gaussians.opacities)),
     }
+
+
+def surface_shares(hand: HandModel, crop: HandCrop, observations: VertexObservations) -> list[dict[str, float]]:
+    """Of the hand's surface at rest [%]: what each photo shows, and what it shows best of all."""
+    areas = surface.vertex_areas(crop.rest.vertices, hand.faces.to(crop.image.device))
+    seen = observations.confidence >= SEEN
+    best = (observations.confidence * observations.share).argmax(0)
+
+    def percent(where: Tensor) -> float:
+        return 100 * float((areas * where).sum() / areas.sum())
+
+    return [
+        {"seen_percent": percent(shown), "best_percent": percent(shown & (best == k))} for k, shown in enumerate(seen)
+    ]
+
+
+def _name_warnings(photos: Sequence[PhotoOfHand], doubts: Sequence[Sequence[str]]) -> list[str]:
+    """Of the fits, the photos (`doubts`) and how they go together; each begins with the photo's name."""
+    messages = [
+        f"{photo.name}: {warning}"
+        for photo, own in zip(photos, doubts, strict=True)
+        for warning in (*photo.fit.warnings, *own)
+    ]
+    for photo in photos[1:]:
+        factor = max(photo.gain, key=lambda gain: max(gain, 1 / gain))
+        if max(factor, 1 / factor) > OTHER_LIGHT:
+            how = f"{factor:.1f} times as bright as" if factor > 1 else f"{1 / factor:.1f} times darker than"
+            messages.append(f"{photo.name}: its light is another, {how} {photos[0].name}; its colours may not fit in")
+        if photo.errors["best_percent"] < NOTHING_NEW:
+            messages.append(f"{photo.name}: adds next to nothing, other photos show all of it as well or better")
+    return messages

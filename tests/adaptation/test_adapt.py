@@ -1,12 +1,16 @@
+"""Photos of a hand whose colours are known."""
+
 import pytest
 import torch
 from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, crop_of
 
-from oasis_warp.adaptation.adapt import adapt, detail_of
+from oasis_warp.adaptation.adapt import adapt, unlit_detail, view_in_photo
+from oasis_warp.adaptation.mixture import mix_guesses
+from oasis_warp.adaptation.reliability import observe_photos, photo_gains
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians
-from oasis_warp.avatar.prior import MeanPrior, estimate_melanin
+from oasis_warp.avatar.prior import MeanHands, MeanPrior
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import CanonicalGaussians, HandCrop
@@ -32,7 +36,7 @@ def case(hand, regions):
     colors = (region_colors(regions, 0.03) * CAST + stripes(hand)).clamp(0, 1)
     crop, truth, _ = crop_of(hand, colors)
     prior = MeanPrior(hand)(crop)
-    return crop, truth, prior, adapt(hand, prior, crop, STEPS)
+    return crop, truth, prior, adapt(hand, [prior], [crop], STEPS)
 
 
 def drawn(hand, gaussians, crop, light=None):
@@ -57,7 +61,7 @@ def test_what_is_drawn_is_completed_and_not_what_each_gaussian_would_be_alone(ha
     inside = (crop.mask > 0.9).float()
     for colors in (prior.colors, apart):
         untaught = AdaptConfig(texture_steps=0, reference_views=0)
-        completed = adapt(hand, prior._replace(colors=colors), crop, untaught)
+        completed = adapt(hand, [prior._replace(colors=colors)], [crop], untaught)
         image = drawn(hand, completed.gaussians, crop, completed.light).image
         assert masked_psnr(image, crop.image, inside) > 28
 
@@ -72,13 +76,14 @@ def test_the_side_that_was_not_seen_takes_the_light_of_the_photo(hand, regions, 
 
 def test_detail_is_read_off_a_photo_only_where_it_surely_shows_the_skin(hand, case):
     crop, _, _, adapted = case
-    assert detail_of(hand, adapted.gaussians, crop, None) is crop
-    plain = detail_of(hand, adapted.gaussians, crop, adapted.light)
+    weights = view_in_photo(hand, adapted.gaussians, crop).weights
+    assert unlit_detail(hand, adapted.gaussians, crop, weights, None) is crop
+    plain = unlit_detail(hand, adapted.gaussians, crop, weights, adapted.light)
     outside = crop.mask < 0.01
     background = torch.tensor([0.1, 0.9, 0.2])
     rim = (crop.mask > 0.9) & (inner_mask(crop.mask, 2) < 0.5)
     stained = torch.where((outside | rim)[..., None], background, crop.image)
-    found = detail_of(hand, adapted.gaussians, crop._replace(image=stained), adapted.light)
+    found = unlit_detail(hand, adapted.gaussians, crop._replace(image=stained), weights, adapted.light)
     inside = inner_mask(crop.mask, 12) > 0.9
     assert int(rim.sum()) > 100 and int(inside.sum()) > 100
     assert float(found.mask[rim].mean()) < 0.3 < 0.7 < float(plain.mask[rim].mean())
@@ -89,7 +94,7 @@ def test_detail_is_read_off_a_photo_only_where_it_surely_shows_the_skin(hand, ca
 def test_there_is_no_seam_where_seen_meets_unseen(hand, case):
     crop, _, _, _ = case
     plain, _, _ = crop_of(hand, torch.full_like(hand.template, 0.5) * torch.tensor([1.1, 0.9, 0.8]))
-    adapted = adapt(hand, MeanPrior(hand)(plain), plain, STEPS).gaussians
+    adapted = adapt(hand, [MeanPrior(hand)(plain)], [plain], STEPS).gaussians
     smooth = region_colors(label_regions(hand), 0.03)
     field = torch.zeros_like(hand.template)
     field[adapted.vertex_index] = adapted.colors[: len(adapted.vertex_index)]
@@ -106,7 +111,7 @@ def test_there_is_no_seam_where_seen_meets_unseen(hand, case):
 def test_the_same_seed_gives_the_same_bits(hand, case):
     crop, _, prior, _ = case
     few = AdaptConfig(texture_steps=5)
-    first, second = (adapt(hand, prior, crop, few).gaussians.colors for _ in range(2))
+    first, second = (adapt(hand, [prior], [crop], few).gaussians.colors for _ in range(2))
     assert torch.equal(first, second)
 
 
@@ -118,7 +123,7 @@ def test_a_gpu_finds_what_the_cpu_finds(hand, case):
         return type(nouns)(*(part.cuda() if isinstance(part, torch.Tensor) else part for part in nouns))
 
     moved = HandCrop(*(part.cuda() if isinstance(part, torch.Tensor) else there(part) for part in crop))
-    found = adapt(hand, MeanPrior(hand)(moved), moved, STEPS).gaussians
+    found = adapt(hand, [MeanPrior(hand)(moved)], [moved], STEPS).gaussians
     assert found.colors.is_cuda
     back = CanonicalGaussians(*(part if part is None else part.cpu() for part in found))
     pictures = [drawn(hand, gaussians, crop).image for gaussians in (back, adapted.gaussians)]
@@ -133,8 +138,8 @@ def test_colours_stay_colours(case):
 
 def test_texture_learning_stops_by_itself_and_obeys_a_given_number(hand, case):
     crop, _, prior, _ = case
-    assert len(adapt(hand, prior, crop, AdaptConfig(texture_steps=3)).losses) == 3
-    assert len(adapt(hand, prior, crop, AdaptConfig(texture_steps=0)).losses) == 0
+    assert len(adapt(hand, [prior], [crop], AdaptConfig(texture_steps=3)).losses) == 3
+    assert len(adapt(hand, [prior], [crop], AdaptConfig(texture_steps=0)).losses) == 0
 
 
 def test_without_calibration_what_was_not_seen_stays_as_the_prior_has_it(hand, regions, case):
@@ -143,7 +148,7 @@ def test_without_calibration_what_was_not_seen_stays_as_the_prior_has_it(hand, r
     moved = {}
     for choice in ("on", "off"):
         config = AdaptConfig(calibration=choice, texture_steps=0, reference_views=0)
-        adapted = adapt(hand, prior, crop, config)
+        adapted = adapt(hand, [prior], [crop], config)
         change = (adapted.gaussians.colors - prior.colors)[: len(back)][back]
         moved[choice] = float(change.abs().amax(1).median())
     assert adapted.calibration.gain.tolist() == [1, 1, 1] and adapted.calibration.offset.tolist() == [0, 0, 0]
@@ -154,5 +159,143 @@ def test_without_calibration_what_was_not_seen_stays_as_the_prior_has_it(hand, r
 @pytest.mark.parametrize("melanin", [0.01, 0.05, 0.25])
 def test_skin_tones_are_told_apart(hand, regions, orientation, melanin):
     crop, _, _ = crop_of(hand, region_colors(regions, melanin), orientation=orientation)
-    estimate = estimate_melanin(regions, observe(hand, crop))
+    seen = observe(hand, crop)
+    estimate = float(MeanHands(hand)(seen.colors[None], seen.confidence[None]).log_melanin.exp())
     assert 0.4 < estimate / melanin < 2.5
+
+
+FUSED_STEPS = AdaptConfig(texture_steps=30, calibration_steps=20)
+LIGHT = torch.tensor([0.75, 0.85, 1.1])
+"""Of the photo of the back over that of the palm."""
+
+
+def lit(crop, gain):
+    return crop._replace(image=(crop.image * gain).clamp(0, 1))
+
+
+@pytest.fixture(scope="module")
+def colors(hand):
+    stripes = 0.08 * torch.sin(hand.template[:, :1] * (2 * torch.pi / 0.012))
+    return (region_colors(label_regions(hand), 0.03) * 0.8 + stripes).clamp(0, 1)
+
+
+@pytest.fixture(scope="module")
+def palm(hand, colors):
+    return crop_of(hand, colors, orientation=PALM_TO_CAMERA)[0]
+
+
+@pytest.fixture(scope="module")
+def back(hand, colors):
+    return crop_of(hand, colors, orientation=BACK_TO_CAMERA)[0]
+
+
+def fused_by_mean(hand, crops, config):
+    return adapt(hand, [MeanPrior(hand)(one) for one in crops], crops, config)
+
+
+@pytest.fixture(scope="module")
+def fused(hand, palm, back):
+    return fused_by_mean(hand, [palm, lit(back, LIGHT)], FUSED_STEPS)
+
+
+@pytest.fixture(scope="module")
+def alone(hand, palm):
+    return adapt(hand, [MeanPrior(hand)(palm)], [palm], FUSED_STEPS)
+
+
+def likeness(hand, gaussians, crop, light):
+    normals = surface.vertex_normals(crop.rest.vertices, hand.faces)
+    posed = pose_gaussians(gaussians, hand.faces, crop.rest.vertices, crop.posed.vertices, (light, normals))
+    image = render(posed, crop.camera).image
+    return masked_psnr(image, crop.image, (crop.mask > 0.9).float())
+
+
+def test_two_photos_explain_palm_and_back_in_the_light_of_the_first(hand, palm, back, fused, alone):
+    assert likeness(hand, fused.gaussians, palm, fused.lights[0]) > 27
+    of_back = likeness(hand, fused.gaussians, back, fused.lights[1])  # but for the gain, and so is `back`
+    assert of_back > 24
+    assert of_back > likeness(hand, alone.gaussians, back, alone.light) + 1.5
+
+
+def test_the_light_of_photos_that_share_a_side_is_told_exactly(hand, colors, palm):
+    other = lit(crop_of(hand, colors, pose_name="victory")[0], LIGHT)
+    sightings = observe_photos(hand, [palm, other], [1.0, 1.0])
+    found = photo_gains(sightings, torch.full_like(colors, 0.5))  # a guess that knows nothing
+    assert torch.allclose(found[0], torch.ones(3))
+    assert torch.allclose(found[1], LIGHT, atol=0.06)
+
+
+def test_the_light_of_palm_and_back_is_told_by_the_guess(fused):
+    found = fused.gains[1]
+    assert torch.allclose(found / found.mean(), LIGHT / LIGHT.mean(), atol=0.05)
+    assert float((found / LIGHT).log().abs().max()) < 0.15  # how much lighter palms are is a guess
+
+
+def test_a_shadow_over_part_of_a_photo_is_no_change_of_its_light(hand, palm):
+    shaded = palm.image.clone()
+    shaded[: len(shaded) // 3] *= 0.5  # the finger tips
+    seen = observe_photos(hand, [palm, palm._replace(image=shaded)], [1.0, 1.0])
+    found = photo_gains(seen, torch.full((12337, 3), 0.5))
+    assert float(found[1].min()) > 0.93
+
+
+def test_the_same_photo_twice_is_nearly_one_photo(hand, palm, alone):
+    twice = fused_by_mean(hand, [palm, palm], FUSED_STEPS)
+    assert torch.allclose(twice.gains, torch.ones(2, 3))
+    assert float((twice.gaussians.colors - alone.gaussians.colors).abs().mean()) < 0.01
+    assert twice.lights is not None
+    of_both = likeness(hand, twice.gaussians, palm, twice.lights[0])
+    assert abs(of_both - likeness(hand, alone.gaussians, palm, alone.light)) < 0.5
+
+
+def test_a_place_belongs_to_the_photo_that_shows_it_larger(hand, palm, back):
+    sightings = observe_photos(hand, [palm, palm, back], [1.0, 0.5, 1.0])  # the second is an enlargement
+    shown = (sightings.confidence[0] > 0.5) & (sightings.confidence[2] == 0)
+    assert torch.all(sightings.share[0, shown] == 1)
+    assert torch.allclose(sightings.share[1, shown], torch.tensor(0.25**2))
+    assert torch.all(sightings.share[2, shown] < 0.01)
+
+
+def test_equal_guesses_mix_to_themselves(hand, palm):
+    guess = MeanPrior(hand)(palm)
+    weight = torch.rand(2, len(hand.template), generator=torch.Generator().manual_seed(0)) + 0.1
+    mixed = mix_guesses([guess, guess._replace(quats=-guess.quats)], weight, hand.faces)
+    assert torch.equal(mixed.vertex_index, guess.vertex_index) and torch.equal(mixed.face_index, guess.face_index)
+    for name in ("offsets", "barycentrics", "quats", "scales", "opacities", "colors"):
+        torch.testing.assert_close(getattr(mixed, name), getattr(guess, name), msg=name)
+
+
+def test_a_gaussian_that_one_guess_lacks_is_fainter(hand, palm):
+    guess = MeanPrior(hand)(palm)
+    n, half = len(guess.vertex_index), torch.arange(0, len(guess.face_index), 2)
+    rows = torch.cat([torch.arange(n), n + half])
+    fewer = guess._replace(
+        face_index=guess.face_index[half], barycentrics=guess.barycentrics[half],
+        **{name: getattr(guess, name)[rows] for name in ("quats", "scales", "opacities", "colors")},
+    )  # fmt: skip
+    mixed = mix_guesses([guess, fewer], torch.ones(2, len(hand.template)), hand.faces)
+    assert torch.equal(mixed.face_index, guess.face_index)
+    ratio = mixed.opacities[n:] / guess.opacities[n:]
+    assert torch.allclose(ratio[0::2], torch.tensor(1.0)) and torch.allclose(ratio[1::2], torch.tensor(0.5))
+    torch.testing.assert_close(mixed.scales, guess.scales)
+
+
+def test_the_photo_that_has_more_pixels_of_a_place_is_believed_there(hand, colors):
+    """Two photos in one view that agree on nothing: the one that was enlarged counts for less."""
+    photo = crop_of(hand, colors, size=48)[0]
+    other = photo._replace(image=photo.image.flip(-1))
+    guess = MeanPrior(hand)(photo)
+    guesses = [guess, guess._replace(opacities=0.5 * guess.opacities)]
+    quick = AdaptConfig(texture_steps=1, calibration_steps=1, reference_views=0)
+    made = adapt(hand, guesses, [photo, other], quick, resolutions=[1.0, 0.5])
+    shown = made.observations.confidence.amin(0) > 0
+    share = made.observations.share[:, shown].mean(1)
+    torch.testing.assert_close(share, torch.tensor([1.0, 0.5**4]), atol=1e-3, rtol=0)
+
+
+def test_guesses_in_different_light_mix_to_one_in_the_light_of_the_first(hand, palm):
+    guess = MeanPrior(hand)(palm)
+    tinted = guess._replace(colors=(guess.colors * LIGHT).clamp(0, 1))
+    made = mix_guesses([guess, tinted], torch.ones(2, len(hand.template)), hand.faces)
+    same = mix_guesses([guess, guess], torch.ones(2, len(hand.template)), hand.faces)
+    torch.testing.assert_close(made.colors, same.colors, atol=0.01, rtol=0)

@@ -1,5 +1,3 @@
-"""The light of a photo is found, taken off it, and stays in the world when the hand turns."""
-
 import math
 
 import pytest
@@ -7,10 +5,28 @@ import torch
 from synthetic import crop_of
 
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.adaptation.sh_lighting import fit_light, with_shade, without_light
+from oasis_warp.adaptation.sh_lighting import (
+    SKIN_DEVIATION,
+    STAYS,
+    add_shade,
+    fit_light,
+    marks,
+    split_albedo_shading,
+    weighted_deviation,
+    without_light,
+)
+from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import observe
-from oasis_warp.avatar.pose import in_even_light, pose_gaussians, posed_normals, shading, split_shade, turn_light
+from oasis_warp.avatar.pose import (
+    in_even_light,
+    pose_gaussians,
+    posed_normals,
+    shading,
+    shading_factors,
+    split_shade,
+    turn_light,
+)
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.config import AdaptConfig
@@ -73,10 +89,10 @@ def test_light_on_nothing_is_even(hand, scene):
 
 def test_what_light_does_to_a_photo_is_drawn_again(hand, scene):
     _, _, pose, lit = scene
-    adapted = adapt(hand, MeanPrior(hand)(lit), lit, AdaptConfig(texture_steps=20))
+    adapted = adapt(hand, [MeanPrior(hand)(lit)], [lit], AdaptConfig(texture_steps=20))
     assert adapted.light is not None
     drawn = avatar(adapted.gaussians, pose, lit, adapted.light, hand).render(lit.camera, pose)
-    kept = adapt(hand, MeanPrior(hand)(lit), lit, AdaptConfig(texture_steps=20, light="keep"))
+    kept = adapt(hand, [MeanPrior(hand)(lit)], [lit], AdaptConfig(texture_steps=20, light="keep"))
     assert kept.light is None
     baked = avatar(kept.gaussians, pose, lit, None, hand).render(lit.camera, pose)
     inside = lit.mask > 0.99
@@ -155,7 +171,7 @@ def test_where_a_photo_may_show_something_else_that_is_shade(hand, scene):
     plain = without_light(hand, even, light).image
 
     def left(sure):
-        shaded = with_shade(hand, even.image, stained, sure, light)
+        shaded = add_shade(hand, even.image, stained, sure, light)
         return float((without_light(hand, stained, shaded).image / plain.clamp_min(1e-3))[amid].mean())
 
     assert left(stained) < 0.36
@@ -201,3 +217,150 @@ def test_gradients_go_through_the_light(hand, scene):
     orientation = pose.orientation.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(lit.pose(pose._replace(orientation=orientation)).colors.sum(), orientation)
     assert bool(gradient.isfinite().all()) and float(gradient.abs().max()) > 1
+
+
+@pytest.fixture(scope="module")
+def skin(hand):
+    return region_colors(label_regions(hand), 0.03)
+
+
+def lines(hand, height, spacing):
+    """Across the hand."""
+    return height * torch.sin(hand.template[:, :1] * (2 * torch.pi / spacing))
+
+
+def adapted(hand, skin, shown, light):
+    """Colours at the vertices that the photo shows well, and the true ones, after the one gain between them."""
+    crop, _, _ = crop_of(hand, shown.clamp(0, 1))
+    prior = MeanPrior(hand)(crop)
+    prior = prior._replace(colors=vertex_to_gaussians(skin, hand.faces, prior))
+    made = adapt(hand, [prior], [crop], AdaptConfig(light=light, texture_steps=0, reference_views=0)).gaussians
+    index = made.vertex_index
+    seen = observe(hand, crop).confidence[index] > 0.9
+    found, true = made.colors[: len(index)][seen], skin[index][seen]
+    return found * (true.mean(0) / found.mean(0)), true, index[seen]
+
+
+def test_a_shadow_is_kept_or_left_out_as_asked(hand, skin):
+    side = hand.template[:, :1]
+    shadow = 1 - 0.25 * torch.sigmoid((side - side.mean()) / 0.01)
+    errors = {}
+    for light in ("keep", "even"):
+        found, true, _ = adapted(hand, skin, skin * shadow, light)
+        errors[light] = float((found - true).square().mean().sqrt())
+    assert errors["even"] < 0.3 * errors["keep"]
+
+
+def test_fine_lines_of_the_skin_stay_and_harsh_shading_does_not(hand, skin):
+    def share_kept(height):
+        pattern, found = lines(hand, height, 0.01), {}
+        for light in ("keep", "even"):
+            colors, true, index = adapted(hand, skin, skin + pattern, light)
+            found[light] = float(((colors - true) * pattern[index]).sum())
+        return found["even"] / found["keep"]
+
+    assert share_kept(SKIN_DEVIATION) > 0.8
+    assert share_kept(0.08) < 0.15
+
+
+def test_a_tattoo_does_not_count_as_what_most_skin_does():
+    generator = torch.Generator().manual_seed(0)
+    values = 0.01 * torch.randn(1000, 3, generator=generator)
+    weight = torch.ones(1000)
+    plain = float(weighted_deviation(values, weight))
+    values[:200] = 0.3
+    assert plain == pytest.approx(0.01, rel=0.15)
+    assert float(weighted_deviation(values, weight)) < 1.3 * plain
+    weight[:] = 0
+    weight[:200] = 1
+    assert float(weighted_deviation(values, weight)) == pytest.approx(0.3)
+
+
+SHADOW = (0.55, 0.4, 0.3)
+"""Factors of a colour: shadows on skin are red."""
+INK, POLISH, HALF_INK = (0.19, 0.25, 0.36), (1.0, 0.22, 0.37), (0.6, 0.67, 0.74)
+
+
+@pytest.fixture(scope="module")
+def albedo_scene(hand):
+    crop, _, _ = crop_of(hand, region_colors(label_regions(hand), 0.03), size=48)
+    guess = MeanPrior(hand)(crop)
+    guess = guess._replace(colors=0.6 * guess.colors)
+    facing = posed_normals(crop.rest.vertices, crop.posed.vertices, hand.faces)
+    harmonics = torch.tensor([[1.0, 0.9, 0.8], [0.1, 0.1, 0.1], [-0.2, -0.2, -0.2], [-0.1, -0.1, -0.1]])
+    limits = torch.stack([torch.full((3,), 0.3), torch.full((3,), 1.5)])
+    return guess, HandLight(harmonics, limits, torch.ones(3), facing=facing)
+
+
+def learned_on(hand, guess, factor):
+    """The guess, but for one half of the hand."""
+    half = (hand.template[:, :1] < hand.template[:, 0].median()).float()
+    where = vertex_to_gaussians(half, hand.faces, guess).round()
+    colors = (guess.colors * (1 + where * (torch.tensor(factor) - 1))).clamp(0.01, 1)
+    return guess._replace(colors=colors), where[:, 0] > 0
+
+
+@pytest.mark.parametrize("factor", [SHADOW, INK, POLISH, (1.2, 1.25, 1.3)])
+def test_the_photo_s_own_view_stays_as_it_is(hand, albedo_scene, factor):
+    guess, light = albedo_scene
+    learned, _ = learned_on(hand, guess, factor)
+    parted = split_albedo_shading(hand, guess.colors, learned)
+    before = learned.colors * shading_factors(learned, hand.faces, light, light.facing)
+    after = parted.colors * shading_factors(parted, hand.faces, light, light.facing)
+    torch.testing.assert_close(after, before, atol=1e-5, rtol=0)
+
+
+def test_a_shadow_goes_and_marks_stay(hand, albedo_scene):
+    guess, _ = albedo_scene
+
+    def share_that_stays(factor):
+        learned, there = learned_on(hand, guess, factor)
+        parted = split_albedo_shading(hand, guess.colors, learned)
+        there = there & (learned.colors > 0.03).all(1)
+        before, after = ((g.colors / guess.colors).log()[there] for g in (learned, parted))
+        return float(after.norm() / before.norm())
+
+    assert share_that_stays(SHADOW) == pytest.approx(STAYS, abs=0.02)
+    assert share_that_stays(HALF_INK) > 0.4
+    assert share_that_stays(INK) > 0.95 and share_that_stays(POLISH) > 0.95  # but for faces at the border
+
+
+def test_what_is_finer_than_the_vertices_is_shade_too(hand, albedo_scene):
+    guess, _ = albedo_scene
+    n_vertices = len(guess.vertex_index)
+    colors = guess.colors.clone()
+    colors[n_vertices::2] *= 0.8
+    parted = split_albedo_shading(hand, guess.colors, guess._replace(colors=colors))
+    left = (parted.colors / guess.colors).log()[n_vertices::2]
+    torch.testing.assert_close(left, torch.full_like(left, STAYS).mul(torch.tensor(0.8).log()), atol=1e-4, rtol=0)
+
+
+def test_what_was_not_learned_does_not_change(hand, albedo_scene):
+    guess, _ = albedo_scene
+    parted = split_albedo_shading(hand, guess.colors, guess)
+    torch.testing.assert_close(parted.colors, guess.colors)
+    assert parted.shade is not None
+    torch.testing.assert_close(parted.shade, torch.ones_like(parted.shade))
+
+
+def test_marks_are_told_from_light_by_what_lies_across():
+    line = torch.tensor([[0.364, 0.574, 0.734]])  # from dark and red to bright and pale
+    assert float(marks(-2 * line)) < 0.05 and float(marks(0.5 * line)) < 0.05
+    assert float(marks(torch.tensor([[-1.0, -0.6, -0.1]]))) == 1
+    assert float(marks(torch.tensor([[0.65, 0.75, 0.85]]))) == 1  # white paint on skin that is not pale
+    assert float(marks(torch.zeros(1, 3))) == 0
+
+
+def test_ink_on_single_gaussians_is_no_mark(hand, albedo_scene):
+    guess, _ = albedo_scene
+    n_vertices = len(guess.vertex_index)
+    colors = guess.colors.clone()
+    colors[n_vertices::2] *= torch.tensor(INK)
+    learned = guess._replace(colors=colors.clamp_min(0.03))
+    parted = split_albedo_shading(hand, guess.colors, learned)
+    clear = (learned.colors > 0.031).all(1)
+    clear[:n_vertices] = False
+    ratio = ((parted.colors / guess.colors).log().norm(dim=1) / (learned.colors / guess.colors).log().norm(dim=1))
+    there = clear & (torch.arange(len(clear)) % 2 == n_vertices % 2)
+    assert int(there.sum()) > 100
+    assert ratio[there].max() < STAYS + 0.1

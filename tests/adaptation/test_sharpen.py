@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from oasis_warp.adaptation.reprojection import Canvas, look
+from oasis_warp.adaptation.reprojection import Canvas, map_surface
 from oasis_warp.adaptation.sharpen import FACING, sharpen
 from oasis_warp.avatar.anchors import RIM_FADE
 from oasis_warp.avatar.observation import inner_mask
@@ -137,7 +137,7 @@ def test_of_two_photos_each_gives_the_detail_where_it_is_believed(hand, case):
     first = (crop.rest.vertices[:, 0] < crop.rest.vertices[:, 0].mean()).float()
     made = sharpen(hand, coarse, [crop, darker], torch.stack([first, 1 - first]))
     picture = draw(hand, crop, made.gaussians, crop.camera).image
-    shown = look(crop.posed.vertices, hand.faces, Canvas(crop.image, crop.mask, crop.camera), FACING)
+    shown = map_surface(crop.posed.vertices, hand.faces, Canvas(crop.image, crop.mask, crop.camera), FACING)
     believed = (first[hand.faces[shown.faces.clamp_min(0)]] * shown.barycentrics).sum(-1)
     inside = judged(hand, crop) * (shown.share > 0.99)
     for photo, share in ((crop, believed), (darker, 1 - believed)):

@@ -12,9 +12,9 @@ from oasis_warp.avatar.quality import (
     SurfaceQuality,
     assess_surface,
     combine_quality,
+    coverage_percent,
     coverage_warnings,
     photo_warnings,
-    shares,
 )
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
@@ -67,7 +67,7 @@ def test_where_the_avatar_is_unlike_the_photo_it_is_less_certain(hand, case):
 
 def test_what_is_uncertain_is_more_often_wrong(hand, case):
     crop, truth, _ = case
-    adapted = adapt(hand, MeanPrior(hand)(crop), crop, AdaptConfig(texture_steps=20, reference_views=0))
+    adapted = adapt(hand, [MeanPrior(hand)(crop)], [crop], AdaptConfig(texture_steps=20, reference_views=0))
     assert adapted.light is not None
     light = adapted.light, surface.vertex_normals(crop.rest.vertices, hand.faces)
     posed = pose_gaussians(adapted.gaussians, hand.faces, crop.rest.vertices, crop.posed.vertices, light)
@@ -81,7 +81,7 @@ def test_what_is_uncertain_is_more_often_wrong(hand, case):
 
 def test_shares_of_the_surface_add_up(hand, case):
     crop, _, quality = case
-    found = shares(hand, crop.rest.vertices, quality)
+    found = coverage_percent(hand, crop.rest.vertices, quality)
     assert sum(found[f"{kind}_percent"] for kind in ("seen", "grazed", "extrapolated")) == pytest.approx(100)
     assert found["palm_seen_percent"] > 60 and found["back_seen_percent"] < 10
     assert 0 < found["uncertainty_mean"] < 1
@@ -100,7 +100,7 @@ def test_a_hand_of_which_nothing_is_seen_is_guessed_throughout(hand, case):
     crop, _, _ = case
     quality = assess_surface(hand, crop._replace(mask=torch.zeros_like(crop.mask)), crop.image)
     assert (quality.visibility == 0).all() and (quality.uncertainty == 1).all()
-    found = shares(hand, crop.rest.vertices, quality)
+    found = coverage_percent(hand, crop.rest.vertices, quality)
     assert found["extrapolated_percent"] == 100
     assert "little was seen" in coverage_warnings(found)[0]
 

@@ -13,6 +13,7 @@ from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.estimation.estimator import HandEstimator
+from oasis_warp.estimation.hand_crop import crop_hand
 from oasis_warp.evaluation import same_hand
 from oasis_warp.evaluation.same_hand import (
     compare_pairs,
@@ -21,7 +22,6 @@ from oasis_warp.evaluation.same_hand import (
     photos_of_hands,
     summarise_pairs,
 )
-from oasis_warp.reconstruction import crop_hand
 
 SMALL = ReconstructConfig(size=96)
 

@@ -10,7 +10,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.data.avatar_file import load_avatar
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
-from oasis_warp.fusion import FusedReconstruction, PhotoOfHand
+from oasis_warp.reconstruction import FusedReconstruction, PhotoOfHand
 
 FILES = {"avatar.safetensors", "summary.png", "quality.png", "turntable.mp4", "report.json"}
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from oasis_warp.avatar.observation import NetworkInput
+from oasis_warp.avatar.observation import CropBatch
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
@@ -22,7 +22,7 @@ def main():
         torch.nn.init.normal_(head.last.weight)
     viewmat, K = torch.eye(4), torch.tensor([[80.0, 0, 16], [0, 80, 16], [0, 0, 1]])
     viewmat[2, 3] = 0.6
-    inputs = NetworkInput(
+    inputs = CropBatch(
         torch.rand(1, 32, 32, 3), torch.ones(1, 32, 32), hand.template[None], viewmat[None], K[None],
         hand.template[None],
     )  # fmt: skip

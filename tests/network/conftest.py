@@ -4,7 +4,7 @@ import pytest
 import torch
 from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, crop_of
 
-from oasis_warp.avatar.observation import NetworkInput, input_of_crop
+from oasis_warp.avatar.observation import CropBatch, batch_of_crop
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
@@ -31,7 +31,7 @@ def crops(hand):
 
 @pytest.fixture(scope="session")
 def batch(crops):
-    return NetworkInput(*(torch.cat(parts) for parts in zip(*map(input_of_crop, crops), strict=True)))
+    return CropBatch(*(torch.cat(parts) for parts in zip(*map(batch_of_crop, crops), strict=True)))
 
 
 @pytest.fixture(scope="session")

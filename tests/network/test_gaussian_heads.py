@@ -1,23 +1,33 @@
-"""Feature-on-Mesh and the Gaussian heads: equations 7 and 8."""
-
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.avatar.anchors import OPACITY
+from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import rotation
+from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.evaluation.methods import prior_guess
 from oasis_warp.network.heads import (
     FACE_LIMITS,
     FACE_OUTPUTS,
     MAX_OFFSET,
+    TRUST,
     VERTEX_LIMITS,
     VERTEX_OUTPUTS,
     FeatureOnMesh,
     GaussianHead,
+    cache_head,
     decode,
+    decode_colors,
     decode_offsets,
+    head_colors,
+    zero_updates,
 )
+from oasis_warp.network.prior import NetworkPrior, guess_with_heads
 
 FACES = torch.tensor([[0, 1, 2], [2, 1, 3]])
 
@@ -112,3 +122,108 @@ def test_barycentrics_and_features_learn(random):
     loss = mesh(features, FACES).square().sum()
     for gradient in torch.autograd.grad(loss, (mesh.logits, features)):
         assert gradient.any(dim=-1).all()
+
+
+LORA = AdaptConfig(texture="lora", lora_rank=4, texture_steps=4, reference_views=2)
+
+
+@pytest.fixture(scope="module")
+def case(network, crops):
+    return crops[0], *guess_with_heads(NetworkPrior(network), crops[0])
+
+
+def updates_of(heads, rank, random):
+    return [zero_updates(head, rank, random) for head in heads]
+
+
+def test_asking_for_the_heads_changes_no_guess_and_they_say_its_colours(case, network, random):
+    crop, guess, heads = case
+    for asked, alone in zip(guess[:-1], NetworkPrior(network)(crop)[:-1], strict=True):
+        assert torch.equal(asked, alone)
+    own = [head_colors(*pair) for pair in zip(heads, updates_of(heads, 3, random), strict=True)]
+    torch.testing.assert_close(torch.cat(own).detach(), guess.colors, atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("switch", [{"fom": "off"}, {"point_evidence": "off"}])
+def test_networks_without_a_part_have_heads_too(make_network, tiny, crops, random, switch):
+    guess, heads = guess_with_heads(NetworkPrior(make_network(replace(tiny, **switch))), crops[0])
+    own = [head_colors(*pair) for pair in zip(heads, updates_of(heads, 3, random), strict=True)]
+    torch.testing.assert_close(torch.cat(own).detach(), guess.colors, atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("outputs", [VERTEX_OUTPUTS, FACE_OUTPUTS | TRUST])
+def test_updates_are_those_of_the_layers_weights(random, outputs):
+    head = GaussianHead(12, 10, outputs).requires_grad_(False)
+    for parameter in head.parameters():
+        parameter.normal_(std=0.5, generator=random)
+    features, colors = torch.randn(20, 12, generator=random), torch.rand(20, 3, generator=random)
+    seen = torch.randn(20, 3, generator=random) if "trust" in outputs else None
+    rows = torch.tensor([4, 4, 17, 0, 9])
+    cache = cache_head(head, features, colors, seen, rows)
+    updates = zero_updates(cache, 2, random)
+    names = [name for name, size in outputs.items() for _ in range(size)]
+    kept = torch.tensor([name in ("colors", "trust") for name in names])
+    with torch.no_grad():
+        for _, up in updates:
+            up.normal_(generator=random)
+        first, second, last = (up.T @ down for down, up in updates)
+    head.first.weight += first
+    head.second.weight += second
+    head.last.weight[kept] += last
+    raw = {name: part[0] for name, part in head(features[None]).items()}
+    wanted = decode_colors(raw, colors, seen)[rows]
+    torch.testing.assert_close(head_colors(cache, updates).detach(), wanted, atol=1e-5, rtol=0)
+
+
+def test_without_a_step_lora_is_the_calibrated_guess_and_with_steps_explains_the_photo_better(case, hand):
+    crop, guess, heads = case
+    dark = torch.linspace(0.5, 1, len(crop.image))[:, None, None]  # a gradient that no calibration explains
+    crop = crop._replace(image=crop.image * dark)
+    start, end = (adapt(hand, [guess], [crop], replace(LORA, texture_steps=steps), heads=heads) for steps in (0, 30))
+    torch.testing.assert_close(start.gaussians.colors, start.calibration.apply(guess.colors), atol=4e-6, rtol=0)
+    assert all(torch.equal(a, b) for a, b in zip(end.gaussians[:-2], guess[:-2], strict=True))
+    assert sum(end.losses[-5:]) < 0.9 * sum(end.losses[:5])
+
+
+def test_the_same_seed_gives_the_same_updates(case, hand):
+    crop, guess, heads = case
+    first, again, other = (
+        adapt(hand, [guess], [crop], replace(LORA, seed=seed), heads=heads).gaussians.colors for seed in (1, 1, 2)
+    )
+    assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+def test_in_every_step_all_reference_views_hold_the_guess_better_than_one_by_colour_alone(case, hand):
+    crop, guess, heads = case
+    few = replace(LORA, texture_steps=6, reference_views=1, weight_ssim=0.0)
+    turns, every = (
+        adapt(hand, [guess], [crop], replace(few, references=how), heads=heads) for how in ("in_turn", "all")
+    )
+    assert turns.losses == pytest.approx(every.losses, rel=1e-6)  # of a single view, by colour alone, they are the same
+    far = replace(few, texture_steps=12, reference_views=2, weight_ssim=1.0, weight_reference=100.0, references="all")
+    held = adapt(hand, [guess], [crop], far, heads=heads)
+    free = adapt(hand, [guess], [crop], replace(far, reference_views=0), heads=heads)
+    calibrated = held.calibration.apply(guess.colors)
+    moved = [float((made.gaussians.colors - calibrated).abs().mean()) for made in (held, free)]
+    assert moved[0] < 0.5 * moved[1]
+
+
+def test_what_has_no_heads_is_refused(case, hand):
+    crop, guess, _ = case
+    with pytest.raises(InputError, match="'none': has no heads"):
+        prior_guess(MeanPrior(hand), crop, LORA)
+    with pytest.raises(ValueError, match="expected the heads of the prior, got none"):
+        adapt(hand, [guess], [crop], LORA)
+    with pytest.raises(ValueError, match="is for one photo"):
+        adapt(hand, [guess] * 2, [crop] * 2, LORA)
+
+
+def test_updates_start_at_nothing_and_as_wide_as_their_layers_inputs_ask(random):
+    head, rows = GaussianHead(12, 40, VERTEX_OUTPUTS), torch.arange(9)
+    cache = cache_head(head, torch.rand(9, 12, generator=random), torch.rand(9, 3, generator=random), None, rows)
+    for inputs, outputs, (down, up) in zip((12, 40, 40), (40, 40, 3), zero_updates(cache, 64, random), strict=True):
+        assert down.shape == (64, inputs) and up.shape == (64, outputs)
+        assert not up.any()
+        bound = inputs**-0.5
+        assert 0.95 * bound < down.abs().max() <= bound
+        assert float(down.detach().std()) == pytest.approx(bound / 3**0.5, rel=0.1)

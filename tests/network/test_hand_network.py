@@ -10,7 +10,7 @@ from typing import NamedTuple
 import pytest
 import torch
 
-from oasis_warp.avatar.observation import NetworkInput, sight
+from oasis_warp.avatar.observation import CropBatch, observe_batch
 from oasis_warp.network.config import COMPACT, PAPER, NetworkConfig
 from oasis_warp.network.hand_network import HandNetwork
 
@@ -105,8 +105,8 @@ def test_an_untrained_network_draws_the_mean_hand_whatever_its_switches(tiny, ma
 
 
 def test_the_literal_visibility_scores_the_surface_itself_about_one_half(network, batch):
-    margin = sight(batch, network.faces, network.vertex_faces, network.vertex_index)
-    literal = sight(batch, network.faces, network.vertex_faces, None)
+    margin = observe_batch(batch, network.faces, network.vertex_faces, network.vertex_index)
+    literal = observe_batch(batch, network.faces, network.vertex_faces, None)
     seen = margin.confidence > 0.5
     assert float(margin.visibility[seen].mean()) > 0.9
     assert 0.3 < float(literal.visibility[seen].mean()) < 0.75
@@ -115,7 +115,7 @@ def test_the_literal_visibility_scores_the_surface_itself_about_one_half(network
 def test_hands_of_a_batch_do_not_see_each_other(network, batch):
     together = run(network, batch)
     for k in range(2):
-        alone = run(network, NetworkInput(*(part[k : k + 1] for part in batch)))
+        alone = run(network, CropBatch(*(part[k : k + 1] for part in batch)))
         for a, b in zip(together, alone, strict=True):
             torch.testing.assert_close(a[k], b[0], atol=2e-5, rtol=1e-4)
 
@@ -205,7 +205,7 @@ def test_the_compact_profile_has_under_five_million_weights(compact):
 
 
 def test_the_compact_profile_reads_a_photo_in_no_time(compact, batch):
-    one = NetworkInput(*(part[:1] for part in batch))
+    one = CropBatch(*(part[:1] for part in batch))
     run(compact, one)
     times = []
     for _ in range(3):

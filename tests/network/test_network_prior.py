@@ -12,7 +12,7 @@ import torch
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import OPACITY, RIM_FADE
-from oasis_warp.avatar.observation import input_of_crop
+from oasis_warp.avatar.observation import batch_of_crop
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core import rotation
@@ -25,10 +25,10 @@ from oasis_warp.network.prior import (
     RIM_LAST,
     NetworkPrior,
     all_gaussians,
+    blend_rim,
     bundled_prior,
     canonical_gaussians,
     choose_prior,
-    settle_rim,
     spread_to_rim,
 )
 from oasis_warp.network.weights_file import read_header, save_network
@@ -94,9 +94,9 @@ def test_the_rim_takes_over_the_colours_beyond_it(hand):
 
 def test_at_the_wrists_end_gaussians_have_the_shapes_of_their_anchors(network, hand, crops):
     with torch.no_grad():
-        prediction = network(input_of_crop(crops[0]))
+        prediction = network(batch_of_crop(crops[0]))
     rest = crops[0].rest.vertices
-    settled = settle_rim(prediction, rest, network.faces, network.vertex_faces, network.rim)
+    settled = blend_rim(prediction, rest, network.faces, network.vertex_faces, network.rim)
     at_vertices = torch.cdist(rest, rest[hand.rim]).amin(1)
     from_rim = torch.cat([at_vertices, at_vertices[hand.faces].amin(1)])
     near, far = from_rim <= RIM_FIRST * RIM_FADE, from_rim >= RIM_LAST * RIM_FADE
@@ -111,7 +111,7 @@ def test_at_the_wrists_end_gaussians_have_the_shapes_of_their_anchors(network, h
 
 def test_faint_gaussians_are_left_out_of_an_avatar_and_kept_for_training(untrained, hand, crops):
     with torch.no_grad():
-        prediction = untrained.network(input_of_crop(crops[0]))
+        prediction = untrained.network(batch_of_crop(crops[0]))
     few = canonical_gaussians(prediction, 0)
     every_vertex, every_face = torch.arange(len(hand.template)), torch.arange(len(hand.faces))
     everything = all_gaussians(prediction, 0, every_vertex, every_face)
@@ -127,7 +127,7 @@ def test_faint_gaussians_are_left_out_of_an_avatar_and_kept_for_training(untrain
 def test_its_guess_can_be_adapted_to_the_photo(network, hand, crops):
     crop = crops[0]
     guess = NetworkPrior(network)(crop)
-    done = adapt(hand, guess, crop, AdaptConfig(calibration_steps=5, texture_steps=5))
+    done = adapt(hand, [guess], [crop], AdaptConfig(calibration_steps=5, texture_steps=5))
 
     def psnr(gaussians):
         posed = pose_gaussians(gaussians, hand.faces, crop.rest.vertices, crop.posed.vertices)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from painted_hands import PaintedHands
 
-from oasis_warp.avatar.observation import input_of_batch
+from oasis_warp.avatar.observation import source_photos
 from oasis_warp.core.types import Camera
 from oasis_warp.losses.image import masked_dssim, masked_l1
 from oasis_warp.network.config import COMPACT
@@ -41,7 +41,7 @@ def network_of(hand):
     def draw(batch):
         network = HandNetwork(config, hand)
         with torch.no_grad():
-            return draw_targets(network(input_of_batch(batch)), batch, network)
+            return draw_targets(network(source_photos(batch)), batch, network)
 
     return draw
 

@@ -1,4 +1,4 @@
-"""Carry what the photo shows over the rim of the seen region, so that it fades into the prior without a seam."""
+"""Surface inpainting: observed values fade smoothly into the prior around the region that photos show."""
 
 import numpy as np
 import scipy.sparse as sparse
@@ -50,7 +50,9 @@ def inpaint(
 def laplacian_and_mass(points: np.ndarray, triangles: np.ndarray) -> tuple[sparse.csc_array, np.ndarray]:
     """The cotangent Laplacian, positive semi-definite, [V, V], and a third of the area round each vertex, [V].
 
-    An edge weighs half the sum of the cotangents of the angles opposite to it (Pinkall and Polthier 1993).
+    An edge weighs half the sum of the cotangents of the angles opposite to it (Pinkall and Polthier 1993). libigl's
+    `cotmatrix` gives the same and is as fast, but importing it takes half a second of every reconstruction, and a
+    degenerate triangle fills its matrix with NaN.
     """
     n = len(points)
     corners = points[triangles]

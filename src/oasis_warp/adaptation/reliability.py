@@ -13,11 +13,11 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from oasis_warp.avatar.anchors import PRIOR_SIZE
-from oasis_warp.avatar.observation import VISIBILITY_MARGIN, facing, inner_mask, observe
+from oasis_warp.avatar.observation import Observation, inner_mask, observe, sample
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandCrop
-from oasis_warp.ops import depth_map, depth_visibility
+from oasis_warp.ops import depth_map
 
 BEHIND_REACH = 5 / PRIOR_SIZE
 """From the outline of what lies before, over the picture's side."""
@@ -98,38 +98,33 @@ class VertexObservations(NamedTuple):
     """How much a photo counts beside the one that shows a place best: 1 for that one, and where none shows it."""
 
 
-def look(hand: HandModel, crops: Sequence[HandCrop], resolution: Sequence[float]) -> VertexObservations:
-    """What every photo shows, and which to believe: the one that spends most pixels on the skin there.
+def observe_photos(hand: HandModel, crops: Sequence[HandCrop], resolutions: Sequence[float]) -> VertexObservations:
+    """What every photo shows, and which to believe: most the one that spends most pixels on the skin there.
 
     Args:
         hand: The model.
         crops: Of K photos of one hand.
-        resolution: Pixels of each photo a pixel of its crop, along a line; below 1 the crop is an enlargement.
+        resolutions: Pixels of each photo for one pixel of its crop, along a line; below 1 the crop is an enlargement.
     """
     seen = [observe(hand, crop) for crop in crops]
+    colors, confidence = (torch.stack(parts) for parts in zip(*((s.colors, s.confidence) for s in seen), strict=True))
+    if len(crops) == 1:
+        return VertexObservations(colors, confidence, torch.ones_like(confidence))
     density = torch.stack([
-        min(1.0, scale) ** 2 * _pixel_density(hand, crop)
-        for crop, scale in zip(crops, resolution, strict=True)
+        min(1.0, scale) ** 2 * _pixel_density(crop, own)
+        for crop, own, scale in zip(crops, seen, resolutions, strict=True)
     ])  # fmt: skip
     best = density.amax(0)
     share = torch.where(best > 0, (density / best.clamp_min(1e-12)) ** SHARPNESS, 1.0)
-    return VertexObservations(
-        torch.stack([photo.colors for photo in seen]), torch.stack([photo.confidence for photo in seen]), share
-    )
+    return VertexObservations(colors, confidence, share)
 
 
-def _pixel_density(hand: HandModel, crop: HandCrop) -> Float[Tensor, "V"]:
-    """Pixels of the crop a square metre of the skin round each vertex; 0 where it is hidden, turned away or cut off."""
-    vertices, camera = crop.posed.vertices, crop.camera
-    faces = hand.faces.to(vertices.device)
-    visible, _, _ = depth_visibility(
-        vertices, vertices, faces, camera.K, camera.viewmat, camera.width, camera.height, margin=VISIBILITY_MARGIN,
-        point_vertices=torch.arange(len(vertices), device=vertices.device),
-    )  # fmt: skip
-    turned = facing(vertices, faces, camera).clamp(0, 1)
-    _, depth = project(camera, vertices)
-    inside = observe(hand, crop._replace(image=inner_mask(crop.mask, 1)[..., None].expand(-1, -1, 3)))
-    return visible * turned * inside.colors[:, 0].clamp(0, 1) * (camera.K[0, 0] / depth.clamp_min(1e-3)) ** 2
+def _pixel_density(crop: HandCrop, seen: Observation) -> Float[Tensor, "V"]:
+    """Pixels of the crop per square metre of the skin around each vertex; 0 where hidden, turned away or cut off."""
+    _, depth = project(crop.camera, crop.posed.vertices)
+    inside = sample(inner_mask(crop.mask, 1)[None, None], seen.uv[None])[0, :, 0].clamp(0, 1)
+    pixels = (crop.camera.K[0, 0] / depth.clamp_min(1e-3)) ** 2
+    return seen.visibility * seen.facing.clamp(0, 1) * inside * pixels
 
 
 def photo_gains(sightings: VertexObservations, guess: Float[Tensor, "V 3"]) -> Float[Tensor, "K 3"]:

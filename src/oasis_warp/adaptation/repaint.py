@@ -10,13 +10,14 @@ from oasis_warp.adaptation.reprojection import (
     PHOTO_WEIGHT,
     Canvas,
     Source,
-    View,
-    beside,
-    carried,
-    cut,
+    SurfaceMap,
+    TargetView,
+    crop_to_points,
     fit_colors,
-    look,
-    read,
+    map_surface,
+    nearby_cameras,
+    reproject,
+    sample_picture,
     with_neighbours,
 )
 from oasis_warp.avatar.densify import densify, parts_for_spacing
@@ -41,7 +42,7 @@ ZOOMS = (1.0, 2.0)
 """Sizes of the views beside the photo's over its own: the smaller a picture, the more the rasterizer's own blur."""
 
 
-class Repainted(NamedTuple):
+class RepaintResult(NamedTuple):
     """Gaussians with the paint."""
 
     gaussians: CanonicalGaussians
@@ -66,7 +67,7 @@ def repaint(
     *,
     steps: int = 40,
     progress: Progress = silent,
-) -> Repainted:
+) -> RepaintResult:
     """Replace the Gaussians under the paint, and a few rings of faces around it, by finer ones that show it.
 
     Their colours minimise the squared difference of pictures that are linear in them: in the photo's view the painted
@@ -85,14 +86,8 @@ def repaint(
     Raises:
         ValueError: no paint on the surface.
     """
-    seen = look(posed, faces, canvas, FACING)
-    under = torch.zeros(len(faces), dtype=torch.bool, device=faces.device)
-    under[seen.faces[seen.share > MIN_PAINT]] = True
-    if not bool(under.any()):
-        raise ValueError("canvas: expected paint on the hand, got none. Check its mask and its camera.")
-    around = under
-    for _ in range(RINGS):
-        around = with_neighbours(around, faces, len(rest))
+    seen = map_surface(posed, faces, canvas, FACING)
+    around = _faces_around_paint(seen, faces, len(rest))
     _, depth = project(canvas.camera, posed)
     pixel = depth[faces].mean(1) / canvas.camera.K[0, 0]
     # A face of one part would keep its vertices' Gaussians, which reach into the faces beside it.
@@ -100,33 +95,44 @@ def repaint(
     dense, changed, n_new = densify(gaussians, rest, faces, parts)
 
     old, new = (pose_gaussians(with_shade_baked(layer), faces, rest, posed) for layer in (gaussians, dense))
-    share, color = read(canvas, seen, new.means[changed])
+    share, color = sample_picture(canvas, seen, new.means[changed])
     start = torch.lerp(new.colors[changed], color, share[:, None])
-    still = torch.where(changed[:, None], 0, new.colors)
+    unchanged = torch.where(changed[:, None], 0, new.colors)
     views = []
     for camera, weight in _cameras(canvas.camera, posed[faces[around]].flatten(0, 1)):
         before = blend_colors(view_weights(old, camera), old.colors)
-        target = carried(before, [Source(canvas, seen, posed)], posed, faces, camera)
+        target = reproject(before, [Source(canvas, seen, posed)], posed, faces, camera)
         weights = view_weights(new, camera)
-        views.append(View(weights, target - blend_colors(weights, still), weight))
+        views.append(TargetView(weights, target - blend_colors(weights, unchanged), weight))
     learned, losses = fit_colors(views, start, changed, steps, progress)
     if dense.shade is not None:  # paint has none
         lighter = torch.lerp(dense.shade[changed], torch.ones_like(learned), share[:, None])
         dense = dense._replace(shade=dense.shade.masked_scatter(changed[:, None], lighter))
     _, areas = surface.face_normals(rest, faces)
     on = dense.face_index[-n_new:]
-    on_hand = (canvas.mask * (seen.faces >= 0)).sum()
-    return Repainted(
-        with_photo_colors(dense, changed, learned),
-        n_new,
-        around,
-        float((areas[on] / parts[on].square() * share[-n_new:]).sum()),
-        float(1 - seen.share.sum() / on_hand),
-        losses,
-    )
+    area = float((areas[on] / parts[on].square() * share[-n_new:]).sum())
+    left_out = float(1 - seen.share.sum() / (canvas.mask * (seen.faces >= 0)).sum())
+    return RepaintResult(with_photo_colors(dense, changed, learned), n_new, around, area, left_out, losses)
+
+
+def _faces_around_paint(seen: SurfaceMap, faces: Int[Tensor, "F 3"], n_vertices: int) -> Bool[Tensor, "F"]:
+    """Faces under the paint, and `RINGS` of neighbours.
+
+    Raises:
+        ValueError: there is no paint.
+    """
+    chosen = torch.zeros(len(faces), dtype=torch.bool, device=faces.device)
+    chosen[seen.faces[seen.share > MIN_PAINT]] = True
+    if not bool(chosen.any()):
+        raise ValueError("canvas: expected paint on the hand, got none. Check its mask and its camera.")
+    for _ in range(RINGS):
+        chosen = with_neighbours(chosen, faces, n_vertices)
+    return chosen
 
 
 def _cameras(camera: Camera, points: Float[Tensor, "K 3"]) -> list[tuple[Camera, float]]:
     """The photo's camera and those beside it, cut to show just `points`; with each the weight of its pixels."""
-    turned = [(cut(other, points, zoom), 1 / zoom**2) for other in beside(camera, points) for zoom in ZOOMS]
-    return [(cut(camera, points, 1.0), PHOTO_WEIGHT), *turned]
+    turned = [
+        (crop_to_points(other, points, zoom), 1 / zoom**2) for other in nearby_cameras(camera, points) for zoom in ZOOMS
+    ]
+    return [(crop_to_points(camera, points, 1.0), PHOTO_WEIGHT), *turned]

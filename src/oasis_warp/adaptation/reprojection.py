@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d
 
-from oasis_warp.avatar import observation as observe
+from oasis_warp.avatar.observation import facing as facing_camera
+from oasis_warp.core import surface
 from oasis_warp.core.camera import project
 from oasis_warp.core.logging import Progress
 from oasis_warp.core.rotation import from_axis_angle
@@ -19,7 +20,7 @@ STEP = 0.003
 """Depth by which one surface lies behind another rather than slopes away from it [m]."""
 FAR = 1e3
 """Stands for an infinite depth where depths are subtracted [m]."""
-TURNS = ((0.0, 0.45), (0.0, -0.45), (0.45, 0.0), (-0.45, 0.0))
+NEARBY_ANGLES = ((0.0, 0.45), (0.0, -0.45), (0.45, 0.0), (-0.45, 0.0))
 """Of the views beside the photo's, about its horizontal and its vertical axis [rad]. Which Gaussian hides which depends
 on the view; colours that suit one view alone come out shifted and frayed in others."""
 PHOTO_WEIGHT = 2.0
@@ -39,7 +40,7 @@ class Canvas(NamedTuple):
     camera: Camera
 
 
-class Seen(NamedTuple):
+class SurfaceMap(NamedTuple):
     """What the canvas shows of the surface."""
 
     faces: Int[Tensor, "H W"]
@@ -55,12 +56,12 @@ class Source(NamedTuple):
     """A picture and the hand in it."""
 
     canvas: Canvas
-    seen: Seen
+    seen: SurfaceMap
     posed: Float[Tensor, "V 3"]
     """In the world of the canvas's camera [m]."""
 
 
-class View(NamedTuple):
+class TargetView(NamedTuple):
     """One picture that colours are fitted to."""
 
     weights: BlendWeights
@@ -70,7 +71,9 @@ class View(NamedTuple):
     """Of each of its pixels."""
 
 
-def look(posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], canvas: Canvas, facing: tuple[float, float]) -> Seen:
+def map_surface(
+    posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], canvas: Canvas, facing: tuple[float, float]
+) -> SurfaceMap:
     """What of the posed surface the canvas shows.
 
     `facing` are the cosines between surface and view below which a pixel says nothing, and above which it is taken as
@@ -80,10 +83,10 @@ def look(posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], canvas: Canvas,
     seen = depth_map(posed, faces, camera.viewmat, camera.K, camera.width, camera.height)
     ids, depth = seen.face_ids.long(), seen.depth.clamp_max(FAR)
     before = -max_pool2d(-depth[None, None], 3, stride=1, padding=1)[0, 0]
-    toward = observe.facing(posed, faces, camera)
+    toward = facing_camera(posed, surface.vertex_normals(posed, faces), camera.viewmat)
     cosine = (toward[faces[ids.clamp_min(0)]] * seen.barycentrics).sum(-1)
     trust = ((cosine - facing[0]) / (facing[1] - facing[0])).clamp(0, 1)
-    return Seen(ids, depth, seen.barycentrics, canvas.mask * trust * ((ids >= 0) & (depth - before < STEP)))
+    return SurfaceMap(ids, depth, seen.barycentrics, canvas.mask * trust * ((ids >= 0) & (depth - before < STEP)))
 
 
 def with_neighbours(chosen: Bool[Tensor, "F"], faces: Tensor, n_vertices: int) -> Bool[Tensor, "F"]:
@@ -93,7 +96,9 @@ def with_neighbours(chosen: Bool[Tensor, "F"], faces: Tensor, n_vertices: int) -
     return at[faces].any(1)
 
 
-def read(canvas: Canvas, seen: Seen, points: Float[Tensor, "M 3"]) -> tuple[Float[Tensor, "M"], Float[Tensor, "M 3"]]:
+def sample_picture(
+    canvas: Canvas, seen: SurfaceMap, points: Float[Tensor, "M 3"]
+) -> tuple[Float[Tensor, "M"], Float[Tensor, "M 3"]]:
     """Share and colour of the picture at points of the posed surface; none where another surface hides them."""
     camera = canvas.camera
     uv, depth = project(camera, points)
@@ -104,17 +109,17 @@ def read(canvas: Canvas, seen: Seen, points: Float[Tensor, "M 3"]) -> tuple[Floa
     return sampled[:, 3] * (depth - front[0, 0, 0] < STEP), sampled[:, :3]
 
 
-def lay_over(
+def overlay_pictures(
     colors: Float[Tensor, "M 3"], sources: Sequence[Source], points: Sequence[Float[Tensor, "M 3"]]
 ) -> Float[Tensor, "M 3"]:
     """`colors` of some places under what each picture shows of them; with each the places in its pose [m]."""
     for source, there in zip(sources, points, strict=True):
-        share, color = read(source.canvas, source.seen, there)
+        share, color = sample_picture(source.canvas, source.seen, there)
         colors = torch.lerp(colors, color, share[:, None])
     return colors
 
 
-def carried(
+def reproject(
     before: Float[Tensor, "h w 3"], sources: Sequence[Source], posed: Tensor, faces: Tensor, camera: Camera
 ) -> Float[Tensor, "h w 3"]:
     """The picture `before` that `camera` makes of the old hand, `posed`, with what the surface carries of others."""
@@ -122,15 +127,15 @@ def carried(
     on = shown.face_ids >= 0
     corners, place = faces[shown.face_ids[on].long()], shown.barycentrics[on][..., None]
     target = before.clone()
-    target[on] = lay_over(before[on], sources, [(source.posed[corners] * place).sum(1) for source in sources])
+    target[on] = overlay_pictures(before[on], sources, [(source.posed[corners] * place).sum(1) for source in sources])
     return target
 
 
-def beside(camera: Camera, points: Float[Tensor, "K 3"]) -> list[Camera]:
-    """Cameras turned by `TURNS` about the middle of `points`."""
+def nearby_cameras(camera: Camera, points: Float[Tensor, "K 3"]) -> list[Camera]:
+    """Cameras turned by `NEARBY_ANGLES` about the middle of `points`."""
     center = (points.amin(0) + points.amax(0)) / 2
     cameras = []
-    for about_x, about_y in TURNS:
+    for about_x, about_y in NEARBY_ANGLES:
         turn = from_axis_angle(camera.viewmat.new_tensor([1.0, 0.0, 0.0]), camera.viewmat.new_tensor(about_x))
         turn = turn @ from_axis_angle(camera.viewmat.new_tensor([0.0, 1.0, 0.0]), camera.viewmat.new_tensor(about_y))
         local = camera.viewmat[:3, :3] @ center + camera.viewmat[:3, 3]
@@ -141,7 +146,7 @@ def beside(camera: Camera, points: Float[Tensor, "K 3"]) -> list[Camera]:
     return cameras
 
 
-def cut(camera: Camera, points: Tensor, zoom: float) -> Camera:
+def crop_to_points(camera: Camera, points: Tensor, zoom: float) -> Camera:
     """The part of the picture, `zoom` times as large, that shows `points`."""
     K = camera.K.clone()
     K[:2] *= zoom
@@ -153,7 +158,7 @@ def cut(camera: Camera, points: Tensor, zoom: float) -> Camera:
 
 
 def fit_colors(
-    views: list[View], start: Float[Tensor, "M 3"], changed: Bool[Tensor, "N"], steps: int, progress: Progress
+    views: list[TargetView], start: Float[Tensor, "M 3"], changed: Bool[Tensor, "N"], steps: int, progress: Progress
 ) -> tuple[Float[Tensor, "M 3"], tuple[float, ...]]:
     """Colours in [0, 1] with the least squared difference in all views, held at `start` where these say nothing.
 

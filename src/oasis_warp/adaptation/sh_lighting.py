@@ -12,7 +12,7 @@ from torch import Tensor
 
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
-from oasis_warp.avatar.observation import Observation, observe
+from oasis_warp.avatar.observation import observe
 from oasis_warp.avatar.pose import GAMMA, posed_normals, shading, shading_picture, split_shade
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
@@ -84,7 +84,7 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) ->
     return HandLight(relative.harmonics * brightest, relative.limits * brightest, relative.even * brightest)
 
 
-def with_shade(
+def add_shade(
     hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop, sure: HandCrop, light: HandLight
 ) -> HandLight:
     """`light` with what it misses where the photo may show something else than the skin there.
@@ -133,10 +133,11 @@ SKIN_DEVIATION = 0.007
 nothing against the prior's own colours and .007 up to .06 dB, but real skin has more to it."""
 
 
-def even_photo(
+def light_evenly(
     image: Float[Tensor, "H W 3"],
     drawn: Float[Tensor, "H W 3"],
-    missing: Observation,
+    missing: Float[Tensor, "V 3"],
+    confidence: Float[Tensor, "V"],
     view: BlendWeights,
     gaussians: CanonicalGaussians,
     vertices: Float[Tensor, "V 3"],
@@ -152,13 +153,14 @@ def even_photo(
         image: The photo.
         drawn: The prior's picture in the photo's tone.
         missing: `image - drawn` at the vertices.
+        confidence: Of that.
         view: Of `gaussians` in the photo.
         gaussians: Which `drawn` shows.
         vertices: The surface at rest [m].
         faces: Corners.
     """
-    shading = inpaint(vertices, faces, missing.colors, missing.confidence, LIGHT_LENGTH, EVEN_REACH)
-    detail = weighted_deviation(missing.colors - shading, missing.confidence)
+    shading = inpaint(vertices, faces, missing, confidence, LIGHT_LENGTH, EVEN_REACH)
+    detail = weighted_deviation(missing - shading, confidence)
     share = (SKIN_DEVIATION / detail.clamp_min(SKIN_DEVIATION)).square()
     light = blend_colors(view, vertex_to_gaussians(shading, faces, gaussians))
     return drawn + share * (image - drawn - light)

@@ -12,13 +12,13 @@ from oasis_warp.adaptation.reprojection import (
     PHOTO_WEIGHT,
     Canvas,
     Source,
-    View,
-    beside,
-    carried,
-    cut,
+    TargetView,
+    crop_to_points,
     fit_colors,
-    lay_over,
-    look,
+    map_surface,
+    nearby_cameras,
+    overlay_pictures,
+    reproject,
     with_neighbours,
 )
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_to_gaussians
@@ -57,7 +57,7 @@ SHRUNK = 2
 and those in front would hide more of the others than they do from near."""
 
 
-class Sharpened(NamedTuple):
+class SharpenResult(NamedTuple):
     """Gaussians with the photos' detail."""
 
     gaussians: CanonicalGaussians
@@ -75,7 +75,7 @@ def sharpen(
     crops: Sequence[HandCrop],
     believed: Float[Tensor, "K V"] | None = None,
     progress: Progress = silent,
-) -> Sharpened:
+) -> SharpenResult:
     """Replace Gaussians by finer ones where pictures of the hand show more than they do.
 
     A face whose picture differs from the avatar's is cut into as many parts as it takes to show what is there; faces
@@ -104,14 +104,14 @@ def sharpen(
     ]).amin(0)  # fmt: skip
     missing = spacing.isfinite()
     if not bool(missing.any()):
-        return Sharpened(gaussians, 0, ())
+        return SharpenResult(gaussians, 0, ())
     around = with_neighbours(missing, faces, len(rest))
     # A face of one part would keep its vertices' Gaussians, which reach into the faces beside it.
     parts = torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
     dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
     shown = with_shade_baked(dense)
     new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
-    start = lay_over(shown.colors[changed], sources, [there.means[changed] for there in new])
+    start = overlay_pictures(shown.colors[changed], sources, [there.means[changed] for there in new])
     colors = shown.colors.masked_scatter(changed[:, None], start)
     whose = vertex_to_gaussians(believed.T, faces, dense).argmax(1)
     whose_face = believed[:, faces].mean(-1).argmax(0)
@@ -125,7 +125,7 @@ def sharpen(
         views = _views(sources, k, points, faces, old[k], new[k], still)
         learned, own = fit_colors(views, colors[mine], mine, STEPS, progress)
         colors, losses = still.masked_scatter(mine[:, None], learned), [*losses, *own]
-    return Sharpened(with_photo_colors(dense, changed, colors[changed]), n_new, tuple(losses))
+    return SharpenResult(with_photo_colors(dense, changed, colors[changed]), n_new, tuple(losses))
 
 
 def _source(
@@ -133,7 +133,7 @@ def _source(
 ) -> Source:
     """The photo on its surface, with nothing of it on `fading` faces and elsewhere as much as it is believed."""
     posed, canvas = crop.posed.vertices, Canvas(crop.image, _faded_in(crop.mask), crop.camera)
-    seen = look(posed, faces, canvas, FACING)
+    seen = map_surface(posed, faces, canvas, FACING)
     ids = seen.faces.clamp_min(0)
     trust = torch.where(fading[ids], 0, (believed[faces[ids]] * seen.barycentrics).sum(-1))
     return Source(canvas, seen._replace(share=seen.share * trust), posed)
@@ -141,20 +141,20 @@ def _source(
 
 def _views(
     sources: Sequence[Source], k: int, points: Tensor, faces: Tensor, old: Gaussians, new: Gaussians, still: Tensor
-) -> list[View]:
+) -> list[TargetView]:
     """Pictures of `points` in the pose of source k: in the photo's view and beside it, in both sizes."""
     camera, posed, views = sources[k].canvas.camera, sources[k].posed, []
-    for other, weight in ((camera, PHOTO_WEIGHT), *((other, 1.0) for other in beside(camera, points))):
-        near = _divisible(cut(other, points, 1.0))
+    for other, weight in ((camera, PHOTO_WEIGHT), *((other, 1.0) for other in nearby_cameras(camera, points))):
+        near = _divisible(crop_to_points(other, points, 1.0))
         image, alpha = render(old, near)
         alpha = alpha.clamp_min(MIN_ALPHA)[..., None]
-        target = alpha * carried(image / alpha, sources, posed, faces, near)
+        target = alpha * reproject(image / alpha, sources, posed, faces, near)
         small = _pooled(target) / _pooled(alpha)
         for goal, shown, scale in ((target / alpha, near, 1), (small, _smaller(near), SHRUNK)):
             weights = view_weights(new, shown)
             # Coverage is not to be fitted: in a small picture the rasterizer draws outlines wider.
             goal = goal * weights.alphas - blend_colors(weights, still)
-            views.append(View(weights, goal, weight * scale**2))
+            views.append(TargetView(weights, goal, weight * scale**2))
     return views
 
 

@@ -30,21 +30,21 @@ FLAT_WINDOW, FLAT_GAIN = 21, 0.05
 views, fell by less than this share."""
 
 
-class Aim(NamedTuple):
-    """What is drawn, and what must come out."""
+class Targets(NamedTuple):
+    """What is drawn, and what it must look like."""
 
-    view: BlendWeights
-    """Of the photo; of K photos `ops.stack_weights` of theirs, and what follows is one below the other, too."""
-    target: Float[Tensor, "H W 3"]
+    weights: BlendWeights
+    """Of the photo; of K photos `ops.stack_weights` of theirs, with `picture` and `mask` one below the other, too."""
+    picture: Float[Tensor, "H W 3"]
     """The photo. It shows through where the Gaussians leave it free, as at the wrist: over black they would learn to
     glow there."""
     mask: Float[Tensor, "H W"]
     """Where it counts."""
     references: list[BlendWeights]
-    kept: list[Float[Tensor, "H W 3"]]
+    expected: list[Float[Tensor, "H W 3"]]
     """What each reference view must stay like."""
-    light: Float[Tensor, "K N 3"] | None = None
-    """Factors that the light of each of K photos multiplies colours with; reference views are in even light."""
+    factors: Float[Tensor, "K N 3"]
+    """What the light of each of K photos multiplies colours with; reference views are in even light."""
 
 
 class Texture(NamedTuple):
@@ -55,36 +55,36 @@ class Texture(NamedTuple):
     """Of every step, reference views included."""
 
 
-def aim(
-    view: BlendWeights,
-    target: Tensor,
+def make_targets(
+    weights: BlendWeights,
+    picture: Tensor,
     mask: Tensor,
     references: list[BlendWeights],
     colors: Float[Tensor, "N 3"],
-    light: Float[Tensor, "K N 3"] | None = None,
-) -> Aim:
+    factors: Float[Tensor, "K N 3"],
+) -> Targets:
     """Reference views must stay as Gaussians of `colors` draw them."""
     with torch.no_grad():
-        kept = [blend_colors(reference, colors) for reference in references]
-    return Aim(view, target, mask, references, kept, light)
+        expected = [blend_colors(reference, colors) for reference in references]
+    return Targets(weights, picture, mask, references, expected, factors)
 
 
 def fit_parameters(
     parameters: Sequence[Tensor],
     colors: Callable[[], Float[Tensor, "N 3"]],
     penalty: Callable[[], Tensor],
-    aim: Aim,
+    targets: Targets,
     learning_rate: float,
     config: AdaptConfig,
     progress: Progress,
 ) -> tuple[float, ...]:
-    """Change `parameters` so that `colors()` draws what it must, and leave their means over the last steps in them.
+    """Change `parameters` so that `colors()` draws the targets, and leave their means over the last steps in them.
 
     Args:
         parameters: Leaves that want gradients.
         colors: Of the Gaussians with the parameters as they are.
         penalty: Added to the loss of pictures.
-        aim: Those pictures.
+        targets: Those pictures.
         learning_rate: Of Adam.
         config: Steps and weights. With `references` "in_turn" one reference view takes part in each step, all of them
             in turn, in an order that `seed` shuffles; with "all" every one, by the photo's loss.
@@ -93,31 +93,27 @@ def fit_parameters(
     Returns:
         The loss of every step, reference views and penalty included.
     """
-    photo = aim.target * aim.mask[..., None]
-    beyond = (1 - aim.view.alphas) * aim.target
+    beyond = (1 - targets.weights.alphas) * targets.picture
     order = torch.Generator().manual_seed(config.seed)
     optimiser = torch.optim.Adam(parameters, lr=learning_rate)
     total = MAX_STEPS if config.texture_steps is None else config.texture_steps
     losses: list[float] = []
     queue: list[int] = []
-    settled = [torch.zeros_like(parameter) for parameter in parameters]
+    means = [torch.zeros_like(parameter) for parameter in parameters]
     for step in range(total):
         now = colors()
-        image = blend_colors(aim.view, now if aim.light is None else (now * aim.light).flatten(0, 1)) + beyond
-        loss = config.weight_rgb * masked_l1(image, aim.target, aim.mask)
-        loss = loss + config.weight_ssim * masked_dssim(image * aim.mask[..., None], photo, aim.mask)
-        if aim.references and config.references == "in_turn":
-            queue = queue or torch.randperm(len(aim.references), generator=order).tolist()
-            k = queue.pop()
-            drift = masked_l1(blend_colors(aim.references[k], now), aim.kept[k], aim.references[k].alphas[..., 0])
-            loss = loss + config.weight_reference * config.weight_rgb * len(aim.references) * drift
-        elif aim.references:
-            loss = loss + config.weight_reference * _drift(now, aim, config)
+        image = blend_colors(targets.weights, (now * targets.factors).flatten(0, 1)) + beyond
+        loss = _picture_loss(image, targets.picture, targets.mask, config)
+        if targets.references and config.references == "in_turn":
+            queue = queue or torch.randperm(len(targets.references), generator=order).tolist()
+            loss = loss + config.weight_reference * _reference_loss(now, targets, queue.pop(), config)
+        elif targets.references:
+            loss = loss + config.weight_reference * _all_reference_losses(now, targets, config)
         loss = loss + penalty()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        for mean, value in zip(settled, parameters, strict=True):
+        for mean, value in zip(means, parameters, strict=True):
             mean.lerp_(value.detach(), max(1 / (step + 1), 1 / AVERAGED))
         losses.append(loss.item())
         progress("texture", step + 1, total)
@@ -126,18 +122,30 @@ def fit_parameters(
             break
     if losses:
         with torch.no_grad():
-            for value, mean in zip(parameters, settled, strict=True):
+            for value, mean in zip(parameters, means, strict=True):
                 value.copy_(mean)
     return tuple(losses)
 
 
-def _drift(colors: Tensor, aim: Aim, config: AdaptConfig) -> Tensor:
+def _picture_loss(image: Tensor, picture: Tensor, mask: Tensor, config: AdaptConfig) -> Tensor:
+    loss = config.weight_rgb * masked_l1(image, picture, mask)
+    return loss + config.weight_ssim * masked_dssim(image * mask[..., None], picture * mask[..., None], mask)
+
+
+def _reference_loss(colors: Tensor, targets: Targets, k: int, config: AdaptConfig) -> Tensor:
+    """Of view k, for all of them."""
+    view = targets.references[k]
+    drift = masked_l1(blend_colors(view, colors), targets.expected[k], view.alphas[..., 0])
+    return config.weight_rgb * len(targets.references) * drift
+
+
+def _all_reference_losses(colors: Tensor, targets: Targets, config: AdaptConfig) -> Tensor:
     """The paper's sum over all reference views."""
     total = colors.new_zeros(())
-    for reference, kept in zip(aim.references, aim.kept, strict=True):
+    for reference, expected in zip(targets.references, targets.expected, strict=True):
         image, mask = blend_colors(reference, colors), reference.alphas[..., 0]
-        total = total + config.weight_rgb * masked_l1(image, kept, mask)
-        total = total + config.weight_ssim * masked_dssim(image, kept, mask)
+        total = total + config.weight_rgb * masked_l1(image, expected, mask)
+        total = total + config.weight_ssim * masked_dssim(image, expected, mask)
     return total
 
 
@@ -164,11 +172,11 @@ COLOR_MARGIN = 1e-3
 def learn_texture(
     gaussians: CanonicalGaussians,
     faces: Int[Tensor, "F 3"],
-    pictures: Aim,
+    targets: Targets,
     config: AdaptConfig,
     progress: Progress,
 ) -> Texture:
-    """Learn colours on `pictures`, starting from `gaussians.colors`.
+    """Learn colours on `targets`, starting from `gaussians.colors`.
 
     The unknowns are the logits of a field over the vertices, read by vertex and face Gaussians alike, and a small
     residual of every face Gaussian. A Gaussian that hides behind its neighbours in the photo therefore learns with
@@ -179,7 +187,7 @@ def learn_texture(
     field = torch.zeros(n_vertices, 3, dtype=base.dtype, device=base.device, requires_grad=True)
     residual = torch.zeros(len(gaussians.face_index), 3, dtype=base.dtype, device=base.device, requires_grad=True)
     still = torch.zeros(n_points, 3, dtype=base.dtype, device=base.device)
-    trust, vertex_trust = _trust(gaussians, faces, pictures.view)
+    trust, vertex_trust = _trust(gaussians, faces, targets.weights)
     edges = surface.mesh_edges(faces)
 
     def colors() -> Tensor:
@@ -193,7 +201,7 @@ def learn_texture(
             loss = loss + RESIDUAL_DECAY * residual.square().mean()
         return loss
 
-    losses = fit_parameters([field, residual], colors, penalty, pictures, LEARNING_RATE, config, progress)
+    losses = fit_parameters([field, residual], colors, penalty, targets, LEARNING_RATE, config, progress)
     with torch.no_grad():
         return Texture(colors(), losses)
 
@@ -218,14 +226,14 @@ LORA_LEARNING_RATE = 0.01
 
 
 def learn_lora(
-    heads: ColorHeads, calibration: Calibration, aim: Aim, config: AdaptConfig, progress: Progress
+    heads: ColorHeads, calibration: Calibration, targets: Targets, config: AdaptConfig, progress: Progress
 ) -> Texture:
-    """Learn updates of rank `config.lora_rank` on `aim`; without a step the colours are the calibrated guess.
+    """Learn updates of rank `config.lora_rank` on `targets`; without a step the colours are the calibrated guess.
 
     Args:
         heads: Of the guess, with what they are asked.
         calibration: Applied to the colours that they put out.
-        aim: Pictures of the guess's Gaussians.
+        targets: Pictures of the guess's Gaussians.
         config: Steps and weights.
         progress: Called as work goes on.
     """
@@ -237,8 +245,8 @@ def learn_lora(
         return calibration.apply(torch.cat(own))
 
     factors = [factor for update in updates for pair in update for factor in pair]
-    nothing = aim.target.new_zeros(())
-    losses = fit_parameters(factors, colors, lambda: nothing, aim, LORA_LEARNING_RATE, config, progress)
+    nothing = targets.picture.new_zeros(())
+    losses = fit_parameters(factors, colors, lambda: nothing, targets, LORA_LEARNING_RATE, config, progress)
     with torch.no_grad():
         return Texture(colors(), losses)
 

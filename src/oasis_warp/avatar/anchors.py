@@ -50,45 +50,13 @@ class Anchors(NamedTuple):
         return CanonicalGaussians(self.vertex_index, offsets, *self[1:], colors)
 
 
-def surface_frames(normals: Float[Tensor, "N 3"], along: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:
-    """Quaternions of frames with z along `normals` and x along `along`, made perpendicular to it."""
-    x = normalize(along - (along * normals).sum(-1, keepdim=True) * normals, dim=-1)
-    return rotation.from_matrix(torch.stack([x, torch.linalg.cross(normals, x), normals], dim=-1))
+class BatchAnchors(NamedTuple):
+    """One Gaussian a vertex, then one a face, of B hands."""
 
-
-def vertex_shapes(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
-) -> tuple[Float[Tensor, "V 4"], Float[Tensor, "V 3"]]:
-    """Quaternions and standard deviations [m] of a disc a vertex, as large as its share of the surface."""
-    normals = surface.vertex_normals(vertices, faces)
-    spread = VERTEX_SPREAD * (surface.vertex_areas(vertices, faces) / math.pi).sqrt().clamp_min(MIN_SCALE)
-    scales = torch.stack([spread, spread, THICKNESS * spread], dim=-1)
-    axis = torch.eye(3, dtype=vertices.dtype, device=vertices.device)[normals.abs().argmin(-1)]
-    return surface_frames(normals, axis), scales
-
-
-def face_shapes(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
-) -> tuple[Float[Tensor, "F 4"], Float[Tensor, "F 3"]]:
-    """Quaternions and standard deviations [m] of a flat Gaussian a face.
-
-    Its axes are those of the triangle as a uniform plate, of covariance (1/12) sum (v - c)(v - c)^T.
-    """
-    normals, _ = surface.face_normals(vertices, faces)
-    corners = vertices[faces]
-    arms = corners - corners.mean(1, keepdim=True)
-    variance, axes = torch.linalg.eigh(arms.transpose(1, 2) @ arms / 12)  # ascending: across, short, long
-    long, short = variance[:, 2].clamp_min(0).sqrt(), variance[:, 1].clamp_min(0).sqrt()
-    long = (FACE_SPREAD * long).clamp_min(MIN_SCALE)
-    short = torch.maximum(FACE_SPREAD * short, long / MAX_ANISOTROPY).clamp_min(MIN_SCALE)
-    scales = torch.stack([long, short, THICKNESS * short], dim=-1)
-    return surface_frames(normals, axes[:, :, 2]), scales
-
-
-def _rim_opacity(hand: HandModel, vertices: Tensor) -> Tensor:
-    distance = torch.cdist(vertices, vertices[hand.rim.to(vertices.device)]).amin(1)
-    fade = (distance / RIM_FADE).clamp(0, 1)
-    return OPACITY * fade * fade * (3 - 2 * fade)
+    quats: Float[Tensor, "B N 4"]
+    scales: Float[Tensor, "B N 3"]
+    fade: Float[Tensor, "B N"]
+    """As `rim_fade`."""
 
 
 def inset_offsets(hand: HandModel, size: int = PRIOR_SIZE) -> Float[Tensor, "V 3"]:
@@ -98,22 +66,95 @@ def inset_offsets(hand: HandModel, size: int = PRIOR_SIZE) -> Float[Tensor, "V 3
 
 def place_anchors(hand: HandModel, rest: PosedHand) -> Anchors:
     """Up to V + F Gaussians on the surface `rest`, vertices first; those that the wrist's fade hides are left out."""
-    vertices, faces = rest.vertices, hand.faces.to(rest.vertices.device)
-    opacity = _rim_opacity(hand, vertices)
-    face_opacity = opacity[faces].mean(1)
-    keep_vertex = torch.nonzero(opacity >= MIN_OPACITY)[:, 0]
-    keep_face = torch.nonzero(face_opacity >= MIN_OPACITY)[:, 0]
-    vertex_quats, vertex_scales = vertex_shapes(vertices, faces)
-    face_quats, face_scales = face_shapes(vertices, faces)
-    third = torch.full((len(keep_face), 3), 1 / 3, dtype=vertices.dtype, device=vertices.device)
+    vertices, faces, rim = rest.vertices, hand.faces.to(rest.vertices.device), hand.rim.to(rest.vertices.device)
+    n_vertices = len(vertices)
+    every = batch_anchors(vertices[None], faces, surface.faces_of_vertices(faces, n_vertices), rim)
+    opacities = OPACITY * every.fade[0]
+    kept = opacities >= MIN_OPACITY
+    vertex_index, face_index = (torch.nonzero(part)[:, 0] for part in kept.split([n_vertices, len(faces)]))
     return Anchors(
-        vertex_index=keep_vertex,
-        face_index=keep_face,
-        barycentrics=third,
-        quats=torch.cat([vertex_quats[keep_vertex], face_quats[keep_face]]),
-        scales=torch.cat([vertex_scales[keep_vertex], face_scales[keep_face]]),
-        opacities=torch.cat([opacity[keep_vertex], face_opacity[keep_face]]),
+        vertex_index=vertex_index,
+        face_index=face_index,
+        barycentrics=vertices.new_full((len(face_index), 3), 1 / 3),
+        quats=every.quats[0, kept],
+        scales=every.scales[0, kept],
+        opacities=opacities[kept],
     )
+
+
+@torch.no_grad()
+def batch_anchors(
+    rest: Float[Tensor, "B V 3"],
+    faces: Int[Tensor, "F 3"],
+    vertex_faces: Int[Tensor, "V M"],
+    rim: Int[Tensor, "R"],
+) -> BatchAnchors:
+    """Gaussians on the surfaces `rest`, the faint ones at the wrist included.
+
+    Args:
+        rest: Vertices at rest [m].
+        faces: Corners.
+        vertex_faces: From `core.surface.faces_of_vertices`; makes sums over neighbours gathers, whose order is fixed.
+        rim: Vertices of the open wrist.
+    """
+    vertex_quats, vertex_scales = vertex_shapes(rest, faces, vertex_faces)
+    face_quats, face_scales = face_shapes(rest, faces)
+    fade = rim_fade(rest, rim)
+    return BatchAnchors(
+        torch.cat([vertex_quats, face_quats], dim=1),
+        torch.cat([vertex_scales, face_scales], dim=1),
+        torch.cat([fade, fade[:, faces].mean(2)], dim=1),
+    )
+
+
+def rim_fade(rest: Float[Tensor, "B V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor, "B V"]:
+    """0 at the open wrist, 1 from `RIM_FADE` on: the share of its opacity that a vertex's Gaussian may have."""
+    fade = (torch.cdist(rest, rest[:, rim]).amin(2) / RIM_FADE).clamp(0, 1)
+    return fade * fade * (3 - 2 * fade)
+
+
+def vertex_shapes(
+    vertices: Float[Tensor, "*B V 3"], faces: Int[Tensor, "F 3"], vertex_faces: Int[Tensor, "V M"]
+) -> tuple[Float[Tensor, "*B V 4"], Float[Tensor, "*B V 3"]]:
+    """Quaternions and standard deviations [m] of a disc a vertex, as large as its share of the surface."""
+    cross = surface.face_crosses(vertices, faces)
+    areas = cross.norm(dim=-1, keepdim=True) / 2
+    around = surface.gather_to_vertices(torch.cat([cross, areas], dim=-1), vertex_faces)
+    normals = normalize(around[..., :3], dim=-1, eps=1e-30)
+    spread = VERTEX_SPREAD * (around[..., 3] / 3 / math.pi).sqrt().clamp_min(MIN_SCALE)
+    axis = torch.eye(3, dtype=cross.dtype, device=cross.device)[normals.abs().argmin(-1)]
+    return surface_frames(normals, axis), torch.stack([spread, spread, THICKNESS * spread], dim=-1)
+
+
+def face_shapes(
+    vertices: Float[Tensor, "*B V 3"], faces: Int[Tensor, "F 3"]
+) -> tuple[Float[Tensor, "*B F 4"], Float[Tensor, "*B F 3"]]:
+    """Quaternions and standard deviations [m] of a flat Gaussian a face.
+
+    Its axes are those of the triangle as a uniform plate, of covariance (1/12) sum (v - c)(v - c)^T: the eigenvectors
+    of a 2 x 2 matrix in the plane of the face.
+    """
+    corners = vertices[..., faces, :]
+    normals = normalize(surface.face_crosses(vertices, faces), dim=-1, eps=1e-30)
+    arms = corners - corners.mean(-2, keepdim=True)
+    first = normalize(corners[..., 1, :] - corners[..., 0, :], dim=-1, eps=1e-30)
+    second = torch.linalg.cross(normals, first)
+    x, y = (arms * first[..., None, :]).sum(-1), (arms * second[..., None, :]).sum(-1)
+    xx, xy, yy = x.square().sum(-1) / 12, (x * y).sum(-1) / 12, y.square().sum(-1) / 12
+    middle, difference = (xx + yy) / 2, (xx - yy) / 2
+    radius = torch.hypot(difference, xy)
+    angle = torch.atan2(xy, difference) / 2
+    along = angle.cos()[..., None] * first + angle.sin()[..., None] * second
+    long = (FACE_SPREAD * (middle + radius).sqrt()).clamp_min(MIN_SCALE)
+    short = FACE_SPREAD * (middle - radius).clamp_min(0).sqrt()
+    short = torch.maximum(short, long / MAX_ANISOTROPY).clamp_min(MIN_SCALE)
+    return surface_frames(normals, along), torch.stack([long, short, THICKNESS * short], dim=-1)
+
+
+def surface_frames(normals: Float[Tensor, "*B N 3"], along: Float[Tensor, "*B N 3"]) -> Float[Tensor, "*B N 4"]:
+    """Quaternions of frames with z along `normals` and x along `along`, made perpendicular to it."""
+    x = normalize(along - (along * normals).sum(-1, keepdim=True) * normals, dim=-1)
+    return rotation.from_matrix(torch.stack([x, torch.linalg.cross(normals, x), normals], dim=-1))
 
 
 def vertex_colors(gaussians: CanonicalGaussians, n_vertices: int) -> Float[Tensor, "V 3"]:
@@ -130,86 +171,3 @@ def vertex_to_gaussians(
     corners = values.index_select(0, faces[anchors.face_index].flatten()).unflatten(0, (-1, 3))
     on_faces = (corners * anchors.barycentrics[..., None]).sum(1)
     return torch.cat([values.index_select(0, anchors.vertex_index), on_faces])
-
-
-class BatchAnchors(NamedTuple):
-    """One Gaussian a vertex, then one a face, of B hands."""
-
-    quats: Float[Tensor, "B N 4"]
-    scales: Float[Tensor, "B N 3"]
-    fade: Float[Tensor, "B N"]
-    """As `rim_fade`."""
-
-
-def faces_of_vertices(faces: Int[Tensor, "F 3"], n_vertices: int) -> Int[Tensor, "V M"]:
-    """The faces round each vertex, ascending; rows are filled up with F, one past the last face."""
-    order = faces.flatten().argsort(stable=True)
-    owner, face = faces.flatten()[order], order // 3
-    count = torch.bincount(owner, minlength=n_vertices)
-    place = torch.arange(len(owner), device=faces.device) - (count.cumsum(0) - count)[owner]
-    table = torch.full((n_vertices, int(count.max())), len(faces), dtype=torch.int64, device=faces.device)
-    table[owner, place] = face
-    return table
-
-
-def rim_fade(rest: Float[Tensor, "B V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor, "B V"]:
-    """0 at the open wrist, 1 from `RIM_FADE` on: the share of its opacity that a vertex's Gaussian may have."""
-    fade = (torch.cdist(rest, rest[:, rim]).amin(2) / RIM_FADE).clamp(0, 1)
-    return fade * fade * (3 - 2 * fade)
-
-
-@torch.no_grad()
-def batch_anchors(
-    rest: Float[Tensor, "B V 3"],
-    faces: Int[Tensor, "F 3"],
-    vertex_faces: Int[Tensor, "V M"],
-    rim: Int[Tensor, "R"],
-) -> BatchAnchors:
-    """Gaussians on the surfaces `rest`, with the shapes and opacities of `avatar.anchors.place_anchors`.
-
-    Args:
-        rest: Vertices at rest [m].
-        faces: Corners.
-        vertex_faces: From `faces_of_vertices`; it makes sums over neighbours gathers, whose order is fixed.
-        rim: Vertices of the open wrist.
-    """
-    corners = rest[:, faces]
-    cross = torch.linalg.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
-    normals = normalize(cross, dim=-1, eps=1e-30)
-    vertex_quats, vertex_scales = _vertex_shapes(cross, vertex_faces)
-    face_quats, face_scales = _face_shapes(corners, normals)
-    fade = rim_fade(rest, rim)
-    return BatchAnchors(
-        torch.cat([vertex_quats, face_quats], dim=1),
-        torch.cat([vertex_scales, face_scales], dim=1),
-        torch.cat([fade, fade[:, faces].mean(2)], dim=1),
-    )
-
-
-def _vertex_shapes(cross: Tensor, vertex_faces: Tensor) -> tuple[Tensor, Tensor]:
-    areas = cross.norm(dim=-1, keepdim=True) / 2
-    values = torch.nn.functional.pad(torch.cat([cross, areas], dim=-1), (0, 0, 0, 1))  # a zero row past the last face
-    around = values[:, vertex_faces].sum(2)
-    normals = normalize(around[..., :3], dim=-1, eps=1e-30)
-    spread = VERTEX_SPREAD * (around[..., 3] / 3 / math.pi).sqrt().clamp_min(MIN_SCALE)
-    axis = torch.eye(3, dtype=cross.dtype, device=cross.device)[normals.abs().argmin(-1)]
-    quats = surface_frames(normals.flatten(0, 1), axis.flatten(0, 1)).unflatten(0, normals.shape[:2])
-    return quats, torch.stack([spread, spread, THICKNESS * spread], dim=-1)
-
-
-def _face_shapes(corners: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Principal axes of each triangle as a uniform plate, by the eigenvectors of its 2 x 2 covariance."""
-    arms = corners - corners.mean(2, keepdim=True)
-    first = normalize(corners[:, :, 1] - corners[:, :, 0], dim=-1, eps=1e-30)
-    second = torch.linalg.cross(normals, first)
-    x, y = (arms * first[:, :, None]).sum(-1), (arms * second[:, :, None]).sum(-1)
-    xx, xy, yy = x.square().sum(2) / 12, (x * y).sum(2) / 12, y.square().sum(2) / 12
-    middle, difference = (xx + yy) / 2, (xx - yy) / 2
-    radius = torch.hypot(difference, xy)
-    angle = torch.atan2(xy, difference) / 2
-    along = angle.cos()[..., None] * first + angle.sin()[..., None] * second
-    long = (FACE_SPREAD * (middle + radius).sqrt()).clamp_min(MIN_SCALE)
-    short = FACE_SPREAD * (middle - radius).clamp_min(0).sqrt()
-    short = torch.maximum(short, long / MAX_ANISOTROPY).clamp_min(MIN_SCALE)
-    quats = surface_frames(normals.flatten(0, 1), along.flatten(0, 1)).unflatten(0, normals.shape[:2])
-    return quats, torch.stack([long, short, THICKNESS * short], dim=-1)

@@ -76,11 +76,8 @@ def densify(
     n_points, index = len(gaussians.vertex_index), gaussians.vertex_index
     sunk = _inside(cut, faces, len(vertices))[index]
     depth = GROUND_DEPTH * surface.vertex_normals(vertices, faces)[index]
-    disc_quats, disc_scales = vertex_shapes(vertices, faces)
-    # Of the surface, not of the vertices' Gaussians alone: a learned prior lets faces cover where these are faint.
-    solid = gaussians.opacities.new_zeros(len(vertices)).index_copy(0, index, gaussians.opacities[:n_points])
-    solid.scatter_reduce_(0, faces.flatten(), opacity.repeat_interleave(3), "amax")
-    disc_opacities = OPACITY * (solid[index] / SOLID).clamp(max=1)
+    disc_quats, disc_scales = vertex_shapes(vertices, faces, surface.faces_of_vertices(faces, len(vertices)))
+    disc_opacities = OPACITY * (_vertex_opacities(gaussians, faces, opacity, len(vertices))[index] / SOLID).clamp(max=1)
     on_top = ~cut[gaussians.face_index]
 
     face_index, barycentrics = _cut(parts, cut, vertices.dtype)
@@ -124,6 +121,15 @@ def _face_opacities(gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"]) ->
         return at_vertices[faces].mean(1)
     opacity = torch.zeros(len(faces), dtype=gaussians.opacities.dtype, device=gaussians.opacities.device)
     return opacity.scatter_reduce_(0, gaussians.face_index, gaussians.opacities[n_points:], "amax")
+
+
+def _vertex_opacities(
+    gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"], of_faces: Tensor, n_vertices: int
+) -> Tensor:
+    """Highest opacity around each vertex: a learned prior lets faces cover where the vertices' Gaussians are faint."""
+    own = gaussians.opacities[: len(gaussians.vertex_index)]
+    opacity = own.new_zeros(n_vertices).index_copy(0, gaussians.vertex_index, own)
+    return opacity.scatter_reduce_(0, faces.flatten(), of_faces.repeat_interleave(3), "amax")
 
 
 def _inside(cut: Bool[Tensor, "F"], faces: Tensor, n_vertices: int) -> Bool[Tensor, "V"]:

@@ -8,9 +8,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d, normalize
 
 from oasis_warp.core import surface
-from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import Camera, HandCrop, TrainingBatch
+from oasis_warp.core.types import HandCrop, TrainingBatch
 from oasis_warp.ops import depth_visibility
 
 RIM_PIXELS = 2
@@ -20,51 +19,11 @@ VISIBILITY_MARGIN = 0.0015
 that a third of the usual margin is enough; finger tips are thinner than the usual one."""
 GRAZING, FACING = 0.15, 0.45
 """Cosines between the normal and the view below which a point says nothing and above which it is fully trusted."""
+NEAR = 0.01
+"""Depth up to which a point counts as behind the camera [m]."""
 
 
-class Observation(NamedTuple):
-    """Colours read off the photo at the vertices of the surface."""
-
-    colors: Float[Tensor, "V 3"]
-    confidence: Float[Tensor, "V"]
-    """0 unseen, 1 seen well: visible, facing the camera and clear of the mask's border."""
-
-
-def inner_mask(mask: Float[Tensor, "S S"], pixels: int = RIM_PIXELS) -> Float[Tensor, "S S"]:
-    """The mask without its outermost `pixels`."""
-    return -max_pool2d(-mask[None, None], 2 * pixels + 1, stride=1, padding=pixels)[0, 0]
-
-
-def _sample(planes: Float[Tensor, "C S S"], uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N C"]:
-    size = planes.shape[-1]
-    grid = (uv / size * 2 - 1)[None, None]
-    return grid_sample(planes[None], grid, align_corners=False)[0, :, 0].T
-
-
-def facing(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], camera: Camera
-) -> Float[Tensor, "V"]:
-    """Cosine between each vertex's normal and its direction to the camera: negative where it turns away."""
-    center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
-    return (surface.vertex_normals(vertices, faces) * normalize(center - vertices, dim=-1)).sum(-1)
-
-
-def observe(hand: HandModel, crop: HandCrop) -> Observation:
-    """Read the photo at every vertex, by projection and the depth buffer of the posed surface."""
-    vertices, camera = crop.posed.vertices, crop.camera
-    faces = hand.faces.to(vertices.device)
-    visible, _, _ = depth_visibility(
-        vertices, vertices, faces, camera.K, camera.viewmat, camera.width, camera.height, margin=VISIBILITY_MARGIN,
-        point_vertices=torch.arange(len(vertices), device=vertices.device),
-    )  # fmt: skip
-    uv, _ = project(camera, vertices)
-    trust = ((facing(vertices, faces, camera) - GRAZING) / (FACING - GRAZING)).clamp(0, 1)
-    planes = torch.cat([crop.image.permute(2, 0, 1), inner_mask(crop.mask)[None]])
-    sampled = _sample(planes, uv)
-    return Observation(sampled[:, :3], visible * trust * sampled[:, 3].clamp(0, 1))
-
-
-class NetworkInput(NamedTuple):
+class CropBatch(NamedTuple):
     """B square crops with the surfaces fitted to them; fields as in `TrainingBatch`."""
 
     image: Float[Tensor, "B S S 3"]
@@ -75,37 +34,86 @@ class NetworkInput(NamedTuple):
     rest: Float[Tensor, "B V 3"]
 
 
-def input_of_crop(crop: HandCrop) -> NetworkInput:
-    """One hand as a batch of one."""
-    camera = crop.camera
-    parts = (
-        crop.image, crop.mask, crop.posed.vertices, camera.viewmat, camera.K, crop.rest.vertices,
-    )  # fmt: skip
-    return NetworkInput(*(part.to(crop.image)[None] for part in parts))
+class Observation(NamedTuple):
+    """The vertices of a posed surface in its photo; of B photos all fields have an axis B in front."""
 
-
-def input_of_batch(batch: TrainingBatch) -> NetworkInput:
-    """The photos of a training batch, without its targets."""
-    return NetworkInput(*batch[: len(NetworkInput._fields)])
-
-
-class Sighting(NamedTuple):
-    """The vertices of B hands in their photos."""
-
-    uv: Float[Tensor, "B V 2"]
+    uv: Float[Tensor, "*B V 2"]
     """Projections; the image's corners at 0 and 1."""
-    inside: Bool[Tensor, "B V"]
+    inside: Bool[Tensor, "*B V"]
     """Whether they fall into the image, in front of the camera."""
-    visibility: Float[Tensor, "B V"]
+    visibility: Float[Tensor, "*B V"]
     """Equation 4; 0 where not inside."""
-    colors: Float[Tensor, "B V 3"]
+    facing: Float[Tensor, "*B V"]
+    """Cosine between each vertex's normal and its direction to the camera: negative where it turns away."""
+    colors: Float[Tensor, "*B V 3"]
     """Read off the photo."""
-    confidence: Float[Tensor, "B V"]
-    """1 where that is skin of this very point: visible, facing the camera, clear of the mask's border."""
+    confidence: Float[Tensor, "*B V"]
+    """0 unseen, 1 seen well: visible, facing the camera and clear of the mask's border."""
 
 
-NEAR = 0.01
-"""Depth up to which a point counts as behind the camera [m]."""
+def batch_of_crop(crop: HandCrop) -> CropBatch:
+    """One crop as a batch of one."""
+    camera = crop.camera
+    parts = crop.image, crop.mask, crop.posed.vertices, camera.viewmat, camera.K, crop.rest.vertices
+    return CropBatch(*(part.to(crop.image)[None] for part in parts))
+
+
+def source_photos(batch: TrainingBatch) -> CropBatch:
+    """The photos of a training batch, without its targets."""
+    return CropBatch(*batch[: len(CropBatch._fields)])
+
+
+def observe(hand: HandModel, crop: HandCrop) -> Observation:
+    """`observe_batch` of one crop."""
+    faces = hand.faces.to(crop.image.device)
+    n_vertices = len(crop.posed.vertices)
+    everything = torch.arange(n_vertices, device=faces.device)
+    seen = observe_batch(batch_of_crop(crop), faces, surface.faces_of_vertices(faces, n_vertices), everything)
+    return Observation(*(part[0] for part in seen))
+
+
+@torch.no_grad()
+def observe_batch(
+    crops: CropBatch,
+    faces: Int[Tensor, "F 3"],
+    vertex_faces: Int[Tensor, "V M"],
+    vertex_index: Int[Tensor, "V"] | None,
+) -> Observation:
+    """Read each photo at every vertex, by projection and the depth buffer of the posed surface.
+
+    Args:
+        crops: Photos and posed surfaces.
+        faces: Corners.
+        vertex_faces: From `core.surface.faces_of_vertices`.
+        vertex_index: Numbers of the vertices: one on a face that is seen is seen itself. With None visibility is
+            equation 4 as printed, without margin or identity.
+    """
+    vertices, size = crops.posed, crops.image.shape[1]
+    uv, inside = project_batch(vertices, crops.viewmat, crops.K, size)
+    visibility = depth_visibility(
+        vertices, vertices, faces, crops.K, crops.viewmat, size, size, margin=VISIBILITY_MARGIN,
+        literal=vertex_index is None, point_vertices=vertex_index, validate=False,
+    ).visibility * inside  # fmt: skip
+    cosine = facing(vertices, surface.gathered_normals(vertices, faces, vertex_faces), crops.viewmat)
+    trust = ((cosine - GRAZING) / (FACING - GRAZING)).clamp(0, 1)
+    inner = inner_mask(crops.mask)[:, None]
+    read = sample(torch.cat([crops.image.permute(0, 3, 1, 2), inner], dim=1), uv)
+    confidence = visibility * trust * read[..., 3].clamp(0, 1)
+    return Observation(uv, inside, visibility, cosine, read[..., :3], confidence)
+
+
+def facing(
+    vertices: Float[Tensor, "*B V 3"], normals: Float[Tensor, "*B V 3"], viewmat: Float[Tensor, "*B 4 4"]
+) -> Float[Tensor, "*B V"]:
+    """Cosine between each vertex's normal and its direction to the camera: negative where it turns away."""
+    center = -viewmat[..., :3, :3].mT @ viewmat[..., :3, 3:]
+    return (normals * normalize(center.mT - vertices, dim=-1)).sum(-1)
+
+
+def inner_mask(mask: Float[Tensor, "*B S S"], pixels: int = RIM_PIXELS) -> Float[Tensor, "*B S S"]:
+    """The mask without its outermost `pixels`."""
+    planes = -mask.reshape(-1, 1, *mask.shape[-2:])
+    return -max_pool2d(planes, 2 * pixels + 1, stride=1, padding=pixels).view(mask.shape)
 
 
 def project_batch(
@@ -130,36 +138,3 @@ def sample(planes: Float[Tensor, "B C H W"], uv: Float[Tensor, "B P 2"]) -> Floa
     """
     read = grid_sample(planes.to(uv.dtype), (2 * uv - 1)[:, None], align_corners=False)
     return read[:, :, 0].transpose(1, 2)
-
-
-@torch.no_grad()
-def sight(
-    inputs: NetworkInput,
-    faces: Int[Tensor, "F 3"],
-    vertex_faces: Int[Tensor, "V M"],
-    vertex_index: Int[Tensor, "V"] | None,
-) -> Sighting:
-    """Look at every vertex; `avatar.observation.observe` in batches.
-
-    Args:
-        inputs: Photos and posed surfaces.
-        faces: Corners.
-        vertex_faces: From `anchors.faces_of_vertices`.
-        vertex_index: Numbers of the vertices: one on a face that is seen is seen itself. With None visibility is
-            equation 4 as printed, without margin or identity.
-    """
-    vertices, size = inputs.posed, inputs.image.shape[1]
-    uv, inside = project_batch(vertices, inputs.viewmat, inputs.K, size)
-    visibility = depth_visibility(
-        vertices, vertices, faces, inputs.K, inputs.viewmat, size, size, margin=VISIBILITY_MARGIN,
-        literal=vertex_index is None, point_vertices=vertex_index, validate=False,
-    ).visibility * inside  # fmt: skip
-    corners = vertices[:, faces]
-    cross = torch.linalg.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
-    normals = normalize(torch.nn.functional.pad(cross, (0, 0, 0, 1))[:, vertex_faces].sum(2), dim=-1, eps=1e-30)
-    center = -inputs.viewmat[:, :3, :3].transpose(1, 2) @ inputs.viewmat[:, :3, 3:]
-    facing = (normals * normalize(center.transpose(1, 2) - vertices, dim=-1)).sum(-1)
-    trust = ((facing - GRAZING) / (FACING - GRAZING)).clamp(0, 1)
-    inner = -max_pool2d(-inputs.mask[:, None], 2 * RIM_PIXELS + 1, stride=1, padding=RIM_PIXELS)
-    read = sample(torch.cat([inputs.image.permute(0, 3, 1, 2), inner], dim=1), uv)
-    return Sighting(uv, inside, visibility, read[..., :3], visibility * trust * read[..., 3].clamp(0, 1))

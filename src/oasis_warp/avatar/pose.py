@@ -49,10 +49,10 @@ def lit_colors(
     normals: Float[Tensor, "*B V 3"],
 ) -> Float[Tensor, "*B N 3"]:
     """Colours of Gaussians in `light`, where the vertices face `normals`."""
-    return (canonical.colors * factors(canonical, faces, light, normals)).clamp(0, 1)
+    return (canonical.colors * shading_factors(canonical, faces, light, normals)).clamp(0, 1)
 
 
-def factors(
+def shading_factors(
     canonical: CanonicalGaussians,
     faces: Int[Tensor, "F 3"],
     light: HandLight,

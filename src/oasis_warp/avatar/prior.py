@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
-from oasis_warp.avatar.appearance import Regions, label_regions, region_colors
-from oasis_warp.avatar.observation import Observation, observe
+from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.observation import observe
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop
 
@@ -40,50 +40,6 @@ class Prior(Protocol):
         ...
 
 
-def estimate_melanin(regions: Regions, seen: Observation) -> float:
-    """Melanin share of the hand's back: the mean over the tones that explain the seen colours.
-
-    For every tone the best gain of each channel has a closed form; its residual, brightness and cast are weighed by
-    their expected sizes. A photo alone cannot tell dark skin in bright light from light skin in dim light, nor brown
-    skin from warm light: the posterior mean of the logarithm errs least.
-    """
-    weight = seen.confidence[:, None]
-    total = weight.sum().clamp_min(1e-6)
-    log_melanin = torch.linspace(math.log(LIGHTEST), math.log(DARKEST), TONES)
-    costs = []
-    for melanin in log_melanin.exp().tolist():
-        model = region_colors(regions, melanin)
-        gain = (weight * model * seen.colors).sum(0) / (weight * model * model).sum(0).clamp_min(1e-6)
-        residual = (weight * (gain * model - seen.colors) ** 2).sum() / (3 * total)
-        log_gain = gain.clamp_min(1e-3).log()
-        exposure = log_gain.mean() / SIGMA_EXPOSURE
-        cast = (log_gain[[0, 2]] - log_gain[1]) / SIGMA_CAST
-        costs.append(residual / SIGMA_COLOR**2 + exposure**2 + (cast**2).sum())
-    posterior = torch.softmax(-torch.stack(costs).cpu() / 2, dim=0)
-    return float((posterior * log_melanin).sum().exp())
-
-
-class MeanPrior:
-    """The mean appearance of palm, back, joints and nails in the photo's skin tone."""
-
-    def __init__(self, hand: HandModel):
-        self.about = MappingProxyType({"name": "none"})
-        self.hand = hand
-        self.regions = label_regions(hand)
-
-    def __call__(self, crop: HandCrop) -> CanonicalGaussians:
-        """Gaussians on the fitted surface with evenly lit mean colours; the photo is only asked for the skin tone."""
-        seen = Observation(*(part.cpu() for part in observe(self.hand, crop)))
-        colors = self.vertex_colors(estimate_melanin(self.regions, seen)).to(crop.image)
-        anchors = place_anchors(self.hand, crop.rest)
-        faces = self.hand.faces.to(colors.device)
-        return anchors.with_colors(vertex_to_gaussians(colors, faces, anchors))
-
-    def vertex_colors(self, melanin: float) -> Float[Tensor, "V 3"]:
-        """Mean colours at the vertices for a skin tone."""
-        return region_colors(self.regions, melanin)
-
-
 class MeanHand(NamedTuple):
     """What region colours and one brightness a channel say of B hands."""
 
@@ -110,8 +66,11 @@ class MeanHands(nn.Module):
         self.register_buffer("table", colors, persistent=False)
 
     def forward(self, observed: Float[Tensor, "B V 3"], confidence: Float[Tensor, "B V"]) -> MeanHand:
-        """See `avatar.prior.estimate_melanin`, which this computes for all tones and hands at once.
+        """Posterior means over the tones that explain the observed colours.
 
+        For every tone the best gain of each channel has a closed form; its residual, brightness and cast are weighed by
+        their expected sizes. A photo alone cannot tell dark skin in bright light from light skin in dim light, nor
+        brown skin from warm light: the posterior mean of the logarithm errs least.
         With w the confidence, m a tone's colours and c the observed ones, the best gain of a channel is
         g = sum w m c / sum w m^2 and the squared residual sum w c^2 - g sum w m c.
         """
@@ -136,3 +95,25 @@ class MeanHands(nn.Module):
         low = place.long().clamp_max(len(self.log_tones) - 2)
         share = (place - low)[:, None, None]
         return (1 - share) * self.table[low] + share * self.table[low + 1]
+
+
+class MeanPrior:
+    """The mean appearance of palm, back, joints and nails in the photo's skin tone."""
+
+    def __init__(self, hand: HandModel):
+        self.about = MappingProxyType({"name": "none"})
+        self.hand = hand
+        self.regions = label_regions(hand)
+        self.mean_hands = MeanHands(hand)
+
+    def __call__(self, crop: HandCrop) -> CanonicalGaussians:
+        """Gaussians on the fitted surface with evenly lit mean colours; the photo gives the skin tone only."""
+        seen = observe(self.hand, crop)
+        mean_hands = self.mean_hands.to(crop.image.device)
+        colors = mean_hands(seen.colors[None], seen.confidence[None]).colors[0]
+        anchors = place_anchors(self.hand, crop.rest)
+        return anchors.with_colors(vertex_to_gaussians(colors, self.hand.faces.to(colors.device), anchors))
+
+    def vertex_colors(self, melanin: float) -> Float[Tensor, "V 3"]:
+        """Mean colours at the vertices for a skin tone."""
+        return region_colors(self.regions, melanin)

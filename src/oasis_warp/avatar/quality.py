@@ -79,7 +79,7 @@ def combine_quality(qualities: Sequence[SurfaceQuality]) -> SurfaceQuality:
     return SurfaceQuality(visibility.amax(0), uncertainty.amin(0))
 
 
-def shares(hand: HandModel, rest: Float[Tensor, "V 3"], quality: SurfaceQuality) -> dict[str, float]:
+def coverage_percent(hand: HandModel, rest: Float[Tensor, "V 3"], quality: SurfaceQuality) -> dict[str, float]:
     """Shares of the surface [%]: seen, grazed, not seen; seen of palm, back and nails; and the mean uncertainty."""
     area = surface.vertex_areas(rest, hand.faces.to(rest.device)).cpu()
     visibility = quality.visibility.cpu()
@@ -97,7 +97,7 @@ def shares(hand: HandModel, rest: Float[Tensor, "V 3"], quality: SurfaceQuality)
 
 
 def coverage_warnings(found: dict[str, float]) -> list[str]:
-    """What `shares` gives reason to warn about, in words."""
+    """Warnings about what `coverage_percent` says."""
     if found["seen_percent"] >= LITTLE_SEEN:
         return []
     percent = f"{found['seen_percent']:.0f} %"

@@ -8,17 +8,19 @@ from jaxtyping import UInt8
 from rich.console import Console
 from torch import Tensor
 
-from oasis_warp.cli.console import check_device, show_progress
+from oasis_warp.cli.console import show_progress
 from oasis_warp.cli.options import Animate
-from oasis_warp.cli.render import check_side, choose_pose, read_color
+from oasis_warp.cli.render import check_output, choose_pose, load_avatar, read_color
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.core.types import Color, HandPose
-from oasis_warp.data.pictures import VIDEO_SUFFIXES, check_suffix, to_uint8, write_video
+from oasis_warp.data.pictures import VIDEO_SUFFIXES, to_uint8, write_video
 from oasis_warp.hand.poses import POSE_NAMES, pose_sequence
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.render.render import render
+
+MAX_FRAMES = 10_000
 
 
 @torch.no_grad()
@@ -57,24 +59,17 @@ def pose_frames(
         progress("poses", frame + 1, len(poses))
 
 
-MAX_FRAMES = 10_000
-
-
 def run(options: Animate) -> int:
     """Write the video.
 
     Raises:
         InputError: a wrong avatar file, option or output.
     """
-    check_device(options.device)
-    check_side(options.size)
-    check_suffix(options.out, VIDEO_SUFFIXES)
+    check_output(options, VIDEO_SUFFIXES)
     background = read_color(options.background)
     n_frames = count_frames(options.seconds, options.fps)
     names = read_names(options.poses)
-    avatar = Avatar.load(options.avatar, options.device)
-    if options.light == "even":
-        avatar = avatar.in_even_light()
+    avatar = load_avatar(options)
     with show_progress(Console(stderr=True)) as progress:
         look = {"elevation": math.radians(options.elevation), "background": background, "progress": progress}
         if options.motion == "turntable":

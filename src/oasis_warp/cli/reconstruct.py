@@ -21,9 +21,8 @@ from oasis_warp.core.logging import timed_stage
 from oasis_warp.data.output_files import output_folder
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture, write_video
-from oasis_warp.fusion import reconstruct_same_hand
 from oasis_warp.network.weights_file import read_header
-from oasis_warp.reconstruction import reconstruct
+from oasis_warp.reconstruction import reconstruct, reconstruct_same_hand
 
 CROP_SIDES = (64, 1024)
 """Smallest and largest useful side of the crop [px]: fewer show no fingers, more take too long."""

@@ -5,7 +5,7 @@ import math
 import torch
 
 from oasis_warp.cli.console import check_device
-from oasis_warp.cli.options import Render
+from oasis_warp.cli.options import Animate, Render
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError
@@ -19,14 +19,26 @@ MAX_SIDE = 8192
 COLORS = {"white": WHITE, "black": BLACK}
 
 
-def check_side(size: int) -> None:
-    """Check the side of a picture [px].
+def check_output(options: Render | Animate, suffixes: tuple[str, ...]) -> None:
+    """Check device, size and output of a command before any work.
 
     Raises:
-        InputError: too small or too large.
+        InputError: no such device, a picture too small or too large, or another suffix.
     """
-    if not 16 <= size <= MAX_SIDE:
-        raise InputError(f"--size {size}: expected 16 to {MAX_SIDE} pixels; choose another size.")
+    check_device(options.device)
+    if not 16 <= options.size <= MAX_SIDE:
+        raise InputError(f"--size {options.size}: expected 16 to {MAX_SIDE} pixels; choose another size.")
+    check_suffix(options.out, suffixes)
+
+
+def load_avatar(options: Render | Animate) -> Avatar:
+    """Load the avatar in the chosen light.
+
+    Raises:
+        InputError: no avatar file.
+    """
+    avatar = Avatar.load(options.avatar, options.device)
+    return avatar.in_even_light() if options.light == "even" else avatar
 
 
 def read_color(text: str) -> tuple[float, float, float]:
@@ -58,14 +70,10 @@ def run(options: Render) -> int:
     Raises:
         InputError: a wrong avatar file, option or output.
     """
-    check_device(options.device)
-    check_side(options.size)
-    check_suffix(options.out, PICTURE_SUFFIXES)
+    check_output(options, PICTURE_SUFFIXES)
     transparent = options.background == "transparent"
     background = BLACK if transparent else read_color(options.background)
-    avatar = Avatar.load(options.avatar, options.device)
-    if options.light == "even":
-        avatar = avatar.in_even_light()
+    avatar = load_avatar(options)
     pose = choose_pose(avatar, options.pose)
     camera = orbit_camera(
         avatar.mesh(pose).vertices, math.radians(options.azimuth), math.radians(options.elevation), options.size

@@ -13,8 +13,7 @@ from rich.table import Table
 from oasis_warp import __version__
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import HandFit, Photo
-from oasis_warp.fusion import FusedReconstruction
-from oasis_warp.reconstruction import Reconstruction
+from oasis_warp.reconstruction import FusedReconstruction, Reconstruction
 
 MEASURES = {
     "reprojection_percent": ("landmarks miss the model by", "{:.1f} % of the hand"),

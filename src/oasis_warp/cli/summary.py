@@ -19,11 +19,11 @@ from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import Camera, HandFit, HandPose, Photo, PosedHand
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.data.square_crop import resample_square, square_around
-from oasis_warp.fusion import FusedReconstruction
+from oasis_warp.estimation.hand_crop import CROP_MARGIN
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
-from oasis_warp.reconstruction import CROP_MARGIN, Reconstruction
+from oasis_warp.reconstruction import FusedReconstruction, Reconstruction
 
 Pixels = np.ndarray
 """RGB, uint8, shape [H, W, 3]."""

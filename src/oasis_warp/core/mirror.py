@@ -9,7 +9,7 @@ function here is its own inverse.
 import dataclasses
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from oasis_warp.core.hand_model import HandModel
@@ -22,6 +22,11 @@ MIRROR = (-1.0, 1.0, 1.0)
 def mirror_points(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Points or directions in the mirrored world."""
     return points * points.new_tensor(MIRROR)
+
+
+def mirror_images(images: Float[Tensor, "B H W *C"], where: Bool[Tensor, "B"]) -> Float[Tensor, "B H W *C"]:
+    """Mirror those images of a batch for which `where` is true."""
+    return torch.where(where.view(-1, *[1] * (images.dim() - 1)), images.flip(2), images)
 
 
 def mirror_pixels(xy: Float[Tensor, "*batch 2"], width: int) -> Float[Tensor, "*batch 2"]:

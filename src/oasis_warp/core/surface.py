@@ -3,15 +3,14 @@
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
 
 def face_normals(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
 ) -> tuple[Float[Tensor, "F 3"], Float[Tensor, "F"]]:
     """Unit normals (right-hand rule; zero for a degenerate face) and areas of faces."""
-    a, b, c = vertices[faces].unbind(1)
-    cross = torch.linalg.cross(b - a, c - a)
+    cross = face_crosses(vertices, faces)
     double_area = cross.norm(dim=-1)
     return cross / double_area.clamp_min(1e-30)[:, None], double_area / 2
 
@@ -58,3 +57,33 @@ def smooth_over_mesh(
     for _ in range(passes):
         values = values.index_add(0, both[:, 0], values[both[:, 1]]) / count
     return values
+
+
+def faces_of_vertices(faces: Int[Tensor, "F 3"], n_vertices: int) -> Int[Tensor, "V M"]:
+    """The faces around each vertex, ascending; rows are filled up with F, one past the last face."""
+    order = faces.flatten().argsort(stable=True)
+    owner, face = faces.flatten()[order], order // 3
+    count = torch.bincount(owner, minlength=n_vertices)
+    place = torch.arange(len(owner), device=faces.device) - (count.cumsum(0) - count)[owner]
+    table = torch.full((n_vertices, int(count.max())), len(faces), dtype=torch.int64, device=faces.device)
+    table[owner, place] = face
+    return table
+
+
+def gather_to_vertices(values: Float[Tensor, "*B F D"], vertex_faces: Int[Tensor, "V M"]) -> Float[Tensor, "*B V D"]:
+    """Sum of the values of the faces around each vertex, as gathers of fixed order."""
+    padded = pad(values, (0, 0, 0, 1))  # a zero row past the last face
+    return padded[..., vertex_faces, :].sum(-2)
+
+
+def gathered_normals(
+    vertices: Float[Tensor, "*B V 3"], faces: Int[Tensor, "F 3"], vertex_faces: Int[Tensor, "V M"]
+) -> Float[Tensor, "*B V 3"]:
+    """Unit area-weighted vertex normals of many surfaces; `vertex_faces` are from `faces_of_vertices`."""
+    return normalize(gather_to_vertices(face_crosses(vertices, faces), vertex_faces), dim=-1, eps=1e-30)
+
+
+def face_crosses(vertices: Float[Tensor, "*B V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "*B F 3"]:
+    """Cross products of two edges of each face: its normal, as long as twice its area."""
+    a, b, c = vertices[..., faces, :].unbind(-2)
+    return torch.linalg.cross(b - a, c - a)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import HandFit, Landmarks, Photo
 from oasis_warp.estimation.fit import Fitter, Solution
 from oasis_warp.estimation.fit_problem import MirroredInput, array, real
@@ -198,3 +199,51 @@ def shared_shape(shapes: Sequence[Float[Tensor, "S"]]) -> Float[Tensor, "S"]:
         return mean
     noise = table.var(0).sum() / len(table)
     return mean * (1 - noise / mean.square().sum().clamp_min(1e-12)).clamp_min(0)
+
+
+def check_sides(photos: Sequence[Photo], landmarks: Sequence[Landmarks | HandFit]) -> None:
+    """All hands must be of one side: mirrored, the other hand would be another one.
+
+    Raises:
+        InputError: some are not; it names those that the fewer, or less sure, say so.
+    """
+    for_right = sum(
+        (1 if found.side == "right" else -1) * (found.side_score if isinstance(found, Landmarks) else 1.0)
+        for found in landmarks
+    )
+    side = landmarks[0].side if for_right == 0 else "right" if for_right > 0 else "left"
+    odd = [photo.name for photo, found in zip(photos, landmarks, strict=True) if found.side != side]
+    if odd:
+        shows = "shows" if len(odd) == 1 else "show"
+        other = "left" if side == "right" else "right"
+        raise InputError(
+            f"{' and '.join(odd)}: {shows} a {other} hand, the other photos a {side} one; give photos of one hand, or "
+            f"--hand {side} where both hands are in a photo."
+        )
+
+
+def fit_together(
+    estimator: HandEstimator, photos: Sequence[Photo], landmarks: Sequence[Landmarks | HandFit], *,
+    force: bool = False, progress: Progress = silent,
+) -> list[HandFit]:  # fmt: skip
+    """Fits of all photos with one shape: each alone first, then again with the shape that they agree on.
+
+    A single photo's fit stays as it is, whether computed here or given in place of landmarks.
+
+    Raises:
+        InputError: as `HandEstimator.fit`, of a photo alone; that a shared shape suits it less is only warned about.
+    """
+    if len(landmarks) == 1 and isinstance(landmarks[0], HandFit):
+        return [landmarks[0]]
+    pairs, fits = list(zip(photos, landmarks, strict=True)), []
+    total = len(pairs) if len(pairs) == 1 else 2 * len(pairs)
+    for photo, points in pairs:
+        fits.append(estimator.fit(photo, points, force=force))
+        progress("fit", len(fits), total)
+    if len(fits) == 1:
+        return fits
+    shape, again = shared_shape([fit.shape for fit in fits]), []
+    for photo, points in pairs:
+        again.append(estimator.fit(photo, points, shape=shape, force=True)._replace(shape=shape))
+        progress("fit", len(pairs) + len(again), total)
+    return again

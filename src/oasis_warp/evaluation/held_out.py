@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import faces_of_vertices
-from oasis_warp.avatar.observation import input_of_batch, sight
+from oasis_warp.avatar.observation import observe_batch, source_photos
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.surface import faces_of_vertices
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.evaluation.metrics import TargetTruth
 from oasis_warp.ops import depth_map
@@ -144,7 +144,7 @@ def target_truths(batch: TrainingBatch, hand: HandModel) -> list[TargetTruth]:
         vertices, hand.faces, batch.target_viewmats[0], batch.target_Ks[0], size, size, validate=False
     )
     every_vertex = torch.arange(len(hand.template), device=vertices.device)
-    visible = sight(input_of_batch(batch), hand.faces, vertex_faces, every_vertex).visibility[0]
+    visible = observe_batch(source_photos(batch), hand.faces, vertex_faces, every_vertex).visibility[0]
     at_rest = _face_areas(batch.rest[0], hand.faces)
     truths = []
     for k, (image, mask) in enumerate(zip(*pictures, strict=True)):

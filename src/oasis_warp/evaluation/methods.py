@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import torch
 
-from oasis_warp.adaptation.adapt import adapt, in_photo
+from oasis_warp.adaptation.adapt import adapt, view_in_photo
 from oasis_warp.adaptation.calibrate import calibrate
 from oasis_warp.avatar.pose import in_even_light
 from oasis_warp.avatar.prior import Prior
@@ -112,12 +112,12 @@ def reconstructions(
         if RAW in stages:
             yield Method(name, RAW), LitGaussians(guess)
         if CALIBRATED in stages:
-            _, view, trusted = in_photo(hand, guess, crop)
+            _, view, trusted = view_in_photo(hand, guess, crop)
             calibration = calibrate(view, guess.colors, crop.image, trusted, config)
             yield Method(name, CALIBRATED), LitGaussians(guess._replace(colors=calibration.apply(guess.colors)))
         for stage, settings in (
             (EVEN, replace(config, light="even")), (KEEP, replace(config, light="keep")), (ONE_SHOT, config)
         ):  # fmt: skip
             if stage in stages:
-                adapted = adapt(hand, guess, crop, settings, heads=heads)
+                adapted = adapt(hand, [guess], [crop], settings, heads=heads)
                 yield Method(name, stage), LitGaussians(adapted.gaussians, adapted.light)

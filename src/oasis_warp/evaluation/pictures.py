@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from oasis_warp.avatar.observation import NetworkInput
+from oasis_warp.avatar.observation import CropBatch
 from oasis_warp.core import surface
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.types import Camera
@@ -57,7 +57,7 @@ def has_attention(network: HandNetwork) -> bool:
 
 
 @torch.no_grad()
-def draw_attention(network: HandNetwork, inputs: NetworkInput) -> list[Float[Tensor, "t t 3"]]:
+def draw_attention(network: HandNetwork, inputs: CropBatch) -> list[Float[Tensor, "t t 3"]]:
     """The row of `ATTENTION_COLUMNS` for the one hand of `inputs`.
 
     Visibility is equation 4, the global attention the share of a point's attention that the global token gets, both
@@ -65,16 +65,16 @@ def draw_attention(network: HandNetwork, inputs: NetworkInput) -> list[Float[Ten
     """
     if not isinstance(network.fusion, VisibilityAttention):
         raise ValueError("network: expected one with visibility-conditioned attention, got another fusion.")
-    sighting = network.look(inputs)
-    mean = network.mean_hands(sighting.colors, sighting.confidence)
-    seen = None if network.point_evidence is None else seen_difference(sighting, mean)
-    points, local, context = network.tokens(inputs, sighting, mean, seen)
-    share = network.fusion.global_share(points, local, context, sighting.visibility)
+    observation = network.observe(inputs)
+    mean = network.mean_hands(observation.colors, observation.confidence)
+    seen = None if network.point_evidence is None else seen_difference(observation, mean)
+    points, local, context = network.tokens(inputs, observation, mean, seen)
+    share = network.fusion.global_share(points, local, context, observation.visibility)
     size, vertices = inputs.image.shape[1], inputs.posed[0]
     cameras = (
         Camera(inputs.viewmat[0], inputs.K[0], size, size), orbit_camera(vertices, math.pi, size=size)
     )  # fmt: skip
-    fields = (sighting.visibility[0], share[0])
+    fields = (observation.visibility[0], share[0])
     drawn = [_draw_field(field, vertices, network.faces, camera) for field in fields for camera in cameras]
     return [tile(inputs.image[0]), *map(tile, drawn)]
 

@@ -23,6 +23,7 @@ from oasis_warp.core.types import HandCrop, HandPose, Landmarks, Photo, Render
 from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
+from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
 from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, method_name, prior_digest, reconstructions
 from oasis_warp.evaluation.metrics import COVERED, color_gain
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
@@ -30,7 +31,7 @@ from oasis_warp.evaluation.summary import Record, select
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr, ssim_map
-from oasis_warp.reconstruction import crop_hand, initial_offsets, make_avatar
+from oasis_warp.reconstruction import make_avatar
 
 PHOTO_METHODS = (
     Method("mean", ONE_SHOT),

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp import __version__
-from oasis_warp.avatar.observation import input_of_batch
+from oasis_warp.avatar.observation import source_photos
 from oasis_warp.avatar.pose import pose_gaussians, turn_light
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core import surface
@@ -270,7 +270,7 @@ def write_attention(path: Path, priors: Mapping[str, Prior], batch: TrainingBatc
     """Write the attention of the learned prior, if its network has any."""
     prior = priors.get("learned")
     if isinstance(prior, NetworkPrior) and has_attention(prior.network):
-        write_strip(path, [draw_attention(prior.network.to(batch.image.device), input_of_batch(batch))])
+        write_strip(path, [draw_attention(prior.network.to(batch.image.device), source_photos(batch))])
 
 
 def crop_of(batch: TrainingBatch) -> HandCrop:

@@ -6,10 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from oasis_warp.avatar.anchors import batch_anchors, faces_of_vertices
-from oasis_warp.avatar.observation import NetworkInput, Sighting, sight
+from oasis_warp.avatar.anchors import batch_anchors
+from oasis_warp.avatar.observation import CropBatch, Observation, observe_batch
 from oasis_warp.avatar.prior import MeanHand, MeanHands
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.surface import faces_of_vertices
 from oasis_warp.network.attention import JointAttention, Perceptron, VisibilityAttention
 from oasis_warp.network.config import NetworkConfig
 from oasis_warp.network.encoders import ConvolutionalEncoder, DinoV2Encoder, ImageFeatures
@@ -135,29 +136,29 @@ class HandNetwork(nn.Module):
         }.items():
             self.register_buffer(name, tensor, persistent=False)
 
-    def forward(self, inputs: NetworkInput) -> Prediction:
+    def forward(self, inputs: CropBatch) -> Prediction:
         """Canonical Gaussians of every hand of the batch."""
         return self.decode(*self.describe(inputs), inputs.rest)
 
-    def describe(self, inputs: NetworkInput) -> Described:
+    def describe(self, inputs: CropBatch) -> Described:
         """All but the heads."""
         with torch.autocast(inputs.image.device.type, enabled=False):
-            sighting = self.look(inputs)
-            mean = self.mean_hands(sighting.colors, sighting.confidence)
-            seen = None if self.point_evidence is None else seen_difference(sighting, mean)
-        points, local, context = self.tokens(inputs, sighting, mean, seen)
-        features = self.fuse(points, local, context, sighting.visibility)
+            observation = self.observe(inputs)
+            mean = self.mean_hands(observation.colors, observation.confidence)
+            seen = None if self.point_evidence is None else seen_difference(observation, mean)
+        points, local, context = self.tokens(inputs, observation, mean, seen)
+        features = self.fuse(points, local, context, observation.visibility)
         if self.refinement is not None:
             features = self.refinement(features, self.level)
         return Described(features, mean.colors, seen)
 
-    def look(self, inputs: NetworkInput) -> Sighting:
+    def observe(self, inputs: CropBatch) -> Observation:
         """What each photo shows of each vertex."""
         identity = None if self.config.visibility == "literal" else self.vertex_index
-        return sight(inputs, self.faces, self.vertex_faces, identity)
+        return observe_batch(inputs, self.faces, self.vertex_faces, identity)
 
     def tokens(
-        self, inputs: NetworkInput, sighting: Sighting, mean: MeanHand, seen: Float[Tensor, "B V 3"] | None
+        self, inputs: CropBatch, observation: Observation, mean: MeanHand, seen: Float[Tensor, "B V 3"] | None
     ) -> tuple[Float[Tensor, "B V C"], Float[Tensor, "B M C"], Float[Tensor, "B C"]]:
         """Geometric tokens, local image tokens and the global token; `seen` comes with point evidence."""
         features = self.encoder(inputs.image, inputs.mask)
@@ -165,15 +166,15 @@ class HandNetwork(nn.Module):
         pooled = features.deep.amax((2, 3))
         if self.point_evidence is None or seen is None:
             context = self.global_token(pooled)
-            aligned = self._aligned(features, sighting) if self.config.vet != "off" else None
-            points, visual = geometric, self._visual(features, aligned, None, sighting)
+            aligned = self._aligned(features, observation) if self.config.vet != "off" else None
+            points, visual = geometric, self._visual(features, aligned, None, observation)
         else:
-            tone = torch.cat([mean.log_melanin[:, None], mean.log_gain, _mean_color(sighting)], dim=1)
+            tone = torch.cat([mean.log_melanin[:, None], mean.log_gain, _mean_color(observation)], dim=1)
             context = self.global_token(torch.cat([pooled, tone.to(pooled.dtype)], dim=1))
-            aligned = self._aligned(features, sighting)
-            visual = self._visual(features, aligned, geometric, sighting)
-            points = geometric + self.point_evidence(aligned, seen, sighting, mean)
-            points = points + self.place(sighting.uv) * sighting.inside[..., None]
+            aligned = self._aligned(features, observation)
+            visual = self._visual(features, aligned, geometric, observation)
+            points = geometric + self.point_evidence(aligned, seen, observation, mean)
+            points = points + self.place(observation.uv) * observation.inside[..., None]
         return points, visual.tokens + self.place(visual.centers), context
 
     def fuse(
@@ -214,24 +215,24 @@ class HandNetwork(nn.Module):
             both = (torch.cat(parts, dim=1) for parts in zip(attributes, more, strict=True))
             return Prediction(decode_offsets(raw), barycentrics, *both, scales)
 
-    def _aligned(self, features: ImageFeatures, sighting: Sighting) -> Tensor:
-        return self.point_features(features, sighting.uv, sighting.inside)
+    def _aligned(self, features: ImageFeatures, observation: Observation) -> Tensor:
+        return self.point_features(features, observation.uv, observation.inside)
 
     def _visual(
-        self, features: ImageFeatures, aligned: Tensor | None, geometric: Tensor | None, sighting: Sighting
+        self, features: ImageFeatures, aligned: Tensor | None, geometric: Tensor | None, observation: Observation
     ) -> VisualTokens:
         if self.config.vet == "off" or aligned is None:
             tokens = self.flatten(features.deep.flatten(2).transpose(1, 2))
-            places = grid_places(*features.deep.shape[2:], like=sighting.uv)
+            places = grid_places(*features.deep.shape[2:], like=observation.uv)
             return VisualTokens(tokens, places.expand(len(tokens), -1, -1))
         if isinstance(self.tokenizer, Tokenizer):
-            return self.tokenizer(aligned, geometric, sighting.uv, sighting.inside)
+            return self.tokenizer(aligned, geometric, observation.uv, observation.inside)
         if self.level is None:
-            return VisualTokens(self.tokenizer(aligned), sighting.uv)
-        return VisualTokens(self.tokenizer(self.level.down(aligned)), self.level.down(sighting.uv))
+            return VisualTokens(self.tokenizer(aligned), observation.uv)
+        return VisualTokens(self.tokenizer(self.level.down(aligned)), self.level.down(observation.uv))
 
 
-def _mean_color(sighting: Sighting) -> Float[Tensor, "B 3"]:
+def _mean_color(observation: Observation) -> Float[Tensor, "B 3"]:
     """Of what is seen well."""
-    weight = sighting.confidence[..., None]
-    return (weight * sighting.colors).sum(1) / weight.sum(1).clamp_min(1)
+    weight = observation.confidence[..., None]
+    return (weight * observation.colors).sum(1) / weight.sum(1).clamp_min(1)

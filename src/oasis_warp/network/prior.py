@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 
 from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import MIN_OPACITY, OPACITY, RIM_FADE, batch_anchors
-from oasis_warp.avatar.observation import input_of_crop
+from oasis_warp.avatar.observation import batch_of_crop
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians, HandCrop
@@ -31,7 +31,7 @@ RIM_FIRST, RIM_LAST = 0.5, 1.25
 on those that the network gave them. Nearer than that its colours may be too dark."""
 
 
-def settle_rim(
+def blend_rim(
     prediction: Prediction,
     rest: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
@@ -44,7 +44,7 @@ def settle_rim(
         prediction: B is 1.
         rest: Vertices at rest [m].
         faces: Corners.
-        vertex_faces: From `anchors.faces_of_vertices`.
+        vertex_faces: From `core.surface.faces_of_vertices`.
         rim: Vertices of the open wrist.
     """
     count = prediction.colors.shape[1]
@@ -132,7 +132,7 @@ class NetworkPrior:
     @torch.no_grad()
     def with_heads(self, crop: HandCrop) -> tuple[CanonicalGaussians, ColorHeads]:
         """The same, and the heads that its colours come from with all that they are asked: LoRA trains them."""
-        network, inputs = self.network.to(crop.image.device), input_of_crop(crop)
+        network, inputs = self.network.to(crop.image.device), batch_of_crop(crop)
         described = network.describe(inputs)
         guess = self._gaussians(network.decode(*described, inputs.rest), crop)
         return guess, self._heads(guess, described, crop)
@@ -152,10 +152,10 @@ class NetworkPrior:
 
     def _gaussians(self, prediction: Prediction, crop: HandCrop) -> CanonicalGaussians:
         network, rest = self.network, crop.rest.vertices
-        return canonical_gaussians(settle_rim(prediction, rest, network.faces, network.vertex_faces, network.rim), 0)
+        return canonical_gaussians(blend_rim(prediction, rest, network.faces, network.vertex_faces, network.rim), 0)
 
     def _predict(self, crop: HandCrop) -> Prediction:
-        device, inputs = crop.image.device, input_of_crop(crop)
+        device, inputs = crop.image.device, batch_of_crop(crop)
         if device.type != "cuda" or self._ready_for != (device, len(crop.image)):
             self._ready_for, self._recording = (device, len(crop.image)), None
             return self.network.to(device)(inputs)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad
 
-from oasis_warp.avatar.observation import Sighting, sample
+from oasis_warp.avatar.observation import Observation, sample
 from oasis_warp.avatar.prior import MeanHand
 from oasis_warp.network.attention import NEVER, FeedForward, SelfAttention, attend, join_heads, split_heads
 from oasis_warp.network.encoders import ImageFeatures
@@ -89,10 +89,10 @@ class PointFeatures(nn.Module):
         return self.project(read) * inside[..., None]
 
 
-def seen_difference(sighting: Sighting, mean: MeanHand) -> Float[Tensor, "B V 3"]:
+def seen_difference(observation: Observation, mean: MeanHand) -> Float[Tensor, "B V 3"]:
     """How the photo differs from the mean colours at each vertex, in logits; 0 where it does not show the vertex."""
-    difference = torch.logit(sighting.colors, COLOR_MARGIN) - torch.logit(mean.colors, COLOR_MARGIN)
-    return difference * sighting.confidence[..., None]
+    difference = torch.logit(observation.colors, COLOR_MARGIN) - torch.logit(mean.colors, COLOR_MARGIN)
+    return difference * observation.confidence[..., None]
 
 
 class PointEvidence(nn.Module):
@@ -108,12 +108,12 @@ class PointEvidence(nn.Module):
         self.known = nn.Linear(8, width)
 
     def forward(
-        self, aligned: Float[Tensor, "B V C"], seen: Float[Tensor, "B V 3"], sighting: Sighting, mean: MeanHand
+        self, aligned: Float[Tensor, "B V C"], seen: Float[Tensor, "B V 3"], observation: Observation, mean: MeanHand
     ) -> Float[Tensor, "B V C"]:
         """To be added to the geometric tokens; `seen` is what `seen_difference` says."""
         base = torch.logit(mean.colors, COLOR_MARGIN)
-        known = torch.cat([base, seen, sighting.visibility[..., None], sighting.confidence[..., None]], dim=-1)
-        return self.seen(aligned * sighting.visibility[..., None]) + self.known(known)
+        known = torch.cat([base, seen, observation.visibility[..., None], observation.confidence[..., None]], dim=-1)
+        return self.seen(aligned * observation.visibility[..., None]) + self.known(known)
 
 
 POSITION_FREQUENCIES = 6

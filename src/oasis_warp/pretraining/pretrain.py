@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from oasis_warp.avatar.observation import input_of_batch
+from oasis_warp.avatar.observation import source_photos
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import TrainingBatch
@@ -203,7 +203,7 @@ class Trainer:
         """Predict, render every target and compute the loss."""
         half = self.config.precision == "bfloat16"
         with torch.autocast(self.process.device.type, torch.bfloat16, enabled=half):
-            prediction = self.network(input_of_batch(batch))
+            prediction = self.network(source_photos(batch))
         drawn = draw_targets(prediction, batch, self.network)
         true = true_pictures(batch, self.network.faces, self.network.rim)
         loss, terms = objective(prediction, drawn, true, self.config.losses, self.perceptual)

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.mirror import mirror_images
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.pretraining.estimator_errors import (
     ALIKE,
@@ -31,50 +32,24 @@ class LabelledPictures(Protocol):
     Poses are in the camera's frame; that of a left hand describes the mirrored model (x -> -x).
     """
 
-    @property
-    def image(self) -> Float[Tensor, "N H H 3"]:
-        """Colours (sRGB)."""
-        ...
-
-    @property
-    def alpha(self) -> Float[Tensor, "N H H"]:
-        """Share of each pixel that is not background."""
-        ...
-
-    @property
-    def mask(self) -> Float[Tensor, "N H H"]:
-        """Share of each pixel that is hand."""
-        ...
-
-    @property
-    def angles(self) -> Float[Tensor, "N 15 3"]:
-        """As `HandPose.angles`."""
-        ...
-
-    @property
-    def orientation(self) -> Float[Tensor, "N 3 3"]:
-        """From the hand's frame to the camera's."""
-        ...
-
-    @property
-    def translation(self) -> Float[Tensor, "N 3"]:
-        """Position of the hand's origin [m]."""
-        ...
-
-    @property
-    def shape(self) -> Float[Tensor, "N S"]:
-        """Shape coefficients."""
-        ...
-
-    @property
-    def K(self) -> Float[Tensor, "N 3 3"]:
-        """Intrinsics [px]."""
-        ...
-
-    @property
-    def left(self) -> Int[Tensor, "N"]:
-        """1 for left hands."""
-        ...
+    image: Float[Tensor, "N H H 3"]
+    """Colours (sRGB)."""
+    alpha: Float[Tensor, "N H H"]
+    """Share of each pixel that is not background."""
+    mask: Float[Tensor, "N H H"]
+    """Share of each pixel that is hand."""
+    angles: Float[Tensor, "N 15 3"]
+    """As `HandPose.angles`."""
+    orientation: Float[Tensor, "N 3 3"]
+    """From the hand's frame to the camera's."""
+    translation: Float[Tensor, "N 3"]
+    """Position of the hand's origin [m]."""
+    shape: Float[Tensor, "N S"]
+    """Shape coefficients."""
+    K: Float[Tensor, "N 3 3"]
+    """Intrinsics [px]."""
+    left: Int[Tensor, "N"]
+    """1 for left hands."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,18 +106,14 @@ def _extent(touched: Tensor) -> tuple[Tensor, Tensor]:
 
 def mirror_left_hands(pictures: LabelledPictures) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image, alpha, mask, orientation, translation and K, with left hands mirrored to right ones."""
-    left = pictures.left.bool()
-
-    def flip(planes: Tensor) -> Tensor:
-        return torch.where(left.view(-1, *[1] * (planes.dim() - 1)), planes.flip(2), planes)
-
-    like = pictures.translation
+    left, like = pictures.left.bool(), pictures.translation
     sign = torch.ones_like(like)
     sign[:, 0] -= 2 * left
     K = pictures.K.clone()
     K[:, 0, 2] = torch.where(left, pictures.image.shape[2] - K[:, 0, 2], K[:, 0, 2])
     orientation = sign[:, :, None] * pictures.orientation * sign[:, None]
-    return flip(pictures.image), flip(pictures.alpha), flip(pictures.mask), orientation, sign * like, K
+    images = (mirror_images(planes, left) for planes in (pictures.image, pictures.alpha, pictures.mask))
+    return *images, orientation, sign * like, K
 
 
 @torch.no_grad()

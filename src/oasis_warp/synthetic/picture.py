@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from oasis_warp.core.mirror import MIRROR, mirror_images
 from oasis_warp.ops import depth_map
 from oasis_warp.synthetic.atlas import HEIGHT, WIDTH
 from oasis_warp.synthetic.backgrounds import cut_background
@@ -44,7 +45,6 @@ SAMPLES = 2
 TEXEL = 0.34e-3
 """Size of a texel on the hand [m]."""
 STRETCH_PASSES = 2
-MIRROR = (-1.0, 1.0, 1.0)
 
 
 class SyntheticBatch(NamedTuple):
@@ -261,18 +261,11 @@ def _cut_backgrounds(scene: SceneConfig, table: ShotTable, size: int) -> Tensor:
 def _mirror_left(batch: SyntheticBatch, size: int) -> SyntheticBatch:
     """Mirror the pictures of left hands: everything is rendered with right hands."""
     left = batch.left.bool()
-
-    def flip(images: Tensor) -> Tensor:
-        return torch.where(left.view(-1, *[1] * (images.dim() - 1)), images.flip(2), images)
-
     mirror = _mirror(batch.image.device)
     sign = torch.where(left[:, None], mirror, torch.ones_like(mirror))
     u, v = batch.landmarks.unbind(-1)
     return batch._replace(
-        image=flip(batch.image),
-        alpha=flip(batch.alpha),
-        mask=flip(batch.mask),
-        depth=flip(batch.depth),
+        **{name: mirror_images(getattr(batch, name), left) for name in ("image", "alpha", "mask", "depth")},
         landmarks=torch.stack([torch.where(left[:, None], size - u, u), v], -1),
         landmarks_3d=batch.landmarks_3d * sign[:, None],
         orientation=batch.orientation * sign[:, :, None] * sign[:, None],

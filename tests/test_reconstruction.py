@@ -1,0 +1,192 @@
+"""Photos of real hands, from files to an avatar."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn.functional import avg_pool2d
+
+from oasis_warp import reconstruction
+from oasis_warp.avatar.observation import inner_mask
+from oasis_warp.core.camera import orbit_camera, project
+from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.mirror import mirror_pose
+from oasis_warp.core.types import Landmarks, Photo
+from oasis_warp.data.photo import read_photo
+from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_hand
+from oasis_warp.estimation.hand_crop import crop_hand, crop_landmarks, initial_offsets
+from oasis_warp.hand.skinning import hand21, rest_hand, skin
+from oasis_warp.losses.image import masked_psnr
+from oasis_warp.reconstruction import composite_over_photo, make_avatar, reconstruct, reconstruct_same_hand
+
+PHOTOS = Path(__file__).parent / "data" / "photos"
+WOOD = PHOTOS / "same_hand" / "a1_wood_right"
+PALM, BACK = WOOD / "02_flat_closed.jpg", WOOD / "03_flat_closed_back.jpg"
+OTHER_SIDE = PHOTOS / "same_hand" / "a7_wood_left" / "03_ring_closed.jpg"
+SMALL = ReconstructConfig(size=96, steps=10)
+
+
+def found(*hands):
+    """Photos without a pixel, and a hand in each: "name side score"."""
+    photos, landmarks = [], []
+    for name, side, score in map(str.split, hands):
+        photos.append(Photo(torch.zeros(4, 4, 3, dtype=torch.uint8), None, None, name, 1.0))
+        landmarks.append(Landmarks(torch.zeros(21, 2), None, side, float(score), 1.0, "network"))
+    return photos, landmarks
+
+
+def test_photos_of_one_side_are_accepted():
+    check_sides(*found("a left 0.9", "b left 0.6"))
+
+
+@pytest.mark.parametrize(
+    ("hands", "named"),
+    [
+        (("a right 0.9", "b left 0.9", "c right 0.9"), "^b: shows a left hand, the other photos a right one"),
+        (("a right 0.9", "b left 0.9", "c left 0.9"), "^a: shows a right hand, the other photos a left one"),
+        (("a right 0.9", "b left 0.9"), "^b: shows a left hand"),  # the first decides
+        (("a right 0.6", "b left 0.9"), "^a: shows a right hand"),  # unless it is less sure
+        (("a left 1", "b right 1", "c right 1", "d left 1", "e left 1"), "^b and c: show a right hand.*--hand left"),
+    ],
+)
+def test_a_photo_of_the_other_side_is_named(hands, named):
+    with pytest.raises(InputError, match=named):
+        check_sides(*found(*hands))
+
+
+def test_no_photo_is_an_error_of_the_caller():
+    with pytest.raises(ValueError, match="photos: expected at least one"):
+        reconstruct_same_hand([])
+
+
+def test_photos_of_two_hands_are_refused_before_the_long_work():
+    with pytest.raises(InputError, match="03_ring_closed.jpg: shows a left hand, the other photos a right one"):
+        reconstruct_same_hand([read_photo(path) for path in (PALM, OTHER_SIDE)], SMALL)
+
+
+def test_a_photo_without_a_hand_is_named():
+    with pytest.raises(InputError, match="^no_hand_cup_15.jpg: found no hand"):
+        reconstruct_same_hand([read_photo(path) for path in (PALM, PHOTOS / "no_hand_cup_15.jpg")], SMALL)
+
+
+@pytest.fixture(scope="module")
+def palm():
+    return read_photo(PALM)
+
+
+@pytest.fixture(scope="module")
+def alone(palm):
+    return reconstruct(palm, SMALL)
+
+
+@pytest.mark.slow
+def test_even_light_is_asked_for_of_several_photos_as_of_one(palm, monkeypatch):
+    asked = []
+
+    def stop(hand, guesses, crops, config, **options):
+        asked.append(config.light)
+        raise InterruptedError
+
+    monkeypatch.setattr(reconstruction, "adapt", stop)
+    for light in ("keep", "even"):
+        with pytest.raises(InterruptedError):
+            reconstruct_same_hand([palm], replace(SMALL, light=light))
+    assert asked == ["keep", "even"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_palm_and_back_show_twice_as_much_as_the_palm(palm, alone):
+    made = reconstruct_same_hand([palm, read_photo(BACK)], SMALL)
+    first, second = (photo.errors for photo in made.photos)
+    assert made.errors["seen_percent"] > 1.7 * first["seen_percent"]
+    assert first["best_percent"] > 15 and second["best_percent"] > 20  # of what each surely shows
+    assert made.photos[0].gain == (1.0, 1.0, 1.0)
+    assert first["input_psnr_db"] > 22 and second["input_psnr_db"] > 22
+    assert torch.equal(made.photos[0].fit.shape, made.photos[1].fit.shape)
+    assert abs(first["mask_iou"] - alone.errors["mask_iou"]) < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_detail_of_both_photos_is_in_the_avatar(palm):
+    photos, steps = [palm, read_photo(BACK)], 10
+    coarse = reconstruct_same_hand(photos, ReconstructConfig(size=256, steps=steps))
+    fine = reconstruct_same_hand(photos, ReconstructConfig(size=448, steps=steps))
+    assert fine.errors["n_gaussians"] > coarse.errors["n_gaussians"] + 10_000
+    assert fine.errors["back_seen_percent"] > 50 and fine.errors["palm_seen_percent"] > 50
+    for k, (photo, own) in enumerate(zip(photos, fine.photos, strict=True)):
+        crop = crop_hand(photo, own.fit, fine.avatar.surface_offsets, ReconstructConfig(), 448)
+        before, after = (
+            detail_error(composite_over_photo(as_in(made.avatar, own, crop), crop), crop) for made in (coarse, fine)
+        )
+        assert after < 0.9 * before, (k, before, after)
+
+
+def as_in(avatar, photo, crop):
+    """The avatar as a photo shows it, in the first photo's light."""
+    return make_avatar(photo.fit, avatar.surface_offsets, crop, avatar.gaussians)
+
+
+def detail_error(picture, crop):
+    """Root mean square of what differs from the photo within a few pixels, light aside, away from the outline."""
+    apart = (picture - crop.image).permute(2, 0, 1)
+    fine = apart - avg_pool2d(apart, 9, stride=1, padding=4)
+    return float(fine[:, inner_mask(crop.mask * crop.above_wrist, 12) > 0.5].square().mean().sqrt())
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_one_photo_is_reconstructed_as_ever(palm, alone):
+    made = reconstruct_same_hand([palm], SMALL)
+    assert torch.equal(made.avatar.gaussians.colors, alone.avatar.gaussians.colors)
+    assert torch.equal(made.avatar.surface_offsets, alone.avatar.surface_offsets)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_same_photo_twice_is_nearly_one_photo_but_for_its_shading(palm, alone):
+    twice = reconstruct_same_hand([palm, palm], SMALL)
+    assert torch.allclose(twice.avatar.shape, alone.avatar.shape, atol=1e-3)
+    camera = orbit_camera(alone.avatar.mesh(alone.avatar.source_pose).vertices, 0.5, size=96)
+    one, two = (made.avatar.render(camera, alone.avatar.source_pose) for made in (alone, twice))
+    assert masked_psnr(one.image, two.image, (one.alpha > 0.9).float()) > 22
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_photo_in_much_less_light_is_brought_to_the_first_one_s(palm, alone):
+    dark = palm._replace(rgb=(palm.rgb.float() * 0.4).to(torch.uint8), name="dark.jpg")
+    made = reconstruct_same_hand([palm, dark], SMALL)
+    assert made.photos[1].gain == pytest.approx((0.4, 0.4, 0.4), abs=0.04)
+    assert any(warning.startswith("dark.jpg: its light is another, 2.5 times darker") for warning in made.warnings)
+    mean = [avatar.gaussians.colors.mean(0) for avatar in (alone.avatar, made.avatar)]
+    assert torch.allclose(*mean, atol=0.04)
+
+
+PHOTO = Path(__file__).parent / "data" / "photos" / "thumb_up_left_06.jpg"
+
+
+def test_landmarks_of_a_left_hand_lie_on_the_mirrored_model(hand):
+    photo, estimator = read_photo(PHOTO), HandEstimator(hand)
+    fit = estimator.fit(photo, choose_hand(estimator.find(photo), "left", photo.name))
+    crop = crop_hand(photo, fit, initial_offsets(hand, fit), ReconstructConfig())
+    model = hand21(skin(hand, rest_hand(hand, fit.shape), mirror_pose(fit.pose)), hand)
+    away = crop_landmarks(fit, crop.camera) - project(crop.camera, model)[0]
+    assert away.norm(dim=1).median() < 8  # px of 256; the mirror image would be a hundred away
+
+
+@pytest.mark.slow
+def test_refinement_of_a_left_hand_moves_it_and_keeps_it_on_its_photo(hand):
+    made = {
+        switch: reconstruct(read_photo(PHOTO), ReconstructConfig(refine=switch, prior="none", steps=0))
+        for switch in ("on", "off")
+    }
+    on, off = made["on"], made["off"]
+    assert off.errors["refined_px"] == 0
+    assert 0 < on.errors["refined_px"] < 20
+    assert not torch.equal(on.fit.pose.angles, off.fit.pose.angles)
+    assert on.errors["reprojection_percent"] < 2.3
+    assert on.errors["render_mask_iou"] > off.errors["render_mask_iou"] - 0.02
