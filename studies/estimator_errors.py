@@ -7,7 +7,6 @@ assets/training/estimator_errors.safetensors (with `--asset`), which training dr
 comes once more with the error of another one, so that none is compared with itself; and of masks, likewise.
 """
 
-import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,7 +63,7 @@ Arrays = dict[str, Any]
 class Options(StudyOptions):
     """Options of this study."""
 
-    selecting: ClassVar[frozenset[str]] = frozenset({"count", "first", "asset", "masks", "mask_seed"})
+    selecting: ClassVar[frozenset[str]] = frozenset({"count", "first", "asset", "masks"})
     count: int = 224
     first: int = 0
     """Number of the first picture; several runs may share the work."""
@@ -126,11 +125,9 @@ def measure(number: int, options: Options) -> Row:
     for name, mask in masks.items():
         cut = resample_square(mask.contiguous(), *square, CROP).clamp(0, 1)
         arrays[name] = (255 * cut).round().to(torch.uint8).numpy()
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
     folder = options.out / "estimator_errors" / "pictures"
     folder.mkdir(exist_ok=True)
-    write_file(folder / f"{number:05d}.npz", buffer.getvalue())
+    np.savez_compressed(folder / f"{number:05d}.npz", **arrays)
     return {"result": "fitted", "picture": f"{number:05d}.npz", "warned": len(fit.warnings) > 0}
 
 
@@ -141,9 +138,8 @@ class Hands:
     """Fitted pictures, true or found, as batches of right hands."""
 
     def __init__(self, hand: HandModel, rows: list[Arrays], which: str):
-        parts = {name: torch.from_numpy(np.stack([row[f"{which}_{name}"] for row in rows])).float() for name in PARTS}
-        self.shape, self.angles, self.orientation = parts["shape"], parts["angles"], parts["orientation"]
-        self.translation, self.K = parts["translation"], parts["K"]
+        parts = (torch.from_numpy(np.stack([row[f"{which}_{name}"] for row in rows])).float() for name in PARTS)
+        self.angles, self.orientation, self.translation, self.shape, self.K = parts
         self.posed = pose_hands(hand, self.shape, self.angles, self.orientation, self.translation)
         self.focal = self.K[:, 0, 0]
         self.distance = self.posed.landmarks[..., 2].mean(1)
@@ -294,10 +290,9 @@ def mask_errors(true: Tensor, found: Tensor, above: Tensor, side: Tensor) -> dic
 
 def found_mask_errors(rows: list[Arrays]) -> dict[str, Tensor]:
     """Of the masks that the estimator cut."""
-    true, found, above = (torch.from_numpy(np.stack([row[name] for row in rows])) > 127
-                          for name in ("true_mask", "found_mask", "above"))  # fmt: skip
-    sides = torch.tensor([float(row["square"][2] / row["true_square"][2]) for row in rows])
-    return mask_errors(true, found, above, sides)
+    names, sides = ("true_mask", "found_mask", "above"), [row["square"][2] / row["true_square"][2] for row in rows]
+    masks = (torch.from_numpy(np.stack([row[name] for row in rows])) > 127 for name in names)
+    return mask_errors(*masks, torch.tensor(sides).float())
 
 
 def training_mask_errors(hand: HandModel, seed: int, count: int) -> dict[str, Tensor]:
@@ -337,18 +332,14 @@ def correlations(true: Hands, found: Hands) -> dict[str, float]:
     return {name: float(torch.corrcoef(torch.stack(pair))[0, 1]) for name, pair in pairs.items()}
 
 
-def number(value: float) -> str:
-    """Three digits."""
-    return f"{value:.3f}" if abs(value) < 1 else f"{value:.3g}"
-
-
 def spread(columns: dict[str, dict[str, Tensor]]) -> str:
     """A table of percentiles of measures, three for each column."""
     headings = [f"{name} {share} %".strip() for name in columns for share in (10, 50, 90)]
     lines = [
-        [measure, *(number(x) for each in columns.values() for x in percentiles(each[measure].double().tolist()))]
+        [measure, *(format(x, ".3f" if abs(x) < 1 else ".3g") for each in columns.values()
+                    for x in percentiles(each[measure].double().tolist()))]
         for measure in next(iter(columns.values()))
-    ]
+    ]  # fmt: skip
     return markdown(["", *headings], lines)
 
 
