@@ -202,7 +202,7 @@ def test_a_person_that_was_written_is_read_and_not_baked(baked, folder, monkeypa
     people.bake_people(SEED, [4], PAINTED, "cpu", jobs=0, folder=folder, progress=lambda *what: reports.append(what))
     read = people.person(SEED, 4, PAINTED, "cpu")
     assert reports == [("people", 0, 1), ("people", 1, 1)]
-    assert read.ring_look == written.ring_look and read.identity.seed == written.identity.seed
+    assert read.ring_material == written.ring_material and read.identity.seed == written.identity.seed
     for name, value in written._asdict().items():
         if isinstance(value, torch.Tensor):
             assert value.dtype == getattr(read, name).dtype and torch.equal(value, getattr(read, name)), name

@@ -10,7 +10,7 @@ from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.contact import bundled_skeleton, overlaps, separate
 from oasis_warp.synthetic.gestures import GESTURE_NAMES, GESTURES, sample_gesture
 from oasis_warp.synthetic.picture import render_batch, render_capture
-from oasis_warp.synthetic.shot_table import arm_turns, tabulate
+from oasis_warp.synthetic.shot_table import arm_rotations, tabulate
 from oasis_warp.synthetic.shots import (
     EVERYBODY,
     PHOTOS,
@@ -130,7 +130,7 @@ def test_softened_light_is_as_much_of_the_same_colour(light):
 
 def toward_elbow(view, bend):
     """Cosine of the angle at which the camera looks down the forearm."""
-    return -(view.rotation @ arm_turns(bend[None])[0, -1] @ np.array([1.0, 0.0, 0.0]))[2]
+    return -(view.rotation @ arm_rotations(bend[None])[0, -1] @ np.array([1.0, 0.0, 0.0]))[2]
 
 
 def test_no_view_is_blocked_by_the_forearm():

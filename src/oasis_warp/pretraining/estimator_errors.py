@@ -126,10 +126,10 @@ def picture_frames(landmarks: Float[Tensor, "N 21 3"]) -> Frames:
     knuckles = up[:, None, None].expand(-1, FINGERS, 1, -1)
     along = torch.cat([up[:, None], torch.cat([knuckles, bones], 2).flatten(1, 2)], 1)
     x, y = normalize(along, dim=-1).unbind(-1)
-    turns = torch.stack([-y, -x, x, -y], -1).unflatten(-1, (2, 2))
-    hand = pad(turns[:, 0], (0, 1, 0, 1))
+    rotations = torch.stack([-y, -x, x, -y], -1).unflatten(-1, (2, 2))
+    hand = pad(rotations[:, 0], (0, 1, 0, 1))
     hand[:, 2, 2] = 1
-    return Frames(hand, turns)
+    return Frames(hand, rotations)
 
 
 def looks(landmarks: Float[Tensor, "N 21 3"], frames: Frames) -> Float[Tensor, "N 63"]:
@@ -185,7 +185,7 @@ def simulate_estimate(
 
 def _onto_outline(posed: Tensor, focal: Tensor, true: PosedHands, normals: Tensor) -> Tensor:
     """Move the vertices of the outline back onto the true outline; `focal` is over the true focal length."""
-    out = (true.turns @ normals[..., None])[..., 0]
+    out = (true.rotations @ normals[..., None])[..., 0]
     view = normalize(true.posed, dim=-1)
     rim = (1 - (normalize(out, dim=-1) * view).sum(-1, keepdim=True).abs() / _GRAZING).clamp(min=0)
     out = normalize(out[..., :2], dim=-1)

@@ -23,7 +23,7 @@ class PosedHands(NamedTuple):
     posed: Float[Tensor, "N V 3"]
     landmarks: Float[Tensor, "N 21 3"]
     """See `hand.skinning.hand21`."""
-    turns: Float[Tensor, "N V 3 3"]
+    rotations: Float[Tensor, "N V 3 3"]
     """Blended linear parts of the skinning transforms from rest to pose: nearly rotations."""
 
 
@@ -43,19 +43,19 @@ def pose_hands(
     blended = torch.einsum("vj,njk->nvk", hand.weights, torch.cat([rotation.flatten(2), offset], dim=2))
     strengths = torch.vmap(lambda a: corrective_coefficients(hand, a))(angles)
     flesh = rest + torch.einsum("vdc,nc->nvd", hand.corrective_basis, strengths)
-    turns = blended[..., :9].unflatten(2, (3, 3))
-    posed = (turns * flesh[:, :, None]).sum(-1) + blended[..., 9:]
+    rotations = blended[..., :9].unflatten(2, (3, 3))
+    posed = (rotations * flesh[:, :, None]).sum(-1) + blended[..., 9:]
     last = [torch.stack([part[:, bone] for bone in TIP_BONES], 1) for part in (rotation, offset)]
     ends = (last[0] @ tips[..., None])[..., 0] + last[1]
-    return PosedHands(rest, posed, torch.cat([origin, ends], 1)[:, hand.keypoint_index], turns)
+    return PosedHands(rest, posed, torch.cat([origin, ends], 1)[:, hand.keypoint_index], rotations)
 
 
 def _bones(
     hand: HandModel, joints: Tensor, angles: Tensor, orientation: Tensor, translation: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Rotations and positions of all bones, [N, 16, 3, 3] and [N, 16, 3]."""
-    turns = from_axis_angle(hand.pose_axes[1:].expand(len(angles), -1, -1, -1), angles)
-    local = (turns[:, :, 0] @ turns[:, :, 1] @ turns[:, :, 2]).unflatten(1, (FINGERS, BONES))
+    about = from_axis_angle(hand.pose_axes[1:].expand(len(angles), -1, -1, -1), angles)
+    local = (about[:, :, 0] @ about[:, :, 1] @ about[:, :, 2]).unflatten(1, (FINGERS, BONES))
     at_rest = joints[:, 1:].unflatten(1, (FINGERS, BONES))
     palm = (orientation @ joints[:, 0, :, None])[..., 0] + translation
     rotation, origin, start = orientation[:, None], palm[:, None], joints[:, :1]

@@ -139,13 +139,13 @@ class Body:
 
 
 def arm_rows(
-    rim: Float[Tensor, "B C 3"], turns: Float[Tensor, "B R 3 3"], girth: Float[Tensor, "B"]
+    rim: Float[Tensor, "B C 3"], rotations: Float[Tensor, "B R 3 3"], girth: Float[Tensor, "B"]
 ) -> Float[Tensor, "B R C 3"]:
     """The rings of the forearm from the wrist's rim to the elbow, along +x when straight [m].
 
     Args:
         rim: The hand's open end.
-        turns: Rotation of each ring about the middle of the rim.
+        rotations: Rotation of each ring about the middle of the rim.
         girth: How much thicker the forearm is than the wrist, about 0.35.
     """
     center = rim.mean(1, keepdim=True)
@@ -157,7 +157,7 @@ def arm_rows(
     rows = torch.stack(
         [around[..., 0] * flat + ARM_LENGTH * s, around[..., 1] * (1 + grow), around[..., 2] * (1 + 1.15 * grow)], -1
     )
-    return torch.einsum("brij,brcj->brci", turns, rows) + center[:, None]
+    return torch.einsum("brij,brcj->brci", rotations, rows) + center[:, None]
 
 
 def smoothstep(low: float, high: float, x: Tensor) -> Tensor:

@@ -116,8 +116,8 @@ class Skeleton:
             joints: At rest, [B, 16, 3], any unit.
         """
         a = angles[..., None, None]
-        turns = np.eye(3) + np.sin(a) * self._cross + (1 - np.cos(a)) * self._square
-        local = turns[:, :, 0] @ turns[:, :, 1] @ turns[:, :, 2]
+        about = np.eye(3) + np.sin(a) * self._cross + (1 - np.cos(a)) * self._square
+        local = about[:, :, 0] @ about[:, :, 1] @ about[:, :, 2]
         rotation, origin = [np.broadcast_to(np.eye(3), (len(angles), 3, 3))], [joints[:, 0]]
         for j in range(1, 16):
             parent = self.parents[j]

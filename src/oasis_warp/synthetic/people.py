@@ -25,7 +25,7 @@ from oasis_warp.synthetic.relief import relief
 from oasis_warp.synthetic.skin_plan import SkinPlan, plan_person
 from oasis_warp.synthetic.skin_texture import bake_texture
 from oasis_warp.synthetic.texels import texels_on
-from oasis_warp.synthetic.wardrobe import ring_at_rest, ring_look
+from oasis_warp.synthetic.wardrobe import ring_at_rest, ring_material
 
 PERSON_BYTES = 24_000_000
 """Size of a cached person, nearly all of it texture."""
@@ -55,7 +55,7 @@ class Person(NamedTuple):
     tone: Float[Tensor, "3"]
     """Mean reflectance."""
     ring: Float[Tensor, "R 3"]
-    ring_look: tuple[float, ...]
+    ring_material: tuple[float, ...]
 
 
 _cache: OrderedDict[tuple[int, int, Population, str], Person] = OrderedDict()
@@ -166,7 +166,7 @@ def _is_whole(path: Path, about: str) -> bool:
 def _read(path: Path, seed: int, number: int, population: Population) -> Person:
     """Read a file that `_bake_or_find` has written."""
     identity = sample_identity(bundled_body().hand, seed, number, population)
-    return Person(identity=identity, ring_look=ring_look(identity), **load_file(path))
+    return Person(identity=identity, ring_material=ring_material(identity), **load_file(path))
 
 
 def _remember(key: tuple[int, int, Population, str], found: Person) -> Person:
@@ -205,5 +205,5 @@ def _finish_person(plan: SkinPlan, device: str) -> Person:
         surface_state(whole, body.skin_faces).areas[0],
         texture[..., :3].float().mean((0, 1)),
         ring_at_rest(body, rest, joints, identity),
-        ring_look(identity),
+        ring_material(identity),
     )

@@ -171,7 +171,7 @@ def _shade_batch(
     shaded = shade_skin(
         seen, K[:, 0, 0], SAMPLES, posed.vertices, body.faces, state.normals, see_sky(body, posed, state.normals),
         _stretch(body, people, state.areas), Texture([p.texture for p in people], *_texels(device)),
-        Worn(body.materials, numbers.looks), torch.stack([p.tone for p in people]),
+        Worn(body.materials, numbers.materials), torch.stack([p.tone for p in people]),
         numbers.view_distance / (posed.focal * fine) / TEXEL, numbers.sky, lit, whole[:, 3],
         n_hand_faces=body.n_hand_faces, ring=RING,
     )  # fmt: skip

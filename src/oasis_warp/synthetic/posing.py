@@ -66,16 +66,16 @@ def pose_people(body: Body, people: Sequence[Person], numbers: ShotTensors) -> P
     correctives = torch.stack([bend, bend * bend], -1).flatten(1)  # `hand.correctives.corrective_coefficients`
     skinned = batched_lbs(
         rest, hand.corrective_basis, correctives, body.normals[: body.n_hand], body.knuckle_rise, numbers.knuckles,
-        hand.weights, numbers.rotations, numbers.shifts,
+        hand.weights, numbers.rotations, numbers.translations,
     )  # fmt: skip
 
     rim = skinned[:, hand.rim]
-    arm = arm_rows(rim, numbers.arm_turns, numbers.arm_girth)
+    arm = arm_rows(rim, numbers.arm_rotations, numbers.arm_girth)
     rows = torch.cat([rim[:, None], arm], 1)
     worn = [
         sleeves(rows, numbers.sleeve_start, numbers.sleeve_gap, numbers.sleeve_phases).flatten(1, 2),
         bands(rows, numbers.band_start, numbers.band_width, numbers.band_thickness).flatten(1, 2),
-        _rotate(numbers.ring_rotation, ring) + numbers.ring_shift[:, None],
+        _rotate(numbers.ring_rotation, ring) + numbers.ring_translation[:, None],
     ]
 
     turn, distance, fill = numbers.view_rotation, numbers.view_distance, numbers.view_fill
@@ -93,7 +93,7 @@ def pose_people(body: Body, people: Sequence[Person], numbers: ShotTensors) -> P
 
     carriers = _carriers(rest.device)[hand.keypoint_index]
     carried = torch.cat([joints, tips], 1)[:, hand.keypoint_index]
-    marks = _rotate(numbers.rotations[:, carriers], carried) + numbers.shifts[:, carriers]
+    marks = _rotate(numbers.rotations[:, carriers], carried) + numbers.translations[:, carriers]
     return PosedPeople(
         torch.cat(parts, 1),
         move(marks),

@@ -21,7 +21,7 @@ from oasis_warp.synthetic.identity import Identity, Population
 from oasis_warp.synthetic.sensor import sensor_row
 from oasis_warp.synthetic.shots import SceneConfig, Shot, cached_identity, sample_shots
 from oasis_warp.synthetic.view_and_light import N_LAMPS
-from oasis_warp.synthetic.wardrobe import SKIN_LOOK, ring_look
+from oasis_warp.synthetic.wardrobe import SKIN_MATERIAL, ring_material
 
 AHEAD = 3
 """Batches that are sampled ahead per worker."""
@@ -45,17 +45,17 @@ class ShotTensors(NamedTuple):
     angles: Float[Tensor, "B 15 3"]
     """As `HandPose.angles`."""
     rotations: Float[Tensor, "B 16 3 3"]
-    """With `shifts` [m] the transform of each bone from rest to pose, with the wrist fixed."""
-    shifts: Float[Tensor, "B 16 3"]
+    """With `translations` [m] the transform of each bone from rest to pose, with the wrist fixed."""
+    translations: Float[Tensor, "B 16 3"]
     knuckles: Float[Tensor, "B 15"]
     """Factor of `Body.knuckle_rise` for each joint."""
     shape: Float[Tensor, "B S"]
-    arm_turns: Float[Tensor, "B R 3 3"]
+    arm_rotations: Float[Tensor, "B R 3 3"]
     """Rotations of the forearm's rings."""
     arm_girth: Float[Tensor, "B"]
     ring_rotation: Float[Tensor, "B 3 3"]
-    """With `ring_shift` the transform of the ring from rest to pose."""
-    ring_shift: Float[Tensor, "B 3"]
+    """With `ring_translation` the transform of the ring from rest to pose."""
+    ring_translation: Float[Tensor, "B 3"]
     wears: Float[Tensor, "B 3"]
     """1 for a sleeve, a wristband, a ring."""
     sleeve_start: Float[Tensor, "B"]
@@ -64,8 +64,8 @@ class ShotTensors(NamedTuple):
     band_start: Float[Tensor, "B"]
     band_width: Float[Tensor, "B"]
     band_thickness: Float[Tensor, "B"]
-    looks: Float[Tensor, "B 4 6"]
-    """Of skin, sleeve, wristband and ring."""
+    materials: Float[Tensor, "B 4 6"]
+    """Materials of skin, sleeve, wristband and ring."""
     view_rotation: Float[Tensor, "B 3 3"]
     view_distance: Float[Tensor, "B"]
     view_fill: Float[Tensor, "B"]
@@ -161,7 +161,7 @@ def _joints(seed: int, number: int, population: Population) -> np.ndarray:
     return (hand.joints + hand.joint_basis @ shape).double().numpy()
 
 
-def arm_turns(bends: np.ndarray) -> np.ndarray:
+def arm_rotations(bends: np.ndarray) -> np.ndarray:
     """Rotations of the forearm's rings, [B, R, 3, 3], for bends at the wrist as rotation vectors [rad], [B, 3]."""
     share = np.minimum(1.0, np.linspace(0, 1, ARM_ROWS + 1)[1:] / ARM_BEND)
     lengths = np.linalg.norm(bends, axis=1)
@@ -175,7 +175,7 @@ def arm_turns(bends: np.ndarray) -> np.ndarray:
 def _columns(shots: Sequence[Shot], identities: Sequence[Identity], joints: np.ndarray) -> dict[str, Any]:
     """The fields of `ShotTensors`, without those that are 0."""
     angles = np.stack([s.angles for s in shots])
-    rotations, shifts = bundled_skeleton().transforms(angles, joints)
+    rotations, translations = bundled_skeleton().transforms(angles, joints)
     flexion = angles[:, 1:, 0] + bundled_hand().rest_bend[1:].numpy()
     bent = (1 - np.cos(np.maximum(flexion, 0))).astype(np.float32)
     bony = np.array([0.4 + 0.9 * i.bony for i in identities], np.float32)
@@ -184,16 +184,16 @@ def _columns(shots: Sequence[Shot], identities: Sequence[Identity], joints: np.n
     columns: dict[str, Any] = {
         "angles": angles[:, 1:],
         "rotations": rotations,
-        "shifts": shifts,
+        "translations": translations,
         "knuckles": bent * bony[:, None],
         "shape": [i.shape for i in identities],
-        "arm_turns": arm_turns(np.stack([s.bend for s in shots])),
+        "arm_rotations": arm_rotations(np.stack([s.bend for s in shots])),
         "arm_girth": [i.arm_girth for i in identities],
         "ring_rotation": rotations[each, finger_root],
-        "ring_shift": shifts[each, finger_root],
+        "ring_translation": translations[each, finger_root],
         "wears": [(c.sleeve_start < ARM_LENGTH, c.band_start < ARM_LENGTH, i.ring_finger >= 0)
                   for c, i in zip(clothes, identities, strict=True)],
-        "looks": [(SKIN_LOOK, c.sleeve_look, c.band_look, ring_look(i))
+        "materials": [(SKIN_MATERIAL, c.sleeve_material, c.band_material, ring_material(i))
                   for c, i in zip(clothes, identities, strict=True)],
     }  # fmt: skip
     for name in ("sleeve_start", "sleeve_gap", "sleeve_phases", "band_start", "band_width", "band_thickness"):

@@ -17,7 +17,7 @@ BAND_PROFILE = (-0.6, 0.7, 1.0, 1.0, 1.0, 0.7, -0.6)
 """Heights of a wristband's rows over the skin, over its thickness."""
 RING_ROUNDNESS = 0.6
 """Half thickness of a ring [mm]."""
-SKIN_LOOK = (0.0, 0.0, 0.0, 0.5, 0.0, 0.0)
+SKIN_MATERIAL = (0.0, 0.0, 0.0, 0.5, 0.0, 0.0)
 """Material of skin: see `ops.skin_shading`. Its colour comes from the texture."""
 AWAY = (0.0, 0.0, -1.0)
 """Position of vertices that an image does not show, in the camera's frame: behind it."""
@@ -31,12 +31,12 @@ class Clothes(NamedTuple):
     sleeve_gap: float
     sleeve_phases: np.ndarray
     """Phases of the wrinkles, [4]."""
-    sleeve_look: tuple[float, ...]
+    sleeve_material: tuple[float, ...]
     band_start: float
     """Distance from the wrist; beyond the arm for none."""
     band_width: float
     band_thickness: float
-    band_look: tuple[float, ...]
+    band_material: tuple[float, ...]
 
 
 def sample_clothes(rng: np.random.Generator, bare: bool) -> Clothes:
@@ -57,11 +57,11 @@ def sample_clothes(rng: np.random.Generator, bare: bool) -> Clothes:
         sleeve_start=start if sleeve else 2 * ARM_LENGTH,
         sleeve_gap=u(0.002, 0.009),
         sleeve_phases=u(0, 2 * np.pi, 4),
-        sleeve_look=look,
+        sleeve_material=look,
         band_start=u(0.012, 0.035) if band else 2 * ARM_LENGTH,
         band_width=u(0.006, 0.022),
         band_thickness=u(0.0012, 0.003),
-        band_look=(*strap, u(0.22, 0.55), metal, 0.0),
+        band_material=(*strap, u(0.22, 0.55), metal, 0.0),
     )
 
 
@@ -137,17 +137,17 @@ def ring_at_rest(
     middle = (high + low) / 2
     side, up = (local[:, 1:] - middle).unbind(1)
     angle, radius = torch.atan2(up, side), torch.hypot(side, up)
-    turns = torch.arange(RING_COLUMNS, device=rest.device, dtype=torch.float64) * (2 * torch.pi / RING_COLUMNS)
-    turns = turns - torch.pi
-    weight = torch.exp(30 * (torch.cos(angle - turns[:, None]) - 1)) * near
+    angles = torch.arange(RING_COLUMNS, device=rest.device, dtype=torch.float64) * (2 * torch.pi / RING_COLUMNS)
+    angles = angles - torch.pi
+    weight = torch.exp(30 * (torch.cos(angle - angles[:, None]) - 1)) * near
     fit = (weight @ radius) / weight.sum(1) + 0.15
     across = torch.arange(RING_ROWS, device=rest.device, dtype=torch.float64)[:, None] * (2 * torch.pi / RING_ROWS)
     wide = place + identity.ring_width / 2 * torch.cos(across).sign() * torch.cos(across).abs() ** 0.6 + 0 * fit
     reach = fit + RING_ROUNDNESS * torch.sin(across)
-    points = torch.stack([wide, reach * torch.cos(turns) + middle[0], reach * torch.sin(turns) + middle[1]], -1)
+    points = torch.stack([wide, reach * torch.cos(angles) + middle[0], reach * torch.sin(angles) + middle[1]], -1)
     return ((points.reshape(-1, 3) @ axes.T + joints[joint]) * 1e-3).float()
 
 
-def ring_look(identity: Identity) -> tuple[float, ...]:
+def ring_material(identity: Identity) -> tuple[float, ...]:
     """The material of a ring: metal."""
     return (*identity.ring_metal, 0.18 + 0.2 * identity.gloss, 1.0, 0.0)
