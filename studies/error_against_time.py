@@ -1,7 +1,7 @@
 """What the thresholds and options of the operators cost and buy: error against run time.
 
 Fills docs/error_against_time.md, its picture included (which needs matplotlib: `pip install -e ".[bench]"`), from
-OUT/error_time/error_time.csv. Running it is this command:
+OUT/error_time/error_time.json. Running it is this command:
 
     oasis bench error-time -o out/error_time
 """
@@ -11,10 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from oasis_warp.bench.pareto import plot_operator
-from oasis_warp.bench.rows import Row as Measurement
-from oasis_warp.bench.rows import read_csv
-from oasis_warp.bench.summary import BUDGETS, Group, fastest, groups
+from oasis_warp.bench.error_time import BUDGETS, Group, SettingRow, fastest, groups
+from oasis_warp.bench.plots import plot_operator
+from oasis_warp.bench.rows import read_json
 from studies.harness import Row, StudyOptions
 from studies.tables import Section, markdown, power
 
@@ -36,8 +35,8 @@ def run(options: Options) -> list[Row]:
 
 def load(out: Path) -> list[Row]:
     """The measurements of the command, in one row."""
-    path = out / "error_time" / "error_time.csv"
-    return [{"measurements": read_csv(path)}] if path.is_file() else []
+    path = out / "error_time" / "error_time.json"
+    return [{"measurements": read_json(SettingRow, path)}] if path.is_file() else []
 
 
 def draw(rows: list[Row], static: Path) -> None:
@@ -47,16 +46,16 @@ def draw(rows: list[Row], static: Path) -> None:
 
 
 class Measured:
-    """The rows of a CSV, by what they measure."""
+    """Rows by what they measure."""
 
-    def __init__(self, rows: list[Measurement]):
+    def __init__(self, rows: list[SettingRow]):
         self.groups = {(g.op, g.scene, g.pass_): g for g in groups(rows)}
 
     def group(self, op: str, scene: str = "hand", pass_: str = FORWARD) -> Group:
         """All settings of an operator on a scene."""
         return self.groups[op, scene, pass_]
 
-    def row(self, knob: str, value: str, op: str = "rasterization", pass_: str = FORWARD) -> Measurement:
+    def row(self, knob: str, value: str, op: str = "rasterization", pass_: str = FORWARD) -> SettingRow:
         """One setting on the hand."""
         return next(r for r in self.group(op, pass_=pass_).rows if (r.knob, r.value) == (knob, value))
 

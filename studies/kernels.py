@@ -25,8 +25,7 @@ import torch
 from oasis_warp.bench import gpu_cases, gpu_speed, roofline, scaling
 from oasis_warp.bench.gpu_cases import OURS
 from oasis_warp.bench.gpu_speed import GpuRow
-from oasis_warp.bench.pareto import MISSING, can_plot
-from oasis_warp.bench.plots import plot_roofline, plot_scaling, plot_speed
+from oasis_warp.bench.plots import MISSING, can_plot, plot_roofline, plot_scaling, plot_speed
 from oasis_warp.bench.roofline import RECORD, KernelRow
 from oasis_warp.bench.rows import json_text, read_json
 from oasis_warp.bench.scaling import ScalingRow, steepest
@@ -63,10 +62,10 @@ def measure_part(part: str, options: Options) -> Sequence[Any]:
     device = torch.device(options.device)
     if part == "kernels":
         peers = {"gsplat": gpu_speed.gsplat_draw()} if options.peer == "gsplat" else {}
-        return gpu_speed.measure(gpu_cases.choose(""), device, groups=GROUPS, peers=peers, progress=report)
+        return gpu_speed.measure_cases(gpu_cases.choose(""), device, groups=GROUPS, peers=peers, progress=report)
     if part == "scaling":
-        return scaling.measure(scaling.points(quick=False), device, seconds=SECONDS, progress=report)
-    return roofline.measure(device, progress=report)
+        return scaling.measure_scaling(scaling.points(quick=False), device, seconds=SECONDS, progress=report)
+    return roofline.measure_roofline(device, progress=report)
 
 
 def measure_gpu(options: Options) -> list[Row]:

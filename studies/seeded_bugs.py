@@ -4,9 +4,6 @@ from typing import NamedTuple
 
 KERNELS = "kernels/oasis_kernels"
 GRID = "tests/certify/test_grid.py"
-GENERIC = {
-    "rasterize_forward", "rasterize_backward", "gaussian", "projection", "tiles", "face_rotation", "barycentric"
-}  # fmt: skip
 FAMILIES = {
     "rasterization": "rasterization",
     "depth": "depth_map or depth_visibility",
@@ -28,17 +25,17 @@ class Bug(NamedTuple):
     """Arguments of pytest: what has to catch it."""
 
 
-VECTOR_TESTS = {"depth_buffer_draw": "tests/ops/test_visibility_vectors.py"}
-"""What holds a module against the generic kernels: bugs that only a filter's doubtful cases show."""
+VECTOR_TESTS = {"depth/buffer.h": "tests/ops/test_visibility_vectors.py"}
+"""What holds a file against the generic kernels: bugs that only a filter's doubtful cases show."""
 
 
 def _in(module: str, operator: str, *bugs: tuple[str, str, str]) -> list[Bug]:
-    """Bugs in a module of kernels: (what, old, new). On the CPU vectors do float32, the generic kernels float64."""
-    dtype = "float64" if module in GENERIC else "float32"
+    """Bugs in a file of kernels: (what, old, new). On the CPU C++ does float32, the generic kernels do float64."""
+    dtype = "float64" if module.endswith(".py") and module != "constants.py" else "float32"
     tests = (GRID, "-k", f"small_scenes and {dtype} and ({FAMILIES[operator]})")
     if module in VECTOR_TESTS:
         tests = (VECTOR_TESTS[module],)
-    return [Bug(f"{module}: {name}", f"{KERNELS}/{module}.py", old, new, tests) for name, old, new in bugs]
+    return [Bug(f"{module}: {name}", f"{KERNELS}/{module}", old, new, tests) for name, old, new in bugs]
 
 
 def _of(room: str, tests: str, only: str, name: str, old: str, new: str) -> Bug:
@@ -77,7 +74,7 @@ PIPELINE = [
         '"centre", (2,)) * photo.shrink', '"centre", (2,))'),
     _of("synthetic/skin_lines", "synthetic/test_people", "lie_on_the_palm", "creases on the back",
         's[:, None], "palm")', 's[:, None], "back")'),
-    _of("cli/animate", "cli/test_render_and_animate", "film_in_even_light", "--light even ignored",
+    _of("cli/render", "cli/test_render_and_animate", "film_in_even_light", "--light even ignored",
         'options.light == "even"', 'options.light == "none"'),
     _of("core/camera", "core/test_camera", "horizon", "azimuth and elevation exchanged",
         "(turn @ tilt)", "(tilt @ turn)"),
@@ -90,7 +87,7 @@ PIPELINE = [
 BUGS = [
     *PIPELINE,
     *_in(
-        "rasterize_forward", "rasterization",
+        "rasterize/rasterize_forward.py", "rasterization",
         ("pixel centre without 0.5", "type(whole)(0.5) - remainder", "type(whole)(0.0) - remainder"),
         ("the stop draws the last layer", "if after <= scalar(stop):", "if before <= scalar(stop):"),
         ("no stop", "if after <= scalar(stop):", "if after < scalar(0.0):"),
@@ -98,7 +95,7 @@ BUGS = [
          "alpha = wp.min(opacity * falloff(-sigma), scalar(1.0))"),
     ),
     *_in(
-        "rasterize_backward", "rasterization",
+        "rasterize/rasterize_backward.py", "rasterization",
         ("gradient leaks through the cap", "if raw <= scalar(constants.ALPHA_MAX):", "if raw <= scalar(2.0):"),
         ("T of the background detached", "behind[pixel] = wp.dot(g, background) - g_alpha[pixel]",
          "behind[pixel] = -g_alpha[pixel]"),
@@ -111,7 +108,7 @@ BUGS = [
         ("opacity gradient is of its logarithm", "g_opacity = m[0] / wp.float64(opacities[index])", "g_opacity = m[0]"),
     ),
     *_in(
-        "gaussian", "rasterization",
+        "rasterize/gaussian.py", "rasterization",
         ("R of the view transposed", "s.b0 = wp.transpose(camera) * s.j0", "s.b0 = camera * s.j0"),
         ("sign of the third column of J", "s.j1 = wp.vec3d(zero, fy / depth, -fy * v / depth)",
          "s.j1 = wp.vec3d(zero, fy / depth, fy * v / depth)"),
@@ -126,7 +123,7 @@ BUGS = [
          "return wp.vec4d(ONE / wp.sqrt(xx), zero, k * xy / xx, k)"),
     ),
     *_in(
-        "projection", "rasterization",
+        "rasterize/projection.py", "rasterization",
         ("J detached from the gradient of means", "                g_j0 = camera * g_b0\n",
          "                g_j0 = wp.float64(0.0) * g_b0\n"),
         ("norm of the quaternion not differentiated", "vec4((g_unit - wp.dot(g_unit, q) * q) / norm)",
@@ -139,7 +136,7 @@ BUGS = [
         ("boxes of 2 sigma", "reach = wp.min(extent_sigmas,", "reach = wp.min(wp.float64(2.0),"),
     ),
     *_in(
-        "projection_vectors_forward", "rasterization",
+        "rasterize/projection.cpp", "rasterization",
         ("J not clamped", "const V slope_u = u < k.u_low ? (V)(k.u_low) : u > k.u_high ? (V)(k.u_high) : u;",
          "const V slope_u = u;"),
         ("sign of the third column of J", "b0[e] = j0 * (k.r[e] - slope_u * k.r[6 + e]);",
@@ -150,11 +147,11 @@ BUGS = [
          "reach = reach + reach < 4.0 ? reach + reach : (V)(4.0);"),
     ),
     *_in(
-        "projection_vectors", "rasterization",
+        "rasterize/projection_vectors.h", "rasterization",
         ("one sign in the rotation", "r[1] = two * (x * y - w * z);", "r[1] = two * (x * y + w * z);"),
     ),
     *_in(
-        "projection_vectors_backward", "rasterization",
+        "rasterize/projection_backward.cpp", "rasterization",
         ("J detached from the gradient of means",
          "const V g_inverse = k.fx * (g_j00 - slope_u * g_j02) + k.fy * (g_j11 - slope_v * g_j12);",
          "const V g_inverse = (V)(0.0);"),
@@ -163,32 +160,39 @@ BUGS = [
          "const V along = inverse_norm * (g_w * w + g_x * x + g_y * y + g_z * z),", "const V along = (V)(0.0),"),
     ),
     *_in(
-        "constants", "rasterization",
+        "constants.py", "rasterization",
         ("threshold 2/255", "ALPHA_MIN = 0.003921568859368563", "ALPHA_MIN = 0.007843137718737125"),
         ("cap 0.99", "ALPHA_MAX = 0.9990000128746033", "ALPHA_MAX = 0.9900000095367432"),
     ),
     *_in(
-        "tiles", "rasterization",
+        "rasterize/tiles.py", "rasterization",
         ("farthest first", "index = order[rank]", "index = order[n_drawn - 1 - rank]"),
     ),
     *_in(
-        "strips_binning", "rasterization",
+        "rasterize/strip_lists.cpp", "rasterization",
         ("pixel centre without 0.5", "r[2] = 0.5f - center[2]", "r[2] = 0.f - center[2]"),
-        ("farthest first", "items[j - 1] > item", "items[j - 1] < item"),
-        ("ties in reverse order", "items[j - 1] > item", "items[j - 1] >> 31 >= item >> 31"),
-        ("depth keys of 11 bits", "((depths[i] - low) >> drop) << 31", "((depths[i] - low) >> drop >> 22 << 22) << 31"),
     ),
     *_in(
-        "strips_forward", "rasterization",
+        "rasterize/strip_sort.h", "rasterization",
+        ("farthest first", "items[j - 1] > item", "items[j - 1] < item"),
+        ("ties in reverse order", "items[j - 1] > item", "items[j - 1] >> 31 >= item >> 31"),
+    ),
+    *_in(
+        "rasterize/strip_fill.h", "rasterization",
+        ("depth keys of 11 bits", "((sort_depths[i] - low) >> drop) << 31",
+         "((sort_depths[i] - low) >> drop >> 22 << 22) << 31"),
+    ),
+    *_in(
+        "rasterize/strips.cpp", "rasterization",
         ("the stop draws the last layer", "const V weight = ends ? (V)(0.f) : full;", "const V weight = full;"),
         ("no stop", "const I ends = drawn & (after <= last());", "const I ends = drawn & (after < 0.f);"),
-        ("no cut-off", "const I drawn = (e >= cut()) & (before > 0.f)@INSIDE@;",
-         "const I drawn = (before > 0.f)@INSIDE@;"),
+        ("no cut-off", "const I drawn = (e >= cut()) & (before > 0.f) INSIDE;",
+         "const I drawn = (before > 0.f) INSIDE;"),
         ("no cap", "const V alpha = drawn ? (raw < cap() ? raw : cap()) : (V)(0.f);",
          "const V alpha = drawn ? raw : (V)(0.f);"),
     ),
     *_in(
-        "strips_backward", "rasterization",
+        "rasterize/strips_backward.cpp", "rasterization",
         ("gradient leaks through the cap", "const V q = raw <= cap() ? weight * step : (V)(0.f);",
          "const V q = weight * step;"),
         ("T of the background detached", "behind = fma(g, (V)background[k], behind);", ""),
@@ -198,11 +202,11 @@ BUGS = [
         ("what is behind is not updated", "store(t + stride, fma(alpha, step, behind));", ""),
     ),
     *_in(
-        "depth_buffer_draw", "depth",
+        "depth/buffer.h", "depth",
         ("farthest in doubt", "if (z > rival ||", "if (z < rival ||"),
     ),
     *_in(
-        "depth_buffer_score", "depth",
+        "depth/visibility.cpp", "depth",
         ("sign of dz", "(depth_of(w, a.z, b.z, c.z) - Z + job.margin)",
          "(Z - depth_of(w, a.z, b.z, c.z) + job.margin)"),
         ("pixel rounded, not floored", "inside ? u : (D)(0.0), I);", "inside ? u + 0.499 : (D)(0.0), I);"),
@@ -214,7 +218,7 @@ BUGS = [
          "slope = soft ? (e * part) * part * per_tau : slope;"),
     ),
     *_in(
-        "face_rotation", "faces",
+        "posing/face_rotation.py", "faces",
         ("one face missing in the vertex mean", "            total += sign * areas[f, 0] * q_face\n",
          "            if j < offsets[v] + 3:\n                total += sign * areas[f, 0] * q_face\n"),
         ("posed areas as weights", "weight = before.area", "weight = after.area"),
@@ -228,16 +232,19 @@ BUGS = [
         ("third corner never added", "rows[f, 6 + k] = rows.dtype(e2[k])", "rows[f, 6 + k] = rows.dtype(ZERO)"),
     ),
     *_in(
-        "face_rotation_vectors", "faces",
+        "posing/face_vectors.h", "faces",
         ("posed areas as weights", "o.weight = 0.5f * rest.l * rest.y * rest.unit * rest.unit;",
          "o.weight = 0.5f * posed.l * posed.y * posed.unit * posed.unit;"),
-        ("no sign alignment", "const V sign = dot4(q, reference) < 0.f ? -one : one;", "const V sign = one;"),
         ("area ratio inverted", "o.ratio = rest.point ? one : grown / damped;",
          "o.ratio = rest.point ? one : damped / grown;"),
+    ),
+    *_in(
+        "posing/face_rotations.cpp", "faces",
+        ("no sign alignment", "const V sign = dot4(q, reference) < 0.f ? -one : one;", "const V sign = one;"),
         ("area weights not differentiated", "by_rest += p.proper ? g_weight : zero;", ""),
     ),
     *_in(
-        "barycentric", "posing",
+        "posing/barycentric.py", "posing",
         ("dq and q swapped", "turned = multiply(mix(f, faces, b, vertex_quats).unit, row4(quats, i))",
          "turned = multiply(row4(quats, i), mix(f, faces, b, vertex_quats).unit)"),
         ("no sign alignment among the corners", "if wp.dot(q, reference) < ZERO:", "if wp.dot(q, reference) < -ONE:"),
@@ -247,10 +254,16 @@ BUGS = [
          "for k in range(2):\n        mean += b[k] * row3(vertices"),
     ),
     *_in(
-        "barycentric_vectors", "posing",
+        "posing/mesh_gaussians.cpp", "posing",
         ("dq and q swapped", "put4(posed_quats + 4ll * at, count, product(turn, get4(quats + 4ll * at, count)));",
          "put4(posed_quats + 4ll * at, count, product(get4(quats + 4ll * at, count), turn));"),
+    ),
+    *_in(
+        "posing/on_face.h", "posing",
         ("no sign alignment", "return dot4(a, reference) < 0.f ? -one : one;", "return one;"),
+    ),
+    *_in(
+        "posing/mesh_gaussians_vectors.h", "posing",
         ("square root left out", "half_powers == 1 ? root(r) : r;", "r;"),
     ),
 ]  # fmt: skip

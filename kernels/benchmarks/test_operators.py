@@ -17,22 +17,22 @@ import torch
 
 from oasis_warp.bench import speed
 from oasis_warp.bench.operators import OPERATORS, exact
-from oasis_warp.bench.scenes import Scene, hand_scenes, surfels
+from oasis_warp.bench.scenes import GaussianScene, hand_scenes, surfels
 from oasis_warp.bench.timing import synchronise
 
 DEVICE = torch.device(os.environ.get("BENCH_DEVICE", "cpu"))
 SIZE = int(os.environ.get("BENCH_SIZE", "256"))
 GAUSSIANS = int(os.environ.get("BENCH_GAUSSIANS", "20000"))
 THREADS = int(os.environ.get("BENCH_THREADS", "1"))
-WAYS = {"warp": speed.WARP, "torch": speed.TORCH} | ({"scalar": speed.SCALAR} if DEVICE.type == "cpu" else {})
+BACKENDS = speed.backends(DEVICE)
 VALUES, GRADIENTS = 5e-6, 5e-5
 """Largest relative errors of ours; torch's depth buffer and gradients in float32 are worse."""
 CASES = [
-    pytest.param(name, pass_, way, id=f"{name}-{pass_.replace(' + ', '_and_')}-{way}")
+    pytest.param(name, pass_, backend, id=f"{name}-{pass_.replace(' + ', '_and_')}-{backend}")
     for name, operator in OPERATORS.items()
     for pass_ in operator.passes
-    for way in WAYS
-    if WAYS[way].choose(operator) is not None
+    for backend in BACKENDS
+    if BACKENDS[backend].choose(operator) is not None
 ]
 
 
@@ -48,18 +48,18 @@ def truths(scenes):
 
     def of(name):
         if name not in found:
-            found[name] = exact(OPERATORS[name], scenes[0] if OPERATORS[name].scene is Scene else scenes[1])
+            found[name] = exact(OPERATORS[name], scenes[0] if OPERATORS[name].scene is GaussianScene else scenes[1])
         return found[name]
 
     return of
 
 
-@pytest.mark.parametrize(("name", "pass_", "way"), CASES)
-def test_operator(benchmark, scenes, truths, name, pass_, way):
+@pytest.mark.parametrize(("name", "pass_", "backend"), CASES)
+def test_operator(benchmark, scenes, truths, name, pass_, backend):
     operator = OPERATORS[name]
-    scene = scenes[0] if operator.scene is Scene else scenes[1]
-    runs = speed.timed_passes(operator, scene, {way: WAYS[way]}, truths(name), THREADS)
-    timed, forward = runs[pass_, way], runs["forward", way]
+    scene = scenes[0] if operator.scene is GaussianScene else scenes[1]
+    runs = speed.timed_passes(operator, scene, {backend: BACKENDS[backend]}, truths(name), THREADS)
+    timed = runs[pass_, backend]
     benchmark.group = f"{name}, {pass_}"
 
     def call():
@@ -67,9 +67,8 @@ def test_operator(benchmark, scenes, truths, name, pass_, way):
         synchronise()
 
     with timed.ready():
-        found = timed.run() if pass_ != "forward" else None
-        value_error, gradient_error = speed.errors(operator, truths(name), forward.run(), found)
-        if way != "torch":
+        value_error, gradient_error = speed.errors(truths(name), timed)
+        if backend != "torch":
             assert value_error <= VALUES
             assert gradient_error is None or gradient_error <= GRADIENTS
         benchmark.extra_info.update(rel_l2=value_error, gradient_rel_l2=gradient_error, threads=THREADS, size=SIZE)

@@ -6,8 +6,8 @@ import pytest
 import torch
 from gpu_rows import FRAME, GPU, KERNELS, SPEED, STUDY
 
-from oasis_warp.bench import error_time, gpu_speed, knobs, pareto, roofline, scaling, speed
-from oasis_warp.bench.rows import KEYS
+from oasis_warp.bench import error_time, gpu_speed, knobs, plots, roofline, scaling, speed
+from oasis_warp.bench.rows import keys
 from oasis_warp.bench.scenes import layered
 from oasis_warp.cli import main
 
@@ -22,11 +22,11 @@ def short(monkeypatch, small):
 
 @pytest.mark.slow
 def test_error_time_writes_tables_and_says_that_plots_need_matplotlib(short, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(pareto, "find_spec", lambda name: None)
+    monkeypatch.setattr(plots, "find_spec", lambda name: None)
     assert main(["bench", "error-time", "-o", str(tmp_path / "out"), "--repeats", "2"]) == 0
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"error_time.csv", "error_time.json"}
     records = list(csv.DictReader((tmp_path / "out" / "error_time.csv").read_text().splitlines()))
-    assert tuple(records[0]) == KEYS
+    assert tuple(records[0]) == keys(error_time.SettingRow)
     assert [r["knob"] for r in records] == ["default", "default", "precision", "precision"]
     captured = capsys.readouterr()
     assert captured.err.count("matplotlib is not installed") == 1
@@ -45,7 +45,7 @@ def test_an_interrupted_measurement_leaves_nothing(short, monkeypatch, tmp_path,
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(error_time, "make_row", interrupt)
+    monkeypatch.setattr(error_time, "error_columns", interrupt)
     assert main(["bench", "error-time", "-o", str(tmp_path / "out"), "--repeats", "2"]) == 130
     assert list(tmp_path.iterdir()) == []
     assert capsys.readouterr().err.endswith("oasis: stopped, nothing written.\n")
@@ -117,8 +117,8 @@ def gpu(monkeypatch):
         asked.update(options, cases=cases, device=device)
         return SPEED
 
-    monkeypatch.setattr(gpu_speed, "measure", measure)
-    monkeypatch.setattr(roofline, "measure", lambda *_: KERNELS)
+    monkeypatch.setattr(gpu_speed, "measure_cases", measure)
+    monkeypatch.setattr(roofline, "measure_roofline", lambda *_: KERNELS)
     return asked
 
 
@@ -163,7 +163,7 @@ def test_what_cannot_be_measured_on_a_gpu_is_refused_in_one_sentence(
 
 
 def test_a_plot_without_matplotlib_is_refused_before_anything_is_measured(gpu, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(pareto, "find_spec", lambda name: None)
+    monkeypatch.setattr(plots, "find_spec", lambda name: None)
     assert main(["bench", "roofline", "--plot", str(tmp_path / "r.png")]) == 2
     assert capsys.readouterr().err.startswith("oasis: --plot: matplotlib is not installed")
     assert list(tmp_path.iterdir()) == []
@@ -179,16 +179,16 @@ def test_the_roofline_is_told_for_every_kernel(gpu, tmp_path, capsys):
 
 
 def test_a_profiler_that_sees_nothing_is_told_in_one_sentence(gpu, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(roofline, "measure", lambda *_: [])
+    monkeypatch.setattr(roofline, "measure_roofline", lambda *_: [])
     assert main(["bench", "roofline", "--json", str(tmp_path / "r.json")]) == 2
     assert "torch's profiler traces no kernels here" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
 def test_scaling_writes_its_tables_and_tells_the_steepest_steps(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(pareto, "find_spec", lambda name: None)
+    monkeypatch.setattr(plots, "find_spec", lambda name: None)
     asked = {}
-    monkeypatch.setattr(scaling, "measure", lambda points, device, **options: asked.update(options) or STUDY)
+    monkeypatch.setattr(scaling, "measure_scaling", lambda points, device, **options: asked.update(options) or STUDY)
     assert main(["bench", "scaling", "--quick", "-o", str(tmp_path / "out"), "--seed", "3"]) == 0
     assert (asked["seconds"], asked["seed"]) == (1.0, 3)
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"scaling.csv", "scaling.json"}
@@ -199,7 +199,7 @@ def test_scaling_writes_its_tables_and_tells_the_steepest_steps(monkeypatch, tmp
 
 def test_scaling_and_kernels_draw_what_they_measured(gpu, monkeypatch, tmp_path):
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(scaling, "measure", lambda points, device, **options: STUDY)
+    monkeypatch.setattr(scaling, "measure_scaling", lambda points, device, **options: STUDY)
     assert main(["bench", "scaling", "-o", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "scaling.png").exists()
     for what in ("kernels", "roofline"):

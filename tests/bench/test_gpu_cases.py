@@ -4,25 +4,25 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from oasis_warp.bench import gpu_speed, gpu_timing
-from oasis_warp.bench.avatar_scene import Learning, avatar_scene, draw, make_avatar, many_poses, pose
-from oasis_warp.bench.gpu_cases import CASES, OURS, avatar_case, choose, picture, visibility
-from oasis_warp.bench.gpu_speed import errors, measure, measure_case, most_error
-from oasis_warp.bench.gpu_timing import Captured
+from oasis_warp.bench import cuda, gpu_speed
+from oasis_warp.bench.avatar_scene import Learning, avatar_scene, draw_avatar, make_avatar, many_poses, pose_avatar
+from oasis_warp.bench.cuda import Captured
+from oasis_warp.bench.gpu_cases import CASES, OURS, avatar_case, choose, image_case, visibility_case
+from oasis_warp.bench.gpu_speed import errors, measure_case, measure_cases
 from oasis_warp.bench.operators import OPERATORS, Results
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
 from oasis_warp.ops._runtime.pair_counts import Overflow
-from oasis_warp.reference.errors import same_bits
+from oasis_warp.reference.errors import most_error, same_bits
 
 SMALL = {
-    "picture": picture(2_000, 64, 1, "forward"),
-    "picture and back": picture(2_000, 64, 1, "forward + backward"),
-    "views and back": picture(36_881, 32, 2, "forward + backward"),
+    "picture": image_case(2_000, 64, "forward"),
+    "picture and back": image_case(2_000, 64, "forward + backward"),
+    "views and back": image_case(36_881, 32, "forward + backward", 2),
     "posing": avatar_case("pose", "posing", "forward", 32),
     "many poses": avatar_case("pose", "posing", "forward", 32, 3),
-    "visibility": visibility(48, "forward"),
-    "visibility and back": visibility(48, "forward + backward"),
+    "visibility": visibility_case(48, "forward"),
+    "visibility and back": visibility_case(48, "forward + backward"),
     "frame": avatar_case("frame", "avatar", "pose + draw", 64),
     "step": avatar_case("step", "learning", "step", 64),
 }
@@ -57,7 +57,7 @@ def test_cases_are_chosen_by_part_of_their_name_or_pass():
 @pytest.mark.parametrize("name", SMALL)
 def test_every_case_gives_the_exact_results_and_the_same_bits_again(name, device):
     case = SMALL[name].make(device, 0, {})
-    found, again = case.ways[OURS].run(), case.ways[OURS].run()
+    found, again = case.implementations[OURS].run(), case.implementations[OURS].run()
     wrong = errors(case, found)
     assert wrong["rel_l2"] is not None
     assert wrong["rel_l2"] < LOOSE.get(name, 5e-6)
@@ -69,7 +69,7 @@ def test_every_case_gives_the_exact_results_and_the_same_bits_again(name, device
 
 def test_what_a_graph_holds_of_a_frame_is_what_the_avatar_draws(device):
     case = SMALL["frame"].make(device, 0, {})
-    run, captured = case.ways[OURS]
+    run, captured = case.implementations[OURS]
     assert captured is not None
     shown, plain = run(), captured()
     torch.testing.assert_close(plain.values[0], shown.values[0], rtol=0, atol=1e-6)
@@ -77,17 +77,17 @@ def test_what_a_graph_holds_of_a_frame_is_what_the_avatar_draws(device):
 
 def test_an_avatar_is_drawn_as_its_scene_is():
     scene = avatar_scene(48)
-    shown = make_avatar(scene).render(scene.camera, scene.held, BLACK)
-    image = draw(scene, scene.canonical, scene.surface())
+    shown = make_avatar(scene).render(scene.camera, scene.hand_pose, BLACK)
+    image = draw_avatar(scene, scene.canonical, scene.surface())
     torch.testing.assert_close(shown.image, image[0], rtol=0, atol=1e-6)
     assert float((scene.mask * (shown.image - scene.target).abs().amin(-1)).max()) < 0.21
 
 
 def test_many_poses_are_different_ones_of_the_same_hand():
     scene = avatar_scene(32)
-    many = many_poses(scene.held, 3, seed=0)
-    assert torch.equal(many.angles, many_poses(scene.held, 3, seed=0).angles)
-    means = pose(replace(scene, held=many), scene.canonical, scene.surface()).means
+    many = many_poses(scene.hand_pose, 3, seed=0)
+    assert torch.equal(many.angles, many_poses(scene.hand_pose, 3, seed=0).angles)
+    means = pose_avatar(replace(scene, hand_pose=many), scene.canonical, scene.surface()).means
     assert means.shape == (3, len(scene.canonical.quats), 3)
     assert float((means[0] - means[1]).norm(dim=-1).max()) > 0.005
 
@@ -105,7 +105,7 @@ def test_a_step_of_learning_does_all_of_it_but_moves_nothing():
 
 
 def test_a_row_has_times_and_errors_and_on_the_cpu_no_graph(cpu):
-    (row,) = measure([SMALL["picture and back"]], cpu, groups=2)
+    (row,) = measure_cases([SMALL["picture and back"]], cpu, groups=2)
     assert (row.case, row.pass_, row.way, row.views) == ("2k at 64 x 64", "forward + backward", OURS, 1)
     assert row.wall_ms > 0
     assert (row.busy_ms, row.launch_ms, row.kernels_ms, row.not_captured) == (None, None, None, "no CUDA device")
@@ -123,7 +123,7 @@ def test_a_peer_is_timed_on_the_same_scene_and_its_errors_are_told(cpu):
         image, alphas = OPERATORS["rasterization"].call(scene)
         return image - 0.25, alphas
 
-    rows = measure([SMALL["picture and back"]], cpu, groups=2, peers={"darker": darker})
+    rows = measure_cases([SMALL["picture and back"]], cpu, groups=2, peers={"darker": darker})
     assert [row.way for row in rows] == [OURS, "darker"]
     assert rows[1].max_abs == pytest.approx(0.25, abs=1e-4)
     assert rows[1].most_abs == pytest.approx(0.25, abs=1e-4)
@@ -137,13 +137,13 @@ def test_a_peer_is_timed_on_the_same_scene_and_its_errors_are_told(cpu):
 def test_other_bits_in_a_second_call_are_told(cpu):
     case = SMALL["picture"].make(cpu, 0, {})
     noise = iter(range(10_000))
-    (name, way) = next(iter(case.ways.items()))
+    (name, way) = next(iter(case.implementations.items()))
 
     def unsteady():
         image, alphas = way.run().values
         return Results((image + 1e-6 * next(noise), alphas))
 
-    (row,) = measure_case(replace(case, ways={name: way._replace(run=unsteady)}), cpu, 2)
+    (row,) = measure_case(replace(case, implementations={name: way._replace(run=unsteady)}), cpu, 2)
     assert not row.bit_equal
 
 
@@ -161,7 +161,7 @@ class Lists(Overflow):
 @pytest.mark.parametrize(("full", "shift", "equal"), [(False, 0.0, True), (True, 0.0, False), (False, 1e-7, False)])
 def test_a_graph_is_timed_by_its_steps_and_its_bits_and_lists_are_looked_at(monkeypatch, cpu, full, shift, equal):
     case = SMALL["picture"].make(cpu, 0, {})
-    monkeypatch.setattr(gpu_timing, "device_clock", lambda run, times: 20.0 * times)
+    monkeypatch.setattr(cuda, "device_clock", lambda run, times: 20.0 * times)
     replays = []
 
     def graphs(way, device):
@@ -196,7 +196,7 @@ def test_a_peer_that_is_not_installed_is_told_in_one_sentence(monkeypatch):
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", SMALL)
 def test_every_case_is_captured_and_the_graph_gives_the_same_bits(name):
-    (row,) = measure([SMALL[name]], torch.device("cuda"), groups=2)
+    (row,) = measure_cases([SMALL[name]], torch.device("cuda"), groups=2)
     assert row.not_captured == ""
     assert row.busy_ms is not None
     assert row.launch_ms is not None

@@ -3,7 +3,7 @@ import torch
 
 from oasis_warp.bench import roofline
 from oasis_warp.bench.counts import count, count_mesh
-from oasis_warp.bench.gpu_profile import KernelTime
+from oasis_warp.bench.cuda import KernelTime
 from oasis_warp.bench.roofline import MESH_KERNELS, PICTURE_KERNELS, Ceilings, Work, assess
 from oasis_warp.bench.scenes import hand_scenes
 
@@ -61,7 +61,7 @@ def test_drawing_512_pixels_costs_what_was_estimated():
 
 @pytest.mark.gpu
 def test_the_kernels_of_a_gpu_have_formulas_and_stay_below_the_ceilings():
-    rows = roofline.measure(torch.device("cuda"))
+    rows = roofline.measure_roofline(torch.device("cuda"))
     assert rows
     for case in dict.fromkeys(row.case for row in rows):
         kernels = [row for row in rows if row.case == case]

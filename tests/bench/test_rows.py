@@ -5,18 +5,22 @@ import math
 from dataclasses import replace
 
 import pytest
+from gpu_rows import GPU, KERNELS, PEER, POINT, SPEED
 
 from oasis_warp.bench import rows
-from oasis_warp.bench.rows import KEYS, Row, csv_text, json_text, read_csv, write_rows
+from oasis_warp.bench.error_time import SettingRow
+from oasis_warp.bench.gpu_speed import GpuRow
+from oasis_warp.bench.rows import csv_text, from_record, json_text, keys, read_json, to_record, write_rows
 from oasis_warp.core.errors import InputError
 
-ROW = Row(
+ROW = SettingRow(
     scene="layered", width=64, height=64, gaussians=1500, faces=None, op="rasterization", pass_="forward",
     knob="stop", value="0.01", device="a CPU, with a comma", threads=1, median_ms=1.25, iqr_ms=0.5, fastest_ms=1.0,
     repeats=20, first_ms=300.0, cpu_ms=1.0, yardstick_ms=11.6, peak_mb=None, rel_l2=1e-2, max_abs=0.1, psnr_db=45.5,
     gradient_rel_l2=None, floor_rel_l2=2e-7, fragile_percent=3.9, bit_equal=False, seed=0, commit="abc",
     versions="oasis_warp 0",
 )  # fmt: skip
+KEYS = keys(ROW)
 
 
 def test_csv_and_json_have_the_same_keys_and_values():
@@ -40,10 +44,15 @@ def test_the_keys_are_those_that_were_promised():
     assert promised <= set(KEYS)
 
 
-def test_a_table_is_read_back_as_it_was_written(tmp_path):
+def test_tables_are_read_back_as_they_were_written(tmp_path):
     table = [ROW, replace(ROW, bit_equal=True, peak_mb=1.5, psnr_db=None)]
     write_rows(table, tmp_path / "t.csv", tmp_path / "t.json")
-    assert read_csv(tmp_path / "t.csv") == table
+    assert read_json(SettingRow, tmp_path / "t.json") == table
+    for row in (GPU, PEER, POINT, KERNELS[1]):
+        assert from_record(type(row), json.loads(json.dumps(to_record(row)))) == row
+    (tmp_path / "rows.json").write_text(json_text(SPEED))
+    assert read_json(GpuRow, tmp_path / "rows.json") == SPEED
+    assert len(csv_text(SPEED).splitlines()) == 4
 
 
 def test_what_is_not_finite_is_empty():
@@ -52,13 +61,12 @@ def test_what_is_not_finite_is_empty():
     assert ",nan," not in csv_text([infinite])
 
 
-@pytest.mark.parametrize("text", [None, "", "scene,width\nhand,64\n"])
-def test_another_file_is_refused_in_one_sentence(tmp_path, text):
-    path = tmp_path / "t.csv"
+@pytest.mark.parametrize("text", [None, "", "[1]", '[{"case": "a"}]'])
+def test_another_file_than_rows_is_refused_in_one_sentence(tmp_path, text):
     if text is not None:
-        path.write_text(text)
-    with pytest.raises(InputError, match=r"t\.csv: expected the CSV of `oasis bench error-time`"):
-        read_csv(path)
+        (tmp_path / "rows.json").write_text(text)
+    with pytest.raises(InputError, match=r"rows\.json: expected (a JSON file|the rows of a GpuRow)"):
+        read_json(GpuRow, tmp_path / "rows.json")
 
 
 def test_the_commit_is_that_of_the_checkout(monkeypatch, tmp_path):

@@ -7,8 +7,8 @@ from gpu_rows import POINT, STUDY, line
 from oasis_warp.bench import scaling
 from oasis_warp.bench.counts import count
 from oasis_warp.bench.operators import OPERATORS, forward
-from oasis_warp.bench.scaling import Point, measure, picture_errors, points, steepest
-from oasis_warp.bench.scaling_scenes import surface
+from oasis_warp.bench.scaling import Point, measure_scaling, picture_errors, points, steepest
+from oasis_warp.bench.scenes import surface
 
 SMALL = Point("gaussians", "64 x 64", lambda seed: surface(2_000, 64, 2, seed))
 
@@ -27,7 +27,7 @@ def test_the_study_goes_as_far_as_was_promised():
 
 
 def test_a_point_is_timed_in_both_passes_and_its_picture_compared(cpu):
-    forward_row, both = measure([SMALL], cpu, seconds=0.1)
+    forward_row, both = measure_scaling([SMALL], cpu, seconds=0.1)
     assert (forward_row.pass_, both.pass_) == ("forward", "forward + backward")
     assert (both.gaussians, both.views, both.width, both.amount) == (2_000, 2, 64, 2_000)
     assert both.pairs == count(surface(2_000, 64, 2)).pairs
@@ -69,7 +69,7 @@ def test_values_that_are_not_finite_are_told(cpu):
         scene = surface(200, 32, 1, seed)
         return replace(scene, colors=scene.colors * float("inf"))
 
-    row, _ = measure([Point("gaussians", "32 x 32", broken)], cpu, seconds=0.05)
+    row, _ = measure_scaling([Point("gaussians", "32 x 32", broken)], cpu, seconds=0.05)
     assert not row.finite
 
 
@@ -93,7 +93,7 @@ def test_what_grows_is_what_the_axis_says():
 
 @pytest.mark.gpu
 def test_a_point_on_a_gpu_is_timed_in_a_graph():
-    for row in measure([SMALL], torch.device("cuda"), seconds=0.2):
+    for row in measure_scaling([SMALL], torch.device("cuda"), seconds=0.2):
         assert row.not_captured == ""
         assert row.busy_ms is not None
         assert 0 < row.busy_ms < 10

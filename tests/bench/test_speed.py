@@ -7,10 +7,10 @@ import torch
 from oasis_warp.bench import speed
 from oasis_warp.bench.operators import OPERATORS, forward
 from oasis_warp.bench.rows import json_text
-from oasis_warp.bench.scalar import generic_kernels
 from oasis_warp.bench.scenes import hand_scenes
+from oasis_warp.bench.speed import generic_kernels
 
-WAYS = {"warp": speed.WARP, "scalar": speed.SCALAR, "torch": speed.TORCH}
+CPU_ONCE = speed.RunOptions(device=torch.device("cpu"), repeats=2)
 
 
 @pytest.fixture(scope="module")
@@ -19,8 +19,8 @@ def mesh():
 
 
 @pytest.mark.slow
-def test_every_way_is_timed_in_every_pass_and_all_agree(small, cpu):
-    rows = speed.measure_operator(OPERATORS["rasterization"], small, WAYS, cpu, 1, 2)
+def test_every_way_is_timed_in_every_pass_and_all_agree(small):
+    rows = speed.measure_operator(OPERATORS["rasterization"], small, CPU_ONCE)
     assert [(r.pass_, r.way) for r in rows] == [
         (pass_, way) for pass_ in ("forward", "forward + backward") for way in ("warp", "scalar", "torch")
     ]
@@ -56,8 +56,8 @@ def test_generic_kernels_answer_no_wherever_an_operator_asks_for_vectors():
         assert not any(answers())
 
 
-def test_rows_are_plain_json(small, cpu):
-    rows = speed.measure_operator(OPERATORS["blend_colors"], small, WAYS, cpu, 1, 2)
+def test_rows_are_plain_json(small):
+    rows = speed.measure_operator(OPERATORS["blend_colors"], small, CPU_ONCE)
     records = json.loads(json_text(rows))
     assert [r["way"] for r in records] == ["warp", "torch"] * 2  # sparse products are torch's: nothing to vectorise
     assert {r["pass"] for r in records} == {"forward", "forward + backward"}

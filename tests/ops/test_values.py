@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from oasis_kernels.runtime import cuda_values
+from oasis_kernels.runtime import finite
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 from oasis_warp.ops.rasterization import rasterization
 
@@ -12,10 +12,10 @@ POISON = float("nan"), float("inf"), -float("inf"), 1.1e15, -1e30
 
 def arrays(device):
     """More than fit into one launch, of sizes around those of a block, of both types."""
-    sizes = [0, 1, 255, 257, cuda_values.CHUNK - 1, cuda_values.CHUNK, cuda_values.CHUNK + 1, 3, 2, 5, 9000, 7]
+    sizes = [0, 1, 255, 257, finite.CHUNK - 1, finite.CHUNK, finite.CHUNK + 1, 3, 2, 5, 9000, 7]
     g = torch.Generator().manual_seed(0)
     made = {f"array{k}": torch.randn(size, generator=g).to(device) for k, size in enumerate(sizes)}
-    assert len(made) > cuda_values.ARRAYS
+    assert len(made) > finite.ARRAYS
     return made
 
 

@@ -17,7 +17,7 @@ from test_visibility_vectors import (
     unproject,
 )
 
-from oasis_kernels.depth import cuda_depth_draw, cuda_depth_pull
+from oasis_kernels.depth import depth_buffer_cuda
 from oasis_warp.ops import depth_map, depth_visibility
 from oasis_warp.ops._runtime import depth_cuda
 
@@ -66,7 +66,7 @@ def test_neither_a_full_queue_nor_few_blocks_lose_a_face(scene, monkeypatch):
     arguments = on("cuda", make(scene, 1, 310, 270, torch.float32))
     want = depth_map(*in_float64(arguments))
     for queue, blocks in ((0, 1 << 22), (3, 2), (1 << 17, 5)):
-        monkeypatch.setattr(cuda_depth_draw, "QUEUE", queue)
+        monkeypatch.setattr(depth_buffer_cuda, "QUEUE", queue)
         monkeypatch.setattr(depth_cuda, "MOST_BLOCKS", blocks)
         assert_same_picture(depth_map(*arguments), want)
 
@@ -135,7 +135,7 @@ def test_repeats_and_few_blocks_give_the_same_bits(monkeypatch):
     first = graded(*arguments)
     for blocks in (1, 2, 1 << 22):
         monkeypatch.setattr(depth_cuda, "MOST_BLOCKS", blocks)
-        monkeypatch.setattr(cuda_depth_pull, "PEAKS", min(blocks, 1024))
+        monkeypatch.setattr(depth_buffer_cuda, "PEAKS", min(blocks, 1024))
         for _ in range(5):
             again = graded(*arguments)
             assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))

@@ -10,12 +10,10 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
-from gpu_rows import FRAME, GPU, KERNELS, PEER, POINT, SPEED, STUDY
+from gpu_rows import FRAME, GPU, KERNELS, SPEED, STUDY
 
-from oasis_warp.bench import pareto
-from oasis_warp.bench.gpu_speed import GpuRow
-from oasis_warp.bench.rows import csv_text, from_record, json_text, read_json, to_record
-from oasis_warp.core.errors import InputError
+from oasis_warp.bench import plots
+from oasis_warp.bench.rows import json_text
 from studies import kernels
 from studies.__main__ import render
 
@@ -38,22 +36,6 @@ def docs(tmp_path):
     for name in ("gpu.md", "kernels.md"):
         shutil.copy(DOCS / name, folder)
     return folder
-
-
-def test_rows_come_back_from_json_as_they_were(tmp_path):
-    for row in (GPU, PEER, POINT, KERNELS[1]):
-        assert from_record(type(row), json.loads(json.dumps(to_record(row)))) == row
-    (tmp_path / "rows.json").write_text(json_text(SPEED))
-    assert read_json(GpuRow, tmp_path / "rows.json") == SPEED
-    assert len(csv_text(SPEED).splitlines()) == 4
-
-
-@pytest.mark.parametrize("text", [None, "", "[1]", '[{"case": "a"}]'])
-def test_another_file_than_rows_is_refused_in_one_sentence(tmp_path, text):
-    if text is not None:
-        (tmp_path / "rows.json").write_text(text)
-    with pytest.raises(InputError, match=r"rows\.json: expected (a JSON file|the rows of a GpuRow)"):
-        read_json(GpuRow, tmp_path / "rows.json")
 
 
 def test_every_table_of_the_page_is_filled(out, docs):
@@ -88,7 +70,7 @@ def test_what_was_not_measured_stays_on_the_page(monkeypatch, out, docs):
 
 
 def test_without_matplotlib_no_picture_is_drawn(monkeypatch, out):
-    monkeypatch.setattr(pareto, "find_spec", lambda name: None)
+    monkeypatch.setattr(plots, "find_spec", lambda name: None)
     with pytest.raises(SystemExit, match="matplotlib is not installed"):
         kernels.draw(kernels.load(out), out)
     assert not list(out.glob("*.png"))
@@ -104,7 +86,7 @@ def test_no_step_is_called_a_cliff_where_none_is():
 
 
 def test_measuring_writes_what_the_page_is_written_from(monkeypatch, tmp_path):
-    monkeypatch.setattr(kernels.scaling, "measure", lambda points, device, **_: STUDY)
+    monkeypatch.setattr(kernels.scaling, "measure_scaling", lambda points, device, **_: STUDY)
     monkeypatch.setattr(kernels.scaling, "points", lambda quick: [])
     (row,) = kernels.measure_gpu(kernels.Options(out=tmp_path, parts=("scaling",)))
     assert {p.name for p in (tmp_path / "gpu").iterdir()} == {"scaling.json"}

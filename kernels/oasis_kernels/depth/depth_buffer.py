@@ -3,7 +3,7 @@
 `camera_points` (one thread a vertex) -> `face_boxes` and `fill_faces` (one thread a face) -> `interpolate` (one thread
 a pixel) and `visibility` (one thread a point); backwards, `corner_gradients` (one thread a point). The first axis of a
 launch and of all arrays but the faces is the batch. These kernels serve CUDA; what they compute on the CPU is computed
-faster, to the same face ids, by `depth_buffer_vectors`, and they are its oracle.
+faster, to the same face ids, by `depth_buffer.cpp`, and they are its oracle.
 
 A pixel's ray is p(z) = z (u, v, 1) with u = (x - cx) / fx, v = (y - cy) / fy. Sheared along it, a corner (X, Y, Z) in
 camera axes lands at (X - u Z, Y - v Z) and the ray at the origin; with 2D cross products w_a = b x c, w_b = c x a,

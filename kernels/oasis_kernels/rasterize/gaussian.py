@@ -10,6 +10,7 @@ from typing import Any
 import warp as wp
 
 from oasis_kernels import constants
+from oasis_kernels.runtime.source import defined, header_source
 
 JACOBIAN_LIMIT = wp.constant(wp.float64(constants.JACOBIAN_LIMIT))
 ONE = wp.constant(wp.float64(1.0))
@@ -160,27 +161,9 @@ def whitened(w: Any, dx: Any, dy: Any):
     return w[0] * dx + w[1] * dy, w[2] * dx + w[3] * dy
 
 
-EXP_SNIPPET = """
-    // e^x = 2^f 2^n with n the whole number nearest to x log2(e): adding 1.5 * 2^23 rounds, and leaves n in the low
-    // bits, from where it is added to the exponent. 2^f on |f| <= 0.5 is a minimax polynomial, relative error 2e-7.
-    auto exponential = [](@V@ x) -> @V@ {
-        const @V@ scaled = x * 1.44269504f;
-        const @V@ rounded = scaled + 12582912.f;
-        const @V@ f = scaled - (rounded - 12582912.f);
-        @V@ p = f * 0.001327647174f + 0.00967554154f;
-        p = p * f + 0.05550713276f;
-        p = p * f + 0.2402211972f;
-        p = p * f + 0.6931469671f;
-        p = p * f + 1.000000072f;
-        return __builtin_bit_cast(@V@, __builtin_bit_cast(@I@, p) + (__builtin_bit_cast(@I@, rounded) << 23));
-    };
-"""
-"""C++ of e^x for -80 < x <= 0, for scalars and for vectors: `@V@` of float, `@I@` of int."""
-
-
 @wp.func_native(
     "#if defined(__CUDA_ARCH__)\n    return ::expf(x);\n#else\n"
-    + EXP_SNIPPET.replace("@V@", "float").replace("@I@", "int")
+    + defined({"VECTOR": "float", "INTEGERS": "int"}, header_source("rasterize/exponential.h"))
     + "    return exponential(x);\n#endif\n"
 )
 def falloff(x: wp.float32) -> wp.float32: ...

@@ -12,6 +12,11 @@ from typing import Any
 
 import warp as wp
 
+from oasis_kernels.runtime.cuda_native import CudaNative, cuda_native
+
+BLOCK = 128
+"""Threads of a block on CUDA."""
+
 L0 = 0.28209479177387814
 """sqrt(1 / (4 pi))."""
 L1 = 0.4886025119029199
@@ -292,3 +297,21 @@ def see_backward(scalar: Any, degree: int) -> Any:
             g_means[gaussian] = vec3(g_mean)
 
     return see_backward
+
+
+def _on_cuda(name: str, label: str, degree: int) -> CudaNative:
+    numbers = {name: f"{value!r}f" for name, value in globals().items() if name[0] == "L" and name[1].isdigit()}
+    constants = {**numbers, "DEGREE": degree, "COUNT": (degree + 1) ** 2}
+    return cuda_native("rasterize/spherical_harmonics.cu", name, BLOCK, label=label, constants=constants)
+
+
+@functools.cache
+def cuda_see(degree: int) -> CudaNative:
+    """CUDA kernel in float32: a scene -> colours of its `total` pairs of a camera and a Gaussian."""
+    return _on_cuda("see", "see_colors", degree)
+
+
+@functools.cache
+def cuda_see_backward(degree: int) -> CudaNative:
+    """CUDA kernel in float32: what `see_backward` gives; a null pointer for what is not wanted."""
+    return _on_cuda("see_backward", "see_colors_backward", degree)

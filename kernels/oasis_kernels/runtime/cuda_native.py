@@ -1,21 +1,27 @@
-"""CUDA kernels written as one C++ snippet each, that take raw pointers and numbers by value.
+"""CUDA kernels: C++ functions that take raw pointers, and numbers by value.
 
-Such a kernel has one argument, a block of 64-bit words: pointers, whole numbers, or doubles, in the order in which the
-kernel names them. Setting them costs the host a microsecond or two, where an array object an argument costs several
+Such a kernel has one argument, a block of 64-bit words: pointers, whole numbers, or doubles, in the order of the C++
+parameters. Setting them costs the host a microsecond or two, where an array object for each argument costs several for
 each, and a launch that was recorded once is replayed with other words.
 """
 
 import ctypes
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
+from oasis_kernels.runtime.native import _typed
+from oasis_kernels.runtime.source import defined, kernel_source
+
+READS = {"float": "(float)__longlong_as_double(words[{}])", "double": "__longlong_as_double(words[{}])"}
+
 
 @dataclass(frozen=True)
 class CudaNative:
-    """A snippet as a kernel."""
+    """A C++ function as a kernel."""
 
     kernel: Any
     words: Any
@@ -23,34 +29,50 @@ class CudaNative:
     parameters: tuple[str, ...]
     """Their names, in order."""
     block: int
-    """Threads a block."""
+    """Threads of a block."""
 
 
 def cuda_native(
-    name: str, parameters: dict[str, str], body: str, block: int, blocks_a_multiprocessor: int = 1
+    path: str,
+    name: str,
+    block: int,
+    *,
+    blocks_per_multiprocessor: int = 1,
+    label: str | None = None,
+    constants: Mapping[str, object] | None = None,
+    scalar: str = "float",
+    fuse: bool = True,
 ) -> CudaNative:
-    """Build the kernel `name` from the C++ `body`.
+    """Build the kernel `name` of the C++ file `path`.
 
-    The body sees each of `parameters` (name: C++ type) as a constant, and `block_index` (int), the number of its block;
-    threads of a block are told apart by threadIdx.x. It runs for all threads of every block.
+    The function sees, besides its parameters, `block_index` (int), the number of its block; threads of a block are told
+    apart by threadIdx.x. It runs for all threads of every block.
 
     Args:
-        name: Of the kernel, as profilers show it.
-        parameters: Pointers, whole numbers, and "float" or "double".
-        body: C++.
-        block: Threads a block: a power of two.
-        blocks_a_multiprocessor: That many shall fit at once: limits the registers of a thread.
+        path: Relative to the package.
+        name: Of the function.
+        block: Threads of a block: a power of two.
+        blocks_per_multiprocessor: That many shall fit at once: limits the registers of a thread.
+        label: Name of the kernel as profilers show it; `name` if None.
+        constants: Macros that the function sees, besides `BLOCK` and `WARPS`, the threads and warps of a block.
+        scalar: "float" or "double": what `T` stands for in the parameters.
+        fuse: Whether multiply-adds are fused.
     """
-    reads = {"float": "(float)__longlong_as_double(words[{}])", "double": "__longlong_as_double(words[{}])"}
-    lines = [f"{kind} const {p} = {reads.get(kind, f'({kind})words[{{}}]').format(k)};"
+    source = kernel_source(path, name)
+    parameters = _typed(source.parameters, scalar)
+    lines = [f"{kind} const {p} = {READS.get(kind, f'({kind})words[{{}}]').format(k)};"
              for k, (p, kind) in enumerate(parameters.items())]  # fmt: skip
+    body = defined({"BLOCK": block, "WARPS": block // 32, **(constants or {})}, source.body)
+    if not fuse:  # never compiled for the CPU, where such a module has no such option
+        body = f"#if defined(__CUDA_ARCH__)\n{body}#endif\n"
     text = "\n    ".join([f"const int block_index = thread / {block};", *lines]) + "\n" + body
     vector = wp.types.vector(length=len(parameters), dtype=wp.int64)
 
     def snippet(thread: int, words: Any): ...
 
     # Warp keeps functions by name, and a second one of a name takes the place of the first.
-    snippet.__qualname__ = f"{name}_{hashlib.sha1(text.encode()).hexdigest()[:16]}"
+    label = label or name
+    snippet.__qualname__ = f"{label}_{hashlib.sha1(text.encode()).hexdigest()[:16]}"
     snippet.__annotations__["words"] = vector
     run = wp.func_native(text)(snippet)
 
@@ -58,10 +80,12 @@ def cuda_native(
         run(wp.tid(), words)
 
     launch.__annotations__["words"] = vector
-    launch.__name__ = launch.__qualname__ = name
-    kernel = wp.kernel(
-        launch, enable_backward=False, module="unique", launch_bounds=(block, blocks_a_multiprocessor)
+    launch.__name__ = launch.__qualname__ = label
+    kernel: Any = wp.kernel(
+        launch, enable_backward=False, module="unique", launch_bounds=(block, blocks_per_multiprocessor)
     )
-    fields = [(p, ctypes.c_double if kind in reads else ctypes.c_longlong) for p, kind in parameters.items()]
-    words = type(f"{name}_words", (ctypes.Structure,), {"_fields_": fields})
+    if not fuse:
+        wp.set_module_options({"fuse_fp": False}, module=kernel.module)
+    fields = [(p, ctypes.c_double if kind in READS else ctypes.c_longlong) for p, kind in parameters.items()]
+    words = type(f"{label}_words", (ctypes.Structure,), {"_fields_": fields})
     return CudaNative(kernel, words, tuple(parameters), block)

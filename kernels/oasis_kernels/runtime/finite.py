@@ -1,31 +1,28 @@
-"""Whether float32 numbers on the CPU are finite and of a sensible size: one pass, on one thread, for many arrays.
+"""Whether numbers are finite and of a sensible size: one pass on the CPU, one launch on CUDA, for several arrays.
 
-Torch's own reductions start its pool of threads for arrays of this size, which goes on spinning for a while on the
-cores that our threads want.
+On the CPU torch's own reductions start its pool of threads for arrays of this size, which goes on spinning for a while
+on the cores that our threads want.
 """
 
+import functools
+
+from oasis_kernels.runtime.cuda_native import CudaNative, cuda_native
 from oasis_kernels.runtime.native import Native, native
 
-BODY = """
-    typedef float V __attribute__((ext_vector_type(16)));
-    typedef float VU __attribute__((ext_vector_type(16), aligned(4)));
-    for (long long a = 0; a < count; a++) {
-        const float* values = (const float*)arrays[2 * a];
-        const long long n = arrays[2 * a + 1];
-        const float limit = 1e15f;
-        decltype(V{} <= V{}) sound = V{} <= V{};
-        long long i = 0;
-        for (; i + 16 <= n; i += 16) {
-            const V v = *(const VU*)(values + i);
-            sound &= (v <= limit) & (v >= -limit);  // both false for NaN
-        }
-        bool bad = !__builtin_reduce_and(sound);
-        for (; i < n; i++) bad |= !(values[i] <= limit && values[i] >= -limit);
-        if (bad) *found = 1;
-    }
-"""
+BLOCK = 256
+CHUNK = 16 * BLOCK
+"""Numbers that a block on CUDA reads."""
+ARRAYS = 10
+"""That fit into one launch on CUDA."""
 
-ALL_FINITE: Native = native(
-    "all_finite", {"arrays": "const long long*", "count": "long long", "found": "long long*"}, BODY
-)
-"""Kernel: `count` pairs of an address and a length -> 1 in `found` if a number is not within 1e15."""
+ALL_FINITE: Native = native("runtime/finite.cpp", "all_finite")
+"""CPU kernel: `count` pairs of an address and a length of float32 -> 1 in `found` if a number is not within 1e15."""
+
+
+@functools.cache
+def cuda_all_finite() -> CudaNative:
+    """CUDA kernel: `ARRAYS` arrays of floats, or of doubles where `wide`, -> 1 in `found` if one is beyond `largest`.
+
+    It takes the chunks of all arrays together as blocks; arrays that are not needed have count 0.
+    """
+    return cuda_native("runtime/finite.cu", "all_finite", BLOCK, label="all_finite_cuda", constants={"CHUNK": CHUNK})

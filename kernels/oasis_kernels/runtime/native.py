@@ -1,69 +1,90 @@
-"""CPU kernels written as one C++ snippet each, that take raw pointers and share their work among threads themselves.
+"""CPU kernels: C++ functions that take raw pointers and share their work among threads themselves.
 
 The one argument of such a kernel is the address of its parameter block: 64-bit words, pointers or whole numbers, in the
-order in which the kernel names them. A launch is one call of the snippet; several threads may launch the same kernel
-with the same block at once, to work on it together: the snippet deals out numbered tasks with `phase`.
+order of the C++ parameters. A launch is one call of the function; several threads may launch the same kernel with the
+same block at once, to work on it together: the function deals out numbered tasks with `phase` (see `phase.h`).
 """
 
 import hashlib
+import os
+import platform
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
-from oasis_kernels.runtime.vectors import cpu_options
+from oasis_kernels.runtime.source import defined, header_source, kernel_source
+
+PHASE_WORDS = 16
+"""Words of zeros that the threads in a phase share."""
+TASK = 1024
+"""Items that a thread takes at a time in `ranges.h`."""
 
 
 @dataclass(frozen=True)
 class Native:
-    """A snippet as a kernel, and the names of its parameters, in order."""
+    """A C++ function as a kernel, and the names of its parameters, in order."""
 
     kernel: Any
     parameters: tuple[str, ...]
     """The first is `give_way`: the address of a function without arguments that lets other threads run, or 0."""
 
 
-PHASE = """
-    // Do the tasks 0 .. n - 1 of a phase together with whoever else has this block. A thread waits only for tasks that
-    // another one has begun: it never matters whether, or when, a thread arrives. `share` returns when none is left to
-    // begin, and is for the last phase of a kernel; `phase` when all are done.
-    auto share = [&](long long* state, long long n, auto&& task) {
-        long long t;
-        while ((t = __atomic_fetch_add(state, 1, __ATOMIC_RELAXED)) < n) {
-            task(t);
-            __atomic_fetch_add(state + 8, 1, __ATOMIC_RELEASE);
-        }
-    };
-    auto phase = [&](long long* state, long long n, auto&& task) {
-        share(state, n, task);
-        for (int spins = 0; __atomic_load_n(state + 8, __ATOMIC_ACQUIRE) < n; spins++) {
-    #if defined(__x86_64__)
-            __builtin_ia32_pause();
-    #endif
-            if (spins > 1000 && give_way) ((void (*)())give_way)();  // the other one may wait for this core
-        }
-    };
-"""
-"""C++: `phase(state, n, task)` and `share`. `state` are 16 words of zeros: the next task, and the number of those done,
-each on a cache line of its own."""
+def cpu_options() -> dict[str, Any]:
+    """Options of a Warp module with wide vectors: the flags in $OASIS_WARP_CPU_FLAGS, else those of this CPU.
 
-PHASE_WORDS = 16
+    Clang prefers 256-bit registers, even where 512-bit ones exist, without a flag. Another value serves to build for,
+    or to try, other machines: "-target-cpu x86-64-v3" has 256-bit vectors, "-target-cpu x86-64-v2" 128-bit ones.
+    """
+    x86 = platform.machine().lower() in ("x86_64", "amd64")
+    native = "-march=native -mprefer-vector-width=512" if x86 else "-march=native"
+    return {"enable_backward": False, "cpu_compiler_flags": os.environ.get("OASIS_WARP_CPU_FLAGS", native)}
 
 
-def native(name: str, parameters: dict[str, str], body: str) -> Native:
-    """Build the kernel `name` from the C++ `body`, which sees each of `parameters` (name: C++ type) as a constant."""
-    parameters = {"give_way": "long long", **parameters}
+def native(
+    path: str,
+    name: str,
+    *,
+    label: str | None = None,
+    constants: Mapping[str, object] | None = None,
+    scalar: str = "float",
+    shared: Mapping[str, str] | None = None,
+) -> Native:
+    """Build the kernel `name` of the C++ file `path`.
+
+    Args:
+        path: Relative to the package.
+        name: Of the function.
+        label: Name of the kernel as profilers show it; `name` if None.
+        constants: Macros that the function sees, besides `PHASE_WORDS` and `TASK`.
+        scalar: "float" or "double": what `T` stands for in the parameters.
+        shared: Parameters before those of the function: C++ types by name.
+    """
+    source = kernel_source(path, name)
+    parameters = {"give_way": "long long", **(shared or {}), **_typed(source.parameters, scalar)}
     words = [f"{kind} const {p} = ({kind})words[{k}];" for k, (p, kind) in enumerate(parameters.items())]
-    text = "\n    ".join(["const long long* words = (const long long*)block;", *words]) + PHASE + body
+    body = source.body
+    if body.lstrip().startswith("#pragma"):  # which has to stand at the start of a block
+        body = "{\n" + body + "}\n"
+    body = defined({"PHASE_WORDS": PHASE_WORDS, "TASK": TASK, **(constants or {})}, body)
+    words = ["const long long* words = (const long long*)block;", *words]
+    text = "\n    ".join(words) + "\n" + header_source("runtime/phase.h") + body
 
     def snippet(block: wp.uint64): ...
 
     # Warp keeps functions by name, and a second one of a name takes the place of the first.
-    snippet.__qualname__ = f"{name}_{hashlib.sha1(text.encode()).hexdigest()[:16]}"
+    label = label or name
+    snippet.__qualname__ = f"{label}_{hashlib.sha1(text.encode()).hexdigest()[:16]}"
     run = wp.func_native(text)(snippet)
 
     def launch(block: wp.uint64):
         run(block)
 
-    launch.__name__ = launch.__qualname__ = name
+    launch.__name__ = launch.__qualname__ = label
     return Native(wp.kernel(launch, module="unique", module_options=cpu_options()), tuple(parameters))
+
+
+def _typed(parameters: Mapping[str, str], scalar: str) -> dict[str, str]:
+    """`parameters` with T* as pointers to `scalar`."""
+    return {name: kind.replace("T*", f"{scalar}*") for name, kind in parameters.items()}

@@ -1,40 +1,40 @@
-"""How much work a picture is: what times are divided by, and what the roofline counts bytes and operations from."""
+"""How much work a scene is: Gaussians, pixels, tiles and pairs, from which the roofline counts bytes and operations."""
 
 from dataclasses import dataclass
 
 import torch
 
 from oasis_kernels.constants import EPS2D
-from oasis_kernels.rasterize.cuda_binning import TILE
+from oasis_kernels.rasterize.tiles_cuda import TILE
 from oasis_warp.bench.avatar_scene import AvatarScene
-from oasis_warp.bench.scenes import MeshScene, Scene
+from oasis_warp.bench.scenes import GaussianScene, MeshScene
 from oasis_warp.ops.projection import project
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Of a picture, over all its cameras."""
+    """The work of drawing a scene, summed over its cameras."""
 
     gaussians: int
     """Once for each camera."""
     drawn: int
-    """Of these, whose box holds a pixel."""
+    """Of these, those whose box contains a pixel."""
     box_pixels: int
-    """In all boxes together: how often a pixel has to be looked at for a Gaussian."""
+    """In all boxes together."""
     pairs: int
-    """Of a Gaussian and a tile of 8 x 8 pixels that its box meets."""
+    """Pairs of a Gaussian and a tile of 8 x 8 pixels that its box meets."""
     tiles: int
     busy_tiles: int
-    """With a list that is not empty."""
+    """Tiles with a list that is not empty."""
     longest: int
-    """List of a tile."""
+    """Length of the longest list of a tile."""
     pixels: int
     views: int
 
 
 @torch.no_grad()
-def count(scene: Scene) -> Counts:
-    """What drawing `scene` takes."""
+def count(scene: GaussianScene) -> Counts:
+    """The work of drawing `scene`."""
     across, down = -(-scene.width // TILE), -(-scene.height // TILE)
     n, n_views = len(scene.means), len(scene.viewmats)
     drawn = box_pixels = pairs = 0
@@ -50,11 +50,11 @@ def count(scene: Scene) -> Counts:
         drawn += len(boxes)
         box_pixels += int((boxes[:, 2:] - boxes[:, :2]).long().prod(-1).sum())
         pairs += int(((x1 - x0).long() * (y1 - y0)).sum())
-        # Rectangles added to a picture by their corners, and summed up both ways.
+        # Rectangles are added by their corners and summed along both axes.
         corners = torch.zeros((down + 1) * (across + 1), dtype=torch.int64, device=boxes.device)
         for x, y, sign in ((x0, y0, 1), (x1, y0, -1), (x0, y1, -1), (x1, y1, 1)):
-            place = (y * (across + 1) + x).long()
-            corners.scatter_add_(0, place, torch.full_like(place, sign))
+            corner = (y * (across + 1) + x).long()
+            corners.scatter_add_(0, corner, torch.full_like(corner, sign))
         lists.append(corners.view(down + 1, across + 1).cumsum(0).cumsum(1)[:down, :across])
     lengths = torch.stack(lists)
     return Counts(
@@ -72,7 +72,7 @@ def count(scene: Scene) -> Counts:
 
 @dataclass(frozen=True)
 class MeshCounts:
-    """Of a mesh that is posed and carries Gaussians, or that hides points."""
+    """The work of posing a mesh with Gaussians, or of finding the points that it hides."""
 
     vertices: int
     faces: int
@@ -86,7 +86,7 @@ class MeshCounts:
 
 
 def count_mesh(scene: MeshScene) -> MeshCounts:
-    """What posing or drawing the mesh of `scene` takes."""
+    """The work of posing or drawing the mesh of `scene`."""
     return MeshCounts(
         vertices=len(scene.rest_vertices),
         faces=len(scene.faces),
@@ -100,7 +100,7 @@ def count_mesh(scene: MeshScene) -> MeshCounts:
 
 
 def count_avatar(scene: AvatarScene) -> MeshCounts:
-    """What posing the Gaussians of an avatar takes."""
+    """The work of posing the Gaussians of an avatar."""
     return MeshCounts(
         vertices=len(scene.hand.template),
         faces=len(scene.hand.faces),

@@ -1,19 +1,28 @@
-"""Error against run time: turn each knob of each operator and see what it costs and what it buys."""
+"""Error against run time: what each setting of each operator costs and buys."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from oasis_warp.bench import knobs
 from oasis_warp.bench.knobs import Setting
-from oasis_warp.bench.operators import OPERATORS, Exact, Operator, Outputs, Pass, exact, forward, gradients
-from oasis_warp.bench.rows import Row, commit, device_name, versions
+from oasis_warp.bench.operators import (
+    OPERATORS,
+    Exact,
+    Operator,
+    Outputs,
+    Pass,
+    Results,
+    exact,
+    forward,
+    with_gradients,
+)
+from oasis_warp.bench.rows import provenance, scene_columns
 from oasis_warp.bench.scenes import (
+    GaussianScene,
     MeshScene,
-    Scene,
     equal_depths,
     far_hand,
     hand_scenes,
@@ -22,22 +31,94 @@ from oasis_warp.bench.scenes import (
     opaque,
     slivers,
 )
-from oasis_warp.bench.timing import Timed, Timing, peak_megabytes, time_together
-from oasis_warp.bench.yardstick import make_yardstick
+from oasis_warp.bench.timing import Timed, make_yardstick, peak_megabytes, time_together
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.ops._runtime.rules import using
 from oasis_warp.reference.errors import largest_error, psnr, relative_error, same_bits
 
 SWEPT = ("rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "skin")
-"""Operators that have knobs of their own: `blend_weights` draws by the rasterizer's, posing is two of these."""
+"""Operators with knobs of their own: `blend_weights` draws by the rasterizer's, posing is two of these."""
+BUDGETS: tuple[tuple[str, float | None], ...] = (("1e-2", 1e-2), ("1e-3", 1e-3), ("1e-4", 1e-4), ("exact", None))
+"""Largest error allowed; None: no more than that of the default, whose arithmetic is exact up to rounding."""
+WORTHWHILE = 0.05
+"""Least share of the time that a setting has to save: such times differ by less."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SettingRow:
+    """An operator on a scene with one setting. What does not apply is empty in CSV and null in JSON."""
+
+    scene: str
+    width: int
+    height: int
+    gaussians: int
+    """In the scene."""
+    faces: int | None
+    """Of its mesh, where it has one."""
+    op: str
+    pass_: str
+    """Called `pass` in files: "forward" or "forward + backward"."""
+    knob: str
+    value: str
+    """Of the knob; "default" for the knob "default"."""
+    device: str
+    threads: int
+    median_ms: float
+    iqr_ms: float
+    fastest_ms: float
+    repeats: int
+    first_ms: float
+    """The first call, with compiling or loading kernels."""
+    cpu_ms: float | None
+    """CPU time of all threads in the call with the least; None on CUDA."""
+    yardstick_ms: float
+    """The yardstick's CPU time in the same rounds: times over it can be compared between runs."""
+    peak_mb: float | None
+    """Memory beyond what was in use before the call [MiB]."""
+    rel_l2: float
+    """Largest relative error of any output, fragile pixels left out."""
+    max_abs: float
+    """Largest error of any element of any output, fragile pixels included."""
+    psnr_db: float | None
+    """Of the image, fragile pixels included; None where it is equal, or there is none."""
+    gradient_rel_l2: float | None
+    """Largest relative error of any gradient, of a loss without the fragile pixels."""
+    floor_rel_l2: float
+    """How far the exact results are known: how much torch in float64, with the Gaussians or faces in another order,
+    differs from them in the first output. Smaller errors than this say nothing."""
+    fragile_percent: float | None
+    """Share of the pixels where a decision depends on rounding."""
+    bit_equal: bool
+    """Whether results and gradients are bit-equal to those of the default setting."""
+    seed: int
+    commit: str
+    versions: str
+
+    @property
+    def error(self) -> float:
+        """The larger of the errors of values and gradients."""
+        return max(self.rel_l2, self.gradient_rel_l2 or 0.0)
+
+    @property
+    def cost_ms(self) -> float:
+        """What settings are compared by: CPU time for one thread, else the fastest call.
+
+        Other work on the machine delays a call, but hardly adds to its CPU time.
+        """
+        return self.fastest_ms if self.cpu_ms is None or self.threads > 1 else self.cpu_ms
+
+    @property
+    def is_default(self) -> bool:
+        """Whether every knob is at its default."""
+        return self.knob == "default"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
     """What to measure."""
 
-    plan: tuple[tuple[Scene | MeshScene, str], ...]
-    """Scenes, each with the operator that is measured on it."""
+    plan: tuple[tuple[GaussianScene | MeshScene, str], ...]
+    """Scenes, each with the operator to measure on it."""
     device: torch.device
     threads: int = 1
     """Of the default setting."""
@@ -46,16 +127,14 @@ class Sweep:
     settings: Callable[[str, torch.device, int, int], Sequence[Setting]] = knobs.settings
 
 
-def standard_plan(size: int, seed: int, quick: bool) -> tuple[tuple[Scene | MeshScene, str], ...]:
-    """Every operator on the avatar, and each on what is hard for it unless `quick`."""
+def standard_plan(size: int, seed: int, quick: bool) -> tuple[tuple[GaussianScene | MeshScene, str], ...]:
+    """Every operator on the avatar and, unless `quick`, on scenes that are hard for it."""
     drawn, mesh = hand_scenes(size, seed)
-    avatar = [(drawn if OPERATORS[name].scene is Scene else mesh, name) for name in SWEPT]
+    avatar = [(drawn if OPERATORS[name].scene is GaussianScene else mesh, name) for name in SWEPT]
     if quick:
         return tuple(avatar)
     far_drawn, far_mesh = far_hand(size, seed)
-    stiff = (
-        far_drawn, layered(seed=seed), needles(seed=seed), opaque(seed=seed), equal_depths(seed=seed),
-    )  # fmt: skip
+    stiff = far_drawn, *(make(seed=seed) for make in (layered, needles, opaque, equal_depths))
     flat = slivers(size, seed)
     return (
         *avatar,
@@ -65,20 +144,20 @@ def standard_plan(size: int, seed: int, quick: bool) -> tuple[tuple[Scene | Mesh
     )
 
 
-def measure(sweep: Sweep, progress: Progress = silent) -> list[Row]:
-    """One row a (scene, operator, setting, pass), in this order.
+def measure_settings(sweep: Sweep, progress: Progress = silent) -> list[SettingRow]:
+    """One row for each scene, operator, setting and pass, in this order.
 
     Args:
         sweep: What to measure.
-        progress: Told after every round of timing.
+        progress: Called after every round of timing.
     """
-    rows: list[Row] = []
-    for place, (scene, op) in enumerate(sweep.plan):
+    rows: list[SettingRow] = []
+    for k, (scene, name) in enumerate(sweep.plan):
 
-        def after_round(n: int, done: int = place * sweep.repeats) -> None:
+        def after_round(n: int, done: int = k * sweep.repeats) -> None:
             progress("error against time", done + n, len(sweep.plan) * sweep.repeats)
 
-        rows += measure_operator(OPERATORS[op], scene, sweep, after_round)
+        rows += measure_operator(OPERATORS[name], scene, sweep, after_round)
     return rows
 
 
@@ -88,13 +167,13 @@ class Variant:
 
     setting: Setting
     pass_: Pass
-    run: Callable[[], Outputs]
+    run: Callable[[], Results]
     threads: int
 
 
 def measure_operator(
     operator: Operator, scene: Any, sweep: Sweep, after_round: Callable[[int], object]
-) -> list[Row]:
+) -> list[SettingRow]:
     """Rows of one operator on one scene, all settings timed in turns."""
     scene = scene.to(device=sweep.device)
     truth = exact(operator, scene)
@@ -108,10 +187,30 @@ def measure_operator(
     )
     yardstick, *timings = timings
     results = {(v.setting, v.pass_): v.run() for v in variants}
-    floor = reference_floor(operator, scene, truth)
-    about = {"commit": commit(), "versions": versions()}
+    common = {
+        **scene_columns(scene),
+        "op": operator.name,
+        **provenance(sweep.device),
+        "yardstick_ms": yardstick.cpu_ms,
+        "floor_rel_l2": reference_floor(operator, scene, truth),
+        "fragile_percent": truth.fragile_percent,
+    }
     return [
-        make_row(operator, scene, variant, timing, yardstick, truth, results, floor, sweep.device, about)
+        SettingRow(
+            **common,
+            pass_=variant.pass_,
+            knob=variant.setting.knob,
+            value=variant.setting.value,
+            threads=variant.threads,
+            median_ms=timing.median_ms,
+            iqr_ms=timing.iqr_ms,
+            fastest_ms=timing.fastest_ms,
+            repeats=len(timing.times_ms),
+            first_ms=timing.first_ms,
+            cpu_ms=timing.cpu_ms if sweep.device.type == "cpu" else None,
+            peak_mb=peak_megabytes(variant.run, sweep.device),
+            **error_columns(operator, scene, variant, truth, results),
+        )
         for variant, timing in zip(variants, timings, strict=True)
     ]
 
@@ -119,21 +218,25 @@ def measure_operator(
 def make_variant(
     operator: Operator, scene: Any, setting: Setting, pass_: Pass, truth: Exact, threads: int
 ) -> Variant:
-    """The call that is timed; what a setting does to the scene is done before."""
+    """The call to time; what a setting does to the scene is done before."""
     prepared = setting.prepare(scene)
-    call = operator.torch_peer if setting.torch else operator.call
-    weights = shaped(truth.weights, setting, prepared)
+    call = operator.torch_call if setting.torch else operator.call
+    if pass_ == "forward":
 
-    def run() -> Outputs:
+        def run() -> Results:
+            return Results(forward(call, prepared, setting.options))
+    else:
+        weights = fitted(truth.weights, setting, prepared)
+        run = with_gradients(operator, call, prepared, setting.options, weights)
+
+    def run_by_rules() -> Results:
         with using(setting.rules):
-            if pass_ == "forward":
-                return forward(call, prepared, setting.options)
-            return gradients(operator, call, prepared, setting.options, weights)
+            return run()
 
-    return Variant(setting, pass_, run, threads)
+    return Variant(setting, pass_, run_by_rules, threads)
 
 
-def shaped(weights: Outputs, setting: Setting, prepared: Any) -> Outputs:
+def fitted(weights: Outputs, setting: Setting, prepared: Any) -> Outputs:
     """Weights of the loss in the precision and size of a setting's outputs; of smaller images the first pixels'."""
     cast = tuple(w.to(setting.dtype) for w in weights)
     if setting.shrink == 1:
@@ -141,71 +244,82 @@ def shaped(weights: Outputs, setting: Setting, prepared: Any) -> Outputs:
     return tuple(w[:, : prepared.height, : prepared.width].contiguous() if w.dim() == 4 else w for w in cast)
 
 
-def make_row(
-    operator: Operator,
-    scene: Any,
-    variant: Variant,
-    timing: Timing,
-    yardstick: Timing,
-    truth: Exact,
-    results: dict[tuple[Setting, Pass], Outputs],
-    floor: float,
-    device: torch.device,
-    about: dict[str, str],
-) -> Row:
-    """Errors of one variant beside its times."""
+def error_columns(
+    operator: Operator, scene: Any, variant: Variant, truth: Exact, results: dict[tuple[Setting, Pass], Results]
+) -> dict[str, Any]:
+    """The columns of a row that say how exact a variant is."""
     setting, pass_ = variant.setting, variant.pass_
     raw = results[setting, "forward"]
-    outputs = operator.comparable(setting.finish(raw))
+    finished = setting.finish(raw.values)
+    outputs = operator.comparable(finished)
     default = next(s for s, _ in results if s.knob == "default")
-    same = same_bits(raw, results[default, "forward"])
+    same = same_bits(raw.values, results[default, "forward"].values)
     gradient_error = None
     if pass_ == "forward + backward":
-        found = setting.spread(results[setting, pass_], scene)
-        same = same and same_bits(results[setting, pass_], results[default, pass_])
-        if found is not None:
-            gradient_error = max(relative_error(g, e) for g, e in zip(found, truth.gradients, strict=True))
-    each = [(o, e, judged_elements(e, truth.judged)) for o, e in zip(outputs, truth.outputs, strict=True)]
-    is_scene = isinstance(scene, Scene)
-    return Row(
-        scene=scene.name,
-        width=scene.width,
-        height=scene.height,
-        gaussians=len(scene.means if is_scene else scene.quats),
-        faces=None if is_scene else len(scene.faces),
-        op=operator.name,
-        pass_=pass_,
-        knob=setting.knob,
-        value=setting.value,
-        device=device_name(device),
-        threads=variant.threads,
-        median_ms=timing.median_ms,
-        iqr_ms=timing.iqr_ms,
-        fastest_ms=timing.fastest_ms,
-        repeats=len(timing.times_ms),
-        first_ms=timing.first_ms,
-        cpu_ms=timing.cpu_ms if device.type == "cpu" else None,
-        yardstick_ms=yardstick.cpu_ms,
-        peak_mb=peak_megabytes(variant.run, device),
-        rel_l2=max(relative_error(o, e, j) for o, e, j in each),
-        max_abs=max(largest_error(o, e) for o, e, _ in each),
-        psnr_db=psnr(outputs[0], truth.outputs[0]) if operator.image else None,
-        gradient_rel_l2=gradient_error,
-        floor_rel_l2=floor,
-        fragile_percent=truth.fragile_percent,
-        bit_equal=same,
-        seed=scene.seed,
-        **about,
-    )
-
-
-def judged_elements(output: Tensor, judged: Tensor | None) -> Tensor | None:
-    """Elements of the judged pixels of an image [1, H, W, D]."""
-    return None if judged is None else judged[..., None].expand_as(output)
+        gradients = results[setting, pass_].gradients
+        found = setting.spread(gradients, scene)
+        same = same and same_bits(gradients, results[default, pass_].gradients)
+        gradient_error = None if found is None else truth.gradient_error(found)
+    return {
+        "rel_l2": truth.value_error(finished),
+        "max_abs": max(largest_error(o, e) for o, e in zip(outputs, truth.values, strict=True)),
+        "psnr_db": psnr(outputs[0], truth.values[0]) if operator.image else None,
+        "gradient_rel_l2": gradient_error,
+        "bit_equal": same,
+    }
 
 
 def reference_floor(operator: Operator, scene: Any, truth: Exact) -> float:
     """Relative difference of the exact first output and that of torch in float64, from a list in another order."""
     other = operator.prepare(knobs.in_other_order(scene.to(dtype=torch.float64)))
-    output = operator.comparable(forward(operator.torch_peer, other, {}))[0]
-    return relative_error(output, truth.outputs[0], judged_elements(truth.outputs[0], truth.judged))
+    output, exact_output = operator.comparable(forward(operator.torch_call, other, {}))[0], truth.values[0]
+    judged = None if truth.judged is None else truth.judged[..., None].expand_as(exact_output)
+    return relative_error(output, exact_output, judged)
+
+
+class Group(NamedTuple):
+    """Rows that can be compared: one operator on one scene in one pass."""
+
+    op: str
+    scene: str
+    pass_: str
+    rows: tuple[SettingRow, ...]
+
+    @property
+    def default(self) -> SettingRow:
+        """The row of the default setting."""
+        return next(row for row in self.rows if row.is_default)
+
+
+def groups(rows: Iterable[SettingRow]) -> list[Group]:
+    """Comparable rows, in the order of their first."""
+    found: dict[tuple[str, str, str], list[SettingRow]] = {}
+    for row in rows:
+        found.setdefault((row.op, row.scene, row.pass_), []).append(row)
+    return [Group(*key, tuple(members)) for key, members in found.items()]
+
+
+def fits(row: SettingRow, budget: float | None, default: SettingRow) -> bool:
+    """Whether a row keeps an error budget; one whose gradients cannot be compared keeps none of its pass."""
+    if row.pass_ != "forward" and row.gradient_rel_l2 is None:
+        return False
+    return row.bit_equal or row.error <= (default.error if budget is None else budget)
+
+
+def fastest(group: Group, budget: float | None) -> SettingRow:
+    """The setting of least `cost_ms` that keeps an error budget; the default if none gains more than `WORTHWHILE`.
+
+    Threads are not among them: they trade no error, and every setting can have them.
+    """
+    within = [row for row in group.rows if row.knob != "threads" and fits(row, budget, group.default)]
+    best = min(within, key=lambda row: row.cost_ms)
+    return best if best.cost_ms < (1 - WORTHWHILE) * group.default.cost_ms else group.default
+
+
+def non_dominated(rows: Sequence[SettingRow]) -> list[SettingRow]:
+    """Rows that no other beats in both time and error, fastest first."""
+    best: list[SettingRow] = []
+    for row in sorted(rows, key=lambda row: (row.cost_ms, row.error)):
+        if not best or row.error < best[-1].error:
+            best.append(row)
+    return best

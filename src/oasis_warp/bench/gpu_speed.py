@@ -1,30 +1,25 @@
 """How fast everything is on a GPU: on the host's clock, in a CUDA graph, and how exact."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 
 import torch
-from torch import Tensor
 
-from oasis_warp.bench.gpu_cases import Case, Draw, Named, Way
-from oasis_warp.bench.gpu_profile import kernel_times
-from oasis_warp.bench.gpu_timing import STEPS_A_GRAPH, Captured, NotCaptured, Probe, Sample, capture, time_groups
-from oasis_warp.bench.operators import Outputs, Results
-from oasis_warp.bench.rows import commit, device_name, versions
-from oasis_warp.bench.scenes import Scene
-from oasis_warp.bench.timing import peak_megabytes, synchronise
+from oasis_warp.bench.cuda import GRAPH_CALLS, Captured, NotCaptured, capture, kernel_times
+from oasis_warp.bench.gpu_cases import CaseMaker, GpuCase, Implementation, Peers
+from oasis_warp.bench.operators import Call, Outputs, Results
+from oasis_warp.bench.rows import provenance
+from oasis_warp.bench.scenes import GaussianScene
+from oasis_warp.bench.timing import Probe, Sample, peak_megabytes, synchronise, time_groups
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.reference.errors import largest_error, relative_error, same_bits
-
-MOST = 0.9999
-"""Share of the pixels that `GpuRow.most_abs` is the largest error of."""
+from oasis_warp.reference.errors import largest_error, most_error, same_bits
 
 
 @dataclass(frozen=True, kw_only=True)
 class GpuRow:
-    """One way to compute one case. Times are medians of groups of calls, in milliseconds a call."""
+    """One implementation of one case. Times are medians of groups of calls, in milliseconds a call."""
 
     case: str
     pass_: str
@@ -51,14 +46,14 @@ class GpuRow:
     peak_mb: float | None
     """Memory beyond what was in use before the call [MiB]."""
     max_abs: float | None
-    """Largest error of any pixel; None where there is no picture."""
+    """Largest error of any pixel; None where there is no image."""
     most_abs: float | None
     """Largest error of 99.99 % of the pixels."""
     rel_l2: float
-    """Largest relative error of any output, without pixels where a decision hangs on rounding."""
+    """Largest relative error of any output, without pixels where a decision depends on rounding."""
     gradient_rel_l2: float | None
     bit_equal: bool
-    """Whether a second call, and the graph, give the same bits."""
+    """Whether a second call and the graph give the same bits."""
     not_captured: str
     """Why there is no graph; "" where there is one."""
     groups: int
@@ -70,8 +65,8 @@ class GpuRow:
     versions: str
 
 
-def gsplat_draw() -> Draw:
-    """The rasterizer of gsplat, which draws on CUDA devices.
+def gsplat_draw() -> Call:
+    """Gsplat's rasterizer, which draws on CUDA devices.
 
     Raises:
         InputError: it is not installed.
@@ -80,7 +75,7 @@ def gsplat_draw() -> Draw:
         raise InputError("--peer gsplat: the package is not installed; `pip install gsplat` brings it.")
     import gsplat
 
-    def draw(scene: Scene) -> Outputs:
+    def draw(scene: GaussianScene) -> Outputs:
         image, alphas, _ = gsplat.rasterization(
             scene.means, scene.quats, scene.scales, scene.opacities, scene.colors, scene.viewmats, scene.Ks,
             scene.width, scene.height, backgrounds=scene.backgrounds, packed=False,
@@ -90,16 +85,16 @@ def gsplat_draw() -> Draw:
     return draw
 
 
-def measure(
-    cases: Sequence[Named],
+def measure_cases(
+    cases: Sequence[CaseMaker],
     device: torch.device,
     *,
     groups: int,
     seed: int = 0,
-    peers: Mapping[str, Draw] | None = None,
+    peers: Peers | None = None,
     progress: Progress = silent,
 ) -> list[GpuRow]:
-    """Rows of every way of every case, those of a case timed in turns.
+    """Rows of every implementation of every case, those of a case timed in turns.
 
     Args:
         cases: What to time.
@@ -107,11 +102,11 @@ def measure(
         groups: Of calls, at least 2; medians are over them.
         seed: Of the scenes.
         peers: Other rasterizers, by name.
-        progress: Told after every case.
+        progress: Called after every case.
     """
     rows: list[GpuRow] = []
-    for done, named in enumerate(cases):
-        rows += measure_case(named.make(device, seed, peers or {}), device, groups)
+    for done, case in enumerate(cases):
+        rows += measure_case(case.make(device, seed, peers or {}), device, groups)
         progress("speed", done + 1, len(cases))
     return rows
 
@@ -125,38 +120,32 @@ class Graphs:
     reason: str = ""
 
 
-def make_graphs(way: Way, device: torch.device) -> Graphs:
+def make_graphs(implementation: Implementation, device: torch.device) -> Graphs:
     """Graphs of one call and of ten."""
     if device.type != "cuda":
         return Graphs(reason="no CUDA device")
-    if way.captured is None:
+    if implementation.captured is None:
         return Graphs()  # a peer that no graph can hold, or graphs already
     try:
-        return Graphs(capture(way.captured), capture(way.captured, STEPS_A_GRAPH))
+        return Graphs(capture(implementation.captured), capture(implementation.captured, GRAPH_CALLS))
     except NotCaptured as error:
         return Graphs(reason=str(error))
 
 
-def measure_case(case: Case, device: torch.device, groups: int) -> list[GpuRow]:
-    """A row for each way."""
-    graphs = {name: make_graphs(way, device) for name, way in case.ways.items()}
+def measure_case(case: GpuCase, device: torch.device, groups: int) -> list[GpuRow]:
+    """A row for each implementation."""
+    graphs = {name: make_graphs(one, device) for name, one in case.implementations.items()}
     probes: dict[tuple[str, str], Probe] = {}
-    for name, way in case.ways.items():
-        probes[name, "wall"] = Probe(way.run)
+    for name, implementation in case.implementations.items():
+        probes[name, "wall"] = Probe(implementation.run)
         for kind, captured in (("launch", graphs[name].one), ("busy", graphs[name].ten)):
             if captured is not None:
                 probes[name, kind] = captured.probe()
     samples = dict(zip(probes, time_groups(list(probes.values()), groups), strict=True))
     rows = []
-    for name, way in case.ways.items():
-        found, again = way.run(), way.run()
-        captured = graphs[name].one
-        equal = same_bits(found.tensors, again.tensors)
-        if captured is not None:
-            captured.graph.replay()
-            synchronise()
-            equal = equal and same_bits(captured.results.tensors, found.tensors) and not captured.overflow.happened()
-        times = kernel_times(way.run) if device.type == "cuda" else []
+    for name, implementation in case.implementations.items():
+        found = implementation.run()
+        times = kernel_times(implementation.run) if device.type == "cuda" else []
         wall, busy, launch = (samples.get((name, kind)) for kind in ("wall", "busy", "launch"))
         assert wall is not None
         rows.append(
@@ -176,16 +165,14 @@ def measure_case(case: Case, device: torch.device, groups: int) -> list[GpuRow]:
                 launch_ms=median(launch),
                 kernels_ms=1e-3 * sum(t.us for t in times) if times else None,
                 kernels=sum(t.launches for t in times) if times else None,
-                peak_mb=peak_megabytes(way.run, device),
+                peak_mb=peak_megabytes(implementation.run, device),
                 **errors(case, found),
-                bit_equal=equal,
+                bit_equal=repeats_bits(implementation, graphs[name].one, found),
                 not_captured=graphs[name].reason,
                 groups=len(wall.times_ms),
                 calls=wall.calls,
-                device=device_name(device),
                 seed=case.seed,
-                commit=commit(),
-                versions=versions(),
+                **provenance(device),
             )
         )
     return rows
@@ -196,21 +183,22 @@ def median(sample: Sample | None) -> float | None:
     return None if sample is None else sample.median_ms
 
 
-def errors(case: Case, found: Results) -> dict[str, float | None]:
+def repeats_bits(implementation: Implementation, captured: Captured[Results] | None, found: Results) -> bool:
+    """Whether another call gives the bits of `found`, and a replay of the graph, whose lists do not overflow."""
+    equal = same_bits(found.tensors, implementation.run().tensors)
+    if captured is None:
+        return equal
+    captured.graph.replay()
+    synchronise()
+    return equal and same_bits(captured.results.tensors, found.tensors) and not captured.overflow.happened()
+
+
+def errors(case: GpuCase, found: Results) -> dict[str, float | None]:
     """The columns of a row that say how exact it is."""
-    values = zip(found.values, case.truth.values, strict=True)
-    judged = None if case.judged is None or not case.image else case.judged[..., None]
-    relative = [relative_error(v, e, None if judged is None else judged.expand_as(e)) for v, e in values]
-    gradients = zip(found.gradients, case.truth.gradients, strict=True)
+    image, exact_image = found.values[0], case.truth.values[0]
     return {
-        "max_abs": largest_error(found.values[0], case.truth.values[0]) if case.image else None,
-        "most_abs": most_error(found.values[0], case.truth.values[0]) if case.image else None,
-        "rel_l2": max(relative),
-        "gradient_rel_l2": max((relative_error(g, e) for g, e in gradients), default=None),
+        "max_abs": largest_error(image, exact_image) if case.image else None,
+        "most_abs": most_error(image, exact_image) if case.image else None,
+        "rel_l2": case.truth.value_error(found.values),
+        "gradient_rel_l2": case.truth.gradient_error(found.gradients),
     }
-
-
-def most_error(got: Tensor, exact: Tensor, share: float = MOST) -> float:
-    """Largest error of that share of the pixels of pictures [C, H, W, D] that are best."""
-    each = (got.double() - exact.double()).abs().amax(-1).flatten()
-    return float(each.kthvalue(max(1, int(share * len(each)))).values)

@@ -1,4 +1,4 @@
-"""What can be turned: thresholds, precision, threads, and how much of a scene is drawn."""
+"""The knobs of the operators: thresholds, precision, threads, and how much of a scene is drawn."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from oasis_warp.bench.operators import Outputs
-from oasis_warp.bench.scenes import MeshScene, Scene
+from oasis_warp.bench.scenes import GaussianScene, MeshScene
 from oasis_warp.ops._runtime.rules import Rules
 
 RULES = Rules()
@@ -17,48 +17,45 @@ RULES = Rules()
 
 @dataclass(frozen=True, eq=False)  # a setting equals itself only, and so can be a key
 class Setting:
-    """One knob turned to one value, everything else as it is by default."""
+    """One knob at one value, everything else at its default."""
 
     knob: str
     value: str
     rules: Rules = RULES
     dtype: torch.dtype = torch.float32
     threads: int | None = None
-    """None: as many as the run was asked to use."""
+    """None: as many as the run uses."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Arguments of the operator."""
     share: float = 1.0
     """Of the Gaussians, those with the largest opacity times area on the surface."""
     shrink: int = 1
-    """Times fewer pixels a side."""
+    """Factor by which each side of the image has fewer pixels."""
     torch: bool = False
     """Whether torch computes it instead of the kernels."""
 
     def prepare(self, scene: Any) -> Any:
-        """The scene as it is drawn with this setting."""
+        """The scene to draw with this setting."""
         if self.share < 1:
-            scene = keep(scene, most_visible(scene, self.share))
+            scene = scene.subset(most_visible(scene, self.share))
         if self.shrink > 1:
             scene = smaller(scene, self.shrink)
         return scene.to(dtype=self.dtype)
 
     def finish(self, outputs: Outputs) -> Outputs:
-        """Images and maps at the size of the scene as it is without this setting."""
+        """Images and maps enlarged to their size without this setting."""
         if self.shrink == 1:
             return outputs
         return tuple(enlarged(output, self.shrink) for output in outputs)
 
     def spread(self, gradients: Outputs, scene: Any) -> Outputs | None:
-        """Gradients by all of the scene, 0 where it was not drawn; None where they cannot be compared.
-
-        Those of a loss on smaller images are gradients of another loss.
-        """
-        if self.shrink > 1 and isinstance(scene, Scene):
+        """Gradients by the whole scene, 0 where it was not drawn; None for smaller images, whose loss is another."""
+        if self.shrink > 1 and isinstance(scene, GaussianScene):
             return None
         if self.share == 1:
             return gradients
-        kept, n = most_visible(scene, self.share), len(scene.means)
-        return tuple(g.new_zeros(n, *g.shape[1:]).index_copy(0, kept, g) for g in gradients)
+        index, n = most_visible(scene, self.share), len(scene.means)
+        return tuple(g.new_zeros(n, *g.shape[1:]).index_copy(0, index, g) for g in gradients)
 
 
 DEFAULT = Setting("default", "default")
@@ -78,7 +75,7 @@ SIZES = tuple(Setting("resolution", f"1/{k}", shrink=k) for k in (2, 4))
 
 
 def settings(op: str, device: torch.device, threads: int, max_threads: int) -> tuple[Setting, ...]:
-    """The default and all that is worth turning on an operator; `threads` are those of the default."""
+    """The default and all settings worth measuring of an operator; `threads` are those of the default."""
     cpu = device.type == "cpu"
     others = [n for n in (1, 2, 4, 8, 16, 32, 64) if n <= max_threads and n != threads] if cpu else []
     common = (FLOAT64, TORCH, UNCHECKED, *(Setting("threads", str(n), threads=n) for n in others))
@@ -90,27 +87,21 @@ def settings(op: str, device: torch.device, threads: int, max_threads: int) -> t
     return (DEFAULT, *extra.get(op, ()), *common)
 
 
-def most_visible(scene: Scene, share: float) -> Tensor:
+def most_visible(scene: GaussianScene, share: float) -> Tensor:
     """Indices, in order, of the `share` of Gaussians with the largest opacity times area of their two longest axes."""
     longest = scene.scales.topk(2, dim=-1).values
     weight = scene.opacities * longest.prod(-1)
     return weight.topk(max(1, round(share * len(weight)))).indices.sort().values
 
 
-def keep(scene: Scene, index: Tensor) -> Scene:
-    """The Gaussians at `index`."""
-    names = ("means", "quats", "scales", "opacities", "colors")
-    return replace(scene, **{name: getattr(scene, name)[index] for name in names})
-
-
-def smaller(scene: Scene | MeshScene, times: int) -> Any:
-    """The same picture with `times` fewer pixels a side."""
+def smaller(scene: GaussianScene | MeshScene, times: int) -> Any:
+    """The same view with `times` fewer pixels a side."""
     if scene.width % times or scene.height % times:
         raise ValueError(f"times: expected a divisor of {scene.width} x {scene.height}, got {times}.")
-    scaling = scene.viewmats.new_tensor if isinstance(scene, Scene) else scene.viewmat.new_tensor
+    scaling = scene.viewmats.new_tensor if isinstance(scene, GaussianScene) else scene.viewmat.new_tensor
     scaling = scaling([1 / times, 1 / times, 1.0])[:, None]
     size = {"width": scene.width // times, "height": scene.height // times}
-    if isinstance(scene, Scene):
+    if isinstance(scene, GaussianScene):
         return replace(scene, Ks=scene.Ks * scaling, **size)
     return replace(scene, K=scene.K * scaling, **size)
 
@@ -130,17 +121,16 @@ def in_other_order(scene: Any) -> Any:
     Gaussians at one depth, which are drawn in the order of the list, keep theirs among each other.
     """
     generator = torch.Generator().manual_seed(scene.seed + 1)
-    if isinstance(scene, Scene):
+    if isinstance(scene, GaussianScene):
         device = scene.means.device
         depths = scene.means.double() @ scene.viewmats[0, 2, :3].double()
         group = depths.unique(return_inverse=True)[1]
         shuffled = torch.randperm(len(depths), generator=generator).to(device)
         order = torch.empty_like(shuffled)
         order[torch.argsort(group[shuffled], stable=True)] = torch.argsort(group, stable=True)
-        return keep(scene, order)
+        return scene.subset(order)
     order = torch.randperm(len(scene.faces), generator=generator).to(scene.faces.device)
-    place = torch.empty_like(order)
-    place[order] = torch.arange(len(order), device=order.device)
-    return replace(
-        scene, faces=scene.faces[order], area_ratio=scene.area_ratio[order], face_index=place[scene.face_index.long()]
-    )
+    position = torch.empty_like(order)
+    position[order] = torch.arange(len(order), device=order.device)
+    face_index = position[scene.face_index.long()]
+    return replace(scene, faces=scene.faces[order], area_ratio=scene.area_ratio[order], face_index=face_index)

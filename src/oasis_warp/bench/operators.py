@@ -1,32 +1,30 @@
-"""The operators as they are measured: how each is called on a scene, and by what its gradients are taken."""
+"""The operators as they are measured: calls on scenes, the same in torch, gradients, and exact results."""
 
+import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from oasis_warp.bench import torch_mesh, torch_rasterizer
-from oasis_warp.bench.scenes import MeshScene, Scene
-from oasis_warp.ops import (
-    BlendWeights,
-    blend_colors,
-    blend_weights,
-    depth_map,
-    depth_visibility,
-    face_rotations,
-    pose_on_mesh,
-    rasterization,
-    skin,
-)
+from oasis_warp import ops
+from oasis_warp.bench.scenes import GaussianScene, MeshScene
+from oasis_warp.ops import BlendWeights, blend_colors, blend_weights
+from oasis_warp.reference import posing, rasterization, visibility
+from oasis_warp.reference.errors import relative_error
+from oasis_warp.reference.rasterization import GSPLAT, Picture, Rules
 
 Outputs = tuple[Tensor, ...]
 Pass = Literal["forward", "forward + backward"]
+Call = Callable[..., Outputs]
+"""From a scene and options to tensors; the first is the main one."""
+FIELDS = {"vertices": "posed_vertices", "means": "rest_vertices", "weights": "skin_weights"}
+"""Fields of a mesh scene by names of arguments, where they differ."""
 
 
 class Results(NamedTuple):
-    """What a call gave: its outputs, and in passes with one the gradients."""
+    """The outputs of a call, and its gradients in passes that take some."""
 
     values: Outputs
     gradients: Outputs = ()
@@ -37,14 +35,14 @@ class Results(NamedTuple):
         return *self.values, *self.gradients
 
 
-def as_it_is(value: Any) -> Any:
+def unchanged(value: Any) -> Any:
     """The value."""
     return value
 
 
 @dataclass(frozen=True)
-class Weighted:
-    """What `blend_colors` takes."""
+class WeightedColors:
+    """Arguments of `blend_colors`."""
 
     weights: BlendWeights
     colors: Tensor
@@ -55,23 +53,23 @@ class Operator:
     """One public function of `oasis_warp.ops`, or, as "posing", face_rotations and pose_on_mesh in a row."""
 
     name: str
-    scene: type[Scene] | type[MeshScene]
-    call: Callable[..., Outputs]
-    """From a scene (what `prepare` makes of it) and options to tensors; the first is the main one."""
-    torch_peer: Callable[[Any], Outputs]
+    scene: type[GaussianScene] | type[MeshScene]
+    call: Call
+    """Takes what `prepare` makes of a scene."""
+    torch_call: Callable[[Any], Outputs]
     """The same in torch."""
     leaves: tuple[str, ...] = ()
     """Fields of the scene that gradients are taken by; none where the operator has no gradient."""
     graded: int | None = None
     """How many of the outputs the loss is made of; all when None."""
     vectorised: bool = True
-    """Whether it has other kernels for the CPU than vectorised ones."""
+    """Whether it has generic kernels for the CPU beside vectorised ones."""
     image: bool = False
     """Whether the first output is an image in [0, 1]."""
-    comparable: Callable[[Outputs], Outputs] = field(default=as_it_is)
-    """Outputs as their errors are taken."""
-    prepare: Callable[[Any], Any] = field(default=as_it_is)
-    """From a scene to what `call` takes, which is not timed."""
+    comparable: Callable[[Outputs], Outputs] = unchanged
+    """Outputs in the form in which errors are taken."""
+    prepare: Callable[[Any], Any] = unchanged
+    """Untimed work on a scene before calls."""
 
     @property
     def passes(self) -> tuple[Pass, ...]:
@@ -79,125 +77,133 @@ class Operator:
         return ("forward", "forward + backward") if self.leaves else ("forward",)
 
 
-def _rasterization(scene: Scene, **options: Any) -> Outputs:
-    image, alphas, _ = rasterization(
+def calling(
+    function: Callable[..., Any], scene_type: type, arguments_of: Callable[..., Any] | None = None,
+    n_outputs: int | None = None,
+) -> Call:  # fmt: skip
+    """A call with the fields of a scene as arguments; names are those of the parameters, or as in `FIELDS`.
+
+    Args:
+        function: An operator or its reference.
+        scene_type: The scenes.
+        arguments_of: The function whose parameters count; `function` when None.
+        n_outputs: How many of the results to return; all tensors when None.
+    """
+    known = {field.name for field in fields(scene_type)}
+    parameters = inspect.signature(arguments_of or function).parameters
+    sources = {name: name if name in known else FIELDS.get(name, "") for name in parameters}
+    sources = {name: source for name, source in sources.items() if source in known}
+
+    def call(scene: Any, **options: Any) -> Outputs:
+        results = function(**{name: getattr(scene, source) for name, source in sources.items()}, **options)
+        return tuple(result for result in results[:n_outputs] if isinstance(result, Tensor))
+
+    return call
+
+
+def public_operator(
+    name: str, scene_type: type, reference: Callable[..., Any], n_outputs: int | None = None, **about: Any
+) -> Operator:
+    """A public operator and its reference, which takes the same arguments."""
+    function = getattr(ops, name)
+    torch_call = calling(reference, scene_type, function, n_outputs)
+    return Operator(name, scene_type, calling(function, scene_type, None, n_outputs), torch_call, **about)
+
+
+def draw_in_torch(scene: GaussianScene, rules: Rules = GSPLAT) -> Picture:
+    """The images of a scene by the reference rasterizer."""
+    return rasterization.rasterization(
         scene.means, scene.quats, scene.scales, scene.opacities, scene.colors, scene.viewmats, scene.Ks,
-        scene.width, scene.height, backgrounds=scene.backgrounds, **options,
+        scene.width, scene.height, scene.backgrounds, **rules._asdict(),
     )  # fmt: skip
-    return image, alphas
 
 
-def _torch_rasterization(scene: Scene) -> Outputs:
-    picture = torch_rasterizer.draw(scene)
-    return picture.image[None], picture.alpha[None]
-
-
-def _blend_weights(scene: Scene, **options: Any) -> Outputs:
-    weights = blend_weights(
+def _blend_weights(scene: GaussianScene, **options: Any) -> BlendWeights:
+    return blend_weights(
         scene.means, scene.quats, scene.scales, scene.opacities, scene.viewmats[0], scene.Ks[0],
         scene.width, scene.height, **options,
     )  # fmt: skip
-    return (weights.alphas[None],)
 
 
 @torch.no_grad()
-def _weighted(scene: Scene) -> Weighted:
-    weights = blend_weights(
-        scene.means, scene.quats, scene.scales, scene.opacities, scene.viewmats[0], scene.Ks[0],
-        scene.width, scene.height,
-    )  # fmt: skip
-    return Weighted(weights, scene.colors)
+def _weighted(scene: GaussianScene) -> WeightedColors:
+    return WeightedColors(_blend_weights(scene), scene.colors)
 
 
-def _torch_blend_colors(scene: Weighted) -> Outputs:
+def _blend_colors_in_torch(scene: WeightedColors) -> Outputs:
     return ((scene.weights.matrix @ scene.colors).view(1, *scene.weights.alphas.shape[:2], -1),)
 
 
-def _depth_map(scene: MeshScene, **options: Any) -> Outputs:
-    drawn = depth_map(
-        scene.posed_vertices, scene.faces, scene.viewmat, scene.K, scene.width, scene.height, **options
-    )  # fmt: skip
-    return (drawn.depth,)
-
-
-def _nearness(outputs: Outputs) -> Outputs:
-    """Reciprocal depths: 0 where nothing is, instead of infinity."""
+def _inverse_depth(outputs: Outputs) -> Outputs:
+    """Reciprocal depths: 0 over the background, instead of infinity."""
     return (outputs[0].reciprocal(),)
 
 
-def _depth_visibility(scene: MeshScene, **options: Any) -> Outputs:
-    seen = depth_visibility(
-        scene.points, scene.posed_vertices, scene.faces, scene.K, scene.viewmat, scene.width, scene.height, **options
+def _depths_in_torch(scene: MeshScene) -> Outputs:
+    return (visibility.depth_map(scene.posed_vertices, scene.faces, scene.camera, dense=False).depth,)
+
+
+def _visibility_in_torch(scene: MeshScene) -> Outputs:
+    return (
+        visibility.depth_visibility(scene.points, scene.posed_vertices, scene.faces, scene.camera, dense=False),
     )
-    return (seen.visibility,)
 
 
-def _face_rotations(scene: MeshScene, **options: Any) -> Outputs:
-    return tuple(face_rotations(scene.rest_vertices, scene.posed_vertices, scene.faces, **options))
+def _posing(face_rotations: Call, pose_on_mesh: Call) -> Call:
+    """`face_rotations`, and `pose_on_mesh` by its results."""
+
+    def call(scene: MeshScene, **options: Any) -> Outputs:
+        vertex_quats, _, area_ratio, vertex_area_ratio = face_rotations(scene, **options)
+        rotated = replace(
+            scene, vertex_quats=vertex_quats, area_ratio=area_ratio, vertex_area_ratio=vertex_area_ratio
+        )  # fmt: skip
+        return pose_on_mesh(rotated, **options)
+
+    return call
 
 
-def _pose_on_mesh(scene: MeshScene, **options: Any) -> Outputs:
-    return tuple(
-        pose_on_mesh(
-            scene.posed_vertices, scene.faces, scene.face_index, scene.barycentrics, scene.vertex_quats,
-            scene.area_ratio, scene.quats, scene.scales, vertex_index=scene.vertex_index, offsets=scene.offsets,
-            vertex_area_ratio=scene.vertex_area_ratio, **options,
-        )
-    )  # fmt: skip
-
-
-def _skin(scene: MeshScene, **options: Any) -> Outputs:
-    skinned = skin(scene.rest_vertices, scene.covars, scene.skin_weights, scene.transforms, **options)
-    return tuple(part for part in skinned if part is not None)
-
-
-def _posing(scene: MeshScene, **options: Any) -> Outputs:
-    vertex_quats, _, area_ratio, vertex_area_ratio = _face_rotations(scene, **options)
-    turned = replace(
-        scene, vertex_quats=vertex_quats, area_ratio=area_ratio, vertex_area_ratio=vertex_area_ratio
-    )  # fmt: skip
-    return _pose_on_mesh(turned, **options)
-
-
+FACE_ROTATIONS = public_operator(
+    "face_rotations", MeshScene, posing.face_rotations, 4, leaves=("rest_vertices", "posed_vertices")
+)
+POSE_ON_MESH = public_operator(
+    "pose_on_mesh", MeshScene, posing.pose_on_mesh,
+    leaves=(
+        "posed_vertices", "barycentrics", "vertex_quats", "area_ratio", "vertex_area_ratio", "offsets", "quats",
+        "scales",
+    ),
+)  # fmt: skip
 OPERATORS = {
     operator.name: operator
     for operator in (
-        Operator(
-            "rasterization", Scene, _rasterization, _torch_rasterization,
+        public_operator(
+            "rasterization", GaussianScene, rasterization.rasterization, 2,
             leaves=("means", "quats", "scales", "opacities", "colors"), graded=1, image=True,
         ),
         Operator(
-            "blend_weights", Scene, _blend_weights, lambda scene: (torch_rasterizer.draw(scene).alpha[None],),
+            "blend_weights", GaussianScene, lambda scene, **options: (_blend_weights(scene, **options).alphas[None],),
+            lambda scene: (draw_in_torch(scene).alphas,),
         ),
         Operator(
-            "blend_colors", Scene, lambda scene: (blend_colors(scene.weights, scene.colors)[None],),
-            _torch_blend_colors, leaves=("colors",), vectorised=False, image=True, prepare=_weighted,
+            "blend_colors", GaussianScene, lambda scene: (blend_colors(scene.weights, scene.colors)[None],),
+            _blend_colors_in_torch, leaves=("colors",), vectorised=False, image=True, prepare=_weighted,
         ),
         Operator(
-            "depth_map", MeshScene, _depth_map, lambda scene: (torch_mesh.depth_map(scene).depth,),
-            comparable=_nearness,
+            "depth_map", MeshScene, calling(ops.depth_map, MeshScene, n_outputs=1), _depths_in_torch,
+            comparable=_inverse_depth,
         ),
         Operator(
-            "depth_visibility", MeshScene, _depth_visibility, lambda scene: (torch_mesh.depth_visibility(scene),),
-            leaves=("points",),
+            "depth_visibility", MeshScene, calling(ops.depth_visibility, MeshScene, n_outputs=1),
+            _visibility_in_torch, leaves=("points",),
+        ),
+        FACE_ROTATIONS,
+        POSE_ON_MESH,
+        public_operator(
+            "skin", MeshScene, posing.skin, leaves=("rest_vertices", "covars", "skin_weights", "transforms"),
+            vectorised=False,
         ),
         Operator(
-            "face_rotations", MeshScene, _face_rotations, lambda scene: tuple(torch_mesh.face_rotations(scene)),
-            leaves=("rest_vertices", "posed_vertices"),
-        ),
-        Operator(
-            "pose_on_mesh", MeshScene, _pose_on_mesh, lambda scene: tuple(torch_mesh.pose_on_mesh(scene)),
-            leaves=(
-                "posed_vertices", "barycentrics", "vertex_quats", "area_ratio", "vertex_area_ratio", "offsets",
-                "quats", "scales",
-            ),
-        ),
-        Operator(
-            "skin", MeshScene, _skin, lambda scene: tuple(torch_mesh.skin(scene)),
-            leaves=("rest_vertices", "covars", "skin_weights", "transforms"), vectorised=False,
-        ),
-        Operator(
-            "posing", MeshScene, _posing, lambda scene: tuple(torch_mesh.pose(scene)),
+            "posing", MeshScene, _posing(FACE_ROTATIONS.call, POSE_ON_MESH.call),
+            _posing(FACE_ROTATIONS.torch_call, POSE_ON_MESH.torch_call),
             leaves=("rest_vertices", "posed_vertices", "barycentrics", "offsets", "quats", "scales"),
         ),
     )
@@ -205,28 +211,15 @@ OPERATORS = {
 
 
 @torch.no_grad()
-def forward(call: Callable[..., Outputs], scene: Any, options: Mapping[str, Any]) -> Outputs:
-    """The outputs, with nothing kept for a backward pass."""
+def forward(call: Call, scene: Any, options: Mapping[str, Any]) -> Outputs:
+    """The outputs, with nothing saved for a backward pass."""
     return call(scene, **options)
 
 
-def gradients(
-    operator: Operator,
-    call: Callable[..., Outputs],
-    scene: Any,
-    options: Mapping[str, Any],
-    weights: Outputs,
-) -> Outputs:
-    """A forward and a backward pass: gradients of the outputs' sum, weighted, by the operator's leaves."""
-    leaves = {name: getattr(scene, name).detach().requires_grad_(True) for name in operator.leaves}
-    outputs = call(replace(scene, **leaves), **options)[: len(weights)]
-    return torch.autograd.grad(outputs, tuple(leaves.values()), weights)
-
-
-def repeated_gradients(
-    operator: Operator, call: Callable[..., Outputs], scene: Any, options: Mapping[str, Any], weights: Outputs
+def with_gradients(
+    operator: Operator, call: Call, scene: Any, options: Mapping[str, Any], weights: Outputs
 ) -> Callable[[], Results]:
-    """`gradients` as a call to be made often, with the outputs: what a call need not do again is done before."""
+    """A forward and a backward pass to repeat: gradients of the weighted outputs by the operator's leaves."""
     leaves = {name: getattr(scene, name).detach().requires_grad_(True) for name in operator.leaves}
     live, inputs = replace(scene, **leaves), tuple(leaves.values())
 
@@ -241,26 +234,41 @@ def repeated_gradients(
 class Exact(NamedTuple):
     """What results are compared with: the float64 kernels on the same float32 numbers, with gsplat's rules."""
 
-    outputs: Outputs
-    weights: Outputs
-    """Of the loss whose gradients are taken: random signs, 0 where rounding decides what is drawn."""
+    values: Outputs
+    """In comparable form."""
     gradients: Outputs
-    judged: Tensor | None
-    """Pixels where no decision hangs on rounding; None where every result counts."""
+    weights: Outputs = ()
+    """Of the loss whose gradients are taken: random signs, 0 where rounding decides what is drawn."""
+    judged: Tensor | None = None
+    """Pixels [C, H, W] where no decision depends on rounding; None where every result counts."""
+    comparable: Callable[[Outputs], Outputs] = unchanged
 
     @property
     def fragile_percent(self) -> float | None:
         """Share of the pixels that are not judged [%]."""
         return None if self.judged is None else 100 * float((~self.judged).double().mean())
 
+    def value_error(self, outputs: Outputs) -> float:
+        """Largest relative error of any output, over the judged pixels."""
+        judged = None if self.judged is None else self.judged[..., None]
+        return max(
+            relative_error(o, e, None if judged is None else judged.expand_as(e))
+            for o, e in zip(self.comparable(outputs), self.values, strict=True)
+        )
+
+    def gradient_error(self, gradients: Outputs) -> float | None:
+        """Largest relative error of any gradient; None where there is none."""
+        errors = (relative_error(g, e) for g, e in zip(gradients, self.gradients, strict=True))
+        return max(errors, default=None)
+
 
 def exact(operator: Operator, scene: Any) -> Exact:
     """The exact results of `operator` on `scene` (float32)."""
     wide = scene.to(dtype=torch.float64)
     judged = None
-    if isinstance(scene, Scene):
+    if isinstance(scene, GaussianScene):
         with torch.no_grad():
-            judged = ~torch.stack([torch_rasterizer.draw(view).fragile for view in wide.views()])
+            judged = torch.cat([~draw_in_torch(view).fragile for view in wide.views()])
     wide = operator.prepare(wide)
     outputs = forward(operator.call, wide, {})
     generator = torch.Generator().manual_seed(scene.seed)
@@ -268,5 +276,5 @@ def exact(operator: Operator, scene: Any) -> Exact:
     for output in outputs[: operator.graded]:
         signs = (torch.randint(0, 2, output.shape, generator=generator) * 2.0 - 1).to(output)
         weights.append(signs if judged is None else signs * judged[..., None])
-    taken = gradients(operator, operator.call, wide, {}, tuple(weights)) if operator.leaves else ()
-    return Exact(operator.comparable(outputs), tuple(weights), taken, judged)
+    taken = with_gradients(operator, operator.call, wide, {}, tuple(weights))().gradients if operator.leaves else ()
+    return Exact(operator.comparable(outputs), taken, tuple(weights), judged, operator.comparable)

@@ -13,15 +13,15 @@ from typing import Any, NamedTuple
 
 import torch
 
-from oasis_kernels.rasterize.cuda_draw_backward import record_size
-from oasis_warp.bench.avatar_scene import avatar_scene, pose
+from oasis_kernels.rasterize.tiles_cuda import record_size
+from oasis_warp.bench.avatar_scene import avatar_scene
 from oasis_warp.bench.counts import Counts, MeshCounts, count, count_avatar, count_mesh
-from oasis_warp.bench.gpu_cases import TRUSTED, size_name, without_gradients
-from oasis_warp.bench.gpu_profile import KernelTime, kernel_times
-from oasis_warp.bench.gpu_timing import Probe, device_clock, time_groups
-from oasis_warp.bench.operators import OPERATORS, Results, forward, repeated_gradients
-from oasis_warp.bench.rows import commit, device_name, versions
+from oasis_warp.bench.cuda import KernelTime, kernel_times
+from oasis_warp.bench.gpu_cases import RASTERIZATION, UNVALIDATED, posing, size_name
+from oasis_warp.bench.operators import OPERATORS, Results, forward, with_gradients
+from oasis_warp.bench.rows import provenance
 from oasis_warp.bench.scenes import HAND_GAUSSIANS, hand_scenes
+from oasis_warp.bench.timing import Probe, device_clock, time_groups
 from oasis_warp.core.logging import Progress, silent
 
 COPY_BYTES = 2**30
@@ -79,7 +79,7 @@ PICTURE_KERNELS: Mapping[str, Callable[[Counts], Work]] = {
         960 * c.gaussians + 9 * c.pairs,
     ),
 }
-"""By the kernel's name, from what a picture takes."""
+"""By the kernel's name, from the work of drawing."""
 
 MESH_KERNELS: Mapping[str, Callable[[MeshCounts], Work]] = {
     # Position 12, weights and displacements in, position out. The displacements are added, 3 multiply-adds each, the
@@ -107,7 +107,7 @@ MESH_KERNELS: Mapping[str, Callable[[MeshCounts], Work]] = {
     # Key 8, depth 4 and face 4 a pixel; a point of 12, 9 keys about it, its score 4.
     "resolve_keys": lambda c: Work(16 * c.pixels + (16 + 72) * c.points, 100 * c.points),
 }
-"""By the kernel's name, from what posing or seeing a mesh takes."""
+"""By the kernel's name, from the work of posing or drawing a mesh."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ def measure_ceilings(device: torch.device) -> Ceilings:
 
 
 class Profiled(NamedTuple):
-    """A call whose kernels are looked at."""
+    """A call to profile."""
 
     case: str
     run: Callable[[], Results]
@@ -227,34 +227,32 @@ class Profiled(NamedTuple):
 
 
 def profiled_cases(device: torch.device, seed: int) -> list[Profiled]:
-    """A picture with its backward pass at two sizes, posing, and visibility."""
+    """An image with its backward pass at two sizes, posing, and visibility."""
     cases = []
-    rasterize, see = OPERATORS["rasterization"], OPERATORS["depth_visibility"]
+    visibility = OPERATORS["depth_visibility"]
     for size in (512, 1024):
         scene = hand_scenes(size, seed)[0].to(device=device)
         signs = torch.randint(0, 2, (1, size, size, 3), generator=torch.Generator().manual_seed(seed)) * 2.0 - 1
-        run = repeated_gradients(rasterize, rasterize.call, scene, TRUSTED, (signs.to(device),))
+        run = with_gradients(RASTERIZATION, RASTERIZATION.call, scene, UNVALIDATED, (signs.to(device),))
         name = f"{size_name(HAND_GAUSSIANS, size)}, forward + backward"
         cases.append(Profiled(name, run, PICTURE_KERNELS, count(scene)))
     avatar, mesh = avatar_scene(512, seed, device), hand_scenes(448, seed)[1].to(device=device)
-    surface = avatar.surface()
-    posing = without_gradients(lambda: Results(pose(avatar, avatar.canonical, surface)[:3]))
-    cases.append(Profiled("posing 37k", posing, MESH_KERNELS, count_avatar(avatar)))
-    seeing = without_gradients(lambda: Results(forward(see.call, mesh, TRUSTED)))
-    cases.append(Profiled("visibility at 448 x 448", seeing, MESH_KERNELS, count_mesh(mesh)))
+    cases.append(Profiled("posing 37k", posing(avatar)[0].run, MESH_KERNELS, count_avatar(avatar)))
+    run_visibility = lambda: Results(forward(visibility.call, mesh, UNVALIDATED))  # noqa: E731
+    cases.append(Profiled("visibility at 448 x 448", run_visibility, MESH_KERNELS, count_mesh(mesh)))
     return cases
 
 
-def measure(device: torch.device, seed: int = 0, progress: Progress = silent) -> list[KernelRow]:
+def measure_roofline(device: torch.device, seed: int = 0, progress: Progress = silent) -> list[KernelRow]:
     """Rows of every kernel of every case, the longest first in each.
 
     Args:
         device: A CUDA device.
         seed: Of the scenes.
-        progress: Told after every case.
+        progress: Called after every case.
     """
     ceilings = measure_ceilings(device)
-    about = {"device": device_name(device), "commit": commit(), "versions": versions()}
+    about = provenance(device)
     cases = profiled_cases(device, seed)
     rows: list[KernelRow] = []
     for done, case in enumerate(cases):

@@ -1,4 +1,4 @@
-"""One measurement as a row of a table, and tables as CSV and JSON files with the same keys."""
+"""Rows of measurements as CSV and JSON files with the same keys, and what the numbers depend on."""
 
 import csv
 import importlib.metadata
@@ -8,93 +8,22 @@ import math
 import platform
 import subprocess
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import torch
 
 from oasis_warp import __version__
+from oasis_warp.bench.scenes import GaussianScene, MeshScene
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import write_file
 
 Kind = TypeVar("Kind")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """An operator on a scene with one knob turned. Empty in CSV and null in JSON is what does not apply."""
-
-    scene: str
-    width: int
-    height: int
-    gaussians: int
-    """In the scene."""
-    faces: int | None
-    """Of its mesh, where it has one."""
-    op: str
-    pass_: str
-    """Called `pass` in files: "forward" or "forward + backward"."""
-    knob: str
-    value: str
-    """Of the knob; "default" under the knob "default", where none is turned."""
-    device: str
-    threads: int
-    median_ms: float
-    iqr_ms: float
-    fastest_ms: float
-    repeats: int
-    first_ms: float
-    """The first call, with compiling or loading kernels."""
-    cpu_ms: float | None
-    """CPU time of all threads in the call with the least; None on CUDA."""
-    yardstick_ms: float
-    """The yardstick's CPU time in the same rounds: times over it can be compared between runs."""
-    peak_mb: float | None
-    """Memory beyond what was in use before the call [MiB]."""
-    rel_l2: float
-    """Largest relative error of any output, fragile pixels left out."""
-    max_abs: float
-    """Largest error of any element of any output, fragile pixels included."""
-    psnr_db: float | None
-    """Of the image, fragile pixels included; None where it is equal, or there is none."""
-    gradient_rel_l2: float | None
-    """Largest relative error of any gradient, of a loss without the fragile pixels."""
-    floor_rel_l2: float
-    """How far the exact results are known: what torch in float64, with the Gaussians or faces listed in another order,
-    differs from them by in the first output. Smaller errors than this say nothing."""
-    fragile_percent: float | None
-    """Share of the pixels where a decision hangs on rounding."""
-    bit_equal: bool
-    """Whether results and gradients have the bits of those with the default setting."""
-    seed: int
-    commit: str
-    versions: str
-
-    @property
-    def error(self) -> float:
-        """The larger of the errors of values and gradients, as far as the pass has them."""
-        return max(self.rel_l2, self.gradient_rel_l2 or 0.0)
-
-    @property
-    def cost_ms(self) -> float:
-        """What settings are compared by: CPU time where one thread does the work, else the fastest call.
-
-        Other work on the machine delays a call, but hardly adds to its CPU time.
-        """
-        return self.fastest_ms if self.cpu_ms is None or self.threads > 1 else self.cpu_ms
-
-    @property
-    def is_default(self) -> bool:
-        """Whether no knob is turned."""
-        return self.knob == "default"
-
-
-KEYS = tuple(field.name.rstrip("_") for field in fields(Row))
-
-
 def to_record(row: Any) -> dict[str, Any]:
-    """A row's values by the keys of the files; numbers that are not finite become None."""
+    """The values of a row by the keys of the files: `pass_` becomes `pass`, and numbers that are not finite None."""
 
     def clean(value: Any) -> Any:
         return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -102,10 +31,15 @@ def to_record(row: Any) -> dict[str, Any]:
     return {name.rstrip("_"): clean(value) for name, value in asdict(row).items()}
 
 
+def keys(row: Any) -> tuple[str, ...]:
+    """The keys of a row, or kind of row, in files."""
+    return tuple(field.name.rstrip("_") for field in fields(row))
+
+
 def csv_text(rows: Sequence[Any]) -> str:
     """Rows, one or more of one kind, as CSV with a heading."""
     out = io.StringIO()
-    writer = csv.DictWriter(out, [field.name.rstrip("_") for field in fields(rows[0])], lineterminator="\n")
+    writer = csv.DictWriter(out, keys(rows[0]), lineterminator="\n")
     writer.writeheader()
     words = {True: "yes", False: "no"}
     for row in rows:
@@ -130,7 +64,7 @@ def write_rows(rows: Sequence[Any], csv_path: Path, json_path: Path) -> None:
 
 
 def from_record(kind: type[Kind], record: dict[str, Any]) -> Kind:
-    """The row that `to_record` made `record` from; a number that was not finite comes back as infinity."""
+    """The inverse of `to_record`; a number that was not finite becomes infinity."""
     values = {}
     for field in fields(kind):
         value, kinds = record[field.name.rstrip("_")], get_args(field.type) or (field.type,)
@@ -152,33 +86,8 @@ def read_json(kind: type[Kind], path: Path) -> list[Kind]:
         raise InputError(f"{path}: expected the rows of a {kind.__name__}, found something else.") from error
 
 
-def read_csv(path: Path) -> list[Row]:
-    """The rows of a file of `write_rows`.
-
-    Raises:
-        InputError: no such file, or other columns.
-    """
-    try:
-        with path.open(newline="") as stream:
-            records = list(csv.DictReader(stream))
-    except OSError as error:
-        raise InputError(f"{path}: expected the CSV of `oasis bench error-time`, got {error.strerror}.") from error
-    if not records or tuple(records[0]) != KEYS:
-        raise InputError(f"{path}: expected the CSV of `oasis bench error-time`, found other columns.")
-    return [Row(**{f.name: _parse(record[f.name.rstrip("_")], f.type) for f in fields(Row)}) for record in records]
-
-
-def _parse(text: str, kind: Any) -> Any:
-    kinds = get_args(kind) or (kind,)
-    if text == "" and type(None) in kinds:
-        return None
-    if kinds[0] is bool:
-        return text == "yes"
-    return kinds[0](text) if text else math.inf  # a number that was not finite
-
-
 def device_name(device: torch.device) -> str:
-    """The device as its maker calls it."""
+    """The name of the GPU or of the processor."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     try:
@@ -190,7 +99,7 @@ def device_name(device: torch.device) -> str:
 
 
 def versions() -> str:
-    """Of what the numbers depend on."""
+    """Versions of the software that the numbers depend on."""
     return (
         f"oasis_warp {__version__}, warp {importlib.metadata.version('warp-lang')}, torch {torch.__version__}, "
         f"python {platform.python_version()}, {platform.system()} {platform.machine()}"
@@ -198,7 +107,7 @@ def versions() -> str:
 
 
 def commit() -> str:
-    """The commit of the checkout that this package is imported from, "+" behind it for changes; "" where there is none.
+    """The commit of the checkout that this package is imported from, with "+" for changes; "" without a checkout.
 
     A package installed inside another project's checkout does not count as part of it.
     """
@@ -215,3 +124,21 @@ def commit() -> str:
         return git("rev-parse", "--short=10", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
     except (OSError, subprocess.CalledProcessError):
         return ""
+
+
+def provenance(device: torch.device) -> dict[str, str]:
+    """The columns of a row that say where it comes from."""
+    return {"device": device_name(device), "commit": commit(), "versions": versions()}
+
+
+def scene_columns(scene: GaussianScene | MeshScene) -> dict[str, Any]:
+    """The columns of a row that describe its scene."""
+    drawn = isinstance(scene, GaussianScene)
+    return {
+        "scene": scene.name,
+        "width": scene.width,
+        "height": scene.height,
+        "gaussians": len(scene.means if drawn else scene.quats),
+        "faces": None if drawn else len(scene.faces),
+        "seed": scene.seed,
+    }

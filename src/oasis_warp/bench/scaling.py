@@ -11,40 +11,37 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.bench.counts import Counts, count
-from oasis_warp.bench.gpu_cases import TRUSTED
-from oasis_warp.bench.gpu_speed import most_error
-from oasis_warp.bench.gpu_timing import STEPS_A_GRAPH, NotCaptured, Probe, capture, time_groups
-from oasis_warp.bench.knobs import keep
-from oasis_warp.bench.operators import OPERATORS, Pass, Results, forward, repeated_gradients
-from oasis_warp.bench.rows import commit, device_name, versions
-from oasis_warp.bench.scaling_scenes import crop, giants, one_tile, surface
-from oasis_warp.bench.scenes import Scene
-from oasis_warp.bench.timing import peak_megabytes, synchronise
+from oasis_warp.bench.cuda import GRAPH_CALLS, NotCaptured, capture
+from oasis_warp.bench.gpu_cases import PASSES, RASTERIZATION, UNVALIDATED
+from oasis_warp.bench.operators import Results, forward, with_gradients
+from oasis_warp.bench.rows import provenance
+from oasis_warp.bench.scenes import GaussianScene, crop, giants, one_tile, surface
+from oasis_warp.bench.timing import Probe, peak_megabytes, synchronise, time_groups
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.ops import rasterization
-from oasis_warp.reference.errors import same_bits
+from oasis_warp.reference.errors import most_error, same_bits
 
 GROUPS = 9
 CALM = 1.5
-"""Growth of the time over that of the work from which on a step along an axis is a cliff."""
+"""Growth of time over growth of work from which on a step along an axis is a cliff."""
 AFFORDABLE = {"cuda": 4 * 10**9, "cpu": 2 * 10**7}
-"""Pixels of tiles times their lists up to which the float64 kernels draw the whole picture in a second or two."""
+"""Pixels of tiles times their lists up to which the float64 kernels draw the whole image in a second or two."""
 CROP, RIM = 64, 48
-"""Side of the part that is compared where they do not, and what is drawn round it [px]: Gaussians from farther away,
-whose projection is clamped by the picture that they are drawn in, do not reach it."""
+"""Side of the part that is compared otherwise, and the margin that is drawn about it [px]: Gaussians from farther away,
+whose projection is clamped by the image that they are drawn in, do not reach it."""
 SETTLED = 3
 """Calls before memory is measured: the first ones learn how long the lists are."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """A place on an axis of the study."""
+    """A point on an axis of the study."""
 
     axis: str
     """What grows: "gaussians", "pixels" or "views"; or "stress" for scenes that stand alone."""
     series: str
-    """What stays as it is."""
-    make: Callable[[int], Scene]
+    """What stays the same."""
+    make: Callable[[int], GaussianScene]
     """From a seed."""
 
 
@@ -104,7 +101,7 @@ def points(quick: bool) -> list[Point]:
     views = (1, 2, 4) if quick else (1, 2, 4, 8, 16, 32, 64)
     size = 256 if quick else 512
 
-    def on_surface(n: int, side: int, n_views: int) -> Callable[[int], Scene]:
+    def on_surface(n: int, side: int, n_views: int) -> Callable[[int], GaussianScene]:
         return lambda seed: surface(n, side, n_views, seed)
 
     return [
@@ -116,7 +113,7 @@ def points(quick: bool) -> list[Point]:
     ]
 
 
-def measure(
+def measure_scaling(
     chosen: Sequence[Point],
     device: torch.device,
     *,
@@ -129,9 +126,9 @@ def measure(
     Args:
         chosen: Of `points`.
         device: Where to compute.
-        seconds: That the timing of a point may take; slow calls are timed in fewer groups.
+        seconds: Limit for timing a point; slow calls are timed in fewer groups.
         seed: Of the scenes.
-        progress: Told after every point.
+        progress: Called after every point.
     """
     rows: list[ScalingRow] = []
     for done, point in enumerate(chosen):
@@ -144,16 +141,15 @@ def measure_point(point: Point, device: torch.device, seconds: float, seed: int)
     """Both passes of one point."""
     scene = point.make(seed).to(device=device)
     work = count(scene)
-    operator = OPERATORS["rasterization"]
     generator = torch.Generator().manual_seed(seed)
     shape = len(scene.viewmats), scene.height, scene.width, 3
     signs = (torch.randint(0, 2, shape, generator=generator, dtype=torch.int8) * 2.0 - 1).to(device)
-    calls: dict[Pass, Callable[[], Results]] = {
-        "forward": lambda: Results(forward(operator.call, scene, TRUSTED)),
-        "forward + backward": repeated_gradients(operator, operator.call, scene, TRUSTED, (signs,)),
-    }
+    calls: tuple[Callable[[], Results], ...] = (
+        lambda: Results(forward(RASTERIZATION.call, scene, UNVALIDATED)),
+        with_gradients(RASTERIZATION, RASTERIZATION.call, scene, UNVALIDATED, (signs,)),
+    )
     rows, error = [], None
-    for pass_, run in calls.items():
+    for pass_, run in zip(PASSES, calls, strict=True):
         for _ in range(SETTLED):
             found = run()
         finite = all(bool(t.isfinite().all()) for t in found.tensors)
@@ -182,17 +178,15 @@ def measure_point(point: Point, device: torch.device, seconds: float, seed: int)
                 max_abs=error[1],
                 most_abs=error[2],
                 not_captured=times.reason,
-                device=device_name(device),
                 seed=seed,
-                commit=commit(),
-                versions=versions(),
+                **provenance(device),
             )
         )
     return rows
 
 
 class Times(NamedTuple):
-    """What `timed` found: see the fields of `ScalingRow`."""
+    """Fields of `ScalingRow`."""
 
     wall_ms: float
     busy_ms: float | None
@@ -207,9 +201,9 @@ def timed(run: Callable[[], Results], device: torch.device, seconds: float) -> T
         start = time.perf_counter()
         run()
         synchronise()
-        long = time.perf_counter() - start > seconds / (4 * STEPS_A_GRAPH)
+        long = time.perf_counter() - start > seconds / (4 * GRAPH_CALLS)
         try:
-            captured, reason = capture(run, 1 if long else STEPS_A_GRAPH), ""
+            captured, reason = capture(run, 1 if long else GRAPH_CALLS), ""
         except NotCaptured as error:
             reason = str(error)
     if captured is None:
@@ -221,12 +215,12 @@ def timed(run: Callable[[], Results], device: torch.device, seconds: float) -> T
     return Times(wall.median_ms, busy.median_ms, captured.overflow.happened() or not same, reason)
 
 
-def picture_errors(scene: Scene, image: Float[Tensor, "C H W 3"], work: Counts) -> tuple[str, float, float]:
+def picture_errors(scene: GaussianScene, image: Float[Tensor, "C H W 3"], work: Counts) -> tuple[str, float, float]:
     """What was compared with the float64 kernels, its largest error, and that of 99.99 % of its pixels."""
     if work.pairs * 64 <= AFFORDABLE[scene.means.device.type]:
         exact = draw_exactly(scene)
         return "all", float((image.double() - exact).abs().max()), most_error(image, exact)
-    # Round the densest pixel, or its neighbourhood: where the picture differs most from its background.
+    # Compare where the image differs most from its background.
     side = CROP + 2 * RIM
     shown = (image[0] - scene.backgrounds[0]).abs().sum(-1)
     coarse = torch.nn.functional.avg_pool2d(shown[None, None], CROP, ceil_mode=True)[0, 0]
@@ -234,19 +228,19 @@ def picture_errors(scene: Scene, image: Float[Tensor, "C H W 3"], work: Counts) 
     top = max(0, min(CROP * row, scene.height - CROP))
     left = max(0, min(CROP * column, scene.width - CROP))
     part = crop(scene, left - RIM, top - RIM, side)
-    exact = draw_exactly(keep(part, reaching(part)))[:, RIM:-RIM, RIM:-RIM]
+    exact = draw_exactly(part.subset(reaching(part)))[:, RIM:-RIM, RIM:-RIM]
     got = image[:1, top : top + CROP, left : left + CROP]
     return "crop", float((got.double() - exact).abs().max()), most_error(got, exact)
 
 
-def draw_exactly(scene: Scene) -> Float[Tensor, "C H W 3"]:
+def draw_exactly(scene: GaussianScene) -> Float[Tensor, "C H W 3"]:
     """The picture by the float64 kernels, view after view."""
-    call = OPERATORS["rasterization"].call
-    return torch.cat([forward(call, view.to(dtype=torch.float64), TRUSTED)[0] for view in scene.views()])
+    wide = (view.to(dtype=torch.float64) for view in scene.views())
+    return torch.cat([forward(RASTERIZATION.call, view, UNVALIDATED)[0] for view in wide])
 
 
 @torch.no_grad()
-def reaching(scene: Scene) -> Tensor:
+def reaching(scene: GaussianScene) -> Tensor:
     """Indices of the Gaussians that the first view shows, in order."""
     _, _, meta = rasterization(
         scene.means, scene.quats, scene.scales, scene.opacities, scene.colors[:, :1], scene.viewmats, scene.Ks,

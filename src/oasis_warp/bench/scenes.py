@@ -1,4 +1,4 @@
-"""Seeded scenes to measure on: the bundled hand, and small ones that are hard to compute.
+"""Seeded scenes to measure on: the bundled hand, surfaces of any size, and scenes that are hard to compute.
 
 Every number is a float32 number, so that both precisions see the same scene. A scene is made on the CPU; `to` moves it.
 """
@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
+from oasis_warp.avatar.anchors import OPACITY, THICKNESS, place_anchors, surface_frames, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.camera import orbit_camera
@@ -32,31 +32,44 @@ TEXTURE = 0.05
 """Standard deviation of the seeded noise on its colours [sRGB]: a bare mean hand has no detail to lose."""
 
 OFFSET = 5e-4
-"""Standard deviation of what Gaussians on vertices are shifted by [m]."""
+"""Standard deviation of the offsets of Gaussians on vertices [m]."""
 VERTEX_GAUSSIAN = 1e-3
 """Size of the Gaussians that are skinned with their vertices [m]."""
 POINT_NOISE = 0.002
 """Standard deviation of the points of a mesh scene about its vertices [m]: visibility takes all values there."""
 
-Bundle = TypeVar("Bundle", bound="_Tensors")
+OFF_CENTER = 0.2
+"""Distance of the principal point of frontal scenes from the centre [px], without which pairs of pixels were alike."""
+SPREAD = 0.6
+"""Standard deviation of a surfel over the root of its share of the surface: the hand's Gaussians have 0.5 to 0.7."""
+UNEVEN = 0.25
+"""Standard deviation of the logarithm of that."""
+TILE = 8
+"""Side of the tile that `one_tile` fills [px]."""
+
+Bundle = TypeVar("Bundle", bound="TensorBundle")
+
+
+def converted(value: Any, device: torch.device | str | None, dtype: torch.dtype | None) -> Any:
+    """A tensor, or all tensors of a tuple or model, on another device; real numbers in another precision."""
+    if isinstance(value, Tensor):
+        return value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*(converted(part, device, dtype) for part in value))
+    return value.to(device, dtype) if isinstance(value, HandModel) else value
 
 
 @dataclass(frozen=True)
-class _Tensors:
-    """A bundle of tensors and plain numbers."""
+class TensorBundle:
+    """A dataclass of tensors, tuples of them, and plain numbers."""
 
     def to(self: Bundle, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Bundle:
         """The same on another device; floating-point tensors in another precision."""
-        moved: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, Tensor):
-                moved[field.name] = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-        return replace(self, **moved)
+        return replace(self, **{f.name: converted(getattr(self, f.name), device, dtype) for f in fields(self)})
 
 
 @dataclass(frozen=True)
-class Scene(_Tensors):
+class GaussianScene(TensorBundle):
     """Gaussians before C cameras, as `rasterization` takes them."""
 
     name: str
@@ -72,7 +85,12 @@ class Scene(_Tensors):
     width: int
     height: int
 
-    def views(self) -> "list[Scene]":
+    def subset(self, index: Tensor) -> "GaussianScene":
+        """The scene with the Gaussians at `index` only."""
+        names = ("means", "quats", "scales", "opacities", "colors")
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
+
+    def views(self) -> "list[GaussianScene]":
         """A scene for each camera."""
         return [
             replace(self, viewmats=viewmat[None], Ks=K[None], backgrounds=background[None])
@@ -81,8 +99,8 @@ class Scene(_Tensors):
 
 
 @dataclass(frozen=True)
-class MeshScene(_Tensors):
-    """A mesh at rest and posed, Gaussians on its vertices (P) and faces (Q), its bones, points round it, a camera."""
+class MeshScene(TensorBundle):
+    """A mesh at rest and posed, Gaussians on its vertices (P) and faces (Q), bones, points near it, and a camera."""
 
     name: str
     seed: int
@@ -90,7 +108,7 @@ class MeshScene(_Tensors):
     posed_vertices: Float[Tensor, "V 3"]
     faces: Int[Tensor, "F 3"]
     vertex_quats: Float[Tensor, "V 4"]
-    """This and the next two as `face_rotations` gives them, rounded from float64."""
+    """This and the next two are results of `face_rotations`, rounded from float64."""
     area_ratio: Float[Tensor, "F"]
     vertex_area_ratio: Float[Tensor, "V"]
     covars: Float[Tensor, "V 3 3"]
@@ -99,7 +117,7 @@ class MeshScene(_Tensors):
     transforms: Float[Tensor, "J 3 4"]
     """Of the bones, rest to posed."""
     points: Float[Tensor, "V 3"]
-    """Whose visibility is asked: the posed vertices, moved at random."""
+    """To score by visibility: the posed vertices, moved at random."""
     vertex_index: Int[Tensor, "P"]
     offsets: Float[Tensor, "P 3"]
     face_index: Int[Tensor, "Q"]
@@ -111,9 +129,14 @@ class MeshScene(_Tensors):
     width: int
     height: int
 
+    @property
+    def camera(self) -> Camera:
+        """The camera as one argument."""
+        return Camera(self.viewmat, self.K, self.width, self.height)
+
 
 class HandParts(NamedTuple):
-    """The bundled hand, open, palm to the camera, and what is needed to pose it."""
+    """The bundled hand, open, palm to the camera, with Gaussians."""
 
     hand: HandModel
     rest: PosedHand
@@ -135,20 +158,19 @@ def hand_parts(generator: torch.Generator) -> HandParts:
     return HandParts(hand, rest, pose, skin(hand, rest, pose).vertices, canonical)
 
 
-def hand_scenes(size: int = 256, seed: int = 0, n_views: int = 1) -> tuple[Scene, MeshScene]:
+def hand_scenes(size: int = 256, seed: int = 0, n_views: int = 1) -> tuple[GaussianScene, MeshScene]:
     """The bundled hand: 36,881 Gaussians over black, seen from `n_views` sides, and its mesh of 24,608 faces."""
     generator = torch.Generator().manual_seed(seed)
     hand, rest, pose, posed, canonical = hand_parts(generator)
     gaussians = pose_gaussians(canonical, hand.faces, rest.vertices, posed)
-    cameras = cameras_around(posed, size, n_views)
-    viewmats, Ks = (torch.stack([getattr(camera, name) for camera in cameras]) for name in ("viewmat", "K"))
-    drawn = Scene("hand", seed, *gaussians, viewmats, Ks, torch.zeros(n_views, 3), size, size)
+    viewmats, Ks = cameras_around(posed, size, n_views)
+    drawn = GaussianScene("hand", seed, *gaussians, viewmats, Ks, torch.zeros(n_views, 3), size, size)
     points = posed + POINT_NOISE * torch.randn(posed.shape, generator=generator)
     offsets = OFFSET * torch.randn(len(canonical.vertex_index), 3, generator=generator)
     axes = VERTEX_GAUSSIAN * torch.randn(len(posed), 3, 3, generator=generator)
     rotations, translations = bone_transforms(hand, rest.joints, pose)
     mesh = MeshScene(
-        "hand", seed, rest.vertices, posed, hand.faces, *turns(rest.vertices, posed, hand.faces),
+        "hand", seed, rest.vertices, posed, hand.faces, *mesh_rotations(rest.vertices, posed, hand.faces),
         axes @ axes.transpose(1, 2), hand.weights, torch.cat([rotations, translations[..., None]], -1), points,
         canonical.vertex_index, offsets, canonical.face_index, canonical.barycentrics, canonical.quats,
         canonical.scales, viewmats[0], Ks[0], size, size,
@@ -156,43 +178,36 @@ def hand_scenes(size: int = 256, seed: int = 0, n_views: int = 1) -> tuple[Scene
     return drawn, mesh
 
 
-def cameras_around(vertices: Float[Tensor, "V 3"], size: int, n: int) -> list[Camera]:
-    """`n` cameras all round, the first before the palm."""
-    return [orbit_camera(vertices, 2 * math.pi * k / n, size=size) for k in range(n)]
+def cameras_around(vertices: Float[Tensor, "V 3"], size: int, n: int) -> tuple[Tensor, Tensor]:
+    """Viewmats and Ks of `n` cameras all round, the first before the palm."""
+    cameras = [orbit_camera(vertices, 2 * math.pi * k / n, size=size) for k in range(n)]
+    return torch.stack([camera.viewmat for camera in cameras]), torch.stack([camera.K for camera in cameras])
 
 
-def turns(rest_vertices: Tensor, posed_vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Vertex quaternions and area ratios, the same whatever becomes of the float32 kernels."""
-    turned = face_rotations(rest_vertices.double(), posed_vertices.double(), faces)
-    vertex_quats, _, area_ratio, vertex_area_ratio = (part.to(rest_vertices) for part in turned)
+def mesh_rotations(rest_vertices: Tensor, posed_vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Vertex quaternions and area ratios by the float64 kernels, so that scenes do not depend on the float32 ones."""
+    rotations = face_rotations(rest_vertices.double(), posed_vertices.double(), faces)
+    vertex_quats, _, area_ratio, vertex_area_ratio = (part.to(rest_vertices) for part in rotations)
     return vertex_quats, area_ratio, vertex_area_ratio
 
 
-def hand(size: int = 256, seed: int = 0) -> Scene:
+def hand(size: int = 256, seed: int = 0) -> GaussianScene:
     """The Gaussians of `hand_scenes`."""
     return hand_scenes(size, seed)[0]
 
 
-def surfels(n: int = 20_000, size: int = 256, seed: int = 0) -> Scene:
+def surfels(n: int = 20_000, size: int = 256, seed: int = 0) -> GaussianScene:
     """`n` Gaussians of the hand, chosen at random and enlarged so that together they cover as much as all did."""
     whole = hand(size, seed)
     total = len(whole.means)
     if not 1 <= n <= total:
         raise ValueError(f"n: expected 1 to {total} Gaussians, got {n}.")
-    kept = torch.randperm(total, generator=torch.Generator().manual_seed(seed))[:n].sort().values
-    return replace(
-        whole,
-        name=f"surfels {n}",
-        means=whole.means[kept],
-        quats=whole.quats[kept],
-        scales=whole.scales[kept] * math.sqrt(total / n),
-        opacities=whole.opacities[kept],
-        colors=whole.colors[kept],
-    )
+    index = torch.randperm(total, generator=torch.Generator().manual_seed(seed))[:n].sort().values
+    return replace(whole.subset(index), name=f"surfels {n}", scales=whole.scales[index] * math.sqrt(total / n))
 
 
-def far_hand(size: int = 256, seed: int = 0, distance: float = 100.0) -> tuple[Scene, MeshScene]:
-    """The hand through a long lens: `distance` metres farther away, in the same place and size on the image."""
+def far_hand(size: int = 256, seed: int = 0, distance: float = 100.0) -> tuple[GaussianScene, MeshScene]:
+    """The hand through a long lens: `distance` metres farther away, at the same position and size in the image."""
     drawn, mesh = hand_scenes(size, seed)
     viewmat, K = mesh.viewmat.clone(), mesh.K.clone()
     depth = float((mesh.posed_vertices @ viewmat[2, :3] + viewmat[2, 3]).mean())
@@ -206,18 +221,18 @@ def far_hand(size: int = 256, seed: int = 0, distance: float = 100.0) -> tuple[S
 
 def frontal(
     name: str, seed: int, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, size: int
-) -> Scene:
+) -> GaussianScene:
     """Gaussians before a camera at the origin that looks along z and sees x and y from -0.5 to 0.5 at depth 1."""
-    center = size / 2 - 0.2  # off the pixels' grid, or pairs of pixels would be alike
+    center = size / 2 - OFF_CENTER
     K = torch.tensor([[size, 0.0, center], [0.0, size, center], [0.0, 0.0, 1.0]])
     floats = (means, quats, scales, opacities, colors)
-    return Scene(
+    return GaussianScene(
         name, seed, *(part.to(torch.float32) for part in floats), torch.eye(4)[None], K[None],
         torch.tensor([[0.1, 0.2, 0.3]]), size, size,
     )  # fmt: skip
 
 
-def layered(n: int = 1500, size: int = 64, seed: int = 0) -> Scene:
+def layered(n: int = 1500, size: int = 64, seed: int = 0) -> GaussianScene:
     """A cloud of `n` small Gaussians of all opacities, some forty behind each pixel: every threshold matters."""
     g = torch.Generator().manual_seed(seed)
     depth = 1 + 2 * torch.rand(n, generator=g)
@@ -229,7 +244,7 @@ def layered(n: int = 1500, size: int = 64, seed: int = 0) -> Scene:
     )  # fmt: skip
 
 
-def needles(n: int = 40, size: int = 64, seed: int = 0) -> Scene:
+def needles(n: int = 40, size: int = 64, seed: int = 0) -> GaussianScene:
     """Gaussians 1e-4 thin that reach across the image and through depth: covariances close to singular."""
     g = torch.Generator().manual_seed(seed)
     means = torch.rand(n, 3, generator=g) - 0.5 + torch.tensor([0.0, 0.0, 2.5])
@@ -240,7 +255,7 @@ def needles(n: int = 40, size: int = 64, seed: int = 0) -> Scene:
     )  # fmt: skip
 
 
-def opaque(n: int = 200, size: int = 64, seed: int = 0) -> Scene:
+def opaque(n: int = 200, size: int = 64, seed: int = 0) -> GaussianScene:
     """Layers of opacity 0.9 to 1, each as wide as the image: most pixels end at the transmittance stop."""
     g = torch.Generator().manual_seed(seed)
     depth = 1 + torch.rand(n, generator=g)
@@ -252,7 +267,7 @@ def opaque(n: int = 200, size: int = 64, seed: int = 0) -> Scene:
     )  # fmt: skip
 
 
-def equal_depths(n: int = 300, size: int = 64, seed: int = 0) -> Scene:
+def equal_depths(n: int = 300, size: int = 64, seed: int = 0) -> GaussianScene:
     """Gaussians in ten planes across the view: within a plane only the index says which is in front."""
     g = torch.Generator().manual_seed(seed)
     depth = 1 + torch.randint(0, 10, (n,), generator=g) / 8
@@ -270,8 +285,95 @@ def slivers(size: int = 256, seed: int = 0) -> MeshScene:
     axis = normalize(torch.tensor([1.0, 0.7, 0.4]), dim=0)
     middle = mesh.posed_vertices.mean(0)
     posed = mesh.posed_vertices - 0.999 * ((mesh.posed_vertices - middle) @ axis)[:, None] * axis
-    vertex_quats, area_ratio, vertex_area_ratio = turns(mesh.rest_vertices, posed, mesh.faces)
+    vertex_quats, area_ratio, vertex_area_ratio = mesh_rotations(mesh.rest_vertices, posed, mesh.faces)
     return replace(
         mesh, name="slivers", posed_vertices=posed, vertex_quats=vertex_quats, area_ratio=area_ratio,
         vertex_area_ratio=vertex_area_ratio, points=posed + (mesh.points - mesh.posed_vertices),
+    )  # fmt: skip
+
+
+def surface(n: int, size: int = 512, n_views: int = 1, seed: int = 0) -> GaussianScene:
+    """`n` surfels spread evenly over the posed hand, smaller the more there are: they cover it as densely for any n.
+
+    Args:
+        n: Gaussians.
+        size: Side of the pictures [px].
+        n_views: Cameras, all round.
+        seed: Of positions, sizes and colours.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    hand, _, _, posed, _ = hand_parts(generator)
+    corners = posed[hand.faces]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    ends = (normals.norm(dim=-1).double() / 2).cumsum(0)
+    area = float(ends[-1])
+    # One in each n-th of the surface, by area along the list of faces.
+    areas = (torch.arange(n, dtype=torch.float64) + torch.rand(n, dtype=torch.float64, generator=generator)) * area / n
+    face = torch.searchsorted(ends, areas).clamp_max(len(ends) - 1)
+    frames = surface_frames(normalize(normals, dim=-1), corners[:, 1] - corners[:, 0])
+    turn = 2 * math.pi * torch.rand(n, generator=generator)
+    spread = SPREAD * math.sqrt(area / n) * torch.exp(UNEVEN * torch.randn(n, 2, generator=generator))
+    viewmats, Ks = cameras_around(posed, size, n_views)
+    return GaussianScene(
+        f"surface {n}", seed, points_on(corners[face], generator), turned_about_z(frames[face], turn),
+        torch.cat([spread, THICKNESS * spread.amin(-1, keepdim=True)], -1), torch.full((n,), OPACITY),
+        torch.rand(n, 3, generator=generator), viewmats, Ks, torch.zeros(n_views, 3), size, size,
+    )  # fmt: skip
+
+
+def points_on(corners: Float[Tensor, "N 3 3"], generator: torch.Generator) -> Float[Tensor, "N 3"]:
+    """A random point on each triangle, all of it equally likely (Osada et al. 2002, section 4.1)."""
+    root, along = torch.rand(2, len(corners), 1, generator=generator)
+    root = root.sqrt()
+    return (1 - root) * corners[:, 0] + root * (1 - along) * corners[:, 1] + root * along * corners[:, 2]
+
+
+def turned_about_z(quats: Float[Tensor, "N 4"], angles: Float[Tensor, "N"]) -> Float[Tensor, "N 4"]:
+    """Quaternions wxyz of frames turned about their own third axis [rad]."""
+    w, x, y, z = quats.unbind(-1)
+    c, s = (0.5 * angles).cos(), (0.5 * angles).sin()
+    return torch.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], -1)
+
+
+def one_tile(n: int = 100_000, size: int = 512, seed: int = 0) -> GaussianScene:
+    """`n` Gaussians of a pixel each, faint, and all in one tile: nearly all of its list is drawn in every pixel."""
+    generator = torch.Generator().manual_seed(seed)
+    corner = size // 2 // TILE * TILE
+    pixels = corner + 0.7 + (TILE - 1.4) * torch.rand(n, 2, generator=generator)
+    depths = 1 + torch.rand(n, generator=generator)
+    means = before_pixels(pixels, depths, size)
+    return frontal(
+        "one tile", seed, means, torch.randn(n, 4, generator=generator), depths[:, None] * torch.full((n, 3), 1e-5),
+        torch.full((n,), 2 / 255), torch.rand(n, 3, generator=generator), size,
+    )  # fmt: skip
+
+
+def giants(n: int = 1000, size: int = 512, seed: int = 0) -> GaussianScene:
+    """`n` Gaussians wider than the picture: every tile lists all, and they are too faint for a pixel to end early."""
+    generator = torch.Generator().manual_seed(seed)
+    pixels = size * torch.rand(n, 2, generator=generator)
+    depths = 1 + torch.rand(n, generator=generator)
+    scales = depths[:, None] * (1.5 + 0.3 * torch.rand(n, 3, generator=generator))
+    scales[:, 2] *= 0.01  # flat to the view
+    opacities = 0.005 + 0.004 * torch.rand(n, generator=generator)
+    level = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(n, 4)
+    return frontal(
+        "giants", seed, before_pixels(pixels, depths, size), level, scales, opacities,
+        torch.rand(n, 3, generator=generator), size,
+    )  # fmt: skip
+
+
+def before_pixels(pixels: Tensor, depths: Tensor, size: int) -> Tensor:
+    """Points that the camera of `frontal` sees at `pixels`."""
+    center = size / 2 - OFF_CENTER
+    return torch.cat([(pixels - center) / size * depths[:, None], depths[:, None]], -1)
+
+
+def crop(scene: GaussianScene, left: int, top: int, side: int) -> GaussianScene:
+    """A square part of the first camera's picture as a picture of its own."""
+    K = scene.Ks[:1].clone()
+    K[:, 0, 2] -= left
+    K[:, 1, 2] -= top
+    return replace(
+        scene, viewmats=scene.viewmats[:1], Ks=K, backgrounds=scene.backgrounds[:1], width=side, height=side
     )  # fmt: skip

@@ -1,4 +1,10 @@
-"""Time calls side by side, and see how much memory they take."""
+"""Time calls side by side, and see how much memory they take.
+
+`time_together` takes the wall and CPU time of single synchronised calls. `time_groups` is for work that a GPU finishes
+later: a call's wall time is what the host takes for many calls in a row and one wait at the end, and its GPU time that
+of a CUDA graph with ten calls in it, replayed back to back between two events: without the host, and with hardly any
+launch. Both run on the CPU too, where there are no graphs and so no GPU time.
+"""
 
 import ctypes
 import gc
@@ -13,71 +19,83 @@ from pathlib import Path
 
 import torch
 
+from oasis_warp.core.processes import using_threads
+
 SLOW_MS = 100.0
 """Calls from here on are not repeated for warm caches: those of their own data are cold anyway."""
+WARM_CALLS = 20
+"""Calls before groups are timed: an idle H200 runs at a sixth of its working clock."""
+WARM_SECONDS = 0.05
+"""Least time of these calls, unless they take longer than `LONGEST_WARM`."""
+LONGEST_WARM = 0.3
+GROUP_SECONDS = 0.01
+"""Duration of a group of calls: the wait at its end, of some ten microseconds, is a thousandth of it."""
+MOST_CALLS = 1000
+"""In a group."""
+YARDSTICK_MATRIX, YARDSTICK_FLOATS = 512, 2**20
+
+Clock = Callable[[Callable[[], object], int], float]
+"""From a call and how often to make it to the milliseconds of all of them."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Milliseconds of one call, a value for each group of calls."""
+
+    times_ms: tuple[float, ...]
+    calls: int = 1
+    """In each group."""
+
+    @property
+    def median_ms(self) -> float:
+        """Median of the groups."""
+        return statistics.median(self.times_ms)
+
+    @property
+    def iqr_ms(self) -> float:
+        """Interquartile range."""
+        low, _, high = statistics.quantiles(self.times_ms, n=4)
+        return high - low
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing(Sample):
+    """Wall times of single synchronised calls, and the CPU times of the process in them."""
+
+    first_ms: float
+    """The first call, with compiling or loading its kernels."""
+    cpu_times_ms: tuple[float, ...]
+
+    @property
+    def fastest_ms(self) -> float:
+        """The fastest call."""
+        return min(self.times_ms)
+
+    @property
+    def cpu_ms(self) -> float:
+        """Least CPU time of all threads together, which waiting for other work does not inflate."""
+        return min(self.cpu_times_ms)
 
 
 @dataclass(frozen=True)
 class Timed:
-    """One call to be timed."""
+    """One call to time."""
 
     run: Callable[[], object]
     threads: int
     """CPU threads that torch and our kernels may use."""
     around: Callable[[], AbstractContextManager[object]] = nullcontext
-    """Surroundings of the call, whose own time does not count."""
+    """A context for the call, whose own time does not count."""
 
     @contextmanager
     def ready(self) -> Iterator[None]:
-        """Everything about the call set up inside the block."""
+        """Set up threads and context inside the block."""
         with using_threads(self.threads), self.around():
             yield
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Wall time of a synchronised call, and the CPU time of the process in it."""
-
-    first_ms: float
-    """The first call, with compiling or loading its kernels."""
-    times_ms: tuple[float, ...]
-    cpu_times_ms: tuple[float, ...]
-
-    @property
-    def median_ms(self) -> float:
-        """What a call takes in the middle."""
-        return statistics.median(self.times_ms)
-
-    @property
-    def iqr_ms(self) -> float:
-        """Distance of the quartiles."""
-        low, _, high = statistics.quantiles(self.times_ms, n=4)
-        return high - low
-
-    @property
-    def fastest_ms(self) -> float:
-        """What it takes at best."""
-        return min(self.times_ms)
-
-    @property
-    def cpu_ms(self) -> float:
-        """CPU time at best, that of all threads added up: what waiting for other work does not inflate."""
-        return min(self.cpu_times_ms)
-
-
-@contextmanager
-def using_threads(threads: int) -> Iterator[None]:
-    """Let torch and our kernels use this many CPU threads inside the block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def synchronise() -> None:
-    """Wait for the GPU, where there is one at work."""
+    """Wait for the GPU, if one is in use."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.synchronize()
 
@@ -92,18 +110,39 @@ def milliseconds(run: Callable[[], object]) -> tuple[float, float]:
     return 1e3 * (end - start), 1e3 * (end_cpu - start_cpu)
 
 
+def in_turns(n: int, rounds: int, after_round: Callable[[int], object] | None = None) -> Iterator[int]:
+    """Indices 0 .. n - 1 in each of `rounds`, each round beginning with another one; garbage is collected in between.
+
+    A machine that gets slower does so for all that take turns.
+    """
+    collecting = gc.isenabled()
+    gc.disable()
+    gc.freeze()  # existing objects are not searched in every round
+    try:
+        for done in range(rounds):
+            for k in range(n):
+                yield (k + done) % n
+            gc.collect()
+            if after_round is not None:
+                after_round(done + 1)
+    finally:
+        gc.unfreeze()
+        if collecting:
+            gc.enable()
+
+
 def time_together(
     calls: Sequence[Timed], repeats: int, after_round: Callable[[int], object] | None = None
 ) -> list[Timing]:
-    """Time `calls` in turns, so that a machine that gets slower does so for all of them.
+    """Time calls in turns.
 
-    Every call is warmed up; each round then goes through the calls, beginning with another one each time, and runs
-    each twice in a row: the first run fetches its data into the caches, the second is timed.
+    Every call is warmed up. Each round runs each call twice in a row: the first run fetches its data into the caches,
+    the second is timed.
 
     Args:
         calls: What to time.
         repeats: Rounds, at least 2.
-        after_round: Told how many rounds are done.
+        after_round: Called with the number of finished rounds.
     """
     if repeats < 2:
         raise ValueError(f"repeats: expected 2 or more, got {repeats}.")
@@ -113,23 +152,96 @@ def time_together(
         with call.ready():
             first.append(milliseconds(call.run)[0])
             warm.append(milliseconds(call.run)[0])
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
-        for done in range(repeats):
-            for place in range(len(calls)):
-                k = (place + done) % len(calls)
-                with calls[k].ready():
-                    if warm[k] < SLOW_MS:
-                        calls[k].run()
-                    times[k].append(milliseconds(calls[k].run))
-            gc.collect()
-            if after_round is not None:
-                after_round(done + 1)
-    finally:
-        if collecting:
-            gc.enable()
-    return [Timing(f, *zip(*t, strict=True)) for f, t in zip(first, times, strict=True)]
+    for k in in_turns(len(calls), repeats, after_round):
+        with calls[k].ready():
+            if warm[k] < SLOW_MS:
+                calls[k].run()
+            times[k].append(milliseconds(calls[k].run))
+    walls_and_cpus = [zip(*t, strict=True) for t in times]
+    return [Timing(wall, first_ms=f, cpu_times_ms=cpu) for f, (wall, cpu) in zip(first, walls_and_cpus, strict=True)]
+
+
+def host_clock(run: Callable[[], object], times: int) -> float:
+    """Wall time of `times` calls with one wait at the end [ms]."""
+    synchronise()
+    start = time.perf_counter()
+    for _ in range(times):
+        run()
+    synchronise()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def device_clock(run: Callable[[], object], times: int) -> float:
+    """Time between CUDA events around `times` calls [ms]: the GPU's own, as long as the host keeps ahead of it."""
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    start.record()
+    for _ in range(times):
+        run()
+    end.record()
+    end.synchronize()
+    return start.elapsed_time(end)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One call to time in groups."""
+
+    run: Callable[[], object]
+    clock: Clock = host_clock
+    steps: int = 1
+    """How often one call does what the time is given for."""
+
+
+def time_groups(probes: Sequence[Probe], groups: int, seconds: float | None = None) -> list[Sample]:
+    """Time groups of calls, the probes taking turns.
+
+    Args:
+        probes: What to time; each is warmed up first.
+        groups: Of each probe; at least 2.
+        seconds: Limit for all groups together: slow calls are made once a group, and in fewer groups.
+    """
+    if groups < 2:
+        raise ValueError(f"groups: expected 2 or more, got {groups}. Quartiles need some.")
+    longest = [warm_up(probe) for probe in probes]
+    calls = [max(1, min(MOST_CALLS, round(1e3 * GROUP_SECONDS / ms))) for ms in longest]
+    if seconds is not None:
+        a_round = 1e-3 * sum((n + 1) * ms for n, ms in zip(calls, longest, strict=True))
+        groups = max(2, min(groups, int(seconds / a_round)))
+    times: list[list[float]] = [[] for _ in probes]
+    for k in in_turns(len(probes), groups):
+        probes[k].run()  # the one before it left its own data in the caches
+        times[k].append(probes[k].clock(probes[k].run, calls[k]) / (calls[k] * probes[k].steps))
+    return [Sample(tuple(t), n) for t, n in zip(times, calls, strict=True)]
+
+
+def warm_up(probe: Probe) -> float:
+    """Milliseconds of one of the last calls, after enough of them for the clocks to rise."""
+    probe.clock(probe.run, 1)  # compiles or loads kernels
+    done, spent = 0, 0.0
+    while True:
+        calls = 1 + done
+        ms = probe.clock(probe.run, calls)
+        done, spent = done + calls, spent + 1e-3 * ms
+        if spent >= LONGEST_WARM or (done >= WARM_CALLS and spent >= WARM_SECONDS):
+            return ms / calls
+
+
+def make_yardstick() -> Callable[[], None]:
+    """A fixed piece of work to measure speed by: the speed of a machine drifts, ratios to the yardstick hardly do.
+
+    Four products of 512 x 512 float32 matrices and four copies of 4 MiB, always on the CPU, on one thread.
+    """
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.randn(YARDSTICK_MATRIX, YARDSTICK_MATRIX, generator=generator) for _ in range(2))
+    product = torch.empty_like(a)
+    source, target = torch.randn(YARDSTICK_FLOATS, generator=generator), torch.empty(YARDSTICK_FLOATS)
+
+    def work() -> None:
+        for _ in range(4):
+            torch.mm(a, b, out=product)
+            target.copy_(source)
+
+    return work
 
 
 def peak_megabytes(run: Callable[[], object], device: torch.device) -> float | None:
@@ -152,13 +264,13 @@ def peak_megabytes(run: Callable[[], object], device: torch.device) -> float | N
         Path("/proc/self/clear_refs").write_text("5")  # the high-water mark falls to what is resident now
     except (OSError, AttributeError):  # a C library without it, a container that forbids it
         return None
-    before = _resident("VmHWM")
+    before = _peak_resident()
     run()
-    return _resident("VmHWM") - before
+    return _peak_resident() - before
 
 
-def _resident(line: str) -> float:
+def _peak_resident() -> float:
     for entry in Path(f"/proc/{os.getpid()}/status").read_text().splitlines():
-        if entry.startswith(line):
+        if entry.startswith("VmHWM"):
             return int(entry.split()[1]) / 1024
-    raise RuntimeError(f"/proc/self/status: expected a line {line}, found none.")
+    raise RuntimeError("/proc/self/status: expected a line VmHWM, found none.")

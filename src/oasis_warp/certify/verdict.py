@@ -1,4 +1,4 @@
-"""Measurements put together: for each operator and check how many, and the one nearest to its bound or beyond."""
+"""Measurements summed up: for each operator and check how many, and the one nearest to its bound or beyond."""
 
 import importlib.metadata
 import platform
@@ -12,7 +12,7 @@ from oasis_warp.certify.compare import Measurement
 
 
 @dataclass
-class Row:
+class Tally:
     """All measurements of one check of one operator."""
 
     worst: Measurement
@@ -27,15 +27,15 @@ class Row:
 
 @dataclass
 class Verdict:
-    """Rows by operator and check, in the order of their first measurement, and what failed."""
+    """Tallies by operator and check, in the order of their first measurement, and all failures."""
 
-    rows: dict[tuple[str, str], Row] = field(default_factory=dict)
+    rows: dict[tuple[str, str], Tally] = field(default_factory=dict)
     failed: list[Measurement] = field(default_factory=list)
-    conditions: dict[tuple[str, str, str], Row] = field(default_factory=dict)
+    conditions: dict[tuple[str, str, str], Tally] = field(default_factory=dict)
     """The same for each kind of scene."""
 
     def add(self, measurements: Iterable[Measurement]) -> None:
-        """Take these in."""
+        """Count these."""
         for m in measurements:
             _count(self.rows, (m.family, m.check), m)
             _count(self.conditions, (m.family, m.check.removesuffix(", stiff"), m.scene.split(", seed")[0]), m)
@@ -49,7 +49,7 @@ class Verdict:
 
 
 def _count(rows: dict, key: tuple[str, ...], m: Measurement) -> None:
-    row = rows.setdefault(key, Row(m))
+    row = rows.setdefault(key, Tally(m))
     row.cases += 1
     row.failures += not m.passed
     if m.load > row.worst.load:
@@ -70,19 +70,19 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
 
 
 def as_table(verdict: Verdict) -> list[dict[str, Any]]:
-    """The rows for JSON."""
+    """The tallies by check, for JSON."""
     return [_entry({"family": family, "check": check}, row) for (family, check), row in verdict.rows.items()]
 
 
 def by_condition(verdict: Verdict) -> list[dict[str, Any]]:
-    """The rows of each kind of scene for JSON."""
+    """The tallies by check and kind of scene, for JSON."""
     return [
         _entry({"family": family, "check": check, "condition": condition}, row)
         for (family, check, condition), row in verdict.conditions.items()
     ]
 
 
-def _entry(key: dict[str, str], row: Row) -> dict[str, Any]:
+def _entry(key: dict[str, str], row: Tally) -> dict[str, Any]:
     return key | {
         "error": row.worst.error,
         "bound": row.worst.bound,

@@ -10,11 +10,10 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from oasis_warp.bench import error_time, gpu_cases, gpu_speed, pareto, plots, roofline, scaling, speed
+from oasis_warp.bench import error_time, gpu_cases, gpu_speed, plots, roofline, scaling, speed
 from oasis_warp.bench.operators import OPERATORS
 from oasis_warp.bench.rows import csv_text, json_text, write_rows
 from oasis_warp.bench.scenes import HAND_GAUSSIANS
-from oasis_warp.bench.summary import groups
 from oasis_warp.bench.tables import (
     budget_table,
     gpu_table,
@@ -24,10 +23,10 @@ from oasis_warp.bench.tables import (
     setting_table,
     speed_table,
 )
-from oasis_warp.bench.timing import using_threads
 from oasis_warp.cli.console import check_device, show_progress
 from oasis_warp.cli.options import Bench, ErrorTime, Kernels, Roofline, Scaling
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.processes import using_threads
 from oasis_warp.data.output_files import output_file, output_folder
 
 TABLE_WIDTH = 200
@@ -46,49 +45,49 @@ def run(options: Bench) -> int:
     check_device(chosen.device)
     match chosen:
         case ErrorTime():
-            measure_error_time(chosen)
+            run_error_time(chosen)
         case Kernels(device="cuda"):
-            measure_gpu(chosen)
+            run_gpu(chosen)
         case Kernels():
-            measure_kernels(chosen)
+            run_kernels(chosen)
         case Scaling():
-            measure_scaling(chosen)
+            run_scaling(chosen)
         case Roofline():
-            measure_roofline(chosen)
+            run_roofline(chosen)
     return 0
 
 
 def check_repeats(repeats: int | None) -> None:
-    """Refuse too few."""
+    """Refuse fewer than two."""
     if repeats is not None and repeats < 2:
         raise InputError(f"--repeats: expected 2 or more, got {repeats}; quartiles need some.")
 
 
 def check_threads(threads: int) -> None:
-    """Refuse more than there are."""
+    """Refuse more threads than cores."""
     cores = os.cpu_count() or 1
     if not 1 <= threads <= cores:
         raise InputError(f"--threads: expected 1 to {cores}, the cores of this machine, got {threads}.")
 
 
 def check_size(size: int, multiple: int = 1) -> None:
-    """Refuse a picture that cannot be drawn."""
+    """Refuse an image size that cannot be drawn."""
     if not 16 <= size <= 4096 or size % multiple:
         wanted = f"a multiple of {multiple} from 16 to 4096" if multiple > 1 else "16 to 4096"
         raise InputError(f"--size: expected {wanted} pixels, got {size}.")
 
 
 def check_plot(plot: Path | None) -> None:
-    """Refuse a picture that cannot be made, before anything is measured."""
+    """Refuse a plot that cannot be made, before anything is measured."""
     if plot is None:
         return
     if plot.suffix not in (".png", ".svg"):
         raise InputError(f"--plot {plot}: expected a name that ends in .png or .svg.")
-    if not pareto.can_plot():
-        raise InputError(f"--plot: {pareto.MISSING}")
+    if not plots.can_plot():
+        raise InputError(f"--plot: {plots.MISSING}")
 
 
-def measure_error_time(options: ErrorTime) -> None:
+def run_error_time(options: ErrorTime) -> None:
     """`oasis bench error-time`."""
     check_repeats(options.repeats)
     check_threads(options.threads)
@@ -98,7 +97,7 @@ def measure_error_time(options: ErrorTime) -> None:
     device = torch.device(options.device)
     with output_folder(options.out) as folder:
         with show_progress(notes) as progress, using_threads(options.threads):
-            rows = error_time.measure(
+            rows = error_time.measure_settings(
                 error_time.Sweep(
                     plan=error_time.standard_plan(options.size, options.seed, options.quick),
                     device=device,
@@ -111,11 +110,11 @@ def measure_error_time(options: ErrorTime) -> None:
         write_rows(rows, folder / "error_time.csv", folder / "error_time.json")
         if with_plots:
             for op in dict.fromkeys(row.op for row in rows):
-                pareto.plot_operator(rows, op, folder / f"{op}.png")
-    show(*(setting_table(group) for group in groups(rows)), budget_table(rows))
+                plots.plot_operator(rows, op, folder / f"{op}.png")
+    show(*(setting_table(group) for group in error_time.groups(rows)), budget_table(rows))
 
 
-def measure_kernels(options: Kernels) -> None:
+def run_kernels(options: Kernels) -> None:
     """`oasis bench kernels` on the CPU."""
     check_repeats(options.repeats)
     check_threads(options.threads)
@@ -130,15 +129,14 @@ def measure_kernels(options: Kernels) -> None:
         raise InputError(f"--only {options.only}: expected part of one of {', '.join(OPERATORS)}.")
     with results(options, plots.plot_speed) as write:
         with show_progress(Console(stderr=True)) as progress, using_threads(options.threads):
-            rows = speed.measure(
-                operators, device=torch.device("cpu"), gaussians=gaussians, size=size, threads=options.threads,
-                repeats=options.repeats or REPEATS, progress=progress,
-            )  # fmt: skip
+            repeats = options.repeats or REPEATS
+            run_options = speed.RunOptions(device=torch.device("cpu"), threads=options.threads, repeats=repeats)
+            rows = speed.measure_operators(operators, run_options, gaussians=gaussians, size=size, progress=progress)
         write(rows)
     show(speed_table(rows))
 
 
-def measure_gpu(options: Kernels) -> None:
+def run_gpu(options: Kernels) -> None:
     """`oasis bench kernels --device cuda`."""
     check_repeats(options.repeats)
     for name, value in (("size", options.size), ("gaussians", options.gaussians)):
@@ -152,7 +150,7 @@ def measure_gpu(options: Kernels) -> None:
     notes = Console(stderr=True)
     with results(options, plots.plot_speed) as write:
         with show_progress(notes) as progress, using_threads(options.threads):
-            rows = gpu_speed.measure(
+            rows = gpu_speed.measure_cases(
                 cases, torch.device("cuda"), groups=options.repeats or GPU_GROUPS, peers=peers, progress=progress
             )
         write(rows)
@@ -162,7 +160,7 @@ def measure_gpu(options: Kernels) -> None:
             notes.print(f"oasis: {row.case}, {row.pass_}: no graph could hold it: {row.not_captured}", soft_wrap=True)
 
 
-def measure_scaling(options: Scaling) -> None:
+def run_scaling(options: Scaling) -> None:
     """`oasis bench scaling`."""
     check_threads(options.threads)
     seconds = options.seconds if options.seconds is not None else 1.0 if options.quick else 2.0
@@ -172,7 +170,7 @@ def measure_scaling(options: Scaling) -> None:
     with_plot = can_plot(notes)
     with output_folder(options.out) as folder:
         with show_progress(notes) as progress, using_threads(options.threads):
-            rows = scaling.measure(
+            rows = scaling.measure_scaling(
                 scaling.points(options.quick), torch.device(options.device), seconds=seconds, seed=options.seed,
                 progress=progress,
             )  # fmt: skip
@@ -182,11 +180,11 @@ def measure_scaling(options: Scaling) -> None:
     show(scaling_table(rows), growth_table(rows))
 
 
-def measure_roofline(options: Roofline) -> None:
+def run_roofline(options: Roofline) -> None:
     """`oasis bench roofline`."""
     with results(options, plots.plot_roofline) as write:
         with show_progress(Console(stderr=True)) as progress:
-            rows = roofline.measure(torch.device(options.device), options.seed, progress)
+            rows = roofline.measure_roofline(torch.device(options.device), options.seed, progress)
         if not rows:
             raise InputError("--device cuda: torch's profiler traces no kernels here; check the driver's permissions.")
         write(rows)
@@ -197,7 +195,7 @@ def measure_roofline(options: Roofline) -> None:
 def results(
     options: Kernels | Roofline, plot: Callable[[Sequence[Any], Path], None]
 ) -> Iterator[Callable[[Sequence[Any]], None]]:
-    """The files that `options` name, all opened now: what cannot be written shows before minutes of work, not after.
+    """The files that `options` name, opened first: what cannot be written is refused before minutes of work.
 
     Raises:
         InputError: one of them cannot be written.
@@ -222,15 +220,15 @@ def results(
 
 
 def can_plot(notes: Console) -> bool:
-    """Whether pictures can be drawn; says so where they cannot."""
-    if not pareto.can_plot():
-        notes.print(f"oasis: {pareto.MISSING}", highlight=False, soft_wrap=True, markup=False)
+    """Whether plots can be drawn; a note says if they cannot."""
+    if not plots.can_plot():
+        notes.print(f"oasis: {plots.MISSING}", highlight=False, soft_wrap=True, markup=False)
         return False
     return True
 
 
 def show(*tables: Table) -> None:
-    """Print tables on a console that is wide enough: a file has no width, and cut numbers say nothing."""
+    """Print tables on a console that is wide enough not to cut numbers."""
     console = Console()
     console = console if console.width >= TABLE_WIDTH else Console(width=TABLE_WIDTH)
     for table in tables:

@@ -13,7 +13,7 @@ from oasis_warp import __version__
 from oasis_warp.certify.certification import grid_scenes, run_grid, steps
 from oasis_warp.certify.compare import Measurement
 from oasis_warp.certify.families import FAMILIES
-from oasis_warp.certify.verdict import Row, Verdict, as_table, by_condition, describe_machine
+from oasis_warp.certify.verdict import Tally, Verdict, as_table, by_condition, describe_machine
 from oasis_warp.cli.console import FAULT, show_progress
 from oasis_warp.cli.options import Gradcheck
 from oasis_warp.cli.report import to_json
@@ -113,7 +113,7 @@ def print_verdict(console: Console, verdict: Verdict, options: Gradcheck, second
         console.print(f"The first failure alone: {again}", highlight=False, soft_wrap=True)
 
 
-def numbers(row: Row) -> tuple[str, str, str]:
+def numbers(row: Tally) -> tuple[str, str, str]:
     """Worst error, its bound and the number of cases, as text."""
     if row.worst.bound == 0:
         return f"{row.worst.error:.0f}", "0", str(row.cases)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels import constants
-from oasis_kernels.rasterize.cuda_binning import INDEX_BITS
+from oasis_kernels.rasterize.tiles_cuda import INDEX_BITS
 from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime import blend_cuda, blend_strips, blend_tiles
 from oasis_warp.ops._runtime.launch import has_vectors

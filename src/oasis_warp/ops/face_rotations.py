@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_kernels.posing import cuda_posing_turn as cuda_kernels
 from oasis_kernels.posing import face_rotation as kernels
-from oasis_kernels.posing import face_rotation_vectors as vector_kernels
+from oasis_kernels.posing import face_rotation_native as native_kernels
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._runtime.incidence import Incidence, incidence, sum_at_items
 from oasis_warp.ops._runtime.launch import (
@@ -69,16 +68,16 @@ def _mesh_words(
         "rest_vertices": place(rest, 3 * n_vertices),
         "posed_vertices": place(posed, 3 * n_vertices),
         "faces": place(corners.table, 3 * n_faces, torch.int32),
-        "triangles": place(triangles, vector_kernels.TRIANGLE * n_faces),
+        "triangles": place(triangles, native_kernels.TRIANGLE * n_faces),
         "offsets": place(corners.offsets, n_vertices + 1, torch.int32),
         "corners": place(corners.entries, 3 * n_faces, torch.int32),
-        "state": place(state, vector_kernels.STATE, torch.int64),
+        "state": place(state, native_kernels.STATE, torch.int64),
     }
 
 
 def _blocks(n: int) -> int:
     """Of a CUDA kernel, for so many faces or vertices."""
-    return -(-n // cuda_kernels.BLOCK)
+    return -(-n // native_kernels.BLOCK)
 
 
 def _face_rotations(
@@ -102,7 +101,7 @@ def _face_rotations(
     vertex_quats, face_quats, area_ratio, vertex_area_ratio, signs, sums = out
     if has_vectors(rest):
         rows_of_faces = rest.new_empty((n_faces, 8))
-        state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
+        state = torch.zeros(native_kernels.STATE, dtype=torch.int64)
         words = _mesh_words(rest, posed, corners, triangles, state) | {
             "rows_of_faces": place(rows_of_faces, 8 * n_faces),
             "vertex_quats": place(vertex_quats, 4 * n_vertices),
@@ -112,7 +111,7 @@ def _face_rotations(
             "signs": place(signs if keep else None, 3 * n_faces),
             "sums": place(sums if keep else None, 2 * n_vertices),
         }
-        run_native(vector_kernels.turn, words, task_count(n_faces, n_vertices))
+        run_native(native_kernels.turn, words, task_count(n_faces, n_vertices))
         return out
 
     areas = rest.new_empty((n_faces, 3), dtype=torch.float64)
@@ -172,8 +171,8 @@ def _turn_on_cuda(
         "sums": sums,
     }
     stream = current_stream(rest.device)
-    run_cuda(cuda_kernels.turn_faces, words, blocks, stream)
-    run_cuda(cuda_kernels.turn_vertices, words, n_poses * _blocks(n_vertices), stream)
+    run_cuda(native_kernels.turn_faces, words, blocks, stream)
+    run_cuda(native_kernels.turn_vertices, words, n_poses * _blocks(n_vertices), stream)
 
 
 def _gradients(rest: Tensor, posed: Tensor, needs_rest: bool, needs_posed: bool) -> tuple[Tensor, Tensor]:
@@ -229,7 +228,7 @@ def _face_rotations_backward(
         at_vertices = rest.new_empty((n_vertices, 8))
         rest_edges = rest.new_empty((n_faces, 8)) if needs_rest else None
         posed_edges = rest.new_empty((n_faces, 8)) if needs_posed else None
-        state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
+        state = torch.zeros(native_kernels.STATE, dtype=torch.int64)
         found = _gradients(rest, posed, needs_rest, needs_posed)
         words = _mesh_words(rest, posed, corners, triangles, state) | {
             "vertex_quats": place(vertex_quats, 4 * n_vertices),
@@ -247,7 +246,7 @@ def _face_rotations_backward(
             "g_rest": place(found[0] if needs_rest else None, 3 * n_vertices),
             "g_posed": place(found[1] if needs_posed else None, 3 * n_vertices),
         }
-        run_native(vector_kernels.turn_backward, words, task_count(n_faces, n_vertices))
+        run_native(native_kernels.turn_backward, words, task_count(n_faces, n_vertices))
         return found
 
     def given(grad: Tensor | None, like: Tensor) -> Tensor:
@@ -317,8 +316,8 @@ def _turn_backward_on_cuda(
         "g_posed": pointer(by_posed),
     }
     stream = current_stream(rest.device)
-    run_cuda(cuda_kernels.turn_faces_backward, words, n_poses * _blocks(n_faces), stream)
-    run_cuda(cuda_kernels.gather_edges, words, n_poses * _blocks(n_vertices), stream)
+    run_cuda(native_kernels.turn_faces_backward, words, n_poses * _blocks(n_faces), stream)
+    run_cuda(native_kernels.gather_edges, words, n_poses * _blocks(n_vertices), stream)
     return rest.new_empty((0, 3)) if by_rest is None else summed_over_poses(by_rest, batched), by_posed
 
 

@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_kernels.posing import cuda_posing_turn as cuda_kernels
-from oasis_kernels.posing import face_rotation_vectors as vector_kernels
+from oasis_kernels.posing import face_rotation_native as native_kernels
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._runtime.incidence import incidence
 from oasis_warp.ops._runtime.launch import current_stream, has_cuda_kernels, has_vectors, run_cuda, run_native
@@ -25,7 +24,7 @@ class RestMesh(NamedTuple):
 
 
 def _empty_table(rest: Tensor, faces: Tensor, *_: object) -> Tensor:
-    return rest.new_empty((len(faces) if rest.dtype == torch.float32 else 0, vector_kernels.TRIANGLE))
+    return rest.new_empty((len(faces) if rest.dtype == torch.float32 else 0, native_kernels.TRIANGLE))
 
 
 def _measure(rest: Tensor, faces: Tensor, validate: bool) -> Tensor:
@@ -35,16 +34,16 @@ def _measure(rest: Tensor, faces: Tensor, validate: bool) -> Tensor:
     out, rest = _empty_table(rest, faces), rest.contiguous()
     n_vertices, n_faces = len(rest), len(faces)
     if has_vectors(rest):
-        state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
+        state = torch.zeros(native_kernels.STATE, dtype=torch.int64)
         words = {
             "n_vertices": n_vertices,
             "n_faces": n_faces,
             "rest_vertices": place(rest, 3 * n_vertices),
             "faces": place(corners, 3 * n_faces, torch.int32),
-            "state": place(state, vector_kernels.STATE, torch.int64),
-            "out": place(out, vector_kernels.TRIANGLE * n_faces),
+            "state": place(state, native_kernels.STATE, torch.int64),
+            "out": place(out, native_kernels.TRIANGLE * n_faces),
         }
-        run_native(vector_kernels.measure, words, task_count(n_faces))
+        run_native(native_kernels.measure, words, task_count(n_faces))
     elif has_cuda_kernels(rest):
         words = {
             "n_vertices": n_vertices,
@@ -53,8 +52,8 @@ def _measure(rest: Tensor, faces: Tensor, validate: bool) -> Tensor:
             "faces": pointer(corners),
             "out": pointer(out),
         }
-        blocks = -(-n_faces // cuda_kernels.BLOCK)
-        run_cuda(cuda_kernels.measure_triangles, words, blocks, current_stream(rest.device))
+        blocks = -(-n_faces // native_kernels.BLOCK)
+        run_cuda(native_kernels.measure_triangles, words, blocks, current_stream(rest.device))
     return out
 
 

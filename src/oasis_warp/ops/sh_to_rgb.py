@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_kernels.rasterize import cuda_seen_colors as cuda_kernels
 from oasis_kernels.rasterize import spherical_harmonics as kernels
 from oasis_warp.ops._runtime.launch import (
     SCALAR,
@@ -30,8 +29,8 @@ def _seen(means: Tensor, coefficients: Tensor, viewmats: Tensor, degree: int) ->
     means, coefficients, viewmats = means.contiguous(), coefficients.contiguous(), viewmats.contiguous()
     if has_cuda_kernels(means):
         words = _cuda_words(means, coefficients, viewmats) | {"total": total, "colors": colors.data_ptr()}
-        n_blocks = -(-total // cuda_kernels.BLOCK)
-        run_cuda(cuda_kernels.see(degree), words, n_blocks, current_stream(means.device))
+        n_blocks = -(-total // kernels.BLOCK)
+        run_cuda(kernels.cuda_see(degree), words, n_blocks, current_stream(means.device))
         return colors
     vec3 = VEC3[means.dtype]
     launch_ranges(
@@ -90,8 +89,8 @@ def _seen_backward(
             "g_means": g_means.data_ptr(), "g_coefficients": g_coefficients.data_ptr(),
             "g_centers": g_centers.data_ptr(),
         }  # fmt: skip
-        n_blocks = -(-n // cuda_kernels.BLOCK)
-        run_cuda(cuda_kernels.see_backward(degree), words, n_blocks, current_stream(means.device))
+        n_blocks = -(-n // kernels.BLOCK)
+        run_cuda(kernels.cuda_see_backward(degree), words, n_blocks, current_stream(means.device))
     else:
         vec3 = VEC3[means.dtype]
         launch_ranges(

@@ -6,9 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_kernels.posing import cuda_posing_skin as cuda_kernels
 from oasis_kernels.skinning import skinning as kernels
-from oasis_kernels.skinning import skinning_vectors as vector_kernels
+from oasis_kernels.skinning import skinning_native as native_kernels
 from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._runtime.launch import (
     current_stream,
@@ -54,7 +53,7 @@ def _input_words(
         "covars": place(covars, 9 * n, dtype),
         "weights": place(weights, n * n_joints, dtype),
         "transforms": place(transforms, 12 * n_joints, dtype),
-        "state": place(state, vector_kernels.STATE, torch.int64),
+        "state": place(state, native_kernels.STATE, torch.int64),
     }
 
 
@@ -109,8 +108,8 @@ def _skin(
             "out_means": pointer(out_means),
             "out_covars": pointer(out_covars),
         }
-        blocks = -(-len(means) // cuda_kernels.POINTS) * -(-inputs.n_poses // cuda_kernels.POSES)
-        run_cuda(cuda_kernels.skin, words, blocks, current_stream(means.device))
+        blocks = -(-len(means) // native_kernels.POINTS) * -(-inputs.n_poses // native_kernels.POSES)
+        run_cuda(native_kernels.cuda_skin, words, blocks, current_stream(means.device))
         return out_means, out_covars
     if transforms.ndim == 4:
 
@@ -125,12 +124,12 @@ def _skin(
     weights, transforms = weights.contiguous(), transforms.contiguous()
     given = out_covars if covars is None else covars.contiguous()
     if means.device.type == "cpu" and not rotation_only:
-        state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
+        state = torch.zeros(native_kernels.STATE, dtype=torch.int64)
         words = _input_words(means, None if covars is None else given, weights, transforms, state) | {
             "out_means": place(out_means, 3 * len(means), means.dtype),
             "out_covars": 0 if covars is None else place(out_covars, 9 * len(means), means.dtype),
         }
-        run_native(vector_kernels.skin(SCALAR_NAMES[means.dtype]), words, task_count(len(means)))
+        run_native(native_kernels.skin(SCALAR_NAMES[means.dtype]), words, task_count(len(means)))
     else:
         launch_ranges(
             kernels.skin,
@@ -215,7 +214,7 @@ def _skin_backward(
     if means.device.type == "cpu" and not rotation_only:
         dtype = means.dtype
         given = [None if t is None else t.contiguous() for t in (covars, grad_means, grad_covars)]
-        state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
+        state = torch.zeros(native_kernels.STATE, dtype=torch.int64)
         words = _input_words(corrected, given[0], weights, transforms, state) | {
             "g_out_means": place(given[1], 3 * n, dtype),
             "g_out_covars": place(given[2], 9 * n, dtype),
@@ -224,7 +223,7 @@ def _skin_backward(
             "g_weights": place(by_weights if needs_weights else None, n * n_joints, dtype),
             "g_blends": place(by_blends if needs_transforms else None, 16 * n, dtype),
         }
-        run_native(vector_kernels.skin_backward(SCALAR_NAMES[dtype]), words, task_count(n))
+        run_native(native_kernels.skin_backward(SCALAR_NAMES[dtype]), words, task_count(n))
     else:
         none = means.new_empty((0, 3, 3))
         launch_ranges(
@@ -272,9 +271,9 @@ def _sum_blends(by_blends: Tensor, weights: Tensor, out: Tensor) -> None:
     """Gradients of transforms from those of blended ones: the sum over points of weight times row."""
     n, n_joints = weights.shape
     if by_blends.device.type == "cpu":
-        dtype, n_blocks = by_blends.dtype, -(-n // vector_kernels.BLOCK)
+        dtype, n_blocks = by_blends.dtype, -(-n // native_kernels.SUM_BLOCK)
         sums = by_blends.new_empty((n_blocks, n_joints, 16))
-        state = torch.zeros(vector_kernels.STATE, dtype=torch.int64)
+        state = torch.zeros(native_kernels.STATE, dtype=torch.int64)
         words = {
             "n": n,
             "n_joints": n_joints,
@@ -283,9 +282,9 @@ def _sum_blends(by_blends: Tensor, weights: Tensor, out: Tensor) -> None:
             "g_blends": place(by_blends, 16 * n, dtype),
             "sums": place(sums, n_blocks * n_joints * 16, dtype),
             "g_transforms": place(out, 12 * n_joints, dtype),
-            "state": place(state, vector_kernels.STATE, torch.int64),
+            "state": place(state, native_kernels.STATE, torch.int64),
         }
-        run_native(vector_kernels.sum_blends(SCALAR_NAMES[dtype]), words, n_blocks)
+        run_native(native_kernels.sum_blends(SCALAR_NAMES[dtype]), words, n_blocks)
     else:
         out.copy_((weights.T @ by_blends).view(n_joints, 4, 4)[:, :, :3].transpose(1, 2))
 
@@ -297,7 +296,7 @@ def _backward_on_cuda(
     means, transforms = inputs.means, inputs.transforms
     n, n_joints = inputs.weights.shape
     batch, n_poses, batched = transforms.shape[:-3], inputs.n_poses, transforms.ndim == 4
-    point_blocks = -(-n // cuda_kernels.BLOCK)
+    point_blocks = -(-n // native_kernels.BLOCK)
 
     def rows(needed: bool, *shape: int) -> Tensor:
         return means.new_empty((*batch, n, *shape)) if needed else means.new_empty((0, *shape))
@@ -318,7 +317,7 @@ def _backward_on_cuda(
         "g_weights": pointer(by_weights),
         "sums": pointer(sums),
     }
-    run_cuda(cuda_kernels.skin_backward, words, n_poses * point_blocks, stream)
+    run_cuda(native_kernels.cuda_skin_backward, words, n_poses * point_blocks, stream)
     if sums is not None:
         words = {
             "n_joints": n_joints,
@@ -326,7 +325,7 @@ def _backward_on_cuda(
             "sums": pointer(sums),
             "g_transforms": pointer(by_transforms),
         }
-        run_cuda(cuda_kernels.sum_blocks, words, n_poses * -(-12 * n_joints // cuda_kernels.BLOCK), stream)
+        run_cuda(native_kernels.cuda_sum_blocks, words, n_poses * -(-12 * n_joints // native_kernels.BLOCK), stream)
     correctives = [
         means.new_empty((0, *(() if tensor is None else tensor.shape[1:])))
         for tensor in (inputs.displacements, inputs.strengths)

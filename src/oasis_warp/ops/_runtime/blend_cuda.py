@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_kernels.rasterize import cuda_binning, cuda_draw, cuda_draw_backward, cuda_long_lists
+from oasis_kernels.rasterize import tiles_cuda
 from oasis_warp.ops._runtime.launch import current_stream, run_cuda, wait_for
 from oasis_warp.ops._runtime.pair_counts import Counts, own_slot, remember, watching
 from oasis_warp.ops._runtime.records import Size
@@ -27,7 +27,7 @@ class Kept(NamedTuple):
 
     planes: Tensor
     """float32: [C, H, W] transmittance at the end; [C, H, W] bits of int32, place in the tile's list of the first
-    Gaussian that was not drawn; what happens between the segments of the lists (`checkpoints` of `cuda_draw`)."""
+    Gaussian that was not drawn; what happens between the segments of the lists (`checkpoints` of `blending.cu`)."""
     lists: Tensor
     """int32: [tiles, 4] column, start and length of the list, row over all cameras of a tile, those with any list
     first; [tiles, spread] cursors, of no further use; [C, N] number of each Gaussian's first pair."""
@@ -56,15 +56,15 @@ class Layout(NamedTuple):
 
     def size_of_lists(self) -> Size:
         """Numbers of `Kept.lists`."""
-        return (4 + cuda_binning.spread_of(self.n_tiles)) * self.n_tiles + self.n_cameras * self.n
+        return (4 + tiles_cuda.spread_of(self.n_tiles)) * self.n_tiles + self.n_cameras * self.n
 
 
 def _layout(colors: Tensor, frame: Frame) -> Layout:
     n_cameras, n, channels = colors.shape
     width, height, _ = frame
-    across, down = -(-width // cuda_binning.TILE), -(-height // cuda_binning.TILE)
+    across, down = -(-width // tiles_cuda.TILE), -(-height // tiles_cuda.TILE)
     n_tiles = n_cameras * across * down
-    segments = cuda_draw.SEGMENTS if n_tiles * (channels + 1) <= MOST_CHECKPOINTS else 1
+    segments = tiles_cuda.SEGMENTS if n_tiles * (channels + 1) <= MOST_CHECKPOINTS else 1
     return Layout(
         n_cameras, n, channels, across, down, width, height, n_tiles, n_cameras * height * width, segments
     )
@@ -74,7 +74,7 @@ def _words(splats: Splats, layout: Layout, lists: Tensor, planes: Tensor | None)
     """Parameters of the kernels: sizes, what is drawn, the arrays of `Kept.lists` and `Kept.planes`."""
     first, plane = lists.data_ptr(), 0 if planes is None else planes.data_ptr()
     n_cameras, n, _, tiles_x, tiles_y, width, height, n_tiles, pixels, _ = layout
-    spread = cuda_binning.spread_of(n_tiles)
+    spread = tiles_cuda.spread_of(n_tiles)
     return {
         **splats.words(), "opacities": splats.opacities.data_ptr(), "colors": splats.colors.data_ptr(),
         "backgrounds": splats.backgrounds.data_ptr(), "n": n, "n_cameras": n_cameras, "total": n_cameras * n,
@@ -111,9 +111,9 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
     capturing = torch.cuda.is_current_stream_capturing()
     report, counts = watching().expect(kind) if capturing else (own_slot(), Counts(MAX_PAIRS, MAX_PAIRS))
     words |= {"capacity": counts.pairs, "longest_sorted": counts.longest, "report": report.data_ptr()}
-    blocks = -(-n_cameras * n // cuda_binning.BLOCK)
-    run_cuda(cuda_binning.count_pairs(), words, blocks, stream)
-    run_cuda(cuda_binning.place_tiles(), words, -(-layout.n_tiles // cuda_binning.PLACE_BLOCK), stream)
+    blocks = -(-n_cameras * n // tiles_cuda.COUNT_BLOCK)
+    run_cuda(tiles_cuda.count_pairs(), words, blocks, stream)
+    run_cuda(tiles_cuda.place_tiles(), words, -(-layout.n_tiles // tiles_cuda.PLACE_BLOCK), stream)
     image = new.new_empty((n_cameras, frame.height, frame.width, channels))
     alphas = new.new_empty((n_cameras, frame.height, frame.width, 1))
     if not capturing:
@@ -122,19 +122,19 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
         counts = Counts(*report.tolist())
         check_pairs(counts.pairs)
         remember(kind, counts)
-    long = counts.longest > cuda_draw.LONGEST
+    long = counts.longest > tiles_cuda.LONGEST
     gaussians = hidden(counts.pairs, torch.int32, device) if keep or long else None
     keys = torch.empty(counts.pairs, dtype=torch.int64, device=device)
     words |= {
         "capacity": counts.pairs, "keys": keys.data_ptr(), "image": image.data_ptr(), "alphas": alphas.data_ptr(),
         "tile_gaussians": 0 if gaussians is None else gaussians.data_ptr(),
     }  # fmt: skip
-    run_cuda(cuda_binning.fill_tiles(), words, blocks, stream)
+    run_cuda(tiles_cuda.fill_tiles(), words, blocks, stream)
     if long:
-        spare = torch.empty_like(keys) if counts.longest > cuda_long_lists.RUN else None
+        spare = torch.empty_like(keys) if counts.longest > tiles_cuda.RUN else None
         words["spare"] = 0 if spare is None else spare.data_ptr()
-        run_cuda(cuda_long_lists.sort_long_lists(), words, layout.n_tiles, stream)
-    run_cuda(cuda_draw.blend(channels, layout.segments, current_rules()), words, layout.n_tiles, stream)
+        run_cuda(tiles_cuda.sort_long_lists(), words, layout.n_tiles, stream)
+    run_cuda(tiles_cuda.blend(channels, layout.segments, current_rules()), words, layout.n_tiles, stream)
     return image, alphas, None if planes is None or gaussians is None else Kept(planes, lists, gaussians)
 
 
@@ -147,7 +147,7 @@ def draw_backward(
     n_cameras, n, channels = new.shape
     stream = current_stream(new.device)
     capacity = kept.gaussians.untyped_storage().nbytes() // 4 - 1
-    size = cuda_draw_backward.record_size(channels, with_shape, with_colors)
+    size = tiles_cuda.record_size(channels, with_shape, with_colors)
     pair_records = new.new_empty(capacity * size)
     tile_backgrounds = new.new_empty((n_cameras, layout.n_tiles // n_cameras, channels)) if with_backgrounds else None
     g_means2d = new.new_empty((n_cameras, n, 2)) if with_shape else None
@@ -163,10 +163,10 @@ def draw_backward(
         **{name: 0 if array is None else array.data_ptr() for name, array in arrays.items()},
     }  # fmt: skip
     rules = current_rules()
-    backward = cuda_draw_backward.blend_backward(channels, layout.segments, with_shape, with_colors, rules)
+    backward = tiles_cuda.blend_backward(channels, layout.segments, with_shape, with_colors, rules)
     run_cuda(backward, words, layout.n_tiles, stream)
     if with_shape or with_colors:
-        blocks = -(-n_cameras * n // cuda_draw_backward.GATHER_BLOCK)
-        run_cuda(cuda_draw_backward.gather(channels, with_shape, with_colors), words, blocks, stream)
+        blocks = -(-n_cameras * n // tiles_cuda.GATHER_BLOCK)
+        run_cuda(tiles_cuda.gather(channels, with_shape, with_colors), words, blocks, stream)
     g_backgrounds = None if tile_backgrounds is None else tile_backgrounds.sum(1)
     return Gradients(g_means2d, g_covars2d, g_opacities, g_colors, g_backgrounds)

@@ -1,6 +1,6 @@
 """Blend strip by strip with the vector kernels: float32 on the CPU.
 
-`oasis_kernels/rasterize/strips.py` describes the layout.
+`oasis_kernels/rasterize/strips.cpp` describes the layout.
 """
 
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_kernels.rasterize import strips, strips_backward, strips_binning, strips_forward
+from oasis_kernels.rasterize import strips
 from oasis_warp.ops._runtime.launch import address, run_native
 from oasis_warp.ops._runtime.registration import hidden, hidden_like_fake, revealed
 from oasis_warp.ops._runtime.rules import current_rules
@@ -105,13 +105,13 @@ def count(splats: Splats, s: Strips) -> Counted:
     counts = torch.empty(s.n_chunks * s.n_strips, dtype=torch.int32)
     by_chunk = torch.empty(3, s.n_chunks, dtype=torch.int64)
     totals = torch.empty(3, dtype=torch.int64)
-    state = torch.zeros(strips_binning.COLLECT_STATE, dtype=torch.int64)
+    state = torch.zeros(strips.STATE, dtype=torch.int64)
     words = s.words | splats.words() | {
         "records": address(records, torch.float32, strips.RECORD * total),
         "starts": address(starts, torch.int64, s.n_strips + 1),
         "pair_starts": address(pair_starts, torch.int32, total),
         "order": address(order, torch.int32, s.n_strips),
-        "state": address(state, torch.int64, strips_binning.COLLECT_STATE),
+        "state": address(state, torch.int64, strips.STATE),
         "counts": address(counts, torch.int32, s.n_chunks * s.n_strips),
         "chunk_pairs": address(by_chunk, torch.int64, 3 * s.n_chunks),
         "lows": by_chunk.data_ptr() + 8 * s.n_chunks,
@@ -120,7 +120,7 @@ def count(splats: Splats, s: Strips) -> Counted:
         "opacities": address(splats.opacities, torch.float32, total),
         "colors": address(splats.colors, torch.float32, channels * total),
     }
-    run_native(strips_binning.collect(in_record), words, s.n_chunks)
+    run_native(strips.collect(in_record), words, s.n_chunks)
     n_pairs = int(totals[0])
     check_pairs(n_pairs)
     lists = Lists(records, starts, pair_starts, order, hidden(n_pairs, torch.int32, records.device))
@@ -180,9 +180,9 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
     transmittance = torch.empty(kept)
     stops = torch.empty(kept, dtype=torch.int32)
     entries = torch.empty(2 * counted.n_pairs, dtype=torch.int64)
-    state = torch.zeros(strips_forward.DRAW_STATE, dtype=torch.int64)
+    state = torch.zeros(strips.STATE, dtype=torch.int64)
     words = counted.words | {
-        "state": address(state, torch.int64, strips_forward.DRAW_STATE),
+        "state": address(state, torch.int64, strips.STATE),
         "backgrounds": address(splats.backgrounds, torch.float32, s.n_cameras * channels),
         "entries": address(entries, torch.int64, 2 * counted.n_pairs),
         "ids": address(revealed(counted.lists.ids), torch.int32, counted.n_pairs),
@@ -192,7 +192,7 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
         "transmittance": address(transmittance, torch.float32, kept),
         "stops": address(stops, torch.int32, kept),
     }
-    run_native(strips_forward.draw(channels, current_rules()), words, max(s.n_chunks, s.n_strips))
+    run_native(strips.draw(channels, current_rules()), words, max(s.n_chunks, s.n_strips))
     return image, alphas, Kept(transmittance, stops, *counted.lists) if keep else None
 
 
@@ -205,24 +205,24 @@ def draw_backward(
     channels, pixels = splats.colors.shape[-1], s.n_cameras * s.height * s.width
     total, pixels_kept = s.n_cameras * s.n, s.n_strips * s.plane
     if g_image is None:  # as with a loss on silhouettes: colours play no part, and get none
-        summed = strips_backward.Wanted(0, with_shape, False)
+        summed = strips.Gradients(0, with_shape, False)
     else:
-        summed = strips_backward.Wanted(channels, with_shape, with_colors)
+        summed = strips.Gradients(channels, with_shape, with_colors)
     with_strips = with_backgrounds and g_image is not None
     ids = revealed(kept.ids)
-    pairs = torch.empty(len(ids) * strips_backward.pair_words(summed))
+    pairs = torch.empty(len(ids) * strips.pair_words(summed))
     strip_backgrounds = torch.empty(s.n_cameras, s.across * s.down, channels if with_strips else 0)
     means2d = torch.empty(s.n_cameras, s.n if with_shape else 0, 2)
     covars2d = torch.empty(s.n_cameras, s.n if with_shape else 0, 3, dtype=torch.float64)
     opacities = torch.empty(s.n_cameras, s.n if with_shape else 0)
     colors = torch.empty(s.n_cameras, s.n if summed.color else 0, channels)
-    state = torch.zeros(strips_backward.BACKWARD_STATE, dtype=torch.int64)
+    state = torch.zeros(strips.STATE, dtype=torch.int64)
     words = s.words | splats.words() | {
         "records": address(kept.records, torch.float32, strips.RECORD * total),
         "starts": address(kept.starts, torch.int64, s.n_strips + 1),
         "pair_starts": address(kept.pair_starts, torch.int32, total),
         "order": address(kept.order, torch.int32, s.n_strips),
-        "state": address(state, torch.int64, strips_backward.BACKWARD_STATE),
+        "state": address(state, torch.int64, strips.STATE),
         "opacities": address(splats.opacities, torch.float32, total),
         "colors": address(splats.colors, torch.float32, total * channels),
         "backgrounds": address(splats.backgrounds, torch.float32, s.n_cameras * channels),
@@ -231,14 +231,14 @@ def draw_backward(
         "stops": address(kept.stops, torch.int32, pixels_kept),
         "g_image": 0 if g_image is None else address(g_image, torch.float32, pixels * channels),
         "g_alpha": 0 if g_alpha is None else address(g_alpha, torch.float32, pixels),
-        "pairs": address(pairs, torch.float32, len(ids) * strips_backward.pair_words(summed)),
+        "pairs": address(pairs, torch.float32, len(ids) * strips.pair_words(summed)),
         "strip_backgrounds": strip_backgrounds.data_ptr() if with_strips else 0,
         "g_means2d": address(means2d, torch.float32, 2 * total * with_shape),
         "g_covars2d": address(covars2d, torch.float64, 3 * total * with_shape),
         "g_opacities": address(opacities, torch.float32, total * with_shape),
         "g_colors": address(colors, torch.float32, channels * total * summed.color),
     }
-    run_native(strips_backward.draw_backward(summed, current_rules()), words, max(s.n_chunks, s.n_strips))
+    run_native(strips.draw_backward(summed, current_rules()), words, max(s.n_chunks, s.n_strips))
     backgrounds = strip_backgrounds.sum(1) if with_strips else torch.zeros_like(splats.backgrounds)
     if with_colors and not summed.color:
         colors = torch.zeros_like(splats.colors)

@@ -10,8 +10,8 @@ import warp as wp
 from torch import Tensor
 
 from oasis_kernels.depth import depth_buffer as kernels
-from oasis_kernels.depth import depth_buffer_vectors as vectors
-from oasis_kernels.depth.depth_buffer_job import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
+from oasis_kernels.depth import depth_buffer_native as vectors
+from oasis_kernels.depth.depth_buffer_native import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
 from oasis_warp.core.checks import check_index, check_positive
 from oasis_warp.ops._runtime import depth_cuda
 from oasis_warp.ops._runtime.depth_scene import (

@@ -7,8 +7,8 @@ vertex.
 import torch
 from torch import Tensor
 
-from oasis_kernels.depth import cuda_depth_draw, cuda_depth_pull, cuda_depth_resolve
-from oasis_kernels.depth.cuda_depth import BLOCK
+from oasis_kernels.depth import depth_buffer_cuda
+from oasis_kernels.depth.depth_buffer_cuda import BLOCK
 from oasis_warp.ops._runtime.depth_scene import (
     Buffer,
     Query,
@@ -81,7 +81,7 @@ def draw(
 
     at_once = BLOCKS_AT_ONCE * stream.device.sm_count
     key_pairs = -(-batch * plane // 2)
-    capacity = min(batch * n_faces, cuda_depth_draw.QUEUE)
+    capacity = min(batch * n_faces, depth_buffer_cuda.QUEUE)
     # One block: keys, the queue's counter, its faces and where they start.
     room = torch.empty(2 * key_pairs + 2 * capacity + 2, dtype=torch.int64, device=scene.vertices.device)
     keys = room.data_ptr()
@@ -98,14 +98,14 @@ def draw(
     found_word = 0 if found is None else found.data_ptr()
     cleared = {name: scene_words[name] for name in ("Ks", "Ks_step", "batch", "keys")}
     cleared |= {"key_pairs": key_pairs, "counter": counter, "found": found_word}
-    run_cuda(cuda_depth_draw.clear, cleared, blocks, stream)
-    blocks = min(batch * _blocks(n_faces, cuda_depth_draw.FACES_A_BLOCK), MOST_BLOCKS)
-    run_cuda(cuda_depth_draw.draw, drawn, blocks, stream)
+    run_cuda(depth_buffer_cuda.clear, cleared, blocks, stream)
+    blocks = min(batch * _blocks(n_faces, depth_buffer_cuda.FACES_A_BLOCK), MOST_BLOCKS)
+    run_cuda(depth_buffer_cuda.draw, drawn, blocks, stream)
     if capacity:
-        run_cuda(cuda_depth_draw.draw_large, drawn, at_once, stream)
+        run_cuda(depth_buffer_cuda.draw_large, drawn, at_once, stream)
 
     # A small picture has a pixel for each of the threads that run at once, or not even that.
-    pixels_a_thread = min(max(batch * plane // (2 * BLOCK * at_once), 1), cuda_depth_resolve.MOST_PIXELS)
+    pixels_a_thread = min(max(batch * plane // (2 * BLOCK * at_once), 1), depth_buffer_cuda.MOST_PIXELS)
     blocks = _blocks(plane, pixels_a_thread * BLOCK) if any(wanted) else 0
     words = scene_words | {
         "depth": buffer.depth.data_ptr() if wanted.depth else 0,
@@ -134,7 +134,7 @@ def draw(
             "pixels": scores.pixels.data_ptr() if query.keep else 0,
         }
         blocks += _blocks(query.points.shape[1])
-    run_cuda(cuda_depth_resolve.resolve, words, min(batch * blocks, 4 * at_once, MOST_BLOCKS), stream)
+    run_cuda(depth_buffer_cuda.resolve, words, min(batch * blocks, 4 * at_once, MOST_BLOCKS), stream)
     return buffer, scores
 
 
@@ -154,7 +154,7 @@ def gradients(
     grad_points = scene.room(n_points, 3) if needs_points else scene.vertices.new_empty(0)
     grad_vertices = scene.room(n_vertices, 3) if needs_vertices else scene.vertices.new_empty(0)
     stream = current_stream(scene.vertices.device)
-    blocks = min(batch * _blocks(n_points), cuda_depth_pull.PEAKS)
+    blocks = min(batch * _blocks(n_points), depth_buffer_cuda.PEAKS)
     if needs_vertices and not blocks:
         grad_vertices.zero_()
     # One block: the sums at vertices, their shift, the largest numbers.
@@ -177,9 +177,9 @@ def gradients(
         "shift": shift,
         "sums": sums,
     }
-    run_cuda(cuda_depth_pull.pull, words, blocks, stream)
+    run_cuda(depth_buffer_cuda.pull, words, blocks, stream)
     if needs_vertices and blocks:
-        run_cuda(cuda_depth_pull.pull, words | {"adds": 1}, blocks, stream)
+        run_cuda(depth_buffer_cuda.pull, words | {"adds": 1}, blocks, stream)
         words = {"sums": sums, "shift": shift, "n": batch * n_vertices, "grad_vertices": grad_vertices.data_ptr()}
-        run_cuda(cuda_depth_pull.settle, words, min(_blocks(batch * n_vertices), MOST_BLOCKS), stream)
+        run_cuda(depth_buffer_cuda.settle, words, min(_blocks(batch * n_vertices), MOST_BLOCKS), stream)
     return grad_points, grad_vertices

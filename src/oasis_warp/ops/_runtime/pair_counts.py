@@ -15,8 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_kernels.rasterize import cuda_draw, cuda_long_lists
-from oasis_kernels.rasterize.cuda_binning import REPORT
+from oasis_kernels.rasterize.tiles_cuda import LONGEST, REPORT, RUN
 from oasis_warp.ops._runtime.tiles import MAX_PAIRS
 
 PAGE = 4096
@@ -143,7 +142,7 @@ def capacity_of(kind: Kind, slack: float) -> Counts:
         )
     last = _last[kind]
     longest = int(slack * last.longest)
-    sorted_ = next(limit for limit in (cuda_draw.LONGEST, cuda_long_lists.RUN, MAX_PAIRS) if limit >= longest)
+    sorted_ = next(limit for limit in (LONGEST, RUN, MAX_PAIRS) if limit >= longest)
     return Counts(min(int(slack * last.pairs) + 4096, MAX_PAIRS), sorted_)
 
 

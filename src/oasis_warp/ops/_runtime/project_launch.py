@@ -11,11 +11,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from oasis_kernels.rasterize import cuda_projection, cuda_projection_backward
 from oasis_kernels.rasterize import projection as generic
-from oasis_kernels.rasterize import projection_vectors_backward as vector_backward
-from oasis_kernels.rasterize import projection_vectors_forward as vector_forward
-from oasis_kernels.rasterize.projection_vectors import CHUNK
+from oasis_kernels.rasterize import projection_native
+from oasis_kernels.rasterize.projection_native import CHUNK
 from oasis_kernels.runtime.native import PHASE_WORDS
 from oasis_warp.core.checks import FINITE_LIMIT
 from oasis_warp.ops._runtime.launch import (
@@ -142,7 +140,7 @@ def project_vectors(scene: Scene, opacities: Tensor, limits: Limits, out: Sequen
     state = torch.zeros(PHASE_WORDS + 1, dtype=torch.int64)
     words = _words(scene, opacities=opacities, limits=numbers, state=state, bad=state[PHASE_WORDS:])
     words |= _output_words(scene, out)
-    run_native(vector_forward.project(), words, -(-len(scene.means) // CHUNK))
+    run_native(projection_native.project(), words, -(-len(scene.means) // CHUNK))
     return not state[PHASE_WORDS]
 
 
@@ -173,15 +171,15 @@ def project_cuda(scene: Scene, opacities: Tensor, limits: Limits, out: Sequence[
         bad = own_slot()
         bad[0] = 0
     total = len(scene.viewmats) * len(scene.means)
-    n_blocks = max(1, -(-total // cuda_projection.BLOCK))  # one clears the counters at least
+    n_blocks = max(1, -(-total // projection_native.BLOCK))  # one clears the counters at least
     n_counters = counters_size(scene.means, len(scene.viewmats), scene.width, scene.height) // 4
     words = _cuda_words(scene, opacities=opacities, bad=bad) | _output_words(scene, out) | {
-        "n_threads": n_blocks * cuda_projection.BLOCK, "n_counters": n_counters,
+        "n_threads": n_blocks * projection_native.BLOCK, "n_counters": n_counters,
         "near": as_float32(limits.near_plane), "far": as_float32(limits.far_plane), "radius_clip": limits.radius_clip,
         "eps2d": as_float32(limits.eps2d), "alpha_min": as_float32(rules.alpha_min),
         "extent_sigmas": rules.extent_sigmas, "largest": FINITE_LIMIT,
     }  # fmt: skip
-    run_cuda(cuda_projection.project(), words, n_blocks, stream)
+    run_cuda(projection_native.cuda_project(), words, n_blocks, stream)
     if bad is None:
         return True
     wait_for(stream)
@@ -197,7 +195,7 @@ def backward_cuda(scene: Scene, radii: Tensor, incoming: "Incoming", out: Mappin
         g_cameras=sums, **{f"g_{name}": out.get(name) for name in ("means", "quats", "scales", "covars")},
     )  # fmt: skip
     run_cuda(
-        cuda_projection_backward.project_backward(), words, -(-n // cuda_projection.BLOCK),
+        projection_native.cuda_project_backward(), words, -(-n // projection_native.BLOCK),
         current_stream(radii.device),
     )  # fmt: skip
     if g_viewmats is not None and sums is not None:
@@ -239,7 +237,7 @@ def backward_vectors(scene: Scene, radii: Tensor, incoming: Incoming, out: Mappi
     """Fill `out`, gradients by any of means, quats, scales, covars and viewmats, by the vector kernel."""
     chunks, n_cameras = -(-len(scene.means) // CHUNK), len(scene.viewmats)
     chunk_cameras = torch.empty(n_cameras if "viewmats" in out else 0, chunks, 12, dtype=torch.float64)
-    state = torch.zeros(vector_backward.STATE, dtype=torch.int64)
+    state = torch.zeros(projection_native.STATE, dtype=torch.int64)
     words = _words(
         scene,
         radii=radii,
@@ -248,7 +246,7 @@ def backward_vectors(scene: Scene, radii: Tensor, incoming: Incoming, out: Mappi
         chunk_cameras=chunk_cameras,
         state=state,
     )
-    run_native(vector_backward.project_backward(), words, max(chunks, n_cameras))
+    run_native(projection_native.project_backward(), words, max(chunks, n_cameras))
 
 
 def backward_generic(scene: Scene, radii: Tensor, incoming: Incoming, out: Mapping[str, Tensor]) -> None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_kernels.rasterize.cuda_binning import COUNTERS, TILE, spread_of
+from oasis_kernels.rasterize.tiles_cuda import COUNTERS, TILE, spread_of
 from oasis_warp.ops._runtime.launch import has_cuda_kernels
 
 Size = int | torch.SymInt

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_kernels.posing import barycentric_vectors as kernels
+from oasis_kernels.posing import mesh_gaussians as kernels
 from oasis_warp.ops._runtime.incidence import Incidence, incidence, riders_at_vertices
 from oasis_warp.ops._runtime.launch import run_native
 from oasis_warp.ops._runtime.poses import at_pose

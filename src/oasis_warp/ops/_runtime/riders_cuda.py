@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from oasis_kernels.posing import cuda_posing_riders as kernels
+from oasis_kernels.posing import mesh_gaussians as kernels
 from oasis_warp.ops._runtime.launch import current_stream, run_cuda
 from oasis_warp.ops._runtime.poses import summed_over_poses
 from oasis_warp.ops._runtime.riders import SHARED, Floats, Riders

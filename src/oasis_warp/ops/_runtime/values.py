@@ -5,8 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from oasis_kernels.runtime import cuda_values
-from oasis_kernels.runtime.finite import ALL_FINITE
+from oasis_kernels.runtime import finite
 from oasis_warp.core import checks
 from oasis_warp.ops._runtime.launch import current_stream, has_vectors, run_cuda, run_native
 from oasis_warp.ops._runtime.pair_counts import slots
@@ -27,7 +26,7 @@ def check_finite(**tensors: Tensor | None) -> None:
         arrays = torch.tensor([(t.data_ptr(), t.numel()) for t in quick])
         found = torch.zeros(1, dtype=torch.int64)
         run_native(
-            ALL_FINITE, {"arrays": arrays.data_ptr(), "count": len(quick), "found": found.data_ptr()}, n_tasks=1
+            finite.ALL_FINITE, {"arrays": arrays.data_ptr(), "count": len(quick), "found": found.data_ptr()}, n_tasks=1
         )
         if not found[0]:
             given = {name: t for name, t in given.items() if not any(t is known for known in quick)}
@@ -62,16 +61,16 @@ class DeferredFiniteCheck:
         self._found = slots.take()
         self._found[0] = 0
         stream = current_stream(self._device)
-        for first in range(0, len(tensors), cuda_values.ARRAYS):
-            words: dict[str, int | float] = dict.fromkeys(cuda_values.all_finite().parameters, 0)
+        for first in range(0, len(tensors), finite.ARRAYS):
+            words: dict[str, int | float] = dict.fromkeys(finite.cuda_all_finite().parameters, 0)
             words |= {"found": self._found.data_ptr(), "largest": checks.FINITE_LIMIT}
             n_blocks = 0
-            for k, tensor in enumerate(tensors[first : first + cuda_values.ARRAYS]):
+            for k, tensor in enumerate(tensors[first : first + finite.ARRAYS]):
                 words[f"data{k}"] = tensor.data_ptr()
                 words[f"count{k}"] = tensor.numel()
                 words[f"wide{k}"] = tensor.dtype == torch.float64
-                n_blocks += -(-tensor.numel() // cuda_values.CHUNK)
-            run_cuda(cuda_values.all_finite(), words, n_blocks, stream)
+                n_blocks += -(-tensor.numel() // finite.CHUNK)
+            run_cuda(finite.cuda_all_finite(), words, n_blocks, stream)
 
     def __exit__(self, kind: Any, *_: Any) -> None:
         torch.cuda.current_stream(self._device).synchronize()  # even after an error: the kernel writes to the slot

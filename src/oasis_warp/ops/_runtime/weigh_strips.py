@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from oasis_kernels.rasterize import strips_weights
+from oasis_kernels.rasterize import strips
 from oasis_warp.ops._runtime.blend_strips import count, cut_strips
 from oasis_warp.ops._runtime.launch import address, run_native
 from oasis_warp.ops._runtime.registration import revealed
@@ -27,9 +27,9 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
     members = torch.empty(n_pairs, dtype=torch.int32)
     pair_weights = torch.empty(n_pairs, dtype=torch.int32)
     pixel_weights = torch.empty(n_pixels, dtype=torch.int32)
-    state = torch.zeros(strips_weights.COUNT_STATE, dtype=torch.int64)
+    state = torch.zeros(strips.STATE, dtype=torch.int64)
     words = counted.words | {
-        "state": address(state, torch.int64, strips_weights.COUNT_STATE),
+        "state": address(state, torch.int64, strips.STATE),
         "entries": address(entries, torch.int64, 2 * n_pairs),
         "ids": address(ids, torch.int32, n_pairs),
         "members": address(members, torch.int32, n_pairs),
@@ -37,7 +37,7 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
         "pixel_weights": address(pixel_weights, torch.int32, n_pixels),
     }
     n_tasks = max(s.n_chunks, s.n_strips)
-    run_native(strips_weights.count_weights(current_rules()), words, n_tasks)
+    run_native(strips.count_weights(current_rules()), words, n_tasks)
 
     pair_places = _starts(pair_weights)
     n_weights = int(pair_places[-1])
@@ -46,9 +46,9 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
     places = pixel_starts[:-1].clone()
     pixels, gaussians = (torch.empty(n_weights, dtype=torch.int32) for _ in range(2))
     by_gaussian, by_pixel, alphas = torch.empty(n_weights), torch.empty(n_weights), torch.empty(n_pixels)
-    state = torch.zeros(strips_weights.FILL_STATE, dtype=torch.int64)
+    state = torch.zeros(strips.STATE, dtype=torch.int64)
     words |= {
-        "state": address(state, torch.int64, strips_weights.FILL_STATE),
+        "state": address(state, torch.int64, strips.STATE),
         "pair_places": address(pair_places, torch.int64, n_pairs + 1),
         "pixel_places": address(places, torch.int32, n_pixels),
         "gaussian_pixels": address(pixels, torch.int32, n_weights),
@@ -57,7 +57,7 @@ def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeig
         "pixel_values": address(by_pixel, torch.float32, n_weights),
         "alphas": address(alphas, torch.float32, n_pixels),
     }
-    run_native(strips_weights.fill_weights(current_rules()), words, n_tasks)
+    run_native(strips.fill_weights(current_rules()), words, n_tasks)
     # A Gaussian without pairs starts where the next one does.
     starts = pair_places[torch.cat([counted.lists.pair_starts.long(), torch.tensor([n_pairs])])]
     return SparseWeights(pixel_starts, gaussians, by_pixel, starts.to(torch.int32), pixels, by_gaussian, alphas)

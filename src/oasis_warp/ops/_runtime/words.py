@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from oasis_kernels.posing.posing_vectors import TASK
+from oasis_kernels.runtime.native import TASK
 from oasis_warp.ops._runtime.launch import address
 
 

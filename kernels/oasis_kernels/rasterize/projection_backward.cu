@@ -1,0 +1,149 @@
+// One thread a Gaussian, which adds its cameras in order.
+__global__ void project_backward(
+    int n,
+    int n_cameras,
+    double width,
+    double height,
+    const float* means,  // [n, 3]
+    const float* quats,  // [n, 4], or null where covars is given
+    const float* scales,  // [n, 3], or null
+    const float* covars,  // [n, 3, 3], or null; read as its symmetric part
+    const float* viewmats,  // [C, 4, 4]
+    const float* Ks,  // [C, 3, 3]
+    const int2* radii,  // [C, n]
+    const float2* g_means2d,  // [C, n], or null for zeros, as the next two
+    const double* g_covars2d,  // [C, n, 3]
+    const float* g_depths,  // [C, n]
+    float* g_means,  // [n, 3], or null where nobody asks, as all that follow
+    float* g_quats,  // [n, 4]
+    float* g_scales,  // [n, 3]
+    float* g_covars,  // [n, 3, 3]
+    double* g_cameras  // [C, n, 12]: by the upper three rows of viewmats, of each Gaussian)
+{
+#include "projection_cuda.h"
+    if (thread >= n) return;
+    const int i = thread;
+    const bool of_place = g_means || g_cameras;
+    const double mean[3] = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
+    double r[9], scale[3], s[6], inverse_norm = 0.0;  // s: covariance xx, xy, xz, yy, yz, zz
+    double w = 1.0, x = 0.0, y = 0.0, z = 0.0;
+    bool loaded = false;
+    double g_mean[3] = {}, g_s[6] = {};  // by the mean and the covariance
+
+    for (int c = 0; c < n_cameras; c++) {
+        const long long at = (long long)c * n + i;
+        double g_x = 0.0, g_y = 0.0, g_xx = 0.0, g_xy = 0.0, g_yy = 0.0;
+        if (g_means2d) { const float2 g = g_means2d[at]; g_x = g.x; g_y = g.y; }
+        if (g_covars2d) {
+            g_xx = g_covars2d[3 * at];
+            g_xy = 0.5 * g_covars2d[3 * at + 1];
+            g_yy = g_covars2d[3 * at + 2];
+        }
+        double g_point[3] = {0.0, 0.0, g_depths ? (double)g_depths[at] : 0.0};
+        double g_b0[3] = {}, g_b1[3] = {}, j0 = 0.0, j1 = 0.0, slope_u = 0.0, slope_v = 0.0;
+        const bool active = radii[at].x > 0 && (g_x != 0.0 || g_y != 0.0 || g_xx != 0.0 || g_xy != 0.0 || g_yy != 0.0);
+        const Camera k = camera_at(c);
+        if (active) {
+            if (!loaded) {
+                loaded = true;
+                if (covars) load_covariance(i, s);
+                else {
+                    w = quats[4 * i]; x = quats[4 * i + 1]; y = quats[4 * i + 2]; z = quats[4 * i + 3];
+                    inverse_norm = rotation(w, x, y, z, r);
+                    for (int e = 0; e < 3; e++) scale[e] = scales[3 * i + e];
+                    double f[9];
+                    for (int e = 0; e < 9; e++) f[e] = r[e] * scale[e % 3];
+                    int e = 0;
+                    for (int row = 0; row < 3; row++) for (int other = row; other < 3; other++, e++)
+                        s[e] = f[3 * row] * f[3 * other] + f[3 * row + 1] * f[3 * other + 1]
+                            + f[3 * row + 2] * f[3 * other + 2];
+                }
+            }
+            const double px = k.r[0] * mean[0] + k.r[1] * mean[1] + k.r[2] * mean[2] + k.t[0];
+            const double py = k.r[3] * mean[0] + k.r[4] * mean[1] + k.r[5] * mean[2] + k.t[1];
+            const double pz = k.r[6] * mean[0] + k.r[7] * mean[1] + k.r[8] * mean[2] + k.t[2];
+            const double inverse = reciprocal(pz), u = px * inverse, v = py * inverse;
+            slope_u = u < k.u_low ? k.u_low : u > k.u_high ? k.u_high : u;
+            slope_v = v < k.v_low ? k.v_low : v > k.v_high ? k.v_high : v;
+            j0 = k.fx * inverse;
+            j1 = k.fy * inverse;
+            double b0[3], b1[3];
+            for (int e = 0; e < 3; e++) {
+                b0[e] = j0 * (k.r[e] - slope_u * k.r[6 + e]);
+                b1[e] = j1 * (k.r[3 + e] - slope_v * k.r[6 + e]);
+                g_b0[e] = g_xx * b0[e] + g_xy * b1[e];  // rows of G B, below times 2 covariance
+                g_b1[e] = g_xy * b0[e] + g_yy * b1[e];
+            }
+            int e = 0;
+            for (int row = 0; row < 3; row++) for (int column = row; column < 3; column++, e++)
+                g_s[e] += b0[row] * g_b0[column] + b1[row] * g_b1[column];
+            if (of_place) {
+                auto spread = [&](double* g) {
+                    const double g0 = g[0] + g[0], g1 = g[1] + g[1], g2 = g[2] + g[2];
+                    g[0] = s[0] * g0 + s[1] * g1 + s[2] * g2;
+                    g[1] = s[1] * g0 + s[3] * g1 + s[4] * g2;
+                    g[2] = s[2] * g0 + s[4] * g1 + s[5] * g2;
+                };
+                spread(g_b0);
+                spread(g_b1);
+                // J depends on the point by 1/z and its slopes, which stand still where they were clamped.
+                const double g_j00 = k.r[0] * g_b0[0] + k.r[1] * g_b0[1] + k.r[2] * g_b0[2];
+                const double g_j02 = k.r[6] * g_b0[0] + k.r[7] * g_b0[1] + k.r[8] * g_b0[2];
+                const double g_j11 = k.r[3] * g_b1[0] + k.r[4] * g_b1[1] + k.r[5] * g_b1[2];
+                const double g_j12 = k.r[6] * g_b1[0] + k.r[7] * g_b1[1] + k.r[8] * g_b1[2];
+                const double g_u = k.fx * g_x - (slope_u == u ? j0 * g_j02 : 0.0);
+                const double g_v = k.fy * g_y - (slope_v == v ? j1 * g_j12 : 0.0);
+                const double g_inverse = k.fx * (g_j00 - slope_u * g_j02) + k.fy * (g_j11 - slope_v * g_j12);
+                g_point[0] = inverse * g_u;
+                g_point[1] = inverse * g_v;
+                g_point[2] -= inverse * (g_u * u + g_v * v + inverse * g_inverse);
+            }
+        }
+        for (int e = 0; e < 3; e++)
+            g_mean[e] += k.r[e] * g_point[0] + k.r[3 + e] * g_point[1] + k.r[6 + e] * g_point[2];
+        if (g_cameras) {
+            double* to = g_cameras + 12 * at;
+            for (int e = 0; e < 3; e++) {
+                const double first_row = j0 * g_b0[e], second_row = j1 * g_b1[e];
+                // Without a gradient there may be no number either, where the caller did not want to be checked.
+                auto by = [&](int row) -> double { return g_point[row] != 0.0 ? g_point[row] * mean[e] : 0.0; };
+                to[e] = by(0) + first_row;
+                to[4 + e] = by(1) + second_row;
+                to[8 + e] = by(2) - (slope_u * first_row + slope_v * second_row);
+                to[4 * e + 3] = g_point[e];
+            }
+        }
+    }
+
+    if (g_means) for (int e = 0; e < 3; e++) g_means[3 * i + e] = (float)g_mean[e];
+    const double g[9] = {g_s[0], g_s[1], g_s[2], g_s[1], g_s[3], g_s[4], g_s[2], g_s[4], g_s[5]};
+    if (g_covars) for (int e = 0; e < 9; e++) g_covars[9 * (long long)i + e] = (float)g[e];
+    if (!loaded) {
+        if (g_quats) for (int e = 0; e < 4; e++) g_quats[4 * i + e] = 0.f;
+        if (g_scales) for (int e = 0; e < 3; e++) g_scales[3 * i + e] = 0.f;
+    } else if (g_quats || g_scales) {
+        double h[9];  // 2 g R: by F = R S it is h S, by R itself h S S
+        for (int row = 0; row < 3; row++) for (int column = 0; column < 3; column++)
+            h[3 * row + column] = 2.0 * (g[3 * row] * r[column] + g[3 * row + 1] * r[3 + column]
+                                         + g[3 * row + 2] * r[6 + column]);
+        for (int e = 0; e < 3; e++) {
+            if (g_scales)
+                g_scales[3 * i + e] = (float)(scale[e] * (r[e] * h[e] + r[3 + e] * h[3 + e] + r[6 + e] * h[6 + e]));
+            const double square = scale[e] * scale[e];
+            for (int row = 0; row < 3; row++) h[3 * row + e] *= square;
+        }
+        if (g_quats) {
+            const double ax = h[7] - h[5], ay = h[2] - h[6], az = h[3] - h[1];
+            const double sx = h[5] + h[7], sy = h[2] + h[6], sz = h[1] + h[3];
+            const double g_w = x * ax + y * ay + z * az;
+            const double g_x = w * ax + y * sz + z * sy - 2.0 * x * (h[4] + h[8]);
+            const double g_y = w * ay + x * sz + z * sx - 2.0 * y * (h[0] + h[8]);
+            const double g_z = w * az + x * sy + y * sx - 2.0 * z * (h[0] + h[4]);
+            const double along = inverse_norm * (g_w * w + g_x * x + g_y * y + g_z * z), two = inverse_norm * 2.0;
+            g_quats[4 * i] = (float)(two * (g_w - along * w));
+            g_quats[4 * i + 1] = (float)(two * (g_x - along * x));
+            g_quats[4 * i + 2] = (float)(two * (g_y - along * y));
+            g_quats[4 * i + 3] = (float)(two * (g_z - along * z));
+        }
+    }
+}

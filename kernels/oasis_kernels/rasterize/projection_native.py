@@ -1,0 +1,43 @@
+"""Projection in float32: `projection.cpp` on the CPU and `projection.cu` on CUDA. See `projection` for float64."""
+
+import functools
+
+from oasis_kernels import constants
+from oasis_kernels.runtime.cuda_native import CudaNative, cuda_native
+from oasis_kernels.runtime.native import PHASE_WORDS, Native, native
+
+CHUNK = 512
+"""Gaussians of a task on the CPU, a multiple of 8; camera gradients are summed by chunks, so that threads do not change
+them."""
+STATE = 2 * PHASE_WORDS
+"""Words of zeros that threads of `project_backward` share; `project` takes PHASE_WORDS."""
+BLOCK = 64
+"""Threads of a block on CUDA; few, so that the blocks of one hand fill a device evenly."""
+CONSTANTS = {"CHUNK": CHUNK, "JACOBIAN_LIMIT": constants.JACOBIAN_LIMIT, "BOX_SLACK": constants.BOX_SLACK}
+
+
+@functools.cache
+def project() -> Native:
+    """CPU kernel: tasks are chunks."""
+    return native("rasterize/projection.cpp", "project", label="project_vectors", constants=CONSTANTS)
+
+
+@functools.cache
+def project_backward() -> Native:
+    """CPU kernel: tasks are chunks, then cameras."""
+    return native("rasterize/projection_backward.cpp", "project_backward", label="project_vectors_backward",
+                  constants=CONSTANTS)  # fmt: skip
+
+
+@functools.cache
+def cuda_project() -> CudaNative:
+    """CUDA kernel: blocks of `BLOCK` (camera, Gaussian) pairs."""
+    return cuda_native("rasterize/projection.cu", "project", BLOCK, blocks_per_multiprocessor=8,
+                       label="project_gaussians", constants=CONSTANTS)  # fmt: skip
+
+
+@functools.cache
+def cuda_project_backward() -> CudaNative:
+    """CUDA kernel: blocks of `BLOCK` Gaussians."""
+    return cuda_native("rasterize/projection_backward.cu", "project_backward", BLOCK, blocks_per_multiprocessor=6,
+                       label="project_gaussians_backward", constants=CONSTANTS)  # fmt: skip
