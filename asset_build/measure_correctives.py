@@ -16,12 +16,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from draw_hand import SKEW, THUMB_SIDE, draw, label
 from elastic_hand import methods, truths
-from elastic_hand.solid import MILLIMETRES
+from elastic_hand.solid import MILLIMETRES, skinned
 from elastic_hand.truths import HELD_OUT, TRAIN, Truth
 from hand_build.anatomy import Array
-from hand_build.quality import closed, self_crossings, signed_volume
+from hand_build.quality import enclosed_volume, self_crossings
+from measure_hand import SKEW, THUMB_SIDE, draw, label
 
 from oasis_warp.hand.template import bundled_hand
 
@@ -69,7 +69,7 @@ class Bench:
         self.volumes = {t.name: self._volume(t.vertices[-1]) for t in self.judged}
 
     def _volume(self, vertices: Array) -> float:
-        return signed_volume(*closed(vertices, self.faces, self.rim))
+        return enclosed_volume(vertices, self.faces, self.rim)
 
     def methods(self) -> dict[str, Method]:
         """By name; what can be fitted is fitted here."""
@@ -79,10 +79,10 @@ class Bench:
             return truths.bones(hand, angles)
 
         def plain(angles: Array) -> Array:
-            return methods.posed(rest, np.zeros(3), weights, bones(angles))
+            return skinned(rest, weights, bones(angles))
 
         def shaped(shapes: methods.PoseShapes) -> Method:
-            return lambda angles: methods.posed(rest, shapes.displacement(angles), weights, bones(angles))
+            return lambda angles: skinned(rest + shapes.displacement(angles), weights, bones(angles))
 
         shipped = methods.PoseShapes(
             methods.flexion_features(hand), hand.corrective_basis.permute(2, 0, 1).numpy() * MILLIMETRES

@@ -7,6 +7,7 @@ L-BFGS from the stiffness of the rest state (Liu, Bouaziz and Kavan 2017), bones
 
 from dataclasses import dataclass
 
+import igl
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
@@ -110,14 +111,9 @@ class Flesh:
     def contacts(self, at: Array) -> Contacts:
         """Skin nodes close to, or inside, skin that faces them."""
         nodes = self._skin_nodes
-        faces = at[self.solid.skin]
-        across = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]) / 2
-        vectors = np.zeros_like(at)
-        areas = np.zeros(len(at))
-        for corner in range(3):
-            np.add.at(vectors, self.solid.skin[:, corner], across / 3)
-            np.add.at(areas, self.solid.skin[:, corner], np.linalg.norm(across, axis=1) / 3)
-        normals = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
+        skin = self.solid.skin
+        normals = np.asarray(igl.per_vertex_normals(at, skin, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_AREA))
+        areas = np.bincount(skin.ravel(), np.repeat(igl.doublearea(at, skin) / 6, 3), len(at))
         distance, near = cKDTree(at[nodes]).query(at[nodes], 24, distance_upper_bound=CONTACT_REACH)
         node = np.repeat(nodes, 24)[np.isfinite(distance).ravel()]
         other = nodes[near[np.isfinite(distance)]]

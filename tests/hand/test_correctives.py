@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from hand_build.quality import closed, self_crossings, signed_volume
+from hand_build.quality import enclosed_volume, self_crossings
 
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.correctives import corrective_coefficients
@@ -31,7 +31,7 @@ def surface(hand, angles):
 
 
 def volume(hand, angles):
-    return signed_volume(*closed(surface(hand, angles), hand.faces.numpy(), hand.rim.numpy()))
+    return enclosed_volume(surface(hand, angles), hand.faces.numpy(), hand.rim.numpy())
 
 
 def test_at_rest_strengths_and_their_slopes_are_zero(hand):

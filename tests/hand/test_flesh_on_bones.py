@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 from elastic_hand import flesh, methods, truths
-from elastic_hand.fitted import ways_out
-from elastic_hand.solid import Solid, outer_faces
-from elastic_hand.surface import skinned
+from elastic_hand.methods import ways_out
+from elastic_hand.solid import Solid, outer_faces, skinned
 from hand_build.quality import self_crossings
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
