@@ -4,6 +4,7 @@ import pytest
 
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator
+from oasis_warp.hand.kinematics import HandKinematics
 
 PHOTOS = Path(__file__).parents[1] / "data" / "photos"
 
@@ -17,6 +18,11 @@ def photos():
 @pytest.fixture(scope="session")
 def estimator(hand):
     return HandEstimator(hand)
+
+
+@pytest.fixture(scope="session")
+def kinematics(hand):
+    return HandKinematics(hand)
 
 
 @pytest.fixture(scope="session")

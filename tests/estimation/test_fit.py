@@ -8,14 +8,8 @@ from oasis_warp.estimation.fit import Fitter, OutlinePairs
 from oasis_warp.estimation.fit_problem import FitState, fit_target
 from oasis_warp.estimation.fit_quality import draw_silhouette, iou_above_wrist
 from oasis_warp.estimation.outline import MaskOutline, wrist_line
-from oasis_warp.hand.kinematics import HandKinematics
 
 SIZE = (480, 400)
-
-
-@pytest.fixture(scope="module")
-def kinematics(hand):
-    return HandKinematics(hand)
 
 
 def posed_hand(kinematics, seed):

@@ -7,14 +7,8 @@ from oasis_warp.estimation.fit_problem import mirrored_fit
 from oasis_warp.estimation.fit_quality import iou_above_wrist
 from oasis_warp.estimation.outline import silhouette
 from oasis_warp.estimation.surface_offsets import LONGEST, outline_offsets
-from oasis_warp.hand.kinematics import HandKinematics
 
 RIGHT, LEFT = "victory_right_09.jpg", "ok_sign_left_10.jpg"
-
-
-@pytest.fixture(scope="module")
-def kinematics(hand):
-    return HandKinematics(hand)
 
 
 @pytest.fixture(scope="module")

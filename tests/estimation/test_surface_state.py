@@ -3,13 +3,7 @@ import pytest
 import torch
 
 from oasis_warp.estimation.surface_state import shape_of, state_of_surface
-from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.poses import named_pose
-
-
-@pytest.fixture(scope="module")
-def kinematics(hand):
-    return HandKinematics(hand)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,8 @@ from torch import Tensor
 PALM_SIDE, BACK_SIDE, FLANK_SIDE = 0, 1, 2
 """Values of `HandModel.region`."""
 
+TIP_JOINTS = (15, 3, 6, 12, 9)
+"""Last joints of thumb, index, middle, ring and little finger, whose bones end at the tips."""
 KNUCKLES = [5, 9, 13, 17]
 """Rows of the 21 landmarks that are the knuckles of index, middle, ring and little finger."""
 
@@ -28,7 +30,7 @@ class HandModel:
     weights: Float[Tensor, "V 16"]
     """Skinning weights; rows sum to one."""
     shape_basis: Float[Tensor, "V 3 S"]
-    """Vertex displacement a standard deviation of each shape coefficient [m]."""
+    """Vertex displacement per standard deviation of each shape coefficient [m]."""
     shape_names: tuple[str, ...]
     joints: Float[Tensor, "16 3"]
     joint_basis: Float[Tensor, "16 3 S"]
@@ -57,7 +59,7 @@ class HandModel:
     region: Int[Tensor, "V"]
     """0 palm, 1 back, 2 flank."""
     bone_t: Float[Tensor, "V"]
-    """Place along the bone of `segment`: 0 at the joint, 1 at the next."""
+    """Position along the bone of `segment`: 0 at the joint, 1 at the next."""
     bone_theta: Float[Tensor, "V"]
     """Angle of the normal about that bone [rad]: 0 back, +-pi palm."""
     nail: Float[Tensor, "V"]

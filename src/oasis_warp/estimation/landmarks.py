@@ -1,6 +1,6 @@
-"""Photo -> hands, each with 21 landmarks: palm detector, turned crop, landmark network, a second tighter crop.
+"""Photo -> hands, each with 21 landmarks: palm detector, rotated crop, landmark network, a second tighter crop.
 
-The recipe of MediaPipe Hands (Zhang et al. 2020), with fallback rungs for hands that fill the frame or lie in the dark.
+The method of MediaPipe Hands (Zhang et al. 2020), with fallback searches for hands that fill the frame or are dark.
 """
 
 from dataclasses import dataclass
@@ -12,20 +12,20 @@ from oasis_warp.estimation.networks import HAND_SIZE, PALM_SIZE, Networks
 
 BONES = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (0, 5), (5, 6), (6, 7), (7, 8), (0, 9), (9, 10), (10, 11), (11, 12),
                   (0, 13), (13, 14), (14, 15), (15, 16), (0, 17), (17, 18), (18, 19), (19, 20)])  # fmt: skip
-"""Rows of landmarks that a bone joins, from the wrist outwards."""
+"""Rows of the two landmarks that each bone joins, from the wrist outwards, [20, 2]."""
 FINGERS = {"thumb": [1, 2, 3, 4], "index": [5, 6, 7, 8], "middle": [9, 10, 11, 12], "ring": [13, 14, 15, 16],
            "little": [17, 18, 19, 20]}  # fmt: skip
 
 _MIN_PRESENCE = 0.5
 _MIN_GUESS = 0.8
-"""Presence and side score that a fallback rung must reach: there the detector sees hands that are none."""
+"""Least presence and side score in fallback searches, in which the palm detector finds false hands."""
 _MARGIN = 0.35
-"""Border replicated around the photo on the fallback rungs, in longer sides."""
+"""Border replicated around the photo in fallback searches, as a fraction of its longer side."""
 
 
 @dataclass(frozen=True)
 class DetectedHand:
-    """One hand in the pixels of the image that was searched."""
+    """One hand, in pixels of the image that was searched."""
 
     xy: np.ndarray
     """[21, 2] px."""
@@ -45,29 +45,29 @@ class DetectedHand:
 
 @dataclass(frozen=True)
 class Crop:
-    """A square of the image, turned so that the fingers point up in it."""
+    """A square of the image, rotated so that the fingers point up in it."""
 
     centre: np.ndarray
     side: float
     angle: float
-    """From the image's upright to the crop's, clockwise as seen [rad]."""
+    """Clockwise rotation of the crop in the image [rad]."""
 
 
 def detect_hands(rgb: np.ndarray, nets: Networks, *, most: int = 8) -> list[DetectedHand]:
-    """Hands in an RGB image of bytes, best palm first; the fallback rungs are tried only when there is none."""
+    """Hands in an RGB image of bytes, best palm first; fallback searches run only if there is none."""
     hands = _search(rgb, nets, 0.5, most, "network")
     if hands:
         return hands
     margin = int(_MARGIN * max(rgb.shape[:2]))
     wide = cv2.copyMakeBorder(rgb, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
     light = cv2.LUT(wide, np.round(255 * (np.arange(256) / 255) ** 0.5).astype(np.uint8))
-    rungs = (
+    searches = (
         (wide, 0.5, "network (margin)"),
         (light, 0.5, "network (margin, brightened)"),
         (wide, 0.25, "network (margin, weak)"),
         (light, 0.25, "network (margin, brightened, weak)"),
     )
-    for image, min_score, source in rungs:
+    for image, min_score, source in searches:
         hands = [h for h in _search(image, nets, min_score, most, source)
                  if min(h.presence, h.side_score) >= _MIN_GUESS]  # fmt: skip
         if hands:
@@ -81,7 +81,7 @@ def _search(rgb: np.ndarray, nets: Networks, min_score: float, most: int, source
         first = read_crop(rgb, nets, crop_of_palm(box, points), score, source)
         second = read_crop(rgb, nets, crop_of_landmarks(first.xy), score, source)
         hand = second if second.presence >= min(_MIN_PRESENCE, first.presence) else first
-        # Two palms may lead to one and the same hand.
+        # Two palms may lead to the same hand.
         if hand.presence >= _MIN_PRESENCE and not any(_same(hand.xy, other.xy) for other in hands):
             hands.append(hand)
     return hands
@@ -92,7 +92,7 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def box_size(xy: np.ndarray) -> float:
-    """Longer side of the box of the landmarks [px]: the unit of all distances that are shares of the hand."""
+    """Longer side of the box of the landmarks [px], the unit of all distances relative to the hand."""
     return float(np.ptp(xy, axis=0).max())
 
 
@@ -116,7 +116,7 @@ def palms(rgb: np.ndarray, nets: Networks, min_score: float) -> list[tuple[float
 
 
 def _anchors() -> np.ndarray:
-    """Centres in [0, 1] of the 2016 anchors: a 24 x 24 grid with two a cell, then a 12 x 12 grid with six."""
+    """Centres in [0, 1] of the 2016 anchors: two per cell of a 24 x 24 grid, then six per cell of a 12 x 12 grid."""
     grids = []
     for n, per_cell in ((24, 2), (12, 6)):
         centre = (np.arange(n) + 0.5) / n
@@ -144,14 +144,14 @@ def _merge(boxes: np.ndarray, scores: np.ndarray, points: np.ndarray) -> list[tu
 
 
 def crop_of_palm(box: np.ndarray, points: np.ndarray) -> Crop:
-    """The square for the first pass: wrist to middle knuckle up, moved towards the fingers, enlarged."""
+    """The square for the first pass: upright from wrist to middle knuckle, shifted towards the fingers, enlarged."""
     angle = _upright(points[2] - points[0])
     shift = 0.5 * box[3] * np.array([np.sin(angle), -np.cos(angle)])
     return Crop(box[:2] + shift, 2.6 * float(box[2:].max()), angle)
 
 
 def crop_of_landmarks(xy: np.ndarray) -> Crop:
-    """The tighter square that known landmarks give."""
+    """The tighter square around known landmarks."""
     angle = _upright(0.25 * (xy[5] + xy[13]) + 0.5 * xy[9] - xy[0])
     trunk = xy[[0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]]  # without the ends of the fingers
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
@@ -162,7 +162,7 @@ def crop_of_landmarks(xy: np.ndarray) -> Crop:
 
 
 def _upright(direction: np.ndarray) -> float:
-    """Angle of the crop in which `direction` points up, in [-pi, pi)."""
+    """Angle of the crop in which `direction` points up, in [-pi, pi) [rad]."""
     angle = np.pi / 2 - np.arctan2(-direction[1], direction[0])
     return float(angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi)))
 

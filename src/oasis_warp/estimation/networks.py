@@ -1,8 +1,8 @@
 """The two bundled MediaPipe networks (palm detector, hand landmarks) behind OpenCV's dnn module, and their self-check.
 
-The combination is delicate: OpenCV 4 reads the landmark network wrongly without an error, the new engine of OpenCV 5
-returns only one of the four outputs, and reading from memory ignores the choice of the engine. `check_networks` proves,
-once a process, that the numbers are right.
+Three faults of OpenCV raise no error: OpenCV 4 reads the landmark network wrongly, the new engine of OpenCV 5 returns
+only one of the four outputs, and reading from memory ignores the choice of the engine. So the networks are checked
+on an input with known outputs once per process.
 """
 
 import functools
@@ -26,7 +26,7 @@ _FILES = {
 _PALM_OUTPUTS = ("Identity", "Identity_1")
 _HAND_OUTPUTS = ("Identity", "Identity_1", "Identity_2", "Identity_3")
 
-# What LiteRT and OpenCV 5.0.0.93 answer to `drawn_hand`: they agree to 0.01 px. OpenCV 4.11 is 3 px and 0.27 m away.
+# Outputs of LiteRT and OpenCV 5.0.0.93 for `drawn_hand`, which agree to 0.01 px. OpenCV 4.11 is off by 3 px and 0.27 m.
 _KNOWN_ROWS = [0, 4, 8, 12, 16, 20]
 _KNOWN_POINTS = [[117.17, 183.28], [37.23, 107.67], [90.23, 55.05], [108.72, 30.57], [133.29, 39.41], [165.54, 62.35]]
 _KNOWN_WORLD = [
@@ -36,12 +36,12 @@ _KNOWN_WORLD = [
 _KNOWN_SCORES = [0.802, 0.941]
 _KNOWN_ANCHOR, _KNOWN_LOGIT, _KNOWN_BOX = 1694, 3.13, [[-7.17, 6.79], [64.47, 64.42]]
 _TOLERANCE = {"pixels": 0.25, "metres": 0.001, "score": 0.02}
-"""Room for another order of additions or half precision; the faults that are known are ten times as large."""
+"""Allows for another summation order and half precision; the known faults are ten times as large."""
 
 
 @dataclass(frozen=True)
 class PalmOutput:
-    """Raw answer of the palm detector."""
+    """Raw output of the palm detector."""
 
     boxes: np.ndarray
     """[2016, 9, 2]: offset of the centre, size, offsets of seven points; in pixels of the 192-pixel input."""
@@ -51,7 +51,7 @@ class PalmOutput:
 
 @dataclass(frozen=True)
 class HandOutput:
-    """Raw answer of the landmark network."""
+    """Raw output of the landmark network."""
 
     points: np.ndarray
     """[21, 2], in pixels of the 224-pixel input."""
@@ -87,10 +87,10 @@ def _forward(net: "cv2.dnn.Net", image: np.ndarray, names: tuple[str, ...]) -> l
 
 @functools.cache
 def networks() -> Networks:
-    """Both networks, loaded and checked once a process.
+    """Both networks, loaded and checked once per process.
 
     Raises:
-        InputError: this installation cannot run them rightly; see `check_networks`.
+        InputError: this installation does not run them correctly; see `check_networks`.
     """
     major = int(cv2.__version__.split(".")[0])
     if major < 5 or not hasattr(cv2.dnn, "ENGINE_CLASSIC"):
@@ -106,17 +106,17 @@ def networks() -> Networks:
             if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
                 raise InputError(f"{path}: the network file is damaged (SHA-256 differs); install oasis_warp again.")
             try:
-                # The path and not the bytes: OpenCV 5 heeds the engine only here.
+                # OpenCV 5 respects the engine only when reading from a path.
                 loaded.append(cv2.dnn.readNetFromTFLite(str(path), cv2.dnn.ENGINE_CLASSIC))
             except cv2.error as error:
                 raise _unusable(f"cannot load {name}") from error
     pair = Networks(*loaded)
-    _check_answers(pair)
+    _check_outputs(pair)
     return pair
 
 
 def check_networks() -> None:
-    """Prove that this installation runs the networks rightly: versions, files, outputs, and a known answer.
+    """Check that this installation runs the networks correctly: versions, files, and outputs for a known input.
 
     Raises:
         InputError: it does not; the sentence says what to install.
@@ -125,7 +125,7 @@ def check_networks() -> None:
 
 
 def drawn_hand(side: int) -> np.ndarray:
-    """A plain drawing of an open right hand, [side, side, 3] bytes: the input with a known answer."""
+    """A simple drawing of an open right hand, [side, side, 3] bytes, for which the outputs are known."""
     y, x = np.mgrid[0:side, 0:side] * (224 / side)
     wrist, tips = (112.0, 196.0), ((40.0, 112.0), (82.0, 42.0), (110.0, 30.0), (137.0, 40.0), (164.0, 68.0))
     roots = ((92.0, 176.0), (92.0, 116.0), (111.0, 112.0), (128.0, 116.0), (144.0, 126.0))
@@ -141,8 +141,8 @@ def drawn_hand(side: int) -> np.ndarray:
     return np.round(inside * skin + (1 - inside) * np.array([60.0, 80.0, 110.0])).astype(np.uint8)
 
 
-def _check_answers(pair: Networks) -> None:
-    """Run both networks on the drawing and compare with the known answer."""
+def _check_outputs(pair: Networks) -> None:
+    """Run both networks on the drawing and compare with the known outputs."""
     try:
         palm, hand = pair.palm(drawn_hand(PALM_SIZE)), pair.hand(drawn_hand(HAND_SIZE))
     except (cv2.error, ValueError, IndexError) as error:

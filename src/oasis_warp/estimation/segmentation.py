@@ -1,7 +1,7 @@
-"""Which pixels are hand: GrabCut (Rother et al. 2004) between a sure inside and a sure outside, the arm cut off.
+"""Hand masks by GrabCut (Rother et al. 2004), cut off at the wrist.
 
-The seeds come from capsules around the landmarks, or, better, from the mesh once it is fitted. The arm is skin too: it
-counts as hand while the colours are learnt and is cut at the wrist afterwards.
+The seeds come from capsules around the landmarks, or, better, from the fitted mesh. The arm is skin too, so it counts
+as hand while the colour models are estimated, and is cut off at the wrist afterwards.
 """
 
 from dataclasses import dataclass
@@ -17,22 +17,25 @@ from oasis_warp.hand.kinematics import unit
 _RADII = np.array([[.016, .014, .0115, .0095], [.0115, .0105, .009, .0078], [.0115, .0105, .009, .0078],
                    [.011, .010, .0087, .0075], [.010, .009, .0078, .0068]])  # fmt: skip
 _WRIST_CUT = 0.02
-"""How far past the wrist point the mask goes towards the arm [m]."""
+"""How far the mask extends past the wrist point towards the arm [m]."""
 _WORK_SIZE = 384
-"""Longer side of the picture that is cut [px]."""
+"""Longer side of the image that is segmented [px]."""
 _ITERATIONS = 4
 _LEAST = 20
-"""Pixels from which colours can be learnt."""
+"""Smallest number of pixels for a colour model."""
 _SUBPIXEL = 16
 
 
 @dataclass(frozen=True)
 class Seeds:
-    """Nested regions of the window: surely hand, about the hand, surely no hand outside."""
+    """Nested regions of the window."""
 
     sure: np.ndarray
+    """Foreground."""
     near: np.ndarray
+    """Probably foreground."""
     far: np.ndarray
+    """Everything outside is background."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class Window:
     """Width and height in the photo [px]."""
     rgb: np.ndarray
     scale: np.ndarray
-    """Working pixels a photo pixel, x and y."""
+    """Working pixels per photo pixel, in x and y."""
 
     def points(self, xy: np.ndarray) -> np.ndarray:
         """Photo points in the window."""
@@ -64,7 +67,7 @@ class Window:
 
 
 def window_of(rgb: np.ndarray, xy: np.ndarray, scale: float) -> Window:
-    """The window 5 cm around the landmarks; `scale` in pixels a metre."""
+    """The window 5 cm around the landmarks; `scale` is in pixels per metre."""
     height, width = rgb.shape[:2]
     pad = 0.05 * scale
     x0, y0 = np.clip(np.floor(xy.min(0) - pad), 0, [width - 8, height - 8]).astype(int)
@@ -82,7 +85,7 @@ def mask_from_landmarks(rgb: np.ndarray, xy: np.ndarray, scale: float) -> np.nda
     Args:
         rgb: The photo, [H, W, 3] bytes.
         xy: Landmarks [px].
-        scale: Pixels a metre at the hand.
+        scale: Pixels per metre at the hand.
     """
     window = window_of(rgb, xy, scale)
     points, size, metre = window.points(xy), window.rgb.shape[:2], scale * float(window.scale.mean())
@@ -95,10 +98,10 @@ def mask_from_landmarks(rgb: np.ndarray, xy: np.ndarray, scale: float) -> np.nda
 
 
 def mask_from_fit(rgb: np.ndarray, xy: np.ndarray, scale: float, mask: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """Cut again, from the first `mask` ([H, W]) and the silhouette `drawn` ([H, W] bytes) of the mesh fitted to it.
+    """Segment again, from the first `mask` ([H, W]) and the silhouette `drawn` ([H, W] bytes) of the fitted mesh.
 
-    What lies more than 7 mm outside of the mesh is no hand, which takes leaks away; what lies more than 6 mm inside and
-    within the capsules is, which closes bites.
+    Pixels more than 7 mm outside the mesh are background, which removes leaks. Pixels more than 6 mm inside the mesh
+    and within the capsules are foreground, which fills missing parts.
     """
     window = window_of(rgb, xy, scale)
     points, size, metre = window.points(xy), window.rgb.shape[:2], scale * float(window.scale.mean())
@@ -107,15 +110,15 @@ def mask_from_fit(rgb: np.ndarray, xy: np.ndarray, scale: float, mask: np.ndarra
     below = _below(size, points, -0.01 * metre)  # the mesh ends at the wrist, the arm does not
     far = (outside < 0.007 * metre) | (below & _capsules(size, points, metre, 2.2, _WRIST_CUT + 0.02))
     sure = _capsules(size, points, metre, 0.45, 0.5 * _WRIST_CUT)
-    sure |= (inside > 0.006 * metre) & _capsules(size, points, metre, 0.6, 0.0)  # fingers that touch leave slits free
+    sure |= (inside > 0.006 * metre) & _capsules(size, points, metre, 0.6, 0.0)  # not in slits between fingers
     near = (window.part(mask) > 0.5) & far
     return window.back(_cut(window, points, metre, Seeds(sure & far, near, far)), rgb.shape[:2])
 
 
 def mask_from_alpha(alpha: np.ndarray, xy: np.ndarray, scale: float) -> np.ndarray | None:
-    """The file's own cut-out [H, W] without the arm; None where it is not of this hand alone.
+    """The file's own alpha channel [H, W] without the arm, or None if it does not show this hand alone.
 
-    A cut-out of a hand is opaque on the hand and clear around it; one of a whole person is opaque all over.
+    A cut-out of a hand is opaque on the hand and transparent around it; that of a whole person is opaque around it too.
     """
     metre, shape = scale, alpha.shape
     inside = _capsules(shape, xy, metre, 0.6, 0.0)
@@ -136,7 +139,7 @@ def _below(shape: tuple[int, int], points: np.ndarray, past: float) -> np.ndarra
 
 
 def _capsules(shape: tuple[int, int], points: np.ndarray, metre: float, grow: float, wrist: float) -> np.ndarray:
-    """A hand of filled capsules around the landmarks, `grow` times as thick, reaching `wrist` metres into the arm."""
+    """Mask of capsules around the landmarks, `grow` times as thick, extending `wrist` metres into the arm."""
     mask = np.zeros(shape, np.uint8)
 
     def cone(a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> None:
@@ -165,19 +168,20 @@ def _capsules(shape: tuple[int, int], points: np.ndarray, metre: float, grow: fl
 def _cut(window: Window, points: np.ndarray, metre: float, seeds: Seeds) -> np.ndarray:
     """GrabCut in the window: soft mask [h, w] float32."""
     arm = _below(window.rgb.shape[:2], points, _WRIST_CUT * metre)
-    if seeds.sure.sum() < _LEAST:  # nearly all of the hand lies outside the photo
+    if seeds.sure.sum() < _LEAST:  # nearly the whole hand is outside the photo
         return (seeds.near & ~arm).astype(np.float32)
     colour = cv2.cvtColor(window.rgb, cv2.COLOR_RGB2YCrCb).astype(np.float64)
     own = colour[seeds.sure]
-    away = colour - own.mean(0)
-    unlike = np.einsum("hwi,ij,hwj->hw", away, np.linalg.inv(np.cov(own.T) + 16 * np.eye(3)), away, optimize=True)
+    difference = colour - own.mean(0)
+    precision = np.linalg.inv(np.cov(own.T) + 16 * np.eye(3))
+    mahalanobis = np.einsum("hwi,ij,hwj->hw", difference, precision, difference, optimize=True)
     labels = np.full(window.rgb.shape[:2], cv2.GC_BGD, np.uint8)
     labels[seeds.far] = cv2.GC_PR_BGD
-    labels[(seeds.near & (unlike < 25)) | (seeds.far & (unlike < 6))] = cv2.GC_PR_FGD
+    labels[(seeds.near & (mahalanobis < 25)) | (seeds.far & (mahalanobis < 6))] = cv2.GC_PR_FGD
     labels[seeds.sure] = cv2.GC_FGD
-    labels[arm & (unlike < 12)] = cv2.GC_PR_FGD
-    ground = np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD))
-    if ground.sum() >= _LEAST:  # else the hand fills the photo
+    labels[arm & (mahalanobis < 12)] = cv2.GC_PR_FGD
+    background = np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD))
+    if background.sum() >= _LEAST:  # else the hand fills the photo
         cv2.setRNGSeed(0)  # GrabCut starts from random clusters
         cv2.grabCut(window.rgb[..., ::-1].copy(), labels, None, np.zeros((1, 65)), np.zeros((1, 65)),
                     _ITERATIONS, cv2.GC_INIT_WITH_MASK)  # fmt: skip

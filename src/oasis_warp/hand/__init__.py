@@ -1,1 +1,1 @@
-"""From a photo to a posed hand: the hand model, landmarks, mask and fit."""
+"""The hand model: template, skinning, pose correctives, kinematics and named poses."""

@@ -1,4 +1,4 @@
-"""Pose correctives: what linear blend skinning loses at a bent joint, as displacements of the rest surface."""
+"""Pose correctives: displacements of the rest surface that restore what linear blend skinning loses at bent joints."""
 
 import torch
 from jaxtyping import Float
@@ -22,8 +22,8 @@ def has_correctives(hand: HandModel) -> bool:
 def corrective_coefficients(hand: HandModel, angles: Float[Tensor, "15 3"]) -> Float[Tensor, "C"]:
     """Strengths of the displacements in `hand.corrective_basis` at joint `angles` [rad]; empty if the hand has none.
 
-    Two for each joint, from its flexion: c and c^2 with c = 1 - cos(flexion). Blend skinning shrinks a joint by c to
-    leading order; both vanish with their slopes at rest. `ops.bone_transforms` works out the same for many poses.
+    Two per joint, from its flexion: c and c^2 with c = 1 - cos(flexion). Blend skinning shrinks a joint by c to leading
+    order, and both vanish at rest with their derivatives. `ops.bone_transforms` computes the same for many poses.
 
     Raises:
         ValueError: `hand` has correctives, but not two a joint.

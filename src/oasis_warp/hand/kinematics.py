@@ -1,7 +1,7 @@
-"""Key points and vertices of the right hand with their derivatives by joint angles and shape, in numpy float64.
+"""Landmarks and vertices of the right hand with their derivatives by joint angles and shape, in numpy float64.
 
-The same forward kinematics as `skinning`, for the least-squares fit: 26 angles instead of 45, because a finger's middle
-and end joints only bend, and the wrist unrotated at its place, because the fit's camera carries the hand.
+The forward kinematics of `skinning`, for the least-squares fit. It has 26 angles instead of 45, because the middle and
+end joints of fingers only flex. The wrist does not move, because the fit's camera moves instead.
 """
 
 from dataclasses import dataclass
@@ -11,16 +11,14 @@ import numpy as np
 import torch
 
 from oasis_warp.core import surface
-from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
 from oasis_warp.hand.correctives import corrective_coefficients
 
-_TIP_JOINT = [15, 3, 6, 12, 9]  # last joint of thumb, index, middle, ring, little
-
-# Where the landmark network puts its points, seen from the hand's joints and tips: millimetres on a hand of 190 mm,
-# along the bone to the tip, towards the back of the hand, and along x back. Least squares over 63 photos, then once
-# more over a third of them with the pose correctives; rounded to half a millimetre, because further passes only trade
-# offsets for shape. Tips are detected 3 to 4 mm short, the thumb's root lies 9 mm away, ring and little knuckles lie
-# deeper.
+# Offsets of the network's landmarks from the hand's joints and tips, in millimetres on a hand of 190 mm: along the bone
+# to the tip, towards the back of the hand, and along the cross product of both. From least squares over 63 photos, then
+# over a third of them with the pose correctives, rounded to half a millimetre, because further passes only trade
+# offsets for shape. Tips are detected 3 to 4 mm short, the thumb's root lies 9 mm away, ring and little knuckles
+# lie deeper.
 _LANDMARK_OFFSETS = np.array([
     [3.5, -0.5, -0.5], [4, 4, -8.5], [-1, 0, 0.5], [0.5, -4, 0], [-3.5, -1, -0.5],
     [0.5, -1.5, 2.5], [1, -0.5, 0.5], [2, -2.5, -1], [-3.5, -1, 0],
@@ -51,7 +49,7 @@ class PosedJoints:
 
 
 class HandKinematics:
-    """A `HandModel` as float64 arrays, with what the derivatives need."""
+    """A `HandModel` in float64 numpy, with the tables that the derivatives need."""
 
     def __init__(self, hand: HandModel):
         def real(tensor: torch.Tensor) -> np.ndarray:
@@ -69,12 +67,12 @@ class HandKinematics:
         keypoints = hand.keypoint_index.cpu().numpy()
         self.points = np.concatenate([self.joints, real(hand.tips)])[keypoints]
         self.points_basis = np.concatenate([self.joint_basis, real(hand.tip_basis)])[keypoints]
-        self.point_joint = np.concatenate([np.arange(16), _TIP_JOINT])[keypoints]
+        self.point_joint = np.concatenate([np.arange(16), TIP_JOINTS])[keypoints]
         self.offsets = self._landmark_offsets()
         self.dofs = np.array([(j, a) for j in range(1, 16) for a in self._free_axes(j)])
         """Joint and axis of each of the 26 angles."""
         self.below = np.zeros((16, 16))
-        """below[a, j] is 1 where j is a or hangs on it."""
+        """below[a, j] is 1 if j is a or a descendant of a."""
         for j in range(16):
             a = j
             while a >= 0:
@@ -98,7 +96,7 @@ class HandKinematics:
         return np.einsum("kab,ka->kb", frames, _LANDMARK_OFFSETS / 190 * size)
 
     def all_angles(self, angles: np.ndarray) -> np.ndarray:
-        """The 26 angles in their places of a [16, 3] table."""
+        """The 26 angles in a table of all angles, [16, 3]."""
         table = np.zeros((16, 3))
         table[self.dofs[:, 0], self.dofs[:, 1]] = angles
         return table
@@ -126,7 +124,7 @@ class HandKinematics:
         return PosedJoints(table, shape, rest, rotation, position, by_shape, axes)
 
     def landmarks(self, joints: PosedJoints) -> tuple[np.ndarray, np.ndarray]:
-        """The 21 points where the network would put them, [21, 3] metres, and d points / d (angles, shape)."""
+        """The 21 landmarks as the network detects them [m], [21, 3], and d landmarks / d (angles, shape)."""
         joint, dof_joint = self.point_joint, self.dofs[:, 0]
         local = self.points + self.points_basis @ joints.shape - joints.rest[joint] + self.offsets
         turn = joints.rotation[joint]
@@ -150,7 +148,7 @@ class HandKinematics:
         return self.pose_surface(joints, self.rest_surface(joints.shape) + self.correctives(joints.angles))
 
     def bone_shifts(self, joints: PosedJoints) -> np.ndarray:
-        """Translations that go with `joints.rotation` to carry rest points, [16, 3]."""
+        """Translations of the bone transforms whose rotations are `joints.rotation`, [16, 3]."""
         return joints.position - (joints.rotation @ joints.rest[..., None])[..., 0]
 
     def blended(self, joints: PosedJoints, index: np.ndarray | slice = slice(None)) -> np.ndarray:
@@ -175,7 +173,7 @@ class HandKinematics:
         points = (turn @ start[..., None])[..., 0] + weights @ shifts
         dof_joint = self.dofs[:, 0]
         below = self.below[dof_joint].T  # bone, angle
-        # Each bone's share of the vertex turns about the joint of the angle when the bone hangs on it.
+        # Each bone's part of the vertex rotates about the joint of the angle if the bone descends from it.
         shares = weights[:, :, None] * ((joints.rotation @ start.T).transpose(2, 0, 1) + shifts)
         moved = np.einsum("nja,jd->nda", shares, below, optimize=True)
         arm = moved - (weights @ below)[..., None] * joints.position[dof_joint]

@@ -23,8 +23,9 @@ _FIST: dict[str, Finger] = {
     "little": (80, 96, 62, -5),
 }
 
-# Flexion counts from a straight finger; abduction, and all of the thumb's base, from rest and towards the thumb.
-# Where the thumb touches a finger, the numbers were searched for the smallest gap at which the two do not cross.
+# Flexion is relative to a straight finger. Abduction, and all angles of the thumb's base, are relative to rest and
+# positive towards the thumb. Where the thumb touches a finger, the angles give the smallest gap without
+# self-intersection.
 _THUMBS: dict[str, Thumb] = {
     "open": (-10, 14, 0, 0, 0),
     "relaxed": (8, -4, 0, 14, 16),
@@ -55,7 +56,7 @@ POSE_NAMES = ("rest", *_FINGERS)
 
 
 def named_pose(hand: HandModel, name: str) -> Float[Tensor, "15 3"]:
-    """Joint angles [rad] of the pose called `name`, one of `POSE_NAMES`, as `HandPose.angles` wants them.
+    """Joint angles [rad] of the pose called `name`, one of `POSE_NAMES`, as in `HandPose.angles`.
 
     Raises:
         ValueError: no pose has that name.
@@ -73,17 +74,17 @@ def named_pose(hand: HandModel, name: str) -> Float[Tensor, "15 3"]:
     degrees[first] = torch.tensor(base)
     degrees[first + 1 : first + 3, 0] = torch.tensor([middle, end])
     angles = degrees.deg2rad()
-    angles[:, 0] -= hand.rest_bend.cpu().double()  # the table's 0 is a straight finger, the model's is the rest pose
+    angles[:, 0] -= hand.rest_bend.cpu().double()  # 0 is a straight finger in the table, the rest pose in the model
     return angles[1:].to(hand.pose_axes)
 
 
 def pose_sequence(
     hand: HandModel, names: Sequence[str], frames_per_transition: int
 ) -> list[Float[Tensor, "15 3"]]:
-    """Joint angles [rad] of an endless loop through the named poses, `frames_per_transition` for each one.
+    """Joint angles [rad] of a loop through the named poses, `frames_per_transition` for each one.
 
-    Frame `i * frames_per_transition` is pose `names[i]`; from there the angles ease into the next pose by half a
-    cosine, and the last pose eases into the first, so that the list can be repeated without a jump.
+    Frame `i * frames_per_transition` is pose `names[i]`. Angles ease from each pose to the next by half a cosine, and
+    from the last to the first, so the sequence repeats without a jump.
 
     Raises:
         ValueError: an unknown name, no name, or fewer than one frame a transition.

@@ -7,13 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp import ops
-from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
 from oasis_warp.core.types import HandPose, PosedHand
 from oasis_warp.hand.correctives import has_correctives
 from oasis_warp.ops import BoneTransforms
-
-TIP_BONES = (15, 3, 6, 12, 9)
-"""Whose ends the tips are: thumb, index, middle, ring, little."""
 
 
 def rest_hand(hand: HandModel, shape: Float[Tensor, "S"]) -> PosedHand:
@@ -28,7 +25,7 @@ def rest_hand(hand: HandModel, shape: Float[Tensor, "S"]) -> PosedHand:
 def bone_transforms(
     hand: HandModel, joints: Float[Tensor, "16 3"], pose: HandPose
 ) -> tuple[Float[Tensor, "*B 16 3 3"], Float[Tensor, "*B 16 3"]]:
-    """Rotation and translation [m] that carry each bone's rest points into the world."""
+    """Rotation and translation [m] from the rest pose to the world, for each bone."""
     transforms = _bones(hand, joints, pose).transforms
     return transforms[..., :3], transforms[..., 3]
 
@@ -59,21 +56,20 @@ def skin(hand: HandModel, rest: PosedHand, pose: HandPose) -> PosedHand:
     """`rest` (from `rest_hand`) in `pose`: pose correctives, then linear blend skinning.
 
     Differentiable in shape and pose. `hand`, `rest` and `pose` share one dtype and device (`HandModel.to`). The
-    correctives are those of the mean hand, whatever the shape. With an axis of poses before all parts of `pose`, the
-    result has it too.
+    correctives are those of the mean hand for all shapes. A batch axis of `pose` is also one of the result.
     """
     bones = _bones(hand, rest.joints, pose)
     every_bone = range(len(hand.parents))
     return PosedHand(
         vertices=_surface(hand, rest, bones),
-        joints=_carried(bones.transforms, every_bone, rest.joints),
-        tips=_carried(bones.transforms, TIP_BONES, rest.tips),
+        joints=_transformed(bones.transforms, every_bone, rest.joints),
+        tips=_transformed(bones.transforms, TIP_JOINTS, rest.tips),
     )
 
 
-def _carried(transforms: Tensor, bones: Sequence[int], points: Tensor) -> Tensor:
-    """Points, one for each of `bones`, moved with them."""
-    # Taken one by one: an index list would be copied to the device at every call.
+def _transformed(transforms: Tensor, bones: Sequence[int], points: Tensor) -> Tensor:
+    """Points, each transformed by one of `bones`."""
+    # Stacked one by one, because an index list would be copied to the device at every call.
     of_points = torch.stack([transforms[..., bone, :, :] for bone in bones], -3)
     return (of_points[..., :3] @ points[..., None])[..., 0] + of_points[..., 3]
 
@@ -84,6 +80,6 @@ def hand21(posed: PosedHand, hand: HandModel) -> Float[Tensor, "21 3"]:
 
 
 def clamp_angles(hand: HandModel, angles: Float[Tensor, "15 3"]) -> Float[Tensor, "15 3"]:
-    """`angles` [rad], each moved to the nearest value that its joint allows."""
+    """`angles` [rad], clamped to the limits of their joints."""
     low, high = hand.pose_limits[1:].unbind(-1)
     return torch.minimum(torch.maximum(angles, low), high)

@@ -28,7 +28,7 @@ def bundled_hand() -> HandModel:
     )
 
     def subdivide(key: str) -> Tensor:
-        """An array over the base vertices carried to the HD mesh; the base's last vertex only closes the wrist."""
+        """An array of the base vertices on the HD mesh. The last base vertex only closes the wrist and is dropped."""
         base = torch.from_numpy(arrays[key])[:n_base].double()
         return (subdivision @ base.flatten(1)).unflatten(1, base.shape[1:]).float()
 

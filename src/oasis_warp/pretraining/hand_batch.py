@@ -7,10 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import inset_offsets
-from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
 from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.hand.correctives import corrective_coefficients
-from oasis_warp.hand.skinning import TIP_BONES
 
 FINGERS, BONES = 5, 3
 """The bones of a finger follow each other in `HandModel`. All fingers are posed together, from the palm outwards."""
@@ -45,7 +44,7 @@ def pose_hands(
     flesh = rest + torch.einsum("vdc,nc->nvd", hand.corrective_basis, strengths)
     rotations = blended[..., :9].unflatten(2, (3, 3))
     posed = (rotations * flesh[:, :, None]).sum(-1) + blended[..., 9:]
-    last = [torch.stack([part[:, bone] for bone in TIP_BONES], 1) for part in (rotation, offset)]
+    last = [torch.stack([part[:, bone] for bone in TIP_JOINTS], 1) for part in (rotation, offset)]
     ends = (last[0] @ tips[..., None])[..., 0] + last[1]
     return PosedHands(rest, posed, torch.cat([origin, ends], 1)[:, hand.keypoint_index], rotations)
 
