@@ -1,5 +1,7 @@
 // Three rows of the view; for columns and rows: focal length, centre, the first ray and the step between rays.
-struct Camera { double view[12], lens[8]; };
+struct Camera {
+    double view[12], lens[8];
+};
 // Thread t of 14 or more reads its part of the camera of batch entry b.
 auto read_camera = [&](Camera& camera, int b, int t) {
     if (t < 12) camera.view[t] = viewmats[b * viewmats_step + t];

@@ -1,25 +1,24 @@
 // The depth buffer on the CPU: what `depth_buffer` computes, 8 or 16 numbers at a time, to the same face ids.
 //
-// `transform` (a task is a range of vertices) -> `draw` (a part of the faces, into a buffer of its own) -> `write` (rows
-// of the buffers, merged) -> `score` (a range of points). Each is launched once a thread, and the threads take tasks off a
-// counter of the call until none is left. Backwards, `pull` (a batch entry) gives the corners of the faces their gradient.
+// `transform` (a task is a range of vertices) -> `draw` (a part of the faces, into a buffer of its own) -> `write`
+// (rows of the buffers, merged) -> `score` (a range of points). Each is launched once a thread, and the threads take
+// tasks off a counter of the call until none is left. Backwards, `pull` (a batch entry) gives the corners of the faces
+// their gradient.
 //
-// Drawing is a filter. Faces are set up 16 at a time in float32, from corners in fixed point on the screen (2^-21 px for
-// pictures up to 512 px) and their inverse depths, and then tested against blocks of 4 x 4 pixels: one vector for each
-// edge function, one for the inverse depth, which is linear on the screen. Each carries a bound of its error, and where
-// a bound leaves open whether a face contains a pixel's centre, or which of two faces is in front, that one pixel is
-// decided by the float64 arithmetic of `depth_buffer`: same expressions, same order, no fused multiply-add. So the
+// Drawing is a filter. Faces are set up 16 at a time in float32, from corners in fixed point on the screen (2^-21 px
+// for pictures up to 512 px) and their inverse depths, and then tested against blocks of 4 x 4 pixels: one vector for
+// each edge function, one for the inverse depth, which is linear on the screen. Each carries a bound of its error, and
+// where a bound leaves open whether a face contains a pixel's centre, or which of two faces is in front, that one pixel
+// is decided by the float64 arithmetic of `depth_buffer`: same expressions, same order, no fused multiply-add. So the
 // filter costs no exactness and opens no seam: which face a pixel shows depends neither on the vectors' width, nor on
 // the threads, nor on whether the processor fuses. What a filter cannot serve (triangles through the near plane, far
 // outside the picture, or too thin for its bounds) is drawn in float64, 8 pixels at a time.
 //
-// A buffer is kept in blocks: pixel (x, y) at (y / 4) * stride + 4 x + y % 4, so that the 4 x 4 pixels at any column are
-// one unaligned load.
+// A buffer is kept in blocks: pixel (x, y) at (y / 4) * stride + 4 x + y % 4, so that the 4 x 4 pixels at any column
+// are one unaligned load.
 
-void transform(
-    unsigned long long address)
-{
-    #pragma clang fp contract(off)
+void transform(unsigned long long address) {
+#pragma clang fp contract(off)
 #include "vectors.h"
 #include "marks.h"
     typedef int I __attribute__((ext_vector_type(8)));
@@ -28,9 +27,9 @@ void transform(
     typedef int I4U __attribute__((ext_vector_type(4), aligned(4)));
     const int ranges = wp::max((job.n_vertices + VERTICES_A_TASK - 1) / VERTICES_A_TASK, 1);
     const double units = (double)(1 << job.fraction_bits);
-    const double reach = (double)(1 << 30) / units;             // of fixed point round the picture's middle [px]
+    const double reach = (double)(1 << 30) / units;  // of fixed point round the picture's middle [px]
     const double middle_x = width / 2, middle_y = height / 2;
-    const D round = (D)(6755399441055744.0);                    // 1.5 * 2^52: adding it leaves an integer's low bits
+    const D round = (D)(6755399441055744.0);  // 1.5 * 2^52: adding it leaves an integer's low bits
     int found = 0;
     for (;;) {
         const int task = __atomic_fetch_add(&job.next_transform, 1, __ATOMIC_RELAXED);
@@ -81,14 +80,20 @@ void transform(
             int places[32];
             double* camera_out = n == 8 ? camera + 4ll * i : rows;
             int* screen_out = n == 8 ? screen + 4ll * i : places;
-            #define ROW(k, xy, z, p, q) \
-                *(D4U*)(camera_out + 4 * (k)) = __builtin_shufflevector(xy, z, 2 * ((k) % 4), 2 * ((k) % 4) + 1, \
-                                                                        8 + 2 * ((k) % 4), 9 + 2 * ((k) % 4)); \
-                *(I4U*)(screen_out + 4 * (k)) = __builtin_shufflevector(p, q, 2 * ((k) % 4), 2 * ((k) % 4) + 1, \
-                                                                        8 + 2 * ((k) % 4), 9 + 2 * ((k) % 4));
-            ROW(0, xy0, z0, p0, q0) ROW(1, xy0, z0, p0, q0) ROW(2, xy0, z0, p0, q0) ROW(3, xy0, z0, p0, q0)
-            ROW(4, xy1, z1, p1, q1) ROW(5, xy1, z1, p1, q1) ROW(6, xy1, z1, p1, q1) ROW(7, xy1, z1, p1, q1)
-            #undef ROW
+#define ROW(k, xy, z, p, q)                                                                                     \
+    *(D4U*)(camera_out + 4 * (k)) =                                                                             \
+        __builtin_shufflevector(xy, z, 2 * ((k) % 4), 2 * ((k) % 4) + 1, 8 + 2 * ((k) % 4), 9 + 2 * ((k) % 4)); \
+    *(I4U*)(screen_out + 4 * (k)) =                                                                             \
+        __builtin_shufflevector(p, q, 2 * ((k) % 4), 2 * ((k) % 4) + 1, 8 + 2 * ((k) % 4), 9 + 2 * ((k) % 4));
+            ROW(0, xy0, z0, p0, q0)
+            ROW(1, xy0, z0, p0, q0)
+            ROW(2, xy0, z0, p0, q0)
+            ROW(3, xy0, z0, p0, q0)
+            ROW(4, xy1, z1, p1, q1)
+            ROW(5, xy1, z1, p1, q1)
+            ROW(6, xy1, z1, p1, q1)
+            ROW(7, xy1, z1, p1, q1)
+#undef ROW
             if (n < 8) {
                 for (int k = 0; k < 4 * n; k++) {
                     camera[4ll * i + k] = rows[k];
@@ -101,10 +106,8 @@ void transform(
     if (found) __atomic_store_n(&job.found, 1, __ATOMIC_RELAXED);
 }
 
-void draw(
-    unsigned long long address)
-{
-    #pragma clang fp contract(off)
+void draw(unsigned long long address) {
+#pragma clang fp contract(off)
 #include "vectors.h"
 #include "marks.h"
 #include "buffer.h"
@@ -115,20 +118,20 @@ void draw(
     auto lower = [](auto a, auto b) { return a < b ? a : b; };
     auto upper = [](auto a, auto b) { return a > b ? a : b; };
     auto size_of = [](F a) -> F { return __builtin_elementwise_abs(a); };
-    #if defined(__FMA__) || defined(__aarch64__)
+#if defined(__FMA__) || defined(__aarch64__)
     auto fma = [](F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
-    #else
+#else
     auto fma = [](F a, F b, F c) -> F { return a * b + c; };
-    #endif
-    // A choice between new and old is compiled to a masked store. Those of AVX2 take many times as long as plain ones
-    // on some processors; a volatile one stays plain.
-    #if defined(__AVX512F__)
+#endif
+// A choice between new and old is compiled to a masked store. Those of AVX2 take many times as long as plain ones
+// on some processors; a volatile one stays plain.
+#if defined(__AVX512F__)
     typedef FU FOut;
     typedef IU IOut;
-    #else
+#else
     typedef volatile FU FOut;
     typedef volatile IU IOut;
-    #endif
+#endif
     const I lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
     const F column = __builtin_convertvector(lane / 4, F), row = __builtin_convertvector(lane % 4, F);
     const int shift = job.fraction_bits, unit = 1 << shift;
@@ -137,7 +140,9 @@ void draw(
     const int centre_x = unit / 2 - width / 2 * unit, centre_y = unit / 2 - height / 2 * unit;
 
     // Corner j of the 16 faces from `first`, those past the last being the last.
-    struct Place { I x, y, inverse, marks; };
+    struct Place {
+        I x, y, inverse, marks;
+    };
     auto place = [&](const int* screen, int first, int j) -> Place {
         I4 r[16];
         for (int k = 0; k < 16; k++) {
@@ -175,8 +180,10 @@ void draw(
             double low_x = 1e300, low_y = 1e300, high_x = -1e300, high_y = -1e300;
             auto reach = [&](double x, double y, double z) {
                 const double u = view.fx * x / z + view.cx, v = view.fy * y / z + view.cy;
-                low_x = wp::min(low_x, u); high_x = wp::max(high_x, u);
-                low_y = wp::min(low_y, v); high_y = wp::max(high_y, v);
+                low_x = wp::min(low_x, u);
+                high_x = wp::max(high_x, u);
+                low_y = wp::min(low_y, v);
+                high_y = wp::max(high_y, v);
             };
             // The box of what lies beyond the near plane: of the corners there, and of where edges pass through it.
             for (int j = 0; j < 3; j++) {
@@ -201,15 +208,16 @@ void draw(
             const int x1 = last_from(__builtin_floor(high_x + slack_x - 0.5), width);
             const int y0 = first_from(__builtin_ceil(low_y - slack_y - 0.5), height);
             const int y1 = last_from(__builtin_floor(high_y + slack_y - 0.5), height);
-            for (int y = y0; y <= y1; y++) for (int x = x0; x <= x1; x += 8) {
-                const D z = exact(scene, f, x, y);
-                for (int hit = bits8(z > 0.0) & ((2 << wp::min(x1 - x, 7)) - 1); hit; hit &= hit - 1) {
-                    const int k = __builtin_ctz(hit);
-                    const float inverse = (float)wp::min(wp::max(1.0 / z[k], 1e-30), 1e30);
-                    const long long i = (long long)(y / 4) * stride + 4 * (x + k) + y % 4;
-                    contest(scene, inverses, ids, i, f, x + k, y, z[k], inverse);
+            for (int y = y0; y <= y1; y++)
+                for (int x = x0; x <= x1; x += 8) {
+                    const D z = exact(scene, f, x, y);
+                    for (int hit = bits8(z > 0.0) & ((2 << wp::min(x1 - x, 7)) - 1); hit; hit &= hit - 1) {
+                        const int k = __builtin_ctz(hit);
+                        const float inverse = (float)wp::min(wp::max(1.0 / z[k], 1e-30), 1e30);
+                        const long long i = (long long)(y / 4) * stride + 4 * (x + k) + y % 4;
+                        contest(scene, inverses, ids, i, f, x + k, y, z[k], inverse);
+                    }
                 }
-            }
         };
         auto settle = [&](int f, unsigned open, int i, int x, int y, F inverse) __attribute__((noinline)) {
             for (; open; open &= open - 1) {
@@ -273,11 +281,17 @@ void draw(
             const F start_b = doubt - slope_xb * cx - slope_yb * cy;
             const F start_c = doubt - slope_xc * ax - slope_yc * ay;
             float of[11][16] __attribute__((aligned(64)));
-            *(F*)of[0] = slope_xa; *(F*)of[1] = slope_ya;
-            *(F*)of[2] = slope_xb; *(F*)of[3] = slope_yb;
-            *(F*)of[4] = slope_xc; *(F*)of[5] = slope_yc;
-            *(F*)of[6] = pa - doubt * (along_b + along_c); *(F*)of[7] = along_b; *(F*)of[8] = along_c;
-            *(F*)of[9] = doubt + doubt; *(F*)of[10] = nearest * (2.f * DOUBT);
+            *(F*)of[0] = slope_xa;
+            *(F*)of[1] = slope_ya;
+            *(F*)of[2] = slope_xb;
+            *(F*)of[3] = slope_yb;
+            *(F*)of[4] = slope_xc;
+            *(F*)of[5] = slope_yc;
+            *(F*)of[6] = pa - doubt * (along_b + along_c);
+            *(F*)of[7] = along_b;
+            *(F*)of[8] = along_c;
+            *(F*)of[9] = doubt + doubt;
+            *(F*)of[10] = nearest * (2.f * DOUBT);
             auto draw_block = [&](int k, int f, float a, float b, float c, int i, int x, int y) {
                 const F wa = fma((F)(of[0][k]), column, fma((F)(of[1][k]), row, (F)(a)));
                 const F wb = fma((F)(of[2][k]), column, fma((F)(of[3][k]), row, (F)(b)));
@@ -289,7 +303,7 @@ void draw(
                 const I won = (least >= of[9][k]) & (apart > of[10][k]);
                 const unsigned certain = bits(won), possible = bits((least >= 0.f) & (apart >= -of[10][k]));
                 *(FOut*)(inverses + i) = won ? inverse : before;
-                *(IOut*)(ids + i) = won ? (I)(f) : (I)*(const IU*)(ids + i);
+                *(IOut*)(ids + i) = won ? (I)(f) : (I) * (const IU*)(ids + i);
                 if (possible != certain) settle(f, possible & ~certain, i, x, y, inverse);
             };
 
@@ -308,28 +322,37 @@ void draw(
                 const F a = fma(slope_xa, (F)(across), fma(slope_ya, (F)(down), start_a));
                 const F b = fma(slope_xb, (F)(across), fma(slope_yb, (F)(down), start_b));
                 const F c = fma(slope_xc, (F)(across), fma(slope_yc, (F)(down), start_c));
-                *(F*)starts[0][block] = a; *(F*)starts[1][block] = b; *(F*)starts[2][block] = c;
+                *(F*)starts[0][block] = a;
+                *(F*)starts[1][block] = b;
+                *(F*)starts[2][block] = c;
                 *(I*)places[block] = place_of + (block % 2 * 16 + block / 2 * stride);
                 const unsigned reached = bits((block % 2 ? wide : (I)(-1)) & (block / 2 ? high : (I)(-1)));
                 blocks |= (unsigned long long)(reached & small) << 16 * block;
             }
             for (; blocks; blocks &= blocks - 1) {
                 const int j = __builtin_ctzll(blocks), k = j % 16, block = j / 16;
-                draw_block(k, first + k, (&starts[0][0][0])[j], (&starts[1][0][0])[j], (&starts[2][0][0])[j],
-                           (&places[0][0])[j], xs[k] + block % 2 * 4, ys[k] + block / 2 * 4);
+                draw_block(
+                    k, first + k, (&starts[0][0][0])[j], (&starts[1][0][0])[j], (&starts[2][0][0])[j],
+                    (&places[0][0])[j], xs[k] + block % 2 * 4, ys[k] + block / 2 * 4
+                );
             }
 
             for (unsigned rest = todo & ~small; rest; rest &= rest - 1) {
                 const int k = __builtin_ctz(rest), f = first + k;
-                if (!(fast >> k & 1)) { draw_exactly(f); continue; }
-                const int left = xs[k], right = x1[k], bottom = y1[k];
-                for (int y = ys[k]; y <= bottom; y += 4) for (int x = left; x <= right; x += 4) {
-                    const float across = (float)(x - left), down = (float)(y - ys[k]);
-                    draw_block(k, f, starts[0][0][k] + across * of[0][k] + down * of[1][k],
-                               starts[1][0][k] + across * of[2][k] + down * of[3][k],
-                               starts[2][0][k] + across * of[4][k] + down * of[5][k],
-                               y / 4 * stride + 4 * x, x, y);
+                if (!(fast >> k & 1)) {
+                    draw_exactly(f);
+                    continue;
                 }
+                const int left = xs[k], right = x1[k], bottom = y1[k];
+                for (int y = ys[k]; y <= bottom; y += 4)
+                    for (int x = left; x <= right; x += 4) {
+                        const float across = (float)(x - left), down = (float)(y - ys[k]);
+                        draw_block(
+                            k, f, starts[0][0][k] + across * of[0][k] + down * of[1][k],
+                            starts[1][0][k] + across * of[2][k] + down * of[3][k],
+                            starts[2][0][k] + across * of[4][k] + down * of[5][k], y / 4 * stride + 4 * x, x, y
+                        );
+                    }
             }
         }
     }

@@ -10,8 +10,8 @@
 // `clear` empties the keys. `draw` gives a warp eight faces: 24 lanes bring a corner each into the camera's axes, eight
 // lanes find a box each, and then the pixels of all eight boxes are dealt out to the 32 lanes, so that a warp is busy
 // whatever the sizes of its faces. Faces with larger boxes go to a queue, and `draw_large` deals out the pixels of the
-// whole queue to all warps of the GPU in equal shares. Those that find the queue full are drawn where they are found: so
-// many fill the GPU either way.
+// whole queue to all warps of the GPU in equal shares. Those that find the queue full are drawn where they are found:
+// so many fill the GPU either way.
 //
 // A key is the depth, rounded down to a float32, above the face's index, so that the smallest key is nearly the answer.
 // Where the rounded depths of two faces agree, the exact ones are compared (see `settle`): the face that stays is the
@@ -24,21 +24,22 @@ __global__ void clear(
     ulonglong2* keys,  // [batch][height][width]: depth rounded to float32, then the face; or all bits
     long long key_pairs,
     unsigned long long* counter,  // of the queue
-    volatile long long* found  // set to 1 where a focal length is not positive; or 0)
-{
+    volatile long long* found     // set to 1 where a focal length is not positive; or 0
+) {
     const ulonglong2 empty = {~0ull, ~0ull};
     const long long step = (long long)gridDim.x * BLOCK;
     for (long long i = (long long)block_index * BLOCK + threadIdx.x; i < key_pairs; i += step) keys[i] = empty;
     if (block_index == 0 && threadIdx.x == 0) *counter = 0;
-    if (found && block_index == 0) for (int b = threadIdx.x; b < batch; b += BLOCK)
-        if (!(Ks[b * Ks_step] > 0.f) || !(Ks[b * Ks_step + 4] > 0.f)) *found = 1;
+    if (found && block_index == 0)
+        for (int b = threadIdx.x; b < batch; b += BLOCK)
+            if (!(Ks[b * Ks_step] > 0.f) || !(Ks[b * Ks_step + 4] > 0.f)) *found = 1;
 }
 
 __global__ void draw(
-    const float* vertices,  // [batch or 1][n_vertices][3]
-    const float* viewmats,  // [batch or 1][4][4]
-    const float* Ks,  // [batch or 1][3][3]
-    const int* faces,  // [n_faces][3]
+    const float* vertices,    // [batch or 1][n_vertices][3]
+    const float* viewmats,    // [batch or 1][4][4]
+    const float* Ks,          // [batch or 1][3][3]
+    const int* faces,         // [n_faces][3]
     long long vertices_step,  // numbers from one batch entry to the next, 0 where they share
     long long viewmats_step,
     long long Ks_step,
@@ -47,17 +48,21 @@ __global__ void draw(
     int width,
     int height,
     double near_plane,
-    unsigned long long* keys,  // [batch][height][width]: depth rounded to float32, then the face; or all bits
+    unsigned long long* keys,     // [batch][height][width]: depth rounded to float32, then the face; or all bits
     unsigned long long* counter,  // of the queue
-    long long* queue_faces,  // [capacity]: batch entry * n_faces + face
-    long long* queue_starts,  // [capacity + 1]: shares of all faces before it
-    int capacity)
-{
+    long long* queue_faces,       // [capacity]: batch entry * n_faces + face
+    long long* queue_starts,      // [capacity + 1]: shares of all faces before it
+    int capacity
+) {
 #include "camera_cuda.h"
 #include "exact_cuda.h"
 #include "pixels_cuda.h"
     constexpr int FACES = 8;  // a warp
-    struct Small { Triangle triangle; double flat; int left, top, width, start; };
+    struct Small {
+        Triangle triangle;
+        double flat;
+        int left, top, width, start;
+    };
     __shared__ Camera camera;
     __shared__ Small smalls[WARPS][FACES];
     Small* small = smalls[warp];
@@ -70,7 +75,9 @@ __global__ void draw(
         float px = 0.f, py = 0.f, pz = 0.f;
         if (has_corner) {
             const float* p = mesh + 3ll * faces[3ll * first + lane];
-            px = p[0]; py = p[1]; pz = p[2];
+            px = p[0];
+            py = p[1];
+            pz = p[2];
         }
         if (b != entry) {
             __syncthreads();  // nobody reads the last camera any more
@@ -88,7 +95,9 @@ __global__ void draw(
             const Triangle t = s.triangle;
             box = box_of(camera, t);
             s.flat = edge_on(t);
-            s.left = box.left; s.top = box.top; s.width = box.width;
+            s.left = box.left;
+            s.top = box.top;
+            s.width = box.width;
         }
         const long long pixels = (long long)box.width * box.height;
         const bool large = pixels > LARGE;
@@ -126,12 +135,16 @@ __global__ void draw(
 
         Key* picture = keys + b * plane;
         int starts[FACES];
-        #pragma unroll
+#pragma unroll
         for (int k = 1; k < FACES; k++) starts[k] = small[k].start;
         draw_items(camera, mesh, 0, total, [&](unsigned item) -> Hit {
             int k = 0, start = 0;
-            #pragma unroll
-            for (int j = 1; j < FACES; j++) if ((int)item >= starts[j]) { k = j; start = starts[j]; }
+#pragma unroll
+            for (int j = 1; j < FACES; j++)
+                if ((int)item >= starts[j]) {
+                    k = j;
+                    start = starts[j];
+                }
             const Small& s = small[k];
             return meet(camera, picture, s.triangle, s.flat, s.left, s.top, s.width, first + k, item - start);
         });
@@ -146,10 +159,10 @@ __global__ void draw(
 }
 
 __global__ void draw_large(
-    const float* vertices,  // [batch or 1][n_vertices][3]
-    const float* viewmats,  // [batch or 1][4][4]
-    const float* Ks,  // [batch or 1][3][3]
-    const int* faces,  // [n_faces][3]
+    const float* vertices,    // [batch or 1][n_vertices][3]
+    const float* viewmats,    // [batch or 1][4][4]
+    const float* Ks,          // [batch or 1][3][3]
+    const int* faces,         // [n_faces][3]
     long long vertices_step,  // numbers from one batch entry to the next, 0 where they share
     long long viewmats_step,
     long long Ks_step,
@@ -158,12 +171,12 @@ __global__ void draw_large(
     int width,
     int height,
     double near_plane,
-    unsigned long long* keys,  // [batch][height][width]: depth rounded to float32, then the face; or all bits
+    unsigned long long* keys,     // [batch][height][width]: depth rounded to float32, then the face; or all bits
     unsigned long long* counter,  // of the queue
-    long long* queue_faces,  // [capacity]: batch entry * n_faces + face
-    long long* queue_starts,  // [capacity + 1]: shares of all faces before it
-    int capacity)
-{
+    long long* queue_faces,       // [capacity]: batch entry * n_faces + face
+    long long* queue_starts,      // [capacity + 1]: shares of all faces before it
+    int capacity
+) {
 #include "camera_cuda.h"
 #include "exact_cuda.h"
 #include "pixels_cuda.h"
@@ -171,7 +184,8 @@ __global__ void draw_large(
     const long long n = min((long long)(counted >> START_BITS), (long long)capacity);
     if (n == 0) return;
     const long long shares = (long long)(counted >> START_BITS) > capacity
-        ? queue_starts[capacity] : (long long)(counted & ((1ull << START_BITS) - 1));
+                                 ? queue_starts[capacity]
+                                 : (long long)(counted & ((1ull << START_BITS) - 1));
     const long long warps = (long long)gridDim.x * WARPS, me = (long long)block_index * WARPS + warp;
     long long share = shares * me / warps;
     const long long end = shares * (me + 1) / warps;
@@ -179,7 +193,10 @@ __global__ void draw_large(
     long long slot = 0;  // the last face that starts at `share` or before
     for (long long beyond = n; beyond - slot > 1;) {
         const long long middle = (slot + beyond) / 2;
-        if (queue_starts[middle] <= share) slot = middle; else beyond = middle;
+        if (queue_starts[middle] <= share)
+            slot = middle;
+        else
+            beyond = middle;
     }
     // Whether a triangle surely has none of the items from `first` to `last`. On the screen its edge functions are
     // linear, so they are largest and smallest at the corners of the columns and rows of these items: a lane a corner.
@@ -187,19 +204,17 @@ __global__ void draw_large(
         const unsigned top = first / box.width, bottom = (last - 1) / box.width;
         const unsigned left = top == bottom ? first - top * box.width : 0;
         const unsigned right = top == bottom ? last - 1 - top * box.width : box.width - 1;
-        const Ray ray = Exact::ray(camera, box.left + (int)(lane & 1 ? right : left),
-                                   box.top + (int)(lane & 2 ? bottom : top));
+        const Ray ray =
+            Exact::ray(camera, box.left + (int)(lane & 1 ? right : left), box.top + (int)(lane & 2 ? bottom : top));
         const Weights w = Exact::weigh(t, ray);
         // What rounding may add up to, here or at a pixel, with a margin.
-        auto size_of = [&](const Corner& p) {
-            return fabs(p.x) + fabs(p.y) + (fabs(ray.u) + fabs(ray.v)) * fabs(p.z);
-        };
+        auto size_of = [&](const Corner& p) { return fabs(p.x) + fabs(p.y) + (fabs(ray.u) + fabs(ray.v)) * fabs(p.z); };
         const double a = size_of(t.a), b = size_of(t.b), c = size_of(t.c);
         const double slack_a = 1e-14 * (b * c), slack_b = 1e-14 * (c * a), slack_c = 1e-14 * (a * b);
-        const bool is_negative = __all_sync(all, w.a < -slack_a) || __all_sync(all, w.b < -slack_b) ||
-                                 __all_sync(all, w.c < -slack_c);
-        const bool is_positive = __all_sync(all, w.a > slack_a) || __all_sync(all, w.b > slack_b) ||
-                                 __all_sync(all, w.c > slack_c);
+        const bool is_negative =
+            __all_sync(all, w.a < -slack_a) || __all_sync(all, w.b < -slack_b) || __all_sync(all, w.c < -slack_c);
+        const bool is_positive =
+            __all_sync(all, w.a > slack_a) || __all_sync(all, w.b > slack_b) || __all_sync(all, w.c > slack_c);
         return is_negative && is_positive;
     };
     __shared__ Camera cameras[WARPS];

@@ -1,12 +1,22 @@
-struct Corner { double x, y, z; };
-struct Triangle { Corner a, b, c; };
-struct Ray { double u, v; };  // passes (u, v, 1)
-struct Weights { double a, b, c, sum; };
+struct Corner {
+    double x, y, z;
+};
+struct Triangle {
+    Corner a, b, c;
+};
+struct Ray {
+    double u, v;
+};  // passes (u, v, 1)
+struct Weights {
+    double a, b, c, sum;
+};
 struct Exact {
     static __device__ Corner in_camera(const Camera& camera, double x, double y, double z) {
         const double* r = camera.view;
-        return {r[0] * x + r[1] * y + r[2] * z + r[3], r[4] * x + r[5] * y + r[6] * z + r[7],
-                r[8] * x + r[9] * y + r[10] * z + r[11]};
+        return {
+            r[0] * x + r[1] * y + r[2] * z + r[3], r[4] * x + r[5] * y + r[6] * z + r[7],
+            r[8] * x + r[9] * y + r[10] * z + r[11]
+        };
     }
     static __device__ Corner corner(const Camera& camera, const float* p) {
         return in_camera(camera, p[0], p[1], p[2]);

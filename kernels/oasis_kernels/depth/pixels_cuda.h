@@ -1,5 +1,7 @@
 // Columns and rows of the picture that a face may reach; width 0 if there are none.
-struct Box { int left, top, width, height; };
+struct Box {
+    int left, top, width, height;
+};
 auto box_of = [&](const Camera& camera, const Triangle& t) -> Box {
     const double* lens = camera.lens;
     double low_x = 1e300, low_y = 1e300, high_x = -1e300, high_y = -1e300;
@@ -7,8 +9,10 @@ auto box_of = [&](const Camera& camera, const Triangle& t) -> Box {
     auto reach = [&](double x, double y, double z) {
         const double inverse = 1.0 / z;
         const double u = lens[0] * x * inverse + lens[1], v = lens[4] * y * inverse + lens[5];
-        low_x = u < low_x ? u : low_x; high_x = u > high_x ? u : high_x;
-        low_y = v < low_y ? v : low_y; high_y = v > high_y ? v : high_y;
+        low_x = u < low_x ? u : low_x;
+        high_x = u > high_x ? u : high_x;
+        low_y = v < low_y ? v : low_y;
+        high_y = v > high_y ? v : high_y;
         beyond = true;
     };
     // Of what lies beyond the near plane: corners, and where edges pass through it.
@@ -29,9 +33,7 @@ auto box_of = [&](const Camera& camera, const Triangle& t) -> Box {
     const double slack_x = 1e-3 + 1e-9 * (fabs(low_x) + fabs(high_x));
     const double slack_y = 1e-3 + 1e-9 * (fabs(low_y) + fabs(high_y));
     auto first_from = [](double v, int size) -> int { return v > 0.0 ? (int)(v < size ? v : size) : 0; };
-    auto last_from = [](double v, int size) -> int {
-        return v < size - 1 ? (int)(v > -1.0 ? v : -1.0) : size - 1;
-    };
+    auto last_from = [](double v, int size) -> int { return v < size - 1 ? (int)(v > -1.0 ? v : -1.0) : size - 1; };
     const int x0 = first_from(ceil(low_x - slack_x - 0.5), width);
     const int x1 = last_from(floor(high_x + slack_x - 0.5), width);
     const int y0 = first_from(ceil(low_y - slack_y - 0.5), height);
@@ -49,10 +51,22 @@ auto edge_on = [](const Triangle& t) -> double {
 
 typedef unsigned long long Key;
 // A ray that meets a face in front of the camera. `at` is null for one that does not.
-struct Hit { Key* at; Key key; double z; Ray ray; };
+struct Hit {
+    Key* at;
+    Key key;
+    double z;
+    Ray ray;
+};
 // Pixel `item` of a box, row by row.
-auto meet = [&](const Camera& camera, Key* picture, const Triangle& t, double flat, int left, int top,
-                unsigned box_width, int f, unsigned item) -> Hit {
+auto meet = [&](const Camera& camera,
+                Key* picture,
+                const Triangle& t,
+                double flat,
+                int left,
+                int top,
+                unsigned box_width,
+                int f,
+                unsigned item) -> Hit {
     const unsigned row = item / box_width;
     const int x = left + (int)(item - row * box_width), y = top + (int)row;
     const Ray ray = Exact::ray(camera, x, y);

@@ -1,9 +1,7 @@
 // Scores of points against a drawn depth buffer, and the gradient of the vertices: see `depth_buffer_vectors`.
 
-void score(
-    unsigned long long address)
-{
-    #pragma clang fp contract(off)
+void score(unsigned long long address) {
+#pragma clang fp contract(off)
 #include "vectors.h"
     typedef int I __attribute__((ext_vector_type(8)));
     typedef int I8U __attribute__((ext_vector_type(8), aligned(4)));
@@ -56,7 +54,9 @@ void score(
             if (shows(x, y, vertex)) return true;
             const int x0 = wp::max(x - 1, 0), x1 = wp::min(x + 1, width - 1);
             const int y0 = wp::max(y - 1, 0), y1 = wp::min(y + 1, height - 1);
-            for (int v = y0; v <= y1; v++) for (int u = x0; u <= x1; u++) if (shows(u, v, vertex)) return true;
+            for (int v = y0; v <= y1; v++)
+                for (int u = x0; u <= x1; u++)
+                    if (shows(u, v, vertex)) return true;
             return false;
         };
 
@@ -91,8 +91,10 @@ void score(
                 *(I8U*)chosen = id < 0 ? (I)(0) : id;
                 const Corner a = gather(camera, chosen, 0), b = gather(camera, chosen, 1);
                 const Corner c = gather(camera, chosen, 2);
-                const Weights w = weigh(a, b, c, view.u0 + __builtin_convertvector(x, D) * view.du,
-                                        view.v0 + __builtin_convertvector(y, D) * view.dv);
+                const Weights w = weigh(
+                    a, b, c, view.u0 + __builtin_convertvector(x, D) * view.du,
+                    view.v0 + __builtin_convertvector(y, D) * view.dv
+                );
                 const D t = (depth_of(w, a.z, b.z, c.z) - Z + job.margin) * per_tau;
                 const D e = falloff(absolute(t));
                 const D part = 1.0 / (1.0 + e);
@@ -104,24 +106,24 @@ void score(
                 *(T8U*)(visibility + i) = __builtin_convertvector(p, T8);
                 if (slopes) *(T8U*)(slopes + i) = __builtin_convertvector(slope, T8);
                 if (slopes) *(I8U*)(pixels + i) = at;
-            } else for (int k = 0; k < n; k++) {
-                visibility[i + k] = (T)p[k];
-                if (slopes) slopes[i + k] = (T)slope[k];
-                if (slopes) pixels[i + k] = at[k];
-            }
-            if (vertex_of) for (int k = 0; k < n; k++) {
-                if (vertex_of[i + k] < -1 || vertex_of[i + k] >= job.n_vertices) found = 1;
-            }
+            } else
+                for (int k = 0; k < n; k++) {
+                    visibility[i + k] = (T)p[k];
+                    if (slopes) slopes[i + k] = (T)slope[k];
+                    if (slopes) pixels[i + k] = at[k];
+                }
+            if (vertex_of)
+                for (int k = 0; k < n; k++) {
+                    if (vertex_of[i + k] < -1 || vertex_of[i + k] >= job.n_vertices) found = 1;
+                }
         }
         if (bits8(bad)) found = 1;
     }
     if (found) __atomic_store_n(&job.found, 1, __ATOMIC_RELAXED);
 }
 
-void pull(
-    unsigned long long address)
-{
-    #pragma clang fp contract(off)
+void pull(unsigned long long address) {
+#pragma clang fp contract(off)
 #include "vectors.h"
     typedef int I __attribute__((ext_vector_type(8)));
     typedef int I8U __attribute__((ext_vector_type(8), aligned(4)));

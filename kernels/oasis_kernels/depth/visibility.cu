@@ -5,10 +5,10 @@
 // takes several pixels and asks for all of their keys at once.
 
 __global__ void resolve(
-    const float* vertices,  // [batch or 1][n_vertices][3]
-    const float* viewmats,  // [batch or 1][4][4]
-    const float* Ks,  // [batch or 1][3][3]
-    const int* faces,  // [n_faces][3]
+    const float* vertices,    // [batch or 1][n_vertices][3]
+    const float* viewmats,    // [batch or 1][4][4]
+    const float* Ks,          // [batch or 1][3][3]
+    const int* faces,         // [n_faces][3]
     long long vertices_step,  // numbers from one batch entry to the next, 0 where they share
     long long viewmats_step,
     long long Ks_step,
@@ -18,7 +18,7 @@ __global__ void resolve(
     int height,
     double near_plane,
     unsigned long long* keys,  // [batch][height][width]: depth rounded to float32, then the face; or all bits
-    const float* points,  // [batch or 1][n_points][3]
+    const float* points,       // [batch or 1][n_points][3]
     long long points_step,
     const void* point_vertices,  // [n_points] of 4 or 8 bytes, or 0: the vertex that a point is, or -1
     int vertex_bytes,
@@ -27,15 +27,15 @@ __global__ void resolve(
     int n_points,
     double tau,
     double margin,
-    float* visibility,  // [batch][n_points]
-    float* slopes,  // [batch][n_points]: derivative by the point's depth; or 0
-    int* pixels,  // [batch][n_points]: row * width + column where the score is soft, else -1; or 0
-    float* depth,  // [batch][height][width], or 0
-    int* face_ids,  // [batch][height][width], or 0
-    float* barycentrics,  // [batch][height][width][3], or 0
-    int pixels_a_thread,  // up to MOST_PIXELS
-    volatile long long* found  // set to 1 where a point's vertex is none; or 0)
-{
+    float* visibility,         // [batch][n_points]
+    float* slopes,             // [batch][n_points]: derivative by the point's depth; or 0
+    int* pixels,               // [batch][n_points]: row * width + column where the score is soft, else -1; or 0
+    float* depth,              // [batch][height][width], or 0
+    int* face_ids,             // [batch][height][width], or 0
+    float* barycentrics,       // [batch][height][width][3], or 0
+    int pixels_a_thread,       // up to MOST_PIXELS
+    volatile long long* found  // set to 1 where a point's vertex is none; or 0
+) {
 #include "camera_cuda.h"
 #include "exact_cuda.h"
     typedef unsigned long long Key;
@@ -51,8 +51,9 @@ __global__ void resolve(
         double seen = 0.0, slope = 0.0;
         int pixel = -1;
         long long vertex = -1;
-        if (point_vertices) vertex = vertex_bytes == 8 ? ((const long long*)point_vertices)[i]
-                                                       : (long long)((const int*)point_vertices)[i];
+        if (point_vertices)
+            vertex =
+                vertex_bytes == 8 ? ((const long long*)point_vertices)[i] : (long long)((const int*)point_vertices)[i];
         if (found && (vertex < -1 || vertex >= n_vertices)) *found = 1;
         const double u = camera.lens[0] * p.x / p.z + camera.lens[1], v = camera.lens[4] * p.y / p.z + camera.lens[5];
         if (p.z > near_plane && u >= 0.0 && v >= 0.0 && u < (double)width && v < (double)height) {
@@ -61,14 +62,15 @@ __global__ void resolve(
             if (!known && by_identity && vertex >= 0) {
                 // All of the 3 x 3 pixels at once, so that the reads do not wait for each other.
                 int ids[9];
-                #pragma unroll
+#pragma unroll
                 for (int k = 0; k < 9; k++)
                     ids[k] = shown(min(max(x + k % 3 - 1, 0), width - 1), min(max(y + k / 3 - 1, 0), height - 1));
-                #pragma unroll
-                for (int k = 0; k < 9; k++) if (ids[k] >= 0) {
-                    const int* f = faces + 3ll * ids[k];
-                    known |= f[0] == vertex || f[1] == vertex || f[2] == vertex;
-                }
+#pragma unroll
+                for (int k = 0; k < 9; k++)
+                    if (ids[k] >= 0) {
+                        const int* f = faces + 3ll * ids[k];
+                        known |= f[0] == vertex || f[1] == vertex || f[2] == vertex;
+                    }
             }
             if (known) {
                 seen = 1.0;
@@ -84,7 +86,10 @@ __global__ void resolve(
             }
         }
         visibility[at] = (float)seen;
-        if (slopes) { slopes[at] = (float)slope; pixels[at] = pixel; }
+        if (slopes) {
+            slopes[at] = (float)slope;
+            pixels[at] = pixel;
+        }
     };
 
     auto show = [&](int b, long long i, int id) {
@@ -93,13 +98,19 @@ __global__ void resolve(
             const Triangle t = Exact::triangle(camera, vertices + b * vertices_step, faces, id);
             const Weights w = Exact::weigh(t, Exact::ray(camera, (int)(i % width), (int)(i / width)));
             z = Exact::depth(t, w);
-            if (barycentrics) { wa = w.a / w.sum; wb = w.b / w.sum; wc = w.c / w.sum; }
+            if (barycentrics) {
+                wa = w.a / w.sum;
+                wb = w.b / w.sum;
+                wc = w.c / w.sum;
+            }
         }
         if (depth) depth[b * plane + i] = (float)z;
         if (face_ids) face_ids[b * plane + i] = id;
         if (barycentrics) {
             float* out = barycentrics + 3 * (b * plane + i);
-            out[0] = (float)wa; out[1] = (float)wb; out[2] = (float)wc;
+            out[0] = (float)wa;
+            out[1] = (float)wb;
+            out[2] = (float)wc;
         }
     };
 
@@ -115,7 +126,7 @@ __global__ void resolve(
         const int b = (int)(place / tasks);
         const long long first = (place - b * tasks) * (scores ? BLOCK : task_pixels) + threadIdx.x;
         int ids[MOST_PIXELS];
-        #pragma unroll
+#pragma unroll
         for (int k = 0; k < MOST_PIXELS; k++) {
             const long long i = first + k * BLOCK;
             ids[k] = !scores && k < pixels_a_thread && i < plane ? (int)(unsigned)keys[b * plane + i] : -1;
@@ -129,11 +140,11 @@ __global__ void resolve(
         if (scores) {
             if (first < n_points) score(b, (int)first);
         } else {
-            #pragma unroll 1
+#pragma unroll 1
             for (int k = 0; k < pixels_a_thread; k++) {
                 const long long i = first + k * BLOCK;
                 if (i < plane) show(b, i, ids[0]);
-                #pragma unroll
+#pragma unroll
                 for (int j = 1; j < MOST_PIXELS; j++) ids[j - 1] = ids[j];  // so that they stay in registers
             }
         }
@@ -144,14 +155,15 @@ __global__ void resolve(
 //
 // Along a ray d = (u, v, 1), a plane with normal n through a corner that moves by e with weight w comes nearer or goes
 // farther by w (n e) / (n d). Many points pull at one vertex, and floats added by atomics would round differently each
-// time. Whole numbers do not: `pull` runs twice, one thread a point, first for the largest of all numbers that are to be
-// added, a block each, then to add multiples of 2^-shift of it in 64 bits, where 2^shift leaves just enough room for
-// their sum: for 10^4 points each is off by 2^-47 of the largest. `settle`, one thread a vertex, turns sums into floats.
+// time. Whole numbers do not: `pull` runs twice, one thread a point, first for the largest of all numbers that are to
+// be added, a block each, then to add multiples of 2^-shift of it in 64 bits, where 2^shift leaves just enough room for
+// their sum: for 10^4 points each is off by 2^-47 of the largest. `settle`, one thread a vertex, turns sums into
+// floats.
 __global__ void pull(
-    const float* vertices,  // [batch or 1][n_vertices][3]
-    const float* viewmats,  // [batch or 1][4][4]
-    const float* Ks,  // [batch or 1][3][3]
-    const int* faces,  // [n_faces][3]
+    const float* vertices,    // [batch or 1][n_vertices][3]
+    const float* viewmats,    // [batch or 1][4][4]
+    const float* Ks,          // [batch or 1][3][3]
+    const int* faces,         // [n_faces][3]
     long long vertices_step,  // numbers from one batch entry to the next, 0 where they share
     long long viewmats_step,
     long long Ks_step,
@@ -161,16 +173,16 @@ __global__ void pull(
     int height,
     int n_vertices,
     int n_points,
-    const int* face_ids,  // [batch][height][width]
+    const int* face_ids,           // [batch][height][width]
     const float* grad_visibility,  // [batch][n_points]
-    const float* slopes,  // [batch][n_points]
-    const int* pixels,  // [batch][n_points]
-    float* grad_points,  // [batch][n_points][3], or 0
-    int adds,  // 0 in the first run, 1 in the second
-    unsigned long long* peaks,  // [blocks]: bits of doubles
-    long long* shift,  // of the sums
-    long long* sums  // [batch][n_vertices][4]: three axes, and not 0 where one was no number; or 0)
-{
+    const float* slopes,           // [batch][n_points]
+    const int* pixels,             // [batch][n_points]
+    float* grad_points,            // [batch][n_points][3], or 0
+    int adds,                      // 0 in the first run, 1 in the second
+    unsigned long long* peaks,     // [blocks]: bits of doubles
+    long long* shift,              // of the sums
+    long long* sums                // [batch][n_vertices][4]: three axes, and not 0 where one was no number; or 0
+) {
 #include "camera_cuda.h"
 #include "exact_cuda.h"
     typedef unsigned long long Bits;
@@ -209,8 +221,8 @@ __global__ void pull(
         const long long at = (long long)b * n_points + i;
         const int pixel = pixels[at];
         const double along = (double)grad_visibility[at] * (double)slopes[at];
-        if (!adds && grad_points) for (int axis = 0; axis < 3; axis++)
-            grad_points[3 * at + axis] = (float)(along * camera.view[8 + axis]);
+        if (!adds && grad_points)
+            for (int axis = 0; axis < 3; axis++) grad_points[3 * at + axis] = (float)(along * camera.view[8 + axis]);
         if (pixel < 0 || !sums) return;
         const int f = face_ids[(long long)b * width * height + pixel];
         const Triangle t = Exact::triangle(camera, vertices + b * vertices_step, faces, f);
@@ -229,8 +241,10 @@ __global__ void pull(
                 const bool finite = fabs(number) <= 1.7976931348623157e308;
                 if (adds) {
                     long long* sum = sums + 4 * ((long long)b * n_vertices + faces[3ll * f + k]);
-                    if (finite) atomicAdd((Bits*)sum + axis, (Bits)__double2ll_rn(scalbn(number, exponent)));
-                    else sum[3] = 1;
+                    if (finite)
+                        atomicAdd((Bits*)sum + axis, (Bits)__double2ll_rn(scalbn(number, exponent)));
+                    else
+                        sum[3] = 1;
                 } else if (finite) {
                     const Bits bits = (Bits)__double_as_longlong(fabs(number));
                     peak = bits > peak ? bits : peak;
@@ -258,11 +272,11 @@ __global__ void pull(
 }
 
 __global__ void settle(
-    const long long* sums,  // [batch][n_vertices][4]: three axes, and not 0 where one was no number; or 0
+    const long long* sums,   // [batch][n_vertices][4]: three axes, and not 0 where one was no number; or 0
     const long long* shift,  // of the sums
-    long long n,  // vertices of all batch entries
-    float* grad_vertices  // [n][3])
-{
+    long long n,             // vertices of all batch entries
+    float* grad_vertices     // [n][3]
+) {
     const long long step = (long long)gridDim.x * BLOCK;
     for (long long i = (long long)block_index * BLOCK + threadIdx.x; i < n; i += step)
         for (int axis = 0; axis < 3; axis++)

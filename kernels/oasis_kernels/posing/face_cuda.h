@@ -1,4 +1,7 @@
-struct Edges { V3 a, b, c; float scale, unit; };
+struct Edges {
+    V3 a, b, c;
+    float scale, unit;
+};
 auto edges = [&](const float* vertices, const int* corner) -> Edges {
     const V3 p0 = get3(vertices, corner[0]), p1 = get3(vertices, corner[1]), p2 = get3(vertices, corner[2]);
     Edges e = {minus(p1, p0), minus(p2, p1), minus(p0, p2)};
@@ -16,7 +19,11 @@ auto start = [&](const Edges& e) -> int {  // the corner where the longest edge 
     const float la = dot3(e.a, e.a), lb = dot3(e.b, e.b), lc = dot3(e.c, e.c);
     return la >= lb && la >= lc ? 0 : lb >= lc ? 1 : 2;
 };
-struct Triangle { V3 t, b, n; float l, x, y, longest, scale, unit; bool flat; };
+struct Triangle {
+    V3 t, b, n;
+    float l, x, y, longest, scale, unit;
+    bool flat;
+};
 auto completed = [&](Triangle o) -> Triangle {
     o.n = cross(o.t, o.b);
     o.flat = !(o.l * o.y > FLAT * o.longest);
@@ -57,7 +64,13 @@ auto at_rest = [&](long long f, const int* corner, int& from) -> Triangle {
     from = (int)r.z;
     return completed(o);
 };
-struct Pair { Triangle rest, posed; int from; bool proper; float weight, damped, ratio, c, s, h; V3 t, b; };
+struct Pair {
+    Triangle rest, posed;
+    int from;
+    bool proper;
+    float weight, damped, ratio, c, s, h;
+    V3 t, b;
+};
 auto pair = [&](const float* posed_vertices, long long f, const int* corner) -> Pair {
     Pair o;
     o.rest = at_rest(f, corner, o.from);

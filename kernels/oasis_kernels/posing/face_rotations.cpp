@@ -1,23 +1,23 @@
 // Float32 face and vertex rotations on the CPU: what `face_rotation` computes, 16 faces or vertices at once.
 //
-// Float32 suffices for triangles of any unit of length: each is first scaled by a power of two, so that its largest edge
-// component lies in [1, 2), and seen from the corner where its longest rest edge begins: in the frame (t, b, n) with t
-// along that edge, e1 = l t and e2 = x t + y b with y >= 0. Edges from 1e-18 to 1e15 have areas that float32 can hold;
-// shorter ones count as flat.
+// Float32 suffices for triangles of any unit of length: each is first scaled by a power of two, so that its largest
+// edge component lies in [1, 2), and seen from the corner where its longest rest edge begins: in the frame (t, b, n)
+// with t along that edge, e1 = l t and e2 = x t + y b with y >= 0. Edges from 1e-18 to 1e15 have areas that float32 can
+// hold; shorter ones count as flat.
 //
-// The turn in the plane has the cosine c = l' y + l y' and the sine s = l' x - l x' over h = hypot(c, s). So R t = t" and
-// R b = b" with t" = c t' + s b', b" = c b' - s t', and h is also the trace of the stretch that divides the gradient of
-// the angle: all that `face_rotation.turn_gradient` needs is at hand in the two frames.
+// The turn in the plane has the cosine c = l' y + l y' and the sine s = l' x - l x' over h = hypot(c, s). So R t = t"
+// and R b = b" with t" = c t' + s b', b" = c b' - s t', and h is also the trace of the stretch that divides the
+// gradient of the angle: all that `face_rotation.turn_gradient` needs is at hand in the two frames.
 
 void measure(
     int n_vertices,
     int n_faces,
     const float* rest_vertices,  // [V, 3]
-    const int* faces,  // [F, 3]
-    long long* state,  // `STATE` words of zeros
-    float* out  // [F, TRIANGLE])
-{
-    #pragma clang fp contract(fast)
+    const int* faces,            // [F, 3]
+    long long* state,            // `STATE` words of zeros
+    float* out                   // [F, TRIANGLE]
+) {
+#pragma clang fp contract(fast)
 #include "../runtime/ranges.h"
 #include "vectors.h"
     const float* triangles = nullptr;
@@ -40,22 +40,22 @@ void measure(
 void turn(
     int n_vertices,
     int n_faces,
-    const float* rest_vertices,  // [V, 3]
-    const int* faces,  // [F, 3]
-    long long* state,  // `STATE` words of zeros
-    const float* triangles,  // [F, TRIANGLE], from `measure`, or 0
+    const float* rest_vertices,   // [V, 3]
+    const int* faces,             // [F, 3]
+    long long* state,             // `STATE` words of zeros
+    const float* triangles,       // [F, TRIANGLE], from `measure`, or 0
     const float* posed_vertices,  // [V, 3]
-    const int* offsets,  // [V + 1]; corners of vertex v are corners[offsets[v] .. offsets[v + 1] - 1]
-    const int* corners,  // [3 F]; 3 face + corner
-    float* rows_of_faces,  // [F, 8], scratch: weight times quaternion; weight, damped rest and posed area, 0
-    float* vertex_quats,  // [V, 4]
-    float* face_quats,  // [F, 4]
-    float* area_ratio,  // [F]
-    float* vertex_area_ratio,  // [V]
-    float* signs,  // [F, 3] or 0: what each corner's quaternion counted with
-    float* sums  // [2, V] or 0: length of the sum before it was normalised; rest areas)
-{
-    #pragma clang fp contract(fast)
+    const int* offsets,           // [V + 1]; corners of vertex v are corners[offsets[v] .. offsets[v + 1] - 1]
+    const int* corners,           // [3 F]; 3 face + corner
+    float* rows_of_faces,         // [F, 8], scratch: weight times quaternion; weight, damped rest and posed area, 0
+    float* vertex_quats,          // [V, 4]
+    float* face_quats,            // [F, 4]
+    float* area_ratio,            // [F]
+    float* vertex_area_ratio,     // [V]
+    float* signs,                 // [F, 3] or 0: what each corner's quaternion counted with
+    float* sums                   // [2, V] or 0: length of the sum before it was normalised; rest areas
+) {
+#pragma clang fp contract(fast)
 #include "../runtime/ranges.h"
 #include "vectors.h"
 #include "face_vectors.h"
@@ -77,9 +77,24 @@ void turn(
             const I w = (trace >= m00) & (trace >= m11) & (trace >= m22), x = ~w & (m00 >= m11) & (m00 >= m22);
             const I y = ~w & ~x & (m11 >= m22);
             const V wx = m21 - m12, wy = m02 - m20, wz = m10 - m01, xy = m01 + m10, xz = m02 + m20, yz = m12 + m21;
-            V4 q = {w ? 1.f + trace : x ? wx : y ? wy : wz, w ? wx : x ? 1.f + m00 - m11 - m22 : y ? xy : xz,
-                    w ? wy : x ? xy : y ? 1.f - m00 + m11 - m22 : yz,
-                    w ? wz : x ? xz : y ? yz : 1.f - m00 - m11 + m22};
+            V4 q = {
+                w   ? 1.f + trace
+                : x ? wx
+                : y ? wy
+                    : wz,
+                w   ? wx
+                : x ? 1.f + m00 - m11 - m22
+                : y ? xy
+                    : xz,
+                w   ? wy
+                : x ? xy
+                : y ? 1.f - m00 + m11 - m22
+                    : yz,
+                w   ? wz
+                : x ? xz
+                : y ? yz
+                    : 1.f - m00 - m11 + m22
+            };
             const V length = 1.f / root(dot4(q, q));
             q = choose4(p.proper, scaled4(q.w < 0.f ? -length : length, q), {one, zero, zero, zero});
             const V square = p.rest.unit * p.rest.unit;
@@ -98,10 +113,11 @@ void turn(
         if (known < 0) {
             float most = 0.f;
             known = 0;
-            for (int f = 0; f < n_faces; f++) if (rows_of_faces[8ll * f + 4] > most) {
-                most = rows_of_faces[8ll * f + 4];
-                known = f;
-            }
+            for (int f = 0; f < n_faces; f++)
+                if (rows_of_faces[8ll * f + 4] > most) {
+                    most = rows_of_faces[8ll * f + 4];
+                    known = f;
+                }
         }
         return n_faces ? load_row(face_quats + 4ll * known) : (Q){1.f, 0.f, 0.f, 0.f};
     };
@@ -143,8 +159,9 @@ void turn(
                 const V4 q = j < KEPT ? kept[j] : gather(rows_of_faces);
                 const V sign = dot4(q, reference) < 0.f ? -one : one;
                 total = plus4(total, scaled4(j <= last ? sign : zero, q));
-                if (signs) for (int lane = 0; lane < count; lane++) if (j <= lasts[lane])
-                    signs[corners[begins[lane] + j]] = sign[lane];
+                if (signs)
+                    for (int lane = 0; lane < count; lane++)
+                        if (j <= lasts[lane]) signs[corners[begins[lane] + j]] = sign[lane];
             }
             const I turned = heaviest > 0.f;
             total = scaled4(turned ? 1.f / heaviest : zero, total);
@@ -164,62 +181,65 @@ void turn(
     });
 
     const bool patch = __atomic_load_n(found_flat, __ATOMIC_RELAXED);
-    if (patch) ranges(state + 2 * PHASE_WORDS, n_faces, [&](int first, int end) {
-        for (int f = first; f < end; f++) if (!(rows_of_faces[8ll * f + 4] > 0.f)) {
-            const Q other = fallback();
-            store_row(face_quats + 4ll * f, other);
-        }
-    });
+    if (patch)
+        ranges(state + 2 * PHASE_WORDS, n_faces, [&](int first, int end) {
+            for (int f = first; f < end; f++)
+                if (!(rows_of_faces[8ll * f + 4] > 0.f)) {
+                    const Q other = fallback();
+                    store_row(face_quats + 4ll * f, other);
+                }
+        });
 }
 
 void turn_backward(
     int n_vertices,
     int n_faces,
-    const float* rest_vertices,  // [V, 3]
-    const int* faces,  // [F, 3]
-    long long* state,  // `STATE` words of zeros
-    const float* triangles,  // [F, TRIANGLE], from `measure`, or 0
-    const float* posed_vertices,  // [V, 3]
-    const int* offsets,  // [V + 1]; corners of vertex v are corners[offsets[v] .. offsets[v + 1] - 1]
-    const int* corners,  // [3 F]; 3 face + corner
-    const float* vertex_quats,  // [V, 4]
-    const float* face_quats,  // [F, 4]
+    const float* rest_vertices,      // [V, 3]
+    const int* faces,                // [F, 3]
+    long long* state,                // `STATE` words of zeros
+    const float* triangles,          // [F, TRIANGLE], from `measure`, or 0
+    const float* posed_vertices,     // [V, 3]
+    const int* offsets,              // [V + 1]; corners of vertex v are corners[offsets[v] .. offsets[v + 1] - 1]
+    const int* corners,              // [3 F]; 3 face + corner
+    const float* vertex_quats,       // [V, 4]
+    const float* face_quats,         // [F, 4]
     const float* vertex_area_ratio,  // [V]
-    const float* signs,  // [F, 3] or 0: what each corner's quaternion counted with
-    const float* sums,  // [2, V] or 0: length of the sum before it was normalised; rest areas
-    const float* g_vertex_quats,  // these four may be 0
+    const float* signs,              // [F, 3] or 0: what each corner's quaternion counted with
+    const float* sums,               // [2, V] or 0: length of the sum before it was normalised; rest areas
+    const float* g_vertex_quats,     // these four may be 0
     const float* g_face_quats,
     const float* g_area_ratio,
     const float* g_vertex_area_ratio,
     float* at_vertices,  // [V, 8], scratch: by the sum of quaternions; by that of posed areas, of rest areas, 0
-    float* rest_edges,  // [F, 8], scratch: by e1, 0, by e2, 0 as seen from corner 0; 0 if not wanted
+    float* rest_edges,   // [F, 8], scratch: by e1, 0, by e2, 0 as seen from corner 0; 0 if not wanted
     float* posed_edges,
     float* g_rest,  // [V, 3]; 0 if not wanted
-    float* g_posed)
-{
-    #pragma clang fp contract(fast)
+    float* g_posed
+) {
+#pragma clang fp contract(fast)
 #include "../runtime/ranges.h"
 #include "vectors.h"
 #include "face_vectors.h"
-    if (g_vertex_quats || g_vertex_area_ratio) ranges(state, n_vertices, [&](int first, int end) {
-        for (int i = first; i < end; i += 16) {
-            const int count = wp::min(16, end - i);
-            V4 g = {zero, zero, zero, zero};
-            if (g_vertex_quats) {
-                const V length = get(sums + i, count);
-                const V4 q = get4(vertex_quats + 4ll * i, count);
-                g = get4(g_vertex_quats + 4ll * i, count);
-                g = scaled4(length > 0.f ? 1.f / length : zero, plus4(g, scaled4(-dot4(g, q), q)));
+    if (g_vertex_quats || g_vertex_area_ratio)
+        ranges(state, n_vertices, [&](int first, int end) {
+            for (int i = first; i < end; i += 16) {
+                const int count = wp::min(16, end - i);
+                V4 g = {zero, zero, zero, zero};
+                if (g_vertex_quats) {
+                    const V length = get(sums + i, count);
+                    const V4 q = get4(vertex_quats + 4ll * i, count);
+                    g = get4(g_vertex_quats + 4ll * i, count);
+                    g = scaled4(length > 0.f ? 1.f / length : zero, plus4(g, scaled4(-dot4(g, q), q)));
+                }
+                put4(at_vertices + 8ll * i, count, g, 8);
+                if (g_vertex_area_ratio) {
+                    const V area = get(sums + n_vertices + i, count);
+                    const V by_posed = area > 0.f ? get(g_vertex_area_ratio + i, count) / area : zero;
+                    const V by_rest = -get(vertex_area_ratio + i, count) * by_posed;
+                    put4(at_vertices + 8ll * i + 4, count, {by_posed, by_rest, zero, zero}, 8);
+                }
             }
-            put4(at_vertices + 8ll * i, count, g, 8);
-            if (g_vertex_area_ratio) {
-                const V area = get(sums + n_vertices + i, count);
-                const V by_posed = area > 0.f ? get(g_vertex_area_ratio + i, count) / area : zero;
-                const V by_rest = -get(vertex_area_ratio + i, count) * by_posed;
-                put4(at_vertices + 8ll * i + 4, count, {by_posed, by_rest, zero, zero}, 8);
-            }
-        }
-    });
+        });
 
     const Table before = table3(rest_vertices, n_vertices), after = table3(posed_vertices, n_vertices);
     ranges(state + PHASE_WORDS, n_faces, [&](int first, int end) {
@@ -301,17 +321,18 @@ void turn_backward(
     });
 
     auto gather = [&](long long* progress, const float* edges, float* to) {
-        if (to) ranges(progress, n_vertices, [&](int first, int end) {
-            const float by_e1[3] = {-1.f, 1.f, 0.f}, by_e2[3] = {-1.f, 0.f, 1.f};
-            for (int v = first; v < end; v++) {
-                Q total = (Q)(0.f);
-                for (int j = offsets[v]; j < offsets[v + 1]; j++) {
-                    const unsigned f = (unsigned)corners[j] / 3u, k = (unsigned)corners[j] - 3u * f;
-                    total += by_e1[k] * load_row(edges + 8ll * f) + by_e2[k] * load_row(edges + 8ll * f + 4);
+        if (to)
+            ranges(progress, n_vertices, [&](int first, int end) {
+                const float by_e1[3] = {-1.f, 1.f, 0.f}, by_e2[3] = {-1.f, 0.f, 1.f};
+                for (int v = first; v < end; v++) {
+                    Q total = (Q)(0.f);
+                    for (int j = offsets[v]; j < offsets[v + 1]; j++) {
+                        const unsigned f = (unsigned)corners[j] / 3u, k = (unsigned)corners[j] - 3u * f;
+                        total += by_e1[k] * load_row(edges + 8ll * f) + by_e2[k] * load_row(edges + 8ll * f + 4);
+                    }
+                    memcpy(to + 3ll * v, &total, 3 * sizeof(float));
                 }
-                memcpy(to + 3ll * v, &total, 3 * sizeof(float));
-            }
-        });
+            });
     };
     gather(state + 2 * PHASE_WORDS, rest_edges, g_rest);
     gather(state + 3 * PHASE_WORDS, posed_edges, g_posed);

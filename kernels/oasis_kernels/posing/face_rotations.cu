@@ -2,16 +2,16 @@
 //
 // `turn_faces` (one thread a face) -> `turn_vertices` (one thread a vertex, over its faces). Backward:
 // `turn_faces_backward` (one thread a face, which looks at its three vertices) -> `gather_edges` (one thread a vertex,
-// over its corners). What a face is at rest is either worked out on the way or read from a table that `measure_triangles`
-// wrote, one row of 12 a face, as `face_rotation_vectors` has it.
+// over its corners). What a face is at rest is either worked out on the way or read from a table that
+// `measure_triangles` wrote, one row of 12 a face, as `face_rotation_vectors` has it.
 
 __global__ void measure_triangles(
     int n_vertices,
     int n_faces,
     const float* rest_vertices,  // [V, 3]; not read where there are triangles
-    const int* faces,  // [F, 3]
-    float* out)
-{
+    const int* faces,            // [F, 3]
+    float* out
+) {
 #include "vectors_cuda.h"
     const long long f = (long long)block_index * BLOCK + threadIdx.x;
     if (f >= n_faces) return;
@@ -28,15 +28,15 @@ __global__ void measure_triangles(
 __global__ void turn_faces(
     int n_vertices,
     int n_faces,
-    const float* rest_vertices,  // [V, 3]; not read where there are triangles
-    const int* faces,  // [F, 3]
-    const float* triangles,  // [F, 12], from `measure_triangles`, or 0
+    const float* rest_vertices,   // [V, 3]; not read where there are triangles
+    const int* faces,             // [F, 3]
+    const float* triangles,       // [F, 12], from `measure_triangles`, or 0
     const float* posed_vertices,  // [B, V, 3]
-    float* face_quats,  // [B, F, 4]
-    float* area_ratio,  // [B, F]
-    float* rows_of_faces,  // [B, F, 8]: weight times quaternion; weight, damped rest and posed area, 0
-    int* flat_blocks  // one number a block: whether one of its faces has no rotation of its own)
-{
+    float* face_quats,            // [B, F, 4]
+    float* area_ratio,            // [B, F]
+    float* rows_of_faces,         // [B, F, 8]: weight times quaternion; weight, damped rest and posed area, 0
+    int* flat_blocks              // one number a block: whether one of its faces has no rotation of its own
+) {
 #include "vectors_cuda.h"
 #include "face_cuda.h"
     const int blocks = (n_faces + BLOCK - 1) / BLOCK, pose = block_index / blocks;
@@ -61,8 +61,24 @@ __global__ void turn_faces(
         const bool w = trace >= m00 && trace >= m11 && trace >= m22, x = !w && m00 >= m11 && m00 >= m22;
         const bool y = !w && !x && m11 >= m22;
         const float wx = m21 - m12, wy = m02 - m20, wz = m10 - m01, xy = m01 + m10, xz = m02 + m20, yz = m12 + m21;
-        V4 q = {w ? 1.f + trace : x ? wx : y ? wy : wz, w ? wx : x ? 1.f + m00 - m11 - m22 : y ? xy : xz,
-                w ? wy : x ? xy : y ? 1.f - m00 + m11 - m22 : yz, w ? wz : x ? xz : y ? yz : 1.f - m00 - m11 + m22};
+        V4 q = {
+            w   ? 1.f + trace
+            : x ? wx
+            : y ? wy
+                : wz,
+            w   ? wx
+            : x ? 1.f + m00 - m11 - m22
+            : y ? xy
+                : xz,
+            w   ? wy
+            : x ? xy
+            : y ? 1.f - m00 + m11 - m22
+                : yz,
+            w   ? wz
+            : x ? xz
+            : y ? yz
+                : 1.f - m00 - m11 + m22
+        };
         const float length = 1.f / sqrtf(dot4(q, q));
         q = proper ? scaled4(q.w < 0.f ? -length : length, q) : identity;
         const float area = p.damped * p.rest.unit * p.rest.unit;
@@ -78,16 +94,16 @@ __global__ void turn_faces(
 __global__ void turn_vertices(
     int n_vertices,
     int n_faces,
-    const int* offsets,  // [V + 1]; corners of vertex v are corners[offsets[v] .. offsets[v + 1] - 1]
-    const int* corners,  // [3 F]; 3 face + corner
+    const int* offsets,          // [V + 1]; corners of vertex v are corners[offsets[v] .. offsets[v + 1] - 1]
+    const int* corners,          // [3 F]; 3 face + corner
     const float* rows_of_faces,  // [B, F, 8]: weight times quaternion; weight, damped rest and posed area, 0
-    const int* flat_blocks,  // one number a block: whether one of its faces has no rotation of its own
-    float* face_quats,  // [B, F, 4]
-    float* vertex_quats,  // [B, V, 4]
-    float* vertex_area_ratio,  // [B, V]
-    float* signs,  // [B, F, 3] or 0: what each corner's quaternion counted with
-    float* sums  // [B, 2, V] or 0: length of the sum before it was normalised; rest areas)
-{
+    const int* flat_blocks,      // one number a block: whether one of its faces has no rotation of its own
+    float* face_quats,           // [B, F, 4]
+    float* vertex_quats,         // [B, V, 4]
+    float* vertex_area_ratio,    // [B, V]
+    float* signs,                // [B, F, 3] or 0: what each corner's quaternion counted with
+    float* sums                  // [B, 2, V] or 0: length of the sum before it was normalised; rest areas
+) {
 #include "vectors_cuda.h"
     const int blocks = (n_vertices + BLOCK - 1) / BLOCK, face_blocks = (n_faces + BLOCK - 1) / BLOCK;
     const int pose = block_index / blocks, mine = block_index - pose * blocks;
@@ -102,7 +118,10 @@ __global__ void turn_vertices(
     auto look = [&](V4 q, V4 areas) {
         before += areas.x;
         after += areas.y;
-        if (areas.w > heaviest) { heaviest = areas.w; reference = q; }
+        if (areas.w > heaviest) {
+            heaviest = areas.w;
+            reference = q;
+        }
     };
     auto add = [&](int j, V4 q) {
         const float sign = dot4(q, reference) < 0.f ? -1.f : 1.f;
@@ -114,23 +133,25 @@ __global__ void turn_vertices(
         // All loads of the first faces start at once, those past the last one too; their rows stay for the second look.
         unsigned f[KEPT];
         V4 kept[KEPT], areas[KEPT];
-        #pragma unroll
+#pragma unroll
         for (int j = 0; j < KEPT; j++) f[j] = (unsigned)corners[min(begin + j, max(end - 1, 0))] / 3u;
-        #pragma unroll
+#pragma unroll
         for (int j = 0; j < KEPT; j++) {
             kept[j] = get4(rows, 2ll * f[j]);
             areas[j] = get4(rows, 2ll * f[j] + 1);
         }
-        #pragma unroll
-        for (int j = 0; j < KEPT; j++) if (begin + j < end) look(kept[j], areas[j]);
+#pragma unroll
+        for (int j = 0; j < KEPT; j++)
+            if (begin + j < end) look(kept[j], areas[j]);
         for (int j = begin + KEPT; j < end; j++) {
             const unsigned more = (unsigned)corners[j] / 3u;
             look(get4(rows, 2ll * more), get4(rows, 2ll * more + 1));
         }
         per_weight = heaviest > 0.f ? 1.f / heaviest : 0.f;
         reference = scaled4(per_weight, reference);
-        #pragma unroll
-        for (int j = 0; j < KEPT; j++) if (begin + j < end) add(begin + j, kept[j]);
+#pragma unroll
+        for (int j = 0; j < KEPT; j++)
+            if (begin + j < end) add(begin + j, kept[j]);
         for (int j = begin + KEPT; j < end; j++) add(j, get4(rows, 2ll * ((unsigned)corners[j] / 3u)));
     }
     const bool turned = heaviest > 0.f;
@@ -176,22 +197,22 @@ __global__ void turn_vertices(
 __global__ void turn_faces_backward(
     int n_vertices,
     int n_faces,
-    const float* rest_vertices,  // [V, 3]; not read where there are triangles
-    const int* faces,  // [F, 3]
-    const float* triangles,  // [F, 12], from `measure_triangles`, or 0
-    const float* posed_vertices,  // [B, V, 3]
-    const float* vertex_quats,  // [B, V, 4]
-    const float* face_quats,  // [B, F, 4]
+    const float* rest_vertices,      // [V, 3]; not read where there are triangles
+    const int* faces,                // [F, 3]
+    const float* triangles,          // [F, 12], from `measure_triangles`, or 0
+    const float* posed_vertices,     // [B, V, 3]
+    const float* vertex_quats,       // [B, V, 4]
+    const float* face_quats,         // [B, F, 4]
     const float* vertex_area_ratio,  // [B, V]
-    const float* signs,  // [B, F, 3] or 0: what each corner's quaternion counted with
-    const float* sums,  // [B, 2, V] or 0: length of the sum before it was normalised; rest areas
-    const float* g_vertex_quats,  // these four may be 0
+    const float* signs,              // [B, F, 3] or 0: what each corner's quaternion counted with
+    const float* sums,               // [B, 2, V] or 0: length of the sum before it was normalised; rest areas
+    const float* g_vertex_quats,     // these four may be 0
     const float* g_face_quats,
     const float* g_area_ratio,
     const float* g_vertex_area_ratio,
     float* rest_edges,  // [B, F, 8]: by e1, 0, by e2, 0 as seen from corner 0; 0 if not wanted
-    float* posed_edges)
-{
+    float* posed_edges
+) {
 #include "vectors_cuda.h"
 #include "face_cuda.h"
     const int blocks = (n_faces + BLOCK - 1) / BLOCK, pose = block_index / blocks;
@@ -276,13 +297,13 @@ __global__ void turn_faces_backward(
 __global__ void gather_edges(
     int n_vertices,
     int n_faces,
-    const int* offsets,  // [V + 1]; corners of vertex v are corners[offsets[v] .. offsets[v + 1] - 1]
-    const int* corners,  // [3 F]; 3 face + corner
+    const int* offsets,       // [V + 1]; corners of vertex v are corners[offsets[v] .. offsets[v + 1] - 1]
+    const int* corners,       // [3 F]; 3 face + corner
     const float* rest_edges,  // [B, F, 8]: by e1, 0, by e2, 0 as seen from corner 0; 0 if not wanted
     const float* posed_edges,
     float* g_rest,  // [B, V, 3]; 0 if not wanted
-    float* g_posed)
-{
+    float* g_posed
+) {
 #include "vectors_cuda.h"
     const int blocks = (n_vertices + BLOCK - 1) / BLOCK, pose = block_index / blocks;
     const int v = (block_index - pose * blocks) * BLOCK + threadIdx.x;

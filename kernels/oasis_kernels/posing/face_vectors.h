@@ -1,6 +1,13 @@
-struct Triangle { V3 t, b, n; V l, x, y, longest, scale, unit; I flat, point; };
+struct Triangle {
+    V3 t, b, n;
+    V l, x, y, longest, scale, unit;
+    I flat, point;
+};
 const I mantissa_off = (I)(0x7f800000), inverse = (I)(0x7f000000);
-struct Edges { V3 a, b, c; V scale, unit; };
+struct Edges {
+    V3 a, b, c;
+    V scale, unit;
+};
 auto edges = [&](const Table& vertices, const int* corners) -> Edges {
     V3 p[3];
     for (int k = 0; k < 3; k++) {
@@ -18,7 +25,9 @@ auto edges = [&](const Table& vertices, const int* corners) -> Edges {
     e.c = scaled(e.scale, e.c);
     return e;
 };
-struct Start { I a, b; };  // whether the longest edge is a, b, else c
+struct Start {
+    I a, b;
+};  // whether the longest edge is a, b, else c
 auto start = [&](const Edges& e) -> Start {
     const V la = dot3(e.a, e.a), lb = dot3(e.b, e.b), lc = dot3(e.c, e.c);
     const I a = (la >= lb) & (la >= lc);
@@ -70,7 +79,13 @@ auto at_rest = [&](const Table& vertices, int first, int count, const int* corne
     from = {r.z == 0.f, r.z == 1.f};
     return completed(o);
 };
-struct Pair { Triangle rest, posed; Start from; I proper; V weight, damped, ratio, c, s, h; V3 t, b; };
+struct Pair {
+    Triangle rest, posed;
+    Start from;
+    I proper;
+    V weight, damped, ratio, c, s, h;
+    V3 t, b;
+};
 auto pair = [&](const Table& before, const Table& after, int first, int count, const int* corners) -> Pair {
     Pair o;
     const Triangle rest = at_rest(before, first, count, corners, o.from);

@@ -1,32 +1,32 @@
 // Float32 posing of Gaussians on the CPU: what `barycentric` computes, 16 Gaussians at once.
 //
-// Backward, each Gaussian writes one row of eight for the vertices it rides on, (by position, by area ratio, by rotation),
-// and for each of its corners the weight of the second half; that of the first are its barycentrics. Then vertices add up
-// the rows, and faces the gradients of area ratios.
+// Backward, each Gaussian writes one row of eight for the vertices it rides on, (by position, by area ratio, by
+// rotation), and for each of its corners the weight of the second half; that of the first are its barycentrics. Then
+// vertices add up the rows, and faces the gradients of area ratios.
 
 void pose(
     int n_vertices,
     int n_faces,
     int n_on_vertices,  // P
-    int n_on_faces,  // Q
+    int n_on_faces,     // Q
     int half_powers,
-    const float* vertices,  // [V, 3]
-    const int* faces,  // [F, 3]
-    const int* vertex_index,  // [P]
-    const int* face_index,  // [Q]
-    const float* barycentrics,  // [Q, 3]
-    const float* vertex_quats,  // [V, 4]
-    const float* area_ratio,  // [F]
+    const float* vertices,           // [V, 3]
+    const int* faces,                // [F, 3]
+    const int* vertex_index,         // [P]
+    const int* face_index,           // [Q]
+    const float* barycentrics,       // [Q, 3]
+    const float* vertex_quats,       // [V, 4]
+    const float* area_ratio,         // [F]
     const float* vertex_area_ratio,  // [V]
-    const float* offsets,  // [P, 3]
-    const float* quats,  // [P + Q, 4]
-    const float* scales,  // [P + Q, 3]
-    long long* state,  // `STATE` words of zeros
-    float* means,  // [P + Q, 3]
-    float* posed_quats,  // [P + Q, 4]
-    float* posed_scales  // [P + Q, 3])
-{
-    #pragma clang fp contract(fast)
+    const float* offsets,            // [P, 3]
+    const float* quats,              // [P + Q, 4]
+    const float* scales,             // [P + Q, 3]
+    long long* state,                // `STATE` words of zeros
+    float* means,                    // [P + Q, 3]
+    float* posed_quats,              // [P + Q, 4]
+    float* posed_scales              // [P + Q, 3]
+) {
+#pragma clang fp contract(fast)
 #include "../runtime/ranges.h"
 #include "vectors.h"
 #include "mesh_gaussians_vectors.h"
@@ -62,40 +62,40 @@ void pose_backward(
     int n_vertices,
     int n_faces,
     int n_on_vertices,  // P
-    int n_on_faces,  // Q
+    int n_on_faces,     // Q
     int half_powers,
-    const float* vertices,  // [V, 3]
-    const int* faces,  // [F, 3]
-    const int* vertex_index,  // [P]
-    const int* face_index,  // [Q]
-    const float* barycentrics,  // [Q, 3]
-    const float* vertex_quats,  // [V, 4]
-    const float* area_ratio,  // [F]
+    const float* vertices,           // [V, 3]
+    const int* faces,                // [F, 3]
+    const int* vertex_index,         // [P]
+    const int* face_index,           // [Q]
+    const float* barycentrics,       // [Q, 3]
+    const float* vertex_quats,       // [V, 4]
+    const float* area_ratio,         // [F]
     const float* vertex_area_ratio,  // [V]
-    const float* offsets,  // [P, 3]
-    const float* quats,  // [P + Q, 4]
-    const float* scales,  // [P + Q, 3]
-    long long* state,  // `STATE` words of zeros
-    const float* g_means,  // these three may be 0
+    const float* offsets,            // [P, 3]
+    const float* quats,              // [P + Q, 4]
+    const float* scales,             // [P + Q, 3]
+    long long* state,                // `STATE` words of zeros
+    const float* g_means,            // these three may be 0
     const float* g_posed_quats,
     const float* g_posed_scales,
     const int* vertex_starts,  // [V + 1]; of `places`, for each vertex
-    const int* places,  // [P + 3 Q]; i < P: the Gaussian i on a vertex; P + 3 i + k: corner k of Gaussian P + i
-    const int* face_starts,  // [F + 1]; of `riders`, for each face
-    const int* riders,  // [Q]
-    float* rows_of_riders,  // [P + Q, 8], scratch; 0 if nothing of vertices is wanted, or nothing rides
-    float* weights,  // [Q, 3], scratch, with the rows
-    float* by_ratio,  // [Q], scratch; 0 if area ratios are not wanted
-    float* g_vertices,  // each of these is 0 if not wanted
+    const int* places,         // [P + 3 Q]; i < P: the Gaussian i on a vertex; P + 3 i + k: corner k of Gaussian P + i
+    const int* face_starts,    // [F + 1]; of `riders`, for each face
+    const int* riders,         // [Q]
+    float* rows_of_riders,     // [P + Q, 8], scratch; 0 if nothing of vertices is wanted, or nothing rides
+    float* weights,            // [Q, 3], scratch, with the rows
+    float* by_ratio,           // [Q], scratch; 0 if area ratios are not wanted
+    float* g_vertices,         // each of these is 0 if not wanted
     float* g_barycentrics,
     float* g_vertex_quats,
     float* g_area_ratio,
     float* g_quats,
     float* g_scales,
     float* g_offsets,
-    float* g_vertex_area_ratio)
-{
-    #pragma clang fp contract(fast)
+    float* g_vertex_area_ratio
+) {
+#pragma clang fp contract(fast)
 #include "../runtime/ranges.h"
 #include "vectors.h"
 #include "mesh_gaussians_vectors.h"
@@ -114,11 +114,16 @@ void pose_backward(
             if (g_scales) put3(g_scales + 3ll * i, count, scaled(grown, g_scale));
             if (rows_of_riders) {
                 // Of u -> o + w t + u x t, which is the rotation for unit quaternions; then only what turns is kept.
-                const V3 by_u = plus(scaled(2.f * q.w, cross(o, g_mean)),
-                                     minus(plus(scaled(2.f * dot3(g_mean, u), o), scaled(2.f * dot3(u, o), g_mean)),
-                                           scaled(4.f * dot3(g_mean, o), u)));
-                V4 g = plus4(product(g_quat, conjugate(get4(quats + 4ll * i, count))),
-                             {dot3(g_mean, t), by_u.x, by_u.y, by_u.z});
+                const V3 by_u = plus(
+                    scaled(2.f * q.w, cross(o, g_mean)),
+                    minus(
+                        plus(scaled(2.f * dot3(g_mean, u), o), scaled(2.f * dot3(u, o), g_mean)),
+                        scaled(4.f * dot3(g_mean, o), u)
+                    )
+                );
+                V4 g = plus4(
+                    product(g_quat, conjugate(get4(quats + 4ll * i, count))), {dot3(g_mean, t), by_u.x, by_u.y, by_u.z}
+                );
                 g = scaled4(per_length, plus4(g, scaled4(-dot4(g, q), q)));
                 const V slope = growth_slope(pick(vertex_area_ratio, v), half_powers);
                 const V by_area = slope * dot3(g_scale, get3(scales + 3ll * i, count));
@@ -162,27 +167,29 @@ void pose_backward(
 
     // A vertex's places: 0 .. n - 1 are Gaussians on it, n + 3 i + k is the corner k of Gaussian n + i.
     const bool wanted = g_vertices || g_vertex_quats || g_vertex_area_ratio;
-    if (wanted) ranges(state + 2 * PHASE_WORDS, n_vertices, [&](int first, int end) {
-        for (int v = first; v < end; v++) {
-            Q low = (Q)(0.f), high = (Q)(0.f);  // by position and area ratio; by rotation
-            for (int j = vertex_starts[v]; j < vertex_starts[v + 1]; j++) {
-                const unsigned place = (unsigned)places[j];
-                const bool corner = place >= (unsigned)n_on_vertices;
-                const unsigned at = place - (unsigned)n_on_vertices;
-                const float* row = rows_of_riders + 8ll * (corner ? (unsigned)n_on_vertices + at / 3u : place);
-                low += (corner ? barycentrics[at] : 1.f) * load_row(row);
-                high += (corner ? weights[at] : 1.f) * load_row(row + 4);
+    if (wanted)
+        ranges(state + 2 * PHASE_WORDS, n_vertices, [&](int first, int end) {
+            for (int v = first; v < end; v++) {
+                Q low = (Q)(0.f), high = (Q)(0.f);  // by position and area ratio; by rotation
+                for (int j = vertex_starts[v]; j < vertex_starts[v + 1]; j++) {
+                    const unsigned place = (unsigned)places[j];
+                    const bool corner = place >= (unsigned)n_on_vertices;
+                    const unsigned at = place - (unsigned)n_on_vertices;
+                    const float* row = rows_of_riders + 8ll * (corner ? (unsigned)n_on_vertices + at / 3u : place);
+                    low += (corner ? barycentrics[at] : 1.f) * load_row(row);
+                    high += (corner ? weights[at] : 1.f) * load_row(row + 4);
+                }
+                if (g_vertices) memcpy(g_vertices + 3ll * v, &low, 3 * sizeof(float));
+                if (g_vertex_quats) store_row(g_vertex_quats + 4ll * v, high);
+                if (g_vertex_area_ratio) g_vertex_area_ratio[v] = low.w;
             }
-            if (g_vertices) memcpy(g_vertices + 3ll * v, &low, 3 * sizeof(float));
-            if (g_vertex_quats) store_row(g_vertex_quats + 4ll * v, high);
-            if (g_vertex_area_ratio) g_vertex_area_ratio[v] = low.w;
-        }
-    });
-    if (g_area_ratio) ranges(state + 3 * PHASE_WORDS, n_faces, [&](int first, int end) {
-        for (int f = first; f < end; f++) {
-            float total = 0.f;
-            for (int j = face_starts[f]; j < face_starts[f + 1]; j++) total += by_ratio[riders[j]];
-            g_area_ratio[f] = total;
-        }
-    });
+        });
+    if (g_area_ratio)
+        ranges(state + 3 * PHASE_WORDS, n_faces, [&](int first, int end) {
+            for (int f = first; f < end; f++) {
+                float total = 0.f;
+                for (int j = face_starts[f]; j < face_starts[f + 1]; j++) total += by_ratio[riders[j]];
+                g_area_ratio[f] = total;
+            }
+        });
 }

@@ -10,23 +10,23 @@ __global__ void pose_riders(
     int n_vertices,
     int n_faces,
     int n_on_vertices,  // P
-    int n_on_faces,  // Q
+    int n_on_faces,     // Q
     int half_powers,
-    const float* vertices,  // [B, V, 3]
-    const int* faces,  // [F, 3]
-    const int* vertex_index,  // [P]
-    const int* face_index,  // [Q]
-    const float* barycentrics,  // [Q, 3]
-    const float* vertex_quats,  // [B, V, 4]
-    const float* area_ratio,  // [B, F]
+    const float* vertices,           // [B, V, 3]
+    const int* faces,                // [F, 3]
+    const int* vertex_index,         // [P]
+    const int* face_index,           // [Q]
+    const float* barycentrics,       // [Q, 3]
+    const float* vertex_quats,       // [B, V, 4]
+    const float* area_ratio,         // [B, F]
     const float* vertex_area_ratio,  // [B, V]
-    const float* offsets,  // [P, 3]
-    const float* quats,  // [P + Q, 4]
-    const float* scales,  // [P + Q, 3]
-    float* means,  // [B, P + Q, 3]
-    float* posed_quats,  // [B, P + Q, 4]
-    float* posed_scales  // [B, P + Q, 3])
-{
+    const float* offsets,            // [P, 3]
+    const float* quats,              // [P + Q, 4]
+    const float* scales,             // [P + Q, 3]
+    float* means,                    // [B, P + Q, 3]
+    float* posed_quats,              // [B, P + Q, 4]
+    float* posed_scales              // [B, P + Q, 3]
+) {
 #include "vectors_cuda.h"
 #include "mesh_gaussians_cuda.h"
     V3 mean;
@@ -40,12 +40,15 @@ __global__ void pose_riders(
         ratio = vertex_area_ratio[v];
     } else {
         const long long f = face_index[i];
-        const long long v[3] = {first_vertex + faces[3 * f], first_vertex + faces[3 * f + 1],
-                                first_vertex + faces[3 * f + 2]};
+        const long long v[3] = {
+            first_vertex + faces[3 * f], first_vertex + faces[3 * f + 1], first_vertex + faces[3 * f + 2]
+        };
         const V3 b = get3(barycentrics, i);
         turn = on_face(b, v).turn;
-        mean = plus(plus(scaled(b.x, get3(vertices, v[0])), scaled(b.y, get3(vertices, v[1]))),
-                    scaled(b.z, get3(vertices, v[2])));
+        mean = plus(
+            plus(scaled(b.x, get3(vertices, v[0])), scaled(b.y, get3(vertices, v[1]))),
+            scaled(b.z, get3(vertices, v[2]))
+        );
         ratio = area_ratio[(long long)pose * n_faces + f];
     }
     put3(means, at, mean);
@@ -57,30 +60,30 @@ __global__ void pose_riders_backward(
     int n_vertices,
     int n_faces,
     int n_on_vertices,  // P
-    int n_on_faces,  // Q
+    int n_on_faces,     // Q
     int half_powers,
-    const float* vertices,  // [B, V, 3]
-    const int* faces,  // [F, 3]
-    const int* vertex_index,  // [P]
-    const int* face_index,  // [Q]
-    const float* barycentrics,  // [Q, 3]
-    const float* vertex_quats,  // [B, V, 4]
-    const float* area_ratio,  // [B, F]
+    const float* vertices,           // [B, V, 3]
+    const int* faces,                // [F, 3]
+    const int* vertex_index,         // [P]
+    const int* face_index,           // [Q]
+    const float* barycentrics,       // [Q, 3]
+    const float* vertex_quats,       // [B, V, 4]
+    const float* area_ratio,         // [B, F]
     const float* vertex_area_ratio,  // [B, V]
-    const float* offsets,  // [P, 3]
-    const float* quats,  // [P + Q, 4]
-    const float* scales,  // [P + Q, 3]
-    const float* g_means,  // these three may be 0
+    const float* offsets,            // [P, 3]
+    const float* quats,              // [P + Q, 4]
+    const float* scales,             // [P + Q, 3]
+    const float* g_means,            // these three may be 0
     const float* g_posed_quats,
     const float* g_posed_scales,
     float* rows_of_riders,  // [B, P + Q, 8]; 0 if nothing of vertices is wanted
-    float* weights,  // [B, Q, 3], with the rows
-    float* by_ratio,  // [B, Q]; 0 if area ratios are not wanted
+    float* weights,         // [B, Q, 3], with the rows
+    float* by_ratio,        // [B, Q]; 0 if area ratios are not wanted
     float* g_barycentrics,  // [B, Q, 3]; each of these is 0 if not wanted
-    float* g_quats,  // [B, P + Q, 4]
-    float* g_scales,  // [B, P + Q, 3]
-    float* g_offsets  // [B, P, 3])
-{
+    float* g_quats,         // [B, P + Q, 4]
+    float* g_scales,        // [B, P + Q, 3]
+    float* g_offsets        // [B, P, 3]
+) {
 #include "vectors_cuda.h"
 #include "mesh_gaussians_cuda.h"
     const V3 none = {0.f, 0.f, 0.f};
@@ -95,16 +98,21 @@ __global__ void pose_riders_backward(
         const float ratio = vertex_area_ratio[v];
         if (g_offsets) {
             const V3 back = scaled(2.f, cross(u, g_mean));
-            put3(g_offsets, (long long)pose * n_on_vertices + i,
-                 plus(g_mean, minus(cross(u, back), scaled(q.w, back))));
+            put3(
+                g_offsets, (long long)pose * n_on_vertices + i, plus(g_mean, minus(cross(u, back), scaled(q.w, back)))
+            );
         }
         if (g_quats) put4(g_quats, at, product(conjugate(q), g_quat));
         if (g_scales) put3(g_scales, at, scaled(growth(ratio), g_scale));
         if (rows_of_riders) {
             // Of u -> o + w t + u x t, which is the rotation for unit quaternions; then only what turns is kept.
-            const V3 by_u = plus(scaled(2.f * q.w, cross(o, g_mean)),
-                                 minus(plus(scaled(2.f * dot3(g_mean, u), o), scaled(2.f * dot3(u, o), g_mean)),
-                                       scaled(4.f * dot3(g_mean, o), u)));
+            const V3 by_u = plus(
+                scaled(2.f * q.w, cross(o, g_mean)),
+                minus(
+                    plus(scaled(2.f * dot3(g_mean, u), o), scaled(2.f * dot3(u, o), g_mean)),
+                    scaled(4.f * dot3(g_mean, o), u)
+                )
+            );
             V4 g = plus4(product(g_quat, conjugate(get4(quats, rider))), {dot3(g_mean, t), by_u.x, by_u.y, by_u.z});
             g = scaled4(place.per_length, plus4(g, scaled4(-dot4(g, q), q)));
             const float by_area = growth_slope(ratio) * dot3(g_scale, get3(scales, rider));
@@ -114,8 +122,9 @@ __global__ void pose_riders_backward(
         return;
     }
     const long long f = face_index[i], here = (long long)pose * n_on_faces + i;
-    const long long v[3] = {first_vertex + faces[3 * f], first_vertex + faces[3 * f + 1],
-                            first_vertex + faces[3 * f + 2]};
+    const long long v[3] = {
+        first_vertex + faces[3 * f], first_vertex + faces[3 * f + 1], first_vertex + faces[3 * f + 2]
+    };
     const V3 b = get3(barycentrics, i);
     const OnFace place = on_face(b, v);
     const float ratio = area_ratio[(long long)pose * n_faces + f];
@@ -140,23 +149,24 @@ __global__ void pose_riders_backward(
 __global__ void gather_riders(
     int n_vertices,
     int n_faces,
-    int n_on_vertices,  // P
-    int n_on_faces,  // Q
-    const float* barycentrics,  // [Q, 3]
+    int n_on_vertices,            // P
+    int n_on_faces,               // Q
+    const float* barycentrics,    // [Q, 3]
     const float* rows_of_riders,  // [B, P + Q, 8]; 0 if nothing of vertices is wanted
-    const float* weights,  // [B, Q, 3], with the rows
-    const float* by_ratio,  // [B, Q]; 0 if area ratios are not wanted
-    const int* vertex_starts,  // [V + 1]; of `places`, for each vertex
-    const int* places,  // [P + 3 Q]; i < P: the Gaussian i on a vertex; P + 3 i + k: corner k of Gaussian P + i
+    const float* weights,         // [B, Q, 3], with the rows
+    const float* by_ratio,        // [B, Q]; 0 if area ratios are not wanted
+    const int* vertex_starts,     // [V + 1]; of `places`, for each vertex
+    const int* places,       // [P + 3 Q]; i < P: the Gaussian i on a vertex; P + 3 i + k: corner k of Gaussian P + i
     const int* face_starts,  // [F + 1]; of `riders`, for each face
-    const int* riders,  // [Q]
-    float* g_vertices,  // [B, V, 3]; each of these is 0 if not wanted
-    float* g_vertex_quats,  // [B, V, 4]
+    const int* riders,       // [Q]
+    float* g_vertices,       // [B, V, 3]; each of these is 0 if not wanted
+    float* g_vertex_quats,   // [B, V, 4]
     float* g_vertex_area_ratio,  // [B, V]
-    float* g_area_ratio  // [B, F])
-{
+    float* g_area_ratio          // [B, F]
+) {
 #include "vectors_cuda.h"
-    const int vertex_blocks = (rows_of_riders ? (n_vertices + BLOCK - 1) / BLOCK : 0), blocks = vertex_blocks + (g_area_ratio ? (n_faces + BLOCK - 1) / BLOCK : 0);
+    const int vertex_blocks = (rows_of_riders ? (n_vertices + BLOCK - 1) / BLOCK : 0),
+              blocks = vertex_blocks + (g_area_ratio ? (n_faces + BLOCK - 1) / BLOCK : 0);
     const int pose = block_index / blocks, mine = block_index - pose * blocks;
     const long long first_on_face = (long long)pose * n_on_faces;
     if (mine >= vertex_blocks) {

@@ -8,8 +8,10 @@ const long long rider = on_vertex ? i : (long long)n_on_vertices + i;  // among 
 const long long at = pose * ((long long)n_on_vertices + n_on_faces) + rider;
 const long long first_vertex = (long long)pose * n_vertices;
 auto product = [](V4 a, V4 b) -> V4 {
-    return {a.w * b.w - a.x * b.x - a.y * b.y - a.z * b.z, a.w * b.x + a.x * b.w + a.y * b.z - a.z * b.y,
-            a.w * b.y - a.x * b.z + a.y * b.w + a.z * b.x, a.w * b.z + a.x * b.y - a.y * b.x + a.z * b.w};
+    return {
+        a.w * b.w - a.x * b.x - a.y * b.y - a.z * b.z, a.w * b.x + a.x * b.w + a.y * b.z - a.z * b.y,
+        a.w * b.y - a.x * b.z + a.y * b.w + a.z * b.x, a.w * b.z + a.x * b.y - a.y * b.x + a.z * b.w
+    };
 };
 auto conjugate = [](V4 a) -> V4 { return {a.w, -a.x, -a.y, -a.z}; };
 auto growth = [&](float ratio) -> float {  // ratio^(half_powers / 2), the ratio bounded
@@ -21,13 +23,19 @@ auto growth_slope = [&](float ratio) -> float {
     return inside ? 0.5f * (float)half_powers * growth(ratio) / ratio : 0.f;
 };
 // The unit rotation of the Gaussian's place on the mesh.
-struct OnVertex { V4 turn; float per_length; };
+struct OnVertex {
+    V4 turn;
+    float per_length;
+};
 auto at_vertex = [&](long long v) -> OnVertex {
     const V4 q = get4(vertex_quats, v);
     const float length = sqrtf(dot4(q, q)), per_length = length > 0.f ? 1.f / length : 0.f;
     return {scaled4(per_length, q), per_length};
 };
-struct OnFace { V4 turn, q[3]; float sign[3], per_length; };
+struct OnFace {
+    V4 turn, q[3];
+    float sign[3], per_length;
+};
 auto on_face = [&](V3 b, const long long* v) -> OnFace {
     OnFace o;
     for (int k = 0; k < 3; k++) o.q[k] = get4(vertex_quats, v[k]);

@@ -1,6 +1,8 @@
 auto product = [](V4 a, V4 b) -> V4 {
-    return {a.w * b.w - a.x * b.x - a.y * b.y - a.z * b.z, a.w * b.x + a.x * b.w + a.y * b.z - a.z * b.y,
-            a.w * b.y - a.x * b.z + a.y * b.w + a.z * b.x, a.w * b.z + a.x * b.y - a.y * b.x + a.z * b.w};
+    return {
+        a.w * b.w - a.x * b.x - a.y * b.y - a.z * b.z, a.w * b.x + a.x * b.w + a.y * b.z - a.z * b.y,
+        a.w * b.y - a.x * b.z + a.y * b.w + a.z * b.x, a.w * b.z + a.x * b.y - a.y * b.x + a.z * b.w
+    };
 };
 auto conjugate = [](V4 a) -> V4 { return {a.w, -a.x, -a.y, -a.z}; };
 auto growth = [&](V ratio, int half_powers) -> V {  // ratio^(half_powers / 2), the ratio bounded

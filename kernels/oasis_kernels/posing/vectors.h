@@ -5,8 +5,12 @@ typedef float QU __attribute__((ext_vector_type(4), aligned(4)));
 typedef float H __attribute__((ext_vector_type(8)));
 typedef int I __attribute__((ext_vector_type(16)));
 typedef int IU __attribute__((ext_vector_type(16), aligned(4)));
-struct V3 { V x, y, z; };
-struct V4 { V w, x, y, z; };
+struct V3 {
+    V x, y, z;
+};
+struct V4 {
+    V w, x, y, z;
+};
 const V zero = (V)(0.f), one = (V)(1.f);
 
 auto load = [](const float* p) -> V { return *(const VU*)p; };
@@ -16,18 +20,14 @@ auto store_row = [](float* p, Q v) { *(QU*)p = v; };
 auto root = [](V v) -> V { return __builtin_elementwise_sqrt(v); };
 auto dot3 = [](V3 a, V3 b) -> V { return a.x * b.x + a.y * b.y + a.z * b.z; };
 auto dot4 = [](V4 a, V4 b) -> V { return a.w * b.w + a.x * b.x + a.y * b.y + a.z * b.z; };
-auto cross = [](V3 a, V3 b) -> V3 {
-    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-};
+auto cross = [](V3 a, V3 b) -> V3 { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; };
 auto scaled = [](V s, V3 a) -> V3 { return {s * a.x, s * a.y, s * a.z}; };
 auto scaled4 = [](V s, V4 a) -> V4 { return {s * a.w, s * a.x, s * a.y, s * a.z}; };
 auto plus = [](V3 a, V3 b) -> V3 { return {a.x + b.x, a.y + b.y, a.z + b.z}; };
 auto minus = [](V3 a, V3 b) -> V3 { return {a.x - b.x, a.y - b.y, a.z - b.z}; };
 auto plus4 = [](V4 a, V4 b) -> V4 { return {a.w + b.w, a.x + b.x, a.y + b.y, a.z + b.z}; };
 auto choose = [](I mask, V3 a, V3 b) -> V3 { return {mask ? a.x : b.x, mask ? a.y : b.y, mask ? a.z : b.z}; };
-auto choose4 = [](I m, V4 a, V4 b) -> V4 {
-    return {m ? a.w : b.w, m ? a.x : b.x, m ? a.y : b.y, m ? a.z : b.z};
-};
+auto choose4 = [](I m, V4 a, V4 b) -> V4 { return {m ? a.w : b.w, m ? a.x : b.x, m ? a.y : b.y, m ? a.z : b.z}; };
 auto largest = [](V a, V b) -> V { return a > b ? a : b; };
 auto magnitude = [](V a) -> V { return __builtin_elementwise_abs(a); };
 
@@ -48,8 +48,10 @@ auto group = [](Q a, Q b, Q c, Q d) -> V {
     return __builtin_shufflevector(ab, cd, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
 };
 auto rows = [&](auto row) -> V4 {  // row(lane) -> Q
-    return transpose(group(row(0), row(4), row(8), row(12)), group(row(1), row(5), row(9), row(13)),
-                     group(row(2), row(6), row(10), row(14)), group(row(3), row(7), row(11), row(15)));
+    return transpose(
+        group(row(0), row(4), row(8), row(12)), group(row(1), row(5), row(9), row(13)),
+        group(row(2), row(6), row(10), row(14)), group(row(3), row(7), row(11), row(15))
+    );
 };
 
 // Blocks of `count` <= 16 contiguous items.
@@ -60,8 +62,10 @@ auto get = [&](const float* p, int count) -> V {
     return v;
 };
 auto put = [&](float* p, int count, V v) {
-    if (count == 16) store(p, v);
-    else memcpy(p, &v, count * sizeof(float));
+    if (count == 16)
+        store(p, v);
+    else
+        memcpy(p, &v, count * sizeof(float));
 };
 auto get3 = [&](const float* from, int count) -> V3 {
     float buffer[48];
@@ -71,15 +75,43 @@ auto get3 = [&](const float* from, int count) -> V3 {
         from = buffer;
     }
     const V p = load(from), q = load(from + 16), r = load(from + 32);
-    return {__builtin_shufflevector(__builtin_shufflevector(p, q, 0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, -1, -1, -1, -1, -1), r, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29), __builtin_shufflevector(__builtin_shufflevector(p, q, 1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, -1, -1, -1, -1, -1), r, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30), __builtin_shufflevector(__builtin_shufflevector(p, q, 2, 5, 8, 11, 14, 17, 20, 23, 26, 29, -1, -1, -1, -1, -1, -1), r, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31)};
+    return {
+        __builtin_shufflevector(
+            __builtin_shufflevector(p, q, 0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, -1, -1, -1, -1, -1), r, 0, 1, 2, 3, 4,
+            5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29
+        ),
+        __builtin_shufflevector(
+            __builtin_shufflevector(p, q, 1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, -1, -1, -1, -1, -1), r, 0, 1, 2, 3,
+            4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30
+        ),
+        __builtin_shufflevector(
+            __builtin_shufflevector(p, q, 2, 5, 8, 11, 14, 17, 20, 23, 26, 29, -1, -1, -1, -1, -1, -1), r, 0, 1, 2, 3,
+            4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31
+        )
+    };
 };
 auto put3 = [&](float* to, int count, V3 v) {
     const V x = v.x, y = v.y, z = v.z;
     float buffer[48];
     float* out = count < 16 ? buffer : to;
-    store(out, __builtin_shufflevector(__builtin_shufflevector(x, y, 0, 16, -1, 1, 17, -1, 2, 18, -1, 3, 19, -1, 4, 20, -1, 5), z, 0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15));
-    store(out + 16, __builtin_shufflevector(__builtin_shufflevector(x, y, 21, -1, 6, 22, -1, 7, 23, -1, 8, 24, -1, 9, 25, -1, 10, 26), z, 0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15));
-    store(out + 32, __builtin_shufflevector(__builtin_shufflevector(x, y, -1, 11, 27, -1, 12, 28, -1, 13, 29, -1, 14, 30, -1, 15, 31, -1), z, 26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31));
+    store(
+        out, __builtin_shufflevector(
+                 __builtin_shufflevector(x, y, 0, 16, -1, 1, 17, -1, 2, 18, -1, 3, 19, -1, 4, 20, -1, 5), z, 0, 1, 16,
+                 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15
+             )
+    );
+    store(
+        out + 16, __builtin_shufflevector(
+                      __builtin_shufflevector(x, y, 21, -1, 6, 22, -1, 7, 23, -1, 8, 24, -1, 9, 25, -1, 10, 26), z, 0,
+                      21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15
+                  )
+    );
+    store(
+        out + 32, __builtin_shufflevector(
+                      __builtin_shufflevector(x, y, -1, 11, 27, -1, 12, 28, -1, 13, 29, -1, 14, 30, -1, 15, 31, -1), z,
+                      26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31
+                  )
+    );
     if (count < 16) memcpy(to, buffer, 3 * count * sizeof(float));
 };
 auto get4 = [&](const float* from, int count) -> V4 {
@@ -97,23 +129,26 @@ auto put4 = [&](float* to, int count, V4 v, int stride = 4) {  // one row every 
     float buffer[64];
     float* out = count < 16 ? buffer : to;
     const int step = count < 16 ? 4 : stride;
-    #pragma clang loop unroll(full)
+#pragma clang loop unroll(full)
     for (int k = 0; k < 4; k++) {
         store_row(out + (0 + k) * step, part[k].lo.lo);
         store_row(out + (4 + k) * step, part[k].lo.hi);
         store_row(out + (8 + k) * step, part[k].hi.lo);
         store_row(out + (12 + k) * step, part[k].hi.hi);
     }
-    if (count < 16) for (int k = 0; k < count; k++) memcpy(to + k * stride, buffer + 4 * k, 4 * sizeof(float));
+    if (count < 16)
+        for (int k = 0; k < count; k++) memcpy(to + k * stride, buffer + 4 * k, 4 * sizeof(float));
 };
 
 // Rows of three anywhere in a table of `size` rows, read as rows of four: the last one through a copy.
-struct Table { const float* rows; int last; Q tail; };
+struct Table {
+    const float* rows;
+    int last;
+    Q tail;
+};
 auto table3 = [&](const float* p, int size) -> Table {
     Table table = {p, size - 1, (Q)(0.f)};
     if (size) memcpy(&table.tail, p + 3ll * table.last, 3 * sizeof(float));
     return table;
 };
-auto at3 = [&](const Table& t, int i) -> Q {
-    return i == t.last ? t.tail : load_row(t.rows + 3ll * i);
-};
+auto at3 = [&](const Table& t, int i) -> Q { return i == t.last ? t.tail : load_row(t.rows + 3ll * i); };

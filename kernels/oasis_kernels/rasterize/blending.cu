@@ -13,20 +13,20 @@ __global__ void blend(
     const float4* centers,  // [C * n]
     const float4* whitenings,
     const float* opacities,
-    const float* colors,  // [C * n, channels]
+    const float* colors,       // [C * n, channels]
     const float* backgrounds,  // [C, channels], or null for black
     int tiles_x,
     int tiles_y,
     int width,
     int height,
-    int* tile_gaussians,  // [pairs]: the lists, nearest first; or null
+    int* tile_gaussians,   // [pairs]: the lists, nearest first; or null
     float* transmittance,  // [C, H, W], or null
-    int* stops,  // [C, H, W]: place in the list of the first layer that was not drawn; or null
-    float* checkpoints,  // [tiles with pairs, segments - 1, 1 + channels, 64], or null
+    int* stops,            // [C, H, W]: place in the list of the first layer that was not drawn; or null
+    float* checkpoints,    // [tiles with pairs, segments - 1, 1 + channels, 64], or null
     const long long* keys,
     float* image,
-    float* alphas)
-{
+    float* alphas
+) {
 #include "tile_layers.h"
     // Each warp sorts 32 keys at a time in its registers; then every key counts those before it in all runs.
     __shared__ long long keys_here[LONGEST];
@@ -36,9 +36,9 @@ __global__ void blend(
         for (int run = warp; run < runs; run += WARPS) {
             const int at = run * 32 + lane;
             long long key = at < count ? keys[start + at] : 0x7fffffffffffffffll;
-            #pragma unroll
+#pragma unroll
             for (int size = 2; size <= 32; size <<= 1) {
-                #pragma unroll
+#pragma unroll
                 for (int step = size >> 1; step > 0; step >>= 1) {
                     const long long other = __shfl_xor_sync(all, key, step);
                     const bool smaller = ((lane & size) == 0 || size == 32) == ((lane & step) == 0);
@@ -51,12 +51,13 @@ __global__ void blend(
         for (int at = threadIdx.x; at < runs * 32; at += BLOCK) {
             const long long key = keys_here[at];
             int rank = 0;
-            #pragma unroll 4
+#pragma unroll 4
             for (int run = 0; run < runs; run++) {
                 const long long* those = keys_here + run * 32;
                 int before = 0;
-                #pragma unroll
-                for (int step = 16; step > 0; step >>= 1) if (those[before + step - 1] < key) before += step;
+#pragma unroll
+                for (int step = 16; step > 0; step >>= 1)
+                    if (those[before + step - 1] < key) before += step;
                 rank += before + (those[before] < key);
             }
             if (at < count) {
@@ -76,9 +77,11 @@ __global__ void blend(
     const float y = (float)row, y_low = (float)(4 * warp), y_high = y_low + 3.f;
     float T = 1.f, C[PADDED] = {}, sums[CHANNELS] = {};
     int stop = count, now = 0;  // the segment being drawn
-    auto keep = [&](int b, int k, float value) { if (boundaries) boundary(b, k, pixel_here) = value; };
+    auto keep = [&](int b, int k, float value) {
+        if (boundaries) boundary(b, k, pixel_here) = value;
+    };
     auto end_segment = [&]() {
-        #pragma unroll
+#pragma unroll
         for (int k = 0; k < CHANNELS; k++) {
             if (now > 0) keep(now - 1, k + 1, C[k]);
             sums[k] += C[k];
@@ -99,7 +102,7 @@ __global__ void blend(
             next_whitening = whitenings[next_index];
             next_opacity = opacities[next_index];
             if (CHANNELS <= 4) {
-                #pragma unroll
+#pragma unroll
                 for (int k = 0; k < CHANNELS; k++) next_color[k] = colors[(long long)next_index * CHANNELS + k];
             }
         }
@@ -121,7 +124,7 @@ __global__ void blend(
         // Four layers at a time: their alphas do not wait for each other, and the next four are under way while these
         // are blended.
         auto alphas_of = [&](int j, float* alpha) {
-            #pragma unroll
+#pragma unroll
             for (int i = 0; i < 4; i++) {
                 const unsigned at = layers_at + (j + i) * (4 * STRIDE);
                 const float4 a = load4(at), b = load4(at + 16);
@@ -133,15 +136,15 @@ __global__ void blend(
         };
         float alpha[4], next_alpha[4] = {};
         if (m) alphas_of(0, alpha);
-        #pragma unroll 2
+#pragma unroll 2
         for (int j = 0; j < m; j += 4) {
             if (j + 4 < m) alphas_of(j + 4, next_alpha);
             float t[5] = {T};
-            #pragma unroll
+#pragma unroll
             for (int i = 0; i < 4; i++) t[i + 1] = fmaf(-alpha[i], t[i], t[i]);
             if (__any_sync(all, t[4] <= STOP)) {  // some pixel ends among the four
                 bool ended = false;
-                #pragma unroll
+#pragma unroll
                 for (int i = 0; i < 4; i++) {
                     if (ended) alpha[i] = 0.f;
                     t[i + 1] = fmaf(-alpha[i], t[i], t[i]);
@@ -153,13 +156,14 @@ __global__ void blend(
                         alpha[i] = 0.f;
                     }
                 }
-                #pragma unroll
-                for (int i = 0; i < 4; i++) if (ended) next_alpha[i] = 0.f;
+#pragma unroll
+                for (int i = 0; i < 4; i++)
+                    if (ended) next_alpha[i] = 0.f;
             }
-            #pragma unroll
+#pragma unroll
             for (int i = 0; i < 4; i++) {
                 const float weight = alpha[i] * t[i];
-                #pragma unroll
+#pragma unroll
                 for (int k = 0; k < CHANNELS; k += 4) {
                     const float4 color = load4(layers_at + (j + i) * (4 * STRIDE) + 32 + 4 * k);
                     C[k] = fmaf(color.x, weight, C[k]);
@@ -169,7 +173,7 @@ __global__ void blend(
                 }
             }
             T = t[4];
-            #pragma unroll
+#pragma unroll
             for (int i = 0; i < 4; i++) alpha[i] = next_alpha[i];
         }
     }
@@ -183,7 +187,7 @@ __global__ void blend(
     alphas[pixel] = 1.f - T;
     if (transmittance) transmittance[pixel] = T;
     if (stops) stops[pixel] = stop;
-    #pragma unroll
+#pragma unroll
     for (int k = 0; k < CHANNELS; k++)
         image[pixel * CHANNELS + k] = sums[k] + (backgrounds ? backgrounds[camera * CHANNELS + k] * T : 0.f);
 }

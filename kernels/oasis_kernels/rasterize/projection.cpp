@@ -5,36 +5,36 @@
 // the end of the arrays is copied to and from buffers of eight on the stack: nothing outside the arrays is read or
 // written, and the same instructions compute every Gaussian, wherever it stands.
 //
-// Both passes use factors: covariance = F F^T with F = R(q) S, or F the Cholesky factor of a given covariance. With B the
-// 2 x 3 matrix J R_camera and M = B F, the covariance in the image is M M^T + eps2d (Zwicker et al. 2001, eq. 31). The
-// adjoint is B^T G B by the covariance and 2 G B covariance by B, where G is the symmetric gradient in the image.
+// Both passes use factors: covariance = F F^T with F = R(q) S, or F the Cholesky factor of a given covariance. With B
+// the 2 x 3 matrix J R_camera and M = B F, the covariance in the image is M M^T + eps2d (Zwicker et al. 2001, eq. 31).
+// The adjoint is B^T G B by the covariance and 2 G B covariance by B, where G is the symmetric gradient in the image.
 
 void project(
     long long n,
     long long n_cameras,
     double width,
     double height,
-    const float* means,  // [n, 3]
-    const float* quats,  // [n, 4], or null where covars is given
-    const float* scales,  // [n, 3], or null
-    const float* covars,  // [n, 3, 3], or null; read as its symmetric part
-    const float* viewmats,  // [C, 4, 4]
-    const float* Ks,  // [C, 3, 3]
+    const float* means,      // [n, 3]
+    const float* quats,      // [n, 4], or null where covars is given
+    const float* scales,     // [n, 3], or null
+    const float* covars,     // [n, 3, 3], or null; read as its symmetric part
+    const float* viewmats,   // [C, 4, 4]
+    const float* Ks,         // [C, 3, 3]
     const float* opacities,  // [n]
-    const double* limits,  // near, far, radius_clip, eps2d, alpha_min, extent_sigmas, largest magnitude
-    float* means2d,  // [C, n, 2]
-    double* covars2d,  // [C, n, 3]
-    float* depths,  // [C, n]
-    float* conics,  // [C, n, 3]
-    int* radii,  // [C, n, 2]
-    double* sort_depths,  // [C, n]
-    float* centers,  // [C, n, 4]
-    float* whitenings,  // [C, n, 4]
-    int* boxes,  // [C, n, 4]
-    long long* bad,  // made 1 where an input is not finite, beyond the largest magnitude or outside its range
-    long long* state  // [PHASE_WORDS], zeros)
-{
-    #pragma clang fp contract(fast)
+    const double* limits,    // near, far, radius_clip, eps2d, alpha_min, extent_sigmas, largest magnitude
+    float* means2d,          // [C, n, 2]
+    double* covars2d,        // [C, n, 3]
+    float* depths,           // [C, n]
+    float* conics,           // [C, n, 3]
+    int* radii,              // [C, n, 2]
+    double* sort_depths,     // [C, n]
+    float* centers,          // [C, n, 4]
+    float* whitenings,       // [C, n, 4]
+    int* boxes,              // [C, n, 4]
+    long long* bad,          // made 1 where an input is not finite, beyond the largest magnitude or outside its range
+    long long* state         // [PHASE_WORDS], zeros
+) {
+#pragma clang fp contract(fast)
 #include "projection_vectors.h"
     // log of x >= 1, by 2 atanh((m - 1) / (m + 1)) with m within a factor sqrt(2) of 1; relative error 1e-12.
     auto logarithm = [](V x) -> V {
@@ -63,14 +63,24 @@ void project(
             d = is[2] ? s[5] : d;
             is[1] &= ~is[2];
             is[0] = ~(is[1] | is[2]);
-            const V v[3] = {is[0] ? s[0] : is[1] ? s[1] : s[2], is[0] ? s[1] : is[1] ? s[3] : s[4],
-                            is[0] ? s[2] : is[1] ? s[4] : s[5]};
+            const V v[3] = {
+                is[0]   ? s[0]
+                : is[1] ? s[1]
+                        : s[2],
+                is[0]   ? s[1]
+                : is[1] ? s[3]
+                        : s[4],
+                is[0]   ? s[2]
+                : is[1] ? s[4]
+                        : s[5]
+            };
             const I some = d > 0.0;
             const V root = 1.0 / __builtin_elementwise_sqrt(some ? d : (V)(1.0));
             for (int row = 0; row < 3; row++) f[3 * row + column] = some ? v[row] * root : zero;
             int k = 0;
-            for (int i = 0; i < 3; i++) for (int j = i; j < 3; j++, k++)
-                s[k] = (is[i] | is[j] | ~some) ? zero : s[k] - f[3 * i + column] * f[3 * j + column];
+            for (int i = 0; i < 3; i++)
+                for (int j = i; j < 3; j++, k++)
+                    s[k] = (is[i] | is[j] | ~some) ? zero : s[k] - f[3 * i + column] * f[3 * j + column];
         }
     };
     const double near = limits[0], far = limits[1], radius_clip = limits[2], eps2d = limits[3], alpha_min = limits[4];
@@ -84,7 +94,9 @@ void project(
         if (Ks[9 * c] == 0.f || Ks[9 * c + 4] == 0.f) camera_flaws |= (N)(1);
     }
 
-    struct From { const float *means, *quats, *scales, *covars, *opacities; };
+    struct From {
+        const float *means, *quats, *scales, *covars, *opacities;
+    };
     struct To {
         double *covars2d, *sort_depths;
         float *means2d, *depths, *conics, *centers, *whitenings;
@@ -116,8 +128,10 @@ void project(
                 };
                 fill(spare.in_means, from.means, 3);
                 fill(spare.in_opacities, from.opacities, 1);
-                if (covars) fill(spare.in_covars, from.covars, 9);
-                else fill(spare.in_quats, from.quats, 4), fill(spare.in_scales, from.scales, 3);
+                if (covars)
+                    fill(spare.in_covars, from.covars, 9);
+                else
+                    fill(spare.in_quats, from.quats, 4), fill(spare.in_scales, from.scales, 3);
             }
 
             F a, b, c, d;
@@ -152,11 +166,11 @@ void project(
             for (long long camera = 0; camera < n_cameras; camera++) {
                 const Camera& k = cameras[camera];
                 const long long at = camera * n + i;
-                To to = {covars2d + 3 * at, sort_depths + at, means2d + 2 * at, depths + at, conics + 3 * at,
-                         centers + 4 * at, whitenings + 4 * at, radii + 2 * at, boxes + 4 * at};
+                To to = {covars2d + 3 * at, sort_depths + at,    means2d + 2 * at, depths + at,   conics + 3 * at,
+                         centers + 4 * at,  whitenings + 4 * at, radii + 2 * at,   boxes + 4 * at};
                 if (!whole)
                     to = {spare.covars2d, spare.sort_depths, spare.means2d, spare.depths, spare.conics,
-                          spare.centers, spare.whitenings, spare.radii, spare.boxes};
+                          spare.centers,  spare.whitenings,  spare.radii,   spare.boxes};
 
                 const V px = k.r[0] * X + k.r[1] * Y + k.r[2] * Z + k.t[0];
                 const V py = k.r[3] * X + k.r[4] * Y + k.r[5] * Z + k.t[1];
@@ -221,24 +235,31 @@ void project(
                     const F y0 = whole_number(low(y, slack_y, height)), y1 = whole_number(high(y, slack_y, height));
                     store4((float*)to.boxes, x0, y0, x1, y1);
                     const V largest = (V)(2147483647.0);
-                    store2((float*)to.radii, whole_number(radius_x < largest ? radius_x : largest),
-                           whole_number(radius_y < largest ? radius_y : largest));
+                    store2(
+                        (float*)to.radii, whole_number(radius_x < largest ? radius_x : largest),
+                        whole_number(radius_y < largest ? radius_y : largest)
+                    );
                     store2(to.means2d, narrow(kept(x)), narrow(kept(y)));
                     const F floor_x = narrow(kept(__builtin_elementwise_floor(x)));
                     const F floor_y = narrow(kept(__builtin_elementwise_floor(y)));
-                    store4(to.centers, floor_x, floor_y, narrow(kept(x) - wide(floor_x)),
-                           narrow(kept(y) - wide(floor_y)));
+                    store4(
+                        to.centers, floor_x, floor_y, narrow(kept(x) - wide(floor_x)), narrow(kept(y) - wide(floor_y))
+                    );
 
                     const V sound = drawn ? det : (V)(1.0), inverse_det = 1.0 / sound;
-                    store3(to.conics, narrow(kept(yy * inverse_det)), narrow(kept(-xy * inverse_det)),
-                           narrow(kept(xx * inverse_det)));
+                    store3(
+                        to.conics, narrow(kept(yy * inverse_det)), narrow(kept(-xy * inverse_det)),
+                        narrow(kept(xx * inverse_det))
+                    );
                     // Cholesky factor of the inverse, pivoted on the larger diagonal.
                     const I across = xx >= yy;
                     const V pivot = drawn ? (across ? xx : yy) : (V)(1.0);
                     const V h = 1.0 / __builtin_elementwise_sqrt(pivot);
                     const V tall = __builtin_elementwise_sqrt(pivot * inverse_det), sheared = -tall * xy * (h * h);
-                    store4(to.whitenings, narrow(kept(across ? h : (V)(0.0))), narrow(kept(across ? (V)(0.0) : h)),
-                           narrow(kept(across ? sheared : tall)), narrow(kept(across ? tall : sheared)));
+                    store4(
+                        to.whitenings, narrow(kept(across ? h : (V)(0.0))), narrow(kept(across ? (V)(0.0) : h)),
+                        narrow(kept(across ? sheared : tall)), narrow(kept(across ? tall : sheared))
+                    );
                     const V rows[3] = {kept(xx), kept(xy), kept(yy)};
                     const V front = __builtin_shufflevector(rows[0], rows[1], 0, 8, -1, 1, 9, -1, 2, 10);
                     const V middle = __builtin_shufflevector(rows[0], rows[1], -1, 3, 11, -1, 4, 12, -1, 5);

@@ -8,12 +8,12 @@ __global__ void project(
     int n_cameras,
     double width,
     double height,
-    const float* means,  // [n, 3]
-    const float* quats,  // [n, 4], or null where covars is given
-    const float* scales,  // [n, 3], or null
-    const float* covars,  // [n, 3, 3], or null; read as its symmetric part
-    const float* viewmats,  // [C, 4, 4]
-    const float* Ks,  // [C, 3, 3]
+    const float* means,      // [n, 3]
+    const float* quats,      // [n, 4], or null where covars is given
+    const float* scales,     // [n, 3], or null
+    const float* covars,     // [n, 3, 3], or null; read as its symmetric part
+    const float* viewmats,   // [C, 4, 4]
+    const float* Ks,         // [C, 3, 3]
     const float* opacities,  // [n]
     double near,
     double far,
@@ -21,21 +21,21 @@ __global__ void project(
     double eps2d,
     double alpha_min,
     double extent_sigmas,
-    float largest,  // magnitude of a sound input
-    float2* means2d,  // [C, n]
-    double* covars2d,  // [C, n, 3]
-    float* depths,  // [C, n]
-    float* conics,  // [C, n, 3]
-    int2* radii,  // [C, n]
+    float largest,        // magnitude of a sound input
+    float2* means2d,      // [C, n]
+    double* covars2d,     // [C, n, 3]
+    float* depths,        // [C, n]
+    float* conics,        // [C, n, 3]
+    int2* radii,          // [C, n]
     double* sort_depths,  // [C, n]
-    float4* centers,  // [C, n]
-    float4* whitenings,  // [C, n]
-    int4* boxes,  // [C, n]
-    int* counters,  // of the tiles, to be cleared
+    float4* centers,      // [C, n]
+    float4* whitenings,   // [C, n]
+    int4* boxes,          // [C, n]
+    int* counters,        // of the tiles, to be cleared
     int n_counters,
     int n_threads,
-    long long* bad  // made 1 where an input is not finite, too large or outside its range; or null)
-{
+    long long* bad  // made 1 where an input is not finite, too large or outside its range; or null
+) {
 #include "projection_cuda.h"
     for (int k = thread; k < n_counters; k += n_threads) counters[k] = 0;
     if (thread >= n * n_cameras) return;
@@ -77,13 +77,14 @@ __global__ void project(
             f[6 + column] = some ? v2 * root : 0.0;
             const bool gone[3] = {!third && !second, second && !third, third};
             int e = 0;
-            for (int row = 0; row < 3; row++) for (int other = row; other < 3; other++, e++)
-                s[e] = gone[row] || gone[other] || !some ? 0.0
-                                                         : s[e] - f[3 * row + column] * f[3 * other + column];
+            for (int row = 0; row < 3; row++)
+                for (int other = row; other < 3; other++, e++)
+                    s[e] = gone[row] || gone[other] || !some ? 0.0 : s[e] - f[3 * row + column] * f[3 * other + column];
         }
     } else {
-        const float4 q = {sound(quats[4 * i]), sound(quats[4 * i + 1]), sound(quats[4 * i + 2]),
-                          sound(quats[4 * i + 3])};
+        const float4 q = {
+            sound(quats[4 * i]), sound(quats[4 * i + 1]), sound(quats[4 * i + 2]), sound(quats[4 * i + 3])
+        };
         flaw |= q.x == 0.f && q.y == 0.f && q.z == 0.f && q.w == 0.f;
         rotation(q.x, q.y, q.z, q.w, f);
         const double scale[3] = {sound(scales[3 * i]), sound(scales[3 * i + 1]), sound(scales[3 * i + 2])};
@@ -131,8 +132,8 @@ __global__ void project(
     auto root = [&](double a) -> double { return a > 0.0 ? a * inverse_root(a) : 0.0; };
     const double extent_x = root(reach * xx), extent_y = root(reach * yy);
     const double radius_x = fmax(ceil(extent_x), 1.0), radius_y = fmax(ceil(extent_y), 1.0);
-    drawn = drawn && (radius_x > radius_clip || radius_y > radius_clip) && x + radius_x > 0.0
-        && x - radius_x < width && y + radius_y > 0.0 && y - radius_y < height;
+    drawn = drawn && (radius_x > radius_clip || radius_y > radius_clip) && x + radius_x > 0.0 && x - radius_x < width &&
+            y + radius_y > 0.0 && y - radius_y < height;
     if (!drawn) {
         means2d[thread] = {0.f, 0.f};
         for (int e = 0; e < 3; e++) covars2d[3 * (long long)thread + e] = 0.0;
@@ -151,8 +152,9 @@ __global__ void project(
     };
     const double slack_x = extent_x * (1.0 + BOX_SLACK) + BOX_SLACK;
     const double slack_y = extent_y * (1.0 + BOX_SLACK) + BOX_SLACK;
-    boxes[thread] = {low(x, slack_x, width), low(y, slack_y, height), high(x, slack_x, width),
-                     high(y, slack_y, height)};
+    boxes[thread] = {
+        low(x, slack_x, width), low(y, slack_y, height), high(x, slack_x, width), high(y, slack_y, height)
+    };
     radii[thread] = {(int)fmin(radius_x, 2147483647.0), (int)fmin(radius_y, 2147483647.0)};
     means2d[thread] = {(float)x, (float)y};
     const float whole_x = (float)floor(x), whole_y = (float)floor(y);
@@ -166,8 +168,10 @@ __global__ void project(
     const bool across = xx >= yy;
     const double pivot = across ? xx : yy, h = inverse_root(pivot);
     const double tall = root(pivot * inverse_det), sheared = -tall * xy * (h * h);
-    whitenings[thread] = {across ? (float)h : 0.f, across ? 0.f : (float)h, (float)(across ? sheared : tall),
-                          (float)(across ? tall : sheared)};
+    whitenings[thread] = {
+        across ? (float)h : 0.f, across ? 0.f : (float)h, (float)(across ? sheared : tall),
+        (float)(across ? tall : sheared)
+    };
     double* covariance = covars2d + 3 * (long long)thread;
     covariance[0] = xx;
     covariance[1] = xy;

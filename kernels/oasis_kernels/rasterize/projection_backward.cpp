@@ -5,27 +5,29 @@ void project_backward(
     long long n_cameras,
     double width,
     double height,
-    const float* means,  // [n, 3]
-    const float* quats,  // [n, 4], or null where covars is given
-    const float* scales,  // [n, 3], or null
-    const float* covars,  // [n, 3, 3], or null; read as its symmetric part
-    const float* viewmats,  // [C, 4, 4]
-    const float* Ks,  // [C, 3, 3]
-    const int* radii,  // [C, n, 2]; 0 where nothing was drawn
-    const float* g_means2d,  // [C, n, 2], or null for zeros, as the next two
+    const float* means,        // [n, 3]
+    const float* quats,        // [n, 4], or null where covars is given
+    const float* scales,       // [n, 3], or null
+    const float* covars,       // [n, 3, 3], or null; read as its symmetric part
+    const float* viewmats,     // [C, 4, 4]
+    const float* Ks,           // [C, 3, 3]
+    const int* radii,          // [C, n, 2]; 0 where nothing was drawn
+    const float* g_means2d,    // [C, n, 2], or null for zeros, as the next two
     const double* g_covars2d,  // [C, n, 3]
-    const float* g_depths,  // [C, n]
-    float* g_means,  // [n, 3], or null where nobody asks, as all that follow
-    float* g_quats,  // [n, 4]
-    float* g_scales,  // [n, 3]
-    float* g_covars,  // [n, 3, 3]
-    float* g_viewmats,  // [C, 4, 4]
-    double* chunk_cameras,  // [C, chunks, 12]: by the upper three rows of viewmats, of each chunk
-    long long* state  // [STATE], zeros)
-{
-    #pragma clang fp contract(fast)
+    const float* g_depths,     // [C, n]
+    float* g_means,            // [n, 3], or null where nobody asks, as all that follow
+    float* g_quats,            // [n, 4]
+    float* g_scales,           // [n, 3]
+    float* g_covars,           // [n, 3, 3]
+    float* g_viewmats,         // [C, 4, 4]
+    double* chunk_cameras,     // [C, chunks, 12]: by the upper three rows of viewmats, of each chunk
+    long long* state           // [STATE], zeros
+) {
+#pragma clang fp contract(fast)
 #include "projection_vectors.h"
-    struct From { const float *means, *quats, *scales, *covars; };
+    struct From {
+        const float *means, *quats, *scales, *covars;
+    };
     struct Spare {
         double g_covars2d[24];
         float means[24], quats[32], scales[24], covars[72], g_means2d[16], g_depths[8];
@@ -51,8 +53,10 @@ void project_backward(
                     from = (const float*)memcpy(spare, from, size * count * sizeof(float));
                 };
                 fill(spare.means, from.means, 3);
-                if (covars) fill(spare.covars, from.covars, 9);
-                else fill(spare.quats, from.quats, 4), fill(spare.scales, from.scales, 3);
+                if (covars)
+                    fill(spare.covars, from.covars, 9);
+                else
+                    fill(spare.quats, from.quats, 4), fill(spare.scales, from.scales, 3);
             }
             F a, b, c, d;
             load3(from.means, a, b, c);
@@ -101,7 +105,8 @@ void project_backward(
                 if (__builtin_reduce_or(active)) {
                     if (!loaded) {
                         loaded = true;
-                        if (covars) load_covariance(from.covars, s);
+                        if (covars)
+                            load_covariance(from.covars, s);
                         else {
                             load4(from.quats, a, b, c, d);
                             w = wide(a);
@@ -116,9 +121,10 @@ void project_backward(
                             V f[9];
                             for (int e = 0; e < 9; e++) f[e] = r[e] * scale[e % 3];
                             int e = 0;
-                            for (int row = 0; row < 3; row++) for (int other = row; other < 3; other++, e++)
-                                s[e] = f[3 * row] * f[3 * other] + f[3 * row + 1] * f[3 * other + 1]
-                                    + f[3 * row + 2] * f[3 * other + 2];
+                            for (int row = 0; row < 3; row++)
+                                for (int other = row; other < 3; other++, e++)
+                                    s[e] = f[3 * row] * f[3 * other] + f[3 * row + 1] * f[3 * other + 1] +
+                                           f[3 * row + 2] * f[3 * other + 2];
                         }
                     }
                     touched |= active;
@@ -144,8 +150,9 @@ void project_backward(
                     }
                     if (of_shape) {
                         int e = 0;
-                        for (int row = 0; row < 3; row++) for (int column = row; column < 3; column++, e++)
-                            g_s[e] += b0[row] * g_b0[column] + b1[row] * g_b1[column];
+                        for (int row = 0; row < 3; row++)
+                            for (int column = row; column < 3; column++, e++)
+                                g_s[e] += b0[row] * g_b0[column] + b1[row] * g_b1[column];
                     }
                     if (of_place) {
                         auto spread = [&](V* g) {
@@ -167,21 +174,23 @@ void project_backward(
                         g_point[0] = kept(inverse * g_u);
                         g_point[1] = kept(inverse * g_v);
                         g_point[2] -= kept(inverse * (g_u * u + g_v * v + inverse * g_inverse));
-                        if (g_viewmats) for (int column = 0; column < 3; column++) {
-                            VU* to = (VU*)(sums + 96 * camera) + column;
-                            const V first_row = j0 * g_b0[column], second_row = j1 * g_b1[column];
-                            to[0] += kept(first_row);
-                            to[4] += kept(second_row);
-                            to[8] -= kept(slope_u * first_row + slope_v * second_row);
-                        }
+                        if (g_viewmats)
+                            for (int column = 0; column < 3; column++) {
+                                VU* to = (VU*)(sums + 96 * camera) + column;
+                                const V first_row = j0 * g_b0[column], second_row = j1 * g_b1[column];
+                                to[0] += kept(first_row);
+                                to[4] += kept(second_row);
+                                to[8] -= kept(slope_u * first_row + slope_v * second_row);
+                            }
                     }
                 }
-                if (g_viewmats) for (int row = 0; row < 3; row++) {
-                    VU* to = (VU*)(sums + 96 * camera) + 4 * row;
-                    const V g = g_point[row];
-                    for (int column = 0; column < 3; column++) to[column] += g != 0.0 ? g * mean[column] : (V)(0.0);
-                    to[3] += g;
-                }
+                if (g_viewmats)
+                    for (int row = 0; row < 3; row++) {
+                        VU* to = (VU*)(sums + 96 * camera) + 4 * row;
+                        const V g = g_point[row];
+                        for (int column = 0; column < 3; column++) to[column] += g != 0.0 ? g * mean[column] : (V)(0.0);
+                        to[3] += g;
+                    }
                 for (int e = 0; e < 3; e++)
                     g_mean[e] += k.r[e] * g_point[0] + k.r[3 + e] * g_point[1] + k.r[6 + e] * g_point[2];
             }
@@ -209,11 +218,12 @@ void project_backward(
             }
             if (g_quats || g_scales) {
                 V h[9], g_scale[3];  // h = 2 g R: by F = R S it is h S, by R itself h S S
-                for (int row = 0; row < 3; row++) for (int column = 0; column < 3; column++) {
-                    const V half = g[3 * row] * r[column] + g[3 * row + 1] * r[3 + column]
-                        + g[3 * row + 2] * r[6 + column];
-                    h[3 * row + column] = half + half;
-                }
+                for (int row = 0; row < 3; row++)
+                    for (int column = 0; column < 3; column++) {
+                        const V half =
+                            g[3 * row] * r[column] + g[3 * row + 1] * r[3 + column] + g[3 * row + 2] * r[6 + column];
+                        h[3 * row + column] = half + half;
+                    }
                 for (int e = 0; e < 3; e++) {
                     g_scale[e] = scale[e] * (r[e] * h[e] + r[3 + e] * h[3 + e] + r[6 + e] * h[6 + e]);
                     const V square = scale[e] * scale[e];
@@ -233,8 +243,10 @@ void project_backward(
                     const V g_z = w * az + x * sy + y * sx - 2.0 * z * (h[0] + h[4]);
                     const V along = inverse_norm * (g_w * w + g_x * x + g_y * y + g_z * z), two = inverse_norm * 2.0;
                     float* to = whole ? g_quats + 4 * i : spare.to_quats;
-                    store4(to, kept(two * (g_w - along * w)), kept(two * (g_x - along * x)),
-                           kept(two * (g_y - along * y)), kept(two * (g_z - along * z)));
+                    store4(
+                        to, kept(two * (g_w - along * w)), kept(two * (g_x - along * x)), kept(two * (g_y - along * y)),
+                        kept(two * (g_z - along * z))
+                    );
                     if (!whole) memcpy(g_quats + 4 * i, to, 4 * count * sizeof(float));
                 }
             }
@@ -251,7 +263,8 @@ void project_backward(
     phase(state + PHASE_WORDS, g_viewmats ? n_cameras : 0, [&](long long c) {
         for (int e = 0; e < 16; e++) {
             double total = 0.0;
-            if (e < 12) for (long long k = 0; k < n_chunks; k++) total += chunk_cameras[(c * n_chunks + k) * 12 + e];
+            if (e < 12)
+                for (long long k = 0; k < n_chunks; k++) total += chunk_cameras[(c * n_chunks + k) * 12 + e];
             g_viewmats[16 * c + e] = (float)total;  // the last row is not read
         }
     });

@@ -4,22 +4,22 @@ __global__ void project_backward(
     int n_cameras,
     double width,
     double height,
-    const float* means,  // [n, 3]
-    const float* quats,  // [n, 4], or null where covars is given
-    const float* scales,  // [n, 3], or null
-    const float* covars,  // [n, 3, 3], or null; read as its symmetric part
-    const float* viewmats,  // [C, 4, 4]
-    const float* Ks,  // [C, 3, 3]
-    const int2* radii,  // [C, n]
-    const float2* g_means2d,  // [C, n], or null for zeros, as the next two
+    const float* means,        // [n, 3]
+    const float* quats,        // [n, 4], or null where covars is given
+    const float* scales,       // [n, 3], or null
+    const float* covars,       // [n, 3, 3], or null; read as its symmetric part
+    const float* viewmats,     // [C, 4, 4]
+    const float* Ks,           // [C, 3, 3]
+    const int2* radii,         // [C, n]
+    const float2* g_means2d,   // [C, n], or null for zeros, as the next two
     const double* g_covars2d,  // [C, n, 3]
-    const float* g_depths,  // [C, n]
-    float* g_means,  // [n, 3], or null where nobody asks, as all that follow
-    float* g_quats,  // [n, 4]
-    float* g_scales,  // [n, 3]
-    float* g_covars,  // [n, 3, 3]
-    double* g_cameras  // [C, n, 12]: by the upper three rows of viewmats, of each Gaussian)
-{
+    const float* g_depths,     // [C, n]
+    float* g_means,            // [n, 3], or null where nobody asks, as all that follow
+    float* g_quats,            // [n, 4]
+    float* g_scales,           // [n, 3]
+    float* g_covars,           // [n, 3, 3]
+    double* g_cameras          // [C, n, 12]: by the upper three rows of viewmats, of each Gaussian
+) {
 #include "projection_cuda.h"
     if (thread >= n) return;
     const int i = thread;
@@ -33,7 +33,11 @@ __global__ void project_backward(
     for (int c = 0; c < n_cameras; c++) {
         const long long at = (long long)c * n + i;
         double g_x = 0.0, g_y = 0.0, g_xx = 0.0, g_xy = 0.0, g_yy = 0.0;
-        if (g_means2d) { const float2 g = g_means2d[at]; g_x = g.x; g_y = g.y; }
+        if (g_means2d) {
+            const float2 g = g_means2d[at];
+            g_x = g.x;
+            g_y = g.y;
+        }
         if (g_covars2d) {
             g_xx = g_covars2d[3 * at];
             g_xy = 0.5 * g_covars2d[3 * at + 1];
@@ -46,17 +50,22 @@ __global__ void project_backward(
         if (active) {
             if (!loaded) {
                 loaded = true;
-                if (covars) load_covariance(i, s);
+                if (covars)
+                    load_covariance(i, s);
                 else {
-                    w = quats[4 * i]; x = quats[4 * i + 1]; y = quats[4 * i + 2]; z = quats[4 * i + 3];
+                    w = quats[4 * i];
+                    x = quats[4 * i + 1];
+                    y = quats[4 * i + 2];
+                    z = quats[4 * i + 3];
                     inverse_norm = rotation(w, x, y, z, r);
                     for (int e = 0; e < 3; e++) scale[e] = scales[3 * i + e];
                     double f[9];
                     for (int e = 0; e < 9; e++) f[e] = r[e] * scale[e % 3];
                     int e = 0;
-                    for (int row = 0; row < 3; row++) for (int other = row; other < 3; other++, e++)
-                        s[e] = f[3 * row] * f[3 * other] + f[3 * row + 1] * f[3 * other + 1]
-                            + f[3 * row + 2] * f[3 * other + 2];
+                    for (int row = 0; row < 3; row++)
+                        for (int other = row; other < 3; other++, e++)
+                            s[e] = f[3 * row] * f[3 * other] + f[3 * row + 1] * f[3 * other + 1] +
+                                   f[3 * row + 2] * f[3 * other + 2];
                 }
             }
             const double px = k.r[0] * mean[0] + k.r[1] * mean[1] + k.r[2] * mean[2] + k.t[0];
@@ -75,8 +84,9 @@ __global__ void project_backward(
                 g_b1[e] = g_xy * b0[e] + g_yy * b1[e];
             }
             int e = 0;
-            for (int row = 0; row < 3; row++) for (int column = row; column < 3; column++, e++)
-                g_s[e] += b0[row] * g_b0[column] + b1[row] * g_b1[column];
+            for (int row = 0; row < 3; row++)
+                for (int column = row; column < 3; column++, e++)
+                    g_s[e] += b0[row] * g_b0[column] + b1[row] * g_b1[column];
             if (of_place) {
                 auto spread = [&](double* g) {
                     const double g0 = g[0] + g[0], g1 = g[1] + g[1], g2 = g[2] + g[2];
@@ -115,17 +125,22 @@ __global__ void project_backward(
         }
     }
 
-    if (g_means) for (int e = 0; e < 3; e++) g_means[3 * i + e] = (float)g_mean[e];
+    if (g_means)
+        for (int e = 0; e < 3; e++) g_means[3 * i + e] = (float)g_mean[e];
     const double g[9] = {g_s[0], g_s[1], g_s[2], g_s[1], g_s[3], g_s[4], g_s[2], g_s[4], g_s[5]};
-    if (g_covars) for (int e = 0; e < 9; e++) g_covars[9 * (long long)i + e] = (float)g[e];
+    if (g_covars)
+        for (int e = 0; e < 9; e++) g_covars[9 * (long long)i + e] = (float)g[e];
     if (!loaded) {
-        if (g_quats) for (int e = 0; e < 4; e++) g_quats[4 * i + e] = 0.f;
-        if (g_scales) for (int e = 0; e < 3; e++) g_scales[3 * i + e] = 0.f;
+        if (g_quats)
+            for (int e = 0; e < 4; e++) g_quats[4 * i + e] = 0.f;
+        if (g_scales)
+            for (int e = 0; e < 3; e++) g_scales[3 * i + e] = 0.f;
     } else if (g_quats || g_scales) {
         double h[9];  // 2 g R: by F = R S it is h S, by R itself h S S
-        for (int row = 0; row < 3; row++) for (int column = 0; column < 3; column++)
-            h[3 * row + column] = 2.0 * (g[3 * row] * r[column] + g[3 * row + 1] * r[3 + column]
-                                         + g[3 * row + 2] * r[6 + column]);
+        for (int row = 0; row < 3; row++)
+            for (int column = 0; column < 3; column++)
+                h[3 * row + column] =
+                    2.0 * (g[3 * row] * r[column] + g[3 * row + 1] * r[3 + column] + g[3 * row + 2] * r[6 + column]);
         for (int e = 0; e < 3; e++) {
             if (g_scales)
                 g_scales[3 * i + e] = (float)(scale[e] * (r[e] * h[e] + r[3 + e] * h[3 + e] + r[6 + e] * h[6 + e]));

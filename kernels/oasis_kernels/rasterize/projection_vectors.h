@@ -38,15 +38,13 @@ auto store2 = [](float* p, F x, F y) {
 };
 auto store3 = [&](float* p, F x, F y, F z) {
     const F16 xy = join(x, y), zz = join(z, z);
-    *(FU16*)p =
-        __builtin_shufflevector(xy, zz, 0, 8, 16, 1, 9, 17, 2, 10, 18, 3, 11, 19, 4, 12, 20, 5);
+    *(FU16*)p = __builtin_shufflevector(xy, zz, 0, 8, 16, 1, 9, 17, 2, 10, 18, 3, 11, 19, 4, 12, 20, 5);
     *(FU*)(p + 16) = __builtin_shufflevector(xy, zz, 13, 21, 6, 14, 22, 7, 15, 23);
 };
 auto store4 = [&](float* p, F x, F y, F z, F w) {
     const F16 xy = join(x, y), zw = join(z, w);
     *(FU16*)p = __builtin_shufflevector(xy, zw, 0, 8, 16, 24, 1, 9, 17, 25, 2, 10, 18, 26, 3, 11, 19, 27);
-    *(FU16*)(p + 16) =
-        __builtin_shufflevector(xy, zw, 4, 12, 20, 28, 5, 13, 21, 29, 6, 14, 22, 30, 7, 15, 23, 31);
+    *(FU16*)(p + 16) = __builtin_shufflevector(xy, zw, 4, 12, 20, 28, 5, 13, 21, 29, 6, 14, 22, 30, 7, 15, 23, 31);
 };
 
 struct Camera {
@@ -89,8 +87,9 @@ auto rotation = [](V w, V x, V y, V z, V* r) -> V {
 // Symmetric part of eight 3 x 3 matrices: xx, xy, xz, yy, yz, zz.
 auto load_covariance = [](const float* p, V* s) {
     const int pair[6][2] = {{0, 0}, {1, 3}, {2, 6}, {4, 4}, {5, 7}, {8, 8}};
-    for (int k = 0; k < 6; k++) for (int lane = 0; lane < 8; lane++)
-        s[k][lane] = 0.5 * ((double)p[9 * lane + pair[k][0]] + (double)p[9 * lane + pair[k][1]]);
+    for (int k = 0; k < 6; k++)
+        for (int lane = 0; lane < 8; lane++)
+            s[k][lane] = 0.5 * ((double)p[9 * lane + pair[k][0]] + (double)p[9 * lane + pair[k][1]]);
 };
 
 const long long n_chunks = (n + CHUNK - 1) / CHUNK;

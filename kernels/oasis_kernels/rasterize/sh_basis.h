@@ -17,7 +17,10 @@ auto direction = [&](int camera, int gaussian, float* d) -> float {
         d[e] = (float)((double)means[3 * (long long)gaussian + e] - center);
     }
     const float peak = fmaxf(fmaxf(fabsf(d[0]), fabsf(d[1])), fabsf(d[2]));
-    if (!(peak > 0.f)) { d[0] = d[1] = d[2] = 0.f; return 0.f; }
+    if (!(peak > 0.f)) {
+        d[0] = d[1] = d[2] = 0.f;
+        return 0.f;
+    }
     for (int e = 0; e < 3; e++) d[e] /= peak;
     const float length = sqrtf(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
     for (int e = 0; e < 3; e++) d[e] /= length;

@@ -1,7 +1,7 @@
 // Colours of Gaussians from spherical harmonics on CUDA: `spherical_harmonics.see` and its adjoint over raw pointers.
 //
-// `see` takes one thread for each camera and Gaussian, its adjoint one for each Gaussian, which goes through the cameras
-// in order, so that no sum depends on how threads run.
+// `see` takes one thread for each camera and Gaussian, its adjoint one for each Gaussian, which goes through the
+// cameras in order, so that no sum depends on how threads run.
 
 __global__ void see(
     int n,
@@ -11,8 +11,8 @@ __global__ void see(
     const float* coefficients,
     const float* poses,
     int total,
-    float* colors)
-{
+    float* colors
+) {
 #include "sh_basis.h"
     if (thread < total) {
         const int camera = thread / n;
@@ -20,7 +20,8 @@ __global__ void see(
         direction(camera, thread - camera * n, d);
         basis(d, b);
         const float* const own = coefficients + (long long)(thread % rows) * 3 * n_harmonics;
-        for (int k = 0; k < COUNT; k++) for (int e = 0; e < 3; e++) sum[e] += b[k] * own[3 * k + e];
+        for (int k = 0; k < COUNT; k++)
+            for (int e = 0; e < 3; e++) sum[e] += b[k] * own[3 * k + e];
         for (int e = 0; e < 3; e++) {
             const float color = sum[e] + 0.5f;
             colors[3 * (long long)thread + e] = color < 0.f ? 0.f : color;  // NaN stays
@@ -40,8 +41,8 @@ __global__ void see_backward(
     const float* g_colors,
     float* g_means,
     float* g_coefficients,
-    double* g_centers)
-{
+    double* g_centers
+) {
 #include "sh_basis.h"
     auto basis_adjoint = [](const float* d, const float* g, float* out) {
         const float x = d[0], y = d[1], z = d[2];
@@ -58,12 +59,12 @@ __global__ void see_backward(
         }
         if (DEGREE > 2) {
             const float xx = x * x, yy = y * y, zz = z * z, ring = 5.f * zz - 1.f, across = 3.f * (xx - yy);
-            out[0] += L3_XYZ * g[10] * y * z - L3_XXX * (6.f * g[9] * x * y + g[15] * across)
-                - L3_YZZ * g[13] * ring + 2.f * L3_XXZ * g[14] * x * z;
-            out[1] += L3_XYZ * g[10] * x * z - L3_XXX * (g[9] * across - 6.f * g[15] * x * y)
-                - L3_YZZ * g[11] * ring - 2.f * L3_XXZ * g[14] * y * z;
-            out[2] += L3_XYZ * g[10] * x * y - 10.f * L3_YZZ * z * (g[11] * y + g[13] * x)
-                + L3_XXZ * g[14] * (xx - yy) + L3_ZZZ * g[12] * (15.f * zz - 3.f);
+            out[0] += L3_XYZ * g[10] * y * z - L3_XXX * (6.f * g[9] * x * y + g[15] * across) - L3_YZZ * g[13] * ring +
+                      2.f * L3_XXZ * g[14] * x * z;
+            out[1] += L3_XYZ * g[10] * x * z - L3_XXX * (g[9] * across - 6.f * g[15] * x * y) - L3_YZZ * g[11] * ring -
+                      2.f * L3_XXZ * g[14] * y * z;
+            out[2] += L3_XYZ * g[10] * x * y - 10.f * L3_YZZ * z * (g[11] * y + g[13] * x) +
+                      L3_XXZ * g[14] * (xx - yy) + L3_ZZZ * g[12] * (15.f * zz - 3.f);
         }
     };
 
@@ -80,9 +81,10 @@ __global__ void see_backward(
                 float* const to = g_coefficients + at;
                 const bool first = row == i;
                 basis(d, b);
-                for (int k = 0; k < COUNT; k++) for (int e = 0; e < 3; e++)
-                    to[3 * k + e] = (first ? 0.f : to[3 * k + e]) + b[k] * g[e];
-                if (first) for (int k = 3 * COUNT; k < 3 * n_harmonics; k++) to[k] = 0.f;
+                for (int k = 0; k < COUNT; k++)
+                    for (int e = 0; e < 3; e++) to[3 * k + e] = (first ? 0.f : to[3 * k + e]) + b[k] * g[e];
+                if (first)
+                    for (int k = 3 * COUNT; k < 3 * n_harmonics; k++) to[k] = 0.f;
             }
             if (g_means || g_centers) {
                 const float* const own = coefficients + at;
@@ -98,6 +100,7 @@ __global__ void see_backward(
                 }
             }
         }
-        if (g_means) for (int e = 0; e < 3; e++) g_means[3 * (long long)thread + e] = (float)g_mean[e];
+        if (g_means)
+            for (int e = 0; e < 3; e++) g_means[3 * (long long)thread + e] = (float)g_mean[e];
     }
 }

@@ -6,7 +6,10 @@ phase(state, n_chunks, [&](long long c) {
     const int base = (int)chunk_pairs[c];
     long long strip0 = first / per_camera * across * down, next = (first / per_camera + 1) * per_camera;
     for (long long i = first; i < end; i++) {
-        if (i == next) { next += per_camera; strip0 += across * down; }
+        if (i == next) {
+            next += per_camera;
+            strip0 += across * down;
+        }
         const int* box = boxes + 4 * i;
         pair_starts[i] += base;
         if (!is_drawn(box)) continue;

@@ -24,7 +24,14 @@ auto layer_of = [](const float* r, const Strip& p) -> Layer {
     l.y0 = (box[1] > p.top ? box[1] - p.top : 0) & ~1;
     l.x1 = box[2] - p.left < p.columns ? box[2] - p.left : p.columns;
     l.y1 = box[3] - p.top < p.rows ? box[3] - p.top : p.rows;
-    l.whole_x = r[0]; l.whole_y = r[1]; l.rx = r[2]; l.ry = r[3];
-    l.w0 = r[4]; l.w1 = r[5]; l.w2 = r[6]; l.w3 = r[7]; l.lo = r[8];
+    l.whole_x = r[0];
+    l.whole_y = r[1];
+    l.rx = r[2];
+    l.ry = r[3];
+    l.w0 = r[4];
+    l.w1 = r[5];
+    l.w2 = r[6];
+    l.w3 = r[7];
+    l.lo = r[8];
     return l;
 };

@@ -1,13 +1,13 @@
 // Records of the drawn Gaussians, and each strip's list of them, nearest first.
 //
-// `collect` goes through the Gaussians in chunks: it writes their records and counts, chunk by chunk, what each strip will
-// get. From the counts follows where every chunk's entries of a strip's list begin, so that `FILL`, with which drawing
-// begins, can write them in any order of the chunks. Each strip then sorts its own list: no step is serial but the adding
-// up of the counts.
+// `collect` goes through the Gaussians in chunks: it writes their records and counts, chunk by chunk, what each strip
+// will get. From the counts follows where every chunk's entries of a strip's list begin, so that `FILL`, with which
+// drawing begins, can write them in any order of the chunks. Each strip then sorts its own list: no step is serial but
+// the adding up of the counts.
 //
-// An entry is one 64-bit word, depth key over index: sorting whole words orders by depth and breaks ties by index. The key
-// is the leading 33 of the bits in which the depths of this call differ. Depths are positive float64, so their bits sort
-// as integers do.
+// An entry is one 64-bit word, depth key over index: sorting whole words orders by depth and breaks ties by index. The
+// key is the leading 33 of the bits in which the depths of this call differ. Depths are positive float64, so their bits
+// sort as integers do.
 
 void collect(
     long long n,  // cameras * per_camera, as all arrays of Gaussians
@@ -20,32 +20,32 @@ void collect(
     long long strip_height,
     long long across,  // strips of an image
     long long down,
-    long long n_strips,  // of all images
-    const int* boxes,  // [n, 4]
-    float* records,  // [n, 16]
-    long long* starts,  // [n_strips + 1]: first place of each strip's list
-    int* pair_starts,  // [n]: number of a Gaussian's first pair
-    int* order,  // [n_strips]: strips, those with much to do first
-    long long* state,  // zeros come in
+    long long n_strips,            // of all images
+    const int* boxes,              // [n, 4]
+    float* records,                // [n, 16]
+    long long* starts,             // [n_strips + 1]: first place of each strip's list
+    int* pair_starts,              // [n]: number of a Gaussian's first pair
+    int* order,                    // [n_strips]: strips, those with much to do first
+    long long* state,              // zeros come in
     const long long* sort_depths,  // [n], the bits of float64
-    int* counts,  // [n_chunks, n_strips]: entries, then place of the first within the strip's list
-    long long* chunk_pairs,  // [n_chunks]: pairs, then number of the first
-    long long* totals,  // pairs; the least depth bits; bits to drop from their differences
-    const float* centers,  // [n, 4]
-    const float* whitenings,  // [n, 4]
-    const float* opacities,  // [n]
-    const float* colors,  // [n, channels]
-    long long* lows,  // [n_chunks]: least and largest depth bits
-    long long* highs)
-{
+    int* counts,                   // [n_chunks, n_strips]: entries, then place of the first within the strip's list
+    long long* chunk_pairs,        // [n_chunks]: pairs, then number of the first
+    long long* totals,             // pairs; the least depth bits; bits to drop from their differences
+    const float* centers,          // [n, 4]
+    const float* whitenings,       // [n, 4]
+    const float* opacities,        // [n]
+    const float* colors,           // [n, channels]
+    long long* lows,               // [n_chunks]: least and largest depth bits
+    long long* highs
+) {
 #include "strip_vectors.h"
 #include "strip_spans.h"
     // log2 of normal numbers: exponent, and the series of artanh for a mantissa between sqrt(1/2) and sqrt(2).
     auto log2 = [](V x) -> V {
         const I bits = __builtin_bit_cast(I, x), above = (bits - 0x3f3504f3) >> 23;
         const V m = __builtin_bit_cast(V, bits - (above << 23)), s = (m - 1.f) / (m + 1.f), q = s * s;
-        return __builtin_convertvector(above, V) + s * (2.885390082f + q * (0.9617966939f + q * (0.5770780164f
-               + q * (0.4121985832f + q * 0.3205988980f))));
+        return __builtin_convertvector(above, V) +
+               s * (2.885390082f + q * (0.9617966939f + q * (0.5770780164f + q * (0.4121985832f + q * 0.3205988980f))));
     };
     auto finite = [](float w) -> float { return w > 1e18f ? 1e18f : w < -1e18f ? -1e18f : w; };
     phase(state, n_chunks, [&](long long c) {
@@ -57,7 +57,10 @@ void collect(
         float logs[LANES];
         int* of_camera = count + camera * across * down;
         for (long long i = first; i < end; i++) {
-            if (i == next) { next += per_camera; of_camera += across * down; }
+            if (i == next) {
+                next += per_camera;
+                of_camera += across * down;
+            }
             if ((i - first) % LANES == 0) {
                 V some = (V)(1.f);
                 memcpy(&some, opacities + i, (end - i < LANES ? end - i : LANES) * sizeof(float));
@@ -72,7 +75,10 @@ void collect(
             high = sort_depths[i] > high ? sort_depths[i] : high;
             float* r = records + 16 * i;
             const float *center = centers + 4 * i, *w = whitenings + 4 * i;
-            r[0] = center[0]; r[1] = center[1]; r[2] = 0.5f - center[2]; r[3] = 0.5f - center[3];
+            r[0] = center[0];
+            r[1] = center[1];
+            r[2] = 0.5f - center[2];
+            r[3] = 0.5f - center[3];
             // sqrt(log2(e) / 2); capped, so that no lane far outside becomes infinite and poisons a masked sum
             for (int k = 0; k < 4; k++) r[4 + k] = finite(0.8493218003f * w[k]);
             r[8] = logs[(i - first) % LANES];
@@ -109,7 +115,8 @@ void collect(
             const long long count = starts[s + 1] - starts[s];
             return count ? __builtin_clzll(count) : 64;
         };
-        for (long long s = 0; s < n_strips; s++) if (rank(s) < 64) place_of[rank(s) + 1]++;
+        for (long long s = 0; s < n_strips; s++)
+            if (rank(s) < 64) place_of[rank(s) + 1]++;
         for (int k = 1; k < 65; k++) place_of[k] += place_of[k - 1];
         for (long long s = 0; s < n_strips; s++) order[place_of[rank(s)]++] = (int)s;
         totals[0] = pairs;

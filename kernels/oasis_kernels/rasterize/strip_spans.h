@@ -1,8 +1,11 @@
 const int width_bits = __builtin_ctzll(strip_width), height_bits = __builtin_ctzll(strip_height);
-struct Span { int x0, y0, x1, y1; };  // strips, past the end
+struct Span {
+    int x0, y0, x1, y1;
+};  // strips, past the end
 auto span_of = [&](const int* box) -> Span {
-    return {box[0] >> width_bits, box[1] >> height_bits, ((box[2] - 1) >> width_bits) + 1,
-            ((box[3] - 1) >> height_bits) + 1};
+    return {
+        box[0] >> width_bits, box[1] >> height_bits, ((box[2] - 1) >> width_bits) + 1, ((box[3] - 1) >> height_bits) + 1
+    };
 };
 // The strips of a span, one loop with one way out: most spans have one strip.
 auto each_strip = [&](const Span& s, auto&& visit) {

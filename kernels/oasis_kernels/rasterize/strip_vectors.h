@@ -6,15 +6,15 @@ typedef float H __attribute__((ext_vector_type(COLUMNS)));
 typedef float HU __attribute__((ext_vector_type(COLUMNS), aligned(4)));
 // Copy `columns` of `COLUMNS` elements; a size that the compiler knows is a move, another is a call.
 auto copy = [](void* to, const void* from, int columns, int element) {
-    if (columns == COLUMNS) __builtin_memcpy(to, from, COLUMNS * element);
-    else memcpy(to, from, columns * element);
+    if (columns == COLUMNS)
+        __builtin_memcpy(to, from, COLUMNS * element);
+    else
+        memcpy(to, from, columns * element);
 };
 auto load = [](const float* p) -> V { return *(const VU*)p; };
 auto store = [](float* p, V v) { *(VU*)p = v; };
 typedef bool B __attribute__((ext_vector_type(LANES)));
-auto bits_of = [](I mask) -> long long {
-    return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask, B));
-};
+auto bits_of = [](I mask) -> long long { return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask, B)); };
 auto fma = [](V a, V b, V c) -> V {
 #if defined(__FMA__) || defined(__aarch64__)
     return __builtin_elementwise_fma(a, b, c);

@@ -4,38 +4,39 @@ auto pair_of = [&](long long index, int strip) -> long long {
 };
 // Draw a strip: `vector(y, x, weight, drawn)` sees every vector, `row_pair(y)` follows the last of two rows, and
 // `layer(gaussian)` the last of all.
-auto walk = [&](const Strip& p, const int* list, int count, float* plane, auto&& vector, auto&& row_pair,
-                auto&& layer) {
-    for (int y = 0; y < p.rows; y += 2) for (int x = 0; x < strip_width + PAD; x += COLUMNS) {
-        const I inside = (column + (float)x < (float)p.columns) & (row + (float)y < (float)p.rows);
-        store(plane + y / 2 * stride + 2 * x, inside ? (V)(1.f) : (V)(-1.f));
-    }
-    for (int place = 0; place < count; place++) {
-        __builtin_prefetch(records + 16ll * list[place + 8 < count ? place + 8 : place]);
-        const float* r = records + 16ll * list[place];
-        const Layer l = layer_of(r, p);
-        for (int y = l.y0; y < l.y1; y += 2) {
-            const V Y = row + (float)(p.top + y);
-            const V dy = (Y - l.whole_y) + l.ry;
-            const V u0 = fma((V)l.w1, dy, (V)(l.w0 * l.rx)), v0 = fma((V)l.w3, dy, (V)(l.w2 * l.rx));
-            float* t = plane + y / 2 * stride + 2 * l.x0;
-            V X = column + (float)(p.left + l.x0);
-            for (int x = l.x0; x < l.x1; x += COLUMNS, t += LANES, X += (float)COLUMNS) {
-                const V d = X - l.whole_x;
-                const V u = fma((V)l.w0, d, u0), v = fma((V)l.w2, d, v0);
-                const V e = fma(-v, v, fma(-u, u, (V)l.lo));
-                const V before = load(t);
-                const I seen = (e >= cut()) & (before > 0.f)INSIDE;
-                const V raw = exp2(e);
-                const V alpha = seen ? (raw < cap() ? raw : cap()) : (V)(0.f);
-                const V full = alpha * before;
-                const V after = before - full;
-                const I ends = seen & (after <= last());
-                store(t, ends ? -before : after);
-                vector(y, x, full, seen & ~ends);
+auto walk =
+    [&](const Strip& p, const int* list, int count, float* plane, auto&& vector, auto&& row_pair, auto&& layer) {
+        for (int y = 0; y < p.rows; y += 2)
+            for (int x = 0; x < strip_width + PAD; x += COLUMNS) {
+                const I inside = (column + (float)x < (float)p.columns) & (row + (float)y < (float)p.rows);
+                store(plane + y / 2 * stride + 2 * x, inside ? (V)(1.f) : (V)(-1.f));
             }
-            row_pair(y);
+        for (int place = 0; place < count; place++) {
+            __builtin_prefetch(records + 16ll * list[place + 8 < count ? place + 8 : place]);
+            const float* r = records + 16ll * list[place];
+            const Layer l = layer_of(r, p);
+            for (int y = l.y0; y < l.y1; y += 2) {
+                const V Y = row + (float)(p.top + y);
+                const V dy = (Y - l.whole_y) + l.ry;
+                const V u0 = fma((V)l.w1, dy, (V)(l.w0 * l.rx)), v0 = fma((V)l.w3, dy, (V)(l.w2 * l.rx));
+                float* t = plane + y / 2 * stride + 2 * l.x0;
+                V X = column + (float)(p.left + l.x0);
+                for (int x = l.x0; x < l.x1; x += COLUMNS, t += LANES, X += (float)COLUMNS) {
+                    const V d = X - l.whole_x;
+                    const V u = fma((V)l.w0, d, u0), v = fma((V)l.w2, d, v0);
+                    const V e = fma(-v, v, fma(-u, u, (V)l.lo));
+                    const V before = load(t);
+                    const I seen = (e >= cut()) & (before > 0.f) INSIDE;
+                    const V raw = exp2(e);
+                    const V alpha = seen ? (raw < cap() ? raw : cap()) : (V)(0.f);
+                    const V full = alpha * before;
+                    const V after = before - full;
+                    const I ends = seen & (after <= last());
+                    store(t, ends ? -before : after);
+                    vector(y, x, full, seen & ~ends);
+                }
+                row_pair(y);
+            }
+            layer(list[place]);
         }
-        layer(list[place]);
-    }
-};
+    };

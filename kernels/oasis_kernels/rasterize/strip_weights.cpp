@@ -1,9 +1,9 @@
 // Weights alpha T of the Gaussians in each pixel, strip by strip: two sparse matrices, each the other's transpose.
 //
-// Strips are as wide as the image, so that a strip's pixels, and a Gaussian's strips, follow each other in both matrices.
-// The strips are drawn twice, without colours. `count_weights` adds up the weights of every pixel and of every pair;
-// `fill_weights` writes a pair's weights, row by row, into the matrix by Gaussians, and then goes through the pairs of
-// each strip in order of memory to copy them into the matrix by pixels: both come out sorted.
+// Strips are as wide as the image, so that a strip's pixels, and a Gaussian's strips, follow each other in both
+// matrices. The strips are drawn twice, without colours. `count_weights` adds up the weights of every pixel and of
+// every pair; `fill_weights` writes a pair's weights, row by row, into the matrix by Gaussians, and then goes through
+// the pairs of each strip in order of memory to copy them into the matrix by pixels: both come out sorted.
 
 void count_weights(
     long long n,  // cameras * per_camera, as all arrays of Gaussians
@@ -16,30 +16,30 @@ void count_weights(
     long long strip_height,
     long long across,  // strips of an image
     long long down,
-    long long n_strips,  // of all images
-    const int* boxes,  // [n, 4]
-    float* records,  // [n, 16]
-    long long* starts,  // [n_strips + 1]: first place of each strip's list
-    int* pair_starts,  // [n]: number of a Gaussian's first pair
-    int* order,  // [n_strips]: strips, those with much to do first
-    long long* state,  // zeros come in
+    long long n_strips,            // of all images
+    const int* boxes,              // [n, 4]
+    float* records,                // [n, 16]
+    long long* starts,             // [n_strips + 1]: first place of each strip's list
+    int* pair_starts,              // [n]: number of a Gaussian's first pair
+    int* order,                    // [n_strips]: strips, those with much to do first
+    long long* state,              // zeros come in
     const long long* sort_depths,  // [n], the bits of float64
-    int* counts,  // [n_chunks, n_strips]: entries, then place of the first within the strip's list
-    long long* chunk_pairs,  // [n_chunks]: pairs, then number of the first
-    long long* totals,  // pairs; the least depth bits; bits to drop from their differences
-    long long* entries,  // [2, pairs]: scratch
-    int* ids,  // [pairs]: Gaussians of each strip, nearest first
-    int* members,  // [pairs]: the same in order of memory
-    int* pair_weights,  // [pairs]: how many weights each has
-    int* pixel_weights  // [height * width])
-{
+    int* counts,                   // [n_chunks, n_strips]: entries, then place of the first within the strip's list
+    long long* chunk_pairs,        // [n_chunks]: pairs, then number of the first
+    long long* totals,             // pairs; the least depth bits; bits to drop from their differences
+    long long* entries,            // [2, pairs]: scratch
+    int* ids,                      // [pairs]: Gaussians of each strip, nearest first
+    int* members,                  // [pairs]: the same in order of memory
+    int* pair_weights,             // [pairs]: how many weights each has
+    int* pixel_weights             // [height * width]
+) {
 #include "strip_vectors.h"
 #include "strip_spans.h"
 #include "strip_layer.h"
-    #define ENTER_ITEM \
-        const long long at = starts[strip0 + strip] + place[strip0 + strip]++; \
-        items[at] = item; \
-        members[at] = (int)i;
+#define ENTER_ITEM                                                         \
+    const long long at = starts[strip0 + strip] + place[strip0 + strip]++; \
+    items[at] = item;                                                      \
+    members[at] = (int)i;
 #include "strip_fill.h"
 #include "strip_sort.h"
 #include "strip_walk.h"
@@ -56,21 +56,29 @@ void count_weights(
             histograms = (Histogram*)malloc(3 * sizeof(Histogram));
         }
         int* list = ids + start;
-        sort((unsigned long long*)entries + start, (unsigned long long*)entries + starts[n_strips] + start, list, count,
-             histograms);
+        sort(
+            (unsigned long long*)entries + start, (unsigned long long*)entries + starts[n_strips] + start, list, count,
+            histograms
+        );
         int* number = (int*)(plane + size);
         memset(number, 0, size * sizeof(int));
         I of_pair = (I)(0);
-        walk(p, list, count, plane, [&](int y, int x, V, I drawn) {
-            of_pair -= drawn;
-            IU* of_pixel = (IU*)(number + y / 2 * stride + 2 * x);
-            *of_pixel -= drawn;
-        }, [](int) {}, [&](int index) {
-            pair_weights[pair_of(index, (int)s)] = __builtin_reduce_add(of_pair);
-            of_pair = (I)(0);
-        });
-        for (int y = 0; y < p.rows; y++) for (int x = 0; x < p.columns; x++)
-            pixel_weights[(p.top + y) * width + x] = number[y / 2 * stride + 2 * x + y % 2];
+        walk(
+            p, list, count, plane,
+            [&](int y, int x, V, I drawn) {
+                of_pair -= drawn;
+                IU* of_pixel = (IU*)(number + y / 2 * stride + 2 * x);
+                *of_pixel -= drawn;
+            },
+            [](int) {},
+            [&](int index) {
+                pair_weights[pair_of(index, (int)s)] = __builtin_reduce_add(of_pair);
+                of_pair = (I)(0);
+            }
+        );
+        for (int y = 0; y < p.rows; y++)
+            for (int x = 0; x < p.columns; x++)
+                pixel_weights[(p.top + y) * width + x] = number[y / 2 * stride + 2 * x + y % 2];
     });
     free(plane);
     free(histograms);
@@ -87,23 +95,23 @@ void fill_weights(
     long long strip_height,
     long long across,  // strips of an image
     long long down,
-    long long n_strips,  // of all images
-    const int* boxes,  // [n, 4]
-    float* records,  // [n, 16]
-    long long* starts,  // [n_strips + 1]: first place of each strip's list
-    int* pair_starts,  // [n]: number of a Gaussian's first pair
-    int* order,  // [n_strips]: strips, those with much to do first
-    long long* state,  // zeros come in
-    const int* ids,  // [pairs]: Gaussians of each strip, nearest first
-    const int* members,  // [pairs]: the same in order of memory
+    long long n_strips,            // of all images
+    const int* boxes,              // [n, 4]
+    float* records,                // [n, 16]
+    long long* starts,             // [n_strips + 1]: first place of each strip's list
+    int* pair_starts,              // [n]: number of a Gaussian's first pair
+    int* order,                    // [n_strips]: strips, those with much to do first
+    long long* state,              // zeros come in
+    const int* ids,                // [pairs]: Gaussians of each strip, nearest first
+    const int* members,            // [pairs]: the same in order of memory
     const long long* pair_places,  // [pairs + 1]: where the weights of each begin
-    int* pixel_places,  // [height * width]: where those of each pixel begin, and at last, end
-    int* gaussian_pixels,  // [weights], by Gaussian
+    int* pixel_places,             // [height * width]: where those of each pixel begin, and at last, end
+    int* gaussian_pixels,          // [weights], by Gaussian
     float* gaussian_weights,
     int* pixel_gaussians,  // [weights], by pixel
     float* pixel_values,
-    float* alphas  // [height * width])
-{
+    float* alphas  // [height * width]
+) {
 #include "strip_vectors.h"
 #include "strip_spans.h"
 #include "strip_layer.h"
@@ -157,8 +165,9 @@ void fill_weights(
             of_pair = 0;
         };
         walk(p, ids + start, count, plane, pack, append_lower, write);
-        for (int y = 0; y < p.rows; y++) for (int x = 0; x < p.columns; x++)
-            alphas[(p.top + y) * width + x] = 1.f - __builtin_fabsf(plane[y / 2 * stride + 2 * x + y % 2]);
+        for (int y = 0; y < p.rows; y++)
+            for (int x = 0; x < p.columns; x++)
+                alphas[(p.top + y) * width + x] = 1.f - __builtin_fabsf(plane[y / 2 * stride + 2 * x + y % 2]);
         const int* member = members + start;
         int* const next = pixel_places;
         int* const to = pixel_gaussians;

@@ -1,10 +1,11 @@
 // Float32 rasterization on the CPU: what binning, drawing and its adjoint share.
 //
 // The image is cut into strips, `strip_width` x `strip_height` pixels (an even number of rows); a pair is one
-// (Gaussian, strip). A strip has planes (transmittance, one a channel, ...) whose pixels lie in vectors of 16: 8 columns
-// of 2 neighbouring rows, pixel (x, y) in lane 2 x + y % 2 of its two rows. A vector may begin at any column: splats are
-// about as wide as a vector, and fixed blocks of columns would cut most of them in two. What a vector reads or writes past
-// the last column lies in `PAD` more columns, past the last row in the odd one; these pixels count as ended.
+// (Gaussian, strip). A strip has planes (transmittance, one a channel, ...) whose pixels lie in vectors of 16: 8
+// columns of 2 neighbouring rows, pixel (x, y) in lane 2 x + y % 2 of its two rows. A vector may begin at any column:
+// splats are about as wide as a vector, and fixed blocks of columns would cut most of them in two. What a vector reads
+// or writes past the last column lies in `PAD` more columns, past the last row in the odd one; these pixels count as
+// ended.
 //
 // A drawn Gaussian is one record of 16 words, a cache line:
 //
@@ -17,10 +18,10 @@
 
 // Draw strips front to back: see `strips.py` for the layout and `rasterize_forward.py` for what is computed.
 //
-// What the generic kernel decides on alpha is decided on its logarithm here, and 1 - alpha is applied as T - alpha T: the
-// same but for rounding. A pixel that has ended keeps its transmittance with a minus sign. The pixels' sums lie in planes
-// on a scratch of each thread until the strip is done. Two rows of a plane are followed by the same rows of the next
-// plane: planes apart by a power of two would compete for the same lines of the cache.
+// What the generic kernel decides on alpha is decided on its logarithm here, and 1 - alpha is applied as T - alpha T:
+// the same but for rounding. A pixel that has ended keeps its transmittance with a minus sign. The pixels' sums lie in
+// planes on a scratch of each thread until the strip is done. Two rows of a plane are followed by the same rows of the
+// next plane: planes apart by a power of two would compete for the same lines of the cache.
 void draw(
     long long n,  // cameras * per_camera, as all arrays of Gaussians
     long long per_camera,
@@ -32,34 +33,34 @@ void draw(
     long long strip_height,
     long long across,  // strips of an image
     long long down,
-    long long n_strips,  // of all images
-    const int* boxes,  // [n, 4]
-    float* records,  // [n, 16]
-    long long* starts,  // [n_strips + 1]: first place of each strip's list
-    int* pair_starts,  // [n]: number of a Gaussian's first pair
-    int* order,  // [n_strips]: strips, those with much to do first
-    long long* state,  // zeros come in
+    long long n_strips,            // of all images
+    const int* boxes,              // [n, 4]
+    float* records,                // [n, 16]
+    long long* starts,             // [n_strips + 1]: first place of each strip's list
+    int* pair_starts,              // [n]: number of a Gaussian's first pair
+    int* order,                    // [n_strips]: strips, those with much to do first
+    long long* state,              // zeros come in
     const long long* sort_depths,  // [n], the bits of float64
-    int* counts,  // [n_chunks, n_strips]: entries, then place of the first within the strip's list
-    long long* chunk_pairs,  // [n_chunks]: pairs, then number of the first
-    long long* totals,  // pairs; the least depth bits; bits to drop from their differences
-    const float* colors,  // [n, channels]
-    const float* backgrounds,  // [cameras, channels]
-    long long* entries,  // [2, pairs]: scratch
-    int* ids,  // [pairs]: Gaussians of each strip, nearest first
-    float* image,  // [cameras, height, width, channels]
-    float* alphas,  // [cameras, height, width]
-    long long keep,  // 1: fill the rest, for the adjoint
-    float* transmittance,  // [n_strips, rows of a strip / 2, 2 * (strip_width + PAD)], of the end
-    int* stops  // the same: place in the strip's list of the first Gaussian that was not drawn)
-{
+    int* counts,                   // [n_chunks, n_strips]: entries, then place of the first within the strip's list
+    long long* chunk_pairs,        // [n_chunks]: pairs, then number of the first
+    long long* totals,             // pairs; the least depth bits; bits to drop from their differences
+    const float* colors,           // [n, channels]
+    const float* backgrounds,      // [cameras, channels]
+    long long* entries,            // [2, pairs]: scratch
+    int* ids,                      // [pairs]: Gaussians of each strip, nearest first
+    float* image,                  // [cameras, height, width, channels]
+    float* alphas,                 // [cameras, height, width]
+    long long keep,                // 1: fill the rest, for the adjoint
+    float* transmittance,          // [n_strips, rows of a strip / 2, 2 * (strip_width + PAD)], of the end
+    int* stops                     // the same: place in the strip's list of the first Gaussian that was not drawn
+) {
 #include "strip_vectors.h"
 #if FEW_CHANNELS
 #include "pixel_shuffles.h"
 #endif
 #include "strip_spans.h"
 #include "strip_layer.h"
-    #define ENTER_ITEM items[starts[strip0 + strip] + place[strip0 + strip]++] = item;
+#define ENTER_ITEM items[starts[strip0 + strip] + place[strip0 + strip]++] = item;
 #include "strip_fill.h"
 #include "strip_sort.h"
     const long long stride = 2 * (strip_width + PAD), block_size = PLANES * stride;  // two rows of all planes
@@ -84,7 +85,8 @@ void draw(
         if (count == 0 && !keep) {
             for (int y = 0; y < p.rows; y++) {
                 float* out = picture + y * width * CHANNELS;
-                for (int x = 0; x < p.columns; x++) for (int k = 0; k < CHANNELS; k++) *out++ = background[k];
+                for (int x = 0; x < p.columns; x++)
+                    for (int k = 0; k < CHANNELS; k++) *out++ = background[k];
                 memset(cover + y * width, 0, p.columns * sizeof(float));
             }
             return;
@@ -95,8 +97,10 @@ void draw(
             histograms = (Histogram*)malloc(3 * sizeof(Histogram));
         }
         int* list = ids + start;
-        sort((unsigned long long*)entries + start, (unsigned long long*)entries + starts[n_strips] + start, list, count,
-             histograms);
+        sort(
+            (unsigned long long*)entries + start, (unsigned long long*)entries + starts[n_strips] + start, list, count,
+            histograms
+        );
 
         int* stop = stops + s * plane;
         for (int y = 0; y < p.rows; y += 2) {
@@ -116,15 +120,17 @@ void draw(
             for (int k = 0; k < n_ended; k++) {
                 const Layer l = layer_of(records + 16ll * list[ended[k].place], p);
                 const unsigned short* mask = masks + ended[k].first_mask;
-                for (int y = l.y0; y < l.y1; y += 2) for (int x = l.x0; x < l.x1; x += COLUMNS)
-                    for (int bits = *mask++; bits; bits &= bits - 1)
-                        stop[y / 2 * stride + 2 * x + __builtin_ctz(bits)] = ended[k].place;
+                for (int y = l.y0; y < l.y1; y += 2)
+                    for (int x = l.x0; x < l.x1; x += COLUMNS)
+                        for (int bits = *mask++; bits; bits &= bits - 1)
+                            stop[y / 2 * stride + 2 * x + __builtin_ctz(bits)] = ended[k].place;
             }
             n_masks = n_ended = 0;
         };
         auto any_open = [&]() -> bool {
-            for (int y = 0; y < p.rows; y += 2) for (long long k = 0; k < stride; k += LANES)
-                if (bits_of(load(planes + y / 2 * block_size + k) > 0.f)) return true;
+            for (int y = 0; y < p.rows; y += 2)
+                for (long long k = 0; k < stride; k += LANES)
+                    if (bits_of(load(planes + y / 2 * block_size + k) > 0.f)) return true;
             return false;
         };
         for (int place = 0; place < count; place++) {
@@ -201,11 +207,12 @@ void draw(
 #endif
             }
         }
-        if (keep) for (int y = 0; y < p.rows; y += 2) {
-            const float* t = planes + y / 2 * block_size;
-            float* out = transmittance + s * plane + y / 2 * stride;
-            for (long long k = 0; k < stride; k++) out[k] = __builtin_fabsf(t[k]);
-        }
+        if (keep)
+            for (int y = 0; y < p.rows; y += 2) {
+                const float* t = planes + y / 2 * block_size;
+                float* out = transmittance + s * plane + y / 2 * stride;
+                for (long long k = 0; k < stride; k++) out[k] = __builtin_fabsf(t[k]);
+            }
     });
     free(planes);
     free(masks);

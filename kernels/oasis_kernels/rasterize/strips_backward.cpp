@@ -13,29 +13,29 @@ void draw_backward(
     long long strip_height,
     long long across,  // strips of an image
     long long down,
-    long long n_strips,  // of all images
-    const int* boxes,  // [n, 4]
-    float* records,  // [n, 16]
-    long long* starts,  // [n_strips + 1]: first place of each strip's list
-    int* pair_starts,  // [n]: number of a Gaussian's first pair
-    int* order,  // [n_strips]: strips, those with much to do first
-    long long* state,  // zeros come in
-    const float* whitenings,  // [n, 4]
-    const float* opacities,  // [n]
-    const float* colors,  // [n, channels]
-    const float* backgrounds,  // [cameras, channels]
-    const int* ids,  // [pairs]
+    long long n_strips,          // of all images
+    const int* boxes,            // [n, 4]
+    float* records,              // [n, 16]
+    long long* starts,           // [n_strips + 1]: first place of each strip's list
+    int* pair_starts,            // [n]: number of a Gaussian's first pair
+    int* order,                  // [n_strips]: strips, those with much to do first
+    long long* state,            // zeros come in
+    const float* whitenings,     // [n, 4]
+    const float* opacities,      // [n]
+    const float* colors,         // [n, channels]
+    const float* backgrounds,    // [cameras, channels]
+    const int* ids,              // [pairs]
     const float* transmittance,  // as `strips_forward.draw` kept them
     const int* stops,
-    const float* g_image,  // [cameras, height, width, channels]
-    const float* g_alpha,  // [cameras, height, width], or null
-    float* pairs,  // [pairs, `pair_words`]
+    const float* g_image,      // [cameras, height, width, channels]
+    const float* g_alpha,      // [cameras, height, width], or null
+    float* pairs,              // [pairs, `pair_words`]
     float* strip_backgrounds,  // [n_strips, channels], or null
-    float* g_means2d,  // [n, 2], not written without `shape`, as the next two
-    double* g_covars2d,  // [n, 3]: by xx, by xy (which stands for both off-diagonal entries), by yy
-    float* g_opacities,  // [n]
-    float* g_colors  // [n, channels], not written without `color`)
-{
+    float* g_means2d,          // [n, 2], not written without `shape`, as the next two
+    double* g_covars2d,        // [n, 3]: by xx, by xy (which stands for both off-diagonal entries), by yy
+    float* g_opacities,        // [n]
+    float* g_colors            // [n, channels], not written without `color`
+) {
 #include "strip_vectors.h"
 #if FEW_CHANNELS
 #include "plane_shuffles.h"
@@ -44,13 +44,13 @@ void draw_backward(
     typedef float Q __attribute__((ext_vector_type(4)));
     typedef float QU __attribute__((ext_vector_type(4), aligned(4)));
     auto ab = [](V a, V b) -> V {
-        return __builtin_shufflevector(a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29)
-             + __builtin_shufflevector(a, b, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
+        return __builtin_shufflevector(a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29) +
+               __builtin_shufflevector(a, b, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
     };
     auto abcd = [&](V a, V b, V c, V d) -> V {
         const V p = ab(a, b), q = ab(c, d);
-        return __builtin_shufflevector(p, q, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29)
-             + __builtin_shufflevector(p, q, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+        return __builtin_shufflevector(p, q, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29) +
+               __builtin_shufflevector(p, q, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
     };
     auto reduce = [&](V a, V b, V c, V d, float* out) {
         const V all = abcd(a, b, c, d);
@@ -82,8 +82,9 @@ void draw_backward(
             memset(t + stride, 0, (PLANES - 1) * stride * sizeof(float));
             const int rows = p.rows - y < 2 ? 1 : 2;
             const long long pixel[2] = {corner + y * width, corner + (y + 1) * width};
-            if (g_alpha) for (int side = 0; side < rows; side++) for (int x = 0; x < p.columns; x++)
-                t[stride + 2 * x + side] = -g_alpha[pixel[side] + x];
+            if (g_alpha)
+                for (int side = 0; side < rows; side++)
+                    for (int x = 0; x < p.columns; x++) t[stride + 2 * x + side] = -g_alpha[pixel[side] + x];
             for (int x = 0; x < p.columns; x += COLUMNS) {
                 const int columns = p.columns - x < COLUMNS ? p.columns - x : COLUMNS;
                 float* first = t + 2 * stride + 2 * x;
@@ -110,11 +111,12 @@ void draw_backward(
                 store(t + stride + i, behind);
             }
         }
-        if (strip_backgrounds) for (int k = 0; k < CHANNELS; k++) {
-            float sums[4];
-            reduce(g_background[k], (V)(0.f), (V)(0.f), (V)(0.f), sums);
-            strip_backgrounds[s * CHANNELS + k] = sums[0];
-        }
+        if (strip_backgrounds)
+            for (int k = 0; k < CHANNELS; k++) {
+                float sums[4];
+                reduce(g_background[k], (V)(0.f), (V)(0.f), (V)(0.f), sums);
+                strip_backgrounds[s * CHANNELS + k] = sums[0];
+            }
 
         const int* list = ids + start;
         const int* stop = stops + s * plane;
@@ -126,8 +128,9 @@ void draw_backward(
             const float* color = COLOR;
             const int* box = (const int*)r + 12;
             const Span span = span_of(box);
-            float* out = pairs + (pair_starts[index] + (long long)(strip_y - span.y0) * (span.x1 - span.x0)
-                                  + (strip_x - span.x0)) * RECORD;
+            float* out = pairs + (pair_starts[index] + (long long)(strip_y - span.y0) * (span.x1 - span.x0) +
+                                  (strip_x - span.x0)) *
+                                     RECORD;
             __builtin_prefetch(out, 1);
             __builtin_prefetch(out + RECORD - 1, 1);
             V m0 = {}, m1 = {}, m2 = {}, m3 = {}, m4 = {}, m5 = {};
@@ -154,8 +157,12 @@ void draw_backward(
                     const V step = STEP;
                     const V q = raw <= cap() ? weight * step : (V)(0.f);
                     const V qu = q * u, qv = q * v;
-                    m0 += q; m1 += qu; m2 += qv;
-                    m3 = fma(qu, u, m3); m4 = fma(qu, v, m4); m5 = fma(qv, v, m5);
+                    m0 += q;
+                    m1 += qu;
+                    m2 += qv;
+                    m3 = fma(qu, u, m3);
+                    m4 = fma(qu, v, m4);
+                    m5 = fma(qv, v, m5);
                     store(t + stride, fma(alpha, step, behind));
 #endif
                     ADD_COLORS
@@ -205,7 +212,9 @@ void draw_backward(
                 g_means2d[2 * (i0 + j)] = (float)x[j];
                 g_means2d[2 * (i0 + j) + 1] = (float)y[j];
                 double* g = g_covars2d + 3 * (i0 + j);
-                g[0] = xx[j]; g[1] = xy[j]; g[2] = yy[j];
+                g[0] = xx[j];
+                g[1] = xy[j];
+                g[2] = yy[j];
             }
         }
     });

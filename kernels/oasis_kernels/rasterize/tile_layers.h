@@ -1,4 +1,6 @@
-struct Layer { float cx, cy, w0, w1, w2, w3, lo; };
+struct Layer {
+    float cx, cy, w0, w1, w2, w3, lo;
+};
 const unsigned all = 0xffffffffu;
 const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
 const int4 own = tiles[block_index];  // column, start and length of the list, row over all cameras
@@ -9,14 +11,24 @@ const long long first_pixel = ((long long)camera * height + top) * width + left;
 // Segments of the list, of 32 layers or a multiple.
 const int segment = max(32, ((count + SEGMENTS - 1) / SEGMENTS + 31) & ~31);
 // The memory of what is kept of this tile: by boundary between segments, number and pixel.
-float* const boundaries = checkpoints
-    ? checkpoints + (long long)block_index * ((SEGMENTS - 1) * (CHANNELS + 1) * 64) : nullptr;
-auto boundary = [&](int b, int k, int pixel) -> float& {
-    return boundaries[(b * (CHANNELS + 1) + k) * 64 + pixel];
+float* const boundaries =
+    checkpoints ? checkpoints + (long long)block_index * ((SEGMENTS - 1) * (CHANNELS + 1) * 64) : nullptr;
+auto boundary = [&](int b, int k, int pixel) -> float& { return boundaries[(b * (CHANNELS + 1) + k) * 64 + pixel]; };
+auto power = [](float x) -> float {
+    float r;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+    return r;
 };
-auto power = [](float x) -> float { float r; asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return r; };
-auto log2_of = [](float x) -> float { float r; asm("lg2.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return r; };
-auto inverse = [](float x) -> float { float r; asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return r; };
+auto log2_of = [](float x) -> float {
+    float r;
+    asm("lg2.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+    return r;
+};
+auto inverse = [](float x) -> float {
+    float r;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+    return r;
+};
 
 // Layers of a warp, STRIDE floats each: centre, W, log2 of the opacity, place in the list, colour.
 __shared__ __align__(16) float layer_memory[WARPS][32 * STRIDE];
@@ -24,18 +36,19 @@ float* const layers = layer_memory[warp];
 const unsigned layers_at = (unsigned)__cvta_generic_to_shared(layers);
 auto load4 = [](unsigned at) -> float4 {  // of shared memory, without the arithmetic that a pointer costs
     float4 v;
-    asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
-                 : "=f"(v.x), "=f"(v.y), "=f"(v.z), "=f"(v.w) : "r"(at));
+    asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];" : "=f"(v.x), "=f"(v.y), "=f"(v.z), "=f"(v.w) : "r"(at));
     return v;
 };
 auto put = [&](int slot, const Layer& l, int place, const float* color) {
     float* const to = layers + slot * STRIDE;
     *(float4*)to = {l.cx, l.cy, l.w0, l.w1};
     *(float4*)(to + 4) = {l.w2, l.w3, l.lo, __int_as_float(place)};
-    #pragma unroll
+#pragma unroll
     for (int k = 0; k < PADDED; k += 4)
-        *(float4*)(to + 8 + k) = {color[k], k + 1 < CHANNELS ? color[k + 1] : 0.f,
-                                  k + 2 < CHANNELS ? color[k + 2] : 0.f, k + 3 < CHANNELS ? color[k + 3] : 0.f};
+        *(float4*)(to + 8 + k) = {
+            color[k], k + 1 < CHANNELS ? color[k + 1] : 0.f, k + 2 < CHANNELS ? color[k + 2] : 0.f,
+            k + 3 < CHANNELS ? color[k + 3] : 0.f
+        };
 };
 auto put_nothing = [&](int slot) {  // a layer that nobody sees
     float* const to = layers + slot * STRIDE;
@@ -47,8 +60,15 @@ auto put_nothing = [&](int slot) {  // a layer that nobody sees
 // remainder; W scaled so that alpha = 2^(lo - |W d|^2).
 auto layer = [&](const float4& c, const float4& w, float opacity) -> Layer {
     const float s = SCALE;
-    return {(c.x - (float)left) + (c.z - 0.5f), (c.y - (float)top) + (c.w - 0.5f), w.x * s, w.y * s, w.z * s,
-            w.w * s, log2_of(opacity)};
+    return {
+        (c.x - (float)left) + (c.z - 0.5f),
+        (c.y - (float)top) + (c.w - 0.5f),
+        w.x * s,
+        w.y * s,
+        w.z * s,
+        w.w * s,
+        log2_of(opacity)
+    };
 };
 // Whether it can reach a pixel of the columns 0 .. 7 and the rows y_low .. y_high: the least |W d|^2 over the
 // rectangle lies at its middle or on an edge that faces the centre. The slack is larger than what rounding does.

@@ -1,10 +1,6 @@
 // Whether float32 numbers on the CPU are finite and of a sensible size: one pass, on one thread, for many arrays.
 
-void all_finite(
-    const long long* arrays,
-    long long count,
-    long long* found)
-{
+void all_finite(const long long* arrays, long long count, long long* found) {
     typedef float V __attribute__((ext_vector_type(16)));
     typedef float VU __attribute__((ext_vector_type(16), aligned(4)));
     for (long long a = 0; a < count; a++) {

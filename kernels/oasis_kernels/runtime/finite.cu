@@ -35,19 +35,33 @@ __global__ void all_finite(
     int wide8,
     const void* data9,
     long long count9,
-    int wide9)
-{
+    int wide9
+) {
     const void* data = nullptr;
     long long count = 0, first = 0, chunk = block_index;
     int wide = 0;
-    #define SELECT(k) \
-        if (chunk >= 0) { \
-            const long long chunks = (count##k + CHUNK - 1) / CHUNK; \
-            if (chunk < chunks) { data = data##k; count = count##k; wide = wide##k; first = chunk * CHUNK; } \
-            chunk -= chunks; \
-        }
-    SELECT(0) SELECT(1) SELECT(2) SELECT(3) SELECT(4) SELECT(5) SELECT(6) SELECT(7) SELECT(8) SELECT(9)
-    #undef SELECT
+#define SELECT(k)                                                \
+    if (chunk >= 0) {                                            \
+        const long long chunks = (count##k + CHUNK - 1) / CHUNK; \
+        if (chunk < chunks) {                                    \
+            data = data##k;                                      \
+            count = count##k;                                    \
+            wide = wide##k;                                      \
+            first = chunk * CHUNK;                               \
+        }                                                        \
+        chunk -= chunks;                                         \
+    }
+    SELECT(0)
+    SELECT(1)
+    SELECT(2)
+    SELECT(3)
+    SELECT(4)
+    SELECT(5)
+    SELECT(6)
+    SELECT(7)
+    SELECT(8)
+    SELECT(9)
+#undef SELECT
     const long long end = first + CHUNK < count ? first + CHUNK : count;
     bool bad = false;
     if (wide) {

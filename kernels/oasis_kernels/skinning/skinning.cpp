@@ -1,23 +1,23 @@
 // Skinning on the CPU, what `skinning` computes with H = G, in float32 and in float64.
 //
-// A transform, padded to the columns (G_0, G_1, G_2, t) of four numbers, is one vector of 16: blending four points at once
-// is one multiply-add a weight. Weights are dense; skipping zeros would cost more in mispredicted branches.
+// A transform, padded to the columns (G_0, G_1, G_2, t) of four numbers, is one vector of 16: blending four points at
+// once is one multiply-add a weight. Weights are dense; skipping zeros would cost more in mispredicted branches.
 //
-// Gradients of the transforms are sums over all points: `sum_blends` adds up blocks of `BLOCK` points, then the blocks, in
-// an order that knows nothing of threads.
+// Gradients of the transforms are sums over all points: `sum_blends` adds up blocks of `BLOCK` points, then the blocks,
+// in an order that knows nothing of threads.
 
 void skin(
     long long n,
     int n_joints,
-    const T* means,  // [N, 3]
-    const T* covars,  // [N, 3, 3] or 0
-    const T* weights,  // [N, J]
+    const T* means,       // [N, 3]
+    const T* covars,      // [N, 3, 3] or 0
+    const T* weights,     // [N, J]
     const T* transforms,  // [J, 3, 4]
-    long long* state,  // `STATE` words of zeros
+    long long* state,     // `STATE` words of zeros
     T* out_means,
-    T* out_covars  // [N, 3]; [N, 3, 3])
-{
-    #pragma clang fp contract(fast)
+    T* out_covars  // [N, 3]; [N, 3, 3]
+) {
+#pragma clang fp contract(fast)
 #include "../runtime/ranges.h"
 #include "vectors.h"
 #include "blends.h"
@@ -54,25 +54,26 @@ void skin(
 void skin_backward(
     long long n,
     int n_joints,
-    const T* means,  // [N, 3]
-    const T* covars,  // [N, 3, 3] or 0
-    const T* weights,  // [N, J]
-    const T* transforms,  // [J, 3, 4]
-    long long* state,  // `STATE` words of zeros
+    const T* means,        // [N, 3]
+    const T* covars,       // [N, 3, 3] or 0
+    const T* weights,      // [N, J]
+    const T* transforms,   // [J, 3, 4]
+    long long* state,      // `STATE` words of zeros
     const T* g_out_means,  // these two may be 0
     const T* g_out_covars,
     T* g_means,  // each of these is 0 if not wanted
     T* g_covars,
     T* g_weights,
-    T* g_blends  // [N, 16]: by the blended transform, of four padded columns)
-{
-    #pragma clang fp contract(fast)
+    T* g_blends  // [N, 16]: by the blended transform, of four padded columns
+) {
+#pragma clang fp contract(fast)
 #include "../runtime/ranges.h"
 #include "vectors.h"
 #include "blends.h"
     const int width = (n_joints + 15) / 16 * 16;
     T* entries = (T*)malloc(16 * (width + 1) * sizeof(T));  // an entry of all transforms a row
-    for (int e = 0; e < 16; e++) for (int j = 0; j < width; j++) entries[e * width + j] = columns[16 * j + e];
+    for (int e = 0; e < 16; e++)
+        for (int j = 0; j < width; j++) entries[e * width + j] = columns[16 * j + e];
     ranges(state, n, [&](int first, int end) {
         for (int i = first; i < end; i += 4) {
             const int count = wp::min(4, end - i);
@@ -110,8 +111,9 @@ void skin_backward(
                     by0 += right[0] * s[0] + right[1] * s[3] + right[2] * s[6];
                     by1 += right[0] * s[1] + right[1] * s[4] + right[2] * s[7];
                     by2 += right[0] * s[2] + right[1] * s[5] + right[2] * s[8];
-                    if (g_covars) for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++)
-                        g_covars[9 * at + 3 * r + c] = dot(linear[r], left[c]);
+                    if (g_covars)
+                        for (int r = 0; r < 3; r++)
+                            for (int c = 0; c < 3; c++) g_covars[9 * at + 3 * r + c] = dot(linear[r], left[c]);
                 }
                 if (g_means) {
                     g_means[3 * at] = dot(g0, by_shift);
@@ -120,12 +122,13 @@ void skin_backward(
                 }
                 const Q by[4] = {by0, by1, by2, by_shift};
                 if (g_blends) memcpy(g_blends + 16 * at, by, sizeof by);
-                if (g_weights) for (int j = 0; j < n_joints; j += 16) {
-                    V total = (V)(0);
-                    for (int c = 0; c < 4; c++) for (int r = 0; r < 3; r++)
-                        total += by[c][r] * load(entries + (4 * c + r) * width + j);
-                    memcpy(g_weights + at * n_joints + j, &total, wp::min(16, n_joints - j) * sizeof(T));
-                }
+                if (g_weights)
+                    for (int j = 0; j < n_joints; j += 16) {
+                        V total = (V)(0);
+                        for (int c = 0; c < 4; c++)
+                            for (int r = 0; r < 3; r++) total += by[c][r] * load(entries + (4 * c + r) * width + j);
+                        memcpy(g_weights + at * n_joints + j, &total, wp::min(16, n_joints - j) * sizeof(T));
+                    }
             }
         }
     });
@@ -137,13 +140,13 @@ void sum_blends(
     long long n,
     int n_joints,
     long long n_blocks,
-    const T* weights,  // [N, J]
+    const T* weights,   // [N, J]
     const T* g_blends,  // [N, 16]: by the blended transform, of four padded columns
-    T* sums,  // [blocks, J, 16], scratch
-    T* g_transforms,  // [J, 3, 4]
-    long long* state  // `STATE` words of zeros)
-{
-    #pragma clang fp contract(fast)
+    T* sums,            // [blocks, J, 16], scratch
+    T* g_transforms,    // [J, 3, 4]
+    long long* state    // `STATE` words of zeros
+) {
+#pragma clang fp contract(fast)
 #include "../runtime/ranges.h"
 #include "vectors.h"
     phase(state, n_blocks, [&](long long b) {
@@ -151,13 +154,13 @@ void sum_blends(
         memset(to, 0, n_joints * 16 * sizeof(T));
         for (long long i = b * BLOCK; i < wp::min((b + 1) * BLOCK, n); i++) {
             const V by = load(g_blends + 16 * i);
-            for (int j = 0; j < n_joints; j++)
-                store(to + 16 * j, load(to + 16 * j) + weights[i * n_joints + j] * by);
+            for (int j = 0; j < n_joints; j++) store(to + 16 * j, load(to + 16 * j) + weights[i * n_joints + j] * by);
         }
     });
     phase(state + PHASE_WORDS, n_joints, [&](long long j) {
         V total = (V)(0);
         for (long long b = 0; b < n_blocks; b++) total += load(sums + (b * n_joints + j) * 16);
-        for (int r = 0; r < 3; r++) for (int c = 0; c < 4; c++) g_transforms[12 * j + 4 * r + c] = total[4 * c + r];
+        for (int r = 0; r < 3; r++)
+            for (int c = 0; c < 4; c++) g_transforms[12 * j + 4 * r + c] = total[4 * c + r];
     });
 }

@@ -1,23 +1,23 @@
 // Float32 skinning on CUDA, what `skinning` computes with H = G, of points at rest that pose correctives move before.
 //
-// `skin`: four threads a point share its transforms and correctives. `skin_backward` (one thread a point) writes, besides
-// the gradients of a point's own inputs, the sums over the block's points of weight times gradient of the blended
-// transform; `sum_blocks` (one thread an entry of a transform) adds up the blocks.
+// `skin`: four threads a point share its transforms and correctives. `skin_backward` (one thread a point) writes,
+// besides the gradients of a point's own inputs, the sums over the block's points of weight times gradient of the
+// blended transform; `sum_blocks` (one thread an entry of a transform) adds up the blocks.
 
 __global__ void skin(
     int n,
     int n_joints,
     int n_correctives,
-    const float* means,  // [N, 3]
-    const float* covars,  // [N, 3, 3] or 0
-    const float* weights,  // [N, J]
-    const float* transforms,  // [B, J, 3, 4]
+    const float* means,          // [N, 3]
+    const float* covars,         // [N, 3, 3] or 0
+    const float* weights,        // [N, J]
+    const float* transforms,     // [B, J, 3, 4]
     const float* displacements,  // [N, 3, C]
-    const float* strengths,  // [B, C]
+    const float* strengths,      // [B, C]
     int n_poses,
     float* out_means,
-    float* out_covars  // [B, N, 3]; [B, N, 3, 3])
-{
+    float* out_covars  // [B, N, 3]; [B, N, 3, 3]
+) {
 #include "../posing/vectors_cuda.h"
     const int blocks = (n + POINTS - 1) / POINTS, poses = block_index / blocks;
     const int lane = threadIdx.x & 3;  // of the four
@@ -38,10 +38,11 @@ __global__ void skin(
             const float* strength = strengths + (long long)pose * n_correctives;
             float shift[3] = {0.f, 0.f, 0.f};
             if (in_pairs) {
-                for (int c = 2 * lane; c < n_correctives; c += 8) for (int k = 0; k < 3; k++) {
-                    const float2 d = *(const float2*)(corrective + k * n_correctives + c);
-                    shift[k] += d.x * strength[c] + d.y * strength[c + 1];
-                }
+                for (int c = 2 * lane; c < n_correctives; c += 8)
+                    for (int k = 0; k < 3; k++) {
+                        const float2 d = *(const float2*)(corrective + k * n_correctives + c);
+                        shift[k] += d.x * strength[c] + d.y * strength[c + 1];
+                    }
             } else {
                 for (int c = lane; c < n_correctives; c += 4)
                     for (int k = 0; k < 3; k++) shift[k] += corrective[k * n_correctives + c] * strength[c];
@@ -87,19 +88,19 @@ __global__ void skin_backward(
     int n,
     int n_joints,
     int n_correctives,
-    const float* means,  // [N, 3]
-    const float* covars,  // [N, 3, 3] or 0
-    const float* weights,  // [N, J]
-    const float* transforms,  // [B, J, 3, 4]
+    const float* means,          // [N, 3]
+    const float* covars,         // [N, 3, 3] or 0
+    const float* weights,        // [N, J]
+    const float* transforms,     // [B, J, 3, 4]
     const float* displacements,  // [N, 3, C]
-    const float* strengths,  // [B, C]
-    const float* g_out_means,  // these two may be 0
+    const float* strengths,      // [B, C]
+    const float* g_out_means,    // these two may be 0
     const float* g_out_covars,
-    float* g_means,  // [B, N, 3]; each of these is 0 if not wanted. By the corrected points, too
-    float* g_covars,  // [B, N, 3, 3]
+    float* g_means,    // [B, N, 3]; each of these is 0 if not wanted. By the corrected points, too
+    float* g_covars,   // [B, N, 3, 3]
     float* g_weights,  // [B, N, J]
-    float* sums  // [B, blocks, J, 3, 4])
-{
+    float* sums        // [B, blocks, J, 3, 4]
+) {
 #include "../posing/vectors_cuda.h"
     const int blocks = (n + BLOCK - 1) / BLOCK, pose = block_index / blocks;
     const int first = (block_index - pose * blocks) * BLOCK, i = first + threadIdx.x;
@@ -120,9 +121,10 @@ __global__ void skin_backward(
         V3 x = get3(means, i);
         if (n_correctives) {
             float shift[3] = {0.f, 0.f, 0.f};
-            for (int c = 0; c < n_correctives; c++) for (int k = 0; k < 3; k++)
-                shift[k] += displacements[((long long)i * 3 + k) * n_correctives + c]
-                            * strengths[(long long)pose * n_correctives + c];
+            for (int c = 0; c < n_correctives; c++)
+                for (int k = 0; k < 3; k++)
+                    shift[k] += displacements[((long long)i * 3 + k) * n_correctives + c] *
+                                strengths[(long long)pose * n_correctives + c];
             x = plus(x, {shift[0], shift[1], shift[2]});
         }
         V3 g_mean = {0.f, 0.f, 0.f};
@@ -140,26 +142,29 @@ __global__ void skin_backward(
         }
         if (g_out_covars) {  // of G S G^T: by G it is D G S^T + D^T G S, by S it is G^T D G
             const float *s = covars + 9ll * i, *d = g_out_covars + 9 * at;
-            const float g[9] = {rows[0].x, rows[0].y, rows[0].z, rows[1].x, rows[1].y, rows[1].z,
-                                rows[2].x, rows[2].y, rows[2].z};
+            const float g[9] = {rows[0].x, rows[0].y, rows[0].z, rows[1].x, rows[1].y,
+                                rows[1].z, rows[2].x, rows[2].y, rows[2].z};
             float gs[9], gst[9], dg[9];  // G S, G S^T, D G
-            for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) {
-                gs[3 * r + c] = g[3 * r] * s[c] + g[3 * r + 1] * s[3 + c] + g[3 * r + 2] * s[6 + c];
-                gst[3 * r + c] = g[3 * r] * s[3 * c] + g[3 * r + 1] * s[3 * c + 1] + g[3 * r + 2] * s[3 * c + 2];
-                dg[3 * r + c] = d[3 * r] * g[c] + d[3 * r + 1] * g[3 + c] + d[3 * r + 2] * g[6 + c];
-            }
-            for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) {
-                for (int k = 0; k < 3; k++)
-                    mine[4 * r + c] += d[3 * r + k] * gst[3 * k + c] + d[3 * k + r] * gs[3 * k + c];
-                if (g_covars)
-                    g_covars[9 * at + 3 * r + c] = g[r] * dg[c] + g[3 + r] * dg[3 + c] + g[6 + r] * dg[6 + c];
-            }
+            for (int r = 0; r < 3; r++)
+                for (int c = 0; c < 3; c++) {
+                    gs[3 * r + c] = g[3 * r] * s[c] + g[3 * r + 1] * s[3 + c] + g[3 * r + 2] * s[6 + c];
+                    gst[3 * r + c] = g[3 * r] * s[3 * c] + g[3 * r + 1] * s[3 * c + 1] + g[3 * r + 2] * s[3 * c + 2];
+                    dg[3 * r + c] = d[3 * r] * g[c] + d[3 * r + 1] * g[3 + c] + d[3 * r + 2] * g[6 + c];
+                }
+            for (int r = 0; r < 3; r++)
+                for (int c = 0; c < 3; c++) {
+                    for (int k = 0; k < 3; k++)
+                        mine[4 * r + c] += d[3 * r + k] * gst[3 * k + c] + d[3 * k + r] * gs[3 * k + c];
+                    if (g_covars)
+                        g_covars[9 * at + 3 * r + c] = g[r] * dg[c] + g[3 + r] * dg[3 + c] + g[6 + r] * dg[6 + c];
+                }
         }
-        if (g_weights) for (int j = 0; j < n_joints; j++) {
-            float total = 0.f;
-            for (int k = 0; k < 12; k++) total += mine[k] * transform[12 * j + k];
-            g_weights[at * n_joints + j] = total;
-        }
+        if (g_weights)
+            for (int j = 0; j < n_joints; j++) {
+                float total = 0.f;
+                for (int k = 0; k < 12; k++) total += mine[k] * transform[12 * j + k];
+                g_weights[at * n_joints + j] = total;
+            }
     }
     if (!sums) return;
     __syncthreads();
@@ -175,15 +180,15 @@ __global__ void skin_backward(
 __global__ void sum_blocks(
     int n_joints,
     int n_sums,
-    const float* sums,  // [B, blocks, J, 3, 4]
-    float* g_transforms  // ...; [B, J, 3, 4])
-{
+    const float* sums,   // [B, blocks, J, 3, 4]
+    float* g_transforms  // ...; [B, J, 3, 4]
+) {
 #include "../posing/vectors_cuda.h"
     const int size = 12 * n_joints, blocks = (size + BLOCK - 1) / BLOCK, pose = block_index / blocks;
     const int entry = (block_index - pose * blocks) * BLOCK + threadIdx.x;
     if (entry >= size) return;
     double total = 0.0;
-    #pragma unroll 8
+#pragma unroll 8
     for (int k = 0; k < n_sums; k++) total += (double)sums[((long long)pose * n_sums + k) * size + entry];
     g_transforms[(long long)pose * size + entry] = (float)total;
 }
