@@ -144,7 +144,7 @@ def test_shares_are_shares_of_area(hand, case, name):
     rest = case[0].rest.vertices
     area, region = surface.vertex_areas(rest, hand.faces), region_masks(label_regions(hand))[name]
     seen = (area > area[region > 0.5].median()).float()  # the larger half of the region's vertices
-    found = shares(hand, rest, SurfaceQuality(seen, 1 - seen))
+    found = coverage_percent(hand, rest, SurfaceQuality(seen, 1 - seen))
     of_area = float((area * region * seen).sum() / (area * region).sum())
     assert of_area > float((region * seen).sum() / region.sum()) + 0.05, "vertices are unlike enough to tell"
     assert found[f"{name}_seen_percent"] == pytest.approx(100 * of_area, abs=0.01)
