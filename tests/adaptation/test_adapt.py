@@ -219,8 +219,8 @@ def test_two_photos_explain_palm_and_back_in_the_light_of_the_first(hand, palm, 
 
 def test_the_light_of_photos_that_share_a_side_is_told_exactly(hand, colors, palm):
     other = lit(crop_of(hand, colors, pose_name="victory")[0], LIGHT)
-    sightings = observe_photos(hand, [palm, other], [1.0, 1.0])
-    found = photo_gains(sightings, torch.full_like(colors, 0.5))  # a guess that knows nothing
+    observations = observe_photos(hand, [palm, other], [1.0, 1.0])
+    found = photo_gains(observations, torch.full_like(colors, 0.5))  # a guess that knows nothing
     assert torch.allclose(found[0], torch.ones(3))
     assert torch.allclose(found[1], LIGHT, atol=0.06)
 
@@ -249,11 +249,11 @@ def test_the_same_photo_twice_is_nearly_one_photo(hand, palm, alone):
 
 
 def test_a_place_belongs_to_the_photo_that_shows_it_larger(hand, palm, back):
-    sightings = observe_photos(hand, [palm, palm, back], [1.0, 0.5, 1.0])  # the second is an enlargement
-    shown = (sightings.confidence[0] > 0.5) & (sightings.confidence[2] == 0)
-    assert torch.all(sightings.share[0, shown] == 1)
-    assert torch.allclose(sightings.share[1, shown], torch.tensor(0.25**2))
-    assert torch.all(sightings.share[2, shown] < 0.01)
+    observations = observe_photos(hand, [palm, palm, back], [1.0, 0.5, 1.0])  # the second is an enlargement
+    shown = (observations.confidence[0] > 0.5) & (observations.confidence[2] == 0)
+    assert torch.all(observations.share[0, shown] == 1)
+    assert torch.allclose(observations.share[1, shown], torch.tensor(0.25**2))
+    assert torch.all(observations.share[2, shown] < 0.01)
 
 
 def test_equal_guesses_mix_to_themselves(hand, palm):

@@ -127,7 +127,7 @@ def _pixel_density(crop: HandCrop, seen: Observation) -> Float[Tensor, "V"]:
     return seen.visibility * seen.facing.clamp(0, 1) * inside * pixels
 
 
-def photo_gains(sightings: VertexObservations, guess: Float[Tensor, "V 3"]) -> Float[Tensor, "K 3"]:
+def photo_gains(observations: VertexObservations, guess: Float[Tensor, "V 3"]) -> Float[Tensor, "K 3"]:
     """How much brighter each photo shows each channel than the first one does.
 
     The least squares of all differences of the logarithms of colours that two photos show of one place, with one
@@ -136,13 +136,13 @@ def photo_gains(sightings: VertexObservations, guess: Float[Tensor, "V 3"]) -> F
     place's own colour is eliminated. Reweighted against shadows and misplaced detail (Cauchy).
 
     Args:
-        sightings: Of K photos.
+        observations: Of K photos.
         guess: Colours of the vertices as the prior has them, in any light.
     """
-    n_photos = len(sightings.colors)
-    logs = torch.cat([sightings.colors, guess[None]]).clamp(DARKEST, 1).log()
-    clear = (sightings.colors > DARKEST) & (sightings.colors < BRIGHTEST)
-    trust = (sightings.confidence * sightings.share)[..., None] * clear
+    n_photos = len(observations.colors)
+    logs = torch.cat([observations.colors, guess[None]]).clamp(DARKEST, 1).log()
+    clear = (observations.colors > DARKEST) & (observations.colors < BRIGHTEST)
+    trust = (observations.confidence * observations.share)[..., None] * clear
     trust = torch.cat([trust, GUESS_WEIGHT * (trust.amax(0, keepdim=True) > 0)]).to(logs)
     gains = logs.new_zeros(n_photos + 1, 3)
     still = 1e-6 * torch.eye(n_photos, dtype=logs.dtype, device=logs.device)  # a photo that shows nothing keeps 1
