@@ -1,4 +1,4 @@
-"""What an avatar rests on: how much of the surface the photo showed, how sure the rest is, and what ails the photo."""
+"""How well the surface is known: how much of it the photo shows, how sure the rest is, and warnings."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -106,7 +106,7 @@ def coverage_warnings(found: dict[str, float]) -> list[str]:
 
 @torch.no_grad()
 def photo_warnings(image: Float[Tensor, "S S 3"], mask: Float[Tensor, "S S"], side: float) -> list[str]:
-    """What ails the photo of a hand, in words: dark, over-exposed, not the colour of skin, blurred.
+    """Warnings about the photo of a hand: dark, over-exposed, not the colour of skin, blurred.
 
     Args:
         image: The square crop around the hand.
@@ -116,19 +116,19 @@ def photo_warnings(image: Float[Tensor, "S S 3"], mask: Float[Tensor, "S S"], si
     inside = inner_mask(mask) > 0.5
     if not bool(inside.any()):
         return ["the hand is thinner than a few pixels: its colours hold the background"]
-    pixels, said = image[inside], []
+    pixels, warnings = image[inside], []
     red, green, blue = pixels.mean(0).tolist()
     brightness = red * LUMA[0] + green * LUMA[1] + blue * LUMA[2]
     clipped = float((pixels.amax(1) > CLIP).float().mean())
     if brightness < DARK:
-        said.append(f"dark photo: the hand has {100 * brightness:.0f} % of full brightness, its colours are noise")
+        warnings.append(f"dark photo: the hand has {100 * brightness:.0f} % of full brightness, its colours are noise")
     if clipped > CLIPPED:
-        said.append(f"over-exposed photo: {100 * clipped:.0f} % of the hand is white or nearly so and has no detail")
+        warnings.append(f"over-exposed photo: {100 * clipped:.0f} % of the hand is white or nearly so and has no detail")
     if red < SKIN_REDNESS * max(green, blue):
-        said.append("the hand has not the colour of skin: coloured light or a glove, and all of it is taken for skin")
+        warnings.append("the hand has not the colour of skin: coloured light or a glove, and all of it is taken for skin")
     if (found := _blur(image, mask, side)) > BLURRED:
-        said.append(f"blurred photo: the avatar will be, too (blur {found:.2f}, sharp photos have less than .65)")
-    return said
+        warnings.append(f"blurred photo: the avatar will be, too (blur {found:.2f}, sharp photos have less than .65)")
+    return warnings
 
 
 def _blur(image: Tensor, mask: Tensor, side: float) -> float:
