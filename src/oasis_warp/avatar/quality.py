@@ -116,19 +116,19 @@ def photo_warnings(image: Float[Tensor, "S S 3"], mask: Float[Tensor, "S S"], si
     inside = inner_mask(mask) > 0.5
     if not bool(inside.any()):
         return ["the hand is thinner than a few pixels: its colours hold the background"]
-    pixels, warnings = image[inside], []
+    pixels, notes = image[inside], []
     red, green, blue = pixels.mean(0).tolist()
     brightness = red * LUMA[0] + green * LUMA[1] + blue * LUMA[2]
     clipped = float((pixels.amax(1) > CLIP).float().mean())
     if brightness < DARK:
-        warnings.append(f"dark photo: the hand has {100 * brightness:.0f} % of full brightness, its colours are noise")
+        notes.append(f"dark photo: the hand has {100 * brightness:.0f} % of full brightness, its colours are noise")
     if clipped > CLIPPED:
-        warnings.append(f"over-exposed photo: {100 * clipped:.0f} % of the hand is white or nearly so and has no detail")
+        notes.append(f"over-exposed photo: {100 * clipped:.0f} % of the hand is white or nearly so and has no detail")
     if red < SKIN_REDNESS * max(green, blue):
-        warnings.append("the hand has not the colour of skin: coloured light or a glove, and all of it is taken for skin")
+        notes.append("the hand has not the colour of skin: coloured light or a glove, and all of it is taken for skin")
     if (found := _blur(image, mask, side)) > BLURRED:
-        warnings.append(f"blurred photo: the avatar will be, too (blur {found:.2f}, sharp photos have less than .65)")
-    return warnings
+        notes.append(f"blurred photo: the avatar will be, too (blur {found:.2f}, sharp photos have less than .65)")
+    return notes
 
 
 def _blur(image: Tensor, mask: Tensor, side: float) -> float:
