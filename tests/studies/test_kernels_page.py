@@ -3,13 +3,10 @@
 import json
 import re
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 from gpu_rows import FRAME, GPU, KERNELS, SPEED, STUDY
 
 from oasis_warp.bench import plots
