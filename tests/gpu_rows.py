@@ -63,5 +63,5 @@ UNKNOWN = replace(
 KERNELS = [
     KERNEL, UNKNOWN, replace(UNKNOWN, kernel="Memset", us=0.1),
     replace(KERNEL, kernel="gather_records_3", us=8.0, flops=1e6, gflop_s=125.0, floor_us=4.7, bound="bytes"),
-    replace(KERNEL, case="posing 37k", kernel="pose_riders", us=5.0),
+    replace(KERNEL, case="posing 37k", kernel="pose_mesh_gaussians", us=5.0),
 ]  # fmt: skip

@@ -300,7 +300,7 @@ def test_kernels_stay_inside_their_memory(monkeypatch):
     cases = [(name, {"n": n, "empty": empty}) for name in NAMES for n in (1, 2, 5) for empty in (False, True)]
     plain = [results(name, **which) for name, which in cases]
     monkeypatch.setattr(_words, "address", guarded_address)
-    for module in ("_riders", "bone_transforms", "face_rotations", "rest_mesh", "skinning"):
+    for module in ("_runtime.riders", "bone_transforms", "face_rotations", "rest_mesh", "skinning"):
         monkeypatch.setattr(sys.modules[f"oasis_warp.ops.{module}"], "run_native", guarded_run)
     for (name, which), want in zip(cases, plain, strict=True):
         for a, b in zip(results(name, **which), want, strict=True):

@@ -1,6 +1,6 @@
 // Float32 posing of Gaussians on the CPU: what `barycentric` computes, 16 Gaussians at once.
 //
-// Backward, each Gaussian writes one row of eight for the vertices it rides on, (by position, by area ratio, by
+// Backward, each Gaussian writes one row of eight for the vertices that it depends on, (by position, by area ratio, by
 // rotation), and for each of its corners the weight of the second half; that of the first are its barycentrics. Then
 // vertices add up the rows, and faces the gradients of area ratios.
 
@@ -79,14 +79,14 @@ void pose_backward(
     const float* g_means,            // these three may be 0
     const float* g_posed_quats,
     const float* g_posed_scales,
-    const int* vertex_starts,  // [V + 1]; of `places`, for each vertex
-    const int* places,         // [P + 3 Q]; i < P: the Gaussian i on a vertex; P + 3 i + k: corner k of Gaussian P + i
-    const int* face_starts,    // [F + 1]; of `riders`, for each face
-    const int* riders,         // [Q]
-    float* rows_of_riders,     // [P + Q, 8], scratch; 0 if nothing of vertices is wanted, or nothing rides
-    float* weights,            // [Q, 3], scratch, with the rows
-    float* by_ratio,           // [Q], scratch; 0 if area ratios are not wanted
-    float* g_vertices,         // each of these is 0 if not wanted
+    const int* vertex_starts,   // [V + 1]; of `places`, for each vertex
+    const int* places,          // [P + 3 Q]; i < P: the Gaussian i on a vertex; P + 3 i + k: corner k of Gaussian P + i
+    const int* face_starts,     // [F + 1]; of `face_gaussians`, for each face
+    const int* face_gaussians,  // [Q]
+    float* gaussian_rows,       // [P + Q, 8], scratch; 0 if nothing of vertices is wanted, or nothing rides
+    float* weights,             // [Q, 3], scratch, with the rows
+    float* by_ratio,            // [Q], scratch; 0 if area ratios are not wanted
+    float* g_vertices,          // each of these is 0 if not wanted
     float* g_barycentrics,
     float* g_vertex_quats,
     float* g_area_ratio,
@@ -112,7 +112,7 @@ void pose_backward(
             }
             if (g_quats) put4(g_quats + 4ll * i, count, product(conjugate(q), g_quat));
             if (g_scales) put3(g_scales + 3ll * i, count, scaled(grown, g_scale));
-            if (rows_of_riders) {
+            if (gaussian_rows) {
                 // Of u -> o + w t + u x t, which is the rotation for unit quaternions; then only what turns is kept.
                 const V3 by_u = plus(
                     scaled(2.f * q.w, cross(o, g_mean)),
@@ -127,8 +127,8 @@ void pose_backward(
                 g = scaled4(per_length, plus4(g, scaled4(-dot4(g, q), q)));
                 const V slope = growth_slope(pick(vertex_area_ratio, v), half_powers);
                 const V by_area = slope * dot3(g_scale, get3(scales + 3ll * i, count));
-                put4(rows_of_riders + 8ll * i, count, {g_mean.x, g_mean.y, g_mean.z, by_area}, 8);
-                put4(rows_of_riders + 8ll * i + 4, count, g, 8);
+                put4(gaussian_rows + 8ll * i, count, {g_mean.x, g_mean.y, g_mean.z, by_area}, 8);
+                put4(gaussian_rows + 8ll * i + 4, count, g, 8);
             }
         }
     });
@@ -144,12 +144,12 @@ void pose_backward(
                 const V slope = growth_slope(ratio, half_powers);
                 put(by_ratio + i, count, slope * dot3(g_scale, get3(scales + 3ll * at, count)));
             }
-            if (rows_of_riders || g_barycentrics) {
+            if (gaussian_rows || g_barycentrics) {
                 V4 g = product(g_quat, conjugate(get4(quats + 4ll * at, count)));
                 g = scaled4(per_length, plus4(g, scaled4(-dot4(g, turn), turn)));
-                if (rows_of_riders) {
-                    put4(rows_of_riders + 8ll * at, count, {g_mean.x, g_mean.y, g_mean.z, zero}, 8);
-                    put4(rows_of_riders + 8ll * at + 4, count, g, 8);
+                if (gaussian_rows) {
+                    put4(gaussian_rows + 8ll * at, count, {g_mean.x, g_mean.y, g_mean.z, zero}, 8);
+                    put4(gaussian_rows + 8ll * at + 4, count, g, 8);
                     put3(weights + 3ll * i, count, {b.x * sign.x, b.y * sign.y, b.z * sign.z});
                 }
                 if (g_barycentrics) {
@@ -175,7 +175,7 @@ void pose_backward(
                     const unsigned place = (unsigned)places[j];
                     const bool corner = place >= (unsigned)n_on_vertices;
                     const unsigned at = place - (unsigned)n_on_vertices;
-                    const float* row = rows_of_riders + 8ll * (corner ? (unsigned)n_on_vertices + at / 3u : place);
+                    const float* row = gaussian_rows + 8ll * (corner ? (unsigned)n_on_vertices + at / 3u : place);
                     low += (corner ? barycentrics[at] : 1.f) * load_row(row);
                     high += (corner ? weights[at] : 1.f) * load_row(row + 4);
                 }
@@ -188,7 +188,7 @@ void pose_backward(
         ranges(state + 3 * PHASE_WORDS, n_faces, [&](int first, int end) {
             for (int f = first; f < end; f++) {
                 float total = 0.f;
-                for (int j = face_starts[f]; j < face_starts[f + 1]; j++) total += by_ratio[riders[j]];
+                for (int j = face_starts[f]; j < face_starts[f + 1]; j++) total += by_ratio[face_gaussians[j]];
                 g_area_ratio[f] = total;
             }
         });

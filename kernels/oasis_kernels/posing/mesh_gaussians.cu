@@ -1,12 +1,12 @@
 // Float32 posing of Gaussians on CUDA: what `barycentric` computes.
 //
-// `pose_riders` (one thread a Gaussian; blocks for those on vertices, then blocks for those on faces). Backward:
-// `pose_riders_backward` (likewise) writes each Gaussian's row of eight for the vertices it rides on, (by position, by
-// area ratio, by rotation), and for each of its corners the weight of the second half; that of the first are its
-// barycentrics. Then `gather_riders` (blocks for vertices, then blocks for faces; one thread each) adds up the rows at
-// vertices, and the gradients of area ratios at faces.
+// `pose_mesh_gaussians` (one thread a Gaussian; blocks for those on vertices, then blocks for those on faces).
+// Backward: `pose_mesh_gaussians_backward` (likewise) writes each Gaussian's row of eight for the vertices that it
+// depends on, (by position, by area ratio, by rotation), and for each of its corners the weight of the second half;
+// that of the first are its barycentrics. Then `gather_mesh_gaussians` (blocks for vertices, then blocks for faces; one
+// thread each) adds up the rows at vertices, and the gradients of area ratios at faces.
 
-__global__ void pose_riders(
+__global__ void pose_mesh_gaussians(
     int n_vertices,
     int n_faces,
     int n_on_vertices,  // P
@@ -52,11 +52,11 @@ __global__ void pose_riders(
         ratio = area_ratio[(long long)pose * n_faces + f];
     }
     put3(means, at, mean);
-    put4(posed_quats, at, product(turn, get4(quats, rider)));
-    put3(posed_scales, at, scaled(growth(ratio), get3(scales, rider)));
+    put4(posed_quats, at, product(turn, get4(quats, gaussian)));
+    put3(posed_scales, at, scaled(growth(ratio), get3(scales, gaussian)));
 }
 
-__global__ void pose_riders_backward(
+__global__ void pose_mesh_gaussians_backward(
     int n_vertices,
     int n_faces,
     int n_on_vertices,  // P
@@ -76,7 +76,7 @@ __global__ void pose_riders_backward(
     const float* g_means,            // these three may be 0
     const float* g_posed_quats,
     const float* g_posed_scales,
-    float* rows_of_riders,  // [B, P + Q, 8]; 0 if nothing of vertices is wanted
+    float* gaussian_rows,   // [B, P + Q, 8]; 0 if nothing of vertices is wanted
     float* weights,         // [B, Q, 3], with the rows
     float* by_ratio,        // [B, Q]; 0 if area ratios are not wanted
     float* g_barycentrics,  // [B, Q, 3]; each of these is 0 if not wanted
@@ -104,7 +104,7 @@ __global__ void pose_riders_backward(
         }
         if (g_quats) put4(g_quats, at, product(conjugate(q), g_quat));
         if (g_scales) put3(g_scales, at, scaled(growth(ratio), g_scale));
-        if (rows_of_riders) {
+        if (gaussian_rows) {
             // Of u -> o + w t + u x t, which is the rotation for unit quaternions; then only what turns is kept.
             const V3 by_u = plus(
                 scaled(2.f * q.w, cross(o, g_mean)),
@@ -113,11 +113,11 @@ __global__ void pose_riders_backward(
                     scaled(4.f * dot3(g_mean, o), u)
                 )
             );
-            V4 g = plus4(product(g_quat, conjugate(get4(quats, rider))), {dot3(g_mean, t), by_u.x, by_u.y, by_u.z});
+            V4 g = plus4(product(g_quat, conjugate(get4(quats, gaussian))), {dot3(g_mean, t), by_u.x, by_u.y, by_u.z});
             g = scaled4(place.per_length, plus4(g, scaled4(-dot4(g, q), q)));
-            const float by_area = growth_slope(ratio) * dot3(g_scale, get3(scales, rider));
-            put4(rows_of_riders, 2 * at, {g_mean.x, g_mean.y, g_mean.z, by_area});
-            put4(rows_of_riders, 2 * at + 1, g);
+            const float by_area = growth_slope(ratio) * dot3(g_scale, get3(scales, gaussian));
+            put4(gaussian_rows, 2 * at, {g_mean.x, g_mean.y, g_mean.z, by_area});
+            put4(gaussian_rows, 2 * at + 1, g);
         }
         return;
     }
@@ -130,12 +130,12 @@ __global__ void pose_riders_backward(
     const float ratio = area_ratio[(long long)pose * n_faces + f];
     if (g_quats) put4(g_quats, at, product(conjugate(place.turn), g_quat));
     if (g_scales) put3(g_scales, at, scaled(growth(ratio), g_scale));
-    if (by_ratio) by_ratio[here] = growth_slope(ratio) * dot3(g_scale, get3(scales, rider));
-    V4 g = product(g_quat, conjugate(get4(quats, rider)));
+    if (by_ratio) by_ratio[here] = growth_slope(ratio) * dot3(g_scale, get3(scales, gaussian));
+    V4 g = product(g_quat, conjugate(get4(quats, gaussian)));
     g = scaled4(place.per_length, plus4(g, scaled4(-dot4(g, place.turn), place.turn)));
-    if (rows_of_riders) {
-        put4(rows_of_riders, 2 * at, {g_mean.x, g_mean.y, g_mean.z, 0.f});
-        put4(rows_of_riders, 2 * at + 1, g);
+    if (gaussian_rows) {
+        put4(gaussian_rows, 2 * at, {g_mean.x, g_mean.y, g_mean.z, 0.f});
+        put4(gaussian_rows, 2 * at + 1, g);
         put3(weights, here, {b.x * place.sign[0], b.y * place.sign[1], b.z * place.sign[2]});
     }
     if (g_barycentrics) {
@@ -146,26 +146,26 @@ __global__ void pose_riders_backward(
 }
 
 // A vertex's places: 0 .. P - 1 are Gaussians on it, P + 3 i + k is the corner k of Gaussian P + i.
-__global__ void gather_riders(
+__global__ void gather_mesh_gaussians(
     int n_vertices,
     int n_faces,
-    int n_on_vertices,            // P
-    int n_on_faces,               // Q
-    const float* barycentrics,    // [Q, 3]
-    const float* rows_of_riders,  // [B, P + Q, 8]; 0 if nothing of vertices is wanted
-    const float* weights,         // [B, Q, 3], with the rows
-    const float* by_ratio,        // [B, Q]; 0 if area ratios are not wanted
-    const int* vertex_starts,     // [V + 1]; of `places`, for each vertex
-    const int* places,       // [P + 3 Q]; i < P: the Gaussian i on a vertex; P + 3 i + k: corner k of Gaussian P + i
-    const int* face_starts,  // [F + 1]; of `riders`, for each face
-    const int* riders,       // [Q]
-    float* g_vertices,       // [B, V, 3]; each of these is 0 if not wanted
-    float* g_vertex_quats,   // [B, V, 4]
+    int n_on_vertices,           // P
+    int n_on_faces,              // Q
+    const float* barycentrics,   // [Q, 3]
+    const float* gaussian_rows,  // [B, P + Q, 8]; 0 if nothing of vertices is wanted
+    const float* weights,        // [B, Q, 3], with the rows
+    const float* by_ratio,       // [B, Q]; 0 if area ratios are not wanted
+    const int* vertex_starts,    // [V + 1]; of `places`, for each vertex
+    const int* places,          // [P + 3 Q]; i < P: the Gaussian i on a vertex; P + 3 i + k: corner k of Gaussian P + i
+    const int* face_starts,     // [F + 1]; of `face_gaussians`, for each face
+    const int* face_gaussians,  // [Q]
+    float* g_vertices,          // [B, V, 3]; each of these is 0 if not wanted
+    float* g_vertex_quats,      // [B, V, 4]
     float* g_vertex_area_ratio,  // [B, V]
     float* g_area_ratio          // [B, F]
 ) {
 #include "vectors_cuda.h"
-    const int vertex_blocks = (rows_of_riders ? (n_vertices + BLOCK - 1) / BLOCK : 0),
+    const int vertex_blocks = (gaussian_rows ? (n_vertices + BLOCK - 1) / BLOCK : 0),
               blocks = vertex_blocks + (g_area_ratio ? (n_faces + BLOCK - 1) / BLOCK : 0);
     const int pose = block_index / blocks, mine = block_index - pose * blocks;
     const long long first_on_face = (long long)pose * n_on_faces;
@@ -173,13 +173,13 @@ __global__ void gather_riders(
         const int f = (mine - vertex_blocks) * BLOCK + threadIdx.x;
         if (f >= n_faces) return;
         float total = 0.f;
-        for (int j = face_starts[f]; j < face_starts[f + 1]; j++) total += by_ratio[first_on_face + riders[j]];
+        for (int j = face_starts[f]; j < face_starts[f + 1]; j++) total += by_ratio[first_on_face + face_gaussians[j]];
         g_area_ratio[(long long)pose * n_faces + f] = total;
         return;
     }
     const int v = mine * BLOCK + threadIdx.x;
     if (v >= n_vertices) return;
-    const float* rows = rows_of_riders + pose * ((long long)n_on_vertices + n_on_faces) * 8;
+    const float* rows = gaussian_rows + pose * ((long long)n_on_vertices + n_on_faces) * 8;
     V4 low = {0.f, 0.f, 0.f, 0.f}, high = low;  // by position and area ratio; by rotation
     for (int j = vertex_starts[v]; j < vertex_starts[v + 1]; j++) {
         const unsigned place = (unsigned)places[j];

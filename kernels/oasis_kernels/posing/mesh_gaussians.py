@@ -17,10 +17,10 @@ def _on_cuda(name: str) -> CudaNative:
 
 pose = native("posing/mesh_gaussians.cpp", "pose", constants=CONSTANTS)
 pose_backward = native("posing/mesh_gaussians.cpp", "pose_backward", constants=CONSTANTS)
-pose_riders = _on_cuda("pose_riders")
+pose_mesh_gaussians = _on_cuda("pose_mesh_gaussians")
 """Kernel: for each pose, one block for every `BLOCK` Gaussians on vertices, then one for every `BLOCK` on faces."""
-pose_riders_backward = _on_cuda("pose_riders_backward")
-"""Kernel: blocks as for `pose_riders`."""
-gather_riders = _on_cuda("gather_riders")
+pose_mesh_gaussians_backward = _on_cuda("pose_mesh_gaussians_backward")
+"""Kernel: blocks as for `pose_mesh_gaussians`."""
+gather_mesh_gaussians = _on_cuda("gather_mesh_gaussians")
 """Kernel: for each pose, one block for every `BLOCK` vertices if there are rows, then one for every `BLOCK` faces if
 area ratios are wanted."""

@@ -1,9 +1,10 @@
-// Colours of Gaussians from spherical harmonics on CUDA: `spherical_harmonics.see` and its adjoint over raw pointers.
+// Colours of Gaussians from spherical harmonics on CUDA: `spherical_harmonics.sh_to_rgb` and its adjoint over raw
+// pointers.
 //
-// `see` takes one thread for each camera and Gaussian, its adjoint one for each Gaussian, which goes through the
+// `sh_to_rgb` takes one thread for each camera and Gaussian, its adjoint one for each Gaussian, which goes through the
 // cameras in order, so that no sum depends on how threads run.
 
-__global__ void see(
+__global__ void sh_to_rgb(
     int n,
     int rows,
     int n_harmonics,
@@ -29,7 +30,7 @@ __global__ void see(
     }
 }
 
-__global__ void see_backward(
+__global__ void sh_to_rgb_backward(
     int n,
     int rows,
     int n_harmonics,

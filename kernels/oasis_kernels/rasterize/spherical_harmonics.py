@@ -1,7 +1,7 @@
 """View-dependent colour: real spherical harmonics up to degree 3, and their adjoint.
 
-`evaluate` takes directions, one thread each; `see` takes Gaussians and cameras, one thread for each pair of them, and
-its adjoint one for each Gaussian, which goes through the cameras in order.
+`evaluate` takes directions, one thread each; `sh_to_rgb` takes Gaussians and cameras, one thread for each pair of them,
+and its adjoint one for each Gaussian, which goes through the cameras in order.
 
 The basis is that of 3DGS (Kerbl et al. 2023): orthonormal, with the Condon-Shortley sign, m from -l to l. It is written
 as polynomials of the unit direction (x, y, z); directions come in at any length. A degree is a kernel of its own.
@@ -209,13 +209,13 @@ def _direction(scalar: Any) -> Any:
 
 
 @functools.cache
-def see(scalar: Any, degree: int) -> Any:
+def sh_to_rgb(scalar: Any, degree: int) -> Any:
     """Kernel: Gaussians, coefficients, poses -> colours max(0, 0.5 + harmonics), as each camera sees them."""
     vec3, vec4 = (wp.types.vector(length=k, dtype=scalar) for k in (3, 4))
     basis, unit, direction = _basis(scalar, degree), _unit(scalar), _direction(scalar)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def see(
+    def sh_to_rgb(
         first: int,
         means: wp.array(dtype=vec3),
         coefficients: wp.array2d(dtype=vec3),  # rows of all cameras, one after the other, or those they share
@@ -235,11 +235,11 @@ def see(scalar: Any, degree: int) -> Any:
             total[k] = wp.where(color < scalar(0.0), scalar(0.0), color)  # NaN stays
         colors[i] = total
 
-    return see
+    return sh_to_rgb
 
 
 @functools.cache
-def see_backward(scalar: Any, degree: int) -> Any:
+def sh_to_rgb_backward(scalar: Any, degree: int) -> Any:
     """Kernel: gradient by the colours -> by means, coefficients, and the cameras' centres for each Gaussian.
 
     An array is empty where it is not wanted.
@@ -250,7 +250,7 @@ def see_backward(scalar: Any, degree: int) -> Any:
     direction = _direction(scalar)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def see_backward(
+    def sh_to_rgb_backward(
         first: int,
         means: wp.array(dtype=vec3),
         coefficients: wp.array2d(dtype=vec3),
@@ -296,7 +296,7 @@ def see_backward(scalar: Any, degree: int) -> Any:
         if g_means.shape[0] > 0:
             g_means[gaussian] = vec3(g_mean)
 
-    return see_backward
+    return sh_to_rgb_backward
 
 
 def _on_cuda(name: str, label: str, degree: int) -> CudaNative:
@@ -306,12 +306,12 @@ def _on_cuda(name: str, label: str, degree: int) -> CudaNative:
 
 
 @functools.cache
-def cuda_see(degree: int) -> CudaNative:
+def cuda_sh_to_rgb(degree: int) -> CudaNative:
     """CUDA kernel in float32: a scene -> colours of its `total` pairs of a camera and a Gaussian."""
-    return _on_cuda("see", "see_colors", degree)
+    return _on_cuda("sh_to_rgb", "sh_to_rgb", degree)
 
 
 @functools.cache
-def cuda_see_backward(degree: int) -> CudaNative:
-    """CUDA kernel in float32: what `see_backward` gives; a null pointer for what is not wanted."""
-    return _on_cuda("see_backward", "see_colors_backward", degree)
+def cuda_sh_to_rgb_backward(degree: int) -> CudaNative:
+    """CUDA kernel in float32: what `sh_to_rgb_backward` gives; a null pointer for what is not wanted."""
+    return _on_cuda("sh_to_rgb_backward", "sh_to_rgb_backward", degree)

@@ -95,7 +95,7 @@ MESH_KERNELS: Mapping[str, Callable[[MeshCounts], Work]] = {
     "turn_vertices": lambda c: Work(3 * 36 * c.faces + 24 * c.vertices, 3 * 18 * c.faces + 40 * c.vertices),
     # On a vertex: index 4, vertex 12, its quaternion 16 and ratio 4, offset 12, quaternion 16, scales 12; on a face:
     # index 4, corners 12, three vertices and quaternions 84, ratio 4, weights 12, quaternion 16, scales 12; 40 out.
-    "pose_riders": lambda c: Work(
+    "pose_mesh_gaussians": lambda c: Work(
         (76 + 40) * c.vertex_gaussians + (144 + 40) * c.face_gaussians,
         110 * c.vertex_gaussians + 150 * c.face_gaussians,
     ),

@@ -30,11 +30,11 @@ def _seen(means: Tensor, coefficients: Tensor, viewmats: Tensor, degree: int) ->
     if has_cuda_kernels(means):
         words = _cuda_words(means, coefficients, viewmats) | {"total": total, "colors": colors.data_ptr()}
         n_blocks = -(-total // kernels.BLOCK)
-        run_cuda(kernels.cuda_see(degree), words, n_blocks, current_stream(means.device))
+        run_cuda(kernels.cuda_sh_to_rgb(degree), words, n_blocks, current_stream(means.device))
         return colors
     vec3 = VEC3[means.dtype]
     launch_ranges(
-        kernels.see(SCALAR[means.dtype], degree),
+        kernels.sh_to_rgb(SCALAR[means.dtype], degree),
         even_cuts(total),
         [
             view(means, vec3), view(_rows(coefficients), vec3), view(viewmats, VEC4[means.dtype]),
@@ -90,11 +90,11 @@ def _seen_backward(
             "g_centers": g_centers.data_ptr(),
         }  # fmt: skip
         n_blocks = -(-n // kernels.BLOCK)
-        run_cuda(kernels.cuda_see_backward(degree), words, n_blocks, current_stream(means.device))
+        run_cuda(kernels.cuda_sh_to_rgb_backward(degree), words, n_blocks, current_stream(means.device))
     else:
         vec3 = VEC3[means.dtype]
         launch_ranges(
-            kernels.see_backward(SCALAR[means.dtype], degree),
+            kernels.sh_to_rgb_backward(SCALAR[means.dtype], degree),
             even_cuts(n),
             [
                 view(means, vec3), view(_rows(coefficients), vec3), view(viewmats, VEC4[means.dtype]),

@@ -43,7 +43,7 @@ def pose_on_cuda(inputs: Floats, riders: Riders, half_powers: int, posed: Sequen
         "posed_scales": scales,
     }
     blocks = _n_poses(inputs) * (_blocks(riders.p) + _blocks(riders.q))
-    run_cuda(kernels.pose_riders, words, blocks, current_stream(inputs.vertices.device))
+    run_cuda(kernels.pose_mesh_gaussians, words, blocks, current_stream(inputs.vertices.device))
 
 
 def pose_backward_on_cuda(
@@ -70,21 +70,21 @@ def pose_backward_on_cuda(
         "g_means": pointer(given[0]),
         "g_posed_quats": pointer(given[1]),
         "g_posed_scales": pointer(given[2]),
-        "rows_of_riders": pointer(rows),
+        "gaussian_rows": pointer(rows),
         "weights": pointer(weights),
         "by_ratio": pointer(by_ratio),
         "vertex_starts": pointer(None if at_vertices is None else at_vertices.offsets),
         "places": pointer(None if at_vertices is None else at_vertices.entries),
         "face_starts": pointer(riders.on_faces.offsets),
-        "riders": pointer(riders.on_faces.entries),
+        "face_gaussians": pointer(riders.on_faces.entries),
         **{f"g_{name}": pointer(tensor) for name, tensor in by._asdict().items()},
     }
     stream = current_stream(like.device)
-    run_cuda(kernels.pose_riders_backward, words, n_poses * (_blocks(p) + _blocks(q)), stream)
+    run_cuda(kernels.pose_mesh_gaussians_backward, words, n_poses * (_blocks(p) + _blocks(q)), stream)
     blocks = (0 if rows is None else _blocks(riders.n_vertices)) + (
         0 if by.area_ratio is None else _blocks(len(riders.corners.table))
     )
-    run_cuda(kernels.gather_riders, words, n_poses * blocks, stream)
+    run_cuda(kernels.gather_mesh_gaussians, words, n_poses * blocks, stream)
     return [
         summed_over_poses(grad, shared and batched) if grad is not None else None
         for grad, shared in zip(each, SHARED, strict=True)

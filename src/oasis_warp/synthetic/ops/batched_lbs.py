@@ -5,7 +5,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_kernels.skinning import flesh as kernels
+from oasis_kernels.skinning import batched_lbs as kernels
 from oasis_warp.core.checks import check_shape
 from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
 from oasis_warp.ops._runtime.registration import operator
@@ -22,7 +22,7 @@ def _pose(
         view(rises.contiguous()), view(knuckles.contiguous()), view(weights.contiguous()),
         view(rotations.contiguous(), wp.mat33f), vec3(shifts), view(out, wp.vec3f),
     ]  # fmt: skip
-    launch_ranges(kernels.pose_flesh, even_cuts(rest.shape[0] * rest.shape[1]), inputs, like=rest)
+    launch_ranges(kernels.batched_lbs, even_cuts(rest.shape[0] * rest.shape[1]), inputs, like=rest)
     return out
 
 

@@ -1,4 +1,4 @@
-"""Posed flesh of hands of different people: one thread a vertex and image; a hand does not depend on its batch."""
+"""Linear blend skinning of hands of different people: one thread per vertex and image, whatever the batch."""
 
 import warp as wp
 
@@ -6,7 +6,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def pose_flesh(
+def batched_lbs(
     first: int,
     rest: wp.array2d[wp.vec3f],
     displacements: wp.array3d[wp.float32],  # [vertex, axis, corrective]
