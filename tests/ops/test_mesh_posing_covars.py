@@ -1,6 +1,5 @@
 """Gaussians stretched with their faces: twin, gradients, laws, flat faces, poison values, messages."""
 
-import math
 
 import pytest
 import torch
@@ -63,38 +62,6 @@ def test_values_and_gradients_are_those_of_the_twin(seed, dtype, device):
         assert rel(a, b) < 10 * tolerance, name
 
 
-def test_gradcheck_passes_for_every_input():
-    arguments = scene(7, n_gaussians=4)
-    floats = [arguments.pop(name).requires_grad_() for name in FLOATS]
-
-    def posed(*values):
-        return tuple(pose_on_mesh_covars(**dict(zip(FLOATS, values, strict=True)), **arguments))
-
-    assert torch.autograd.gradcheck(posed, floats)
-
-
-@pytest.mark.parametrize("wanted", FLOATS)
-def test_only_inputs_that_require_a_gradient_get_one_and_it_is_the_same(wanted):
-    alone, together = scene(1), scene(1)
-    alone[wanted].requires_grad_()
-    for name in FLOATS:
-        together[name].requires_grad_()
-    for arguments in (alone, together):
-        got = pose_on_mesh_covars(**arguments)
-        sum((out * torch.arange(out.numel()).view_as(out)).sum() for out in got).backward()
-    assert [name for name in FLOATS if alone[name].grad is not None] == [wanted]
-    assert torch.equal(alone[wanted].grad, together[wanted].grad)
-
-
-def test_a_second_derivative_is_refused():
-    arguments = scene(2)
-    arguments["scales"].requires_grad_()
-    covars = pose_on_mesh_covars(**arguments).covars
-    (first,) = torch.autograd.grad(covars.square().sum(), arguments["scales"], create_graph=True)
-    with pytest.raises(RuntimeError, match="pose_on_mesh_covars: expected one derivative"):
-        first.sum().backward()
-
-
 def test_a_rigid_motion_turns_covariances():
     arguments = scene(3)
     turn = from_axis_angle(torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64), torch.tensor(2.5).double())
@@ -151,26 +118,6 @@ def test_the_unit_of_length_does_not_matter(unit):
     scaled = pose_on_mesh_covars(**arguments)
     assert rel(scaled.means / unit, one.means.double()) < 1e-6
     assert rel(scaled.covars / unit / unit, one.covars.double()) < 1e-6
-
-
-def test_a_set_without_gaussians_is_empty_and_gives_zero_gradients():
-    arguments = scene(0, n_gaussians=0)
-    for name in FLOATS:
-        arguments[name].requires_grad_()
-    got = pose_on_mesh_covars(**arguments)
-    assert [out.shape for out in got] == [(0, 3), (0, 3, 3)]
-    inputs = [arguments[name] for name in FLOATS]
-    for grad, tensor in zip(torch.autograd.grad(sum(out.sum() for out in got), inputs), inputs, strict=True):
-        assert grad.shape == tensor.shape and not grad.any()
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
-@pytest.mark.parametrize("name", FLOATS)
-def test_values_that_are_no_numbers_are_refused_by_name(name, value):
-    arguments = scene(0)
-    arguments[name].view(-1)[5] = value
-    with pytest.raises(ValueError, match=rf"^{name}: expected finite values .* got 1 of "):
-        pose_on_mesh_covars(**arguments)
 
 
 @pytest.mark.parametrize(

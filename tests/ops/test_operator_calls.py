@@ -1,10 +1,11 @@
 """A plain call of an operator, which bypasses torch's dispatcher, is the custom op in all but its time."""
 
 import gc
+import importlib
+import inspect
 import warnings
 import weakref
 
-import compile_operators
 import pytest
 import test_posing_operators
 import torch
@@ -13,6 +14,58 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from oasis_warp import ops
+from oasis_warp.ops import DECLARATIONS
+
+
+def spherical_harmonics():
+    g = torch.Generator().manual_seed(0)
+    directions, coefficients = torch.randn(5, 3, generator=g), torch.randn(5, 16, 3, generator=g)
+    return lambda d, c: ops.spherical_harmonics(3, d, c), [directions, coefficients]
+
+
+def gaussians(n=6):
+    g = torch.Generator().manual_seed(1)
+    means = torch.randn(n, 3, generator=g) * 0.3
+    quats, scales = torch.randn(n, 4, generator=g), torch.rand(n, 3, generator=g) * 0.2 + 0.05
+    return means, quats, scales, torch.rand(n, generator=g) * 0.8 + 0.1
+
+
+def camera():
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 2.0
+    return viewmat, torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]])
+
+
+def rasterization():
+    viewmat, K = camera()
+
+    def draw(means, quats, scales, opacities, colors, backgrounds, viewmats):
+        image, alphas, meta = ops.rasterization(
+            means, quats, scales, opacities, colors, viewmats, K[None], 17, 15, backgrounds=backgrounds,
+            render_mode="RGB+ED",
+        )  # fmt: skip
+        return image, alphas, meta["means2d"]
+
+    g = torch.Generator().manual_seed(2)
+    return draw, [*gaussians(), torch.rand(6, 3, generator=g), torch.rand(1, 3, generator=g), viewmat[None]]
+
+
+def rasterization_of_harmonics_and_covariances():
+    viewmat, K = camera()
+    means, _, scales, opacities = gaussians()
+
+    def draw(means, variances, opacities, coefficients):
+        covars = torch.diag_embed(variances)
+        image, alphas, _ = ops.rasterization(
+            means, None, None, opacities, coefficients, viewmat[None], K[None], 17, 15, covars=covars, sh_degree=1
+        )
+        return image, alphas
+
+    coefficients = torch.rand(6, 4, 3, generator=torch.Generator().manual_seed(3))
+    return draw, [means, scales.square(), opacities, coefficients]
+
+
+CASES = [spherical_harmonics, rasterization, rasterization_of_harmonics_and_covariances]
 
 
 def visibility():
@@ -29,17 +82,19 @@ def visibility():
 
 def cases():
     """Of each operator and way of calling it: a function of float tensors, and these."""
-    made = {case.__name__: case() for case in compile_operators.CASES} | {"visibility": visibility()}
-    return made | test_posing_operators.calls()
+    made = {case.__name__: case() for case in CASES} | {"visibility": visibility()}
+    posing = test_posing_operators.calls()
+    return made | {name: posing[name] for name in POSING}
 
 
+POSING = "bone_transforms poses", "face_rotations poses", "pose_on_mesh poses", "pose_on_mesh_covars", "skin poses"
 NAMES = tuple(cases())
 OPERATORS = {
     "spherical_harmonics": ["spherical_harmonics"],
     "rasterization": ["project", "blend"],
     "rasterization_of_harmonics_and_covariances": ["sh_to_rgb", "project", "blend"],
     "visibility": ["depth_visibility"],
-} | {name: [name.split()[0]] for name in test_posing_operators.calls()}
+} | {name: [name.split()[0]] for name in POSING}
 """The custom ops that a case calls, in this order."""
 
 
@@ -65,8 +120,9 @@ def weighted(out):
     return sum(((k + 1) * o).square().sum() for k, o in enumerate(out) if o.requires_grad)
 
 
-def results(name, transform=lambda leaf: leaf):
-    call, inputs = cases()[name]
+def results(name, transform=lambda leaf: leaf, call=None):
+    plain, inputs = cases()[name]
+    call = call or plain
     leaves = [tensor.clone().requires_grad_() for tensor in inputs]
     out = outputs(call, [transform(leaf) for leaf in leaves])
     return [o.detach() for o in out] + list(torch.autograd.grad(weighted(out), leaves))
@@ -75,6 +131,24 @@ def results(name, transform=lambda leaf: leaf):
 def assert_same_bits(some, others):
     assert len(some) == len(others)
     assert all(torch.equal(a, b) for a, b in zip(some, others, strict=True))
+
+
+@pytest.mark.parametrize("name", DECLARATIONS)
+def test_a_declaration_describes_its_public_function_and_names_its_reference(name):
+    declared = DECLARATIONS[name]
+    parameters = inspect.signature(declared.function).parameters
+    assert declared.inputs.keys() <= parameters.keys()
+    if declared.reference:
+        module, function = declared.reference.split(".")
+        assert callable(getattr(importlib.import_module(f"oasis_warp.reference.{module}"), function))
+
+
+@pytest.mark.parametrize("name", [case.__name__ for case in CASES])
+def test_an_operator_compiles_into_one_graph_with_its_gradient(name, as_shipped):
+    call, _ = cases()[name]
+    torch._dynamo.reset()
+    compiled = torch.compile(call, fullgraph=True, backend="aot_eager")
+    assert_same_bits(results(name, call=compiled), results(name))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -110,7 +184,7 @@ def test_a_tracer_sees_one_node_for_an_operator(name, as_shipped):
 
 
 def test_fake_tensors_meet_no_kernel():
-    directions, coefficients = compile_operators.spherical_harmonics()[1]
+    directions, coefficients = spherical_harmonics()[1]
     mode = FakeTensorMode()
     fakes = [mode.from_tensor(t).requires_grad_() for t in (directions, coefficients)]
     for _ in range(2):
@@ -233,7 +307,7 @@ def test_other_kinds_of_tensors_and_default_devices_change_nothing(name, as_ship
 
 
 def test_transforms_of_functions_go_through_torch():
-    directions, coefficients = compile_operators.spherical_harmonics()[1]
+    directions, coefficients = spherical_harmonics()[1]
     one_by_one = torch.stack([ops.spherical_harmonics(3, d, coefficients[0]) for d in directions])
     with warnings.catch_warnings(action="ignore"):  # that it is slow
         mapped = torch.func.vmap(lambda d: ops.spherical_harmonics(3, d, coefficients[0]))(directions)

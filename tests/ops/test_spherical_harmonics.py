@@ -1,10 +1,15 @@
+"""Spherical harmonics: against the textbook, and as colours of Gaussians (`sh_degree` of the rasterizer)."""
+
 import numpy as np
 import pytest
 import torch
+from rasterization_scenes import ordinary_scene
 from scipy.special import sph_harm_y
 
-from oasis_warp.ops import spherical_harmonics
+from oasis_warp.ops import rasterization, spherical_harmonics
+from oasis_warp.ops.spherical_harmonics import sh_to_rgb
 from oasis_warp.reference import rasterization as twin
+from oasis_warp.reference.rasterization import sh_to_rgb as expected_colors
 
 DEGREES = range(4)
 
@@ -103,15 +108,6 @@ def test_torch_finds_no_fault_with_the_registration():
     torch.library.opcheck(torch.ops.oasis_warp.spherical_harmonics, (directions, coefficients, 3, True))
 
 
-def test_a_second_derivative_is_refused():
-    directions, coefficients = (t.requires_grad_() for t in directions_and_coefficients(1, n=3))
-    (g,) = torch.autograd.grad(
-        spherical_harmonics(1, directions, coefficients).square().sum(), directions, create_graph=True
-    )
-    with pytest.raises(RuntimeError, match="spherical_harmonics: expected one derivative"):
-        g.sum().backward()
-
-
 @pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize(
     ("degree", "shape", "words"),
@@ -129,3 +125,116 @@ def test_values_that_are_not_finite_are_refused_by_name(bad, device):
     coefficients[2, 1, 0] = bad
     with pytest.raises(ValueError, match="coefficients: expected finite"):
         spherical_harmonics(1, torch.ones(5, 3, device=device), coefficients)
+
+
+def scene_and_coefficients(degree=3, cameras=2, dtype=torch.float64, per_camera=False):
+    scene = ordinary_scene(11, n=30, cameras=cameras, dtype=dtype)
+    g = torch.Generator().manual_seed(12)
+    shape = (cameras,) if per_camera else ()
+    return scene, torch.randn(*shape, 30, (degree + 1) ** 2, 3, generator=g, dtype=torch.float64).to(dtype)
+
+
+def draw(scene, colors, **options):
+    return rasterization(
+        *scene.gaussians, colors, scene.viewmats, scene.Ks, scene.width, scene.height,
+        backgrounds=scene.backgrounds, **options,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("per_camera", [False, True])
+@pytest.mark.parametrize("degree", range(4))
+def test_harmonics_are_drawn_as_the_colours_they_stand_for(degree, per_camera, device):
+    scene, coefficients = scene_and_coefficients(per_camera=per_camera)
+    colors = expected_colors(degree, scene.means, coefficients, scene.viewmats)
+    expected, alphas, _ = draw(scene.to(device), colors.to(device))
+    got, got_alphas, _ = draw(scene.to(device), coefficients.to(device), sh_degree=degree)
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-12)
+    assert torch.equal(got_alphas, alphas)
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_gradients_reach_means_coefficients_and_cameras(device):
+    scene, coefficients = scene_and_coefficients(degree=2, cameras=1)
+    inputs = [t.to(device).requires_grad_() for t in (scene.means.clone(), coefficients, scene.viewmats.clone())]
+    scene = scene.to(device)
+    weights = torch.randn(3, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
+
+    def total(means, coefficients, viewmats):
+        image, *_ = draw(scene.with_(means=means, viewmats=viewmats), coefficients, sh_degree=2)
+        return (image * weights).mean()
+
+    got = torch.autograd.grad(total(*inputs), inputs)
+    g = torch.Generator().manual_seed(2)
+    for k, gradient in enumerate(got):
+        direction = torch.randn(gradient.shape, generator=g, dtype=torch.float64).to(device)
+        step = 1e-5
+
+        def moved(by, k=k, direction=direction):
+            return total(*[t.detach() + (by * direction if i == k else 0) for i, t in enumerate(inputs)])
+
+        slope = (8 * (moved(step) - moved(-step)) - (moved(2 * step) - moved(-2 * step))) / (12 * step)
+        assert abs(float((gradient * direction).sum() - slope)) <= 1e-6 * abs(float(slope))
+
+
+def test_a_far_camera_sees_the_same_colours(device):
+    scene, coefficients = scene_and_coefficients(cameras=1, dtype=torch.float32)
+    shift = torch.tensor([1024.0, -512.0, 2048.0])
+    far = scene.viewmats.double().clone()
+    far[:, :3, 3] -= (far[:, :3, :3] @ shift.double())
+    # Means on a grid that float32 still holds at that distance.
+    near = scene.with_(means=(scene.means * 1024).round() / 1024).to(device)
+    moved = near.with_(means=near.means + shift.to(device), viewmats=far.to(torch.float32).to(device))
+    exact = moved.to("cpu").to(torch.float64)
+    truth = expected_colors(3, exact.means, coefficients.double(), exact.viewmats)
+    got = sh_to_rgb(3, moved.means, coefficients.to(device), moved.viewmats).cpu()
+    assert (got - truth).norm() <= 1e-6 * truth.norm()
+
+
+@pytest.mark.usefixtures("as_shipped")
+@pytest.mark.parametrize(
+    ("degree", "shape", "words"),
+    [(4, (30, 25, 3), "sh_degree: expected a degree from 0 to 3"), (3, (30, 9, 3), "sh_degree: expected at most"),
+     (1, (30, 3), "colors: expected shape"), (1, (30, 4, 5), "colors: expected shape")],
+)  # fmt: skip
+def test_a_wrong_degree_or_shape_is_refused_by_name(degree, shape, words):
+    scene, _ = scene_and_coefficients(dtype=torch.float32)
+    with pytest.raises(ValueError, match=words):
+        draw(scene, torch.zeros(shape), sh_degree=degree)
+
+
+@pytest.mark.parametrize("wanted", [(1, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
+@pytest.mark.parametrize("per_camera", [False, True])
+@pytest.mark.parametrize("degree", range(4))
+def test_colours_and_their_gradients_are_those_of_the_twin(degree, per_camera, wanted, device):
+    scene, coefficients = scene_and_coefficients(cameras=3, per_camera=per_camera)  # more than the degree's
+    inputs = [
+        t.to(device).clone().requires_grad_(bool(asked))
+        for t, asked in zip((scene.means, coefficients, scene.viewmats), wanted, strict=True)
+    ]
+    leaves = [t for t in inputs if t.requires_grad]
+    got, expected = sh_to_rgb(degree, *inputs), expected_colors(degree, *inputs)
+    assert (expected == 0).any() and (expected > 0).any()
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-13)
+    incoming = torch.randn(got.shape, generator=torch.Generator().manual_seed(3), dtype=got.dtype).to(device)
+    expected = expected + 0 * sum(leaf.sum() for leaf in leaves)  # degree 0 depends on the coefficients alone
+    for a, b in zip(
+        torch.autograd.grad(got, leaves, incoming), torch.autograd.grad(expected, leaves, incoming), strict=True
+    ):
+        assert (a - b).norm() <= 1e-12 * b.norm()
+
+
+def test_nothing_to_see_has_no_colours_and_gradients_of_zero(device):
+    scene, coefficients = scene_and_coefficients()
+    none = scene.means[:0].to(device), coefficients[:0].to(device), scene.viewmats.to(device)
+    inputs = [t.clone().requires_grad_() for t in none]
+    colors = sh_to_rgb(3, *inputs)
+    assert colors.shape == (2, 0, 3)
+    gradients = torch.autograd.grad(colors.sum(), inputs)
+    assert [g.shape for g in gradients] == [t.shape for t in inputs] and not gradients[2].any()
+
+
+def test_colours_that_are_no_numbers_stay_so(device):
+    scene, coefficients = scene_and_coefficients(dtype=torch.float32)
+    coefficients[3, 0, 1] = float("nan")
+    colors = sh_to_rgb(3, scene.means.to(device), coefficients.to(device), scene.viewmats.to(device))
+    assert colors[:, 3, 1].isnan().all() and colors.isnan().sum() == 2

@@ -15,9 +15,9 @@ from test_rasterization_stiff import CASES
 from oasis_kernels.constants import Rules
 from oasis_warp.ops import blending, rasterization
 from oasis_warp.ops._runtime import blend_strips, tiles
-from oasis_warp.ops._runtime.registration import revealed
+from oasis_warp.ops._runtime.records import Frame, GradientFlags, Splats
 from oasis_warp.ops._runtime.rules import using
-from oasis_warp.ops._runtime.splats import Frame, Splats, Wanted
+from oasis_warp.ops._runtime.tiles import opaque_elements
 from oasis_warp.ops.projection import project
 
 SIZES = [(1, 1), (16, 16), (257, 2), (2, 65), (65, 63)]
@@ -174,7 +174,7 @@ def test_lists_hold_each_strips_gaussians_by_depth_and_then_by_index(n, distinct
     )  # fmt: skip
     _, _, lists = blend_strips.draw(splats, Frame(80, 70, 8), True)
     assert lists is not None
-    ids = revealed(lists.ids)
+    ids = opaque_elements(lists.ids)
     boxes, depths = p.tables().boxes.view(-1, 4), p.tables().sort_depths.view(-1)
     x0, y0, x1, y1 = boxes.unbind(1)
     for s in range(cut.n_strips):
@@ -221,10 +221,10 @@ class Guards:
     def zeros(self, *shape, dtype=torch.float32):
         return self._between(shape, dtype, 0)
 
-    def hidden(self, size, dtype, device):
-        return self.empty(size + 1, dtype=dtype)  # told apart by `revealed`
+    def opaque_buffer(self, size, dtype, device):
+        return self.empty(size + 1, dtype=dtype)  # told apart by `opaque_elements`
 
-    def revealed(self, buffer):
+    def opaque_elements(self, buffer):
         return buffer[:-1]
 
     def check(self):
@@ -256,16 +256,16 @@ def test_nothing_is_written_past_a_buffer_nor_read_from_there(name, channels, ti
     opacities = scene.opacities.expand(n_cameras, n).contiguous()
     g_image = torch.rand(n_cameras, scene.height, scene.width, channels, generator=g)
     g_alpha = torch.rand(n_cameras, scene.height, scene.width, 1, generator=g)
-    frame, wanted = Frame(scene.width, scene.height, tile_size), Wanted(True, True, True)
+    frame, flags = Frame(scene.width, scene.height, tile_size), GradientFlags(True, True, True)
 
     def run(copy):
         splats = Splats(
             *map(copy, (p.records, opacities, colors, backgrounds))
         )
         *plain, nothing = blend_strips.draw(splats, frame, False)
-        *drawn, kept = blend_strips.draw(splats, frame, True)
-        assert nothing is None and kept is not None
-        back = blend_strips.draw_backward(copy(g_image), copy(g_alpha), splats, frame, kept, wanted)
+        *drawn, saved = blend_strips.draw(splats, frame, True)
+        assert nothing is None and saved is not None
+        back = blend_strips.draw_backward(copy(g_image), copy(g_alpha), splats, frame, saved, flags)
         return [*plain, *drawn, *back]
 
     expected = run(lambda t: t)
@@ -278,8 +278,8 @@ def test_nothing_is_written_past_a_buffer_nor_read_from_there(name, channels, ti
 
     with monkeypatch.context() as patch:
         patch.setattr(blend_strips, "torch", guards)
-        patch.setattr(blend_strips, "hidden", guards.hidden)
-        patch.setattr(blend_strips, "revealed", guards.revealed)
+        patch.setattr(blend_strips, "opaque_buffer", guards.opaque_buffer)
+        patch.setattr(blend_strips, "opaque_elements", guards.opaque_elements)
         got = run(guarded)
     guards.check()
     assert all(torch.equal(a, b) for a, b in zip(got, expected, strict=True))

@@ -117,15 +117,6 @@ def test_visibility_passes_gradcheck_in_the_points():
     assert torch.autograd.gradcheck(lambda p: visible(p, vertices, faces, viewmat, K).visibility, points)
 
 
-def test_a_second_derivative_is_refused():
-    vertices, faces, viewmat, K = soup(0)
-    points = some_points(vertices, faces, 0).requires_grad_()
-    squares = visible(points, vertices, faces, viewmat, K).visibility.square()
-    (first,) = torch.autograd.grad(squares.sum(), points, create_graph=True)
-    with pytest.raises(RuntimeError, match="^depth_visibility: expected one derivative"):
-        first.sum().backward()
-
-
 def test_depth_maps_carry_no_gradient():
     vertices, faces, viewmat, K = soup(1)
     points = some_points(vertices, faces, 1).requires_grad_()

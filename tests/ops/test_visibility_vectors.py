@@ -194,14 +194,14 @@ GUARD = 1024
 def test_nothing_is_written_past_a_buffer(monkeypatch):
     guarded = []
 
-    def room(scene, *shape, dtype=None):
+    def empty(scene, *shape, dtype=None):
         like = scene.vertices.new_empty((len(scene.vertices), *shape), dtype=dtype, device="meta")
         size = like.numel() * like.element_size()
         memory = torch.full((size + 2 * GUARD,), 0xA5, dtype=torch.uint8)
         guarded.append(memory)
         return memory[GUARD : GUARD + size].view(like.dtype).view(like.shape)
 
-    monkeypatch.setattr(depth_buffer.Scene, "room", room)
+    monkeypatch.setattr(depth_buffer.DepthScene, "empty", empty)
     monkeypatch.setattr(depth_buffer, "FACES_A_PART", 20)
     for dtype in (torch.float32, torch.float64):
         for seed, (width, height) in enumerate(SIZES):

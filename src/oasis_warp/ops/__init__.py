@@ -1,5 +1,6 @@
 """Differentiable operators on torch tensors, computed by Warp kernels on the CPU or a CUDA device."""
 
+from oasis_warp.ops._runtime.declaration import DECLARATIONS as DECLARATIONS
 from oasis_warp.ops._runtime.pair_counts import watch_overflow as watch_overflow
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck as DeferredFiniteCheck
 from oasis_warp.ops._runtime.values import check_finite as check_finite
@@ -14,14 +15,14 @@ from oasis_warp.ops.cuda_graph import RecordedRasterization as RecordedRasteriza
 from oasis_warp.ops.depth_map import DepthMap as DepthMap
 from oasis_warp.ops.depth_map import depth_map as depth_map
 from oasis_warp.ops.face_rotations import FaceRotations as FaceRotations
+from oasis_warp.ops.face_rotations import RestMesh as RestMesh
 from oasis_warp.ops.face_rotations import face_rotations as face_rotations
+from oasis_warp.ops.face_rotations import rest_mesh as rest_mesh
+from oasis_warp.ops.mesh_posing import PosedCovars as PosedCovars
 from oasis_warp.ops.mesh_posing import PosedOnMesh as PosedOnMesh
 from oasis_warp.ops.mesh_posing import pose_on_mesh as pose_on_mesh
-from oasis_warp.ops.mesh_posing_covars import PosedCovars as PosedCovars
-from oasis_warp.ops.mesh_posing_covars import pose_on_mesh_covars as pose_on_mesh_covars
+from oasis_warp.ops.mesh_posing import pose_on_mesh_covars as pose_on_mesh_covars
 from oasis_warp.ops.rasterization import rasterization as rasterization
-from oasis_warp.ops.rest_mesh import RestMesh as RestMesh
-from oasis_warp.ops.rest_mesh import rest_mesh as rest_mesh
 from oasis_warp.ops.skinning import Skinned as Skinned
 from oasis_warp.ops.skinning import skin as skin
 from oasis_warp.ops.spherical_harmonics import spherical_harmonics as spherical_harmonics

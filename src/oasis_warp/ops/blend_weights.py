@@ -11,11 +11,10 @@ from torch.autograd.function import once_differentiable
 
 from oasis_kernels import constants
 from oasis_warp.core.checks import check_float, check_shape
-from oasis_warp.ops._runtime.launch import has_vectors
-from oasis_warp.ops._runtime.scene_checks import check_cameras, check_gaussians
-from oasis_warp.ops._runtime.splats import Splats
-from oasis_warp.ops._runtime.weigh_strips import weigh as weigh_strips
-from oasis_warp.ops._runtime.weigh_tiles import weigh as weigh_tiles
+from oasis_warp.ops._runtime.declaration import Array, Declaration
+from oasis_warp.ops._runtime.rasterization_checks import check_cameras, check_gaussians
+from oasis_warp.ops._runtime.records import Splats
+from oasis_warp.ops._runtime.weigh import weigh
 from oasis_warp.ops.projection import project
 
 
@@ -27,7 +26,18 @@ class BlendWeights(NamedTuple):
     transpose: Tensor
     """The same, sparse CSR [N, H*W]: gradients by the colours are a product with it."""
     alphas: Float[Tensor, "H W 1"]
-    """What the Gaussians cover: the row sums. The background shows through 1 - alphas."""
+    """Coverage by the Gaussians, the row sums. The share of the background is 1 - alphas."""
+
+
+WEIGHTS = Declaration(
+    "blend_weights",
+    inputs={
+        "means": Array("N 3"), "quats": Array("N 4"), "scales": Array("N 3"), "opacities": Array("N"),
+        "viewmat": Array("4 4"), "K": Array("3 3"),
+    },
+    outputs={"matrix": "HW N", "transpose": "N HW", "alphas": "H W 1"},
+)  # fmt: skip
+COLORS = Declaration("blend_colors", inputs={"colors": Array("N D", grad=True)}, outputs={"image": "H W D"})
 
 
 def blend_weights(
@@ -86,7 +96,6 @@ def blend_weights(
         splats = Splats(
             projection.records, opacities[None].contiguous(), means.new_empty(1, n, 0), means.new_empty(1, 0)
         )
-        weigh = weigh_strips if has_vectors(means) else weigh_tiles
         w = weigh(splats, width, height, tile_size)
         matrix = _csr(w.pixel_starts, w.gaussians, w.by_pixel, (pixels, n))
         transpose = _csr(w.gaussian_starts, w.pixels, w.by_gaussian, (n, pixels))

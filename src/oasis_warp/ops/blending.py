@@ -1,4 +1,4 @@
-"""Projected Gaussians -> image and alpha, differentiable in their places, shapes, opacities, colours, backgrounds."""
+"""Projected Gaussians -> image and alpha, differentiable in positions, shapes, opacities, colours and backgrounds."""
 
 from types import ModuleType
 from typing import Any
@@ -9,17 +9,16 @@ from torch import Tensor
 
 from oasis_kernels import constants
 from oasis_kernels.rasterize.tiles_cuda import INDEX_BITS
-from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime import blend_cuda, blend_strips, blend_tiles
-from oasis_warp.ops._runtime.launch import has_vectors
-from oasis_warp.ops._runtime.registration import adjoint, differentiable, needs_gradient, operator
-from oasis_warp.ops._runtime.splats import Frame, Splats, Wanted
+from oasis_warp.ops._runtime.declaration import Array, Operator, needs_gradient
+from oasis_warp.ops._runtime.launch import contiguous, has_vectors
+from oasis_warp.ops._runtime.records import Frame, GradientFlags, Splats
 from oasis_warp.ops._runtime.values import check_finite
 from oasis_warp.ops.projection import Projection
 
 
-def _way(colors: Tensor) -> ModuleType:
-    """How Gaussians with these colours [C, N, D] are drawn."""
+def _backend(colors: Tensor) -> ModuleType:
+    """The backend that blends Gaussians with these colours [C, N, D]."""
     if has_vectors(colors):
         return blend_strips
     if colors.is_cuda and colors.dtype == torch.float32 and colors.shape[1] <= 1 << INDEX_BITS:
@@ -27,114 +26,78 @@ def _way(colors: Tensor) -> ModuleType:
     return blend_tiles
 
 
-# Sizes and flags come in lists: torch takes time for every argument of an op.
+# Sizes and flags come in lists: each argument of an op costs torch time.
 def _blend(
-    means2d: Tensor,
-    covars2d: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    backgrounds: Tensor,
-    records: Tensor,
-    frame: list[int],
-    keep: bool,
-    validate: bool,
-) -> tuple[Tensor, Tensor, list[Tensor]]:
+    means2d: Tensor, covars2d: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor, records: Tensor,
+    frame: list[int], keep: bool, validate: bool,
+) -> tuple[Tensor, Tensor, list[Tensor]]:  # fmt: skip
     if validate:
         shared = colors.stride(0) == 0  # by the cameras: each value counts once
         check_finite(colors=colors[:1] if shared else colors, backgrounds=backgrounds)
-    splats = Splats(records, opacities.contiguous(), colors.contiguous(), backgrounds.contiguous())
-    image, alphas, kept = _way(colors).draw(splats, Frame(*frame), keep)
-    return image, alphas, [] if kept is None else list(kept)
+    splats = Splats(records, *contiguous(opacities, colors, backgrounds))
+    image, alphas, saved = _backend(colors).draw(splats, Frame(*frame), keep)
+    return image, alphas, [] if saved is None else list(saved)
 
 
 def _blend_fake(
-    means2d: Tensor,
-    covars2d: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    backgrounds: Tensor,
-    records: Tensor,
-    frame: list[int],
-    keep: bool,
-    validate: bool,
-) -> tuple[Tensor, Tensor, list[Tensor]]:
+    means2d: Any, covars2d: Any, opacities: Any, colors: Tensor, backgrounds: Any, records: Any, frame: list[int],
+    keep: bool, validate: bool,
+) -> tuple[Tensor, Tensor, list[Tensor]]:  # fmt: skip
     n_cameras, _, channels = colors.shape
     width, height, _ = frame
     image, alphas = (colors.new_empty(n_cameras, height, width, k) for k in (channels, 1))
-    return image, alphas, list(_way(colors).kept_like(colors, Frame(*frame))) if keep else []
+    return image, alphas, list(_backend(colors).fake_saved(colors, Frame(*frame))) if keep else []
 
 
 def _blend_backward(
-    g_image: Tensor | None,
-    g_alpha: Tensor | None,
-    splats: list[Tensor],
-    kept: list[Tensor],
-    frame: list[int],
-    wanted: list[bool],
-) -> list[Tensor]:
-    drawn = Splats(*(t.contiguous() for t in splats))
-    incoming = [None if g is None else g.contiguous() for g in (g_image, g_alpha)]
-    way = _way(drawn.colors)
-    gradients = way.draw_backward(*incoming, drawn, Frame(*frame), way.Kept(*kept), Wanted(*wanted))
-    return [drawn.colors.new_empty(0) if g is None else g for g in gradients]
+    opacities: Tensor, colors: Tensor, backgrounds: Tensor, records: Tensor, saved: list[Tensor], frame: list[int],
+    g_image: Tensor | None, g_alphas: Tensor | None, needs: list[bool],
+) -> list[Tensor]:  # fmt: skip
+    splats = Splats(records, *contiguous(opacities, colors, backgrounds))
+    backend, flags = _backend(colors), GradientFlags(any(needs[:3]), *needs[3:])
+    gradients = backend.draw_backward(
+        *contiguous(g_image, g_alphas), splats, Frame(*frame), backend.SavedTensors(*saved), flags
+    )
+    return [colors.new_empty(0) if g is None else g for g in gradients]
 
 
 def _blend_backward_fake(
-    g_image: Tensor | None,
-    g_alpha: Tensor | None,
-    splats: list[Tensor],
-    kept: list[Tensor],
-    frame: list[int],
-    wanted: list[bool],
-) -> list[Tensor]:
-    colors = Splats(*splats).colors
+    opacities: Any, colors: Tensor, backgrounds: Any, records: Any, saved: Any, frame: Any, g_image: Any, g_alphas: Any,
+    needs: list[bool],
+) -> list[Tensor]:  # fmt: skip
     n_cameras, n, channels = colors.shape
-    by = Wanted(*wanted)
+    shape = any(needs[:3])
     gradients = [
-        (by.shape, (n_cameras, n, 2), colors.dtype),
-        (by.shape, (n_cameras, n, 3), torch.float64),
-        (by.shape, (n_cameras, n), colors.dtype),
-        (by.colors, (n_cameras, n, channels), colors.dtype),
-        (by.backgrounds, (n_cameras, channels), colors.dtype),
+        (shape, (n_cameras, n, 2), colors.dtype),
+        (shape, (n_cameras, n, 3), torch.float64),
+        (shape, (n_cameras, n), colors.dtype),
+        (needs[3], (n_cameras, n, channels), colors.dtype),
+        (needs[4], (n_cameras, channels), colors.dtype),
     ]
     return [
-        colors.new_empty(shape, dtype=dtype) if asked else colors.new_empty(0) for asked, shape, dtype in gradients
+        colors.new_empty(shape, dtype=dtype) if needed else colors.new_empty(0) for needed, shape, dtype in gradients
     ]
 
 
-_forward = operator("blend", _blend, _blend_fake)
-_adjoint = adjoint("blend_backward", _blend_backward, _blend_backward_fake)
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
-    _, _, opacities, colors, backgrounds, records, ctx.frame, _, _ = inputs
-    ctx.save_for_backward(records, opacities, colors, backgrounds, *output[2])
-    ctx.bytes = None if is_traced() else [t.untyped_storage().nbytes() for t in output[2]]
-    ctx.set_materialize_grads(False)
-
-
-def _back(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, _kept: Any) -> tuple[Any, ...]:
-    by_means2d, by_covars2d, by_opacities, by_colors, by_backgrounds = needs = ctx.needs_input_grad[:5]
-    wanted = [by_means2d or by_covars2d or by_opacities, by_colors, by_backgrounds]
-    gradients: Any = (None,) * 5
-    if g_image is not None or g_alpha is not None:
-        saved = ctx.saved_tensors
-        if ctx.bytes is not None and ctx.bytes != [t.untyped_storage().nbytes() for t in saved[4:]]:
-            raise RuntimeError(
-                "rasterization: expected the tensors that it saved, got copies, which lack what is hidden behind them. "
-                "Draw outside of hooks that move saved tensors, such as torch.autograd.graph.save_on_cpu."
-            )
-        gradients = _adjoint(g_image, g_alpha, list(saved[:4]), list(saved[4:]), ctx.frame, wanted)
-    return (
-        *(g if need else None for g, need in zip(gradients, needs, strict=True)),
-        None,  # records
-        None,  # frame
-        None,  # keep
-        None,  # validate
-    )
-
-
-differentiable(_forward, _back, _save)
+_OPERATOR = Operator(
+    "blend",
+    _blend,
+    _blend_fake,
+    _blend_backward,
+    _blend_backward_fake,
+    inputs={
+        "means2d": Array("C N 2", grad=True),
+        "covars2d": Array("C N 3", grad=True),
+        "opacities": Array("C N", grad=True),
+        "colors": Array("C N D", grad=True),
+        "backgrounds": Array("C D", grad=True),
+    },
+    outputs={"image": "C H W D", "alphas": "C H W 1"},
+    auxiliary={"saved": "..."},
+    validates_itself=True,
+    caller="rasterization",
+    public=False,
+)
 
 
 def blend(
@@ -161,7 +124,7 @@ def blend(
         colors = torch.nn.functional.pad(colors, (0, padding))
         backgrounds = torch.nn.functional.pad(backgrounds, (0, padding))
     means2d, covars2d = projection.means2d, projection.covars2d
-    image, alphas, _ = _forward(
+    image, alphas, _ = _OPERATOR(
         means2d, covars2d, opacities, colors, backgrounds, projection.records, [width, height, tile_size],
         needs_gradient(means2d, covars2d, opacities, colors, backgrounds), validate,
     )  # fmt: skip

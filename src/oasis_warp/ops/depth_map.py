@@ -1,4 +1,4 @@
-"""What a camera sees of a mesh: depths, face ids and barycentrics, a pixel each."""
+"""Depth, face id and barycentrics of the surface that a camera sees in each pixel."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -7,17 +7,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_warp.core.checks import check_choice, check_float, check_positive, check_shape
+from oasis_warp.core.checks import check_choice, check_positive
+from oasis_warp.ops._runtime.declaration import Array, Operator
 from oasis_warp.ops._runtime.depth_buffer import draw, plane_size
-from oasis_warp.ops._runtime.depth_scene import Scene, Wanted
+from oasis_warp.ops._runtime.depth_scene import BufferParts, DepthScene, empty_buffer
 from oasis_warp.ops._runtime.incidence import incidence
-from oasis_warp.ops._runtime.registration import operator
 
 
 class DepthMap(NamedTuple):
-    """The nearest surface of each pixel. The batch axis B is there if an argument has one.
+    """The nearest surface of each pixel, with a batch axis B if an argument has one.
 
-    Fields that were not among the `outputs` asked for have no rows and no columns.
+    Fields that are not among `outputs` have no rows and no columns.
     """
 
     depth: Float[Tensor, "H W"] | Float[Tensor, "B H W"]
@@ -28,71 +28,61 @@ class DepthMap(NamedTuple):
     """Weights of that face's corners at the pixel's centre, perspective correct; 0 where there is none."""
 
 
-def check_batched(name: str, tensor: Tensor, *shape: int | str, sizes: dict[str, int], hint: str = "") -> None:
-    """Check that `tensor` has `shape`, or that with a batch axis B before it."""
-    batched = isinstance(tensor, Tensor) and tensor.dim() > len(shape)
-    check_shape(name, tensor, *(("B", *shape) if batched else shape), sizes=sizes if batched else None, hint=hint)
+MESH_AND_CAMERA = {
+    "vertices": Array("?B V 3"),
+    "faces": Array("F 3", index="V", hint="Three vertex indices a face."),
+    "viewmat": Array("?B 4 4", hint="World to camera."),
+    "K": Array("?B 3 3"),
+}
 
 
-def check_scene(
-    vertices: Tensor, faces: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, near_plane: float
-) -> dict[str, int]:
-    """Check shapes and types of a mesh and a camera; the size of their batch as B, if they have one."""
-    sizes: dict[str, int] = {}
-    check_batched("vertices", vertices, "V", 3, sizes=sizes)
-    check_float("vertices", vertices)
-    check_shape("faces", faces, "F", 3, hint="Three vertex indices a face.")
-    check_batched("viewmat", viewmat, 4, 4, sizes=sizes, hint="World to camera.")
-    check_float("viewmat", viewmat, vertices)
-    check_batched("K", K, 3, 3, sizes=sizes)
-    check_float("K", K, vertices)
+def check_picture(width: int, height: int, near_plane: float) -> None:
+    """Refuse sizes that cannot be drawn.
+
+    Raises:
+        ValueError: names the argument.
+    """
     for name, size in (("width", width), ("height", height)):
         if size < 1:
             raise ValueError(f"{name}: expected 1 or more pixels, got {size}.")
     if plane_size(width, height) >= 2**31:
         raise ValueError(f"width: expected fewer than 2^31 pixels, got {width} x {height}. Draw the picture in tiles.")
     check_positive("near_plane", near_plane)
-    return sizes
 
 
-def batched(tensor: Tensor, batch: int, n_axes: int) -> Tensor:
-    """`tensor`, of `n_axes` without a batch axis, the same for all of the batch."""
+def expand_batch(tensor: Tensor, batch: int, n_axes: int = 2) -> Tensor:
+    """`tensor`, of `n_axes` without a batch axis, repeated over the batch without a copy."""
     if tensor.dim() > n_axes:
         return tensor
     return tensor[None] if batch == 1 else tensor.expand(batch, *tensor.shape)
 
 
 def _depth_map(
-    vertices: Tensor,
-    faces: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float,
-    depth: bool,
-    face_ids: bool,
-    barycentrics: bool,
-    validate: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
+    vertices: Tensor, faces: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, near_plane: float,
+    depth: bool, face_ids: bool, barycentrics: bool, validate: bool,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     table = incidence("faces", faces, vertices.shape[1], "vertices").table
-    scene = Scene(vertices, table, viewmats, Ks, width, height, near_plane)
-    buffer, _ = draw(scene, None, Wanted(depth, face_ids, barycentrics), validate)
+    scene = DepthScene(vertices, table, viewmats, Ks, width, height, near_plane)
+    buffer, _ = draw(scene, None, BufferParts(depth, face_ids, barycentrics), validate)
     return buffer.depth, buffer.face_ids, buffer.barycentrics
 
 
 def _depth_map_fake(
     vertices, faces, viewmats, Ks, width, height, near_plane, depth, face_ids, barycentrics, validate
 ):  # fmt: skip
-    size, nothing = (len(vertices), height, width), (len(vertices), 0, 0)
-    return (
-        vertices.new_empty(size if depth else nothing),
-        vertices.new_empty(size if face_ids else nothing, dtype=torch.int32),
-        vertices.new_empty((*(size if barycentrics else nothing), 3)),
-    )
+    scene = DepthScene(vertices, faces, viewmats, Ks, width, height, near_plane)
+    return tuple(empty_buffer(scene, BufferParts(depth, face_ids, barycentrics)))
 
 
-_op = operator("depth_map", _depth_map, _depth_map_fake)
+_OPERATOR = Operator(
+    "depth_map",
+    _depth_map,
+    _depth_map_fake,
+    inputs=MESH_AND_CAMERA,
+    outputs={"depth": "?B H W", "face_ids": "?B H W", "barycentrics": "?B H W 3"},
+    validates_itself=True,
+    reference="visibility.depth_map",
+)
 
 
 @torch.no_grad()
@@ -108,7 +98,7 @@ def depth_map(
     outputs: Sequence[Literal["depth", "face_ids", "barycentrics"]] = DepthMap._fields,
     validate: bool = True,
 ) -> DepthMap:
-    """The nearest surface behind each pixel's centre, from either side; nothing here carries a gradient.
+    """The nearest surface behind each pixel's centre, from either side. Not differentiable.
 
     Edges belong to both of their faces, so a closed surface has no holes; of faces at one depth the smallest index is
     kept. Faces may pass through the camera's plane (2D homogeneous rasterization, Olano and Greer 1997); a face that
@@ -127,21 +117,22 @@ def depth_map(
         width: Columns of the image.
         height: Rows of the image.
         near_plane: Depth up to which surfaces are not seen [m].
-        outputs: Fields to compute. Barycentrics cost most, ids nearly nothing; depths are float64 rounded to the
-            vertices' type only in company of barycentrics or on CUDA, else within 5e-6 in float32.
-        validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
-            Shapes and indices are always checked, indices once a tensor.
+        outputs: Fields to compute. Barycentrics cost most, ids nearly nothing. Depths are float64 rounded to the
+            vertices' type with barycentrics or on CUDA, else within 5e-6 in float32.
+        validate: Check the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
+            Shapes and indices are always checked, indices once for each tensor.
 
     Raises:
         ValueError: a wrong shape, dtype or index, a value that is not finite, or a size or focal length that is not
             positive.
     """
-    sizes = check_scene(vertices, faces, viewmat, K, width, height, near_plane)
+    sizes = _OPERATOR.check(vertices=vertices, faces=faces, viewmat=viewmat, K=K)
+    check_picture(width, height, near_plane)
     for name in outputs:
         check_choice("outputs", name, DepthMap._fields)
     batch = sizes.get("B", 1)
-    out = _op(
-        batched(vertices, batch, 2), faces, batched(viewmat, batch, 2), batched(K, batch, 2), width, height,
+    out = _OPERATOR(
+        expand_batch(vertices, batch), faces, expand_batch(viewmat, batch), expand_batch(K, batch), width, height,
         near_plane, *(name in outputs for name in DepthMap._fields), validate,
     )  # fmt: skip
     return DepthMap(*(out if "B" in sizes else (t[0] for t in out)))

@@ -1,4 +1,4 @@
-"""Gaussians and cameras -> what the rasterizer draws, differentiable in means, shapes and viewmats.
+"""Gaussians and cameras -> projected Gaussians, differentiable in means, shapes and viewmats.
 
 A shape is a quaternion with three scales, or a covariance.
 """
@@ -10,12 +10,14 @@ from jaxtyping import Float, Float64, Int32, UInt8
 from torch import Tensor
 
 from oasis_warp.core.checks import check_finite
-from oasis_warp.ops._runtime.launch import has_cuda_kernels, has_vectors
-from oasis_warp.ops._runtime.project_launch import (
+from oasis_warp.ops._runtime.declaration import Array, Operator, empty_gradients
+from oasis_warp.ops._runtime.launch import contiguous, has_cuda_kernels, has_vectors
+from oasis_warp.ops._runtime.projection_backends import (
     Incoming,
     Limits,
     Outputs,
-    Scene,
+    ProjectionGradients,
+    ProjectionInputs,
     backward_cuda,
     backward_generic,
     backward_vectors,
@@ -26,11 +28,6 @@ from oasis_warp.ops._runtime.project_launch import (
     project_vectors,
 )
 from oasis_warp.ops._runtime.records import Tables, tables
-from oasis_warp.ops._runtime.registration import adjoint, differentiable, operator
-
-INPUTS = "means", "quats", "scales", "covars", "viewmats"
-"""Arguments that receive gradients."""
-Gradients = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 class Projection(NamedTuple):
@@ -41,13 +38,13 @@ class Projection(NamedTuple):
     covars2d: Float64[Tensor, "C N 3"]
     """Covariances xx, xy, yy with the low-pass [px^2]; float64, or the gradient of a needle would cancel."""
     depths: Float[Tensor, "C N"]
-    """Camera z, of Gaussians that are not drawn too."""
+    """Camera z, also of Gaussians that are not drawn."""
     conics: Float[Tensor, "C N 3"]
     """Inverse covariances xx, xy, yy; for reading, without gradient, as all below."""
     radii: Int32[Tensor, "C N 2"]
     """Half the sides of the box outside which the Gaussian is fainter than 1/255 [px], rounded up."""
     records: UInt8[Tensor, "B"]
-    """For whoever draws: see `_records`."""
+    """For the blending: see `records`."""
 
     def tables(self) -> Tables:
         """The records."""
@@ -55,15 +52,10 @@ class Projection(NamedTuple):
 
 
 def check_values(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    opacities: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-) -> None:
-    """Refuse values that a kernel would hide in a plausible picture.
+    means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
+    viewmats: Tensor, Ks: Tensor,
+) -> None:  # fmt: skip
+    """Refuse values that would give a plausible but wrong picture.
 
     Raises:
         ValueError: names the argument: NaN, infinities and magnitudes above 1e15, zero quaternions, negative variances,
@@ -106,16 +98,13 @@ def _project(
     limits: list[float],  # as `Limits`
     validate: bool,
 ) -> Outputs:
-    scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
+    scene = ProjectionInputs(means, quats, scales, covars, viewmats, Ks, width, height)
     check_arrays(scene, opacities=(opacities, means.shape[:1], means.dtype))
     out = empty_outputs(means, viewmats, width, height)
     if has_cuda_kernels(means) or (len(means) and len(viewmats) and has_vectors(means)):
-        # The kernel looks at the values as it reads them; what is wrong with them is for the slow checks to say.
-        scene, opacities = scene.contiguous(), opacities.contiguous()
-        if means.is_cuda:
-            sound = project_cuda(scene, opacities, Limits(*limits), out, validate)
-        else:
-            sound = project_vectors(scene, opacities, Limits(*limits), out)
+        # The kernel checks values as it reads them; the slow checks then say what is wrong with them.
+        run = project_cuda if means.is_cuda else project_vectors
+        sound = run(scene.contiguous(), opacities.contiguous(), Limits(*limits), out, validate)
         if validate and not sound:
             check_values(means, quats, scales, covars, opacities, viewmats, Ks)
             raise AssertionError("the kernel has met a bad value that is not in its inputs")
@@ -128,36 +117,18 @@ def _project(
 
 
 def _project_fake(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    opacities: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    *_: Any,
-) -> Outputs:
+    means: Tensor, quats: Any, scales: Any, covars: Any, opacities: Any, viewmats: Tensor, Ks: Any, width: int,
+    height: int, *_: Any,
+) -> Outputs:  # fmt: skip
     return empty_outputs(means, viewmats, width, height)
 
 
 def _project_backward(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    radii: Tensor,
-    g_means2d: Tensor | None,
-    g_covars2d: Tensor | None,
-    g_depths: Tensor | None,
-    wanted: list[bool],
-) -> Gradients:
-    scene = Scene(means, quats, scales, covars, viewmats, Ks, width, height)
+    means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, viewmats: Tensor, Ks: Tensor,
+    radii: Tensor, width: int, height: int, g_means2d: Tensor | None, g_covars2d: Tensor | None,
+    g_depths: Tensor | None, needs: list[bool],
+) -> list[Tensor]:  # fmt: skip
+    scene = ProjectionInputs(means, quats, scales, covars, viewmats, Ks, width, height)
     shape = len(viewmats), len(means)
     check_arrays(
         scene,
@@ -166,90 +137,34 @@ def _project_backward(
         g_covars2d=(g_covars2d, (*shape, 3), torch.float64),
         g_depths=(g_depths, shape, means.dtype),
     )
-    out = _empty_gradients(means, quats, scales, covars, viewmats, wanted)
+    gradients = empty_gradients((means, quats, scales, covars, viewmats), needs)
     if not (len(means) and len(viewmats)):
-        for gradient in out:
-            gradient.zero_()
-        return out
-    incoming = Incoming(g_means2d, g_covars2d, g_depths).contiguous()
+        return [gradient.zero_() for gradient in gradients]
+    incoming = Incoming(*contiguous(g_means2d, g_covars2d, g_depths))
     run = backward_vectors if has_vectors(means) else backward_cuda if has_cuda_kernels(means) else backward_generic
-    named = {name: g for name, g, asked in zip(INPUTS, out, wanted, strict=True) if asked}
-    run(scene.contiguous(), radii.contiguous(), incoming, named)
-    return out
+    run(scene.contiguous(), radii.contiguous(), incoming, ProjectionGradients(*gradients), needs_cameras=needs[-1])
+    return gradients
 
 
-def _project_backward_fake(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    radii: Tensor,
-    g_means2d: Tensor | None,
-    g_covars2d: Tensor | None,
-    g_depths: Tensor | None,
-    wanted: list[bool],
-) -> Gradients:
-    return _empty_gradients(means, quats, scales, covars, viewmats, wanted)
-
-
-def _empty_gradients(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    viewmats: Tensor,
-    wanted: list[bool],
-) -> Gradients:
-    """Memory for the gradients by `INPUTS` that are `wanted`, and tensors of size 0 for the others."""
-    inputs = means, quats, scales, covars, viewmats
-    g_means, g_quats, g_scales, g_covars, g_viewmats = (
-        means.new_empty(tensor.shape if asked and tensor is not None else 0)
-        for tensor, asked in zip(inputs, wanted, strict=True)
-    )
-    return g_means, g_quats, g_scales, g_covars, g_viewmats
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    means, quats, scales, covars, _opacities, viewmats, Ks, width, height, *_ = inputs
-    projection = Projection(*output)
-    ctx.size = width, height
-    ctx.save_for_backward(means, quats, scales, covars, viewmats, Ks, projection.radii)
-    ctx.mark_non_differentiable(*projection[3:])
-    ctx.set_materialize_grads(False)
-
-
-def _differentiate(
-    ctx: Any, g_means2d: Tensor | None, g_covars2d: Tensor | None, g_depths: Tensor | None, *_: None
-) -> tuple[Tensor | None, ...]:
-    *scene, radii = ctx.saved_tensors
-    needs = ctx.needs_input_grad
-    wanted = [*needs[:4], needs[5]]
-    out = project_backward_op(*scene, *ctx.size, radii, g_means2d, g_covars2d, g_depths, wanted)
-    g_means, g_quats, g_scales, g_covars, g_viewmats = (
-        g if asked else None for g, asked in zip(out, wanted, strict=True)
-    )
-    return (
-        g_means,
-        g_quats,
-        g_scales,
-        g_covars,
-        None,  # opacities: they decide what is drawn, and no more
-        g_viewmats,
-        None,  # Ks
-        None,  # width
-        None,  # height
-        None,  # limits
-        None,  # validate
-    )
-
-
-project_op = operator("project", _project, _project_fake)
-project_backward_op = adjoint("project_backward", _project_backward, _project_backward_fake)
-differentiable(project_op, _differentiate, _save)
+_OPERATOR = Operator(
+    "project",
+    _project,
+    _project_fake,
+    _project_backward,
+    inputs={
+        "means": Array("N 3", grad=True),
+        "quats": Array("N 4", grad=True, optional=True),
+        "scales": Array("N 3", grad=True, optional=True),
+        "covars": Array("N 3 3", grad=True, optional=True),
+        "opacities": Array("N"),
+        "viewmats": Array("C 4 4", grad=True),
+        "Ks": Array("C 3 3"),
+    },
+    outputs={"means2d": "C N 2", "covars2d": "C N 3", "depths": "C N"},
+    auxiliary={"conics": "C N 3", "radii": "C N 2", "records": "B"},
+    validates_itself=True,
+    public=False,
+)
 
 
 def project(
@@ -269,15 +184,15 @@ def project(
     covars: Float[Tensor, "N 3 3"] | None = None,
     validate: bool = False,
 ) -> Projection:
-    """The Gaussians on each camera's image plane (Zwicker et al. 2001); arguments as in `rasterization`.
+    """Gaussians projected to each camera's image plane (Zwicker et al. 2001); arguments as in `rasterization`.
 
-    Shapes are quats and scales, or covars, of which the symmetric part is read: gradients by it are symmetric.
+    Shapes are quats and scales, or covars. Of covars the symmetric part is read, so gradients by them are symmetric.
 
     Raises:
         ValueError: shapes, types or devices that do not belong together; with `validate`, as `check_values`.
     """
     return Projection(
-        *project_op(
+        *_OPERATOR(
             means, quats, scales, covars, opacities, viewmats, Ks, width, height,
             [near_plane, far_plane, radius_clip, eps2d], validate,
         )

@@ -13,30 +13,51 @@ from oasis_kernels import constants
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.checks import check_choice
 from oasis_warp.core.tracing import is_traced
-from oasis_warp.ops._runtime.scene_checks import check_cameras, check_coefficients, check_colors, check_gaussians
+from oasis_warp.ops._runtime.declaration import Array, Declaration
+from oasis_warp.ops._runtime.rasterization_checks import (
+    check_cameras,
+    check_coefficients,
+    check_colors,
+    check_gaussians,
+)
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 from oasis_warp.ops.blending import blend
-from oasis_warp.ops.projection import project
-from oasis_warp.ops.sh_to_rgb import sh_to_rgb
+from oasis_warp.ops.projection import Projection, project
+from oasis_warp.ops.spherical_harmonics import sh_to_rgb
 
 UNSUPPORTED: dict[str, tuple[Any, str]] = {
     "sparse_grad": (False, "Gradients are dense."),
     "absgrad": (False, "The gradient of meta['means2d'] is the plain one."),
     "rasterize_mode": ("classic", "Antialiasing by opacity compensation is not built in."),
-    "distributed": (False, "Draw on one device."),
-    "camera_model": ("pinhole", "Undistort to a pinhole camera first."),
-    "with_ut": (False, "Projection is EWA."),
-    "with_eval3d": (False, "Gaussians are evaluated in the image."),
+    "distributed": (False, "Draw on one device."), "camera_model": ("pinhole", "Undistort to a pinhole camera first."),
+    "with_ut": (False, "Projection is EWA."), "with_eval3d": (False, "Gaussians are evaluated in the image."),
     "radial_coeffs": (None, "Undistort to a pinhole camera first."),
     "tangential_coeffs": (None, "Undistort to a pinhole camera first."),
     "thin_prism_coeffs": (None, "Undistort to a pinhole camera first."),
     "ftheta_coeffs": (None, "Undistort to a pinhole camera first."),
-    "rolling_shutter": (None, "The whole image has one pose."),
-    "viewmats_rs": (None, "The whole image has one pose."),
-}
-"""Arguments of gsplat that are taken by name: their default, and what to do instead of another value."""
+    "rolling_shutter": (None, "The whole image has one pose."), "viewmats_rs": (None, "The whole image has one pose."),
+}  # fmt: skip
+"""Unsupported arguments of gsplat: their default, and what to do instead of another value."""
 USUAL = tuple(default for default, _ in UNSUPPORTED.values())
 RENDER_MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
+
+DECLARATION = Declaration(
+    "rasterization",
+    inputs={
+        "means": Array("N 3", grad=True),
+        "quats": Array("N 4", grad=True, optional=True),
+        "scales": Array("N 3", grad=True, optional=True),
+        "opacities": Array("N", grad=True),
+        "colors": Array("N D", grad=True),
+        "viewmats": Array("C 4 4", grad=True),
+        "Ks": Array("C 3 3"),
+        "backgrounds": Array("C D", grad=True, optional=True),
+        "covars": Array("N 3 3", grad=True, optional=True),
+    },
+    outputs={"render": "C H W X", "alphas": "C H W 1"},
+    reference="rasterization.rasterization",
+)
+"""It runs the operators sh_to_rgb, project and blend, which are registered with torch."""
 
 
 def rasterization(
@@ -104,7 +125,7 @@ def rasterization(
         far_plane: Nor are those farther than this [m].
         radius_clip: Nor those whose box has both half sides at or below this [px].
         eps2d: Variance added to both image axes [px^2].
-        packed: Accepted for gsplat's sake: changes nothing, and `meta` is never packed.
+        packed: Accepted for compatibility with gsplat, without effect: `meta` is never packed.
         tile_size: Side of the square tiles that work is split into [px]; changes only the time.
         backgrounds: Colour behind the Gaussians, shape [C, D]; black where None.
         render_mode: "RGB" draws `colors`, "D" the accumulated camera z, sum z_i alpha_i T_i, "ED" the expected one,
@@ -115,8 +136,7 @@ def rasterization(
         segmented: Like `packed`.
         covars: Covariances [m^2] instead of quats and scales, which are then not read and may be None, shape [N, 3, 3];
             the symmetric part is used.
-        sparse_grad: Not supported, as all that follow: known by name so that calls need no change, and refused where
-            they are not the default.
+        sparse_grad: Not supported, like all that follow: accepted with its default so that calls need no change.
         absgrad: Not supported.
         rasterize_mode: Not supported.
         distributed: Not supported.
@@ -129,7 +149,7 @@ def rasterization(
         ftheta_coeffs: Not supported.
         rolling_shutter: Not supported.
         viewmats_rs: Not supported.
-        validate: Look at the values of the tensors: refuse NaN, infinities, magnitudes above 1e15, zero quaternions,
+        validate: Check the values of the tensors: refuse NaN, infinities, magnitudes above 1e15, zero quaternions,
             opacities outside [0, 1] and zero focal lengths. Waits for a CUDA device; switch it off for trusted inputs,
             and while a CUDA graph is being captured.
 
@@ -159,50 +179,52 @@ def rasterization(
         colors = sh_to_rgb(sh_degree, means, colors, viewmats)
     check_colors(colors, backgrounds, means, n_cameras)
     if validate and render_mode in ("D", "ED") and not torch.compiler.is_compiling():
-        check_finite(colors=colors, backgrounds=backgrounds)  # nobody draws them, who would see what is wrong
+        check_finite(colors=colors, backgrounds=backgrounds)  # the blending, which does not get them, cannot check them
 
-    # Projection waits for what it says of its own inputs: a look at the others costs next to nothing meanwhile.
-    looking = validate and render_mode == "RGB" and means.is_cuda and not is_traced()
-    with DeferredFiniteCheck(colors=colors, backgrounds=backgrounds) if looking else nullcontext():
+    # Projection waits for the result of its own checks: another check on the device costs next to nothing meanwhile.
+    deferred = validate and render_mode == "RGB" and means.is_cuda and not is_traced()
+    with DeferredFiniteCheck(colors=colors, backgrounds=backgrounds) if deferred else nullcontext():
         projection = project(
             means, quats, scales, opacities, viewmats, Ks, width, height, near_plane=near_plane, far_plane=far_plane,
             radius_clip=radius_clip, eps2d=eps2d, covars=covars, validate=validate,
         )  # fmt: skip
     opacities = for_each_camera(opacities, n_cameras)
     colors = for_each_camera(colors, n_cameras) if colors.dim() == 2 else colors
+    render, alphas = blend_layers(
+        projection, opacities, colors, backgrounds, (width, height, tile_size), render_mode, validate and not deferred
+    )
+    meta = {
+        "camera_ids": None, "gaussian_ids": None, "means2d": projection.means2d, "depths": projection.depths,
+        "conics": projection.conics, "radii": projection.radii, "opacities": opacities, "tile_size": tile_size,
+        "width": width, "height": height, "n_cameras": n_cameras,
+    }  # fmt: skip
+    return render, alphas, meta
+
+
+def blend_layers(
+    projection: Projection, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, frame: tuple[int, int, int],
+    render_mode: str, validate: bool,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """The images of a render mode, and alpha; `frame` is width, height and tile size."""
+    n_cameras = len(colors)
     channels = layers_to_blend(colors, projection.depths, render_mode)
     n_channels = channels.shape[-1]
     if backgrounds is None or render_mode in ("D", "ED"):
-        backgrounds = plain_background((0.0,) * n_channels, n_cameras, like=means)
+        backgrounds = plain_background((0.0,) * n_channels, n_cameras, like=channels)
     elif n_channels > backgrounds.shape[-1]:
         backgrounds = torch.nn.functional.pad(backgrounds, (0, n_channels - backgrounds.shape[-1]))
-    render, alphas = blend(
-        projection, opacities, channels, backgrounds, width, height, tile_size, validate=validate and not looking
-    )
+    render, alphas = blend(projection, opacities, channels, backgrounds, *frame, validate=validate)
     if render_mode in ("ED", "RGB+ED"):
         # Over the weights' own sum: alpha, as 1 - T, has lost digits where little was drawn.
         depth, cover = render[..., -2:-1], render[..., -1:]
         drawn = cover > 0
         expected = torch.where(drawn, depth / torch.where(drawn, cover, 1), 0)
         render = torch.cat([render[..., :-2], expected], -1)
-    meta = {
-        "camera_ids": None,
-        "gaussian_ids": None,
-        "means2d": projection.means2d,
-        "depths": projection.depths,
-        "conics": projection.conics,
-        "radii": projection.radii,
-        "opacities": opacities,
-        "tile_size": tile_size,
-        "width": width,
-        "height": height,
-        "n_cameras": n_cameras,
-    }
-    return render, alphas, meta
+    return render, alphas
 
 
 def refuse_unsupported(values: Sequence[Any]) -> None:
-    """Refuse what is not built in among `values` of the `UNSUPPORTED` arguments.
+    """Refuse `values` of the `UNSUPPORTED` arguments other than their defaults.
 
     Raises:
         ValueError: names the argument.
@@ -212,7 +234,7 @@ def refuse_unsupported(values: Sequence[Any]) -> None:
 
 
 def refuse_unless_default(name: str, value: Any, default: Any, hint: str) -> None:
-    """Refuse an argument of gsplat that is not built in."""
+    """Refuse an unsupported value of an argument of gsplat."""
     if value is None or (isinstance(value, bool | str) and value == default):
         return
     if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
@@ -227,7 +249,7 @@ def for_each_camera(tensor: Tensor, n_cameras: int) -> Tensor:
 
 
 def layers_to_blend(colors: Tensor, depths: Tensor, render_mode: str) -> Tensor:
-    """Channels [C, N, X] that a render mode draws: colours, depth, and for expected depths a one to divide by."""
+    """Channels [C, N, X] of a render mode: colours, depth, and for expected depths a one to divide by."""
     if render_mode == "RGB":
         return colors
     drawn = [] if render_mode in ("D", "ED") else [colors]

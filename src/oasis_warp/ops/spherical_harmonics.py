@@ -1,4 +1,4 @@
-"""View-dependent colours from spherical harmonics, differentiable in directions and coefficients."""
+"""Spherical harmonics: values in given directions, and colours of Gaussians as cameras see them; differentiable."""
 
 from typing import Any
 
@@ -8,16 +8,25 @@ from torch import Tensor
 
 from oasis_kernels.rasterize import spherical_harmonics as kernels
 from oasis_warp.core.checks import check_float
-from oasis_warp.ops._runtime.launch import SCALAR, VEC3, even_cuts, launch_ranges, view
-from oasis_warp.ops._runtime.registration import adjoint, differentiable, operator
-from oasis_warp.ops._runtime.values import check_finite
+from oasis_warp.ops._runtime.declaration import Array, Operator, empty_gradients
+from oasis_warp.ops._runtime.launch import (
+    SCALAR,
+    VEC3,
+    VEC4,
+    block_count,
+    contiguous,
+    current_stream,
+    even_cuts,
+    has_cuda_kernels,
+    launch_ranges,
+    run_cuda,
+    view,
+)
 
 MAX_DEGREE = 3
 
 
 def _evaluate(directions: Tensor, coefficients: Tensor, degree: int, validate: bool) -> Tensor:
-    if validate:
-        check_finite(directions=directions, coefficients=coefficients)
     out = torch.empty_like(directions, memory_format=torch.contiguous_format)
     vec3 = VEC3[directions.dtype]
     launch_ranges(
@@ -29,69 +38,40 @@ def _evaluate(directions: Tensor, coefficients: Tensor, degree: int, validate: b
     return out
 
 
+def _evaluate_fake(directions: Tensor, coefficients: Tensor, degree: int, validate: bool) -> Tensor:
+    return torch.empty_like(directions, memory_format=torch.contiguous_format)
+
+
 def _evaluate_backward(
-    g_out: Tensor, directions: Tensor, coefficients: Tensor, degree: int, by_directions: bool, by_coefficients: bool
-) -> tuple[Tensor, Tensor]:
-    n, n_coefficients, _ = coefficients.shape
-    g_directions = directions.new_empty(n if by_directions else 0, 3)
-    g_coefficients = coefficients.new_zeros(n if by_coefficients else 0, n_coefficients, 3)
+    directions: Tensor, coefficients: Tensor, degree: int, g_values: Tensor, needs: list[bool]
+) -> list[Tensor]:
+    gradients = empty_gradients((directions, coefficients), needs)
+    gradients[1].zero_()
     vec3 = VEC3[directions.dtype]
     launch_ranges(
         kernels.evaluate_backward(SCALAR[directions.dtype], degree),
-        even_cuts(n),
-        [
-            view(directions.contiguous(), vec3), view(coefficients.contiguous(), vec3), view(g_out.contiguous(), vec3),
-            view(g_directions, vec3), view(g_coefficients, vec3),
-        ],
+        even_cuts(len(directions)),
+        [view(t.contiguous(), vec3) for t in (directions, coefficients, g_values, *gradients)],
         like=directions,
-    )  # fmt: skip
-    return g_directions, g_coefficients
-
-
-def _fake_backward(
-    g_out: Tensor, directions: Tensor, coefficients: Tensor, degree: int, by_directions: bool, by_coefficients: bool
-) -> tuple[Tensor, Tensor]:
-    n, n_coefficients, _ = coefficients.shape
-    return (
-        directions.new_empty(n if by_directions else 0, 3),
-        coefficients.new_empty(n if by_coefficients else 0, n_coefficients, 3),
     )
+    return gradients
 
 
-_forward = operator(
+_OPERATOR = Operator(
     "spherical_harmonics",
     _evaluate,
-    lambda directions, coefficients, degree, validate: torch.empty_like(
-        directions, memory_format=torch.contiguous_format
-    ),
+    _evaluate_fake,
+    _evaluate_backward,
+    inputs={"directions": Array("N 3", grad=True), "coefficients": Array("N K 3", grad=True)},
+    outputs={"values": "N 3"},
 )
-_backward = adjoint("spherical_harmonics_backward", _evaluate_backward, _fake_backward)
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    directions, coefficients, ctx.degree, _validate = inputs
-    ctx.save_for_backward(directions, coefficients)
-
-
-def _differentiate(ctx: Any, g_out: Tensor) -> tuple[Tensor | None, ...]:
-    by_directions, by_coefficients = ctx.needs_input_grad[:2]
-    g_directions, g_coefficients = _backward(g_out, *ctx.saved_tensors, ctx.degree, by_directions, by_coefficients)
-    return (
-        g_directions if by_directions else None,
-        g_coefficients if by_coefficients else None,
-        None,  # degree
-        None,  # validate
-    )
-
-
-differentiable(_forward, _differentiate, _save)
 
 
 def check_degree(name: str, degree: int, n_coefficients: int) -> None:
-    """Refuse a degree that is not built in, or that has more harmonics than there are coefficients.
+    """Refuse a degree that is not supported, or that has more harmonics than there are coefficients.
 
     Raises:
-        ValueError: it is so.
+        ValueError: names the argument.
     """
     if isinstance(degree, bool) or not isinstance(degree, int) or not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"{name}: expected a degree from 0 to {MAX_DEGREE}, got {degree!r}.")
@@ -141,10 +121,125 @@ def spherical_harmonics(
             "coefficients: expected leading axes that broadcast against those of directions, "
             f"got {list(coefficients.shape)} and {list(directions.shape)}."
         ) from None
-    flat = _forward(
+    flat = _OPERATOR(
         directions.expand(*batch, 3).reshape(-1, 3),
         coefficients.expand(*batch, n_coefficients, 3).reshape(-1, n_coefficients, 3),
         degree,
         validate,
     )
     return flat.view(*batch, 3)
+
+
+def _colors_like(means: Tensor, coefficients: Tensor, viewmats: Tensor, degree: int) -> Tensor:
+    return means.new_empty((viewmats.shape[0], means.shape[0], 3))
+
+
+def _cuda_params(means: Tensor, coefficients: Tensor, viewmats: Tensor, **others: Any) -> dict[str, Any]:
+    n_harmonics = coefficients.shape[-2]
+    return {
+        "n": means.shape[0], "rows": coefficients.numel() // (3 * n_harmonics), "n_harmonics": n_harmonics,
+        "means": means, "coefficients": coefficients, "poses": viewmats, **others,
+    }  # fmt: skip
+
+
+def _rows(coefficients: Tensor) -> Tensor:
+    """Coefficients [N, K, 3] or [C, N, K, 3] without an axis of cameras."""
+    return coefficients.view(-1, *coefficients.shape[-2:])
+
+
+def _sh_to_rgb(means: Tensor, coefficients: Tensor, viewmats: Tensor, degree: int) -> Tensor:
+    colors = _colors_like(means, coefficients, viewmats, degree)
+    total = colors.shape[0] * colors.shape[1]
+    if not total:
+        return colors
+    means, coefficients, viewmats = contiguous(means, coefficients, viewmats)
+    if has_cuda_kernels(means):
+        params = _cuda_params(means, coefficients, viewmats, total=total, colors=colors)
+        n_blocks = block_count(total, kernels.BLOCK)
+        run_cuda(kernels.cuda_sh_to_rgb(degree), params, n_blocks, current_stream(means.device))
+        return colors
+    vec3 = VEC3[means.dtype]
+    launch_ranges(
+        kernels.sh_to_rgb(SCALAR[means.dtype], degree),
+        even_cuts(total),
+        [
+            view(means, vec3), view(_rows(coefficients), vec3), view(viewmats, VEC4[means.dtype]),
+            view(colors.view(-1, 3), vec3),
+        ],
+        like=means,
+    )  # fmt: skip
+    return colors
+
+
+def _sh_to_rgb_backward(
+    means: Tensor, coefficients: Tensor, viewmats: Tensor, colors: Tensor, degree: int, g_colors: Tensor,
+    needs: list[bool],
+) -> list[Tensor]:  # fmt: skip
+    gradients = g_means, g_coefficients, g_viewmats = empty_gradients((means, coefficients, viewmats), needs)
+    n_cameras, n, _ = colors.shape
+    if not colors.numel():
+        return [gradient.zero_() for gradient in gradients]
+    means, coefficients, viewmats, g_colors = contiguous(means, coefficients, viewmats, g_colors)
+    g_centers = means.new_empty((n_cameras * n if needs[2] else 0, 3), dtype=torch.float64)
+    if has_cuda_kernels(means):
+        params = _cuda_params(
+            means, coefficients, viewmats, n_cameras=n_cameras, colors=colors, g_colors=g_colors, g_means=g_means,
+            g_coefficients=g_coefficients, g_centers=g_centers,
+        )  # fmt: skip
+        n_blocks = block_count(n, kernels.BLOCK)
+        run_cuda(kernels.cuda_sh_to_rgb_backward(degree), params, n_blocks, current_stream(means.device))
+    else:
+        vec3 = VEC3[means.dtype]
+        launch_ranges(
+            kernels.sh_to_rgb_backward(SCALAR[means.dtype], degree),
+            even_cuts(n),
+            [
+                view(means, vec3), view(_rows(coefficients), vec3), view(viewmats, VEC4[means.dtype]),
+                view(colors.view(-1, 3), vec3), view(g_colors.view(-1, 3), vec3), view(g_means, vec3),
+                view(_rows(g_coefficients), vec3), view(g_centers, VEC3[torch.float64]),
+            ],
+            like=means,
+        )  # fmt: skip
+    if needs[2]:
+        _fill_viewmats(g_viewmats, viewmats.detach().double(), g_centers.view(n_cameras, n, 3).sum(1))
+    return gradients
+
+
+def _fill_viewmats(g_viewmats: Tensor, viewmats: Tensor, g_centers: Tensor) -> None:
+    """Gradient by poses A | t from those [C, 3] by the centres c = -A^-1 t: -y c^T and -y, with A^T y the latter."""
+    rotation, translation = viewmats[:, :3, :3], viewmats[:, :3, 3:]
+    centers, _ = torch.linalg.solve_ex(rotation, -translation)
+    y, _ = torch.linalg.solve_ex(rotation.mT, g_centers[..., None])
+    g_viewmats[:, :3, :3] = -y @ centers.mT
+    g_viewmats[:, :3, 3:] = -y
+    g_viewmats[:, 3] = 0
+
+
+_SH_TO_RGB = Operator(
+    "sh_to_rgb",
+    _sh_to_rgb,
+    _colors_like,
+    _sh_to_rgb_backward,
+    inputs={
+        "means": Array("N 3", grad=True),
+        "coefficients": Array("?C N K 3", grad=True),
+        "viewmats": Array("C 4 4", grad=True),
+    },
+    outputs={"colors": "C N 3"},
+    reference="rasterization.sh_to_rgb",
+    public=False,
+)
+
+
+def sh_to_rgb(
+    sh_degree: int,
+    means: Float[Tensor, "N 3"],
+    coefficients: Float[Tensor, "N K 3"] | Float[Tensor, "C N K 3"],
+    viewmats: Float[Tensor, "C 4 4"],
+) -> Float[Tensor, "C N 3"]:
+    """Colours max(0, 0.5 + harmonics) of Gaussians at `means`, seen from each camera's centre (Kerbl et al. 2023).
+
+    Directions are computed in float64, because a far camera's centre cancels against the means in float32. Values are
+    not checked: bad ones give bad colours, which blending refuses by that name.
+    """
+    return _SH_TO_RGB(means, coefficients, viewmats, sh_degree)

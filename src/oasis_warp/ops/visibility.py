@@ -1,24 +1,23 @@
-"""How visible points are past a mesh."""
+"""Soft visibility of points behind a mesh."""
 
 from typing import NamedTuple
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_warp.core.checks import check_float, check_positive, check_shape
+from oasis_warp.core.checks import check_positive
+from oasis_warp.ops._runtime.declaration import Array, Operator, needs_gradient
 from oasis_warp.ops._runtime.depth_buffer import draw, gradients
-from oasis_warp.ops._runtime.depth_scene import Query, Scene, Wanted
+from oasis_warp.ops._runtime.depth_scene import BufferParts, DepthScene, Query, empty_buffer, empty_scores
 from oasis_warp.ops._runtime.incidence import incidence
-from oasis_warp.ops._runtime.registration import adjoint, differentiable, needs_gradient, operator
-from oasis_warp.ops.depth_map import batched, check_batched, check_scene
+from oasis_warp.ops.depth_map import MESH_AND_CAMERA, check_picture, expand_batch
 
 MARGIN_TAUS = 3.0
 """Default margin in units of tau: without one, half a pixel of slope hides half of the visible points."""
 
 
 class DepthVisibility(NamedTuple):
-    """Visibility of points, and the depth buffer it came from. The batch axis B is there if an argument has one.
+    """Visibility of points and the depth buffer behind it, with a batch axis B if an argument has one.
 
     Without `maps`, the two maps have no rows and no columns.
     """
@@ -32,29 +31,17 @@ class DepthVisibility(NamedTuple):
 
 
 def _visibility(
-    points: Tensor,
-    vertices: Tensor,
-    faces: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    point_vertices: Tensor | None,
-    by_identity: bool,
-    width: int,
-    height: int,
-    near_plane: float,
-    tau: float,
-    margin: float,
-    maps: bool,
-    keep: bool,
+    points: Tensor, vertices: Tensor, faces: Tensor, viewmats: Tensor, Ks: Tensor, point_vertices: Tensor | None,
+    by_identity: bool, width: int, height: int, near_plane: float, tau: float, margin: float, maps: bool, keep: bool,
     validate: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     table = incidence("faces", faces, vertices.shape[1], "vertices").table
-    scene = Scene(vertices, table, viewmats, Ks, width, height, near_plane)
+    scene = DepthScene(vertices, table, viewmats, Ks, width, height, near_plane)
     if point_vertices is not None:
         point_vertices = point_vertices.contiguous()
     query = Query(points, point_vertices, by_identity, tau, margin, keep)
-    # The adjoint asks which face each score came from.
-    buffer, scores = draw(scene, query, Wanted(depth=maps, face_ids=maps or keep, barycentrics=False), validate)
+    # The adjoint needs to know the face that each score came from.
+    buffer, scores = draw(scene, query, BufferParts(maps, maps or keep, barycentrics=False), validate)
     assert scores is not None
     return scores.visibility, buffer.depth, buffer.face_ids, scores.slopes, scores.pixels
 
@@ -63,75 +50,46 @@ def _visibility_fake(
     points, vertices, faces, viewmats, Ks, point_vertices, by_identity, width, height, near_plane, tau, margin, maps,
     keep, validate,
 ):  # fmt: skip
-    batch, n_points, _ = points.shape
-    size, nothing, kept = (batch, height, width), (batch, 0, 0), (batch, n_points if keep else 0)
-    return (
-        points.new_empty((batch, n_points)),
-        points.new_empty(size if maps else nothing),
-        points.new_empty(size if maps or keep else nothing, dtype=torch.int32),
-        points.new_empty(kept),
-        points.new_empty(kept, dtype=torch.int32),
-    )
+    scene = DepthScene(vertices, faces, viewmats, Ks, width, height, near_plane)
+    buffer = empty_buffer(scene, BufferParts(maps, maps or keep, barycentrics=False))
+    scores = empty_scores(scene, Query(points, point_vertices, by_identity, tau, margin, keep))
+    return scores.visibility, buffer.depth, buffer.face_ids, scores.slopes, scores.pixels
 
 
 def _visibility_backward(
-    grad_visibility: Tensor,
-    slopes: Tensor,
-    pixels: Tensor,
-    face_ids: Tensor,
-    vertices: Tensor,
-    faces: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    near_plane: float,
-    needs_points: bool,
-    needs_vertices: bool,
-) -> tuple[Tensor, Tensor]:
+    vertices: Tensor, faces: Tensor, viewmats: Tensor, Ks: Tensor, face_ids: Tensor, slopes: Tensor, pixels: Tensor,
+    near_plane: float, g_visibility: Tensor, needs: list[bool],
+) -> list[Tensor]:  # fmt: skip
     table = incidence("faces", faces, vertices.shape[1], "vertices").table
     height, width = face_ids.shape[1:]
-    scene = Scene(vertices, table, viewmats, Ks, width, height, near_plane)
-    return gradients(scene, face_ids, grad_visibility, slopes, pixels, needs_points, needs_vertices)
+    scene = DepthScene(vertices, table, viewmats, Ks, width, height, near_plane)
+    return list(gradients(scene, face_ids, g_visibility, slopes, pixels, *needs))
 
 
-def _visibility_backward_fake(
-    grad_visibility, slopes, pixels, face_ids, vertices, faces, viewmats, Ks, near_plane, needs_points,
-    needs_vertices,
-):  # fmt: skip
-    nothing = vertices.new_empty(0)
-    return (
-        vertices.new_empty((*slopes.shape, 3)) if needs_points else nothing,
-        vertices.new_empty(vertices.shape) if needs_vertices else nothing.clone(),
-    )
+def _visibility_backward_fake(vertices, faces, viewmats, Ks, face_ids, slopes, pixels, near_plane, g_visibility, needs):
+    return [
+        vertices.new_empty((*slopes.shape, 3) if needs[0] else 0),
+        vertices.new_empty(vertices.shape if needs[1] else 0),
+    ]
 
 
-_op = operator("depth_visibility", _visibility, _visibility_fake)
-_op_backward = adjoint("depth_visibility_backward", _visibility_backward, _visibility_backward_fake)
-
-
-def _save(ctx, inputs, output) -> None:
-    _, vertices, faces, viewmats, Ks, _, _, _, _, near_plane, *_ = inputs
-    ctx.near_plane = near_plane
-    _, depth, face_ids, slopes, pixels = output
-    ctx.set_materialize_grads(False)
-    ctx.mark_non_differentiable(depth, slopes)
-    ctx.save_for_backward(slopes, pixels, face_ids, vertices, faces, viewmats, Ks)
-
-
-def _backward(ctx, grad_visibility, *_):
-    needs_points, needs_vertices = ctx.needs_input_grad[:2]
-    grad_points = grad_vertices = None
-    if grad_visibility is not None:
-        grad_points, grad_vertices = _op_backward(
-            grad_visibility, *ctx.saved_tensors, ctx.near_plane, needs_points, needs_vertices
-        )
-    return (
-        grad_points if needs_points else None,  # points
-        grad_vertices if needs_vertices else None,  # vertices
-        *[None] * 13,  # the mesh's faces, the camera and the options
-    )
-
-
-differentiable(_op, _backward, _save)
+_OPERATOR = Operator(
+    "depth_visibility",
+    _visibility,
+    _visibility_fake,
+    _visibility_backward,
+    _visibility_backward_fake,
+    inputs={
+        **MESH_AND_CAMERA,
+        "vertices": Array("?B V 3", grad=True),
+        "points": Array("?B P 3", grad=True),
+        "point_vertices": Array("P", index="V", least=-1, optional=True, hint="One vertex a point, -1 for none."),
+    },
+    outputs={"visibility": "?B P"},
+    auxiliary={"depth_map": "?B H W", "face_ids": "?B H W", "slopes": "?B P", "pixels": "?B P"},
+    validates_itself=True,
+    reference="visibility.depth_visibility",
+)
 
 
 def depth_visibility(
@@ -151,11 +109,11 @@ def depth_visibility(
     maps: bool = True,
     validate: bool = True,
 ) -> DepthVisibility:
-    """How visible points are past a mesh: p = sigmoid((dz + margin) / tau), dz = depth buffer - depth of the point.
+    """Soft visibility of points behind a mesh: p = sigmoid((dz + margin) / tau), dz = buffered depth - point depth.
 
     OASIS (MM '26, eq. 4) with a margin, because a point on the visible surface itself has dz near 0 and would score
     one half. The buffer is read at the pixel that contains the point. Outside the image, or not beyond the near
-    plane, p = 0; over the background p = 1; where one of the 3 x 3 pixels round the point shows a face with the
+    plane, p = 0; over the background p = 1; where one of the 3 x 3 pixels around the point shows a face with the
     point's own vertex as a corner, p = 1.
 
     Differentiable, once, in `points` and `vertices` where p is the soft score: through the depth of the point, and
@@ -164,7 +122,7 @@ def depth_visibility(
     does the camera. The depth map carries no gradient.
 
     Args:
-        points: Where visibility is asked [m], shape [P, 3] or a batch [B, P, 3]; P may be 0.
+        points: Points to score [m], shape [P, 3] or a batch [B, P, 3]; P may be 0.
         vertices: Vertices of the mesh [m], shape [V, 3] or [B, V, 3].
         faces: Vertex indices, shape [F, 3], the same for all of the batch; F may be 0.
         K: Intrinsics [px], shape [3, 3] or [B, 3, 3].
@@ -177,42 +135,30 @@ def depth_visibility(
         literal: Equation 4 as printed: `margin` is 0, and `point_vertices` is not used.
         point_vertices: Vertex that each point is, or -1, shape [P], the same for all of the batch.
         near_plane: Depth up to which nothing is seen [m].
-        maps: Return the depth map and its face ids too. Leaving them out saves the writing of them on CUDA.
-        validate: Look at the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
-            Shapes and indices are always checked, indices once a tensor.
+        maps: Return the depth map and its face ids too. Without them, CUDA does not write them.
+        validate: Check the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
+            Shapes and indices are always checked, indices once for each tensor.
 
     Raises:
         ValueError: a wrong shape, dtype or index, a value that is not finite, or a `tau`, size or focal length that is
             not positive.
     """
-    sizes = check_scene(vertices, faces, viewmat, K, width, height, near_plane)
-    check_batched("points", points, "P", 3, sizes=sizes)
-    check_float("points", points, vertices)
+    sizes = _OPERATOR.check(
+        vertices=vertices, faces=faces, viewmat=viewmat, K=K, points=points, point_vertices=point_vertices
+    )
+    check_picture(width, height, near_plane)
     check_positive("tau", tau)
     margin = MARGIN_TAUS * tau if margin is None else margin
     if not 0 <= margin < float("inf"):
         raise ValueError(f"margin: expected a finite number, 0 or more, got {margin!r}.")
-    if point_vertices is not None:
-        check_shape("point_vertices", point_vertices, points.shape[-2], hint="One vertex a point, -1 for none.")
     batch = sizes.get("B", 1)
     keep = needs_gradient(points, vertices)
-    visibility, depth, face_ids, _, _ = _op(
-        batched(points, batch, 2),
-        batched(vertices, batch, 2),
-        faces,
-        batched(viewmat.detach(), batch, 2),
-        batched(K.detach(), batch, 2),
-        point_vertices,
-        not literal and point_vertices is not None,
-        width,
-        height,
-        near_plane,
-        tau,
-        0.0 if literal else margin,
-        maps,
-        keep,
-        validate,
-    )
+    by_identity = not literal and point_vertices is not None
+    visibility, depth, face_ids, _, _ = _OPERATOR(
+        expand_batch(points, batch), expand_batch(vertices, batch), faces, expand_batch(viewmat.detach(), batch),
+        expand_batch(K.detach(), batch), point_vertices, by_identity, width, height, near_plane, tau,
+        0.0 if literal else margin, maps, keep, validate,
+    )  # fmt: skip
     if keep and not maps:
         face_ids = face_ids[:, :0, :0]
     if "B" not in sizes:

@@ -1,1 +1,1 @@
-"""The machinery behind the public operators: launching, registration, checks, back ends. Private to `ops`."""
+"""The machinery behind the public operators: declarations, launching, checks, backends. Private to `ops`."""

@@ -3,17 +3,16 @@
 `oasis_kernels/rasterize/strips.cpp` describes the layout.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from oasis_kernels.rasterize import strips
-from oasis_warp.ops._runtime.launch import address, run_native
-from oasis_warp.ops._runtime.registration import hidden, hidden_like_fake, revealed
+from oasis_warp.ops._runtime.launch import phase_state, run_native
+from oasis_warp.ops._runtime.records import Frame, GradientFlags, Gradients, Splats
 from oasis_warp.ops._runtime.rules import current_rules
-from oasis_warp.ops._runtime.splats import Frame, Gradients, Splats, Wanted
-from oasis_warp.ops._runtime.tiles import check_pairs
+from oasis_warp.ops._runtime.tiles import check_pairs, fake_opaque_buffer, opaque_buffer, opaque_elements
 
 TILES_ACROSS, TILES_DOWN = 16, 2
 """Size of a strip in tiles: 256 x 32 pixels with tiles of 16."""
@@ -38,7 +37,7 @@ class Strips(NamedTuple):
     chunk: int
 
     @property
-    def words(self) -> dict[str, int]:
+    def params(self) -> dict[str, Any]:
         """As parameters of a kernel."""
         return {
             "n": self.n_cameras * self.n, "per_camera": self.n, "n_chunks": self.n_chunks, "chunk": self.chunk,
@@ -66,7 +65,7 @@ def cut_strips(
 
 
 class Lists(NamedTuple):
-    """Gaussians as records, and which of them each strip draws. P pairs of a Gaussian and a strip."""
+    """Gaussians as records, and the Gaussians of each strip. P pairs of a Gaussian and a strip."""
 
     records: Tensor
     """[M, 16]; of those that are not drawn, anything."""
@@ -77,17 +76,15 @@ class Lists(NamedTuple):
     order: Tensor
     """[strips]: those with long lists first."""
     ids: Tensor
-    """`hidden` [P]: Gaussians, nearest first."""
+    """`opaque_buffer` [P]: Gaussians, nearest first."""
 
 
 class Counted(NamedTuple):
-    """What `count` leaves for the kernel that fills the lists."""
+    """Results of `count` for the kernel that fills the lists."""
 
     lists: Lists
-    words: dict[str, int]
+    params: dict[str, Any]
     n_pairs: int
-    scratch: tuple[Tensor, ...]
-    """Kept alive for the kernel."""
 
 
 def count(splats: Splats, s: Strips) -> Counted:
@@ -102,33 +99,23 @@ def count(splats: Splats, s: Strips) -> Counted:
     starts = torch.empty(s.n_strips + 1, dtype=torch.int64)
     pair_starts = torch.empty(total, dtype=torch.int32)
     order = torch.empty(s.n_strips, dtype=torch.int32)
-    counts = torch.empty(s.n_chunks * s.n_strips, dtype=torch.int32)
     by_chunk = torch.empty(3, s.n_chunks, dtype=torch.int64)
     totals = torch.empty(3, dtype=torch.int64)
-    state = torch.zeros(strips.STATE, dtype=torch.int64)
-    words = s.words | splats.words() | {
-        "records": address(records, torch.float32, strips.RECORD * total),
-        "starts": address(starts, torch.int64, s.n_strips + 1),
-        "pair_starts": address(pair_starts, torch.int32, total),
-        "order": address(order, torch.int32, s.n_strips),
-        "state": address(state, torch.int64, strips.STATE),
-        "counts": address(counts, torch.int32, s.n_chunks * s.n_strips),
-        "chunk_pairs": address(by_chunk, torch.int64, 3 * s.n_chunks),
-        "lows": by_chunk.data_ptr() + 8 * s.n_chunks,
-        "highs": by_chunk.data_ptr() + 16 * s.n_chunks,
-        "totals": address(totals, torch.int64, 3),
-        "opacities": address(splats.opacities, torch.float32, total),
-        "colors": address(splats.colors, torch.float32, channels * total),
-    }
-    run_native(strips.collect(in_record), words, s.n_chunks)
+    params = s.params | splats.params() | {
+        "records": records, "starts": starts, "pair_starts": pair_starts, "order": order,
+        "state": phase_state(strips.STATE),
+        "counts": torch.empty(s.n_chunks * s.n_strips, dtype=torch.int32), "chunk_pairs": by_chunk,
+        "lows": by_chunk.data_ptr() + 8 * s.n_chunks, "highs": by_chunk.data_ptr() + 16 * s.n_chunks, "totals": totals,
+    }  # fmt: skip
+    run_native(strips.collect(in_record), params, s.n_chunks)
     n_pairs = int(totals[0])
     check_pairs(n_pairs)
-    lists = Lists(records, starts, pair_starts, order, hidden(n_pairs, torch.int32, records.device))
-    return Counted(lists, words, n_pairs, (counts, by_chunk, totals))
+    lists = Lists(records, starts, pair_starts, order, opaque_buffer(n_pairs, torch.int32, records.device))
+    return Counted(lists, params, n_pairs)
 
 
-class Kept(NamedTuple):
-    """What the adjoint needs."""
+class SavedTensors(NamedTuple):
+    """Tensors saved for the adjoint."""
 
     transmittance: Tensor
     """[strips * plane], of the end, as the strips have their pixels."""
@@ -146,99 +133,74 @@ def _strips_of(colors: Tensor, frame: Frame) -> Strips:
     return cut_strips(colors.shape[0], colors.shape[1], *frame)
 
 
-def kept_like(colors: Tensor, frame: Frame) -> Kept:
-    """Empty tensors of the shapes that `draw` keeps."""
+def fake_saved(colors: Tensor, frame: Frame) -> SavedTensors:
+    """Empty tensors of the shapes that `draw` saves."""
     s = _strips_of(colors, frame)
     total = s.n_cameras * s.n
 
     def empty(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
         return colors.new_empty(shape, dtype=dtype)
 
-    return Kept(
+    return SavedTensors(
         empty(s.n_strips * s.plane, dtype=torch.float32),
         empty(s.n_strips * s.plane),
         empty(total, strips.RECORD, dtype=torch.float32),
         empty(s.n_strips + 1, dtype=torch.int64),
         empty(total),
         empty(s.n_strips),
-        hidden_like_fake(torch.int32, colors.device),
+        fake_opaque_buffer(torch.int32, colors.device),
     )
 
 
-def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept | None]:
-    """Images over the backgrounds, alpha, and what the adjoint needs if it is to be kept.
+def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, SavedTensors | None]:
+    """Images over the backgrounds, alpha, and, with `keep`, what the adjoint needs.
 
     Raises:
         ValueError: more pairs of a Gaussian and a strip than can be numbered.
     """
     s = _strips_of(splats.colors, frame)
-    channels, pixels = splats.colors.shape[-1], s.n_cameras * s.height * s.width
+    channels = splats.colors.shape[-1]
     counted = count(splats, s)
-    kept = s.n_strips * s.plane if keep else 0
+    n_saved = s.n_strips * s.plane if keep else 0
     image = torch.empty(s.n_cameras, s.height, s.width, channels)
     alphas = torch.empty(s.n_cameras, s.height, s.width, 1)
-    transmittance = torch.empty(kept)
-    stops = torch.empty(kept, dtype=torch.int32)
-    entries = torch.empty(2 * counted.n_pairs, dtype=torch.int64)
-    state = torch.zeros(strips.STATE, dtype=torch.int64)
-    words = counted.words | {
-        "state": address(state, torch.int64, strips.STATE),
-        "backgrounds": address(splats.backgrounds, torch.float32, s.n_cameras * channels),
-        "entries": address(entries, torch.int64, 2 * counted.n_pairs),
-        "ids": address(revealed(counted.lists.ids), torch.int32, counted.n_pairs),
-        "image": address(image, torch.float32, pixels * channels),
-        "alphas": address(alphas, torch.float32, pixels),
-        "keep": int(keep),
-        "transmittance": address(transmittance, torch.float32, kept),
-        "stops": address(stops, torch.int32, kept),
-    }
-    run_native(strips.draw(channels, current_rules()), words, max(s.n_chunks, s.n_strips))
-    return image, alphas, Kept(transmittance, stops, *counted.lists) if keep else None
+    transmittance = torch.empty(n_saved)
+    stops = torch.empty(n_saved, dtype=torch.int32)
+    params = counted.params | {
+        "state": phase_state(strips.STATE), "entries": torch.empty(2 * counted.n_pairs, dtype=torch.int64),
+        "ids": opaque_elements(counted.lists.ids), "image": image, "alphas": alphas, "keep": keep,
+        "transmittance": transmittance, "stops": stops,
+    }  # fmt: skip
+    run_native(strips.draw(channels, current_rules()), params, max(s.n_chunks, s.n_strips))
+    return image, alphas, SavedTensors(transmittance, stops, *counted.lists) if keep else None
 
 
 def draw_backward(
-    g_image: Tensor | None, g_alpha: Tensor | None, splats: Splats, frame: Frame, kept: Kept, wanted: Wanted
-) -> Gradients:
+    g_image: Tensor | None, g_alpha: Tensor | None, splats: Splats, frame: Frame, saved: SavedTensors,
+    flags: GradientFlags,
+) -> Gradients:  # fmt: skip
     """Gradients from those by image and alpha, None standing for zeros."""
     s = _strips_of(splats.colors, frame)
-    with_shape, with_colors, with_backgrounds = wanted
-    channels, pixels = splats.colors.shape[-1], s.n_cameras * s.height * s.width
-    total, pixels_kept = s.n_cameras * s.n, s.n_strips * s.plane
-    if g_image is None:  # as with a loss on silhouettes: colours play no part, and get none
+    with_shape, with_colors, with_backgrounds = flags
+    channels = splats.colors.shape[-1]
+    if g_image is None:  # as with a loss on silhouettes: the kernel computes no gradient by colours
         summed = strips.Gradients(0, with_shape, False)
     else:
         summed = strips.Gradients(channels, with_shape, with_colors)
     with_strips = with_backgrounds and g_image is not None
-    ids = revealed(kept.ids)
-    pairs = torch.empty(len(ids) * strips.pair_words(summed))
+    ids = opaque_elements(saved.ids)
     strip_backgrounds = torch.empty(s.n_cameras, s.across * s.down, channels if with_strips else 0)
-    means2d = torch.empty(s.n_cameras, s.n if with_shape else 0, 2)
-    covars2d = torch.empty(s.n_cameras, s.n if with_shape else 0, 3, dtype=torch.float64)
-    opacities = torch.empty(s.n_cameras, s.n if with_shape else 0)
+    n_shapes = s.n if with_shape else 0
+    means2d = torch.empty(s.n_cameras, n_shapes, 2)
+    covars2d = torch.empty(s.n_cameras, n_shapes, 3, dtype=torch.float64)
+    opacities = torch.empty(s.n_cameras, n_shapes)
     colors = torch.empty(s.n_cameras, s.n if summed.color else 0, channels)
-    state = torch.zeros(strips.STATE, dtype=torch.int64)
-    words = s.words | splats.words() | {
-        "records": address(kept.records, torch.float32, strips.RECORD * total),
-        "starts": address(kept.starts, torch.int64, s.n_strips + 1),
-        "pair_starts": address(kept.pair_starts, torch.int32, total),
-        "order": address(kept.order, torch.int32, s.n_strips),
-        "state": address(state, torch.int64, strips.STATE),
-        "opacities": address(splats.opacities, torch.float32, total),
-        "colors": address(splats.colors, torch.float32, total * channels),
-        "backgrounds": address(splats.backgrounds, torch.float32, s.n_cameras * channels),
-        "ids": address(ids, torch.int32, len(ids)),
-        "transmittance": address(kept.transmittance, torch.float32, pixels_kept),
-        "stops": address(kept.stops, torch.int32, pixels_kept),
-        "g_image": 0 if g_image is None else address(g_image, torch.float32, pixels * channels),
-        "g_alpha": 0 if g_alpha is None else address(g_alpha, torch.float32, pixels),
-        "pairs": address(pairs, torch.float32, len(ids) * strips.pair_words(summed)),
-        "strip_backgrounds": strip_backgrounds.data_ptr() if with_strips else 0,
-        "g_means2d": address(means2d, torch.float32, 2 * total * with_shape),
-        "g_covars2d": address(covars2d, torch.float64, 3 * total * with_shape),
-        "g_opacities": address(opacities, torch.float32, total * with_shape),
-        "g_colors": address(colors, torch.float32, channels * total * summed.color),
-    }
-    run_native(strips.draw_backward(summed, current_rules()), words, max(s.n_chunks, s.n_strips))
+    params = s.params | splats.params() | saved._asdict() | {
+        "state": phase_state(strips.STATE), "ids": ids, "g_image": g_image, "g_alpha": g_alpha,
+        "pairs": torch.empty(len(ids) * strips.pair_words(summed)), "strip_backgrounds": strip_backgrounds,
+        "g_means2d": means2d, "g_covars2d": covars2d, "g_opacities": opacities, "g_colors": colors,
+    }  # fmt: skip
+    run_native(strips.draw_backward(summed, current_rules()), params, max(s.n_chunks, s.n_strips))
     backgrounds = strip_backgrounds.sum(1) if with_strips else torch.zeros_like(splats.backgrounds)
     if with_colors and not summed.color:
         colors = torch.zeros_like(splats.colors)

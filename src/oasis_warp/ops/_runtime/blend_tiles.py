@@ -1,6 +1,6 @@
 """Blend tile by tile with the generic kernels: on CUDA, and in float64 on the CPU."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,19 +10,18 @@ from warp.types import vector
 from oasis_kernels.rasterize import rasterize_backward as backward_kernels
 from oasis_kernels.rasterize import rasterize_forward as forward_kernels
 from oasis_warp.ops._runtime.launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
-from oasis_warp.ops._runtime.registration import hidden_like_fake, revealed
+from oasis_warp.ops._runtime.records import Frame, GradientFlags, Gradients, Splats
 from oasis_warp.ops._runtime.rules import current_rules
-from oasis_warp.ops._runtime.splats import Frame, Gradients, Splats, Wanted
-from oasis_warp.ops._runtime.tiles import Tiles, bin_to_tiles, even_work
+from oasis_warp.ops._runtime.tiles import bin_to_tiles, even_work, fake_opaque_buffer, opaque_elements
 
 CUDA_LANES = 16, 16
-"""Lanes across and down a tile on CUDA: with the default tile of 16 pixels, one lane a pixel."""
+"""Lanes across and down a tile on CUDA: one per pixel of the default tile of 16 pixels."""
 CUDA_WARP_LANES = 4, 8
 """The same for the backward pass, where the lanes of one warp share a tile."""
 
 
-class Kept(NamedTuple):
-    """What the adjoint needs. P pairs of a Gaussian and a tile."""
+class SavedTensors(NamedTuple):
+    """Tensors saved for the adjoint. P pairs of a Gaussian and a tile."""
 
     transmittance: Tensor
     """[C, H, W], of the end."""
@@ -36,8 +35,8 @@ class Kept(NamedTuple):
     pairs: Tensor
 
 
-def kept_like(colors: Tensor, frame: Frame) -> Kept:
-    """Empty tensors of the shapes that `draw` keeps."""
+def fake_saved(colors: Tensor, frame: Frame) -> SavedTensors:
+    """Empty tensors of the shapes that `draw` saves."""
     n_cameras, n, _ = colors.shape
     width, height, tile_size = frame
     n_tiles = n_cameras * -(-width // tile_size) * -(-height // tile_size)
@@ -45,14 +44,14 @@ def kept_like(colors: Tensor, frame: Frame) -> Kept:
     def empty(*shape: int, dtype: torch.dtype) -> Tensor:
         return colors.new_empty(shape, dtype=dtype)
 
-    return Kept(
+    return SavedTensors(
         empty(n_cameras, height, width, dtype=colors.dtype),
         empty(n_cameras, height, width, dtype=torch.int32),
         empty(n_tiles + 1, dtype=torch.int64),
         empty(n_cameras * n, dtype=torch.int64),
         empty(n_cameras * n, dtype=torch.int64),
-        hidden_like_fake(torch.int32, colors.device),
-        hidden_like_fake(torch.int64, colors.device),
+        fake_opaque_buffer(torch.int32, colors.device),
+        fake_opaque_buffer(torch.int64, colors.device),
     )
 
 
@@ -65,13 +64,22 @@ def lane_grid(tile_size: int, device: torch.device, grid: tuple[int, int]) -> tu
     return across * down, -(-tile_size // across), -(-tile_size // down)
 
 
-def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept | None]:
-    """Images over the backgrounds, alpha, and what the adjoint needs if it is to be kept."""
+def splat_views(splats: Splats) -> list[Any]:
+    """Arguments boxes, centers, whitenings, opacities of the generic kernels."""
+    records, vec4 = splats.tables(), VEC4[splats.opacities.dtype]
+    return [
+        view(records.boxes.view(-1, 4), vec4i), view(records.centers.view(-1, 4), vec4),
+        view(records.whitenings.view(-1, 4), vec4), view(splats.opacities.view(-1)),
+    ]  # fmt: skip
+
+
+def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, SavedTensors | None]:
+    """Images over the backgrounds, alpha, and, with `keep`, what the adjoint needs."""
     width, height, tile_size = frame
     n_cameras, _, channels = splats.colors.shape
     dtype, device = splats.colors.dtype, splats.colors.device
     start()
-    color, vec4 = vector(channels, SCALAR[dtype]), VEC4[dtype]
+    color = vector(channels, SCALAR[dtype])
     records = splats.tables()
     tiles = bin_to_tiles(records.boxes, records.sort_depths, width, height, tile_size)
     image = torch.empty(n_cameras, height, width, channels, dtype=dtype, device=device)
@@ -83,12 +91,10 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
         forward_kernels.blend(SCALAR[dtype], channels, current_rules()),
         even_work(tiles.starts),
         [
-            view(tiles.starts), view(revealed(tiles.gaussians)), view(records.boxes.view(-1, 4), vec4i),
-            view(records.centers.view(-1, 4), vec4), view(records.whitenings.view(-1, 4), vec4),
-            view(splats.opacities.view(-1)), view(splats.colors.view(-1, channels), color),
-            view(splats.backgrounds, color), tile_size, lane_width, lane_height, tiles.across, tiles.down, width,
-            height, view(image.view(-1, channels), color), view(alphas.view(-1)), view(transmittance.view(-1)),
-            view(stops.view(-1)),
+            view(tiles.starts), view(opaque_elements(tiles.gaussians)), *splat_views(splats),
+            view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color), tile_size, lane_width,
+            lane_height, tiles.across, tiles.down, width, height, view(image.view(-1, channels), color),
+            view(alphas.view(-1)), view(transmittance.view(-1)), view(stops.view(-1)),
         ],
         like=image,
         lanes=lanes,
@@ -96,22 +102,22 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Kept
     if not keep:
         return image, alphas, None
     lists = tiles.starts, tiles.pair_starts, tiles.pair_counts, tiles.gaussians, tiles.pairs
-    return image, alphas, Kept(transmittance, stops, *lists)
+    return image, alphas, SavedTensors(transmittance, stops, *lists)
 
 
 def draw_backward(
-    g_image: Tensor | None, g_alpha: Tensor | None, splats: Splats, frame: Frame, kept: Kept, wanted: Wanted
-) -> Gradients:
+    g_image: Tensor | None, g_alpha: Tensor | None, splats: Splats, frame: Frame, saved: SavedTensors,
+    flags: GradientFlags,
+) -> Gradients:  # fmt: skip
     """Gradients from those by image and alpha, None standing for zeros."""
     n_cameras, n, channels = splats.colors.shape
     width, height, tile_size = frame
-    transmittance, stops, starts, pair_starts, pair_counts, gaussians, pairs = kept
+    transmittance, stops, starts, pair_starts, pair_counts, gaussians, pairs = saved
     across, down = -(-width // tile_size), -(-height // tile_size)
-    tiles = Tiles(tile_size, across, down, starts, gaussians, pairs, pair_starts, pair_counts)
-    with_shape, with_colors, with_backgrounds = wanted
+    with_shape, with_colors, with_backgrounds = flags
     dtype, device = splats.colors.dtype, splats.colors.device
     start()
-    scalar, vec4, records = SCALAR[dtype], VEC4[dtype], splats.tables()
+    scalar = SCALAR[dtype]
     color, moments = vector(channels, scalar), vector(6, scalar)
     pixels = n_cameras * height * width
 
@@ -120,21 +126,19 @@ def draw_backward(
 
     of_image = splats.colors.new_zeros(pixels, channels) if g_image is None else g_image.view(-1, channels)
     of_alpha = splats.colors.new_zeros(pixels) if g_alpha is None else g_alpha.view(-1)
-    pair_numbers = revealed(tiles.pairs)
+    pair_numbers = opaque_elements(pairs)
     pair_moments = empty(len(pair_numbers) if with_shape else 0, 6)
     pair_colors = empty(len(pair_numbers), channels)
-    tile_backgrounds = empty(len(tiles.starts) - 1, channels)
-    lanes, lane_width, lane_height = lane_grid(tiles.size, device, CUDA_WARP_LANES)
+    tile_backgrounds = empty(len(starts) - 1, channels)
+    lanes, lane_width, lane_height = lane_grid(tile_size, device, CUDA_WARP_LANES)
     launch_ranges(
         backward_kernels.blend_backward(scalar, channels, current_rules()),
-        even_work(tiles.starts),
+        even_work(starts),
         [
-            view(tiles.starts), view(revealed(tiles.gaussians)), view(pair_numbers),
-            view(records.boxes.view(-1, 4), vec4i), view(records.centers.view(-1, 4), vec4),
-            view(records.whitenings.view(-1, 4), vec4), view(splats.opacities.view(-1)),
-            view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color),
-            view(stops.view(-1)), view(of_image, color), view(of_alpha), tiles.size, lane_width,
-            lane_height, tiles.across, tiles.down, width, height, int(with_shape),
+            view(starts), view(opaque_elements(gaussians)), view(pair_numbers),
+            *splat_views(splats), view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color),
+            view(stops.view(-1)), view(of_image, color), view(of_alpha), tile_size, lane_width,
+            lane_height, across, down, width, height, int(with_shape),
             view(transmittance.view(-1).clone()), view(empty(pixels)),
             view(pair_moments, moments), view(pair_colors, color), view(tile_backgrounds, color),
         ],
@@ -142,28 +146,15 @@ def draw_backward(
         lanes=lanes,
     )  # fmt: skip
 
-    cuts = even_cuts(n_cameras * n)
-    spans = [view(tiles.pair_starts), view(tiles.pair_counts)]
     g_means2d = g_covars2d = g_opacities = g_colors = g_backgrounds = None
     if with_shape:
-        g_means2d = empty(n_cameras, n, 2)
-        g_covars2d = torch.empty(n_cameras, n, 3, dtype=torch.float64, device=device)
-        g_opacities = empty(n_cameras, n)
-        launch_ranges(
-            backward_kernels.gather_shape(scalar),
-            cuts,
-            [
-                *spans, view(pair_moments, moments), view(records.whitenings.view(-1, 4), vec4),
-                view(splats.opacities.view(-1)), view(g_means2d.view(-1, 2), VEC2[dtype]),
-                view(g_covars2d.view(-1, 3), VEC3[torch.float64]), view(g_opacities.view(-1)),
-            ],
-            like=pair_colors,
-        )  # fmt: skip
+        g_means2d, g_covars2d, g_opacities = _gather_shape(splats, saved, pair_moments)
     if with_colors:
         g_colors = empty(n_cameras, n, channels)
+        spans = view(pair_starts), view(pair_counts)
         launch_ranges(
             backward_kernels.gather_colors(scalar, channels),
-            cuts,
+            even_cuts(n_cameras * n),
             [*spans, view(pair_colors, color), view(g_colors.view(-1, channels), color)],
             like=pair_colors,
         )
@@ -172,7 +163,27 @@ def draw_backward(
         launch_ranges(
             backward_kernels.sum_backgrounds(scalar, channels),
             [0, n_cameras],
-            [tiles.across * tiles.down, view(tile_backgrounds, color), view(g_backgrounds, color)],
+            [across * down, view(tile_backgrounds, color), view(g_backgrounds, color)],
             like=pair_colors,
         )
     return Gradients(g_means2d, g_covars2d, g_opacities, g_colors, g_backgrounds)
+
+
+def _gather_shape(splats: Splats, saved: SavedTensors, pair_moments: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients by means2d, covars2d and opacities: sums over the pairs of each Gaussian."""
+    like, (n_cameras, n) = splats.opacities, splats.opacities.shape
+    dtype = like.dtype
+    g_means2d, g_opacities = like.new_empty(n_cameras, n, 2), like.new_empty(n_cameras, n)
+    g_covars2d = like.new_empty(n_cameras, n, 3, dtype=torch.float64)
+    _, _, whitenings, opacities = splat_views(splats)
+    launch_ranges(
+        backward_kernels.gather_shape(SCALAR[dtype]),
+        even_cuts(n_cameras * n),
+        [
+            view(saved.pair_starts), view(saved.pair_counts), view(pair_moments, vector(6, SCALAR[dtype])), whitenings,
+            opacities, view(g_means2d.view(-1, 2), VEC2[dtype]), view(g_covars2d.view(-1, 3), VEC3[torch.float64]),
+            view(g_opacities.view(-1)),
+        ],
+        like=pair_moments,
+    )  # fmt: skip
+    return g_means2d, g_covars2d, g_opacities

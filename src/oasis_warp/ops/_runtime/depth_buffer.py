@@ -1,6 +1,6 @@
 """Draw meshes into depth buffers and score points against them.
 
-On the CPU by vectorised kernels, on CUDA in float32 by those of `depth_cuda`, in float64 by the plain ones.
+On the CPU by vectorised kernels, on CUDA in float32 by those of `depth_cuda`, in float64 by the generic ones.
 """
 
 import ctypes
@@ -16,27 +16,27 @@ from oasis_warp.core.checks import check_index, check_positive
 from oasis_warp.ops._runtime import depth_cuda
 from oasis_warp.ops._runtime.depth_scene import (
     Buffer,
+    BufferParts,
+    DepthScene,
     Query,
-    Scene,
     Scores,
-    Wanted,
     empty_buffer,
     empty_scores,
-    only,
+    restrict,
     shared,
 )
 from oasis_warp.ops._runtime.incidence import _transposed, sum_at_items
-from oasis_warp.ops._runtime.launch import launch, run_shared, view
+from oasis_warp.ops._runtime.launch import SCALAR_NAMES, launch, run_shared, view
 from oasis_warp.ops._runtime.pair_counts import own_slot
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 
-C_TYPES = {torch.float32: "float", torch.float64: "double"}
+Drawn = tuple[Buffer, Scores | None]
 MAX_FRACTION_BITS = 22
 FACES_A_PART = 4096
-"""A mesh is drawn in parts, one a thread, of no fewer faces than this."""
+"""A mesh is drawn in parts, one per thread, of at least this many faces."""
 
 
-def draw(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
+def draw(scene: DepthScene, query: Query | None, outputs: BufferParts, validate: bool) -> Drawn:
     """Fill the depth buffers and score the points, if any.
 
     Raises:
@@ -44,13 +44,13 @@ def draw(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> t
             vertex that is none.
     """
     if scene.vertices.device.type == "cpu":
-        return draw_by_vectors(scene, query, wanted, validate)
+        return draw_by_vectors(scene, query, outputs, validate)
     method = draw_by_keys if scene.vertices.dtype == torch.float32 else draw_by_faces
-    return method(scene, query, wanted, validate)
+    return method(scene, query, outputs, validate)
 
 
-def refuse_bad_values(scene: Scene, query: Query | None) -> None:
-    """Raise what is wrong with the values, if anything is."""
+def refuse_bad_values(scene: DepthScene, query: Query | None) -> None:
+    """Refuse values that are not finite, focal lengths that are not positive, and vertices that do not exist."""
     check_finite(vertices=scene.vertices, viewmat=scene.viewmats, K=scene.Ks)
     for i in (0, 1):
         focal = scene.Ks[:, i, i]
@@ -73,7 +73,7 @@ def _fraction_bits(width: int, height: int) -> int:
     return min(MAX_FRACTION_BITS, 30 - (max(width, height) - 1).bit_length())
 
 
-def _job(scene: Scene, **more: int) -> tuple[Job, list[Tensor]]:
+def _job(scene: DepthScene, **more: int) -> tuple[Job, list[Tensor]]:
     """A job for `scene`, and the tensors it points to, which must outlive it; `more` are further fields."""
     vertices, vertices_step = shared(scene.vertices)
     viewmats, viewmats_step = shared(scene.viewmats)
@@ -98,16 +98,16 @@ def _job(scene: Scene, **more: int) -> tuple[Job, list[Tensor]]:
     return job, [vertices, viewmats, Ks]
 
 
-def draw_by_vectors(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
-    """The way of the CPU."""
+def draw_by_vectors(scene: DepthScene, query: Query | None, outputs: BufferParts, validate: bool) -> Drawn:
+    """`draw` on the CPU."""
     batch, n_vertices, _ = scene.vertices.shape
     width, height = scene.width, scene.height
     parts = max(1, min(-(-torch.get_num_threads() // max(batch, 1)), scene.faces.shape[0] // FACES_A_PART))
-    drawn = wanted._replace(depth=True, face_ids=True)
+    drawn = outputs._replace(depth=True, face_ids=True)
     buffer = empty_buffer(scene, drawn)
-    # One block: camera_vertices, screen_vertices and planes, in numbers of 4 bytes.
-    room = scene.room(12 * n_vertices + 2 * parts * plane_size(width, height), dtype=torch.float32)
-    first = room.data_ptr()
+    # One allocation: camera_vertices, screen_vertices and planes, in numbers of 4 bytes.
+    scratch = scene.empty(12 * n_vertices + 2 * parts * plane_size(width, height), dtype=torch.float32)
+    first = scratch.data_ptr()
     job, _alive = _job(
         scene,
         camera_vertices=first,
@@ -116,7 +116,7 @@ def draw_by_vectors(scene: Scene, query: Query | None, wanted: Wanted, validate:
         parts=parts,
         depth=buffer.depth.data_ptr(),
         face_ids=buffer.face_ids.data_ptr(),
-        barycentrics=buffer.barycentrics.data_ptr() if wanted.barycentrics else 0,
+        barycentrics=buffer.barycentrics.data_ptr() if outputs.barycentrics else 0,
     )
     scores = None
     if query is not None:
@@ -131,11 +131,11 @@ def draw_by_vectors(scene: Scene, query: Query | None, wanted: Wanted, validate:
         job.visibility = scores.visibility.data_ptr()
         if query.keep:
             job.slopes, job.pixels = scores.slopes.data_ptr(), scores.pixels.data_ptr()
-    _run_all(job, C_TYPES[scene.vertices.dtype])
-    # Values that are refused do no harm on the way.
+    _run_all(job, SCALAR_NAMES[scene.vertices.dtype])
+    # Bad values do no harm before they are refused.
     if validate and job.found:
         refuse_bad_values(scene, query)
-    return (buffer if drawn == wanted else only(buffer, wanted)), scores
+    return (buffer if drawn == outputs else restrict(buffer, outputs)), scores
 
 
 def _run_all(job: Job, dtype: str) -> None:
@@ -154,33 +154,33 @@ def _run(stage: str, dtype: str, job: Job, tasks: int) -> None:
     run_shared(getattr(vectors.kernels(dtype), stage), ctypes.addressof(job), job.batch * tasks)
 
 
-def draw_by_keys(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
-    """The way of CUDA in float32."""
+def draw_by_keys(scene: DepthScene, query: Query | None, outputs: BufferParts, validate: bool) -> Drawn:
+    """`draw` on CUDA in float32."""
     if not validate:
-        return depth_cuda.draw(scene, query, wanted)
+        return depth_cuda.draw(scene, query, outputs)
     points = None if query is None else query.points
     with DeferredFiniteCheck(vertices=scene.vertices, viewmat=scene.viewmats, K=scene.Ks, points=points):
         found = own_slot()
         found[0] = 0
-        drawn = depth_cuda.draw(scene, query, wanted, found)
-    # Values that are refused do no harm on the way.
+        drawn = depth_cuda.draw(scene, query, outputs, found)
+    # Bad values do no harm before they are refused.
     if found[0]:
         refuse_bad_values(scene, query)
     return drawn
 
 
-def draw_by_faces(scene: Scene, query: Query | None, wanted: Wanted, validate: bool) -> tuple[Buffer, Scores | None]:
-    """The plain way: all faces at once, first for the depths, then for the smallest face at that depth."""
+def draw_by_faces(scene: DepthScene, query: Query | None, outputs: BufferParts, validate: bool) -> Drawn:
+    """`draw` by the generic kernels: all faces at once, first for depths, then for the smallest face at each depth."""
     if validate:
         refuse_bad_values(scene, query)
     batch, n_vertices, _ = scene.vertices.shape
     n_faces, width, height = len(scene.faces), scene.width, scene.height
     like = scene.vertices
     viewmats, Ks = view(scene.viewmats.contiguous()), view(scene.Ks.contiguous())
-    depth = scene.room(height, width, dtype=torch.float64).fill_(torch.inf)
-    face_ids = scene.room(height, width, dtype=torch.int32).fill_(-1)
-    camera_vertices = scene.room(n_vertices, 3, dtype=torch.float64)
-    boxes = scene.room(n_faces, 4, dtype=torch.int32)
+    depth = scene.empty(height, width, dtype=torch.float64).fill_(torch.inf)
+    face_ids = scene.empty(height, width, dtype=torch.int32).fill_(-1)
+    camera_vertices = scene.empty(n_vertices, 3, dtype=torch.float64)
+    boxes = scene.empty(n_faces, 4, dtype=torch.int32)
     vertices, faces = view(camera_vertices, wp.vec3d), view(scene.faces)
     near = wp.float64(scene.near_plane)
     launch(
@@ -199,19 +199,20 @@ def draw_by_faces(scene: Scene, query: Query | None, wanted: Wanted, validate: b
             [stage, vertices, faces, view(boxes, wp.vec4i), Ks, near, view(depth), view(face_ids, wp.uint32)],
             like=like,
         )
-    weights = scene.room(height, width, 3).zero_()
-    if wanted.barycentrics:
+    weights = scene.empty(height, width, 3).zero_()
+    if outputs.barycentrics:
         launch(
             kernels.interpolate,
             (batch, height, width),
             [vertices, faces, Ks, view(face_ids), view(weights)],
             like=like,
         )
-    buffer = only(Buffer(depth.to(like.dtype), face_ids, weights), wanted)
-    if query is None:
-        return buffer, None
+    buffer = restrict(Buffer(depth.to(like.dtype), face_ids, weights), outputs)
+    return buffer, None if query is None else _score_points(scene, query, depth, face_ids)
 
-    n_points = query.points.shape[1]
+
+def _score_points(scene: DepthScene, query: Query, depth: Tensor, face_ids: Tensor) -> Scores:
+    """Scores by the generic kernel, given the buffers."""
     known = query.point_vertices if query.by_identity else None
     scores = empty_scores(scene, query)
     scores.visibility.zero_()
@@ -219,34 +220,22 @@ def draw_by_faces(scene: Scene, query: Query | None, wanted: Wanted, validate: b
     scores.pixels.fill_(-1)
     launch(
         kernels.visibility,
-        (batch, n_points),
+        (len(query.points), query.points.shape[1]),
         [
-            view(query.points.contiguous()),
-            view(face_ids.new_empty(0) if known is None else known.to(torch.int32)),
-            faces,
-            viewmats,
-            Ks,
-            near,
-            wp.float64(query.tau),
-            wp.float64(query.margin),
-            view(depth),
-            view(face_ids),
-            *(view(t) for t in scores),
+            view(query.points.contiguous()), view(face_ids.new_empty(0) if known is None else known.to(torch.int32)),
+            view(scene.faces), view(scene.viewmats.contiguous()), view(scene.Ks.contiguous()),
+            wp.float64(scene.near_plane), wp.float64(query.tau), wp.float64(query.margin), view(depth), view(face_ids),
+            *map(view, scores),
         ],
-        like=like,
-    )
-    return buffer, scores
+        like=scene.vertices,
+    )  # fmt: skip
+    return scores
 
 
 def gradients(
-    scene: Scene,
-    face_ids: Tensor,
-    grad_visibility: Tensor,
-    slopes: Tensor,
-    pixels: Tensor,
-    needs_points: bool,
+    scene: DepthScene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor, needs_points: bool,
     needs_vertices: bool,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Gradients of scores by the points, [B, P, 3], and by the vertices of the faces in their pixels, [B, V, 3].
 
     Sums have a fixed order, or none. What is not needed has no elements.
@@ -265,14 +254,14 @@ def gradients(
 
 
 def vertex_gradients_by_vectors(
-    scene: Scene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
+    scene: DepthScene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
 ) -> Tensor:
-    """The way of the CPU: point after point."""
+    """Gradients by vertices on the CPU: point after point."""
     batch, n_vertices, _ = scene.vertices.shape
-    grad_vertices = scene.room(n_vertices, 3)
-    # One block: camera_vertices, sums and screen_vertices, in numbers of 8 bytes.
-    room = scene.room(9 * n_vertices, dtype=torch.float64)
-    first = room.data_ptr()
+    grad_vertices = scene.empty(n_vertices, 3)
+    # One allocation: camera_vertices, sums and screen_vertices, in numbers of 8 bytes.
+    scratch = scene.empty(9 * n_vertices, dtype=torch.float64)
+    first = scratch.data_ptr()
     job, _alive = _job(
         scene,
         camera_vertices=first,
@@ -285,19 +274,19 @@ def vertex_gradients_by_vectors(
         pixels=pixels.data_ptr(),
         grad_vertices=grad_vertices.data_ptr(),
     )
-    dtype = C_TYPES[slopes.dtype]
+    dtype = SCALAR_NAMES[slopes.dtype]
     _run("transform", dtype, job, -(-n_vertices // VERTICES_A_TASK))
     _run("pull", dtype, job, 1)
     return grad_vertices
 
 
 def vertex_gradients_by_points(
-    scene: Scene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
+    scene: DepthScene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor
 ) -> Tensor:
-    """The plain way: all points at once, then for each vertex the sum over the points that name it."""
+    """Gradients by vertices by the generic kernels: all points at once, then sums over the points of each vertex."""
     batch, n_points = slopes.shape
     n_vertices = scene.vertices.shape[1]
-    rows = scene.room(n_points, 3, 3)
+    rows = scene.empty(n_points, 3, 3)
     tensors = (
         grad_visibility, slopes, pixels, face_ids, scene.vertices, scene.faces, scene.viewmats, scene.Ks, rows
     )  # fmt: skip

@@ -1,8 +1,9 @@
 """Depth buffers and scores in float32 on CUDA: four launches, their adjoint in three; nothing waits for the device.
 
-Beside the results they take 8 bytes a pixel and 16 a face, but 2 MiB for all faces at the most; the adjoint takes 32 a
-vertex.
+Besides the results they need 8 bytes per pixel and 16 per face, at most 2 MiB for all faces; the adjoint 32 per vertex.
 """
+
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,70 +12,66 @@ from oasis_kernels.depth import depth_buffer_cuda
 from oasis_kernels.depth.depth_buffer_cuda import BLOCK
 from oasis_warp.ops._runtime.depth_scene import (
     Buffer,
+    BufferParts,
+    DepthScene,
     Query,
-    Scene,
     Scores,
-    Wanted,
     empty_buffer,
     empty_scores,
     shared,
 )
-from oasis_warp.ops._runtime.launch import current_stream, run_cuda
+from oasis_warp.ops._runtime.launch import block_count, current_stream, run_cuda
 
 MOST_BLOCKS = 1 << 22
-"""Of a launch: Warp counts threads in 32 bits. Kernels go round until all is done."""
+"""Of a launch: Warp counts threads in 32 bits. Kernels loop until all is done."""
 PAIRS_A_BLOCK = 4 * BLOCK
 """Pairs of keys that a block clears."""
 BLOCKS_AT_ONCE = 3
-"""Blocks that a multiprocessor holds. So many draw large faces; four times as many share the looking at keys."""
+"""Blocks that a multiprocessor holds. So many draw large faces; four times as many read the keys."""
 
-NO_QUERY = dict.fromkeys(
-    (
-        "points", "points_step", "point_vertices", "vertex_bytes", "by_identity", "n_points", "tau", "margin",
-        "visibility", "slopes", "pixels",
-    ),
-    0,
+QUERY_PARAMETERS = (
+    "points", "points_step", "point_vertices", "vertex_bytes", "by_identity", "n_points", "tau", "margin", "visibility",
+    "slopes", "pixels",
 )  # fmt: skip
 
 
-def _scene_words(scene: Scene) -> tuple[dict[str, int | float], list[Tensor]]:
-    """What all kernels are told, and the tensors that it points to."""
+def _scene_params(scene: DepthScene) -> dict[str, Any]:
+    """The parameters that all kernels share."""
     vertices, vertices_step = shared(scene.vertices)
     viewmats, viewmats_step = shared(scene.viewmats)
     Ks, Ks_step = shared(scene.Ks)
-    words: dict[str, int | float] = {
-        "vertices": vertices.data_ptr(),
-        "viewmats": viewmats.data_ptr(),
-        "Ks": Ks.data_ptr(),
-        "faces": scene.faces.data_ptr(),
-        "vertices_step": vertices_step,
-        "viewmats_step": viewmats_step,
-        "Ks_step": Ks_step,
-        "batch": len(scene.vertices),
-        "n_faces": len(scene.faces),
-        "width": scene.width,
-        "height": scene.height,
-    }
-    return words, [vertices, viewmats, Ks]
+    return {
+        "vertices": vertices, "viewmats": viewmats, "Ks": Ks, "faces": scene.faces, "vertices_step": vertices_step,
+        "viewmats_step": viewmats_step, "Ks_step": Ks_step, "batch": len(scene.vertices), "n_faces": len(scene.faces),
+        "width": scene.width, "height": scene.height,
+    }  # fmt: skip
 
 
-def _blocks(n: int, a_block: int = BLOCK) -> int:
-    return -(-n // a_block)
+def _query_params(query: Query | None, scores: Scores | None) -> dict[str, Any]:
+    if query is None or scores is None:
+        return dict.fromkeys(QUERY_PARAMETERS)
+    points, points_step = shared(query.points)
+    known = query.point_vertices
+    values = (
+        points, points_step, known, 0 if known is None else known.element_size(), query.by_identity,
+        query.points.shape[1], query.tau, query.margin, *scores,
+    )  # fmt: skip
+    return dict(zip(QUERY_PARAMETERS, values, strict=True))
 
 
 def draw(
-    scene: Scene, query: Query | None, wanted: Wanted, found: Tensor | None = None
+    scene: DepthScene, query: Query | None, outputs: BufferParts, found: Tensor | None = None
 ) -> tuple[Buffer, Scores | None]:
-    """As `_depth_buffer.draw`, without a look at values that costs a launch or a wait of its own.
+    """As `depth_buffer.draw`, without a check of values that costs a launch or a wait of its own.
 
     Args:
         scene: Meshes and cameras.
         query: Points.
-        wanted: What to write.
+        outputs: The parts to fill.
         found: Page-locked, int64: its first element becomes 1 if a focal length is not positive or a point's vertex is
-            none, once the device is there.
+            none, once the device has finished.
     """
-    buffer = empty_buffer(scene, wanted)
+    buffer = empty_buffer(scene, outputs)
     scores = None if query is None else empty_scores(scene, query)
     batch, n_faces, plane = len(scene.vertices), len(scene.faces), scene.width * scene.height
     stream = current_stream(scene.vertices.device)
@@ -82,104 +79,56 @@ def draw(
     at_once = BLOCKS_AT_ONCE * stream.device.sm_count
     key_pairs = -(-batch * plane // 2)
     capacity = min(batch * n_faces, depth_buffer_cuda.QUEUE)
-    # One block: keys, the queue's counter, its faces and where they start.
-    room = torch.empty(2 * key_pairs + 2 * capacity + 2, dtype=torch.int64, device=scene.vertices.device)
-    keys = room.data_ptr()
+    # One allocation: keys, the queue's counter, its faces and their starts.
+    scratch = torch.empty(2 * key_pairs + 2 * capacity + 2, dtype=torch.int64, device=scene.vertices.device)
+    keys = scratch.data_ptr()
     counter = keys + 16 * key_pairs
-    scene_words, _alive = _scene_words(scene)
-    scene_words |= {"near_plane": scene.near_plane, "keys": keys}
-    drawn = scene_words | {
-        "counter": counter,
-        "queue_faces": counter + 8,
-        "queue_starts": counter + 8 + 8 * capacity,
-        "capacity": capacity,
-    }
-    blocks = min(_blocks(key_pairs, PAIRS_A_BLOCK), MOST_BLOCKS)
-    found_word = 0 if found is None else found.data_ptr()
-    cleared = {name: scene_words[name] for name in ("Ks", "Ks_step", "batch", "keys")}
-    cleared |= {"key_pairs": key_pairs, "counter": counter, "found": found_word}
-    run_cuda(depth_buffer_cuda.clear, cleared, blocks, stream)
-    blocks = min(batch * _blocks(n_faces, depth_buffer_cuda.FACES_A_BLOCK), MOST_BLOCKS)
-    run_cuda(depth_buffer_cuda.draw, drawn, blocks, stream)
-    if capacity:
-        run_cuda(depth_buffer_cuda.draw_large, drawn, at_once, stream)
-
-    # A small picture has a pixel for each of the threads that run at once, or not even that.
+    # A small image has one pixel, or less, for each thread that runs at once.
     pixels_a_thread = min(max(batch * plane // (2 * BLOCK * at_once), 1), depth_buffer_cuda.MOST_PIXELS)
-    blocks = _blocks(plane, pixels_a_thread * BLOCK) if any(wanted) else 0
-    words = scene_words | {
-        "depth": buffer.depth.data_ptr() if wanted.depth else 0,
-        "face_ids": buffer.face_ids.data_ptr() if wanted.face_ids else 0,
-        "barycentrics": buffer.barycentrics.data_ptr() if wanted.barycentrics else 0,
-        "n_vertices": scene.vertices.shape[1],
-        "pixels_a_thread": pixels_a_thread,
-        "found": found_word,
-    }
-    if query is None or scores is None:
-        words |= NO_QUERY
-    else:
-        points, points_step = shared(query.points)
-        known = query.point_vertices
-        words |= {
-            "points": points.data_ptr(),
-            "points_step": points_step,
-            "point_vertices": 0 if known is None else known.data_ptr(),
-            "vertex_bytes": 0 if known is None else known.element_size(),
-            "by_identity": query.by_identity,
-            "n_points": query.points.shape[1],
-            "tau": query.tau,
-            "margin": query.margin,
-            "visibility": scores.visibility.data_ptr(),
-            "slopes": scores.slopes.data_ptr() if query.keep else 0,
-            "pixels": scores.pixels.data_ptr() if query.keep else 0,
-        }
-        blocks += _blocks(query.points.shape[1])
-    run_cuda(depth_buffer_cuda.resolve, words, min(batch * blocks, 4 * at_once, MOST_BLOCKS), stream)
+    params = _scene_params(scene) | _query_params(query, scores) | buffer._asdict() | {
+        "near_plane": scene.near_plane, "n_vertices": scene.vertices.shape[1], "keys": keys, "key_pairs": key_pairs,
+        "counter": counter, "queue_faces": counter + 8, "queue_starts": counter + 8 + 8 * capacity,
+        "capacity": capacity, "pixels_a_thread": pixels_a_thread, "found": found,
+    }  # fmt: skip
+    blocks = min(block_count(key_pairs, PAIRS_A_BLOCK), MOST_BLOCKS)
+    run_cuda(depth_buffer_cuda.clear, params, blocks, stream)
+    blocks = min(batch * block_count(n_faces, depth_buffer_cuda.FACES_A_BLOCK), MOST_BLOCKS)
+    run_cuda(depth_buffer_cuda.draw, params, blocks, stream)
+    if capacity:
+        run_cuda(depth_buffer_cuda.draw_large, params, at_once, stream)
+    blocks = block_count(plane, pixels_a_thread * BLOCK) if any(outputs) else 0
+    blocks += 0 if query is None else block_count(query.points.shape[1], BLOCK)
+    run_cuda(depth_buffer_cuda.resolve, params, min(batch * blocks, 4 * at_once, MOST_BLOCKS), stream)
     return buffer, scores
 
 
 def gradients(
-    scene: Scene,
-    face_ids: Tensor,
-    grad_visibility: Tensor,
-    slopes: Tensor,
-    pixels: Tensor,
-    needs_points: bool,
+    scene: DepthScene, face_ids: Tensor, grad_visibility: Tensor, slopes: Tensor, pixels: Tensor, needs_points: bool,
     needs_vertices: bool,
-) -> tuple[Tensor, Tensor]:
-    """As `_depth_buffer.gradients`."""
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """As `depth_buffer.gradients`."""
     batch, n_points = slopes.shape
     n_vertices = scene.vertices.shape[1]
-    grad_visibility = grad_visibility.contiguous()
-    grad_points = scene.room(n_points, 3) if needs_points else scene.vertices.new_empty(0)
-    grad_vertices = scene.room(n_vertices, 3) if needs_vertices else scene.vertices.new_empty(0)
+    grad_points = scene.empty(n_points, 3) if needs_points else scene.vertices.new_empty(0)
+    grad_vertices = scene.empty(n_vertices, 3) if needs_vertices else scene.vertices.new_empty(0)
     stream = current_stream(scene.vertices.device)
-    blocks = min(batch * _blocks(n_points), depth_buffer_cuda.PEAKS)
+    blocks = min(batch * block_count(n_points, BLOCK), depth_buffer_cuda.PEAKS)
     if needs_vertices and not blocks:
         grad_vertices.zero_()
-    # One block: the sums at vertices, their shift, the largest numbers.
-    room = torch.empty(
+    # One allocation: the sums at vertices, their shift, the largest numbers.
+    scratch = torch.empty(
         4 * batch * n_vertices + 1 + blocks if needs_vertices else 0, dtype=torch.int64, device=slopes.device
     )
-    sums = room.data_ptr() if needs_vertices else 0
+    sums = scratch.data_ptr() if needs_vertices else 0
     shift = sums + 32 * batch * n_vertices
-    words, _alive = _scene_words(scene)
-    words |= {
-        "n_vertices": n_vertices,
-        "n_points": n_points,
-        "face_ids": face_ids.data_ptr(),
-        "grad_visibility": grad_visibility.data_ptr(),
-        "slopes": slopes.data_ptr(),
-        "pixels": pixels.data_ptr(),
-        "grad_points": grad_points.data_ptr() if needs_points else 0,
-        "adds": 0,
-        "peaks": shift + 8,
-        "shift": shift,
-        "sums": sums,
-    }
-    run_cuda(depth_buffer_cuda.pull, words, blocks, stream)
+    params = _scene_params(scene) | {
+        "n_vertices": n_vertices, "n_points": n_points, "face_ids": face_ids,
+        "grad_visibility": grad_visibility.contiguous(), "slopes": slopes, "pixels": pixels, "grad_points": grad_points,
+        "adds": 0, "peaks": shift + 8, "shift": shift, "sums": sums,
+    }  # fmt: skip
+    run_cuda(depth_buffer_cuda.pull, params, blocks, stream)
     if needs_vertices and blocks:
-        run_cuda(depth_buffer_cuda.pull, words | {"adds": 1}, blocks, stream)
-        words = {"sums": sums, "shift": shift, "n": batch * n_vertices, "grad_vertices": grad_vertices.data_ptr()}
-        run_cuda(depth_buffer_cuda.settle, words, min(_blocks(batch * n_vertices), MOST_BLOCKS), stream)
+        run_cuda(depth_buffer_cuda.pull, params | {"adds": 1}, blocks, stream)
+        params = {"sums": sums, "shift": shift, "n": batch * n_vertices, "grad_vertices": grad_vertices}
+        run_cuda(depth_buffer_cuda.settle, params, min(block_count(batch * n_vertices, BLOCK), MOST_BLOCKS), stream)
     return grad_points, grad_vertices

@@ -1,6 +1,6 @@
-"""What is drawn into depth buffers, and what comes out: the nouns of all ways to draw.
+"""Inputs and outputs of the depth buffer, shared by all backends.
 
-Everything has a leading batch axis here. A tensor that is the same for the whole batch may come expanded.
+All tensors have a leading batch axis. One that is the same for the whole batch may be expanded.
 """
 
 from typing import NamedTuple
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 
-class Scene(NamedTuple):
+class DepthScene(NamedTuple):
     """Meshes and cameras. B batch entries, V vertices, F faces."""
 
     vertices: Tensor
@@ -24,28 +24,28 @@ class Scene(NamedTuple):
     height: int
     near_plane: float
 
-    def room(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
-        """An empty tensor of `shape` for each batch entry, of the vertices' type unless told."""
+    def empty(self, *shape: int | torch.SymInt, dtype: torch.dtype | None = None) -> Tensor:
+        """An empty tensor of `shape` for each batch entry, by default of the vertices' type."""
         return self.vertices.new_empty((self.vertices.shape[0], *shape), dtype=dtype)
 
 
 class Query(NamedTuple):
-    """Points to be scored."""
+    """Points to score."""
 
     points: Tensor
     """[B, P, 3]."""
     point_vertices: Tensor | None
     """int32 or int64 [P], contiguous: the vertex that each point is, or -1."""
     by_identity: bool
-    """Whether points that are vertices of a face in view are seen by that alone."""
+    """Whether points that are vertices of a face in view count as seen."""
     tau: float
     margin: float
     keep: bool
-    """Whether `Scores.slopes` and `pixels` are wanted."""
+    """Whether to fill `Scores.slopes` and `pixels`."""
 
 
-class Wanted(NamedTuple):
-    """Which parts of a `Buffer` somebody needs."""
+class BufferParts(NamedTuple):
+    """The parts of a `Buffer` to fill."""
 
     depth: bool = True
     face_ids: bool = True
@@ -53,7 +53,7 @@ class Wanted(NamedTuple):
 
 
 class Buffer(NamedTuple):
-    """What the cameras see. A part that was not wanted has no rows and no columns."""
+    """What the cameras see. A part that is not filled has no rows and no columns."""
 
     depth: Tensor
     """[B, H, W]."""
@@ -63,13 +63,13 @@ class Buffer(NamedTuple):
     """[B, H, W, 3]."""
 
 
-def empty_buffer(scene: Scene, wanted: Wanted) -> Buffer:
-    """Room for the parts that are wanted."""
+def empty_buffer(scene: DepthScene, outputs: BufferParts) -> Buffer:
+    """Memory for the parts to fill."""
     size, nothing = (scene.height, scene.width), (0, 0)
     return Buffer(
-        scene.room(*(size if wanted.depth else nothing)),
-        scene.room(*(size if wanted.face_ids else nothing), dtype=torch.int32),
-        scene.room(*(size if wanted.barycentrics else nothing), 3),
+        scene.empty(*(size if outputs.depth else nothing)),
+        scene.empty(*(size if outputs.face_ids else nothing), dtype=torch.int32),
+        scene.empty(*(size if outputs.barycentrics else nothing), 3),
     )
 
 
@@ -79,16 +79,16 @@ class Scores(NamedTuple):
     visibility: Tensor
     """[B, P]."""
     slopes: Tensor
-    """Derivative with respect to the point's depth, [B, P]; [B, 0] unless kept."""
+    """Derivative with respect to the point's depth, [B, P]; [B, 0] unless `keep`."""
     pixels: Tensor
     """int32: row * width + column where the score is soft, else -1; as `slopes`."""
 
 
-def empty_scores(scene: Scene, query: Query) -> Scores:
-    """Room for what is asked of the points."""
+def empty_scores(scene: DepthScene, query: Query) -> Scores:
+    """Memory for the scores of the points."""
     n_points = query.points.shape[1]
     kept = n_points if query.keep else 0
-    return Scores(scene.room(n_points), scene.room(kept), scene.room(kept, dtype=torch.int32))
+    return Scores(scene.empty(n_points), scene.empty(kept), scene.empty(kept, dtype=torch.int32))
 
 
 def shared(tensor: Tensor) -> tuple[Tensor, int]:
@@ -99,10 +99,10 @@ def shared(tensor: Tensor) -> tuple[Tensor, int]:
     return tensor, tensor.stride(0)
 
 
-def only(buffer: Buffer, wanted: Wanted) -> Buffer:
-    """`buffer` without what nobody wanted but had to be drawn all the same."""
+def restrict(buffer: Buffer, outputs: BufferParts) -> Buffer:
+    """`buffer` without the parts that were drawn only because others need them."""
     parts = (
-        part if is_wanted else part.new_empty((len(part), 0, 0, *part.shape[3:]))
-        for part, is_wanted in zip(buffer, wanted, strict=True)
+        part if needed else part.new_empty((len(part), 0, 0, *part.shape[3:]))
+        for part, needed in zip(buffer, outputs, strict=True)
     )
     return Buffer(*parts)

@@ -1,4 +1,4 @@
-"""Everything between a torch tensor and a Warp launch: start Warp, view tensors, device and stream, launch."""
+"""From torch tensors to Warp launches: start Warp, view tensors, find device and stream, launch."""
 
 import ctypes
 import functools
@@ -6,7 +6,7 @@ import itertools
 import os
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -17,7 +17,7 @@ import warp as wp
 from torch import Tensor
 
 from oasis_kernels.runtime.cuda_native import CudaNative
-from oasis_kernels.runtime.native import Native
+from oasis_kernels.runtime.native import TASK, Native
 
 _start_lock = threading.Lock()
 _load_lock = threading.Lock()
@@ -26,6 +26,7 @@ _started = False
 VEC2 = {torch.float32: wp.vec2f, torch.float64: wp.vec2d}
 VEC3 = {torch.float32: wp.vec3f, torch.float64: wp.vec3d}
 VEC4 = {torch.float32: wp.vec4f, torch.float64: wp.vec4d}
+SCALAR_NAMES = {torch.float32: "float", torch.float64: "double"}
 SCALAR = {torch.float32: wp.float32, torch.float64: wp.float64, torch.int32: wp.int32, torch.int64: wp.int64}
 
 
@@ -40,7 +41,7 @@ def kernel_cache() -> Path:
 
 @contextmanager
 def _native_stderr_closed() -> Iterator[None]:
-    """Send what native code prints to nowhere: on a machine without a GPU Warp warns of the missing driver."""
+    """Discard what native code prints: without a GPU, Warp warns of the missing driver."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
@@ -78,8 +79,8 @@ def current_stream(device: torch.device) -> "wp.Stream":
     stream = _warp_streams.get(key)
     if stream is None:
         start()
-        # Kept for the life of the process: making one costs 5 us, and torch's pool of streams is small. It is made from
-        # the object: rebuilt from its handle, the default stream (handle 0) would become another one, out of order.
+        # Cached for the life of the process: making one costs 5 us, and torch's pool of streams is small. It is made
+        # from the object: rebuilt from its handle, the default stream (handle 0) would become another one.
         stream = _warp_streams[key] = wp.stream_from_torch(torch.cuda.current_stream(index))
     return stream
 
@@ -106,12 +107,12 @@ def view(tensor: Tensor, dtype: Any = None) -> Any:
 
 
 def has_vectors(tensor: Tensor) -> bool:
-    """Whether kernels for tensors like this one have a vectorised form: float32 on the CPU."""
+    """Whether vectorised CPU kernels take tensors like this one: float32 on the CPU."""
     return tensor.device.type == "cpu" and tensor.dtype == torch.float32
 
 
 def has_cuda_kernels(tensor: Tensor) -> bool:
-    """Whether kernels for tensors like this one have a form that is written for CUDA: float32 there."""
+    """Whether native CUDA kernels take tensors like this one: float32 on CUDA."""
     return tensor.is_cuda and tensor.dtype == torch.float32
 
 
@@ -130,7 +131,7 @@ def _pool(process: int, n_threads: int) -> ThreadPoolExecutor:
 
 
 def even_cuts(n: int, least: int = 2048) -> list[int]:
-    """Bounds 0 .. n of ranges for `launch_ranges`: one a thread, but none with fewer than `least` tasks."""
+    """Bounds 0 .. n of ranges for `launch_ranges`: one for each thread, none with fewer than `least` tasks."""
     parts = max(1, min(torch.get_num_threads(), n // least))
     return [n * k // parts for k in range(parts + 1)]
 
@@ -165,7 +166,7 @@ def launch_ranges(
 
 
 class _Recorded(threading.local):
-    """Launches of native kernels, recorded once a thread: replaying one costs a fifth of `wp.launch`."""
+    """Launches of native kernels, recorded once per thread: replaying one costs a fifth of `wp.launch`."""
 
     def __init__(self) -> None:
         self.launches: dict[Any, Any] = {}  # by kernel
@@ -187,8 +188,8 @@ def _replay(kernel: Any, block: int) -> None:
 def run_shared(kernel: Any, block: int, n_tasks: int) -> None:
     """Run a CPU kernel of one argument, the address of a parameter block, and return when it is done.
 
-    Up to `n_tasks` of torch's threads run it together, this one among them; the kernel deals out its tasks to them, so
-    that a thread that comes late, or never, costs time only.
+    Up to `n_tasks` of torch's threads run it together, including this one. The kernel deals out its tasks, so a thread
+    that comes late, or never, costs only time.
     """
     start()
     helpers = min(torch.get_num_threads(), n_tasks) - 1
@@ -205,12 +206,6 @@ def run_shared(kernel: Any, block: int, n_tasks: int) -> None:
                 future.result()
 
 
-def address(tensor: Tensor, dtype: torch.dtype, size: int) -> int:
-    """Where the data of a CPU `tensor` begin, for a native kernel that expects `size` contiguous elements there."""
-    assert tensor.dtype == dtype and tensor.numel() == size and tensor.is_contiguous() and tensor.device.type == "cpu"
-    return tensor.data_ptr()
-
-
 @functools.cache
 def _give_way() -> int:
     """Address of the C library's sched_yield, 0 where there is none."""
@@ -219,21 +214,57 @@ def _give_way() -> int:
     return ctypes.cast(ctypes.CDLL(None).sched_yield, ctypes.c_void_p).value or 0
 
 
-def run_native(native: Native, words: dict[str, int], n_tasks: int) -> None:
-    """Run a native kernel with the parameter block `words` on the CPU: see `run_shared`.
+Parameters = Mapping[str, Any]
+"""Numbers and tensors by parameter of a kernel. A tensor stands for its address; None or an empty tensor for null."""
+
+
+def run_native(native: Native, params: Parameters, n_tasks: int) -> None:
+    """Run a native kernel on the CPU: see `run_shared`.
 
     Args:
         native: The kernel.
-        words: A number or an `address` for each of its parameters; others are ignored.
+        params: A number or contiguous tensor for each of its parameters; others are ignored.
         n_tasks: The largest number of tasks in one of its phases.
     """
-    words = {"give_way": _give_way(), **words}
-    block = (ctypes.c_longlong * len(native.parameters))(*[words[name] for name in native.parameters])
+    values = []
+    for name in native.parameters:
+        value = _give_way() if name == "give_way" else params[name]
+        if isinstance(value, Tensor):
+            assert value.is_contiguous() and value.is_cpu, name
+            value = value.data_ptr()
+        values.append(value or 0)
+    block = (ctypes.c_longlong * len(values))(*values)
     run_shared(native.kernel, ctypes.addressof(block), n_tasks)
 
 
+def phase_state(size: int) -> Tensor:
+    """The words of zeros with which the threads of a native kernel share out its phases."""
+    return torch.zeros(size, dtype=torch.int64)
+
+
+def task_count(*items: int) -> int:
+    """Number of tasks of a native kernel of posing with phases over so many items."""
+    return -(-max(items) // TASK)
+
+
+def block_count(n: int, block: int) -> int:
+    """Number of blocks for `n` threads."""
+    return -(-n // block)
+
+
+def contiguous(*tensors: Tensor | None) -> list[Any]:
+    """The tensors in contiguous memory; None stays None."""
+    return [None if tensor is None else tensor.contiguous() for tensor in tensors]
+
+
+def aligned(*tensors: Tensor | None) -> list[Any]:
+    """`contiguous`, at multiples of 16 bytes: CUDA kernels read rows of four numbers as one."""
+    found = contiguous(*tensors)
+    return [t.clone() if t is not None and t.data_ptr() % 16 else t for t in found]
+
+
 class _CudaLaunches(threading.local):
-    """Launches of CUDA kernels, recorded once a thread."""
+    """Launches of CUDA kernels, recorded once per thread."""
 
     def __init__(self) -> None:
         self.launches: dict[Any, list[Any]] = {}  # by kernel and device: the launch, and its number of blocks
@@ -242,19 +273,19 @@ class _CudaLaunches(threading.local):
 _cuda_launches = _CudaLaunches()
 
 
-def run_cuda(native: CudaNative, words: dict[str, int | float], n_blocks: int, stream: "wp.Stream") -> None:
+def run_cuda(native: CudaNative, params: Parameters, n_blocks: int, stream: "wp.Stream") -> None:
     """Launch a CUDA kernel of `n_blocks` blocks on `stream`, which a graph may be capturing; none for no blocks.
 
     Args:
         native: The kernel.
-        words: A number or `Tensor.data_ptr()` for each of its parameters, by name; 0 is a null pointer. Others are
-            ignored.
+        params: A number or contiguous tensor for each of its parameters; others are ignored.
         n_blocks: Of `native.block` threads.
         stream: A `current_stream`.
     """
     if not n_blocks:
         return
-    block = native.words(*[words[name] for name in native.parameters])
+    values = [params[name] for name in native.parameters]
+    block = native.words(*[v.data_ptr() if isinstance(v, Tensor) else v or 0 for v in values])
     key = native.kernel, stream.device.ordinal
     recorded = _cuda_launches.launches.get(key)
     if recorded is None:

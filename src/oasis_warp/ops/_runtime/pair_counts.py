@@ -1,8 +1,8 @@
-"""How many pairs of a Gaussian and a tile a CUDA rasterization has: read off the device, or expected in a graph.
+"""Memory for the pairs of a Gaussian and a tile in a CUDA rasterization.
 
-An eager call waits for its count, the one moment at which the host waits for the device, and takes memory for exactly
-that many. A call that a CUDA graph captures cannot wait: it takes what the last eager call of its kind needed and some
-more. Where a replay needs more, lists that do not fit stay empty, and `Overflow.happened` says so.
+An eager call waits for their count, the only point at which the host waits for the device, and allocates exactly that
+much. A call that a CUDA graph captures cannot wait: it allocates what the last eager call of its kind needed, and some
+more. If a replay needs more, lists that do not fit stay empty, and `Overflow.happened` returns True.
 """
 
 import threading
@@ -19,11 +19,11 @@ from oasis_kernels.rasterize.tiles_cuda import LONGEST, REPORT, RUN
 from oasis_warp.ops._runtime.tiles import MAX_PAIRS
 
 PAGE = 4096
-"""Words of host memory that are taken at a time for reports."""
+"""Words of host memory per allocation for reports."""
 
 
 class Counts(NamedTuple):
-    """What a call needs, or has memory for."""
+    """What a call needs or has memory for."""
 
     pairs: int
     longest: int
@@ -36,7 +36,7 @@ _last: dict[Kind, Counts] = {}
 
 
 class _Slots:
-    """Words of page-locked host memory that kernels write to, handed out in parts of `REPORT`."""
+    """Page-locked host memory that kernels write to, in slots of `REPORT` words."""
 
     def __init__(self) -> None:
         self.free: list[Tensor] = []
@@ -50,7 +50,7 @@ class _Slots:
             return self.free.pop()
 
     def stock(self) -> None:
-        """Have slots ready for captures to come, during which no memory can be page-locked."""
+        """Keep a slot ready: during a capture no memory can be page-locked."""
         if not self.free:
             self.give(self.take())
 
@@ -60,11 +60,11 @@ class _Slots:
 
 
 slots = _Slots()
-"""For kernels that tell the host a few numbers."""
+"""For kernels that report a few numbers to the host."""
 
 
 class _Own(threading.local):
-    """A slot a thread, for calls that wait."""
+    """One slot for each thread, for calls that wait."""
 
     def __init__(self) -> None:
         self.slot = slots.take()
@@ -76,7 +76,7 @@ _start = threading.Lock()
 
 
 def own_slot() -> Tensor:
-    """Host memory [REPORT], int64, of this thread, for one call at a time that waits for the device."""
+    """This thread's host memory [REPORT], int64, for a call that waits for the device."""
     global _own
     with _start:
         if _own is None:  # not at import: page-locked memory needs a device
@@ -85,15 +85,15 @@ def own_slot() -> Tensor:
 
 
 class Overflow:
-    """Whether graphs that were captured while this was watching have met more pairs than they have memory for."""
+    """Whether watched graphs have met more pairs than they have memory for."""
 
     def __init__(self, slack: float) -> None:
         self._slack = slack
         self._reports: list[tuple[Tensor, Counts]] = []
 
     def expect(self, kind: Kind) -> tuple[Tensor, Counts]:
-        """A report's memory and the capacity for a call of this `kind`."""
-        # The slot is the graph's for ever: it may be replayed when nobody watches any more.
+        """Memory for the report, and the capacity, of a captured call of this `kind`."""
+        # The slot stays the graph's: it may be replayed after the watch has ended.
         slot, capacity = slots.take().zero_(), capacity_of(kind, self._slack)
         self._reports.append((slot, capacity))
         return slot, capacity
@@ -117,8 +117,8 @@ def watch_overflow(slack: float = 1.5) -> Iterator[Overflow]:
 
     A captured call of `rasterization` has memory for `slack` times as many pairs of a Gaussian and a tile as the last
     eager call with the same device, numbers of cameras and Gaussians, and size. After a replay that needed more, the
-    picture lacks Gaussians and `Overflow.happened()` is true. Capturing outside such a block is refused, for nobody
-    would learn of it.
+    image lacks Gaussians and `Overflow.happened()` is true. A capture outside such a block is refused, because it would
+    go unnoticed.
     """
     overflow = Overflow(slack)
     token = _watching.set(overflow)
@@ -147,10 +147,10 @@ def capacity_of(kind: Kind, slack: float) -> Counts:
 
 
 def watching() -> Overflow:
-    """Who watches this capture.
+    """The watch over this capture.
 
     Raises:
-        RuntimeError: nobody does.
+        RuntimeError: there is none.
     """
     overflow = _watching.get()
     if overflow is None:
@@ -162,6 +162,6 @@ def watching() -> Overflow:
 
 
 def remember(kind: Kind, counts: Counts) -> None:
-    """Keep what an eager call needed, as a graph of the same kind may come next."""
+    """Record the needs of an eager call for graphs of the same kind."""
     _last[kind] = counts
     slots.stock()

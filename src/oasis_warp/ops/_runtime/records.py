@@ -1,4 +1,4 @@
-"""What the projection tells whoever draws, in one piece of memory: torch takes its time for every tensor.
+"""What the projection hands to the blending, in one allocation, as each tensor costs torch time.
 
 Four tables with a row for each (camera, Gaussian), one after the other, and for the CUDA rasterizer the counters of its
 tiles, which are zero between calls.
@@ -57,7 +57,7 @@ def tables(records: Tensor, n_cameras: Size, n: Size, dtype: torch.dtype) -> Tab
     return Tables(table(0, dtype, 4), table(1, dtype, 4), table(2, torch.int32, 4), table(3, torch.float64))
 
 
-def table_words(records: Tensor, total: int, dtype: torch.dtype) -> dict[str, Any]:
+def table_params(records: Tensor, total: int, dtype: torch.dtype) -> dict[str, Any]:
     """Addresses of the tables by name and of the `counters`, for kernels that take raw pointers."""
     first, (centers, whitenings, boxes, depths, counters) = records.data_ptr(), _starts(total, dtype)
     return {
@@ -67,3 +67,51 @@ def table_words(records: Tensor, total: int, dtype: torch.dtype) -> dict[str, An
         "sort_depths": first + depths,
         "counters": first + counters,
     }
+
+
+class Splats(NamedTuple):
+    """Projected Gaussians of C cameras, contiguous."""
+
+    records: Tensor
+    """Of the projection."""
+    opacities: Tensor
+    """[C, N]."""
+    colors: Tensor
+    """[C, N, D]."""
+    backgrounds: Tensor
+    """[C, D]."""
+
+    def tables(self) -> Tables:
+        """Where and how the Gaussians are drawn."""
+        return tables(self.records, *self.opacities.shape, self.opacities.dtype)
+
+    def params(self) -> dict[str, Any]:
+        """Parameters of the float32 kernels: the tables and these."""
+        return {**table_params(self.records, self.opacities.numel(), self.opacities.dtype), **self._asdict()}
+
+
+class Frame(NamedTuple):
+    """Size of the images and of the tiles that work is split into [px]."""
+
+    width: int
+    height: int
+    tile_size: int
+
+
+class GradientFlags(NamedTuple):
+    """Which gradients of blending are needed."""
+
+    shape: bool
+    """Gradients by means2d, covars2d and opacities."""
+    colors: bool
+    backgrounds: bool
+
+
+class Gradients(NamedTuple):
+    """Gradients of blending; None where they are not needed."""
+
+    means2d: Tensor | None
+    covars2d: Tensor | None
+    opacities: Tensor | None
+    colors: Tensor | None
+    backgrounds: Tensor | None

@@ -11,7 +11,7 @@ _rules: ContextVar[Rules] = ContextVar("rules", default=_GSPLAT)
 
 
 def current_rules() -> Rules:
-    """What the operators called from here draw by: gsplat's, unless inside `using`."""
+    """The rules of the operators called from here: those of gsplat, unless inside `using`."""
     return _rules.get()
 
 

@@ -9,16 +9,15 @@ from torch import Tensor
 
 from oasis_kernels.rasterize import tiles
 from oasis_warp.ops._runtime.launch import even_cuts, launch, launch_ranges, view
-from oasis_warp.ops._runtime.registration import hidden, revealed
 
 MAX_PAIRS = 2**31 - 1
 """Pairs of a Gaussian and a tile that one call can hold."""
 RANGES_A_THREAD = 4
-"""Ranges of tiles a thread, so that none waits long for the last."""
+"""Ranges of tiles per thread, so that none waits long for the last."""
 
 
 class Tiles(NamedTuple):
-    """Which Gaussians each tile draws, front to back. P pairs of a Gaussian and a tile."""
+    """The Gaussians of each tile, front to back. P pairs of a Gaussian and a tile."""
 
     size: int
     """Side of a tile [px]."""
@@ -27,12 +26,30 @@ class Tiles(NamedTuple):
     starts: Int64[Tensor, "tiles_plus_one"]
     """First place of each tile, camera by camera, row by row; at the end P."""
     gaussians: Int32[Tensor, "1"]
-    """`hidden` [P]: camera * N + gaussian at each place."""
+    """`opaque_buffer` [P]: camera * N + gaussian at each place."""
     pairs: Int64[Tensor, "1"]
-    """`hidden` [P]: number of the pair at each place; a Gaussian's pairs have consecutive numbers."""
+    """`opaque_buffer` [P]: number of the pair at each place; a Gaussian's pairs have consecutive numbers."""
     pair_starts: Int64[Tensor, "M"]
     """First number of each Gaussian's pairs, by camera * N + gaussian."""
     pair_counts: Int64[Tensor, "M"]
+
+
+def opaque_buffer(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Memory for `size` elements, as `opaque_elements` shows it, in the form of a tensor of one element.
+
+    The one element is at the start of a longer storage: shapes stay known, and the storage travels along.
+    """
+    return torch.empty(size + 1, dtype=dtype, device=device).resize_(1)
+
+
+def opaque_elements(buffer: Tensor) -> Tensor:
+    """All elements of an `opaque_buffer`."""
+    return buffer.as_strided((buffer.untyped_storage().nbytes() // buffer.element_size() - 1,), (1,))
+
+
+def fake_opaque_buffer(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The visible part of an `opaque_buffer`, for a fake."""
+    return torch.empty(1, dtype=dtype, device=device)
 
 
 def bin_to_tiles(boxes: Tensor, depths: Tensor, width: int, height: int, tile_size: int) -> Tiles:
@@ -79,10 +96,10 @@ def bin_by_sorting(boxes: Tensor, depths: Tensor, tile_size: int, across: int, d
     sorted_tiles, pairs = torch.sort(pair_tiles, stable=True)
     every_tile = torch.arange(n_cameras * across * down + 1, dtype=torch.int32, device=device)
     starts = torch.searchsorted(sorted_tiles, every_tile)
-    hidden_gaussians, hidden_pairs = (hidden(n_pairs, dtype, device) for dtype in (torch.int32, torch.int64))
-    torch.index_select(pair_gaussians, 0, pairs, out=revealed(hidden_gaussians))
-    revealed(hidden_pairs).copy_(pairs)
-    return Tiles(tile_size, across, down, starts, hidden_gaussians, hidden_pairs, pair_starts, counts)
+    gaussians, pair_numbers = (opaque_buffer(n_pairs, dtype, device) for dtype in (torch.int32, torch.int64))
+    torch.index_select(pair_gaussians, 0, pairs, out=opaque_elements(gaussians))
+    opaque_elements(pair_numbers).copy_(pairs)
+    return Tiles(tile_size, across, down, starts, gaussians, pair_numbers, pair_starts, counts)
 
 
 def bin_by_dealing(boxes: Tensor, depths: Tensor, tile_size: int, across: int, down: int) -> Tiles:
@@ -109,7 +126,7 @@ def bin_by_dealing(boxes: Tensor, depths: Tensor, tile_size: int, across: int, d
     )  # fmt: skip
     n_drawn, n_pairs = totals.tolist()
     check_pairs(n_pairs)
-    gaussians, pairs = (hidden(n_pairs, dtype, starts.device) for dtype in (torch.int32, torch.int64))
+    gaussians, pairs = (opaque_buffer(n_pairs, dtype, starts.device) for dtype in (torch.int32, torch.int64))
     if n_drawn:
         # Depths are positive: their bits sort as integers do. The sort is stable.
         wp.utils.radix_sort_pairs(view(keys), view(order), n_drawn)
@@ -118,7 +135,7 @@ def bin_by_dealing(boxes: Tensor, depths: Tensor, tile_size: int, across: int, d
             1,
             [
                 view(order), n_drawn, tile_boxes, across, view(pair_starts), view(starts.clone()),
-                view(revealed(gaussians)), view(revealed(pairs)),
+                view(opaque_elements(gaussians)), view(opaque_elements(pairs)),
             ],
             like=starts,
         )  # fmt: skip
@@ -135,11 +152,11 @@ def check_pairs(n_pairs: int) -> None:
 
 
 def even_work(starts: Tensor) -> list[int]:
-    """Bounds of ranges of tiles with about as many pairs each; a tile counts a little even when it is empty."""
+    """Bounds of ranges of tiles with about equally many pairs; an empty tile counts a little too."""
     n_tiles = len(starts) - 1
     parts = min(RANGES_A_THREAD * torch.get_num_threads(), n_tiles)
     if starts.is_cuda or torch.get_num_threads() == 1:
         return [0, n_tiles]
     work = starts + torch.arange(n_tiles + 1) * 4
-    wanted = torch.arange(1, parts) * int(work[-1]) // parts
-    return [0, *torch.searchsorted(work, wanted).tolist(), n_tiles]
+    targets = torch.arange(1, parts) * int(work[-1]) // parts
+    return [0, *torch.searchsorted(work, targets).tolist(), n_tiles]

@@ -1,4 +1,4 @@
-"""`core.checks.check_finite` for the operators' implementations, where it is part of every call."""
+"""Checks for finite values that are fast enough to be part of every call of an operator."""
 
 from typing import Any
 
@@ -25,19 +25,17 @@ def check_finite(**tensors: Tensor | None) -> None:
     if quick:
         arrays = torch.tensor([(t.data_ptr(), t.numel()) for t in quick])
         found = torch.zeros(1, dtype=torch.int64)
-        run_native(
-            finite.ALL_FINITE, {"arrays": arrays.data_ptr(), "count": len(quick), "found": found.data_ptr()}, n_tasks=1
-        )
+        run_native(finite.ALL_FINITE, {"arrays": arrays, "count": len(quick), "found": found}, n_tasks=1)
         if not found[0]:
             given = {name: t for name, t in given.items() if not any(t is known for known in quick)}
-    checks.check_finite(**given)  # also for the words, where something was found
+    checks.check_finite(**given)  # also for the message, if something was found
 
 
 def refuse_capture() -> None:
-    """Refuse to look at values while a CUDA graph captures the call: nobody knows them yet.
+    """Refuse to check values while a CUDA graph captures the call: they do not exist yet.
 
     Raises:
-        ValueError: it is being captured.
+        ValueError: a capture is under way.
     """
     if torch.cuda.is_current_stream_capturing():
         raise ValueError(
@@ -46,9 +44,9 @@ def refuse_capture() -> None:
 
 
 class DeferredFiniteCheck:
-    """A look at CUDA tensors that the device takes while the host goes on to what stands in the `with` block.
+    """`check_finite` of CUDA tensors that runs on the device while the host runs the `with` block.
 
-    At the end of the block it waits for the device, and refuses as `check_finite` does.
+    The end of the block waits for the device and raises what `check_finite` raises.
     """
 
     def __init__(self, **tensors: Tensor | None) -> None:
@@ -62,15 +60,13 @@ class DeferredFiniteCheck:
         self._found[0] = 0
         stream = current_stream(self._device)
         for first in range(0, len(tensors), finite.ARRAYS):
-            words: dict[str, int | float] = dict.fromkeys(finite.cuda_all_finite().parameters, 0)
-            words |= {"found": self._found.data_ptr(), "largest": checks.FINITE_LIMIT}
+            params: dict[str, Any] = dict.fromkeys(finite.cuda_all_finite().parameters)
+            params |= {"found": self._found, "largest": checks.FINITE_LIMIT}
             n_blocks = 0
             for k, tensor in enumerate(tensors[first : first + finite.ARRAYS]):
-                words[f"data{k}"] = tensor.data_ptr()
-                words[f"count{k}"] = tensor.numel()
-                words[f"wide{k}"] = tensor.dtype == torch.float64
+                params |= {f"data{k}": tensor, f"count{k}": tensor.numel(), f"wide{k}": tensor.dtype == torch.float64}
                 n_blocks += -(-tensor.numel() // finite.CHUNK)
-            run_cuda(finite.cuda_all_finite(), words, n_blocks, stream)
+            run_cuda(finite.cuda_all_finite(), params, n_blocks, stream)
 
     def __exit__(self, kind: Any, *_: Any) -> None:
         torch.cuda.current_stream(self._device).synchronize()  # even after an error: the kernel writes to the slot

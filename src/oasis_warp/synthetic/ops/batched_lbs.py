@@ -1,4 +1,4 @@
-"""Skin the hands of different people: correctives and knuckles on each one's resting surface, then blended bones."""
+"""Linear blend skinning of a batch of hands of different people, with correctives on each resting surface."""
 
 import torch
 import warp as wp
@@ -6,12 +6,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels.skinning import batched_lbs as kernels
-from oasis_warp.core.checks import check_shape
+from oasis_warp.ops._runtime.declaration import Array, Operator
 from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
-from oasis_warp.ops._runtime.registration import operator
 
 
-def _pose(
+def _batched_lbs(
     rest: Tensor, displacements: Tensor, strengths: Tensor, normals: Tensor, rises: Tensor, knuckles: Tensor,
     weights: Tensor, rotations: Tensor, shifts: Tensor,
 ) -> Tensor:  # fmt: skip
@@ -26,11 +25,28 @@ def _pose(
     return out
 
 
-def _pose_fake(rest: Tensor, *_: Tensor) -> Tensor:
+def _batched_lbs_fake(rest: Tensor, *_: Tensor) -> Tensor:
     return torch.empty_like(rest, memory_format=torch.contiguous_format)
 
 
-_op = operator("batched_lbs", _pose, _pose_fake)
+_OPERATOR = Operator(
+    "batched_lbs",
+    _batched_lbs,
+    _batched_lbs_fake,
+    inputs={
+        "rest": Array("B V 3"),
+        "displacements": Array("V 3 C"),
+        "strengths": Array("B C"),
+        "normals": Array("V 3"),
+        "rises": Array("V K"),
+        "knuckles": Array("B K"),
+        "weights": Array("V J"),
+        "rotations": Array("B J 3 3"),
+        "shifts": Array("B J 3"),
+    },
+    outputs={"vertices": "B V 3"},
+    public=False,
+)
 
 
 @torch.no_grad()
@@ -45,30 +61,24 @@ def batched_lbs(
     rotations: Float[Tensor, "B J 3 3"],
     shifts: Float[Tensor, "B J 3"],
 ) -> Float[Tensor, "B V 3"]:
-    """Vertices of posed hands, float32: the bits of one hand are the same in any batch. Nothing carries a gradient.
+    """Vertices of posed hands, float32: the bits of one hand are the same in any batch. Not differentiable.
 
     Args:
-        rest: Each one's surface at rest [m].
-        displacements: Of the pose correctives [m].
-        strengths: How much of each.
-        normals: Along which knuckles stand out.
-        rises: How far, for a knuckle of strength 1 [m].
-        knuckles: Strengths.
-        weights: Of the bones.
-        rotations: With `shifts` [m] they carry the rest points of each bone.
-        shifts: See `rotations`.
+        rest: Surface of each hand at rest [m].
+        displacements: Displacements of the pose correctives [m].
+        strengths: Strengths of the pose correctives.
+        normals: Directions in which knuckles stand out.
+        rises: Heights for a knuckle of strength 1 [m].
+        knuckles: Strengths of the knuckles.
+        weights: Skinning weights of the bones.
+        rotations: Rotation of each bone, applied to rest points before `shifts`.
+        shifts: Translation of each bone [m].
 
     Raises:
         ValueError: wrong shapes.
     """
-    sizes: dict[str, int] = {}
-    check_shape("rest", rest, "B", "V", 3, sizes=sizes)
-    check_shape("displacements", displacements, "V", 3, "C", sizes=sizes)
-    check_shape("strengths", strengths, "B", "C", sizes=sizes)
-    check_shape("normals", normals, "V", 3, sizes=sizes)
-    check_shape("rises", rises, "V", "K", sizes=sizes)
-    check_shape("knuckles", knuckles, "B", "K", sizes=sizes)
-    check_shape("weights", weights, "V", "J", sizes=sizes)
-    check_shape("rotations", rotations, "B", "J", 3, 3, sizes=sizes)
-    check_shape("shifts", shifts, "B", "J", 3, sizes=sizes)
-    return _op(rest, displacements, strengths, normals, rises, knuckles, weights, rotations, shifts)
+    _OPERATOR.check(
+        rest=rest, displacements=displacements, strengths=strengths, normals=normals, rises=rises, knuckles=knuckles,
+        weights=weights, rotations=rotations, shifts=shifts,
+    )  # fmt: skip
+    return _OPERATOR(rest, displacements, strengths, normals, rises, knuckles, weights, rotations, shifts)

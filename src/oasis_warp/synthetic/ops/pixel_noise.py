@@ -1,4 +1,4 @@
-"""Random numbers that depend on a seed an image and nothing else."""
+"""Random numbers that depend on one seed per image and nothing else."""
 
 import math
 
@@ -7,9 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels.scene import pixel_noise as kernels
-from oasis_warp.core.checks import check_shape
+from oasis_warp.ops._runtime.declaration import Array, Operator
 from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
-from oasis_warp.ops._runtime.registration import operator
 
 
 def _noise(seeds: Tensor, shape: list[int]) -> Tensor:
@@ -24,7 +23,14 @@ def _noise_fake(seeds: Tensor, shape: list[int]) -> Tensor:
     return torch.empty((len(seeds), *shape), device=seeds.device)
 
 
-_op = operator("pixel_noise", _noise, _noise_fake)
+_OPERATOR = Operator(
+    "pixel_noise",
+    _noise,
+    _noise_fake,
+    inputs={"seeds": Array("B", index="any")},
+    outputs={"noise": "B ..."},
+    public=False,
+)
 
 
 def pixel_noise(seeds: Int[Tensor, "B"], *shape: int) -> Float[Tensor, "B ..."]:
@@ -33,5 +39,5 @@ def pixel_noise(seeds: Int[Tensor, "B"], *shape: int) -> Float[Tensor, "B ..."]:
     Raises:
         ValueError: `seeds` is not a row.
     """
-    check_shape("seeds", seeds, "B")
-    return _op(seeds, list(shape))
+    _OPERATOR.check(seeds=seeds)
+    return _OPERATOR(seeds, list(shape))

@@ -1,4 +1,4 @@
-"""Pictures of simple rooms, lit by the same light as the hand in front of them, which casts its shadow on them."""
+"""Images of simple rooms, lit by the same light as the hand in front of them, which casts its shadow on them."""
 
 import torch
 import warp as wp
@@ -6,9 +6,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels.scene import rooms as kernels
-from oasis_warp.core.checks import check_shape
+from oasis_warp.ops._runtime.declaration import Array, Operator
 from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
-from oasis_warp.ops._runtime.registration import operator
 from oasis_warp.synthetic.ops.skin_shading import Lamps
 
 SOLID_WORDS = int(kernels.SOLID_WORDS)
@@ -54,7 +53,21 @@ def _trace_fake(solids, focals, sky, *rest):
     return hidden.new_empty((*hidden.shape, 3)), torch.empty_like(hidden)
 
 
-_op = operator("trace_rooms", _trace, _trace_fake)
+_OPERATOR = Operator(
+    "trace_rooms",
+    _trace,
+    _trace_fake,
+    inputs={
+        "solids": Array(f"B N {SOLID_WORDS}"),
+        "focals": Array("B"),
+        "sky": Array("B 9 3"),
+        "hidden": Array("B H W"),
+        "focus": Array("B"),
+        "apertures": Array("B"),
+    },
+    outputs={"light": "B H W 3", "depth": "B H W"},
+    public=False,
+)
 
 
 @torch.no_grad()
@@ -67,14 +80,14 @@ def trace_rooms(
     focus: Float[Tensor, "B"],
     apertures: Float[Tensor, "B"],
 ) -> Float[Tensor, "B H W 3"]:
-    """Linear light of rooms of solids, out of focus with their distance; nothing here carries a gradient.
+    """Linear light of rooms of solids, out of focus with their distance. Not differentiable.
 
     Args:
         solids: float32 rows of `SOLID_WORDS` numbers in the camera's frame, laid out in `oasis_kernels.scene.rooms`;
-            rows of shape 0 are none.
+            rows of shape 0 are empty.
         focals: Of the camera [px], whose axis is the picture's middle.
         sky: Coefficients of the light from all around.
-        lamps: With what they see of the hand.
+        lamps: The lamps, with their depth buffers of the hand.
         hidden: Share of each pixel that the hand covers; covered ones are left black.
         focus: Depth that is sharp [m].
         apertures: Radius of the blur of things far off, over the width of the picture.
@@ -82,12 +95,6 @@ def trace_rooms(
     Raises:
         ValueError: wrong shapes.
     """
-    sizes: dict[str, int] = {}
-    check_shape("solids", solids, "B", "N", SOLID_WORDS, sizes=sizes)
-    check_shape("focals", focals, "B", sizes=sizes)
-    check_shape("sky", sky, "B", 9, 3, sizes=sizes)
-    check_shape("hidden", hidden, "B", "H", "W", sizes=sizes)
-    for name, tensor in (("focus", focus), ("apertures", apertures)):
-        check_shape(name, tensor, "B", sizes=sizes)
-    light, _ = _op(solids, focals, sky, *lamps, hidden, focus, apertures)
+    _OPERATOR.check(solids=solids, focals=focals, sky=sky, hidden=hidden, focus=focus, apertures=apertures)
+    light, _ = _OPERATOR(solids, focals, sky, *lamps, hidden, focus, apertures)
     return light

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from oasis_kernels.scene import skin_light, skin_shading
 from oasis_warp.core.checks import check_positive, check_shape
+from oasis_warp.ops._runtime.declaration import Array, Operator
 from oasis_warp.ops._runtime.incidence import incidence
 from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
-from oasis_warp.ops._runtime.registration import operator
 from oasis_warp.ops.depth_map import DepthMap
 
 LIGHT_WIDTHS = (1.25e-3, 0.45e-3, 0.25e-3)
-"""How far red, green and blue light comes out from where it entered skin: standard deviations [m]."""
+"""Scattering distances of red, green and blue light in skin: standard deviations [m]."""
 LIGHT_REACH = 3e-3
 """Depth step that light does not cross [m]."""
 
@@ -26,7 +26,7 @@ class SurfaceState(NamedTuple):
     normals: Float[Tensor, "B V 3"]
     """Unit, area-weighted; zero where no face is."""
     areas: Float[Tensor, "B V"]
-    """Twice the area of the faces round each vertex."""
+    """Twice the area of the faces around each vertex."""
 
 
 class Lamps(NamedTuple):
@@ -92,19 +92,25 @@ def _surface_state_fake(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor
     return torch.empty_like(vertices), vertices.new_empty(vertices.shape[:2])
 
 
-_surface_state_op = operator("surface_state", _surface_state, _surface_state_fake)
+_SURFACE_STATE = Operator(
+    "surface_state",
+    _surface_state,
+    _surface_state_fake,
+    inputs={"vertices": Array("B V 3"), "faces": Array("F 3", index="V")},
+    outputs={"normals": "B V 3", "areas": "B V"},
+    public=False,
+)
 
 
 @torch.no_grad()
 def surface_state(vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]) -> SurfaceState:
-    """Vertex normals and the areas round vertices of float32 meshes, summed in a fixed order.
+    """Vertex normals and the areas around vertices of float32 meshes, summed in a fixed order.
 
     Raises:
         ValueError: a wrong shape or index.
     """
-    check_shape("vertices", vertices, "B", "V", 3)
-    check_shape("faces", faces, "F", 3)
-    return SurfaceState(*_surface_state_op(vertices, faces))
+    _SURFACE_STATE.check(vertices=vertices, faces=faces)
+    return SurfaceState(*_SURFACE_STATE(vertices, faces))
 
 
 def _smooth(values: Tensor, faces: Tensor) -> Tensor:
@@ -120,19 +126,25 @@ def _smooth_fake(values: Tensor, faces: Tensor) -> Tensor:
     return torch.empty_like(values)
 
 
-_smooth_op = operator("smooth_over_faces", _smooth, _smooth_fake)
+_SMOOTH = Operator(
+    "smooth_over_faces",
+    _smooth,
+    _smooth_fake,
+    inputs={"values": Array("B V C"), "faces": Array("F 3", index="V")},
+    outputs={"smooth": "B V C"},
+    public=False,
+)
 
 
 @torch.no_grad()
 def smooth_over_faces(values: Float[Tensor, "B V C"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "B V C"]:
-    """Mean over the corners of the faces round each vertex, which counts itself once a face; others stay.
+    """Mean over the corners of the faces around each vertex, itself counted once per face; lonely vertices stay.
 
     Raises:
         ValueError: a wrong shape or index.
     """
-    check_shape("values", values, "B", "V", "C")
-    check_shape("faces", faces, "F", 3)
-    return _smooth_op(values, faces)
+    _SMOOTH.check(values=values, faces=faces)
+    return _SMOOTH(values, faces)
 
 
 def _sky_transfer(
@@ -154,7 +166,17 @@ def _sky_transfer_fake(vertices, normals, directions, viewmats, focals, depths, 
     return vertices.new_empty((*vertices.shape[:2], 10))
 
 
-_sky_transfer_op = operator("sky_transfer", _sky_transfer, _sky_transfer_fake)
+_SKY_TRANSFER = Operator(
+    "sky_transfer",
+    _sky_transfer,
+    _sky_transfer_fake,
+    inputs={
+        "vertices": Array("B V 3"), "normals": Array("B V 3"), "directions": Array("D 3"),
+        "viewmats": Array("B D 4 4"), "focals": Array("B"), "depths": Array("B D M M"),
+    },
+    outputs={"transfer": "B V 10"},
+    public=False,
+)  # fmt: skip
 
 
 @torch.no_grad()
@@ -182,23 +204,19 @@ def sky_transfer(
         focals: Of those cameras [px], whose axis is the middle of the buffer, [B].
         depths: What they see, [B, D, M, M].
         lift: Distance off the surface from which vertices look [m]; as much again is allowed in depth.
-        n_lit: Only the first so many vertices are wanted; the rows of the others are 0.
+        n_lit: Number of leading vertices to compute; the rows of the others are 0.
 
     Raises:
         ValueError: wrong shapes, or a lift that is not positive.
     """
-    sizes: dict[str, int] = {}
-    check_shape("vertices", vertices, "B", "V", 3, sizes=sizes)
-    check_shape("normals", normals, "B", "V", 3, sizes=sizes)
-    check_shape("directions", directions, "D", 3, sizes=sizes)
-    check_shape("viewmats", viewmats, "B", "D", 4, 4, sizes=sizes)
-    check_shape("focals", focals, "B", sizes=sizes)
-    check_shape("depths", depths, "B", "D", "M", "M", sizes=sizes)
+    sizes = _SKY_TRANSFER.check(
+        vertices=vertices, normals=normals, directions=directions, viewmats=viewmats, focals=focals, depths=depths
+    )
     check_positive("lift", lift)
     n_lit = sizes["V"] if n_lit is None else n_lit
     if not 0 <= n_lit <= sizes["V"]:
         raise ValueError(f"n_lit: expected 0 to {sizes['V']}, got {n_lit}.")
-    return _sky_transfer_op(vertices, normals, directions, viewmats, focals, depths, lift, n_lit)
+    return _SKY_TRANSFER(vertices, normals, directions, viewmats, focals, depths, lift, n_lit)
 
 
 def _addresses(pages: list[Tensor], device: torch.device) -> Tensor:
@@ -260,7 +278,25 @@ def _shade_fake(face_ids, barycentrics, depths, focals, samples, n_hand_faces, r
     return vertices.new_empty((*size, 3)), *(vertices.new_empty(size) for _ in range(3))
 
 
-_shade_op = operator("shade_skin", _shade, _shade_fake)
+_SHADE = Operator(
+    "shade_skin",
+    _shade,
+    _shade_fake,
+    inputs={
+        "seen.face_ids": Array("B H W", index="F", least=-1, hint="A batch, of one image at least."),
+        "vertices": Array("B V 3"),
+        "faces": Array("F 3", index="V"),
+        "normals": Array("B V 3"),
+        "transfer": Array("B V 10"),
+        "stretch": Array("B V 1"),
+        "worn.looks": Array(f"B T {int(skin_shading.MATERIAL_WORDS)}"),
+        "sky": Array("B 9 3"),
+        "lamps.depths": Array("B L M M"),
+        "lamps.positions": Array("B L 3"),
+    },
+    outputs={"color": "B H W 3", "alpha": "B H W", "mask": "B H W", "depth": "B H W"},
+    public=False,
+)
 
 
 @torch.no_grad()
@@ -286,7 +322,7 @@ def shade_skin(
 ) -> Shaded:
     """Pictures of skin: textured relief, subsurface light, two-lobed gloss, soft shadows of lamps, hidden sky.
 
-    The same values on every device, up to rounding, and in a batch as alone; nothing here carries a gradient.
+    The same values on every device, up to rounding, and in a batch as alone. Not differentiable.
 
     Args:
         seen: Depth map of the mesh at `samples` times the picture's size, in the camera's own frame, batched.
@@ -296,7 +332,7 @@ def shade_skin(
         faces: As drawn in `seen`.
         normals: Of `surface_state`.
         transfer: Of `sky_transfer`.
-        stretch: Area of the posed over that of the resting surface round each vertex.
+        stretch: Area of the posed over that of the resting surface around each vertex.
         texture: Of the skin.
         worn: Materials of the faces and how they look.
         tones: Mean reflectance of each image's skin, linear RGB, for light that skin throws on skin.
@@ -304,33 +340,27 @@ def shade_skin(
         sky: Coefficients of the light from all around.
         lamps: The lamps.
         seeds: int32, of the weave of cloth.
-        n_hand_faces: The first so many faces are the hand's.
+        n_hand_faces: Number of leading faces that belong to the hand.
         ring: Material that counts as hand in the mask.
 
     Raises:
         ValueError: wrong shapes.
     """
-    sizes: dict[str, int] = {}
-    check_shape("seen.face_ids", seen.face_ids, "B", "H", "W", sizes=sizes, hint="A batch, of one image at least.")
-    check_shape("vertices", vertices, "B", "V", 3, sizes=sizes)
-    check_shape("faces", faces, "F", 3, sizes=sizes)
-    check_shape("normals", normals, "B", "V", 3, sizes=sizes)
-    check_shape("transfer", transfer, "B", "V", 10, sizes=sizes)
-    check_shape("stretch", stretch, "B", "V", 1, sizes=sizes)
+    sizes = _SHADE.check(**{
+        "seen.face_ids": seen.face_ids, "vertices": vertices, "faces": faces, "normals": normals, "transfer": transfer,
+        "stretch": stretch, "worn.looks": worn.looks, "sky": sky, "lamps.depths": lamps.depths,
+        "lamps.positions": lamps.positions,
+    })  # fmt: skip
     if len(texture.pages) != sizes["B"]:
         raise ValueError(f"texture.pages: expected {sizes['B']}, one an image, got {len(texture.pages)}.")
     for page in texture.pages:
         check_shape("texture.pages", page, "Y", "X", 8, sizes=sizes)
         if page.dtype != torch.float16 or not page.is_contiguous() or page.device != vertices.device:
             raise ValueError("texture.pages: expected contiguous float16 on the device of the vertices.")
-    check_shape("worn.looks", worn.looks, "B", "T", skin_shading.MATERIAL_WORDS, sizes=sizes)
-    check_shape("sky", sky, "B", 9, 3, sizes=sizes)
-    check_shape("lamps.depths", lamps.depths, "B", "L", "M", "M", sizes=sizes)
-    check_shape("lamps.positions", lamps.positions, "B", "L", 3, sizes=sizes)
     if sizes["H"] % samples or sizes["W"] % samples:
         raise ValueError(f"samples: expected a divisor of {sizes['H']} and {sizes['W']}, got {samples}.")
     return Shaded(
-        *_shade_op(
+        *_SHADE(
             seen.face_ids, seen.barycentrics, seen.depth, focals, samples, n_hand_faces, ring, vertices, faces, normals,
             transfer, stretch, worn.materials, worn.looks, *texture, tones, texels_a_pixel, sky, *lamps, seeds,
         )

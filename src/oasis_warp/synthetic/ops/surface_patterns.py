@@ -10,8 +10,8 @@ from torch import Tensor
 
 from oasis_kernels.scene import surface_patterns as kernels
 from oasis_warp.core.checks import check_index, check_positive, check_shape
+from oasis_warp.ops._runtime.declaration import Array, Operator
 from oasis_warp.ops._runtime.launch import even_cuts, launch, launch_ranges, view
-from oasis_warp.ops._runtime.registration import operator
 
 
 class NoiseField(NamedTuple):
@@ -35,7 +35,9 @@ def _noise_fake(points: Tensor, cells: Tensor, seeds: Tensor, octaves: Tensor) -
     return points.new_empty((len(cells), len(points)))
 
 
-_noise_op = operator("surface_noise", _noise, _noise_fake)
+_NOISE = Operator(
+    "surface_noise", _noise, _noise_fake, inputs={"points": Array("N 3")}, outputs={"noise": "K N"}, public=False
+)
 
 
 def surface_noise(points: Float[Tensor, "N 3"], fields: Sequence[NoiseField]) -> Float[Tensor, "K N"]:
@@ -44,14 +46,14 @@ def surface_noise(points: Float[Tensor, "N 3"], fields: Sequence[NoiseField]) ->
     Raises:
         ValueError: a wrong shape, or a cell that is not positive.
     """
-    check_shape("points", points, "N", 3)
+    _NOISE.check(points=points)
     for field in fields:
         check_positive("cell", field.cell)
 
     def column(values: list, dtype: torch.dtype) -> Tensor:
         return torch.tensor(values, dtype=dtype, device=points.device)
 
-    return _noise_op(
+    return _NOISE(
         points.detach().float(),
         column([f.cell for f in fields], torch.float32),
         column([f.seed for f in fields], torch.int32),
@@ -121,7 +123,16 @@ def _dabs_fake(centers, widths, strengths, kinds, n_kinds, flat, points, numbers
     return points.new_empty((n_kinds, len(points)))
 
 
-_dabs_op = operator("surface_dabs", _dabs, _dabs_fake)
+_DABS = Operator(
+    "surface_dabs",
+    _dabs,
+    _dabs_fake,
+    inputs={
+        "centers": Array("M 3"), "widths": Array("M"), "strengths": Array("M"), "kinds": Array("M", index="K"),
+    },
+    outputs={"dabs": "K N"},
+    public=False,
+)  # fmt: skip
 
 
 @torch.no_grad()
@@ -151,13 +162,10 @@ def surface_dabs(
     Raises:
         ValueError: wrong shapes, or a kind that has no row.
     """
-    sizes: dict[str, int] = {}
-    check_shape("centers", centers, "M", 3, sizes=sizes)
-    for name, tensor in (("widths", widths), ("strengths", strengths), ("kinds", kinds)):
-        check_shape(name, tensor, "M", sizes=sizes)
+    _DABS.check(centers=centers, widths=widths, strengths=strengths, kinds=kinds)
     check_index("kinds", kinds, n_kinds, "kinds")
     points, numbers, starts, low, cell, size = grid
-    return _dabs_op(
+    return _DABS(
         centers.float(), widths.float(), strengths.float(), kinds.to(torch.int32), n_kinds, flat, points, numbers,
         starts, list(low), cell, list(size),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Shapes, types and plain numbers that the rasterizer is called with; values are for its operators to look at."""
+"""Checks of shapes, types and plain numbers for the rasterizer; its operators check the values."""
 
 import torch
 from torch import Tensor
@@ -34,17 +34,9 @@ def check_gaussians(
 
 
 def check_cameras(
-    viewmats: Tensor,
-    Ks: Tensor,
-    means: Tensor,
-    width: int,
-    height: int,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
-    eps2d: float,
-    tile_size: int,
-) -> None:
+    viewmats: Tensor, Ks: Tensor, means: Tensor, width: int, height: int, near_plane: float, far_plane: float,
+    radius_clip: float, eps2d: float, tile_size: int,
+) -> None:  # fmt: skip
     """Refuse cameras, images and limits that kernels cannot draw.
 
     Raises:
