@@ -22,14 +22,13 @@ from oasis_warp.ops._runtime.rasterization_checks import (
 )
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 from oasis_warp.ops.blending import blend
+from oasis_warp.ops.gsplat_options import compensated_opacities, record_absolute_gradients
 from oasis_warp.ops.projection import Projection, project
 from oasis_warp.ops.spherical_harmonics import sh_to_rgb
 
 UNSUPPORTED: dict[str, tuple[Any, str]] = {
     "sparse_grad": (False, "Gradients are dense."),
-    "absgrad": (False, "The gradient of meta['means2d'] is the plain one."),
-    "rasterize_mode": ("classic", "Antialiasing by opacity compensation is not built in."),
-    "distributed": (False, "Draw on one device."), "camera_model": ("pinhole", "Undistort to a pinhole camera first."),
+    "distributed": (False, "Draw on one device."),
     "with_ut": (False, "Projection is EWA."), "with_eval3d": (False, "Gaussians are evaluated in the image."),
     "radial_coeffs": (None, "Undistort to a pinhole camera first."),
     "tangential_coeffs": (None, "Undistort to a pinhole camera first."),
@@ -39,6 +38,8 @@ UNSUPPORTED: dict[str, tuple[Any, str]] = {
 }  # fmt: skip
 """Unsupported arguments of gsplat: their default, and what to do instead of another value."""
 USUAL = tuple(default for default, _ in UNSUPPORTED.values())
+RASTERIZE_MODES = "classic", "antialiased"
+CAMERA_MODELS = "pinhole", "ortho"
 RENDER_MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
 
 DECLARATION = Declaration(
@@ -136,11 +137,14 @@ def rasterization(
         segmented: Like `packed`.
         covars: Covariances [m^2] instead of quats and scales, which are then not read and may be None, shape [N, 3, 3];
             the symmetric part is used.
-        sparse_grad: Not supported, like all that follow: accepted with its default so that calls need no change.
-        absgrad: Not supported.
-        rasterize_mode: Not supported.
+        sparse_grad: Not supported, like all without a text: accepted with its default so that calls need no change.
+        absgrad: After backward, `meta["means2d"].absgrad` holds sums over pixels of the magnitudes of gradients, shape
+            [C, N, 2]: what densification looks at (Ye et al. 2024). Lists every pair of a pixel and a Gaussian, so
+            backward takes several times as long.
+        rasterize_mode: "classic", or "antialiased": opacities are multiplied by sqrt(det(S) / det(S + eps2d)), S being
+            the covariance in the image (Yu et al. 2024), so that Gaussians below a pixel become fainter.
         distributed: Not supported.
-        camera_model: Not supported.
+        camera_model: "pinhole", or "ortho": x = fx X + cx, y = fy Y + cy in camera axes, whatever the depth.
         with_ut: Not supported.
         with_eval3d: Not supported.
         radial_coeffs: Not supported.
@@ -163,12 +167,14 @@ def rasterization(
         ValueError: names the argument, what was expected and what it was.
     """
     unsupported = (
-        sparse_grad, absgrad, rasterize_mode, distributed, camera_model, with_ut, with_eval3d, radial_coeffs,
+        sparse_grad, distributed, with_ut, with_eval3d, radial_coeffs,
         tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, rolling_shutter, viewmats_rs,
     )  # fmt: skip
     if not all(map(is_, unsupported, USUAL)):
         refuse_unsupported(unsupported)
     check_choice("render_mode", render_mode, RENDER_MODES)
+    check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    check_choice("camera_model", camera_model, CAMERA_MODELS)
     if covars is not None:
         quats = scales = None
     check_gaussians(means, quats, scales, covars, opacities)
@@ -189,10 +195,13 @@ def rasterization(
             radius_clip=radius_clip, eps2d=eps2d, covars=covars, validate=validate,
         )  # fmt: skip
     opacities = for_each_camera(opacities, n_cameras)
+    if rasterize_mode == "antialiased":
+        opacities = compensated_opacities(opacities, projection.covars2d, eps2d)
     colors = for_each_camera(colors, n_cameras) if colors.dim() == 2 else colors
     render, alphas = blend_layers(
-        projection, opacities, colors, backgrounds, (width, height, tile_size), render_mode, validate and not deferred
-    )
+        projection, opacities, colors, backgrounds, (width, height, tile_size), render_mode, absgrad,
+        validate and not deferred,
+    )  # fmt: skip
     meta = {
         "camera_ids": None, "gaussian_ids": None, "means2d": projection.means2d, "depths": projection.depths,
         "conics": projection.conics, "radii": projection.radii, "opacities": opacities, "tile_size": tile_size,
@@ -203,7 +212,7 @@ def rasterization(
 
 def blend_layers(
     projection: Projection, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, frame: tuple[int, int, int],
-    render_mode: str, validate: bool,
+    render_mode: str, absgrad: bool, validate: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """The images of a render mode, and alpha; `frame` is width, height and tile size."""
     n_cameras = len(colors)
@@ -214,6 +223,10 @@ def blend_layers(
     elif n_channels > backgrounds.shape[-1]:
         backgrounds = torch.nn.functional.pad(backgrounds, (0, n_channels - backgrounds.shape[-1]))
     render, alphas = blend(projection, opacities, channels, backgrounds, *frame, validate=validate)
+    if absgrad and projection.means2d.requires_grad:
+        render, alphas = record_absolute_gradients(
+            render, alphas, projection, opacities, channels, backgrounds, frame[2]
+        )
     if render_mode in ("ED", "RGB+ED"):
         # Over the weights' own sum: alpha, as 1 - T, has lost digits where little was drawn.
         depth, cover = render[..., -2:-1], render[..., -1:]

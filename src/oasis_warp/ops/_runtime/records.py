@@ -57,6 +57,12 @@ def tables(records: Tensor, n_cameras: Size, n: Size, dtype: torch.dtype) -> Tab
     return Tables(table(0, dtype, 4), table(1, dtype, 4), table(2, torch.int32, 4), table(3, torch.float64))
 
 
+def records_of_camera(records: Tensor, camera: int, n_cameras: int, n: int, dtype: torch.dtype) -> Tensor:
+    """The tables of one camera, as records of their own; without counters."""
+    parts = tables(records, n_cameras, n, dtype)
+    return torch.cat([table[camera].contiguous().view(torch.uint8).flatten() for table in parts])
+
+
 def table_params(records: Tensor, total: int, dtype: torch.dtype) -> dict[str, Any]:
     """Addresses of the tables by name and of the `counters`, for kernels that take raw pointers."""
     first, (centers, whitenings, boxes, depths, counters) = records.data_ptr(), _starts(total, dtype)
