@@ -116,7 +116,8 @@ def test_an_orthographic_camera_shifts_and_scales_alone(device):
     rows = viewmats[:, None, :2, :3] @ (factor @ factor.mT) @ viewmats[:, None, :2, :3].mT
     focal = Ks[:, None, [0, 1], [0, 1]]
     covariance = rows * focal[..., :, None] * focal[..., None, :] + EPS2D * torch.eye(2).to(rows)
-    torch.testing.assert_close(torch.linalg.inv(matrices(meta["conics"][drawn])), covariance[drawn], rtol=1e-7, atol=1e-9)
+    found = torch.linalg.inv(matrices(meta["conics"][drawn]))
+    torch.testing.assert_close(found, covariance[drawn], rtol=1e-7, atol=1e-9)
 
 
 def rotations(quats):

@@ -103,8 +103,7 @@ def test_something_that_is_no_tensor_is_refused(call):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("sparse_grad", True), ("absgrad", True),
-        ("rasterize_mode", "antialiased"), ("distributed", True), ("camera_model", "fisheye"),
+        ("sparse_grad", True), ("distributed", True),
         ("with_ut", True), ("with_eval3d", True),
         ("radial_coeffs", torch.zeros(2, 6)), ("tangential_coeffs", torch.zeros(2, 2)),
         ("thin_prism_coeffs", torch.zeros(2, 4)), ("ftheta_coeffs", object()), ("rolling_shutter", "LEFT_TO_RIGHT"),

@@ -113,13 +113,19 @@ def factor(covariance: wp.mat33d) -> wp.mat33d:
 
 
 @wp.func
-def splat(point: wp.vec3d, camera: wp.mat33d, f: wp.mat33d, intrinsics: wp.vec4d, size: wp.vec2d) -> Splat:
+def splat(
+    point: wp.vec3d, camera: wp.mat33d, f: wp.mat33d, intrinsics: wp.vec4d, size: wp.vec2d, ortho: int
+) -> Splat:
     """The Gaussian at `point` (z > 0) with covariance f f^T: EWA splatting (Zwicker et al. 2001, eq. 23 to 31)."""
     s = Splat()
     fx, fy = intrinsics[0], intrinsics[1]
     depth = point[2]
     u, u_inside = clamped_slope(point[0] / depth, fx, intrinsics[2], size[0])
     v, v_inside = clamped_slope(point[1] / depth, fy, intrinsics[3], size[1])
+    if ortho != 0:  # J is diag(fx, fy), without slopes
+        depth = wp.float64(1.0)
+        u, u_inside = wp.float64(0.0), wp.float64(0.0)
+        v, v_inside = wp.float64(0.0), wp.float64(0.0)
     s.slope = wp.vec2d(u, v)
     s.inside = wp.vec2d(u_inside, v_inside)
     zero = wp.float64(0.0)

@@ -20,6 +20,7 @@ void project(
     const float* covars,     // [n, 3, 3], or null; read as its symmetric part
     const float* viewmats,   // [C, 4, 4]
     const float* Ks,         // [C, 3, 3]
+    long long ortho,         // 1: x = fx X + cx, y = fy Y + cy, whatever the depth
     const float* opacities,  // [n]
     const double* limits,    // near, far, radius_clip, eps2d, alpha_min, extent_sigmas, largest magnitude
     float* means2d,          // [C, n, 2]
@@ -180,7 +181,8 @@ void project(
                 // Comparisons are written so that a NaN, where the caller did not want to be checked, is not drawn.
                 I drawn = (pz >= near) & (pz <= far) & bright;
                 if (__builtin_reduce_or(drawn)) {
-                    const V inverse = 1.0 / (drawn ? pz : (V)(1.0)), u = px * inverse, v = py * inverse;
+                    const V inverse = ortho ? (V)(1.0) : 1.0 / (drawn ? pz : (V)(1.0)), u = px * inverse,
+                            v = py * inverse;
                     const V slope_u = u < k.u_low ? (V)(k.u_low) : u > k.u_high ? (V)(k.u_high) : u;
                     const V slope_v = v < k.v_low ? (V)(k.v_low) : v > k.v_high ? (V)(k.v_high) : v;
                     V m0[3], m1[3];

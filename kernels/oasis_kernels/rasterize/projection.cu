@@ -14,6 +14,7 @@ __global__ void project(
     const float* covars,     // [n, 3, 3], or null; read as its symmetric part
     const float* viewmats,   // [C, 4, 4]
     const float* Ks,         // [C, 3, 3]
+    int ortho,               // 1: x = fx X + cx, y = fy Y + cy, whatever the depth
     const float* opacities,  // [n]
     double near,
     double far,
@@ -98,7 +99,7 @@ __global__ void project(
     bool drawn = pz >= near && pz <= far && opacity >= alpha_min;
     double x = 0.0, y = 0.0, xx = 0.0, xy = 0.0, yy = 0.0, det = 1.0, reach = 0.0;
     if (drawn) {
-        const double inverse = reciprocal(pz);
+        const double inverse = ortho ? 1.0 : reciprocal(pz);
         const double u = (k.r[0] * X + k.r[1] * Y + k.r[2] * Z + k.t[0]) * inverse;
         const double v = (k.r[3] * X + k.r[4] * Y + k.r[5] * Z + k.t[1]) * inverse;
         const double slope_u = u < k.u_low ? k.u_low : u > k.u_high ? k.u_high : u;

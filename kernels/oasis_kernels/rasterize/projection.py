@@ -76,6 +76,7 @@ def project(scalar: Any) -> Any:
         opacities: wp.array(dtype=scalar),  # [n]
         viewmats: wp.array3d(dtype=scalar),  # [C, 4, 4]
         Ks: wp.array3d(dtype=scalar),  # [C, 3, 3]
+        ortho: int,  # 1: x = fx X + cx, y = fy Y + cy, whatever the depth
         width: int,
         height: int,
         near: wp.float64,
@@ -123,12 +124,14 @@ def project(scalar: Any) -> Any:
             f = rotation(q) * wp.diag(wp.vec3d(scales[i]))
         intrinsics = camera_intrinsics(Ks, c)
         size = wp.vec2d(wp.float64(width), wp.float64(height))
-        s = splat(point, camera, f, intrinsics, size)
+        s = splat(point, camera, f, intrinsics, size, ortho)
         cov = wp.vec3d(wp.dot(s.m0, s.m0) + eps2d, wp.dot(s.m0, s.m1), wp.dot(s.m1, s.m1) + eps2d)
         det = determinant(s.m0, s.m1, eps2d)
         if not (det > wp.float64(0.0)):  # flat in the image, and eps2d is 0
             return
 
+        if ortho != 0:
+            depth = wp.float64(1.0)
         x = intrinsics[0] * point[0] / depth + intrinsics[2]
         y = intrinsics[1] * point[1] / depth + intrinsics[3]
         reach = wp.min(extent_sigmas, wp.sqrt(wp.float64(2.0) * wp.log(opacity / alpha_min)))
@@ -179,6 +182,7 @@ def project_backward(scalar: Any) -> Any:
         with_covars: int,
         viewmats: wp.array3d(dtype=scalar),
         Ks: wp.array3d(dtype=scalar),
+        ortho: int,
         width: int,
         height: int,
         radii: wp.array(dtype=wp.vec2i),  # [C * n]; 0 where nothing was drawn
@@ -217,7 +221,7 @@ def project_backward(scalar: Any) -> Any:
                 point = camera * mean + camera_translation(viewmats, c)
                 intrinsics = camera_intrinsics(Ks, c)
                 fx, fy = intrinsics[0], intrinsics[1]
-                s = splat(point, camera, f, intrinsics, size)
+                s = splat(point, camera, f, intrinsics, size, ortho)
                 g = g_covars2d[index]  # by xy once: half of it belongs to either off-diagonal entry
                 row0 = g[0] * s.b0 + half * g[1] * s.b1  # of G B
                 row1 = half * g[1] * s.b0 + g[2] * s.b1
@@ -228,14 +232,18 @@ def project_backward(scalar: Any) -> Any:
                 g_j0 = camera * g_b0
                 g_j1 = camera * g_b1
 
-                inverse = wp.float64(1.0) / point[2]
+                inverse = wp.float64(1.0)
+                moving = wp.float64(0.0)  # whether J changes with depth
+                if ortho == 0:
+                    inverse = wp.float64(1.0) / point[2]
+                    moving = wp.float64(1.0)
                 u, v = point[0] * inverse, point[1] * inverse
                 g_xy = wp.vec2d(g_means2d[index])
                 # J depends on the point through 1/z and through its slopes, which stand still where they were clamped.
                 g_u = fx * g_xy[0] - s.inside[0] * fx * inverse * g_j0[2]
                 g_v = fy * g_xy[1] - s.inside[1] * fy * inverse * g_j1[2]
                 g_inverse = fx * (g_j0[0] - s.slope[0] * g_j0[2]) + fy * (g_j1[1] - s.slope[1] * g_j1[2])
-                g_point += inverse * wp.vec3d(g_u, g_v, -g_u * u - g_v * v - inverse * g_inverse)
+                g_point += inverse * wp.vec3d(g_u, g_v, moving * (-g_u * u - g_v * v - inverse * g_inverse))
             sum_mean += wp.transpose(camera) * g_point
             if per_camera != 0:
                 # Without a gradient there may be no number either, where the caller did not want to be checked.

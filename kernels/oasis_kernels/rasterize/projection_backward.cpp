@@ -11,6 +11,7 @@ void project_backward(
     const float* covars,       // [n, 3, 3], or null; read as its symmetric part
     const float* viewmats,     // [C, 4, 4]
     const float* Ks,           // [C, 3, 3]
+    long long ortho,           // 1: x = fx X + cx, y = fy Y + cy, whatever the depth
     const int* radii,          // [C, n, 2]; 0 where nothing was drawn
     const float* g_means2d,    // [C, n, 2], or null for zeros, as the next two
     const double* g_covars2d,  // [C, n, 3]
@@ -25,6 +26,7 @@ void project_backward(
 ) {
 #pragma clang fp contract(fast)
 #include "projection_vectors.h"
+    const double moving = ortho ? 0.0 : 1.0;  // of J with the point
     struct From {
         const float *means, *quats, *scales, *covars;
     };
@@ -137,7 +139,8 @@ void project_backward(
                     const V px = k.r[0] * mean[0] + k.r[1] * mean[1] + k.r[2] * mean[2] + k.t[0];
                     const V py = k.r[3] * mean[0] + k.r[4] * mean[1] + k.r[5] * mean[2] + k.t[1];
                     const V pz = k.r[6] * mean[0] + k.r[7] * mean[1] + k.r[8] * mean[2] + k.t[2];
-                    const V inverse = 1.0 / (active ? pz : (V)(1.0)), u = px * inverse, v = py * inverse;
+                    const V inverse = ortho ? (V)(1.0) : 1.0 / (active ? pz : (V)(1.0)), u = px * inverse,
+                            v = py * inverse;
                     const V slope_u = u < k.u_low ? (V)(k.u_low) : u > k.u_high ? (V)(k.u_high) : u;
                     const V slope_v = v < k.v_low ? (V)(k.v_low) : v > k.v_high ? (V)(k.v_high) : v;
                     const V j0 = k.fx * inverse, j1 = k.fy * inverse;
@@ -168,12 +171,12 @@ void project_backward(
                         const V g_j02 = k.r[6] * g_b0[0] + k.r[7] * g_b0[1] + k.r[8] * g_b0[2];
                         const V g_j11 = k.r[3] * g_b1[0] + k.r[4] * g_b1[1] + k.r[5] * g_b1[2];
                         const V g_j12 = k.r[6] * g_b1[0] + k.r[7] * g_b1[1] + k.r[8] * g_b1[2];
-                        const V g_u = k.fx * g_x - (slope_u == u ? j0 * g_j02 : (V)(0.0));
-                        const V g_v = k.fy * g_y - (slope_v == v ? j1 * g_j12 : (V)(0.0));
+                        const V g_u = k.fx * g_x - (slope_u == u ? moving * j0 * g_j02 : (V)(0.0));
+                        const V g_v = k.fy * g_y - (slope_v == v ? moving * j1 * g_j12 : (V)(0.0));
                         const V g_inverse = k.fx * (g_j00 - slope_u * g_j02) + k.fy * (g_j11 - slope_v * g_j12);
                         g_point[0] = kept(inverse * g_u);
                         g_point[1] = kept(inverse * g_v);
-                        g_point[2] -= kept(inverse * (g_u * u + g_v * v + inverse * g_inverse));
+                        g_point[2] -= kept(moving * inverse * (g_u * u + g_v * v + inverse * g_inverse));
                         if (g_viewmats)
                             for (int column = 0; column < 3; column++) {
                                 VU* to = (VU*)(sums + 96 * camera) + column;

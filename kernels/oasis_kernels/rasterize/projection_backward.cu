@@ -10,6 +10,7 @@ __global__ void project_backward(
     const float* covars,       // [n, 3, 3], or null; read as its symmetric part
     const float* viewmats,     // [C, 4, 4]
     const float* Ks,           // [C, 3, 3]
+    int ortho,                 // 1: x = fx X + cx, y = fy Y + cy, whatever the depth
     const int2* radii,         // [C, n]
     const float2* g_means2d,   // [C, n], or null for zeros, as the next two
     const double* g_covars2d,  // [C, n, 3]
@@ -71,7 +72,7 @@ __global__ void project_backward(
             const double px = k.r[0] * mean[0] + k.r[1] * mean[1] + k.r[2] * mean[2] + k.t[0];
             const double py = k.r[3] * mean[0] + k.r[4] * mean[1] + k.r[5] * mean[2] + k.t[1];
             const double pz = k.r[6] * mean[0] + k.r[7] * mean[1] + k.r[8] * mean[2] + k.t[2];
-            const double inverse = reciprocal(pz), u = px * inverse, v = py * inverse;
+            const double inverse = ortho ? 1.0 : reciprocal(pz), u = px * inverse, v = py * inverse;
             slope_u = u < k.u_low ? k.u_low : u > k.u_high ? k.u_high : u;
             slope_v = v < k.v_low ? k.v_low : v > k.v_high ? k.v_high : v;
             j0 = k.fx * inverse;
@@ -101,12 +102,12 @@ __global__ void project_backward(
                 const double g_j02 = k.r[6] * g_b0[0] + k.r[7] * g_b0[1] + k.r[8] * g_b0[2];
                 const double g_j11 = k.r[3] * g_b1[0] + k.r[4] * g_b1[1] + k.r[5] * g_b1[2];
                 const double g_j12 = k.r[6] * g_b1[0] + k.r[7] * g_b1[1] + k.r[8] * g_b1[2];
-                const double g_u = k.fx * g_x - (slope_u == u ? j0 * g_j02 : 0.0);
-                const double g_v = k.fy * g_y - (slope_v == v ? j1 * g_j12 : 0.0);
+                const double g_u = k.fx * g_x - (slope_u == u && !ortho ? j0 * g_j02 : 0.0);
+                const double g_v = k.fy * g_y - (slope_v == v && !ortho ? j1 * g_j12 : 0.0);
                 const double g_inverse = k.fx * (g_j00 - slope_u * g_j02) + k.fy * (g_j11 - slope_v * g_j12);
                 g_point[0] = inverse * g_u;
                 g_point[1] = inverse * g_v;
-                g_point[2] -= inverse * (g_u * u + g_v * v + inverse * g_inverse);
+                if (!ortho) g_point[2] -= inverse * (g_u * u + g_v * v + inverse * g_inverse);
             }
         }
         for (int e = 0; e < 3; e++)

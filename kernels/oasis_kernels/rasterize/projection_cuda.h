@@ -32,6 +32,7 @@ auto camera_at = [&](int c) -> Camera {
     out.u_high = (width - out.cx) * per_fx + margin_x;
     out.v_low = -out.cy * per_fy - margin_y;
     out.v_high = (height - out.cy) * per_fy + margin_y;
+    if (ortho) out.u_low = out.u_high = out.v_low = out.v_high = 0.0;  // J has no slopes
     return out;
 };
 // Rotation matrix by rows of a quaternion of any norm but 0; 1 / |q|^2. Squares of float32 fit in float64.

@@ -67,6 +67,7 @@ auto camera_at = [&](long long c) -> Camera {
     out.u_high = (width - out.cx) / out.fx + margin_x;
     out.v_low = -(out.cy / out.fy) - margin_y;
     out.v_high = (height - out.cy) / out.fy + margin_y;
+    if (ortho) out.u_low = out.u_high = out.v_low = out.v_high = 0.0;  // J has no slopes
     return out;
 };
 

@@ -95,10 +95,11 @@ def _project(
     Ks: Tensor,
     width: int,
     height: int,
+    ortho: bool,
     limits: list[float],  # as `Limits`
     validate: bool,
 ) -> Outputs:
-    scene = ProjectionInputs(means, quats, scales, covars, viewmats, Ks, width, height)
+    scene = ProjectionInputs(means, quats, scales, covars, viewmats, Ks, width, height, int(ortho))
     check_arrays(scene, opacities=(opacities, means.shape[:1], means.dtype))
     out = empty_outputs(means, viewmats, width, height)
     if has_cuda_kernels(means) or (len(means) and len(viewmats) and has_vectors(means)):
@@ -125,10 +126,10 @@ def _project_fake(
 
 def _project_backward(
     means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, viewmats: Tensor, Ks: Tensor,
-    radii: Tensor, width: int, height: int, g_means2d: Tensor | None, g_covars2d: Tensor | None,
+    radii: Tensor, width: int, height: int, ortho: bool, g_means2d: Tensor | None, g_covars2d: Tensor | None,
     g_depths: Tensor | None, needs: list[bool],
 ) -> list[Tensor]:  # fmt: skip
-    scene = ProjectionInputs(means, quats, scales, covars, viewmats, Ks, width, height)
+    scene = ProjectionInputs(means, quats, scales, covars, viewmats, Ks, width, height, int(ortho))
     shape = len(viewmats), len(means)
     check_arrays(
         scene,
@@ -182,6 +183,7 @@ def project(
     radius_clip: float,
     eps2d: float,
     covars: Float[Tensor, "N 3 3"] | None = None,
+    ortho: bool = False,
     validate: bool = False,
 ) -> Projection:
     """Gaussians projected to each camera's image plane (Zwicker et al. 2001); arguments as in `rasterization`.
@@ -193,7 +195,7 @@ def project(
     """
     return Projection(
         *_OPERATOR(
-            means, quats, scales, covars, opacities, viewmats, Ks, width, height,
+            means, quats, scales, covars, opacities, viewmats, Ks, width, height, ortho,
             [near_plane, far_plane, radius_clip, eps2d], validate,
         )
     )  # fmt: skip

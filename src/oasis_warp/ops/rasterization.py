@@ -192,7 +192,7 @@ def rasterization(
     with DeferredFiniteCheck(colors=colors, backgrounds=backgrounds) if deferred else nullcontext():
         projection = project(
             means, quats, scales, opacities, viewmats, Ks, width, height, near_plane=near_plane, far_plane=far_plane,
-            radius_clip=radius_clip, eps2d=eps2d, covars=covars, validate=validate,
+            radius_clip=radius_clip, eps2d=eps2d, covars=covars, ortho=camera_model == "ortho", validate=validate,
         )  # fmt: skip
     opacities = for_each_camera(opacities, n_cameras)
     if rasterize_mode == "antialiased":

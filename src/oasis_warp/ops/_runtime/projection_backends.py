@@ -61,10 +61,12 @@ class ProjectionInputs(NamedTuple):
     Ks: Tensor
     width: int
     height: int
+    ortho: int
+    """1 for orthographic cameras."""
 
     def contiguous(self) -> "ProjectionInputs":
         """The same in contiguous memory, which kernels need."""
-        return ProjectionInputs(*contiguous(*self[:6]), self.width, self.height)
+        return ProjectionInputs(*contiguous(*self[:6]), self.width, self.height, self.ortho)
 
     def params(self, **others: Any) -> dict[str, Any]:
         """Parameters of the float32 kernels: these, the sizes and others."""
@@ -178,7 +180,7 @@ def project_generic(
         even_cuts(len(scene.viewmats) * len(scene.means)),
         [
             len(scene.means), *_gaussian_views(scene), view(opacities), view(scene.viewmats), view(scene.Ks),
-            scene.width, scene.height, as_float32(limits.near_plane), as_float32(limits.far_plane),
+            scene.ortho, scene.width, scene.height, as_float32(limits.near_plane), as_float32(limits.far_plane),
             as_float32(limits.eps2d), limits.radius_clip, as_float32(rules.alpha_min), rules.extent_sigmas,
             *(_rows(tensor, size) for (_name, size, _dtype), tensor in zip(OUTPUTS, out, strict=False)),
             _rows(records.sort_depths, 0), _rows(records.centers, 4), _rows(records.whitenings, 4),
@@ -252,7 +254,8 @@ def backward_generic(
         generic.project_backward(SCALAR[dtype]),
         even_cuts(n),
         [
-            n, n_cameras, *_gaussian_views(scene), view(scene.viewmats), view(scene.Ks), scene.width, scene.height,
+            n, n_cameras, *_gaussian_views(scene), view(scene.viewmats), view(scene.Ks), scene.ortho, scene.width,
+            scene.height,
             _rows(radii, 2), _rows(given(incoming.g_means2d, 2), 2),
             _rows(given(incoming.g_covars2d, 3, dtype=torch.float64), 3), _rows(given(incoming.g_depths), 0),
             int(needs_cameras), _rows(filled("means", 3), 3), _rows(filled("quats", 4), 4),
