@@ -113,7 +113,7 @@ class Flesh:
         nodes = self._skin_nodes
         skin = self.solid.skin
         normals = np.asarray(igl.per_vertex_normals(at, skin, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_AREA))
-        areas = np.bincount(skin.ravel(), np.repeat(igl.doublearea(at, skin) / 6, 3), len(at))
+        areas = np.bincount(skin.ravel(), np.repeat(np.asarray(igl.doublearea(at, skin)) / 6, 3), len(at))
         distance, near = cKDTree(at[nodes]).query(at[nodes], 24, distance_upper_bound=CONTACT_REACH)
         node = np.repeat(nodes, 24)[np.isfinite(distance).ravel()]
         other = nodes[near[np.isfinite(distance)]]

@@ -150,7 +150,7 @@ def arguments(scene, covars=None, wanted=True):
     shape = [leaf(scene.quats), leaf(scene.scales), None] if covars is None else [None, None, leaf(covars)]
     return [
         leaf(scene.means), *shape, scene.opacities, leaf(scene.viewmats), scene.Ks, scene.width, scene.height,
-        list(OPTIONS.values()), True,
+        False, list(OPTIONS.values()), True,
     ]  # fmt: skip
 
 
@@ -167,7 +167,7 @@ def test_torch_finds_the_operators_well_formed(with_covars, dtype, device):
     wanted = [True, not with_covars, False, with_covars, True]
     torch.library.opcheck(
         torch.ops.oasis_warp.project_backward,
-        (means, quats, scales, covars, viewmats, Ks, out.radii, scene.width, scene.height, *given, wanted),
+        (means, quats, scales, covars, viewmats, Ks, out.radii, scene.width, scene.height, False, *given, wanted),
     )
 
 

@@ -95,10 +95,11 @@ def test_visibility_and_its_gradient_are_those_of_the_twin(seed, known, dtype, d
     got = visible(points, vertices, faces, viewmat, K, point_vertices=point_vertices)
     (grad,) = torch.autograd.grad(got.visibility.sum(), points)
 
+    owners = None if point_vertices is None else point_vertices.cpu()
     twin_points = wide(points).requires_grad_()
     hits = seen_by_twin(*map(wide, (vertices, faces, viewmat, K)))
     camera = Camera(wide(viewmat), wide(K), WIDTH, HEIGHT)
-    want = twin.score_points(twin_points, hits, faces.cpu(), camera, TAU, 3 * TAU, point_vertices)
+    want = twin.score_points(twin_points, hits, faces.cpu(), camera, TAU, 3 * TAU, owners)
     (twin_grad,) = torch.autograd.grad(want.sum(), twin_points)
     tolerance = 1e-6 if dtype == torch.float32 else 1e-9
     torch.testing.assert_close(wide(got.visibility), want.detach(), rtol=0, atol=tolerance)

@@ -95,10 +95,9 @@ def fit_of_pose(
     state = mirrored_state(kinematics, side, shape, pose, camera)
     points = kinematics.landmarks(kinematics.pose_joints(state.angles, state.shape))[0]
     xy, world = torch.from_numpy(state.project(points)), torch.from_numpy(state.in_camera(points))
-    landmarks = Landmarks(xy, world - world.mean(0), "right", 1.0, 1.0, "file")
+    landmarks = Landmarks(xy.float(), (world - world.mean(0)).float(), "right", 1.0, 1.0, "file")
     if side == "left":
         landmarks = mirror_landmarks(landmarks, camera.width)
-    landmarks = landmarks._replace(xy=landmarks.xy.float(), world=landmarks.world.float())
     view = MirroredInput(photo, landmarks, state.focal)
     state = replace(state, focal=state.focal * float(view.scale[0]), centre=state.centre * view.scale)
     scale, xy = state.pixels_per_metre(), view.target.xy

@@ -71,9 +71,8 @@ def minimize(
         for _ in range(trials):
             damped = at.normal + factor * np.diag(np.diag(at.normal) + damping.floor)
             trial = move(state, -np.linalg.solve(damped, at.gradient))
-            if cost is None:
-                ahead = model(trial)
-            trial_cost = cost(trial) if ahead is None else ahead.cost
+            ahead = model(trial) if cost is None else None
+            trial_cost = ahead.cost if ahead is not None else cost(trial)  # pyright: ignore[reportOptionalCall]
             if trial_cost < at.cost:
                 break
             factor *= damping.grow

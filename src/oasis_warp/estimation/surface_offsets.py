@@ -233,6 +233,7 @@ class ThinSheet:
 
     def __init__(self, faces: np.ndarray, n_vertices: int):
         self._stiffness = _bending(np.ascontiguousarray(faces, np.int64).tobytes(), n_vertices)
+        self._n_vertices = n_vertices
         self._factors: SuperLU | None = None
 
     def solve(self, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -241,15 +242,15 @@ class ThinSheet:
         The first system is factorised. Its factors precondition conjugate gradients for later ones, which have targets
         at nearly the same vertices: a few iterations take less time than another factorisation.
         """
-        n_vertices = self._stiffness.shape[0]
-        diagonal, right = np.zeros(n_vertices), np.zeros((n_vertices, target.shape[1]))
+        diagonal, right = np.zeros(self._n_vertices), np.zeros((self._n_vertices, target.shape[1]))
         np.add.at(diagonal, vertices, weight)
         np.add.at(right, vertices, weight[:, None] * target)
         system = (self._stiffness + sparse.diags_array(diagonal)).tocsc()
         if self._factors is None:
             options = {"SymmetricMode": True}
-            self._factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-            return self._factors.solve(right)
+            factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            self._factors = factors
+            return factors.solve(right)
         solution, _ = cg(
             _operator(system.dot, right.shape), right.ravel(), M=_operator(self._factors.solve, right.shape),
             rtol=_TOLERANCE, maxiter=_MOST_STEPS,

@@ -112,8 +112,8 @@ def mirror_left_hands(pictures: LabelledPictures) -> tuple[Tensor, Tensor, Tenso
     K = pictures.K.clone()
     K[:, 0, 2] = torch.where(left, pictures.image.shape[2] - K[:, 0, 2], K[:, 0, 2])
     orientation = sign[:, :, None] * pictures.orientation * sign[:, None]
-    images = (mirror_images(planes, left) for planes in (pictures.image, pictures.alpha, pictures.mask))
-    return *images, orientation, sign * like, K
+    image, alpha, mask = (mirror_images(planes, left) for planes in (pictures.image, pictures.alpha, pictures.mask))
+    return image, alpha, mask, orientation, sign * like, K
 
 
 @torch.no_grad()

@@ -211,7 +211,7 @@ def _with_ground_truth(
     index, number, left, _ = batch.whole.unbind(1)
     K = pinhole(posed.focal * size, size)
     marks = posed.landmarks @ K.transpose(1, 2)
-    batch = SyntheticBatch(
+    pictures = SyntheticBatch(
         image=image,
         alpha=shaded.alpha,
         mask=shaded.mask,
@@ -228,7 +228,7 @@ def _with_ground_truth(
         index=index,
         gestures=table.gestures,
     )
-    return _mirror_left(batch, size)
+    return _mirror_left(pictures, size)
 
 
 def slice_batch(batch: SyntheticBatch, rows: slice) -> SyntheticBatch:

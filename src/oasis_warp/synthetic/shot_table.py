@@ -148,8 +148,8 @@ def copy_to(tensor: Tensor, device: torch.device) -> Tensor:
 
 def shot_tensors(table: ShotTable, device: torch.device) -> ShotTensors:
     """The numbers of a table on `device`, in one copy."""
-    table = copy_to(torch.from_numpy(table.numbers), device)
-    return ShotTensors(**{name: table[:, place].view(-1, *shape) if shape else table[:, place.start]
+    numbers = copy_to(torch.from_numpy(table.numbers), device)
+    return ShotTensors(**{name: numbers[:, place].view(-1, *shape) if shape else numbers[:, place.start]
                       for name, (place, shape) in _places().items()})  # fmt: skip
 
 
