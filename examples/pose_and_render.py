@@ -17,9 +17,9 @@ import tyro
 
 from oasis_warp import Avatar, read_photo, reconstruct
 from oasis_warp.assets import asset
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.data.pictures import to_uint8, write_picture
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.render.cameras import orbit_camera
 
 
 @dataclass(frozen=True, kw_only=True)
