@@ -209,14 +209,18 @@ def remove_photo_light(
 
 
 def unlit_detail(
-    hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, weights: BlendWeights, light: HandLight | None
-) -> HandCrop:
+    hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, weights: BlendWeights, light: HandLight | None,
+    *, several: bool = False,
+) -> HandCrop:  # fmt: skip
     """What a photo, perhaps a larger one than was adapted to, shows of the skin of `gaussians`.
 
-    As `remove_photo_light`: in even light, with a mask of reliable pixels. The photo itself where no light is apart.
+    As `remove_photo_light`: in even light, with a mask of reliable pixels. The photo itself where no light is apart. Of
+    `several` photos all pixels count: with reliable ones only, a second photo's detail takes less off the error.
     """
     if light is None:
         return crop
+    if several:
+        return without_light(hand, crop, light)
     lit = apply_light(hand, _picture(weights, gaussians.colors), crop, light._replace(shade=None))
     return without_light(hand, mask_unreliable(hand, lit, crop), light)
 
@@ -247,7 +251,7 @@ def add_detail(
     for k, (crop, light, gain) in enumerate(zip(crops, lights, adaptation.gains, strict=True)):
         as_bright = gaussians._replace(colors=gaussians.colors * gain)
         weights = view_in_photo(hand, gaussians, crop).weights
-        unlit.append(unlit_detail(hand, as_bright, crop, weights, light))
+        unlit.append(unlit_detail(hand, as_bright, crop, weights, light, several=len(crops) > 1))
         if len(crop.image) > size:
             image = _in_first_light(hand, unlit[k].image, weights, gaussians, gain, adaptation.shading[k])
             finer.append((k, unlit[k]._replace(image=image)))
