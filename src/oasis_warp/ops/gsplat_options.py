@@ -16,7 +16,7 @@ from oasis_warp.ops.projection import Projection
 def compensated_opacities(
     opacities: Float[Tensor, "C N"], covars2d: Float64[Tensor, "C N 3"], eps2d: float
 ) -> Float[Tensor, "C N"]:
-    """Opacities times sqrt(det(S) / det(S + eps2d I)), S being the covariance in the image (Yu et al. 2024, eq. 9).
+    """Opacities times sqrt(det(S) / det(S + eps2d I)), S being the covariance in the image (Yu et al. 2024).
 
     Gaussians smaller than a pixel then become fainter, instead of wider alone.
 
@@ -82,7 +82,7 @@ def absolute_gradients(
     projection: Projection, opacities: Tensor, channels: Tensor, backgrounds: Tensor, g_render: Tensor,
     g_alphas: Tensor, tile_size: int,
 ) -> Float[Tensor, "C N 2"]:  # fmt: skip
-    """Sums over pixels of |gradient by means2d| (Ye et al. 2024, eq. 6) [loss per px], shape [C, N, 2].
+    """Sums over pixels of |gradient by means2d| (Ye et al. 2024) [loss per px], shape [C, N, 2].
 
     The weights of every pair of a pixel and a Gaussian are listed front to back. With w = alpha T, the gradient by
     alpha is T g.c - (sum of w g.c behind + T_end (g.background - g_alpha)) / (1 - alpha).

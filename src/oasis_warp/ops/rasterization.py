@@ -137,10 +137,10 @@ def rasterization(
         segmented: Like `packed`.
         covars: Covariances [m^2] instead of quats and scales, which are then not read and may be None, shape [N, 3, 3];
             the symmetric part is used.
-        sparse_grad: Not supported, like all without a text: accepted with its default so that calls need no change.
+        sparse_grad: Not supported: accepted with its default, so that calls written for gsplat need no change.
         absgrad: After backward, `meta["means2d"].absgrad` holds sums over pixels of the magnitudes of gradients, shape
-            [C, N, 2]: what densification looks at (Ye et al. 2024). Lists every pair of a pixel and a Gaussian, so
-            backward takes several times as long.
+            [C, N, 2], as a criterion for densification (Ye et al. 2024). Backward then lists every pair of a pixel and
+            a Gaussian, which costs time and memory.
         rasterize_mode: "classic", or "antialiased": opacities are multiplied by sqrt(det(S) / det(S + eps2d)), S being
             the covariance in the image (Yu et al. 2024), so that Gaussians below a pixel become fainter.
         distributed: Not supported.
