@@ -4,6 +4,7 @@ A U-Net (Ronneberger et al. 2015) with residual blocks at high resolution, wide 
 at an eighth and a sixteenth, and one self-attention at a sixteenth. It is fully convolutional.
 """
 
+import itertools
 from typing import NamedTuple
 
 import torch
@@ -119,7 +120,7 @@ class DenseNetwork(nn.Module):
         self.encoder = nn.ModuleList(
             nn.Sequential(*(_block(level) for _ in range(depth))) for level, depth in enumerate(DEPTHS)
         )
-        steps = list(zip(WIDTHS, WIDTHS[1:], strict=False))
+        steps = list(itertools.pairwise(WIDTHS))
         self.down = nn.ModuleList(
             nn.Sequential(nn.Conv2d(a, b, 3, 2, 1, bias=False), nn.GroupNorm(NORM_GROUPS, b)) for a, b in steps
         )
