@@ -12,6 +12,7 @@ from torch import Tensor
 
 from oasis_warp.core.mirror import MIRROR, mirror_images
 from oasis_warp.ops import depth_map
+from oasis_warp.ops.depth_map import DepthMap
 from oasis_warp.synthetic.atlas import HEIGHT, WIDTH
 from oasis_warp.synthetic.backgrounds import cut_background
 from oasis_warp.synthetic.body import RING, Body, body_on, device_name
@@ -110,11 +111,11 @@ def render_table(
 ) -> SyntheticBatch:
     """Render the shots that `sample_table` has drawn for the same seed and scene, without waiting for the device."""
     even = scene.look == "even"
-    batch = _shade_batch(seed, table, size, torch.device(device), scene.population, lamps=not even)
+    batch = shade_batch(seed, table, size, torch.device(device), scene.population, lamps=not even)
     if even:
         image = _over_black(batch.shaded, lambda linear: srgb(linear.clamp(max=1)))
     else:
-        image = _photo(batch, _scene_light(batch, table, size, scene))
+        image = take_photo(batch, scene_light(batch, table, size, scene))
     return _with_ground_truth(batch, image, table, size)
 
 
@@ -133,29 +134,37 @@ def render_capture(
         scene: Scene of the photo.
     """
     device = torch.device(device)
-    batch = _shade_batch(seed, photo, size, device, scene.population, lamps=True)
-    light = _scene_light(batch, photo, size, scene)
-    again = _shade_batch(seed, others, size, device, scene.population, lamps=True)
+    batch = shade_batch(seed, photo, size, device, scene.population, lamps=True)
+    light = scene_light(batch, photo, size, scene)
+    again = shade_batch(seed, others, size, device, scene.population, lamps=True)
     count = len(others.numbers)
     gains = meter(light, batch.shaded.alpha, batch.numbers.sensor, batch.numbers.incident).expand(count, -1)
     sensors = batch.numbers.sensor.expand(count, -1)
     image = _over_black(again.shaded, lambda linear: develop(linear, gains, sensors))
-    return _with_ground_truth(batch, _photo(batch, light), photo, size), _with_ground_truth(again, image, others, size)
+    return _with_ground_truth(batch, take_photo(batch, light), photo, size), _with_ground_truth(
+        again, image, others, size
+    )
 
 
-class _ShadedBatch(NamedTuple):
+class ShadedBatch(NamedTuple):
     """A batch of posed, lit and shaded hands, in linear light and without background."""
 
     numbers: ShotTensors
     whole: Int[Tensor, "B 4"]
+    """As `ShotTable.whole`."""
     posed: PosedPeople
+    seen: DepthMap
+    """The body's mesh at `SAMPLES` times the size."""
+    normals: Float[Tensor, "B V 3"]
+    """Of the posed vertices, in the camera's frame."""
     lamps: Lamps
     shaded: Shaded
 
 
-def _shade_batch(
+def shade_batch(
     seed: int, table: ShotTable, size: int, device: torch.device, population: Population, *, lamps: bool
-) -> _ShadedBatch:
+) -> ShadedBatch:
+    """Pose, light and shade the hands of a table, with its lamps or under an even sky alone."""
     name = device_name(device)
     device, body = torch.device(name), body_on(name)
     people = [person(seed, number, population, name) for number in table.whole[:, 1].tolist()]
@@ -175,7 +184,7 @@ def _shade_batch(
         numbers.view_distance / (posed.focal * fine) / TEXEL, numbers.sky, lit, whole[:, 3],
         n_hand_faces=body.n_hand_faces, ring=RING,
     )  # fmt: skip
-    return _ShadedBatch(numbers, whole, posed, lit, shaded)
+    return ShadedBatch(numbers, whole, posed, seen, state.normals, lit, shaded)
 
 
 def _over_black(shaded: Shaded, camera: Callable[[Tensor], Tensor]) -> Float[Tensor, "B H W 3"]:
@@ -184,7 +193,7 @@ def _over_black(shaded: Shaded, camera: Callable[[Tensor], Tensor]) -> Float[Ten
     return share * camera((shaded.color / share.clamp_min(1e-3)).clamp_min(0))
 
 
-def _scene_light(batch: _ShadedBatch, table: ShotTable, size: int, scene: SceneConfig) -> Float[Tensor, "B H W 3"]:
+def scene_light(batch: ShadedBatch, table: ShotTable, size: int, scene: SceneConfig) -> Float[Tensor, "B H W 3"]:
     """The linear light of hand, arm and background."""
     numbers, shaded = batch.numbers, batch.shaded
     if scene.backgrounds:
@@ -197,14 +206,14 @@ def _scene_light(batch: _ShadedBatch, table: ShotTable, size: int, scene: SceneC
     return shaded.color + (1 - shaded.alpha[..., None]) * behind
 
 
-def _photo(batch: _ShadedBatch, light: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:
+def take_photo(batch: ShadedBatch, light: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:
     """The photo that the sensors take of the light."""
     numbers = batch.numbers
     return expose(light, batch.shaded.alpha, numbers.sensor, numbers.incident, batch.whole[:, 3])
 
 
 def _with_ground_truth(
-    batch: _ShadedBatch, image: Float[Tensor, "B H W 3"], table: ShotTable, size: int
+    batch: ShadedBatch, image: Float[Tensor, "B H W 3"], table: ShotTable, size: int
 ) -> SyntheticBatch:
     """The pictures with their ground truth; left hands are mirrored."""
     numbers, posed, shaded = batch.numbers, batch.posed, batch.shaded

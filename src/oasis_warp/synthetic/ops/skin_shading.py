@@ -75,6 +75,8 @@ class Shaded(NamedTuple):
     """Share of each pixel that is hand, without forearm and clothes."""
     depth: Float[Tensor, "B H W"]
     """Nearest surface of each pixel [m], +inf where there is none."""
+    albedo: Float[Tensor, "B Y X 3"]
+    """Diffuse reflectance of each sub-pixel, linear RGB; 0 where no surface is."""
 
 
 def _surface_state(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
@@ -231,7 +233,7 @@ def _shade(
     materials: Tensor, looks: Tensor, pages: list[Tensor], uv: Tensor, uv_faces: Tensor, tones: Tensor,
     texels_a_pixel: Tensor, sky: Tensor, lamp_positions: Tensor, lamp_colors: Tensor, lamp_ranges: Tensor,
     lamp_spreads: Tensor, lamp_viewmats: Tensor, lamp_focals: Tensor, lamp_depths: Tensor, seeds: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     batch, rows, columns = face_ids.shape
     light, tone, mirrored = (vertices.new_zeros((batch, rows, columns, 3)) for _ in range(3))
     vec3 = lambda t: view(t.contiguous(), wp.vec3f)  # noqa: E731
@@ -270,12 +272,13 @@ def _shade(
         ],
         like=vertices,
     )  # fmt: skip
-    return color, alpha, mask, nearest
+    return color, alpha, mask, nearest, tone
 
 
 def _shade_fake(face_ids, barycentrics, depths, focals, samples, n_hand_faces, ring, vertices, *_):
     size = (len(face_ids), face_ids.shape[1] // samples, face_ids.shape[2] // samples)
-    return vertices.new_empty((*size, 3)), *(vertices.new_empty(size) for _ in range(3))
+    color, fine = (vertices.new_empty((*shape, 3)) for shape in (size, face_ids.shape))
+    return color, *(vertices.new_empty(size) for _ in range(3)), fine
 
 
 _SHADE = Operator(
@@ -294,7 +297,7 @@ _SHADE = Operator(
         "lamps.depths": Array("B L M M"),
         "lamps.positions": Array("B L 3"),
     },
-    outputs={"color": "B H W 3", "alpha": "B H W", "mask": "B H W", "depth": "B H W"},
+    outputs={"color": "B R S 3", "alpha": "B R S", "mask": "B R S", "depth": "B R S", "albedo": "B H W 3"},
     public=False,
 )
 
