@@ -29,14 +29,8 @@ from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.network.weights_file import load_network, save_network
 from oasis_warp.pretraining.distributed import ProcessInfo
-from oasis_warp.pretraining.pretrain import (
-    CHECKPOINT,
-    WEIGHTS,
-    PretrainConfig,
-    Trainer,
-    load_checkpoint,
-    save_checkpoint,
-)
+from oasis_warp.pretraining.pretrain import CHECKPOINT, WEIGHTS, PretrainConfig
+from oasis_warp.pretraining.prior_trainer import PriorTrainer
 from oasis_warp.pretraining.synthetic_source import SyntheticHands
 from studies.harness import SETTINGS, Row, StudyOptions, report, write_rows
 from studies.parts import FULL, ablation_rows, ablation_text
@@ -122,15 +116,14 @@ def row_titles(names: list[str], ending: str) -> dict[str, str]:
     return titles
 
 
-def make_trainer(name: str, options: Options, folder: Path) -> Trainer:
+def make_trainer(name: str, options: Options, folder: Path) -> PriorTrainer:
     """A network at the start, or where its checkpoint is."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
         network = HandNetwork(network_config(name, options), bundled_hand())
     config = PretrainConfig(steps=options.steps, precision=options.precision)
-    trainer = Trainer(network, config, ProcessInfo(0, 1, torch.device(options.device)))
-    if (folder / CHECKPOINT).is_file():
-        trainer.step = load_checkpoint(folder / CHECKPOINT, network, trainer.optimizer)
+    trainer = PriorTrainer(network, config, ProcessInfo(0, 1, torch.device(options.device)))
+    trainer.resume(folder / CHECKPOINT)
     return trainer
 
 
@@ -154,7 +147,7 @@ def train_together(names: list[str], folder: Path, options: Options, deadline: f
     began = time.perf_counter()
     for step, batch in zip(range(first, options.steps), hands(first, 0, 1), strict=False):
         behind = {name: trainer for name, trainer in trainers.items() if trainer.step == step}
-        found = {name: trainer.advance(batch).psnr for name, trainer in behind.items()}
+        found = {name: trainer.advance(batch).metrics["psnr"] for name, trainer in behind.items()}
         if (step + 1) % LOG_EVERY == 0:
             for trainer in behind.values():
                 trainer.check_recording()
@@ -166,7 +159,7 @@ def train_together(names: list[str], folder: Path, options: Options, deadline: f
         last, late = step + 1 == options.steps, time.monotonic() > deadline
         if late or last or (step + 1) % CHECKPOINT_EVERY == 0:
             for name, trainer in behind.items():
-                save_checkpoint(folder / name / CHECKPOINT, trainer.network, trainer.optimizer, trainer.step)
+                trainer.save(folder / name / CHECKPOINT)
         if late and not last:
             return False
     for name, trainer in trainers.items():

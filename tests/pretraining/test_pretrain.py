@@ -24,12 +24,10 @@ from oasis_warp.pretraining.pretrain import (
     SHEET,
     WEIGHTS,
     PretrainConfig,
-    Trainer,
     learning_rate,
-    load_checkpoint,
     pretrain,
-    save_checkpoint,
 )
+from oasis_warp.pretraining.prior_trainer import PriorTrainer
 
 ALONE = ProcessInfo(0, 1, torch.device("cpu"))
 SMALL = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
@@ -51,7 +49,7 @@ def source(hand):
 def unbroken(hand, source, tmp_path_factory):
     folder = tmp_path_factory.mktemp("unbroken")
     network = small_network(hand)
-    pretrain(Trainer(network, CONFIG, ALONE), source, folder)
+    pretrain(PriorTrainer(network, CONFIG, ALONE), source, folder)
     return folder, network
 
 
@@ -65,9 +63,9 @@ def test_a_training_that_was_killed_ends_with_the_same_bits(hand, source, unbrok
         raise Killed
 
     with pytest.raises(Killed):
-        pretrain(Trainer(small_network(hand), CONFIG, ALONE), until_killed, tmp_path)
+        pretrain(PriorTrainer(small_network(hand), CONFIG, ALONE), until_killed, tmp_path)
     assert [json.loads(line)["step"] for line in (tmp_path / METRICS).read_text().splitlines()] == [1, 2, 3]
-    pretrain(Trainer(small_network(hand), CONFIG, ALONE), source, tmp_path)
+    pretrain(PriorTrainer(small_network(hand), CONFIG, ALONE), source, tmp_path)
     for name in (CHECKPOINT, WEIGHTS, SHEET):
         assert (tmp_path / name).read_bytes() == (unbroken[0] / name).read_bytes(), name
 
@@ -88,14 +86,14 @@ def test_a_finished_training_is_left_as_it_is(hand, source, unbroken):
     folder, network = unbroken
     before = (folder / CHECKPOINT).read_bytes()
     again = small_network(hand)
-    pretrain(Trainer(again, CONFIG, ALONE), source, folder)
+    pretrain(PriorTrainer(again, CONFIG, ALONE), source, folder)
     assert (folder / CHECKPOINT).read_bytes() == before
     assert all(torch.equal(a, b) for a, b in zip(again.parameters(), network.parameters(), strict=True))
 
 
 def test_the_checkpoint_of_another_network_is_refused(hand, source, unbroken):
     with pytest.raises(InputError, match="the checkpoint of a network with other sizes or switches"):
-        pretrain(Trainer(small_network(hand, vpia="no_bias"), CONFIG, ALONE), source, unbroken[0])
+        pretrain(PriorTrainer(small_network(hand, vpia="no_bias"), CONFIG, ALONE), source, unbroken[0])
 
 
 def test_the_learning_rate_rises_and_falls_or_stays():
@@ -107,6 +105,9 @@ def test_the_learning_rate_rises_and_falls_or_stays():
     assert rates[-1] < 1e-8
     flat = PretrainConfig(steps=1000, warmup=100, decay="none")
     assert learning_rate(flat, 100) == learning_rate(flat, 999) == 4e-4
+    cooled = replace(flat, decay="cooldown")
+    assert learning_rate(cooled, 100) == learning_rate(cooled, 800) == 4e-4
+    assert learning_rate(cooled, 900) == pytest.approx(2e-4) and learning_rate(cooled, 1000) == 0
 
 
 def test_a_loss_that_is_not_finite_ends_the_training(hand, source, tmp_path):
@@ -115,13 +116,13 @@ def test_a_loss_that_is_not_finite_ends_the_training(hand, source, tmp_path):
             yield batch._replace(target_images=batch.target_images * float("nan"))
 
     with pytest.raises(InputError, match="the loss is not finite at step 1; lower the learning rate"):
-        pretrain(Trainer(small_network(hand), CONFIG, ALONE), poisoned, tmp_path)
+        pretrain(PriorTrainer(small_network(hand), CONFIG, ALONE), poisoned, tmp_path)
     assert not (tmp_path / CHECKPOINT).exists()
 
 
 def test_half_precision_trains_too(hand, source):
-    trainer = Trainer(small_network(hand), replace(CONFIG, precision="bfloat16"), ALONE)
-    exact = Trainer(small_network(hand), CONFIG, ALONE)
+    trainer = PriorTrainer(small_network(hand), replace(CONFIG, precision="bfloat16"), ALONE)
+    exact = PriorTrainer(small_network(hand), CONFIG, ALONE)
     batch = source.batch(0)
     torch.testing.assert_close(trainer.evaluate(batch).loss, exact.evaluate(batch).loss, rtol=0.02, atol=0)
     trainer.advance(batch)
@@ -131,7 +132,7 @@ def test_half_precision_trains_too(hand, source):
 
 @pytest.mark.parametrize("switch", [{"fom": "off"}, {"vpia": "off", "vet": "mlp"}])
 def test_ablated_networks_train_too(hand, source, switch):
-    trainer = Trainer(small_network(hand, **switch), CONFIG, ALONE)
+    trainer = PriorTrainer(small_network(hand, **switch), CONFIG, ALONE)
     before = [parameter.detach().clone() for parameter in trainer.network.vertex_head.parameters()]
     trainer.advance(source.batch(0))
     after = list(trainer.network.vertex_head.parameters())
@@ -139,12 +140,12 @@ def test_ablated_networks_train_too(hand, source, switch):
 
 
 def test_a_part_that_a_switch_leaves_out_of_use_is_saved_and_read_too(hand, source, tmp_path):
-    made = [Trainer(small_network(hand, vet="off", point_evidence="off"), CONFIG, ALONE) for _ in range(2)]
+    made = [PriorTrainer(small_network(hand, vet="off", point_evidence="off"), CONFIG, ALONE) for _ in range(2)]
     made[0].advance(source.batch(0))
     unused = [name for name, parameter in made[0].network.named_parameters() if parameter.grad is None]
     assert unused
-    save_checkpoint(tmp_path / CHECKPOINT, made[0].network, made[0].optimizer, made[0].step)
-    made[1].step = load_checkpoint(tmp_path / CHECKPOINT, made[1].network, made[1].optimizer)
+    made[0].save(tmp_path / CHECKPOINT)
+    made[1].resume(tmp_path / CHECKPOINT)
     for trainer in made:
         trainer.advance(source.batch(1))
     assert all(map(torch.equal, made[0].network.parameters(), made[1].network.parameters()))
@@ -155,7 +156,7 @@ def test_a_part_that_a_switch_leaves_out_of_use_is_saved_and_read_too(hand, sour
 def test_training_finds_the_paint(hand):
     source = PaintedHands(hand, hands=1, targets=1, size=48)
     config = replace(CONFIG, steps=80, warmup=5, learning_rate=2e-3)
-    trainer = Trainer(small_network(hand, width=32, head_width=32, image_size=64), config, ALONE)
+    trainer = PriorTrainer(small_network(hand, width=32, head_width=32, image_size=64), config, ALONE)
     test = PaintedHands(hand, hands=2, targets=2, size=48).batch(10**6)
     with torch.no_grad():
         before = trainer.evaluate(test)
@@ -163,7 +164,7 @@ def test_training_finds_the_paint(hand):
         trainer.advance(batch)
     with torch.no_grad():
         after = trainer.evaluate(test)
-    assert float(after.psnr) > float(before.psnr) + 0.5
+    assert float(after.metrics["psnr"]) > float(before.metrics["psnr"]) + 0.5
     assert float(after.loss) < 0.95 * float(before.loss)
 
 
@@ -179,7 +180,7 @@ def test_two_processes_average_their_gradients(hand, source, tmp_path):
     ours, theirs = (load_file(tmp_path / f"rank{rank}.safetensors") for rank in range(2))
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
     # one process with both batches: Adam's first moment after one step is a tenth of the mean gradient
-    trainer = Trainer(small_network(hand), replace(CONFIG, steps=1, clip=1e9), ALONE)
+    trainer = PriorTrainer(small_network(hand), replace(CONFIG, steps=1, clip=1e9), ALONE)
     loss = (trainer.evaluate(source.batch(0)).loss + trainer.evaluate(source.batch(1)).loss) / 2
     loss.backward()
     moments = load_file(tmp_path / CHECKPOINT)

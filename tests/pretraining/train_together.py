@@ -11,7 +11,8 @@ from test_pretrain import CONFIG, small_network
 
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.pretraining.distributed import join_processes
-from oasis_warp.pretraining.pretrain import Trainer, pretrain
+from oasis_warp.pretraining.pretrain import pretrain
+from oasis_warp.pretraining.prior_trainer import PriorTrainer
 
 
 def main(folder: Path):
@@ -20,7 +21,7 @@ def main(folder: Path):
     with join_processes("cpu") as process:
         network = small_network(hand)
         source = PaintedHands(hand, hands=1, targets=1, size=32)
-        pretrain(Trainer(network, replace(CONFIG, steps=1, clip=1e9), process), source, folder)
+        pretrain(PriorTrainer(network, replace(CONFIG, steps=1, clip=1e9), process), source, folder)
         state = {name: parameter.detach() for name, parameter in network.named_parameters()}
         save_file(state, folder / f"rank{process.rank}.safetensors")
 

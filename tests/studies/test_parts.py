@@ -130,7 +130,7 @@ def test_variants_are_trained_alike_and_go_on_where_they_were_stopped(tiny, tmp_
     text = ablation_text(rows) or ""
     assert "w/o bias" in text and "full model" in text and "Settings: " in text
 
-    advance = network_parts.Trainer.advance
+    advance = network_parts.PriorTrainer.advance
 
     def until_stopped(trainer, batch):
         if trainer.step == 2 and trainer.network.config.vet == "off":
@@ -139,7 +139,7 @@ def test_variants_are_trained_alike_and_go_on_where_they_were_stopped(tiny, tmp_
 
     part = replace(whole, out=tmp_path / "parts")
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(network_parts.Trainer, "advance", until_stopped)
+        patch.setattr(network_parts.PriorTrainer, "advance", until_stopped)
         network_parts.run(replace(part, only=("full", "vet_off")))
     network_parts.run(replace(part, only=("no_bias",), minutes=0))
     assert "the same command goes on" in capsys.readouterr().err

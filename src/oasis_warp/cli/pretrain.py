@@ -24,7 +24,8 @@ from oasis_warp.network.encoders import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, read_config
 from oasis_warp.pretraining.distributed import ProcessInfo, join_processes, wait_for_all
-from oasis_warp.pretraining.pretrain import CHECKPOINT, PretrainConfig, Trainer, pretrain
+from oasis_warp.pretraining.pretrain import CHECKPOINT, PretrainConfig, pretrain
+from oasis_warp.pretraining.prior_trainer import PriorTrainer
 from oasis_warp.pretraining.synthetic_source import MULTIPLE, SyntheticHands
 from oasis_warp.synthetic.people import max_people_cached
 from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH
@@ -117,7 +118,7 @@ def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
     hands.bake(met, options.out / PEOPLE, options.workers, progress)
     config = PretrainConfig(steps=options.steps, precision=PRECISIONS[options.precision])
     with stop_signals(can_force=process.world == 1) as should_stop:
-        trainer = Trainer(network, config, process)
+        trainer = PriorTrainer(network, config, process)
         return pretrain(trainer, hands, options.out, about=settings, should_stop=should_stop, progress=progress)
 
 

@@ -1,29 +1,24 @@
-"""Train the prior network on many hands: paper, section 4.1 and appendix B.2."""
+"""The training loop of every network: stopped, resumed, in one process or several, with files that report."""
 
 import json
 import math
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 
-from oasis_warp.avatar.observation import source_photos
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import TrainingBatch
 from oasis_warp.data.output_files import write_file
 from oasis_warp.data.pictures import to_uint8, write_picture
-from oasis_warp.losses.image import detail_difference
-from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.weights_file import save_network
 from oasis_warp.ops.cuda_graph import CapturedCall
+from oasis_warp.pretraining.checkpoint import load_checkpoint, save_checkpoint
 from oasis_warp.pretraining.distributed import (
     ProcessInfo,
     any_process,
@@ -31,80 +26,25 @@ from oasis_warp.pretraining.distributed import (
     mean_over_processes,
     share_weights,
 )
-from oasis_warp.pretraining.objective import (
-    LossConfig,
-    Perceptual,
-    RenderBatch,
-    draw_targets,
-    objective,
-    picture_psnr,
-    true_pictures,
-)
 
-FORMAT = "oasis-pretraining"
-MOMENTS = ("exp_avg", "exp_avg_sq")
-
-
-def save_checkpoint(path: Path, network: HandNetwork, optimizer: torch.optim.Adam, step: int) -> None:
-    """Write weights, Adam's moments and a JSON header after `step` steps as one safetensors file, atomically."""
-    tensors: dict[str, Tensor] = {}
-    for name, parameter in _trained(network).items():
-        tensors[f"weights.{name}"] = parameter
-        for moment in MOMENTS:
-            # A switch may leave a part without gradients, for which Adam has no moments.
-            tensors[f"{moment}.{name}"] = optimizer.state[parameter].get(moment, torch.zeros_like(parameter))
-    header = {"step": step, "config": asdict(network.config), "hand_model": network.hand_name}
-    stored = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    write_file(path, save(stored, {FORMAT: json.dumps(header, sort_keys=True)}))
-
-
-def load_checkpoint(path: Path, network: HandNetwork, optimizer: torch.optim.Adam) -> int:
-    """Load a file of `save_checkpoint` into network and optimizer; the number of steps done.
-
-    Raises:
-        InputError: another format, or a checkpoint of another network.
-    """
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = _read_header(path, file.metadata(), network)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except SafetensorError as error:
-        raise InputError(f"{path}: expected a checkpoint, got a file cut short ({error}); remove it.") from error
-    state = {}
-    for k, (name, parameter) in enumerate(_trained(network).items()):
-        parameter.data.copy_(tensors[f"weights.{name}"])
-        moments = {moment: tensors[f"{moment}.{name}"] for moment in MOMENTS}
-        state[k] = {"step": torch.tensor(float(header["step"])), **moments}
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    return header["step"]
-
-
-def _trained(network: HandNetwork) -> dict[str, torch.nn.Parameter]:
-    return {name: parameter for name, parameter in network.named_parameters() if parameter.requires_grad}
-
-
-def _read_header(path: Path, metadata: dict[str, str] | None, network: HandNetwork) -> dict[str, Any]:
-    text = (metadata or {}).get(FORMAT)
-    if text is None:
-        raise InputError(f"{path}: expected a checkpoint, got another safetensors file; remove it.")
-    header = json.loads(text)
-    if header["config"] != asdict(network.config) or header["hand_model"] != network.hand_name:
-        raise InputError(f"{path}: the checkpoint of a network with other sizes or switches; choose another folder.")
-    return header
-
+Network = TypeVar("Network", bound=nn.Module)
+Batch = TypeVar("Batch", bound=tuple[Tensor, ...])
+Yielded = TypeVar("Yielded", bound=tuple[Tensor, ...], covariant=True)
 
 CHECKPOINT, WEIGHTS, METRICS, SHEET = "checkpoint.safetensors", "network.safetensors", "metrics.jsonl", "pictures.png"
 """Files in the folder of a training."""
-SHEET_HANDS = 8
+SHEET_ROWS = 8
 EAGER_STEPS = 4
 """Steps on CUDA before one is captured: they load the kernels, and show how much memory the pictures need."""
 SLACK = 3.0
 """Factor of the memory that pictures needed for their Gaussians, since each hand and pose needs another amount."""
+COOLDOWN = 0.2
+"""Share of the steps over which a cooldown lowers the learning rate."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainConfig:
-    """How the prior is trained."""
+    """How a network is trained; the defaults are the prior's."""
 
     steps: int = 20_000
     """Batches per process."""
@@ -112,13 +52,12 @@ class PretrainConfig:
     """Highest learning rate of Adam; the paper's."""
     warmup: int = 200
     """Steps over which the learning rate rises from 0."""
-    decay: Literal["cosine", "none"] = "cosine"
-    """Decay to 0 at the last step, which short trainings need, or constant as in the paper."""
+    decay: Literal["cosine", "cooldown", "none"] = "cosine"
+    """Decay to 0 at the last step, over all steps or linearly over the last `COOLDOWN`, or constant as in the paper."""
     precision: Literal["bfloat16", "float32"] = "bfloat16"
     """Of attention and perceptrons; geometry, Gaussians and weights are float32."""
     clip: float = 1.0
     """Norm to which the gradient of all weights is clipped."""
-    losses: LossConfig = field(default_factory=LossConfig)
     checkpoint_every: int = 500
     """Steps between two checkpoints."""
     log_every: int = 20
@@ -126,10 +65,10 @@ class PretrainConfig:
 
 
 @runtime_checkable
-class BatchSource(Protocol):
+class BatchSource(Protocol[Yielded]):
     """Training data. Batch k of a process depends on k, rank and world only, so that training can resume anywhere."""
 
-    def __call__(self, first_step: int, rank: int, world: int) -> Iterator[TrainingBatch]:
+    def __call__(self, first_step: int, rank: int, world: int) -> Iterator[Yielded]:
         """Batches from step `first_step` on, on the device of the network."""
         ...
 
@@ -138,31 +77,31 @@ class StepResult(NamedTuple):
     """Results of one step; numbers are still on the device."""
 
     loss: Tensor
-    terms: dict[str, Tensor]
-    psnr: Tensor
-    drawn: RenderBatch
-    true: RenderBatch
+    metrics: dict[str, Tensor]
+    """Further numbers to report."""
+    pictures: tuple[Tensor, ...]
+    """What `Trainer.sheet` needs."""
 
 
 def learning_rate(config: PretrainConfig, step: int) -> float:
     """Learning rate of step `step`, counted from 0."""
     rise = min(1.0, (step + 1) / max(config.warmup, 1))
-    fall = 0.5 + 0.5 * math.cos(math.pi * step / config.steps) if config.decay == "cosine" else 1.0
+    match config.decay:
+        case "cosine":
+            fall = 0.5 + 0.5 * math.cos(math.pi * step / config.steps)
+        case "cooldown":
+            fall = min(1.0, (config.steps - step) / (COOLDOWN * config.steps))
+        case "none":
+            fall = 1.0
     return config.learning_rate * rise * fall
 
 
-class Trainer:
-    """A network in training and its optimizer; `step` counts the steps done."""
+class Trainer(ABC, Generic[Network, Batch]):
+    """A network in training and its optimizer; `step` counts the steps done. A subclass is one task with its loss."""
 
-    def __init__(
-        self,
-        network: HandNetwork,
-        config: PretrainConfig,
-        process: ProcessInfo,
-        perceptual: Perceptual = detail_difference,
-    ):
+    def __init__(self, network: Network, config: PretrainConfig, process: ProcessInfo):
         self.network = network.to(process.device).train()
-        self.config, self.process, self.perceptual = config, process, perceptual
+        self.config, self.process = config, process
         self.trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
         share_weights(self.trained, process.world)
         on_cuda = process.device.type == "cuda"
@@ -173,7 +112,28 @@ class Trainer:
         self._recorded: CapturedCall[StepResult] | None = None
         self._eager_steps = 0
 
-    def advance(self, batch: TrainingBatch) -> StepResult:
+    @abstractmethod
+    def evaluate(self, batch: Batch) -> StepResult:
+        """Predict and compute the loss, without waiting for the device."""
+
+    @abstractmethod
+    def identity(self) -> dict[str, Any]:
+        """What a checkpoint must agree with, as JSON values."""
+
+    @abstractmethod
+    def save_weights(self, path: Path, notes: Mapping[str, Any]) -> None:
+        """Write the weights file; `notes` are JSON values that say how the weights came about."""
+
+    @abstractmethod
+    def sheet(self, batch: Batch, result: StepResult) -> list[Tensor]:
+        """Columns of the sheet of pictures: each a stack of square pictures of one size, one for each item."""
+
+    def autocast(self) -> torch.autocast:
+        """The context in which a network predicts in the precision of the config."""
+        half = self.config.precision == "bfloat16"
+        return torch.autocast(self.process.device.type, torch.bfloat16, enabled=half)
+
+    def advance(self, batch: Batch) -> StepResult:
         """Take one step of Adam, without waiting for the device.
 
         On CUDA the result's tensors belong to a captured step, which overwrites them the next time.
@@ -199,17 +159,20 @@ class Trainer:
         if self._recorded is not None and self._recorded.lacked_memory():
             self._recorded, self._eager_steps = None, 0
 
-    def evaluate(self, batch: TrainingBatch) -> StepResult:
-        """Predict, render every target and compute the loss."""
-        half = self.config.precision == "bfloat16"
-        with torch.autocast(self.process.device.type, torch.bfloat16, enabled=half):
-            prediction = self.network(source_photos(batch))
-        drawn = draw_targets(prediction, batch, self.network)
-        true = true_pictures(batch, self.network.faces, self.network.rim)
-        loss, terms = objective(prediction, drawn, true, self.config.losses, self.perceptual)
-        return StepResult(loss, terms, picture_psnr(drawn, true), drawn, true)
+    def save(self, path: Path) -> None:
+        """Write a checkpoint."""
+        save_checkpoint(path, self.network, self.optimizer, self.step, self.identity())
 
-    def _update(self, batch: TrainingBatch) -> StepResult:
+    def resume(self, path: Path) -> None:
+        """Go on from a checkpoint, if there is one.
+
+        Raises:
+            InputError: it is damaged or of another network.
+        """
+        if path.is_file():
+            self.step = load_checkpoint(path, self.network, self.optimizer, self.identity())
+
+    def _update(self, batch: Batch) -> StepResult:
         result = self.evaluate(batch)
         gradients = torch.autograd.grad(result.loss, self.trained, allow_unused=True)
         for parameter, gradient in zip(self.trained, gradients, strict=True):
@@ -219,19 +182,13 @@ class Trainer:
         average_gradients(self.trained, self.process.world)
         torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
         self.optimizer.step()
-        return _without_history(result)
-
-
-def _without_history(result: StepResult) -> StepResult:
-    """The result, detached from the graph."""
-    terms = {name: term.detach() for name, term in result.terms.items()}
-    drawn, true = (RenderBatch(*(tensor.detach() for tensor in pictures)) for pictures in (result.drawn, result.true))
-    return StepResult(result.loss.detach(), terms, result.psnr.detach(), drawn, true)
+        metrics = {name: value.detach() for name, value in result.metrics.items()}
+        return StepResult(result.loss.detach(), metrics, tuple(picture.detach() for picture in result.pictures))
 
 
 def pretrain(
-    trainer: Trainer,
-    source: BatchSource,
+    trainer: Trainer[Network, Batch],
+    source: BatchSource[Batch],
     folder: Path,
     *,
     about: Mapping[str, object] = MappingProxyType({}),
@@ -240,9 +197,9 @@ def pretrain(
 ) -> int:
     """Train until `trainer.config.steps`, from the checkpoint in `folder` if there is one; the number of steps done.
 
-    Writes a checkpoint, the weights in half precision, a line of JSON every few steps, and a sheet of pictures: photo,
-    target, rendered. Only process 0 writes. On the CPU, a training that was stopped and resumed ends with the same bits
-    as one that was not, because steps and batches count from the start and nothing else is random.
+    Writes a checkpoint, the weights, a line of JSON every few steps, and a sheet of pictures. Only process 0 writes. On
+    the CPU, a training that was stopped and resumed ends with the same bits as one that was not, because steps and
+    batches count from the start and nothing else is random.
 
     Args:
         trainer: The network in training; changed in place.
@@ -256,8 +213,7 @@ def pretrain(
         InputError: a checkpoint of another network, a folder that cannot be written, or a loss that is not finite.
     """
     config, process = trainer.config, trainer.process
-    if (folder / CHECKPOINT).is_file():
-        trainer.step = load_checkpoint(folder / CHECKPOINT, trainer.network, trainer.optimizer)
+    trainer.resume(folder / CHECKPOINT)
     if process.rank == 0:
         _drop_lines_after(folder / METRICS, trainer.step)
     start, first = time.perf_counter(), trainer.step
@@ -283,18 +239,17 @@ def pretrain(
                 with (folder / METRICS).open("a") as file:
                     file.write(json.dumps({"step": trainer.step, "seconds_per_step": seconds, **numbers}) + "\n")
         if process.rank == 0 and save_now:
-            save_checkpoint(folder / CHECKPOINT, trainer.network, trainer.optimizer, trainer.step)
-            notes = {"step": trainer.step, **about, **asdict(config)}
-            save_network(folder / WEIGHTS, trainer.network, notes=json.dumps(notes))
-            write_picture(folder / SHEET, to_uint8(_sheet(batch, result)))
+            trainer.save(folder / CHECKPOINT)
+            trainer.save_weights(folder / WEIGHTS, {"step": trainer.step, **about, **asdict(config)})
+            columns = [column[:SHEET_ROWS].flatten(0, 1) for column in trainer.sheet(batch, result)]
+            write_picture(folder / SHEET, to_uint8(torch.cat(columns, dim=1)))
     return trainer.step
 
 
 def _mean_metrics(result: StepResult, world: int) -> dict[str, float]:
-    """Loss, PSNR and terms of a step, averaged over the processes."""
-    names = ["loss", "psnr", *result.terms]
-    values = torch.stack([result.loss, result.psnr, *result.terms.values()])
-    return dict(zip(names, mean_over_processes(values, world).tolist(), strict=True))
+    """Loss and metrics of a step, averaged over the processes."""
+    values = {"loss": result.loss, **result.metrics}
+    return dict(zip(values, mean_over_processes(torch.stack([*values.values()]), world).tolist(), strict=True))
 
 
 def _drop_lines_after(path: Path, step: int) -> None:
@@ -302,13 +257,3 @@ def _drop_lines_after(path: Path, step: int) -> None:
     if path.is_file():
         lines = [line for line in path.read_text().splitlines() if json.loads(line)["step"] <= step]
         write_file(path, "".join(line + "\n" for line in lines).encode())
-
-
-def _sheet(batch: TrainingBatch, result: StepResult) -> Tensor:
-    """One row per hand: its photo, its first target and the rendering."""
-    targets = batch.target_images.shape[1]
-    size = batch.target_images.shape[2]
-    photos = batch.image.permute(0, 3, 1, 2)
-    photos = torch.nn.functional.interpolate(photos, size=(size, size), mode="bilinear").permute(0, 2, 3, 1)
-    columns = [photos, result.true.images[::targets], result.drawn.images.detach()[::targets]]
-    return torch.cat([column[:SHEET_HANDS].flatten(0, 1) for column in columns], dim=1)

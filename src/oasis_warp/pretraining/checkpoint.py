@@ -1,0 +1,62 @@
+"""Checkpoints: weights, Adam's moments and a JSON header in one safetensors file; loading executes nothing."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.data.output_files import write_file
+
+FORMAT = "oasis-pretraining"
+MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+def save_checkpoint(
+    path: Path, network: nn.Module, optimizer: torch.optim.Adam, step: int, identity: Mapping[str, Any]
+) -> None:
+    """Write the state after `step` steps, all or nothing; `identity` says which network it is."""
+    tensors: dict[str, Tensor] = {}
+    for name, parameter in _trained(network).items():
+        tensors[f"weights.{name}"] = parameter
+        for moment in MOMENTS:
+            # A switch may leave a part without gradients, for which Adam has no moments.
+            tensors[f"{moment}.{name}"] = optimizer.state[parameter].get(moment, torch.zeros_like(parameter))
+    stored = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    write_file(path, save(stored, {FORMAT: json.dumps({"step": step, **identity}, sort_keys=True)}))
+
+
+def load_checkpoint(path: Path, network: nn.Module, optimizer: torch.optim.Adam, identity: Mapping[str, Any]) -> int:
+    """Load a file of `save_checkpoint` into network and optimizer; the number of steps done.
+
+    Raises:
+        InputError: another format, or a checkpoint of another network.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get(FORMAT, "null"))
+            if header is None:
+                raise InputError(f"{path}: expected a checkpoint, got another safetensors file; remove it.")
+            if header != {"step": header["step"], **identity}:
+                raise InputError(
+                    f"{path}: the checkpoint of a network with other sizes or switches; choose another folder."
+                )
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+    except SafetensorError as error:
+        raise InputError(f"{path}: expected a checkpoint, got a file cut short ({error}); remove it.") from error
+    state = {}
+    for k, (name, parameter) in enumerate(_trained(network).items()):
+        parameter.data.copy_(tensors[f"weights.{name}"])
+        moments = {moment: tensors[f"{moment}.{name}"] for moment in MOMENTS}
+        state[k] = {"step": torch.tensor(float(header["step"])), **moments}
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+    return header["step"]
+
+
+def _trained(network: nn.Module) -> dict[str, nn.Parameter]:
+    return {name: parameter for name, parameter in network.named_parameters() if parameter.requires_grad}
