@@ -2,7 +2,6 @@
 
 import torch
 
-from oasis_warp.core.rotation import to_matrix
 from oasis_warp.ops.projection import Projection, project
 
 OPTIONS = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3}
@@ -36,9 +35,3 @@ def bits(result):
 def assert_equal_bits(one, other):
     for a, b in zip(bits(one), bits(other), strict=True):
         assert torch.equal(a, b)
-
-
-def covariances(scene):
-    """R S S R^T of a scene's quats and scales."""
-    half = to_matrix(torch.nn.functional.normalize(scene.quats, dim=-1)) * scene.scales[:, None]
-    return half @ half.mT

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from oasis_warp.core.rotation import to_matrix
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -32,6 +34,12 @@ class Scene:
 
     def with_(self, **changes):
         return replace(self, **changes)
+
+
+def covariances(scene):
+    """R S S R^T of a scene's quats and scales."""
+    half = to_matrix(torch.nn.functional.normalize(scene.quats, dim=-1)) * scene.scales[:, None]
+    return half @ half.mT
 
 
 def look_from(eye, target=(0.0, 0.0, 0.0)):
@@ -85,7 +93,7 @@ def frontal_scene(means, scales, opacities, width=32, height=32, focal=40.0, qua
     scales = torch.tensor([scales, 0.8 * scales, 0.6 * scales]) if isinstance(scales, float) else scales
     random_quats = torch.randn(n, 4, generator=g, dtype=torch.float64)
     random_colors = torch.rand(n, 3, generator=g, dtype=torch.float64)
-    return Scene(
+    scene = Scene(
         means=means,
         quats=random_quats if quats is None else torch.as_tensor(quats, dtype=torch.float64),
         scales=torch.as_tensor(scales, dtype=torch.float64).expand(n, 3).clone(),
@@ -96,4 +104,5 @@ def frontal_scene(means, scales, opacities, width=32, height=32, focal=40.0, qua
         backgrounds=torch.rand(1, 3, generator=g, dtype=torch.float64),
         width=width,
         height=height,
-    ).to(torch.float32).to(torch.float64)
+    )
+    return scene.to(torch.float32).to(torch.float64)

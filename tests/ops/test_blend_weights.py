@@ -54,9 +54,7 @@ def test_gradient_by_the_colors_is_that_of_the_rasterizer(device):
     g = torch.randn(scene.height, scene.width, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     g = g.to(device)
     (mine,) = torch.autograd.grad(blend_colors(weights, colors), colors, g)
-    image, *_ = rasterization(
-        *scene.gaussians, colors, scene.viewmats[:1], scene.Ks[:1], scene.width, scene.height
-    )
+    image, *_ = rasterization(*scene.gaussians, colors, scene.viewmats[:1], scene.Ks[:1], scene.width, scene.height)
     (theirs,) = torch.autograd.grad(image, colors, g[None])
     assert torch.allclose(mine, theirs, rtol=0, atol=1e-12)
 

@@ -1,4 +1,4 @@
-"""Bone transforms: twin, gradients, laws, poison values, messages."""
+"""Bone transforms against their reference, and what they owe a skeleton."""
 
 import math
 
@@ -60,16 +60,6 @@ def test_values_and_gradients_are_those_of_the_twin(seed, dtype, device):
     )
     for name, a, b in pairs:
         assert rel(a, b) < (1e-6 if dtype == torch.float32 else 1e-13), name
-
-
-def test_the_gradient_of_one_output_is_its_share_of_the_gradient_of_both():
-    arguments = skeleton(5)
-    arguments["angles"].requires_grad_()
-    out = bone_transforms(**arguments)
-    generator = torch.Generator().manual_seed(0)
-    parts = [(o * torch.randn(o.shape, generator=generator, dtype=torch.float64)).sum() for o in out]
-    shares = [torch.autograd.grad(part, arguments["angles"], retain_graph=True)[0] for part in parts]
-    torch.testing.assert_close(sum(shares), torch.autograd.grad(sum(parts), arguments["angles"])[0])
 
 
 def test_a_skeleton_of_one_bone_only_moves():
@@ -148,12 +138,6 @@ def test_axes_that_are_not_finite_are_refused():
     [
         ({"angles": torch.zeros(5, 3).double()}, r"angles: expected shape \[6, 3\], got \[5, 3\]. One row for each"),
         ({"angles": torch.zeros(2, 6, 3).double()}, r"orientation: expected shape \[2, 3, 3\], got \[3, 3\]."),
-        ({"orientation": torch.eye(4).double()}, r"orientation: expected shape \[3, 3\], got \[4, 4\]."),
-        ({"translation": torch.zeros(1, 3).double()}, r"translation: expected shape \[3\], got \[1, 3\]."),
-        ({"joints": torch.zeros(6, 3).double()}, r"joints: expected shape \[7, 3\], got \[6, 3\]. One for each"),
-        ({"axes": torch.zeros(7, 3).double()}, r"axes: expected shape \[7, 3, 3\], got \[7, 3\]. Three for each"),
-        ({"angles": torch.zeros(6, 3).half()}, "angles: expected float32 or float64, got float16."),
-        ({"joints": torch.zeros(7, 3)}, "joints: expected torch.float64 on cpu, got torch.float32 on cpu."),
         ({"parents": (-1, 0, 2, 1, 0, 4, 3)}, "parents: expected -1, then an earlier bone for each other one, got "),
         ({"parents": (0, 0, 1, 1, 0, 4, 3)}, "parents: expected -1, then an earlier bone for each other one, got "),
         ({"parents": ()}, r"parents: expected -1, then an earlier bone for each other one, got \[\]."),

@@ -1,4 +1,4 @@
-"""A plain call of an operator, which bypasses torch's dispatcher, is the custom op in all but its time."""
+"""An operator is what torch expects of a custom op: one node of a graph, whose plain calls bypass the dispatcher."""
 
 import gc
 import importlib
@@ -7,130 +7,29 @@ import warnings
 import weakref
 
 import pytest
-import test_posing_operators
 import torch
+from operator_calls import ONE_OF_EACH, assert_same_bits, calls, gradients, loss_of, mesh, results, weights_of
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from oasis_warp import ops
-from oasis_warp.ops import DECLARATIONS
+from oasis_warp.ops import DECLARATIONS, face_rotations, rest_mesh
 
-
-def spherical_harmonics():
-    g = torch.Generator().manual_seed(0)
-    directions, coefficients = torch.randn(5, 3, generator=g), torch.randn(5, 16, 3, generator=g)
-    return lambda d, c: ops.spherical_harmonics(3, d, c), [directions, coefficients]
-
-
-def gaussians(n=6):
-    g = torch.Generator().manual_seed(1)
-    means = torch.randn(n, 3, generator=g) * 0.3
-    quats, scales = torch.randn(n, 4, generator=g), torch.rand(n, 3, generator=g) * 0.2 + 0.05
-    return means, quats, scales, torch.rand(n, generator=g) * 0.8 + 0.1
-
-
-def camera():
-    viewmat = torch.eye(4)
-    viewmat[2, 3] = 2.0
-    return viewmat, torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]])
-
-
-def rasterization():
-    viewmat, K = camera()
-
-    def draw(means, quats, scales, opacities, colors, backgrounds, viewmats):
-        image, alphas, meta = ops.rasterization(
-            means, quats, scales, opacities, colors, viewmats, K[None], 17, 15, backgrounds=backgrounds,
-            render_mode="RGB+ED",
-        )  # fmt: skip
-        return image, alphas, meta["means2d"]
-
-    g = torch.Generator().manual_seed(2)
-    return draw, [*gaussians(), torch.rand(6, 3, generator=g), torch.rand(1, 3, generator=g), viewmat[None]]
-
-
-def rasterization_of_harmonics_and_covariances():
-    viewmat, K = camera()
-    means, _, scales, opacities = gaussians()
-
-    def draw(means, variances, opacities, coefficients):
-        covars = torch.diag_embed(variances)
-        image, alphas, _ = ops.rasterization(
-            means, None, None, opacities, coefficients, viewmat[None], K[None], 17, 15, covars=covars, sh_degree=1
-        )
-        return image, alphas
-
-    coefficients = torch.rand(6, 4, 3, generator=torch.Generator().manual_seed(3))
-    return draw, [means, scales.square(), opacities, coefficients]
-
-
-CASES = [spherical_harmonics, rasterization, rasterization_of_harmonics_and_covariances]
-
-
-def visibility():
-    rest, _, faces = test_posing_operators.mesh(0, 4, torch.float32)
-    K, viewmat = torch.tensor([[10.0, 0, 8], [0, 10, 8], [0, 0, 1]]), torch.eye(4)
-
-    def look(points, vertices):
-        seen = ops.depth_visibility(points, vertices, faces, K, viewmat, 16, 16, 0.1)
-        return seen.visibility, seen.depth_map
-
-    ahead = rest - torch.tensor([2.0, 2.0, -6.0])
-    return look, [ahead[:7] + 0.01, ahead]
-
-
-def cases():
-    """Of each operator and way of calling it: a function of float tensors, and these."""
-    made = {case.__name__: case() for case in CASES} | {"visibility": visibility()}
-    posing = test_posing_operators.calls()
-    return made | {name: posing[name] for name in POSING}
-
-
-POSING = "bone_transforms poses", "face_rotations poses", "pose_on_mesh poses", "pose_on_mesh_covars", "skin poses"
-NAMES = tuple(cases())
-OPERATORS = {
-    "spherical_harmonics": ["spherical_harmonics"],
-    "rasterization": ["project", "blend"],
-    "rasterization_of_harmonics_and_covariances": ["sh_to_rgb", "project", "blend"],
-    "visibility": ["depth_visibility"],
-} | {name: [name.split()[0]] for name in POSING}
-"""The custom ops that a case calls, in this order."""
+EACH = pytest.mark.parametrize("name", ONE_OF_EACH)
 
 
 class Watched(TorchDispatchMode):
-    """Does nothing but being there, and keeps the names of our ops that pass."""
+    """Does nothing but being there, and keeps the calls of our ops that pass: names and arguments."""
 
     def __init__(self):
         super().__init__()
-        self.names = []
+        self.seen = []
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         if func.namespace == "oasis_warp":
-            self.names.append(func._schema.name.removeprefix("oasis_warp::"))
+            self.seen.append((func._schema.name.removeprefix("oasis_warp::"), args))
         return func(*args, **(kwargs or {}))
-
-
-def outputs(call, inputs):
-    out = call(*inputs)
-    return [out] if isinstance(out, torch.Tensor) else list(out)
-
-
-def weighted(out):
-    return sum(((k + 1) * o).square().sum() for k, o in enumerate(out) if o.requires_grad)
-
-
-def results(name, transform=lambda leaf: leaf, call=None):
-    plain, inputs = cases()[name]
-    call = call or plain
-    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-    out = outputs(call, [transform(leaf) for leaf in leaves])
-    return [o.detach() for o in out] + list(torch.autograd.grad(weighted(out), leaves))
-
-
-def assert_same_bits(some, others):
-    assert len(some) == len(others)
-    assert all(torch.equal(a, b) for a, b in zip(some, others, strict=True))
 
 
 @pytest.mark.parametrize("name", DECLARATIONS)
@@ -143,24 +42,64 @@ def test_a_declaration_describes_its_public_function_and_names_its_reference(nam
         assert callable(getattr(importlib.import_module(f"oasis_warp.reference.{module}"), function))
 
 
-@pytest.mark.parametrize("name", [case.__name__ for case in CASES])
+@EACH
 def test_an_operator_compiles_into_one_graph_with_its_gradient(name, as_shipped):
-    call, _ = cases()[name]
     torch._dynamo.reset()
-    compiled = torch.compile(call, fullgraph=True, backend="aot_eager")
-    assert_same_bits(results(name, call=compiled), results(name))
+    compiled = torch.compile(calls()[name].function, fullgraph=True, backend="aot_eager")
+    assert_same_bits(results(name, compiled), results(name))
 
 
-@pytest.mark.parametrize("name", NAMES)
+def test_functions_without_a_gradient_compile_into_one_graph(as_shipped):
+    rest, posed, faces = mesh(2, 3, torch.float32)
+    seen = {name: calls()["depth_visibility"].arguments[name] for name in ("vertices", "faces", "viewmat", "K")}
+
+    def turned(posed, vertices):
+        covered = ops.depth_map(**seen | {"vertices": vertices}, width=16, height=16).face_ids >= 0
+        return *face_rotations(rest_mesh(rest, faces), posed, faces), covered
+
+    torch._dynamo.reset()
+    compiled = torch.compile(turned, fullgraph=True, backend="aot_eager")
+    assert_same_bits(compiled(posed, seen["vertices"]), turned(posed, seen["vertices"]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@EACH
+def test_what_torch_is_told_of_an_operator_is_true(name, dtype):
+    call = calls(dtype=dtype, n_poses=2)[name]
+    leaves = call.leaves()
+    with Watched() as watched:
+        gradients(call.function(*leaves), leaves)
+    for op, arguments in watched.seen:
+        if op.startswith("blend"):  # passes opaque buffers, which opcheck copies without what is behind them
+            continue
+        needs_gradient = not op.endswith("_backward")
+        arguments = [
+            a.detach().requires_grad_(needs_gradient and a.is_floating_point()) if isinstance(a, torch.Tensor) else a
+            for a in arguments
+        ]
+        torch.library.opcheck(getattr(torch.ops.oasis_warp, op).default, tuple(arguments))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_torch_is_told_of_ops_without_a_gradient_is_true(dtype):
+    rest, _, faces = mesh(2, 3, dtype)
+    torch.library.opcheck(torch.ops.oasis_warp.rest_mesh.default, (rest, faces, True))
+    seen = calls(dtype=dtype)["depth_visibility"].arguments
+    drawn = seen["vertices"][None], seen["faces"], seen["viewmat"][None], seen["K"][None], 16, 16, 0.01
+    for outputs in ((True, True, True), (False, True, False)):
+        torch.library.opcheck(torch.ops.oasis_warp.depth_map.default, (*drawn, *outputs, True))
+
+
+@EACH
 def test_a_plain_call_has_the_bits_of_the_custom_op(name):
     with Watched() as watched:
         through_torch = results(name)
-    forward = OPERATORS[name]
-    assert watched.names == forward + [f"{op}_backward" for op in reversed(forward)]
+    forward = calls()[name].custom_ops
+    assert [op for op, _ in watched.seen] == [*forward, *(f"{op}_backward" for op in reversed(forward))]
     assert_same_bits(results(name), through_torch)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@EACH
 def test_a_plain_call_does_not_pass_through_the_dispatcher(name):
     def ours(run):
         with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
@@ -174,37 +113,37 @@ def test_a_plain_call_does_not_pass_through_the_dispatcher(name):
     assert ours(watched) and not ours(lambda: results(name))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@EACH
 def test_a_tracer_sees_one_node_for_an_operator(name, as_shipped):
-    call, inputs = cases()[name]
-    graph = make_fx(lambda *inputs: outputs(call, inputs))(*inputs)
+    call = calls()[name]
+    graph = make_fx(call.function)(*call.inputs)
     nodes = [n.target.name() for n in graph.graph.nodes if str(n.target).startswith("oasis_warp")]
-    assert nodes == [f"oasis_warp::{op}" for op in OPERATORS[name]]
-    assert_same_bits(graph(*inputs), outputs(call, inputs))
+    assert nodes == [f"oasis_warp::{op}" for op in call.custom_ops]
+    assert_same_bits(graph(*call.inputs), call.function(*call.inputs))
 
 
 def test_fake_tensors_meet_no_kernel():
-    directions, coefficients = spherical_harmonics()[1]
+    call = calls()["spherical_harmonics"]
     mode = FakeTensorMode()
-    fakes = [mode.from_tensor(t).requires_grad_() for t in (directions, coefficients)]
+    fakes = [mode.from_tensor(t).requires_grad_() for t in call.inputs]
     for _ in range(2):
-        out = ops.spherical_harmonics(3, *fakes)  # outside of their mode, and then in it
+        (out,) = call.function(*fakes)  # outside of their mode, and then in it
         grads = torch.autograd.grad(out.sum(), fakes)
         assert [type(t) for t in (out, *grads)] == [type(fakes[0])] * 3
-        assert [t.shape for t in (out, *grads)] == [(5, 3), (5, 3), (5, 16, 3)]
+        assert [t.shape for t in (out, *grads)] == [(18, 3), (18, 3), (18, 16, 3)]
         mode.__enter__()
     mode.__exit__(None, None, None)
     mode.__exit__(None, None, None)
 
 
 @pytest.mark.parametrize("traced", [False, True])
-@pytest.mark.parametrize("name", NAMES)
-def test_a_second_derivative_is_refused_in_words(name, traced):
-    call, inputs = cases()[name]
-    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
+@EACH
+def test_a_second_derivative_is_refused(name, traced):
+    call = calls()[name]
+    leaves = call.leaves()
 
     def first():
-        return torch.autograd.grad(weighted(outputs(call, leaves)), leaves, create_graph=True)
+        return torch.autograd.grad(loss_of(call.function(*leaves)), leaves, create_graph=True)
 
     if traced:
         with Watched():
@@ -212,44 +151,44 @@ def test_a_second_derivative_is_refused_in_words(name, traced):
     else:
         grads = first()
     assert_same_bits([g.detach() for g in grads], results(name)[-len(leaves) :])
-    with pytest.raises(RuntimeError, match=f"({'|'.join(OPERATORS[name])}): expected one derivative, got a"):
+    with pytest.raises(RuntimeError, match=f"({'|'.join(call.custom_ops)}): expected one derivative, got a"):
         torch.autograd.grad(sum(g.sum() for g in grads), leaves)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@EACH
 def test_a_graph_that_is_kept_can_be_walked_again_and_else_not(name):
-    call, inputs = cases()[name]
-    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-    loss = weighted(outputs(call, leaves))
+    call = calls()[name]
+    leaves = call.leaves()
+    loss = loss_of(call.function(*leaves))
     first = torch.autograd.grad(loss, leaves, retain_graph=True)
     assert_same_bits(torch.autograd.grad(loss, leaves), first)
     with pytest.raises(RuntimeError, match="a second time"):
         torch.autograd.grad(loss, leaves)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_what_changed_under_the_graph_is_no_gradient(name):
-    call, inputs = cases()[name]
-    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-    loss = weighted(outputs(call, leaves))
+@EACH
+def test_inputs_that_changed_under_the_graph_are_refused(name):
+    call = calls()[name]
+    leaves = call.leaves()
+    out = call.function(*leaves)
     with torch.no_grad():
         for leaf in leaves:
             leaf.add_(1)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        torch.autograd.grad(loss, leaves)
+        gradients(out, leaves)
 
 
 @pytest.mark.parametrize("backward", [False, True])
-@pytest.mark.parametrize("name", NAMES)
+@EACH
 def test_nothing_lives_longer_than_its_graph(name, backward):
-    call, inputs = cases()[name]
+    call = calls()[name]
     gc.collect()
     gc.disable()  # reference counts alone have to do it: a cycle would hold the memory until the next collection
     try:
-        leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-        out = outputs(call, leaves)
+        leaves = call.leaves()
+        out = call.function(*leaves)
         if backward:
-            torch.autograd.grad(weighted(out), leaves)
+            gradients(out, leaves)
         watched = [weakref.ref(tensor) for tensor in (*leaves, *out)]
         del leaves, out
         assert not any(tensor() is not None for tensor in watched)
@@ -257,17 +196,15 @@ def test_nothing_lives_longer_than_its_graph(name, backward):
         gc.enable()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@EACH
 def test_checkpoints_and_hooks_find_what_they_look_for(name):
-    call, inputs = cases()[name]
-    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-    out = torch.utils.checkpoint.checkpoint(lambda *leaves: tuple(outputs(call, leaves)), *leaves, use_reentrant=False)
+    call = calls()[name]
+    leaves = call.leaves()
+    out = torch.utils.checkpoint.checkpoint(call.function, *leaves, use_reentrant=False)
     seen = []
     out[0].register_hook(seen.append)
-    grads = torch.autograd.grad(weighted(out), leaves)
-    plain = results(name)
-    assert_same_bits([*(o.detach() for o in out), *grads], plain)
-    assert torch.equal(seen[0], 2 * plain[0])  # of its square
+    assert_same_bits([*(o.detach() for o in out), *gradients(out, leaves)], results(name))
+    assert torch.equal(seen[0], weights_of(out)[0])
 
 
 def opposite(tensor):
@@ -277,13 +214,13 @@ def opposite(tensor):
     return lazy
 
 
-@pytest.mark.parametrize("name", NAMES)
+@EACH
 def test_memory_that_holds_the_opposite_is_read_as_what_it_stands_for(name):
-    assert_same_bits(results(name, opposite), results(name))
-    call, inputs = cases()[name]
-    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-    out = [o for o in outputs(call, leaves) if o.requires_grad]
-    incoming = [torch.rand_like(o) for o in out]
+    assert_same_bits(results(name, None, opposite), results(name))
+    call = calls()[name]
+    leaves = call.leaves()
+    out = [o for o in call.function(*leaves) if o.requires_grad]
+    incoming = weights_of(out)
     plain = torch.autograd.grad(out, leaves, incoming, retain_graph=True)
     assert_same_bits(torch.autograd.grad(out, leaves, [opposite(g) for g in incoming]), plain)
 
@@ -292,22 +229,22 @@ class Labelled(torch.Tensor):
     """A tensor of a user's own kind."""
 
 
-@pytest.mark.parametrize("name", NAMES)
+@EACH
 def test_other_kinds_of_tensors_and_default_devices_change_nothing(name, as_shipped):
     plain = results(name)
-    assert_same_bits(results(name, lambda leaf: leaf.as_subclass(Labelled)), plain)
-    call, inputs = cases()[name]
-    parameters = [torch.nn.Parameter(tensor.clone()) for tensor in inputs]
-    out = outputs(call, parameters)
-    assert_same_bits([*(o.detach() for o in out), *torch.autograd.grad(weighted(out), parameters)], plain)
+    assert_same_bits(results(name, None, lambda leaf: leaf.as_subclass(Labelled)), plain)
+    call = calls()[name]
+    parameters = [torch.nn.Parameter(tensor.clone()) for tensor in call.inputs]
+    out = call.function(*parameters)
+    assert_same_bits([*(o.detach() for o in out), *gradients(out, parameters)], plain)
     if not name.startswith("rasterization"):  # which makes tensors itself
         with torch.device("meta"):
-            elsewhere = outputs(call, inputs)
+            elsewhere = call.function(*call.inputs)
         assert_same_bits(elsewhere, plain[: len(elsewhere)])
 
 
 def test_transforms_of_functions_go_through_torch():
-    directions, coefficients = spherical_harmonics()[1]
+    directions, coefficients = calls()["spherical_harmonics"].inputs
     one_by_one = torch.stack([ops.spherical_harmonics(3, d, coefficients[0]) for d in directions])
     with warnings.catch_warnings(action="ignore"):  # that it is slow
         mapped = torch.func.vmap(lambda d: ops.spherical_harmonics(3, d, coefficients[0]))(directions)

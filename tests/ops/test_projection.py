@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from projection_runs import OPTIONS, assert_equal_bits, bits, covariances, incoming, run
-from rasterization_scenes import ordinary_scene
+from projection_runs import OPTIONS, assert_equal_bits, bits, incoming, run
+from rasterization_scenes import covariances, ordinary_scene
 from test_rasterization_stiff import CASES
 
 from oasis_kernels.constants import Rules
@@ -273,7 +273,7 @@ NARROW = """
 import sys, torch
 sys.path.insert(0, {folder!r})
 from projection_runs import bits, run
-from rasterization_scenes import ordinary_scene
+from rasterization_scenes import covariances, ordinary_scene
 torch.save(bits(run(ordinary_scene(17, n=29, cameras=2))), sys.argv[1])
 """
 

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from projection_runs import OPTIONS, assert_equal_bits, covariances, run
-from rasterization_scenes import ordinary_scene
+from projection_runs import OPTIONS, assert_equal_bits, run
+from rasterization_scenes import covariances, ordinary_scene
 from test_projection import DTYPES
 
 from oasis_warp.ops import projection as module

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from projection_runs import OPTIONS, covariances, incoming, run
-from rasterization_scenes import frontal_scene, ordinary_scene
+from projection_runs import OPTIONS, incoming, run
+from rasterization_scenes import covariances, frontal_scene, ordinary_scene
 from test_projection import DTYPES, assert_same, both
 from test_rasterization_gradcheck import safe_scene
 

@@ -149,9 +149,7 @@ def test_the_sign_and_a_power_of_two_of_a_quaternion_change_no_bit(factor, devic
 def test_the_order_in_memory_does_not_matter(device, dtype):
     scene = ordinary_scene(21, device=device, dtype=dtype)
     order = torch.randperm(len(scene.means), generator=torch.Generator().manual_seed(0)).to(device)
-    shuffled = scene.with_(
-        **{k: getattr(scene, k)[order] for k in ("means", "quats", "scales", "opacities", "colors")}
-    )
+    shuffled = scene.with_(**{k: getattr(scene, k)[order] for k in ("means", "quats", "scales", "opacities", "colors")})
     # Depths are distinct, so that the layers and with them every rounding are the same.
     assert torch.equal(draw(scene)[0], draw(shuffled)[0])
 
@@ -198,9 +196,7 @@ def test_moving_scene_and_camera_together_changes_nothing(device):
     shift = torch.tensor([0.5, -2.0, 1.0], dtype=torch.float64, device=device)
     back = torch.eye(4, dtype=torch.float64, device=device)
     back[:3, :3], back[:3, 3] = R.T, -R.T @ shift
-    moved = scene.with_(
-        means=scene.means @ R.T + shift, quats=scene.quats @ left.T, viewmats=scene.viewmats @ back
-    )
+    moved = scene.with_(means=scene.means @ R.T + shift, quats=scene.quats @ left.T, viewmats=scene.viewmats @ back)
     assert torch.allclose(draw(scene)[0], draw(moved)[0], rtol=0, atol=1e-10)
 
 
@@ -320,8 +316,6 @@ def test_a_radius_clip_drops_the_small_ones(device):
     scene = ordinary_scene(38, device=device)
     _, _, meta = rasterization(*scene.gaussians, scene.colors, scene.viewmats, scene.Ks, 37, 29)
     clip = float(meta["radii"].amax(-1).float().median())
-    _, _, clipped = rasterization(
-        *scene.gaussians, scene.colors, scene.viewmats, scene.Ks, 37, 29, radius_clip=clip
-    )
+    _, _, clipped = rasterization(*scene.gaussians, scene.colors, scene.viewmats, scene.Ks, 37, 29, radius_clip=clip)
     expected = torch.where((meta["radii"] > clip).any(-1, keepdim=True), meta["radii"], 0)
     assert torch.equal(clipped["radii"], expected)

@@ -136,9 +136,7 @@ def test_positions_of_the_arguments_are_those_of_gsplat(call):
 
 
 def test_arguments_that_are_not_contiguous_give_the_same_image(call):
-    scattered = {
-        k: torch.stack([v, v], -1)[..., 0] for k, v in call.arguments.items() if isinstance(v, torch.Tensor)
-    }
+    scattered = {k: torch.stack([v, v], -1)[..., 0] for k, v in call.arguments.items() if isinstance(v, torch.Tensor)}
     assert not scattered["means"].is_contiguous()
     assert torch.equal(call(**scattered)[0], call()[0])
 

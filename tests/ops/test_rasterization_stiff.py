@@ -193,7 +193,5 @@ def test_ordinary_scenes_do_not_feel_an_absent_low_pass(device):
 
 def test_flat_gaussians_seen_edge_on_are_skipped_without_a_low_pass(device):
     scene = frontal_scene(cloud(10), 0.0, 0.9).to(device, torch.float32)
-    image, alphas, meta = rasterization(
-        *scene.gaussians, scene.colors, scene.viewmats, scene.Ks, 32, 32, eps2d=0.0
-    )
+    image, alphas, meta = rasterization(*scene.gaussians, scene.colors, scene.viewmats, scene.Ks, 32, 32, eps2d=0.0)
     assert torch.isfinite(image).all() and not alphas.any() and not meta["radii"].any()

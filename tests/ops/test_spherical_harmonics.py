@@ -180,7 +180,7 @@ def test_a_far_camera_sees_the_same_colours(device):
     scene, coefficients = scene_and_coefficients(cameras=1, dtype=torch.float32)
     shift = torch.tensor([1024.0, -512.0, 2048.0])
     far = scene.viewmats.double().clone()
-    far[:, :3, 3] -= (far[:, :3, :3] @ shift.double())
+    far[:, :3, 3] -= far[:, :3, :3] @ shift.double()
     # Means on a grid that float32 still holds at that distance.
     near = scene.with_(means=(scene.means * 1024).round() / 1024).to(device)
     moved = near.with_(means=near.means + shift.to(device), viewmats=far.to(torch.float32).to(device))

@@ -259,9 +259,7 @@ def test_nothing_is_written_past_a_buffer_nor_read_from_there(name, channels, ti
     frame, flags = Frame(scene.width, scene.height, tile_size), GradientFlags(True, True, True)
 
     def run(copy):
-        splats = Splats(
-            *map(copy, (p.records, opacities, colors, backgrounds))
-        )
+        splats = Splats(*map(copy, (p.records, opacities, colors, backgrounds)))
         *plain, nothing = blend_strips.draw(splats, frame, False)
         *drawn, saved = blend_strips.draw(splats, frame, True)
         assert nothing is None and saved is not None

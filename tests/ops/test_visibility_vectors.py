@@ -30,9 +30,7 @@ def sheet(generator, width, height, spacing, roughness):
     pixels = torch.stack([x, y], -1).double().reshape(-1, 2) * spacing - spacing
     depths = 2 + roughness * normal(generator, len(pixels)).clamp(-3, 3)
     a = (torch.arange(rows - 1)[:, None] * columns + torch.arange(columns - 1)).reshape(-1)
-    faces = torch.cat(
-        [torch.stack([a, a + 1, a + columns + 1], 1), torch.stack([a, a + columns + 1, a + columns], 1)]
-    )
+    faces = torch.cat([torch.stack([a, a + 1, a + columns + 1], 1), torch.stack([a, a + columns + 1, a + columns], 1)])
     return pixels, depths, faces
 
 
@@ -62,9 +60,7 @@ def one_surface_triangulated_twice(generator, K, width, height):
     pixels, _, faces = sheet(generator, width, height, 4.0, 0.0)
     columns = int(width / 4.0) + 3
     a = faces[: len(faces) // 2, 0]
-    other = torch.cat(
-        [torch.stack([a, a + 1, a + columns], 1), torch.stack([a + 1, a + columns + 1, a + columns], 1)]
-    )
+    other = torch.cat([torch.stack([a, a + 1, a + columns], 1), torch.stack([a + 1, a + columns + 1, a + columns], 1)])
     depths = 1 / (0.5 + 1e-3 * (pixels @ torch.tensor([0.7, -0.4], dtype=torch.float64)))  # a tilted plane
     faces = torch.cat([faces, other])
     return unproject(pixels, depths, K), faces[torch.randperm(len(faces), generator=generator)]

@@ -86,14 +86,23 @@ def check_finite(**tensors: Tensor | None) -> None:
             )
 
 
+def check_integer(name: str, tensor: Tensor) -> None:
+    """Check that `tensor` is int32 or int64.
+
+    Raises:
+        ValueError: another dtype.
+    """
+    if tensor.dtype not in (torch.int32, torch.int64):
+        raise ValueError(_sentence(name, "int32 or int64", str(tensor.dtype).removeprefix("torch."), ""))
+
+
 def check_index(name: str, tensor: Tensor, size: int, what: str) -> None:
     """Check that integer `tensor` lies in [0, size).
 
     Raises:
         ValueError: not an integer tensor, or an index out of range.
     """
-    if tensor.dtype not in (torch.int32, torch.int64):
-        raise ValueError(_sentence(name, "int32 or int64", str(tensor.dtype).removeprefix("torch."), ""))
+    check_integer(name, tensor)
     if tensor.numel():
         low, high = (int(v) for v in torch.aminmax(tensor))
         if low < 0 or high >= size:

@@ -84,9 +84,7 @@ def blend_weights(
     check_shape("viewmat", viewmat, 4, 4)
     check_shape("K", K, 3, 3)
     check_gaussians(means, quats, scales, None, opacities)
-    check_cameras(
-        viewmat[None], K[None], means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size
-    )
+    check_cameras(viewmat[None], K[None], means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size)
     n, pixels = len(means), width * height
     with torch.no_grad():
         projection = project(

@@ -145,6 +145,4 @@ def bone_transforms(
         {"A": n_joints - 1, "J": n_joints}, angles=angles, orientation=orientation, translation=translation,
         joints=joints, axes=axes,
     )  # fmt: skip
-    return BoneTransforms(
-        *_OPERATOR(angles, orientation, translation, joints, axes, list(parents), validate)[:2]
-    )
+    return BoneTransforms(*_OPERATOR(angles, orientation, translation, joints, axes, list(parents), validate)[:2])

@@ -294,9 +294,7 @@ _REST_MESH = Operator(
 )
 
 
-def rest_mesh(
-    rest_vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], *, validate: bool = True
-) -> RestMesh:
+def rest_mesh(rest_vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], *, validate: bool = True) -> RestMesh:
     """A mesh at rest that is posed many times: `face_rotations` takes it in place of the rest vertices.
 
     It holds what `face_rotations` needs of the rest mesh, computed once instead of for every pose. Not differentiable:

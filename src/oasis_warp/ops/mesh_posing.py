@@ -225,9 +225,7 @@ def _pose_covars(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     out = _covars_outputs(rest_vertices, posed_vertices, faces, face_index)
     arguments = _stretch_arguments(rest_vertices, posed_vertices, faces, face_index, barycentrics, quats, scales)
-    launch_ranges(
-        stretch_kernels.pose, even_cuts(len(face_index)), [*arguments, *map(view, out)], like=rest_vertices
-    )
+    launch_ranges(stretch_kernels.pose, even_cuts(len(face_index)), [*arguments, *map(view, out)], like=rest_vertices)
     return out
 
 
@@ -308,7 +306,5 @@ def pose_on_mesh_covars(
         barycentrics=barycentrics, quats=quats, scales=scales,
     )  # fmt: skip
     return PosedCovars(
-        *_POSE_ON_MESH_COVARS(
-            rest_vertices, posed_vertices, faces, face_index, barycentrics, quats, scales, validate
-        )
+        *_POSE_ON_MESH_COVARS(rest_vertices, posed_vertices, faces, face_index, barycentrics, quats, scales, validate)
     )

@@ -61,9 +61,7 @@ def check_values(
         ValueError: names the argument: NaN, infinities and magnitudes above 1e15, zero quaternions, negative variances,
             opacities outside [0, 1], zero focal lengths.
     """
-    check_finite(
-        means=means, quats=quats, scales=scales, covars=covars, opacities=opacities, viewmats=viewmats, Ks=Ks
-    )
+    check_finite(means=means, quats=quats, scales=scales, covars=covars, opacities=opacities, viewmats=viewmats, Ks=Ks)
     if quats is not None:
         zeros = int((quats.detach() == 0).all(-1).sum())
         if zeros:

@@ -42,9 +42,7 @@ def _outputs(
     return means.new_empty((*batch, len(means), 3)), means.new_empty((*batch, n_covars, 3, 3))
 
 
-def _params(
-    means: Tensor, covars: Tensor | None, weights: Tensor, transforms: Tensor, **others: Any
-) -> dict[str, Any]:
+def _params(means: Tensor, covars: Tensor | None, weights: Tensor, transforms: Tensor, **others: Any) -> dict[str, Any]:
     """Parameters of the CPU and CUDA kernels; the inputs are contiguous."""
     return {
         "n": len(means), "n_joints": weights.shape[1], "means": means, "covars": covars, "weights": weights,
@@ -289,7 +287,5 @@ def skin(
         strengths=strengths,
     )  # fmt: skip
     affine = transforms if rows == 3 else transforms[..., :3, :]
-    out_means, out_covars = _OPERATOR(
-        means, covars, weights, affine, displacements, strengths, rotation_only, validate
-    )
+    out_means, out_covars = _OPERATOR(means, covars, weights, affine, displacements, strengths, rotation_only, validate)
     return Skinned(out_means, None if covars is None else out_covars)

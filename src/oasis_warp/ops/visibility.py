@@ -5,7 +5,7 @@ from typing import NamedTuple
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_warp.core.checks import check_positive
+from oasis_warp.core.checks import check_integer, check_positive
 from oasis_warp.ops._runtime.declaration import Array, Operator, needs_gradient
 from oasis_warp.ops._runtime.depth_buffer import draw, gradients
 from oasis_warp.ops._runtime.depth_scene import BufferParts, DepthScene, Query, empty_buffer, empty_scores
@@ -154,6 +154,8 @@ def depth_visibility(
     batch = sizes.get("B", 1)
     keep = needs_gradient(points, vertices)
     by_identity = not literal and point_vertices is not None
+    if point_vertices is not None:
+        check_integer("point_vertices", point_vertices)
     visibility, depth, face_ids, _, _ = _OPERATOR(
         expand_batch(points, batch), expand_batch(vertices, batch), faces, expand_batch(viewmat.detach(), batch),
         expand_batch(K.detach(), batch), point_vertices, by_identity, width, height, near_plane, tau,

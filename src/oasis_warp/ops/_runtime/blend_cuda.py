@@ -63,9 +63,7 @@ def _layout(colors: Tensor, frame: Frame) -> Layout:
     across, down = -(-width // tiles_cuda.TILE), -(-height // tiles_cuda.TILE)
     n_tiles = n_cameras * across * down
     segments = tiles_cuda.SEGMENTS if n_tiles * (channels + 1) <= MOST_CHECKPOINTS else 1
-    return Layout(
-        n_cameras, n, channels, across, down, width, height, n_tiles, n_cameras * height * width, segments
-    )
+    return Layout(n_cameras, n, channels, across, down, width, height, n_tiles, n_cameras * height * width, segments)
 
 
 def _params(splats: Splats, layout: Layout, lists: Tensor, planes: Tensor | None) -> dict[str, Any]:

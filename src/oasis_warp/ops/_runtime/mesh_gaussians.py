@@ -90,9 +90,7 @@ def _blocks(*items: int) -> int:
     return sum(block_count(n, kernels.BLOCK) for n in items)
 
 
-def pose_float32(
-    inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int, posed: Sequence[Tensor]
-) -> None:
+def pose_float32(inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int, posed: Sequence[Tensor]) -> None:
     """Write means, quats and scales to `posed`: on the CPU for one pose, on CUDA for any number."""
     p, q, on_cuda = gaussians.p, gaussians.q, inputs.vertices.is_cuda
     inputs = PosingInputs(*(aligned if on_cuda else contiguous)(*inputs))
@@ -167,9 +165,7 @@ def _face_arguments(inputs: PosingInputs, gaussians: MeshGaussians, half_powers:
     return [*map(view, tensors), half_powers]
 
 
-def pose_float64(
-    inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int, posed: Sequence[Tensor]
-) -> None:
+def pose_float64(inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int, posed: Sequence[Tensor]) -> None:
     """`pose_float32` of one pose by the generic kernels."""
     inputs, p = PosingInputs(*contiguous(*inputs)), gaussians.p
     if gaussians.on_vertices is not None:
@@ -215,8 +211,10 @@ def backward_float64(
         "area_ratio": (ratio_rows, gaussians.on_faces),
         "vertex_area_ratio": (vertex_ratio_rows, gaussians.on_vertices),
     }
-    return gradients._replace(**{
-        name: sum_at_items(summands, index).view_as(getattr(gradients, name))
-        for name, (summands, index) in sums.items()
-        if getattr(needs, name) and index is not None
-    })
+    return gradients._replace(
+        **{
+            name: sum_at_items(summands, index).view_as(getattr(gradients, name))
+            for name, (summands, index) in sums.items()
+            if getattr(needs, name) and index is not None
+        }
+    )

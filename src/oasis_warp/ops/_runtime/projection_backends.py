@@ -91,8 +91,7 @@ def empty_outputs(means: Tensor, viewmats: Tensor, width: int, height: int) -> O
     """Memory for `OUTPUTS` and the records."""
     shape = viewmats.shape[0], means.shape[0]
     means2d, covars2d, depths, conics, radii = (
-        means.new_empty((*shape, size) if size else shape, dtype=dtype)
-        for _name, size, dtype in OUTPUTS
+        means.new_empty((*shape, size) if size else shape, dtype=dtype) for _name, size, dtype in OUTPUTS
     )
     return means2d, covars2d, depths, conics, radii, empty_records(means, *shape, width, height)
 
@@ -169,9 +168,7 @@ def project_cuda(
     return not bad[0]
 
 
-def project_generic(
-    scene: ProjectionInputs, opacities: Tensor, limits: Limits, out: Sequence[Tensor]
-) -> None:
+def project_generic(scene: ProjectionInputs, opacities: Tensor, limits: Limits, out: Sequence[Tensor]) -> None:
     """Fill `out` by the generic kernel, which does not check values."""
     rules = current_rules()
     records = tables(out[-1], len(scene.viewmats), len(scene.means), scene.means.dtype)

@@ -28,9 +28,7 @@ def warm_up(device: torch.device | str = "cpu") -> None:
         skin(vertices, None, ones[:, None], viewmat[None])
         turned = face_rotations(vertices, vertices, faces)
         each = torch.arange(4, device=device)
-        posed = pose_on_mesh(
-            vertices, faces, each, thirds, turned.vertex_quats, turned.area_ratio, quats, scales
-        )
+        posed = pose_on_mesh(vertices, faces, each, thirds, turned.vertex_quats, turned.area_ratio, quats, scales)
         depth_visibility(vertices, vertices, faces, K, viewmat, 16, 16)
         blend_weights(*posed, ones, viewmat, K, 16, 16)
         rasterization(*posed, ones, thirds, viewmat[None], K[None], 16, 16, backgrounds=ones[None, :3])
