@@ -2,6 +2,11 @@ import pytest
 import torch
 
 
+@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+def dtype(request):
+    return request.param
+
+
 @pytest.fixture
 def with_threads():
     """Calls a function while torch, and so our CPU launches, use the given number of threads."""

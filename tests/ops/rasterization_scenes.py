@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from oasis_warp.certify.rasterization_scenes import CONDITIONS as CONDITIONS_OF_CASES
+from oasis_warp.certify.rasterization_scenes import rasterization_case
 from oasis_warp.core.rotation import to_matrix
 
 
@@ -106,3 +108,21 @@ def frontal_scene(means, scales, opacities, width=32, height=32, focal=40.0, qua
         height=height,
     )
     return scene.to(torch.float32).to(torch.float64)
+
+
+def cloud(n, seed=0, spread=(1.0, 1.0, 0.6), centre=(0.0, 0.0, 3.0)):
+    """Points in a box of half sides `spread` about `centre`."""
+    g = torch.Generator().manual_seed(seed)
+    uniform = torch.rand(n, 3, generator=g, dtype=torch.float64) - 0.5
+    return 2 * uniform * torch.tensor(spread, dtype=torch.float64) + torch.tensor(centre, dtype=torch.float64)
+
+
+CONDITIONS = tuple(name for name in CONDITIONS_OF_CASES if name != "covariances")
+
+
+def stiff_scene(condition, n=40):
+    """A scene under a condition that breaks an obvious float32 implementation."""
+    floats = rasterization_case(condition, 0, n=n, size=(32, 32), n_cameras=1, channels=3, mode="RGB").floats
+    names = "means", "quats", "scales", "opacities", "viewmats", "Ks"
+    others = ordinary_scene(1, n=len(floats["means"]), cameras=1)
+    return others.with_(**{name: floats[name] for name in names}, width=32, height=32).to(torch.float64)

@@ -20,7 +20,6 @@ def weights_and_image(device, dtype, **options):
     return scene, weights, image[0], alphas[0]
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_weights_times_colors_is_the_rasterized_image(device, dtype):
     scene, weights, image, alphas = weights_and_image(device, dtype)
     rounding = 10 * torch.finfo(dtype).eps  # another order of the same sums

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from oasis_warp.core.rotation import to_matrix
 from oasis_warp.ops import rasterization
 
 SIZE = 24
@@ -50,19 +51,6 @@ def test_an_antialiased_picture_is_the_classic_one_of_faded_gaussians():
     torch.testing.assert_close(alpha, plain_alpha, rtol=1e-9, atol=1e-9)
 
 
-def test_an_antialiased_picture_has_the_right_gradients():
-    """A scene of large faint Gaussians, so that no alpha crosses a threshold within the step."""
-    means, quats, scales, opacities, colors, viewmats, Ks = scene(n=3)
-    means = torch.tensor([[0.0, 0.05, 2.0], [0.1, -0.05, 2.2], [-0.1, 0.0, 2.4]], dtype=torch.float64)
-    scales, opacities = scales * 0 + torch.tensor([0.4, 0.3, 0.35]).double(), opacities * 0 + 0.4
-
-    def draw(*inputs):
-        return rasterization(*inputs, viewmats[:1], Ks[:1], 4, 4, rasterize_mode="antialiased")[0]
-
-    inputs = [t.clone().requires_grad_() for t in (means, quats, scales, opacities, colors)]
-    assert torch.autograd.gradcheck(draw, inputs, eps=1e-6, atol=1e-6)
-
-
 def signs(like):
     """Weights of a loss, another one for each number."""
     return torch.sin(torch.arange(like.numel(), dtype=like.dtype, device=like.device)).view(like.shape)
@@ -73,8 +61,8 @@ def loss_of(render, alphas):
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
-def test_absolute_gradients_are_sums_over_pixels_of_magnitudes(device, mode):
-    *inputs, Ks = scene(device=device, n=12)
+def test_absolute_gradients_are_sums_over_pixels_of_magnitudes(device, dtype, mode):
+    *inputs, Ks = scene(dtype, device, n=12)
     inputs[0].requires_grad_()
     size = 6
     Ks = Ks * torch.tensor([[0.25], [0.25], [1.0]]).to(Ks)
@@ -91,8 +79,9 @@ def test_absolute_gradients_are_sums_over_pixels_of_magnitudes(device, mode):
             for x in range(size):
                 (gradient,) = torch.autograd.grad(by_pixel[c, y, x], plain["means2d"], retain_graph=True)
                 expected += gradient.abs()
-    torch.testing.assert_close(meta["means2d"].absgrad, expected, rtol=1e-6, atol=1e-9)
-    assert bool((meta["means2d"].absgrad >= meta["means2d"].grad.abs() - 1e-9).all())
+    rounding = 1e-4 if dtype == torch.float32 else 1e-6
+    assert (meta["means2d"].absgrad - expected).norm() <= rounding * expected.norm()
+    assert bool((meta["means2d"].absgrad >= meta["means2d"].grad.abs() - rounding * expected.max()).all())
 
 
 def test_without_a_gradient_nothing_is_recorded():
@@ -112,48 +101,12 @@ def test_an_orthographic_camera_shifts_and_scales_alone(device):
     torch.testing.assert_close(meta["means2d"][drawn], expected[drawn], rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(meta["depths"], at[..., 2], rtol=1e-9, atol=1e-9)
 
-    factor = rotations(quats) * scales[:, None]
+    factor = to_matrix(torch.nn.functional.normalize(quats, dim=1)) * scales[:, None]
     rows = viewmats[:, None, :2, :3] @ (factor @ factor.mT) @ viewmats[:, None, :2, :3].mT
     focal = Ks[:, None, [0, 1], [0, 1]]
     covariance = rows * focal[..., :, None] * focal[..., None, :] + EPS2D * torch.eye(2).to(rows)
     found = torch.linalg.inv(matrices(meta["conics"][drawn]))
     torch.testing.assert_close(found, covariance[drawn], rtol=1e-7, atol=1e-9)
-
-
-def rotations(quats):
-    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
-    return torch.stack(rows, -1).view(-1, 3, 3)
-
-
-def test_an_orthographic_picture_has_the_right_gradients():
-    means, quats, scales, opacities, colors, viewmats, Ks = scene(n=3)
-    means = torch.tensor([[0.0, 0.05, 2.0], [0.1, -0.05, 2.2], [-0.1, 0.0, 2.4]], dtype=torch.float64)
-    scales, opacities = scales * 0 + torch.tensor([0.4, 0.3, 0.35]).double(), opacities * 0 + 0.4
-    Ks = Ks[:1] * torch.tensor([[0.1], [0.1], [1.0]]).double()
-
-    def draw(*inputs):
-        *gaussians, viewmats = inputs
-        return rasterization(*gaussians, viewmats, Ks, 4, 4, camera_model="ortho", render_mode="RGB+D")[0]
-
-    inputs = [t.clone().requires_grad_() for t in (means, quats, scales, opacities, colors, viewmats[:1])]
-    assert torch.autograd.gradcheck(draw, inputs, eps=1e-6, atol=1e-6)
-
-
-def test_float32_agrees_with_float64(device):
-    pictures = []
-    for dtype in (torch.float32, torch.float64):
-        *inputs, Ks = scene(dtype, device)
-        inputs[0].requires_grad_()
-        options = {"camera_model": "ortho", "rasterize_mode": "antialiased", "absgrad": True}
-        render, alphas, meta = rasterization(*inputs, Ks, SIZE, SIZE, **options)
-        loss_of(render, alphas).backward()
-        pictures.append((render, inputs[0].grad, meta["means2d"].absgrad))
-    for single, double in zip(*pictures, strict=True):
-        error = (single.detach().double() - double.detach()).norm() / double.detach().norm()
-        assert float(error) < 1e-4
 
 
 @pytest.mark.parametrize("option", [{"rasterize_mode": "smooth"}, {"camera_model": "fisheye"}])

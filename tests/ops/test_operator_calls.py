@@ -62,7 +62,6 @@ def test_functions_without_a_gradient_compile_into_one_graph(as_shipped):
     assert_same_bits(compiled(posed, seen["vertices"]), turned(posed, seen["vertices"]))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @EACH
 def test_what_torch_is_told_of_an_operator_is_true(name, dtype):
     call = calls(dtype=dtype, n_poses=2)[name]
@@ -80,7 +79,6 @@ def test_what_torch_is_told_of_an_operator_is_true(name, dtype):
         torch.library.opcheck(getattr(torch.ops.oasis_warp, op).default, tuple(arguments))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_what_torch_is_told_of_ops_without_a_gradient_is_true(dtype):
     rest, _, faces = mesh(2, 3, dtype)
     torch.library.opcheck(torch.ops.oasis_warp.rest_mesh.default, (rest, faces, True))

@@ -23,7 +23,6 @@ from operator_calls import (
 from oasis_warp.ops import DECLARATIONS
 from oasis_warp.ops._runtime import launch
 
-DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 EVERY_CALL = pytest.mark.parametrize("name", NAMES)
 SHARED = {
     "bone_transforms poses": {"joints"},
@@ -167,7 +166,6 @@ def test_a_value_that_is_not_finite_is_refused_by_the_name_of_its_input(name, va
 
 
 @pytest.mark.parametrize("empty", [False, True])
-@DTYPES
 @EVERY_CALL
 def test_nothing_comes_out_that_nobody_wrote(name, dtype, empty, device):
     plain = results(name, dtype=dtype, empty=empty, device=device)
@@ -310,7 +308,6 @@ def test_narrower_vectors_give_the_same_results(flags, tmp_path):
 # Poses
 
 
-@DTYPES
 @pytest.mark.parametrize("name", SHARED)
 def test_many_poses_in_one_call_are_what_as_many_calls_give(name, dtype, device):
     call = calls(dtype=dtype, device=device)[name]
@@ -328,7 +325,6 @@ def test_many_poses_in_one_call_are_what_as_many_calls_give(name, dtype, device)
         assert (a - b).norm() <= (2e-6 if dtype == torch.float32 else 1e-14) * b.norm()
 
 
-@DTYPES
 @pytest.mark.parametrize("name", SHARED)
 def test_no_poses_give_empty_results_and_zero_gradients(name, dtype, device):
     call = calls(dtype=dtype, device=device)[name]

@@ -1,16 +1,9 @@
 """Projection: the vector kernels of the CPU against the generic float64 one, and laws that both obey."""
 
-import os
-import platform
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
-from projection_runs import OPTIONS, assert_equal_bits, bits, incoming, run
-from rasterization_scenes import covariances, ordinary_scene
-from test_rasterization_stiff import CASES
+from projection_runs import OPTIONS, assert_equal_bits, incoming, run
+from rasterization_scenes import CONDITIONS, covariances, ordinary_scene, stiff_scene
 
 from oasis_kernels.constants import Rules
 from oasis_warp.ops import projection as module
@@ -20,7 +13,6 @@ from oasis_warp.ops.projection import Projection, project
 
 # Both kernels compute in float64: what differs is the rounding of the stored float32, 6e-8 relative.
 ROUNDING = 2e-7
-DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 
 
 NAMES = (*Projection._fields[:-1], *Tables._fields)
@@ -53,9 +45,9 @@ def test_vectors_equal_the_generic_kernel_on_ordinary_scenes(seed):
     assert_same(*both(ordinary_scene(seed, n=100 + 7 * seed, cameras=1 + seed)))
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", CONDITIONS)
 def test_vectors_equal_the_generic_kernel_on_stiff_scenes(name):
-    assert_same(*both(CASES[name][0]))
+    assert_same(*both(stiff_scene(name)))
 
 
 @pytest.mark.parametrize(
@@ -101,7 +93,6 @@ def test_vectors_bear_cameras_far_from_the_origin():
 
 
 @pytest.mark.parametrize("n", [0, 1, 7, 8, 9, 15, 16, 17])
-@DTYPES
 def test_the_first_gaussians_do_not_depend_on_how_many_follow(n, dtype):
     scene = ordinary_scene(8, n=40, cameras=2, dtype=dtype)
     few = scene.with_(**{k: getattr(scene, k)[:n] for k in ("means", "quats", "scales", "opacities")})
@@ -127,73 +118,6 @@ def incoming_like(scene, projection):
     return [torch.randn(size, generator=g).to(out) for size, out in zip(sizes, projection, strict=False)]
 
 
-@DTYPES
-def test_threads_and_repetition_change_no_bit(dtype, with_threads):
-    scene = ordinary_scene(9, n=3001, cameras=2, dtype=dtype)
-    alone = with_threads(1, run, scene)
-    assert_equal_bits(alone, with_threads(1, run, scene))
-    for n_threads in (2, 3, 4):
-        assert_equal_bits(alone, with_threads(n_threads, run, scene))
-
-
-@DTYPES
-def test_strided_and_broadcast_inputs_are_read_as_they_are(dtype, device):
-    scene = ordinary_scene(10, n=21, dtype=dtype, device=device)
-    scene = scene.with_(scales=scene.scales[:1].expand(21, 3), Ks=scene.Ks[:1].expand(2, 3, 3))
-
-    def strided(t):
-        wide = torch.full((*t.shape[:-1], 2 * t.shape[-1]), float("nan"), dtype=t.dtype, device=t.device)
-        wide[..., ::2] = t
-        return wide[..., ::2]
-
-    names = "means", "quats", "viewmats", "opacities"
-    apart = scene.with_(**{k: strided(getattr(scene, k)) for k in names})
-    plain = scene.with_(scales=scene.scales.contiguous(), Ks=scene.Ks.contiguous())
-    assert not apart.means.is_contiguous() and apart.scales.stride(0) == 0
-    assert_equal_bits(run(apart), run(plain))
-
-
-@DTYPES
-def test_strided_and_broadcast_gradients_are_read_as_they_are(dtype, device):
-    scene = ordinary_scene(11, n=21, dtype=dtype, device=device)
-    means = scene.means.clone().requires_grad_()
-    out = project(
-        means, scene.quats, scene.scales, scene.opacities, scene.viewmats, scene.Ks, scene.width, scene.height,
-        **OPTIONS,
-    )  # fmt: skip
-    one = torch.ones((), dtype=dtype, device=device)
-    broadcast = [one.to(t).expand(t.shape) for t in out[:3]]
-    got = torch.autograd.grad(out[:3], means, broadcast, retain_graph=True)[0]
-    assert torch.equal(got, torch.autograd.grad(out[:3], means, [t.contiguous() for t in broadcast])[0])
-
-
-@DTYPES
-def test_each_gradient_is_the_same_alone_and_with_the_others(dtype, device):
-    scene = ordinary_scene(12, dtype=dtype, device=device)
-    together = run(scene)[1]
-    for name, want in together.items():
-        assert torch.equal(run(scene, by=(name,))[1][name], want), name
-
-
-@DTYPES
-def test_gradients_of_single_outputs_add_up(dtype, device):
-    scene = ordinary_scene(13, dtype=torch.float64).to(device, dtype)
-    inputs = [getattr(scene, k).clone().requires_grad_() for k in ("means", "quats", "scales", "viewmats")]
-    out = project(*inputs[:3], scene.opacities, inputs[3], scene.Ks, scene.width, scene.height, **OPTIONS)
-    given = incoming(out)
-
-    def gradients(outputs, g):
-        found = torch.autograd.grad(outputs, inputs, g, retain_graph=True, allow_unused=True)
-        return [torch.zeros_like(t) if f is None else f for t, f in zip(inputs, found, strict=True)]
-
-    whole = gradients(out[:3], given)
-    parts = [gradients([o], [g]) for o, g in zip(out[:3], given, strict=True)]
-    error = 1e-5 if dtype == torch.float32 else 1e-13
-    for total, *terms in zip(whole, *parts, strict=True):
-        assert float((sum(terms) - total).norm()) <= error * float(total.norm())
-
-
-@DTYPES
 def test_gaussians_that_are_not_drawn_pass_on_the_gradient_of_depth_only(dtype, device):
     scene = ordinary_scene(14, n=19, dtype=dtype, device=device)
     inputs = [getattr(scene, k).clone().requires_grad_() for k in ("means", "quats", "scales")]
@@ -208,7 +132,6 @@ def test_gaussians_that_are_not_drawn_pass_on_the_gradient_of_depth_only(dtype, 
     assert not g_quats.any() and not g_scales.any()
 
 
-@DTYPES
 def test_rules_decide_what_is_drawn_and_how_far_it_reaches(dtype, device):
     scene = ordinary_scene(15, dtype=dtype, device=device)
     plain, _ = run(scene)
@@ -267,23 +190,3 @@ def test_nothing_is_read_or_written_beside_the_arrays(n, with_covars, monkeypatc
     assert len(wholes) == 2 * (6 + 5)
     for whole in wholes:
         assert (whole[:GUARD] == 77).all() and (whole[-GUARD:] == 77).all()
-
-
-NARROW = """
-import sys, torch
-sys.path.insert(0, {folder!r})
-from projection_runs import bits, run
-from rasterization_scenes import covariances, ordinary_scene
-torch.save(bits(run(ordinary_scene(17, n=29, cameras=2))), sys.argv[1])
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="flags of x86")
-@pytest.mark.parametrize("flags", ["-target-cpu x86-64-v3", "-target-cpu x86-64-v2"])
-def test_narrower_vectors_give_the_same(flags, tmp_path):
-    script = NARROW.format(folder=str(Path(__file__).parent))
-    environment = os.environ | {"OASIS_WARP_CPU_FLAGS": flags}
-    subprocess.run([sys.executable, "-c", script, str(tmp_path / "out.pt")], env=environment, check=True, timeout=250)
-    for a, b in zip(torch.load(tmp_path / "out.pt"), bits(run(ordinary_scene(17, n=29, cameras=2))), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-7 * float(b.abs().max()))

@@ -2,11 +2,9 @@
 
 import pytest
 import torch
-from projection_runs import OPTIONS, assert_equal_bits, run
+from projection_runs import OPTIONS, run
 from rasterization_scenes import covariances, ordinary_scene
-from test_projection import DTYPES
 
-from oasis_warp.ops import projection as module
 from oasis_warp.ops._runtime.records import Tables
 from oasis_warp.ops.projection import Projection, project
 
@@ -21,7 +19,6 @@ def spoiled(tensor, value, place):
     return copy
 
 
-@DTYPES
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 2e15])
 @pytest.mark.parametrize("name", [*TENSORS, "covars"])
 @pytest.mark.parametrize("place", [0, -1])
@@ -36,7 +33,6 @@ def test_values_that_are_not_finite_are_refused_by_name(name, value, place, dtyp
         run(scene, covars, validate=True)
 
 
-@DTYPES
 @pytest.mark.parametrize("place", [0, 7, 8, 18])
 @pytest.mark.parametrize(
     ("name", "value", "words"),
@@ -54,7 +50,6 @@ def test_a_value_out_of_range_is_refused_wherever_it_stands(name, value, words, 
         run(scene.with_(**{name: tensor}), validate=True)
 
 
-@DTYPES
 @pytest.mark.parametrize("entry", [(0, 0), (1, 1)])
 def test_a_focal_length_of_zero_is_refused(entry, dtype):
     scene = ordinary_scene(42, n=N, dtype=dtype)
@@ -64,7 +59,6 @@ def test_a_focal_length_of_zero_is_refused(entry, dtype):
         run(scene.with_(Ks=Ks), validate=True)
 
 
-@DTYPES
 def test_a_negative_variance_is_refused(dtype):
     scene = ordinary_scene(43, n=N, dtype=dtype)
     covars = covariances(scene)
@@ -73,7 +67,6 @@ def test_a_negative_variance_is_refused(dtype):
         run(scene, covars, validate=True)
 
 
-@DTYPES
 def test_values_are_looked_at_where_there_is_nothing_to_project(dtype):
     scene = ordinary_scene(44, n=N, dtype=dtype)
     none = scene.with_(**{k: getattr(scene, k)[:0] for k in ("means", "quats", "scales", "opacities")})
@@ -82,7 +75,6 @@ def test_values_are_looked_at_where_there_is_nothing_to_project(dtype):
         run(none.with_(viewmats=spoiled(scene.viewmats, float("nan"), 0)), validate=True)
 
 
-@DTYPES
 def test_extreme_values_within_the_limits_are_accepted(dtype):
     scene = ordinary_scene(45, n=N, dtype=dtype)
     opacities = scene.opacities.clone()
@@ -95,7 +87,6 @@ def test_extreme_values_within_the_limits_are_accepted(dtype):
     assert all(torch.isfinite(t).all() for t in [*checked[0], *checked[1].values()])
 
 
-@DTYPES
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("name", ["means", "quats", "scales"])
 def test_unchecked_a_bad_gaussian_is_not_drawn_and_harms_no_other(name, value, dtype, device):
@@ -142,36 +133,3 @@ def test_only_places_shapes_and_depths_have_gradients(device):
     )  # fmt: skip
     with_gradient = {name for name, t in zip(Projection._fields, out, strict=True) if t.requires_grad}
     assert with_gradient == {"means2d", "covars2d", "depths"}
-
-
-def arguments(scene, covars=None, wanted=True):
-    """Of the forward op."""
-    leaf = (lambda t: t.clone().requires_grad_()) if wanted else (lambda t: t.clone())
-    shape = [leaf(scene.quats), leaf(scene.scales), None] if covars is None else [None, None, leaf(covars)]
-    return [
-        leaf(scene.means), *shape, scene.opacities, leaf(scene.viewmats), scene.Ks, scene.width, scene.height,
-        False, list(OPTIONS.values()), True,
-    ]  # fmt: skip
-
-
-@DTYPES
-@pytest.mark.parametrize("with_covars", [False, True], ids=["quats", "covars"])
-def test_torch_finds_the_operators_well_formed(with_covars, dtype, device):
-    scene = ordinary_scene(50, n=N, dtype=dtype, device=device)
-    covars = covariances(scene) if with_covars else None
-    forward = arguments(scene, covars)
-    torch.library.opcheck(torch.ops.oasis_warp.project, forward)
-    means, quats, scales, covars, _opacities, viewmats, Ks, *_ = arguments(scene, covars, wanted=False)
-    out = Projection(*module._OPERATOR(*arguments(scene, covars, wanted=False)))
-    given = [torch.ones_like(t) for t in out[:3]]
-    wanted = [True, not with_covars, False, with_covars, True]
-    torch.library.opcheck(
-        torch.ops.oasis_warp.project_backward,
-        (means, quats, scales, covars, viewmats, Ks, out.radii, scene.width, scene.height, False, *given, wanted),
-    )
-
-
-@DTYPES
-def test_looking_at_values_changes_no_bit(dtype, device):
-    scene = ordinary_scene(52, n=N, dtype=dtype, device=device)
-    assert_equal_bits(run(scene, validate=True), run(scene, validate=False))

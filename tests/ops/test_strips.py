@@ -1,26 +1,49 @@
 """The vector kernels of the CPU: against the generic ones, by themselves, and what they do to memory."""
 
-import os
-import platform
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
-from rasterization_scenes import frontal_scene, ordinary_scene
-from test_rasterization import GRADIENT_ERROR, INPUTS, VALUE_ERROR, draw, rel, sound_pixels, values_and_gradients
-from test_rasterization_stiff import CASES
+from rasterization_scenes import CONDITIONS, frontal_scene, ordinary_scene, stiff_scene
+from test_rasterization import INPUTS, draw
 
 from oasis_kernels.constants import Rules
-from oasis_warp.ops import blending, rasterization
+from oasis_warp.ops import blending
 from oasis_warp.ops._runtime import blend_strips, tiles
 from oasis_warp.ops._runtime.records import Frame, GradientFlags, Splats
 from oasis_warp.ops._runtime.rules import using
 from oasis_warp.ops._runtime.tiles import opaque_elements
 from oasis_warp.ops.projection import project
+from oasis_warp.reference import rasterization as reference
 
 SIZES = [(1, 1), (16, 16), (257, 2), (2, 65), (65, 63)]
+
+
+VALUE_ERROR, GRADIENT_ERROR = 5e-6, 5e-5
+"""Rel-L2 of a careful float32 rasterizer against float64 is below 1e-6 in values and 2e-5 in gradients."""
+
+
+def rel(a, b):
+    scale = b.norm()
+    return float((a.double().cpu() - b).norm() / scale) if scale > 0 else float(a.abs().max())
+
+
+def values_and_gradients(scene, keep=None, **options):
+    """Image, alpha and the gradients of a randomly signed sum over them; pixels not in `keep` do not count."""
+    inputs = {name: getattr(scene, name).detach().clone().requires_grad_() for name in INPUTS}
+    image, alphas = draw(scene.with_(**inputs), **options)
+    g = torch.Generator().manual_seed(0)
+    loss = 0
+    for out in (image, alphas):
+        weight = torch.randint(0, 2, out.shape, generator=g).to(out) * 2 - 1
+        if keep is not None:
+            weight = weight * keep[..., None].to(out)
+        loss = loss + (out * weight).sum()
+    return image.detach(), alphas.detach(), torch.autograd.grad(loss, list(inputs.values()), allow_unused=True)
+
+
+def sound_pixels(scene, **options):
+    """Pixels [C, H, W] where no decision hangs on rounding."""
+    views = scene.viewmats, scene.Ks, scene.width, scene.height
+    return ~reference.rasterization(*scene.gaussians, scene.colors, *views, dense=True, **options).fragile
 
 
 def generically(monkeypatch, function, *args, **options):
@@ -36,9 +59,9 @@ def assert_same_picture(scene, monkeypatch, value_error=None, gradient_error=Non
     generic = generically(monkeypatch, values_and_gradients, scene, keep=keep, **options)
     for got, want in zip(strips[:2], generic[:2], strict=True):
         seen = keep[..., None].to(got)
-        assert rel(got * seen, (want * seen).double()) <= (value_error or VALUE_ERROR[torch.float32])
+        assert rel(got * seen, (want * seen).double()) <= (value_error or VALUE_ERROR)
     for name, got, want in zip(INPUTS, strips[2], generic[2], strict=True):
-        assert rel(got, want.double()) <= (gradient_error or GRADIENT_ERROR[torch.float32]), name
+        assert rel(got, want.double()) <= (gradient_error or GRADIENT_ERROR), name
 
 
 def assert_equal_bits(a, b):
@@ -70,9 +93,9 @@ def test_images_that_end_in_mid_vector_are_drawn_as_tiles_draw_them(size, monkey
     assert_same_picture(ordinary_scene(3, width=size[0], height=size[1]), monkeypatch)
 
 
-@pytest.mark.parametrize("name", ["opaque stack", "3000 faint layers", "larger than the image", "at the near plane"])
+@pytest.mark.parametrize("name", CONDITIONS)
 def test_stiff_scenes_are_drawn_as_tiles_draw_them(name, monkeypatch):
-    assert_same_picture(CASES[name][0].to(torch.float32), monkeypatch, 1e-5, 1e-4)
+    assert_same_picture(stiff_scene(name).to(torch.float32), monkeypatch, 1e-5, 1e-4)
 
 
 def test_a_loss_on_alpha_alone_gives_the_gradients_that_tiles_give(monkeypatch):
@@ -87,7 +110,7 @@ def test_a_loss_on_alpha_alone_gives_the_gradients_that_tiles_give(monkeypatch):
     strips, generic = gradients(), generically(monkeypatch, gradients)
     assert not strips[4].any() and not strips[5].any()
     for got, want in zip(strips[:4], generic[:4], strict=True):
-        assert rel(got, want.double()) <= GRADIENT_ERROR[torch.float32]
+        assert rel(got, want.double()) <= GRADIENT_ERROR
 
 
 @pytest.mark.parametrize("rules", [
@@ -141,17 +164,6 @@ def test_cameras_together_or_apart_give_the_same_bits():
         )
         image, alphas = draw(one)
         assert torch.equal(image[0], together[0][c]) and torch.equal(alphas[0], together[1][c])
-
-
-@pytest.mark.parametrize("name", ["opacities", "colors", "backgrounds", "means"])
-def test_a_gradient_asked_for_alone_has_the_same_bits(name):
-    scene = ordinary_scene(10)
-    together = dict(zip(INPUTS, values_and_gradients(scene)[2], strict=True))[name]
-    leaf = getattr(scene, name).clone().requires_grad_()
-    image, alphas = draw(scene.with_(**{name: leaf}))
-    g = torch.Generator().manual_seed(0)
-    loss = sum((out * (torch.randint(0, 2, out.shape, generator=g).to(out) * 2 - 1)).sum() for out in (image, alphas))
-    assert torch.equal(torch.autograd.grad(loss, leaf)[0], together)
 
 
 # Lists
@@ -235,7 +247,7 @@ class Guards:
 
 MEMORY_SCENES = {
     **{f"{w}x{h}": ordinary_scene(12, n=40, width=w, height=h) for w, h in SIZES},
-    "larger than the image": frontal_scene(CASES["larger than the image"][0].means, 40.0, 0.3, 33, 17),
+    "larger than the image": stiff_scene("larger than the image").with_(width=33, height=17),
     "all culled": ordinary_scene(13, n=40).with_(opacities=torch.zeros(40)),
     "none": ordinary_scene(14, n=0),
     "one": ordinary_scene(15, n=1),
@@ -295,39 +307,3 @@ def test_two_pictures_before_their_gradients_keep_apart():
         losses.append(sum((o * (torch.randint(0, 2, o.shape, generator=g).to(o) * 2 - 1)).sum() for o in outs))
     for loss, means, expected in zip(losses, leaves, alone, strict=True):
         assert torch.equal(torch.autograd.grad(loss, means)[0], expected)
-
-
-def test_broadcast_colors_and_gradients_are_taken():
-    scene = ordinary_scene(18)
-    gray = torch.rand(1, 1, generator=torch.Generator().manual_seed(0)).expand(60, 3).requires_grad_()
-    image, *_ = rasterization(*scene.gaussians, gray, scene.viewmats, scene.Ks, scene.width, scene.height)
-    (g,) = torch.autograd.grad(image.sum(), gray)  # the incoming gradient has stride 0
-    dense = gray.detach().clone().requires_grad_()
-    again, *_ = rasterization(*scene.gaussians, dense, scene.viewmats, scene.Ks, scene.width, scene.height)
-    assert torch.equal(image, again)
-    assert torch.equal(g, torch.autograd.grad(again, dense, torch.ones_like(again))[0])
-
-
-CPU_FLAGS = "-target-cpu x86-64-v3", "-target-cpu x86-64-v2"
-ANOTHER_CPU = """
-import sys
-import torch
-sys.path[:0] = [{tests!r}, {tests!r} + "/ops"]
-from rasterization_scenes import ordinary_scene
-from test_rasterization import values_and_gradients
-torch.save(values_and_gradients(ordinary_scene(19)), {file!r})
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the flags are of x86")
-@pytest.mark.parametrize("flags", CPU_FLAGS)
-def test_kernels_for_cpus_with_narrower_vectors_draw_the_same(flags, tmp_path):
-    file = tmp_path / "picture.pt"
-    script = ANOTHER_CPU.format(tests=str(Path(__file__).parents[1]), file=str(file))
-    environment = os.environ | {"OASIS_WARP_CPU_FLAGS": flags}
-    subprocess.run([sys.executable, "-c", script], env=environment, check=True, timeout=280)
-    here, there = values_and_gradients(ordinary_scene(19)), torch.load(file)
-    assert rel(there[0], here[0].double()) <= 1e-6 and rel(there[1], here[1].double()) <= 1e-6
-    for name, got, want in zip(INPUTS, there[2], here[2], strict=True):
-        assert rel(got, want.double()) <= 1e-5, name

@@ -64,7 +64,6 @@ def seen_by_twin(vertices, faces, viewmat, K):
     return twin.depth_map(vertices, faces, Camera(viewmat, K, WIDTH, HEIGHT))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("near", [False, True])
 @pytest.mark.parametrize("seed", range(4))
 def test_depths_faces_and_barycentrics_are_those_of_the_twin(seed, near, dtype, device, way):
@@ -81,7 +80,6 @@ def test_depths_faces_and_barycentrics_are_those_of_the_twin(seed, near, dtype, 
     assert (want[1] >= 0).any()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("seed", range(3))
 def test_visibility_and_its_gradient_are_those_of_the_twin(seed, known, dtype, device):

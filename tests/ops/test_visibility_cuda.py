@@ -188,7 +188,6 @@ def test_an_output_that_does_not_exist_is_named(as_shipped):
 
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype")
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_trusted_call_never_waits_for_the_device(dtype):
     arguments = on("cuda", scoring(1))
     arguments = arguments if dtype == torch.float32 else in_float64(arguments)

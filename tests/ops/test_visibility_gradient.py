@@ -24,7 +24,6 @@ def twin_gradients(points, vertices, faces, viewmat, K, weights):
     return torch.autograd.grad((scores * weights).sum(), [points, vertices])
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("seed", range(3))
 def test_both_gradients_are_those_of_the_twin(seed, dtype, device, backward_way):
     vertices, faces, viewmat, K = soup(seed, dtype=dtype)
@@ -123,7 +122,6 @@ def batch(n, dtype=torch.float64):
 
 
 @pytest.mark.parametrize("way", ["vectors", "plain"])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_batch_equals_its_parts_to_the_bit(dtype, way, monkeypatch):
     if way == "plain":
         monkeypatch.setattr(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces)
@@ -227,7 +225,6 @@ def test_torch_compiles_both_functions_without_a_break(as_shipped):
     assert torch.equal(torch.compile(mask, fullgraph=True, backend="aot_eager")(vertices), mask(vertices))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_ops_keep_the_contract_of_custom_ops(dtype):
     vertices, faces, viewmats, Ks, points = batch(2, dtype)
     ops = torch.ops.oasis_warp

@@ -136,7 +136,6 @@ def plainly(monkeypatch):
     return call
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("scene", SCENES)
 def test_vectors_see_the_same_as_the_plain_kernels_to_the_bit(scene, dtype, plainly):
     covered = 0
@@ -149,7 +148,6 @@ def test_vectors_see_the_same_as_the_plain_kernels_to_the_bit(scene, dtype, plai
     assert covered > 100
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_scores_are_those_of_the_plain_kernels(dtype, plainly):
     for seed, (width, height) in enumerate(SIZES):
         vertices, faces, viewmat, K, *_ = make(small_faces, seed, width, height, dtype)
