@@ -185,6 +185,7 @@ def test_refinement_of_a_left_hand_moves_it_and_keeps_it_on_its_photo(hand):
         for switch in ("on", "off")
     }
     on, off = made["on"], made["off"]
+    assert on.prior["name"] == off.prior["name"] == "none"
     assert off.errors["refined_px"] == 0
     assert 0 < on.errors["refined_px"] < 20
     assert not torch.equal(on.fit.pose.angles, off.fit.pose.angles)

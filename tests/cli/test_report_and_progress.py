@@ -12,8 +12,9 @@ from oasis_warp.core.config import ReconstructConfig
 
 def test_a_report_holds_the_run(scene, made):
     made = made._replace(warnings=("the thumb is hidden",))
-    report = json.loads(to_json(make_report([scene[0]], made, ReconstructConfig(seed=3), {"fit": 0.25, "save": 0.5})))
-    assert report["photo"]["name"] == "known.png"
+    photo = scene[0]._replace(shrink=0.5)
+    report = json.loads(to_json(make_report([photo], made, ReconstructConfig(seed=3), {"fit": 0.25, "save": 0.5})))
+    assert report["photo"]["name"] == "known.png" and report["photo"]["shrink"] == 0.5
     assert report["hand"] == {"side": "right", "side_score": 0.99, "presence": 0.98, "landmarks_from": "network"}
     assert report["config"]["seed"] == 3
     assert report["prior"] == {"name": "learned", "sha256": "0a1b", "step": 7}

@@ -30,17 +30,6 @@ def test_a_hand_is_found_with_its_side(photos, estimator, name):
     assert found[0].side_score > 0.9
 
 
-@pytest.mark.slow
-def test_the_side_is_right_in_every_photo_that_names_it(photos, estimator):
-    wrong = []
-    for path in sorted(photos.rglob("*.jpg")):
-        told = path.name if path.parent == photos else path.parent.name  # a set of one hand is named after its side
-        side = next((s for s in ("left", "right") if s in told), None)
-        if side and any(hand.side != side for hand in estimator.find(read_photo(path))):
-            wrong.append(path.name)
-    assert wrong == []
-
-
 def test_no_hand_is_found_where_there_is_none(photos):
     rng = np.random.default_rng(0)
     pictures = [
