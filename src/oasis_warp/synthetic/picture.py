@@ -19,15 +19,8 @@ from oasis_warp.synthetic.body import RING, Body, body_on, device_name
 from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.illumination import light_lamps, no_lamps, pinhole, see_sky
 from oasis_warp.synthetic.ops.room_tracing import trace_rooms
-from oasis_warp.synthetic.ops.skin_shading import (
-    Lamps,
-    Shaded,
-    Texture,
-    Worn,
-    shade_skin,
-    smooth_over_faces,
-    surface_state,
-)
+from oasis_warp.synthetic.ops.skin_shading import Shaded, Texture, Worn, shade_skin, smooth_over_faces, surface_state
+from oasis_warp.synthetic.ops.views import Lamps
 from oasis_warp.synthetic.people import Person, person
 from oasis_warp.synthetic.posing import PosedPeople, pose_people
 from oasis_warp.synthetic.sensor import develop, expose, meter, srgb

@@ -65,7 +65,7 @@ class Declaration:
         name: str,
         *,
         inputs: Mapping[str, Array],
-        outputs: Mapping[str, str],
+        outputs: Mapping[str, str] = MappingProxyType({}),
         reference: str = "",
         public: bool = True,
     ) -> None:

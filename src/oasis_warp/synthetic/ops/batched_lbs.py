@@ -6,33 +6,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels.skinning import batched_lbs as kernels
-from oasis_warp.ops._runtime.declaration import Array, Operator
+from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
+from oasis_warp.synthetic.ops.views import scalars, vectors
 
-
-def _batched_lbs(
-    rest: Tensor, displacements: Tensor, strengths: Tensor, normals: Tensor, rises: Tensor, knuckles: Tensor,
-    weights: Tensor, rotations: Tensor, shifts: Tensor,
-) -> Tensor:  # fmt: skip
-    out = torch.empty_like(rest, memory_format=torch.contiguous_format)
-    vec3 = lambda t: view(t.contiguous(), wp.vec3f)  # noqa: E731
-    inputs = [
-        vec3(rest), view(displacements.contiguous()), view(strengths.contiguous()), vec3(normals),
-        view(rises.contiguous()), view(knuckles.contiguous()), view(weights.contiguous()),
-        view(rotations.contiguous(), wp.mat33f), vec3(shifts), view(out, wp.vec3f),
-    ]  # fmt: skip
-    launch_ranges(kernels.batched_lbs, even_cuts(rest.shape[0] * rest.shape[1]), inputs, like=rest)
-    return out
-
-
-def _batched_lbs_fake(rest: Tensor, *_: Tensor) -> Tensor:
-    return torch.empty_like(rest, memory_format=torch.contiguous_format)
-
-
-_OPERATOR = Operator(
+_DECLARATION = Declaration(
     "batched_lbs",
-    _batched_lbs,
-    _batched_lbs_fake,
     inputs={
         "rest": Array("B V 3"),
         "displacements": Array("V 3 C"),
@@ -44,7 +23,6 @@ _OPERATOR = Operator(
         "rotations": Array("B J 3 3"),
         "shifts": Array("B J 3"),
     },
-    outputs={"vertices": "B V 3"},
     public=False,
 )
 
@@ -77,8 +55,14 @@ def batched_lbs(
     Raises:
         ValueError: wrong shapes.
     """
-    _OPERATOR.check(
+    _DECLARATION.check(
         rest=rest, displacements=displacements, strengths=strengths, normals=normals, rises=rises, knuckles=knuckles,
         weights=weights, rotations=rotations, shifts=shifts,
     )  # fmt: skip
-    return _OPERATOR(rest, displacements, strengths, normals, rises, knuckles, weights, rotations, shifts)
+    out = torch.empty_like(rest, memory_format=torch.contiguous_format)
+    inputs = [
+        vectors(rest), scalars(displacements), scalars(strengths), vectors(normals), scalars(rises), scalars(knuckles),
+        scalars(weights), view(rotations.contiguous(), wp.mat33f), vectors(shifts), vectors(out),
+    ]  # fmt: skip
+    launch_ranges(kernels.batched_lbs, even_cuts(rest.shape[0] * rest.shape[1]), inputs, like=rest)
+    return out

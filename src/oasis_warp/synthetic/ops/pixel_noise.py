@@ -7,30 +7,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels.scene import pixel_noise as kernels
-from oasis_warp.ops._runtime.declaration import Array, Operator
+from oasis_warp.core.checks import check_shape
 from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
-
-
-def _noise(seeds: Tensor, shape: list[int]) -> Tensor:
-    n = math.prod(shape)
-    out = torch.empty((len(seeds), n), device=seeds.device)
-    inputs = [view(seeds.to(torch.int32).contiguous()), n, view(out)]
-    launch_ranges(kernels.normal, even_cuts(out.numel()), inputs, like=out)
-    return out.unflatten(1, shape)
-
-
-def _noise_fake(seeds: Tensor, shape: list[int]) -> Tensor:
-    return torch.empty((len(seeds), *shape), device=seeds.device)
-
-
-_OPERATOR = Operator(
-    "pixel_noise",
-    _noise,
-    _noise_fake,
-    inputs={"seeds": Array("B", index="any")},
-    outputs={"noise": "B ..."},
-    public=False,
-)
+from oasis_warp.synthetic.ops.views import integers
 
 
 def pixel_noise(seeds: Int[Tensor, "B"], *shape: int) -> Float[Tensor, "B ..."]:
@@ -39,5 +18,8 @@ def pixel_noise(seeds: Int[Tensor, "B"], *shape: int) -> Float[Tensor, "B ..."]:
     Raises:
         ValueError: `seeds` is not a row.
     """
-    _OPERATOR.check(seeds=seeds)
-    return _OPERATOR(seeds, list(shape))
+    check_shape("seeds", seeds, "B")
+    n = math.prod(shape)
+    out = torch.empty((len(seeds), n), device=seeds.device)
+    launch_ranges(kernels.normal, even_cuts(out.numel()), [integers(seeds), n, view(out)], like=out)
+    return out.unflatten(1, shape)

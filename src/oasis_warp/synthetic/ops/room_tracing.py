@@ -1,14 +1,13 @@
 """Images of simple rooms, lit by the same light as the hand in front of them, which casts its shadow on them."""
 
 import torch
-import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels.scene import rooms as kernels
-from oasis_warp.ops._runtime.declaration import Array, Operator
-from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
-from oasis_warp.synthetic.ops.skin_shading import Lamps
+from oasis_warp.ops._runtime.declaration import Array, Declaration
+from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges
+from oasis_warp.synthetic.ops.views import Lamps, scalars, vectors
 
 SOLID_WORDS = int(kernels.SOLID_WORDS)
 SHAPES = ("nothing", "box", "ball", "cylinder")
@@ -18,45 +17,8 @@ PATTERNS = (
 )  # fmt: skip
 
 
-def _vec3(tensor: Tensor) -> object:
-    return view(tensor.contiguous(), wp.vec3f)
-
-
-def _trace(
-    solids: Tensor, focals: Tensor, sky: Tensor, lamp_positions: Tensor, lamp_colors: Tensor, lamp_ranges: Tensor,
-    lamp_spreads: Tensor, lamp_viewmats: Tensor, lamp_focals: Tensor, lamp_depths: Tensor, hidden: Tensor,
-    focus: Tensor, apertures: Tensor,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    sharp, out = hidden.new_empty((*hidden.shape, 3)), hidden.new_empty((*hidden.shape, 3))
-    depth = torch.empty_like(hidden)
-    cuts = even_cuts(hidden.numel())
-    covered = view(hidden.contiguous())
-    launch_ranges(
-        kernels.trace,
-        cuts,
-        [
-            view(solids.contiguous()), view(focals.contiguous()), _vec3(sky), _vec3(lamp_positions), _vec3(lamp_colors),
-            view(lamp_ranges.contiguous()), view(lamp_spreads.contiguous()),
-            view(lamp_viewmats.contiguous(), wp.mat44f), view(lamp_focals.contiguous()),
-            view(lamp_depths.flatten(0, 1).contiguous()), covered, view(sharp, wp.vec3f), view(depth),
-        ],
-        like=hidden,
-    )  # fmt: skip
-    inputs = [view(depth), covered, view(focus.contiguous()), view(apertures.contiguous()),
-              view(sharp, wp.vec3f), view(out, wp.vec3f)]  # fmt: skip
-    launch_ranges(kernels.defocus, cuts, inputs, like=hidden)
-    return out, depth
-
-
-def _trace_fake(solids, focals, sky, *rest):
-    hidden = rest[7]
-    return hidden.new_empty((*hidden.shape, 3)), torch.empty_like(hidden)
-
-
-_OPERATOR = Operator(
+_DECLARATION = Declaration(
     "trace_rooms",
-    _trace,
-    _trace_fake,
     inputs={
         "solids": Array(f"B N {SOLID_WORDS}"),
         "focals": Array("B"),
@@ -65,7 +27,6 @@ _OPERATOR = Operator(
         "focus": Array("B"),
         "apertures": Array("B"),
     },
-    outputs={"light": "B H W 3", "depth": "B H W"},
     public=False,
 )
 
@@ -95,6 +56,12 @@ def trace_rooms(
     Raises:
         ValueError: wrong shapes.
     """
-    _OPERATOR.check(solids=solids, focals=focals, sky=sky, hidden=hidden, focus=focus, apertures=apertures)
-    light, _ = _OPERATOR(solids, focals, sky, *lamps, hidden, focus, apertures)
-    return light
+    _DECLARATION.check(solids=solids, focals=focals, sky=sky, hidden=hidden, focus=focus, apertures=apertures)
+    sharp, out = hidden.new_empty((*hidden.shape, 3)), hidden.new_empty((*hidden.shape, 3))
+    depth, covered = scalars(torch.empty_like(hidden)), scalars(hidden)
+    cuts = even_cuts(hidden.numel())
+    inputs = [scalars(solids), scalars(focals), vectors(sky), *lamps.views(), covered, vectors(sharp), depth]
+    launch_ranges(kernels.trace, cuts, inputs, like=hidden)
+    inputs = [depth, covered, scalars(focus), scalars(apertures), vectors(sharp), vectors(out)]
+    launch_ranges(kernels.defocus, cuts, inputs, like=hidden)
+    return out

@@ -9,10 +9,11 @@ from torch import Tensor
 
 from oasis_kernels.scene import skin_light, skin_shading
 from oasis_warp.core.checks import check_positive, check_shape
-from oasis_warp.ops._runtime.declaration import Array, Operator
+from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.incidence import incidence
 from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
 from oasis_warp.ops.depth_map import DepthMap
+from oasis_warp.synthetic.ops.views import Lamps, integers, matrices, scalars, vectors
 
 LIGHT_WIDTHS = (1.25e-3, 0.45e-3, 0.25e-3)
 """Scattering distances of red, green and blue light in skin: standard deviations [m]."""
@@ -27,21 +28,6 @@ class SurfaceState(NamedTuple):
     """Unit, area-weighted; zero where no face is."""
     areas: Float[Tensor, "B V"]
     """Twice the area of the faces around each vertex."""
-
-
-class Lamps(NamedTuple):
-    """Round lamps, with the depth buffers that they see; L lamps an image. A black one is none."""
-
-    positions: Float[Tensor, "B L 3"]
-    colors: Float[Tensor, "B L 3"]
-    """Irradiance over pi on a surface that faces the lamp at distance `ranges`, linear RGB."""
-    ranges: Float[Tensor, "B L"]
-    spreads: Float[Tensor, "B L"]
-    """Radius over distance."""
-    viewmats: Float[Tensor, "B L 4 4"]
-    focals: Float[Tensor, "B L"]
-    """Of the depth buffers [px], whose axis is their middle."""
-    depths: Float[Tensor, "B L M M"]
 
 
 class Worn(NamedTuple):
@@ -79,28 +65,8 @@ class Shaded(NamedTuple):
     """Diffuse reflectance of each sub-pixel, linear RGB; 0 where no surface is."""
 
 
-def _surface_state(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    batch, n = vertices.shape[:2]
-    index = incidence("faces", faces, n, "vertices")
-    normals, areas = torch.empty_like(vertices), vertices.new_empty((batch, n))
-    inputs = [
-        view(vertices.contiguous(), wp.vec3f), *map(view, index), view(normals, wp.vec3f), view(areas),
-    ]  # fmt: skip
-    launch_ranges(skin_light.surface_state, even_cuts(batch * n), inputs, like=vertices)
-    return normals, areas
-
-
-def _surface_state_fake(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(vertices), vertices.new_empty(vertices.shape[:2])
-
-
-_SURFACE_STATE = Operator(
-    "surface_state",
-    _surface_state,
-    _surface_state_fake,
-    inputs={"vertices": Array("B V 3"), "faces": Array("F 3", index="V")},
-    outputs={"normals": "B V 3", "areas": "B V"},
-    public=False,
+_SURFACE_STATE = Declaration(
+    "surface_state", inputs={"vertices": Array("B V 3"), "faces": Array("F 3", index="V")}, public=False
 )
 
 
@@ -111,30 +77,17 @@ def surface_state(vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]) -
     Raises:
         ValueError: a wrong shape or index.
     """
-    _SURFACE_STATE.check(vertices=vertices, faces=faces)
-    return SurfaceState(*_SURFACE_STATE(vertices, faces))
+    sizes = _SURFACE_STATE.check(vertices=vertices, faces=faces)
+    index = incidence("faces", faces, sizes["V"], "vertices")
+    normals = torch.empty_like(vertices, memory_format=torch.contiguous_format)
+    areas = vertices.new_empty(vertices.shape[:2])
+    inputs = [vectors(vertices), *map(view, index), vectors(normals), view(areas)]
+    launch_ranges(skin_light.surface_state, even_cuts(areas.numel()), inputs, like=vertices)
+    return SurfaceState(normals, areas)
 
 
-def _smooth(values: Tensor, faces: Tensor) -> Tensor:
-    index = incidence("faces", faces, values.shape[1], "vertices")
-    values = values.contiguous()
-    out = torch.empty_like(values)
-    inputs = [view(values), *map(view, index), view(out)]
-    launch_ranges(skin_light.smooth, even_cuts(values.numel()), inputs, like=values)
-    return out
-
-
-def _smooth_fake(values: Tensor, faces: Tensor) -> Tensor:
-    return torch.empty_like(values)
-
-
-_SMOOTH = Operator(
-    "smooth_over_faces",
-    _smooth,
-    _smooth_fake,
-    inputs={"values": Array("B V C"), "faces": Array("F 3", index="V")},
-    outputs={"smooth": "B V C"},
-    public=False,
+_SMOOTH = Declaration(
+    "smooth_over_faces", inputs={"values": Array("B V C"), "faces": Array("F 3", index="V")}, public=False
 )
 
 
@@ -145,38 +98,20 @@ def smooth_over_faces(values: Float[Tensor, "B V C"], faces: Int[Tensor, "F 3"])
     Raises:
         ValueError: a wrong shape or index.
     """
-    _SMOOTH.check(values=values, faces=faces)
-    return _SMOOTH(values, faces)
-
-
-def _sky_transfer(
-    vertices: Tensor, normals: Tensor, directions: Tensor, viewmats: Tensor, focals: Tensor, depths: Tensor,
-    lift: float, n_lit: int,
-) -> Tensor:  # fmt: skip
-    batch, n = vertices.shape[:2]
-    out = vertices.new_zeros((batch, n, 10))
-    inputs = [
-        view(vertices.contiguous(), wp.vec3f), view(normals.contiguous(), wp.vec3f),
-        view(directions.contiguous(), wp.vec3f), view(viewmats.contiguous(), wp.mat44f), view(focals.contiguous()),
-        view(depths.contiguous()), lift, n_lit, view(out),
-    ]  # fmt: skip
-    launch_ranges(skin_light.sky_transfer, even_cuts(batch * n_lit), inputs, like=vertices)
+    sizes = _SMOOTH.check(values=values, faces=faces)
+    index = incidence("faces", faces, sizes["V"], "vertices")
+    out = torch.empty_like(values, memory_format=torch.contiguous_format)
+    inputs = [scalars(values), *map(view, index), view(out)]
+    launch_ranges(skin_light.smooth, even_cuts(values.numel()), inputs, like=values)
     return out
 
 
-def _sky_transfer_fake(vertices, normals, directions, viewmats, focals, depths, lift, n_lit):
-    return vertices.new_empty((*vertices.shape[:2], 10))
-
-
-_SKY_TRANSFER = Operator(
+_SKY_TRANSFER = Declaration(
     "sky_transfer",
-    _sky_transfer,
-    _sky_transfer_fake,
     inputs={
         "vertices": Array("B V 3"), "normals": Array("B V 3"), "directions": Array("D 3"),
         "viewmats": Array("B D 4 4"), "focals": Array("B"), "depths": Array("B D M M"),
     },
-    outputs={"transfer": "B V 10"},
     public=False,
 )  # fmt: skip
 
@@ -218,7 +153,13 @@ def sky_transfer(
     n_lit = sizes["V"] if n_lit is None else n_lit
     if not 0 <= n_lit <= sizes["V"]:
         raise ValueError(f"n_lit: expected 0 to {sizes['V']}, got {n_lit}.")
-    return _SKY_TRANSFER(vertices, normals, directions, viewmats, focals, depths, lift, n_lit)
+    out = vertices.new_zeros((*vertices.shape[:2], 10))
+    inputs = [
+        vectors(vertices), vectors(normals), vectors(directions), matrices(viewmats), scalars(focals), scalars(depths),
+        lift, n_lit, view(out),
+    ]  # fmt: skip
+    launch_ranges(skin_light.sky_transfer, even_cuts(len(vertices) * n_lit), inputs, like=vertices)
+    return out
 
 
 def _addresses(pages: list[Tensor], device: torch.device) -> Tensor:
@@ -227,64 +168,8 @@ def _addresses(pages: list[Tensor], device: torch.device) -> Tensor:
     return host.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else host
 
 
-def _shade(
-    face_ids: Tensor, barycentrics: Tensor, depths: Tensor, focals: Tensor, samples: int, n_hand_faces: int, ring: int,
-    vertices: Tensor, faces: Tensor, normals: Tensor, transfer: Tensor, stretch: Tensor,
-    materials: Tensor, looks: Tensor, pages: list[Tensor], uv: Tensor, uv_faces: Tensor, tones: Tensor,
-    texels_a_pixel: Tensor, sky: Tensor, lamp_positions: Tensor, lamp_colors: Tensor, lamp_ranges: Tensor,
-    lamp_spreads: Tensor, lamp_viewmats: Tensor, lamp_focals: Tensor, lamp_depths: Tensor, seeds: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    batch, rows, columns = face_ids.shape
-    light, tone, mirrored = (vertices.new_zeros((batch, rows, columns, 3)) for _ in range(3))
-    vec3 = lambda t: view(t.contiguous(), wp.vec3f)  # noqa: E731
-    whole = lambda t: view(t.to(torch.int32).contiguous())  # noqa: E731
-    ids, kinds, table = view(face_ids), whole(materials), incidence("faces", faces, vertices.shape[1], "vertices").table
-    cuts = even_cuts(batch * rows * columns)
-    launch_ranges(
-        skin_shading.shade,
-        cuts,
-        [
-            ids, vec3(barycentrics), vec3(vertices), vec3(normals), view(transfer.contiguous()),
-            view(stretch.contiguous()), view(table), kinds, view(uv.contiguous(), wp.vec2f), whole(uv_faces),
-            view(_addresses(pages, vertices.device)), *pages[0].shape[:2], view(looks.contiguous()), vec3(tones),
-            vec3(sky), vec3(lamp_positions), vec3(lamp_colors), view(lamp_ranges.contiguous()),
-            view(lamp_spreads.contiguous()), view(lamp_viewmats.contiguous(), wp.mat44f),
-            view(lamp_focals.contiguous()), view(lamp_depths.flatten(0, 1).contiguous()),
-            view(texels_a_pixel.contiguous()), whole(seeds),
-            view(light, wp.vec3f), view(tone, wp.vec3f), view(mirrored, wp.vec3f),
-        ],
-        like=vertices,
-    )  # fmt: skip
-    depth, focal = view(depths.contiguous()), view(focals.contiguous())
-    between = torch.zeros_like(light)
-    for vertical, source, target in ((0, light, between), (1, between, light)):
-        inputs = [ids, depth, kinds, focal, wp.vec3f(*LIGHT_WIDTHS), LIGHT_REACH, vertical,
-                  view(source, wp.vec3f), view(target, wp.vec3f)]  # fmt: skip
-        launch_ranges(skin_shading.scatter, cuts, inputs, like=vertices)
-    size = (batch, rows // samples, columns // samples)
-    color, (alpha, mask, nearest) = vertices.new_empty((*size, 3)), (vertices.new_empty(size) for _ in range(3))
-    launch_ranges(
-        skin_shading.resolve,
-        even_cuts(alpha.numel()),
-        [
-            ids, depth, kinds, n_hand_faces, ring, view(light, wp.vec3f), view(tone, wp.vec3f),
-            view(mirrored, wp.vec3f), view(color, wp.vec3f), view(alpha), view(mask), view(nearest),
-        ],
-        like=vertices,
-    )  # fmt: skip
-    return color, alpha, mask, nearest, tone
-
-
-def _shade_fake(face_ids, barycentrics, depths, focals, samples, n_hand_faces, ring, vertices, *_):
-    size = (len(face_ids), face_ids.shape[1] // samples, face_ids.shape[2] // samples)
-    color, fine = (vertices.new_empty((*shape, 3)) for shape in (size, face_ids.shape))
-    return color, *(vertices.new_empty(size) for _ in range(3)), fine
-
-
-_SHADE = Operator(
+_SHADE = Declaration(
     "shade_skin",
-    _shade,
-    _shade_fake,
     inputs={
         "seen.face_ids": Array("B H W", index="F", least=-1, hint="A batch, of one image at least."),
         "vertices": Array("B V 3"),
@@ -297,7 +182,6 @@ _SHADE = Operator(
         "lamps.depths": Array("B L M M"),
         "lamps.positions": Array("B L 3"),
     },
-    outputs={"color": "B R S 3", "alpha": "B R S", "mask": "B R S", "depth": "B R S", "albedo": "B H W 3"},
     public=False,
 )
 
@@ -362,9 +246,29 @@ def shade_skin(
             raise ValueError("texture.pages: expected contiguous float16 on the device of the vertices.")
     if sizes["H"] % samples or sizes["W"] % samples:
         raise ValueError(f"samples: expected a divisor of {sizes['H']} and {sizes['W']}, got {samples}.")
-    return Shaded(
-        *_SHADE(
-            seen.face_ids, seen.barycentrics, seen.depth, focals, samples, n_hand_faces, ring, vertices, faces, normals,
-            transfer, stretch, worn.materials, worn.looks, *texture, tones, texels_a_pixel, sky, *lamps, seeds,
-        )
-    )  # fmt: skip
+    rows, columns = sizes["H"], sizes["W"]
+    light, tone, mirrored = (vertices.new_zeros((sizes["B"], rows, columns, 3)) for _ in range(3))
+    ids, kinds, table = view(seen.face_ids), integers(worn.materials), incidence("faces", faces, sizes["V"], "vertices")
+    cuts = even_cuts(seen.face_ids.numel())
+    inputs = [
+        ids, vectors(seen.barycentrics), vectors(vertices), vectors(normals), scalars(transfer), scalars(stretch),
+        view(table.table), kinds, view(texture.uv.contiguous(), wp.vec2f), integers(texture.uv_faces),
+        view(_addresses(texture.pages, vertices.device)), *texture.pages[0].shape[:2], scalars(worn.looks),
+        vectors(tones), vectors(sky), *lamps.views(), scalars(texels_a_pixel), integers(seeds),
+        vectors(light), vectors(tone), vectors(mirrored),
+    ]  # fmt: skip
+    launch_ranges(skin_shading.shade, cuts, inputs, like=vertices)
+    depth, focal = scalars(seen.depth), scalars(focals)
+    between = torch.zeros_like(light)
+    for vertical, source, target in ((0, light, between), (1, between, light)):
+        widths = wp.vec3f(*LIGHT_WIDTHS)
+        inputs = [ids, depth, kinds, focal, widths, LIGHT_REACH, vertical, vectors(source), vectors(target)]
+        launch_ranges(skin_shading.scatter, cuts, inputs, like=vertices)
+    size = (sizes["B"], rows // samples, columns // samples)
+    color, (alpha, mask, nearest) = vertices.new_empty((*size, 3)), (vertices.new_empty(size) for _ in range(3))
+    inputs = [
+        ids, depth, kinds, n_hand_faces, ring, vectors(light), vectors(tone), vectors(mirrored),
+        vectors(color), view(alpha), view(mask), view(nearest),
+    ]  # fmt: skip
+    launch_ranges(skin_shading.resolve, even_cuts(alpha.numel()), inputs, like=vertices)
+    return Shaded(color, alpha, mask, nearest, tone)

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from oasis_kernels.scene import surface_patterns as kernels
 from oasis_warp.core.checks import check_index, check_positive, check_shape
-from oasis_warp.ops._runtime.declaration import Array, Operator
+from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.launch import even_cuts, launch, launch_ranges, view
+from oasis_warp.synthetic.ops.views import integers, scalars, vectors
 
 
 class NoiseField(NamedTuple):
@@ -24,20 +25,7 @@ class NoiseField(NamedTuple):
     """Each has half the size and half the strength of the one before."""
 
 
-def _noise(points: Tensor, cells: Tensor, seeds: Tensor, octaves: Tensor) -> Tensor:
-    out = points.new_empty((len(cells), len(points)))
-    inputs = [view(points.contiguous(), wp.vec3f), view(cells), view(seeds), view(octaves), view(out)]
-    launch_ranges(kernels.noise, even_cuts(len(points)), inputs, like=points)
-    return out
-
-
-def _noise_fake(points: Tensor, cells: Tensor, seeds: Tensor, octaves: Tensor) -> Tensor:
-    return points.new_empty((len(cells), len(points)))
-
-
-_NOISE = Operator(
-    "surface_noise", _noise, _noise_fake, inputs={"points": Array("N 3")}, outputs={"noise": "K N"}, public=False
-)
+_NOISE = Declaration("surface_noise", inputs={"points": Array("N 3")}, public=False)
 
 
 def surface_noise(points: Float[Tensor, "N 3"], fields: Sequence[NoiseField]) -> Float[Tensor, "K N"]:
@@ -53,12 +41,14 @@ def surface_noise(points: Float[Tensor, "N 3"], fields: Sequence[NoiseField]) ->
     def column(values: list, dtype: torch.dtype) -> Tensor:
         return torch.tensor(values, dtype=dtype, device=points.device)
 
-    return _NOISE(
-        points.detach().float(),
-        column([f.cell for f in fields], torch.float32),
-        column([f.seed for f in fields], torch.int32),
-        column([f.octaves for f in fields], torch.int32),
-    )
+    points, out = points.detach().float(), points.new_empty((len(fields), len(points)), dtype=torch.float32)
+    inputs = [
+        vectors(points), view(column([f.cell for f in fields], torch.float32)),
+        view(column([f.seed for f in fields], torch.int32)), view(column([f.octaves for f in fields], torch.int32)),
+        view(out),
+    ]  # fmt: skip
+    launch_ranges(kernels.noise, even_cuts(len(points)), inputs, like=points)
+    return out
 
 
 class PointGrid(NamedTuple):
@@ -105,34 +95,11 @@ def point_grid(points: Float[Tensor, "N 3"], cell: float) -> PointGrid:
     )
 
 
-def _dabs(
-    centers: Tensor, widths: Tensor, strengths: Tensor, kinds: Tensor, n_kinds: int, flat: bool, points: Tensor,
-    numbers: Tensor, starts: Tensor, low: list[float], cell: float, size: list[int],
-) -> Tensor:  # fmt: skip
-    out = points.new_zeros((n_kinds, len(points)))
-    inputs = [
-        view(centers.contiguous(), wp.vec3f), view(widths.contiguous()), view(strengths.contiguous()),
-        view(kinds.contiguous()), flat, view(points, wp.vec3f), view(numbers), view(starts), wp.vec3f(*low), cell,
-        wp.vec3i(*size), view(out),
-    ]  # fmt: skip
-    launch(kernels.dabs, len(centers), inputs, like=points)
-    return out
-
-
-def _dabs_fake(centers, widths, strengths, kinds, n_kinds, flat, points, numbers, starts, low, cell, size):
-    return points.new_empty((n_kinds, len(points)))
-
-
-_DABS = Operator(
+_DABS = Declaration(
     "surface_dabs",
-    _dabs,
-    _dabs_fake,
-    inputs={
-        "centers": Array("M 3"), "widths": Array("M"), "strengths": Array("M"), "kinds": Array("M", index="K"),
-    },
-    outputs={"dabs": "K N"},
+    inputs={"centers": Array("M 3"), "widths": Array("M"), "strengths": Array("M"), "kinds": Array("M", index="K")},
     public=False,
-)  # fmt: skip
+)
 
 
 @torch.no_grad()
@@ -165,7 +132,10 @@ def surface_dabs(
     _DABS.check(centers=centers, widths=widths, strengths=strengths, kinds=kinds)
     check_index("kinds", kinds, n_kinds, "kinds")
     points, numbers, starts, low, cell, size = grid
-    return _DABS(
-        centers.float(), widths.float(), strengths.float(), kinds.to(torch.int32), n_kinds, flat, points, numbers,
-        starts, list(low), cell, list(size),
-    )  # fmt: skip
+    out = points.new_zeros((n_kinds, len(points)))
+    inputs = [
+        vectors(centers.float()), scalars(widths.float()), scalars(strengths.float()), integers(kinds), flat,
+        vectors(points), view(numbers), view(starts), wp.vec3f(*low), cell, wp.vec3i(*size), view(out),
+    ]  # fmt: skip
+    launch(kernels.dabs, len(centers), inputs, like=points)
+    return out

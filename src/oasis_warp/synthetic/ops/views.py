@@ -1,0 +1,52 @@
+"""Float32 tensors as arguments of Warp kernels. The operators beside this file have no derivative."""
+
+from typing import Any, NamedTuple
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.ops._runtime.launch import view
+
+
+def scalars(tensor: Tensor) -> Any:
+    """An array of numbers."""
+    return view(tensor.contiguous())
+
+
+def integers(tensor: Tensor) -> Any:
+    """An array of int32."""
+    return view(tensor.to(torch.int32).contiguous())
+
+
+def vectors(tensor: Tensor) -> Any:
+    """An array of vectors along the last axis, which has 3."""
+    return view(tensor.contiguous(), wp.vec3f)
+
+
+def matrices(tensor: Tensor) -> Any:
+    """An array of 4 x 4 matrices."""
+    return view(tensor.contiguous(), wp.mat44f)
+
+
+class Lamps(NamedTuple):
+    """Round lamps, with the depth buffers that they see; L lamps an image. A black one is none."""
+
+    positions: Float[Tensor, "B L 3"]
+    colors: Float[Tensor, "B L 3"]
+    """Irradiance over pi on a surface that faces the lamp at distance `ranges`, linear RGB."""
+    ranges: Float[Tensor, "B L"]
+    spreads: Float[Tensor, "B L"]
+    """Radius over distance."""
+    viewmats: Float[Tensor, "B L 4 4"]
+    focals: Float[Tensor, "B L"]
+    """Of the depth buffers [px], whose axis is their middle."""
+    depths: Float[Tensor, "B L M M"]
+
+    def views(self) -> list[Any]:
+        """All of these as arguments of a kernel."""
+        return [
+            vectors(self.positions), vectors(self.colors), scalars(self.ranges), scalars(self.spreads),
+            matrices(self.viewmats), scalars(self.focals), scalars(self.depths.flatten(0, 1)),
+        ]  # fmt: skip
