@@ -79,13 +79,16 @@ def test_what_torch_is_told_of_an_operator_is_true(name, dtype):
         torch.library.opcheck(getattr(torch.ops.oasis_warp, op).default, tuple(arguments))
 
 
-def test_what_torch_is_told_of_ops_without_a_gradient_is_true(dtype):
+def test_what_torch_is_told_of_ops_that_need_no_gradient_is_true(dtype):
     rest, _, faces = mesh(2, 3, dtype)
     torch.library.opcheck(torch.ops.oasis_warp.rest_mesh.default, (rest, faces, True))
     seen = calls(dtype=dtype)["depth_visibility"].arguments
     drawn = seen["vertices"][None], seen["faces"], seen["viewmat"][None], seen["K"][None], 16, 16, 0.01
     for outputs in ((True, True, True), (False, True, False)):
         torch.library.opcheck(torch.ops.oasis_warp.depth_map.default, (*drawn, *outputs, True))
+    looked = seen["points"][None], *drawn[:4], None, False, 16, 16, 0.01, 0.1, 0.3
+    for maps in (True, False):
+        torch.library.opcheck(torch.ops.oasis_warp.depth_visibility.default, (*looked, maps, False, True))
 
 
 @EACH

@@ -1,4 +1,4 @@
-"""Depth buffer and visibility: twin, gradients, laws, poison values, messages."""
+"""Depth buffer and visibility: known answers and laws, where gradients flow, and batches."""
 
 import math
 
@@ -6,10 +6,8 @@ import pytest
 import torch
 
 from oasis_warp.core.rotation import to_matrix
-from oasis_warp.core.types import Camera
 from oasis_warp.ops import depth_map, depth_visibility
 from oasis_warp.ops._runtime import depth_buffer
-from oasis_warp.reference import visibility as twin
 
 WIDTH, HEIGHT = 37, 26
 TAU = 0.05
@@ -43,77 +41,15 @@ def some_points(vertices, faces, seed, n=60):
     return (weights[..., None] * vertices[faces[chosen]]).sum(1) + jitter
 
 
-def wide(tensor):
-    """The same numbers for the twin: on the CPU, in double precision."""
-    tensor = tensor.detach().cpu()
-    return tensor.double() if tensor.is_floating_point() else tensor
-
-
 def visible(points, vertices, faces, viewmat, K, **options):
     return depth_visibility(points, vertices, faces, K, viewmat, WIDTH, HEIGHT, **{"tau": TAU, **options})
 
 
 @pytest.fixture(params=["vectors", "faces"])
-def way(request, monkeypatch):
-    """Both ways to fill the buffer: the one for CUDA, a thread a face, runs on the CPU too."""
+def backend(request, monkeypatch):
+    """Both ways to fill the buffer: the generic kernels, a thread a face, run on the CPU too."""
     if request.param == "faces":
         monkeypatch.setattr(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces)
-
-
-def seen_by_twin(vertices, faces, viewmat, K):
-    return twin.depth_map(vertices, faces, Camera(viewmat, K, WIDTH, HEIGHT))
-
-
-@pytest.mark.parametrize("near", [False, True])
-@pytest.mark.parametrize("seed", range(4))
-def test_depths_faces_and_barycentrics_are_those_of_the_twin(seed, near, dtype, device, way):
-    scene = soup(seed, near=near, dtype=dtype, device=device)
-    got = depth_map(*scene, WIDTH, HEIGHT)
-    want = seen_by_twin(*map(wide, scene))
-    assert got.depth.dtype == dtype
-    assert torch.equal(got.face_ids.cpu().long(), want[1])
-    # Both sides are exact to float64 rounding of the float inputs: what is left is the rounding of the output. The
-    # twin's linear solve loses digits on triangles that are nearly edge-on.
-    rtol = 1e-7 if dtype == torch.float32 else 1e-9
-    torch.testing.assert_close(wide(got.depth), want[0], rtol=rtol, atol=0)
-    torch.testing.assert_close(wide(got.barycentrics), want[2], rtol=0, atol=100 * rtol)
-    assert (want[1] >= 0).any()
-
-
-@pytest.mark.parametrize("known", [False, True])
-@pytest.mark.parametrize("seed", range(3))
-def test_visibility_and_its_gradient_are_those_of_the_twin(seed, known, dtype, device):
-    vertices, faces, viewmat, K = soup(seed, dtype=dtype, device=device)
-    points = some_points(vertices, faces, seed)
-    point_vertices = None
-    if known:
-        points = torch.cat([points, vertices])
-        point_vertices = torch.cat([torch.full((60,), -1, device=device), torch.arange(len(vertices), device=device)])
-    points.requires_grad_()
-    got = visible(points, vertices, faces, viewmat, K, point_vertices=point_vertices)
-    (grad,) = torch.autograd.grad(got.visibility.sum(), points)
-
-    owners = None if point_vertices is None else point_vertices.cpu()
-    twin_points = wide(points).requires_grad_()
-    hits = seen_by_twin(*map(wide, (vertices, faces, viewmat, K)))
-    camera = Camera(wide(viewmat), wide(K), WIDTH, HEIGHT)
-    want = twin.score_points(twin_points, hits, faces.cpu(), camera, TAU, 3 * TAU, owners)
-    (twin_grad,) = torch.autograd.grad(want.sum(), twin_points)
-    tolerance = 1e-6 if dtype == torch.float32 else 1e-9
-    torch.testing.assert_close(wide(got.visibility), want.detach(), rtol=0, atol=tolerance)
-    assert (wide(grad) - twin_grad).norm() <= 10 * tolerance * twin_grad.norm()
-    assert ((want > 0.1) & (want < 0.9)).any()
-
-
-def test_visibility_passes_gradcheck_in_the_points():
-    vertices, faces, viewmat, K = soup(5)
-    points = some_points(vertices, faces, 5, n=16)
-    # Differences are safe away from the borders of pixels, where the buffer jumps.
-    camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    pixel = camera[:, :2] / camera[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
-    points = points[((pixel - pixel.round()).abs() > 1e-3).all(-1)].requires_grad_()
-    assert len(points) > 12
-    assert torch.autograd.gradcheck(lambda p: visible(p, vertices, faces, viewmat, K).visibility, points)
 
 
 def test_depth_maps_carry_no_gradient():
@@ -148,16 +84,6 @@ def test_moving_mesh_points_and_camera_together_changes_nothing():
     torch.testing.assert_close(before.visibility, after.visibility, rtol=0, atol=1e-10)
 
 
-def test_scaling_the_world_and_tau_changes_nothing():
-    vertices, faces, viewmat, K = soup(4)
-    points = some_points(vertices, faces, 4)
-    larger = viewmat.clone()
-    larger[:3, 3] *= 1000
-    small = visible(points, vertices, faces, viewmat, K)
-    large = visible(1000 * points, 1000 * vertices, faces, larger, K, tau=1000 * TAU, near_plane=10.0)
-    torch.testing.assert_close(small.visibility, large.visibility, rtol=0, atol=1e-10)
-
-
 def test_the_order_of_faces_and_corners_changes_no_depth():
     vertices, faces, viewmat, K = soup(6, near=True)
     order = torch.randperm(len(faces), generator=torch.Generator().manual_seed(0))
@@ -173,14 +99,14 @@ def test_the_order_of_faces_and_corners_changes_no_depth():
         torch.testing.assert_close(plain.barycentrics[..., corners], other.barycentrics, rtol=0, atol=1e-10)
 
 
-def test_of_two_equal_faces_the_first_is_kept(way):
+def test_of_two_equal_faces_the_first_is_kept(backend):
     vertices, faces, viewmat, K = soup(7)
     twice = depth_map(vertices, torch.cat([faces, faces]), viewmat, K, WIDTH, HEIGHT)
     once = depth_map(vertices, faces, viewmat, K, WIDTH, HEIGHT)
     assert torch.equal(once.face_ids, twice.face_ids) and torch.equal(once.depth, twice.depth)
 
 
-def test_a_face_through_the_near_plane_is_seen_beyond_it_only(way):
+def test_a_face_through_the_near_plane_is_seen_beyond_it_only(backend):
     # The floor y = 0.5 has depth 20 / (row below the horizon): with the near plane at 2 m, its last rows are too near.
     floor = torch.tensor([[-300.0, 0.5, -300], [300, 0.5, -300], [0, 0.5, 900]], dtype=torch.float64)
     K = torch.tensor([[40.0, 0, 8], [0, 40, 0], [0, 0, 1]], dtype=torch.float64)
@@ -240,42 +166,12 @@ def test_the_containing_pixel_counts_not_the_nearest_centre():
     assert seen[0] > 0.999 and seen[1] < 0.001
 
 
-def test_neither_threads_nor_repeats_change_a_bit(with_threads):
-    scene = soup(10, near=True, dtype=torch.float32)
-    first = depth_map(*scene, WIDTH, HEIGHT)
-    for n_threads in (1, 2, 3, 5, 40):
-        for _ in range(3):
-            again = with_threads(n_threads, depth_map, *scene, WIDTH, HEIGHT)
-            assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-
-
-POISON = {"vertices": 0, "viewmat": 2, "K": 3}
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
-@pytest.mark.parametrize("name", [*POISON, "points"])
-def test_values_that_are_no_numbers_are_refused_by_name(name, value):
-    scene = soup(0)
-    points = some_points(scene[0], scene[1], 0)
-    (points if name == "points" else scene[POISON[name]])[0, 0] = value
-    with pytest.raises(ValueError, match=rf"^{name}: expected finite values"):
-        visible(points, *scene)
-
-
 def test_large_values_below_the_limit_are_no_error():
     # Their sum is above it, which is what the kernels look at first.
     vertices, faces, viewmat, K = soup(0)
     vertices[0], points = 0.9e15, some_points(vertices, faces, 0)
     points[1] = -0.9e15
     assert visible(points, vertices, faces, viewmat, K).visibility.isfinite().all()
-
-
-@pytest.mark.parametrize("index", [-1, 75])
-def test_a_face_that_names_no_vertex_is_refused(index):
-    vertices, faces, viewmat, K = soup(0)
-    faces[3, 1] = index
-    with pytest.raises(ValueError, match=r"^faces: expected indices in 0 .. 74 \(75 vertices\)"):
-        depth_map(vertices, faces, viewmat, K, WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize(
@@ -288,16 +184,7 @@ def test_a_face_that_names_no_vertex_is_refused(index):
         ({"tau": math.nan}, "tau: expected a positive"),
         ({"margin": -1.0}, "margin: expected a finite number, 0 or more, got -1.0."),
         ({"margin": math.nan}, "margin: expected a finite number"),
-        ({"points": torch.zeros(3, 2).double()}, r"points: expected shape \[P, 3\], got \[3, 2\]."),
-        ({"points": torch.zeros(3, 3)}, "points: expected torch.float64 on cpu, got torch.float32 on cpu."),
-        ({"vertices": torch.zeros(3, 4, dtype=torch.float64)}, r"vertices: expected shape \[V, 3\]"),
-        ({"faces": torch.zeros(3, 4).long()}, r"faces: expected shape \[F, 3\], got \[3, 4\]. Three vertex"),
-        ({"faces": torch.zeros(3, 3)}, "faces: expected int32 or int64, got float32."),
-        ({"viewmat": torch.eye(3).double()}, r"viewmat: expected shape \[4, 4\].* World to camera."),
         ({"K": torch.diag(torch.tensor([0.0, 1, 1])).double()}, r"K\[0, 0\]: expected a positive"),
-        ({"K": torch.eye(3)}, "K: expected torch.float64"),
-        ({"point_vertices": torch.zeros(3).long()}, r"point_vertices: expected shape \[60\], got \[3\]."),
-        ({"point_vertices": torch.full((60,), 75)}, r"point_vertices: expected indices in 0 .. 74"),
     ],
 )
 def test_a_wrong_argument_is_named_with_what_was_expected(change, message, as_shipped):
@@ -347,3 +234,100 @@ def test_a_map_gives_masks_normals_and_textured_pictures(device):
 
     normals = torch.nn.functional.normalize(torch.linalg.cross(wall[1] - wall[0], wall[2] - wall[0]), dim=0)[None]
     assert ((hits - wall[0]) * normals[face_ids[mask].long()]).sum(-1).abs().max() < 1e-10
+
+
+# Gradients and batches
+
+
+@pytest.fixture(params=["vectors", "points"])
+def backward(request, monkeypatch):
+    """Both ways to add up gradients at vertices: the generic kernels run on the CPU too."""
+    if request.param == "points":
+        monkeypatch.setattr(depth_buffer, "vertex_gradients_by_vectors", depth_buffer.vertex_gradients_by_points)
+
+
+def test_points_that_move_with_a_wall_across_the_view_keep_their_score():
+    # Moved by dz along the axis, a wall square to it and points at it stay as far apart.
+    wall = torch.tensor([[-9.0, -9, 3], [9, -9, 3], [0, 9, 3]], dtype=torch.float64).requires_grad_()
+    points = torch.tensor([[0.1, 0.2, 2.9], [-0.3, 0.1, 2.8]], dtype=torch.float64).requires_grad_()
+    K = torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]], dtype=torch.float64)
+    seen = depth_visibility(points, wall, torch.tensor([[0, 1, 2]]), K, torch.eye(4).double(), 16, 16, 0.5)
+    by_points, by_wall = torch.autograd.grad(seen.visibility.sum(), [points, wall])
+    assert (by_points[:, 2] < -0.01).all() and not by_points[:, :2].any()
+    normal = torch.linalg.cross(wall[1] - wall[0], wall[2] - wall[0]).detach()
+    assert torch.linalg.cross(by_wall, normal.expand(3, 3)).norm() < 1e-12 * normal.norm()
+    torch.testing.assert_close(by_wall[:, 2].sum(), -by_points[:, 2].sum(), rtol=1e-12, atol=0)
+
+
+def test_no_gradient_comes_where_the_score_is_not_soft(backward):
+    wall = torch.tensor([[-0.1, -0.1, 2], [0.1, -0.1, 2], [0, 0.1, 2]], dtype=torch.float64).requires_grad_()
+    points = torch.tensor(
+        [[0.0, 0.0, 2.0], [0.7, 0.7, 2.0], [0.0, 0.0, -1.0], [9.0, 0.0, 2.0]], dtype=torch.float64
+    ).requires_grad_()  # its own vertex is in view; background; behind the camera; outside
+    K = torch.tensor([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]], dtype=torch.float64)
+    seen = depth_visibility(
+        points, wall, torch.tensor([[0, 1, 2]]), K, torch.eye(4).double(), 40, 40, 0.5,
+        point_vertices=torch.tensor([2, -1, -1, -1]),
+    )  # fmt: skip
+    assert seen.visibility.tolist() == [1, 1, 0, 0]
+    by_points, by_wall = torch.autograd.grad(seen.visibility.sum(), [points, wall])
+    assert not by_points.any() and not by_wall.any()
+
+
+def batch(n, dtype=torch.float64):
+    """Scenes of one mesh: [B, V, 3], faces, [B, 4, 4], [B, 3, 3], [B, P, 3]."""
+    scenes = [soup(seed, dtype=dtype) for seed in range(n)]
+    faces = scenes[0][1]
+    vertices, viewmats, Ks = (torch.stack([scene[k] for scene in scenes]) for k in (0, 2, 3))
+    points = torch.stack([some_points(v, faces, seed, n=37) for seed, v in enumerate(vertices)])
+    return vertices, faces, viewmats, Ks, points
+
+
+@pytest.mark.parametrize("kernels", ["vectors", "generic"])
+def test_a_batch_equals_its_parts_to_the_bit(dtype, kernels, monkeypatch):
+    if kernels == "generic":
+        monkeypatch.setattr(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces)
+        monkeypatch.setattr(depth_buffer, "vertex_gradients_by_vectors", depth_buffer.vertex_gradients_by_points)
+    vertices, faces, viewmats, Ks, points = batch(3, dtype)
+    known = torch.arange(37) - 1
+
+    def look(points, vertices, viewmats, Ks):
+        leaves = [points.clone().requires_grad_(), vertices.clone().requires_grad_()]
+        seen = visible(*leaves, faces, viewmats, Ks, point_vertices=known)
+        grads = torch.autograd.grad(seen.visibility.square().sum(), leaves)
+        return [*seen, *grads, *depth_map(vertices, faces, viewmats, Ks, WIDTH, HEIGHT)]
+
+    together = look(points, vertices, viewmats, Ks)
+    for b in range(3):
+        alone = look(points[b], vertices[b], viewmats[b], Ks[b])
+        assert all(torch.equal(x[b], y) for x, y in zip(together, alone, strict=True))
+
+
+def test_batches_of_different_sizes_are_refused(as_shipped):
+    vertices, faces, viewmats, Ks, points = batch(3)
+    with pytest.raises(ValueError, match=r"^viewmat: expected shape \[3, 4, 4\], got \[2, 4, 4\]."):
+        depth_map(vertices, faces, viewmats[:2], Ks, WIDTH, HEIGHT)
+    with pytest.raises(ValueError, match=r"^points: expected shape \[3, P, 3\], got \[2, 37, 3\]."):
+        visible(points[:2], vertices, faces, viewmats, Ks)
+
+
+def test_a_bad_value_anywhere_in_a_batch_is_refused_by_name():
+    for name in ("points", "vertices", "viewmat", "K"):
+        vertices, faces, viewmats, Ks, points = batch(3)
+        {"points": points, "vertices": vertices, "viewmat": viewmats, "K": Ks}[name][2, 0, 0] = torch.nan
+        with pytest.raises(ValueError, match=f"^{name}: expected finite values"):
+            visible(points, vertices, faces, viewmats, Ks)
+
+
+@pytest.mark.parametrize("n_batch, n_points, n_faces", [(0, 5, 5), (2, 0, 5), (2, 5, 0), (2, 0, 0)])
+def test_empty_axes_give_empty_answers_and_gradients(n_batch, n_points, n_faces, backward):
+    vertices, faces, viewmats, Ks, points = batch(2)
+    points = points[:n_batch, :n_points].clone().requires_grad_()
+    vertices = vertices[:n_batch].clone().requires_grad_()
+    seen = visible(points, vertices, faces[:n_faces], viewmats[:n_batch], Ks[:n_batch])
+    assert seen.visibility.shape == (n_batch, n_points) and seen.face_ids.shape == (n_batch, HEIGHT, WIDTH)
+    by_points, by_vertices = torch.autograd.grad(seen.visibility.sum(), [points, vertices])
+    assert by_points.shape == points.shape and by_vertices.shape == vertices.shape
+    assert not by_vertices.any() or (n_points and n_faces)
+    drawn = depth_map(vertices, faces[:n_faces], viewmats[:n_batch], Ks[:n_batch], WIDTH, HEIGHT)
+    assert drawn.barycentrics.shape == (n_batch, HEIGHT, WIDTH, 3)

@@ -118,17 +118,6 @@ def test_scores_and_gradients_are_those_of_float64(known, device):
             assert (a.double() - b).norm() <= 1e-6 * b.norm()
 
 
-@pytest.mark.parametrize("wanted", [0, 1])
-def test_a_gradient_that_is_wanted_alone_is_the_same(wanted, device):
-    arguments = on(device, scoring(1))
-    both = graded(*arguments)[3:]
-    leaves = [arguments[0].clone(), arguments[1].clone()]
-    leaves[wanted].requires_grad_()
-    seen = depth_visibility(*leaves, *arguments[3:])
-    (alone,) = torch.autograd.grad((seen.visibility * arguments[2]).sum(), leaves[wanted])
-    assert alone.any() and torch.equal(alone, both[wanted])
-
-
 @pytest.mark.gpu
 def test_repeats_and_few_blocks_give_the_same_bits(monkeypatch):
     arguments = on("cuda", scoring(1))

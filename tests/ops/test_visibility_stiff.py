@@ -7,7 +7,6 @@ import torch
 
 from oasis_warp.core.hand_model import BACK_SIDE, PALM_SIDE
 from oasis_warp.ops import depth_map, depth_visibility
-from oasis_warp.ops._runtime import depth_buffer
 
 EYE = torch.eye(4, dtype=torch.float64)
 
@@ -71,50 +70,6 @@ def test_vertices_at_all_pixel_centres_at_random_depths_leave_no_hole(focal):
     torch.testing.assert_close(got.depth, depths.view(62, 62)[1:61, 1:61], rtol=1e-9, atol=0)
 
 
-def test_degenerate_faces_change_nothing():
-    vertices, faces = grid(6, z=1.5, spacing=0.1)
-    line = torch.tensor([[0, 0, 1], [2, 2, 2], [0, 1, 2], [0, 8, 16]])  # corners repeated, and in a line
-    K = pinhole(60.0, 40, 40)
-    plain = depth_map(vertices, faces, EYE, K, 40, 40)
-    more = depth_map(vertices, torch.cat([line, faces]), EYE, K, 40, 40)
-    assert torch.equal(plain.depth, more.depth)
-    assert torch.equal(plain.face_ids, torch.where(more.face_ids >= 0, more.face_ids - 4, -1))
-
-
-def test_faces_seen_edge_on_cover_nothing():
-    # In planes through the camera and through pixel centres: x = 0, and x = 3 y, where all is a matter of rounding.
-    upright = torch.tensor([[0.0, -1, 1], [0, 1, 1], [0, 0, 3]], dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
-    y, z = 4 * torch.rand(2, 300, generator=generator, dtype=torch.float64) - torch.tensor([[2.0], [-1.0]])
-    vertices = torch.cat([upright, torch.stack([3 * y, y, z], 1)])
-    got = depth_map(vertices, torch.arange(303).view(-1, 3), EYE, pinhole(21.7, 33, 33), 33, 33)
-    assert (got.face_ids == -1).all() and got.depth.isinf().all() and not got.barycentrics.any()
-
-
-@pytest.mark.parametrize("distance", [1.0, 100.0, 1000.0])
-def test_a_millimetre_counts_at_any_distance(distance):
-    # Scores of points one tau behind a wall, camera and world far from each other; float32 depth holds 6e-5 m there.
-    wall, faces = grid(2, z=0.0, spacing=1.0)
-    points = torch.tensor([[0.01, 0.02, 0.001], [0.01, 0.02, -0.001], [0.01, 0.02, 0.0]])
-    view = EYE.float().clone()
-    view[2, 3] = distance
-    K = pinhole(100.0 * distance, 64, 64, torch.float32)
-    got = depth_visibility(points, wall.float(), faces, K, view, 64, 64, tau=0.001, margin=0.0).visibility
-    expected = torch.sigmoid(torch.tensor([-1.0, 1.0, 0.0]))
-    torch.testing.assert_close(got, expected, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("tau", [1e-6, 1e-12, 1e3])
-def test_a_tiny_tau_is_a_step_and_a_huge_one_a_half_with_finite_gradients(tau):
-    wall, faces = grid(2, z=2.0, spacing=5.0)
-    points = torch.tensor([[0.1, 0.1, 1.0], [0.1, 0.1, 3.0], [0.1, 0.1, 2.0]], dtype=torch.float64).requires_grad_()
-    got = depth_visibility(points, wall, faces, pinhole(20.0, 16, 16), EYE, 16, 16, tau=tau, margin=0.0).visibility
-    (grad,) = torch.autograd.grad(got.sum(), points)
-    step = [1.0, 0.0, 0.5] if tau < 1 else [0.5, 0.5, 0.5]
-    torch.testing.assert_close(got.detach(), torch.tensor(step, dtype=torch.float64), rtol=0, atol=1e-3)
-    assert grad.isfinite().all()
-
-
 def test_points_that_are_not_in_the_picture_are_hidden_and_points_over_the_background_are_seen():
     wall, faces = grid(2, z=2.0, spacing=0.2)
     points = torch.tensor(
@@ -142,49 +97,6 @@ def test_points_that_are_not_in_the_picture_are_hidden_and_points_over_the_backg
         assert not grad[:9].any()
 
 
-def test_what_is_nearer_than_the_near_plane_is_not_seen():
-    near, faces = grid(2, z=0.3, spacing=1.0)
-    far, _ = grid(2, z=0.6, spacing=1.0)
-    vertices, both = torch.cat([near, far]), torch.cat([faces, faces + len(near)])
-    got = depth_map(vertices, both, EYE, pinhole(20.0, 16, 16), 16, 16, near_plane=0.5)
-    torch.testing.assert_close(got.depth, torch.full_like(got.depth, 0.6))
-    assert (got.face_ids >= len(faces)).all()
-
-
-@pytest.mark.parametrize("n_points", [0, 3])
-def test_a_mesh_without_faces_hides_nothing_and_no_points_give_an_empty_answer(n_points):
-    vertices = torch.zeros(4, 3)
-    nothing = torch.zeros(0, 3, dtype=torch.int64)
-    inside = 0.5 * torch.rand(n_points, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0, 0, 2.0])
-    points = inside.requires_grad_()
-    got = depth_visibility(points, vertices, nothing, pinhole(20.0, 16, 12, torch.float32), EYE.float(), 16, 12)
-    assert got.visibility.shape == (n_points,) and (got.visibility == 1).all()
-    assert got.depth_map.shape == (12, 16) and got.depth_map.isinf().all() and (got.face_ids == -1).all()
-    (grad,) = torch.autograd.grad(got.visibility.sum(), points)
-    assert grad.shape == points.shape and not grad.any()
-    empty = depth_map(torch.zeros(0, 3), nothing, EYE.float(), pinhole(20.0, 16, 12, torch.float32), 16, 12)
-    assert (empty.face_ids == -1).all()
-
-
-@pytest.mark.parametrize("width, height", [(1, 1), (1, 9), (257, 2), (65, 63)])
-def test_any_image_size_is_filled_to_its_border(width, height):
-    wall, faces = grid(3, z=2.0, spacing=100.0)
-    got = depth_map(wall, faces, EYE, pinhole(20.0, width, height), width, height)
-    torch.testing.assert_close(got.depth, torch.full((height, width), 2.0, dtype=torch.float64))
-    torch.testing.assert_close(got.barycentrics.sum(-1), torch.ones(height, width, dtype=torch.float64))
-
-
-@pytest.mark.parametrize("unit", [1e-9, 1e-3, 1e6, 1e12])
-def test_the_unit_of_length_does_not_matter(unit):
-    vertices, faces = grid(8, z=3.0, spacing=0.31, centre=(0.013, 0.007))
-    vertices[:, 2] += torch.rand(len(vertices), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    K = pinhole(30.0, 40, 30)
-    one = depth_map(vertices.float().double(), faces, EYE, K, 40, 30)
-    other = depth_map((unit * vertices.float().double()), faces, EYE, K, 40, 30, near_plane=0.01 * unit)
-    assert torch.equal(one.face_ids, other.face_ids)
-    torch.testing.assert_close(one.depth * unit, other.depth, rtol=1e-12, atol=0)
-
-
 def test_a_curved_surface_does_not_shadow_itself():
     # A sphere the size of a hand, 128 px, tau 2 mm: few of its visible points are lost, few of the hidden ones leak.
     n = 120
@@ -206,16 +118,6 @@ def test_a_curved_surface_does_not_shadow_itself():
         assert (scores[facing < -0.05] > 0.5).double().mean() < 0.05
 
 
-def test_the_kernel_for_cuda_fills_the_same_buffer_as_the_one_for_the_cpu(hand, monkeypatch):
-    vertices, viewmat, K = palm_view(hand, 128)
-    twice = torch.cat([hand.faces, hand.faces])  # every pixel is a tie
-    vectors = depth_map(vertices, twice, viewmat, K, 128, 128)
-    monkeypatch.setattr(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces)
-    faces = depth_map(vertices, twice, viewmat, K, 128, 128)
-    assert (vectors.face_ids >= 0).any() and (vectors.face_ids < len(hand.faces)).all()
-    assert all(torch.equal(a, b) for a, b in zip(vectors, faces, strict=True))
-
-
 def palm_view(hand, size, distance=0.5):
     """Vertices and a camera that looks at the palm from below (the palm faces -y)."""
     vertices = hand.template
@@ -224,17 +126,6 @@ def palm_view(hand, size, distance=0.5):
     viewmat[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     viewmat[:3, 3] = -viewmat[:3, :3] @ centre + torch.tensor([0, 0, distance])
     return vertices, viewmat, pinhole(2.2 * size, size, size, torch.float32)
-
-
-def test_a_hand_looks_the_same_from_any_number_of_threads(hand, with_threads):
-    vertices, viewmat, K = palm_view(hand, 200)
-
-    def look():
-        seen = depth_visibility(vertices, vertices, hand.faces, K, viewmat, 200, 200)
-        return [*seen, *depth_map(vertices, hand.faces, viewmat, K, 200, 200)]
-
-    one, several = with_threads(1, look), with_threads(3, look)
-    assert all(torch.equal(a, b) for a, b in zip(one, several, strict=True))
 
 
 @pytest.fixture(scope="module")

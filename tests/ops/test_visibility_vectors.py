@@ -131,6 +131,7 @@ def plainly(monkeypatch):
     def call(function, *args, **options):
         with monkeypatch.context() as patch:
             patch.setattr(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces)
+            patch.setattr(depth_buffer, "vertex_gradients_by_vectors", depth_buffer.vertex_gradients_by_points)
             return function(*args, **options)
 
     return call
@@ -148,20 +149,27 @@ def test_vectors_see_the_same_as_the_plain_kernels_to_the_bit(scene, dtype, plai
     assert covered > 100
 
 
-def test_scores_are_those_of_the_plain_kernels(dtype, plainly):
+def test_scores_and_gradients_are_those_of_the_plain_kernels(dtype, plainly):
+    def look(points, vertices, *rest, **options):
+        leaves = [points.clone().requires_grad_(), vertices.clone().requires_grad_()]
+        seen = depth_visibility(*leaves, *rest, **options)
+        return seen, torch.autograd.grad(seen.visibility.square().sum(), leaves)
+
+    eps = torch.finfo(dtype).eps
     for seed, (width, height) in enumerate(SIZES):
         vertices, faces, viewmat, K, *_ = make(small_faces, seed, width, height, dtype)
-        arguments = (vertices, vertices, faces, K, viewmat, width, height, 0.1)
+        arguments = (vertices + 0.05, vertices, faces, K, viewmat, width, height, 0.1)
         known = torch.arange(len(vertices))
         known[::3] = -1
         for options in ({}, {"point_vertices": known}, {"literal": True}):
-            got, want = depth_visibility(*arguments, **options), plainly(depth_visibility, *arguments, **options)
-            eps = torch.finfo(dtype).eps
+            (got, gradients), (want, exact) = look(*arguments, **options), plainly(look, *arguments, **options)
             torch.testing.assert_close(got.visibility, want.visibility, rtol=0, atol=4 * eps)
             assert torch.equal(got.face_ids, want.face_ids)
             # The filter's inverse depths, as they are: within 2^-18 by the bound, and much closer in fact.
             close = 2**-18 if dtype == torch.float32 else 0
             torch.testing.assert_close(got.depth_map, want.depth_map, rtol=close, atol=0)
+            for a, b in zip(gradients, exact, strict=True):
+                assert (a - b).norm() <= 40 * eps * b.norm()
 
 
 def test_neither_threads_nor_parts_of_the_mesh_change_a_bit(hand, with_threads, monkeypatch):
