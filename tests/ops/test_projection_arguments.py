@@ -123,13 +123,3 @@ def test_arrays_that_a_kernel_would_run_out_of_are_refused(changes, words):
     named = {k: getattr(scene, k) for k in TENSORS} | {"covars": None} | changes
     with pytest.raises(ValueError, match=words):
         project(**named, width=scene.width, height=scene.height, **OPTIONS)
-
-
-def test_only_places_shapes_and_depths_have_gradients(device):
-    scene = ordinary_scene(49, n=N, device=device)
-    out = project(
-        scene.means.clone().requires_grad_(), scene.quats, scene.scales, scene.opacities, scene.viewmats, scene.Ks,
-        scene.width, scene.height, **OPTIONS,
-    )  # fmt: skip
-    with_gradient = {name for name, t in zip(Projection._fields, out, strict=True) if t.requires_grad}
-    assert with_gradient == {"means2d", "covars2d", "depths"}

@@ -4,7 +4,7 @@ import pytest
 import torch
 from projection_runs import OPTIONS, incoming, run
 from rasterization_scenes import covariances, frontal_scene, ordinary_scene
-from test_projection import assert_same, both
+from test_projection import assert_same
 
 from oasis_warp.ops import rasterization
 from oasis_warp.ops.projection import project
@@ -130,36 +130,11 @@ def test_a_larger_scale_of_the_world_changes_no_decision():
     assert torch.equal(got.radii, run(scene, covariances(scene))[0].radii)
 
 
-def test_vectors_of_quaternions_and_of_covariances_share_means_and_depths():
-    scene = ordinary_scene(38)
-    (quats, _), _ = both(scene)
-    covars, _ = run(scene, covariances(scene))
-    for name in ("means2d", "depths"):
-        assert torch.equal(getattr(quats, name), getattr(covars, name)), name
-    for name in ("sort_depths", "centers"):
-        assert torch.equal(getattr(quats.tables(), name), getattr(covars.tables(), name)), name
-
-
 def draw_covariances(scene, covars, **options):
     return rasterization(
         scene.means, None, None, scene.opacities, scene.colors, scene.viewmats, scene.Ks, scene.width, scene.height,
         backgrounds=scene.backgrounds, covars=covars, **options,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-6), (torch.float64, 1e-12)])
-def test_covariances_draw_what_their_quaternions_and_scales_draw(dtype, bound, device):
-    scene = ordinary_scene(21, n=200).to(torch.float64)
-    exact = covariances(scene)
-    scene, covars = scene.to(device=device, dtype=dtype), exact.to(device=device, dtype=dtype)
-    expected, alphas, _ = rasterization(
-        *scene.gaussians, scene.colors, scene.viewmats, scene.Ks, scene.width, scene.height,
-        backgrounds=scene.backgrounds,
-    )  # fmt: skip
-    got, got_alphas, meta = draw_covariances(scene, covars)
-    assert (got - expected).norm() <= bound * expected.norm()
-    assert (got_alphas - alphas).norm() <= bound * alphas.norm()
-    assert (meta["radii"] > 0).any()
 
 
 def test_quats_and_scales_are_not_read_beside_covariances(device):
@@ -171,13 +146,6 @@ def test_quats_and_scales_are_not_read_beside_covariances(device):
         scene.height, backgrounds=scene.backgrounds, covars=covars,
     )  # fmt: skip
     assert torch.equal(got, draw_covariances(scene, covars)[0])
-
-
-def test_the_gradient_by_a_covariance_is_symmetric(device):
-    scene = ordinary_scene(24, dtype=torch.float64).to(device)
-    covars = covariances(scene).requires_grad_()
-    (g,) = torch.autograd.grad(draw_covariances(scene, covars)[0].square().sum(), covars)
-    torch.testing.assert_close(g, g.mT, rtol=1e-12, atol=1e-12 * float(g.abs().max()))
 
 
 @pytest.mark.usefixtures("as_shipped")

@@ -26,18 +26,6 @@ def call():
     return change
 
 
-TENSORS = "means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds"
-
-
-@pytest.mark.parametrize("value", POISON)
-@pytest.mark.parametrize("name", TENSORS)
-def test_values_that_are_not_finite_are_refused_by_name(name, value, call):
-    bad = call.arguments[name].clone()
-    bad.view(-1)[1] = value
-    with pytest.raises(ValueError, match=rf"^{name}: expected finite values below 1e\+15, got 1 of {bad.numel()}"):
-        call(**{name: bad})
-
-
 def test_validate_false_skips_the_look_at_values(call):
     colors = call.arguments["colors"].clone()
     colors[0, 0] = float("nan")
@@ -60,19 +48,11 @@ def test_unchecked_values_that_are_not_finite_do_not_reach_other_gaussians(name,
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"means": torch.zeros(60, 2)}, r"means: expected shape \[N, 3\], got \[60, 2\]"),
         ({"quats": torch.zeros(59, 4)}, r"quats: expected shape \[60, 4\], got \[59, 4\]. One wxyz row"),
-        ({"scales": torch.zeros(60)}, r"scales: expected shape \[60, 3\], got \[60\]"),
-        ({"opacities": torch.zeros(60, 1)}, r"opacities: expected shape \[60\], got \[60, 1\]"),
-        ({"colors": torch.zeros(61, 3)}, r"colors: expected shape \[60, D\], got \[61, 3\]"),
         ({"colors": torch.zeros(1, 60, 3)}, r"colors: expected shape \[2, 60, D\], got \[1, 60, 3\]"),
         ({"colors": torch.zeros(60, 33), "backgrounds": None}, r"colors: expected 1 to 32 channels, got 33"),
         ({"colors": torch.zeros(60, 0), "backgrounds": None}, r"colors: expected 1 to 32 channels, got 0"),
         ({"viewmats": torch.eye(4)}, r"viewmats: expected shape \[C, 4, 4\], got \[4, 4\]. A single camera"),
-        ({"Ks": torch.eye(3)[None]}, r"Ks: expected shape \[2, 3, 3\], got \[1, 3, 3\]"),
-        ({"backgrounds": torch.zeros(3)}, r"backgrounds: expected shape \[2, 3\], got \[3\]"),
-        ({"means": torch.zeros(60, 3).half()}, r"means: expected float32 or float64, got float16"),
-        ({"scales": torch.zeros(60, 3).double()}, r"scales: expected torch.float32 on cpu, got torch.float64"),
         ({"quats": torch.zeros(60, 4)}, r"quats: expected rows that are not zero, got 60 zero rows"),
         ({"opacities": torch.full((60,), 1.5)}, r"opacities: expected values in \[0, 1\], got 1.5 to 1.5. Logits"),
         ({"opacities": torch.full((60,), -0.5)}, r"opacities: expected values in \[0, 1\], got -0.5"),

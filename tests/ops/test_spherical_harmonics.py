@@ -54,6 +54,14 @@ def test_sums_are_those_of_the_textbook_basis(degree, device):
     torch.testing.assert_close(got, expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.usefixtures("as_shipped")
+@pytest.mark.parametrize("degree", DEGREES)
+def test_gradients_are_those_of_finite_differences(degree, device):
+    inputs = [t.to(device).requires_grad_() for t in directions_and_coefficients(degree, n=6)]
+    inputs[0] = torch.nn.functional.normalize(inputs[0].detach(), dim=-1).mul_(1.7).requires_grad_()
+    assert torch.autograd.gradcheck(lambda *given: spherical_harmonics(degree, *given), inputs, nondet_tol=0.0)
+
+
 def test_further_coefficients_are_not_read_and_get_no_gradient(device):
     directions, coefficients = (t.to(device) for t in directions_and_coefficients(3))
     coefficients.requires_grad_()

@@ -64,12 +64,6 @@ def assert_same_picture(scene, monkeypatch, value_error=None, gradient_error=Non
         assert rel(got, want.double()) <= (gradient_error or GRADIENT_ERROR), name
 
 
-def assert_equal_bits(a, b):
-    assert torch.equal(a[0], b[0]) and torch.equal(a[1], b[1])
-    for name, got, want in zip(INPUTS, a[2], b[2], strict=True):
-        assert torch.equal(got, want), name
-
-
 def projected(scene):
     options = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3}
     return project(*scene.gaussians, scene.viewmats, scene.Ks, scene.width, scene.height, **options)
@@ -137,33 +131,6 @@ def test_each_degree_of_the_exponential_has_its_error(monkeypatch):
 
 
 # The same bits
-
-
-@pytest.mark.parametrize("n_threads", [2, 3, 5])
-def test_threads_share_strips_without_changing_a_bit(n_threads, with_threads):
-    scene = ordinary_scene(7, n=6000, width=300, height=140, size=(0.01, 0.04))
-    alone = with_threads(1, values_and_gradients, scene)
-    for _ in range(3):
-        assert_equal_bits(with_threads(n_threads, values_and_gradients, scene), alone)
-
-
-def test_a_backward_to_come_changes_no_bit_of_the_picture():
-    scene = ordinary_scene(8, n=300)
-    with torch.no_grad():
-        image, alphas = draw(scene)
-    later = draw(scene.with_(means=scene.means.clone().requires_grad_()))
-    assert torch.equal(image, later[0]) and torch.equal(alphas, later[1])
-
-
-def test_cameras_together_or_apart_give_the_same_bits():
-    scene = ordinary_scene(9, n=300, cameras=3)
-    together = values_and_gradients(scene)
-    for c in range(3):
-        one = scene.with_(
-            viewmats=scene.viewmats[c : c + 1], Ks=scene.Ks[c : c + 1], backgrounds=scene.backgrounds[c : c + 1]
-        )
-        image, alphas = draw(one)
-        assert torch.equal(image[0], together[0][c]) and torch.equal(alphas[0], together[1][c])
 
 
 # Lists

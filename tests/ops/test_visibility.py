@@ -116,32 +116,6 @@ def test_a_face_through_the_near_plane_is_seen_beyond_it_only(backend):
     assert torch.equal(got.face_ids >= 0, (20 / below > 2)[:, None].expand(16, 16))
 
 
-def test_a_wall_behind_everything_changes_no_covered_pixel_and_one_in_front_hides_every_point():
-    vertices, faces, viewmat, K = soup(8)
-    points = some_points(vertices, faces, 8)
-    corners = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]], dtype=torch.float64)
-
-    def with_wall(depth):
-        wall = torch.cat([100 * depth * corners, torch.full((4, 1), depth, dtype=torch.float64)], 1)
-        wall = (wall - viewmat[:3, 3]) @ viewmat[:3, :3]
-        more = torch.tensor([[0, 1, 2], [0, 2, 3]]) + len(vertices)
-        return torch.cat([vertices, wall]), torch.cat([faces, more]), viewmat, K
-
-    open_map = depth_map(vertices, faces, viewmat, K, WIDTH, HEIGHT)
-    walled = depth_map(*with_wall(50.0), WIDTH, HEIGHT)
-    covered = open_map.face_ids >= 0
-    assert walled.depth.isfinite().all()
-    assert torch.equal(open_map.depth[covered], walled.depth[covered])
-    assert torch.equal(open_map.face_ids[covered], walled.face_ids[covered])
-
-    camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    beyond = camera[:, 2] > 0.2 + 20 * TAU
-    hidden = visible(points[beyond], *with_wall(0.2)).visibility
-    assert beyond.sum() > 30 and hidden.max() < 1e-6
-    free = visible(points, vertices, faces, viewmat, K).visibility
-    assert (visible(points, *with_wall(3.0)).visibility <= free + 1e-12).all()
-
-
 def test_a_point_that_comes_nearer_along_its_ray_is_never_less_visible():
     vertices, faces, viewmat, K = soup(9)
     points = some_points(vertices, faces, 9)
