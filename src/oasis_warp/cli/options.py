@@ -250,7 +250,7 @@ class Synthesize:
 
 @dataclass(frozen=True, kw_only=True)
 class Pretrain:
-    """Train the learned prior on synthetic hands: network.safetensors, metrics.jsonl and pictures.png.
+    """Train a network on synthetic hands: network.safetensors, metrics.jsonl and pictures.png.
 
     People are baked first and kept in OUT/people, 23 MB each. A training that was stopped goes on when it is started
     again with the same options, and on the CPU ends with the same bits. Ctrl-C ends it after the step it is at.
@@ -259,14 +259,16 @@ class Pretrain:
 
     out: Positional[Path]
     """Folder for what training leaves; its parent must exist."""
+    task: Literal["prior", "dense"] = "prior"
+    """The learned prior, which predicts Gaussians, or the estimator's dense network, which reads every pixel."""
     profile: Literal["compact", "paper"] = "compact"
-    """Sizes of the network: ours, or the paper's."""
+    """Sizes of the prior: ours, or the paper's."""
     steps: int = 20_000
     """Batches that each process sees."""
     hands: int = 16
-    """Photos a batch and process, each of another person."""
+    """Photos a batch and process, each of another person; the dense network was trained with 64."""
     views: int = 2
-    """Targets a photo: the same hand in other poses and even light, 1 to 8."""
+    """For the prior: targets a photo, the same hand in other poses and even light, 1 to 8."""
     people: int = 512
     """How many there are."""
     hold_out: tuple[Kind, ...] = ()
@@ -283,7 +285,7 @@ class Pretrain:
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for the paper's profile."""
     start: Path | None = None
-    """Weights to begin with: a network.safetensors of the same profile. From nothing when not given."""
+    """Weights to begin with: a network.safetensors of the same task and profile. From nothing when not given."""
 
 
 @dataclass(frozen=True, kw_only=True)

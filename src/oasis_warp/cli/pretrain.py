@@ -1,4 +1,4 @@
-"""`oasis pretrain`: train the learned prior on the synthetic world."""
+"""`oasis pretrain`: train the learned prior, or the dense network, on the synthetic world."""
 
 import hashlib
 import os
@@ -20,11 +20,15 @@ from oasis_warp.core.logging import Progress, silent
 from oasis_warp.data.output_files import open_resumable_folder
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PROFILES, NetworkConfig
+from oasis_warp.network.dense_network import DenseNetwork
+from oasis_warp.network.dense_weights import load_dense_network
 from oasis_warp.network.encoders import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, read_config
+from oasis_warp.pretraining.dense_source import DensePhotos
+from oasis_warp.pretraining.dense_trainer import DenseTrainer
 from oasis_warp.pretraining.distributed import ProcessInfo, join_processes, wait_for_all
-from oasis_warp.pretraining.pretrain import CHECKPOINT, PretrainConfig, pretrain
+from oasis_warp.pretraining.pretrain import CHECKPOINT, PretrainConfig, Trainer, pretrain
 from oasis_warp.pretraining.prior_trainer import PriorTrainer
 from oasis_warp.pretraining.synthetic_source import MULTIPLE, SyntheticHands
 from oasis_warp.synthetic.people import max_people_cached
@@ -33,6 +37,8 @@ from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH
 SETTINGS, PEOPLE = "training.json", "people"
 """Names in the folder: the settings of the training, and the folder of people baked on a CPU."""
 PRECISIONS = {"bf16": "bfloat16", "float32": "float32"}
+DENSE_SCHEDULE: dict[str, Any] = {"learning_rate": 1e-3, "warmup": 300, "decay": "cooldown"}
+"""Of the dense network's training; a cooldown lets a training go on from weights before it."""
 AHEAD = 4
 """Batches that a GPU renders together."""
 SIZES = range(32, 1025, MULTIPLE)
@@ -76,6 +82,20 @@ def check_options(options: Pretrain) -> None:
         raise InputError(
             f"--size: expected a multiple of {MULTIPLE} from {SIZES[0]} to {SIZES[-1]} pixels, got {options.size}."
         )
+    if options.task == "prior":
+        check_prior_options(options)
+    else:
+        for name in ("profile", "views", "hold_out", "backbone_weights"):
+            if getattr(options, name) != getattr(Pretrain, name, None):
+                raise InputError(f"--{name.replace('_', '-')}: is for --task prior, got it with dense; leave it out.")
+
+
+def check_prior_options(options: Pretrain) -> None:
+    """Check what only a prior's training takes.
+
+    Raises:
+        InputError: weights that the network does not need or lacks, or of another one.
+    """
     backbone, weights = PROFILES[options.profile].backbone, options.backbone_weights
     if backbone == "convolutional" and weights is not None:
         raise InputError(f"--backbone-weights: the {options.profile} profile trains its own encoder; leave them out.")
@@ -96,11 +116,7 @@ def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
     Raises:
         InputError: a folder that cannot be used, weights that do not fit, or a loss that is not finite.
     """
-    hands = SyntheticHands(
-        seed=options.seed, people=options.people, hands=options.hands, views=options.views, size=options.size,
-        device=process.device, population=replace(EVERYBODY, **dict.fromkeys(options.hold_out, 0.0)),
-        workers=options.workers, ahead=AHEAD if process.device.type == "cuda" else 1,
-    )  # fmt: skip
+    hands = prior_hands(options, process.device) if options.task == "prior" else dense_photos(options, process.device)
     met = hands.people_met(process.rank, process.world, options.steps)
     most = max_people_cached(str(process.device))
     if len(met) > most:
@@ -108,7 +124,7 @@ def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
             f"--people: expected at most {most} that one {process.device.type} device meets, got {len(met)}; "
             "each takes 23 MB there."
         )
-    network = make_network(PROFILES[options.profile], options.seed, options.backbone_weights, options.start)
+    trainer = make_trainer(options, process)
     settings = settings_of(options, process.world)
     if process.rank == 0:
         claim(options.out, settings)
@@ -116,10 +132,53 @@ def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
             (options.out / PEOPLE).mkdir(exist_ok=True)
     wait_for_all(process)
     hands.bake(met, options.out / PEOPLE, options.workers, progress)
-    config = PretrainConfig(steps=options.steps, precision=PRECISIONS[options.precision])
     with stop_signals(can_force=process.world == 1) as should_stop:
-        trainer = PriorTrainer(network, config, process)
         return pretrain(trainer, hands, options.out, about=settings, should_stop=should_stop, progress=progress)
+
+
+def prior_hands(options: Pretrain, device: torch.device) -> SyntheticHands:
+    """The batches of a prior's training."""
+    return SyntheticHands(
+        seed=options.seed, people=options.people, hands=options.hands, views=options.views, size=options.size,
+        device=device, population=replace(EVERYBODY, **dict.fromkeys(options.hold_out, 0.0)),
+        workers=options.workers, ahead=AHEAD if device.type == "cuda" else 1,
+    )  # fmt: skip
+
+
+def dense_photos(options: Pretrain, device: torch.device) -> DensePhotos:
+    """The batches of a dense network's training."""
+    return DensePhotos(
+        seed=options.seed, people=options.people, photos=options.hands, size=options.size, device=device,
+        workers=options.workers,
+    )  # fmt: skip
+
+
+def make_trainer(options: Pretrain, process: ProcessInfo) -> Trainer:
+    """The network in training.
+
+    Raises:
+        InputError: weights do not fit.
+    """
+    precision = PRECISIONS[options.precision]
+    if options.task == "dense":
+        config = PretrainConfig(steps=options.steps, precision=precision, **DENSE_SCHEDULE)
+        return DenseTrainer(make_dense_network(options.seed, options.start), config, process)
+    config = PretrainConfig(steps=options.steps, precision=precision)
+    network = make_network(PROFILES[options.profile], options.seed, options.backbone_weights, options.start)
+    return PriorTrainer(network, config, process)
+
+
+def make_dense_network(seed: int, start: Path | None) -> DenseNetwork:
+    """A new dense network, or the one in the file `start`.
+
+    Raises:
+        InputError: weights do not fit.
+    """
+    if start is not None:
+        return load_dense_network(start)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return DenseNetwork()
 
 
 def make_network(config: NetworkConfig, seed: int, backbone_weights: Path | None, start: Path | None) -> HandNetwork:
@@ -140,9 +199,13 @@ def make_network(config: NetworkConfig, seed: int, backbone_weights: Path | None
 
 def settings_of(options: Pretrain, processes: int) -> dict[str, Any]:
     """All settings that the resulting weights depend on, unlike the device and the number of workers."""
-    names = ("profile", "steps", "hands", "views", "people", "size", "seed", "precision")
+    names = ("steps", "hands", "people", "size", "seed", "precision")
     settings = {name: getattr(options, name) for name in names} | {"processes": processes}
-    settings["hold_out"] = sorted(options.hold_out)
+    if options.task == "dense":
+        settings["task"] = "dense"
+    else:
+        settings |= {name: getattr(options, name) for name in ("profile", "views")}
+        settings["hold_out"] = sorted(options.hold_out)
     for name, path in {"backbone": options.backbone_weights, "start": options.start}.items():
         if path is not None:
             with path.open("rb") as file:

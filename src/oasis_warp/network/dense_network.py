@@ -51,15 +51,23 @@ class DensePrediction(NamedTuple):
     """Logits of palm and back, thumb, index, middle, ring and little finger."""
 
 
+class _Norm(nn.GroupNorm):
+    """Group norm in the precision of its input; torch's own writes float32 under autocast, which takes longer."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.autocast(x.device.type, enabled=False):
+            return F.group_norm(x, self.num_groups, self.weight.to(x.dtype), self.bias.to(x.dtype), self.eps)
+
+
 class _Residual(nn.Module):
     """Two 3 x 3 convolutions with a skip connection."""
 
     def __init__(self, width: int):
         super().__init__()
         self.first = nn.Conv2d(width, width, 3, 1, 1, bias=False)
-        self.norm_first = nn.GroupNorm(NORM_GROUPS, width)
+        self.norm_first = _Norm(NORM_GROUPS, width)
         self.second = nn.Conv2d(width, width, 3, 1, 1, bias=False)
-        self.norm_second = nn.GroupNorm(NORM_GROUPS, width)
+        self.norm_second = _Norm(NORM_GROUPS, width)
 
     def forward(self, x: Tensor) -> Tensor:
         y = F.silu(self.norm_first(self.first(x)))
@@ -72,7 +80,7 @@ class _Wide(nn.Module):
     def __init__(self, width: int):
         super().__init__()
         self.depthwise = nn.Conv2d(width, width, 7, 1, 3, groups=width, bias=False)
-        self.norm = nn.GroupNorm(1, width)
+        self.norm = _Norm(1, width)
         self.rise = nn.Conv2d(width, 3 * width, 1)
         self.fall = nn.Conv2d(3 * width, width, 1)
 
@@ -86,7 +94,7 @@ class _Attention(nn.Module):
     def __init__(self, width: int, heads: int = 8):
         super().__init__()
         self.heads = heads
-        self.norm = nn.GroupNorm(1, width)
+        self.norm = _Norm(1, width)
         self.inputs = nn.Conv2d(width, 3 * width, 1)
         self.output = nn.Conv2d(width, width, 1)
 
@@ -106,7 +114,7 @@ def _block(level: int) -> nn.Module:
 
 def _joined(inputs: int, width: int) -> nn.Module:
     return nn.Sequential(
-        nn.Conv2d(inputs, width, 3, 1, 1, bias=False), nn.GroupNorm(NORM_GROUPS, width), nn.SiLU()
+        nn.Conv2d(inputs, width, 3, 1, 1, bias=False), _Norm(NORM_GROUPS, width), nn.SiLU()
     )  # fmt: skip
 
 
@@ -122,7 +130,7 @@ class DenseNetwork(nn.Module):
         )
         steps = list(itertools.pairwise(WIDTHS))
         self.down = nn.ModuleList(
-            nn.Sequential(nn.Conv2d(a, b, 3, 2, 1, bias=False), nn.GroupNorm(NORM_GROUPS, b)) for a, b in steps
+            nn.Sequential(nn.Conv2d(a, b, 3, 2, 1, bias=False), _Norm(NORM_GROUPS, b)) for a, b in steps
         )
         self.attention = nn.Sequential(_Attention(WIDTHS[-1]), _Wide(WIDTHS[-1]))
         self.up = nn.ModuleList(_joined(a + b, a) for a, b in reversed(steps))

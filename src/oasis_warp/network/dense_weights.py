@@ -50,7 +50,10 @@ def load_dense_network(path: Path | str) -> DenseNetwork:
             header = json.loads((file.metadata() or {}).get(FORMAT, "null"))
             sizes = [header.get(name) for name in ("version", "widths", "depths")] if isinstance(header, dict) else None
             if sizes != [VERSION, list(WIDTHS), list(DEPTHS)]:
-                raise InputError(f"{path}: expected a dense network of version {VERSION}; train it again.")
+                raise InputError(
+                    f"{path}: expected the weights of a dense network of version {VERSION}, got another file; give one "
+                    "that `oasis pretrain --task dense` wrote."
+                )
             network = DenseNetwork()
             tensors = {name: file.get_tensor(name).float() for name in file.keys()}
     except (SafetensorError, json.JSONDecodeError) as error:

@@ -1,0 +1,93 @@
+"""The dense network in training: its loss, and the files that show it."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import cross_entropy
+
+from oasis_warp.network.dense_network import DEPTHS, HAND, SURFACE_UNIT, WIDTHS, DenseNetwork, DensePrediction
+from oasis_warp.network.dense_weights import save_dense_network
+from oasis_warp.pretraining.pretrain import StepResult, Trainer
+from oasis_warp.synthetic.dense_pictures import DenseBatch
+from oasis_warp.synthetic.sensor import srgb
+
+WEIGHTS = {"classes": 1.0, "surface": 0.3, "normal": 0.5, "albedo": 2.0, "edges": 1.0, "finger": 0.1}
+"""Weights of the terms of the loss."""
+MILLIMETRES = 1e3 * SURFACE_UNIT
+
+
+class DenseTrainer(Trainer[DenseNetwork, DenseBatch]):
+    """Trains the network to tell what each pixel of a photo shows."""
+
+    def evaluate(self, batch: DenseBatch) -> StepResult:
+        """Predict and compute the loss; `pictures` are true and predicted masks, surfaces and albedos."""
+        with self.autocast():
+            said = self.network(batch.image, batch.landmarks)
+        terms = dense_loss(said, batch)
+        loss = sum((WEIGHTS[name] * term for name, term in terms.items()), torch.zeros_like(terms["classes"]))
+        # A graph cannot hold indexing by a mask, whose result has no fixed size; so the mean is over all skin.
+        off = (said.surface - batch.surface).norm(dim=1) * batch.skin
+        terms["surface_mm"] = MILLIMETRES * off.sum() / batch.skin.sum().clamp_min(1)
+        hand = said.classes.softmax(1)[:, HAND]
+        pictures = (
+            batch.classes[:, HAND], hand, _shown(batch.surface, batch.skin), _shown(said.surface, hand > 0.5),
+            _shown(2 * srgb(batch.albedo) - 1, batch.skin), _shown(2 * said.albedo - 1, hand > 0.5),
+        )  # fmt: skip
+        return StepResult(loss, terms, pictures)
+
+    def identity(self) -> dict[str, Any]:
+        """Sizes of the network."""
+        return {"widths": list(WIDTHS), "depths": list(DEPTHS)}
+
+    def save_weights(self, path: Path, notes: Mapping[str, Any]) -> None:
+        """Write the weights in half precision."""
+        save_dense_network(path, self.network, notes=json.dumps({**notes, "loss_weights": WEIGHTS}, sort_keys=True))
+
+    def sheet(self, batch: DenseBatch, result: StepResult) -> list[Tensor]:
+        """Photos; masks, surfaces and albedos, each true and predicted."""
+        pictures = (
+            picture if picture.ndim == 4 else picture[:, None].expand(-1, 3, -1, -1) for picture in result.pictures
+        )
+        return [picture.permute(0, 2, 3, 1) for picture in (batch.image, *pictures)]
+
+
+def dense_loss(said: DensePrediction, true: DenseBatch) -> dict[str, Tensor]:
+    """The terms of the loss, each a mean over pixels.
+
+    classes, finger: cross-entropy. surface: negative log-likelihood of a Laplace distribution with the predicted
+    scale. normal: 1 - cosine. albedo: absolute difference in the encoding of sRGB; edges: the same of the differences
+    between neighbours, so that lines of the skin stay sharp.
+    """
+    skin, albedo = true.skin.float(), srgb(true.albedo)
+    count = skin.sum().clamp_min(1)
+
+    def on_skin(values: Float[Tensor, "B H W"]) -> Tensor:
+        return (values * skin).sum() / count
+
+    off = (said.surface - true.surface).abs().sum(1)
+    difference = said.albedo - albedo
+    slopes = [difference.diff(dim=axis).abs().mean(1) * torch.minimum(*_neighbours(skin, axis - 1)) for axis in (2, 3)]
+    return {
+        "classes": -(true.classes * said.classes.log_softmax(1)).sum(1).mean(),
+        "surface": on_skin(off * (-said.log_scale).exp() + 3 * said.log_scale),
+        "normal": on_skin(1 - (said.normal * true.normal).sum(1)),
+        "albedo": on_skin(difference.abs().mean(1)),
+        "edges": (slopes[0].sum() + slopes[1].sum()) / count,
+        "finger": on_skin(cross_entropy(said.finger, true.finger, reduction="none")),
+    }
+
+
+def _neighbours(values: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    """All but the last and all but the first along an axis."""
+    size = values.shape[axis] - 1
+    return values.narrow(axis, 0, size), values.narrow(axis, 1, size)
+
+
+def _shown(values: Float[Tensor, "B 3 H W"], where: Bool[Tensor, "B H W"]) -> Tensor:
+    """Values in [-1, 1] as colours, black elsewhere."""
+    return (0.5 + 0.5 * values).clamp(0, 1) * where[:, None]
