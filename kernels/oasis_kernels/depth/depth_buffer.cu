@@ -36,22 +36,8 @@ __global__ void clear(
 }
 
 __global__ void draw(
-    const float* vertices,    // [batch or 1][n_vertices][3]
-    const float* viewmats,    // [batch or 1][4][4]
-    const float* Ks,          // [batch or 1][3][3]
-    const int* faces,         // [n_faces][3]
-    long long vertices_step,  // numbers from one batch entry to the next, 0 where they share
-    long long viewmats_step,
-    long long Ks_step,
-    int batch,
-    int n_faces,
-    int width,
-    int height,
-    double near_plane,
-    unsigned long long* keys,     // [batch][height][width]: depth rounded to float32, then the face; or all bits
-    unsigned long long* counter,  // of the queue
-    long long* queue_faces,       // [capacity]: batch entry * n_faces + face
-    long long* queue_starts,      // [capacity + 1]: shares of all faces before it
+#include "mesh_parameters.inc"
+#include "queue_parameters.inc"
     int capacity
 ) {
 #include "camera_cuda.h"
@@ -159,22 +145,8 @@ __global__ void draw(
 }
 
 __global__ void draw_large(
-    const float* vertices,    // [batch or 1][n_vertices][3]
-    const float* viewmats,    // [batch or 1][4][4]
-    const float* Ks,          // [batch or 1][3][3]
-    const int* faces,         // [n_faces][3]
-    long long vertices_step,  // numbers from one batch entry to the next, 0 where they share
-    long long viewmats_step,
-    long long Ks_step,
-    int batch,
-    int n_faces,
-    int width,
-    int height,
-    double near_plane,
-    unsigned long long* keys,     // [batch][height][width]: depth rounded to float32, then the face; or all bits
-    unsigned long long* counter,  // of the queue
-    long long* queue_faces,       // [capacity]: batch entry * n_faces + face
-    long long* queue_starts,      // [capacity + 1]: shares of all faces before it
+#include "mesh_parameters.inc"
+#include "queue_parameters.inc"
     int capacity
 ) {
 #include "camera_cuda.h"

@@ -5,17 +5,7 @@
 // takes several pixels and asks for all of their keys at once.
 
 __global__ void resolve(
-    const float* vertices,    // [batch or 1][n_vertices][3]
-    const float* viewmats,    // [batch or 1][4][4]
-    const float* Ks,          // [batch or 1][3][3]
-    const int* faces,         // [n_faces][3]
-    long long vertices_step,  // numbers from one batch entry to the next, 0 where they share
-    long long viewmats_step,
-    long long Ks_step,
-    int batch,
-    int n_faces,
-    int width,
-    int height,
+#include "mesh_parameters.inc"
     double near_plane,
     unsigned long long* keys,  // [batch][height][width]: depth rounded to float32, then the face; or all bits
     const float* points,       // [batch or 1][n_points][3]
@@ -160,17 +150,7 @@ __global__ void resolve(
 // their sum: for 10^4 points each is off by 2^-47 of the largest. `settle`, one thread a vertex, turns sums into
 // floats.
 __global__ void pull(
-    const float* vertices,    // [batch or 1][n_vertices][3]
-    const float* viewmats,    // [batch or 1][4][4]
-    const float* Ks,          // [batch or 1][3][3]
-    const int* faces,         // [n_faces][3]
-    long long vertices_step,  // numbers from one batch entry to the next, 0 where they share
-    long long viewmats_step,
-    long long Ks_step,
-    int batch,
-    int n_faces,
-    int width,
-    int height,
+#include "mesh_parameters.inc"
     int n_vertices,
     int n_points,
     const int* face_ids,           // [batch][height][width]

@@ -5,26 +5,11 @@
 // vertices add up the rows, and faces the gradients of area ratios.
 
 void pose(
-    int n_vertices,
-    int n_faces,
-    int n_on_vertices,  // P
-    int n_on_faces,     // Q
-    int half_powers,
-    const float* vertices,           // [V, 3]
-    const int* faces,                // [F, 3]
-    const int* vertex_index,         // [P]
-    const int* face_index,           // [Q]
-    const float* barycentrics,       // [Q, 3]
-    const float* vertex_quats,       // [V, 4]
-    const float* area_ratio,         // [F]
-    const float* vertex_area_ratio,  // [V]
-    const float* offsets,            // [P, 3]
-    const float* quats,              // [P + Q, 4]
-    const float* scales,             // [P + Q, 3]
-    long long* state,                // `STATE` words of zeros
-    float* means,                    // [P + Q, 3]
-    float* posed_quats,              // [P + Q, 4]
-    float* posed_scales              // [P + Q, 3]
+#include "mesh_gaussian_parameters.inc"
+    long long* state,    // `STATE` words of zeros
+    float* means,        // [P + Q, 3]
+    float* posed_quats,  // [P + Q, 4]
+    float* posed_scales  // [P + Q, 3]
 ) {
 #pragma clang fp contract(fast)
 #include "../runtime/ranges.h"
@@ -59,24 +44,9 @@ void pose(
 }
 
 void pose_backward(
-    int n_vertices,
-    int n_faces,
-    int n_on_vertices,  // P
-    int n_on_faces,     // Q
-    int half_powers,
-    const float* vertices,           // [V, 3]
-    const int* faces,                // [F, 3]
-    const int* vertex_index,         // [P]
-    const int* face_index,           // [Q]
-    const float* barycentrics,       // [Q, 3]
-    const float* vertex_quats,       // [V, 4]
-    const float* area_ratio,         // [F]
-    const float* vertex_area_ratio,  // [V]
-    const float* offsets,            // [P, 3]
-    const float* quats,              // [P + Q, 4]
-    const float* scales,             // [P + Q, 3]
-    long long* state,                // `STATE` words of zeros
-    const float* g_means,            // these three may be 0
+#include "mesh_gaussian_parameters.inc"
+    long long* state,      // `STATE` words of zeros
+    const float* g_means,  // these three may be 0
     const float* g_posed_quats,
     const float* g_posed_scales,
     const int* vertex_starts,   // [V + 1]; of `places`, for each vertex

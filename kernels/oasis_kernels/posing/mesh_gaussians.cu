@@ -7,25 +7,10 @@
 // thread each) adds up the rows at vertices, and the gradients of area ratios at faces.
 
 __global__ void pose_mesh_gaussians(
-    int n_vertices,
-    int n_faces,
-    int n_on_vertices,  // P
-    int n_on_faces,     // Q
-    int half_powers,
-    const float* vertices,           // [B, V, 3]
-    const int* faces,                // [F, 3]
-    const int* vertex_index,         // [P]
-    const int* face_index,           // [Q]
-    const float* barycentrics,       // [Q, 3]
-    const float* vertex_quats,       // [B, V, 4]
-    const float* area_ratio,         // [B, F]
-    const float* vertex_area_ratio,  // [B, V]
-    const float* offsets,            // [P, 3]
-    const float* quats,              // [P + Q, 4]
-    const float* scales,             // [P + Q, 3]
-    float* means,                    // [B, P + Q, 3]
-    float* posed_quats,              // [B, P + Q, 4]
-    float* posed_scales              // [B, P + Q, 3]
+#include "mesh_gaussian_parameters.inc"
+    float* means,        // [B, P + Q, 3]
+    float* posed_quats,  // [B, P + Q, 4]
+    float* posed_scales  // [B, P + Q, 3]
 ) {
 #include "vectors_cuda.h"
 #include "mesh_gaussians_cuda.h"
@@ -57,23 +42,8 @@ __global__ void pose_mesh_gaussians(
 }
 
 __global__ void pose_mesh_gaussians_backward(
-    int n_vertices,
-    int n_faces,
-    int n_on_vertices,  // P
-    int n_on_faces,     // Q
-    int half_powers,
-    const float* vertices,           // [B, V, 3]
-    const int* faces,                // [F, 3]
-    const int* vertex_index,         // [P]
-    const int* face_index,           // [Q]
-    const float* barycentrics,       // [Q, 3]
-    const float* vertex_quats,       // [B, V, 4]
-    const float* area_ratio,         // [B, F]
-    const float* vertex_area_ratio,  // [B, V]
-    const float* offsets,            // [P, 3]
-    const float* quats,              // [P + Q, 4]
-    const float* scales,             // [P + Q, 3]
-    const float* g_means,            // these three may be 0
+#include "mesh_gaussian_parameters.inc"
+    const float* g_means,  // these three may be 0
     const float* g_posed_quats,
     const float* g_posed_scales,
     float* gaussian_rows,   // [B, P + Q, 8]; 0 if nothing of vertices is wanted

@@ -7,25 +7,8 @@
 // pixel, and the transmittance at the end of each but the last, are kept, so that the segments can be replayed at once.
 
 __global__ void blend(
-    int n,
-    const int4* tiles,  // [tiles]: see `place_tiles`
-    int n_cameras,
-    const float4* centers,  // [C * n]
-    const float4* whitenings,
-    const float* opacities,
-    const float* colors,       // [C * n, channels]
-    const float* backgrounds,  // [C, channels], or null for black
-    int tiles_x,
-    int tiles_y,
-    int width,
-    int height,
-    int* tile_gaussians,   // [pairs]: the lists, nearest first; or null
-    float* transmittance,  // [C, H, W], or null
-    int* stops,            // [C, H, W]: place in the list of the first layer that was not drawn; or null
-    float* checkpoints,    // [tiles with pairs, segments - 1, 1 + channels, 64], or null
-    const long long* keys,
-    float* image,
-    float* alphas
+#include "tile_parameters.inc"
+    const long long* keys, float* image, float* alphas
 ) {
 #include "tile_layers.h"
     // Each warp sorts 32 keys at a time in its registers; then every key counts those before it in all runs.

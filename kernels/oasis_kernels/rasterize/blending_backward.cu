@@ -5,22 +5,7 @@
 // at the pair's number; a Gaussian adds its own in order. Records hold sums over the tile's pixels as in
 // `rasterize_backward`, of the scaled offset y = SCALE W d: six by the shape, then one a channel.
 __global__ void blend_backward(
-    int n,
-    const int4* tiles,  // [tiles]: see `place_tiles`
-    int n_cameras,
-    const float4* centers,  // [C * n]
-    const float4* whitenings,
-    const float* opacities,
-    const float* colors,       // [C * n, channels]
-    const float* backgrounds,  // [C, channels], or null for black
-    int tiles_x,
-    int tiles_y,
-    int width,
-    int height,
-    int* tile_gaussians,     // [pairs]: the lists, nearest first; or null
-    float* transmittance,    // [C, H, W], or null
-    int* stops,              // [C, H, W]: place in the list of the first layer that was not drawn; or null
-    float* checkpoints,      // [tiles with pairs, segments - 1, 1 + channels, 64], or null
+#include "tile_parameters.inc"
     const int* pair_starts,  // [C * n]
     const int4* boxes,
     const float* g_image,    // [C, H, W, channels], or null for zeros

@@ -6,14 +6,7 @@
 __global__ void project(
     int n,
     int n_cameras,
-    double width,
-    double height,
-    const float* means,      // [n, 3]
-    const float* quats,      // [n, 4], or null where covars is given
-    const float* scales,     // [n, 3], or null
-    const float* covars,     // [n, 3, 3], or null; read as its symmetric part
-    const float* viewmats,   // [C, 4, 4]
-    const float* Ks,         // [C, 3, 3]
+#include "gaussian_parameters.inc"
     int ortho,               // 1: x = fx X + cx, y = fy Y + cy, whatever the depth
     const float* opacities,  // [n]
     double near,

@@ -3,14 +3,7 @@
 void project_backward(
     long long n,
     long long n_cameras,
-    double width,
-    double height,
-    const float* means,        // [n, 3]
-    const float* quats,        // [n, 4], or null where covars is given
-    const float* scales,       // [n, 3], or null
-    const float* covars,       // [n, 3, 3], or null; read as its symmetric part
-    const float* viewmats,     // [C, 4, 4]
-    const float* Ks,           // [C, 3, 3]
+#include "gaussian_parameters.inc"
     long long ortho,           // 1: x = fx X + cx, y = fy Y + cy, whatever the depth
     const int* radii,          // [C, n, 2]; 0 where nothing was drawn
     const float* g_means2d,    // [C, n, 2], or null for zeros, as the next two

@@ -1,4 +1,4 @@
-// One Gaussian over one strip: `vectors` walks the pixels of its box, `exponent` is log2(alpha) before the cap.
+// One Gaussian over one strip: `strip_row.h` and `strip_exponent.h` compute it at the pixels of its box.
 struct Layer {
     int x0, y0, x1, y1;  // relative to the strip, y0 even
     float whole_x, whole_y, w0, w1, w2, w3, rx, ry, lo;

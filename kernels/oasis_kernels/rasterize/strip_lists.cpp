@@ -10,23 +10,7 @@
 // sort as integers do.
 
 void collect(
-    long long n,  // cameras * per_camera, as all arrays of Gaussians
-    long long per_camera,
-    long long n_chunks,
-    long long chunk,  // Gaussians of a chunk
-    long long width,
-    long long height,
-    long long strip_width,
-    long long strip_height,
-    long long across,  // strips of an image
-    long long down,
-    long long n_strips,            // of all images
-    const int* boxes,              // [n, 4]
-    float* records,                // [n, 16]
-    long long* starts,             // [n_strips + 1]: first place of each strip's list
-    int* pair_starts,              // [n]: number of a Gaussian's first pair
-    int* order,                    // [n_strips]: strips, those with much to do first
-    long long* state,              // zeros come in
+#include "strip_parameters.inc"
     const long long* sort_depths,  // [n], the bits of float64
     int* counts,                   // [n_chunks, n_strips]: entries, then place of the first within the strip's list
     long long* chunk_pairs,        // [n_chunks]: pairs, then number of the first

@@ -16,24 +16,12 @@ auto walk =
             const float* r = records + 16ll * list[place];
             const Layer l = layer_of(r, p);
             for (int y = l.y0; y < l.y1; y += 2) {
-                const V Y = row + (float)(p.top + y);
-                const V dy = (Y - l.whole_y) + l.ry;
-                const V u0 = fma((V)l.w1, dy, (V)(l.w0 * l.rx)), v0 = fma((V)l.w3, dy, (V)(l.w2 * l.rx));
+#include "strip_row.h"
                 float* t = plane + y / 2 * stride + 2 * l.x0;
-                V X = column + (float)(p.left + l.x0);
                 for (int x = l.x0; x < l.x1; x += COLUMNS, t += LANES, X += (float)COLUMNS) {
-                    const V d = X - l.whole_x;
-                    const V u = fma((V)l.w0, d, u0), v = fma((V)l.w2, d, v0);
-                    const V e = fma(-v, v, fma(-u, u, (V)l.lo));
-                    const V before = load(t);
-                    const I seen = (e >= cut()) & (before > 0.f) INSIDE;
-                    const V raw = exp2(e);
-                    const V alpha = seen ? (raw < cap() ? raw : cap()) : (V)(0.f);
-                    const V full = alpha * before;
-                    const V after = before - full;
-                    const I ends = seen & (after <= last());
+#include "strip_blend.h"
                     store(t, ends ? -before : after);
-                    vector(y, x, full, seen & ~ends);
+                    vector(y, x, full, drawn & ~ends);
                 }
                 row_pair(y);
             }

@@ -23,23 +23,7 @@
 // planes on a scratch of each thread until the strip is done. Two rows of a plane are followed by the same rows of the
 // next plane: planes apart by a power of two would compete for the same lines of the cache.
 void draw(
-    long long n,  // cameras * per_camera, as all arrays of Gaussians
-    long long per_camera,
-    long long n_chunks,
-    long long chunk,  // Gaussians of a chunk
-    long long width,
-    long long height,
-    long long strip_width,
-    long long strip_height,
-    long long across,  // strips of an image
-    long long down,
-    long long n_strips,            // of all images
-    const int* boxes,              // [n, 4]
-    float* records,                // [n, 16]
-    long long* starts,             // [n_strips + 1]: first place of each strip's list
-    int* pair_starts,              // [n]: number of a Gaussian's first pair
-    int* order,                    // [n_strips]: strips, those with much to do first
-    long long* state,              // zeros come in
+#include "strip_parameters.inc"
     const long long* sort_depths,  // [n], the bits of float64
     int* counts,                   // [n_chunks, n_strips]: entries, then place of the first within the strip's list
     long long* chunk_pairs,        // [n_chunks]: pairs, then number of the first
@@ -141,22 +125,10 @@ void draw(
             const long long first_mask = n_masks;
             int any = 0;
             for (int y = l.y0; y < l.y1; y += 2) {
-                const V Y = row + (float)(p.top + y);
-                const V dy = (Y - l.whole_y) + l.ry;
-                const V u0 = fma((V)l.w1, dy, (V)(l.w0 * l.rx)), v0 = fma((V)l.w3, dy, (V)(l.w2 * l.rx));
+#include "strip_row.h"
                 float* t = planes + y / 2 * block_size + 2 * l.x0;
-                V X = column + (float)(p.left + l.x0);
                 for (int x = l.x0; x < l.x1; x += COLUMNS, t += LANES, X += (float)COLUMNS) {
-                    const V d = X - l.whole_x;
-                    const V u = fma((V)l.w0, d, u0), v = fma((V)l.w2, d, v0);
-                    const V e = fma(-v, v, fma(-u, u, (V)l.lo));
-                    const V before = load(t);
-                    const I drawn = (e >= cut()) & (before > 0.f) INSIDE;
-                    const V raw = exp2(e);
-                    const V alpha = drawn ? (raw < cap() ? raw : cap()) : (V)(0.f);
-                    const V full = alpha * before;
-                    const V after = before - full;
-                    const I ends = drawn & (after <= last());
+#include "strip_blend.h"
                     const V weight = ends ? (V)(0.f) : full;
                     READ
                     store(t, ends ? -before : after);

@@ -3,23 +3,7 @@
 // Back to front from the transmittance of the end, one record a pair at the pair's number; then every Gaussian adds its
 // own records in order. The sums over a pair's pixels are kept in a vector each and reduced together at the end.
 void draw_backward(
-    long long n,  // cameras * per_camera, as all arrays of Gaussians
-    long long per_camera,
-    long long n_chunks,
-    long long chunk,  // Gaussians of a chunk
-    long long width,
-    long long height,
-    long long strip_width,
-    long long strip_height,
-    long long across,  // strips of an image
-    long long down,
-    long long n_strips,          // of all images
-    const int* boxes,            // [n, 4]
-    float* records,              // [n, 16]
-    long long* starts,           // [n_strips + 1]: first place of each strip's list
-    int* pair_starts,            // [n]: number of a Gaussian's first pair
-    int* order,                  // [n_strips]: strips, those with much to do first
-    long long* state,            // zeros come in
+#include "strip_parameters.inc"
     const float* whitenings,     // [n, 4]
     const float* opacities,      // [n]
     const float* colors,         // [n, channels]
@@ -136,16 +120,11 @@ void draw_backward(
             V m0 = {}, m1 = {}, m2 = {}, m3 = {}, m4 = {}, m5 = {};
             ACCUMULATORS
             for (int y = l.y0; y < l.y1; y += 2) {
-                const V Y = row + (float)(p.top + y);
-                const V dy = (Y - l.whole_y) + l.ry;
-                const V u0 = fma((V)l.w1, dy, (V)(l.w0 * l.rx)), v0 = fma((V)l.w3, dy, (V)(l.w2 * l.rx));
+#include "strip_row.h"
                 float* t = planes + y / 2 * block_size + 2 * l.x0;
                 const int* ended = stop + y / 2 * stride + 2 * l.x0;
-                V X = column + (float)(p.left + l.x0);
                 for (int x = l.x0; x < l.x1; x += COLUMNS, t += LANES, ended += LANES, X += (float)COLUMNS) {
-                    const V d = X - l.whole_x;
-                    const V u = fma((V)l.w0, d, u0), v = fma((V)l.w2, d, v0);
-                    const V e = fma(-v, v, fma(-u, u, (V)l.lo));
+#include "strip_exponent.h"
                     const I drawn = (e >= cut()) & (*(const IU*)ended > place) INSIDE;
                     const V raw = exp2(e);
                     const V alpha = drawn ? (raw < cap() ? raw : cap()) : (V)(0.f);

@@ -1,8 +1,9 @@
 """CUDA kernels: C++ functions that take raw pointers, and numbers by value.
 
 Such a kernel has one argument, a block of 64-bit words: pointers, whole numbers, or doubles, in the order of the C++
-parameters. Setting them costs the host a microsecond or two, where an array object for each argument costs several for
-each, and a launch that was recorded once is replayed with other words.
+parameters; an array `T name[n]` of pointers or long longs is n words. Setting them costs the host a microsecond or two,
+where an array object for each argument costs several for each, and a launch that was recorded once is replayed with
+other words.
 """
 
 import ctypes
@@ -60,13 +61,23 @@ def cuda_native(
     """
     source = kernel_source(path, name)
     parameters = _typed(source.parameters, scalar)
-    lines = [f"{kind} const {p} = {READS.get(kind, f'({kind})words[{{}}]').format(k)};"
-             for k, (p, kind) in enumerate(parameters.items())]  # fmt: skip
-    body = defined({"BLOCK": block, "WARPS": block // 32, **(constants or {})}, source.body)
+    constants = {"BLOCK": block, "WARPS": block // 32, **(constants or {})}
+    lines, fields, size = [], [], 0
+    for p, kind in parameters.items():
+        field: Any = ctypes.c_double if kind in READS else ctypes.c_longlong
+        if kind.endswith("]"):
+            kind, length = kind[:-1].split("[")
+            lines.append(f"{kind} const* const {p} = ({kind} const*)&words.c[{size}];")
+            field = field * int(str(constants.get(length, length)))
+        else:
+            lines.append(f"{kind} const {p} = {READS.get(kind, f'({kind})words[{{}}]').format(size)};")
+        fields.append((p, field))
+        size += ctypes.sizeof(field) // 8
+    body = defined(constants, source.body)
     if not fuse:  # never compiled for the CPU, where such a module has no such option
         body = f"#if defined(__CUDA_ARCH__)\n{body}#endif\n"
     text = "\n    ".join([f"const int block_index = thread / {block};", *lines]) + "\n" + body
-    vector = wp.types.vector(length=len(parameters), dtype=wp.int64)
+    vector = wp.types.vector(length=size, dtype=wp.int64)
 
     def snippet(thread: int, words: Any): ...
 
@@ -86,6 +97,5 @@ def cuda_native(
     )
     if not fuse:
         wp.set_module_options({"fuse_fp": False}, module=kernel.module)
-    fields = [(p, ctypes.c_double if kind in READS else ctypes.c_longlong) for p, kind in parameters.items()]
     words = type(f"{label}_words", (ctypes.Structure,), {"_fields_": fields})
     return CudaNative(kernel, words, tuple(parameters), block)

@@ -25,4 +25,5 @@ def cuda_all_finite() -> CudaNative:
 
     It takes the chunks of all arrays together as blocks; arrays that are not needed have count 0.
     """
-    return cuda_native("runtime/finite.cu", "all_finite", BLOCK, label="all_finite_cuda", constants={"CHUNK": CHUNK})
+    constants = {"ARRAYS": ARRAYS, "CHUNK": CHUNK}
+    return cuda_native("runtime/finite.cu", "all_finite", BLOCK, label="all_finite_cuda", constants=constants)

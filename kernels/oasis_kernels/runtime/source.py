@@ -1,8 +1,9 @@
 """C++ of the kernels: functions in the `.cpp` and `.cu` files of this package, read as text and compiled by Warp.
 
-A kernel is a function at the left margin. Its parameters become those of the launch; its body, with the files that it
-includes put in their places, becomes the text of a Warp snippet. Headers hold what several kernels share; they are
-included inside of functions, so that their lambdas see the parameters.
+A kernel is a function at the left margin. Its parameters become those of the launch, its body the text of a Warp
+snippet, both with the files that they include put in their places. Headers (`.h`) hold what the bodies of several
+kernels share; they are included inside of functions, so that their lambdas see the parameters. Parameters that several
+kernels share stand in lists of their own (`.inc`).
 """
 
 import functools
@@ -36,8 +37,8 @@ def _included(text: str, folder: Path) -> str:
 
 def _parameters(text: str) -> dict[str, str]:
     declared = " ".join(line.split("//")[0] for line in text.splitlines())
-    pairs = (re.fullmatch(r"\s*(.+?)\s*(\w+)\s*", parameter) for parameter in declared.split(","))
-    return {pair[2]: pair[1] for pair in pairs if pair}
+    pairs = (re.fullmatch(r"\s*(.+?)\s*(\w+)(\[\w+\])?\s*", parameter) for parameter in declared.split(","))
+    return {pair[2]: pair[1] + (pair[3] or "") for pair in pairs if pair}
 
 
 @functools.cache
@@ -50,7 +51,7 @@ def kernel_source(path: str, name: str) -> Source:
     file = ROOT / path
     for found in _KERNEL.finditer(file.read_text(encoding="utf-8")):
         if found[1] == name:
-            return Source(_parameters(found[2]), _included(found[3], file.parent))
+            return Source(_parameters(_included(found[2], file.parent)), _included(found[3], file.parent))
     raise ValueError(f"name: expected a kernel of {path}, got {name!r}.")
 
 

@@ -14,11 +14,7 @@
 // whatever the arrays hold.
 
 void bone_transforms(
-    int n_joints,
-    const T* angles,       // [B, J - 1, 3]
-    const T* joints,       // [J, 3]
-    const T* axes,         // [J, 3, 3]: a row an axis
-    const int* parents,    // [J]: -1, then the number of an earlier bone
+#include "bone_parameters.inc"
     const T* orientation,  // [B, 3, 3]
     const T* translation,  // [B, 3]
     double* locals,        // [B, J, LOCAL]
@@ -86,11 +82,7 @@ void bone_transforms(
 }
 
 void bone_transforms_backward(
-    int n_joints,
-    const T* angles,        // [B, J - 1, 3]
-    const T* joints,        // [J, 3]
-    const T* axes,          // [J, 3, 3]: a row an axis
-    const int* parents,     // [J]: -1, then the number of an earlier bone
+#include "bone_parameters.inc"
     const T* transforms,    // [B, J, 3, 4]
     const double* locals,   // [B, J, LOCAL]
     const T* g_transforms,  // [B, J, 3, 4]; these two may be 0

@@ -5,15 +5,7 @@
 // blended transform; `sum_blocks` (one thread an entry of a transform) adds up the blocks.
 
 __global__ void skin(
-    int n,
-    int n_joints,
-    int n_correctives,
-    const float* means,          // [N, 3]
-    const float* covars,         // [N, 3, 3] or 0
-    const float* weights,        // [N, J]
-    const float* transforms,     // [B, J, 3, 4]
-    const float* displacements,  // [N, 3, C]
-    const float* strengths,      // [B, C]
+#include "skin_parameters.inc"
     int n_poses,
     float* out_means,
     float* out_covars  // [B, N, 3]; [B, N, 3, 3]
@@ -85,16 +77,8 @@ __global__ void skin(
 }
 
 __global__ void skin_backward(
-    int n,
-    int n_joints,
-    int n_correctives,
-    const float* means,          // [N, 3]
-    const float* covars,         // [N, 3, 3] or 0
-    const float* weights,        // [N, J]
-    const float* transforms,     // [B, J, 3, 4]
-    const float* displacements,  // [N, 3, C]
-    const float* strengths,      // [B, C]
-    const float* g_out_means,    // these two may be 0
+#include "skin_parameters.inc"
+    const float* g_out_means,  // these two may be 0
     const float* g_out_covars,
     float* g_means,    // [B, N, 3]; each of these is 0 if not wanted. By the corrected points, too
     float* g_covars,   // [B, N, 3, 3]

@@ -60,12 +60,13 @@ class DeferredFiniteCheck:
         self._found[0] = 0
         stream = current_stream(self._device)
         for first in range(0, len(tensors), finite.ARRAYS):
-            params: dict[str, Any] = dict.fromkeys(finite.cuda_all_finite().parameters)
-            params |= {"found": self._found, "largest": checks.FINITE_LIMIT}
-            n_blocks = 0
-            for k, tensor in enumerate(tensors[first : first + finite.ARRAYS]):
-                params |= {f"data{k}": tensor, f"count{k}": tensor.numel(), f"wide{k}": tensor.dtype == torch.float64}
-                n_blocks += -(-tensor.numel() // finite.CHUNK)
+            some = tensors[first : first + finite.ARRAYS]
+            params = {
+                "found": self._found, "largest": checks.FINITE_LIMIT,
+                "arrays": tuple(t.data_ptr() for t in some), "counts": tuple(t.numel() for t in some),
+                "wide": tuple(t.dtype == torch.float64 for t in some),
+            }  # fmt: skip
+            n_blocks = sum(-(-t.numel() // finite.CHUNK) for t in some)
             run_cuda(finite.cuda_all_finite(), params, n_blocks, stream)
 
     def __exit__(self, kind: Any, *_: Any) -> None:
