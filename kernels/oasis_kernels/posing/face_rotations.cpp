@@ -28,11 +28,11 @@ void measure(
             const int count = wp::min(16, end - i);
             Start from;
             const Triangle o = at_rest(vertices, i, count, corners_of(faces, i, count), from);
-            const V begins = from.a ? zero : from.b ? one : (V)(2.f);
-            float* row = out + 12ll * i;
-            put4(row, count, {o.t.x, o.t.y, o.t.z, o.l}, TRIANGLE);
-            put4(row + 4, count, {o.b.x, o.b.y, o.b.z, o.x}, TRIANGLE);
-            put4(row + 8, count, {o.y, o.longest, o.unit, begins}, TRIANGLE);
+            const Row row = to_row(o, from);
+            float* to = out + 12ll * i;
+            put4(to, count, row.p, TRIANGLE);
+            put4(to + 4, count, row.q, TRIANGLE);
+            put4(to + 8, count, row.r, TRIANGLE);
         }
     });
 }
@@ -65,38 +65,7 @@ void turn(
         for (int i = first; i < end; i += 16) {
             const int count = wp::min(16, end - i);
             const Pair p = pair(before, after, i, count, corners_of(faces, i, count));
-            const V3 t = p.rest.t, b = p.rest.b, n = p.rest.n, n1 = p.posed.n;
-            auto entry = [&](V u, V v, V w, V x, V y, V z) -> V { return u * x + v * y + w * z; };
-            const V m00 = entry(p.t.x, p.b.x, n1.x, t.x, b.x, n.x), m01 = entry(p.t.x, p.b.x, n1.x, t.y, b.y, n.y);
-            const V m02 = entry(p.t.x, p.b.x, n1.x, t.z, b.z, n.z), m10 = entry(p.t.y, p.b.y, n1.y, t.x, b.x, n.x);
-            const V m11 = entry(p.t.y, p.b.y, n1.y, t.y, b.y, n.y), m12 = entry(p.t.y, p.b.y, n1.y, t.z, b.z, n.z);
-            const V m20 = entry(p.t.z, p.b.z, n1.z, t.x, b.x, n.x), m21 = entry(p.t.z, p.b.z, n1.z, t.y, b.y, n.y);
-            const V m22 = entry(p.t.z, p.b.z, n1.z, t.z, b.z, n.z);
-            // The largest component first (Shepperd 1978).
-            const V trace = m00 + m11 + m22;
-            const I w = (trace >= m00) & (trace >= m11) & (trace >= m22), x = ~w & (m00 >= m11) & (m00 >= m22);
-            const I y = ~w & ~x & (m11 >= m22);
-            const V wx = m21 - m12, wy = m02 - m20, wz = m10 - m01, xy = m01 + m10, xz = m02 + m20, yz = m12 + m21;
-            V4 q = {
-                w   ? 1.f + trace
-                : x ? wx
-                : y ? wy
-                    : wz,
-                w   ? wx
-                : x ? 1.f + m00 - m11 - m22
-                : y ? xy
-                    : xz,
-                w   ? wy
-                : x ? xy
-                : y ? 1.f - m00 + m11 - m22
-                    : yz,
-                w   ? wz
-                : x ? xz
-                : y ? yz
-                    : 1.f - m00 - m11 + m22
-            };
-            const V length = 1.f / root(dot4(q, q));
-            q = choose4(p.proper, scaled4(q.w < 0.f ? -length : length, q), {one, zero, zero, zero});
+            const V4 q = quaternion_of(p);
             const V square = p.rest.unit * p.rest.unit;
             put4(face_quats + 4ll * i, count, q);
             put(area_ratio + i, count, p.ratio);
@@ -273,50 +242,10 @@ void turn_backward(
             const V3 u = {q.x, q.y, q.z}, gu = {g.x, g.y, g.z};
             V3 omega = minus(minus(scaled(q.w, gu), scaled(g.w, u)), cross(gu, u));
             omega = choose(p.proper, scaled((V)(0.5f), omega), {zero, zero, zero});
-            const V per_trace = p.proper ? 1.f / p.h : zero;
-
             const V g_ratio = g_area_ratio ? get(g_area_ratio + i, count) : zero;
-            const V per_area = r.point ? zero : g_ratio * r.scale * r.scale / p.damped;
-            by_posed += per_area;
-            by_rest -= p.ratio * per_area;
-            const V by_damping = by_posed + by_rest;
-            by_rest += p.proper ? g_weight : zero;
-
-            // By e1 and e2 of one triangle: its tilt, its spin over the other's edges o1, o2, its area, its damping.
-            auto edge_gradients = [&](const Triangle& m, V3 w, V3 o1, V3 o2, V by_area, V by_longest, V3& g1, V3& g2) {
-                const V per_y = m.flat ? zero : 1.f / m.y, per_l = m.flat ? zero : 1.f / m.l;
-                const V wt = dot3(w, m.t), wb = dot3(w, m.b), spin = dot3(w, m.n) * per_trace;
-                const V area = m.flat ? zero : 0.5f * by_area * m.unit;
-                g1 = plus(scaled(-(m.x * wt * per_y + wb) * per_l, m.n), scaled(spin, o2));
-                g2 = minus(scaled(wt * per_y, m.n), scaled(spin, o1));
-                g1 = plus(scaled(m.scale, g1), scaled(area, minus(scaled(m.y, m.t), scaled(m.x, m.b))));
-                g1 = plus(g1, scaled(2.f * by_longest * m.unit * m.l, m.t));
-                g2 = plus(scaled(m.scale, g2), scaled(area * m.l, m.b));
-            };
-            // From the corner where the longest edge begins to corner 0.
-            auto store_edges = [&](float* to, V3 g1, V3 g2) {
-                const Start& from = p.from;
-                const V3 g0 = scaled((V)(-1.f), plus(g1, g2));
-                const V3 by_e1 = choose(from.a, g1, choose(from.b, g0, g2));
-                const V3 by_e2 = choose(from.a, g2, choose(from.b, g1, g0));
-                put4(to, count, {by_e1.x, by_e1.y, by_e1.z, zero}, 8);
-                put4(to + 4, count, {by_e2.x, by_e2.y, by_e2.z, zero}, 8);
-            };
-            V3 g1, g2;
-            if (posed_edges) {
-                const V3 o1 = scaled(r.l, p.t), o2 = plus(scaled(r.x, p.t), scaled(r.y, p.b));
-                edge_gradients(o, omega, o1, o2, by_posed, zero, g1, g2);
-                store_edges(posed_edges + 8ll * i, g1, g2);
-            }
-            if (rest_edges) {
-                const V3 back = {-dot3(omega, p.t), -dot3(omega, p.b), -dot3(omega, o.n)};
-                const V3 w = plus(scaled(back.x, r.t), plus(scaled(back.y, r.b), scaled(back.z, r.n)));
-                const V3 t = minus(scaled(p.c, r.t), scaled(p.s, r.b));  // posed t and b, turned back
-                const V3 b = plus(scaled(p.s, r.t), scaled(p.c, r.b));
-                const V3 o1 = scaled(o.l, t), o2 = plus(scaled(o.x, t), scaled(o.y, b));
-                edge_gradients(r, w, o1, o2, by_rest, DAMPING * by_damping, g1, g2);
-                store_edges(rest_edges + 8ll * i, g1, g2);
-            }
+            const long long at = i;
+#define PUT_EDGE(to, edge, ...) put4(to + 4 * edge, count, __VA_ARGS__, 8)
+#include "edge_gradients.h"
         }
     });
 

@@ -18,11 +18,12 @@ __global__ void measure_triangles(
     const float* triangles = nullptr;
 #include "face_cuda.h"
     const int corner[3] = {faces[3 * f], faces[3 * f + 1], faces[3 * f + 2]};
-    int from;
+    Start from;
     const Triangle o = at_rest(f, corner, from);
-    put4(out, 3 * f, {o.t.x, o.t.y, o.t.z, o.l});
-    put4(out, 3 * f + 1, {o.b.x, o.b.y, o.b.z, o.x});
-    put4(out, 3 * f + 2, {o.y, o.longest, o.unit, (float)from});
+    const Row row = to_row(o, from);
+    put4(out, 3 * f, row.p);
+    put4(out, 3 * f + 1, row.q);
+    put4(out, 3 * f + 2, row.r);
 }
 
 __global__ void turn_faces(
@@ -47,40 +48,7 @@ __global__ void turn_faces(
         const int corner[3] = {faces[3 * f], faces[3 * f + 1], faces[3 * f + 2]};
         const Pair p = pair(posed_vertices + (long long)pose * 3 * n_vertices, f, corner);
         proper = p.proper;
-        const V3 t = p.rest.t, b = p.rest.b, n = p.rest.n, n1 = p.posed.n;
-        auto entry = [&](float u, float v, float w, float x, float y, float z) -> float {
-            return u * x + v * y + w * z;
-        };
-        const float m00 = entry(p.t.x, p.b.x, n1.x, t.x, b.x, n.x), m01 = entry(p.t.x, p.b.x, n1.x, t.y, b.y, n.y);
-        const float m02 = entry(p.t.x, p.b.x, n1.x, t.z, b.z, n.z), m10 = entry(p.t.y, p.b.y, n1.y, t.x, b.x, n.x);
-        const float m11 = entry(p.t.y, p.b.y, n1.y, t.y, b.y, n.y), m12 = entry(p.t.y, p.b.y, n1.y, t.z, b.z, n.z);
-        const float m20 = entry(p.t.z, p.b.z, n1.z, t.x, b.x, n.x), m21 = entry(p.t.z, p.b.z, n1.z, t.y, b.y, n.y);
-        const float m22 = entry(p.t.z, p.b.z, n1.z, t.z, b.z, n.z);
-        // The largest component first (Shepperd 1978).
-        const float trace = m00 + m11 + m22;
-        const bool w = trace >= m00 && trace >= m11 && trace >= m22, x = !w && m00 >= m11 && m00 >= m22;
-        const bool y = !w && !x && m11 >= m22;
-        const float wx = m21 - m12, wy = m02 - m20, wz = m10 - m01, xy = m01 + m10, xz = m02 + m20, yz = m12 + m21;
-        V4 q = {
-            w   ? 1.f + trace
-            : x ? wx
-            : y ? wy
-                : wz,
-            w   ? wx
-            : x ? 1.f + m00 - m11 - m22
-            : y ? xy
-                : xz,
-            w   ? wy
-            : x ? xy
-            : y ? 1.f - m00 + m11 - m22
-                : yz,
-            w   ? wz
-            : x ? xz
-            : y ? yz
-                : 1.f - m00 - m11 + m22
-        };
-        const float length = 1.f / sqrtf(dot4(q, q));
-        q = proper ? scaled4(q.w < 0.f ? -length : length, q) : identity;
+        const V4 q = quaternion_of(p);
         const float area = p.damped * p.rest.unit * p.rest.unit;
         put4(face_quats, at, q);
         area_ratio[at] = p.ratio;
@@ -249,49 +217,9 @@ __global__ void turn_faces_backward(
     const V3 u = {q.x, q.y, q.z}, gu = {g.x, g.y, g.z};
     V3 omega = minus(minus(scaled(q.w, gu), scaled(g.w, u)), cross(gu, u));
     omega = scaled(p.proper ? 0.5f : 0.f, omega);
-    const float per_trace = p.proper ? 1.f / p.h : 0.f;
-
     const float g_ratio = g_area_ratio ? g_area_ratio[at] : 0.f;
-    const float per_area = r.longest > 0.f ? g_ratio * r.scale * r.scale / p.damped : 0.f;
-    by_posed += per_area;
-    by_rest -= p.ratio * per_area;
-    const float by_damping = by_posed + by_rest;
-    by_rest += p.proper ? g_weight : 0.f;
-
-    // By e1 and e2 of one triangle: its tilt, its spin over the other's edges o1, o2, its area, its damping.
-    auto edge_gradients = [&](const Triangle& m, V3 w, V3 o1, V3 o2, float by_area, float by_longest, V3& g1, V3& g2) {
-        const float per_y = m.flat ? 0.f : 1.f / m.y, per_l = m.flat ? 0.f : 1.f / m.l;
-        const float wt = dot3(w, m.t), wb = dot3(w, m.b), spin = dot3(w, m.n) * per_trace;
-        const float area = m.flat ? 0.f : 0.5f * by_area * m.unit;
-        g1 = plus(scaled(-(m.x * wt * per_y + wb) * per_l, m.n), scaled(spin, o2));
-        g2 = minus(scaled(wt * per_y, m.n), scaled(spin, o1));
-        g1 = plus(scaled(m.scale, g1), scaled(area, minus(scaled(m.y, m.t), scaled(m.x, m.b))));
-        g1 = plus(g1, scaled(2.f * by_longest * m.unit * m.l, m.t));
-        g2 = plus(scaled(m.scale, g2), scaled(area * m.l, m.b));
-    };
-    // From the corner where the longest edge begins to corner 0.
-    auto store_edges = [&](float* to, V3 g1, V3 g2) {
-        const V3 g0 = scaled(-1.f, plus(g1, g2));
-        const V3 by_e1 = p.from == 0 ? g1 : p.from == 1 ? g0 : g2;
-        const V3 by_e2 = p.from == 0 ? g2 : p.from == 1 ? g1 : g0;
-        put4(to, 2 * at, {by_e1.x, by_e1.y, by_e1.z, 0.f});
-        put4(to, 2 * at + 1, {by_e2.x, by_e2.y, by_e2.z, 0.f});
-    };
-    V3 g1, g2;
-    if (posed_edges) {
-        const V3 o1 = scaled(r.l, p.t), o2 = plus(scaled(r.x, p.t), scaled(r.y, p.b));
-        edge_gradients(o, omega, o1, o2, by_posed, 0.f, g1, g2);
-        store_edges(posed_edges, g1, g2);
-    }
-    if (rest_edges) {
-        const V3 back = {-dot3(omega, p.t), -dot3(omega, p.b), -dot3(omega, o.n)};
-        const V3 w = plus(scaled(back.x, r.t), plus(scaled(back.y, r.b), scaled(back.z, r.n)));
-        const V3 t = minus(scaled(p.c, r.t), scaled(p.s, r.b));  // posed t and b, turned back
-        const V3 b = plus(scaled(p.s, r.t), scaled(p.c, r.b));
-        const V3 o1 = scaled(o.l, t), o2 = plus(scaled(o.x, t), scaled(o.y, b));
-        edge_gradients(r, w, o1, o2, by_rest, DAMPING * by_damping, g1, g2);
-        store_edges(rest_edges, g1, g2);
-    }
+#define PUT_EDGE put4
+#include "edge_gradients.h"
 }
 
 __global__ void gather_edges(

@@ -18,18 +18,12 @@ auto store = [](float* p, V v) { *(VU*)p = v; };
 auto load_row = [](const float* p) -> Q { return *(const QU*)p; };
 auto store_row = [](float* p, Q v) { *(QU*)p = v; };
 auto root = [](V v) -> V { return __builtin_elementwise_sqrt(v); };
-auto dot3 = [](V3 a, V3 b) -> V { return a.x * b.x + a.y * b.y + a.z * b.z; };
-auto dot4 = [](V4 a, V4 b) -> V { return a.w * b.w + a.x * b.x + a.y * b.y + a.z * b.z; };
-auto cross = [](V3 a, V3 b) -> V3 { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; };
-auto scaled = [](V s, V3 a) -> V3 { return {s * a.x, s * a.y, s * a.z}; };
-auto scaled4 = [](V s, V4 a) -> V4 { return {s * a.w, s * a.x, s * a.y, s * a.z}; };
-auto plus = [](V3 a, V3 b) -> V3 { return {a.x + b.x, a.y + b.y, a.z + b.z}; };
-auto minus = [](V3 a, V3 b) -> V3 { return {a.x - b.x, a.y - b.y, a.z - b.z}; };
-auto plus4 = [](V4 a, V4 b) -> V4 { return {a.w + b.w, a.x + b.x, a.y + b.y, a.z + b.z}; };
-auto choose = [](I mask, V3 a, V3 b) -> V3 { return {mask ? a.x : b.x, mask ? a.y : b.y, mask ? a.z : b.z}; };
-auto choose4 = [](I m, V4 a, V4 b) -> V4 { return {m ? a.w : b.w, m ? a.x : b.x, m ? a.y : b.y, m ? a.z : b.z}; };
+#include "algebra.h"
 auto largest = [](V a, V b) -> V { return a > b ? a : b; };
 auto magnitude = [](V a) -> V { return __builtin_elementwise_abs(a); };
+// The power of two at or below a positive number, and the inverse of a power of two.
+auto power_below = [](V a) -> V { return __builtin_bit_cast(V, __builtin_bit_cast(I, a) & (I)(0x7f800000)); };
+auto inverse_power = [](V a) -> V { return __builtin_bit_cast(V, (I)(0x7f000000) - __builtin_bit_cast(I, a)); };
 
 // 16 rows of four numbers, given in four groups (rows 0 4 8 12, rows 1 5 9 13, ...), to lanes and back.
 auto transpose = [](V a, V b, V c, V d) -> V4 {

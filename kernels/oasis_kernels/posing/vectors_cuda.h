@@ -1,17 +1,18 @@
+typedef float V;
+typedef bool I;
 struct V3 {
     float x, y, z;
 };
 struct __align__(16) V4 {
     float w, x, y, z;
 };
-auto dot3 = [](V3 a, V3 b) -> float { return a.x * b.x + a.y * b.y + a.z * b.z; };
-auto dot4 = [](V4 a, V4 b) -> float { return a.w * b.w + a.x * b.x + a.y * b.y + a.z * b.z; };
-auto cross = [](V3 a, V3 b) -> V3 { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; };
-auto scaled = [](float s, V3 a) -> V3 { return {s * a.x, s * a.y, s * a.z}; };
-auto scaled4 = [](float s, V4 a) -> V4 { return {s * a.w, s * a.x, s * a.y, s * a.z}; };
-auto plus = [](V3 a, V3 b) -> V3 { return {a.x + b.x, a.y + b.y, a.z + b.z}; };
-auto minus = [](V3 a, V3 b) -> V3 { return {a.x - b.x, a.y - b.y, a.z - b.z}; };
-auto plus4 = [](V4 a, V4 b) -> V4 { return {a.w + b.w, a.x + b.x, a.y + b.y, a.z + b.z}; };
+const float zero = 0.f, one = 1.f;
+auto root = [](float a) -> float { return sqrtf(a); };
+auto largest = [](float a, float b) -> float { return fmaxf(a, b); };
+auto magnitude = [](float a) -> float { return fabsf(a); };
+auto power_below = [](float a) -> float { return __int_as_float(__float_as_int(a) & 0x7f800000); };
+auto inverse_power = [](float a) -> float { return __int_as_float(0x7f000000 - __float_as_int(a)); };
+#include "algebra.h"
 auto get3 = [](const float* p, long long i) -> V3 {
     p += 3 * i;
     return {p[0], p[1], p[2]};
