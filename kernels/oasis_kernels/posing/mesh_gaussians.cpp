@@ -20,9 +20,9 @@ void pose(
         for (int i = first; i < end; i += 16) {
             const int count = wp::min(16, end - i);
 #include "on_vertex.h"
-            const V4 place = rows([&](int lane) -> Q { return at3(table, v[lane]); });
+            const V4 vertex = rows([&](int lane) -> Q { return at3(table, v[lane]); });
             const V3 shift = plus(o, plus(scaled(q.w, t), cross(u, t)));
-            put3(means + 3ll * i, count, plus({place.w, place.x, place.y}, shift));
+            put3(means + 3ll * i, count, plus({vertex.w, vertex.x, vertex.y}, shift));
             put4(posed_quats + 4ll * i, count, product(q, get4(quats + 4ll * i, count)));
             put3(posed_scales + 3ll * i, count, scaled(grown, get3(scales + 3ll * i, count)));
         }
@@ -37,7 +37,7 @@ void pose(
                 mean = plus(mean, scaled(k == 0 ? b.x : k == 1 ? b.y : b.z, {p.w, p.x, p.y}));
             }
             put3(means + 3ll * at, count, mean);
-            put4(posed_quats + 4ll * at, count, product(turn, get4(quats + 4ll * at, count)));
+            put4(posed_quats + 4ll * at, count, product(place.rotation, get4(quats + 4ll * at, count)));
             put3(posed_scales + 3ll * at, count, scaled(grown, get3(scales + 3ll * at, count)));
         }
     });
@@ -83,19 +83,9 @@ void pose_backward(
             if (g_quats) put4(g_quats + 4ll * i, count, product(conjugate(q), g_quat));
             if (g_scales) put3(g_scales + 3ll * i, count, scaled(grown, g_scale));
             if (gaussian_rows) {
-                // Of u -> o + w t + u x t, which is the rotation for unit quaternions; then only what turns is kept.
-                const V3 by_u = plus(
-                    scaled(2.f * q.w, cross(o, g_mean)),
-                    minus(
-                        plus(scaled(2.f * dot3(g_mean, u), o), scaled(2.f * dot3(u, o), g_mean)),
-                        scaled(4.f * dot3(g_mean, o), u)
-                    )
-                );
-                V4 g = plus4(
-                    product(g_quat, conjugate(get4(quats + 4ll * i, count))), {dot3(g_mean, t), by_u.x, by_u.y, by_u.z}
-                );
-                g = scaled4(per_length, plus4(g, scaled4(-dot4(g, q), q)));
-                const V slope = growth_slope(pick(vertex_area_ratio, v), half_powers);
+                V4 g = plus4(product(g_quat, conjugate(get4(quats + 4ll * i, count))), by_rotation(g_mean, q, u, o, t));
+                g = unnormalised(g, q, place.per_length);
+                const V slope = growth_slope(pick(vertex_area_ratio, v));
                 const V by_area = slope * dot3(g_scale, get3(scales + 3ll * i, count));
                 put4(gaussian_rows + 8ll * i, count, {g_mean.x, g_mean.y, g_mean.z, by_area}, 8);
                 put4(gaussian_rows + 8ll * i + 4, count, g, 8);
@@ -108,26 +98,26 @@ void pose_backward(
 #include "on_face.h"
             const V3 g_mean = get3_or_zero(g_means, at, count), g_scale = get3_or_zero(g_posed_scales, at, count);
             const V4 g_quat = get4_or_zero(g_posed_quats, at, count);
-            if (g_quats) put4(g_quats + 4ll * at, count, product(conjugate(turn), g_quat));
+            if (g_quats) put4(g_quats + 4ll * at, count, product(conjugate(place.rotation), g_quat));
             if (g_scales) put3(g_scales + 3ll * at, count, scaled(grown, g_scale));
             if (by_ratio) {
-                const V slope = growth_slope(ratio, half_powers);
+                const V slope = growth_slope(ratio);
                 put(by_ratio + i, count, slope * dot3(g_scale, get3(scales + 3ll * at, count)));
             }
             if (gaussian_rows || g_barycentrics) {
                 V4 g = product(g_quat, conjugate(get4(quats + 4ll * at, count)));
-                g = scaled4(per_length, plus4(g, scaled4(-dot4(g, turn), turn)));
+                g = unnormalised(g, place.rotation, place.per_length);
                 if (gaussian_rows) {
                     put4(gaussian_rows + 8ll * at, count, {g_mean.x, g_mean.y, g_mean.z, zero}, 8);
                     put4(gaussian_rows + 8ll * at + 4, count, g, 8);
-                    put3(weights + 3ll * i, count, {b.x * sign.x, b.y * sign.y, b.z * sign.z});
+                    put3(weights + 3ll * i, count, {b.x * place.sign.x, b.y * place.sign.y, b.z * place.sign.z});
                 }
                 if (g_barycentrics) {
                     V by[3];
                     for (int k = 0; k < 3; k++) {
                         const V4 p = rows([&](int lane) -> Q { return at3(table, c[3 * lane + k]); });
-                        const V turn_sign = k == 0 ? sign.x : k == 1 ? sign.y : sign.z;
-                        by[k] = dot3(g_mean, {p.w, p.x, p.y}) + turn_sign * dot4(g, q[k]);
+                        const V sign = k == 0 ? place.sign.x : k == 1 ? place.sign.y : place.sign.z;
+                        by[k] = dot3(g_mean, {p.w, p.x, p.y}) + sign * dot4(g, q[k]);
                     }
                     put3(g_barycentrics + 3ll * i, count, {by[0], by[1], by[2]});
                 }

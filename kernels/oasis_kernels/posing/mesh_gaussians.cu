@@ -15,13 +15,13 @@ __global__ void pose_mesh_gaussians(
 #include "vectors_cuda.h"
 #include "mesh_gaussians_cuda.h"
     V3 mean;
-    V4 turn;
+    V4 rotation;
     float ratio;
     if (on_vertex) {
         const long long v = first_vertex + vertex_index[i];
-        turn = at_vertex(v).turn;
-        const V3 u = {turn.x, turn.y, turn.z}, o = get3(offsets, i), t = scaled(2.f, cross(u, o));
-        mean = plus(get3(vertices, v), plus(o, plus(scaled(turn.w, t), cross(u, t))));
+        rotation = at_vertex(get4(vertex_quats, v)).q;
+        const V3 u = {rotation.x, rotation.y, rotation.z}, o = get3(offsets, i), t = scaled(2.f, cross(u, o));
+        mean = plus(get3(vertices, v), plus(o, plus(scaled(rotation.w, t), cross(u, t))));
         ratio = vertex_area_ratio[v];
     } else {
         const long long f = face_index[i];
@@ -29,7 +29,8 @@ __global__ void pose_mesh_gaussians(
             first_vertex + faces[3 * f], first_vertex + faces[3 * f + 1], first_vertex + faces[3 * f + 2]
         };
         const V3 b = get3(barycentrics, i);
-        turn = on_face(b, v).turn;
+        const V4 q[3] = {get4(vertex_quats, v[0]), get4(vertex_quats, v[1]), get4(vertex_quats, v[2])};
+        rotation = at_face(b, q).rotation;
         mean = plus(
             plus(scaled(b.x, get3(vertices, v[0])), scaled(b.y, get3(vertices, v[1]))),
             scaled(b.z, get3(vertices, v[2]))
@@ -37,7 +38,7 @@ __global__ void pose_mesh_gaussians(
         ratio = area_ratio[(long long)pose * n_faces + f];
     }
     put3(means, at, mean);
-    put4(posed_quats, at, product(turn, get4(quats, gaussian)));
+    put4(posed_quats, at, product(rotation, get4(quats, gaussian)));
     put3(posed_scales, at, scaled(growth(ratio), get3(scales, gaussian)));
 }
 
@@ -62,8 +63,8 @@ __global__ void pose_mesh_gaussians_backward(
     if (g_posed_quats) g_quat = get4(g_posed_quats, at);
     if (on_vertex) {
         const long long v = first_vertex + vertex_index[i];
-        const OnVertex place = at_vertex(v);
-        const V4 q = place.turn;
+        const OnVertex place = at_vertex(get4(vertex_quats, v));
+        const V4 q = place.q;
         const V3 u = {q.x, q.y, q.z}, o = get3(offsets, i), t = scaled(2.f, cross(u, o));
         const float ratio = vertex_area_ratio[v];
         if (g_offsets) {
@@ -75,16 +76,8 @@ __global__ void pose_mesh_gaussians_backward(
         if (g_quats) put4(g_quats, at, product(conjugate(q), g_quat));
         if (g_scales) put3(g_scales, at, scaled(growth(ratio), g_scale));
         if (gaussian_rows) {
-            // Of u -> o + w t + u x t, which is the rotation for unit quaternions; then only what turns is kept.
-            const V3 by_u = plus(
-                scaled(2.f * q.w, cross(o, g_mean)),
-                minus(
-                    plus(scaled(2.f * dot3(g_mean, u), o), scaled(2.f * dot3(u, o), g_mean)),
-                    scaled(4.f * dot3(g_mean, o), u)
-                )
-            );
-            V4 g = plus4(product(g_quat, conjugate(get4(quats, gaussian))), {dot3(g_mean, t), by_u.x, by_u.y, by_u.z});
-            g = scaled4(place.per_length, plus4(g, scaled4(-dot4(g, q), q)));
+            V4 g = plus4(product(g_quat, conjugate(get4(quats, gaussian))), by_rotation(g_mean, q, u, o, t));
+            g = unnormalised(g, q, place.per_length);
             const float by_area = growth_slope(ratio) * dot3(g_scale, get3(scales, gaussian));
             put4(gaussian_rows, 2 * at, {g_mean.x, g_mean.y, g_mean.z, by_area});
             put4(gaussian_rows, 2 * at + 1, g);
@@ -96,21 +89,23 @@ __global__ void pose_mesh_gaussians_backward(
         first_vertex + faces[3 * f], first_vertex + faces[3 * f + 1], first_vertex + faces[3 * f + 2]
     };
     const V3 b = get3(barycentrics, i);
-    const OnFace place = on_face(b, v);
+    const V4 q[3] = {get4(vertex_quats, v[0]), get4(vertex_quats, v[1]), get4(vertex_quats, v[2])};
+    const OnFace place = at_face(b, q);
     const float ratio = area_ratio[(long long)pose * n_faces + f];
-    if (g_quats) put4(g_quats, at, product(conjugate(place.turn), g_quat));
+    if (g_quats) put4(g_quats, at, product(conjugate(place.rotation), g_quat));
     if (g_scales) put3(g_scales, at, scaled(growth(ratio), g_scale));
     if (by_ratio) by_ratio[here] = growth_slope(ratio) * dot3(g_scale, get3(scales, gaussian));
     V4 g = product(g_quat, conjugate(get4(quats, gaussian)));
-    g = scaled4(place.per_length, plus4(g, scaled4(-dot4(g, place.turn), place.turn)));
+    g = unnormalised(g, place.rotation, place.per_length);
     if (gaussian_rows) {
         put4(gaussian_rows, 2 * at, {g_mean.x, g_mean.y, g_mean.z, 0.f});
         put4(gaussian_rows, 2 * at + 1, g);
-        put3(weights, here, {b.x * place.sign[0], b.y * place.sign[1], b.z * place.sign[2]});
+        put3(weights, here, {b.x * place.sign.x, b.y * place.sign.y, b.z * place.sign.z});
     }
     if (g_barycentrics) {
         float by[3];
-        for (int k = 0; k < 3; k++) by[k] = dot3(g_mean, get3(vertices, v[k])) + place.sign[k] * dot4(g, place.q[k]);
+        const float sign[3] = {place.sign.x, place.sign.y, place.sign.z};
+        for (int k = 0; k < 3; k++) by[k] = dot3(g_mean, get3(vertices, v[k])) + sign[k] * dot4(g, q[k]);
         put3(g_barycentrics, here, {by[0], by[1], by[2]});
     }
 }

@@ -1,20 +1,4 @@
-auto product = [](V4 a, V4 b) -> V4 {
-    return {
-        a.w * b.w - a.x * b.x - a.y * b.y - a.z * b.z, a.w * b.x + a.x * b.w + a.y * b.z - a.z * b.y,
-        a.w * b.y - a.x * b.z + a.y * b.w + a.z * b.x, a.w * b.z + a.x * b.y - a.y * b.x + a.z * b.w
-    };
-};
-auto conjugate = [](V4 a) -> V4 { return {a.w, -a.x, -a.y, -a.z}; };
-auto growth = [&](V ratio, int half_powers) -> V {  // ratio^(half_powers / 2), the ratio bounded
-    const V low = ratio > LIMIT ? (V)(LIMIT) : ratio;
-    const V r = low < 1.f / LIMIT ? (V)(1.f / LIMIT) : low;
-    return half_powers == 0 ? one : half_powers == 1 ? root(r) : r;
-};
-auto growth_slope = [&](V ratio, int half_powers) -> V {
-    const V slope = 0.5f * (float)half_powers * growth(ratio, half_powers) / ratio;
-    const I inside = (ratio >= 1.f / LIMIT) & (ratio <= LIMIT);
-    return inside ? slope : zero;
-};
+#include "on_mesh.h"
 int last_indices[16];
 auto indices_of = [&](const int* from, int count) -> const int* {
     if (count == 16) return from;
