@@ -176,31 +176,9 @@ void project(
                 if (__builtin_reduce_or(drawn)) {
                     const V inverse = ortho ? (V)(1.0) : 1.0 / (drawn ? pz : (V)(1.0)), u = px * inverse,
                             v = py * inverse;
-                    const V slope_u = u < k.u_low ? (V)(k.u_low) : u > k.u_high ? (V)(k.u_high) : u;
-                    const V slope_v = v < k.v_low ? (V)(k.v_low) : v > k.v_high ? (V)(k.v_high) : v;
-                    V m0[3], m1[3];
-                    {
-                        V b0[3], b1[3];
-                        const V j0 = k.fx * inverse, j1 = k.fy * inverse;
-                        for (int e = 0; e < 3; e++) {
-                            b0[e] = j0 * (k.r[e] - slope_u * k.r[6 + e]);
-                            b1[e] = j1 * (k.r[3 + e] - slope_v * k.r[6 + e]);
-                        }
-                        for (int e = 0; e < 3; e++) {
-                            m0[e] = f[e] * b0[0] + f[3 + e] * b0[1] + f[6 + e] * b0[2];
-                            m1[e] = f[e] * b1[0] + f[3 + e] * b1[1] + f[6 + e] * b1[2];
-                        }
-                    }
-                    const V flat_xx = m0[0] * m0[0] + m0[1] * m0[1] + m0[2] * m0[2];
-                    const V flat_yy = m1[0] * m1[0] + m1[1] * m1[1] + m1[2] * m1[2];
-                    const V xy = m0[0] * m1[0] + m0[1] * m1[1] + m0[2] * m1[2];
-                    const V xx = flat_xx + eps2d, yy = flat_yy + eps2d;
-                    // Cauchy-Binet: a sum of terms >= 0, where xx yy - xy^2 cancels for needles.
-                    const V n0 = m0[1] * m1[2] - m0[2] * m1[1];
-                    const V n1 = m0[2] * m1[0] - m0[0] * m1[2];
-                    const V n2 = m0[0] * m1[1] - m0[1] * m1[0];
-                    const V det = n0 * n0 + n1 * n1 + n2 * n2 + eps2d * (flat_xx + flat_yy + eps2d);
-
+                    V slope_u, slope_v, j0, j1, b0[3], b1[3], xx, xy, yy, det;
+#include "jacobian.h"
+#include "covariance2d.h"
                     const V x = k.fx * u + k.cx, y = k.fy * v + k.cy;
                     const V extent_x = __builtin_elementwise_sqrt(reach * xx);
                     const V extent_y = __builtin_elementwise_sqrt(reach * yy);

@@ -95,28 +95,9 @@ __global__ void project(
         const double inverse = ortho ? 1.0 : reciprocal(pz);
         const double u = (k.r[0] * X + k.r[1] * Y + k.r[2] * Z + k.t[0]) * inverse;
         const double v = (k.r[3] * X + k.r[4] * Y + k.r[5] * Z + k.t[1]) * inverse;
-        const double slope_u = u < k.u_low ? k.u_low : u > k.u_high ? k.u_high : u;
-        const double slope_v = v < k.v_low ? k.v_low : v > k.v_high ? k.v_high : v;
-        const double j0 = k.fx * inverse, j1 = k.fy * inverse;
-        double b0[3], b1[3], m0[3], m1[3];
-        for (int e = 0; e < 3; e++) {
-            b0[e] = j0 * (k.r[e] - slope_u * k.r[6 + e]);
-            b1[e] = j1 * (k.r[3 + e] - slope_v * k.r[6 + e]);
-        }
-        for (int e = 0; e < 3; e++) {
-            m0[e] = f[e] * b0[0] + f[3 + e] * b0[1] + f[6 + e] * b0[2];
-            m1[e] = f[e] * b1[0] + f[3 + e] * b1[1] + f[6 + e] * b1[2];
-        }
-        const double flat_xx = m0[0] * m0[0] + m0[1] * m0[1] + m0[2] * m0[2];
-        const double flat_yy = m1[0] * m1[0] + m1[1] * m1[1] + m1[2] * m1[2];
-        xy = m0[0] * m1[0] + m0[1] * m1[1] + m0[2] * m1[2];
-        xx = flat_xx + eps2d;
-        yy = flat_yy + eps2d;
-        // Cauchy-Binet: a sum of terms >= 0, where xx yy - xy^2 cancels for needles.
-        const double n0 = m0[1] * m1[2] - m0[2] * m1[1];
-        const double n1 = m0[2] * m1[0] - m0[0] * m1[2];
-        const double n2 = m0[0] * m1[1] - m0[1] * m1[0];
-        det = n0 * n0 + n1 * n1 + n2 * n2 + eps2d * (flat_xx + flat_yy + eps2d);
+        double slope_u, slope_v, j0, j1, b0[3], b1[3];
+#include "jacobian.h"
+#include "covariance2d.h"
         x = k.fx * u + k.cx;
         y = k.fy * v + k.cy;
         reach = 2.0 * log(opacity / alpha_min);  // squared, in standard deviations

@@ -19,7 +19,7 @@ void project_backward(
 ) {
 #pragma clang fp contract(fast)
 #include "projection_vectors.h"
-    const double moving = ortho ? 0.0 : 1.0;  // of J with the point
+    const I moving = (I)(ortho ? 0 : -1);  // whether J changes with the point
     struct From {
         const float *means, *quats, *scales, *covars;
     };
@@ -134,13 +134,9 @@ void project_backward(
                     const V pz = k.r[6] * mean[0] + k.r[7] * mean[1] + k.r[8] * mean[2] + k.t[2];
                     const V inverse = ortho ? (V)(1.0) : 1.0 / (active ? pz : (V)(1.0)), u = px * inverse,
                             v = py * inverse;
-                    const V slope_u = u < k.u_low ? (V)(k.u_low) : u > k.u_high ? (V)(k.u_high) : u;
-                    const V slope_v = v < k.v_low ? (V)(k.v_low) : v > k.v_high ? (V)(k.v_high) : v;
-                    const V j0 = k.fx * inverse, j1 = k.fy * inverse;
-                    V b0[3], b1[3], g_b0[3], g_b1[3];
+                    V slope_u, slope_v, j0, j1, b0[3], b1[3], g_b0[3], g_b1[3];
+#include "jacobian.h"
                     for (int e = 0; e < 3; e++) {
-                        b0[e] = j0 * (k.r[e] - slope_u * k.r[6 + e]);
-                        b1[e] = j1 * (k.r[3 + e] - slope_v * k.r[6 + e]);
                         g_b0[e] = g_xx * b0[e] + g_xy * b1[e];  // rows of G B, below times 2 covariance
                         g_b1[e] = g_xy * b0[e] + g_yy * b1[e];
                     }
@@ -151,25 +147,10 @@ void project_backward(
                                 g_s[e] += b0[row] * g_b0[column] + b1[row] * g_b1[column];
                     }
                     if (of_place) {
-                        auto spread = [&](V* g) {
-                            const V g0 = g[0] + g[0], g1 = g[1] + g[1], g2 = g[2] + g[2];
-                            g[0] = s[0] * g0 + s[1] * g1 + s[2] * g2;
-                            g[1] = s[1] * g0 + s[3] * g1 + s[4] * g2;
-                            g[2] = s[2] * g0 + s[4] * g1 + s[5] * g2;
-                        };
-                        spread(g_b0);
-                        spread(g_b1);
-                        // J depends on the point by 1/z and its slopes, which stand still where they were clamped.
-                        const V g_j00 = k.r[0] * g_b0[0] + k.r[1] * g_b0[1] + k.r[2] * g_b0[2];
-                        const V g_j02 = k.r[6] * g_b0[0] + k.r[7] * g_b0[1] + k.r[8] * g_b0[2];
-                        const V g_j11 = k.r[3] * g_b1[0] + k.r[4] * g_b1[1] + k.r[5] * g_b1[2];
-                        const V g_j12 = k.r[6] * g_b1[0] + k.r[7] * g_b1[1] + k.r[8] * g_b1[2];
-                        const V g_u = k.fx * g_x - (slope_u == u ? moving * j0 * g_j02 : (V)(0.0));
-                        const V g_v = k.fy * g_y - (slope_v == v ? moving * j1 * g_j12 : (V)(0.0));
-                        const V g_inverse = k.fx * (g_j00 - slope_u * g_j02) + k.fy * (g_j11 - slope_v * g_j12);
+#include "point_gradient.h"
                         g_point[0] = kept(inverse * g_u);
                         g_point[1] = kept(inverse * g_v);
-                        g_point[2] -= kept(moving * inverse * (g_u * u + g_v * v + inverse * g_inverse));
+                        g_point[2] -= kept(moving ? inverse * (g_u * u + g_v * v + inverse * g_inverse) : (V)(0.0));
                         if (g_viewmats)
                             for (int column = 0; column < 3; column++) {
                                 VU* to = (VU*)(sums + 96 * camera) + column;
@@ -231,18 +212,9 @@ void project_backward(
                     if (!whole) memcpy(g_scales + 3 * i, to, 3 * count * sizeof(float));
                 }
                 if (g_quats) {
-                    const V ax = h[7] - h[5], ay = h[2] - h[6], az = h[3] - h[1];
-                    const V sx = h[5] + h[7], sy = h[2] + h[6], sz = h[1] + h[3];
-                    const V g_w = x * ax + y * ay + z * az;
-                    const V g_x = w * ax + y * sz + z * sy - 2.0 * x * (h[4] + h[8]);
-                    const V g_y = w * ay + x * sz + z * sx - 2.0 * y * (h[0] + h[8]);
-                    const V g_z = w * az + x * sy + y * sx - 2.0 * z * (h[0] + h[4]);
-                    const V along = inverse_norm * (g_w * w + g_x * x + g_y * y + g_z * z), two = inverse_norm * 2.0;
+#include "quaternion_gradient.h"
                     float* to = whole ? g_quats + 4 * i : spare.to_quats;
-                    store4(
-                        to, kept(two * (g_w - along * w)), kept(two * (g_x - along * x)), kept(two * (g_y - along * y)),
-                        kept(two * (g_z - along * z))
-                    );
+                    store4(to, kept(g_quat[0]), kept(g_quat[1]), kept(g_quat[2]), kept(g_quat[3]));
                     if (!whole) memcpy(g_quats + 4 * i, to, 4 * count * sizeof(float));
                 }
             }

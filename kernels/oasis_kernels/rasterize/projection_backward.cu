@@ -17,7 +17,7 @@ __global__ void project_backward(
 #include "projection_cuda.h"
     if (thread >= n) return;
     const int i = thread;
-    const bool of_place = g_means || g_cameras;
+    const bool of_place = g_means || g_cameras, moving = !ortho;
     const double mean[3] = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
     double r[9], scale[3], s[6], inverse_norm = 0.0;  // s: covariance xx, xy, xz, yy, yz, zz
     double w = 1.0, x = 0.0, y = 0.0, z = 0.0;
@@ -66,14 +66,9 @@ __global__ void project_backward(
             const double py = k.r[3] * mean[0] + k.r[4] * mean[1] + k.r[5] * mean[2] + k.t[1];
             const double pz = k.r[6] * mean[0] + k.r[7] * mean[1] + k.r[8] * mean[2] + k.t[2];
             const double inverse = ortho ? 1.0 : reciprocal(pz), u = px * inverse, v = py * inverse;
-            slope_u = u < k.u_low ? k.u_low : u > k.u_high ? k.u_high : u;
-            slope_v = v < k.v_low ? k.v_low : v > k.v_high ? k.v_high : v;
-            j0 = k.fx * inverse;
-            j1 = k.fy * inverse;
             double b0[3], b1[3];
+#include "jacobian.h"
             for (int e = 0; e < 3; e++) {
-                b0[e] = j0 * (k.r[e] - slope_u * k.r[6 + e]);
-                b1[e] = j1 * (k.r[3 + e] - slope_v * k.r[6 + e]);
                 g_b0[e] = g_xx * b0[e] + g_xy * b1[e];  // rows of G B, below times 2 covariance
                 g_b1[e] = g_xy * b0[e] + g_yy * b1[e];
             }
@@ -82,22 +77,7 @@ __global__ void project_backward(
                 for (int column = row; column < 3; column++, e++)
                     g_s[e] += b0[row] * g_b0[column] + b1[row] * g_b1[column];
             if (of_place) {
-                auto spread = [&](double* g) {
-                    const double g0 = g[0] + g[0], g1 = g[1] + g[1], g2 = g[2] + g[2];
-                    g[0] = s[0] * g0 + s[1] * g1 + s[2] * g2;
-                    g[1] = s[1] * g0 + s[3] * g1 + s[4] * g2;
-                    g[2] = s[2] * g0 + s[4] * g1 + s[5] * g2;
-                };
-                spread(g_b0);
-                spread(g_b1);
-                // J depends on the point by 1/z and its slopes, which stand still where they were clamped.
-                const double g_j00 = k.r[0] * g_b0[0] + k.r[1] * g_b0[1] + k.r[2] * g_b0[2];
-                const double g_j02 = k.r[6] * g_b0[0] + k.r[7] * g_b0[1] + k.r[8] * g_b0[2];
-                const double g_j11 = k.r[3] * g_b1[0] + k.r[4] * g_b1[1] + k.r[5] * g_b1[2];
-                const double g_j12 = k.r[6] * g_b1[0] + k.r[7] * g_b1[1] + k.r[8] * g_b1[2];
-                const double g_u = k.fx * g_x - (slope_u == u && !ortho ? j0 * g_j02 : 0.0);
-                const double g_v = k.fy * g_y - (slope_v == v && !ortho ? j1 * g_j12 : 0.0);
-                const double g_inverse = k.fx * (g_j00 - slope_u * g_j02) + k.fy * (g_j11 - slope_v * g_j12);
+#include "point_gradient.h"
                 g_point[0] = inverse * g_u;
                 g_point[1] = inverse * g_v;
                 if (!ortho) g_point[2] -= inverse * (g_u * u + g_v * v + inverse * g_inverse);
@@ -142,17 +122,8 @@ __global__ void project_backward(
             for (int row = 0; row < 3; row++) h[3 * row + e] *= square;
         }
         if (g_quats) {
-            const double ax = h[7] - h[5], ay = h[2] - h[6], az = h[3] - h[1];
-            const double sx = h[5] + h[7], sy = h[2] + h[6], sz = h[1] + h[3];
-            const double g_w = x * ax + y * ay + z * az;
-            const double g_x = w * ax + y * sz + z * sy - 2.0 * x * (h[4] + h[8]);
-            const double g_y = w * ay + x * sz + z * sx - 2.0 * y * (h[0] + h[8]);
-            const double g_z = w * az + x * sy + y * sx - 2.0 * z * (h[0] + h[4]);
-            const double along = inverse_norm * (g_w * w + g_x * x + g_y * y + g_z * z), two = inverse_norm * 2.0;
-            g_quats[4 * i] = (float)(two * (g_w - along * w));
-            g_quats[4 * i + 1] = (float)(two * (g_x - along * x));
-            g_quats[4 * i + 2] = (float)(two * (g_y - along * y));
-            g_quats[4 * i + 3] = (float)(two * (g_z - along * z));
+#include "quaternion_gradient.h"
+            for (int e = 0; e < 4; e++) g_quats[4 * i + e] = (float)g_quat[e];
         }
     }
 }

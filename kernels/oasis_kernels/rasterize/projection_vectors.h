@@ -47,44 +47,9 @@ auto store4 = [&](float* p, F x, F y, F z, F w) {
     *(FU16*)(p + 16) = __builtin_shufflevector(xy, zw, 4, 12, 20, 28, 5, 13, 21, 29, 6, 14, 22, 30, 7, 15, 23, 31);
 };
 
-struct Camera {
-    double r[9], t[3], fx, fy, cx, cy, u_low, u_high, v_low, v_high;  // r by rows; limits of x/z and y/z in J
-};
-auto camera_at = [&](long long c) -> Camera {
-    const float *view = viewmats + 16 * c, *K = Ks + 9 * c;
-    Camera out;
-    for (int row = 0; row < 3; row++) {
-        for (int column = 0; column < 3; column++) out.r[3 * row + column] = view[4 * row + column];
-        out.t[row] = view[4 * row + 3];
-    }
-    out.fx = K[0];
-    out.fy = K[4];
-    out.cx = K[2];
-    out.cy = K[5];
-    const double margin_x = JACOBIAN_LIMIT * 0.5 * width / out.fx;
-    const double margin_y = JACOBIAN_LIMIT * 0.5 * height / out.fy;
-    out.u_low = -(out.cx / out.fx) - margin_x;
-    out.u_high = (width - out.cx) / out.fx + margin_x;
-    out.v_low = -(out.cy / out.fy) - margin_y;
-    out.v_high = (height - out.cy) / out.fy + margin_y;
-    if (ortho) out.u_low = out.u_high = out.v_low = out.v_high = 0.0;  // J has no slopes
-    return out;
-};
-
-// Rotation matrix by rows of quaternions of any norm but 0; 1 / |q|^2. Squares of float32 fit in float64.
-auto rotation = [](V w, V x, V y, V z, V* r) -> V {
-    const V inverse = 1.0 / (w * w + x * x + y * y + z * z), two = inverse + inverse;
-    r[0] = 1.0 - two * (y * y + z * z);
-    r[1] = two * (x * y - w * z);
-    r[2] = two * (x * z + w * y);
-    r[3] = two * (x * y + w * z);
-    r[4] = 1.0 - two * (x * x + z * z);
-    r[5] = two * (y * z - w * x);
-    r[6] = two * (x * z - w * y);
-    r[7] = two * (y * z + w * x);
-    r[8] = 1.0 - two * (x * x + y * y);
-    return inverse;
-};
+auto reciprocal = [](V a) -> V { return 1.0 / a; };
+auto quotient = [](double a, double b) -> double { return a / b; };
+#include "projection.h"
 // Symmetric part of eight 3 x 3 matrices: xx, xy, xz, yy, yz, zz.
 auto load_covariance = [](const float* p, V* s) {
     const int pair[6][2] = {{0, 0}, {1, 3}, {2, 6}, {4, 4}, {5, 7}, {8, 8}};
