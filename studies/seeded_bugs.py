@@ -137,25 +137,33 @@ BUGS = [
     ),
     *_in(
         "rasterize/projection.cpp", "rasterization",
-        ("J not clamped", "const V slope_u = u < k.u_low ? (V)(k.u_low) : u > k.u_high ? (V)(k.u_high) : u;",
-         "const V slope_u = u;"),
-        ("sign of the third column of J", "b0[e] = j0 * (k.r[e] - slope_u * k.r[6 + e]);",
-         "b0[e] = j0 * (k.r[e] + slope_u * k.r[6 + e]);"),
-        ("low-pass 1 % off", "const V xx = flat_xx + eps2d,", "const V xx = flat_xx + 1.01 * eps2d,"),
         ("no near test", "I drawn = (pz >= near) & (pz <= far) & bright;", "I drawn = (pz <= far) & bright;"),
         ("boxes of 2 sigma", "reach = reach + reach < reach_limit ? reach + reach : reach_limit;",
          "reach = reach + reach < 4.0 ? reach + reach : (V)(4.0);"),
     ),
     *_in(
-        "rasterize/projection_vectors.h", "rasterization",
+        "rasterize/jacobian.h", "rasterization",
+        ("J not clamped", "slope_u = u < k.u_low ? (V)(k.u_low) : u > k.u_high ? (V)(k.u_high) : u;", "slope_u = u;"),
+        ("sign of the third column of J", "b0[e] = j0 * (k.r[e] - slope_u * k.r[6 + e]);",
+         "b0[e] = j0 * (k.r[e] + slope_u * k.r[6 + e]);"),
+    ),
+    *_in(
+        "rasterize/covariance2d.h", "rasterization",
+        ("low-pass 1 % off", "xx = flat_xx + eps2d;", "xx = flat_xx + 1.01 * eps2d;"),
+    ),
+    *_in(
+        "rasterize/projection.h", "rasterization",
         ("one sign in the rotation", "r[1] = two * (x * y - w * z);", "r[1] = two * (x * y + w * z);"),
     ),
     *_in(
-        "rasterize/projection_backward.cpp", "rasterization",
+        "rasterize/point_gradient.h", "rasterization",
         ("J detached from the gradient of means",
          "const V g_inverse = k.fx * (g_j00 - slope_u * g_j02) + k.fy * (g_j11 - slope_v * g_j12);",
          "const V g_inverse = (V)(0.0);"),
-        ("clamped slopes differentiated", "(slope_u == u ? j0 * g_j02 : (V)(0.0))", "j0 * g_j02"),
+        ("clamped slopes differentiated", "((slope_u == u) & moving ? j0 * g_j02 : (V)(0.0))", "j0 * g_j02"),
+    ),
+    *_in(
+        "rasterize/quaternion_gradient.h", "rasterization",
         ("norm of the quaternion not differentiated",
          "const V along = inverse_norm * (g_w * w + g_x * x + g_y * y + g_z * z),", "const V along = (V)(0.0),"),
     ),
@@ -185,6 +193,9 @@ BUGS = [
     *_in(
         "rasterize/strips.cpp", "rasterization",
         ("the stop draws the last layer", "const V weight = ends ? (V)(0.f) : full;", "const V weight = full;"),
+    ),
+    *_in(
+        "rasterize/strip_blend.h", "rasterization",
         ("no stop", "const I ends = drawn & (after <= last());", "const I ends = drawn & (after < 0.f);"),
         ("no cut-off", "const I drawn = (e >= cut()) & (before > 0.f) INSIDE;",
          "const I drawn = (before > 0.f) INSIDE;"),
@@ -232,15 +243,18 @@ BUGS = [
         ("third corner never added", "rows[f, 6 + k] = rows.dtype(e2[k])", "rows[f, 6 + k] = rows.dtype(ZERO)"),
     ),
     *_in(
-        "posing/face_vectors.h", "faces",
+        "posing/face.h", "faces",
         ("posed areas as weights", "o.weight = 0.5f * rest.l * rest.y * rest.unit * rest.unit;",
          "o.weight = 0.5f * posed.l * posed.y * posed.unit * posed.unit;"),
-        ("area ratio inverted", "o.ratio = rest.point ? one : grown / damped;",
-         "o.ratio = rest.point ? one : damped / grown;"),
+        ("area ratio inverted", "o.ratio = rest.point ? one : grown / o.damped;",
+         "o.ratio = rest.point ? one : o.damped / grown;"),
     ),
     *_in(
         "posing/face_rotations.cpp", "faces",
         ("no sign alignment", "const V sign = dot4(q, reference) < 0.f ? -one : one;", "const V sign = one;"),
+    ),
+    *_in(
+        "posing/edge_gradients.h", "faces",
         ("area weights not differentiated", "by_rest += p.proper ? g_weight : zero;", ""),
     ),
     *_in(
@@ -255,15 +269,12 @@ BUGS = [
     ),
     *_in(
         "posing/mesh_gaussians.cpp", "posing",
-        ("dq and q swapped", "put4(posed_quats + 4ll * at, count, product(turn, get4(quats + 4ll * at, count)));",
-         "put4(posed_quats + 4ll * at, count, product(get4(quats + 4ll * at, count), turn));"),
+        ("dq and q swapped", "product(place.rotation, get4(quats + 4ll * at, count))",
+         "product(get4(quats + 4ll * at, count), place.rotation)"),
     ),
     *_in(
-        "posing/on_face.h", "posing",
+        "posing/on_mesh.h", "posing",
         ("no sign alignment", "return dot4(a, reference) < 0.f ? -one : one;", "return one;"),
-    ),
-    *_in(
-        "posing/mesh_gaussians_vectors.h", "posing",
         ("square root left out", "half_powers == 1 ? root(r) : r;", "r;"),
     ),
 ]  # fmt: skip

@@ -10,12 +10,9 @@
 // gradient of the angle: all that `face_rotation.turn_gradient` needs is at hand in the two frames.
 
 void measure(
-    int n_vertices,
-    int n_faces,
-    const float* rest_vertices,  // [V, 3]
-    const int* faces,            // [F, 3]
-    long long* state,            // `STATE` words of zeros
-    float* out                   // [F, TRIANGLE]
+#include "face_parameters.inc"
+    long long* state,  // `STATE` words of zeros
+    float* out         // [F, TRIANGLE]
 ) {
 #pragma clang fp contract(fast)
 #include "../runtime/ranges.h"
@@ -38,10 +35,7 @@ void measure(
 }
 
 void turn(
-    int n_vertices,
-    int n_faces,
-    const float* rest_vertices,   // [V, 3]
-    const int* faces,             // [F, 3]
+#include "face_parameters.inc"
     long long* state,             // `STATE` words of zeros
     const float* triangles,       // [F, TRIANGLE], from `measure`, or 0
     const float* posed_vertices,  // [V, 3]
@@ -161,10 +155,7 @@ void turn(
 }
 
 void turn_backward(
-    int n_vertices,
-    int n_faces,
-    const float* rest_vertices,      // [V, 3]
-    const int* faces,                // [F, 3]
+#include "face_parameters.inc"
     long long* state,                // `STATE` words of zeros
     const float* triangles,          // [F, TRIANGLE], from `measure`, or 0
     const float* posed_vertices,     // [V, 3]

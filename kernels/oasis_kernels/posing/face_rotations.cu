@@ -6,10 +6,7 @@
 // `measure_triangles` wrote, one row of 12 a face, as `face_rotation_vectors` has it.
 
 __global__ void measure_triangles(
-    int n_vertices,
-    int n_faces,
-    const float* rest_vertices,  // [V, 3]; not read where there are triangles
-    const int* faces,            // [F, 3]
+#include "face_parameters.inc"
     float* out
 ) {
 #include "vectors_cuda.h"
@@ -27,10 +24,7 @@ __global__ void measure_triangles(
 }
 
 __global__ void turn_faces(
-    int n_vertices,
-    int n_faces,
-    const float* rest_vertices,   // [V, 3]; not read where there are triangles
-    const int* faces,             // [F, 3]
+#include "face_parameters.inc"
     const float* triangles,       // [F, 12], from `measure_triangles`, or 0
     const float* posed_vertices,  // [B, V, 3]
     float* face_quats,            // [B, F, 4]
@@ -163,10 +157,7 @@ __global__ void turn_vertices(
 }
 
 __global__ void turn_faces_backward(
-    int n_vertices,
-    int n_faces,
-    const float* rest_vertices,      // [V, 3]; not read where there are triangles
-    const int* faces,                // [F, 3]
+#include "face_parameters.inc"
     const float* triangles,          // [F, 12], from `measure_triangles`, or 0
     const float* posed_vertices,     // [B, V, 3]
     const float* vertex_quats,       // [B, V, 4]

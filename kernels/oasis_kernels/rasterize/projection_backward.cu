@@ -53,13 +53,7 @@ __global__ void project_backward(
                     z = quats[4 * i + 3];
                     inverse_norm = rotation(w, x, y, z, r);
                     for (int e = 0; e < 3; e++) scale[e] = scales[3 * i + e];
-                    double f[9];
-                    for (int e = 0; e < 9; e++) f[e] = r[e] * scale[e % 3];
-                    int e = 0;
-                    for (int row = 0; row < 3; row++)
-                        for (int other = row; other < 3; other++, e++)
-                            s[e] = f[3 * row] * f[3 * other] + f[3 * row + 1] * f[3 * other + 1] +
-                                   f[3 * row + 2] * f[3 * other + 2];
+#include "covariance3d.h"
                 }
             }
             const double px = k.r[0] * mean[0] + k.r[1] * mean[1] + k.r[2] * mean[2] + k.t[0];

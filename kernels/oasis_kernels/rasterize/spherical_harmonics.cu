@@ -5,14 +5,8 @@
 // cameras in order, so that no sum depends on how threads run.
 
 __global__ void sh_to_rgb(
-    int n,
-    int rows,
-    int n_harmonics,
-    const float* means,
-    const float* coefficients,
-    const float* poses,
-    int total,
-    float* colors
+#include "sh_parameters.inc"
+    int total, float* colors
 ) {
 #include "sh_basis.h"
     if (thread < total) {
@@ -31,18 +25,8 @@ __global__ void sh_to_rgb(
 }
 
 __global__ void sh_to_rgb_backward(
-    int n,
-    int rows,
-    int n_harmonics,
-    const float* means,
-    const float* coefficients,
-    const float* poses,
-    int n_cameras,
-    const float* colors,
-    const float* g_colors,
-    float* g_means,
-    float* g_coefficients,
-    double* g_centers
+#include "sh_parameters.inc"
+    int n_cameras, const float* colors, const float* g_colors, float* g_means, float* g_coefficients, double* g_centers
 ) {
 #include "sh_basis.h"
     auto basis_adjoint = [](const float* d, const float* g, float* out) {

@@ -22,12 +22,7 @@ void bone_transforms(
     T* bends               // [B, J - 1, 2]
 ) {
 #include "bones.h"
-#if defined(__CUDA_ARCH__)
-    const long long pose = block_index;
-#else
-    share(state, n_poses, [&](long long pose) {
-#endif
-    const T* angle = angles + pose * 3 * (n_joints - 1);
+#include "each_pose.h"
     double* local = locals + pose * LOCAL * n_joints;
     EACH_BONE {
         double* to = local + LOCAL * j;
@@ -94,12 +89,7 @@ void bone_transforms_backward(
     T* g_joints             // [B, J, 3]
 ) {
 #include "bones.h"
-#if defined(__CUDA_ARCH__)
-    const long long pose = block_index;
-#else
-    share(state, n_poses, [&](long long pose) {
-#endif
-    const T* angle = angles + pose * 3 * (n_joints - 1);
+#include "each_pose.h"
     const double* local = locals + pose * LOCAL * n_joints;
     double* sum = sums + pose * 12 * n_joints;
     EACH_ROW {

@@ -7,13 +7,7 @@
 // in an order that knows nothing of threads.
 
 void skin(
-    long long n,
-    int n_joints,
-    const T* means,       // [N, 3]
-    const T* covars,      // [N, 3, 3] or 0
-    const T* weights,     // [N, J]
-    const T* transforms,  // [J, 3, 4]
-    long long* state,     // `STATE` words of zeros
+#include "cpu_skin_parameters.inc"
     T* out_means,
     T* out_covars  // [N, 3]; [N, 3, 3]
 ) {
@@ -23,17 +17,7 @@ void skin(
 #include "blends.h"
     ranges(state, n, [&](int first, int end) {
         for (int i = first; i < end; i += 4) {
-            const int count = wp::min(4, end - i);
-            const T* w[4];
-            V blends[4];
-            for (int k = 0; k < 4; k++) {
-                w[k] = weights + (long long)wp::min(i + k, end - 1) * n_joints;
-                blends[k] = (V)(0);
-            }
-            for (int j = 0; j < n_joints; j++) {
-                const V transform = load(columns + 16 * j);
-                for (int k = 0; k < 4; k++) blends[k] += w[k][j] * transform;
-            }
+#include "four_blends.h"
             for (int k = 0; k < count; k++) {
                 const long long at = i + k;
                 const Q g0 = blends[k].lo.lo, g1 = blends[k].lo.hi, g2 = blends[k].hi.lo;
@@ -52,13 +36,7 @@ void skin(
 }
 
 void skin_backward(
-    long long n,
-    int n_joints,
-    const T* means,        // [N, 3]
-    const T* covars,       // [N, 3, 3] or 0
-    const T* weights,      // [N, J]
-    const T* transforms,   // [J, 3, 4]
-    long long* state,      // `STATE` words of zeros
+#include "cpu_skin_parameters.inc"
     const T* g_out_means,  // these two may be 0
     const T* g_out_covars,
     T* g_means,  // each of these is 0 if not wanted
@@ -76,17 +54,7 @@ void skin_backward(
         for (int j = 0; j < width; j++) entries[e * width + j] = columns[16 * j + e];
     ranges(state, n, [&](int first, int end) {
         for (int i = first; i < end; i += 4) {
-            const int count = wp::min(4, end - i);
-            const T* w[4];
-            V blends[4];
-            for (int k = 0; k < 4; k++) {
-                w[k] = weights + (long long)wp::min(i + k, end - 1) * n_joints;
-                blends[k] = (V)(0);
-            }
-            for (int j = 0; j < n_joints; j++) {
-                const V transform = load(columns + 16 * j);
-                for (int k = 0; k < 4; k++) blends[k] += w[k][j] * transform;
-            }
+#include "four_blends.h"
             for (int k = 0; k < count; k++) {
                 const long long at = i + k;
                 const Q g0 = blends[k].lo.lo, g1 = blends[k].lo.hi, g2 = blends[k].hi.lo;
