@@ -64,7 +64,7 @@ def training_text(path: Path) -> str:
         lines.append(["losses", losses])
     options = [f"--{name} {notes[name]}" for name in RETRAIN if name in notes]
     if notes.get("start_sha256"):
-        options.append("--start START.safetensors")  # the weights of that SHA-256
+        options.append("--initial-weights START.safetensors")  # the weights of that SHA-256
     if notes.get("hold_out"):
         options.append("--hold-out " + " ".join(notes["hold_out"]))
     command = f"```sh\noasis pretrain prior {' '.join(options).replace('bfloat16', 'bf16')}\n```"

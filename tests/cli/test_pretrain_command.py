@@ -197,6 +197,6 @@ def test_it_begins_with_weights_that_are_given(tiny, unbroken, tmp_path, capsys)
 
 def test_weights_of_another_profile_are_no_start(unbroken, tmp_path, capsys):
     start = unbroken / WEIGHTS
-    assert main(["pretrain", str(tmp_path / "on"), *SMALL, "--start", str(start)]) == BAD_INPUT
+    assert main(["pretrain", str(tmp_path / "on"), *SMALL, "--initial-weights", str(start)]) == BAD_INPUT
     assert "of another network than --profile compact" in capsys.readouterr().err
     assert not (tmp_path / "on").exists()

@@ -197,3 +197,8 @@ def test_a_capture_of_one_person_comes_again(capture):
     again = capture_shots(SEED, photo, sample_shots(SEED, [0, 1], SceneConfig(population=EVERYBODY, look="even")))
     for one, two in zip(others, again, strict=True):
         np.testing.assert_array_equal(one.light.sky, two.light.sky)
+
+
+def test_a_wall_that_is_turned_away_stays_before_the_camera():
+    shot = sample_shot(1000, 289656, SceneConfig(people=1024))  # its yaw is drawn beyond a right angle
+    assert shot.room is not None and np.isfinite(shot.room.solids).all()

@@ -284,7 +284,7 @@ class Pretrain:
     """Processes that bake people and plan pictures ahead, for each GPU; 0 for none."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for the paper's profile."""
-    start: Path | None = None
+    initial_weights: Annotated[Path | None, arg(aliases=["--start"])] = None  # torchrun takes --start for its own
     """Weights to begin with: a network.safetensors of the same task and profile. From nothing when not given."""
 
 

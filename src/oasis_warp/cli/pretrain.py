@@ -106,8 +106,9 @@ def check_prior_options(options: Pretrain) -> None:
         )
     if weights is not None and not weights.is_file():
         raise InputError(f"--backbone-weights {weights}: no such file; download model.safetensors of {backbone}.")
-    if options.start is not None and read_config(options.start) != PROFILES[options.profile]:
-        raise InputError(f"--start {options.start}: of another network than --profile {options.profile}.")
+    start = options.initial_weights
+    if start is not None and read_config(start) != PROFILES[options.profile]:
+        raise InputError(f"--initial-weights {start}: of another network than --profile {options.profile}.")
 
 
 def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
@@ -162,9 +163,9 @@ def make_trainer(options: Pretrain, process: ProcessInfo) -> Trainer:
     precision = PRECISIONS[options.precision]
     if options.task == "dense":
         config = PretrainConfig(steps=options.steps, precision=precision, **DENSE_SCHEDULE)
-        return DenseTrainer(make_dense_network(options.seed, options.start), config, process)
+        return DenseTrainer(make_dense_network(options.seed, options.initial_weights), config, process)
     config = PretrainConfig(steps=options.steps, precision=precision)
-    network = make_network(PROFILES[options.profile], options.seed, options.backbone_weights, options.start)
+    network = make_network(PROFILES[options.profile], options.seed, options.backbone_weights, options.initial_weights)
     return PriorTrainer(network, config, process)
 
 
@@ -206,7 +207,7 @@ def settings_of(options: Pretrain, processes: int) -> dict[str, Any]:
     else:
         settings |= {name: getattr(options, name) for name in ("profile", "views")}
         settings["hold_out"] = sorted(options.hold_out)
-    for name, path in {"backbone": options.backbone_weights, "start": options.start}.items():
+    for name, path in {"backbone": options.backbone_weights, "start": options.initial_weights}.items():
         if path is not None:
             with path.open("rb") as file:
                 settings[f"{name}_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()

@@ -40,10 +40,9 @@ def join_processes(device: str) -> Iterator[ProcessInfo]:
         yield ProcessInfo(0, 1, here)
         return
     dist.init_process_group("nccl" if device == "cuda" else "gloo")
-    try:
-        yield ProcessInfo(dist.get_rank(), world, here)
-    finally:
-        dist.destroy_process_group()
+    yield ProcessInfo(dist.get_rank(), world, here)
+    # Not after an error: it would wait for the other processes, which wait for this one; torchrun ends them all.
+    dist.destroy_process_group()
 
 
 def mean_over_processes(values: Tensor, world: int) -> Tensor:

@@ -127,7 +127,7 @@ def moved(batch: DenseBatch, random: torch.Generator) -> DenseBatch:
     def sample(values: Tensor, mode: str = "bilinear") -> Tensor:
         return grid_sample(values, grid, mode=mode, align_corners=False)
 
-    border = uniform(count, 3, 1, 1, low=0, high=1) * (uniform(count, 1, 1, 1, low=-1, high=1) > 0)
+    border = uniform(count, 3, 1, 1, low=0.0, high=1.0) * (uniform(count, 1, 1, 1, low=-1.0, high=1.0) > 0)
     power, gain = normal(count, 1, 1, 1, sigma=0.2).exp(), normal(count, 3, 1, 1, sigma=0.12).exp()
     image = ((sample(batch.image - border) + border).clamp(0, 1) ** power * gain).clamp(0, 1)
     classes, albedo, inside = sample(

@@ -105,7 +105,7 @@ def _oval(count: int, size: int, random: torch.Generator) -> Float[Tensor, "B H 
     u, v = (_uniform(random, count, 1, 1, low=-1.2, high=1.2) for _ in range(2))
     a, b = (_uniform(random, count, 1, 1, low=0.3, high=1.2) for _ in range(2))
     radius = ((x - u) / a) ** 2 + ((y - v) / b) ** 2 + 0.25 * _noise(count, size, 5, random)
-    return torch.sigmoid((1 - radius) * _uniform(random, count, 1, 1, low=6, high=30))
+    return torch.sigmoid((1 - radius) * _uniform(random, count, 1, 1, low=6.0, high=30.0))
 
 
 def _thing(count: int, size: int, incident: Tensor, random: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -115,7 +115,7 @@ def _thing(count: int, size: int, incident: Tensor, random: torch.Generator) -> 
     u, v = (_uniform(random, count, 1, 1, low=-0.6, high=0.6) for _ in range(2))
     length = _uniform(random, count, 1, 1, low=0.15, high=1.2)
     width = (length * torch.exp(_uniform(random, count, 1, 1, low=-2.8, high=-0.4))).clamp_min(0.03)
-    power = 2 ** _uniform(random, count, 1, 1, low=1, high=3.5)  # an ellipse to nearly a rectangle
+    power = 2.0 ** _uniform(random, count, 1, 1, low=1.0, high=3.5)  # an ellipse to nearly a rectangle
     along = ((x - u) * angle.cos() + (y - v) * angle.sin()) / length
     across = (-(x - u) * angle.sin() + (y - v) * angle.cos()) / width
     radius = (along.abs().clamp_max(4) ** power + across.abs().clamp_max(4) ** power) ** (1 / power)
@@ -135,7 +135,7 @@ def _other_hand(color: Tensor, alpha: Tensor, incident: Tensor, random: torch.Ge
     angle = _uniform(random, count, low=-math.pi, high=math.pi)
     scale = _uniform(random, count, low=0.7, high=1.6)
     flip = torch.where(_uniform(random, count) < 0.5, -1.0, 1.0)
-    x, y = (_uniform(random, count, low=-1, high=1) for _ in range(2))
+    x, y = (_uniform(random, count, low=-1.0, high=1.0) for _ in range(2))
     cos, sin = scale * angle.cos(), scale * angle.sin()
     rows = torch.stack([cos * flip, -sin, x, sin * flip, cos, y], 1).view(-1, 2, 3)
     grid = affine_grid(rows, [count, 1, size, size], align_corners=False)
@@ -148,7 +148,7 @@ def _motion_blur(light: Tensor, random: torch.Generator) -> Tensor:
     count, size = light.shape[:2]
     reach = torch.arange(-BLUR_REACH, BLUR_REACH + 1, device=light.device, dtype=light.dtype)
     angle = _uniform(random, count, 1, 1, high=math.pi)
-    length = _uniform(random, count, 1, 1, low=1.0, high=BLUR_REACH) * _chance(count, BLURRED, random)
+    length = _uniform(random, count, 1, 1, low=1.0, high=float(BLUR_REACH)) * _chance(count, BLURRED, random)
     along = reach[None, :, None] * angle.sin() + reach[None, None, :] * angle.cos()
     across = reach[None, None, :] * angle.sin() - reach[None, :, None] * angle.cos()
     kernel = torch.exp(-2 * across**2) * torch.sigmoid((length / 2 - along.abs() + 0.5) * 4)
