@@ -9,23 +9,10 @@ from torch import Tensor
 from oasis_kernels.posing import face_rotation as kernels
 from oasis_kernels.posing import face_rotation_native as native_kernels
 from oasis_warp.core.checks import check_float, check_shape
+from oasis_warp.ops._runtime import launch
 from oasis_warp.ops._runtime.declaration import Array, Operator, empty_gradients, needs_gradient
 from oasis_warp.ops._runtime.incidence import Incidence, incidence, sum_at_items
-from oasis_warp.ops._runtime.launch import (
-    aligned,
-    block_count,
-    contiguous,
-    current_stream,
-    even_cuts,
-    has_cuda_kernels,
-    has_vectors,
-    launch_ranges,
-    phase_state,
-    run_cuda,
-    run_native,
-    task_count,
-    view,
-)
+from oasis_warp.ops._runtime.launch import launch_ranges
 
 
 class RestMesh(NamedTuple):
@@ -73,13 +60,13 @@ def _mesh_params(rest: Tensor, posed: Tensor, corners: Incidence, triangles: Ten
 def _face_rotations(
     rest_vertices: Tensor, posed_vertices: Tensor, faces: Tensor, triangles: Tensor | None, keep: bool, validate: bool
 ) -> Outputs:
-    on_cuda = has_cuda_kernels(rest_vertices)
+    on_cuda = launch.has_cuda_kernels(rest_vertices)
     if posed_vertices.ndim == 3 and not on_cuda:
         return _OPERATOR.each_pose(rest_vertices, posed_vertices, faces, triangles, keep, validate)
     corners = incidence("faces", faces, len(rest_vertices), "vertices")
     out = _outputs(rest_vertices, posed_vertices, faces, triangles, keep)
-    (rest, posed), (triangles,) = contiguous(rest_vertices, posed_vertices), aligned(triangles)
-    if not (on_cuda or has_vectors(rest)):
+    (rest, posed), (triangles,) = launch.contiguous(rest_vertices, posed_vertices), launch.aligned(triangles)
+    if not (on_cuda or launch.has_vectors(rest)):
         _rotate_float64(rest, posed, corners, out)
         return out
     n_vertices, n_faces = len(rest), len(faces)
@@ -88,14 +75,15 @@ def _face_rotations(
     params = _mesh_params(rest, posed, corners, triangles) | dict(zip(names, out, strict=True))
     params["rows_of_faces"] = rest.new_empty((n_poses * n_faces, 8))
     if on_cuda:
-        blocks = n_poses * block_count(n_faces, native_kernels.BLOCK)
+        blocks = n_poses * launch.block_count(n_faces, native_kernels.BLOCK)
         params["flat_blocks"] = corners.table.new_empty(blocks)
-        stream = current_stream(rest.device)
-        run_cuda(native_kernels.turn_faces, params, blocks, stream)
-        run_cuda(native_kernels.turn_vertices, params, n_poses * block_count(n_vertices, native_kernels.BLOCK), stream)
+        stream = launch.current_stream(rest.device)
+        launch.run_cuda(native_kernels.turn_faces, params, blocks, stream)
+        blocks = n_poses * launch.block_count(n_vertices, native_kernels.BLOCK)
+        launch.run_cuda(native_kernels.turn_vertices, params, blocks, stream)
     else:
-        params["state"] = phase_state(native_kernels.STATE)
-        run_native(native_kernels.turn, params, task_count(n_faces, n_vertices))
+        params["state"] = launch.phase_state(native_kernels.STATE)
+        launch.run_native(native_kernels.turn, params, launch.task_count(n_faces, n_vertices))
     return out
 
 
@@ -104,25 +92,17 @@ def _rotate_float64(rest: Tensor, posed: Tensor, corners: Incidence, out: Output
     vertex_quats, face_quats, area_ratio, vertex_area_ratio, signs, sums = out
     n_vertices, n_faces = len(rest), len(corners.table)
     areas = rest.new_empty((n_faces, 3), dtype=torch.float64)
-    launch_ranges(
-        kernels.face_rotations,
-        even_cuts(n_faces),
-        [*map(view, (rest, posed, corners.table, face_quats, area_ratio, areas))],
-        like=rest,
-    )
+    inputs = [rest, posed, corners.table, face_quats, area_ratio, areas]
+    launch_ranges(kernels.face_rotations, n_faces, inputs, like=rest)
     # What has no rotation of its own gets that of the largest face, so that a rigid motion still acts rigidly.
     fallback = areas[:, 0].argmax(keepdim=True) if n_faces else areas.new_empty(0, dtype=torch.int64)
     if n_faces:
         face_quats.copy_(torch.where(areas[:, :1] > 0, face_quats, face_quats[fallback]))
-    launch_ranges(
-        kernels.vertex_rotations,
-        even_cuts(n_vertices),
-        [
-            *map(view, (face_quats, areas, corners.offsets, corners.entries, fallback.to(torch.int32))),
-            *map(view, (vertex_quats, vertex_area_ratio, signs, sums)),
-        ],
-        like=rest,
-    )
+    inputs = [
+        face_quats, areas, corners.offsets, corners.entries, fallback.to(torch.int32), vertex_quats, vertex_area_ratio,
+        signs, sums,
+    ]  # fmt: skip
+    launch_ranges(kernels.vertex_rotations, n_vertices, inputs, like=rest)
 
 
 def _face_rotations_backward(
@@ -130,22 +110,20 @@ def _face_rotations_backward(
     face_quats: Tensor, vertex_area_ratio: Tensor, signs: Tensor, sums: Tensor, g_vertex_quats: Tensor | None,
     g_face_quats: Tensor | None, g_area_ratio: Tensor | None, g_vertex_area_ratio: Tensor | None, needs: list[bool],
 ) -> list[Tensor]:  # fmt: skip
-    on_cuda = has_cuda_kernels(rest_vertices)
+    on_cuda = launch.has_cuda_kernels(rest_vertices)
     saved = {
-        "vertex_quats": vertex_quats,
-        "face_quats": face_quats,
-        "vertex_area_ratio": vertex_area_ratio,
-        "signs": signs,
-        "sums": sums,
-    }
+        "vertex_quats": vertex_quats, "face_quats": face_quats, "vertex_area_ratio": vertex_area_ratio,
+        "signs": signs, "sums": sums,
+    }  # fmt: skip
     incoming = g_vertex_quats, g_face_quats, g_area_ratio, g_vertex_area_ratio
     if posed_vertices.ndim == 3 and not on_cuda:
         return _OPERATOR.each_pose_backward(
             rest_vertices, posed_vertices, faces, triangles, *saved.values(), *incoming, needs
         )
     corners = incidence("faces", faces, len(rest_vertices), "vertices")
-    (rest, posed), (triangles, *incoming) = contiguous(rest_vertices, posed_vertices), aligned(triangles, *incoming)
-    if not (on_cuda or has_vectors(rest)):
+    rest, posed = launch.contiguous(rest_vertices, posed_vertices)
+    triangles, *incoming = launch.aligned(triangles, *incoming)
+    if not (on_cuda or launch.has_vectors(rest)):
         return _backward_float64(rest, posed, corners, saved, incoming, needs)
     g_rest, g_posed = empty_gradients((rest, posed), [False, needs[1]])
     n_vertices, n_faces, batch = len(rest), len(faces), posed.shape[:-2]
@@ -158,13 +136,14 @@ def _face_rotations_backward(
         "rest_edges": rest_edges, "posed_edges": posed_edges, "g_rest": g_rest, "g_posed": g_posed,
     }  # fmt: skip
     if on_cuda:
-        stream = current_stream(rest.device)
-        blocks = n_poses * block_count(n_faces, native_kernels.BLOCK)
-        run_cuda(native_kernels.turn_faces_backward, params, blocks, stream)
-        run_cuda(native_kernels.gather_edges, params, n_poses * block_count(n_vertices, native_kernels.BLOCK), stream)
+        stream = launch.current_stream(rest.device)
+        blocks = n_poses * launch.block_count(n_faces, native_kernels.BLOCK)
+        launch.run_cuda(native_kernels.turn_faces_backward, params, blocks, stream)
+        blocks = n_poses * launch.block_count(n_vertices, native_kernels.BLOCK)
+        launch.run_cuda(native_kernels.gather_edges, params, blocks, stream)
     else:
-        params |= {"at_vertices": rest.new_empty((n_vertices, 8)), "state": phase_state(native_kernels.STATE)}
-        run_native(native_kernels.turn_backward, params, task_count(n_faces, n_vertices))
+        params |= {"at_vertices": rest.new_empty((n_vertices, 8)), "state": launch.phase_state(native_kernels.STATE)}
+        launch.run_native(native_kernels.turn_backward, params, launch.task_count(n_faces, n_vertices))
     return [torch.sum(g_rest, 0) if batch and needs[0] else g_rest, g_posed]
 
 
@@ -181,22 +160,13 @@ def _backward_float64(
     )
     n_vertices, n_faces = len(rest), len(corners.table)
     g_sums = rest.new_empty((n_vertices, 6), dtype=torch.float64)
-    launch_ranges(
-        kernels.vertex_rotations_backward,
-        even_cuts(n_vertices),
-        [*map(view, (vertex_quats, vertex_area_ratio, sums, g_vertex_quats, g_vertex_area_ratio, g_sums))],
-        like=rest,
-    )
+    inputs = [vertex_quats, vertex_area_ratio, sums, g_vertex_quats, g_vertex_area_ratio, g_sums]
+    launch_ranges(kernels.vertex_rotations_backward, n_vertices, inputs, like=rest)
     rest_rows, posed_rows = (rest.new_empty((n_faces if needed else 0, 9)) for needed in needs)
-    launch_ranges(
-        kernels.face_rotations_backward,
-        even_cuts(n_faces),
-        [
-            *map(view, (rest, posed, corners.table, face_quats, signs, g_sums)),
-            *map(view, (g_face_quats, g_area_ratio, rest_rows, posed_rows)),
-        ],
-        like=rest,
-    )
+    inputs = [
+        rest, posed, corners.table, face_quats, signs, g_sums, g_face_quats, g_area_ratio, rest_rows, posed_rows,
+    ]  # fmt: skip
+    launch_ranges(kernels.face_rotations_backward, n_faces, inputs, like=rest)
     return [
         sum_at_items(rows.view(-1, 3), corners) if needed else rows.view(-1, 3)
         for rows, needed in zip((rest_rows, posed_rows), needs, strict=True)
@@ -273,12 +243,12 @@ def _rest_mesh(rest_vertices: Tensor, faces: Tensor, validate: bool) -> Tensor:
     corners = incidence("faces", faces, len(rest_vertices), "vertices").table
     out, rest = _empty_table(rest_vertices, faces, validate), rest_vertices.contiguous()
     params = {"n_vertices": len(rest), "n_faces": len(faces), "rest_vertices": rest, "faces": corners, "out": out}
-    if has_vectors(rest):
-        params["state"] = phase_state(native_kernels.STATE)
-        run_native(native_kernels.measure, params, task_count(len(faces)))
-    elif has_cuda_kernels(rest):
-        blocks = block_count(len(faces), native_kernels.BLOCK)
-        run_cuda(native_kernels.measure_triangles, params, blocks, current_stream(rest.device))
+    if launch.has_vectors(rest):
+        params["state"] = launch.phase_state(native_kernels.STATE)
+        launch.run_native(native_kernels.measure, params, launch.task_count(len(faces)))
+    elif launch.has_cuda_kernels(rest):
+        blocks = launch.block_count(len(faces), native_kernels.BLOCK)
+        launch.run_cuda(native_kernels.measure_triangles, params, blocks, launch.current_stream(rest.device))
     return out
 
 

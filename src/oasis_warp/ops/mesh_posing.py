@@ -9,14 +9,7 @@ from oasis_kernels.posing import face_stretch as stretch_kernels
 from oasis_warp.core.checks import check_choice
 from oasis_warp.ops._runtime.declaration import Array, Operator, empty_gradients
 from oasis_warp.ops._runtime.incidence import gaussians_at_vertices, incidence, sum_at_items
-from oasis_warp.ops._runtime.launch import (
-    contiguous,
-    even_cuts,
-    has_cuda_kernels,
-    has_vectors,
-    launch_ranges,
-    view,
-)
+from oasis_warp.ops._runtime.launch import contiguous, has_cuda_kernels, has_vectors, launch_ranges
 from oasis_warp.ops._runtime.mesh_gaussians import (
     PosingInputs,
     backward_float32,
@@ -216,7 +209,7 @@ def _stretch_arguments(
     corners = incidence("faces", faces, len(rest_vertices), "vertices").table
     face_of = incidence("face_index", face_index, len(faces), "faces").table
     rest, posed, *floats = contiguous(rest_vertices, posed_vertices, *others)
-    return [*map(view, (rest, posed, corners, face_of, *floats))]
+    return [rest, posed, corners, face_of, *floats]
 
 
 def _pose_covars(
@@ -225,7 +218,7 @@ def _pose_covars(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     out = _covars_outputs(rest_vertices, posed_vertices, faces, face_index)
     arguments = _stretch_arguments(rest_vertices, posed_vertices, faces, face_index, barycentrics, quats, scales)
-    launch_ranges(stretch_kernels.pose, even_cuts(len(face_index)), [*arguments, *map(view, out)], like=rest_vertices)
+    launch_ranges(stretch_kernels.pose, len(face_index), [*arguments, *out], like=rest_vertices)
     return out
 
 
@@ -238,8 +231,7 @@ def _pose_covars_backward(
     gradients = empty_gradients((rest_vertices, posed_vertices, barycentrics, quats, scales), needs)
     rows = [rest_vertices.new_empty((q if needed else 0, 9)) for needed in needs[:2]]
     arguments = _stretch_arguments(rest_vertices, posed_vertices, faces, face_index, barycentrics, quats, scales)
-    arguments += map(view, (*incoming, *rows, *gradients[2:]))
-    launch_ranges(stretch_kernels.pose_backward, even_cuts(q), arguments, like=rest_vertices)
+    launch_ranges(stretch_kernels.pose_backward, q, [*arguments, *incoming, *rows, *gradients[2:]], like=rest_vertices)
     at_vertices = gaussians_at_vertices(faces, face_index, None, len(rest_vertices))
     for k in range(2):
         if needs[k]:

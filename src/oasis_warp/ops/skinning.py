@@ -8,22 +8,9 @@ from torch import Tensor
 
 from oasis_kernels.skinning import skinning as kernels
 from oasis_kernels.skinning import skinning_native as native_kernels
+from oasis_warp.ops._runtime import launch
 from oasis_warp.ops._runtime.declaration import Array, Operator, empty_gradients
-from oasis_warp.ops._runtime.launch import (
-    SCALAR_NAMES,
-    aligned,
-    block_count,
-    contiguous,
-    current_stream,
-    even_cuts,
-    has_cuda_kernels,
-    launch_ranges,
-    phase_state,
-    run_cuda,
-    run_native,
-    task_count,
-    view,
-)
+from oasis_warp.ops._runtime.launch import launch_ranges
 
 
 class Skinned(NamedTuple):
@@ -54,7 +41,7 @@ def _cuda_params(
     means: Tensor, covars: Tensor | None, weights: Tensor, transforms: Tensor, displacements: Tensor | None,
     strengths: Tensor | None, **others: Any,
 ) -> dict[str, Any]:  # fmt: skip
-    *inputs, displacements, strengths = aligned(means, covars, weights, transforms, displacements, strengths)
+    *inputs, displacements, strengths = launch.aligned(means, covars, weights, transforms, displacements, strengths)
     n_correctives = 0 if displacements is None else displacements.shape[-1]
     correctives = {"n_correctives": n_correctives, "displacements": displacements, "strengths": strengths}
     return _params(*inputs, **correctives, **others)
@@ -72,28 +59,29 @@ def _skin(
     strengths: Tensor | None, rotation_only: bool, validate: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     inputs = means, covars, weights, transforms, displacements, strengths
-    on_cuda = has_cuda_kernels(means) and not rotation_only
+    on_cuda = launch.has_cuda_kernels(means) and not rotation_only
     if transforms.ndim == 4 and not on_cuda:
         return _OPERATOR.each_pose(*inputs, rotation_only, validate)
     out_means, out_covars = _outputs(*inputs)
     if on_cuda:
         n_poses = transforms.shape[:-3].numel()
         params = _cuda_params(*inputs, n_poses=n_poses, out_means=out_means, out_covars=out_covars)
-        blocks = block_count(len(means), native_kernels.POINTS) * block_count(n_poses, native_kernels.POSES)
-        run_cuda(native_kernels.cuda_skin, params, blocks, current_stream(means.device))
+        blocks = launch.block_count(len(means), native_kernels.POINTS)
+        blocks *= launch.block_count(n_poses, native_kernels.POSES)
+        launch.run_cuda(native_kernels.cuda_skin, params, blocks, launch.current_stream(means.device))
         return out_means, out_covars
     means = _corrected(means, displacements, strengths)
-    covars, weights, transforms = contiguous(covars, weights, transforms)
+    covars, weights, transforms = launch.contiguous(covars, weights, transforms)
     if means.is_cpu and not rotation_only:
-        state = phase_state(native_kernels.STATE)
+        state = launch.phase_state(native_kernels.STATE)
         params = _params(means, covars, weights, transforms, state=state, out_means=out_means, out_covars=out_covars)
-        run_native(native_kernels.skin(SCALAR_NAMES[means.dtype]), params, task_count(len(means)))
+        launch.run_native(native_kernels.skin(launch.SCALAR_NAMES[means.dtype]), params, launch.task_count(len(means)))
     else:
         given = out_covars if covars is None else covars
         launch_ranges(
             kernels.skin,
-            even_cuts(len(means)),
-            [*map(view, (means, given, weights, transforms)), int(rotation_only), view(out_means), view(out_covars)],
+            len(means),
+            [means, given, weights, transforms, int(rotation_only), out_means, out_covars],
             like=means,
         )
     return out_means, out_covars
@@ -105,7 +93,7 @@ def _skin_backward(
     needs: list[bool],
 ) -> list[Tensor]:  # fmt: skip
     inputs = means, covars, weights, transforms, displacements, strengths
-    if has_cuda_kernels(means) and not rotation_only:
+    if launch.has_cuda_kernels(means) and not rotation_only:
         return _skin_backward_on_cuda(inputs, g_out_means, g_out_covars, needs)
     if transforms.ndim == 4:
         return _OPERATOR.each_pose_backward(*inputs, rotation_only, g_out_means, g_out_covars, needs)
@@ -117,30 +105,26 @@ def _skin_backward(
     if g_out_covars is None:
         g_covars.zero_()
     corrected, n = _corrected(means, displacements, strengths), len(means)
-    covars, weights, transforms, g_out_means, g_out_covars = contiguous(
+    covars, weights, transforms, g_out_means, g_out_covars = launch.contiguous(
         covars, weights, transforms, g_out_means, g_out_covars
     )
     g_blends = means.new_empty((n if needs_transforms else 0, 16))
     if means.is_cpu and not rotation_only:
+        state = launch.phase_state(native_kernels.STATE)
         params = _params(
-            corrected, covars, weights, transforms, state=phase_state(native_kernels.STATE), g_out_means=g_out_means,
-            g_out_covars=g_out_covars, g_means=g_means, g_covars=g_covars, g_weights=g_weights, g_blends=g_blends,
+            corrected, covars, weights, transforms, state=state, g_out_means=g_out_means, g_out_covars=g_out_covars,
+            g_means=g_means, g_covars=g_covars, g_weights=g_weights, g_blends=g_blends,
         )  # fmt: skip
-        run_native(native_kernels.skin_backward(SCALAR_NAMES[means.dtype]), params, task_count(n))
+        launch.run_native(native_kernels.skin_backward(launch.SCALAR_NAMES[means.dtype]), params, launch.task_count(n))
     else:
         none = means.new_empty((0, 3, 3))
-        launch_ranges(
-            kernels.skin_backward,
-            even_cuts(n),
-            [
-                *map(view, (corrected, none if covars is None else covars, weights, transforms)),
-                int(rotation_only),
-                view(torch.zeros_like(corrected) if g_out_means is None else g_out_means),
-                view(none if g_out_covars is None else g_out_covars),
-                *map(view, (g_means, none if covars is None else g_covars, g_weights, g_blends)),
-            ],
-            like=means,
-        )
+        given_means = torch.zeros_like(corrected) if g_out_means is None else g_out_means
+        given_covars = none if g_out_covars is None else g_out_covars
+        arguments = [
+            corrected, none if covars is None else covars, weights, transforms, int(rotation_only), given_means,
+            given_covars, g_means, none if covars is None else g_covars, g_weights, g_blends,
+        ]  # fmt: skip
+        launch_ranges(kernels.skin_backward, n, arguments, like=means)
     if needs_transforms:
         _sum_blends(g_blends, weights, g_transforms)
     if any(needs_correctives):
@@ -176,13 +160,13 @@ def _sum_blends(g_blends: Tensor, weights: Tensor, g_transforms: Tensor) -> None
     if not g_blends.is_cpu:
         g_transforms.copy_((weights.T @ g_blends).view(n_joints, 4, 4)[:, :, :3].transpose(1, 2))
         return
-    n_blocks = block_count(n, native_kernels.SUM_BLOCK)
+    n_blocks = launch.block_count(n, native_kernels.SUM_BLOCK)
     params = {
         "n": n, "n_joints": n_joints, "n_blocks": n_blocks, "weights": weights, "g_blends": g_blends,
         "sums": g_blends.new_empty((n_blocks, n_joints, 16)), "g_transforms": g_transforms,
-        "state": phase_state(native_kernels.STATE),
+        "state": launch.phase_state(native_kernels.STATE),
     }  # fmt: skip
-    run_native(native_kernels.sum_blends(SCALAR_NAMES[g_blends.dtype]), params, n_blocks)
+    launch.run_native(native_kernels.sum_blends(launch.SCALAR_NAMES[g_blends.dtype]), params, n_blocks)
 
 
 def _skin_backward_on_cuda(
@@ -191,7 +175,7 @@ def _skin_backward_on_cuda(
     means, _, weights, transforms, displacements, strengths = inputs
     n, n_joints = weights.shape
     batch, n_poses = transforms.shape[:-3], transforms.shape[:-3].numel()
-    point_blocks = block_count(n, native_kernels.BLOCK)
+    point_blocks = launch.block_count(n, native_kernels.BLOCK)
     gradients = empty_gradients(inputs, [False, False, False, needs[3], False, False])
 
     def of_each_pose(needed: bool, shared: Tensor) -> Tensor:
@@ -202,17 +186,17 @@ def _skin_backward_on_cuda(
     if g_out_covars is None:
         by_covars.zero_()
     sums = means.new_empty((n_poses, point_blocks, n_joints, 12)) if needs[3] else None
-    stream = current_stream(means.device)
-    g_out_means, g_out_covars = contiguous(g_out_means, g_out_covars)
+    stream = launch.current_stream(means.device)
+    g_out_means, g_out_covars = launch.contiguous(g_out_means, g_out_covars)
     params = _cuda_params(
         *inputs, g_out_means=g_out_means, g_out_covars=g_out_covars, g_means=by_points, g_covars=by_covars,
         g_weights=by_weights, sums=sums,
     )  # fmt: skip
-    run_cuda(native_kernels.cuda_skin_backward, params, n_poses * point_blocks, stream)
+    launch.run_cuda(native_kernels.cuda_skin_backward, params, n_poses * point_blocks, stream)
     if sums is not None:
         params = {"n_joints": n_joints, "n_sums": point_blocks, "sums": sums, "g_transforms": gradients[3]}
-        blocks = n_poses * block_count(12 * n_joints, native_kernels.BLOCK)
-        run_cuda(native_kernels.cuda_sum_blocks, params, blocks, stream)
+        blocks = n_poses * launch.block_count(12 * n_joints, native_kernels.BLOCK)
+        launch.run_cuda(native_kernels.cuda_sum_blocks, params, blocks, stream)
     if any(needs[4:]):
         gradients[4:] = _corrective_gradients(by_points, displacements, strengths, gradients[4:], needs[4:])
     for k, by_pose in enumerate((by_points, by_covars, by_weights)):

@@ -16,7 +16,6 @@ from oasis_warp.ops._runtime.launch import (
     block_count,
     contiguous,
     current_stream,
-    even_cuts,
     has_cuda_kernels,
     launch_ranges,
     run_cuda,
@@ -26,15 +25,15 @@ from oasis_warp.ops._runtime.launch import (
 MAX_DEGREE = 3
 
 
+def _vec3(tensor: Tensor) -> Any:
+    """A contiguous tensor [..., 3] as an array of vectors."""
+    return view(tensor, VEC3[tensor.dtype])
+
+
 def _evaluate(directions: Tensor, coefficients: Tensor, degree: int, validate: bool) -> Tensor:
     out = torch.empty_like(directions, memory_format=torch.contiguous_format)
-    vec3 = VEC3[directions.dtype]
-    launch_ranges(
-        kernels.evaluate(SCALAR[directions.dtype], degree),
-        even_cuts(len(directions)),
-        [view(directions.contiguous(), vec3), view(coefficients.contiguous(), vec3), view(out, vec3)],
-        like=directions,
-    )
+    inputs = [_vec3(t.contiguous()) for t in (directions, coefficients, out)]
+    launch_ranges(kernels.evaluate(SCALAR[directions.dtype], degree), len(directions), inputs, like=directions)
     return out
 
 
@@ -47,13 +46,8 @@ def _evaluate_backward(
 ) -> list[Tensor]:
     gradients = empty_gradients((directions, coefficients), needs)
     gradients[1].zero_()
-    vec3 = VEC3[directions.dtype]
-    launch_ranges(
-        kernels.evaluate_backward(SCALAR[directions.dtype], degree),
-        even_cuts(len(directions)),
-        [view(t.contiguous(), vec3) for t in (directions, coefficients, g_values, *gradients)],
-        like=directions,
-    )
+    inputs = [_vec3(t.contiguous()) for t in (directions, coefficients, g_values, *gradients)]
+    launch_ranges(kernels.evaluate_backward(SCALAR[directions.dtype], degree), len(directions), inputs, like=directions)
     return gradients
 
 
@@ -158,16 +152,9 @@ def _sh_to_rgb(means: Tensor, coefficients: Tensor, viewmats: Tensor, degree: in
         n_blocks = block_count(total, kernels.BLOCK)
         run_cuda(kernels.cuda_sh_to_rgb(degree), params, n_blocks, current_stream(means.device))
         return colors
-    vec3 = VEC3[means.dtype]
-    launch_ranges(
-        kernels.sh_to_rgb(SCALAR[means.dtype], degree),
-        even_cuts(total),
-        [
-            view(means, vec3), view(_rows(coefficients), vec3), view(viewmats, VEC4[means.dtype]),
-            view(colors.view(-1, 3), vec3),
-        ],
-        like=means,
-    )  # fmt: skip
+    poses = view(viewmats, VEC4[means.dtype])
+    inputs = [_vec3(means), _vec3(_rows(coefficients)), poses, _vec3(colors.view(-1, 3))]
+    launch_ranges(kernels.sh_to_rgb(SCALAR[means.dtype], degree), total, inputs, like=means)
     return colors
 
 
@@ -189,17 +176,11 @@ def _sh_to_rgb_backward(
         n_blocks = block_count(n, kernels.BLOCK)
         run_cuda(kernels.cuda_sh_to_rgb_backward(degree), params, n_blocks, current_stream(means.device))
     else:
-        vec3 = VEC3[means.dtype]
-        launch_ranges(
-            kernels.sh_to_rgb_backward(SCALAR[means.dtype], degree),
-            even_cuts(n),
-            [
-                view(means, vec3), view(_rows(coefficients), vec3), view(viewmats, VEC4[means.dtype]),
-                view(colors.view(-1, 3), vec3), view(g_colors.view(-1, 3), vec3), view(g_means, vec3),
-                view(_rows(g_coefficients), vec3), view(g_centers, VEC3[torch.float64]),
-            ],
-            like=means,
-        )  # fmt: skip
+        inputs = [
+            _vec3(means), _vec3(_rows(coefficients)), view(viewmats, VEC4[means.dtype]), _vec3(colors.view(-1, 3)),
+            _vec3(g_colors.view(-1, 3)), _vec3(g_means), _vec3(_rows(g_coefficients)), _vec3(g_centers),
+        ]  # fmt: skip
+        launch_ranges(kernels.sh_to_rgb_backward(SCALAR[means.dtype], degree), n, inputs, like=means)
     if needs[2]:
         _fill_viewmats(g_viewmats, viewmats.detach().double(), g_centers.view(n_cameras, n, 3).sum(1))
     return gradients

@@ -9,7 +9,7 @@ from warp.types import vector
 
 from oasis_kernels.rasterize import rasterize_backward as backward_kernels
 from oasis_kernels.rasterize import rasterize_forward as forward_kernels
-from oasis_warp.ops._runtime.launch import SCALAR, VEC2, VEC3, VEC4, even_cuts, launch_ranges, start, view
+from oasis_warp.ops._runtime.launch import SCALAR, VEC2, VEC3, VEC4, launch_ranges, start, view
 from oasis_warp.ops._runtime.records import Frame, GradientFlags, Gradients, Splats
 from oasis_warp.ops._runtime.rules import current_rules
 from oasis_warp.ops._runtime.tiles import bin_to_tiles, even_work, fake_opaque_buffer, opaque_elements
@@ -69,7 +69,7 @@ def splat_views(splats: Splats) -> list[Any]:
     records, vec4 = splats.tables(), VEC4[splats.opacities.dtype]
     return [
         view(records.boxes.view(-1, 4), vec4i), view(records.centers.view(-1, 4), vec4),
-        view(records.whitenings.view(-1, 4), vec4), view(splats.opacities.view(-1)),
+        view(records.whitenings.view(-1, 4), vec4), splats.opacities.view(-1),
     ]  # fmt: skip
 
 
@@ -91,10 +91,10 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Save
         forward_kernels.blend(SCALAR[dtype], channels, current_rules()),
         even_work(tiles.starts),
         [
-            view(tiles.starts), view(opaque_elements(tiles.gaussians)), *splat_views(splats),
+            tiles.starts, opaque_elements(tiles.gaussians), *splat_views(splats),
             view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color), tile_size, lane_width,
             lane_height, tiles.across, tiles.down, width, height, view(image.view(-1, channels), color),
-            view(alphas.view(-1)), view(transmittance.view(-1)), view(stops.view(-1)),
+            alphas.view(-1), transmittance.view(-1), stops.view(-1),
         ],
         like=image,
         lanes=lanes,
@@ -135,12 +135,11 @@ def draw_backward(
         backward_kernels.blend_backward(scalar, channels, current_rules()),
         even_work(starts),
         [
-            view(starts), view(opaque_elements(gaussians)), view(pair_numbers),
-            *splat_views(splats), view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color),
-            view(stops.view(-1)), view(of_image, color), view(of_alpha), tile_size, lane_width,
-            lane_height, across, down, width, height, int(with_shape),
-            view(transmittance.view(-1).clone()), view(empty(pixels)),
-            view(pair_moments, moments), view(pair_colors, color), view(tile_backgrounds, color),
+            starts, opaque_elements(gaussians), pair_numbers, *splat_views(splats),
+            view(splats.colors.view(-1, channels), color), view(splats.backgrounds, color), stops.view(-1),
+            view(of_image, color), of_alpha, tile_size, lane_width, lane_height, across, down, width, height,
+            int(with_shape), transmittance.view(-1).clone(), empty(pixels), view(pair_moments, moments),
+            view(pair_colors, color), view(tile_backgrounds, color),
         ],
         like=pair_colors,
         lanes=lanes,
@@ -151,21 +150,12 @@ def draw_backward(
         g_means2d, g_covars2d, g_opacities = _gather_shape(splats, saved, pair_moments)
     if with_colors:
         g_colors = empty(n_cameras, n, channels)
-        spans = view(pair_starts), view(pair_counts)
-        launch_ranges(
-            backward_kernels.gather_colors(scalar, channels),
-            even_cuts(n_cameras * n),
-            [*spans, view(pair_colors, color), view(g_colors.view(-1, channels), color)],
-            like=pair_colors,
-        )
+        inputs = [pair_starts, pair_counts, view(pair_colors, color), view(g_colors.view(-1, channels), color)]
+        launch_ranges(backward_kernels.gather_colors(scalar, channels), n_cameras * n, inputs, like=pair_colors)
     if with_backgrounds:
         g_backgrounds = empty(n_cameras, channels)
-        launch_ranges(
-            backward_kernels.sum_backgrounds(scalar, channels),
-            [0, n_cameras],
-            [across * down, view(tile_backgrounds, color), view(g_backgrounds, color)],
-            like=pair_colors,
-        )
+        inputs = [across * down, view(tile_backgrounds, color), view(g_backgrounds, color)]
+        launch_ranges(backward_kernels.sum_backgrounds(scalar, channels), n_cameras, inputs, like=pair_colors)
     return Gradients(g_means2d, g_covars2d, g_opacities, g_colors, g_backgrounds)
 
 
@@ -176,14 +166,10 @@ def _gather_shape(splats: Splats, saved: SavedTensors, pair_moments: Tensor) -> 
     g_means2d, g_opacities = like.new_empty(n_cameras, n, 2), like.new_empty(n_cameras, n)
     g_covars2d = like.new_empty(n_cameras, n, 3, dtype=torch.float64)
     _, _, whitenings, opacities = splat_views(splats)
-    launch_ranges(
-        backward_kernels.gather_shape(SCALAR[dtype]),
-        even_cuts(n_cameras * n),
-        [
-            view(saved.pair_starts), view(saved.pair_counts), view(pair_moments, vector(6, SCALAR[dtype])), whitenings,
-            opacities, view(g_means2d.view(-1, 2), VEC2[dtype]), view(g_covars2d.view(-1, 3), VEC3[torch.float64]),
-            view(g_opacities.view(-1)),
-        ],
-        like=pair_moments,
-    )  # fmt: skip
+    inputs = [
+        saved.pair_starts, saved.pair_counts, view(pair_moments, vector(6, SCALAR[dtype])), whitenings, opacities,
+        view(g_means2d.view(-1, 2), VEC2[dtype]), view(g_covars2d.view(-1, 3), VEC3[torch.float64]),
+        g_opacities.view(-1),
+    ]  # fmt: skip
+    launch_ranges(backward_kernels.gather_shape(SCALAR[dtype]), n_cameras * n, inputs, like=pair_moments)
     return g_means2d, g_covars2d, g_opacities

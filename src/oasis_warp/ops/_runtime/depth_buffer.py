@@ -176,37 +176,20 @@ def draw_by_faces(scene: DepthScene, query: Query | None, outputs: BufferParts, 
     batch, n_vertices, _ = scene.vertices.shape
     n_faces, width, height = len(scene.faces), scene.width, scene.height
     like = scene.vertices
-    viewmats, Ks = view(scene.viewmats.contiguous()), view(scene.Ks.contiguous())
+    viewmats, Ks = scene.viewmats.contiguous(), scene.Ks.contiguous()
     depth = scene.empty(height, width, dtype=torch.float64).fill_(torch.inf)
     face_ids = scene.empty(height, width, dtype=torch.int32).fill_(-1)
     camera_vertices = scene.empty(n_vertices, 3, dtype=torch.float64)
-    boxes = scene.empty(n_faces, 4, dtype=torch.int32)
-    vertices, faces = view(camera_vertices, wp.vec3d), view(scene.faces)
-    near = wp.float64(scene.near_plane)
-    launch(
-        kernels.camera_points, (batch, n_vertices), [view(scene.vertices.contiguous()), viewmats, vertices], like=like
-    )
-    launch(
-        kernels.face_boxes,
-        (batch, n_faces),
-        [vertices, faces, Ks, width, height, near, view(boxes, wp.vec4i)],
-        like=like,
-    )
+    boxes = view(scene.empty(n_faces, 4, dtype=torch.int32), wp.vec4i)
+    vertices, faces, near = view(camera_vertices, wp.vec3d), scene.faces, wp.float64(scene.near_plane)
+    launch(kernels.camera_points, (batch, n_vertices), [scene.vertices.contiguous(), viewmats, vertices], like=like)
+    launch(kernels.face_boxes, (batch, n_faces), [vertices, faces, Ks, width, height, near, boxes], like=like)
     for stage in (0, 1):
-        launch(
-            kernels.fill_faces,
-            (batch, n_faces),
-            [stage, vertices, faces, view(boxes, wp.vec4i), Ks, near, view(depth), view(face_ids, wp.uint32)],
-            like=like,
-        )
+        inputs = [stage, vertices, faces, boxes, Ks, near, depth, view(face_ids, wp.uint32)]
+        launch(kernels.fill_faces, (batch, n_faces), inputs, like=like)
     weights = scene.empty(height, width, 3).zero_()
     if outputs.barycentrics:
-        launch(
-            kernels.interpolate,
-            (batch, height, width),
-            [vertices, faces, Ks, view(face_ids), view(weights)],
-            like=like,
-        )
+        launch(kernels.interpolate, (batch, height, width), [vertices, faces, Ks, face_ids, weights], like=like)
     buffer = restrict(Buffer(depth.to(like.dtype), face_ids, weights), outputs)
     return buffer, None if query is None else _score_points(scene, query, depth, face_ids)
 
@@ -218,17 +201,12 @@ def _score_points(scene: DepthScene, query: Query, depth: Tensor, face_ids: Tens
     scores.visibility.zero_()
     scores.slopes.zero_()
     scores.pixels.fill_(-1)
-    launch(
-        kernels.visibility,
-        (len(query.points), query.points.shape[1]),
-        [
-            view(query.points.contiguous()), view(face_ids.new_empty(0) if known is None else known.to(torch.int32)),
-            view(scene.faces), view(scene.viewmats.contiguous()), view(scene.Ks.contiguous()),
-            wp.float64(scene.near_plane), wp.float64(query.tau), wp.float64(query.margin), view(depth), view(face_ids),
-            *map(view, scores),
-        ],
-        like=scene.vertices,
-    )  # fmt: skip
+    inputs = [
+        query.points.contiguous(), face_ids.new_empty(0) if known is None else known.to(torch.int32), scene.faces,
+        scene.viewmats.contiguous(), scene.Ks.contiguous(), wp.float64(scene.near_plane), wp.float64(query.tau),
+        wp.float64(query.margin), depth, face_ids, *scores,
+    ]  # fmt: skip
+    launch(kernels.visibility, query.points.shape[:2], inputs, like=scene.vertices)
     return scores
 
 
@@ -287,10 +265,8 @@ def vertex_gradients_by_points(
     batch, n_points = slopes.shape
     n_vertices = scene.vertices.shape[1]
     rows = scene.empty(n_points, 3, 3)
-    tensors = (
-        grad_visibility, slopes, pixels, face_ids, scene.vertices, scene.faces, scene.viewmats, scene.Ks, rows
-    )  # fmt: skip
-    launch(kernels.corner_gradients, (batch, n_points), [view(t.contiguous()) for t in tensors], like=slopes)
+    tensors = grad_visibility, slopes, pixels, face_ids, scene.vertices, scene.faces, scene.viewmats, scene.Ks, rows
+    launch(kernels.corner_gradients, (batch, n_points), [t.contiguous() for t in tensors], like=slopes)
     # Scores that are not soft name the first vertex, with rows of zeros.
     seen = face_ids.flatten(1).gather(1, pixels.clamp_min(0).long()).where(pixels >= 0, 0)
     corners = scene.faces[seen.long()] if len(scene.faces) else scene.faces.new_zeros((batch, n_points, 3))

@@ -9,7 +9,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from oasis_kernels.posing import incidence as kernels
 from oasis_warp.core.checks import check_index
-from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._runtime.launch import launch_ranges
 
 
 class Incidence(NamedTuple):
@@ -85,10 +85,5 @@ def sum_at_items(rows: Tensor, index: Incidence) -> Tensor:
     """Sums [size, D] of the rows [N K, D], one for each entry of the table, of each item; in a fixed order."""
     n_items, n_columns = len(index.offsets) - 1, rows.shape[1]
     out = rows.new_empty((n_items, n_columns))
-    launch_ranges(
-        kernels.sum_rows,
-        even_cuts(n_items),
-        [view(rows), view(index.offsets), view(index.entries), view(out)],
-        like=rows,
-    )
+    launch_ranges(kernels.sum_rows, n_items, [rows, index.offsets, index.entries, out], like=rows)
     return out

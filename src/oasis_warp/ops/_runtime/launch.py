@@ -116,12 +116,20 @@ def has_cuda_kernels(tensor: Tensor) -> bool:
     return tensor.is_cuda and tensor.dtype == torch.float32
 
 
+def _seen_by_warp(inputs: Sequence[Any]) -> list[Any]:
+    """`inputs` of a kernel, with views of tensors."""
+    return [view(value) if isinstance(value, Tensor) else value for value in inputs]
+
+
 def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], like: Tensor, block_dim: int = 256) -> None:
-    """Launch `kernel` over `dim` threads on the device and current stream of `like`; an empty launch is skipped."""
+    """Launch `kernel` over `dim` threads on the device and current stream of `like`; an empty launch is skipped.
+
+    Tensors among the inputs are contiguous; those that stand for vectors come as a `view`.
+    """
     if 0 in ([dim] if isinstance(dim, int) else list(dim)):
         return
     device, stream = device_and_stream(like)
-    wp.launch(kernel, dim=dim, inputs=list(inputs), device=device, stream=stream, block_dim=block_dim)
+    wp.launch(kernel, dim=dim, inputs=_seen_by_warp(inputs), device=device, stream=stream, block_dim=block_dim)
 
 
 @functools.cache
@@ -137,15 +145,17 @@ def even_cuts(n: int, least: int = 2048) -> list[int]:
 
 
 def launch_ranges(
-    kernel: Any, cuts: Sequence[int], inputs: Sequence[Any], like: Tensor, lanes: int | None = None
+    kernel: Any, cuts: int | Sequence[int], inputs: Sequence[Any], like: Tensor, lanes: int | None = None
 ) -> None:
     """Launch `kernel(first, *inputs)` over the tasks 0 .. cuts[-1]; thread t does task first + t.
 
     On the CPU, where a launch is one loop on the calling thread with the GIL released, the ranges between `cuts` are
-    shared out over `torch.get_num_threads()` threads. A task must write only what is its own; then results do not
-    depend on the cuts. On CUDA it is one launch. With `lanes` the launch has a second axis of that size.
+    shared out over `torch.get_num_threads()` threads; those of so many tasks are `even_cuts`. A task must write only
+    what is its own; then results do not depend on the cuts. On CUDA it is one launch. With `lanes` the launch has a
+    second axis of that size. Inputs are as in `launch`.
     """
     device, stream = device_and_stream(like)
+    cuts, inputs = even_cuts(cuts) if isinstance(cuts, int) else cuts, _seen_by_warp(inputs)
     if device.is_cuda:
         cuts = [0, cuts[-1]]
     ranges = [(a, b) for a, b in itertools.pairwise(cuts) if b > a]

@@ -8,20 +8,9 @@ from torch import Tensor
 
 from oasis_kernels.posing import barycentric as generic_kernels
 from oasis_kernels.posing import mesh_gaussians as kernels
+from oasis_warp.ops._runtime import launch
 from oasis_warp.ops._runtime.incidence import Incidence, gaussians_at_vertices, incidence, sum_at_items
-from oasis_warp.ops._runtime.launch import (
-    aligned,
-    block_count,
-    contiguous,
-    current_stream,
-    even_cuts,
-    launch_ranges,
-    phase_state,
-    run_cuda,
-    run_native,
-    task_count,
-    view,
-)
+from oasis_warp.ops._runtime.launch import launch_ranges
 
 
 class PosingInputs(NamedTuple):
@@ -87,20 +76,21 @@ def _params(inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int) ->
 
 
 def _blocks(*items: int) -> int:
-    return sum(block_count(n, kernels.BLOCK) for n in items)
+    return sum(launch.block_count(n, kernels.BLOCK) for n in items)
 
 
 def pose_float32(inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int, posed: Sequence[Tensor]) -> None:
     """Write means, quats and scales to `posed`: on the CPU for one pose, on CUDA for any number."""
     p, q, on_cuda = gaussians.p, gaussians.q, inputs.vertices.is_cuda
-    inputs = PosingInputs(*(aligned if on_cuda else contiguous)(*inputs))
+    inputs = PosingInputs(*(launch.aligned if on_cuda else launch.contiguous)(*inputs))
     means, quats, scales = posed
     params = _params(inputs, gaussians, half_powers) | {"means": means, "posed_quats": quats, "posed_scales": scales}
     if on_cuda:
         n_poses = inputs.vertices.shape[:-2].numel()
-        run_cuda(kernels.pose_mesh_gaussians, params, n_poses * _blocks(p, q), current_stream(inputs.vertices.device))
+        stream = launch.current_stream(inputs.vertices.device)
+        launch.run_cuda(kernels.pose_mesh_gaussians, params, n_poses * _blocks(p, q), stream)
     else:
-        run_native(kernels.pose, params | {"state": phase_state(kernels.STATE)}, task_count(p, q))
+        launch.run_native(kernels.pose, params | {"state": launch.phase_state(kernels.STATE)}, launch.task_count(p, q))
 
 
 def backward_float32(
@@ -117,8 +107,8 @@ def backward_float32(
     like, at_vertices, p, q = inputs.vertices, gaussians.at_vertices, gaussians.p, gaussians.q
     n_vertices, n_faces, n_poses = gaussians.n_vertices, len(gaussians.corners.table), like.shape[:-2].numel()
     batched = like.ndim == 3
-    inputs = PosingInputs(*(aligned if like.is_cuda else contiguous)(*inputs))
-    incoming = (aligned if like.is_cuda else contiguous)(*incoming)
+    inputs = PosingInputs(*(launch.aligned if like.is_cuda else launch.contiguous)(*inputs))
+    incoming = (launch.aligned if like.is_cuda else launch.contiguous)(*incoming)
     summed = [shared and batched and g.numel() > 0 for g, shared in zip(gradients, SHARED, strict=True)]
     by_pose = PosingInputs(
         *(g.new_empty((n_poses, *g.shape)) if s else g for g, s in zip(gradients, summed, strict=True))
@@ -135,44 +125,41 @@ def backward_float32(
         **{f"g_{name}": g for name, g in by_pose._asdict().items()},
     }  # fmt: skip
     if like.is_cuda:
-        stream = current_stream(like.device)
-        run_cuda(kernels.pose_mesh_gaussians_backward, params, n_poses * _blocks(p, q), stream)
+        stream = launch.current_stream(like.device)
+        launch.run_cuda(kernels.pose_mesh_gaussians_backward, params, n_poses * _blocks(p, q), stream)
         blocks = _blocks(0 if at_vertices is None else n_vertices, n_faces if needs_ratio else 0)
-        run_cuda(kernels.gather_mesh_gaussians, params, n_poses * blocks, stream)
+        launch.run_cuda(kernels.gather_mesh_gaussians, params, n_poses * blocks, stream)
     else:
-        params["state"] = phase_state(kernels.STATE)
-        run_native(kernels.pose_backward, params, task_count(p, q, n_vertices, n_faces))
+        params["state"] = launch.phase_state(kernels.STATE)
+        launch.run_native(kernels.pose_backward, params, launch.task_count(p, q, n_vertices, n_faces))
     return PosingInputs(*(torch.sum(g, 0) if s else g for g, s in zip(by_pose, summed, strict=True)))
 
 
-def _vertex_arguments(inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int) -> list[Any]:
+def _vertex_arguments(inputs: PosingInputs, vertex_index: Tensor, half_powers: int) -> list[Any]:
     """The first arguments of the generic kernels for Gaussians on vertices."""
-    assert gaussians.on_vertices is not None
-    tensors = (
-        inputs.vertices, gaussians.on_vertices.table, inputs.vertex_quats, inputs.vertex_area_ratio, inputs.offsets,
-        inputs.quats, inputs.scales,
-    )  # fmt: skip
-    return [*map(view, tensors), half_powers]
+    return [
+        inputs.vertices, vertex_index, inputs.vertex_quats, inputs.vertex_area_ratio, inputs.offsets, inputs.quats,
+        inputs.scales, half_powers,
+    ]  # fmt: skip
 
 
 def _face_arguments(inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int) -> list[Any]:
     """The first arguments of the generic kernels for Gaussians on faces."""
     p = gaussians.p
-    tensors = (
+    return [
         inputs.vertices, gaussians.corners.table, gaussians.on_faces.table, inputs.barycentrics, inputs.vertex_quats,
-        inputs.area_ratio, inputs.quats[p:], inputs.scales[p:],
-    )  # fmt: skip
-    return [*map(view, tensors), half_powers]
+        inputs.area_ratio, inputs.quats[p:], inputs.scales[p:], half_powers,
+    ]  # fmt: skip
 
 
 def pose_float64(inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int, posed: Sequence[Tensor]) -> None:
     """`pose_float32` of one pose by the generic kernels."""
-    inputs, p = PosingInputs(*contiguous(*inputs)), gaussians.p
+    inputs, p = PosingInputs(*launch.contiguous(*inputs)), gaussians.p
     if gaussians.on_vertices is not None:
-        arguments = [*_vertex_arguments(inputs, gaussians, half_powers), *map(view, posed)]
-        launch_ranges(generic_kernels.pose_on_vertices, even_cuts(p), arguments, like=inputs.quats)
-    arguments = [*_face_arguments(inputs, gaussians, half_powers), *(view(out[p:]) for out in posed)]
-    launch_ranges(generic_kernels.pose_on_faces, even_cuts(gaussians.q), arguments, like=inputs.quats)
+        arguments = [*_vertex_arguments(inputs, gaussians.on_vertices.table, half_powers), *posed]
+        launch_ranges(generic_kernels.pose_on_vertices, p, arguments, like=inputs.quats)
+    arguments = [*_face_arguments(inputs, gaussians, half_powers), *(out[p:] for out in posed)]
+    launch_ranges(generic_kernels.pose_on_faces, gaussians.q, arguments, like=inputs.quats)
 
 
 def backward_float64(
@@ -180,8 +167,8 @@ def backward_float64(
     gradients: PosingInputs, needs: PosingInputs,
 ) -> PosingInputs:  # fmt: skip
     """`backward_float32` of one pose by the generic kernels; `incoming` has no None."""
-    inputs, p, q = PosingInputs(*contiguous(*inputs)), gaussians.p, gaussians.q
-    incoming = contiguous(*incoming)
+    inputs, p, q = PosingInputs(*launch.contiguous(*inputs)), gaussians.p, gaussians.q
+    incoming = launch.contiguous(*incoming)
 
     def rows(needed: bool, n: int, width: int) -> Tensor:
         return inputs.quats.new_empty((n if needed else 0, width))
@@ -194,17 +181,15 @@ def backward_float64(
     g_quats, g_scales = gradients.quats, gradients.scales
     if gaussians.on_vertices is not None:
         arguments = [
-            *_vertex_arguments(inputs, gaussians, half_powers),
-            *map(view, (*incoming, vertex_rows, quat_rows, vertex_ratio_rows, gradients.offsets, g_quats, g_scales)),
-        ]
-        launch_ranges(generic_kernels.pose_on_vertices_backward, even_cuts(p), arguments, like=inputs.quats)
+            *_vertex_arguments(inputs, gaussians.on_vertices.table, half_powers), *incoming, vertex_rows, quat_rows,
+            vertex_ratio_rows, gradients.offsets, g_quats, g_scales,
+        ]  # fmt: skip
+        launch_ranges(generic_kernels.pose_on_vertices_backward, p, arguments, like=inputs.quats)
     arguments = [
-        *_face_arguments(inputs, gaussians, half_powers),
-        *(view(g[p:]) for g in incoming),
-        *map(view, (vertex_rows[p:].view(-1, 9), quat_rows[p:].view(-1, 12), ratio_rows)),
-        *map(view, (gradients.barycentrics, g_quats[p:], g_scales[p:])),
-    ]
-    launch_ranges(generic_kernels.pose_on_faces_backward, even_cuts(q), arguments, like=inputs.quats)
+        *_face_arguments(inputs, gaussians, half_powers), *(g[p:] for g in incoming), vertex_rows[p:].view(-1, 9),
+        quat_rows[p:].view(-1, 12), ratio_rows, gradients.barycentrics, g_quats[p:], g_scales[p:],
+    ]  # fmt: skip
+    launch_ranges(generic_kernels.pose_on_faces_backward, q, arguments, like=inputs.quats)
     sums = {
         "vertices": (vertex_rows, gaussians.at_vertices),
         "vertex_quats": (quat_rows, gaussians.at_vertices),

@@ -24,7 +24,6 @@ from oasis_warp.ops._runtime.launch import (
     block_count,
     contiguous,
     current_stream,
-    even_cuts,
     launch_ranges,
     phase_state,
     run_cuda,
@@ -174,13 +173,13 @@ def project_generic(scene: ProjectionInputs, opacities: Tensor, limits: Limits, 
     records = tables(out[-1], len(scene.viewmats), len(scene.means), scene.means.dtype)
     launch_ranges(
         generic.project(SCALAR[scene.means.dtype]),
-        even_cuts(len(scene.viewmats) * len(scene.means)),
+        len(scene.viewmats) * len(scene.means),
         [
-            len(scene.means), *_gaussian_views(scene), view(opacities), view(scene.viewmats), view(scene.Ks),
-            scene.ortho, scene.width, scene.height, as_float32(limits.near_plane), as_float32(limits.far_plane),
-            as_float32(limits.eps2d), limits.radius_clip, as_float32(rules.alpha_min), rules.extent_sigmas,
+            len(scene.means), *_gaussian_views(scene), opacities, scene.viewmats, scene.Ks, scene.ortho, scene.width,
+            scene.height, as_float32(limits.near_plane), as_float32(limits.far_plane), as_float32(limits.eps2d),
+            limits.radius_clip, as_float32(rules.alpha_min), rules.extent_sigmas,
             *(_rows(tensor, size) for (_name, size, _dtype), tensor in zip(OUTPUTS, out, strict=False)),
-            _rows(records.sort_depths, 0), _rows(records.centers, 4), _rows(records.whitenings, 4),
+            records.sort_depths.view(-1), _rows(records.centers, 4), _rows(records.whitenings, 4),
             _rows(records.boxes, 4),
         ],
         like=scene.means,
@@ -249,14 +248,13 @@ def backward_generic(
     sums = radii.new_empty(n_cameras * n if needs_cameras else 0, 12, dtype=torch.float64)
     launch_ranges(
         generic.project_backward(SCALAR[dtype]),
-        even_cuts(n),
+        n,
         [
-            n, n_cameras, *_gaussian_views(scene), view(scene.viewmats), view(scene.Ks), scene.ortho, scene.width,
-            scene.height,
+            n, n_cameras, *_gaussian_views(scene), scene.viewmats, scene.Ks, scene.ortho, scene.width, scene.height,
             _rows(radii, 2), _rows(given(incoming.g_means2d, 2), 2),
-            _rows(given(incoming.g_covars2d, 3, dtype=torch.float64), 3), _rows(given(incoming.g_depths), 0),
+            _rows(given(incoming.g_covars2d, 3, dtype=torch.float64), 3), given(incoming.g_depths).view(-1),
             int(needs_cameras), _rows(filled("means", 3), 3), _rows(filled("quats", 4), 4),
-            _rows(filled("scales", 3), 3), view(filled("covars", 3, 3)), view(sums),
+            _rows(filled("scales", 3), 3), filled("covars", 3, 3), sums,
         ],
         like=scene.means,
     )  # fmt: skip
@@ -270,7 +268,7 @@ def _gaussian_views(scene: ProjectionInputs) -> list[object]:
     quats = means.new_empty(0, 4) if scene.quats is None else scene.quats
     scales = means.new_empty(0, 3) if scene.scales is None else scene.scales
     covars = means.new_empty(0, 3, 3) if scene.covars is None else scene.covars
-    return [_rows(means, 3), _rows(quats, 4), _rows(scales, 3), view(covars), int(scene.covars is not None)]
+    return [_rows(means, 3), _rows(quats, 4), _rows(scales, 3), covars, int(scene.covars is not None)]
 
 
 def _rows(tensor: Tensor, size: int) -> object:
@@ -290,7 +288,5 @@ def _sum_rows(values: Tensor, n: int, block: int) -> Tensor:
     """Sums of blocks of rows of each group of `n` rows, in order."""
     tasks = len(values) // n * -(-n // block)
     sums = values.new_empty(tasks, values.shape[1])
-    launch_ranges(
-        generic.sum_blocks, [0, tasks], [n, block, view(values), view(sums)], like=values, lanes=values.shape[1]
-    )
+    launch_ranges(generic.sum_blocks, [0, tasks], [n, block, values, sums], like=values, lanes=values.shape[1])
     return sums

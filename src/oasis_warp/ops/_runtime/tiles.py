@@ -8,7 +8,7 @@ from jaxtyping import Int32, Int64
 from torch import Tensor
 
 from oasis_kernels.rasterize import tiles
-from oasis_warp.ops._runtime.launch import even_cuts, launch, launch_ranges, view
+from oasis_warp.ops._runtime.launch import launch, launch_ranges, view
 
 MAX_PAIRS = 2**31 - 1
 """Pairs of a Gaussian and a tile that one call can hold."""
@@ -53,14 +53,7 @@ def fake_opaque_buffer(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def bin_to_tiles(boxes: Tensor, depths: Tensor, width: int, height: int, tile_size: int) -> Tiles:
-    """Sort the drawn Gaussians of each tile by depth, ties by index.
-
-    Args:
-        boxes: Pixels x0, y0, x1, y1 (past the end), shape [C, N, 4]; int32.
-        depths: Positive, shape [C, N]; float64.
-        width: Of the images [px].
-        height: Of the images [px].
-        tile_size: Side of a tile [px].
+    """Sort the drawn Gaussians of each tile by depth, ties by index; boxes and depths are those of `Tables`.
 
     Raises:
         ValueError: more than `MAX_PAIRS` pairs.
@@ -76,7 +69,7 @@ def bin_by_sorting(boxes: Tensor, depths: Tensor, tile_size: int, across: int, d
     device = depths.device
     pixels = view(boxes.view(-1, 4), wp.vec4i)
     counts = torch.zeros(n_cameras * n, dtype=torch.int64, device=device)
-    launch_ranges(tiles.count_tiles, even_cuts(len(counts)), [pixels, tile_size, view(counts)], like=counts)
+    launch_ranges(tiles.count_tiles, len(counts), [pixels, tile_size, counts], like=counts)
 
     drawn = counts.nonzero().squeeze(1)
     order = drawn[torch.argsort(depths.view(-1)[drawn], stable=True)]
@@ -87,12 +80,8 @@ def bin_by_sorting(boxes: Tensor, depths: Tensor, tile_size: int, across: int, d
     pair_starts[order] = ends - counts[order]
     pair_tiles = torch.empty(n_pairs, dtype=torch.int32, device=device)
     pair_gaussians = torch.empty(n_pairs, dtype=torch.int32, device=device)
-    launch_ranges(
-        tiles.emit_pairs,
-        even_cuts(len(order)),
-        [view(order), view(pair_starts), pixels, n, tile_size, across, down, view(pair_tiles), view(pair_gaussians)],
-        like=counts,
-    )
+    inputs = [order, pair_starts, pixels, n, tile_size, across, down, pair_tiles, pair_gaussians]
+    launch_ranges(tiles.emit_pairs, len(order), inputs, like=counts)
     sorted_tiles, pairs = torch.sort(pair_tiles, stable=True)
     every_tile = torch.arange(n_cameras * across * down + 1, dtype=torch.int32, device=device)
     starts = torch.searchsorted(sorted_tiles, every_tile)
@@ -115,30 +104,22 @@ def bin_by_dealing(boxes: Tensor, depths: Tensor, tile_size: int, across: int, d
     starts = torch.zeros(n_tiles + 1, dtype=torch.int64)
     tile_boxes = view(torch.empty(total, 4, dtype=torch.int32), wp.vec4i)
     keys, order = int64(2 * total), torch.empty(2 * total, dtype=torch.int32)  # the sort needs room for two
-    launch(
-        tiles.collect,
-        1 if total else 0,
-        [
-            pixels, view(depths.view(-1)), n, tile_size, across, down, view(pair_starts),
-            view(pair_counts), tile_boxes, view(keys.view(torch.float64)), view(order), view(starts), view(totals),
-        ],
-        like=starts,
-    )  # fmt: skip
+    inputs = [
+        pixels, depths.view(-1), n, tile_size, across, down, pair_starts, pair_counts, tile_boxes,
+        keys.view(torch.float64), order, starts, totals,
+    ]  # fmt: skip
+    launch(tiles.collect, 1 if total else 0, inputs, like=starts)
     n_drawn, n_pairs = totals.tolist()
     check_pairs(n_pairs)
     gaussians, pairs = (opaque_buffer(n_pairs, dtype, starts.device) for dtype in (torch.int32, torch.int64))
     if n_drawn:
         # Depths are positive: their bits sort as integers do. The sort is stable.
         wp.utils.radix_sort_pairs(view(keys), view(order), n_drawn)
-        launch(
-            tiles.deal,
-            1,
-            [
-                view(order), n_drawn, tile_boxes, across, view(pair_starts), view(starts.clone()),
-                view(opaque_elements(gaussians)), view(opaque_elements(pairs)),
-            ],
-            like=starts,
-        )  # fmt: skip
+        inputs = [
+            order, n_drawn, tile_boxes, across, pair_starts, starts.clone(), opaque_elements(gaussians),
+            opaque_elements(pairs),
+        ]  # fmt: skip
+        launch(tiles.deal, 1, inputs, like=starts)
     return Tiles(tile_size, across, down, starts, gaussians, pairs, pair_starts, pair_counts)
 
 

@@ -9,7 +9,7 @@ from oasis_kernels.rasterize import rasterize_weights as kernels
 from oasis_kernels.rasterize import strips
 from oasis_warp.ops._runtime.blend_strips import count, cut_strips
 from oasis_warp.ops._runtime.blend_tiles import CUDA_LANES, lane_grid, splat_views
-from oasis_warp.ops._runtime.launch import SCALAR, has_vectors, launch_ranges, phase_state, run_native, view
+from oasis_warp.ops._runtime.launch import SCALAR, has_vectors, launch_ranges, phase_state, run_native
 from oasis_warp.ops._runtime.records import Splats
 from oasis_warp.ops._runtime.rules import current_rules
 from oasis_warp.ops._runtime.tiles import bin_to_tiles, even_work, opaque_elements
@@ -60,9 +60,9 @@ def weigh_tiles(splats: Splats, width: int, height: int, tile_size: int) -> Spar
             kernels.weigh(SCALAR[dtype], current_rules()),
             even_work(tiles.starts),
             [
-                view(tiles.starts), view(opaque_elements(tiles.gaussians)), *splat_views(splats), tiles.size,
-                lane_width, lane_height, tiles.across, tiles.down, width, height, int(write), view(starts),
-                view(scratch), view(counts), view(columns), view(values),
+                tiles.starts, opaque_elements(tiles.gaussians), *splat_views(splats), tiles.size, lane_width,
+                lane_height, tiles.across, tiles.down, width, height, int(write), starts, scratch, counts, columns,
+                values,
             ],
             like=scratch,
             lanes=lanes,
