@@ -161,13 +161,15 @@ def test_gradients_of_stacked_pictures_are_theirs(views, device):
     assert torch.equal(stack_weights(views).transpose.to_dense(), dense.T)
 
 
-def test_pictures_of_different_gaussians_stack(views):
-    fewer = blend_weights(
-        torch.tensor([[0.0, 0.0, 1.0]]).to(views[0].alphas), torch.tensor([[1.0, 0.0, 0.0, 0.0]]).to(views[0].alphas),
-        torch.full((1, 3), 0.01).to(views[0].alphas), torch.ones(1).to(views[0].alphas),
-        torch.eye(4).to(views[0].alphas), torch.diag(torch.tensor([30.0, 30.0, 1.0])).to(views[0].alphas), 24, 8,
-    )  # fmt: skip
-    stacked = stack_weights([fewer, views[0]])
+def one_gaussian(device, width, height):
+    parts = [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0, 0.0]], [[0.01] * 3], [1.0]
+    gaussian = [torch.tensor(part, device=device) for part in parts]
+    K = torch.diag(torch.tensor([30.0, 30.0, 1.0], device=device))
+    return blend_weights(*gaussian, torch.eye(4, device=device), K, width, height)
+
+
+def test_pictures_of_different_gaussians_stack(views, device):
+    stacked = stack_weights([one_gaussian(device, 24, 8), views[0]])
     assert stacked.matrix.shape == (24 * (8 + 16), 61)
 
 
@@ -176,12 +178,7 @@ def test_one_picture_is_stacked_as_it_is(views):
 
 
 def test_pictures_that_do_not_stack_are_refused(views, device):
-    other = blend_weights(
-        torch.tensor([[0.0, 0.0, 1.0]], device=device), torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device),
-        torch.full((1, 3), 0.01, device=device), torch.ones(1, device=device), torch.eye(4, device=device),
-        torch.eye(3, device=device), 32, 16,
-    )  # fmt: skip
     with pytest.raises(ValueError, match="expected pictures 24 pixels wide, got 32"):
-        stack_weights([views[0], other])
+        stack_weights([views[0], one_gaussian(device, 32, 16)])
     with pytest.raises(ValueError, match="at least one"):
         stack_weights([])

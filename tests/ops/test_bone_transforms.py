@@ -8,7 +8,7 @@ from reference.kinematics import bone_transforms as twin
 from reference.kinematics import joint_rotations
 
 from oasis_warp.core.rotation import from_axis_angle, to_matrix
-from oasis_warp.ops import bone_transforms, skin
+from oasis_warp.ops import bone_transforms
 
 PARENTS = (-1, 0, 1, 1, 0, 4, 3)  # a chain of four, two forks
 FLOATS = ("angles", "orientation", "translation", "joints")
@@ -107,22 +107,6 @@ def test_the_joints_of_the_twin_turn_by_rotations_and_the_first_not_at_all():
     eye = torch.eye(3, dtype=torch.float64)
     torch.testing.assert_close(local @ local.mT, eye.expand(7, 3, 3))
     assert torch.linalg.det(local).gt(0).all() and torch.equal(local[0], eye)
-
-
-@pytest.mark.usefixtures("as_shipped")
-def test_skinning_by_them_is_differentiable_through_both():
-    arguments = skeleton(13)
-    generator = torch.Generator().manual_seed(0)
-    points = torch.randn(4, 3, generator=generator, dtype=torch.float64)
-    weights = torch.randn(4, 7, generator=generator, dtype=torch.float64).softmax(-1)
-    shifts = torch.randn(4, 3, 12, generator=generator, dtype=torch.float64)
-    angles = arguments.pop("angles").requires_grad_()
-
-    def posed(angles):
-        bones = bone_transforms(angles, **arguments)
-        return skin(points, None, weights, bones.transforms, displacements=shifts, strengths=bones.bends).means
-
-    assert torch.autograd.gradcheck(posed, [angles])
 
 
 def test_axes_that_are_not_finite_are_refused():

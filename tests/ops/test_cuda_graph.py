@@ -30,6 +30,16 @@ def gradients(outputs, leaves, weights):
     return [g.clone() for g in torch.autograd.grad(outputs, wanted, weights)]
 
 
+def assert_equals_eager_call(draw, scene):
+    """Images and gradients of a random sum, to the bit."""
+    recorded, plain = leaves_of(scene), leaves_of(scene)
+    got, want = draw(*recorded), eager(plain, scene)
+    weights = [torch.randn_like(o) for o in want]
+    assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
+    found, expected = gradients(got, recorded, weights), gradients(want, plain, weights)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
 def test_what_cannot_be_recorded_is_refused():
     scene = ordinary_scene(0)
     with pytest.raises(ValueError, match=r"means: expected float32 on a CUDA device, got torch.float32 on cpu"):
@@ -38,16 +48,10 @@ def test_what_cannot_be_recorded_is_refused():
 
 @pytest.mark.gpu
 def test_pictures_and_gradients_have_the_bits_of_eager_calls_for_any_values():
-    draw = None
-    for seed in range(3):
-        scene = ordinary_scene(seed, device="cuda")
-        draw = draw or RecordedRasterization(scene.width, scene.height)
-        recorded, plain = leaves_of(scene), leaves_of(scene)
-        got, want = draw(*recorded), eager(plain, scene)
-        weights = [torch.randn_like(o) for o in want]
-        assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
-        found, expected = gradients(got, recorded, weights), gradients(want, plain, weights)
-        assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+    scenes = [ordinary_scene(seed, device="cuda") for seed in range(3)]
+    draw = RecordedRasterization(scenes[0].width, scenes[0].height)
+    for scene in scenes:
+        assert_equals_eager_call(draw, scene)
 
 
 @pytest.mark.gpu
@@ -70,12 +74,7 @@ def test_more_pairs_than_were_recorded_are_drawn_exactly_and_recorded_anew():
     large = scene.with_(scales=scene.scales * 60)
     draw = RecordedRasterization(scene.width, scene.height)
     for which in (scene, large, large, scene):
-        recorded, plain = leaves_of(which), leaves_of(which)
-        got, want = draw(*recorded), eager(plain, which)
-        assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
-        weights = [torch.ones_like(o) for o in want]
-        found, expected = gradients(got, recorded, weights), gradients(want, plain, weights)
-        assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+        assert_equals_eager_call(draw, which)
 
 
 @pytest.mark.gpu

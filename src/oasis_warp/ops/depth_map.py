@@ -10,7 +10,7 @@ from torch import Tensor
 from oasis_warp.core.checks import check_choice, check_positive
 from oasis_warp.ops._runtime.declaration import Array, Operator
 from oasis_warp.ops._runtime.depth_buffer import draw, plane_size
-from oasis_warp.ops._runtime.depth_scene import BufferParts, DepthScene, empty_buffer
+from oasis_warp.ops._runtime.depth_scene import BufferParts, DepthScene
 from oasis_warp.ops._runtime.incidence import incidence
 
 
@@ -71,7 +71,7 @@ def _depth_map_fake(
     vertices, faces, viewmats, Ks, width, height, near_plane, depth, face_ids, barycentrics, validate
 ):  # fmt: skip
     scene = DepthScene(vertices, faces, viewmats, Ks, width, height, near_plane)
-    return tuple(empty_buffer(scene, BufferParts(depth, face_ids, barycentrics)))
+    return tuple(scene.empty_buffer(BufferParts(depth, face_ids, barycentrics)))
 
 
 _OPERATOR = Operator(

@@ -237,11 +237,7 @@ def blend_layers(
 
 
 def refuse_unsupported(values: Sequence[Any]) -> None:
-    """Refuse `values` of the `UNSUPPORTED` arguments other than their defaults.
-
-    Raises:
-        ValueError: names the argument.
-    """
+    """Refuse `values` of the `UNSUPPORTED` arguments other than their defaults."""
     for (name, (default, hint)), value in zip(UNSUPPORTED.items(), values, strict=True):
         refuse_unless_default(name, value, default, hint)
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from oasis_warp.core.checks import check_integer, check_positive
 from oasis_warp.ops._runtime.declaration import Array, Operator, needs_gradient
 from oasis_warp.ops._runtime.depth_buffer import draw, gradients
-from oasis_warp.ops._runtime.depth_scene import BufferParts, DepthScene, Query, empty_buffer, empty_scores
+from oasis_warp.ops._runtime.depth_scene import BufferParts, DepthScene, Query
 from oasis_warp.ops._runtime.incidence import incidence
 from oasis_warp.ops.depth_map import MESH_AND_CAMERA, check_picture, expand_batch
 
@@ -51,8 +51,8 @@ def _visibility_fake(
     keep, validate,
 ):  # fmt: skip
     scene = DepthScene(vertices, faces, viewmats, Ks, width, height, near_plane)
-    buffer = empty_buffer(scene, BufferParts(maps, maps or keep, barycentrics=False))
-    scores = empty_scores(scene, Query(points, point_vertices, by_identity, tau, margin, keep))
+    buffer = scene.empty_buffer(BufferParts(maps, maps or keep, barycentrics=False))
+    scores = scene.empty_scores(Query(points, point_vertices, by_identity, tau, margin, keep))
     return scores.visibility, buffer.depth, buffer.face_ids, scores.slopes, scores.pixels
 
 

@@ -88,11 +88,7 @@ class Counted(NamedTuple):
 
 
 def count(splats: Splats, s: Strips) -> Counted:
-    """Records, and the lengths of the strips' lists.
-
-    Raises:
-        ValueError: more pairs than can be numbered.
-    """
+    """Records, and the lengths of the strips' lists."""
     total, channels = s.n_cameras * s.n, splats.colors.shape[-1]
     in_record = channels if channels <= strips.RECORD_CHANNELS else 0
     records = torch.empty(total, strips.RECORD)
@@ -153,11 +149,7 @@ def fake_saved(colors: Tensor, frame: Frame) -> SavedTensors:
 
 
 def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, SavedTensors | None]:
-    """Images over the backgrounds, alpha, and, with `keep`, what the adjoint needs.
-
-    Raises:
-        ValueError: more pairs of a Gaussian and a strip than can be numbered.
-    """
+    """Images over the backgrounds, alpha, and, with `keep`, what the adjoint needs."""
     s = _strips_of(splats.colors, frame)
     channels = splats.colors.shape[-1]
     counted = count(splats, s)

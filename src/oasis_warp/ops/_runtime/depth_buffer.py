@@ -14,17 +14,7 @@ from oasis_kernels.depth import depth_buffer_native as vectors
 from oasis_kernels.depth.depth_buffer_native import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
 from oasis_warp.core.checks import check_index, check_positive
 from oasis_warp.ops._runtime import depth_cuda
-from oasis_warp.ops._runtime.depth_scene import (
-    Buffer,
-    BufferParts,
-    DepthScene,
-    Query,
-    Scores,
-    empty_buffer,
-    empty_scores,
-    restrict,
-    shared,
-)
+from oasis_warp.ops._runtime.depth_scene import Buffer, BufferParts, DepthScene, Query, Scores, restrict, shared
 from oasis_warp.ops._runtime.incidence import _transposed, sum_at_items
 from oasis_warp.ops._runtime.launch import SCALAR_NAMES, launch, run_shared, view
 from oasis_warp.ops._runtime.pair_counts import own_slot
@@ -104,7 +94,7 @@ def draw_by_vectors(scene: DepthScene, query: Query | None, outputs: BufferParts
     width, height = scene.width, scene.height
     parts = max(1, min(-(-torch.get_num_threads() // max(batch, 1)), scene.faces.shape[0] // FACES_A_PART))
     drawn = outputs._replace(depth=True, face_ids=True)
-    buffer = empty_buffer(scene, drawn)
+    buffer = scene.empty_buffer(drawn)
     # One allocation: camera_vertices, screen_vertices and planes, in numbers of 4 bytes.
     scratch = scene.empty(12 * n_vertices + 2 * parts * plane_size(width, height), dtype=torch.float32)
     first = scratch.data_ptr()
@@ -122,7 +112,7 @@ def draw_by_vectors(scene: DepthScene, query: Query | None, outputs: BufferParts
     if query is not None:
         points, job.points_step = shared(query.points)
         job.n_points = query.points.shape[1]
-        scores = empty_scores(scene, query)
+        scores = scene.empty_scores(query)
         named = None if query.point_vertices is None else query.point_vertices.to(torch.int32)
         job.points = points.data_ptr()
         job.point_vertices = 0 if named is None else named.data_ptr()
@@ -197,7 +187,7 @@ def draw_by_faces(scene: DepthScene, query: Query | None, outputs: BufferParts, 
 def _score_points(scene: DepthScene, query: Query, depth: Tensor, face_ids: Tensor) -> Scores:
     """Scores by the generic kernel, given the buffers."""
     known = query.point_vertices if query.by_identity else None
-    scores = empty_scores(scene, query)
+    scores = scene.empty_scores(query)
     scores.visibility.zero_()
     scores.slopes.zero_()
     scores.pixels.fill_(-1)

@@ -10,16 +10,7 @@ from torch import Tensor
 
 from oasis_kernels.depth import depth_buffer_cuda
 from oasis_kernels.depth.depth_buffer_cuda import BLOCK
-from oasis_warp.ops._runtime.depth_scene import (
-    Buffer,
-    BufferParts,
-    DepthScene,
-    Query,
-    Scores,
-    empty_buffer,
-    empty_scores,
-    shared,
-)
+from oasis_warp.ops._runtime.depth_scene import Buffer, BufferParts, DepthScene, Query, Scores, shared
 from oasis_warp.ops._runtime.launch import block_count, current_stream, run_cuda
 
 MOST_BLOCKS = 1 << 22
@@ -71,8 +62,8 @@ def draw(
         found: Page-locked, int64: its first element becomes 1 if a focal length is not positive or a point's vertex is
             none, once the device has finished.
     """
-    buffer = empty_buffer(scene, outputs)
-    scores = None if query is None else empty_scores(scene, query)
+    buffer = scene.empty_buffer(outputs)
+    scores = None if query is None else scene.empty_scores(query)
     batch, n_faces, plane = len(scene.vertices), len(scene.faces), scene.width * scene.height
     stream = current_stream(scene.vertices.device)
 

@@ -28,6 +28,21 @@ class DepthScene(NamedTuple):
         """An empty tensor of `shape` for each batch entry, by default of the vertices' type."""
         return self.vertices.new_empty((self.vertices.shape[0], *shape), dtype=dtype)
 
+    def empty_buffer(self, parts: "BufferParts") -> "Buffer":
+        """Memory for the parts to fill."""
+        size, nothing = (self.height, self.width), (0, 0)
+        return Buffer(
+            self.empty(*(size if parts.depth else nothing)),
+            self.empty(*(size if parts.face_ids else nothing), dtype=torch.int32),
+            self.empty(*(size if parts.barycentrics else nothing), 3),
+        )
+
+    def empty_scores(self, query: "Query") -> "Scores":
+        """Memory for the scores of the points."""
+        n_points = query.points.shape[1]
+        kept = n_points if query.keep else 0
+        return Scores(self.empty(n_points), self.empty(kept), self.empty(kept, dtype=torch.int32))
+
 
 class Query(NamedTuple):
     """Points to score."""
@@ -63,16 +78,6 @@ class Buffer(NamedTuple):
     """[B, H, W, 3]."""
 
 
-def empty_buffer(scene: DepthScene, outputs: BufferParts) -> Buffer:
-    """Memory for the parts to fill."""
-    size, nothing = (scene.height, scene.width), (0, 0)
-    return Buffer(
-        scene.empty(*(size if outputs.depth else nothing)),
-        scene.empty(*(size if outputs.face_ids else nothing), dtype=torch.int32),
-        scene.empty(*(size if outputs.barycentrics else nothing), 3),
-    )
-
-
 class Scores(NamedTuple):
     """Visibility of the points of a `Query`, and what its adjoint needs."""
 
@@ -82,13 +87,6 @@ class Scores(NamedTuple):
     """Derivative with respect to the point's depth, [B, P]; [B, 0] unless `keep`."""
     pixels: Tensor
     """int32: row * width + column where the score is soft, else -1; as `slopes`."""
-
-
-def empty_scores(scene: DepthScene, query: Query) -> Scores:
-    """Memory for the scores of the points."""
-    n_points = query.points.shape[1]
-    kept = n_points if query.keep else 0
-    return Scores(scene.empty(n_points), scene.empty(kept), scene.empty(kept, dtype=torch.int32))
 
 
 def shared(tensor: Tensor) -> tuple[Tensor, int]:

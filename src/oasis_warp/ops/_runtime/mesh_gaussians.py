@@ -53,11 +53,7 @@ class MeshGaussians(NamedTuple):
 def find_gaussians(
     faces: Tensor, face_index: Tensor, vertex_index: Tensor | None, n_vertices: int, *, transposed: bool
 ) -> MeshGaussians:
-    """The Gaussians that these indices bind, with `at_vertices` if `transposed`.
-
-    Raises:
-        ValueError: an index is out of range.
-    """
+    """The Gaussians that these indices bind, with `at_vertices` if `transposed`."""
     corners = incidence("faces", faces, n_vertices, "vertices")
     on_faces = incidence("face_index", face_index, len(faces), "faces")
     on_vertices = None if vertex_index is None else incidence("vertex_index", vertex_index, n_vertices, "vertices")

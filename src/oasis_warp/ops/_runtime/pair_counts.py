@@ -129,11 +129,7 @@ def watch_overflow(slack: float = 1.5) -> Iterator[Overflow]:
 
 
 def capacity_of(kind: Kind, slack: float) -> Counts:
-    """Memory for a captured call.
-
-    Raises:
-        RuntimeError: no eager call of this kind has been made.
-    """
+    """Memory for a captured call; refuses one without an eager call of its kind before."""
     if kind not in _last:
         device, n_cameras, n, width, height = kind
         raise RuntimeError(
@@ -147,11 +143,7 @@ def capacity_of(kind: Kind, slack: float) -> Counts:
 
 
 def watching() -> Overflow:
-    """The watch over this capture.
-
-    Raises:
-        RuntimeError: there is none.
-    """
+    """The watch over this capture; refuses one without."""
     overflow = _watching.get()
     if overflow is None:
         raise RuntimeError(

@@ -101,11 +101,7 @@ def _output_params(scene: ProjectionInputs, out: Sequence[Tensor]) -> dict[str, 
 
 
 def check_arrays(scene: ProjectionInputs, **others: tuple[Tensor | None, tuple[int, ...], torch.dtype]) -> None:
-    """Refuse tensors whose shapes, types or devices do not belong together.
-
-    Raises:
-        ValueError: names the argument.
-    """
+    """Refuse tensors whose shapes, types or devices do not belong together."""
     means, quats, scales, covars, viewmats, Ks = scene[:6]
     n, c, dtype = means.shape[0], viewmats.shape[0], means.dtype
     if (quats is None or scales is None) if covars is None else not (quats is None and scales is None):

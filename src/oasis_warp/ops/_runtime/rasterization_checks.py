@@ -14,11 +14,7 @@ WHOLE = int, torch.SymInt
 def check_gaussians(
     means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor
 ) -> None:
-    """Refuse Gaussians whose tensors do not belong together.
-
-    Raises:
-        ValueError: names the argument.
-    """
+    """Refuse Gaussians whose tensors do not belong together."""
     check_shape("means", means, "N", 3)
     check_float("means", means)
     n = means.shape[0]
@@ -37,11 +33,7 @@ def check_cameras(
     viewmats: Tensor, Ks: Tensor, means: Tensor, width: int, height: int, near_plane: float, far_plane: float,
     radius_clip: float, eps2d: float, tile_size: int,
 ) -> None:  # fmt: skip
-    """Refuse cameras, images and limits that kernels cannot draw.
-
-    Raises:
-        ValueError: names the argument.
-    """
+    """Refuse cameras, images and limits that kernels cannot draw."""
     check_shape("viewmats", viewmats, "C", 4, 4, hint="A single camera is viewmat[None].")
     check_float("viewmats", viewmats, like=means)
     n_cameras = viewmats.shape[0]
@@ -64,11 +56,7 @@ def check_cameras(
 
 
 def check_coefficients(coefficients: Tensor, sh_degree: int, means: Tensor, n_cameras: int) -> None:
-    """Refuse coefficients of spherical harmonics that do not belong to the Gaussians, cameras and degree.
-
-    Raises:
-        ValueError: names the argument.
-    """
+    """Refuse coefficients of spherical harmonics that do not belong to the Gaussians, cameras and degree."""
     sizes = {"N": means.shape[0], "C": n_cameras}
     if isinstance(coefficients, Tensor) and coefficients.dim() == 4:
         check_shape("colors", coefficients, "C", "N", "K", 3, sizes=sizes, hint="Or [N, K, 3].")
@@ -80,11 +68,7 @@ def check_coefficients(coefficients: Tensor, sh_degree: int, means: Tensor, n_ca
 
 
 def check_colors(colors: Tensor, backgrounds: Tensor | None, means: Tensor, n_cameras: int) -> None:
-    """Refuse colours and backgrounds that do not belong to the Gaussians and cameras.
-
-    Raises:
-        ValueError: names the argument.
-    """
+    """Refuse colours and backgrounds that do not belong to the Gaussians and cameras."""
     sizes = {"N": means.shape[0], "C": n_cameras}
     if isinstance(colors, Tensor) and colors.dim() == 2:
         check_shape("colors", colors, "N", "D", sizes=sizes, hint="One row for each centre.")

@@ -53,11 +53,7 @@ def fake_opaque_buffer(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def bin_to_tiles(boxes: Tensor, depths: Tensor, width: int, height: int, tile_size: int) -> Tiles:
-    """Sort the drawn Gaussians of each tile by depth, ties by index; boxes and depths are those of `Tables`.
-
-    Raises:
-        ValueError: more than `MAX_PAIRS` pairs.
-    """
+    """Sort the drawn Gaussians of each tile by depth, ties by index; boxes and depths are those of `Tables`."""
     across, down = -(-width // tile_size), -(-height // tile_size)
     bin_by = bin_by_sorting if depths.is_cuda else bin_by_dealing
     return bin_by(boxes, depths, tile_size, across, down)

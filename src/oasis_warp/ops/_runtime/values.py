@@ -32,11 +32,7 @@ def check_finite(**tensors: Tensor | None) -> None:
 
 
 def refuse_capture() -> None:
-    """Refuse to check values while a CUDA graph captures the call: they do not exist yet.
-
-    Raises:
-        ValueError: a capture is under way.
-    """
+    """Refuse to check values while a CUDA graph captures the call: they do not exist yet."""
     if torch.cuda.is_current_stream_capturing():
         raise ValueError(
             "validate: expected False while a CUDA graph is being captured, got True. Values exist only once it runs."

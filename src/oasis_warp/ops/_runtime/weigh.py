@@ -37,11 +37,7 @@ def check_weights(n_weights: int) -> None:
 
 
 def weigh(splats: Splats, width: int, height: int, tile_size: int) -> SparseWeights:
-    """Weight alpha T of every Gaussian in every pixel, for one camera. Colours and backgrounds are not read.
-
-    Raises:
-        ValueError: more weights than int32 can count.
-    """
+    """Weight alpha T of every Gaussian in every pixel, for one camera. Colours and backgrounds are not read."""
     weigh_by = weigh_strips if has_vectors(splats.opacities) else weigh_tiles
     return weigh_by(splats, width, height, tile_size)
 
