@@ -4,7 +4,10 @@ The metadata have one entry, "oasis-dense": a JSON object with `version`, `width
 """
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -43,28 +46,52 @@ def load_dense_network(path: Path | str) -> DenseNetwork:
         InputError: no such file, another format, another version or other sizes, or weights that are damaged.
     """
     path = Path(path)
+    with _opened(path) as file:
+        _checked_header(path, file)
+        tensors = {name: file.get_tensor(name).float() for name in file.keys()}
+    network = DenseNetwork()
+    if {name: t.shape for name, t in network.state_dict().items()} != {name: t.shape for name, t in tensors.items()}:
+        raise InputError(f"{path}: its weights are not those of a dense network; copy it again.")
+    if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
+        raise InputError(f"{path}: expected finite weights of a dense network, got others; copy it again.")
+    network.load_state_dict(tensors)
+    return network.eval()
+
+
+def read_dense_header(path: Path | str) -> dict[str, Any]:
+    """What a file of `save_dense_network` says of itself.
+
+    Raises:
+        InputError: as `load_dense_network`.
+    """
+    path = Path(path)
+    with _opened(path) as file:
+        return _checked_header(path, file)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     if not path.is_file():
         raise InputError(f"{path}: expected the dense network's weights, found no such file; give another path.")
     try:
         with safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get(FORMAT, "null"))
-            sizes = [header.get(name) for name in ("version", "widths", "depths")] if isinstance(header, dict) else None
-            if sizes != [VERSION, list(WIDTHS), list(DEPTHS)]:
-                raise InputError(
-                    f"{path}: expected the weights of a dense network of version {VERSION}, got another file; give one "
-                    "that `oasis pretrain --task dense` wrote."
-                )
-            network = DenseNetwork()
-            tensors = {name: file.get_tensor(name).float() for name in file.keys()}
-    except (SafetensorError, json.JSONDecodeError) as error:
+            yield file
+    except SafetensorError as error:
         raise InputError(
             f"{path}: expected the dense network's weights, got another format or a file cut short ({error}); "
             "copy it again."
         ) from error
-    shapes = {name: tensor.shape for name, tensor in network.state_dict().items()}
-    if shapes != {name: tensor.shape for name, tensor in tensors.items()}:
-        raise InputError(f"{path}: its weights are not those of a dense network; copy it again.")
-    if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
-        raise InputError(f"{path}: expected finite weights, got others; copy it again.")
-    network.load_state_dict(tensors)
-    return network.eval()
+
+
+def _checked_header(path: Path, file: Any) -> dict[str, Any]:
+    try:
+        header = json.loads((file.metadata() or {}).get(FORMAT, "null"))
+    except json.JSONDecodeError:
+        header = None
+    sizes = [header.get(name) for name in ("version", "widths", "depths")] if isinstance(header, dict) else None
+    if sizes != [VERSION, list(WIDTHS), list(DEPTHS)]:
+        raise InputError(
+            f"{path}: expected the weights of a dense network of version {VERSION}, got another file; give one that "
+            "`oasis pretrain --task dense` wrote."
+        )
+    return header

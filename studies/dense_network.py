@@ -1,0 +1,164 @@
+"""What the dense network says about synthetic photos of people that it has not met, against the truth of each pixel.
+
+Fills docs/dense_network.md (file, held-out, landmarks, skin).
+"""
+
+import hashlib
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from oasis_warp.assets import asset
+from oasis_warp.network.dense_network import HAND, DenseNetwork, DensePrediction
+from oasis_warp.network.dense_weights import load_dense_network, read_dense_header
+from oasis_warp.pretraining.dense_source import DensePhotos, detected
+from oasis_warp.synthetic.dense_pictures import UNIT, DenseBatch, render_dense
+from oasis_warp.synthetic.shot_table import sample_table
+from oasis_warp.synthetic.shots import SceneConfig, cached_identity
+from studies.harness import Row, StudyOptions, measured
+from studies.inputs import iou
+from studies.tables import Column, Section, distribution, markdown, mean, percentiles
+
+PHOTOS_EACH = 4
+CLAIMED = 0.9
+"""Share of coordinates that lie within this quantile of their Laplace distribution, if the confidence is true."""
+LEAST_SKIN = 200
+"""Pixels of visible skin below which a photo says little."""
+DARKEST = 1e-3
+"""Reflectance below which its logarithm counts as this one's."""
+MEASURES = (
+    Column("IoU of the mask", "iou", ".3f"),
+    Column("surface point, median of a photo, mm", "surface_mm", ".1f"),
+    Column("surface point, 90 % of a photo, mm", "surface_90_mm", ".1f"),
+    Column("normal, median of a photo, degrees", "normal_deg", ".1f"),
+    Column("finger, share of pixels right", "finger", ".3f"),
+    Column("albedo, scale-free error of the logarithm", "albedo_log", ".3f"),
+    Column("shading, correlation of the logarithm", "shading", ".3f"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(StudyOptions):
+    """Options of this study."""
+
+    weights: Path | None = None
+    """Weights file of `oasis pretrain --task dense`; that of the package when not given."""
+    people: int = 32
+    """Each shows PHOTOS_EACH photos."""
+    seed: int = 77
+    """Of a world that training does not use."""
+
+
+def errors(said: DensePrediction, true: DenseBatch, k: int) -> Row | None:
+    """What is wrong in photo `k`; None where hardly any skin is visible."""
+    skin = true.skin[k]
+    if int(skin.sum()) < LEAST_SKIN:
+        return None
+    off = (said.surface[k] - true.surface[k])[:, skin]
+    distance = off.norm(dim=0) * UNIT * 1e3
+    cosine = (said.normal[k] * true.normal[k]).sum(0)[skin].clamp(-1, 1)
+    albedo, known = (values[:, skin].clamp_min(DARKEST).log() for values in (_linear(said.albedo[k]), true.albedo[k]))
+    light = _linear(true.image[k])[:, skin].clamp_min(DARKEST).log()
+    within = off.abs() / said.log_scale[k][skin].exp() < -torch.log(torch.tensor(1 - CLAIMED))
+    return {
+        "iou": iou(said.classes[k].softmax(0)[HAND] > 0.5, true.classes[k, HAND] > 0.5),
+        "surface_mm": float(distance.median()), "surface_90_mm": float(distance.quantile(0.9)),
+        "normal_deg": float(cosine.acos().rad2deg().median()),
+        "finger": float((said.finger[k].argmax(0) == true.finger[k])[skin].float().mean()),
+        "albedo_log": float((_centred(albedo) - _centred(known)).abs().mean()),
+        "shading": float(torch.corrcoef(torch.stack([(light - albedo).mean(0), (light - known).mean(0)]))[0, 1]),
+        "within": float(within.float().mean()),
+    }  # fmt: skip
+
+
+def _centred(logarithms: Tensor) -> Tensor:
+    return logarithms - logarithms.mean(1, keepdim=True)
+
+
+def _linear(srgb: Tensor) -> Tensor:
+    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+@torch.inference_mode()
+def measure(network: DenseNetwork, options: Options, number: int) -> list[Row]:
+    """Rows of one rendering: two people, with landmarks as a detector finds them, and without."""
+    photos = DensePhotos(seed=options.seed, people=options.people, photos=2, size=256, device=torch.device("cpu"))
+    scene, random = SceneConfig(people=options.people), torch.Generator().manual_seed(number)
+    table = sample_table(options.seed, photos.indices(number), scene)
+    true = render_dense(options.seed, table, photos.size, "cpu", scene=scene, random=random)
+    found = detected(true.landmarks, random)
+    rows = []
+    for known, landmarks in ((True, found), (False, torch.full_like(found, torch.nan))):
+        said = network(true.image, landmarks)
+        for k, person in enumerate(table.whole[:, 1]):
+            row = errors(said, true, k)
+            if row is not None:
+                melanin = cached_identity(options.seed, int(person), scene.population).melanin
+                rows.append({**row, "landmarks": known, "melanin": melanin})
+    return rows
+
+
+def run(options: Options) -> list[Row]:
+    """Measure every photo."""
+    with resources.as_file(asset("estimator", "dense.safetensors")) as bundled:
+        network = load_dense_network(options.weights or bundled)
+    numbers = range(options.people * PHOTOS_EACH // 2)
+    cases = {f"rendering {number}": (network, options, number) for number in numbers}
+    return measured("dense_network", cases, measure, options)
+
+
+def held_out(rows: list[Row]) -> str | None:
+    """The table of all photos with landmarks, and how true the confidence is."""
+    own = [row for row in rows if row["landmarks"]]
+    made, share = distribution(own, MEASURES, "256 px"), mean(row["within"] for row in own)
+    return made and (
+        f"{made}\n\n{len(own)} photos. Of the surface coordinates, {share:.1%} lie within the {CLAIMED:.0%} claimed."
+    )
+
+
+def by_landmarks(rows: list[Row]) -> str | None:
+    """Medians with landmarks and without."""
+    return side_by_side({
+        "landmarks as a detector finds them": [row for row in rows if row["landmarks"]],
+        "none": [row for row in rows if not row["landmarks"]],
+    })
+
+
+def by_skin(rows: list[Row]) -> str | None:
+    """Medians of the lightest, the middle and the darkest third."""
+    own = sorted((row for row in rows if row["landmarks"]), key=lambda row: row["melanin"])
+    names = ("lightest third", "middle", "darkest third")
+    return side_by_side({name: own[k * len(own) // 3 : (k + 1) * len(own) // 3] for k, name in enumerate(names)})
+
+
+def side_by_side(groups: dict[str, list[Row]]) -> str | None:
+    """Medians of groups of rows, a column each."""
+    if not all(groups.values()):
+        return None
+    lines = [
+        [column.heading, *(column.text(percentiles(row[column.value] for row in rows)[1]) for rows in groups.values())]
+        for column in MEASURES
+    ]
+    return markdown(["median", *groups], lines)
+
+
+def file_table(rows: list[Row]) -> str:
+    """What the bundled file is, and how it was trained."""
+    with resources.as_file(asset("estimator", "dense.safetensors")) as path:
+        header, content = read_dense_header(path), path.read_bytes()
+    lines = {
+        "file": f"`src/oasis_warp/assets/estimator/dense.safetensors`, {len(content) / 1e6:.2f} MB, half precision",
+        "SHA-256": f"`{hashlib.sha256(content).hexdigest()}`",
+        "channels, blocks": f"{header['widths']}, {header['depths']}",
+        "training": header["notes"],
+    }
+    return markdown(["", ""], [[name, text] for name, text in lines.items()])
+
+
+SECTIONS = (
+    Section("dense_network.md", "file", file_table), Section("dense_network.md", "held-out", held_out),
+    Section("dense_network.md", "landmarks", by_landmarks), Section("dense_network.md", "skin", by_skin),
+)  # fmt: skip
