@@ -50,9 +50,9 @@ def check_picture(width: int, height: int, near_plane: float) -> None:
     check_positive("near_plane", near_plane)
 
 
-def expand_batch(tensor: Tensor, batch: int, n_axes: int = 2) -> Tensor:
-    """`tensor`, of `n_axes` without a batch axis, repeated over the batch without a copy."""
-    if tensor.dim() > n_axes:
+def expand_batch(tensor: Tensor, batch: int) -> Tensor:
+    """`tensor`, of two axes without a batch axis, repeated over the batch without a copy."""
+    if tensor.dim() > 2:
         return tensor
     return tensor[None] if batch == 1 else tensor.expand(batch, *tensor.shape)
 

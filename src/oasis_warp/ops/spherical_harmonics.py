@@ -11,28 +11,21 @@ from oasis_warp.core.checks import check_float
 from oasis_warp.ops._runtime.declaration import Array, Operator, empty_gradients
 from oasis_warp.ops._runtime.launch import (
     SCALAR,
-    VEC3,
-    VEC4,
     block_count,
     contiguous,
     current_stream,
     has_cuda_kernels,
     launch_ranges,
     run_cuda,
-    view,
+    vectors,
 )
 
 MAX_DEGREE = 3
 
 
-def _vec3(tensor: Tensor) -> Any:
-    """A contiguous tensor [..., 3] as an array of vectors."""
-    return view(tensor, VEC3[tensor.dtype])
-
-
 def _evaluate(directions: Tensor, coefficients: Tensor, degree: int, validate: bool) -> Tensor:
     out = torch.empty_like(directions, memory_format=torch.contiguous_format)
-    inputs = [_vec3(t.contiguous()) for t in (directions, coefficients, out)]
+    inputs = [vectors(directions.contiguous()), vectors(coefficients.contiguous(), 2), vectors(out)]
     launch_ranges(kernels.evaluate(SCALAR[directions.dtype], degree), len(directions), inputs, like=directions)
     return out
 
@@ -46,7 +39,11 @@ def _evaluate_backward(
 ) -> list[Tensor]:
     gradients = empty_gradients((directions, coefficients), needs)
     gradients[1].zero_()
-    inputs = [_vec3(t.contiguous()) for t in (directions, coefficients, g_values, *gradients)]
+    directions, coefficients, g_values = contiguous(directions, coefficients, g_values)
+    inputs = [
+        vectors(directions), vectors(coefficients, 2), vectors(g_values), vectors(gradients[0]),
+        vectors(gradients[1], 2),
+    ]  # fmt: skip
     launch_ranges(kernels.evaluate_backward(SCALAR[directions.dtype], degree), len(directions), inputs, like=directions)
     return gradients
 
@@ -136,11 +133,6 @@ def _cuda_params(means: Tensor, coefficients: Tensor, viewmats: Tensor, **others
     }  # fmt: skip
 
 
-def _rows(coefficients: Tensor) -> Tensor:
-    """Coefficients [N, K, 3] or [C, N, K, 3] without an axis of cameras."""
-    return coefficients.view(-1, *coefficients.shape[-2:])
-
-
 def _sh_to_rgb(means: Tensor, coefficients: Tensor, viewmats: Tensor, degree: int) -> Tensor:
     colors = _colors_like(means, coefficients, viewmats, degree)
     total = colors.shape[0] * colors.shape[1]
@@ -152,8 +144,7 @@ def _sh_to_rgb(means: Tensor, coefficients: Tensor, viewmats: Tensor, degree: in
         n_blocks = block_count(total, kernels.BLOCK)
         run_cuda(kernels.cuda_sh_to_rgb(degree), params, n_blocks, current_stream(means.device))
         return colors
-    poses = view(viewmats, VEC4[means.dtype])
-    inputs = [_vec3(means), _vec3(_rows(coefficients)), poses, _vec3(colors.view(-1, 3))]
+    inputs = [vectors(means), vectors(coefficients, 2), vectors(viewmats, 2), vectors(colors)]
     launch_ranges(kernels.sh_to_rgb(SCALAR[means.dtype], degree), total, inputs, like=means)
     return colors
 
@@ -177,8 +168,8 @@ def _sh_to_rgb_backward(
         run_cuda(kernels.cuda_sh_to_rgb_backward(degree), params, n_blocks, current_stream(means.device))
     else:
         inputs = [
-            _vec3(means), _vec3(_rows(coefficients)), view(viewmats, VEC4[means.dtype]), _vec3(colors.view(-1, 3)),
-            _vec3(g_colors.view(-1, 3)), _vec3(g_means), _vec3(_rows(g_coefficients)), _vec3(g_centers),
+            vectors(means), vectors(coefficients, 2), vectors(viewmats, 2), vectors(colors), vectors(g_colors),
+            vectors(g_means), vectors(g_coefficients, 2), vectors(g_centers),
         ]  # fmt: skip
         launch_ranges(kernels.sh_to_rgb_backward(SCALAR[means.dtype], degree), n, inputs, like=means)
     if needs[2]:

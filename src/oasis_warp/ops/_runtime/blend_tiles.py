@@ -4,12 +4,11 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from warp import vec4i
 from warp.types import vector
 
 from oasis_kernels.rasterize import rasterize_backward as backward_kernels
 from oasis_kernels.rasterize import rasterize_forward as forward_kernels
-from oasis_warp.ops._runtime.launch import SCALAR, VEC2, VEC3, VEC4, launch_ranges, start, view
+from oasis_warp.ops._runtime.launch import SCALAR, launch_ranges, start, vectors, view
 from oasis_warp.ops._runtime.records import Frame, GradientFlags, Gradients, Splats
 from oasis_warp.ops._runtime.rules import current_rules
 from oasis_warp.ops._runtime.tiles import bin_to_tiles, even_work, fake_opaque_buffer, opaque_elements
@@ -66,11 +65,9 @@ def lane_grid(tile_size: int, device: torch.device, grid: tuple[int, int]) -> tu
 
 def splat_views(splats: Splats) -> list[Any]:
     """Arguments boxes, centers, whitenings, opacities of the generic kernels."""
-    records, vec4 = splats.tables(), VEC4[splats.opacities.dtype]
-    return [
-        view(records.boxes.view(-1, 4), vec4i), view(records.centers.view(-1, 4), vec4),
-        view(records.whitenings.view(-1, 4), vec4), splats.opacities.view(-1),
-    ]  # fmt: skip
+    records = splats.tables()
+    tables = records.boxes, records.centers, records.whitenings
+    return [*map(vectors, tables), splats.opacities.view(-1)]
 
 
 def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, SavedTensors | None]:
@@ -168,8 +165,7 @@ def _gather_shape(splats: Splats, saved: SavedTensors, pair_moments: Tensor) -> 
     _, _, whitenings, opacities = splat_views(splats)
     inputs = [
         saved.pair_starts, saved.pair_counts, view(pair_moments, vector(6, SCALAR[dtype])), whitenings, opacities,
-        view(g_means2d.view(-1, 2), VEC2[dtype]), view(g_covars2d.view(-1, 3), VEC3[torch.float64]),
-        g_opacities.view(-1),
+        vectors(g_means2d), vectors(g_covars2d), g_opacities.view(-1),
     ]  # fmt: skip
     launch_ranges(backward_kernels.gather_shape(SCALAR[dtype]), n_cameras * n, inputs, like=pair_moments)
     return g_means2d, g_covars2d, g_opacities

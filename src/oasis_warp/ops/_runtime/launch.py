@@ -23,9 +23,13 @@ _start_lock = threading.Lock()
 _load_lock = threading.Lock()
 _started = False
 
-VEC2 = {torch.float32: wp.vec2f, torch.float64: wp.vec2d}
-VEC3 = {torch.float32: wp.vec3f, torch.float64: wp.vec3d}
-VEC4 = {torch.float32: wp.vec4f, torch.float64: wp.vec4d}
+VECTORS = {
+    torch.float32: {2: wp.vec2f, 3: wp.vec3f, 4: wp.vec4f},
+    torch.float64: {2: wp.vec2d, 3: wp.vec3d, 4: wp.vec4d},
+    torch.int32: {2: wp.vec2i, 4: wp.vec4i},
+}
+LEAST_TASKS = 2048
+"""Of a generic kernel, for which another thread is worth its while."""
 SCALAR_NAMES = {torch.float32: "float", torch.float64: "double"}
 SCALAR = {torch.float32: wp.float32, torch.float64: wp.float64, torch.int32: wp.int32, torch.int64: wp.int64}
 
@@ -106,6 +110,11 @@ def view(tensor: Tensor, dtype: Any = None) -> Any:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=False)
 
 
+def vectors(tensor: Tensor, axes: int = 1) -> Any:
+    """`tensor` [..., 2 to 4] as a Warp array of vectors along its last axis, the others folded into so many `axes`."""
+    return view(tensor.view(-1, *tensor.shape[-axes:]), VECTORS[tensor.dtype][tensor.shape[-1]])
+
+
 def has_vectors(tensor: Tensor) -> bool:
     """Whether vectorised CPU kernels take tensors like this one: float32 on the CPU."""
     return tensor.device.type == "cpu" and tensor.dtype == torch.float32
@@ -121,15 +130,15 @@ def _seen_by_warp(inputs: Sequence[Any]) -> list[Any]:
     return [view(value) if isinstance(value, Tensor) else value for value in inputs]
 
 
-def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], like: Tensor, block_dim: int = 256) -> None:
+def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], like: Tensor) -> None:
     """Launch `kernel` over `dim` threads on the device and current stream of `like`; an empty launch is skipped.
 
-    Tensors among the inputs are contiguous; those that stand for vectors come as a `view`.
+    Tensors among the inputs are contiguous; those that stand for vectors come as `vectors`.
     """
     if 0 in ([dim] if isinstance(dim, int) else list(dim)):
         return
     device, stream = device_and_stream(like)
-    wp.launch(kernel, dim=dim, inputs=_seen_by_warp(inputs), device=device, stream=stream, block_dim=block_dim)
+    wp.launch(kernel, dim=dim, inputs=_seen_by_warp(inputs), device=device, stream=stream, block_dim=256)
 
 
 @functools.cache
@@ -138,9 +147,9 @@ def _pool(process: int, n_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(n_threads, thread_name_prefix="oasis_warp")
 
 
-def even_cuts(n: int, least: int = 2048) -> list[int]:
-    """Bounds 0 .. n of ranges for `launch_ranges`: one for each thread, none with fewer than `least` tasks."""
-    parts = max(1, min(torch.get_num_threads(), n // least))
+def even_cuts(n: int) -> list[int]:
+    """Bounds 0 .. n of ranges for `launch_ranges`: one for each thread, none with fewer than `LEAST_TASKS`."""
+    parts = max(1, min(torch.get_num_threads(), n // LEAST_TASKS))
     return [n * k // parts for k in range(parts + 1)]
 
 

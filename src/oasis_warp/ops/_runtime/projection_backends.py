@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from oasis_kernels.rasterize import projection as generic
@@ -18,9 +17,6 @@ from oasis_kernels.runtime.native import PHASE_WORDS
 from oasis_warp.core.checks import FINITE_LIMIT
 from oasis_warp.ops._runtime.launch import (
     SCALAR,
-    VEC2,
-    VEC3,
-    VEC4,
     block_count,
     contiguous,
     current_stream,
@@ -28,7 +24,7 @@ from oasis_warp.ops._runtime.launch import (
     phase_state,
     run_cuda,
     run_native,
-    view,
+    vectors,
     wait_for,
 )
 from oasis_warp.ops._runtime.pair_counts import own_slot
@@ -45,8 +41,6 @@ OUTPUTS = (
 """Name, numbers per Gaussian (0: no axis for them) and type (None: that of the inputs) of the outputs, besides the
 records."""
 Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-VECTORS = {dtype: {2: VEC2[dtype], 3: VEC3[dtype], 4: VEC4[dtype]} for dtype in (torch.float32, torch.float64)}
-VECTORS[torch.int32] = {2: wp.vec2i, 4: wp.vec4i}
 
 
 class ProjectionInputs(NamedTuple):
@@ -174,9 +168,8 @@ def project_generic(scene: ProjectionInputs, opacities: Tensor, limits: Limits, 
             len(scene.means), *_gaussian_views(scene), opacities, scene.viewmats, scene.Ks, scene.ortho, scene.width,
             scene.height, as_float32(limits.near_plane), as_float32(limits.far_plane), as_float32(limits.eps2d),
             limits.radius_clip, as_float32(rules.alpha_min), rules.extent_sigmas,
-            *(_rows(tensor, size) for (_name, size, _dtype), tensor in zip(OUTPUTS, out, strict=False)),
-            records.sort_depths.view(-1), _rows(records.centers, 4), _rows(records.whitenings, 4),
-            _rows(records.boxes, 4),
+            *(vectors(t) if size else t.view(-1) for (_, size, _), t in zip(OUTPUTS, out, strict=False)),
+            records.sort_depths.view(-1), vectors(records.centers), vectors(records.whitenings), vectors(records.boxes),
         ],
         like=scene.means,
     )  # fmt: skip
@@ -247,10 +240,10 @@ def backward_generic(
         n,
         [
             n, n_cameras, *_gaussian_views(scene), scene.viewmats, scene.Ks, scene.ortho, scene.width, scene.height,
-            _rows(radii, 2), _rows(given(incoming.g_means2d, 2), 2),
-            _rows(given(incoming.g_covars2d, 3, dtype=torch.float64), 3), given(incoming.g_depths).view(-1),
-            int(needs_cameras), _rows(filled("means", 3), 3), _rows(filled("quats", 4), 4),
-            _rows(filled("scales", 3), 3), filled("covars", 3, 3), sums,
+            vectors(radii), vectors(given(incoming.g_means2d, 2)),
+            vectors(given(incoming.g_covars2d, 3, dtype=torch.float64)), given(incoming.g_depths).view(-1),
+            int(needs_cameras), vectors(filled("means", 3)), vectors(filled("quats", 4)), vectors(filled("scales", 3)),
+            filled("covars", 3, 3), sums,
         ],
         like=scene.means,
     )  # fmt: skip
@@ -264,12 +257,7 @@ def _gaussian_views(scene: ProjectionInputs) -> list[object]:
     quats = means.new_empty(0, 4) if scene.quats is None else scene.quats
     scales = means.new_empty(0, 3) if scene.scales is None else scene.scales
     covars = means.new_empty(0, 3, 3) if scene.covars is None else scene.covars
-    return [_rows(means, 3), _rows(quats, 4), _rows(scales, 3), covars, int(scene.covars is not None)]
-
-
-def _rows(tensor: Tensor, size: int) -> object:
-    """A contiguous tensor as an array of vectors of `size` numbers, or of numbers where it is 0."""
-    return view(tensor.view(-1, size), VECTORS[tensor.dtype][size]) if size else view(tensor.view(-1))
+    return [vectors(means), vectors(quats), vectors(scales), covars, int(scene.covars is not None)]
 
 
 def _fill_viewmats(g_viewmats: Tensor, sums: Tensor) -> None:

@@ -8,7 +8,7 @@ from jaxtyping import Int32, Int64
 from torch import Tensor
 
 from oasis_kernels.rasterize import tiles
-from oasis_warp.ops._runtime.launch import launch, launch_ranges, view
+from oasis_warp.ops._runtime.launch import launch, launch_ranges, vectors, view
 
 MAX_PAIRS = 2**31 - 1
 """Pairs of a Gaussian and a tile that one call can hold."""
@@ -63,7 +63,7 @@ def bin_by_sorting(boxes: Tensor, depths: Tensor, tile_size: int, across: int, d
     """`bin_to_tiles` with torch's parallel sorts."""
     n_cameras, n = depths.shape
     device = depths.device
-    pixels = view(boxes.view(-1, 4), wp.vec4i)
+    pixels = vectors(boxes)
     counts = torch.zeros(n_cameras * n, dtype=torch.int64, device=device)
     launch_ranges(tiles.count_tiles, len(counts), [pixels, tile_size, counts], like=counts)
 
@@ -91,14 +91,14 @@ def bin_by_dealing(boxes: Tensor, depths: Tensor, tile_size: int, across: int, d
     """`bin_to_tiles` on one CPU thread, which is faster there than any parallel sort."""
     n_cameras, n = depths.shape
     total, n_tiles = n_cameras * n, n_cameras * across * down
-    pixels = view(boxes.view(-1, 4), wp.vec4i)
+    pixels = vectors(boxes)
 
     def int64(size: int) -> Tensor:
         return torch.empty(size, dtype=torch.int64)
 
     pair_starts, pair_counts, totals = int64(total), int64(total), torch.zeros(2, dtype=torch.int64)
     starts = torch.zeros(n_tiles + 1, dtype=torch.int64)
-    tile_boxes = view(torch.empty(total, 4, dtype=torch.int32), wp.vec4i)
+    tile_boxes = vectors(torch.empty(total, 4, dtype=torch.int32))
     keys, order = int64(2 * total), torch.empty(2 * total, dtype=torch.int32)  # the sort needs room for two
     inputs = [
         pixels, depths.view(-1), n, tile_size, across, down, pair_starts, pair_counts, tile_boxes,
