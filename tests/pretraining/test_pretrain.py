@@ -82,15 +82,6 @@ def test_what_is_left_in_the_folder_says_what_happened(hand, unbroken):
     assert sorted(path.name for path in folder.iterdir()) == sorted([CHECKPOINT, WEIGHTS, METRICS, SHEET])
 
 
-def test_a_finished_training_is_left_as_it_is(hand, source, unbroken):
-    folder, network = unbroken
-    before = (folder / CHECKPOINT).read_bytes()
-    again = small_network(hand)
-    pretrain(PriorTrainer(again, CONFIG, ALONE), source, folder)
-    assert (folder / CHECKPOINT).read_bytes() == before
-    assert all(torch.equal(a, b) for a, b in zip(again.parameters(), network.parameters(), strict=True))
-
-
 def test_the_checkpoint_of_another_network_is_refused(hand, source, unbroken):
     with pytest.raises(InputError, match="the checkpoint of a network with other sizes or switches"):
         pretrain(PriorTrainer(small_network(hand, vpia="no_bias"), CONFIG, ALONE), source, unbroken[0])
