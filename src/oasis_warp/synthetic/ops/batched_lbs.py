@@ -7,7 +7,7 @@ from torch import Tensor
 
 from oasis_kernels.skinning import batched_lbs as kernels
 from oasis_warp.ops._runtime.declaration import Array, Declaration
-from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._runtime.launch import launch_ranges, view
 from oasis_warp.synthetic.ops.views import scalars, vectors
 
 _DECLARATION = Declaration(
@@ -64,5 +64,5 @@ def batched_lbs(
         vectors(rest), scalars(displacements), scalars(strengths), vectors(normals), scalars(rises), scalars(knuckles),
         scalars(weights), view(rotations.contiguous(), wp.mat33f), vectors(shifts), vectors(out),
     ]  # fmt: skip
-    launch_ranges(kernels.batched_lbs, even_cuts(rest.shape[0] * rest.shape[1]), inputs, like=rest)
+    launch_ranges(kernels.batched_lbs, rest.shape[0] * rest.shape[1], inputs, like=rest)
     return out

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from oasis_kernels.scene import pixel_noise as kernels
 from oasis_warp.core.checks import check_shape
-from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._runtime.launch import launch_ranges
 from oasis_warp.synthetic.ops.views import integers
 
 
@@ -21,5 +21,5 @@ def pixel_noise(seeds: Int[Tensor, "B"], *shape: int) -> Float[Tensor, "B ..."]:
     check_shape("seeds", seeds, "B")
     n = math.prod(shape)
     out = torch.empty((len(seeds), n), device=seeds.device)
-    launch_ranges(kernels.normal, even_cuts(out.numel()), [integers(seeds), n, view(out)], like=out)
+    launch_ranges(kernels.normal, out.numel(), [integers(seeds), n, out], like=out)
     return out.unflatten(1, shape)

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from oasis_kernels.scene import rooms as kernels
 from oasis_warp.ops._runtime.declaration import Array, Declaration
-from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges
+from oasis_warp.ops._runtime.launch import launch_ranges
 from oasis_warp.synthetic.ops.views import Lamps, scalars, vectors
 
 SOLID_WORDS = int(kernels.SOLID_WORDS)
@@ -59,9 +59,9 @@ def trace_rooms(
     _DECLARATION.check(solids=solids, focals=focals, sky=sky, hidden=hidden, focus=focus, apertures=apertures)
     sharp, out = hidden.new_empty((*hidden.shape, 3)), hidden.new_empty((*hidden.shape, 3))
     depth, covered = scalars(torch.empty_like(hidden)), scalars(hidden)
-    cuts = even_cuts(hidden.numel())
+    count = hidden.numel()
     inputs = [scalars(solids), scalars(focals), vectors(sky), *lamps.views(), covered, vectors(sharp), depth]
-    launch_ranges(kernels.trace, cuts, inputs, like=hidden)
+    launch_ranges(kernels.trace, count, inputs, like=hidden)
     inputs = [depth, covered, scalars(focus), scalars(apertures), vectors(sharp), vectors(out)]
-    launch_ranges(kernels.defocus, cuts, inputs, like=hidden)
+    launch_ranges(kernels.defocus, count, inputs, like=hidden)
     return out

@@ -11,7 +11,7 @@ from oasis_kernels.scene import skin_light, skin_shading
 from oasis_warp.core.checks import check_positive, check_shape
 from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.incidence import incidence
-from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, view
+from oasis_warp.ops._runtime.launch import launch_ranges, view
 from oasis_warp.ops.depth_map import DepthMap
 from oasis_warp.synthetic.ops.views import Lamps, integers, matrices, scalars, vectors
 
@@ -81,8 +81,8 @@ def surface_state(vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]) -
     index = incidence("faces", faces, sizes["V"], "vertices")
     normals = torch.empty_like(vertices, memory_format=torch.contiguous_format)
     areas = vertices.new_empty(vertices.shape[:2])
-    inputs = [vectors(vertices), *map(view, index), vectors(normals), view(areas)]
-    launch_ranges(skin_light.surface_state, even_cuts(areas.numel()), inputs, like=vertices)
+    inputs = [vectors(vertices), *index, vectors(normals), areas]
+    launch_ranges(skin_light.surface_state, areas.numel(), inputs, like=vertices)
     return SurfaceState(normals, areas)
 
 
@@ -101,8 +101,8 @@ def smooth_over_faces(values: Float[Tensor, "B V C"], faces: Int[Tensor, "F 3"])
     sizes = _SMOOTH.check(values=values, faces=faces)
     index = incidence("faces", faces, sizes["V"], "vertices")
     out = torch.empty_like(values, memory_format=torch.contiguous_format)
-    inputs = [scalars(values), *map(view, index), view(out)]
-    launch_ranges(skin_light.smooth, even_cuts(values.numel()), inputs, like=values)
+    inputs = [scalars(values), *index, out]
+    launch_ranges(skin_light.smooth, values.numel(), inputs, like=values)
     return out
 
 
@@ -156,9 +156,9 @@ def sky_transfer(
     out = vertices.new_zeros((*vertices.shape[:2], 10))
     inputs = [
         vectors(vertices), vectors(normals), vectors(directions), matrices(viewmats), scalars(focals), scalars(depths),
-        lift, n_lit, view(out),
+        lift, n_lit, out,
     ]  # fmt: skip
-    launch_ranges(skin_light.sky_transfer, even_cuts(len(vertices) * n_lit), inputs, like=vertices)
+    launch_ranges(skin_light.sky_transfer, len(vertices) * n_lit, inputs, like=vertices)
     return out
 
 
@@ -248,27 +248,27 @@ def shade_skin(
         raise ValueError(f"samples: expected a divisor of {sizes['H']} and {sizes['W']}, got {samples}.")
     rows, columns = sizes["H"], sizes["W"]
     light, tone, mirrored = (vertices.new_zeros((sizes["B"], rows, columns, 3)) for _ in range(3))
-    ids, kinds, table = view(seen.face_ids), integers(worn.materials), incidence("faces", faces, sizes["V"], "vertices")
-    cuts = even_cuts(seen.face_ids.numel())
+    ids, kinds, table = seen.face_ids, integers(worn.materials), incidence("faces", faces, sizes["V"], "vertices")
+    count = seen.face_ids.numel()
     inputs = [
         ids, vectors(seen.barycentrics), vectors(vertices), vectors(normals), scalars(transfer), scalars(stretch),
-        view(table.table), kinds, view(texture.uv.contiguous(), wp.vec2f), integers(texture.uv_faces),
-        view(_addresses(texture.pages, vertices.device)), *texture.pages[0].shape[:2], scalars(worn.looks),
+        table.table, kinds, view(texture.uv.contiguous(), wp.vec2f), integers(texture.uv_faces),
+        _addresses(texture.pages, vertices.device), *texture.pages[0].shape[:2], scalars(worn.looks),
         vectors(tones), vectors(sky), *lamps.views(), scalars(texels_a_pixel), integers(seeds),
         vectors(light), vectors(tone), vectors(mirrored),
     ]  # fmt: skip
-    launch_ranges(skin_shading.shade, cuts, inputs, like=vertices)
+    launch_ranges(skin_shading.shade, count, inputs, like=vertices)
     depth, focal = scalars(seen.depth), scalars(focals)
     between = torch.zeros_like(light)
     for vertical, source, target in ((0, light, between), (1, between, light)):
         widths = wp.vec3f(*LIGHT_WIDTHS)
         inputs = [ids, depth, kinds, focal, widths, LIGHT_REACH, vertical, vectors(source), vectors(target)]
-        launch_ranges(skin_shading.scatter, cuts, inputs, like=vertices)
+        launch_ranges(skin_shading.scatter, count, inputs, like=vertices)
     size = (sizes["B"], rows // samples, columns // samples)
     color, (alpha, mask, nearest) = vertices.new_empty((*size, 3)), (vertices.new_empty(size) for _ in range(3))
     inputs = [
         ids, depth, kinds, n_hand_faces, ring, vectors(light), vectors(tone), vectors(mirrored),
-        vectors(color), view(alpha), view(mask), view(nearest),
+        vectors(color), alpha, mask, nearest,
     ]  # fmt: skip
-    launch_ranges(skin_shading.resolve, even_cuts(alpha.numel()), inputs, like=vertices)
+    launch_ranges(skin_shading.resolve, alpha.numel(), inputs, like=vertices)
     return Shaded(color, alpha, mask, nearest, tone)

@@ -11,7 +11,7 @@ from torch import Tensor
 from oasis_kernels.scene import surface_patterns as kernels
 from oasis_warp.core.checks import check_index, check_positive, check_shape
 from oasis_warp.ops._runtime.declaration import Array, Declaration
-from oasis_warp.ops._runtime.launch import even_cuts, launch, launch_ranges, view
+from oasis_warp.ops._runtime.launch import launch, launch_ranges
 from oasis_warp.synthetic.ops.views import integers, scalars, vectors
 
 
@@ -43,11 +43,10 @@ def surface_noise(points: Float[Tensor, "N 3"], fields: Sequence[NoiseField]) ->
 
     points, out = points.detach().float(), points.new_empty((len(fields), len(points)), dtype=torch.float32)
     inputs = [
-        vectors(points), view(column([f.cell for f in fields], torch.float32)),
-        view(column([f.seed for f in fields], torch.int32)), view(column([f.octaves for f in fields], torch.int32)),
-        view(out),
+        vectors(points), column([f.cell for f in fields], torch.float32), column([f.seed for f in fields], torch.int32),
+        column([f.octaves for f in fields], torch.int32), out,
     ]  # fmt: skip
-    launch_ranges(kernels.noise, even_cuts(len(points)), inputs, like=points)
+    launch_ranges(kernels.noise, len(points), inputs, like=points)
     return out
 
 
@@ -135,7 +134,7 @@ def surface_dabs(
     out = points.new_zeros((n_kinds, len(points)))
     inputs = [
         vectors(centers.float()), scalars(widths.float()), scalars(strengths.float()), integers(kinds), flat,
-        vectors(points), view(numbers), view(starts), wp.vec3f(*low), cell, wp.vec3i(*size), view(out),
+        vectors(points), numbers, starts, wp.vec3f(*low), cell, wp.vec3i(*size), out,
     ]  # fmt: skip
     launch(kernels.dabs, len(centers), inputs, like=points)
     return out

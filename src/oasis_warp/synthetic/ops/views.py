@@ -10,14 +10,14 @@ from torch import Tensor
 from oasis_warp.ops._runtime.launch import view
 
 
-def scalars(tensor: Tensor) -> Any:
+def scalars(tensor: Tensor) -> Tensor:
     """An array of numbers."""
-    return view(tensor.contiguous())
+    return tensor.contiguous()
 
 
-def integers(tensor: Tensor) -> Any:
+def integers(tensor: Tensor) -> Tensor:
     """An array of int32."""
-    return view(tensor.to(torch.int32).contiguous())
+    return tensor.to(torch.int32).contiguous()
 
 
 def vectors(tensor: Tensor) -> Any:
