@@ -12,7 +12,7 @@ from oasis_warp.ops import depth_map
 from oasis_warp.render.render import render
 from studies.painted_truth import Chart, draw_truth, make_truth
 
-SIZE = 256
+SIZE = 192
 
 
 @pytest.fixture(scope="module")
