@@ -19,20 +19,19 @@ from oasis_warp.bench import speed
 from oasis_warp.bench.operators import OPERATORS, exact
 from oasis_warp.bench.scenes import GaussianScene, hand_scenes, surfels
 from oasis_warp.bench.timing import synchronise
+from oasis_warp.bench.variants import timed_pass
 
 DEVICE = torch.device(os.environ.get("BENCH_DEVICE", "cpu"))
 SIZE = int(os.environ.get("BENCH_SIZE", "256"))
 GAUSSIANS = int(os.environ.get("BENCH_GAUSSIANS", "20000"))
 THREADS = int(os.environ.get("BENCH_THREADS", "1"))
-BACKENDS = speed.backends(DEVICE)
 VALUES, GRADIENTS = 5e-6, 5e-5
 """Largest relative errors of ours; torch's depth buffer and gradients in float32 are worse."""
 CASES = [
     pytest.param(name, pass_, backend, id=f"{name}-{pass_.replace(' + ', '_and_')}-{backend}")
     for name, operator in OPERATORS.items()
     for pass_ in operator.passes
-    for backend in BACKENDS
-    if BACKENDS[backend].choose(operator) is not None
+    for backend in speed.ways(operator, DEVICE)
 ]
 
 
@@ -58,8 +57,8 @@ def truths(scenes):
 def test_operator(benchmark, scenes, truths, name, pass_, backend):
     operator = OPERATORS[name]
     scene = scenes[0] if operator.scene is GaussianScene else scenes[1]
-    runs = speed.timed_passes(operator, scene, {backend: BACKENDS[backend]}, truths(name), THREADS)
-    timed = runs[pass_, backend]
+    truth = truths(name)
+    timed = timed_pass(operator, scene, speed.ways(operator, DEVICE)[backend], pass_, truth, THREADS)
     benchmark.group = f"{name}, {pass_}"
 
     def call():
@@ -67,7 +66,8 @@ def test_operator(benchmark, scenes, truths, name, pass_, backend):
         synchronise()
 
     with timed.ready():
-        value_error, gradient_error = speed.errors(truths(name), timed)
+        found = timed.run()
+        value_error, gradient_error = truth.value_error(found.values), truth.gradient_error(found.gradients)
         if backend != "torch":
             assert value_error <= VALUES
             assert gradient_error is None or gradient_error <= GRADIENTS

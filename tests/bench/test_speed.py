@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from oasis_warp.bench import speed
+from oasis_warp.bench.knobs import generic_kernels
 from oasis_warp.bench.operators import OPERATORS, forward
 from oasis_warp.bench.rows import json_text
 from oasis_warp.bench.scenes import hand_scenes
-from oasis_warp.bench.speed import generic_kernels
 
 CPU_ONCE = speed.RunOptions(device=torch.device("cpu"), repeats=2)
 

@@ -1,6 +1,6 @@
 """Error against run time: what each setting of each operator costs and buys."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -8,17 +8,7 @@ import torch
 
 from oasis_warp.bench import knobs
 from oasis_warp.bench.knobs import Setting
-from oasis_warp.bench.operators import (
-    OPERATORS,
-    Exact,
-    Operator,
-    Outputs,
-    Pass,
-    Results,
-    exact,
-    forward,
-    with_gradients,
-)
+from oasis_warp.bench.operators import OPERATORS, Exact, Operator, Results, forward
 from oasis_warp.bench.rows import provenance, scene_columns
 from oasis_warp.bench.scenes import (
     GaussianScene,
@@ -31,9 +21,8 @@ from oasis_warp.bench.scenes import (
     opaque,
     slivers,
 )
-from oasis_warp.bench.timing import Timed, make_yardstick, peak_megabytes, time_together
+from oasis_warp.bench.variants import Measured, cost_ms, measure_settings_of
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.ops._runtime.rules import using
 from oasis_warp.reference.errors import largest_error, psnr, relative_error, same_bits
 
 SWEPT = ("rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "skin")
@@ -101,11 +90,8 @@ class SettingRow:
 
     @property
     def cost_ms(self) -> float:
-        """What settings are compared by: CPU time for one thread, else the fastest call.
-
-        Other work on the machine delays a call, but hardly adds to its CPU time.
-        """
-        return self.fastest_ms if self.cpu_ms is None or self.threads > 1 else self.cpu_ms
+        """What settings are compared by: see `variants.cost_ms`."""
+        return cost_ms(self.fastest_ms, self.cpu_ms, self.threads)
 
     @property
     def is_default(self) -> bool:
@@ -161,104 +147,51 @@ def measure_settings(sweep: Sweep, progress: Progress = silent) -> list[SettingR
     return rows
 
 
-@dataclass(frozen=True)
-class Variant:
-    """A pass of an operator on a scene with one setting."""
-
-    setting: Setting
-    pass_: Pass
-    run: Callable[[], Results]
-    threads: int
-
-
 def measure_operator(
     operator: Operator, scene: Any, sweep: Sweep, after_round: Callable[[int], object]
 ) -> list[SettingRow]:
     """Rows of one operator on one scene, all settings timed in turns."""
     scene = scene.to(device=sweep.device)
-    truth = exact(operator, scene)
-    variants = [
-        make_variant(operator, scene, setting, pass_, truth, setting.threads or sweep.threads)
-        for setting in sweep.settings(operator.name, sweep.device, sweep.threads, sweep.max_threads)
-        for pass_ in operator.passes
-    ]
-    timings = time_together(
-        [Timed(make_yardstick(), 1), *(Timed(v.run, v.threads) for v in variants)], sweep.repeats, after_round
+    settings = sweep.settings(operator.name, sweep.device, sweep.threads, sweep.max_threads)
+    truth, found = measure_settings_of(
+        operator, scene, settings, sweep.device, sweep.threads, sweep.repeats, after_round
     )
-    yardstick, *timings = timings
-    results = {(v.setting, v.pass_): v.run() for v in variants}
     common = {
         **scene_columns(scene),
         "op": operator.name,
         **provenance(sweep.device),
-        "yardstick_ms": yardstick.cpu_ms,
         "floor_rel_l2": reference_floor(operator, scene, truth),
         "fragile_percent": truth.fragile_percent,
     }
+    results = {(m.setting.knob, m.setting.value, m.pass_): m.results for m in found}
     return [
         SettingRow(
             **common,
-            pass_=variant.pass_,
-            knob=variant.setting.knob,
-            value=variant.setting.value,
-            threads=variant.threads,
-            median_ms=timing.median_ms,
-            iqr_ms=timing.iqr_ms,
-            fastest_ms=timing.fastest_ms,
-            repeats=len(timing.times_ms),
-            first_ms=timing.first_ms,
-            cpu_ms=timing.cpu_ms if sweep.device.type == "cpu" else None,
-            peak_mb=peak_megabytes(variant.run, sweep.device),
-            **error_columns(operator, scene, variant, truth, results),
+            **m.columns,
+            yardstick_ms=m.yardstick_ms,
+            knob=m.setting.knob,
+            value=m.setting.value,
+            **error_columns(operator, scene, m, truth, results),
         )
-        for variant, timing in zip(variants, timings, strict=True)
+        for m in found
     ]
 
 
-def make_variant(
-    operator: Operator, scene: Any, setting: Setting, pass_: Pass, truth: Exact, threads: int
-) -> Variant:
-    """The call to time; what a setting does to the scene is done before."""
-    prepared = setting.prepare(scene)
-    call = operator.torch_call if setting.torch else operator.call
-    if pass_ == "forward":
-
-        def run() -> Results:
-            return Results(forward(call, prepared, setting.options))
-    else:
-        weights = fitted(truth.weights, setting, prepared)
-        run = with_gradients(operator, call, prepared, setting.options, weights)
-
-    def run_by_rules() -> Results:
-        with using(setting.rules):
-            return run()
-
-    return Variant(setting, pass_, run_by_rules, threads)
-
-
-def fitted(weights: Outputs, setting: Setting, prepared: Any) -> Outputs:
-    """Weights of the loss in the precision and size of a setting's outputs; of smaller images the first pixels'."""
-    cast = tuple(w.to(setting.dtype) for w in weights)
-    if setting.shrink == 1:
-        return cast
-    return tuple(w[:, : prepared.height, : prepared.width].contiguous() if w.dim() == 4 else w for w in cast)
-
-
 def error_columns(
-    operator: Operator, scene: Any, variant: Variant, truth: Exact, results: dict[tuple[Setting, Pass], Results]
+    operator: Operator, scene: Any, measured: Measured, truth: Exact, results: Mapping[tuple[str, str, str], Results]
 ) -> dict[str, Any]:
-    """The columns of a row that say how exact a variant is."""
-    setting, pass_ = variant.setting, variant.pass_
-    raw = results[setting, "forward"]
-    finished = setting.finish(raw.values)
+    """The columns of a row that say how exact it is, given the results by knob, value and pass."""
+    setting, pass_ = measured.setting, measured.pass_
+    raw = results[setting.knob, setting.value, "forward"].values
+    usual = (knobs.DEFAULT.knob, knobs.DEFAULT.value)
+    finished = setting.finish(raw)
     outputs = operator.comparable(finished)
-    default = next(s for s, _ in results if s.knob == "default")
-    same = same_bits(raw.values, results[default, "forward"].values)
+    same = same_bits(raw, results[*usual, "forward"].values)
     gradient_error = None
     if pass_ == "forward + backward":
-        gradients = results[setting, pass_].gradients
+        gradients = measured.results.gradients
         found = setting.spread(gradients, scene)
-        same = same and same_bits(gradients, results[default, pass_].gradients)
+        same = same and same_bits(gradients, results[*usual, pass_].gradients)
         gradient_error = None if found is None else truth.gradient_error(found)
     return {
         "rel_l2": truth.value_error(finished),

@@ -16,7 +16,7 @@ from oasis_warp.bench.avatar_scene import (
     many_poses,
     pose_avatar,
 )
-from oasis_warp.bench.operators import OPERATORS, Call, Exact, Operator, Pass, Results, exact, forward, with_gradients
+from oasis_warp.bench.operators import OPERATORS, Call, Exact, Operator, Pass, Results, exact, one_pass
 from oasis_warp.bench.scenes import HAND_GAUSSIANS, GaussianScene, MeshScene, hand_scenes, surfels
 from oasis_warp.core.config import BLACK
 from oasis_warp.ops import RecordedRasterization
@@ -91,7 +91,7 @@ def image_case(gaussians: int, size: int, pass_: Pass, n_views: int = 1, recorde
 
         case = operator_case(name, RASTERIZATION, scene.to(device=device), pass_, {} if recorded else peers)
         if recorded:
-            run = runner(RASTERIZATION, draw_recorded, scene.to(device=device), pass_, {}, case.truth)
+            run = one_pass(RASTERIZATION, draw_recorded, scene.to(device=device), pass_, {}, case.truth.weights)
             return replace(case, implementations={OURS: Implementation(run, None)})
         return case
 
@@ -109,22 +109,17 @@ def visibility_case(size: int, pass_: Pass) -> CaseMaker:
     return CaseMaker(name, pass_, make)
 
 
-def runner(
-    operator: Operator, call: Call, scene: Any, pass_: Pass, options: Mapping[str, Any], truth: Exact
-) -> Callable[[], Results]:
-    """A pass of a call on a scene."""
-    if pass_ == "forward":
-        return lambda: Results(forward(call, scene, options))
-    return with_gradients(operator, call, scene, options, tuple(w.to(torch.float32) for w in truth.weights))
-
-
 def operator_case(
     name: str, operator: Operator, scene: GaussianScene | MeshScene, pass_: Pass, peers: Peers
 ) -> GpuCase:
     """A pass of an operator on a scene; `peers` do the same."""
     truth = exact(operator, scene)
-    ours = runner(operator, operator.call, scene, pass_, UNVALIDATED, truth)
-    others = {k: Implementation(runner(operator, call, scene, pass_, {}, truth), None) for k, call in peers.items()}
+
+    def run(call: Call, options: Mapping[str, Any]) -> Callable[[], Results]:
+        return one_pass(operator, call, scene, pass_, options, truth.weights)
+
+    ours = run(operator.call, UNVALIDATED)
+    others = {name: Implementation(run(call, {}), None) for name, call in peers.items()}
     drawn = isinstance(scene, GaussianScene)
     return GpuCase(
         name=name,

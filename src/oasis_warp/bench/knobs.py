@@ -1,8 +1,11 @@
 """The knobs of the operators: thresholds, precision, threads, and how much of a scene is drawn."""
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -10,9 +13,29 @@ from torch.nn.functional import interpolate
 
 from oasis_warp.bench.operators import Outputs
 from oasis_warp.bench.scenes import GaussianScene, MeshScene
-from oasis_warp.ops._runtime.rules import Rules
+from oasis_warp.ops._runtime import depth_buffer
+from oasis_warp.ops._runtime.rules import Rules, using
 
 RULES = Rules()
+
+
+@contextmanager
+def generic_kernels() -> Iterator[None]:
+    """Use the generic kernels inside the block, for float32 on the CPU too, and fill depth buffers as on CUDA.
+
+    This is not an option of the operators, because only a benchmark needs it.
+    """
+
+    def no(tensor: Tensor) -> bool:
+        return False
+
+    modules = [module for name, module in sys.modules.items() if name.startswith("oasis_warp.ops.")]
+    with ExitStack() as patched:
+        for module in modules:
+            if hasattr(module, "has_vectors"):
+                patched.enter_context(patch.object(module, "has_vectors", no))
+        patched.enter_context(patch.object(depth_buffer, "draw_by_vectors", depth_buffer.draw_by_faces))
+        yield
 
 
 @dataclass(frozen=True, eq=False)  # a setting equals itself only, and so can be a key
@@ -33,6 +56,14 @@ class Setting:
     """Factor by which each side of the image has fewer pixels."""
     torch: bool = False
     """Whether torch computes it instead of the kernels."""
+    generic: bool = False
+    """Whether the generic kernels compute it, where vectorised ones would."""
+
+    @contextmanager
+    def around(self) -> Iterator[None]:
+        """What is set up for every call."""
+        with using(self.rules), generic_kernels() if self.generic else nullcontext():
+            yield
 
     def prepare(self, scene: Any) -> Any:
         """The scene to draw with this setting."""
@@ -68,6 +99,7 @@ EXPONENTIAL = tuple(Setting("exp degree", str(degree), Rules(exp_degree=degree))
 """Of the float32 kernels of the CPU; CUDA computes exponentials in hardware."""
 FLOAT64 = Setting("precision", "float64", dtype=torch.float64)
 TORCH = Setting("torch", "float32", torch=True)
+GENERIC = Setting("generic", "float32", generic=True)
 UNCHECKED = Setting("validate", "False", options={"validate": False})
 TILES = tuple(Setting("tile", f"{size} px", options={"tile_size": size}) for size in (8, 32))
 GAUSSIANS = tuple(Setting("Gaussians", f"{share:.0%}", share=share) for share in (0.75, 0.5, 0.25))

@@ -144,9 +144,7 @@ def _depths_in_torch(scene: MeshScene) -> Outputs:
 
 
 def _visibility_in_torch(scene: MeshScene) -> Outputs:
-    return (
-        visibility.depth_visibility(scene.points, scene.posed_vertices, scene.faces, scene.camera, dense=False),
-    )
+    return (visibility.depth_visibility(scene.points, scene.posed_vertices, scene.faces, scene.camera, dense=False),)
 
 
 def _posing(face_rotations: Call, pose_on_mesh: Call) -> Call:
@@ -231,6 +229,15 @@ def with_gradients(
     return run
 
 
+def one_pass(
+    operator: Operator, call: Call, scene: Any, pass_: str, options: Mapping[str, Any], weights: Outputs
+) -> Callable[[], Results]:
+    """A pass of a call on a scene, to repeat; `weights` are those of the loss."""
+    if pass_ == "forward":
+        return lambda: Results(forward(call, scene, options))
+    return with_gradients(operator, call, scene, options, weights)
+
+
 class Exact(NamedTuple):
     """What results are compared with: the float64 kernels on the same float32 numbers, with gsplat's rules."""
 
@@ -238,7 +245,7 @@ class Exact(NamedTuple):
     """In comparable form."""
     gradients: Outputs
     weights: Outputs = ()
-    """Of the loss whose gradients are taken: random signs, 0 where rounding decides what is drawn."""
+    """Of the loss whose gradients are taken: random signs in float32, 0 where rounding decides what is drawn."""
     judged: Tensor | None = None
     """Pixels [C, H, W] where no decision depends on rounding; None where every result counts."""
     comparable: Callable[[Outputs], Outputs] = unchanged
@@ -258,8 +265,7 @@ class Exact(NamedTuple):
 
     def gradient_error(self, gradients: Outputs) -> float | None:
         """Largest relative error of any gradient; None where there is none."""
-        errors = (relative_error(g, e) for g, e in zip(gradients, self.gradients, strict=True))
-        return max(errors, default=None)
+        return max(map(relative_error, gradients, self.gradients), default=None)
 
 
 def exact(operator: Operator, scene: Any) -> Exact:
@@ -277,4 +283,5 @@ def exact(operator: Operator, scene: Any) -> Exact:
         signs = (torch.randint(0, 2, output.shape, generator=generator) * 2.0 - 1).to(output)
         weights.append(signs if judged is None else signs * judged[..., None])
     taken = with_gradients(operator, operator.call, wide, {}, tuple(weights))().gradients if operator.leaves else ()
-    return Exact(operator.comparable(outputs), taken, tuple(weights), judged, operator.comparable)
+    single = tuple(w.to(torch.float32) for w in weights)
+    return Exact(operator.comparable(outputs), taken, single, judged, operator.comparable)

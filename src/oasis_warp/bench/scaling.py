@@ -13,7 +13,7 @@ from torch import Tensor
 from oasis_warp.bench.counts import Counts, count
 from oasis_warp.bench.cuda import GRAPH_CALLS, NotCaptured, capture
 from oasis_warp.bench.gpu_cases import PASSES, RASTERIZATION, UNVALIDATED
-from oasis_warp.bench.operators import Results, forward, with_gradients
+from oasis_warp.bench.operators import Results, forward, one_pass
 from oasis_warp.bench.rows import provenance
 from oasis_warp.bench.scenes import GaussianScene, crop, giants, one_tile, surface
 from oasis_warp.bench.timing import Probe, peak_megabytes, synchronise, time_groups
@@ -144,19 +144,16 @@ def measure_point(point: Point, device: torch.device, seconds: float, seed: int)
     generator = torch.Generator().manual_seed(seed)
     shape = len(scene.viewmats), scene.height, scene.width, 3
     signs = (torch.randint(0, 2, shape, generator=generator, dtype=torch.int8) * 2.0 - 1).to(device)
-    calls: tuple[Callable[[], Results], ...] = (
-        lambda: Results(forward(RASTERIZATION.call, scene, UNVALIDATED)),
-        with_gradients(RASTERIZATION, RASTERIZATION.call, scene, UNVALIDATED, (signs,)),
-    )
     rows, error = [], None
-    for pass_, run in zip(PASSES, calls, strict=True):
+    for pass_ in PASSES:
+        run = one_pass(RASTERIZATION, RASTERIZATION.call, scene, pass_, UNVALIDATED, (signs,))
         for _ in range(SETTLED):
             found = run()
         finite = all(bool(t.isfinite().all()) for t in found.tensors)
         error = error or picture_errors(scene, found.values[0], work)
         del found
         memory = peak_megabytes(run, device)
-        times = timed(run, device, seconds / len(calls))
+        times = timed(run, device, seconds / len(PASSES))
         rows.append(
             ScalingRow(
                 axis=point.axis,
@@ -282,4 +279,3 @@ def steepest(rows: Sequence[ScalingRow]) -> list[Growth]:
         ]
         found += [max(steps, key=lambda step: step.ratio)] if steps else []
     return found
-
