@@ -216,7 +216,9 @@ def rotate(q: wp.vec4d, v: wp.vec3d) -> wp.vec3d:
 def rotate_gradient(q: wp.vec4d, v: wp.vec3d, g: wp.vec3d) -> wp.vec4d:
     """Gradient by `q` of g . rotate(q, v)."""
     u = wp.vec3d(q[1], q[2], q[3])
-    by_u = TWO * (q[0] * wp.cross(v, g) + wp.dot(g, u) * v + wp.dot(u, v) * g - TWO * wp.dot(g, v) * u)
+    by_u = TWO * (
+        q[0] * wp.cross(v, g) + wp.dot(g, u) * v + wp.dot(u, v) * g - TWO * wp.dot(g, v) * u
+    )
     return wp.vec4d(TWO * wp.dot(g, wp.cross(u, v)), by_u[0], by_u[1], by_u[2])
 
 

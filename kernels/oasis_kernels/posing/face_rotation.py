@@ -334,7 +334,9 @@ def face_rotations_backward(
     if grad_rest.shape[0] > 0:
         area = area_gradient(by_rest, before)
         damping = longest_gradient(DAMPING * by_damping, before)
-        store_corners(grad_rest, f, before_grad.e1 + area.e1 + damping.e1, before_grad.e2 + area.e2 + damping.e2)
+        store_corners(
+            grad_rest, f, before_grad.e1 + area.e1 + damping.e1, before_grad.e2 + area.e2 + damping.e2
+        )
 
 
 for real in (wp.float32, wp.float64):

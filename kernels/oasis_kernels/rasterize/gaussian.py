@@ -113,7 +113,9 @@ def factor(covariance: wp.mat33d) -> wp.mat33d:
 
 
 @wp.func
-def splat(point: wp.vec3d, camera: wp.mat33d, f: wp.mat33d, intrinsics: wp.vec4d, size: wp.vec2d, ortho: int) -> Splat:
+def splat(
+    point: wp.vec3d, camera: wp.mat33d, f: wp.mat33d, intrinsics: wp.vec4d, size: wp.vec2d, ortho: int
+) -> Splat:
     """The Gaussian at `point` (z > 0) with covariance f f^T: EWA splatting (Zwicker et al. 2001, eq. 23 to 31)."""
     s = Splat()
     fx, fy = intrinsics[0], intrinsics[1]

@@ -45,7 +45,9 @@ def camera_translation(viewmats: wp.array3d(dtype=Any), c: int) -> wp.vec3d:
 @wp.func
 def camera_intrinsics(Ks: wp.array3d(dtype=Any), c: int) -> wp.vec4d:
     """(fx, fy, cx, cy)."""
-    return wp.vec4d(wp.float64(Ks[c, 0, 0]), wp.float64(Ks[c, 1, 1]), wp.float64(Ks[c, 0, 2]), wp.float64(Ks[c, 1, 2]))
+    return wp.vec4d(
+        wp.float64(Ks[c, 0, 0]), wp.float64(Ks[c, 1, 1]), wp.float64(Ks[c, 0, 2]), wp.float64(Ks[c, 1, 2])
+    )
 
 
 @wp.func
@@ -155,7 +157,9 @@ def project(scalar: Any) -> Any:
         covars2d[index] = cov
         conics[index] = vec3(scalar(cov[2] / det), scalar(-cov[1] / det), scalar(cov[0] / det))
         whole_x, whole_y = scalar(wp.floor(x)), scalar(wp.floor(y))
-        centers[index] = vec4(whole_x, whole_y, scalar(x - wp.float64(whole_x)), scalar(y - wp.float64(whole_y)))
+        centers[index] = vec4(
+            whole_x, whole_y, scalar(x - wp.float64(whole_x)), scalar(y - wp.float64(whole_y))
+        )
         whitenings[index] = vec4(whitening(cov, det))
 
     return project
@@ -263,7 +267,9 @@ def project_backward(scalar: Any) -> Any:
             axes = rotation(q)
             g_f = two * (sum_covariance * f)  # f = axes * scale
             g_scales[i] = vec3(
-                wp.vec3d(wp.dot(axes[:, 0], g_f[:, 0]), wp.dot(axes[:, 1], g_f[:, 1]), wp.dot(axes[:, 2], g_f[:, 2]))
+                wp.vec3d(
+                    wp.dot(axes[:, 0], g_f[:, 0]), wp.dot(axes[:, 1], g_f[:, 1]), wp.dot(axes[:, 2], g_f[:, 2])
+                )
             )
             g_unit = rotation_adjoint(q, g_f * wp.diag(scale))
             g_quats[i] = vec4((g_unit - wp.dot(g_unit, q) * q) / norm)

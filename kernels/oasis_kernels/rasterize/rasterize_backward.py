@@ -82,7 +82,9 @@ def blend_backward(scalar: Any, channels: int, rules: Rules) -> Any:
     ):
         task, lane = wp.tid()
         tile = first + task
-        camera, area = lane_pixels(tile, lane, tile_size, lane_width, lane_height, tiles_x, tiles_y, width, height)
+        camera, area = lane_pixels(
+            tile, lane, tile_size, lane_width, lane_height, tiles_x, tiles_y, width, height
+        )
         start = tile_starts[tile]
         background = backgrounds[camera]
         g_background = color()

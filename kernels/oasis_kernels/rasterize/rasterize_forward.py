@@ -20,17 +20,8 @@ from oasis_kernels.rasterize.gaussian import falloff, whitened
 
 
 @wp.func
-def lane_pixels(
-    tile: int,
-    lane: int,
-    tile_size: int,
-    lane_width: int,
-    lane_height: int,
-    tiles_x: int,
-    tiles_y: int,
-    width: int,
-    height: int,
-):
+def lane_pixels(tile: int, lane: int, tile_size: int, lane_width: int, lane_height: int, tiles_x: int, tiles_y: int,
+                width: int, height: int):
     """Camera and pixels x0, y0, x1, y1 (past the end) of a lane; the rectangle may be empty."""
     camera = tile // (tiles_x * tiles_y)
     tile_y = tile // tiles_x - camera * tiles_y
@@ -81,7 +72,9 @@ def blend(scalar: Any, channels: int, rules: Rules) -> Any:
     ):
         task, lane = wp.tid()
         tile = first + task
-        camera, area = lane_pixels(tile, lane, tile_size, lane_width, lane_height, tiles_x, tiles_y, width, height)
+        camera, area = lane_pixels(
+            tile, lane, tile_size, lane_width, lane_height, tiles_x, tiles_y, width, height
+        )
         start = tile_starts[tile]
         count = int(tile_starts[tile + 1] - start)
         for y in range(area[1], area[3]):

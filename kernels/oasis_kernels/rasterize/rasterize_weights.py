@@ -46,7 +46,9 @@ def weigh(scalar: Any, rules: Rules) -> Any:
     ):
         task, lane = wp.tid()
         tile = first + task
-        _camera, area = lane_pixels(tile, lane, tile_size, lane_width, lane_height, tiles_x, tiles_y, width, height)
+        _camera, area = lane_pixels(
+            tile, lane, tile_size, lane_width, lane_height, tiles_x, tiles_y, width, height
+        )
         for y in range(area[1], area[3]):
             for x in range(area[0], area[2]):
                 transmittance[y * width + x] = scalar(1.0)

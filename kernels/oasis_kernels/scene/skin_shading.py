@@ -155,8 +155,12 @@ def shade(
             volume = wp.dot(pu, r1)
             if wp.abs(volume) > 1.0e-14:
                 o = wp.max(0.75, 0.5 * texels_a_pixel[b])
-                hu = height(page, t[0] + o, t[1], fold, wrinkle) - height(page, t[0] - o, t[1], fold, wrinkle)
-                hv = height(page, t[0], t[1] + o, fold, wrinkle) - height(page, t[0], t[1] - o, fold, wrinkle)
+                hu = height(page, t[0] + o, t[1], fold, wrinkle) - height(
+                    page, t[0] - o, t[1], fold, wrinkle
+                )
+                hv = height(page, t[0], t[1] + o, fold, wrinkle) - height(
+                    page, t[0], t[1] - o, fold, wrinkle
+                )
                 gradient = (hu * r1 + hv * r2) / (2.0 * o * volume)
                 steep = wp.length(gradient)
                 gradient = gradient / (1.0 + 0.5 * steep)
