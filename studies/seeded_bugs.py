@@ -240,7 +240,11 @@ BUGS = [
          "return (rest.area + damping) / (posed.area + damping)"),
         ("absolute damping", "damping = DAMPING * rest.longest\n    return", "damping = wp.float64(1e-4)\n    return"),
         ("polar angle of the first edge alone", "length_posed * x - length * x_posed))", "ZERO))"),
-        ("third corner never added", "rows[f, 6 + k] = rows.dtype(e2[k])", "rows[f, 6 + k] = rows.dtype(ZERO)"),
+    ),
+    *_in(
+        "runtime/arrays.py", "faces",
+        ("third corner never added", "a[i, 6 + k] = a.dtype(corners[2, k] + e2[k])",
+         "a[i, 6 + k] = a.dtype(corners[2, k])"),
     ),
     *_in(
         "posing/face.h", "faces",
@@ -259,13 +263,12 @@ BUGS = [
     ),
     *_in(
         "posing/barycentric.py", "posing",
-        ("dq and q swapped", "turned = multiply(mix(f, faces, b, vertex_quats).unit, row4(quats, i))",
-         "turned = multiply(row4(quats, i), mix(f, faces, b, vertex_quats).unit)"),
+        ("dq and q swapped", "multiply(rotation, row4(quats, i))", "multiply(row4(quats, i), rotation)"),
         ("no sign alignment among the corners", "if wp.dot(q, reference) < ZERO:", "if wp.dot(q, reference) < -ONE:"),
         ("area ratio detached", "return HALF * wp.float64(half_powers) * growth(ratio, half_powers) / ratio",
          "return ZERO"),
-        ("third corner left out of the mean", "for k in range(3):\n        mean += b[k] * row3(vertices",
-         "for k in range(2):\n        mean += b[k] * row3(vertices"),
+        ("third corner left out of the mean", "for k in range(3):\n            mean += b[k] * row3(vertices",
+         "for k in range(2):\n            mean += b[k] * row3(vertices"),
     ),
     *_in(
         "posing/mesh_gaussians.cpp", "posing",

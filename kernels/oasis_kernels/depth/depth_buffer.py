@@ -24,15 +24,14 @@ from typing import Any
 
 import warp as wp
 
+from oasis_kernels.runtime.arrays import HALF, ONE, ZERO
+
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BOX_MARGIN = wp.constant(wp.float64(1e-3))
 """Pixels added round a projected triangle, so that rounding of the box never decides about a pixel on an edge."""
 EDGE_ON = wp.constant(wp.float64(1e-13))
 """A ray within this sine of the triangle's plane misses it; float64 rounding of a unit normal, with a margin of 500."""
-ZERO = wp.constant(wp.float64(0.0))
-HALF = wp.constant(wp.float64(0.5))
-ONE = wp.constant(wp.float64(1.0))
 
 
 @wp.struct

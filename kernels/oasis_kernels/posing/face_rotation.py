@@ -1,7 +1,7 @@
-"""How each face, and the surface round each vertex, has turned from the rest mesh to the posed one.
+"""How each face, and the surface around each vertex, has rotated from the rest mesh to the posed one.
 
-`face_rotations` (one thread a face) -> `vertex_rotations` (one thread a vertex, over its faces). Backward:
-`vertex_rotations_backward` (one thread a vertex) -> `face_rotations_backward` (one thread a face; reads its three
+`face_rotations` (one thread per face) -> `vertex_rotations` (one per vertex, over its faces). Backward:
+`vertex_rotations_backward` (one per vertex) -> `face_rotations_backward` (one per face; reads its three
 vertices, writes a row of nine for its corners) -> `incidence.sum_rows` (corners to vertices).
 
 Face. With the two edges e1, e2 of a corner at rest, e1', e2' posed, and unit normals n, n', the rotation takes n to n'
@@ -20,7 +20,8 @@ from typing import Any
 
 import warp as wp
 
-from oasis_kernels.runtime.arrays import row3, row4
+from oasis_kernels.posing.quaternions import conjugate, rotate
+from oasis_kernels.runtime.arrays import HALF, ONE, TWO, ZERO, put4, put_corners, row3, row4
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,10 +29,6 @@ FLAT = wp.constant(wp.float64(1e-6))
 """A triangle with |e1 x e2| up to this share of its longest edge squared has no plane worth the name."""
 DAMPING = wp.constant(wp.float64(0.5e-6))
 """Area, as a share of the longest rest edge squared, added to both areas of a ratio: it stays finite for slivers."""
-ZERO = wp.constant(wp.float64(0.0))
-HALF = wp.constant(wp.float64(0.5))
-ONE = wp.constant(wp.float64(1.0))
-TWO = wp.constant(wp.float64(2.0))
 
 
 @wp.struct
@@ -83,14 +80,6 @@ def quaternion(m: wp.mat33d) -> wp.vec4d:
 
 
 @wp.func
-def rotate(q: wp.vec4d, v: wp.vec3d) -> wp.vec3d:
-    """R(q) v for a unit wxyz quaternion."""
-    u = wp.vec3d(q[1], q[2], q[3])
-    t = TWO * wp.cross(u, v)
-    return v + q[0] * t + wp.cross(u, t)
-
-
-@wp.func
 def rotation_between(rest: Plane, posed: Plane) -> wp.vec4d:
     """Takes the rest plane to the posed one; in the plane, the rotation nearest to the map of the edges."""
     length = wp.length(rest.e1)
@@ -103,12 +92,12 @@ def rotation_between(rest: Plane, posed: Plane) -> wp.vec4d:
     b_posed = wp.cross(posed.normal, t_posed)
     x_posed = wp.dot(posed.e2, t_posed)
     y_posed = wp.dot(posed.e2, b_posed)
-    turn = wp.normalize(wp.vec2d(length_posed * y + length * y_posed, length_posed * x - length * x_posed))
-    cos = turn[0]
-    sin = turn[1]
-    t_turned = cos * t_posed + sin * b_posed
-    b_turned = cos * b_posed - sin * t_posed
-    return quaternion(wp.outer(t_turned, t) + wp.outer(b_turned, b) + wp.outer(posed.normal, rest.normal))
+    polar = wp.normalize(wp.vec2d(length_posed * y + length * y_posed, length_posed * x - length * x_posed))
+    cos = polar[0]
+    sin = polar[1]
+    t_rotated = cos * t_posed + sin * b_posed
+    b_rotated = cos * b_posed - sin * t_posed
+    return quaternion(wp.outer(t_rotated, t) + wp.outer(b_rotated, b) + wp.outer(posed.normal, rest.normal))
 
 
 @wp.func
@@ -138,8 +127,7 @@ def face_rotations(
     if before.proper and after.proper:
         q = rotation_between(before, after)
         weight = before.area
-    for k in range(4):
-        quats[f, k] = quats.dtype(q[k])
+    put4(quats, f, q)
     area_ratio[f] = area_ratio.dtype(damped_ratio(before, after))
     areas[f, 0] = weight
     areas[f, 1] = before.area + DAMPING * before.longest
@@ -189,8 +177,7 @@ def vertex_rotations(
         q = total / norm
     elif fallback.shape[0] > 0:
         q = row4(face_quats, fallback[0])
-    for k in range(4):
-        quats[v, k] = quats.dtype(q[k])
+    put4(quats, v, q)
     ratio = ONE
     if rest > ZERO:
         ratio = posed / rest
@@ -236,7 +223,7 @@ class Edges:
 
 
 @wp.func
-def turn_gradient(omega: wp.vec3d, tri: Plane, e1: wp.vec3d, e2: wp.vec3d) -> Edges:
+def rotation_gradient(omega: wp.vec3d, tri: Plane, e1: wp.vec3d, e2: wp.vec3d) -> Edges:
     """Gradient with respect to the edges of `tri` of a rotation onto it, given the gradient `omega` by its spin.
 
     `e1`, `e2` are the other triangle's edges after that rotation. A small change of tri.e1, tri.e2 spins the rotation
@@ -273,14 +260,6 @@ def longest_gradient(grad: wp.float64, tri: Plane) -> Edges:
     return out
 
 
-@wp.func
-def store_corners(rows: wp.array2d[Any], f: int, e1: wp.vec3d, e2: wp.vec3d):
-    for k in range(3):
-        rows[f, k] = rows.dtype(-e1[k] - e2[k])
-        rows[f, 3 + k] = rows.dtype(e1[k])
-        rows[f, 6 + k] = rows.dtype(e2[k])
-
-
 @wp.kernel
 def face_rotations_backward(
     first: int,
@@ -292,8 +271,8 @@ def face_rotations_backward(
     grad_sums: wp.array2d[wp.float64],
     grad_face_quats: wp.array2d[Any],
     grad_area_ratio: wp.array[Any],
-    grad_rest: wp.array2d[Any],  # nine values a face; no rows when not wanted
-    grad_posed: wp.array2d[Any],  # nine values a face; no rows when not wanted
+    grad_rest: wp.array2d[Any],  # nine values per face; no rows when not wanted
+    grad_posed: wp.array2d[Any],  # nine values per face; no rows when not wanted
 ):
     f = first + wp.tid()
     before = plane(f, faces, rest)
@@ -324,19 +303,19 @@ def face_rotations_backward(
         g_vector = wp.vec3d(g[1], g[2], g[3])
         q_vector = wp.vec3d(q[1], q[2], q[3])
         omega = HALF * (q[0] * g_vector - g[0] * q_vector - wp.cross(g_vector, q_vector))
-        back = wp.vec4d(q[0], -q[1], -q[2], -q[3])
-        after_grad = turn_gradient(omega, after, rotate(q, before.e1), rotate(q, before.e2))
-        before_grad = turn_gradient(-rotate(back, omega), before, rotate(back, after.e1), rotate(back, after.e2))
+        back = conjugate(q)
+        after_grad = rotation_gradient(omega, after, rotate(q, before.e1), rotate(q, before.e2))
+        before_grad = rotation_gradient(-rotate(back, omega), before, rotate(back, after.e1), rotate(back, after.e2))
 
     if grad_posed.shape[0] > 0:
         area = area_gradient(by_posed, after)
-        store_corners(grad_posed, f, after_grad.e1 + area.e1, after_grad.e2 + area.e2)
+        put_corners(grad_posed, f, after_grad.e1 + area.e1, after_grad.e2 + area.e2, wp.mat33d())
     if grad_rest.shape[0] > 0:
         area = area_gradient(by_rest, before)
         damping = longest_gradient(DAMPING * by_damping, before)
-        store_corners(
-            grad_rest, f, before_grad.e1 + area.e1 + damping.e1, before_grad.e2 + area.e2 + damping.e2
-        )
+        e1 = before_grad.e1 + area.e1 + damping.e1
+        e2 = before_grad.e2 + area.e2 + damping.e2
+        put_corners(grad_rest, f, e1, e2, wp.mat33d())
 
 
 for real in (wp.float32, wp.float64):
@@ -349,16 +328,5 @@ for real in (wp.float32, wp.float64):
         vertex_rotations_backward,
         {"quats": rows, "area_ratio": values, "sums": rows, "grad_quats": rows, "grad_area_ratio": values},
     )
-    wp.overload(
-        face_rotations_backward,
-        {
-            "rest": rows,
-            "posed": rows,
-            "face_quats": rows,
-            "signs": values,
-            "grad_face_quats": rows,
-            "grad_area_ratio": values,
-            "grad_rest": rows,
-            "grad_posed": rows,
-        },
-    )
+    inputs = dict.fromkeys(("rest", "posed", "face_quats", "grad_face_quats", "grad_rest", "grad_posed"), rows)
+    wp.overload(face_rotations_backward, inputs | {"signs": values, "grad_area_ratio": values})

@@ -1,6 +1,6 @@
-"""Carry Gaussians on the faces of a mesh along with all that happens to the face: not only turned, but stretched.
+"""Pose Gaussians on the faces of a mesh that rotate and stretch with their faces.
 
-`pose` and `pose_backward`: one thread a Gaussian. With edges e_1, e_2 and unit normal n of its face at rest, primes
+`pose` and `pose_backward`: one thread per Gaussian. With edges e_1, e_2 and unit normal n of its face at rest, primes
 when posed, the map of the face and the Gaussian are
 
     F = [e_1' e_2' n'] [e_1 e_2 n]^-1,    mean = sum b_k v_k',    covariance' = F R(q) diag(s)^2 R(q)^T F^T
@@ -9,23 +9,19 @@ F takes lengths along the normal to themselves: a surface has no thickness to ch
 d_1 = e_2 x n / 2A, d_2 = n x e_1 / 2A and n, so F = e_1' d_1^T + e_2' d_2^T + n' n^T. A face that is flat in either
 pose has no such map and leaves covariances alone: F = 1 without gradient.
 
-Backward writes gradients of the three corners as a row of nine a Gaussian; `incidence.sum_rows` adds them at vertices.
+Backward writes gradients of the three corners as a row of nine per Gaussian; `incidence.sum_rows` adds them up.
 """
 
 from typing import Any
 
 import warp as wp
 
-from oasis_kernels.posing.face_rotation import Plane, plane
+from oasis_kernels.posing.face_rotation import Edges, Plane, plane
+from oasis_kernels.posing.quaternions import normalized, normalized_gradient
 from oasis_kernels.rasterize.gaussian import rotation, rotation_adjoint
-from oasis_kernels.runtime.arrays import row3, row4
+from oasis_kernels.runtime.arrays import TWO, ZERO, matrix33, put3, put4, put33, put_corners, row3, row4
 
 wp.set_module_options({"enable_backward": False})
-
-ZERO = wp.constant(wp.float64(0.0))
-ONE = wp.constant(wp.float64(1.0))
-TWO = wp.constant(wp.float64(2.0))
-
 
 @wp.func
 def inverse(rest: Plane) -> wp.mat33d:
@@ -40,25 +36,6 @@ def face_map(rest: Plane, posed: Plane) -> wp.mat33d:
     if rest.proper and posed.proper:
         return wp.matrix_from_cols(posed.e1, posed.e2, posed.normal) * inverse(rest)
     return wp.identity(n=3, dtype=wp.float64)
-
-
-@wp.struct
-class Quaternion:
-    """Of any norm."""
-
-    unit: wp.vec4d
-    norm: wp.float64
-
-
-@wp.func
-def quaternion(quats: wp.array2d[Any], i: int) -> Quaternion:
-    q = row4(quats, i)
-    out = Quaternion()
-    out.norm = wp.length(q)
-    out.unit = wp.vec4d(ONE, ZERO, ZERO, ZERO)
-    if out.norm > ZERO:
-        out.unit = q / out.norm
-    return out
 
 
 @wp.kernel
@@ -79,40 +56,21 @@ def pose(
     mean = wp.vec3d()
     for k in range(3):
         mean += wp.float64(barycentrics[i, k]) * row3(posed, faces[f, k])
-    half = face_map(plane(f, faces, rest), plane(f, faces, posed)) * rotation(quaternion(quats, i).unit)
+    half = face_map(plane(f, faces, rest), plane(f, faces, posed)) * rotation(normalized(row4(quats, i)).unit)
     half = half * wp.diag(row3(scales, i))
-    covar = half * wp.transpose(half)
-    for r in range(3):
-        means[i, r] = means.dtype(mean[r])
-        for c in range(3):
-            covars[i, r, c] = covars.dtype(covar[r, c])
-
-
-@wp.struct
-class Gradient:
-    """With respect to the edges of a triangle."""
-
-    e1: wp.vec3d
-    e2: wp.vec3d
+    put3(means, i, mean)
+    put33(covars, i, half * wp.transpose(half))
 
 
 @wp.func
-def edge_gradient(by_columns: wp.mat33d, of: Plane) -> Gradient:
+def edge_gradient(by_columns: wp.mat33d, of: Plane) -> Edges:
     """Given the gradient by the columns e1, e2, n."""
     by_normal = wp.vec3d(by_columns[0, 2], by_columns[1, 2], by_columns[2, 2])
     by_cross = (by_normal - wp.dot(by_normal, of.normal) * of.normal) / (TWO * of.area)
-    out = Gradient()
+    out = Edges()
     out.e1 = wp.vec3d(by_columns[0, 0], by_columns[1, 0], by_columns[2, 0]) + wp.cross(of.e2, by_cross)
     out.e2 = wp.vec3d(by_columns[0, 1], by_columns[1, 1], by_columns[2, 1]) + wp.cross(by_cross, of.e1)
     return out
-
-
-@wp.func
-def store_corners(rows: wp.array2d[Any], i: int, e1: wp.vec3d, e2: wp.vec3d, b: wp.vec3d, g_mean: wp.vec3d):
-    for k in range(3):
-        rows[i, k] = rows.dtype(b[0] * g_mean[k] - e1[k] - e2[k])
-        rows[i, 3 + k] = rows.dtype(b[1] * g_mean[k] + e1[k])
-        rows[i, 6 + k] = rows.dtype(b[2] * g_mean[k] + e2[k])
 
 
 @wp.kernel
@@ -127,8 +85,8 @@ def pose_backward(
     scales: wp.array2d[Any],
     grad_means: wp.array2d[Any],
     grad_covars: wp.array3d[Any],
-    # Each of these has a row a Gaussian, or none when it is not wanted.
-    grad_rest: wp.array2d[Any],  # nine values: three a corner
+    # Each of these has a row per Gaussian, or none when it is not wanted.
+    grad_rest: wp.array2d[Any],  # nine values: three per corner
     grad_posed: wp.array2d[Any],
     grad_barycentrics: wp.array2d[Any],
     grad_quats: wp.array2d[Any],
@@ -140,16 +98,13 @@ def pose_backward(
     after = plane(f, faces, posed)
     b = row3(barycentrics, i)
     g_mean = row3(grad_means, i)
-    g = wp.mat33d()
-    for r in range(3):
-        for c in range(3):
-            g[r, c] = wp.float64(grad_covars[i, r, c])
+    g = matrix33(grad_covars, i)
     g = g + wp.transpose(g)
     m = face_map(before, after)
-    q = quaternion(quats, i)
-    turn = rotation(q.unit)
+    q = normalized(row4(quats, i))
+    axes = rotation(q.unit)
     scale = row3(scales, i)
-    half = turn * wp.diag(scale)
+    half = axes * wp.diag(scale)
     by_half = g * m * half  # of F half
     by_map = by_half * wp.transpose(half)
     by_half = wp.transpose(m) * by_half
@@ -161,26 +116,21 @@ def pose_backward(
         for k in range(3):
             total = ZERO
             for r in range(3):
-                total += by_half[r, k] * turn[r, k]
+                total += by_half[r, k] * axes[r, k]
             grad_scales[i, k] = grad_scales.dtype(total)
     if grad_quats.shape[0] > 0:
-        by_quat = wp.vec4d()
-        if q.norm > ZERO:
-            by_unit = rotation_adjoint(q.unit, by_half * wp.diag(scale))
-            by_quat = (by_unit - wp.dot(by_unit, q.unit) * q.unit) / q.norm
-        for k in range(4):
-            grad_quats[i, k] = grad_quats.dtype(by_quat[k])
+        put4(grad_quats, i, normalized_gradient(q, rotation_adjoint(q.unit, by_half * wp.diag(scale))))
 
-    of_posed = Gradient()
-    of_rest = Gradient()
+    of_posed = Edges()
+    of_rest = Edges()
     if before.proper and after.proper:
         back = wp.transpose(inverse(before))
         of_posed = edge_gradient(by_map * back, after)
         of_rest = edge_gradient(-wp.transpose(m) * by_map * back, before)
     if grad_posed.shape[0] > 0:
-        store_corners(grad_posed, i, of_posed.e1, of_posed.e2, b, g_mean)
+        put_corners(grad_posed, i, of_posed.e1, of_posed.e2, wp.outer(b, g_mean))
     if grad_rest.shape[0] > 0:
-        store_corners(grad_rest, i, of_rest.e1, of_rest.e2, b, wp.vec3d())
+        put_corners(grad_rest, i, of_rest.e1, of_rest.e2, wp.mat33d())
 
 
 for real in (wp.float32, wp.float64):

@@ -10,11 +10,10 @@ from typing import Any
 import warp as wp
 
 from oasis_kernels import constants
+from oasis_kernels.runtime.arrays import ONE, TWO, matrix33
 from oasis_kernels.runtime.source import defined, header_source
 
 JACOBIAN_LIMIT = wp.constant(wp.float64(constants.JACOBIAN_LIMIT))
-ONE = wp.constant(wp.float64(1.0))
-TWO = wp.constant(wp.float64(2.0))
 
 
 @wp.struct
@@ -79,11 +78,7 @@ def clamped_slope(slope: wp.float64, focal: wp.float64, centre: wp.float64, size
 @wp.func
 def symmetric_part(covars: wp.array3d(dtype=Any), i: int) -> wp.mat33d:
     """Covariance i, (A + A^T) / 2: what a covariance off by rounding means, and gradients by it are symmetric."""
-    a = wp.mat33d(
-        wp.float64(covars[i, 0, 0]), wp.float64(covars[i, 0, 1]), wp.float64(covars[i, 0, 2]),
-        wp.float64(covars[i, 1, 0]), wp.float64(covars[i, 1, 1]), wp.float64(covars[i, 1, 2]),
-        wp.float64(covars[i, 2, 0]), wp.float64(covars[i, 2, 1]), wp.float64(covars[i, 2, 2]),
-    )  # fmt: skip
+    a = matrix33(covars, i)
     return wp.float64(0.5) * (a + wp.transpose(a))
 
 

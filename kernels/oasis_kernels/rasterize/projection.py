@@ -24,17 +24,9 @@ from oasis_kernels.rasterize.gaussian import (
     unit_quaternion,
     whitening,
 )
+from oasis_kernels.runtime.arrays import matrix33, put33
 
 BOX_SLACK = wp.constant(wp.float64(constants.BOX_SLACK))
-
-
-@wp.func
-def camera_rotation(viewmats: wp.array3d(dtype=Any), c: int) -> wp.mat33d:
-    return wp.mat33d(
-        wp.float64(viewmats[c, 0, 0]), wp.float64(viewmats[c, 0, 1]), wp.float64(viewmats[c, 0, 2]),
-        wp.float64(viewmats[c, 1, 0]), wp.float64(viewmats[c, 1, 1]), wp.float64(viewmats[c, 1, 2]),
-        wp.float64(viewmats[c, 2, 0]), wp.float64(viewmats[c, 2, 1]), wp.float64(viewmats[c, 2, 2]),
-    )  # fmt: skip
 
 
 @wp.func
@@ -99,7 +91,7 @@ def project(scalar: Any) -> Any:
         c = index // n
         i = index - c * n
         mean = wp.vec3d(means[i])
-        camera = camera_rotation(viewmats, c)
+        camera = matrix33(viewmats, c)
         point = camera * mean + camera_translation(viewmats, c)
         depth = point[2]
         depths[index] = scalar(depth)
@@ -213,7 +205,7 @@ def project_backward(scalar: Any) -> Any:
         sum_covariance = wp.mat33d()
         for c in range(n_cameras):
             index = c * n + i
-            camera = camera_rotation(viewmats, c)
+            camera = matrix33(viewmats, c)
             g_point = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(g_depths[index]))
             g_camera = wp.mat33d()
             if radii[index][0] > 0:
@@ -255,9 +247,7 @@ def project_backward(scalar: Any) -> Any:
                     g_cameras[index, row * 4 + 3] = g_point[row]
         g_means[i] = vec3(sum_mean)
         if with_covars != 0:
-            for row in range(3):
-                for column in range(3):
-                    g_covars[i, row, column] = scalar(sum_covariance[row, column])
+            put33(g_covars, i, sum_covariance)
         elif drawn == 0:
             g_quats[i] = vec4()
             g_scales[i] = vec3()

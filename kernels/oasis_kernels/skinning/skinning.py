@@ -1,13 +1,13 @@
 """Linear blend skinning of points and of their covariances.
 
-`skin` and `skin_backward`: one thread a point. Blended with the point's weights, the transforms (G_j | t_j) give
+`skin` and `skin_backward`: one thread per point. Blended with the point's weights, the transforms (G_j | t_j) give
 
     mean'       = G mean + t          (G | t) = sum_j w_j (G_j | t_j)
     covariance' = H covariance H^T    H = G, or the rotation nearest to G
 
 The nearest rotation maximises tr(R^T G): its quaternion is the eigenvector of the largest eigenvalue of Davenport's
 4 x 4 matrix K (Horn 1987), found by squaring K + c 1 until nothing else is left; a mirroring G has one too. With
-P = R^T G, a change of G turns R by omega, (tr(P) 1 - P) omega = axial(R^T dG - dG^T R); where the two smallest
+P = R^T G, a change of G rotates R by omega, (tr(P) 1 - P) omega = axial(R^T dG - dG^T R); where the two smallest
 stretches cancel, the rotation jumps and has no gradient.
 
 Backward writes the gradient of each point's blended transform as a row of 4 x 4: columns G_0, G_1, G_2, t, each with a
@@ -18,7 +18,8 @@ from typing import Any
 
 import warp as wp
 
-from oasis_kernels.runtime.arrays import row3
+from oasis_kernels.rasterize.gaussian import rotation
+from oasis_kernels.runtime.arrays import ZERO, matrix33, put3, put33, row3
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,9 +28,6 @@ SQUARINGS = wp.constant(40)
 RANK_ONE = wp.constant(wp.float64(1.0 - 1e-15))
 """Norm of the square of a matrix of norm 1 from which it has one eigenvalue and no other."""
 SINGULAR = wp.constant(wp.float64(1e-12))
-ZERO = wp.constant(wp.float64(0.0))
-ONE = wp.constant(wp.float64(1.0))
-TWO = wp.constant(wp.float64(2.0))
 
 
 @wp.struct
@@ -38,15 +36,6 @@ class Blend:
 
     linear: wp.mat33d
     shift: wp.vec3d
-
-
-@wp.func
-def matrix(a: wp.array3d[Any], i: int) -> wp.mat33d:
-    m = wp.mat33d()
-    for r in range(3):
-        for c in range(3):
-            m[r, c] = wp.float64(a[i, r, c])
-    return m
 
 
 @wp.func
@@ -85,16 +74,7 @@ def nearest_rotation(g: wp.mat33d) -> wp.mat33d:
     for c in range(1, 4):
         if k[c, c] > k[best, best]:
             best = c
-    q = wp.normalize(wp.vec4d(k[0, best], k[1, best], k[2, best], k[3, best]))
-    w = q[0]
-    x = q[1]
-    y = q[2]
-    z = q[3]
-    return wp.mat33d(
-        ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y),
-        TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x),
-        TWO * (x * z - w * y), TWO * (y * z + w * x), ONE - TWO * (x * x + y * y),
-    )  # fmt: skip
+    return rotation(wp.normalize(wp.vec4d(k[0, best], k[1, best], k[2, best], k[3, best])))
 
 
 @wp.func
@@ -123,17 +103,12 @@ def skin(
 ):
     i = first + wp.tid()
     g = blend(i, weights, transforms)
-    mean = g.linear * row3(means, i) + g.shift
-    for c in range(3):
-        out_means[i, c] = out_means.dtype(mean[c])
+    put3(out_means, i, g.linear * row3(means, i) + g.shift)
     if covars.shape[0] > 0:
         h = g.linear
         if rotation_only != 0:
             h = nearest_rotation(g.linear)
-        covar = h * matrix(covars, i) * wp.transpose(h)
-        for r in range(3):
-            for c in range(3):
-                out_covars[i, r, c] = out_covars.dtype(covar[r, c])
+        put33(out_covars, i, h * matrix33(covars, i) * wp.transpose(h))
 
 
 @wp.kernel
@@ -146,7 +121,7 @@ def skin_backward(
     rotation_only: int,
     grad_out_means: wp.array2d[Any],
     grad_out_covars: wp.array3d[Any],  # no rows when there is no such gradient
-    # Each of these has a row a point, or none when it is not wanted.
+    # Each of these has a row per point, or none when it is not wanted.
     grad_means: wp.array2d[Any],
     grad_covars: wp.array3d[Any],
     grad_weights: wp.array2d[Any],
@@ -161,21 +136,16 @@ def skin_backward(
         h = g.linear
         if rotation_only != 0:
             h = nearest_rotation(g.linear)
-        covar = matrix(covars, i)
-        g_covar = matrix(grad_out_covars, i)
+        covar = matrix33(covars, i)
+        g_covar = matrix33(grad_out_covars, i)
         by_h = g_covar * h * wp.transpose(covar) + wp.transpose(g_covar) * h * covar
         if rotation_only != 0:
             by_h = nearest_rotation_gradient(g.linear, h, by_h)
         by_linear += by_h
         if grad_covars.shape[0] > 0:
-            back = wp.transpose(h) * g_covar * h
-            for r in range(3):
-                for c in range(3):
-                    grad_covars[i, r, c] = grad_covars.dtype(back[r, c])
+            put33(grad_covars, i, wp.transpose(h) * g_covar * h)
     if grad_means.shape[0] > 0:
-        back_mean = wp.transpose(g.linear) * g_mean
-        for c in range(3):
-            grad_means[i, c] = grad_means.dtype(back_mean[c])
+        put3(grad_means, i, wp.transpose(g.linear) * g_mean)
     if grad_weights.shape[0] > 0:
         for j in range(transforms.shape[0]):
             total = ZERO

@@ -131,31 +131,24 @@ def backward_float32(
     return PosingInputs(*(torch.sum(g, 0) if s else g for g, s in zip(by_pose, summed, strict=True)))
 
 
-def _vertex_arguments(inputs: PosingInputs, vertex_index: Tensor, half_powers: int) -> list[Any]:
-    """The first arguments of the generic kernels for Gaussians on vertices."""
-    return [
-        inputs.vertices, vertex_index, inputs.vertex_quats, inputs.vertex_area_ratio, inputs.offsets, inputs.quats,
-        inputs.scales, half_powers,
-    ]  # fmt: skip
-
-
-def _face_arguments(inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int) -> list[Any]:
-    """The first arguments of the generic kernels for Gaussians on faces."""
-    p = gaussians.p
-    return [
-        inputs.vertices, gaussians.corners.table, gaussians.on_faces.table, inputs.barycentrics, inputs.vertex_quats,
-        inputs.area_ratio, inputs.quats[p:], inputs.scales[p:], half_powers,
-    ]  # fmt: skip
+def _arguments(inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int) -> list[Any]:
+    """The first arguments of the generic kernels."""
+    like, faces = inputs.quats, gaussians.corners.table
+    on_vertices = faces.new_empty(0) if gaussians.on_vertices is None else gaussians.on_vertices.table
+    ratio = like.new_empty(0) if inputs.vertex_area_ratio is None else inputs.vertex_area_ratio
+    offsets = like.new_empty((0, 3)) if inputs.offsets is None else inputs.offsets
+    tensors = (
+        inputs.vertices, faces, on_vertices, gaussians.on_faces.table, inputs.barycentrics, inputs.vertex_quats,
+        inputs.area_ratio, ratio, offsets, inputs.quats, inputs.scales,
+    )  # fmt: skip
+    return [gaussians.p, *tensors, half_powers]
 
 
 def pose_float64(inputs: PosingInputs, gaussians: MeshGaussians, half_powers: int, posed: Sequence[Tensor]) -> None:
     """`pose_float32` of one pose by the generic kernels."""
-    inputs, p = PosingInputs(*launch.contiguous(*inputs)), gaussians.p
-    if gaussians.on_vertices is not None:
-        arguments = [*_vertex_arguments(inputs, gaussians.on_vertices.table, half_powers), *posed]
-        launch_ranges(generic_kernels.pose_on_vertices, p, arguments, like=inputs.quats)
-    arguments = [*_face_arguments(inputs, gaussians, half_powers), *(out[p:] for out in posed)]
-    launch_ranges(generic_kernels.pose_on_faces, gaussians.q, arguments, like=inputs.quats)
+    inputs = PosingInputs(*launch.contiguous(*inputs))
+    arguments = [*_arguments(inputs, gaussians, half_powers), *posed]
+    launch_ranges(generic_kernels.pose, gaussians.p + gaussians.q, arguments, like=inputs.quats)
 
 
 def backward_float64(
@@ -174,18 +167,12 @@ def backward_float64(
     quat_rows = rows(needs.vertex_quats, p + 3 * q, 4)
     ratio_rows = rows(needs.area_ratio, q, 1)
     vertex_ratio_rows = rows(needs.vertex_area_ratio, p, 1)
-    g_quats, g_scales = gradients.quats, gradients.scales
-    if gaussians.on_vertices is not None:
-        arguments = [
-            *_vertex_arguments(inputs, gaussians.on_vertices.table, half_powers), *incoming, vertex_rows, quat_rows,
-            vertex_ratio_rows, gradients.offsets, g_quats, g_scales,
-        ]  # fmt: skip
-        launch_ranges(generic_kernels.pose_on_vertices_backward, p, arguments, like=inputs.quats)
-    arguments = [
-        *_face_arguments(inputs, gaussians, half_powers), *(g[p:] for g in incoming), vertex_rows[p:].view(-1, 9),
-        quat_rows[p:].view(-1, 12), ratio_rows, gradients.barycentrics, g_quats[p:], g_scales[p:],
-    ]  # fmt: skip
-    launch_ranges(generic_kernels.pose_on_faces_backward, q, arguments, like=inputs.quats)
+    outputs = (
+        *incoming, vertex_rows, quat_rows, ratio_rows, vertex_ratio_rows, gradients.barycentrics,
+        gradients.offsets.view(-1, 3), gradients.quats, gradients.scales,
+    )  # fmt: skip
+    arguments = [*_arguments(inputs, gaussians, half_powers), *outputs]
+    launch_ranges(generic_kernels.pose_backward, p + q, arguments, like=inputs.quats)
     sums = {
         "vertices": (vertex_rows, gaussians.at_vertices),
         "vertex_quats": (quat_rows, gaussians.at_vertices),
