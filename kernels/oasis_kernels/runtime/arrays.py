@@ -1,4 +1,4 @@
-"""Rows of arrays as float64 vectors, whatever the arrays hold, and numbers in float64."""
+"""Rows of arrays as float64 vectors, whatever the arrays hold; numbers in float64; places in arrays."""
 
 from typing import Any
 
@@ -56,3 +56,11 @@ def put_corners(a: wp.array2d[Any], i: int, e1: wp.vec3d, e2: wp.vec3d, corners:
         a[i, k] = a.dtype(corners[0, k] - e1[k] - e2[k])
         a[i, 3 + k] = a.dtype(corners[1, k] + e1[k])
         a[i, 6 + k] = a.dtype(corners[2, k] + e2[k])
+
+
+@wp.func
+def place_in(i: int, rows: int, columns: int):
+    """Image, row and column of element `i` of a stack of images."""
+    image = i // (rows * columns)
+    row = (i - image * rows * columns) // columns
+    return image, row, i - (image * rows + row) * columns

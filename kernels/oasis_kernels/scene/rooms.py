@@ -1,6 +1,6 @@
-"""Rooms of boxes, balls and cylinders behind a hand, traced a few rays a pixel, and the blur of what is out of focus.
+"""Rooms of boxes, balls and cylinders behind a hand, traced a few rays per pixel, and the blur of what is out of focus.
 
-`trace`: one thread a pixel; everything in the camera's frame, the camera at the origin. A solid is a row of
+`trace`: one thread per pixel; everything in the camera's frame, the camera at the origin. A solid is a row of
 SOLID_WORDS numbers: shape, pattern, pattern size [m], gloss, glow, seed; centre; half sizes; the rotation from the
 camera's frame to its own (rows); two colours. Light is the sky by its harmonics, darkened near other solids by their
 distance fields (Evans 2006), and the lamps with the hand's soft shadow and a marched one of the solids.
@@ -8,6 +8,7 @@ distance fields (Evans 2006), and the lamps with the hand's soft shadow and a ma
 
 import warp as wp
 
+from oasis_kernels.runtime.arrays import place_in
 from oasis_kernels.scene.room_patterns import CLOTH, painted, rough_noise
 from oasis_kernels.scene.sky import blurred, cosine_lobe, disc, dither, harmonics, light_along, lit_share
 
@@ -15,7 +16,7 @@ wp.set_module_options({"enable_backward": False})  # fast_math makes NaN of powe
 
 SOLID_WORDS = wp.constant(27)
 SHAPE, PATTERN, CELL, GLOSS, GLOW, SEED = (wp.constant(k) for k in range(6))
-CENTER, HALF, TURN, FIRST, SECOND = (wp.constant(k) for k in (6, 9, 12, 21, 24))
+CENTER, HALF, ROTATION, FIRST, SECOND = (wp.constant(k) for k in (6, 9, 12, 21, 24))
 
 NOTHING, BOX, BALL, CYLINDER = (wp.constant(k) for k in range(4))
 FAR = wp.constant(60.0)
@@ -30,20 +31,22 @@ def vector_at(solids: wp.array3d[wp.float32], b: int, k: int, at: int) -> wp.vec
 
 
 @wp.func
-def turned(solids: wp.array3d[wp.float32], b: int, k: int, v: wp.vec3f) -> wp.vec3f:
+def to_solid(solids: wp.array3d[wp.float32], b: int, k: int, v: wp.vec3f) -> wp.vec3f:
+    """A vector of the camera's frame in that of a solid."""
     return wp.vec3f(
-        wp.dot(vector_at(solids, b, k, TURN), v),
-        wp.dot(vector_at(solids, b, k, TURN + 3), v),
-        wp.dot(vector_at(solids, b, k, TURN + 6), v),
+        wp.dot(vector_at(solids, b, k, ROTATION), v),
+        wp.dot(vector_at(solids, b, k, ROTATION + 3), v),
+        wp.dot(vector_at(solids, b, k, ROTATION + 6), v),
     )
 
 
 @wp.func
-def turned_back(solids: wp.array3d[wp.float32], b: int, k: int, v: wp.vec3f) -> wp.vec3f:
+def from_solid(solids: wp.array3d[wp.float32], b: int, k: int, v: wp.vec3f) -> wp.vec3f:
+    """The inverse of `to_solid`."""
     return (
-        v[0] * vector_at(solids, b, k, TURN)
-        + v[1] * vector_at(solids, b, k, TURN + 3)
-        + v[2] * vector_at(solids, b, k, TURN + 6)
+        v[0] * vector_at(solids, b, k, ROTATION)
+        + v[1] * vector_at(solids, b, k, ROTATION + 3)
+        + v[2] * vector_at(solids, b, k, ROTATION + 6)
     )
 
 
@@ -110,7 +113,7 @@ def clearance(solids: wp.array3d[wp.float32], b: int, p: wp.vec3f, limit: float)
             half = vector_at(solids, b, k, HALF)
             reach = wp.length(half) + least
             if wp.dot(q, q) < reach * reach:
-                q = turned(solids, b, k, q)
+                q = to_solid(solids, b, k, q)
                 if shape == BOX:
                     e = wp.vec3f(wp.abs(q[0]) - half[0], wp.abs(q[1]) - half[1], wp.abs(q[2]) - half[2])
                     out = wp.vec3f(wp.max(e[0], 0.0), wp.max(e[1], 0.0), wp.max(e[2], 0.0))
@@ -151,7 +154,7 @@ def sight(
             center = vector_at(solids, b, k, CENTER)
             size = vector_at(solids, b, k, HALF)
             if in_the_way(center, size, d):
-                s = entry(shape, size, turned(solids, b, k, -center), turned(solids, b, k, d))
+                s = entry(shape, size, to_solid(solids, b, k, -center), to_solid(solids, b, k, d))
                 if s < t:
                     t = s
                     hit = k
@@ -161,7 +164,7 @@ def sight(
     p = t * d
     shape = int(solids[b, hit, SHAPE])
     half = vector_at(solids, b, hit, HALF)
-    q = turned(solids, b, hit, p - vector_at(solids, b, hit, CENTER))
+    q = to_solid(solids, b, hit, p - vector_at(solids, b, hit, CENTER))
     n = wp.vec3f(0.0, 1.0, 0.0)
     u, v = q[0], q[2]
     if shape == BOX:
@@ -202,7 +205,7 @@ def sight(
             rough_noise((q + wp.vec3f(0.0, 0.0, 0.008)) / 0.09, seed + 50, 2) - g,
         )
         n = wp.normalize(n)
-    n = turned_back(solids, b, hit, n)
+    n = from_solid(solids, b, hit, n)
     glow = solids[b, hit, GLOW]
     gloss = solids[b, hit, GLOSS]
     open_ = wp.float32(1.0)
@@ -268,11 +271,8 @@ def trace(
     light: wp.array3d[wp.vec3f],
     depth: wp.array3d[wp.float32],
 ):
-    i = first + wp.tid()
     rows, columns = light.shape[1], light.shape[2]
-    b = i // (rows * columns)
-    y = (i - b * rows * columns) // columns
-    x = i - (b * rows + y) * columns
+    b, y, x = place_in(first + wp.tid(), rows, columns)
     total = wp.vec3f()
     nearest = float(FAR)
     if hidden[b, y, x] <= 0.999:
@@ -313,11 +313,8 @@ def defocus(
     out: wp.array3d[wp.vec3f],
 ):
     """Gathers over a disc as large as the pixel's own circle of confusion; what the hand hides does not count."""
-    i = first + wp.tid()
     rows, columns = light.shape[1], light.shape[2]
-    b = i // (rows * columns)
-    y = (i - b * rows * columns) // columns
-    x = i - (b * rows + y) * columns
+    b, y, x = place_in(first + wp.tid(), rows, columns)
     if hidden[b, y, x] > 0.999:
         out[b, y, x] = light[b, y, x]
         return

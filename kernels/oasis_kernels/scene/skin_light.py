@@ -1,13 +1,14 @@
 """Light on the posed vertices: normals and stretch, and how much of the sky each one sees.
 
-`surface_state`: one thread a vertex and image. `sky_transfer`: the same; it compares the vertex with depth buffers of
+`surface_state`: one thread per vertex and image. `sky_transfer`: the same; it compares the vertex with depth buffers of
 the mesh, one for each of D directions spread over the sphere. The open sky is known in closed form, so the directions
 only sample what is hidden: T = cosine lobe - sum over hidden d of max(0, n . d) Y(d) 4 / D. `smooth`: means over the
-faces round a vertex, one thread a channel.
+faces around a vertex, one thread per channel.
 """
 
 import warp as wp
 
+from oasis_kernels.runtime.arrays import place_in
 from oasis_kernels.scene.sky import cosine_lobe, harmonics
 
 wp.set_module_options({"enable_backward": False})
@@ -48,11 +49,7 @@ def smooth(
     entries: wp.array[wp.int32],
     out: wp.array3d[wp.float32],
 ):
-    i = first + wp.tid()
-    n_vertices, n_channels = values.shape[1], values.shape[2]
-    b = i // (n_vertices * n_channels)
-    v = (i - b * n_vertices * n_channels) // n_channels
-    c = i - (b * n_vertices + v) * n_channels
+    b, v, c = place_in(first + wp.tid(), values.shape[1], values.shape[2])
     begin, end = offsets[v], offsets[v + 1]
     total = wp.float32(0.0)
     for e in range(begin, end):

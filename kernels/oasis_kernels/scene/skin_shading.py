@@ -1,4 +1,4 @@
-"""Deferred shading of skin and of what is worn on it. One thread a sub-pixel; everything in the camera's frame.
+"""Deferred shading of skin and of what is worn on it. One thread per sub-pixel; everything in the camera's frame.
 
 `shade` reads the visibility buffer (face and barycentrics) and the person's texture, and writes incoming diffuse light,
 reflectance and mirrored light apart: `scatter` blurs the first over the skin, a pass an axis, with a width of its own
@@ -11,6 +11,7 @@ lobes for lamps, low-order harmonics of the sky along the mirrored ray.
 
 import warp as wp
 
+from oasis_kernels.runtime.arrays import place_in
 from oasis_kernels.scene.sky import blurred, cosine_lobe, dither, harmonics, light_along, lit_share, vec9
 
 wp.set_module_options({"enable_backward": False})  # fast_math makes NaN of powers: a dot product may exceed 1
@@ -101,11 +102,8 @@ def shade(
     tone: wp.array3d[wp.vec3f],
     mirrored: wp.array3d[wp.vec3f],
 ):
-    i = first + wp.tid()
     rows, columns = face_ids.shape[1], face_ids.shape[2]
-    b = i // (rows * columns)
-    y = (i - b * rows * columns) // columns
-    x = i - (b * rows + y) * columns
+    b, y, x = place_in(first + wp.tid(), rows, columns)
     f = face_ids[b, y, x]
     if f < 0:
         return
@@ -276,11 +274,8 @@ def scatter(
     light: wp.array3d[wp.vec3f],
     out: wp.array3d[wp.vec3f],
 ):
-    i = first + wp.tid()
     rows, columns = face_ids.shape[1], face_ids.shape[2]
-    b = i // (rows * columns)
-    y = (i - b * rows * columns) // columns
-    x = i - (b * rows + y) * columns
+    b, y, x = place_in(first + wp.tid(), rows, columns)
     f = face_ids[b, y, x]
     if f < 0:
         return
@@ -328,11 +323,8 @@ def resolve(
     mask: wp.array3d[wp.float32],
     depth: wp.array3d[wp.float32],
 ):
-    i = first + wp.tid()
     rows, columns = color.shape[1], color.shape[2]
-    b = i // (rows * columns)
-    y = (i - b * rows * columns) // columns
-    x = i - (b * rows + y) * columns
+    b, y, x = place_in(first + wp.tid(), rows, columns)
     n = face_ids.shape[1] // rows
     total = wp.vec3f()
     covered = wp.float32(0.0)
