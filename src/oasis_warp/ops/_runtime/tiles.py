@@ -3,12 +3,11 @@
 from typing import NamedTuple
 
 import torch
-import warp as wp
 from jaxtyping import Int32, Int64
 from torch import Tensor
 
 from oasis_kernels.rasterize import tiles
-from oasis_warp.ops._runtime.launch import launch, launch_ranges, vectors, view
+from oasis_warp.ops._runtime.launch import launch_ranges, vectors
 
 MAX_PAIRS = 2**31 - 1
 """Pairs of a Gaussian and a tile that one call can hold."""
@@ -55,12 +54,6 @@ def fake_opaque_buffer(dtype: torch.dtype, device: torch.device) -> Tensor:
 def bin_to_tiles(boxes: Tensor, depths: Tensor, width: int, height: int, tile_size: int) -> Tiles:
     """Sort the drawn Gaussians of each tile by depth, ties by index; boxes and depths are those of `Tables`."""
     across, down = -(-width // tile_size), -(-height // tile_size)
-    bin_by = bin_by_sorting if depths.is_cuda else bin_by_dealing
-    return bin_by(boxes, depths, tile_size, across, down)
-
-
-def bin_by_sorting(boxes: Tensor, depths: Tensor, tile_size: int, across: int, down: int) -> Tiles:
-    """`bin_to_tiles` with torch's parallel sorts."""
     n_cameras, n = depths.shape
     device = depths.device
     pixels = vectors(boxes)
@@ -85,38 +78,6 @@ def bin_by_sorting(boxes: Tensor, depths: Tensor, tile_size: int, across: int, d
     torch.index_select(pair_gaussians, 0, pairs, out=opaque_elements(gaussians))
     opaque_elements(pair_numbers).copy_(pairs)
     return Tiles(tile_size, across, down, starts, gaussians, pair_numbers, pair_starts, counts)
-
-
-def bin_by_dealing(boxes: Tensor, depths: Tensor, tile_size: int, across: int, down: int) -> Tiles:
-    """`bin_to_tiles` on one CPU thread, which is faster there than any parallel sort."""
-    n_cameras, n = depths.shape
-    total, n_tiles = n_cameras * n, n_cameras * across * down
-    pixels = vectors(boxes)
-
-    def int64(size: int) -> Tensor:
-        return torch.empty(size, dtype=torch.int64)
-
-    pair_starts, pair_counts, totals = int64(total), int64(total), torch.zeros(2, dtype=torch.int64)
-    starts = torch.zeros(n_tiles + 1, dtype=torch.int64)
-    tile_boxes = vectors(torch.empty(total, 4, dtype=torch.int32))
-    keys, order = int64(2 * total), torch.empty(2 * total, dtype=torch.int32)  # the sort needs room for two
-    inputs = [
-        pixels, depths.view(-1), n, tile_size, across, down, pair_starts, pair_counts, tile_boxes,
-        keys.view(torch.float64), order, starts, totals,
-    ]  # fmt: skip
-    launch(tiles.collect, 1 if total else 0, inputs, like=starts)
-    n_drawn, n_pairs = totals.tolist()
-    check_pairs(n_pairs)
-    gaussians, pairs = (opaque_buffer(n_pairs, dtype, starts.device) for dtype in (torch.int32, torch.int64))
-    if n_drawn:
-        # Depths are positive: their bits sort as integers do. The sort is stable.
-        wp.utils.radix_sort_pairs(view(keys), view(order), n_drawn)
-        inputs = [
-            order, n_drawn, tile_boxes, across, pair_starts, starts.clone(), opaque_elements(gaussians),
-            opaque_elements(pairs),
-        ]  # fmt: skip
-        launch(tiles.deal, 1, inputs, like=starts)
-    return Tiles(tile_size, across, down, starts, gaussians, pairs, pair_starts, pair_counts)
 
 
 def check_pairs(n_pairs: int) -> None:
