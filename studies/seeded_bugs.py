@@ -93,8 +93,7 @@ BUGS = [
         ("pixel centre without 0.5", "type(whole)(0.5) - remainder", "type(whole)(0.0) - remainder"),
         ("the stop draws the last layer", "if after <= scalar(stop):", "if before <= scalar(stop):"),
         ("no stop", "if after <= scalar(stop):", "if after < scalar(0.0):"),
-        ("no cap", "alpha = wp.min(opacity * falloff(-sigma), scalar(constants.ALPHA_MAX))",
-         "alpha = wp.min(opacity * falloff(-sigma), scalar(1.0))"),
+        ("no cap", "alpha = wp.min(raw, scalar(constants.ALPHA_MAX))", "alpha = wp.min(raw, scalar(1.0))"),
     ),
     *_in(
         "rasterize/rasterize_backward.py", "rasterization",

@@ -1,8 +1,8 @@
-"""Adjoint of the blending: replay each tile back to front, reduce to one record a pair, gather a Gaussian's pairs.
+"""Adjoint of the blending: replay each tile back to front, reduce to one record per pair, gather a Gaussian's pairs.
 
 Let S be the colour seen behind a layer; behind the last one it is the background. Then dC/dalpha = T (c - S) and in
 front of the layer S becomes alpha c + (1 - alpha) S: no division, every factor in [0, 1]. Contracted with the incoming
-gradient g first, S is the one number `behind` a pixel; the alpha image adds a background of -g_alpha. T comes from
+gradient g first, S is the one number `behind` of a pixel; the alpha image adds a background of -g_alpha. T comes from
 the stored transmittance, divided back by the 1 - alpha of each layer.
 
 A record holds sums over the pair's pixels, with y = W d the whitened offset and v = alpha dL/dalpha (0 where the layer
@@ -18,33 +18,29 @@ import warp as wp
 
 from oasis_kernels import constants
 from oasis_kernels.constants import Rules
-from oasis_kernels.rasterize.gaussian import falloff, whitened
-from oasis_kernels.rasterize.rasterize_forward import from_centre, lane_pixels
+from oasis_kernels.rasterize.rasterize_forward import alpha_at, exponent_cut, lane_pixels
 
-
-@wp.func_native("""
+ADD_LANES = """
 #if defined(__CUDA_ARCH__)
     for (int offset = 16; offset > 0; offset >>= 1) value += __shfl_xor_sync(0xffffffffu, value, offset);
 #endif
     return value;
-""")
+"""
+
+
+@wp.func_native(ADD_LANES)
 def add_lanes(value: wp.float32) -> wp.float32: ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    for (int offset = 16; offset > 0; offset >>= 1) value += __shfl_xor_sync(0xffffffffu, value, offset);
-#endif
-    return value;
-""")
+@wp.func_native(ADD_LANES)
 def add_lanes(value: wp.float64) -> wp.float64: ...  # noqa: F811
 
 
 @functools.cache
 def blend_backward(scalar: Any, channels: int, rules: Rules) -> Any:
-    """Kernel: gradients by image and alpha -> one record a pair and one background gradient a tile.
+    """Kernel: gradients by image and alpha -> one record per pair and one background gradient per tile.
 
-    One thread a (tile, lane); on CUDA the 32 lanes of a warp share a tile, on the CPU one lane has all of it.
+    One thread per (tile, lane); on CUDA the 32 lanes of a warp share a tile, on the CPU one lane has all of it.
     """
     alpha_min = rules.alpha_min
     vec4 = wp.types.vector(length=4, dtype=scalar)
@@ -109,31 +105,26 @@ def blend_backward(scalar: Any, channels: int, rules: Rules) -> Any:
             w = whitenings[index]
             opacity = opacities[index]
             rgb = colors[index]
-            cut = wp.log(opacity / scalar(alpha_min)) + scalar(constants.CUT_SLACK)
+            cut = exponent_cut(opacity, scalar(alpha_min))
             m = moments()
             g_color = color()
             for y in range(wp.max(area[1], box[1]), wp.min(area[3], box[3])):
-                dy = from_centre(y, center[1], center[3])
                 for x in range(wp.max(area[0], box[0]), wp.min(area[2], box[2])):
-                    dx = from_centre(x, center[0], center[2])
-                    y0, y1 = whitened(w, dx, dy)
-                    sigma = scalar(0.5) * (y0 * y0 + y1 * y1)
-                    if sigma < cut:
-                        raw = opacity * falloff(-sigma)
-                        alpha = wp.min(raw, scalar(constants.ALPHA_MAX))
-                        pixel = (camera * height + y) * width + x
-                        if alpha >= scalar(alpha_min) and place < stops[pixel]:
-                            t = transmittance[pixel] / (scalar(1.0) - alpha)
-                            transmittance[pixel] = t
-                            g = g_image[pixel]
-                            g_color += g * (alpha * t)
-                            if with_shape != 0:
-                                s = behind[pixel]
-                                step_up = wp.dot(g, rgb) - s
-                                behind[pixel] = s + alpha * step_up
-                                if raw <= scalar(constants.ALPHA_MAX):
-                                    v = alpha * t * step_up
-                                    m += moments(v, v * y0, v * y1, v * y0 * y0, v * y0 * y1, v * y1 * y1)
+                    raw, y0, y1 = alpha_at(x, y, center, w, opacity, cut)
+                    alpha = wp.min(raw, scalar(constants.ALPHA_MAX))
+                    pixel = (camera * height + y) * width + x
+                    if alpha >= scalar(alpha_min) and place < stops[pixel]:
+                        t = transmittance[pixel] / (scalar(1.0) - alpha)
+                        transmittance[pixel] = t
+                        g = g_image[pixel]
+                        g_color += g * (alpha * t)
+                        if with_shape != 0:
+                            s = behind[pixel]
+                            step_up = wp.dot(g, rgb) - s
+                            behind[pixel] = s + alpha * step_up
+                            if raw <= scalar(constants.ALPHA_MAX):
+                                v = alpha * t * step_up
+                                m += moments(v, v * y0, v * y1, v * y0 * y0, v * y0 * y1, v * y1 * y1)
             pair = tile_pairs[slot]
             if with_shape != 0:
                 for k in range(6):
@@ -169,7 +160,7 @@ def shape_gradients(w: wp.vec4d, m: Moments):
 
 @functools.cache
 def gather_shape(scalar: Any) -> Any:
-    """Kernel: records -> gradients by means2d, covars2d and opacities; one thread a (camera, Gaussian)."""
+    """Kernel: records -> gradients by means2d, covars2d and opacities; one thread per (camera, Gaussian)."""
     vec2, vec4 = (wp.types.vector(length=n, dtype=scalar) for n in (2, 4))
     moments = wp.types.vector(length=6, dtype=scalar)
 
@@ -205,7 +196,7 @@ def gather_shape(scalar: Any) -> Any:
 
 @functools.cache
 def gather_colors(scalar: Any, channels: int) -> Any:
-    """Kernel: records -> gradients by colours; one thread a (camera, Gaussian)."""
+    """Kernel: records -> gradients by colours; one thread per (camera, Gaussian)."""
     color = wp.types.vector(length=channels, dtype=scalar)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -228,7 +219,7 @@ def gather_colors(scalar: Any, channels: int) -> Any:
 
 @functools.cache
 def sum_backgrounds(scalar: Any, channels: int) -> Any:
-    """Kernel: background gradients of the tiles -> of the cameras, added in order; one thread a camera."""
+    """Kernel: background gradients of the tiles -> of the cameras, added in order; one thread per camera."""
     color = wp.types.vector(length=channels, dtype=scalar)
 
     @wp.kernel(enable_backward=False, module="unique")

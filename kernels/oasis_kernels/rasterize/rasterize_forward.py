@@ -1,6 +1,6 @@
 """Blend the Gaussians of each tile front to back (Kerbl et al. 2023, eq. 3) into image, alpha and transmittance.
 
-One thread a (tile, lane). A lane owns a rectangle of the tile's pixels: the whole tile on the CPU, where one lane
+One thread per (tile, lane). A lane owns a rectangle of the tile's pixels: the whole tile on the CPU, where one lane
 walks the box of each Gaussian and nothing outside it; one pixel or a few on CUDA. The code is the same, each lane
 intersects a Gaussian's box with its own rectangle, and each pixel sees the same arithmetic in the same order, so
 neither tile size nor lanes nor threads change a bit of the picture.
@@ -38,6 +38,23 @@ def lane_pixels(tile: int, lane: int, tile_size: int, lane_width: int, lane_heig
 def from_centre(pixel: int, whole: Any, remainder: Any):
     """Signed distance of a pixel's centre from a Gaussian's, without the rounding of a large coordinate."""
     return (type(whole)(pixel) - whole) + (type(whole)(0.5) - remainder)
+
+
+@wp.func
+def exponent_cut(opacity: Any, alpha_min: Any):
+    """The exponent from which a layer is surely fainter than `alpha_min`."""
+    return wp.log(opacity / alpha_min) + type(opacity)(constants.CUT_SLACK)
+
+
+@wp.func
+def alpha_at(x: int, y: int, center: Any, w: Any, opacity: Any, cut: Any):
+    """Alpha of a layer at a pixel before the cap, 0 beyond `cut`, and the whitened offset of the pixel."""
+    u, v = whitened(w, from_centre(x, center[0], center[2]), from_centre(y, center[1], center[3]))
+    sigma = type(opacity)(0.5) * (u * u + v * v)
+    alpha = type(opacity)(0.0)
+    if sigma < cut:
+        alpha = opacity * falloff(-sigma)
+    return alpha, u, v
 
 
 @functools.cache
@@ -95,28 +112,24 @@ def blend(scalar: Any, channels: int, rules: Rules) -> Any:
             w = whitenings[g]
             opacity = opacities[g]
             rgb = colors[g]
-            cut = wp.log(opacity / scalar(alpha_min)) + scalar(constants.CUT_SLACK)
+            cut = exponent_cut(opacity, scalar(alpha_min))
             for y in range(wp.max(area[1], box[1]), wp.min(area[3], box[3])):
-                dy = from_centre(y, center[1], center[3])
                 for x in range(wp.max(area[0], box[0]), wp.min(area[2], box[2])):
-                    dx = from_centre(x, center[0], center[2])
-                    u, v = whitened(w, dx, dy)
-                    sigma = scalar(0.5) * (u * u + v * v)
-                    if sigma < cut:
-                        alpha = wp.min(opacity * falloff(-sigma), scalar(constants.ALPHA_MAX))
-                        pixel = (camera * height + y) * width + x
-                        before = transmittance[pixel]
-                        if alpha >= scalar(alpha_min) and before > scalar(0.0):
-                            after = before * (scalar(1.0) - alpha)
-                            if after <= scalar(stop):
-                                transmittance[pixel] = -before
-                                stops[pixel] = place
-                                open_pixels -= 1
-                            else:
-                                weight = alpha * before
-                                image[pixel] = image[pixel] + rgb * weight
-                                alphas[pixel] = alphas[pixel] + weight
-                                transmittance[pixel] = after
+                    raw, _u, _v = alpha_at(x, y, center, w, opacity, cut)
+                    alpha = wp.min(raw, scalar(constants.ALPHA_MAX))
+                    pixel = (camera * height + y) * width + x
+                    before = transmittance[pixel]
+                    if alpha >= scalar(alpha_min) and before > scalar(0.0):
+                        after = before * (scalar(1.0) - alpha)
+                        if after <= scalar(stop):
+                            transmittance[pixel] = -before
+                            stops[pixel] = place
+                            open_pixels -= 1
+                        else:
+                            weight = alpha * before
+                            image[pixel] = image[pixel] + rgb * weight
+                            alphas[pixel] = alphas[pixel] + weight
+                            transmittance[pixel] = after
 
         background = backgrounds[camera]
         for y in range(area[1], area[3]):

@@ -1,7 +1,7 @@
 """Weights alpha T of the Gaussians in each pixel, as rows of a sparse matrix.
 
 The loop of `rasterize_forward.blend` without colours, run twice: the first time it counts the layers of each pixel,
-the second time it writes them, front to back, from the pixel's row start on. One thread a (tile, lane).
+the second time it writes them, front to back, from the pixel's row start on. One thread per (tile, lane).
 """
 
 import functools
@@ -11,13 +11,12 @@ import warp as wp
 
 from oasis_kernels import constants
 from oasis_kernels.constants import Rules
-from oasis_kernels.rasterize.gaussian import falloff, whitened
-from oasis_kernels.rasterize.rasterize_forward import from_centre, lane_pixels
+from oasis_kernels.rasterize.rasterize_forward import alpha_at, exponent_cut, lane_pixels
 
 
 @functools.cache
 def weigh(scalar: Any, rules: Rules) -> Any:
-    """Kernel: the tiles' Gaussians -> layers a pixel and, where `write`, their Gaussians and weights."""
+    """Kernel: the tiles' Gaussians -> layers per pixel and, where `write`, their Gaussians and weights."""
     alpha_min, stop = rules.alpha_min, rules.transmittance_stop
     vec4 = wp.types.vector(length=4, dtype=scalar)
 
@@ -59,28 +58,24 @@ def weigh(scalar: Any, rules: Rules) -> Any:
             center = centers[g]
             w = whitenings[g]
             opacity = opacities[g]
-            cut = wp.log(opacity / scalar(alpha_min)) + scalar(constants.CUT_SLACK)
+            cut = exponent_cut(opacity, scalar(alpha_min))
             for y in range(wp.max(area[1], box[1]), wp.min(area[3], box[3])):
-                dy = from_centre(y, center[1], center[3])
                 for x in range(wp.max(area[0], box[0]), wp.min(area[2], box[2])):
-                    dx = from_centre(x, center[0], center[2])
-                    u, v = whitened(w, dx, dy)
-                    sigma = scalar(0.5) * (u * u + v * v)
-                    if sigma < cut:
-                        alpha = wp.min(opacity * falloff(-sigma), scalar(constants.ALPHA_MAX))
-                        pixel = y * width + x
-                        before = transmittance[pixel]
-                        if alpha >= scalar(alpha_min) and before > scalar(0.0):
-                            after = before * (scalar(1.0) - alpha)
-                            if after <= scalar(stop):
-                                transmittance[pixel] = -before
-                            else:
-                                transmittance[pixel] = after
-                                layer = counts[pixel]
-                                counts[pixel] = layer + 1
-                                if write != 0:
-                                    place = row_starts[pixel] + wp.int64(layer)
-                                    columns[place] = g
-                                    values[place] = alpha * before
+                    raw, _u, _v = alpha_at(x, y, center, w, opacity, cut)
+                    alpha = wp.min(raw, scalar(constants.ALPHA_MAX))
+                    pixel = y * width + x
+                    before = transmittance[pixel]
+                    if alpha >= scalar(alpha_min) and before > scalar(0.0):
+                        after = before * (scalar(1.0) - alpha)
+                        if after <= scalar(stop):
+                            transmittance[pixel] = -before
+                        else:
+                            transmittance[pixel] = after
+                            layer = counts[pixel]
+                            counts[pixel] = layer + 1
+                            if write != 0:
+                                place = row_starts[pixel] + wp.int64(layer)
+                                columns[place] = g
+                                values[place] = alpha * before
 
     return weigh
