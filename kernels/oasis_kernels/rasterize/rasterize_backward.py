@@ -18,7 +18,7 @@ import warp as wp
 
 from oasis_kernels import constants
 from oasis_kernels.constants import Rules
-from oasis_kernels.rasterize.rasterize_forward import alpha_at, exponent_cut, lane_pixels
+from oasis_kernels.rasterize.rasterize_forward import alpha_at, exponent_cut, from_centre, lane_pixels
 
 ADD_LANES = """
 #if defined(__CUDA_ARCH__)
@@ -109,8 +109,9 @@ def blend_backward(scalar: Any, channels: int, rules: Rules) -> Any:
             m = moments()
             g_color = color()
             for y in range(wp.max(area[1], box[1]), wp.min(area[3], box[3])):
+                dy = from_centre(y, center[1], center[3])
                 for x in range(wp.max(area[0], box[0]), wp.min(area[2], box[2])):
-                    raw, y0, y1 = alpha_at(x, y, center, w, opacity, cut)
+                    raw, y0, y1 = alpha_at(from_centre(x, center[0], center[2]), dy, w, opacity, cut)
                     alpha = wp.min(raw, scalar(constants.ALPHA_MAX))
                     pixel = (camera * height + y) * width + x
                     if alpha >= scalar(alpha_min) and place < stops[pixel]:

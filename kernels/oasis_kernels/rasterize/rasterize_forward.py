@@ -47,9 +47,9 @@ def exponent_cut(opacity: Any, alpha_min: Any):
 
 
 @wp.func
-def alpha_at(x: int, y: int, center: Any, w: Any, opacity: Any, cut: Any):
-    """Alpha of a layer at a pixel before the cap, 0 beyond `cut`, and the whitened offset of the pixel."""
-    u, v = whitened(w, from_centre(x, center[0], center[2]), from_centre(y, center[1], center[3]))
+def alpha_at(dx: Any, dy: Any, w: Any, opacity: Any, cut: Any):
+    """Alpha of a layer off its centre before the cap, 0 beyond `cut`, and the whitened offset."""
+    u, v = whitened(w, dx, dy)
     sigma = type(opacity)(0.5) * (u * u + v * v)
     alpha = type(opacity)(0.0)
     if sigma < cut:
@@ -114,8 +114,9 @@ def blend(scalar: Any, channels: int, rules: Rules) -> Any:
             rgb = colors[g]
             cut = exponent_cut(opacity, scalar(alpha_min))
             for y in range(wp.max(area[1], box[1]), wp.min(area[3], box[3])):
+                dy = from_centre(y, center[1], center[3])
                 for x in range(wp.max(area[0], box[0]), wp.min(area[2], box[2])):
-                    raw, _u, _v = alpha_at(x, y, center, w, opacity, cut)
+                    raw, _u, _v = alpha_at(from_centre(x, center[0], center[2]), dy, w, opacity, cut)
                     alpha = wp.min(raw, scalar(constants.ALPHA_MAX))
                     pixel = (camera * height + y) * width + x
                     before = transmittance[pixel]

@@ -11,7 +11,7 @@ import warp as wp
 
 from oasis_kernels import constants
 from oasis_kernels.constants import Rules
-from oasis_kernels.rasterize.rasterize_forward import alpha_at, exponent_cut, lane_pixels
+from oasis_kernels.rasterize.rasterize_forward import alpha_at, exponent_cut, from_centre, lane_pixels
 
 
 @functools.cache
@@ -60,8 +60,9 @@ def weigh(scalar: Any, rules: Rules) -> Any:
             opacity = opacities[g]
             cut = exponent_cut(opacity, scalar(alpha_min))
             for y in range(wp.max(area[1], box[1]), wp.min(area[3], box[3])):
+                dy = from_centre(y, center[1], center[3])
                 for x in range(wp.max(area[0], box[0]), wp.min(area[2], box[2])):
-                    raw, _u, _v = alpha_at(x, y, center, w, opacity, cut)
+                    raw, _u, _v = alpha_at(from_centre(x, center[0], center[2]), dy, w, opacity, cut)
                     alpha = wp.min(raw, scalar(constants.ALPHA_MAX))
                     pixel = y * width + x
                     before = transmittance[pixel]
