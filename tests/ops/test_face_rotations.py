@@ -239,14 +239,8 @@ def test_a_rest_mesh_of_something_else_is_refused(rest, message, as_shipped):
         face_rotations(rest, posed, faces)
 
 
-def test_a_rest_mesh_refuses_what_face_rotations_refuses(as_shipped):
+def test_a_rest_mesh_of_values_that_are_not_finite_is_refused():
     rest, _, faces = mesh(0, 2, torch.float32)
-    with pytest.raises(ValueError, match=r"^faces: expected indices in 0 .. 8 \(9 vertices\)"):
-        rest_mesh(rest, faces + 1)
-    with pytest.raises(ValueError, match=r"^rest_vertices: expected shape \[V, 3\], got \[9, 2\]."):
-        rest_mesh(rest[:, :2], faces)
-    with pytest.raises(ValueError, match="^rest_vertices: expected float32 or float64, got float16."):
-        rest_mesh(rest.half(), faces)
     rest[2, 1] = torch.nan
     with pytest.raises(ValueError, match="^rest_vertices: expected finite values .* got 1 of 27"):
         rest_mesh(rest, faces)

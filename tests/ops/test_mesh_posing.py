@@ -8,9 +8,7 @@ import pytest
 import torch
 from operator_calls import calls, mesh
 
-from oasis_warp.core.rotation import from_axis_angle, multiply, to_matrix
-from oasis_warp.core.types import HandPose
-from oasis_warp.hand.skinning import rest_hand, skin
+from oasis_warp.core.rotation import multiply, to_matrix
 from oasis_warp.ops import face_rotations, pose_on_mesh
 
 LAWS = ["sqrt_area", "area", "none"]
@@ -199,31 +197,6 @@ def test_indices_made_in_inference_mode_are_accepted():
         arguments = on_faces(1)
         got = pose_on_mesh(**arguments)
     assert torch.equal(got.means, pose_on_mesh(**on_faces(1)).means)
-
-
-def test_gaussians_on_the_hand_follow_a_bent_finger(hand):
-    rest = rest_hand(hand, torch.zeros(hand.shape_basis.shape[2]))
-    angles = torch.zeros(15, 3)
-    angles[0:3, 0] = 0.6
-    turn = from_axis_angle(torch.tensor([0.0, 0, 1]), torch.tensor(0.7))
-    posed = skin(hand, rest, HandPose(angles, turn, torch.tensor([0.1, 0, 0.4])))
-    n_faces = len(hand.faces)
-    gaussians = {
-        "face_index": torch.arange(n_faces),
-        "barycentrics": torch.full((n_faces, 3), 1 / 3),
-        "quats": torch.tensor([[1.0, 0, 0, 0]]).expand(n_faces, 4),
-        "scales": torch.full((n_faces, 3), 0.001),
-    }
-    got = carry(rest.vertices, posed.vertices, hand.faces, gaussians)
-    torch.testing.assert_close(got.means, posed.vertices[hand.faces].mean(1), rtol=0, atol=1e-7)
-    assert ((got.quats.norm(dim=1) - 1).abs() < 2e-6).all()
-    assert (got.scales > 0.0001).all() and (got.scales < 0.01).all()
-    # Faces that no joint of the index finger moves just turn with the wrist.
-    corrected = hand.corrective_basis[..., :6].abs().amax((1, 2))
-    still = ((hand.weights[:, 1:4].sum(1) < 1e-6) & (corrected < 1e-6))[hand.faces].all(1)
-    assert still.sum() > 500
-    turned = to_matrix(got.quats[still])
-    torch.testing.assert_close(turned, turn.expand_as(turned), rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize(

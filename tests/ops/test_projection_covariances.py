@@ -62,30 +62,6 @@ def test_vectors_equal_the_generic_kernel(seed):
     assert_same(run(scene, covars), run(scene.to(torch.float64), covars.double()))
 
 
-def test_covariances_are_projected_as_their_quaternions_and_scales(dtype, device):
-    scene = ordinary_scene(35, cameras=2, dtype=torch.float64)
-    covars = covariances(scene).to(device, dtype)
-    scene = scene.to(device, dtype)
-    (got, g_got), (want, g_want) = run(scene, covars), run(scene)
-    error = 1e-6 if dtype == torch.float32 else 1e-12
-    assert torch.equal(got.tables().boxes, want.tables().boxes)
-    for name in ("means2d", "covars2d", "conics", "depths"):
-        torch.testing.assert_close(getattr(got, name), getattr(want, name), rtol=10 * error, atol=error)
-    for name in ("means", "viewmats"):
-        assert float((g_got[name] - g_want[name]).norm()) <= 10 * error * float(g_want[name].norm())
-
-
-def test_gradients_reach_quaternions_and_scales_through_a_covariance(dtype, device):
-    scene = ordinary_scene(36, cameras=2).to(device, dtype)
-    _, direct = run(scene)
-    inputs = [scene.quats.clone().requires_grad_(), scene.scales.clone().requires_grad_()]
-    covars = covariances(scene.with_(quats=inputs[0], scales=inputs[1]))
-    through = torch.autograd.grad(covars, inputs, run(scene, covars)[1]["covars"])
-    error = 1e-5 if dtype == torch.float32 else 1e-12
-    for name, got in zip(("quats", "scales"), through, strict=True):
-        assert float((got - direct[name]).norm()) <= error * float(direct[name].norm())
-
-
 def test_only_the_symmetric_part_counts_and_gradients_are_symmetric(dtype, device):
     scene = ordinary_scene(37).to(device, dtype)
     covars = covariances(scene)

@@ -237,19 +237,14 @@ def blend_layers(
 
 
 def refuse_unsupported(values: Sequence[Any]) -> None:
-    """Refuse `values` of the `UNSUPPORTED` arguments other than their defaults."""
+    """Refuse `values` of the `UNSUPPORTED` arguments other than their defaults, by name."""
     for (name, (default, hint)), value in zip(UNSUPPORTED.items(), values, strict=True):
-        refuse_unless_default(name, value, default, hint)
-
-
-def refuse_unless_default(name: str, value: Any, default: Any, hint: str) -> None:
-    """Refuse an unsupported value of an argument of gsplat."""
-    if value is None or (isinstance(value, bool | str) and value == default):
-        return
-    if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
-        return
-    got = repr(value) if isinstance(value, bool | int | str) else type(value).__name__
-    raise ValueError(f"{name}: expected {default!r}, got {got}. Not supported in this version. {hint}")
+        if value is None or (isinstance(value, bool | str) and value == default):
+            continue
+        if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
+            continue
+        got = repr(value) if isinstance(value, bool | int | str) else type(value).__name__
+        raise ValueError(f"{name}: expected {default!r}, got {got}. Not supported in this version. {hint}")
 
 
 def for_each_camera(tensor: Tensor, n_cameras: int) -> Tensor:
