@@ -85,9 +85,9 @@ def _linear(srgb: Tensor) -> Tensor:
 @torch.inference_mode()
 def measure(network: DenseNetwork, options: Options, number: int) -> list[Row]:
     """Rows of one rendering: two people, with landmarks as a detector finds them, and without."""
-    photos = DensePhotos(seed=options.seed, people=options.people, photos=2, size=256, device=torch.device("cpu"))
+    photos = DensePhotos(seed=options.seed, people=options.people, hands=2, size=256, device=torch.device("cpu"))
     scene, random = SceneConfig(people=options.people), torch.Generator().manual_seed(number)
-    table = sample_table(options.seed, photos.indices(number), scene)
+    table = sample_table(options.seed, photos.photo_indices(number), scene)
     true = render_dense(options.seed, table, photos.size, "cpu", scene=scene, random=random)
     found = detected(true.landmarks, random)
     rows = []

@@ -22,7 +22,6 @@ from oasis_warp.core.types import HandCrop
 from oasis_warp.estimation.refine import refine
 from oasis_warp.estimation.surface_state import shape_of, state_of_surface
 from oasis_warp.evaluation.held_out import (
-    ERROR_STREAM,
     CaptureConfig,
     CapturedPerson,
     Lighting,
@@ -37,6 +36,7 @@ from oasis_warp.evaluation.synthetic import crop_of, draw_targets
 from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map, depth_visibility
+from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, seeded
 from oasis_warp.pretraining.training_batch import EstimatorNoise, training_batch
 from studies.harness import AvatarOptions, Row, measured
 from studies.inputs import iou, people, prior_named
@@ -69,9 +69,8 @@ class Options(AvatarOptions):
 
 def true_crop(person: CapturedPerson, light: Lighting, capture: CaptureConfig, factor: float) -> HandCrop:
     """The true surface in the crop of the wrong mask: the same random numbers as of `estimated_batch`."""
-    (state,) = np.random.SeedSequence([capture.seed, ERROR_STREAM, person.number]).generate_state(1)
     noise = EstimatorNoise(surface=0.0, mask=estimator_noise(factor).mask)
-    random, photo = torch.Generator().manual_seed(int(state)), person.photos[light]
+    random, photo = seeded(capture.seed, ERROR_STREAM, person.number), person.photos[light]
     hand = bundled_hand().to(photo.image.device)
     return crop_of(training_batch(hand, photo, person.targets[light], capture.size, random, noise))
 
@@ -149,9 +148,7 @@ def measure(number: int, options: Options) -> Iterator[Row]:
 
 def run(options: Options) -> list[Row]:
     """Measure everybody."""
-    cases = {
-        f"person {k}, errors {options.errors}": (k, options) for k in people(options.people, first=options.first)
-    }
+    cases = {f"person {k}, errors {options.errors}": (k, options) for k in people(options.people, first=options.first)}
     return measured("refinement", cases, measure, options)
 
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
@@ -47,7 +46,7 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
-from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
+from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS, seeded
 from oasis_warp.pretraining.training_batch import training_batch
 from oasis_warp.reconstruction import composite_over_photo, make_avatar, reconstruct, reconstruct_same_hand
 from oasis_warp.synthetic.picture import SyntheticBatch, render_table
@@ -122,8 +121,7 @@ def capture(
     if light == "studio":
         taken = taken._replace(image=taken.image + 0.5 * (1 - taken.alpha[..., None]))  # a grey wall
     hand = bundled_hand().to(device)
-    (state,) = np.random.SeedSequence([HELD_OUT_SEED, ERROR_STREAM, number]).generate_state(1)
-    random = torch.Generator().manual_seed(int(state))
+    random = seeded(HELD_OUT_SEED, ERROR_STREAM, number)
     photos = [SyntheticBatch(*(part[k : k + 1] for part in taken)) for k in range(MOST)]
     batches = [training_batch(hand, photo, targets, size, random, estimator_noise(1.0)) for photo in photos]
     exact = training_batch(hand, photos[0], targets, size, torch.Generator(), estimator_noise(0.0))

@@ -149,7 +149,7 @@ def prior_hands(options: Pretrain, device: torch.device) -> SyntheticHands:
 def dense_photos(options: Pretrain, device: torch.device) -> DensePhotos:
     """The batches of a dense network's training."""
     return DensePhotos(
-        seed=options.seed, people=options.people, photos=options.hands, size=options.size, device=device,
+        seed=options.seed, people=options.people, hands=options.hands, size=options.size, device=device,
         workers=options.workers,
     )  # fmt: skip
 

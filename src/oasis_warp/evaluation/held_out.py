@@ -16,7 +16,7 @@ from oasis_warp.core.types import TrainingBatch
 from oasis_warp.evaluation.metrics import TargetTruth
 from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.objective import true_pictures
-from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS
+from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS, seeded
 from oasis_warp.pretraining.training_batch import EstimatorNoise, training_batch
 from oasis_warp.synthetic.picture import SyntheticBatch, render_capture, render_table, slice_batch
 from oasis_warp.synthetic.shot_table import ShotTable, tabulate
@@ -128,8 +128,7 @@ def estimated_batch(
     Errors affect where the photo is read. Targets are drawn on the true surface, since the outline of a wrong one would
     outweigh all else.
     """
-    (state,) = np.random.SeedSequence([capture.seed, ERROR_STREAM, person.number]).generate_state(1)
-    random = torch.Generator().manual_seed(int(state))
+    random = seeded(capture.seed, ERROR_STREAM, person.number)
     return training_batch(
         hand, person.photos[light], person.targets[light], capture.size, random, estimator_noise(factor)
     )
@@ -140,9 +139,7 @@ def target_truths(batch: TrainingBatch, hand: HandModel) -> list[TargetTruth]:
     vertex_faces = faces_of_vertices(hand.faces, len(hand.template))
     pictures = true_pictures(batch, hand.faces, hand.rim)
     size, vertices = batch.target_images.shape[2], batch.target_posed[0]
-    seen = depth_map(
-        vertices, hand.faces, batch.target_viewmats[0], batch.target_Ks[0], size, size, validate=False
-    )
+    seen = depth_map(vertices, hand.faces, batch.target_viewmats[0], batch.target_Ks[0], size, size, validate=False)
     every_vertex = torch.arange(len(hand.template), device=vertices.device)
     visible = observe_batch(source_photos(batch), hand.faces, vertex_faces, every_vertex).visibility[0]
     at_rest = _face_areas(batch.rest[0], hand.faces)

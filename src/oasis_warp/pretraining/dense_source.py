@@ -3,22 +3,17 @@
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
-from numpy.random import SeedSequence
 from torch import Tensor
 
-from oasis_warp.core.logging import Progress, silent
+from oasis_warp.pretraining.synthetic_source import SyntheticSource, seeded
 from oasis_warp.synthetic.dense_pictures import DenseBatch, moved, render_dense
-from oasis_warp.synthetic.identity import Population
-from oasis_warp.synthetic.people import bake_people
 from oasis_warp.synthetic.shot_table import sample_tables_ahead
-from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH, SceneConfig
+from oasis_warp.synthetic.shots import SceneConfig
 
-REPEATS = 2
-"""Batches that each rendering serves for: as it is, then moved."""
 DISTURBANCE_STREAM = 5
 """Stream number of the disturbances, beside those of identities and pictures with the same seed."""
 UNKNOWN, POINT_UNKNOWN = 0.15, 0.05
@@ -30,56 +25,28 @@ FINGER_OFF, FINGER_SIGMA = 0.2, 0.08
 
 
 @dataclass(frozen=True, kw_only=True)
-class DensePhotos:
-    """A `BatchSource` of labelled photos. On the CPU a batch has the same bits wherever training was resumed."""
+class DensePhotos(SyntheticSource):
+    """A `BatchSource` of labelled photos."""
 
-    seed: int
-    """Seed of the world and of the disturbances."""
-    people: int
-    """Number of people, who come again and again in other photos."""
-    photos: int
-    """Per batch, each of another person."""
-    size: int
-    """Side of a photo [px], a multiple of 16."""
-    device: torch.device
-    """Where photos are rendered."""
-    population: Population = EVERYBODY
-    """What people may have."""
-    workers: int = 0
-    """Processes that sample shots ahead, or 0."""
+    repeats: ClassVar[int] = 2
+    """The photos of a rendering as they are, then moved."""
 
     def __call__(self, first_step: int, rank: int, world: int) -> Iterator[DenseBatch]:
         """Endless batches; `landmarks` have a detector's errors, and are NaN where it finds none."""
         scene = SceneConfig(people=self.people, population=self.population)
-        first = first_step // REPEATS * world + rank
-        blocks = ((self.indices(number), scene) for number in itertools.count(first, world))
+        first = first_step // self.repeats * world + rank
+        blocks = ((self.photo_indices(number), scene) for number in itertools.count(first, world))
         tables = sample_tables_ahead(self.seed, blocks, self.workers)
-        step = first_step // REPEATS * REPEATS
+        step = first_step // self.repeats * self.repeats
         for number, table in zip(itertools.count(first, world), tables, strict=False):
-            random = torch.Generator(self.device).manual_seed(self._state(number))
+            random = seeded(self.seed, DISTURBANCE_STREAM, number, device=self.device)
             rendered = render_dense(self.seed, table, self.size, self.device, scene=scene, random=random)
-            for repeat in range(REPEATS):
+            for repeat in range(self.repeats):
                 batch = moved(rendered, random) if repeat else rendered
                 batch = batch._replace(landmarks=detected(batch.landmarks, random))
                 if step >= first_step:
                     yield batch
                 step += 1
-
-    def indices(self, number: int) -> list[int]:
-        """Indices of the pictures of rendering `number`, each of another person."""
-        return [PICTURES_EACH * (number * self.photos + k) for k in range(self.photos)]
-
-    def people_met(self, rank: int, world: int, steps: int) -> list[int]:
-        """The people that process `rank` of `world` shows in a number of steps."""
-        renderings = range(rank, min(-(-steps // REPEATS), self.people) * world, world)
-        return sorted({(number * self.photos + k) % self.people for number in renderings for k in range(self.photos)})
-
-    def bake(self, met: list[int], folder: Path | None, jobs: int, progress: Progress = silent) -> None:
-        """Bake the people of `people_met`, or read those that `folder` holds already (see `people.bake_people`)."""
-        bake_people(self.seed, met, self.population, str(self.device), jobs=jobs, folder=folder, progress=progress)
-
-    def _state(self, number: int) -> int:
-        return int(SeedSequence([self.seed, DISTURBANCE_STREAM, number]).generate_state(1)[0])
 
 
 def detected(landmarks: Float[Tensor, "B 21 2"], random: torch.Generator) -> Float[Tensor, "B 21 2"]:

@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -30,26 +31,63 @@ MULTIPLE = 16
 """Divisor of a crop's side [px]: the rendered picture and the scales of the losses are whole pixels then."""
 
 
+def seeded(*numbers: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """The random generator of a seed, a stream and a number of it."""
+    (state,) = np.random.SeedSequence(numbers).generate_state(1)
+    return torch.Generator(device).manual_seed(int(state))
+
+
 @dataclass(frozen=True, kw_only=True)
-class SyntheticHands:
-    """A `BatchSource`. On the CPU a batch has the same bits wherever training was resumed."""
+class SyntheticSource:
+    """What sources of synthetic photos share. On the CPU a batch has the same bits wherever training was resumed."""
 
     seed: int
-    """Seed of the world and of the estimator's errors."""
+    """Seed of the world and of the errors and disturbances of a task."""
     people: int
     """Number of people, who come again and again in other photos."""
     hands: int
     """Photos per batch, each of another person."""
-    views: int
-    """Targets per photo, up to `PICTURES_EACH`."""
     size: int
-    """Side of photos and targets [px], a multiple of `MULTIPLE`."""
+    """Side of a picture [px], a multiple of `MULTIPLE`."""
     device: torch.device
     """Where pictures are rendered."""
     population: Population = EVERYBODY
     """What people may have."""
     workers: int = 0
     """Processes that sample shots ahead, or 0."""
+    repeats: ClassVar[int] = 1
+    """Batches that each rendering serves for."""
+
+    def photo_indices(self, number: int) -> list[int]:
+        """Indices of the pictures that are the photos of rendering `number`."""
+        return [PICTURES_EACH * (number * self.hands + k) for k in range(self.hands)]
+
+    def people_met(self, rank: int, world: int, steps: int) -> list[int]:
+        """The people that process `rank` of `world` shows in a number of steps.
+
+        Each process gets them in another order, so that processes do not bake the same person at the same time.
+        """
+        renderings = range(rank, min(-(-steps // self.repeats), self.people) * world, world)  # after that people repeat
+        met = sorted({(number * self.hands + k) % self.people for number in renderings for k in range(self.hands)})
+        first = rank * len(met) // world
+        return met[first:] + met[:first]
+
+    def bake(self, met: list[int], folder: Path | None, jobs: int, progress: Progress = silent) -> None:
+        """Bake the people of `people_met`, or read those that `folder` holds already.
+
+        Raises:
+            ValueError: more than `synthetic.people.max_people_cached`.
+            InputError: the folder cannot be written.
+        """
+        bake_people(self.seed, met, self.population, str(self.device), jobs=jobs, folder=folder, progress=progress)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticHands(SyntheticSource):
+    """A `BatchSource` for the prior."""
+
+    views: int
+    """Targets per photo, up to `PICTURES_EACH`."""
     ahead: int = 1
     """Batches that are rendered together, which uses a GPU better and gives the same batches."""
 
@@ -83,10 +121,6 @@ class SyntheticHands:
                     photo = self.before_walls(slice_batch(target, slice(None, None, self.views)), number)
                 yield training_batch(hand, photo, target, self.size, self.errors(number))
 
-    def photo_indices(self, number: int) -> list[int]:
-        """Indices of the pictures that are the photos of batch `number`."""
-        return [PICTURES_EACH * (number * self.hands + k) for k in range(self.hands)]
-
     def target_indices(self, number: int) -> list[int]:
         """Indices of its targets in even light, those of the first photo first."""
         return [index + view for index in self.photo_indices(number) for view in range(self.views)]
@@ -101,24 +135,4 @@ class SyntheticHands:
 
     def errors(self, number: int) -> torch.Generator:
         """The random generator of the estimator's errors in batch `number`."""
-        (state,) = np.random.SeedSequence([self.seed, ERROR_STREAM, number]).generate_state(1)
-        return torch.Generator().manual_seed(int(state))
-
-    def people_met(self, rank: int, world: int, steps: int) -> list[int]:
-        """The people that process `rank` of `world` shows in a number of steps.
-
-        Each process gets them in another order, so that processes do not bake the same person at the same time.
-        """
-        batches = range(rank, min(steps, self.people) * world, world)  # after that people repeat
-        met = sorted({(number * self.hands + k) % self.people for number in batches for k in range(self.hands)})
-        first = rank * len(met) // world
-        return met[first:] + met[:first]
-
-    def bake(self, met: list[int], folder: Path | None, jobs: int, progress: Progress = silent) -> None:
-        """Bake the people of `people_met`, or read those that `folder` holds already.
-
-        Raises:
-            ValueError: more than `synthetic.people.max_people_cached`.
-            InputError: the folder cannot be written.
-        """
-        bake_people(self.seed, met, self.population, str(self.device), jobs=jobs, folder=folder, progress=progress)
+        return seeded(self.seed, ERROR_STREAM, number)
