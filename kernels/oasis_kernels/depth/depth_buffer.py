@@ -1,16 +1,16 @@
 """Depth buffer of a triangle mesh with face ids, and visibility of points against it.
 
-`camera_points` (one thread a vertex) -> `face_boxes` and `fill_faces` (one thread a face) -> `interpolate` (one thread
-a pixel) and `visibility` (one thread a point); backwards, `corner_gradients` (one thread a point). The first axis of a
-launch and of all arrays but the faces is the batch. These kernels serve CUDA; what they compute on the CPU is computed
-faster, to the same face ids, by `depth_buffer.cpp`, and they are its oracle.
+`camera_points` (one thread per vertex) -> `face_boxes` and `fill_faces` (one per face) -> `interpolate` (one per pixel)
+and `visibility` (one per point); backwards, `corner_gradients` (one per point). The first axis of a launch and of all
+arrays but the faces is the batch. These kernels serve float64 on CUDA; on the CPU `depth_buffer.cpp` computes the same
+face ids faster, and they are its oracle.
 
 A pixel's ray is p(z) = z (u, v, 1) with u = (x - cx) / fx, v = (y - cy) / fy. Sheared along it, a corner (X, Y, Z) in
 camera axes lands at (X - u Z, Y - v Z) and the ray at the origin; with 2D cross products w_a = b x c, w_b = c x a,
 w_c = a x b of the sheared corners, the ray hits where the three agree in sign. The hit has the barycentrics
 w / (w_a + w_b + w_c), perspective correct as they stand. Nothing is divided by a vertex's depth, so a triangle may pass
 through the camera's plane and needs no clipping (Olano and Greer, "Triangle scan conversion using 2D homogeneous
-coordinates", 1997); the near test is made a pixel.
+coordinates", 1997); the near test is made per pixel.
 
 No ray slips between faces (Woop, Benthin and Wald, "Watertight ray/triangle intersection", 2013): a corner lands at the
 same rounded place for each of its faces, rounding never swaps the order of the two products of w, so its sign is right
@@ -29,7 +29,7 @@ from oasis_kernels.runtime.arrays import HALF, ONE, ZERO
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BOX_MARGIN = wp.constant(wp.float64(1e-3))
-"""Pixels added round a projected triangle, so that rounding of the box never decides about a pixel on an edge."""
+"""Pixels added around a projected triangle, so that rounding of the box never decides about a pixel on an edge."""
 EDGE_ON = wp.constant(wp.float64(1e-13))
 """A ray within this sine of the triangle's plane misses it; float64 rounding of a unit normal, with a margin of 500."""
 

@@ -1,4 +1,4 @@
-// From the keys of `cuda_depth_draw` to scores of points and to pictures: one thread a point, then one a pixel.
+// From the keys of `cuda_depth_draw` to scores of points and to pictures: one thread per point, then one a pixel.
 //
 // Both read the keys alone, so that they are one node. Pictures that nobody asks for are not written, and only the
 // pixels that need a depth look at their face again: its float64 depth is not in the key. A thread of a large picture
@@ -145,9 +145,9 @@ __global__ void resolve(
 //
 // Along a ray d = (u, v, 1), a plane with normal n through a corner that moves by e with weight w comes nearer or goes
 // farther by w (n e) / (n d). Many points pull at one vertex, and floats added by atomics would round differently each
-// time. Whole numbers do not: `pull` runs twice, one thread a point, first for the largest of all numbers that are to
+// time. Whole numbers do not: `pull` runs twice, one thread per point, first for the largest of all numbers that are to
 // be added, a block each, then to add multiples of 2^-shift of it in 64 bits, where 2^shift leaves just enough room for
-// their sum: for 10^4 points each is off by 2^-47 of the largest. `settle`, one thread a vertex, turns sums into
+// their sum: for 10^4 points each is off by 2^-47 of the largest. `settle`, one thread per vertex, turns sums into
 // floats.
 __global__ void pull(
 #include "mesh_parameters.inc"

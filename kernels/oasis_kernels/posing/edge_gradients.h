@@ -36,7 +36,7 @@ if (posed_edges) {
 if (rest_edges) {
     const V3 back = {-dot3(omega, p.t), -dot3(omega, p.b), -dot3(omega, o.n)};
     const V3 w = plus(scaled(back.x, r.t), plus(scaled(back.y, r.b), scaled(back.z, r.n)));
-    const V3 t = minus(scaled(p.c, r.t), scaled(p.s, r.b));  // posed t and b, turned back
+    const V3 t = minus(scaled(p.c, r.t), scaled(p.s, r.b));  // posed t and b, rotated back
     const V3 b = plus(scaled(p.s, r.t), scaled(p.c, r.b));
     const V3 o1 = scaled(o.l, t), o2 = plus(scaled(o.x, t), scaled(o.y, b));
     edge_gradients(r, w, o1, o2, by_rest, DAMPING * by_damping, g1, g2);

@@ -20,14 +20,14 @@ def _on_cuda(name: str) -> CudaNative:
     return cuda_native("posing/face_rotations.cu", name, BLOCK, constants=CONSTANTS)
 
 
-measure, turn, turn_backward = (_on_cpu(name) for name in ("measure", "turn", "turn_backward"))
+measure, rotate, rotate_backward = (_on_cpu(name) for name in ("measure", "rotate", "rotate_backward"))
 measure_triangles = _on_cuda("measure_triangles")
 """Kernel: one block for every `BLOCK` faces."""
-turn_faces = _on_cuda("turn_faces")
+rotate_faces = _on_cuda("rotate_faces")
 """Kernel: for each pose, one block for every `BLOCK` faces."""
-turn_vertices = _on_cuda("turn_vertices")
+rotate_vertices = _on_cuda("rotate_vertices")
 """Kernel: for each pose, one block for every `BLOCK` vertices."""
-turn_faces_backward = _on_cuda("turn_faces_backward")
+rotate_faces_backward = _on_cuda("rotate_faces_backward")
 """Kernel: for each pose, one block for every `BLOCK` faces."""
 gather_edges = _on_cuda("gather_edges")
 """Kernel: for each pose, one block for every `BLOCK` vertices."""

@@ -5,9 +5,9 @@
 // with t along that edge, e1 = l t and e2 = x t + y b with y >= 0. Edges from 1e-18 to 1e15 have areas that float32 can
 // hold; shorter ones count as flat.
 //
-// The turn in the plane has the cosine c = l' y + l y' and the sine s = l' x - l x' over h = hypot(c, s). So R t = t"
-// and R b = b" with t" = c t' + s b', b" = c b' - s t', and h is also the trace of the stretch that divides the
-// gradient of the angle: all that `face_rotation.turn_gradient` needs is at hand in the two frames.
+// The rotation in the plane has the cosine c = l' y + l y' and the sine s = l' x - l x' over h = hypot(c, s). So R t =
+// t" and R b = b" with t" = c t' + s b', b" = c b' - s t', and h is also the trace of the stretch that divides the
+// gradient of the angle: all that `face_rotation.rotation_gradient` needs is at hand in the two frames.
 
 void measure(
 #include "face_parameters.inc"
@@ -34,7 +34,7 @@ void measure(
     });
 }
 
-void turn(
+void rotate(
 #include "face_parameters.inc"
     long long* state,             // `STATE` words of zeros
     const float* triangles,       // [F, TRIANGLE], from `measure`, or 0
@@ -154,7 +154,7 @@ void turn(
         });
 }
 
-void turn_backward(
+void rotate_backward(
 #include "face_parameters.inc"
     long long* state,                // `STATE` words of zeros
     const float* triangles,          // [F, TRIANGLE], from `measure`, or 0

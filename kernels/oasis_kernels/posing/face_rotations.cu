@@ -1,9 +1,9 @@
-// Float32 face and vertex rotations on CUDA: `face_rotation` by the formulas of `face_rotation_vectors`.
+// Float32 face and vertex rotations on CUDA: `face_rotation` by the formulas of `face_rotations.cpp`.
 //
-// `turn_faces` (one thread a face) -> `turn_vertices` (one thread a vertex, over its faces). Backward:
-// `turn_faces_backward` (one thread a face, which looks at its three vertices) -> `gather_edges` (one thread a vertex,
-// over its corners). What a face is at rest is either worked out on the way or read from a table that
-// `measure_triangles` wrote, one row of 12 a face, as `face_rotation_vectors` has it.
+// `rotate_faces` (one thread per face) -> `rotate_vertices` (one thread per vertex, over its faces). Backward:
+// `rotate_faces_backward` (one thread per face, which looks at its three vertices) -> `gather_edges` (one thread per
+// vertex, over its corners). What a face is at rest is either worked out on the way or read from a table that
+// `measure_triangles` wrote, one row of 12 a face, as the CPU kernels have it.
 
 __global__ void measure_triangles(
 #include "face_parameters.inc"
@@ -23,14 +23,14 @@ __global__ void measure_triangles(
     put4(out, 3 * f + 2, row.r);
 }
 
-__global__ void turn_faces(
+__global__ void rotate_faces(
 #include "face_parameters.inc"
     const float* triangles,       // [F, 12], from `measure_triangles`, or 0
     const float* posed_vertices,  // [B, V, 3]
     float* face_quats,            // [B, F, 4]
     float* area_ratio,            // [B, F]
     float* rows_of_faces,         // [B, F, 8]: weight times quaternion; weight, damped rest and posed area, 0
-    int* flat_blocks              // one number a block: whether one of its faces has no rotation of its own
+    int* flat_blocks              // one number per block: whether one of its faces has no rotation of its own
 ) {
 #include "vectors_cuda.h"
 #include "face_cuda.h"
@@ -53,13 +53,13 @@ __global__ void turn_faces(
     if (threadIdx.x == 0) flat_blocks[block_index] = any;
 }
 
-__global__ void turn_vertices(
+__global__ void rotate_vertices(
     int n_vertices,
     int n_faces,
     const int* offsets,          // [V + 1]; corners of vertex v are corners[offsets[v] .. offsets[v + 1] - 1]
     const int* corners,          // [3 F]; 3 face + corner
     const float* rows_of_faces,  // [B, F, 8]: weight times quaternion; weight, damped rest and posed area, 0
-    const int* flat_blocks,      // one number a block: whether one of its faces has no rotation of its own
+    const int* flat_blocks,      // one number per block: whether one of its faces has no rotation of its own
     float* face_quats,           // [B, F, 4]
     float* vertex_quats,         // [B, V, 4]
     float* vertex_area_ratio,    // [B, V]
@@ -156,7 +156,7 @@ __global__ void turn_vertices(
     }
 }
 
-__global__ void turn_faces_backward(
+__global__ void rotate_faces_backward(
 #include "face_parameters.inc"
     const float* triangles,          // [F, 12], from `measure_triangles`, or 0
     const float* posed_vertices,     // [B, V, 3]

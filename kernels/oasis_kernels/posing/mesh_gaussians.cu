@@ -1,6 +1,6 @@
 // Float32 posing of Gaussians on CUDA: what `barycentric` computes.
 //
-// `pose_mesh_gaussians` (one thread a Gaussian; blocks for those on vertices, then blocks for those on faces).
+// `pose_mesh_gaussians` (one thread per Gaussian; blocks for those on vertices, then blocks for those on faces).
 // Backward: `pose_mesh_gaussians_backward` (likewise) writes each Gaussian's row of eight for the vertices that it
 // depends on, (by position, by area ratio, by rotation), and for each of its corners the weight of the second half;
 // that of the first are its barycentrics. Then `gather_mesh_gaussians` (blocks for vertices, then blocks for faces; one

@@ -1,4 +1,4 @@
-// Float32 blending on CUDA: two warps sort and draw a tile of 8 x 8 pixels, one pixel a lane.
+// Float32 blending on CUDA: two warps sort and draw a tile of 8 x 8 pixels, one pixel per lane.
 //
 // A warp goes through the tile's list 32 layers at a time: each lane fetches one and tests it against the warp's 8 x 4
 // pixels; those that can reach a pixel are packed together in shared memory, where all lanes read them in turn.

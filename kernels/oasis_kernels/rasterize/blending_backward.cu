@@ -1,8 +1,8 @@
 // Adjoint of the CUDA blending: `blend_backward` replays each tile back to front, `gather` adds up its records.
 //
 // A warp replays a segment of the list for all 64 pixels, two a lane. What the forward pass kept tells it the
-// transmittance at the segment's end and what the later segments add, and so what is seen behind it. One record a pair,
-// at the pair's number; a Gaussian adds its own in order. Records hold sums over the tile's pixels as in
+// transmittance at the segment's end and what the later segments add, and so what is seen behind it. One record per
+// pair, at the pair's number; a Gaussian adds its own in order. Records hold sums over the tile's pixels as in
 // `rasterize_backward`, of the scaled offset y = SCALE W d: six by the shape, then one a channel.
 __global__ void blend_backward(
 #include "tile_parameters.inc"

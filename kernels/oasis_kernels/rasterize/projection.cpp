@@ -1,8 +1,8 @@
 // Float32 projection on the CPU, eight Gaussians at once: what forward and backward share.
 //
 // A task is a chunk of `CHUNK` Gaussians, through all cameras. Arithmetic is float64 as in the generic kernels, eight
-// lanes a vector, so that the two agree to the rounding of the stored float32. A block of fewer than eight Gaussians at
-// the end of the arrays is copied to and from buffers of eight on the stack: nothing outside the arrays is read or
+// lanes per vector, so that the two agree to the rounding of the stored float32. A block of fewer than eight Gaussians
+// at the end of the arrays is copied to and from buffers of eight on the stack: nothing outside the arrays is read or
 // written, and the same instructions compute every Gaussian, wherever it stands.
 //
 // Both passes use factors: covariance = F F^T with F = R(q) S, or F the Cholesky factor of a given covariance. With B

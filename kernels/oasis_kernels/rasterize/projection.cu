@@ -1,4 +1,4 @@
-// `projection.project` in float32 on CUDA: one thread a (camera, Gaussian).
+// `projection.project` in float32 on CUDA: one thread per (camera, Gaussian).
 //
 // Arithmetic is float64 as in the generic kernels, of which a float32 GPU for training does half as much a second; what
 // takes time is the latency of its divisions and roots, so that they start from the hardware's approximations.

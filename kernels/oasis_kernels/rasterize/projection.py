@@ -1,6 +1,6 @@
 """EWA projection of Gaussians into cameras, culling, and the adjoint of it.
 
-Forward: one thread a (camera, Gaussian), flat index `camera * n + gaussian`. Backward: one thread a Gaussian, which
+Forward: one thread per (camera, Gaussian), flat index `camera * n + gaussian`. Backward: one thread per Gaussian, which
 adds its cameras in order, so that no sum depends on scheduling. Arithmetic is float64 (see `gaussian.py`); arrays hold
 `scalar`. A point's place in the image is stored as a whole number plus a remainder, because a float32 pixel coordinate
 alone is the largest rounding error of the picture.

@@ -1,4 +1,4 @@
-// One thread a Gaussian, which adds its cameras in order.
+// One thread per Gaussian, which adds its cameras in order.
 __global__ void project_backward(
     int n,
     int n_cameras,

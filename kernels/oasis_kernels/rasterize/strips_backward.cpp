@@ -1,7 +1,7 @@
 // Adjoint of the drawing of strips: see `rasterize_backward.py` for the equations and `strips.py` for the layout.
 //
-// Back to front from the transmittance of the end, one record a pair at the pair's number; then every Gaussian adds its
-// own records in order. The sums over a pair's pixels are kept in a vector each and reduced together at the end.
+// Back to front from the transmittance of the end, one record per pair at the pair's number; then every Gaussian adds
+// its own records in order. The sums over a pair's pixels are kept in a vector each and reduced together at the end.
 void draw_backward(
 #include "strip_parameters.inc"
     const float* whitenings,     // [n, 4]

@@ -1,11 +1,11 @@
 // Lists of pairs for the tiles of the CUDA rasterizer, counted and filled in any order by atomic counters.
 //
-// `count_pairs` (one thread a Gaussian) numbers the pairs of a Gaussian and a tile and counts those of each tile;
-// `place_tiles` (one thread a tile) gives each tile its part of the memory for lists, and puts the tiles that draw
-// anything first, so that they share out evenly over the device; `fill_tiles` (one thread a Gaussian) writes a sorting
-// key for each pair into its tile's list. All these numbers differ from run to run, but nothing that is drawn depends
-// on them: a key holds depth and index, so a sorted list is the same whatever order it was filled in, and a Gaussian's
-// own pairs have consecutive numbers, tile after tile.
+// `count_pairs` (one thread per Gaussian) numbers the pairs of a Gaussian and a tile and counts those of each tile;
+// `place_tiles` (one thread per tile) gives each tile its part of the memory for lists, and puts the tiles that draw
+// anything first, so that they share out evenly over the device; `fill_tiles` (one thread per Gaussian) writes a
+// sorting key for each pair into its tile's list. All these numbers differ from run to run, but nothing that is drawn
+// depends on them: a key holds depth and index, so a sorted list is the same whatever order it was filled in, and a
+// Gaussian's own pairs have consecutive numbers, tile after tile.
 
 __global__ void count_pairs(
     int n,

@@ -3,7 +3,7 @@
 Such a kernel has one argument, a block of 64-bit words: pointers, whole numbers, or doubles, in the order of the C++
 parameters; an array `T name[n]` of pointers or long longs is n words. Setting them costs the host a microsecond or two,
 where an array object for each argument costs several for each, and a launch that was recorded once is replayed with
-other words.
+another block.
 """
 
 import ctypes
@@ -17,7 +17,7 @@ import warp as wp
 from oasis_kernels.runtime.native import _typed
 from oasis_kernels.runtime.source import defined, kernel_source
 
-READS = {"float": "(float)__longlong_as_double(words[{}])", "double": "__longlong_as_double(words[{}])"}
+READS = {"float": "(float)__longlong_as_double(parameters[{}])", "double": "__longlong_as_double(parameters[{}])"}
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class CudaNative:
     """A C++ function as a kernel."""
 
     kernel: Any
-    words: Any
+    block_type: Any
     """A ctypes structure of its parameters."""
     parameters: tuple[str, ...]
     """Their names, in order."""
@@ -60,17 +60,17 @@ def cuda_native(
         fuse: Whether multiply-adds are fused.
     """
     source = kernel_source(path, name)
-    parameters = _typed(source.parameters, scalar)
+    declared = _typed(source.parameters, scalar)
     constants = {"BLOCK": block, "WARPS": block // 32, **(constants or {})}
     lines, fields, size = [], [], 0
-    for p, kind in parameters.items():
+    for p, kind in declared.items():
         field: Any = ctypes.c_double if kind in READS else ctypes.c_longlong
         if kind.endswith("]"):
             kind, length = kind[:-1].split("[")
-            lines.append(f"{kind} const* const {p} = ({kind} const*)&words.c[{size}];")
+            lines.append(f"{kind} const* const {p} = ({kind} const*)&parameters.c[{size}];")
             field = field * int(str(constants.get(length, length)))
         else:
-            lines.append(f"{kind} const {p} = {READS.get(kind, f'({kind})words[{{}}]').format(size)};")
+            lines.append(f"{kind} const {p} = {READS.get(kind, f'({kind})parameters[{{}}]').format(size)};")
         fields.append((p, field))
         size += ctypes.sizeof(field) // 8
     body = defined(constants, source.body)
@@ -79,23 +79,23 @@ def cuda_native(
     text = "\n    ".join([f"const int block_index = thread / {block};", *lines]) + "\n" + body
     vector = wp.types.vector(length=size, dtype=wp.int64)
 
-    def snippet(thread: int, words: Any): ...
+    def snippet(thread: int, parameters: Any): ...
 
     # Warp keeps functions by name, and a second one of a name takes the place of the first.
     label = label or name
     snippet.__qualname__ = f"{label}_{hashlib.sha1(text.encode()).hexdigest()[:16]}"
-    snippet.__annotations__["words"] = vector
+    snippet.__annotations__["parameters"] = vector
     run = wp.func_native(text)(snippet)
 
-    def launch(words: Any):
-        run(wp.tid(), words)
+    def launch(parameters: Any):
+        run(wp.tid(), parameters)
 
-    launch.__annotations__["words"] = vector
+    launch.__annotations__["parameters"] = vector
     launch.__name__ = launch.__qualname__ = label
     kernel: Any = wp.kernel(
         launch, enable_backward=False, module="unique", launch_bounds=(block, blocks_per_multiprocessor)
     )
     if not fuse:
         wp.set_module_options({"fuse_fp": False}, module=kernel.module)
-    words = type(f"{label}_words", (ctypes.Structure,), {"_fields_": fields})
-    return CudaNative(kernel, words, tuple(parameters), block)
+    block_type = type(f"{label}_parameters", (ctypes.Structure,), {"_fields_": fields})
+    return CudaNative(kernel, block_type, tuple(declared), block)

@@ -63,13 +63,13 @@ def native(
     """
     source = kernel_source(path, name)
     parameters = {"give_way": "long long", **(shared or {}), **_typed(source.parameters, scalar)}
-    words = [f"{kind} const {p} = ({kind})words[{k}];" for k, (p, kind) in enumerate(parameters.items())]
+    lines = [f"{kind} const {p} = ({kind})words[{k}];" for k, (p, kind) in enumerate(parameters.items())]
     body = source.body
     if body.lstrip().startswith("#pragma"):  # which has to stand at the start of a block
         body = "{\n" + body + "}\n"
     body = defined({"PHASE_WORDS": PHASE_WORDS, "TASK": TASK, **(constants or {})}, body)
-    words = ["const long long* words = (const long long*)block;", *words]
-    text = "\n    ".join(words) + "\n" + header_source("runtime/phase.h") + body
+    lines = ["const long long* words = (const long long*)block;", *lines]
+    text = "\n    ".join(lines) + "\n" + header_source("runtime/phase.h") + body
 
     def snippet(block: wp.uint64): ...
 

@@ -1,4 +1,4 @@
-"""Patterns on a surface: gradient noise, one thread a point, and the dabs of lines and spots, one thread a dab.
+"""Patterns on a surface: gradient noise, one thread per point, and the dabs of lines and spots, one thread per dab.
 
 Everything is evaluated at points in space, so that a pattern has no seam where its texture has one.
 """

@@ -26,7 +26,7 @@ auto about = [&](D3 a, double angle) -> D33 {  // Rodrigues
     };
 };
 
-#if defined(__CUDA_ARCH__)  // a block a pose, whose threads share the bones
+#if defined(__CUDA_ARCH__)  // one block per pose, whose threads share the bones
 #define EACH_BONE for (int j = threadIdx.x; j < n_joints; j += BLOCK)
 #define EACH_ROW for (int r = threadIdx.x; r < 3; r += 3)
 #define TOGETHER __syncthreads();

@@ -38,11 +38,11 @@ def transforms_backward(scalar: str) -> Native:
 
 @functools.cache
 def cuda_transforms(scalar: str) -> CudaNative:
-    """CUDA kernel in "float" or "double": one block a pose."""
+    """CUDA kernel in "float" or "double": one block per pose."""
     return _on_cuda("bone_transforms", scalar)
 
 
 @functools.cache
 def cuda_transforms_backward(scalar: str) -> CudaNative:
-    """CUDA kernel in "float" or "double": one block a pose."""
+    """CUDA kernel in "float" or "double": one block per pose."""
     return _on_cuda("bone_transforms_backward", scalar)

@@ -1,6 +1,6 @@
 // Float32 skinning on CUDA, what `skinning` computes with H = G, of points at rest that pose correctives move before.
 //
-// `skin`: four threads a point share its transforms and correctives. `skin_backward` (one thread a point) writes,
+// `skin`: four threads per point share its transforms and correctives. `skin_backward` (one thread per point) writes,
 // besides the gradients of a point's own inputs, the sums over the block's points of weight times gradient of the
 // blended transform; `sum_blocks` (one thread an entry of a transform) adds up the blocks.
 

@@ -89,10 +89,10 @@ MESH_KERNELS: Mapping[str, Callable[[MeshCounts], Work]] = {
         (24 * c.joints + 6 * c.correctives + 18) * c.vertices,
     ),
     # Three indices and a row of 48 on the face at rest; posed corners, each vertex once; quaternion 16, area ratio 4,
-    # row for the vertices 32. A frame of 40, roots and divisions of 10 each, the turn in the plane, a product of 28.
-    "turn_faces": lambda c: Work(12 * c.vertices + (60 + 52) * c.faces, 180 * c.faces),
+    # row for the vertices 32. A frame of 40, roots and divisions of 10 each, the rotation in the plane, a product 28.
+    "rotate_faces": lambda c: Work(12 * c.vertices + (60 + 52) * c.faces, 180 * c.faces),
     # Three corners a face: place 4 and row 32; quaternion 16 and area ratio 4 a vertex.
-    "turn_vertices": lambda c: Work(3 * 36 * c.faces + 24 * c.vertices, 3 * 18 * c.faces + 40 * c.vertices),
+    "rotate_vertices": lambda c: Work(3 * 36 * c.faces + 24 * c.vertices, 3 * 18 * c.faces + 40 * c.vertices),
     # On a vertex: index 4, vertex 12, its quaternion 16 and ratio 4, offset 12, quaternion 16, scales 12; on a face:
     # index 4, corners 12, three vertices and quaternions 84, ratio 4, weights 12, quaternion 16, scales 12; 40 out.
     "pose_mesh_gaussians": lambda c: Work(

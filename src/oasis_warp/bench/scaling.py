@@ -121,7 +121,7 @@ def measure_scaling(
     seed: int = 0,
     progress: Progress = silent,
 ) -> list[ScalingRow]:
-    """Two rows a point, a forward pass and one with a backward pass.
+    """Two rows per point, a forward pass and one with a backward pass.
 
     Args:
         chosen: Of `points`.

@@ -78,12 +78,12 @@ def _face_rotations(
         blocks = n_poses * launch.block_count(n_faces, native_kernels.BLOCK)
         params["flat_blocks"] = corners.table.new_empty(blocks)
         stream = launch.current_stream(rest.device)
-        launch.run_cuda(native_kernels.turn_faces, params, blocks, stream)
+        launch.run_cuda(native_kernels.rotate_faces, params, blocks, stream)
         blocks = n_poses * launch.block_count(n_vertices, native_kernels.BLOCK)
-        launch.run_cuda(native_kernels.turn_vertices, params, blocks, stream)
+        launch.run_cuda(native_kernels.rotate_vertices, params, blocks, stream)
     else:
         params["state"] = launch.phase_state(native_kernels.STATE)
-        launch.run_native(native_kernels.turn, params, launch.task_count(n_faces, n_vertices))
+        launch.run_native(native_kernels.rotate, params, launch.task_count(n_faces, n_vertices))
     return out
 
 
@@ -138,12 +138,12 @@ def _face_rotations_backward(
     if on_cuda:
         stream = launch.current_stream(rest.device)
         blocks = n_poses * launch.block_count(n_faces, native_kernels.BLOCK)
-        launch.run_cuda(native_kernels.turn_faces_backward, params, blocks, stream)
+        launch.run_cuda(native_kernels.rotate_faces_backward, params, blocks, stream)
         blocks = n_poses * launch.block_count(n_vertices, native_kernels.BLOCK)
         launch.run_cuda(native_kernels.gather_edges, params, blocks, stream)
     else:
         params |= {"at_vertices": rest.new_empty((n_vertices, 8)), "state": launch.phase_state(native_kernels.STATE)}
-        launch.run_native(native_kernels.turn_backward, params, launch.task_count(n_faces, n_vertices))
+        launch.run_native(native_kernels.rotate_backward, params, launch.task_count(n_faces, n_vertices))
     return [torch.sum(g_rest, 0) if batch and needs[0] else g_rest, g_posed]
 
 

@@ -304,7 +304,7 @@ def run_cuda(native: CudaNative, params: Parameters, n_blocks: int, stream: "wp.
     if not n_blocks:
         return
     values = [params[name] for name in native.parameters]
-    block = native.words(*[v.data_ptr() if isinstance(v, Tensor) else v or 0 for v in values])
+    block = native.block_type(*[v.data_ptr() if isinstance(v, Tensor) else v or 0 for v in values])
     key = native.kernel, stream.device.ordinal
     recorded = _cuda_launches.launches.get(key)
     if recorded is None:
