@@ -1,4 +1,4 @@
-"""A call of every operator in every way, for the laws that all of them obey."""
+"""Calls of every operator in all their variants, for the laws that all of them obey."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -84,7 +84,7 @@ def call_of(operator, arguments, custom_ops):
 
 
 def calls(seed=0, n=4, dtype=torch.float32, *, empty=False, device="cpu", validate=True, n_poses=N_POSES):
-    """By name "operator way" all calls: meshes of n x n cells, and about n^2 of all else; `empty`: none of all else."""
+    """All calls by name, "operator variant": meshes of n x n cells, and about n^2 of all else, or none if `empty`."""
     generator = torch.Generator().manual_seed(seed)
     rest, posed, faces = (part.to(device) for part in mesh(seed, n, dtype))
     n_vertices, n_faces = len(rest), len(faces)

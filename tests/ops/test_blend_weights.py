@@ -1,4 +1,4 @@
-"""Blend weights: against the rasterizer and its twin, for one image and for several."""
+"""Blend weights: against the rasterizer and its reference, for one image and for several."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from test_strips import Guards
 from oasis_warp.core.types import Camera
 from oasis_warp.ops import blend_colors, blend_weights, rasterization, stack_weights
 from oasis_warp.ops._runtime import blend_strips, weigh
-from oasis_warp.reference import rasterization as twin
+from oasis_warp.reference import rasterization as reference
 
 
 def weights_and_image(device, dtype, **options):
@@ -27,12 +27,12 @@ def test_weights_times_colors_is_the_rasterized_image(device, dtype):
     assert torch.allclose(weights.alphas, alphas, rtol=0, atol=rounding)
 
 
-def test_weights_equal_those_of_the_dense_twin(device):
+def test_weights_equal_those_of_the_dense_reference(device):
     scene, weights, *_ = weights_and_image(device, torch.float64)
     camera = Camera(scene.viewmats[0].cpu(), scene.Ks[0].cpu(), scene.width, scene.height)
-    splats = twin.project(twin.Gaussians(*(g.cpu() for g in scene.gaussians)), camera)
+    splats = reference.project(reference.Gaussians(*(g.cpu() for g in scene.gaussians)), camera)
     expected = torch.zeros(scene.width * scene.height, len(scene.means), dtype=torch.float64)
-    expected[:, splats.index] = twin.blend(twin.dense_layers(splats, camera))[0]
+    expected[:, splats.index] = reference.blend(reference.dense_layers(splats, camera))[0]
     assert torch.allclose(weights.matrix.to_dense().cpu(), expected, rtol=0, atol=1e-12)
 
 

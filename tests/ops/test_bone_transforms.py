@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from reference.kinematics import bone_transforms as twin
+from reference.kinematics import bone_transforms as reference
 from reference.kinematics import joint_rotations
 
 from oasis_warp.core.rotation import from_axis_angle, to_matrix
@@ -44,13 +44,13 @@ def weighted(out, seed=0):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_values_and_gradients_are_those_of_the_twin(seed, dtype, device):
+def test_values_and_gradients_are_those_of_the_reference(seed, dtype, device):
     ours = skeleton(seed, dtype, device)
     theirs = {name: t.cpu().double() if name != "parents" else t for name, t in ours.items()}
     leaves = [ours[name].requires_grad_() for name in FLOATS]
     wide = [theirs[name].requires_grad_() for name in FLOATS]
-    got, want = bone_transforms(**ours), twin(**theirs)
-    # Axes are rounded to the same numbers; the twin's formulas are exact for unit ones, and so is the adjoint.
+    got, want = bone_transforms(**ours), reference(**theirs)
+    # Axes are rounded to the same numbers; the reference's formulas are exact for unit ones, and so is the adjoint.
     tolerance = 2e-7 if dtype == torch.float32 else 1e-14
     for a, b in zip(got, want, strict=True):
         assert a.dtype == dtype and rel(a, b) < tolerance
@@ -101,7 +101,7 @@ def test_bends_keep_their_digits_at_small_angles():
     torch.testing.assert_close(bone_transforms(**arguments).bends[::2], torch.full((6,), want), rtol=1e-6, atol=0)
 
 
-def test_the_joints_of_the_twin_turn_by_rotations_and_the_first_not_at_all():
+def test_the_joints_of_the_reference_turn_by_rotations_and_the_first_not_at_all():
     arguments = skeleton(12)
     local = joint_rotations(arguments["angles"], arguments["axes"])
     eye = torch.eye(3, dtype=torch.float64)

@@ -11,7 +11,7 @@ from oasis_warp.core.types import HandPose
 from oasis_warp.hand.correctives import corrective_coefficients
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.ops import RestMesh, face_rotations, rest_mesh
-from oasis_warp.reference import posing as twin
+from oasis_warp.reference import posing as reference
 
 
 def angle_between(a, b):
@@ -94,7 +94,7 @@ def test_the_area_ratio_of_a_vertex_is_that_of_its_faces_together():
     rest, posed, faces = mesh(3, 4, torch.float64)
     posed[faces[0]] = posed[faces[0]].mean(0)  # one collapses: it turns nothing but still counts
     got = face_rotations(rest, posed, faces).vertex_area_ratio
-    before, after = (twin.planes(vertices, faces).area for vertices in (rest, posed))
+    before, after = (reference.planes(vertices, faces).area for vertices in (rest, posed))
     around = torch.stack([(faces == v).any(1) for v in range(len(rest))]).double()
     # The damping pulls ratios to one by its share of the area, 1e-6 and more for thin faces.
     torch.testing.assert_close(got, (around @ after) / (around @ before), rtol=1e-5, atol=1e-5)

@@ -262,14 +262,14 @@ def test_vectorised_kernels_stay_inside_their_memory(monkeypatch):
             tensor = params.get(name)
             if isinstance(tensor, torch.Tensor) and tensor.numel():
                 poison = torch.nan if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max
-                yard = torch.full((tensor.numel() + 2 * GUARD,), poison, dtype=tensor.dtype)
-                params[name] = yard[GUARD:-GUARD].view(tensor.shape)
+                memory = torch.full((tensor.numel() + 2 * GUARD,), poison, dtype=tensor.dtype)
+                params[name] = memory[GUARD:-GUARD].view(tensor.shape)
                 params[name].copy_(tensor)
-                moved.append((yard, tensor, params[name], poison))
+                moved.append((memory, tensor, params[name], poison))
         run_native(native, params, n_tasks)
-        for yard, tensor, inside, poison in moved:
-            guards = torch.cat([yard[:GUARD], yard[-GUARD:]])
-            assert guards.isnan().all() if yard.is_floating_point() else (guards == poison).all()
+        for memory, tensor, inside, poison in moved:
+            guards = torch.cat([memory[:GUARD], memory[-GUARD:]])
+            assert guards.isnan().all() if memory.is_floating_point() else (guards == poison).all()
             tensor.copy_(inside)
             checked += 1
 

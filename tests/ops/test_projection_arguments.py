@@ -1,4 +1,4 @@
-"""The projection as an operator: what it refuses, what it bears unchecked, and what torch asks of it."""
+"""The projection as an operator: what it refuses, and what it does with unchecked values."""
 
 import pytest
 import torch

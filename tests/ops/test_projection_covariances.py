@@ -33,7 +33,7 @@ def inner_scene(seed):
 
 
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 2e-7), (torch.float64, 1e-13)])
-def test_values_and_gradients_are_those_of_a_dense_twin(dtype, error):
+def test_values_and_gradients_are_those_of_a_dense_reference(dtype, error):
     scene = inner_scene(30)
     g = torch.Generator().manual_seed(0)
     # Not symmetric: every entry has its own derivative.

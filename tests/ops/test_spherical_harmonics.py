@@ -8,7 +8,7 @@ from scipy.special import sph_harm_y
 
 from oasis_warp.ops import rasterization, spherical_harmonics
 from oasis_warp.ops.spherical_harmonics import sh_to_rgb
-from oasis_warp.reference import rasterization as twin
+from oasis_warp.reference import rasterization as reference
 from oasis_warp.reference.rasterization import sh_to_rgb as expected_colors
 
 DEGREES = range(4)
@@ -32,9 +32,9 @@ def textbook_basis(degree, directions):
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_the_twin_is_the_textbook_basis(degree):
+def test_the_reference_is_the_textbook_basis(degree):
     directions, _ = directions_and_coefficients(degree)
-    torch.testing.assert_close(twin.sh_basis(degree, directions), textbook_basis(degree, directions))
+    torch.testing.assert_close(reference.sh_basis(degree, directions), textbook_basis(degree, directions))
 
 
 def directions_and_coefficients(degree, n=50, seed=0, dtype=torch.float64):
@@ -134,9 +134,9 @@ def test_a_far_camera_sees_the_same_colours(device):
     near = scene.with_(means=(scene.means * 1024).round() / 1024).to(device)
     moved = near.with_(means=near.means + shift.to(device), viewmats=far.to(torch.float32).to(device))
     exact = moved.to("cpu").to(torch.float64)
-    truth = expected_colors(3, exact.means, coefficients.double(), exact.viewmats)
+    exact_colors = expected_colors(3, exact.means, coefficients.double(), exact.viewmats)
     got = sh_to_rgb(3, moved.means, coefficients.to(device), moved.viewmats).cpu()
-    assert (got - truth).norm() <= 1e-6 * truth.norm()
+    assert (got - exact_colors).norm() <= 1e-6 * exact_colors.norm()
 
 
 @pytest.mark.usefixtures("as_shipped")
@@ -154,7 +154,7 @@ def test_a_wrong_degree_or_shape_is_refused_by_name(degree, shape, words):
 @pytest.mark.parametrize("wanted", [(1, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
 @pytest.mark.parametrize("per_camera", [False, True])
 @pytest.mark.parametrize("degree", range(4))
-def test_colours_and_their_gradients_are_those_of_the_twin(degree, per_camera, wanted, device):
+def test_colours_and_their_gradients_are_those_of_the_reference(degree, per_camera, wanted, device):
     scene, coefficients = scene_and_coefficients(cameras=3, per_camera=per_camera)  # more than the degree's
     inputs = [
         t.to(device).clone().requires_grad_(bool(asked))
