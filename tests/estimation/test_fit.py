@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from oasis_warp.estimation.fit import Fitter, OutlinePairs
+from oasis_warp.estimation.fit import Fitter, OutlinePairs, SurfacePoints
 from oasis_warp.estimation.fit_problem import FitState, fit_target
 from oasis_warp.estimation.fit_quality import draw_silhouette, iou_above_wrist
 from oasis_warp.estimation.outline import MaskOutline, wrist_line
@@ -42,6 +42,15 @@ def error(kinematics, fitter, state):
     return gaps.mean() / fitter.target.box
 
 
+def pixels(kinematics, truth, count, *, seed=0):
+    """What pixels show of a hand in a known state, its hidden side included."""
+    vertex = np.random.default_rng(seed).integers(0, len(kinematics.template), count)
+    joints = kinematics.pose_joints(truth.angles, truth.shape)
+    normals = kinematics.normals(joints, vertex)[0] @ truth.rotation.T
+    xy, still = truth.project(kinematics.surface(joints)[vertex]), np.zeros((count, 3))
+    return SurfacePoints(vertex, still, still, xy, np.full(count, 0.003 * truth.pixels_per_metre()), normals)
+
+
 def test_derivatives_of_all_terms_are_those_of_differences(kinematics):
     state = posed_hand(kinematics, 0)
     fitter = Fitter(kinematics, seen(kinematics, posed_hand(kinematics, 1)))
@@ -49,17 +58,18 @@ def test_derivatives_of_all_terms_are_those_of_differences(kinematics):
     index = rng.integers(0, len(kinematics.template), 30)
     normal = np.stack([np.cos(index), np.sin(index)], 1)
     target = rng.uniform(100, 300, (30, 2))
-    pairs = OutlinePairs(index, target, normal, np.ones(30), np.zeros_like(kinematics.template))
-    _, slope, _ = fitter.system(state, pairs=pairs)
+    pairs = OutlinePairs(index, target, normal, np.ones(30), np.zeros((30, 3)))
+    terms = {"pairs": pairs, "surface": pixels(kinematics, posed_hand(kinematics, 1), 50)}
+    _, slope, _ = fitter.system(state, **terms)
     # Reweighting makes the gradient of the robust cost 2 J^T r, whatever the loss.
-    residual = fitter.system(state, pairs=pairs)[0]
+    residual = fitter.system(state, **terms)[0]
     gradient = 2 * slope.T @ residual
     step = 1e-6
     free = fitter.everything
     eye = np.eye(slope.shape[1])
     differences = [
-        (fitter.system(state.moved(step * eye[k]), pairs=pairs)[2]
-         - fitter.system(state.moved(-step * eye[k]), pairs=pairs)[2]) / (2 * step)
+        (fitter.system(state.moved(step * eye[k]), **terms)[2]
+         - fitter.system(state.moved(-step * eye[k]), **terms)[2]) / (2 * step)
         for k in free
     ]  # fmt: skip
     np.testing.assert_allclose(gradient[free], differences, rtol=1e-4, atol=1e-4 * np.abs(gradient[free]).max())
@@ -132,6 +142,32 @@ def test_the_outline_brings_the_mesh_onto_the_mask(kinematics):
     drawn = [draw_silhouette(kinematics, solution.state, SIZE) > 0 for solution in (start, found)]
     before, after = (iou_above_wrist(silhouette, mask > 0, noisy) for silhouette in drawn)
     assert 1 - after < min(0.7 * (1 - before), 0.035)
+
+
+def test_pixels_that_say_where_they_are_on_the_surface_bring_a_bad_start_to_the_truth(kinematics):
+    truth = posed_hand(kinematics, 0)
+    target = seen(kinematics, truth, focal=truth.focal)
+    wild = target.xy + np.random.default_rng(1).normal(size=(21, 2)) * 0.04 * target.box
+    fitter = Fitter(kinematics, replace(target, xy=wild))
+    start = fitter.fit_landmarks().state
+    points = pixels(kinematics, truth, 600)
+    points.xy[::5] += np.random.default_rng(2).normal(size=(120, 2)) * 0.2 * target.box  # outliers
+
+    def gap(state):
+        surfaces = [kinematics.surface(kinematics.pose_joints(s.angles, s.shape)) for s in (state, truth)]
+        return np.linalg.norm(state.project(surfaces[0]) - truth.project(surfaces[1]), axis=1).mean() / target.box
+
+    found = fitter.fit_surface(fitter.fit_surface(start, points).state, points).state
+    assert gap(start) > 0.02
+    assert gap(found) < 0.006
+    assert np.abs(found.angles - truth.angles).mean() < 0.5 * np.abs(start.angles - truth.angles).mean()
+
+
+def test_no_pixels_leave_the_fit_to_the_landmarks(kinematics):
+    fitter = Fitter(kinematics, seen(kinematics, posed_hand(kinematics, 1)))
+    state, nothing = fitter.fit_landmarks().state, pixels(kinematics, posed_hand(kinematics, 1), 0)
+    found = fitter.fit_surface(state, nothing).state
+    assert error(kinematics, fitter, found) < 0.02
 
 
 def test_the_wrist_line_separates_hand_from_arm(kinematics):

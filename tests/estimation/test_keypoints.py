@@ -52,7 +52,7 @@ def test_landmarks_in_the_plane_alone_are_fitted(estimator, fitted, tmp_path):
     photo, landmarks, with_world = fitted(NAME)
     path = write(tmp_path / "k.json", {"side": "left", "xy": landmarks.xy.tolist()})
     fit = estimator.fit(photo, read_keypoints(path, photo))
-    assert fit.reprojection < 2
+    assert fit.reprojection < 3
     assert fit.mask_iou > 0.9
     # The same side of the hand faces the camera.
     assert (fit.pose.orientation[:, 1] * with_world.pose.orientation[:, 1]).sum() > 0.7

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -6,119 +8,117 @@ from oasis_warp.core.hand_model import KNUCKLES
 from oasis_warp.estimation.fit_problem import pixels_per_metre
 from oasis_warp.estimation.landmarks import Crop, read_crop
 from oasis_warp.estimation.networks import drawn_hand, networks
-from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
+from oasis_warp.estimation.pixel_reading import SIDE, PixelReading
+from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_reading
+from oasis_warp.network.dense_network import ARM, FRONT, HAND
+
+
+def hand_side(xy, shape):
+    """Distance of pixels from the wrist point towards the knuckles [px]."""
+    up = xy[KNUCKLES].mean(0) - xy[0]
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
+    return ((x - xy[0, 0]) * up[0] + (y - xy[0, 1]) * up[1]) / np.linalg.norm(up)
+
+
+def reading_of(hand, arm, front=None):
+    """What a network says that sees these masks of a photo, a little blurred."""
+    scale = SIDE / len(hand)
+    shares = np.zeros((4, SIDE, SIDE), np.float32)
+    for row, mask in ((HAND, hand), (ARM, arm), (FRONT, np.zeros_like(hand) if front is None else front)):
+        shares[row] = cv2.GaussianBlur(cv2.resize(mask.astype(np.float32), (SIDE, SIDE)), (0, 0), 1.5)
+    shares[0] = 1 - shares[1:].sum(0)
+    nothing = np.zeros((6, SIDE, SIDE), np.float32)
+    return PixelReading(np.zeros(2), scale, shares, nothing[:3], nothing[0], nothing[:3], nothing[:3], nothing)
 
 
 @pytest.fixture(scope="module")
 def drawing():
-    """A drawn hand, so that the mask is known: picture, landmarks, pixels a metre, true mask of hand and arm."""
+    """A drawn hand, so that the mask is known: picture, landmarks, pixels a metre, true masks of hand and of arm."""
     picture = drawn_hand(224)
     seen = read_crop(picture, networks(), Crop(np.array([112.0, 112.0]), 224.0, 0.0))
-    truth = picture[..., 0].astype(int) > picture[..., 2]  # skin is red, the ground blue
-    return picture, seen.xy, pixels_per_metre(seen.xy, seen.world), truth
+    skin = picture[..., 0].astype(int) > picture[..., 2]  # the ground is blue
+    above = hand_side(seen.xy, skin.shape) > 0
+    return picture, seen.xy, pixels_per_metre(seen.xy, seen.world), skin & above, skin & ~above
 
 
 def iou(a, b):
     return (a & b).sum() / (a | b).sum()
 
 
-def hand_side(xy, shape):
-    up = xy[KNUCKLES].mean(0) - xy[0]
-    y, x = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
-    return (x - xy[0, 0]) * up[0] + (y - xy[0, 1]) * up[1]
+def test_the_mask_is_the_hand_without_the_arm(drawing):
+    picture, xy, _, hand, arm = drawing
+    mask = mask_from_reading(picture, reading_of(hand, arm), xy)
+    assert iou(mask > 0.5, hand) > 0.98
+    assert mask.dtype == np.float32
+    assert 0 <= mask.min() < mask.max() <= 1
 
 
-def test_the_mask_is_the_drawn_hand(drawing):
-    picture, xy, scale, truth = drawing
-    mask = mask_from_landmarks(picture, xy, scale)
-    above = hand_side(xy, truth.shape) > 0
-    assert iou((mask > 0.5) & above, truth & above) > 0.97
-    assert mask.min() >= 0
-    assert mask.max() <= 1
+@pytest.mark.parametrize("grown", [-3, 3])
+def test_the_mask_follows_the_edges_of_the_photo_where_the_network_is_a_little_off(drawing, grown):
+    picture, xy, _, hand, arm = drawing
+    change = cv2.dilate if grown > 0 else cv2.erode
+    coarse = change(hand.astype(np.uint8), np.ones((abs(grown), abs(grown)))) > 0
+    seen = reading_of(coarse & ~arm, arm)
+    before = iou(seen.in_photo(seen.hand, (224, 224)) > 0.5, hand)
+    assert 1 - iou(mask_from_reading(picture, seen, xy) > 0.5, hand) < 0.4 * (1 - before)
 
 
-def test_the_arm_is_cut_a_little_below_the_wrist(drawing):
-    picture, xy, scale, truth = drawing
-    mask = mask_from_landmarks(picture, xy, scale)
-    up = np.linalg.norm(xy[KNUCKLES].mean(0) - xy[0])
-    below = hand_side(xy, truth.shape) / up  # pixels beyond the wrist
-    assert (truth & (below < -0.03 * scale)).any(), "there is an arm to cut"
-    assert mask[below < -0.03 * scale].max() < 0.1
-    assert mask[truth & (below > -0.01 * scale) & (below < 0)].mean() > 0.9
+def test_slits_between_fingers_stay_open(drawing):
+    picture, xy, _, hand, arm = drawing
+    slits = (cv2.morphologyEx(hand.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((15, 15))) > 0) & ~hand & ~arm
+    assert slits.sum() > 40
+    mask = mask_from_reading(picture, reading_of(hand, arm), xy)
+    assert (mask[slits] > 0.5).mean() < 0.1
 
 
-def test_a_mask_follows_its_photo(drawing):
-    picture, xy, scale, _ = drawing
-    wide = cv2.copyMakeBorder(picture, 40, 60, 70, 30, cv2.BORDER_REPLICATE)
-    inner = mask_from_landmarks(wide, xy + np.array([70, 40]), scale)[40:-60, 70:-30]
-    assert iou(inner > 0.5, mask_from_landmarks(picture, xy, scale) > 0.5) > 0.98
+def test_a_thing_in_front_of_the_hand_is_left_out_although_it_has_the_colour_of_skin(drawing):
+    picture, xy, _, hand, arm = drawing
+    x, y = xy[KNUCKLES].mean(0).astype(int)
+    bar = np.zeros_like(hand)
+    bar[y - 8 : y + 8, x:] = True  # somebody else's finger
+    joined = picture.copy()
+    joined[bar] = np.median(picture[hand], axis=0)
+    mask = mask_from_reading(joined, reading_of(hand & ~bar, arm, bar), xy)
+    assert mask[cv2.erode(bar.astype(np.uint8), np.ones((9, 9))) > 0].max() < 0.1
+    assert iou(mask > 0.5, hand & ~bar) > 0.95
 
 
 def test_a_large_photo_gives_a_mask_of_its_own_size(drawing):
-    picture, xy, scale, truth = drawing
+    picture, xy, _, hand, arm = drawing
     large = cv2.resize(picture, None, fx=5, fy=5, interpolation=cv2.INTER_CUBIC)
-    mask = mask_from_landmarks(large, xy * 5, scale * 5)
+    seen = reading_of(hand, arm)
+    mask = mask_from_reading(large, replace(seen, scale=seen.scale / 5), xy * 5)
     assert mask.shape == (1120, 1120)
-    small = cv2.resize(mask, (224, 224), interpolation=cv2.INTER_AREA)
-    above = hand_side(xy, truth.shape) > 0
-    assert iou((small > 0.5) & above, truth & above) > 0.97
-
-
-def test_the_second_cut_takes_a_leak_away_and_fills_a_bite(drawing):
-    picture, xy, scale, truth = drawing
-    mesh = (truth & (hand_side(xy, truth.shape) > 0)).astype(np.uint8) * 255
-    mask = mask_from_landmarks(picture, xy, scale)
-    spoilt = mask.copy()
-    spoilt[:30, :60] = 1.0
-    palm = xy[[0, *KNUCKLES]].mean(0).astype(int)
-    spoilt[palm[1] - 6 : palm[1] + 6, palm[0] - 6 : palm[0] + 6] = 0.0
-    again = mask_from_fit(picture, xy, scale, spoilt, mesh)
-    above = hand_side(xy, truth.shape) > 0
-    assert iou((again > 0.5) & above, truth & above) > 0.97
-
-
-def test_fingers_that_touch_in_the_mesh_but_not_in_the_photo_stay_apart(drawing):
-    picture, xy, scale, truth = drawing
-    above = hand_side(xy, truth.shape) > 0
-    wide = int(0.012 * scale)
-    mesh = cv2.morphologyEx((truth & above).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((wide, wide))) * 255
-    slits = (mesh > 0) & ~truth & above
-    assert slits.sum() > 40
-    again = mask_from_fit(picture, xy, scale, truth.astype(np.float32), mesh)
-    assert (again[slits] > 0.5).mean() < 0.1
+    assert iou(cv2.resize(mask, (224, 224), interpolation=cv2.INTER_AREA) > 0.5, hand) > 0.97
 
 
 def test_masks_are_repeatable(drawing):
-    picture, xy, scale, _ = drawing
-    np.testing.assert_array_equal(mask_from_landmarks(picture, xy, scale), mask_from_landmarks(picture, xy, scale))
+    picture, xy, _, hand, arm = drawing
+    first, second = (mask_from_reading(picture, reading_of(hand, arm), xy) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_a_photo_without_a_hand_has_an_empty_mask(drawing):
+    picture, xy, _, hand, _ = drawing
+    nothing = np.zeros_like(hand)
+    assert mask_from_reading(picture, reading_of(nothing, nothing), xy).max() < 0.5
 
 
 def test_the_cut_out_of_a_hand_is_its_mask_without_the_arm(drawing):
-    _, xy, scale, truth = drawing
-    mask = mask_from_alpha(truth.astype(np.float32), xy, scale)
+    _, xy, scale, hand, arm = drawing
+    mask = mask_from_alpha((hand | arm).astype(np.float32), reading_of(hand, arm), xy, scale)
     assert mask is not None
-    above = hand_side(xy, truth.shape) > 0
-    np.testing.assert_array_equal(mask[above], truth[above])
-    assert mask[-10:].max() == 0
+    np.testing.assert_array_equal(mask[hand], 1)
+    assert mask[~(hand | arm)].max() == 0
+    past = -hand_side(xy, hand.shape)
+    assert (arm & (past > 0.03 * scale)).any(), "there is an arm to cut"
+    assert mask[past > 0.03 * scale].max() == 0
+    assert mask[arm & (past < 0.01 * scale)].min() == 1
 
 
 @pytest.mark.parametrize("case", ["a whole person", "half of the hand", "nothing"])
 def test_a_cut_out_that_is_not_of_this_hand_is_left_aside(drawing, case):
-    _, xy, scale, truth = drawing
-    left = np.arange(truth.shape[1]) < xy[9, 0]
-    alpha = {"a whole person": np.ones_like(truth), "half of the hand": truth & left, "nothing": truth & False}[case]
-    assert mask_from_alpha(alpha.astype(np.float32), xy, scale) is None
-
-
-def test_skin_that_sticks_out_of_the_fitted_mesh_is_no_hand(drawing):
-    picture, xy, scale, truth = drawing
-    mesh = (truth & (hand_side(xy, truth.shape) > 0)).astype(np.uint8) * 255
-    x, y = xy[KNUCKLES].mean(0).astype(int)
-    bar = np.zeros_like(truth)
-    bar[y - 8 : y + 8, x:] = True  # somebody else's finger beside the palm
-    joined = picture.copy()
-    joined[bar] = np.median(picture[truth], axis=0)
-    away = cv2.distanceTransform((mesh == 0).astype(np.uint8), cv2.DIST_L2, 5) / scale  # [m]
-    assert (bar & (away > 0.02)).sum() > 200
-    again = mask_from_fit(joined, xy, scale, (truth | bar).astype(np.float32), mesh)
-    assert again[bar & (away > 0.012)].max() < 0.1
+    _, xy, scale, hand, arm = drawing
+    left = np.arange(hand.shape[1]) < xy[9, 0]
+    alpha = {"a whole person": np.ones_like(hand), "half of the hand": hand & left, "nothing": hand & False}[case]
+    assert mask_from_alpha(alpha.astype(np.float32), reading_of(hand, arm), xy, scale) is None

@@ -1,9 +1,8 @@
 """`HandEstimator`: a photo -> the hands in it -> one of them explained by the model."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -13,30 +12,40 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import HandFit, Landmarks, Photo
-from oasis_warp.estimation.fit import Fitter, Solution
+from oasis_warp.estimation.fit import Fitter, Solution, SurfacePoints
 from oasis_warp.estimation.fit_problem import MirroredInput, array, real
 from oasis_warp.estimation.fit_quality import (
     MANY_FINGERS,
     REFUSE_BOUNDS,
+    STRAY_SHARE,
     TINY_HAND,
-    draw_silhouette,
     finger_warnings,
     fit_quality,
     framing_warnings,
     other_side_cost,
     second_detections,
     side_warnings,
+    stray_pixels,
 )
 from oasis_warp.estimation.landmarks import box_size, detect_hands
 from oasis_warp.estimation.networks import networks
 from oasis_warp.estimation.outline import MaskOutline
-from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
+from oasis_warp.estimation.pixel_reading import read_pixels
+from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_reading
+from oasis_warp.estimation.surface_points import surface_points
 from oasis_warp.hand.kinematics import HandKinematics
 
 _NO_HAND = 16
 """Smaller hands are refused even by force [px]."""
-_ROUNDS, _LAST_ROUNDS = 3, 2
-"""Rounds of pairing outlines with the first and the second mask."""
+_ROUNDS = 3
+"""Of pairing outlines."""
+
+
+class _FittedPixels(NamedTuple):
+    found: Solution
+    mask: np.ndarray
+    points: SurfacePoints
+    warnings: list[str]
 
 
 class HandEstimator:
@@ -100,17 +109,21 @@ class HandEstimator:
         known_shape = None if shape is None else array(shape)
         fitter = Fitter(self.kinematics, view.target, shape=known_shape)
         start = fitter.fit_landmarks()
-        found, mask, warnings = self._fit_outline(view, fitter, start)
+        found, mask, points, warnings = self._fit_pixels(view, fitter, start)
         quality = fit_quality(self.kinematics, view.target, found.state, mask, found.cost)
         detections = second_detections(view.rgb, networks(), view.target.xy)
         fingers = finger_warnings(view.target, detections)
-        warnings = [*quality.warnings(), *warnings, *framing_warnings(view.target, mask), *fingers]
+        stray, stray_fingers = stray_pixels(self.kinematics, view.target, found.state, points)
+        framing = framing_warnings(view.target, mask)
+        warnings = [*quality.warnings(), *warnings, *framing, *fingers, *stray_fingers]
         if landmarks.world is not None:  # 21 points in the plane alone do not tell a palm from the other hand's back
             other_cost = other_side_cost(self.kinematics, view.target, known_shape)
             warnings += side_warnings(landmarks.side, start.cost, other_cost, detections)
         refused = quality.beyond(REFUSE_BOUNDS)
         if len(fingers) >= MANY_FINGERS:
             refused.append("the network sees the hand elsewhere")
+        if stray > STRAY_SHARE:
+            refused.append(f"{100 * stray:.0f} % of the hand's pixels lie elsewhere on the model")
         if refused and not force:
             raise InputError(
                 f"{photo.name}: the fit of the {landmarks.side} hand is too poor to use, {' and '.join(refused)}; "
@@ -127,26 +140,19 @@ class HandEstimator:
             warnings=tuple(warnings),
         )
 
-    def _fit_outline(
-        self, view: MirroredInput, fitter: Fitter, start: Solution
-    ) -> tuple[Solution, np.ndarray, list[str]]:
-        """Fit to the outline of a first mask, then to that of a second one, which is cut with the help of the fit."""
+    def _fit_pixels(self, view: MirroredInput, fitter: Fitter, start: Solution) -> _FittedPixels:
+        """Fit to the surface that the dense network reads and to the mask's outline."""
         warnings = []
         xy, scale = view.target.xy, start.state.pixels_per_metre()
-        ready = None if view.alpha is None else mask_from_alpha(view.alpha, xy, scale)
-        if view.alpha is not None and ready is None:
+        reading = read_pixels(view.rgb, xy)
+        mask = None if view.alpha is None else mask_from_alpha(view.alpha, reading, xy, scale)
+        if view.alpha is not None and mask is None:
             warnings.append("the photo's own cut-out was left aside: it does not show this hand alone and whole")
-        mask = mask_from_landmarks(view.rgb, xy, scale) if ready is None else ready
-        outline = MaskOutline(mask, xy)
-        found = fitter.refine(start.state, lambda state: outline.match(self.kinematics, state), _ROUNDS)
-        if ready is None:
-            drawn = draw_silhouette(self.kinematics, found.state, view.target.size)
-            first, mask = mask, mask_from_fit(view.rgb, xy, scale, mask, drawn)
-            # Where the two masks disagree, the photo does not say where the hand ends.
-            disagreement = cv2.dilate(np.abs(mask - first), np.ones((5, 5), np.uint8))
-            outline = MaskOutline(mask, xy, confidence=1 - 0.75 * disagreement)
-            found = fitter.refine(found.state, lambda state: outline.match(self.kinematics, state), _LAST_ROUNDS)
-        return found, mask, warnings
+        mask = mask_from_reading(view.rgb, reading, xy) if mask is None else mask
+        outline, points = MaskOutline(mask, xy), surface_points(self.kinematics, reading, scale)
+        found = fitter.fit_surface(start.state, points)
+        found = fitter.refine(found.state, lambda state: outline.match(self.kinematics, state), _ROUNDS, points)
+        return _FittedPixels(found, mask, points, warnings)
 
 
 def choose_hand(

@@ -14,7 +14,7 @@ from oasis_warp.core.hand_model import KNUCKLES
 from oasis_warp.estimation.fit_problem import FitState, FitTarget, Linearized
 from oasis_warp.estimation.landmarks import BONES
 from oasis_warp.estimation.least_squares import Damping, QuadraticModel, cauchy, charbonnier, minimize
-from oasis_warp.hand.kinematics import HandKinematics, unit
+from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, unit
 
 _PALM = [0, *KNUCKLES]
 _DAMPING = Damping(start=1e-2, grow=4, shrink=3, least=1e-6, floor=1e-6)
@@ -51,6 +51,16 @@ class FitSettings:
     """Robust scale in sigmas (Cauchy)."""
     outline_weight: float = 60.0
     """Number of observations that all pairs of the outline together count as."""
+    surface: float = 0.008
+    """Least sigma of a pixel's place on the surface; the spread that the network gives is added in quadrature."""
+    surface_scale: float = 2.0
+    """Robust scale in sigmas (Cauchy)."""
+    surface_weight: float = 200.0
+    """Number of observations that all pixels together count as, in their places and in their normals."""
+    normal: float = 0.3
+    normal_weight: float = 100.0
+    weak_landmark: float = 0.04
+    """Of landmarks beside pixels."""
 
 
 _FIXED = 1e-4
@@ -70,7 +80,25 @@ class OutlinePairs:
     weight: np.ndarray
     """At most 1, [P]."""
     displacement: np.ndarray
-    """Pose correctives of the rest surface when the pairs were made [m], [V, 3]."""
+    """Pose correctives of the vertices at rest when the pairs were made [m], [P, 3]."""
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Places on the surface that pixels of the photo show."""
+
+    vertex: np.ndarray
+    """The nearest vertex, [P]."""
+    offset: np.ndarray
+    """From it along the mean hand's surface at rest to the place [m], [P, 3]."""
+    displacement: np.ndarray
+    """The same with pose correctives, [P, 3]."""
+    xy: np.ndarray
+    """The pixel's centre [px], [P, 2]."""
+    spread: np.ndarray
+    """Scale of the Laplace distribution of the place on the surface [px], [P]."""
+    normal: np.ndarray
+    """Unit normal in the camera's frame, [P, 3]."""
 
 
 @dataclass(frozen=True)
@@ -114,19 +142,21 @@ class Fitter:
 
     def system(
         self, state: FitState, *, landmarks: bool = True, robust: bool = True, pairs: OutlinePairs | None = None,
+        surface: SurfacePoints | None = None,
     ) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
         """Weighted residuals, their Jacobian by a step, and the robust cost."""
         s, box = self.settings, self.target.box
+        sigma = box * (s.landmark if surface is None else s.weak_landmark)
         joints = self.kinematics.pose_joints(state.angles, state.shape)
         points = state.linearize(*self.kinematics.landmarks(joints))
         n = points.d_image.shape[2]
         residuals, jacobians, cost = [], [], 0.0
         if landmarks:
-            error = (points.image - self.target.xy) / (s.landmark * box)
+            error = (points.image - self.target.xy) / sigma
             weight, loss = charbonnier((error**2).sum(1), s.landmark_scale if robust else 1e6)
             weight = weight**0.5
             residuals.append((error * weight[:, None]).ravel())
-            jacobians.append((points.d_image * (weight / (s.landmark * box))[:, None, None]).reshape(-1, n))
+            jacobians.append((points.d_image * (weight / sigma)[:, None, None]).reshape(-1, n))
             cost += float(loss.sum())
         for residual, jacobian in (*self._bone_term(points), *self._priors(state, n)):
             residuals.append(residual)
@@ -141,6 +171,11 @@ class Fitter:
             residuals.append(error * weight)
             jacobians.append(np.einsum("na,nak->nk", pairs.normal * (weight / (s.outline * box))[:, None], rim.d_image))
             cost += float((loss * share).sum())
+        if surface is not None and len(surface.vertex):
+            for residual, jacobian, loss in self._surface_terms(state, joints, surface):
+                residuals.append(residual.ravel())
+                jacobians.append(jacobian.reshape(-1, n))
+                cost += loss
         return np.concatenate(residuals), np.concatenate(jacobians), cost
 
     def _bone_term(self, points: Linearized) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -153,6 +188,30 @@ class Fitter:
         across /= np.linalg.norm(bones, axis=1)[:, None, None] * self.settings.bone
         residual = (direction - self.target.directions) / self.settings.bone
         return [(residual.ravel(), (across @ (points.d_seen[end] - points.d_seen[start])).reshape(len(BONES) * 3, -1))]
+
+    def _surface_terms(
+        self, state: FitState, joints: PosedJoints, surface: SurfacePoints
+    ) -> list[tuple[np.ndarray, np.ndarray, float]]:
+        """Pixels against the projections of their places on the surface, and their normals against those there."""
+        s, count = self.settings, len(surface.vertex)
+        places = state.linearize(*self.kinematics.vertices(joints, surface.vertex, surface.displacement))
+        sigma = np.hypot(s.surface * self.target.box, surface.spread)
+        error = (places.image - surface.xy) / sigma[:, None]
+        weight, loss = cauchy((error**2).sum(1), s.surface_scale)
+        share = s.surface_weight / count
+        weight = np.sqrt(weight * share)[:, None]
+        terms = [(error * weight, places.d_image * (weight / sigma[:, None])[..., None], float(loss.sum() * share))]
+        normals, by_angle = self.kinematics.normals(joints, surface.vertex)
+        normals = normals @ state.rotation.T
+        error = (normals - surface.normal) / s.normal
+        weight, loss = cauchy((error**2).sum(1), s.surface_scale)
+        share = s.normal_weight / count
+        weight = np.sqrt(weight * share)[:, None]
+        slope = np.zeros(places.d_seen.shape)
+        slope[:, :, :3] = -cross_matrices(normals)
+        slope[:, :, 6 : 6 + self.n_angles] = state.rotation @ by_angle
+        terms.append((error * weight, slope * (weight / s.normal)[..., None], float(loss.sum() * share)))
+        return terms
 
     def _priors(self, state: FitState, n: int) -> list[tuple[np.ndarray, np.ndarray]]:
         s, eye = self.settings, np.eye(n)
@@ -195,12 +254,25 @@ class Fitter:
         found = [self._from_start(start) for start in self._starts_without_world()]
         return min(found, key=lambda solution: solution.cost)
 
-    def refine(self, state: FitState, match: Callable[[FitState], OutlinePairs], rounds: int) -> Solution:
+    def fit_surface(self, state: FitState, surface: SurfacePoints) -> Solution:
+        """Fit to what pixels show of the surface, beside landmarks of little weight."""
+        return self.solve(state, 8, self.everything, tolerance=1e-3, surface=self._corrected(surface, state))
+
+    def refine(
+        self, state: FitState, match: Callable[[FitState], OutlinePairs], rounds: int,
+        surface: SurfacePoints | None = None,
+    ) -> Solution:  # fmt: skip
         """Alternate between pairing outlines and three steps of all unknowns."""
         found = Solution(state, np.inf)
         for _ in range(rounds):
-            found = self.solve(found.state, 3, self.everything, pairs=match(found.state))
+            corrected = None if surface is None else self._corrected(surface, found.state)
+            found = self.solve(found.state, 3, self.everything, pairs=match(found.state), surface=corrected)
         return found
+
+    def _corrected(self, surface: SurfacePoints, state: FitState) -> SurfacePoints:
+        """`surface` with the pose correctives of `state`."""
+        correctives = self.kinematics.correctives(self.kinematics.all_angles(state.angles))
+        return replace(surface, displacement=surface.offset + correctives[surface.vertex])
 
     def _from_start(self, state: FitState) -> Solution:
         state = self.solve(state, 15, self.pose_and_camera, tolerance=1e-3, robust=False).state
@@ -253,6 +325,14 @@ class Fitter:
                 scale = np.sqrt((b**2).sum() / (a**2).sum())
                 starts.append(self._centred(replace(state, rotation=rotation), float(np.log(state.focal / scale))))
         return starts
+
+
+def cross_matrices(vectors: np.ndarray) -> np.ndarray:
+    """Matrices that take the cross product of each vector with another one, [P, 3, 3]."""
+    matrices = np.zeros((len(vectors), 3, 3))
+    for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        matrices[:, b, a], matrices[:, a, b] = vectors[:, c], -vectors[:, c]
+    return matrices
 
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.mirror import MIRROR
 from oasis_warp.core.types import HandFit, HandPose
-from oasis_warp.estimation.fit import Fitter
+from oasis_warp.estimation.fit import Fitter, SurfacePoints
 from oasis_warp.estimation.fit_problem import FitState, FitTarget, fit_target, mirrored_fit
 from oasis_warp.estimation.landmarks import FINGERS, DetectedHand, crop_of_landmarks, read_crop
 from oasis_warp.estimation.networks import Networks
@@ -29,6 +29,16 @@ _FINGER_GAP = 0.06
 _CROP_ROTATION = 0.3
 """Angle by which the crop of the second detection is rotated [rad]."""
 _MIN_PRESENCE = 0.5
+_STRAY = 0.06
+"""Distance of a pixel from its place on the model, as a fraction of the box, beyond which it strays."""
+STRAY_SHARE = 0.35
+"""Share of all pixels that stray from which a fit is refused. At most .07 on 16 good fits."""
+_STRAY_WARNED, _STRAY_FINGER = 0.15, 0.5
+"""Shares of all pixels, and of those of a finger, about which a warning is given."""
+_FEWEST_PIXELS = 12
+"""Of a finger that is judged."""
+_FINGERS_OF_JOINTS = ("index", "middle", "little", "ring", "thumb")
+"""In the order of the model's joints."""
 _BORDER = 0.08
 """Length along which a hand may touch the photo's border, as a fraction of the box."""
 
@@ -43,8 +53,8 @@ class Bounds:
     cost: float
 
 
-WARN_BOUNDS = Bounds(reprojection=2.3, worst_point=8.0, mask_iou=0.90, cost=170.0)
-REFUSE_BOUNDS = Bounds(reprojection=4.0, worst_point=np.inf, mask_iou=0.85, cost=400.0)
+WARN_BOUNDS = Bounds(reprojection=3.5, worst_point=10.0, mask_iou=0.90, cost=450.0)
+REFUSE_BOUNDS = Bounds(reprojection=6.0, worst_point=np.inf, mask_iou=0.85, cost=900.0)
 
 
 @dataclass(frozen=True)
@@ -147,6 +157,29 @@ def finger_warnings(target: FitTarget, detections: list[DetectedHand]) -> list[s
                 f"{100 * min(gaps):.0f} % of the hand's size elsewhere"
             )
     return warnings
+
+
+def stray_pixels(
+    kinematics: HandKinematics, target: FitTarget, state: FitState, points: SurfacePoints
+) -> tuple[float, list[str]]:
+    """Share of the pixels whose places on the fitted surface lie elsewhere, and warnings about fingers."""
+    if not len(points.vertex):
+        return 0.0, []
+    surface = kinematics.surface(kinematics.pose_joints(state.angles, state.shape))
+    gap = np.linalg.norm(state.project(surface[points.vertex]) - points.xy, axis=1)
+    stray = gap > _STRAY * target.box
+    finger = (kinematics.weights[points.vertex].argmax(1) + 2) // 3
+    warnings = []
+    for number, name in enumerate(_FINGERS_OF_JOINTS, 1):
+        own = stray[finger == number]
+        if len(own) >= _FEWEST_PIXELS and own.mean() > _STRAY_FINGER:
+            warnings.append(
+                f"{name} {'' if name == 'thumb' else 'finger '}doubtful: {100 * own.mean():.0f} % of its pixels lie "
+                "elsewhere on the fitted hand"
+            )
+    if stray.mean() > _STRAY_WARNED:
+        warnings.insert(0, f"poor fit: {100 * stray.mean():.0f} % of the hand's pixels lie elsewhere on the model")
+    return float(stray.mean()), warnings
 
 
 def other_side_cost(kinematics: HandKinematics, target: FitTarget, shape: np.ndarray | None) -> float:

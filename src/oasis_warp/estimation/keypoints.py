@@ -13,8 +13,9 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.mirror import mirror_landmarks
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
 from oasis_warp.estimation.fit_problem import MirroredInput, mirrored_state, real
-from oasis_warp.estimation.fit_quality import draw_silhouette, fit_quality, framing_warnings
-from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_fit, mask_from_landmarks
+from oasis_warp.estimation.fit_quality import fit_quality, framing_warnings
+from oasis_warp.estimation.pixel_reading import read_pixels
+from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_reading
 from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.template import bundled_hand
 
@@ -101,10 +102,9 @@ def fit_of_pose(
     view = MirroredInput(photo, landmarks, state.focal)
     state = replace(state, focal=state.focal * float(view.scale[0]), centre=state.centre * view.scale)
     scale, xy = state.pixels_per_metre(), view.target.xy
-    mask = None if view.alpha is None else mask_from_alpha(view.alpha, xy, scale)
-    if mask is None:
-        first = mask_from_landmarks(view.rgb, xy, scale)
-        mask = mask_from_fit(view.rgb, xy, scale, first, draw_silhouette(kinematics, state, view.target.size))
+    reading = read_pixels(view.rgb, xy)
+    mask = None if view.alpha is None else mask_from_alpha(view.alpha, reading, xy, scale)
+    mask = mask_from_reading(view.rgb, reading, xy) if mask is None else mask
     quality = fit_quality(kinematics, view.target, state, mask, 0.0)
     return HandFit(
         side=side,

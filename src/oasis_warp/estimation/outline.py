@@ -130,7 +130,7 @@ class MaskOutline:
         posed = kinematics.pose_surface(joints, kinematics.rest_surface(state.shape) + displacement)
         vertex, normals, inset, edge = self._mesh_outline(kinematics, state, posed)
         if len(vertex) < 10 or len(self.points) < 10:
-            return OutlinePairs(np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), displacement)
+            return OutlinePairs(np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3)))
         p, q = self.points / self.box, edge / self.box
         squared = (p**2).sum(1)[:, None] + (q**2).sum(1) - 2 * p @ q.T
         squared[self.normals @ normals.T < _PARALLEL] = np.inf
@@ -144,7 +144,7 @@ class MaskOutline:
             target=self.points[row] - self.normals[row] * inset[col, None],
             normal=self.normals[row],
             weight=self.weights[row],
-            displacement=displacement,
+            displacement=displacement[vertex[col]],
         )
 
     def _mesh_outline(

@@ -65,7 +65,8 @@ def state_of_surface(
 
     def model(state: FitState) -> QuadraticModel:
         joints = kinematics.pose_joints(state.angles, state.shape)
-        points = state.linearize(*kinematics.vertices(joints, index, kinematics.correctives(joints.angles) + own))
+        displacement = (kinematics.correctives(joints.angles) + own)[index]
+        points = state.linearize(*kinematics.vertices(joints, index, displacement))
         error = (points.seen - posed[index]) / _SIGMA
         weight = charbonnier((error**2).sum(1), _SCALE)[0] ** 0.5
         jacobian = (points.d_seen * (weight / _SIGMA)[:, None, None]).reshape(-1, points.d_seen.shape[2])

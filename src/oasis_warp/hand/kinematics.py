@@ -64,6 +64,7 @@ class HandKinematics:
         self.weights = real(hand.weights)
         self.faces = hand.faces.cpu().numpy().astype(np.int64)
         self.rim = hand.rim.cpu().numpy()
+        self.rest_normals = self.vertex_normals(self.template)
         keypoints = hand.keypoint_index.cpu().numpy()
         self.points = np.concatenate([self.joints, real(hand.tips)])[keypoints]
         self.points_basis = np.concatenate([self.joint_basis, real(hand.tip_basis)])[keypoints]
@@ -166,9 +167,9 @@ class HandKinematics:
     def vertices(
         self, joints: PosedJoints, index: np.ndarray, displacement: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Posed vertices `index`, and d vertices / d (angles, shape); the surface's `displacement` stays constant."""
+        """Posed vertices `index`, and d vertices / d (angles, shape); their `displacement` [P, 3] stays constant."""
         basis = self.shape_basis[index]
-        start, weights = self.template[index] + basis @ joints.shape + displacement[index], self.weights[index]
+        start, weights = self.template[index] + basis @ joints.shape + displacement, self.weights[index]
         shifts, turn = self.bone_shifts(joints), self.blended(joints, index)
         points = (turn @ start[..., None])[..., 0] + weights @ shifts
         dof_joint = self.dofs[:, 0]
@@ -181,6 +182,18 @@ class HandKinematics:
         shift_by_shape = joints.position_by_shape - joints.rotation @ self.joint_basis
         by_shape = turn @ basis + np.tensordot(weights, shift_by_shape, 1)
         return points, np.concatenate([by_angle.transpose(0, 2, 1), by_shape], 2)
+
+    def normals(self, joints: PosedJoints, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Posed normals of vertices of the mean hand, [P, 3], and d normals / d angles, [P, 3, 26]."""
+        rest, weights = self.rest_normals[index], self.weights[index]
+        shares = weights[:, :, None] * (joints.rotation @ rest.T).transpose(2, 0, 1)
+        normals = shares.sum(1)
+        length = np.linalg.norm(normals, axis=1)[:, None]
+        moved = np.einsum("nja,jd->nda", shares, self.below[self.dofs[:, 0]].T, optimize=True)
+        by_angle = np.cross(joints.axes[tuple(self.dofs.T)], moved)
+        normals, by_angle = normals / length, by_angle / length[:, None]
+        by_angle -= normals[:, None] * (by_angle @ normals[..., None])
+        return normals, by_angle.transpose(0, 2, 1)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
