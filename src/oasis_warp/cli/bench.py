@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from rich.table import Table
 
 from oasis_warp.bench import error_time, gpu_cases, gpu_speed, plots, roofline, scaling, speed
 from oasis_warp.bench.operators import OPERATORS
@@ -23,7 +22,7 @@ from oasis_warp.bench.tables import (
     setting_table,
     speed_table,
 )
-from oasis_warp.cli.console import check_device, show_progress
+from oasis_warp.cli.console import check_device, print_tables, show_progress
 from oasis_warp.cli.options import Bench, ErrorTime, Kernels, Roofline, Scaling
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.processes import using_threads
@@ -111,7 +110,7 @@ def run_error_time(options: ErrorTime) -> None:
         if with_plots:
             for op in dict.fromkeys(row.op for row in rows):
                 plots.plot_operator(rows, op, folder / f"{op}.png")
-    show(*(setting_table(group) for group in error_time.groups(rows)), budget_table(rows))
+    print_tables([*(setting_table(group) for group in error_time.groups(rows)), budget_table(rows)], TABLE_WIDTH)
 
 
 def run_kernels(options: Kernels) -> None:
@@ -133,7 +132,7 @@ def run_kernels(options: Kernels) -> None:
             run_options = speed.RunOptions(device=torch.device("cpu"), threads=options.threads, repeats=repeats)
             rows = speed.measure_operators(operators, run_options, gaussians=gaussians, size=size, progress=progress)
         write(rows)
-    show(speed_table(rows))
+    print_tables([speed_table(rows)], TABLE_WIDTH)
 
 
 def run_gpu(options: Kernels) -> None:
@@ -154,7 +153,7 @@ def run_gpu(options: Kernels) -> None:
                 cases, torch.device("cuda"), groups=options.repeats or GPU_GROUPS, peers=peers, progress=progress
             )
         write(rows)
-    show(gpu_table(rows))
+    print_tables([gpu_table(rows)], TABLE_WIDTH)
     for row in rows:
         if row.not_captured and row.way == gpu_cases.OURS:
             notes.print(f"oasis: {row.case}, {row.pass_}: no graph could hold it: {row.not_captured}", soft_wrap=True)
@@ -177,7 +176,7 @@ def run_scaling(options: Scaling) -> None:
         write_rows(rows, folder / "scaling.csv", folder / "scaling.json")
         if with_plot:
             plots.plot_scaling(rows, folder / "scaling.png")
-    show(scaling_table(rows), growth_table(rows))
+    print_tables([scaling_table(rows), growth_table(rows)], TABLE_WIDTH)
 
 
 def run_roofline(options: Roofline) -> None:
@@ -188,7 +187,7 @@ def run_roofline(options: Roofline) -> None:
         if not rows:
             raise InputError("--device cuda: torch's profiler traces no kernels here; check the driver's permissions.")
         write(rows)
-    show(roofline_table(rows))
+    print_tables([roofline_table(rows)], TABLE_WIDTH)
 
 
 @contextmanager
@@ -225,11 +224,3 @@ def can_plot(notes: Console) -> bool:
         notes.print(f"oasis: {plots.MISSING}", highlight=False, soft_wrap=True, markup=False)
         return False
     return True
-
-
-def show(*tables: Table) -> None:
-    """Print tables on a console that is wide enough not to cut numbers."""
-    console = Console()
-    console = console if console.width >= TABLE_WIDTH else Console(width=TABLE_WIDTH)
-    for table in tables:
-        console.print(table)

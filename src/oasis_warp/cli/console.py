@@ -2,11 +2,12 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
+from rich.table import Table
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
@@ -64,6 +65,14 @@ def line_progress(write: Callable[[str], object], clock: Callable[[], float] = t
             write(f"{stage}: {done} of {total}, about {left:.0f} s left")
 
     return progress
+
+
+def print_tables(tables: Iterable[Table], width: int) -> None:
+    """Print tables, on a terminal narrower than `width` characters as if it had these, so that no number is cut."""
+    console = Console()
+    console = console if console.width >= width else Console(width=width)
+    for table in tables:
+        console.print(table)
 
 
 def check_device(device: str) -> None:

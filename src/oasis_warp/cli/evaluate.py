@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from oasis_warp.avatar.prior import MeanPrior, Prior
-from oasis_warp.cli.console import INTERRUPTED, check_device, show_progress
+from oasis_warp.cli.console import INTERRUPTED, check_device, print_tables, show_progress
 from oasis_warp.cli.options import Evaluate
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
@@ -61,10 +61,7 @@ def run(options: Evaluate) -> int:
     except KeyboardInterrupt:
         print(f"oasis: stopped; what is whole stays in {options.out}, the same command goes on.", file=sys.stderr)
         return INTERRUPTED
-    console = Console()
-    console = console if console.width >= TABLE_WIDTH else Console(width=TABLE_WIDTH)
-    for table in made:
-        console.print(table)
+    print_tables(made, TABLE_WIDTH)
     return 0
 
 

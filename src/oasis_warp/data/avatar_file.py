@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
@@ -20,6 +19,7 @@ from oasis_warp import __version__
 from oasis_warp.core.checks import check_finite, check_shape
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import write_file
+from oasis_warp.data.tensor_file import open_tensors
 
 FORMAT = "oasis-avatar"
 VERSION = 4
@@ -104,22 +104,12 @@ def load_avatar(path: Path | str) -> tuple[dict[str, Tensor], dict[str, Any]]:
             missing, unknown or out of bounds.
     """
     path = Path(path)
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
-        raise InputError(f"{path}: expected an avatar file, found {found}; `oasis reconstruct` writes one.")
-    try:
-        with safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get(FORMAT)
-            if text is None:
-                raise InputError(f"{path}: a safetensors file, but no avatar; give the one `oasis reconstruct` wrote.")
-            header = _read_header(path, text)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except SafetensorError as error:
-        raise InputError(
-            f"{path}: expected an avatar file, got another format or a file cut short ({error}); copy it again."
-        ) from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file's permissions.") from error
+    with open_tensors(path, "an avatar file", "`oasis reconstruct` writes one") as file:
+        text = (file.metadata() or {}).get(FORMAT)
+        if text is None:
+            raise InputError(f"{path}: a safetensors file, but no avatar; give the one `oasis reconstruct` wrote.")
+        header = _read_header(path, text)
+        tensors = {name: file.get_tensor(name) for name in file.keys()}
     try:
         _check_tensors(tensors)
     except ValueError as error:

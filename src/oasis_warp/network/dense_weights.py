@@ -4,19 +4,19 @@ The metadata have one entry, "oasis-dense": a JSON object with `version`, `width
 """
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from oasis_warp import __version__
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import write_file
+from oasis_warp.data.tensor_file import open_tensors
 from oasis_warp.network.dense_network import DEPTHS, WIDTHS, DenseNetwork
+from oasis_warp.network.encoders import differing_tensors
 
 FORMAT = "oasis-dense"
 VERSION = 1
@@ -50,7 +50,7 @@ def load_dense_network(path: Path | str) -> DenseNetwork:
         _checked_header(path, file)
         tensors = {name: file.get_tensor(name).float() for name in file.keys()}
     network = DenseNetwork()
-    if {name: t.shape for name, t in network.state_dict().items()} != {name: t.shape for name, t in tensors.items()}:
+    if differing_tensors(network.state_dict(), tensors):
         raise InputError(f"{path}: its weights are not those of a dense network; copy it again.")
     if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
         raise InputError(f"{path}: expected finite weights of a dense network, got others; copy it again.")
@@ -69,18 +69,8 @@ def read_dense_header(path: Path | str) -> dict[str, Any]:
         return _checked_header(path, file)
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    if not path.is_file():
-        raise InputError(f"{path}: expected the dense network's weights, found no such file; give another path.")
-    try:
-        with safe_open(path, framework="pt") as file:
-            yield file
-    except SafetensorError as error:
-        raise InputError(
-            f"{path}: expected the dense network's weights, got another format or a file cut short ({error}); "
-            "copy it again."
-        ) from error
+def _opened(path: Path) -> AbstractContextManager[Any]:
+    return open_tensors(path, "the dense network's weights", "give another path")
 
 
 def _checked_header(path: Path, file: Any) -> dict[str, Any]:
@@ -88,8 +78,8 @@ def _checked_header(path: Path, file: Any) -> dict[str, Any]:
         header = json.loads((file.metadata() or {}).get(FORMAT, "null"))
     except json.JSONDecodeError:
         header = None
-    sizes = [header.get(name) for name in ("version", "widths", "depths")] if isinstance(header, dict) else None
-    if sizes != [VERSION, list(WIDTHS), list(DEPTHS)]:
+    expected = {"version": VERSION, "widths": list(WIDTHS), "depths": list(DEPTHS)}
+    if not isinstance(header, dict) or not expected.items() <= header.items():
         raise InputError(
             f"{path}: expected the weights of a dense network of version {VERSION}, got another file; give one that "
             "`oasis pretrain --task dense` wrote."

@@ -4,6 +4,7 @@ The published `model.safetensors` of facebook/dinov2-small, -base and -large (Ap
 file of the user's; nothing is downloaded.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -206,17 +207,18 @@ class DinoV2Encoder(nn.Module):
                 f"{path}: expected the weights of DINOv2, got another format or a file cut short ({error})."
             ) from error
         state = {_our_name(name): tensor.float() for name, tensor in published.items() if "mask_token" not in name}
-        own = self.state_dict()
-        wrong = sorted(
-            name for name in own.keys() | state.keys()
-            if name not in own or name not in state or own[name].shape != state[name].shape
-        )  # fmt: skip
-        if wrong:
+        if wrong := differing_tensors(self.state_dict(), state):
             raise InputError(
                 f"{path}: expected a DINOv2 of width {self.position.shape[-1]} and {len(self.blocks)} layers without "
                 f"registers, but {len(wrong)} tensors differ, {wrong[0]} first; give the file of that size."
             )
         self.load_state_dict(state)
+
+
+def differing_tensors(own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> list[str]:
+    """Names that only one of them has, or whose shapes differ."""
+    shapes, others = ({name: tensor.shape for name, tensor in tensors.items()} for tensors in (own, given))
+    return sorted(name for name in shapes.keys() | others.keys() if shapes.get(name) != others.get(name))
 
 
 def _our_name(name: str) -> str:

@@ -6,14 +6,12 @@ not in it: they lie in a file of their own.
 """
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
@@ -21,8 +19,9 @@ from oasis_warp import __version__
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.data.output_files import write_file
+from oasis_warp.data.tensor_file import open_tensors
 from oasis_warp.network.config import NetworkConfig
-from oasis_warp.network.encoders import DinoV2Encoder
+from oasis_warp.network.encoders import DinoV2Encoder, differing_tensors
 from oasis_warp.network.hand_network import HandNetwork
 
 FORMAT = "oasis-network"
@@ -121,18 +120,8 @@ def trained_state(network: HandNetwork) -> dict[str, Tensor]:
     }
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
-        raise InputError(f"{path}: expected a network's weights, found {found}; `oasis pretrain` writes them.")
-    try:
-        with safe_open(path, framework="pt") as file:
-            yield file
-    except SafetensorError as error:
-        raise InputError(
-            f"{path}: expected a network's weights, got another format or a file cut short ({error}); copy it again."
-        ) from error
+def _opened(path: Path) -> AbstractContextManager[Any]:
+    return open_tensors(path, "a network's weights", "`oasis pretrain` writes them")
 
 
 def _checked_header(path: Path, file: Any) -> dict[str, Any]:
@@ -163,12 +152,7 @@ def _config_of(path: Path, stored: dict[str, Any]) -> NetworkConfig:
 
 
 def _fill(path: Path, network: HandNetwork, tensors: dict[str, Tensor]) -> None:
-    own = trained_state(network)
-    wrong = sorted(
-        name for name in own.keys() | tensors.keys()
-        if name not in own or name not in tensors or own[name].shape != tensors[name].shape
-    )  # fmt: skip
-    if wrong:
+    if wrong := differing_tensors(trained_state(network), tensors):
         raise InputError(
             f"{path}: {len(wrong)} tensors do not fit the network that the header describes, {wrong[0]} first; "
             "copy it again."

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import write_file
+from oasis_warp.data.tensor_file import open_tensors
 
 FORMAT = "oasis-pretraining"
 MOMENTS = ("exp_avg", "exp_avg_sq")
@@ -37,18 +37,15 @@ def load_checkpoint(path: Path, network: nn.Module, optimizer: torch.optim.Adam,
     Raises:
         InputError: another format, or a checkpoint of another network.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get(FORMAT, "null"))
-            if header is None:
-                raise InputError(f"{path}: expected a checkpoint, got another safetensors file; remove it.")
-            if header != {"step": header["step"], **identity}:
-                raise InputError(
-                    f"{path}: the checkpoint of a network with other sizes or switches; choose another folder."
-                )
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except SafetensorError as error:
-        raise InputError(f"{path}: expected a checkpoint, got a file cut short ({error}); remove it.") from error
+    with open_tensors(path, "a checkpoint", "choose another folder", "remove it") as file:
+        header = json.loads((file.metadata() or {}).get(FORMAT, "null"))
+        if header is None:
+            raise InputError(f"{path}: expected a checkpoint, got another safetensors file; remove it.")
+        if header != {"step": header["step"], **identity}:
+            raise InputError(
+                f"{path}: the checkpoint of a network with other sizes or switches; choose another folder."
+            )
+        tensors = {name: file.get_tensor(name) for name in file.keys()}
     state = {}
     for k, (name, parameter) in enumerate(_trained(network).items()):
         parameter.data.copy_(tensors[f"weights.{name}"])
