@@ -155,7 +155,7 @@ def calls(seed=0, n=4, dtype=torch.float32, *, empty=False, device="cpu", valida
     }  # fmt: skip
     add("depth_visibility", seen | {"point_vertices": known})
     add("depth_visibility poses", seen | {"vertices": ahead + 0.1 * normal(n_poses, n_vertices, 3)})
-    add("spherical_harmonics", {"directions": normal(k, 3), "coefficients": normal(k, 16, 3), "degree": 3})
+    add("spherical_harmonics", {"directions": normal(k, 3), "coefficients": normal(k, 16, 3), "degree": 2})
     scene = ordinary_scene(seed + 1, n=k, width=17, height=15).to(device, dtype)
     cloud = {name: getattr(scene, name) for name in ("means", "opacities", "viewmats", "Ks", "width", "height")}
     axes, whole = {"quats": scene.quats, "scales": scene.scales}, {"quats": None, "scales": None}

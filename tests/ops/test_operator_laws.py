@@ -238,7 +238,7 @@ def test_a_tensor_of_another_shape_type_or_device_is_refused_by_name(name):
             refuses(f"{expected}, got torch.float32 on meta", tensor.to("meta"))
 
 
-@pytest.mark.parametrize("name", [name for name, example in examples().items() if "faces" in example])
+@pytest.mark.parametrize("name", [name for name, declared in DECLARATIONS.items() if "faces" in declared.inputs])
 def test_without_validation_values_go_through_and_indices_do_not(name):
     function, arguments = DECLARATIONS[name].function, examples()[name]
     assert_same_bits(function(**arguments | {"validate": True}), function(**arguments | {"validate": False}))
