@@ -1,6 +1,6 @@
 """What the dense network says about synthetic photos of people that it has not met, against the truth of each pixel.
 
-Fills docs/dense_network.md (file, held-out, landmarks, skin).
+Fills docs/dense_network.md (file, held-out, landmarks, skin), and draws what it says about real photos.
 """
 
 import hashlib
@@ -8,10 +8,15 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
 from oasis_warp.assets import asset
+from oasis_warp.core.types import Photo
+from oasis_warp.estimation.estimator import choose_hand
+from oasis_warp.estimation.pixel_reading import read_pixels
 from oasis_warp.network.dense_network import HAND, DenseNetwork, DensePrediction
 from oasis_warp.network.dense_weights import load_dense_network, read_dense_header
 from oasis_warp.pretraining.dense_source import DensePhotos, detected
@@ -19,14 +24,17 @@ from oasis_warp.synthetic.dense_pictures import UNIT, DenseBatch, render_dense
 from oasis_warp.synthetic.shot_table import sample_table
 from oasis_warp.synthetic.shots import SceneConfig, cached_identity
 from studies.harness import Row, StudyOptions, measured
-from studies.inputs import iou
-from studies.tables import Column, Section, distribution, markdown, mean, percentiles
+from studies.inputs import estimator, iou, photo_named
+from studies.tables import Column, Section, distribution, markdown, mean, percentiles, write_jpeg
 
 PHOTOS_EACH = 4
 CLAIMED = 0.9
 """Share of coordinates that lie within this quantile of their Laplace distribution, if the confidence is true."""
 LEAST_SKIN = 200
 """Pixels of visible skin below which a photo says little."""
+SHOWN = ("palm_flat_right_03.jpg", "two_fingers_dark_skin_16.jpg", "ok_sign_left_10.jpg", "pointing_side_right_11.jpg")
+"""Photos of the tests that are drawn."""
+GAMMA = 2.2
 DARKEST = 1e-3
 """Reflectance below which its logarithm counts as this one's."""
 MEASURES = (
@@ -156,6 +164,33 @@ def file_table(rows: list[Row]) -> str:
         "training": header["notes"],
     }
     return markdown(["", ""], [[name, text] for name, text in lines.items()])
+
+
+def draw(rows: list[Row], static: Path) -> None:
+    """Draw photo with mask, classes, surface, confidence, normals, albedo and shading, a line for each photo."""
+    lines = [np.concatenate(panels(photo_named(name)), 1) for name in SHOWN]
+    write_jpeg(static / "dense_network.jpg", np.concatenate(lines, 0))
+
+
+def panels(photo: Photo) -> list[np.ndarray]:
+    """What the network says about the largest hand of a photo, as pictures of bytes."""
+    found = choose_hand(estimator().find(photo), "largest", photo.name)
+    rgb, xy = photo.rgb.numpy(), found.xy.double().numpy().copy()
+    if found.side == "left":
+        rgb, xy[:, 0] = np.ascontiguousarray(rgb[:, ::-1]), rgb.shape[1] - xy[:, 0]
+    said = read_pixels(rgb, xy)
+    on_hand = (said.hand > 0.5)[..., None]
+    outline, _ = cv2.findContours((said.hand > 0.5).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    marked = cv2.drawContours(said.image.copy(), outline, -1, (255, 0, 0), 1)
+    confidence = np.clip((-3 - np.log(said.spread)) / 4, 0, 1)[..., None].repeat(3, 2)
+    albedo = said.albedo.transpose(1, 2, 0)
+    shading = (said.image / 255.0) ** GAMMA / np.maximum(albedo, DARKEST)
+    fields = (
+        said.shares[1:].transpose(1, 2, 0), (0.5 + 5 * said.surface.transpose(1, 2, 0)) * on_hand, confidence * on_hand,
+        (0.5 + 0.5 * said.normal.transpose(1, 2, 0)) * on_hand, albedo ** (1 / GAMMA) * on_hand,
+        (shading / 2) ** (1 / GAMMA) * on_hand,
+    )  # fmt: skip
+    return [marked, *((255 * field.clip(0, 1)).astype(np.uint8) for field in fields)]
 
 
 SECTIONS = (

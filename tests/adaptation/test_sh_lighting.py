@@ -80,6 +80,22 @@ def test_light_is_found_and_taken_off(hand, scene):
     assert error(after) < 0.45 * error(untouched)
 
 
+def test_a_guess_of_the_wrong_hue_lights_no_side_in_colour(hand, scene):
+    """Fitted a colour at a time, redder fingertips or a yellow edge became a green light behind the hand."""
+    even, truth, _, lit = scene
+    normals = posed_normals(even.rest.vertices, even.posed.vertices, hand.faces)
+    tint = torch.ones_like(normals)
+    tint[:, 1] += 0.3 * normals[:, 2]  # greener where skin is seen at an angle
+    tinted = pose_gaussians(
+        truth._replace(colors=truth.colors * vertex_to_gaussians(tint, hand.faces, truth)), hand.faces,
+        even.rest.vertices, even.posed.vertices,
+    )  # fmt: skip
+    drawn = render(tinted, even.camera)
+    found = fit_light(hand, drawn.image + (1 - drawn.alpha)[..., None] * even.image, lit)
+    directed = found.harmonics[1:]
+    assert float((directed - directed.mean(1, keepdim=True)).abs().max()) < 0.12  # of .24 a colour at a time
+
+
 def test_light_on_nothing_is_even(hand, scene):
     even, *_ = scene
     nothing = even._replace(mask=torch.zeros_like(even.mask))

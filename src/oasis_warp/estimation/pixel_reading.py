@@ -26,6 +26,8 @@ class PixelReading:
     """Upper left corner of the crop [px of the photo]."""
     scale: float
     """Pixels of the crop per pixel of the photo."""
+    image: np.ndarray
+    """The crop itself, [S, S, 3] bytes; black where the photo ends."""
     shares: np.ndarray
     """Probabilities of background, hand, arm or clothes, and things in front of the hand, [4, S, S]."""
     surface: np.ndarray
@@ -92,6 +94,7 @@ def read_pixels(rgb: np.ndarray, xy: np.ndarray, network: DenseNetwork | None = 
         return PixelReading(
             corner,
             scale,
+            crop,
             out.classes[0].softmax(0).numpy(),
             SURFACE_UNIT * out.surface[0].numpy(),
             SURFACE_UNIT * out.log_scale[0].exp().numpy(),
