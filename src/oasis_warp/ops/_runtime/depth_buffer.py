@@ -69,22 +69,11 @@ def _job(scene: DepthScene, **more: int) -> tuple[Job, list[Tensor]]:
     viewmats, viewmats_step = shared(scene.viewmats)
     Ks, Ks_step = shared(scene.Ks)
     job = Job(
-        vertices=vertices.data_ptr(),
-        viewmats=viewmats.data_ptr(),
-        Ks=Ks.data_ptr(),
-        faces=scene.faces.data_ptr(),
-        vertices_step=vertices_step,
-        viewmats_step=viewmats_step,
-        Ks_step=Ks_step,
-        batch=scene.vertices.shape[0],
-        n_vertices=scene.vertices.shape[1],
-        n_faces=scene.faces.shape[0],
-        width=scene.width,
-        height=scene.height,
-        fraction_bits=_fraction_bits(scene.width, scene.height),
-        near_plane=scene.near_plane,
-        **more,
-    )
+        vertices=vertices.data_ptr(), viewmats=viewmats.data_ptr(), Ks=Ks.data_ptr(), faces=scene.faces.data_ptr(),
+        vertices_step=vertices_step, viewmats_step=viewmats_step, Ks_step=Ks_step, batch=scene.vertices.shape[0],
+        n_vertices=scene.vertices.shape[1], n_faces=scene.faces.shape[0], width=scene.width, height=scene.height,
+        fraction_bits=_fraction_bits(scene.width, scene.height), near_plane=scene.near_plane, **more,
+    )  # fmt: skip
     return job, [vertices, viewmats, Ks]
 
 
@@ -99,15 +88,11 @@ def draw_by_vectors(scene: DepthScene, query: Query | None, outputs: BufferParts
     scratch = scene.empty(12 * n_vertices + 2 * parts * plane_size(width, height), dtype=torch.float32)
     first = scratch.data_ptr()
     job, _alive = _job(
-        scene,
-        camera_vertices=first,
-        screen_vertices=first + 32 * batch * n_vertices,
-        planes=first + 48 * batch * n_vertices,
-        parts=parts,
-        depth=buffer.depth.data_ptr(),
+        scene, camera_vertices=first, screen_vertices=first + 32 * batch * n_vertices,
+        planes=first + 48 * batch * n_vertices, parts=parts, depth=buffer.depth.data_ptr(),
         face_ids=buffer.face_ids.data_ptr(),
         barycentrics=buffer.barycentrics.data_ptr() if outputs.barycentrics else 0,
-    )
+    )  # fmt: skip
     scores = None
     if query is not None:
         points, job.points_step = shared(query.points)
@@ -231,17 +216,11 @@ def vertex_gradients_by_vectors(
     scratch = scene.empty(9 * n_vertices, dtype=torch.float64)
     first = scratch.data_ptr()
     job, _alive = _job(
-        scene,
-        camera_vertices=first,
-        sums=first + 32 * batch * n_vertices,
-        screen_vertices=first + 56 * batch * n_vertices,
-        face_ids=face_ids.data_ptr(),
-        n_points=slopes.shape[1],
-        grad_visibility=grad_visibility.data_ptr(),
-        slopes=slopes.data_ptr(),
-        pixels=pixels.data_ptr(),
+        scene, n_points=slopes.shape[1], camera_vertices=first, sums=first + 32 * batch * n_vertices,
+        screen_vertices=first + 56 * batch * n_vertices, face_ids=face_ids.data_ptr(),
+        grad_visibility=grad_visibility.data_ptr(), slopes=slopes.data_ptr(), pixels=pixels.data_ptr(),
         grad_vertices=grad_vertices.data_ptr(),
-    )
+    )  # fmt: skip
     dtype = SCALAR_NAMES[slopes.dtype]
     _run("transform", dtype, job, -(-n_vertices // VERTICES_A_TASK))
     _run("pull", dtype, job, 1)
