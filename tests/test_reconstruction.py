@@ -181,7 +181,7 @@ def test_landmarks_of_a_left_hand_lie_on_the_mirrored_model(hand):
 @pytest.mark.slow
 def test_refinement_of_a_left_hand_moves_it_and_keeps_it_on_its_photo(hand):
     made = {
-        switch: reconstruct(read_photo(PHOTO), ReconstructConfig(refine=switch, prior="none", steps=0))
+        switch: reconstruct(read_photo(PHOTO), ReconstructConfig(refine=switch, prior="none", size=96, steps=0))
         for switch in ("on", "off")
     }
     on, off = made["on"], made["off"]

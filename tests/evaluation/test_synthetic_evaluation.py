@@ -126,7 +126,7 @@ def test_what_measures_people_travels_whole(hand, network):
 
 @pytest.mark.slow
 def test_people_measured_by_other_processes_come_out_the_same(left, network, tmp_path):
-    config = replace(CONFIG, people=2, lights=("studio",))
+    config = replace(CONFIG, people=2, lights=("studio",), methods=(METHODS[2],))
     here = evaluate_people(default_priors(network), config, tmp_path / "here", CPU)
     there = evaluate_people(default_priors(network), config, tmp_path / "there", CPU, workers=1)
     assert [record["person"] for record in there["pictures"][:: len(there["pictures"]) // 2]] == [
