@@ -29,7 +29,7 @@ from oasis_warp.network.prior import (
     bundled_prior,
     canonical_gaussians,
     choose_prior,
-    spread_to_rim,
+    color_sources,
 )
 from oasis_warp.network.weights_file import read_header, save_network
 from oasis_warp.render.render import render
@@ -84,7 +84,7 @@ def test_the_rim_takes_over_the_colours_beyond_it(hand):
     colors = torch.cat([shades, shades[hand.faces].amin(1)])[:, None].expand(-1, 3)
     for count in (len(colors), len(rest)):  # with face Gaussians and without
         away = torch.cat([from_rim, from_rim[hand.faces].amin(1)])[:count]
-        spread = spread_to_rim(colors[:count], rest, hand.faces, away)
+        spread = colors[color_sources(rest, hand.faces, away)]
         assert float(spread.min()) > 0.38
         near = from_rim < RIM_LAST * RIM_FADE
         assert torch.equal(spread[: len(rest)][~near], colors[: len(rest)][~near])

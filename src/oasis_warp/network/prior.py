@@ -58,7 +58,7 @@ def blend_rim(
         quats=normalize(torch.lerp(same, prediction.quats, share), dim=-1),
         scales=scales * (prediction.scales / scales) ** share,
         opacities=torch.lerp(OPACITY * fade, prediction.opacities, share[..., 0]),
-        colors=spread_to_rim(prediction.colors[0], rest, faces, from_rim)[None],
+        colors=prediction.colors[:, color_sources(rest, faces, from_rim)],
     )
 
 
@@ -70,27 +70,14 @@ def distance_from_rim(
     return torch.cat([at_vertices, at_vertices[faces].amin(1)])
 
 
-def spread_to_rim(
-    colors: Float[Tensor, "N 3"],
-    rest: Float[Tensor, "V 3"],
-    faces: Int[Tensor, "F 3"],
-    from_rim: Float[Tensor, "N"],
-) -> Float[Tensor, "N 3"]:
-    """Colours where Gaussians fade out at the wrist become those of the nearest ones that do not.
-
-    Args:
-        colors: Of the vertices, and of the faces if they carry Gaussians.
-        rest: Vertices at rest [m].
-        faces: Corners.
-        from_rim: Distance of each of them from the open wrist [m].
-    """
-    return colors[color_sources(rest, faces, from_rim)]
-
-
 def color_sources(
     rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], from_rim: Float[Tensor, "N"]
 ) -> Int[Tensor, "N"]:
-    """Whose colour each vertex, and each face if `from_rim` has them, takes in `spread_to_rim`."""
+    """Whose colour each vertex, and each face if it carries a Gaussian, takes.
+
+    Where Gaussians fade out at the wrist, that is the nearest one that does not; `from_rim` holds their distances from
+    the open wrist [m].
+    """
     n, sources = len(rest), []
     for places, part in ((rest, slice(0, n)), (rest[faces].mean(1), slice(n, None))):
         away = from_rim[part]
