@@ -273,7 +273,19 @@ def errors_of_parts(true: Hands, found: Hands, scale: Tensor) -> dict[str, Tenso
         "focal length, found over true [%]": 100 * (found.focal / true.focal - 1),
         "metres in a pixel at the hand, found over true [%]": 100 * (log_size(true, found).exp() - 1),
         "shape coefficients": (found.shape - true.shape).abs().flatten(),
+        "landmarks after similarity alignment, mean of a hand [mm]": aligned_errors(true, found),
     }
+
+
+def aligned_errors(true: Hands, found: Hands) -> Tensor:
+    """PA-MPJPE: mean distance of the 21 landmarks after the best rotation, shift and scale [mm], a number a hand."""
+    a, b = (hands.posed.landmarks - hands.posed.landmarks.mean(1, keepdim=True) for hands in (found, true))
+    u, sizes, vt = torch.linalg.svd(b.transpose(1, 2) @ a)
+    signs = torch.ones_like(sizes)
+    signs[:, 2] = torch.linalg.det(u @ vt)
+    rotation = (u * signs[:, None]) @ vt
+    scale = (sizes * signs).sum(1) / a.square().sum((1, 2))
+    return 1e3 * (scale[:, None, None] * a @ rotation.transpose(1, 2) - b).norm(dim=-1).mean(1)
 
 
 def mask_errors(true: Tensor, found: Tensor, above: Tensor, side: Tensor) -> dict[str, Tensor]:

@@ -5,12 +5,14 @@ import torch
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_points, mirror_pose
+from oasis_warp.core.types import Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import choose_hand, shared_shape
 from oasis_warp.estimation.fit_quality import iou_above_wrist
 from oasis_warp.estimation.landmarks import FINGERS, box_size
 from oasis_warp.estimation.outline import silhouette
 from oasis_warp.hand.skinning import rest_hand, skin
+from oasis_warp.synthetic.picture import render_batch
 
 RIGHT, LEFT = "victory_right_09.jpg", "ok_sign_left_10.jpg"
 
@@ -141,7 +143,37 @@ def test_a_cut_out_of_something_else_is_left_aside_with_a_warning(estimator, fit
     assert any("cut-out was left aside" in warning for warning in again.warnings)
 
 
+def test_two_hands_in_one_photo_have_masks_of_their_own(estimator, photos):
+    photo = read_photo(photos / "backs_two_left_05.jpg")
+    fits = [estimator.fit(photo, landmarks) for landmarks in estimator.find(photo)]
+    assert len(fits) == 2
+    first, second = (fit.mask > 0.5 for fit in fits)
+    assert (first & second).sum() < 0.01 * min(first.sum(), second.sum())
+    assert min(fit.mask_iou for fit in fits) > 0.93
+
+
+@pytest.mark.slow
+def test_a_synthetic_photo_is_fitted_as_it_was_rendered(hand, estimator):
+    batch = render_batch(6006, [0], 384)
+    photo = Photo((batch.image[0] * 255).round().to(torch.uint8), None, None, "synthetic", 1.0)
+    fit = estimator.fit(photo, choose_hand(estimator.find(photo), "largest", photo.name))
+    assert fit.side == ("left" if batch.left[0] else "right")
+    true = batch.mask[0] > 0.5
+    assert float(((fit.mask > 0.5) & true).sum() / ((fit.mask > 0.5) | true).sum()) > 0.93
+    turn = fit.pose.orientation @ batch.orientation[0].T
+    assert torch.rad2deg(torch.arccos(((turn.trace() - 1) / 2).clamp(-1, 1))) < 25
+    assert (fit.pose.angles - batch.angles[0])[:12, 0].abs().median() < np.radians(20)
+
+
 # ---- what is doubtful
+
+
+def test_landmarks_that_are_not_finite_are_refused(estimator, fitted):
+    photo, landmarks, _ = fitted(RIGHT)
+    xy = landmarks.xy.clone()
+    xy[3] = torch.nan
+    with pytest.raises(ValueError, match="landmarks: expected finite pixels"):
+        estimator.fit(photo, landmarks._replace(xy=xy))
 
 
 def test_the_wrong_side_is_noticed(estimator, fitted):

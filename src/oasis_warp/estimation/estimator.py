@@ -37,7 +37,7 @@ from oasis_warp.hand.kinematics import HandKinematics
 
 _NO_HAND = 16
 """Smaller hands are refused even by force [px]."""
-_ROUNDS = 3
+_ROUNDS = 2
 """Of pairing outlines."""
 
 
@@ -96,8 +96,11 @@ class HandEstimator:
             force: Return a fit that would be refused, with its faults among the warnings.
 
         Raises:
+            ValueError: landmarks that are not finite.
             InputError: the hand is too small, or the model does not explain it.
         """
+        if not bool(landmarks.xy.isfinite().all()):
+            raise ValueError("landmarks: expected finite pixels, got others. Leave out a hand that is not found.")
         size = box_size(array(landmarks.xy))
         least = _NO_HAND if force else TINY_HAND
         if size < least:

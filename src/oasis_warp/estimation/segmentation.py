@@ -18,7 +18,7 @@ _WORK_SIZE = 512
 """Longest side of the image that is segmented [px]."""
 _BAND = 3.0
 """Half the width of the band in which the colours decide [px of the network's crop]."""
-_SURE_HAND, _SURE_BACKGROUND = 0.95, 0.03
+_SURE_HAND, _SURE_BACKGROUND = 0.8, 0.1
 """Probabilities of the hand above and below which a pixel outside the band is decided."""
 _SURE = 0.9
 """Probability from which the network's word counts against an alpha channel."""

@@ -13,7 +13,8 @@ _HAND = 0.6
 """Least probability of the hand at a pixel that is used."""
 _SPREAD = 0.015
 """Largest spread of the surface point at a pixel that is used [m]."""
-_MOST_POINTS = 800
+_MOST_POINTS = 500
+"""More do not fit better: the errors of neighbouring pixels are alike."""
 
 
 @functools.cache
@@ -22,7 +23,7 @@ def _rest_places(template: bytes) -> KDTree:
 
 
 def surface_points(kinematics: HandKinematics, reading: PixelReading, scale: float) -> SurfacePoints:
-    """Where the confident pixels of the hand lie on the mean hand at rest; at most some 800, evenly over the picture.
+    """Where the confident pixels of the hand lie on the mean hand at rest; at most some 500, evenly over the picture.
 
     `scale` is in pixels of the photo per metre.
     """

@@ -1,0 +1,94 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from oasis_warp.estimation.fit import Fitter, SurfacePoints
+from oasis_warp.estimation.fit_problem import FitState, fit_target
+from oasis_warp.estimation.fit_quality import stray_pixels
+from oasis_warp.estimation.pixel_reading import SIDE, PixelReading, read_pixels
+from oasis_warp.estimation.surface_points import surface_points
+
+SIZE = (300, 300)
+
+
+def reading(surface, spread=0.002, hand=0.99):
+    """All pixels of a crop say `hand`, and show the same place."""
+    ones = np.ones((SIDE, SIDE), np.float32)
+    shares = np.stack([(1 - hand) * ones, hand * ones, 0 * ones, 0 * ones])
+    place = np.array(surface, np.float32)[:, None, None] * ones
+    finger = np.zeros((6, SIDE, SIDE), np.float32)
+    return PixelReading(np.array([10.0, 20.0]), 2.0, shares, place, spread * ones, place, place, finger)
+
+
+def test_a_pixel_shows_the_place_on_the_surface_that_is_nearest(kinematics):
+    vertex = 5000
+    beside = kinematics.template[vertex] + 0.002 * kinematics.rest_normals[vertex]
+    points = surface_points(kinematics, reading(beside), 1000.0)
+    assert 300 < len(points.vertex) <= 500
+    assert (points.vertex == vertex).all()
+    np.testing.assert_allclose(points.offset, 0, atol=2e-6)
+    np.testing.assert_allclose(points.spread, 2.0, rtol=1e-6)
+    assert points.xy.min(0).tolist() >= [10, 20] and points.xy.max() < 20 + SIDE / 2
+
+
+@pytest.mark.parametrize("doubt", [{"hand": 0.4}, {"spread": 0.05}])
+def test_pixels_in_doubt_are_left_out(kinematics, doubt):
+    assert len(surface_points(kinematics, reading(kinematics.template[0], **doubt), 1000.0).vertex) == 0
+
+
+@pytest.fixture(scope="module")
+def posed(kinematics):
+    """A flat hand that faces the camera, its target, and all its vertices as pixels."""
+    rest = Fitter(kinematics, fit_target(np.zeros((21, 2)), None, SIZE, 500.0))
+    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    state = FitState(turn, np.array([0.1, 0.0, np.log(0.45)]), rest.relaxed, np.zeros(40), 500.0, np.array([150.0] * 2))
+    joints = kinematics.pose_joints(state.angles, state.shape)
+    target = fit_target(state.project(kinematics.landmarks(joints)[0]), None, SIZE, 500.0)
+    vertex = np.arange(0, len(kinematics.template), 20)
+    still, xy = np.zeros((len(vertex), 3)), state.project(kinematics.surface(joints)[vertex])
+    return state, target, SurfacePoints(vertex, still, still, xy, np.ones(len(vertex)), still)
+
+
+def test_pixels_on_their_places_are_no_doubt(kinematics, posed):
+    state, target, points = posed
+    assert stray_pixels(kinematics, target, state, points) == (0.0, [])
+
+
+@pytest.mark.parametrize(("name", "joints"), [("index", (1, 2, 3)), ("little", (7, 8, 9)), ("thumb", (13, 14, 15))])
+def test_a_finger_whose_pixels_lie_elsewhere_is_named(kinematics, posed, name, joints):
+    state, target, points = posed
+    own = np.isin(kinematics.weights[points.vertex].argmax(1), joints)
+    xy = points.xy + np.where(own, 0.1 * target.box, 0)[:, None]
+    share, warnings = stray_pixels(kinematics, target, state, replace(points, xy=xy))
+    assert share == pytest.approx(own.mean())
+    (finger,) = (warning for warning in warnings if "doubtful" in warning)
+    assert finger.startswith(name) and "100 % of its pixels" in finger
+
+
+def test_another_pose_than_the_pixels_show_is_a_poor_fit(kinematics, posed):
+    state, target, points = posed
+    share, warnings = stray_pixels(kinematics, target, state, replace(points, xy=points.xy + 0.2 * target.box))
+    assert share == 1
+    assert warnings[0].startswith("poor fit: 100 % of the hand's pixels")
+
+
+def test_a_reading_needs_no_more_than_some_landmarks_and_repeats_its_bits(fitted):
+    photo, landmarks, _ = fitted("victory_right_09.jpg")
+    xy = landmarks.xy.numpy().astype(float)
+    xy[[3, 8]] = np.nan
+    first, second = (read_pixels(photo.rgb.numpy(), xy) for _ in range(2))
+    for a, b in zip(vars(first).values(), vars(second).values(), strict=True):
+        assert np.isfinite(a).all()
+        np.testing.assert_array_equal(a, b)
+    assert first.hand.max() > 0.9
+
+
+def test_two_pixels_of_the_crop_are_where_the_photo_has_them(fitted):
+    photo, landmarks, _ = fitted("victory_right_09.jpg")
+    read = read_pixels(photo.rgb.numpy(), landmarks.xy.numpy().astype(float))
+    across = np.broadcast_to(np.arange(SIDE, dtype=np.float32) + 0.5, (SIDE, SIDE)).copy()
+    height, width = photo.rgb.shape[:2]
+    shown = read.in_photo(across, (width, height), np.nan)
+    y, x = np.argwhere(np.isfinite(shown))[500]
+    assert read.to_photo(np.array([shown[y, x], 0.0]))[0] == pytest.approx(x + 0.5, abs=0.01)
