@@ -8,10 +8,10 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_warp import ops
+from oasis_warp import ops, reference
 from oasis_warp.bench.scenes import GaussianScene, MeshScene
 from oasis_warp.ops import BlendWeights, blend_colors, blend_weights
-from oasis_warp.reference import posing, rasterization, visibility
+from oasis_warp.reference import rasterization, visibility
 from oasis_warp.reference.errors import relative_error
 from oasis_warp.reference.rasterization import GSPLAT, Picture, Rules
 
@@ -101,13 +101,16 @@ def calling(
     return call
 
 
-def public_operator(
-    name: str, scene_type: type, reference: Callable[..., Any], n_outputs: int | None = None, **about: Any
-) -> Operator:
-    """A public operator and its reference, which takes the same arguments."""
-    function = getattr(ops, name)
-    torch_call = calling(reference, scene_type, function, n_outputs)
-    return Operator(name, scene_type, calling(function, scene_type, None, n_outputs), torch_call, **about)
+def declared(name: str, scene_type: type, n_outputs: int | None = None, **about: Any) -> Operator:
+    """A public operator and the reference of its declaration, which takes the same arguments.
+
+    Gradients are taken by all inputs that have one and that the scenes hold, if `about` does not say otherwise.
+    """
+    declaration, known = ops.DECLARATIONS[name], {field.name for field in fields(scene_type)}
+    inputs = (name if name in known else FIELDS.get(name) for name in declaration.differentiable)
+    about = {"leaves": tuple(name for name in inputs if name is not None)} | about
+    torch_call = calling(reference.named(declaration.reference), scene_type, declaration.function, n_outputs)
+    return Operator(name, scene_type, calling(declaration.function, scene_type, None, n_outputs), torch_call, **about)
 
 
 def draw_in_torch(scene: GaussianScene, rules: Rules = GSPLAT) -> Picture:
@@ -160,21 +163,13 @@ def _posing(face_rotations: Call, pose_on_mesh: Call) -> Call:
     return call
 
 
-FACE_ROTATIONS = public_operator(
-    "face_rotations", MeshScene, posing.face_rotations, 4, leaves=("rest_vertices", "posed_vertices")
-)
-POSE_ON_MESH = public_operator(
-    "pose_on_mesh", MeshScene, posing.pose_on_mesh,
-    leaves=(
-        "posed_vertices", "barycentrics", "vertex_quats", "area_ratio", "vertex_area_ratio", "offsets", "quats",
-        "scales",
-    ),
-)  # fmt: skip
+FACE_ROTATIONS = declared("face_rotations", MeshScene, 4)
+POSE_ON_MESH = declared("pose_on_mesh", MeshScene)
 OPERATORS = {
     operator.name: operator
     for operator in (
-        public_operator(
-            "rasterization", GaussianScene, rasterization.rasterization, 2,
+        declared(
+            "rasterization", GaussianScene, 2,
             leaves=("means", "quats", "scales", "opacities", "colors"), graded=1, image=True,
         ),
         Operator(
@@ -195,10 +190,7 @@ OPERATORS = {
         ),
         FACE_ROTATIONS,
         POSE_ON_MESH,
-        public_operator(
-            "skin", MeshScene, posing.skin, leaves=("rest_vertices", "covars", "skin_weights", "transforms"),
-            vectorised=False,
-        ),
+        declared("skin", MeshScene, vectorised=False),
         Operator(
             "posing", MeshScene, _posing(FACE_ROTATIONS.call, POSE_ON_MESH.call),
             _posing(FACE_ROTATIONS.torch_call, POSE_ON_MESH.torch_call),

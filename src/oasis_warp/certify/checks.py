@@ -1,16 +1,18 @@
 """What an operator must keep besides its values: finite differences, equal bits, and refusals of bad arguments."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from oasis_warp import ops
 from oasis_warp.certify.case import Case
 from oasis_warp.certify.compare import CPU, Measurement, loss_weights
 from oasis_warp.certify.families import Family
 from oasis_warp.core.processes import using_threads
+from oasis_warp.ops._runtime.declaration import Array
 from oasis_warp.reference.errors import same_bits
 
 STEP = 1e-5
@@ -123,11 +125,17 @@ def bad_arguments(family: Family, case: Case, good: dict[str, Any]) -> Iterator[
             yield "NaN or Inf", name, f"with {value}", with_middle(good[name], value)
         bad = good[name].detach()[..., :-1] if good[name].dim() > 1 else good[name].detach()[:-1]
         yield "wrong shapes", name, f"of shape {list(bad.shape)}", bad
-    for name, (rows, least) in family.indices.items():
-        if name in good:
-            named = case.floats[rows]
-            for value in (least - 1, named.shape[-2] if named.dim() > 1 else len(named)):
+    inputs = ops.DECLARATIONS[family.name].inputs
+    for name, array in inputs.items():
+        if array.index and name in good:
+            for value in (array.least - 1, axis_size(inputs, good, array.index)):
                 yield "wrong indices", name, f"with {value}", with_middle(good[name], value)
+
+
+def axis_size(inputs: Mapping[str, Array], arguments: Mapping[str, Any], letter: str) -> int:
+    """The size of the axis that the declared `inputs` call by this letter."""
+    axes = ((arguments.get(name), array.dims) for name, array in inputs.items() if letter in array.dims)
+    return next(tensor.shape[dims.index(letter) - len(dims)] for tensor, dims in axes if tensor is not None)
 
 
 def with_middle(tensor: Tensor, value: float) -> Tensor:

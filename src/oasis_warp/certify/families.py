@@ -1,13 +1,13 @@
 """The operators under certification: how to read their results, their float64 references, and their scenes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from oasis_warp import ops
+from oasis_warp import ops, reference
 from oasis_warp.certify import mesh_scenes, posing_scenes, rasterization_scenes
 from oasis_warp.certify.case import Case
 from oasis_warp.core.types import Camera
@@ -40,8 +40,6 @@ class Family:
     conditions: tuple[str, ...]
     large: dict[str, Any]
     """Arguments of `case` for a scene that is shared out over threads, too large for the reference."""
-    indices: dict[str, tuple[str, int]] = field(default_factory=dict)
-    """Index arguments: the argument whose rows each names, and the least index."""
     smooth: Callable[[Case], bool] = bool
     """Whether a small step changes no decision in a scene but those that the mask leaves out."""
 
@@ -152,15 +150,14 @@ def reference_pose_on_mesh(arguments: Arguments, slack: float) -> tuple[Outputs,
     return (means, squares(quats), scales), (ALL, aligned, ALL)
 
 
-def reference_pose_on_mesh_covars(arguments: Arguments, slack: float) -> tuple[Outputs, Outputs]:
-    """Means and covariances."""
-    return posing.pose_on_mesh_covars(**arguments), (ALL, ALL)
+def whole_reference(name: str) -> Callable[[Arguments, float], tuple[Outputs, Outputs]]:
+    """The declared reference of an operator whose results all count."""
 
+    def compute(arguments: Arguments, slack: float) -> tuple[Outputs, Outputs]:
+        outputs = reference.named(ops.DECLARATIONS[name].reference)(**arguments)
+        return outputs, (ALL,) * len(outputs)
 
-def reference_skin(arguments: Arguments, slack: float) -> tuple[Outputs, Outputs]:
-    """Means and, where given, covariances."""
-    outputs = posing.skin(**arguments)
-    return outputs, (ALL,) * len(outputs)
+    return compute
 
 
 FAMILIES = {
@@ -175,32 +172,28 @@ FAMILIES = {
         Family(
             "depth_map", ("1 / depth", "barycentrics"), read_depth_map,
             lambda arguments, slack: each_of_batch(reference_depth_map, arguments, slack),
-            mesh_scenes.depth_map_case, tuple(mesh_scenes.CONDITIONS), LARGE_MESH, {"faces": ("vertices", 0)},
+            mesh_scenes.depth_map_case, tuple(mesh_scenes.CONDITIONS), LARGE_MESH,
         ),
         Family(
             "depth_visibility", ("visibility",), lambda answer: (answer.visibility.double(),),
             lambda arguments, slack: each_of_batch(reference_visibility, arguments, slack),
-            mesh_scenes.depth_visibility_case, tuple(mesh_scenes.CONDITIONS),
-            LARGE_MESH | {"n_points": 5000}, {"faces": ("vertices", 0), "point_vertices": ("vertices", -1)},
+            mesh_scenes.depth_visibility_case, tuple(mesh_scenes.CONDITIONS), LARGE_MESH | {"n_points": 5000},
         ),
         Family(
             "face_rotations", ("vertex_quats", "face_quats", "area_ratio", "vertex_area_ratio"),
             read_face_rotations, reference_face_rotations,
             posing_scenes.face_rotations_case, tuple(posing_scenes.BENDS), {"side": 50},
-            {"faces": ("rest_vertices", 0)},
         ),
         Family(
             "pose_on_mesh", ("means", "quats", "scales"), read_pose_on_mesh, reference_pose_on_mesh,
             posing_scenes.pose_on_mesh_case, tuple(posing_scenes.ON_MESH), {"n": 10_000},
-            {"faces": ("posed_vertices", 0), "face_index": ("area_ratio", 0), "vertex_index": ("posed_vertices", 0)},
         ),
         Family(
-            "pose_on_mesh_covars", ("means", "covars"), read_all, reference_pose_on_mesh_covars,
+            "pose_on_mesh_covars", ("means", "covars"), read_all, whole_reference("pose_on_mesh_covars"),
             posing_scenes.pose_on_mesh_covars_case, tuple(posing_scenes.BENDS), {"side": 20, "n": 10_000},
-            {"faces": ("rest_vertices", 0)},
         ),
         Family(
-            "skin", ("means", "covars"), read_all, reference_skin,
+            "skin", ("means", "covars"), read_all, whole_reference("skin"),
             posing_scenes.skin_case, tuple(posing_scenes.SKINNING), {"n": 10_000, "n_joints": 16},
         ),
     )
