@@ -1,7 +1,5 @@
 """Projection in float32: `projection.cpp` on the CPU and `projection.cu` on CUDA. See `projection` for float64."""
 
-import functools
-
 from oasis_kernels import constants
 from oasis_kernels.runtime.cuda_native import CudaNative, cuda_native
 from oasis_kernels.runtime.native import PHASE_WORDS, Native, native
@@ -16,28 +14,19 @@ BLOCK = 64
 CONSTANTS = {"CHUNK": CHUNK, "JACOBIAN_LIMIT": constants.JACOBIAN_LIMIT, "BOX_SLACK": constants.BOX_SLACK}
 
 
-@functools.cache
-def project() -> Native:
-    """CPU kernel: tasks are chunks."""
-    return native("rasterize/projection.cpp", "project", label="project_vectors", constants=CONSTANTS)
-
-
-@functools.cache
-def project_backward() -> Native:
-    """CPU kernel: tasks are chunks, then cameras."""
-    return native("rasterize/projection_backward.cpp", "project_backward", label="project_vectors_backward",
-                  constants=CONSTANTS)  # fmt: skip
-
-
-@functools.cache
-def cuda_project() -> CudaNative:
-    """CUDA kernel: blocks of `BLOCK` (camera, Gaussian) pairs."""
-    return cuda_native("rasterize/projection.cu", "project", BLOCK, blocks_per_multiprocessor=8,
-                       label="project_gaussians", constants=CONSTANTS)  # fmt: skip
-
-
-@functools.cache
-def cuda_project_backward() -> CudaNative:
-    """CUDA kernel: blocks of `BLOCK` Gaussians."""
-    return cuda_native("rasterize/projection_backward.cu", "project_backward", BLOCK, blocks_per_multiprocessor=6,
-                       label="project_gaussians_backward", constants=CONSTANTS)  # fmt: skip
+project = native("rasterize/projection.cpp", "project", label="project_vectors", constants=CONSTANTS)
+"""CPU kernel: tasks are chunks."""
+project_backward = native(
+    "rasterize/projection_backward.cpp", "project_backward", label="project_vectors_backward", constants=CONSTANTS
+)
+"""CPU kernel: tasks are chunks, then cameras."""
+cuda_project = cuda_native(
+    "rasterize/projection.cu", "project", BLOCK, blocks_per_multiprocessor=8, label="project_gaussians",
+    constants=CONSTANTS,
+)  # fmt: skip
+"""CUDA kernel: blocks of `BLOCK` (camera, Gaussian) pairs."""
+cuda_project_backward = cuda_native(
+    "rasterize/projection_backward.cu", "project_backward", BLOCK, blocks_per_multiprocessor=6,
+    label="project_gaussians_backward", constants=CONSTANTS,
+)  # fmt: skip
+"""CUDA kernel: blocks of `BLOCK` Gaussians."""

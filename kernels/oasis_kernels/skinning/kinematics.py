@@ -14,35 +14,15 @@ STATE = PHASE_WORDS
 PATH = "skinning/kinematics.cu"
 
 
-def _on_cpu(name: str, scalar: str) -> Native:
+@functools.cache
+def on_cpu(name: str, scalar: str) -> Native:
+    """CPU kernel "bone_transforms" or "bone_transforms_backward" in "float" or "double"."""
     return native(PATH, name, label=f"{name}_{scalar}", constants={"SCALAR": scalar, "LOCAL": LOCAL}, scalar=scalar,
                   shared={"n_poses": "long long", "state": "long long*"})  # fmt: skip
 
 
-def _on_cuda(name: str, scalar: str) -> CudaNative:
+@functools.cache
+def on_cuda(name: str, scalar: str) -> CudaNative:
+    """The same for CUDA: one block per pose."""
     constants = {"SCALAR": scalar, "LOCAL": LOCAL}
     return cuda_native(PATH, name, BLOCK, label=f"{name}_{scalar}", constants=constants, scalar=scalar)
-
-
-@functools.cache
-def transforms(scalar: str) -> Native:
-    """CPU kernel in "float" or "double"."""
-    return _on_cpu("bone_transforms", scalar)
-
-
-@functools.cache
-def transforms_backward(scalar: str) -> Native:
-    """CPU kernel in "float" or "double"."""
-    return _on_cpu("bone_transforms_backward", scalar)
-
-
-@functools.cache
-def cuda_transforms(scalar: str) -> CudaNative:
-    """CUDA kernel in "float" or "double": one block per pose."""
-    return _on_cuda("bone_transforms", scalar)
-
-
-@functools.cache
-def cuda_transforms_backward(scalar: str) -> CudaNative:
-    """CUDA kernel in "float" or "double": one block per pose."""
-    return _on_cuda("bone_transforms_backward", scalar)

@@ -17,27 +17,14 @@ POSES = 8
 """Poses that a block of `cuda_skin` works on, one after the other: its points and correctives stay in the cache."""
 
 
-def _on_cpu(name: str, scalar: str) -> Native:
+@functools.cache
+def on_cpu(name: str, scalar: str) -> Native:
+    """CPU kernel "skin", "skin_backward" or "sum_blends" in "float" or "double".
+
+    The last gives the gradients of the transforms from those of the blended ones.
+    """
     constants = {"SCALAR": scalar, "BLOCK": SUM_BLOCK}
     return native("skinning/skinning.cpp", name, label=f"{name}_{scalar}", scalar=scalar, constants=constants)
-
-
-@functools.cache
-def skin(scalar: str) -> Native:
-    """CPU kernel in "float" or "double"."""
-    return _on_cpu("skin", scalar)
-
-
-@functools.cache
-def skin_backward(scalar: str) -> Native:
-    """CPU kernel in "float" or "double"."""
-    return _on_cpu("skin_backward", scalar)
-
-
-@functools.cache
-def sum_blends(scalar: str) -> Native:
-    """CPU kernel in "float" or "double": gradients of the transforms from those of the blended ones."""
-    return _on_cpu("sum_blends", scalar)
 
 
 def _on_cuda(name: str) -> CudaNative:

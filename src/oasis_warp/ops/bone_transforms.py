@@ -47,10 +47,10 @@ def _run(name: str, params: dict[str, Any], parents: Sequence[int]) -> None:
     params = params | {"n_joints": len(parents), "n_poses": n_poses, "parents": parent_table}
     scalar = SCALAR_NAMES[like.dtype]
     if like.is_cuda:
-        run_cuda(getattr(kernels, f"cuda_{name}")(scalar), params, n_poses, current_stream(like.device))
+        run_cuda(kernels.on_cuda(name, scalar), params, n_poses, current_stream(like.device))
     else:
         params["state"] = phase_state(kernels.STATE)
-        run_native(getattr(kernels, name)(scalar), params, n_poses)
+        run_native(kernels.on_cpu(name, scalar), params, n_poses)
 
 
 def _bone_transforms(
@@ -60,7 +60,7 @@ def _bone_transforms(
     inputs = contiguous(angles, orientation, translation, joints, axes)
     transforms, bends, locals = out = _outputs(*inputs)
     params = dict(zip(_OPERATOR.inputs, inputs, strict=True))
-    _run("transforms", params | {"transforms": transforms, "bends": bends, "locals": locals}, parents)
+    _run("bone_transforms", params | {"transforms": transforms, "bends": bends, "locals": locals}, parents)
     return out
 
 
@@ -83,7 +83,7 @@ def _bone_transforms_backward(
         "g_transforms": g_transforms, "g_bends": g_bends, "sums": torch.empty_like(locals), "g_angles": gradients[0],
         "g_orientation": gradients[1], "g_translation": gradients[2], "g_joints": g_joints,
     }  # fmt: skip
-    _run("transforms_backward", params, parents)
+    _run("bone_transforms_backward", params, parents)
     return [*gradients[:3], torch.sum(g_joints, 0) if sums_poses else g_joints]
 
 

@@ -75,7 +75,7 @@ def _skin(
     if means.is_cpu and not rotation_only:
         state = launch.phase_state(native_kernels.STATE)
         params = _params(means, covars, weights, transforms, state=state, out_means=out_means, out_covars=out_covars)
-        launch.run_native(native_kernels.skin(launch.SCALAR_NAMES[means.dtype]), params, launch.task_count(len(means)))
+        launch.run_native(native_kernels.on_cpu("skin", launch.SCALAR_NAMES[means.dtype]), params, launch.task_count(len(means)))
     else:
         given = out_covars if covars is None else covars
         launch_ranges(
@@ -115,7 +115,7 @@ def _skin_backward(
             corrected, covars, weights, transforms, state=state, g_out_means=g_out_means, g_out_covars=g_out_covars,
             g_means=g_means, g_covars=g_covars, g_weights=g_weights, g_blends=g_blends,
         )  # fmt: skip
-        launch.run_native(native_kernels.skin_backward(launch.SCALAR_NAMES[means.dtype]), params, launch.task_count(n))
+        launch.run_native(native_kernels.on_cpu("skin_backward", launch.SCALAR_NAMES[means.dtype]), params, launch.task_count(n))
     else:
         none = means.new_empty((0, 3, 3))
         given_means = torch.zeros_like(corrected) if g_out_means is None else g_out_means
@@ -166,7 +166,7 @@ def _sum_blends(g_blends: Tensor, weights: Tensor, g_transforms: Tensor) -> None
         "sums": g_blends.new_empty((n_blocks, n_joints, 16)), "g_transforms": g_transforms,
         "state": launch.phase_state(native_kernels.STATE),
     }  # fmt: skip
-    launch.run_native(native_kernels.sum_blends(launch.SCALAR_NAMES[g_blends.dtype]), params, n_blocks)
+    launch.run_native(native_kernels.on_cpu("sum_blends", launch.SCALAR_NAMES[g_blends.dtype]), params, n_blocks)
 
 
 def _skin_backward_on_cuda(

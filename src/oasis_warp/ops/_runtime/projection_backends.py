@@ -126,7 +126,7 @@ def project_vectors(
     )  # fmt: skip
     state = phase_state(PHASE_WORDS + 1)
     params = scene.params(opacities=opacities, limits=numbers, state=state, bad=state[PHASE_WORDS:])
-    run_native(projection_native.project(), params | _output_params(scene, out), block_count(len(scene.means), CHUNK))
+    run_native(projection_native.project, params | _output_params(scene, out), block_count(len(scene.means), CHUNK))
     return not state[PHASE_WORDS]
 
 
@@ -150,7 +150,7 @@ def project_cuda(
         eps2d=as_float32(limits.eps2d), alpha_min=as_float32(rules.alpha_min), extent_sigmas=rules.extent_sigmas,
         largest=FINITE_LIMIT,
     )  # fmt: skip
-    run_cuda(projection_native.cuda_project(), params, n_blocks, stream)
+    run_cuda(projection_native.cuda_project, params, n_blocks, stream)
     if bad is None:
         return True
     wait_for(stream)
@@ -203,7 +203,7 @@ def backward_cuda(
         radii=radii, g_cameras=sums, **incoming._asdict(), **{f"g_{k}": g for k, g in gradients._asdict().items()}
     )
     n_blocks = block_count(n, projection_native.BLOCK)
-    run_cuda(projection_native.cuda_project_backward(), params, n_blocks, current_stream(radii.device))
+    run_cuda(projection_native.cuda_project_backward, params, n_blocks, current_stream(radii.device))
     if sums is not None:
         _fill_viewmats(gradients.viewmats, _sum_rows(sums, n, CAMERA_SUM_BLOCK))
 
@@ -218,7 +218,7 @@ def backward_vectors(
         state=phase_state(projection_native.STATE), **incoming._asdict(),
         **{f"g_{k}": g for k, g in gradients._asdict().items()},
     )  # fmt: skip
-    run_native(projection_native.project_backward(), params, max(chunks, n_cameras))
+    run_native(projection_native.project_backward, params, max(chunks, n_cameras))
 
 
 def backward_generic(
