@@ -1,8 +1,8 @@
 """Projection in float32: `projection.cpp` on the CPU and `projection.cu` on CUDA. See `projection` for float64."""
 
 from oasis_kernels import constants
-from oasis_kernels.runtime.cuda_native import CudaNative, cuda_native
-from oasis_kernels.runtime.native import PHASE_WORDS, Native, native
+from oasis_kernels.runtime.cuda_native import cuda_native
+from oasis_kernels.runtime.native import PHASE_WORDS, native
 
 CHUNK = 512
 """Gaussians of a task on the CPU, a multiple of 8; camera gradients are summed by chunks, so that threads do not change

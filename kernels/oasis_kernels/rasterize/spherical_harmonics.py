@@ -125,10 +125,46 @@ def _unit(scalar: Any) -> Any:
 
 
 @functools.cache
+def _sum(scalar: Any, degree: int) -> Any:
+    """Function: unit direction, a row of coefficients -> the sum of harmonics."""
+    vec3, basis = wp.types.vector(length=3, dtype=scalar), _basis(scalar, degree)
+
+    @wp.func
+    def total(d: vec3, coefficients: wp.array2d(dtype=vec3), row: int):
+        b = basis(d)
+        out = vec3()
+        for k in range(wp.static((degree + 1) ** 2)):
+            out += b[k] * coefficients[row, k]
+        return out
+
+    return total
+
+
+@functools.cache
+def _sum_adjoint(scalar: Any, degree: int) -> Any:
+    """Function: the same and the gradient by the sum -> gradient by a direction of length `norm`; 0 for length 0."""
+    values = wp.types.vector(length=(degree + 1) ** 2, dtype=scalar)
+    vec3, basis_adjoint = wp.types.vector(length=3, dtype=scalar), _basis_adjoint(scalar, degree)
+
+    @wp.func
+    def by_direction(d: vec3, norm: scalar, coefficients: wp.array2d(dtype=vec3), row: int, g: vec3):
+        by_harmonic = values()
+        for k in range(wp.static((degree + 1) ** 2)):
+            by_harmonic[k] = wp.dot(coefficients[row, k], g)
+        g_unit = basis_adjoint(d, by_harmonic)
+        out = vec3()
+        if norm > scalar(0.0):
+            out = (g_unit - wp.dot(g_unit, d) * d) / norm
+        return out
+
+    return by_direction
+
+
+@functools.cache
 def evaluate(scalar: Any, degree: int) -> Any:
     """Kernel: directions, coefficients -> sums of harmonics."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
-    basis, unit = _basis(scalar, degree), _unit(scalar)
+    total, unit = _sum(scalar, degree), _unit(scalar)
 
     @wp.kernel(enable_backward=False, module="unique")
     def evaluate(
@@ -139,11 +175,7 @@ def evaluate(scalar: Any, degree: int) -> Any:
     ):
         i = first + wp.tid()
         d, _norm = unit(directions[i])
-        b = basis(d)
-        total = vec3()
-        for k in range(wp.static((degree + 1) ** 2)):
-            total += b[k] * coefficients[i, k]
-        out[i] = total
+        out[i] = total(d, coefficients, i)
 
     return evaluate
 
@@ -151,9 +183,8 @@ def evaluate(scalar: Any, degree: int) -> Any:
 @functools.cache
 def evaluate_backward(scalar: Any, degree: int) -> Any:
     """Kernel: gradient by the sums -> by directions and by coefficients; either array empty where not wanted."""
-    values = wp.types.vector(length=(degree + 1) ** 2, dtype=scalar)
     vec3 = wp.types.vector(length=3, dtype=scalar)
-    basis, basis_adjoint, unit = _basis(scalar, degree), _basis_adjoint(scalar, degree), _unit(scalar)
+    basis, by_direction, unit = _basis(scalar, degree), _sum_adjoint(scalar, degree), _unit(scalar)
 
     @wp.kernel(enable_backward=False, module="unique")
     def evaluate_backward(
@@ -172,14 +203,7 @@ def evaluate_backward(scalar: Any, degree: int) -> Any:
             for k in range(wp.static((degree + 1) ** 2)):
                 g_coefficients[i, k] = b[k] * g
         if g_directions.shape[0] > 0:
-            by_harmonic = values()
-            for k in range(wp.static((degree + 1) ** 2)):
-                by_harmonic[k] = wp.dot(coefficients[i, k], g)
-            g_unit = basis_adjoint(d, by_harmonic)
-            g_direction = vec3()
-            if norm > scalar(0.0):
-                g_direction = (g_unit - wp.dot(g_unit, d) * d) / norm
-            g_directions[i] = g_direction
+            g_directions[i] = by_direction(d, norm, coefficients, i, g)
 
     return evaluate_backward
 
@@ -212,7 +236,7 @@ def _direction(scalar: Any) -> Any:
 def sh_to_rgb(scalar: Any, degree: int) -> Any:
     """Kernel: Gaussians, coefficients, poses -> colours max(0, 0.5 + harmonics), as each camera sees them."""
     vec3, vec4 = (wp.types.vector(length=k, dtype=scalar) for k in (3, 4))
-    basis, unit, direction = _basis(scalar, degree), _unit(scalar), _direction(scalar)
+    total, unit, direction = _sum(scalar, degree), _unit(scalar), _direction(scalar)
 
     @wp.kernel(enable_backward=False, module="unique")
     def sh_to_rgb(
@@ -226,14 +250,11 @@ def sh_to_rgb(scalar: Any, degree: int) -> Any:
         n = means.shape[0]
         camera, row = i // n, i % coefficients.shape[0]
         d, _norm = unit(direction(means[i % n], poses[camera, 0], poses[camera, 1], poses[camera, 2]))
-        b = basis(d)
-        total = vec3()
-        for k in range(wp.static((degree + 1) ** 2)):
-            total += b[k] * coefficients[row, k]
+        color = total(d, coefficients, row)
         for k in range(3):
-            color = total[k] + scalar(0.5)
-            total[k] = wp.where(color < scalar(0.0), scalar(0.0), color)  # NaN stays
-        colors[i] = total
+            value = color[k] + scalar(0.5)
+            color[k] = wp.where(value < scalar(0.0), scalar(0.0), value)  # NaN stays
+        colors[i] = color
 
     return sh_to_rgb
 
@@ -244,9 +265,8 @@ def sh_to_rgb_backward(scalar: Any, degree: int) -> Any:
 
     An array is empty where it is not wanted.
     """
-    values = wp.types.vector(length=(degree + 1) ** 2, dtype=scalar)
     vec3, vec4 = (wp.types.vector(length=k, dtype=scalar) for k in (3, 4))
-    basis, basis_adjoint, unit = _basis(scalar, degree), _basis_adjoint(scalar, degree), _unit(scalar)
+    basis, by_direction, unit = _basis(scalar, degree), _sum_adjoint(scalar, degree), _unit(scalar)
     direction = _direction(scalar)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -283,13 +303,7 @@ def sh_to_rgb_backward(scalar: Any, degree: int) -> Any:
                     for k in range(wp.static((degree + 1) ** 2), coefficients.shape[1]):
                         g_coefficients[row, k] = vec3()
             if g_means.shape[0] > 0 or g_centers.shape[0] > 0:
-                by_harmonic = values()
-                for k in range(wp.static((degree + 1) ** 2)):
-                    by_harmonic[k] = wp.dot(coefficients[row, k], g)
-                g_unit = basis_adjoint(d, by_harmonic)
-                g_direction = vec3()
-                if norm > scalar(0.0):
-                    g_direction = (g_unit - wp.dot(g_unit, d) * d) / norm
+                g_direction = by_direction(d, norm, coefficients, row, g)
                 g_mean += wp.vec3d(g_direction)
                 if g_centers.shape[0] > 0:
                     g_centers[i] = -wp.vec3d(g_direction)

@@ -75,7 +75,8 @@ def _skin(
     if means.is_cpu and not rotation_only:
         state = launch.phase_state(native_kernels.STATE)
         params = _params(means, covars, weights, transforms, state=state, out_means=out_means, out_covars=out_covars)
-        launch.run_native(native_kernels.on_cpu("skin", launch.SCALAR_NAMES[means.dtype]), params, launch.task_count(len(means)))
+        kernel = native_kernels.on_cpu("skin", launch.SCALAR_NAMES[means.dtype])
+        launch.run_native(kernel, params, launch.task_count(len(means)))
     else:
         given = out_covars if covars is None else covars
         launch_ranges(
@@ -115,7 +116,8 @@ def _skin_backward(
             corrected, covars, weights, transforms, state=state, g_out_means=g_out_means, g_out_covars=g_out_covars,
             g_means=g_means, g_covars=g_covars, g_weights=g_weights, g_blends=g_blends,
         )  # fmt: skip
-        launch.run_native(native_kernels.on_cpu("skin_backward", launch.SCALAR_NAMES[means.dtype]), params, launch.task_count(n))
+        kernel = native_kernels.on_cpu("skin_backward", launch.SCALAR_NAMES[means.dtype])
+        launch.run_native(kernel, params, launch.task_count(n))
     else:
         none = means.new_empty((0, 3, 3))
         given_means = torch.zeros_like(corrected) if g_out_means is None else g_out_means
