@@ -60,34 +60,25 @@ def kernels(dtype: str) -> Kernels:
         def stub(address: wp.uint64): ...
 
         stub.__name__ = stub.__qualname__ = f"{stage}_natively"
-        return wp.func_native(defined({"SCALAR": dtype, **CONSTANTS}, kernel_source(file, stage).body))(stub)
+        text = defined({"SCALAR": dtype, **CONSTANTS}, kernel_source(f"depth/{file}.cpp", stage).body)
+        return wp.func_native(text)(stub)
 
-    transform_natively, draw_natively, write_natively = (
-        native(f"depth/{file}.cpp", stage)
-        for file, stage in (("depth_buffer", "transform"), ("depth_buffer", "draw"), ("depth_write", "write"))
-    )
-    score_natively, pull_natively = (native("depth/visibility.cpp", stage) for stage in ("score", "pull"))
+    def kernel(stage: str, run: Any) -> Any:
+        def launch(address: wp.uint64):
+            run(address)
 
-    def transform(address: wp.uint64):
-        transform_natively(address)
+        launch.__name__ = launch.__qualname__ = stage
+        return wp.Kernel(launch, module=module)
 
-    def draw(address: wp.uint64):
-        draw_natively(address)
-
-    def write(address: wp.uint64):
-        write_natively(address)
-
-    def score(address: wp.uint64):
-        score_natively(address)
-
-    def pull(address: wp.uint64):
-        pull_natively(address)
+    transform, draw = (native("depth_buffer", stage) for stage in ("transform", "draw"))
+    write = native("depth_write", "write")
+    score, pull = (native("visibility", stage) for stage in ("score", "pull"))
 
     def transform_draw_write_score(address: wp.uint64):
-        transform_natively(address)
-        draw_natively(address)
-        write_natively(address)
-        score_natively(address)
+        transform(address)
+        draw(address)
+        write(address)
+        score(address)
 
-    functions = (transform, draw, write, score, pull, transform_draw_write_score)
-    return Kernels(*(wp.Kernel(function, module=module) for function in functions))
+    stages = {"transform": transform, "draw": draw, "write": write, "score": score, "pull": pull}
+    return Kernels(*(kernel(*stage) for stage in stages.items()), wp.Kernel(transform_draw_write_score, module=module))

@@ -4,18 +4,13 @@ void project_backward(
     long long n,
     long long n_cameras,
 #include "gaussian_parameters.inc"
-    long long ortho,           // 1: x = fx X + cx, y = fy Y + cy, whatever the depth
-    const int* radii,          // [C, n, 2]; 0 where nothing was drawn
-    const float* g_means2d,    // [C, n, 2], or null for zeros, as the next two
-    const double* g_covars2d,  // [C, n, 3]
-    const float* g_depths,     // [C, n]
-    float* g_means,            // [n, 3], or null where nobody asks, as all that follow
-    float* g_quats,            // [n, 4]
-    float* g_scales,           // [n, 3]
-    float* g_covars,           // [n, 3, 3]
-    float* g_viewmats,         // [C, 4, 4]
-    double* chunk_cameras,     // [C, chunks, 12]: by the upper three rows of viewmats, of each chunk
-    long long* state           // [STATE], zeros
+    long long ortho,         // 1: x = fx X + cx, y = fy Y + cy, whatever the depth
+    const int* radii,        // [C, n, 2]; 0 where nothing was drawn
+    const float* g_means2d,  // [C, n, 2], or null for zeros, as the next two
+#include "gradient_parameters.inc"
+    float* g_viewmats,      // [C, 4, 4]
+    double* chunk_cameras,  // [C, chunks, 12]: by the upper three rows of viewmats, of each chunk
+    long long* state        // [STATE], zeros
 ) {
 #pragma clang fp contract(fast)
 #include "projection_vectors.h"

@@ -3,16 +3,11 @@ __global__ void project_backward(
     int n,
     int n_cameras,
 #include "gaussian_parameters.inc"
-    int ortho,                 // 1: x = fx X + cx, y = fy Y + cy, whatever the depth
-    const int2* radii,         // [C, n]
-    const float2* g_means2d,   // [C, n], or null for zeros, as the next two
-    const double* g_covars2d,  // [C, n, 3]
-    const float* g_depths,     // [C, n]
-    float* g_means,            // [n, 3], or null where nobody asks, as all that follow
-    float* g_quats,            // [n, 4]
-    float* g_scales,           // [n, 3]
-    float* g_covars,           // [n, 3, 3]
-    double* g_cameras          // [C, n, 12]: by the upper three rows of viewmats, of each Gaussian
+    int ortho,                // 1: x = fx X + cx, y = fy Y + cy, whatever the depth
+    const int2* radii,        // [C, n]
+    const float2* g_means2d,  // [C, n], or null for zeros, as the next two
+#include "gradient_parameters.inc"
+    double* g_cameras  // [C, n, 12]: by the upper three rows of viewmats, of each Gaussian
 ) {
 #include "projection_cuda.h"
     if (thread >= n) return;

@@ -29,11 +29,8 @@ void count_weights(
 #include "strip_walk.h"
     float* plane = nullptr;
     Histogram* histograms = nullptr;
-    share(state + 16, n_strips, [&](long long turn) {
-        const long long s = order[turn];
-        const Strip p = strip_of(s);
-        const long long start = starts[s];
-        const int count = (int)(starts[s + 1] - start);
+    share(state + 16, n_strips, [&](long long task) {
+#include "own_strip.h"
         const long long size = (strip_height + 1) / 2 * stride;
         if (!plane) {
             plane = (float*)malloc(2 * size * sizeof(float));
@@ -87,11 +84,8 @@ void fill_weights(
     const long long size = (strip_height + 1) / 2 * stride;
     float *plane = nullptr, *weights = nullptr, *lower_weights = nullptr;
     int *pixels = nullptr, *lower_pixels = nullptr;
-    share(state, n_strips, [&](long long turn) {
-        const long long s = order[turn];
-        const Strip p = strip_of(s);
-        const long long start = starts[s];
-        const int count = (int)(starts[s + 1] - start);
+    share(state, n_strips, [&](long long task) {
+#include "own_strip.h"
         if (!plane) {
             plane = (float*)malloc((4 * size + 2 * (stride + 2 * LANES)) * sizeof(float));
             weights = plane + size;

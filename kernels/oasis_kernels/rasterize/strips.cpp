@@ -57,11 +57,8 @@ void draw(
     Ended ended[BATCH + 1];
     unsigned short* masks = nullptr;  // of as many layers, each as large as the strip
     Histogram* histograms = nullptr;
-    share(state + 16, n_strips, [&](long long turn) {
-        const long long s = order[turn];
-        const Strip p = strip_of(s);
-        const long long start = starts[s];
-        const int count = (int)(starts[s + 1] - start);
+    share(state + 16, n_strips, [&](long long task) {
+#include "own_strip.h"
         const long long camera = s / (across * down);
         const float* background = backgrounds + camera * CHANNELS;
         float* picture = image + ((camera * height + p.top) * width + p.left) * CHANNELS;

@@ -46,11 +46,8 @@ void draw_backward(
     const long long stride = 2 * (strip_width + PAD), block_size = PLANES * stride;
     const long long plane = (strip_height + 1) / 2 * stride;
     float* planes = nullptr;
-    phase(state, n_strips, [&](long long turn) {
-        const long long s = order[turn];
-        const Strip p = strip_of(s);
-        const long long start = starts[s];
-        const int count = (int)(starts[s + 1] - start);
+    phase(state, n_strips, [&](long long task) {
+#include "own_strip.h"
         const long long camera = s / (across * down), in_camera = s % (across * down);
         const int strip_x = (int)(in_camera % across), strip_y = (int)(in_camera / across);
         const float* background = backgrounds + camera * CHANNELS;

@@ -19,9 +19,7 @@ void skin(
         for (int i = first; i < end; i += 4) {
 #include "four_blends.h"
             for (int k = 0; k < count; k++) {
-                const long long at = i + k;
-                const Q g0 = blends[k].lo.lo, g1 = blends[k].lo.hi, g2 = blends[k].hi.lo;
-                const T *x = means + 3 * at, *s = covars + 9 * at;
+#include "one_point.h"
                 store3(out_means + 3 * at, g0 * x[0] + g1 * x[1] + g2 * x[2] + blends[k].hi.hi);
                 if (covars) {
                     Q half[3];  // columns of G S
@@ -56,9 +54,7 @@ void skin_backward(
         for (int i = first; i < end; i += 4) {
 #include "four_blends.h"
             for (int k = 0; k < count; k++) {
-                const long long at = i + k;
-                const Q g0 = blends[k].lo.lo, g1 = blends[k].lo.hi, g2 = blends[k].hi.lo;
-                const T *x = means + 3 * at, *s = covars + 9 * at;
+#include "one_point.h"
                 Q by_shift = (Q)(0);
                 if (g_out_means) memcpy(&by_shift, g_out_means + 3 * at, 3 * sizeof(T));
                 Q by0 = by_shift * x[0], by1 = by_shift * x[1], by2 = by_shift * x[2];
