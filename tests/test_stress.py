@@ -18,7 +18,7 @@ from studies.damage import DAMAGES, DamagedInput, hand_size
 from studies.stress import is_sane, likeness, make
 
 PHOTO = Path(__file__).parent / "data" / "photos" / "palm_open_left_02.png"
-FEW = ReconstructConfig(steps=20)
+FEW = ReconstructConfig(size=256, steps=20)
 SAID = {
     "mask eroded": "", "mask dilated": "", "landmarks off": "poor fit", "half out": "border", "warm light": "",
     "cold light": "colour of skin", "dark": "dark photo", "blurred": "blurred photo", "tiny": "small hand",
