@@ -6,6 +6,8 @@ import re
 import pytest
 import torch
 
+from oasis_warp import reconstruction
+from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.cli import evaluate as command
 from oasis_warp.cli import main
 from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
@@ -15,6 +17,7 @@ from oasis_warp.data.pictures import write_picture
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.hand_crop import crop_hand
 from oasis_warp.evaluation import same_hand
+from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
 from oasis_warp.evaluation.same_hand import (
     compare_pairs,
     compare_with_photo,
@@ -22,6 +25,7 @@ from oasis_warp.evaluation.same_hand import (
     photos_of_hands,
     summarise_pairs,
 )
+from oasis_warp.reconstruction import reconstruct
 
 SMALL = ReconstructConfig(size=96)
 
@@ -127,9 +131,19 @@ def hands(scene, tmp_path, monkeypatch):
             write_picture(path, scene[0].rgb)
         else:
             path.write_text("nothing to see")
-    monkeypatch.setattr(same_hand, "HandEstimator", lambda hand: KnownEstimator(scene[1]))
-    monkeypatch.setattr(same_hand, "initial_offsets", lambda hand, fit: torch.zeros_like(hand.template))
+    for module in (same_hand, reconstruction):
+        monkeypatch.setattr(module, "HandEstimator", lambda hand: KnownEstimator(scene[1]))
     return folder
+
+
+def test_the_avatars_that_are_compared_are_those_of_reconstruct(hands, scene, hand):
+    priors, few = {"mean": MeanPrior(hand)}, ReconstructConfig(size=64, steps=1)
+    made, shown = same_hand.make_avatars(scene[0], priors, [Method("mean", RAW), Method("mean", ONE_SHOT)], few)
+    shipped = reconstruct(scene[0], ReconstructConfig(steps=1), prior=priors["mean"]).avatar
+    ours = made["mean one-shot"].gaussians
+    assert all(torch.equal(a, b) for a, b in zip(ours, shipped.gaussians, strict=True) if a is not None)
+    assert all(torch.equal(avatar.surface_offsets, shipped.surface_offsets) for avatar in made.values())
+    assert not torch.equal(made["mean raw"].gaussians.colors, ours.colors) and shown.shape == (64, 64, 3)
 
 
 def test_photos_of_the_same_hand_are_measured_and_the_run_is_not_done_twice(hands, tmp_path, capsys, monkeypatch):

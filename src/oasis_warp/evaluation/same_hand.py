@@ -1,10 +1,12 @@
 """Evaluate avatars on photos of the same hands: appearance from one photo, pose from another."""
 
+import functools
 import json
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -15,7 +17,7 @@ from oasis_warp import __version__
 from oasis_warp.avatar.appearance import label_regions, region_masks
 from oasis_warp.avatar.observation import Observation, inner_mask, observe
 from oasis_warp.avatar.prior import Prior
-from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
+from oasis_warp.core.config import BLACK, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.mirror import mirror_camera
@@ -24,14 +26,14 @@ from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
-from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, method_name, prior_digest, reconstructions
+from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, method_name, prior_digest
 from oasis_warp.evaluation.metrics import COVERED, color_gain
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, select
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr, ssim_map
-from oasis_warp.reconstruction import make_avatar
+from oasis_warp.reconstruction import Reconstruction, make_avatar, reconstruct
 
 PHOTO_METHODS = (
     Method("mean", ONE_SHOT),
@@ -41,6 +43,8 @@ PHOTO_METHODS = (
     Method("learned", ONE_SHOT),
 )
 """Methods of the table."""
+LIGHTS: dict[str, Literal["fit", "even", "keep"]] = {RAW: "fit", EVEN: "even", KEEP: "keep", ONE_SHOT: "fit"}
+"""Light of the reconstruction by stage; on the surface of the first stands the guess."""
 SETTINGS, METRICS, SHEET, HANDS = "evaluation.json", "metrics.json", "sheet.png", "hands"
 """Files that an evaluation writes; the last is a folder with the results of each hand."""
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
@@ -94,7 +98,7 @@ def compare_pairs(
     Args:
         estimator: Fits the second photo, with the shape of the first one's avatars.
         photos: Of one hand, and where it is in each.
-        avatars: By photo and then by a name, all of one photo with the same surface; photos without are targets only.
+        avatars: By photo and then by a name, all of one photo with the same shape; photos without are targets only.
         config: Size of the pictures and device.
     """
     for target, (photo, landmarks) in photos.items():
@@ -105,12 +109,13 @@ def compare_pairs(
             fit = estimator.fit(photo, landmarks, shape=first.shape.cpu(), force=True)
             if fit.side != first.side:
                 continue
-            crop = crop_hand(photo, fit, first.surface_offsets.cpu(), config)
-            drawn = {name: draw_as_photo(avatar, crop, fit.pose) for name, avatar in made.items()}
+            crops = {name: crop_hand(photo, fit, each.surface_offsets.cpu(), config) for name, each in made.items()}
+            drawn = {name: draw_as_photo(avatar, crops[name], fit.pose) for name, avatar in made.items()}
             scores = {
-                name: compare_with_photo(avatar, drawn[name], crop, fit.pose) for name, avatar in made.items()
+                name: compare_with_photo(avatar, drawn[name], crops[name], fit.pose) for name, avatar in made.items()
             }
-            yield Pair(source, target, crop.image, {name: what.image for name, what in drawn.items()}, scores)
+            shown = next(iter(crops.values())).image
+            yield Pair(source, target, shown, {name: what.image for name, what in drawn.items()}, scores)
 
 
 @torch.no_grad()
@@ -149,9 +154,7 @@ def _small_ssim(image: Tensor, target: Tensor, weight: Tensor) -> float:
     return float((similarity * share).sum() / share.sum().clamp_min(1e-6))
 
 
-def _region_errors(
-    avatar: Avatar, lit: Float[Tensor, "N 3"], crop: HandCrop, gain: Tensor
-) -> dict[str, float]:
+def _region_errors(avatar: Avatar, lit: Float[Tensor, "N 3"], crop: HandCrop, gain: Tensor) -> dict[str, float]:
     hand, index = avatar.hand, avatar.gaussians.vertex_index
     seen: Observation = observe(hand, crop)
     colors, present = torch.zeros_like(seen.colors), torch.zeros_like(seen.confidence)
@@ -210,7 +213,7 @@ def evaluate_photos(
         priors: By the names of methods' priors: "mean" and, if there is one, "learned".
         folder: See `photos_of_hands`.
         out: Output folder; its parent must exist.
-        config: Its steps, seed, size and device are used.
+        config: Its steps, seed and device are used, and its size for the pictures that are compared.
         progress: Called for photos and pairs.
 
     Raises:
@@ -257,7 +260,7 @@ def _measure_hand(
         try:
             photo = read_photo(path)
             photos[path.name] = photo, choose_hand(estimator.find(photo), "largest", photo.name)
-            avatars[path.name], crops[path.name] = _make_avatars(estimator, *photos[path.name], priors, methods, config)
+            avatars[path.name], crops[path.name] = make_avatars(photo, priors, methods, config)
         except InputError as error:
             left_out[f"{name}/{path.name}"] = str(error)
     progress(stage, len(paths), len(paths))
@@ -274,21 +277,29 @@ def _measure_hand(
     write_file(place, json.dumps({"pairs": records, "left_out": left_out}, allow_nan=False).encode())
 
 
-def _make_avatars(
-    estimator: HandEstimator, photo: Photo, landmarks: Landmarks, priors: Mapping[str, Prior],
-    methods: Sequence[Method], config: ReconstructConfig,
-):  # fmt: skip
-    """Avatars of one photo by the labels of methods, and its crop; the photo is fitted once."""
-    hand = bundled_hand()
-    fit = estimator.fit(photo, landmarks)
-    offsets = initial_offsets(hand, fit)
-    crop = crop_hand(photo, fit, offsets, config)
-    settings = AdaptConfig(texture_steps=config.steps, seed=config.seed)
-    avatars = {
-        method_name(method): make_avatar(fit, offsets, crop, *made)
-        for method, made in reconstructions(hand, crop, priors, methods, settings)
-    }
-    return avatars, crop.image
+def make_avatars(
+    photo: Photo, priors: Mapping[str, Prior], methods: Sequence[Method], config: ReconstructConfig
+) -> tuple[dict[str, Avatar], Float[Tensor, "S S 3"]]:
+    """Avatars of one photo by the names of methods, and its crop.
+
+    Avatars are made by `reconstruct`, with all detail of the photo, whatever the size of pictures in `config`. The
+    prior's own guess is put on the surface that `reconstruct` finds with it.
+    """
+
+    @functools.cache
+    def ship(prior: str, light: Literal["fit", "even", "keep"]) -> Reconstruction:
+        return reconstruct(photo, replace(config, size="auto", light=light), prior=priors[prior])
+
+    hand, avatars = bundled_hand(), {}
+    for method in methods:
+        made = ship(method.prior, LIGHTS[method.stage])
+        avatar = made.avatar
+        if method.stage == RAW:
+            crop = crop_hand(photo, made.fit, initial_offsets(hand, made.fit), replace(config, size="auto"))
+            avatar = make_avatar(made.fit, avatar.surface_offsets, crop, priors[method.prior](crop))
+        avatars[method_name(method)] = avatar
+    made = ship(methods[-1].prior, LIGHTS[methods[-1].stage])
+    return avatars, crop_hand(photo, made.fit, made.avatar.surface_offsets.cpu(), config).image
 
 
 def _record(hand: str, pair: Pair, method: Method) -> Record:
