@@ -1,13 +1,11 @@
 """What each part of the network is worth: trained with one part removed at a time (the paper's table 2).
 
 Fills docs/evaluation.md (network). Every variant is trained without point evidence, which is ours and does part of the
-work of the paper's parts, and with it. Variants are trained side by side on the very same batches, which are rendered
-once for all of them. A run that was stopped, or has used up its `--minutes`, goes on from its checkpoints when the same
-command comes again. With `--only` several processes share the training; a run without it trains what is left and
-evaluates all.
+work of the paper's parts, and with it. All are trained on the very same batches. A run that was stopped, or has used up
+its `--minutes`, goes on from its checkpoints when the same command comes again. With `--only` several processes share
+the training; a run without it trains what is left and evaluates all.
 """
 
-import json
 import math
 import sys
 import time
@@ -19,17 +17,17 @@ import torch
 
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.data.output_files import open_resumable_folder
-from oasis_warp.evaluation.held_out import POPULATIONS
-from oasis_warp.evaluation.methods import BASELINE, ONE_SHOT, RAW, Method
+from oasis_warp.evaluation.held_out import POPULATIONS, CaptureConfig
+from oasis_warp.evaluation.methods import BASELINE, RAW, Method
 from oasis_warp.evaluation.summary import Record
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate_people
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior
-from oasis_warp.network.weights_file import load_network, save_network
+from oasis_warp.network.weights_file import load_network
 from oasis_warp.pretraining.distributed import ProcessInfo
-from oasis_warp.pretraining.pretrain import CHECKPOINT, WEIGHTS, PretrainConfig
+from oasis_warp.pretraining.pretrain import WEIGHTS, PretrainConfig, pretrain
 from oasis_warp.pretraining.prior_trainer import PriorTrainer
 from oasis_warp.pretraining.synthetic_source import SyntheticHands
 from studies.harness import SETTINGS, Row, StudyOptions, report, write_rows
@@ -60,16 +58,13 @@ WITH = "_with_evidence"
 """Ends the names of networks that have point evidence."""
 TABLES = (("studio", "raw"), ("studio", "matched"), ("wild", "matched"))
 """Light and colours; matched ones say less of the hand's tone, and so more of everything else."""
-CHECKPOINT_EVERY, LOG_EVERY = 250, 25
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(StudyOptions):
     """Options of this study."""
 
-    selecting: ClassVar[frozenset[str]] = frozenset(
-        {"device", "baked", "held_out", "one_shot", "together", "only", "minutes"}
-    )
+    selecting: ClassVar[frozenset[str]] = frozenset({"device", "baked", "held_out", "targets", "only", "minutes"})
     steps: int = 3000
     hands: int = 16
     """Photos per batch."""
@@ -86,10 +81,8 @@ class Options(StudyOptions):
     """Folder of people that were baked before, as of `oasis pretrain`."""
     held_out: int = 32
     """People to evaluate on."""
-    one_shot: bool = False
-    """Evaluate the adapted avatars too."""
-    together: int = 5
-    """Variants at a time: each holds the memory of a step."""
+    targets: int = 4
+    """Pictures of each of them."""
     only: tuple[str, ...] = ()
     """Networks to train now; nothing is evaluated."""
     minutes: float = math.inf
@@ -116,67 +109,28 @@ def row_titles(names: list[str], ending: str) -> dict[str, str]:
     return titles
 
 
-def make_trainer(name: str, options: Options, folder: Path) -> PriorTrainer:
-    """A network at the start, or where its checkpoint is."""
+def train(name: str, hands: SyntheticHands, folder: Path, options: Options, deadline: float) -> bool:
+    """Train one network, or go on from its checkpoint; whether there was enough time."""
+    folder.mkdir(exist_ok=True)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
         network = HandNetwork(network_config(name, options), bundled_hand())
     config = PretrainConfig(steps=options.steps, precision=options.precision)
-    trainer = PriorTrainer(network, config, ProcessInfo(0, 1, torch.device(options.device)))
-    trainer.resume(folder / CHECKPOINT)
-    return trainer
-
-
-def train_together(names: list[str], folder: Path, options: Options, deadline: float) -> bool:
-    """Train the networks side by side; those with weights already are left alone. Whether there was enough time."""
-    missing = [name for name in names if not (folder / name / WEIGHTS).is_file()]
-    if not missing:
-        return True
-    hands = SyntheticHands(
-        seed=options.seed, people=options.people, hands=options.hands, views=options.views, size=options.size,
-        device=torch.device(options.device), population=POPULATIONS["ordinary"], workers=options.workers,
-    )  # fmt: skip
-    cache = options.baked or folder / "people"
-    cache.mkdir(exist_ok=True)
-    hands.bake(hands.people_met(0, 1, options.steps), cache, options.workers, report)
-    trainers = {}
-    for name in missing:
-        (folder / name).mkdir(exist_ok=True)
-        trainers[name] = make_trainer(name, options, folder / name)
-    first = min(trainer.step for trainer in trainers.values())
-    began = time.perf_counter()
-    for step, batch in zip(range(first, options.steps), hands(first, 0, 1), strict=False):
-        behind = {name: trainer for name, trainer in trainers.items() if trainer.step == step}
-        found = {name: trainer.advance(batch).metrics["psnr"] for name, trainer in behind.items()}
-        if (step + 1) % LOG_EVERY == 0:
-            for trainer in behind.values():
-                trainer.check_recording()
-            line = {"step": step + 1, "psnr": {name: round(float(psnr), 3) for name, psnr in found.items()}}
-            with (folder / "training.jsonl").open("a") as file:
-                file.write(json.dumps(line) + "\n")
-            pace = (time.perf_counter() - began) / (step + 1 - first)
-            print(f"step {step + 1}: {pace:.2f} s each, PSNR {line['psnr']}", file=sys.stderr)
-        last, late = step + 1 == options.steps, time.monotonic() > deadline
-        if late or last or (step + 1) % CHECKPOINT_EVERY == 0:
-            for name, trainer in behind.items():
-                trainer.save(folder / name / CHECKPOINT)
-        if late and not last:
-            return False
-    for name, trainer in trainers.items():
-        save_network(folder / name / WEIGHTS, trainer.network, notes=json.dumps({"step": trainer.step}))
-    return True
+    trainer = PriorTrainer(network, config, ProcessInfo(0, 1, hands.device))
+    done = pretrain(trainer, hands, folder, should_stop=lambda: time.monotonic() > deadline, progress=report)
+    return done == options.steps
 
 
 def evaluate_all(names: list[str], folder: Path, options: Options) -> list[Record]:
     """Every network on the same held-out people; the records of all pictures."""
     hand = bundled_hand()
     priors = {name: NetworkPrior(load_network(folder / name / WEIGHTS, hand)) for name in names}
-    stages = (RAW, ONE_SHOT) if options.one_shot else (RAW,)
     config = SyntheticEvaluation(
         groups=("ordinary",), people=options.held_out, lights=("studio", "wild"), noise=(1.0,), curve=(),
-        methods=(BASELINE, *(Method(name, stage) for name in priors for stage in stages)),
+        capture=CaptureConfig(size=options.size, targets=options.targets),
+        methods=(BASELINE, *(Method(name, RAW) for name in priors)),
     )  # fmt: skip
-    place, device = folder / f"evaluation_{options.held_out}_{stages[-1]}", torch.device(options.device)
+    place, device = folder / f"evaluation_{options.held_out}", torch.device(options.device)
     priors = {"mean": MeanPrior(hand), **priors}
     return evaluate_people(priors, config, place, device, workers=options.workers, progress=report)["pictures"]
 
@@ -186,23 +140,28 @@ def run(options: Options) -> list[Row]:
     deadline, everything = time.monotonic() + 60 * options.minutes, network_names(options)
     if unknown := set(options.only) - set(everything):
         raise SystemExit(f"--only: expected some of {', '.join(everything)}, got {', '.join(sorted(unknown))}")
-    names, folder = list(options.only) or everything, options.out / "network_parts"
+    folder = options.out / "network_parts"
     options.out.mkdir(parents=True, exist_ok=True)
     open_resumable_folder(folder, SETTINGS, options.settings(), "ablations")
-    for k in range(0, len(names), options.together):
-        if not train_together(names[k : k + options.together], folder, options, deadline):
+    hands = SyntheticHands(
+        seed=options.seed, people=options.people, hands=options.hands, views=options.views, size=options.size,
+        device=torch.device(options.device), population=POPULATIONS["ordinary"], workers=options.workers,
+    )  # fmt: skip
+    baked = options.baked or folder / "people"
+    baked.mkdir(exist_ok=True)
+    hands.bake(hands.people_met(0, 1, options.steps), baked, options.workers, report)
+    for name in options.only or everything:
+        if not train(name, hands, folder / name, options, deadline):
             print("stopped for lack of time; the same command goes on.", file=sys.stderr)
             return []
     if options.only:
         return []
     records, rows = evaluate_all(everything, folder, options), []
     for ending in ("", WITH):
-        for stage in (RAW, ONE_SHOT) if options.one_shot else (RAW,):
-            titles = row_titles(everything, ending)
-            variants = {name: (title, Method(name, stage)) for name, title in titles.items()}
-            if FULL + ending in variants:
-                for kind in TABLES:
-                    rows += ablation_rows(records, *kind, stage, variants, FULL + ending)
+        variants = {name: (title, Method(name, RAW)) for name, title in row_titles(everything, ending).items()}
+        if FULL + ending in variants:
+            for kind in TABLES:
+                rows += ablation_rows(records, *kind, RAW, variants, FULL + ending)
     settings = {**options.settings(), "held_out": options.held_out}
     return write_rows(folder, ({"settings": settings, **row} for row in rows))
 

@@ -31,6 +31,7 @@ from oasis_warp.ops import depth_map
 from oasis_warp.reconstruction import reconstruct
 
 KINDS = ("tattoo", "writing", "ring", "nail polish")
+JPEG_QUALITY = 92
 SAMPLES = 4
 """Sub-pixels along a pixel's side, of every true picture."""
 MELANIN = 0.03
@@ -245,6 +246,13 @@ def paint_photo(known: KnownHand, chart: Chart) -> Photo:
     drawn = _averaged(torch.cat([chart.rgba[..., :3] * chart.rgba[..., 3:], chart.rgba[..., 3:]], -1))
     pixels = known.photo.rgb.float() / 255 * (1 - drawn[..., 3:]) + drawn[..., :3]
     return known.photo._replace(rgb=(pixels.clamp(0, 1) * 255).round().to(torch.uint8), name="painted.png")
+
+
+def encoded(photo: Photo) -> Photo:
+    """The photo as a JPEG encoder leaves it."""
+    _, data = cv2.imencode(".jpg", photo.rgb.numpy()[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
+    pixels = cv2.cvtColor(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB)
+    return photo._replace(rgb=torch.from_numpy(pixels), name="painted.jpg")
 
 
 def edited_area(known: KnownHand, paint: Float[Tensor, "H W"], camera: Camera, reach: float) -> Float[Tensor, "H W"]:

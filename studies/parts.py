@@ -1,27 +1,22 @@
-"""What each part of adaptation, and of the trained network, is worth: synthetic people without one part at a time.
+"""What each part of adaptation is worth: synthetic people without one part at a time (the paper's table 4).
 
-Fills docs/evaluation.md: "one-shot" (adaptation with one part removed at a time: the paper's table 4) and "probe" (the
-network with one part changed at a time). A probe trains nothing: unlike `network_parts` it does not say what the other
-parts would have learned without the changed one, but it takes minutes. A run that was stopped goes on.
+Fills docs/evaluation.md (one-shot). A run that was stopped goes on. `network_parts` makes tables of the same kind.
 """
 
-import copy
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import torch
 
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.evaluation.columns import COLORS, LIGHTS, SYNTHETIC, Measure
-from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
+from oasis_warp.evaluation.held_out import CaptureConfig
+from oasis_warp.evaluation.methods import ONE_SHOT, Method
 from oasis_warp.evaluation.summary import Record, difference, mean, select
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate_people
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.network.attention import VisibilityAttention
-from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior, choose_prior
 from studies.harness import Row, StudyOptions, prior_choice, report, write_rows
 from studies.tables import Section, groups, markdown
@@ -42,9 +37,6 @@ TITLES = {
     "texture": "w/o texture learning", "references": "w/o reference views", "light": "w/o the photo's light",
     "schedule": "100 + 400 steps of the field", "paper": "the paper's 100 + 400 steps of LoRA",
 }  # fmt: skip
-PROBED_LIGHT = "studio"
-WEAK = 1e-3
-"""Of the bias: next to none."""
 CONTRASTS = {"hidden_more": ("psnr_hidden", "psnr_visible"), "stretched_more": ("psnr_stretched", "psnr_unchanged")}
 """How much better one part of a picture's hand is than the other. What is gained everywhere cancels."""
 COLUMNS = {
@@ -62,11 +54,13 @@ COLUMNS = {
 class Options(StudyOptions):
     """Options of this study."""
 
-    selecting: ClassVar[frozenset[str]] = frozenset({"of"})
-    of: tuple[Literal["adaptation", "network"], ...] = ("adaptation", "network")
     prior: str = "learned"
     """learned, or a weights file."""
     people: int = 16
+    targets: int = 4
+    """Pictures of each of them to compare with."""
+    size: int = 256
+    """Side of photos and targets [px]."""
 
 
 # ---- tables of ablations, also of `network_parts`
@@ -141,111 +135,36 @@ def _cell(row: Row, measure: str, column: Measure) -> str:
 # ---- adaptation
 
 
-def measure_adaptation(name: str, prior: NetworkPrior, options: Options) -> list[Record]:
-    """The records of one setting; its methods are called after it, or "prior" for that of the mean hand."""
+def measure(name: str, prior: NetworkPrior, options: Options) -> list[Record]:
+    """The pictures' records of one setting; its methods are called after it, or "prior" for that of the mean hand."""
     priors: dict[str, Any] = {"learned": prior, **({"mean": MeanPrior(bundled_hand())} if name == FULL else {})}
     config = SyntheticEvaluation(
         groups=("ordinary",), people=options.people, noise=(1.0,), curve=(), adapt=ADAPTATIONS[name],
+        capture=CaptureConfig(size=options.size, targets=options.targets),
         methods=tuple(Method(prior, ONE_SHOT) for prior in priors),
     )  # fmt: skip
-    found = run_evaluation(priors, config, f"{name}_{options.people}", options)
-    titles = {"learned": name, "mean": "prior"}
-    return [{**record, "prior": titles[record["prior"]]} for record in found]
-
-
-def run_evaluation(
-    priors: Mapping[str, Any], config: SyntheticEvaluation, folder: str, options: Options
-) -> list[Record]:
-    """`evaluate` in a folder of this study; the records of all pictures."""
-    place = options.out / "parts" / folder
-    place.parent.mkdir(parents=True, exist_ok=True)
-    device = torch.device(options.device)
+    folder = options.out / "parts" / f"{name}_{options.people}"
+    folder.parent.mkdir(parents=True, exist_ok=True)
     found = evaluate_people(
-        priors, config, place, device, workers=options.workers,
-        progress=lambda stage, done, total: report(f"{folder}, {stage}", done, total),
-    )  # fmt: skip
-    return found["pictures"]
-
-
-def adaptation_rows(prior: NetworkPrior, options: Options) -> list[Row]:
-    """Of every setting, in every light."""
-    records = [record for name in ADAPTATIONS for record in measure_adaptation(name, prior, options)]
-    variants = {name: (title, Method(name, ONE_SHOT)) for name, title in TITLES.items()}
-    return [
-        row for light in COLORS for row in ablation_rows(records, light, COLORS[light], ONE_SHOT, variants, FULL)
-    ]
-
-
-# ---- probes of the network
-
-
-def scaled_bias(share: float) -> Callable[[HandNetwork], None]:
-    """A change of the strength of VPIA's bias (equation 6)."""
-
-    def change(network: HandNetwork) -> None:
-        if not isinstance(network.fusion, VisibilityAttention) or network.fusion.log_beta is None:
-            raise SystemExit("expected a network whose attention has a bias; probe another.")
-        network.fusion.log_beta.data += math.log(share)
-
-    return change
-
-
-def mix_evenly(network: HandNetwork) -> None:
-    """Features of faces become the mean of their corners' (equation 7 without what it learns)."""
-    network.feature_on_mesh.logits.data.zero_()
-
-
-def _zeroed(network: HandNetwork, output: str) -> None:
-    start = 0
-    for name, width in network.face_head.outputs.items():
-        if name == output:
-            network.face_head.last.weight.data[start : start + width] = 0
-            network.face_head.last.bias.data[start : start + width] = 0
-        start += width
-
-
-PROBES: dict[str, tuple[str, Callable[[HandNetwork], None]]] = {
-    FULL: ("as trained", lambda network: None),
-    "no_bias": ("VPIA's bias off", scaled_bias(WEAK)),
-    "twice": ("VPIA's bias twice as strong", scaled_bias(2.0)),
-    "mixing": ("features of faces mixed evenly", mix_evenly),
-    "places": ("Gaussians in the middle of faces", lambda network: _zeroed(network, "barycentrics")),
-    "colors": ("no colours of faces' own", lambda network: _zeroed(network, "colors")),
-}
-"""Title and change."""
-
-
-def probe_rows(prior: NetworkPrior, options: Options) -> list[Row]:
-    """Of every probe."""
-    if prior.network.config.fom == "off":
-        raise SystemExit("--prior: expected a network with Gaussians on faces.")
-    priors = {}
-    for name, (_, change) in PROBES.items():
-        network = copy.deepcopy(prior.network)
-        change(network)
-        priors[name] = NetworkPrior(network)
-    config = SyntheticEvaluation(
-        groups=("ordinary",), people=options.people, lights=(PROBED_LIGHT,), noise=(1.0,), curve=(),
-        methods=tuple(Method(name, RAW) for name in PROBES),
-    )  # fmt: skip
-    records = run_evaluation(priors, config, f"probes_{options.people}", options)
-    variants = {name: (title, Method(name, RAW)) for name, (title, _) in PROBES.items()}
-    return ablation_rows(records, PROBED_LIGHT, COLORS[PROBED_LIGHT], RAW, variants, FULL)
+        priors, config, folder, torch.device(options.device), workers=options.workers, progress=report
+    )
+    titles = {"learned": name, "mean": "prior"}
+    return [{**record, "prior": titles[record["prior"]]} for record in found["pictures"]]
 
 
 def run(options: Options) -> list[Row]:
-    """Evaluate every variant."""
+    """Evaluate every variant in every light."""
     prior = choose_prior(prior_choice(options.prior))
     if not isinstance(prior, NetworkPrior):
         raise SystemExit("--prior: expected a network.")
-    measure = {"adaptation": adaptation_rows, "network": probe_rows}
+    records = [record for name in ADAPTATIONS for record in measure(name, prior, options)]
+    variants = {name: (title, Method(name, ONE_SHOT)) for name, title in TITLES.items()}
     settings = {"people": options.people, "prior": options.prior}
-    rows = [{"of": of, "settings": settings, **row} for of in options.of for row in measure[of](prior, options)]
+    rows = [
+        {"settings": settings, **row}
+        for light in COLORS for row in ablation_rows(records, light, COLORS[light], ONE_SHOT, variants, FULL)
+    ]  # fmt: skip
     return write_rows(options.out / "parts", rows)
 
 
-def _section(marker: str, of: str) -> Section:
-    return Section("evaluation.md", marker, lambda rows: ablation_text([row for row in rows if row["of"] == of]))
-
-
-SECTIONS = (_section("one-shot", "adaptation"), _section("probe", "network"))
+SECTIONS = (Section("evaluation.md", "one-shot", ablation_text),)

@@ -1,11 +1,8 @@
 """What is measured of the avatars of all photos of the tests, with the learned prior and without.
 
 Fills docs/results.md (estimator, avatar, single, pairs) and docs/prior.md (photos). Avatars stay in OUT/photos/avatars.
-`--sheet` draws docs/_static/priors.jpg instead: each single photo, and for every prior its guess and what adaptation
-makes of it, from the photo's view, from the side and from behind.
 """
 
-import math
 import resource
 import time
 from collections.abc import Iterator
@@ -13,26 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-import cv2
-import numpy as np
-from torch import Tensor
-
-from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.cli.summary import Panel, make_sheet, panel_side
-from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import choose_hand
-from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
 from oasis_warp.evaluation.metrics import coverage
 from oasis_warp.evaluation.same_hand import compare_pairs
-from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.reconstruction import make_avatar, reconstruct
+from oasis_warp.reconstruction import reconstruct
 from studies.harness import Row, StudyOptions, measured, prior_choice
-from studies.inputs import PHOTOS, SAME_HAND, estimator, fit_largest, photos_below, photos_in, prior_named
-from studies.tables import Column, Section, complete, distribution, groups, mean, percentiles, table, write_jpeg
+from studies.inputs import PHOTOS, SAME_HAND, estimator, photos_below, photos_in
+from studies.tables import Column, Section, complete, distribution, groups, mean, percentiles, table
 
 ESTIMATOR = (
     Column("reprojection, % of the box", "reprojection_percent", ".2f"),
@@ -63,16 +51,13 @@ SINGLE = (
     Column("2 px inside, dB", "input_psnr_inner_db", ".1f"),
     Column("coverage", "coverage_worst", ".3f"),
 )
-AZIMUTHS = (90, 180)
-"""Of the views on the sheet beside the photo's own [degrees]."""
-SHEET_WIDTH = 1800
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(StudyOptions):
     """Options of this study."""
 
-    selecting: ClassVar[frozenset[str]] = frozenset({"priors", "folders", "sheet"})
+    selecting: ClassVar[frozenset[str]] = frozenset({"priors", "folders"})
     priors: tuple[str, ...] = ("none", "learned")
     """none, learned, or weights files."""
     folders: tuple[Path, ...] = (PHOTOS, SAME_HAND)
@@ -81,8 +66,6 @@ class Options(StudyOptions):
     seed: int = 0
     size: int | None = None
     """Side of the crop [px]; that of the photo by default."""
-    sheet: Path | None = None
-    """JPEG to draw instead."""
 
 
 def avatar_file(options: Options, prior: str, path: Path) -> Path:
@@ -130,10 +113,7 @@ def measure_pairs(folder: Path, prior: str, options: Options) -> Iterator[Row]:
 
 
 def run(options: Options) -> list[Row]:
-    """Measure every photo with every prior, and pairs of photos of one hand; or draw the sheet."""
-    if options.sheet is not None:
-        draw_sheet(photos_in(options.folders[0]), options.priors, options.sheet)
-        return []
+    """Measure every photo with every prior, and pairs of photos of one hand."""
     paths = [path for folder in options.folders for path in photos_in(folder) or photos_below(folder)]
     cases = {f"{path}, {prior}": (path, prior, options) for prior in options.priors for path in paths}
     rows = measured("photos", cases, measure, options)
@@ -141,37 +121,6 @@ def run(options: Options) -> list[Row]:
     hands = sorted({path.parent for folder in of_hands for path in photos_below(folder)})
     pairs = {f"pairs of {folder}, {prior}": (folder, prior, options) for prior in options.priors for folder in hands}
     return rows + measured("photos", pairs, measure_pairs, options)
-
-
-def draw_sheet(paths: list[Path], priors: tuple[str, ...], sheet: Path) -> None:
-    """A row for each photo: the photo, then for each prior its guess and the adapted hand, in three views each."""
-    side, rows = panel_side(1 + 6 * len(priors), SHEET_WIDTH), []
-
-    def panel(image: Tensor, caption: str) -> Panel:
-        small = cv2.resize(image.detach().numpy(), (side, side), interpolation=cv2.INTER_AREA)
-        return Panel(np.asarray(small.clip(0, 1) * 255).round().astype(np.uint8), caption)
-
-    for path in paths:
-        photo = read_photo(path)
-        try:
-            fit = fit_largest(photo)
-        except InputError as error:
-            print(f"left out: {error}")
-            continue
-        offsets = initial_offsets(bundled_hand(), fit)
-        crop = crop_hand(photo, fit, offsets, ReconstructConfig())
-        row = [panel(crop.image.flip(1) if fit.side == "left" else crop.image, "photo")]
-        for name in priors:
-            guess = prior_named(name)(crop)
-            adapted = adapt(bundled_hand(), [guess], [crop])
-            for words, gaussians, light in (("guess", guess, None), ("adapted", adapted.gaussians, adapted.light)):
-                avatar = make_avatar(fit, offsets, crop, gaussians, light)
-                vertices = avatar.mesh(avatar.source_pose).vertices
-                cameras = [orbit_camera(vertices, math.radians(azimuth), size=256) for azimuth in AZIMUTHS]
-                for camera in (avatar.source_camera, *cameras):
-                    row.append(panel(avatar.render(camera, avatar.source_pose).image, f"{Path(name).stem}: {words}"))
-        rows.append(row)
-    write_jpeg(sheet, make_sheet("Priors", "their guesses, and what adaptation makes of them", rows, SHEET_WIDTH))
 
 
 # ---- tables

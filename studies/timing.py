@@ -1,8 +1,7 @@
 """How fast synthetic pictures are made, by stage, and how long the learned prior takes to load and to encode one photo.
 
-Fills docs/synthetic.md (speed) and docs/prior.md (speed). With `--training` it times batches of training instead of the
-stages of a picture. CPU seconds are those of all threads together; with one thread they are its time, whatever other
-work goes on beside it.
+Fills docs/synthetic.md (speed) and docs/prior.md (speed). CPU seconds are those of all threads together; with one
+thread they are its time, whatever other work goes on beside it.
 """
 
 import resource
@@ -21,7 +20,6 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import NetworkPrior, choose_prior
-from oasis_warp.pretraining.synthetic_source import SyntheticHands
 from oasis_warp.synthetic import picture
 from oasis_warp.synthetic.people import person
 from oasis_warp.synthetic.shot_table import sample_table
@@ -42,24 +40,16 @@ WARM_UP, CROP = 3, 256
 class Options(StudyOptions):
     """Options of this study."""
 
-    selecting: ClassVar[frozenset[str]] = frozenset({"of", "device", "kernels"})
-    of: tuple[Literal["pictures", "training", "prior"], ...] = ("pictures", "prior")
+    selecting: ClassVar[frozenset[str]] = frozenset({"of", "device"})
+    of: tuple[Literal["pictures", "prior"], ...] = ("pictures", "prior")
     prior: str = "learned"
     """learned, or a weights file."""
     threads: int | None = 1
     size: int = 256
-    """Side of pictures, or of training's crops [px]."""
+    """Side of pictures [px]."""
     batch: int = 8
     repeats: int = 5
     seed: int = 0
-    kernels: bool = False
-    """Print the GPU's time by kernel, too."""
-    hands: int = 16
-    """Photos of a batch of training."""
-    views: int = 2
-    people: int = 64
-    ahead: int = 8
-    """Batches of training that are rendered together."""
 
 
 def wait(device: str) -> None:
@@ -71,49 +61,6 @@ def wait(device: str) -> None:
 def device_words(options: Options) -> str:
     """The device, for people."""
     return torch.cuda.get_device_name() if options.device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
-
-
-# ---- training's batches
-
-
-def time_training(options: Options) -> list[Row]:
-    """Data of a training step, and how long the process that asks for it is kept from other work."""
-    source = SyntheticHands(
-        seed=options.seed, people=options.people, hands=options.hands, views=options.views, size=options.size,
-        device=torch.device(options.device), workers=options.workers, ahead=options.ahead,
-    )  # fmt: skip
-    start = time.perf_counter()
-    source.bake(list(range(options.people)), None, max(options.workers, 1))
-    baking, batches = time.perf_counter() - start, source(0, 0, 1)
-
-    def several() -> tuple[float, float]:
-        start = time.perf_counter()
-        for _ in range(options.ahead):
-            next(batches)
-        asked = time.perf_counter() - start
-        wait(options.device)
-        return asked / options.ahead, (time.perf_counter() - start) / options.ahead
-
-    for _ in range(2):
-        several()
-    asked, done = zip(*(several() for _ in range(options.repeats)), strict=True)
-    if options.kernels and options.device == "cuda":
-        print_kernels(several, options.hands * (1 + options.views) * options.ahead)
-    return [
-        {"stage": f"baking {options.people} people", "ms": 1e3 * baking},
-        {"stage": f"a batch of {options.hands} photos and {options.views} targets each", "ms": 1e3 * min(done)},
-        {"stage": "the call returns after", "ms": 1e3 * min(asked)},
-    ]
-
-
-def print_kernels(render: Callable[[], object], pictures: int) -> None:
-    """GPU time of each kernel."""
-    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
-        render()
-    spent = sorted(profile.key_averages(), key=lambda row: -row.device_time_total)
-    print(f"on the GPU: {sum(row.device_time_total for row in spent) / pictures:.0f} us a picture")
-    for row in spent[:30]:
-        print(f"  {row.device_time_total / pictures:8.2f} us a picture, {row.count:4d} x {row.key[:90]}")
 
 
 # ---- pictures
@@ -152,8 +99,6 @@ def time_pictures(options: Options) -> list[Row]:
         timed("together", picture.render_table), options.seed, plan(), options.size, options.device, scene=PHOTOS
     )
     render()  # builds or loads kernels
-    if options.kernels and options.device == "cuda":
-        print_kernels(render, options.batch)
     found = best(plan) | best(render)
     originals = {name: getattr(picture, name) for name in STAGES}
     try:
@@ -214,7 +159,7 @@ def time_prior(options: Options) -> Row:
 
 def run(options: Options) -> list[Row]:
     """Time what is asked for."""
-    measure = {"pictures": time_pictures, "training": time_training, "prior": time_prior}
+    measure = {"pictures": time_pictures, "prior": time_prior}
     rows: list[Row] = []
     for of in options.of:
         rows += measured("timing", {f"{of} on {options.device}": (options,)}, measure[of], options)
@@ -225,14 +170,6 @@ SECTIONS = (
     Section("synthetic.md", "speed", table(
         (Column("stage", "stage"), Column("ms a picture", "ms", ".3g")),
         lambda rows: [row for row in rows if row["case"] == "pictures on cpu"],
-    )),
-    Section(None, "pictures on a GPU", table(
-        (Column("stage", "stage"), Column("ms a picture", "ms", ".3g")),
-        lambda rows: [row for row in rows if row["case"] == "pictures on cuda"],
-    )),
-    Section(None, "batches of training", table(
-        (Column("", "stage"), Column("ms", "ms", ".1f")),
-        lambda rows: [row for row in rows if row["case"].startswith("training")],
     )),
     Section("prior.md", "speed", table(
         (

@@ -1,18 +1,15 @@
 """Tables of ablations, and the studies that train and adapt without one part."""
 
-import copy
 from dataclasses import replace
 
 import pytest
 import torch
-from safetensors.torch import load_file
 
 from oasis_warp.evaluation.methods import Method
 from oasis_warp.evaluation.metrics import MEASURES
 from oasis_warp.network.config import COMPACT, PROFILES
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import save_network
-from oasis_warp.pretraining.pretrain import CHECKPOINT, WEIGHTS
 from studies import network_parts, parts
 from studies.harness import ROWS, read_rows
 from studies.parts import COLUMNS, ablation_rows, ablation_text, heading
@@ -78,26 +75,6 @@ def test_a_table_shows_differences_and_leaves_out_what_was_not_measured(tables):
     assert less.startswith("| w/o a part | -2.00 ± 1.00 | +0.00 ± 0.00 |")
 
 
-def test_a_probe_changes_its_part_alone(hand):
-    network = HandNetwork(TINY, hand)
-    for parameter in network.parameters():
-        torch.nn.init.normal_(parameter)
-    before = {name: value.clone() for name, value in network.named_parameters()}
-    touched = {
-        "full": set(), "no_bias": {"fusion.log_beta"}, "twice": {"fusion.log_beta"},
-        "mixing": {"feature_on_mesh.logits"}, "places": {"face_head.last.weight", "face_head.last.bias"},
-        "colors": {"face_head.last.weight", "face_head.last.bias"},
-    }  # fmt: skip
-    assert list(touched) == list(parts.PROBES)
-    for name, (_, change) in parts.PROBES.items():
-        changed = copy.deepcopy(network)
-        change(changed)
-        after = dict(changed.named_parameters())
-        assert {key for key, value in before.items() if not torch.equal(value, after[key])} == touched[name]
-        still = (after["face_head.last.weight"] == 0).all(1).sum()
-        assert int(still) == {"places": 3, "colors": 3}.get(name, 0)
-
-
 @pytest.fixture
 def tiny(monkeypatch):
     monkeypatch.setitem(PROFILES, "compact", TINY)
@@ -116,42 +93,28 @@ def test_networks_are_trained_with_and_without_point_evidence(tiny):
 
 
 @pytest.mark.slow
-def test_variants_are_trained_alike_and_go_on_where_they_were_stopped(tiny, tmp_path, monkeypatch, capsys):
-    few = {name: network_parts.VARIANTS[name] for name in ("full", "no_bias", "vet_off")}
+def test_variants_are_trained_on_the_same_batches_until_time_is_up_and_then_evaluated(
+    tiny, tmp_path, monkeypatch, capsys
+):
+    few = {name: network_parts.VARIANTS[name] for name in ("full", "vet_off")}
     monkeypatch.setattr(network_parts, "VARIANTS", few)
-    monkeypatch.setattr(network_parts, "CHECKPOINT_EVERY", 1)
-    whole = network_parts.Options(
-        steps=3, hands=1, people=1, views=1, size=32, precision="float32", held_out=1, evidence="off",
-        out=tmp_path / "whole",
+    met, advance = [], network_parts.PriorTrainer.advance
+    monkeypatch.setattr(
+        network_parts.PriorTrainer, "advance", lambda self, batch: (met.append(batch.image), advance(self, batch))[1]
+    )
+    options = network_parts.Options(
+        steps=2, hands=1, people=1, views=1, size=32, precision="float32", held_out=1, targets=1, evidence="off",
+        out=tmp_path,
     )  # fmt: skip
-    rows = network_parts.run(whole)
+    assert network_parts.run(replace(options, only=("vet_off",))) == []
+    assert network_parts.run(replace(options, minutes=0)) == []
+    assert "the same command goes on" in capsys.readouterr().err and len(met) == 3
+    rows = network_parts.run(options)
+    assert len(met) == 4 and torch.equal(met[0], met[2]) and torch.equal(met[1], met[3])
     kinds = dict.fromkeys((row["light"], row["colors"]) for row in rows)
-    assert list(kinds) == [("studio", "raw"), ("studio", "matched"), ("wild", "matched")] and len(rows) == 9
+    assert list(kinds) == [("studio", "raw"), ("studio", "matched"), ("wild", "matched")] and len(rows) == 6
     text = ablation_text(rows) or ""
-    assert "w/o bias" in text and "full model" in text and "Settings: " in text
-
-    advance = network_parts.PriorTrainer.advance
-
-    def until_stopped(trainer, batch):
-        if trainer.step == 2 and trainer.network.config.vet == "off":
-            raise KeyboardInterrupt
-        return advance(trainer, batch)
-
-    part = replace(whole, out=tmp_path / "parts")
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(network_parts.PriorTrainer, "advance", until_stopped)
-        network_parts.run(replace(part, only=("full", "vet_off")))
-    network_parts.run(replace(part, only=("no_bias",), minutes=0))
-    assert "the same command goes on" in capsys.readouterr().err
-    folder = tmp_path / "parts" / "network_parts"
-    assert (folder / "no_bias" / CHECKPOINT).exists()
-    assert not (folder / "no_bias" / WEIGHTS).exists()
-    network_parts.run(replace(part, only=("vet_off",)))
-    network_parts.run(replace(part, only=("full", "no_bias")))
-    for name in few:
-        ours, theirs = (load_file(place / "network_parts" / name / CHECKPOINT) for place in (whole.out, part.out))
-        assert all(torch.equal(ours[key], theirs[key]) for key in ours), name
-        assert (folder / name / WEIGHTS).exists()
+    assert "w/o VETs" in text and "full model" in text and "Settings: " in text
 
 
 @pytest.mark.slow
@@ -166,9 +129,9 @@ def test_adaptation_is_measured_without_its_parts(tiny, tmp_path, monkeypatch, h
     monkeypatch.setattr(parts, "ADAPTATIONS", few)
     save_network(tmp_path / "network.safetensors", HandNetwork(TINY, hand))
     weights = str(tmp_path / "network.safetensors")
-    rows = parts.run(parts.Options(prior=weights, people=1, of=("adaptation",), out=tmp_path / "out"))
+    rows = parts.run(parts.Options(prior=weights, people=1, targets=1, size=64, out=tmp_path / "out"))
     assert read_rows(tmp_path / "out" / "parts" / ROWS) == rows
     assert list(dict.fromkeys(row["light"] for row in rows)) == ["same", "studio", "wild"]
     assert [row["variant"] for row in rows] == 3 * list(parts.TITLES)
-    one_shot, probe = parts.SECTIONS
-    assert all(title in (one_shot.text(rows) or "") for title in parts.TITLES.values()) and probe.text(rows) is None
+    (one_shot,) = parts.SECTIONS
+    assert all(title in (one_shot.text(rows) or "") for title in parts.TITLES.values())

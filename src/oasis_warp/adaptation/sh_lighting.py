@@ -1,7 +1,7 @@
 """The light of a photo: fitted spherical harmonics; what the photo shows beyond them, split in albedo and shade.
 
 Two photos of one hand agree on little of what they show beyond the prior. Where skin faces as before, a third to a half
-of it is found again; where it has turned by more than 45 degrees, a tenth at most (studies/light.py). The
+of it is found again; where it has turned by more than 45 degrees, a tenth at most (docs/avatar.md). The
 rest is shadows, gloss, wrinkles of the pose, and detail beside its place. So most of it is shade, which the photo's own
 view keeps and other poses lose. Only what no light does to skin is taken for a mark, and stays whole.
 """
@@ -26,7 +26,7 @@ SPREAD = (
     (-0.010, 0.0, 0.033, -0.006),
     (0.018, 0.0, -0.006, 0.064),
 )
-"""Their covariance. Both are those of synthetic rooms (studies/light.py), made alike left and right."""
+"""Their covariance. Both are those of 40 synthetic rooms, made alike left and right."""
 HUE = 0.95
 """Correlation of a harmonic's three colours: rooms have dark and bright sides, but hardly any light is green on one
 side and pink on the other. In 3,000 synthetic rooms it is .99; coloured walls near the hand are left some room."""
