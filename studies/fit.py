@@ -242,7 +242,7 @@ def beside(rows: list[Row]) -> list[Row]:
 SECTIONS = (
     Section("estimator.md", "fit", lambda rows: distribution(hands(rows, "real"), MEASURES)),
     Section("estimator.md", "faults", table(
-        (Column("fault", "fault"), *(Column(heading, percent(heading)) for heading in WARNINGS)), shares
+        (Column("fault", "fault"), *(Column(heading, heading, percent) for heading in WARNINGS)), shares
     )),
     Section("results.md", "masks", table(
         (

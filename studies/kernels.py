@@ -16,7 +16,7 @@ On a machine with torch and Warp but without the packages of the command line,
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -26,15 +26,18 @@ from oasis_warp.bench import gpu_cases, gpu_speed, roofline, scaling
 from oasis_warp.bench.gpu_cases import OURS
 from oasis_warp.bench.gpu_speed import GpuRow
 from oasis_warp.bench.plots import MISSING, can_plot, plot_roofline, plot_scaling, plot_speed
-from oasis_warp.bench.roofline import RECORD, KernelRow
+from oasis_warp.bench.roofline import KernelRow
 from oasis_warp.bench.rows import json_text, read_json
 from oasis_warp.bench.scaling import ScalingRow, steepest
 from oasis_warp.data.output_files import write_file
 from studies.harness import Row, StudyOptions, report
-from studies.tables import Section, markdown, power, section_of, short
+from studies.tables import Column, Section, power, section_of, short, table, yes
 
 GROUPS, SECONDS = 11, 2.0
 """Groups of calls of each case, and seconds for each point of the scaling: those of `oasis bench`."""
+
+
+times = "{:.1f}x".format
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,16 +48,6 @@ class Options(StudyOptions):
     """Of the GPU's."""
     peer: Literal["none", "gsplat"] = "none"
     """Another rasterizer to time beside the kernels."""
-
-
-class Part(NamedTuple):
-    """One file of measurements of the GPU, and what the page makes of it."""
-
-    kind: type
-    tables: dict[str, Callable[..., str]]
-    """By their markers."""
-    plot: Callable[..., None]
-    caption: str
 
 
 def measure_part(part: str, options: Options) -> Sequence[Any]:
@@ -115,38 +108,77 @@ def draw(rows: list[Row], static: Path) -> None:
 
 # ---- the CPU
 
+SPEED = (
+    Column("operator", lambda row: f"`{row['op']}`"), Column("pass", "pass"),
+    Column("ms", lambda row: row["cpu_ms"] or row["fastest_ms"], ".2f"),
+    Column("/ yardstick", "over_yardstick", ".3f"), Column("generic kernels", "scalar", times),
+    Column("torch", "torch", times), Column("rel-L2", "rel_l2", power), Column("gradient", "gradient_rel_l2", power),
+)  # fmt: skip
+
 
 def speed_text(rows: list[Row]) -> str | None:
-    """A line for each operator and pass."""
+    """A line for each operator and pass of the CPU's measurements, one thread beside several."""
     parts = {row["part"]: row["rows"] for row in rows}
     one, several = parts.get("speed"), parts.get("speed_threads", [])
     if one is None:
         return None
-
-    def find(records: list[dict[str, Any]], like: dict[str, Any], way: str) -> dict[str, Any] | None:
-        return next((r for r in records if (r["op"], r["pass"], r["way"]) == (like["op"], like["pass"], way)), None)
-
-    lines = []
-    for ours in (record for record in one if record["way"] == "warp"):
-        peers = (find(one, ours, way) for way in ("scalar", "torch"))
-        threaded = find(several, ours, "warp")
-        lines.append([
-            f"`{ours['op']}`", ours["pass"], f"{ours['cpu_ms'] or ours['fastest_ms']:.2f}",
-            f"{ours['over_yardstick']:.3f}", *("" if peer is None else f"{peer['over_warp']:.1f}x" for peer in peers),
-            power(ours["rel_l2"]), power(ours["gradient_rel_l2"]),
-            *([f"{threaded['fastest_ms']:.2f}"] if threaded else []),
-        ])  # fmt: skip
-    headings = ["operator", "pass", "ms", "/ yardstick", "generic kernels", "torch", "rel-L2", "gradient"]
-    headings += [f"ms, {several[0]['threads']} threads"] if several else []
+    over = {(r["op"], r["pass"], r["way"]): r.get("over_warp") for r in one}
+    threaded = {(r["op"], r["pass"]): r["fastest_ms"] for r in several if r["way"] == "warp"}
+    lines = [
+        row | {way: over.get((row["op"], row["pass"], way)) for way in ("scalar", "torch")}
+        | {"threaded": threaded.get((row["op"], row["pass"]))}
+        for row in one if row["way"] == "warp"
+    ]  # fmt: skip
+    more = (Column(f"ms, {several[0]['threads']} threads", "threaded", ".2f"),) if several else ()
     first = one[0]
     about = (
         f"{first['device']}, {first['versions']}, commit {first['commit']}; {first['gaussians']:,} Gaussians drawn at "
         f"{first['width']} x {first['height']}, the best of {first['repeats']} calls."
     )
-    return f"{markdown(headings, lines)}\n\n{about}"
+    return f"{table((*SPEED, *more))(lines)}\n\n{about}"
 
 
 # ---- the GPU
+
+CASES = (
+    Column("case", "case"), Column("pass", "pass_"), Column("wall ms", "wall_ms", short),
+    Column("GPU ms", "busy_ms", short), Column("launched ms", "launch_ms", short),
+    Column("views a second", lambda row: 1e3 * row["views"] / row["wall_ms"], short),
+    Column("kernels", "kernels", short), Column("MiB", "peak_mb", short), Column("max error", "max_abs", power),
+    Column("of 99.99 %", "most_abs", power), Column("rel-L2", "rel_l2", power),
+    Column("gradient", "gradient_rel_l2", power), Column("same bits", "bit_equal", yes),
+)  # fmt: skip
+PEERS = (
+    Column("case", "case"), Column("pass", "pass_"), Column("peer", "way"), Column("wall ms", "our_wall_ms", short),
+    Column("peer's", "wall_ms", short), Column("ratio", lambda row: row["wall_ms"] / row["our_wall_ms"], times),
+    Column("kernels ms", "our_kernels_ms", short), Column("peer's", "kernels_ms", short),
+    Column("ratio", lambda row: ratio(row["kernels_ms"], row["our_kernels_ms"]), times),
+    Column("peer's error of 99.99 %", "most_abs", power), Column("peer's gradient", "gradient_rel_l2", power),
+)  # fmt: skip
+GROWTH = (
+    Column("axis", "axis"), Column("of", "series"), Column("pass", "pass_"), Column("time over work", "ratio", ".2f"),
+    Column("between", lambda row: f"{row['before']:,} and {row['after']:,}"),
+)  # fmt: skip
+POINTS = (
+    Column("scene", "scene"), Column("size", lambda row: f"{row['width']} x {row['height']}"), Column("views", "views"),
+    Column("pairs", "pairs", ","), Column("longest list", "longest", ","), Column("wall ms", "wall_ms", short),
+    Column("GPU ms", "busy_ms", short), Column("with backward: wall ms", "both_wall_ms", short),
+    Column("GPU ms", "both_busy_ms", short), Column("MiB", "peak_mb", short),
+    Column("with backward", "both_peak_mb", short), Column("finite", "finite", yes),
+    Column("overflow", "overflow", yes), Column("compared", "checked"), Column("max error", "max_abs", power),
+    Column("of 99.99 %", "most_abs", power),
+)  # fmt: skip
+ROOFLINE = (
+    Column("case", "case"), Column("kernel", "kernel"), Column("launches", "launches", short),
+    Column("us", "us", short), Column("MB", "bytes", lambda n: short(1e-6 * n)), Column("GB/s", "gb_s", short),
+    Column("MFLOP", "flops", lambda n: short(1e-6 * n)), Column("GFLOP/s", "gflop_s", short),
+    Column("floor us", "floor_us", short), Column("share", "share"),
+)  # fmt: skip
+
+
+def ratio(one: float | None, other: float | None) -> float | None:
+    """Their quotient; None where either is missing."""
+    return None if one is None or other is None else one / other
 
 
 def provenance(row: GpuRow | ScalingRow | KernelRow) -> str:
@@ -155,100 +187,49 @@ def provenance(row: GpuRow | ScalingRow | KernelRow) -> str:
     return f"{row.device}; {row.versions}{made}."
 
 
-def speed_lines(rows: Sequence[GpuRow]) -> str:
-    """A line a case and pass, ours."""
-    lines = [
-        (
-            row.case, row.pass_, short(row.wall_ms), short(row.busy_ms), short(row.launch_ms),
-            short(1e3 * row.views / row.wall_ms), short(row.kernels), short(row.peak_mb), power(row.max_abs),
-            power(row.most_abs), power(row.rel_l2), power(row.gradient_rel_l2), "yes" if row.bit_equal else "no",
-        )
-        for row in rows
-        if row.way == OURS
-    ]  # fmt: skip
-    heading = (
-        "case", "pass", "wall ms", "GPU ms", "launched ms", "views a second", "kernels", "MiB", "max error",
-        "of 99.99 %", "rel-L2", "gradient", "same bits",
-    )  # fmt: skip
-    first = rows[0]
-    about = f"{provenance(first)} Medians of {first.groups} groups of calls."
-    missing = [f"No graph holds {row.case}, {row.pass_}: {row.not_captured}" for row in rows if lacks_graph(row)]
-    return "\n\n".join([markdown(heading, lines), about, *missing])
+def case_text(rows: Sequence[GpuRow]) -> str:
+    """A line for each case and pass of ours."""
+    ours = [row for row in rows if row.way == OURS]
+    missing = [f"No graph holds {row.case}, {row.pass_}: {row.not_captured}" for row in ours if row.not_captured]
+    about = f"{provenance(rows[0])} Medians of {rows[0].groups} groups of calls."
+    return "\n\n".join([table(CASES)(list(map(asdict, ours))) or "", about, *missing])
 
 
-def lacks_graph(row: GpuRow) -> bool:
-    """Whether a graph of ours was tried in vain."""
-    return row.way == OURS and bool(row.not_captured)
-
-
-def peer_lines(rows: Sequence[GpuRow]) -> str:
-    """Ours over each peer, on the host's clock and in kernels."""
+def peer_text(rows: Sequence[GpuRow]) -> str:
+    """Ours beside each peer, on the host's clock and in kernels."""
     ours = {(row.case, row.pass_): row for row in rows if row.way == OURS}
-    lines = []
-    for peer in rows:
-        if peer.way == OURS:
-            continue
-        own = ours[peer.case, peer.pass_]
-        kernels = None
-        if own.kernels_ms is not None and peer.kernels_ms is not None:
-            kernels = peer.kernels_ms / own.kernels_ms
-        lines.append(
-            (
-                peer.case, peer.pass_, peer.way, short(own.wall_ms), short(peer.wall_ms),
-                f"{peer.wall_ms / own.wall_ms:.1f}x", short(own.kernels_ms), short(peer.kernels_ms),
-                "" if kernels is None else f"{kernels:.1f}x", power(peer.most_abs), power(peer.gradient_rel_l2),
-            )
-        )  # fmt: skip
-    if not lines:
-        return "No other rasterizer was installed where this was measured."
-    heading = (
-        "case", "pass", "peer", "wall ms", "peer's", "ratio", "kernels ms", "peer's", "ratio",
-        "peer's error of 99.99 %", "peer's gradient",
-    )  # fmt: skip
-    return markdown(heading, lines)
-
-
-def growth_lines(rows: Sequence[ScalingRow]) -> str:
-    """The steepest step of every line."""
     lines = [
-        (step.axis, step.series, step.pass_, f"{step.ratio:.2f}", f"{step.before:,} and {step.after:,}")
-        for step in steepest(rows)
-    ]
-    found = [f"{step.series}, {step.pass_}" for step in steepest(rows) if step.cliff]
-    verdict = f"Cliffs: {'; '.join(found)}." if found else "No step is a cliff."
-    return f"{markdown(('axis', 'of', 'pass', 'time over work', 'between'), lines)}\n\n{verdict} {provenance(rows[0])}"
+        asdict(row) | {f"our_{name}": getattr(ours[row.case, row.pass_], name) for name in ("wall_ms", "kernels_ms")}
+        for row in rows if row.way != OURS
+    ]  # fmt: skip
+    return table(PEERS)(lines) or "No other rasterizer was installed where this was measured."
 
 
-def point_lines(rows: Sequence[ScalingRow]) -> str:
+def growth_text(rows: Sequence[ScalingRow]) -> str:
+    """The steepest step of every line."""
+    steps = steepest(rows)
+    cliffs = "; ".join(f"{step.series}, {step.pass_}" for step in steps if step.cliff)
+    verdict = f"Cliffs: {cliffs}." if cliffs else "No step is a cliff."
+    return f"{table(GROWTH)([vars(step) for step in steps])}\n\n{verdict} {provenance(rows[0])}"
+
+
+def point_text(rows: Sequence[ScalingRow]) -> str:
     """Every point, both passes on one line."""
-    backward = {key(row): row for row in rows if row.pass_ != "forward"}
-    lines = []
+
+    def key(row: ScalingRow) -> tuple:
+        return row.axis, row.scene, row.width, row.height, row.views
+
+    backward, lines = {key(row): row for row in rows if row.pass_ != "forward"}, []
     for row in rows:
-        if row.pass_ != "forward":
-            continue
-        both = backward[key(row)]
-        right = "yes" if row.finite and both.finite else "no"
-        overflow = "" if row.overflow is None else "yes" if row.overflow or both.overflow else "no"
-        lines.append(
-            (
-                row.scene, f"{row.width} x {row.height}", str(row.views), f"{row.pairs:,}", f"{row.longest:,}",
-                short(row.wall_ms), short(row.busy_ms), short(both.wall_ms), short(both.busy_ms), short(row.peak_mb),
-                short(both.peak_mb), right, overflow, row.checked, power(row.max_abs), power(row.most_abs),
-            )
-        )  # fmt: skip
-    heading = (
-        "scene", "size", "views", "pairs", "longest list", "wall ms", "GPU ms", "with backward: wall ms", "GPU ms",
-        "MiB", "with backward", "finite", "overflow", "compared", "max error", "of 99.99 %",
-    )  # fmt: skip
-    return markdown(heading, lines)
+        if row.pass_ == "forward":
+            both = backward[key(row)]
+            more = {f"both_{name}": getattr(both, name) for name in ("wall_ms", "busy_ms", "peak_mb")}
+            overflow = None if row.overflow is None else row.overflow or both.overflow
+            lines.append({**asdict(row), **more, "finite": row.finite and both.finite, "overflow": overflow})
+    return table(POINTS)(lines) or ""
 
 
-def key(row: ScalingRow) -> tuple[str, str, int, int, int]:
-    """What a point's two rows share."""
-    return row.axis, row.scene, row.width, row.height, row.views
-
-
-def roofline_lines(rows: Sequence[KernelRow]) -> str:
+def roofline_text(rows: Sequence[KernelRow]) -> str:
     """Every kernel that takes a hundredth of its case, or has a formula."""
     lines = []
     for case in dict.fromkeys(row.case for row in rows):
@@ -256,71 +237,33 @@ def roofline_lines(rows: Sequence[KernelRow]) -> str:
         total = sum(row.us for row in kernels)
         floors = [row.floor_us for row in kernels if row.floor_us is not None]
         for row in kernels:
-            if row.bytes is None and row.us < total / 100:
-                continue
-            lines.append(
-                (
-                    case, f"`{row.kernel}`", short(row.launches), short(row.us),
-                    "" if row.bytes is None else short(1e-6 * row.bytes), short(row.gb_s),
-                    "" if row.flops is None else short(1e-6 * row.flops), short(row.gflop_s), short(row.floor_us),
-                    "" if row.share is None else f"{row.share:.0%} of {row.bound}",
-                )
-            )  # fmt: skip
-        share = f"{sum(floors) / total:.0%}" if floors else ""
-        lines.append((case, "all", "", short(total), "", "", "", "", short(sum(floors)) if floors else "", share))
-    first = rows[0]
-    about = (
-        f"Ceilings, measured in the same run: {first.ceiling_gb_s:,.0f} GB/s and {first.ceiling_gflop_s:,.0f} GFLOP/s. "
-        f"{provenance(first)}"
-    )
-    heading = ("case", "kernel", "launches", "us", "MB", "GB/s", "MFLOP", "GFLOP/s", "floor us", "share")
-    return f"{markdown(heading, lines)}\n\n{about}"
+            if row.bytes is not None or row.us >= total / 100:
+                share = None if row.share is None else f"{row.share:.0%} of {row.bound}"
+                lines.append({**asdict(row), "kernel": f"`{row.kernel}`", "share": share})
+        floor = {"floor_us": sum(floors), "share": f"{sum(floors) / total:.0%}"} if floors else {}
+        lines.append({"case": case, "kernel": "all", "us": total, **floor})
+    ceilings = f"{rows[0].ceiling_gb_s:,.0f} GB/s and {rows[0].ceiling_gflop_s:,.0f} GFLOP/s"
+    return f"{table(ROOFLINE)(lines)}\n\nCeilings, measured in the same run: {ceilings}. {provenance(rows[0])}"
 
 
-def determinism_lines(rows: Sequence[KernelRow]) -> str:
-    """What adding up in a fixed order takes in each case that does it."""
-    sentences = []
-    for case in dict.fromkeys(row.case for row in rows):
-        kernels = [row for row in rows if row.case == case]
-        gathers = [row for row in kernels if row.kernel.startswith("gather_")]
-        writer = next((row for row in kernels if row.kernel.startswith("blend_tiles_backward")), None)
-        if not gathers or writer is None:
-            continue
-        total, taken = sum(row.us for row in kernels), sum(row.us for row in gathers)
-        names = " and ".join(f"`{row.kernel}`" for row in gathers)
-        sentences.append(
-            f"{case}: {names} {'take' if len(gathers) > 1 else 'takes'} {short(taken)} of the {short(total)} us that "
-            f"all kernels take ({taken / total:.0%}); a record has {RECORD} bytes."
-        )
-    return "\n".join(f"- {sentence}" for sentence in sentences) or "Not measured."
+class Part(NamedTuple):
+    """One file of measurements of the GPU, and what the page makes of it."""
+
+    kind: type
+    texts: dict[str, Callable[..., str]]
+    """By their markers."""
+    plot: Callable[..., None]
 
 
 PARTS = {
-    "kernels": Part(GpuRow, {"kernels": speed_lines, "peers": peer_lines}, plot_speed, "Times of every case"),
-    "scaling": Part(
-        ScalingRow, {"growth": growth_lines, "points": point_lines}, plot_scaling,
-        "Time for a Gaussian, a pixel and a view, and memory, against their number",
-    ),
-    "roofline": Part(
-        KernelRow, {"roofline": roofline_lines, "determinism": determinism_lines}, plot_roofline,
-        "Operations a second of every kernel below the ceilings",
-    ),
-}  # fmt: skip
-
-
-def picture_link(row: Row) -> str:
-    """The picture of a part."""
-    return f"![{PARTS[row['part']].caption}](_static/gpu_{row['part']}.png)"
-
-
+    "kernels": Part(GpuRow, {"kernels": case_text, "peers": peer_text}, plot_speed),
+    "scaling": Part(ScalingRow, {"growth": growth_text, "points": point_text}, plot_scaling),
+    "roofline": Part(KernelRow, {"roofline": roofline_text}, plot_roofline),
+}
 SECTIONS = (
     Section("kernels.md", "speed", speed_text),
     *(
         section_of("gpu.md", marker, lambda row, text=text: text(row["rows"]), part=name)
-        for name, part in PARTS.items() for marker, text in part.tables.items()
+        for name, part in PARTS.items() for marker, text in part.texts.items()
     ),
-    *(
-        section_of("gpu.md", f"picture of {name}", picture_link, part=name)
-        for name in PARTS
-    ),
-)
+)  # fmt: skip

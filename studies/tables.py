@@ -25,13 +25,17 @@ class Column(NamedTuple):
     heading: str
     value: str | Callable[[Row], Any]
     """A key of the rows, or a function of one."""
-    form: str = ""
-    """Of its numbers, as `format` takes it."""
+    form: str | Callable[[Any], str] = ""
+    """Of its numbers: as `format` takes it, or a function such as `short`."""
 
     def cell(self, row: Row) -> str:
         """The text of one row; empty where it has no value."""
         value = self.value(row) if callable(self.value) else row.get(self.value)
-        return "" if value is None else value if isinstance(value, str) else format(value, self.form)
+        return value if isinstance(value, str) else self.text(value)
+
+    def text(self, value: Any) -> str:
+        """A number in the column's form; empty for None."""
+        return "" if value is None else self.form(value) if callable(self.form) else format(value, self.form)
 
 
 class Section(NamedTuple):
@@ -89,7 +93,7 @@ def table(
 def medians(rows: list[Row], columns: Sequence[Column]) -> list[Sequence[str]]:
     """A foot with the median of every column but the first."""
     values = {column: statistics.median(row[str(column.value)] for row in rows) for column in columns[1:]}
-    return [["**median**", *(format(value, column.form) for column, value in values.items())]]
+    return [["**median**", *(column.text(value) for column, value in values.items())]]
 
 
 def markdown(headings: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
@@ -97,9 +101,14 @@ def markdown(headings: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (headings, ["---"] * len(headings), *lines))
 
 
-def percent(key: str) -> Callable[[Row], str | None]:
-    """The value of a column that shows a share as "12 %"."""
-    return lambda row: None if row.get(key) is None else f"{100 * row[key]:.0f} %"
+def percent(share: float) -> str:
+    """A share as "12 %"."""
+    return f"{100 * share:.0f} %"
+
+
+def yes(value: bool) -> str:
+    """Yes or no."""
+    return "yes" if value else "no"
 
 
 def power(value: float | None, digits: int = 0) -> str:
@@ -138,7 +147,7 @@ def distribution(
             values = [row[measure.value] for row in own if row.get(measure.value) is not None]
             if values:
                 numbers = percentiles(values) + ([min(values), max(values)] if extremes else [])
-                lines.append([measure.heading, *name, *(format(number, measure.form) for number in numbers)])
+                lines.append([measure.heading, *name, *map(measure.text, numbers)])
     headings = [title, *([by] if by else []), "10 %", "median", "90 %", *(["least", "most"] if extremes else [])]
     return markdown(headings, lines) if lines else None
 
