@@ -59,19 +59,11 @@ def _keypoints(made: Reconstruction, xy: torch.Tensor | None = None) -> dict:
     return {"side": landmarks.side, "xy": (landmarks.xy if xy is None else xy).tolist(), **world}
 
 
-def _disc(made: Reconstruction) -> np.ndarray:
+def wrong_mask(photo: Photo, made: Reconstruction, *, change: Callable[..., np.ndarray]) -> DamagedInput:
+    """The cut-out is too small or too large: every part of the hand is `SHARE` of its size thinner or thicker."""
     radius = max(1, round(SHARE * hand_size(made) / 2))
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-
-
-def mask_eroded(photo: Photo, made: Reconstruction) -> DamagedInput:
-    """The cut-out is too small: every part of the hand is `SHARE` of its size thinner."""
-    return DamagedInput(photo._replace(alpha=torch.from_numpy(cv2.erode(made.fit.mask.numpy(), _disc(made)))))
-
-
-def mask_dilated(photo: Photo, made: Reconstruction) -> DamagedInput:
-    """The cut-out is too large: every part of the hand is `SHARE` of its size thicker."""
-    return DamagedInput(photo._replace(alpha=torch.from_numpy(cv2.dilate(made.fit.mask.numpy(), _disc(made)))))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return DamagedInput(photo._replace(alpha=torch.from_numpy(change(made.fit.mask.numpy(), disc))))
 
 
 def landmarks_off(photo: Photo, made: Reconstruction) -> DamagedInput:
@@ -132,8 +124,8 @@ def painted(photo: Photo, made: Reconstruction, *, drawing: str) -> DamagedInput
 
 
 DAMAGES: dict[str, Damage] = {
-    "mask eroded": mask_eroded,
-    "mask dilated": mask_dilated,
+    "mask eroded": partial(wrong_mask, change=cv2.erode),
+    "mask dilated": partial(wrong_mask, change=cv2.dilate),
     "landmarks off": landmarks_off,
     "half out": half_out,
     "warm light": partial(coloured_light, gains=WARM),

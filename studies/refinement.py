@@ -1,13 +1,11 @@
 """How much of the estimator's error joint refinement repairs, on synthetic people that training never meets.
 
 Poses are off as in `oasis evaluate --dataset synthetic`, by the measured errors of the estimator; landmarks are not
-given to the refinement, since none go with these. Fills docs/estimator.md (refinement). With `--avatars` it also prints
-PSNR of pictures in other poses, of the prior's guess and of the adapted one, when the surface is the estimated, the
-refined or the true one; from photos in any light after one gain per channel.
+given to the refinement, since none go with these. Fills docs/estimator.md (refinement).
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,32 +13,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.core.camera import project
-from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import HandCrop
 from oasis_warp.estimation.refine import refine
 from oasis_warp.estimation.surface_state import shape_of, state_of_surface
 from oasis_warp.evaluation.held_out import (
+    ERROR_STREAM,
     CaptureConfig,
     CapturedPerson,
     Lighting,
     capture_person,
     estimated_batch,
     estimator_noise,
-    target_truths,
 )
-from oasis_warp.evaluation.methods import LitGaussians
-from oasis_warp.evaluation.metrics import match_colors, score
-from oasis_warp.evaluation.synthetic import crop_of, draw_targets
+from oasis_warp.evaluation.synthetic import crop_of
 from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map, depth_visibility
-from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, seeded
 from oasis_warp.pretraining.training_batch import EstimatorNoise, training_batch
-from studies.harness import AvatarOptions, Row, measured
+from studies.harness import Row, StudyOptions, measured
 from studies.inputs import iou, people, prior_named
-from studies.tables import Column, Section, complete, groups, mean, percentiles, table
+from studies.tables import Column, Section, complete, groups, mean, percent, percentiles, table
 
 MARGIN = 0.0015
 """Depth by which a vertex may lie behind the nearest surface and count as visible [m]."""
@@ -54,23 +47,22 @@ MEASURES = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(AvatarOptions):
+class Options(StudyOptions):
     """Options of this study."""
 
-    selecting: ClassVar[frozenset[str]] = frozenset({"people", "first", "errors"})
+    selecting: ClassVar[frozenset[str]] = frozenset({"people", "first"})
+    prior: str = "learned"
+    """learned, or a weights file."""
     people: int = 6
     first: int = 40
     """Number of the first of them."""
-    errors: tuple[float, ...] = (1.0,)
-    """Factors of the estimator's errors."""
-    avatars: bool = False
-    """Reconstruct, too."""
 
 
-def true_crop(person: CapturedPerson, light: Lighting, capture: CaptureConfig, factor: float) -> HandCrop:
+def true_crop(person: CapturedPerson, light: Lighting, capture: CaptureConfig) -> HandCrop:
     """The true surface in the crop of the wrong mask: the same random numbers as of `estimated_batch`."""
-    noise = EstimatorNoise(surface=0.0, mask=estimator_noise(factor).mask)
-    random, photo = seeded(capture.seed, ERROR_STREAM, person.number), person.photos[light]
+    (state,) = np.random.SeedSequence([capture.seed, ERROR_STREAM, person.number]).generate_state(1)
+    noise = EstimatorNoise(surface=0.0, mask=estimator_noise(1.0).mask)
+    random, photo = torch.Generator().manual_seed(int(state)), person.photos[light]
     hand = bundled_hand().to(photo.image.device)
     return crop_of(training_batch(hand, photo, person.targets[light], capture.size, random, noise))
 
@@ -116,86 +108,50 @@ def joint_angles(crop: HandCrop) -> np.ndarray:
 
 
 def measure(number: int, options: Options) -> Iterator[Row]:
-    """Rows of one person: one for each light and factor, and with avatars one for each surface and stage, too."""
+    """A row for each light on one person."""
     capture, device = CaptureConfig(), torch.device(options.device)
-    hand, on_device, prior = bundled_hand(), bundled_hand().to(device), prior_named(options.prior)
+    hand, prior = bundled_hand(), prior_named(options.prior)
     person = capture_person(capture, "ordinary", number, device)
     for light in person.photos:
-        exact = estimated_batch(on_device, person, light, capture, 0.0)
-        truths = target_truths(exact, on_device)
-        for factor in options.errors:
-            batch = estimated_batch(on_device, person, light, capture, factor)
-            crop, truth = crop_of(batch), true_crop(person, light, capture, factor)
-            start = time.perf_counter()
-            refined = refine(hand, prior(crop), crop)
-            about = {"person": number, "light": light, "factor": factor}
-            yield {
-                **about, "before": errors(crop, truth), "after": errors(refined.crop, truth),
-                "accepted": refined.accepted, "seconds": time.perf_counter() - start,
-            }  # fmt: skip
-            surfaces = {"estimated": crop, "refined": refined.crop, "true": truth} if options.avatars else {}
-            for surface, each in surfaces.items():
-                guess = prior(each)
-                config = AdaptConfig(light="keep", texture_steps=options.steps)
-                for stage, gaussians in (("raw", guess), ("one-shot", adapt(hand, [guess], [each], config).gaussians)):
-                    images = draw_targets(LitGaussians(gaussians), on_device, batch, None)
-                    psnr = [
-                        score(match_colors(i, t.image, t.mask) if light == "wild" else i, t)["psnr"]
-                        for i, t in zip(images, truths, strict=True)
-                    ]
-                    yield {**about, "surface": surface, "stage": stage, "psnr": mean(psnr)}
+        crop = crop_of(estimated_batch(hand.to(device), person, light, capture, 1.0))
+        truth, start = true_crop(person, light, capture), time.perf_counter()
+        refined = refine(hand, prior(crop), crop)
+        yield {
+            "light": light, "seconds": time.perf_counter() - start, "taken": refined.accepted,
+            "before": errors(crop, truth), "after": errors(refined.crop, truth),
+        }  # fmt: skip
 
 
 def run(options: Options) -> list[Row]:
     """Measure everybody."""
-    cases = {f"person {k}, errors {options.errors}": (k, options) for k in people(options.people, first=options.first)}
+    cases = {f"person {k}": (k, options) for k in people(options.people, first=options.first)}
     return measured("refinement", cases, measure, options)
 
 
-def median(rows: list[Row], part: str, key: str) -> float:
-    """Over people."""
-    return percentiles((row[part][key] for row in rows), (50,))[0]
-
-
-def table_rows(rows: list[Row]) -> list[Row]:
-    """A line for each measure: estimated poses, and refined ones in each light, with the smallest errors tried."""
-    rows = [row for row in complete(rows) if "before" in row]
-    least = min((row["factor"] for row in rows), default=0)
-    by_light = {light: own for (light,), own in groups([r for r in rows if r["factor"] == least], "light").items()}
+def lines(rows: list[Row]) -> list[Row]:
+    """A line for each measure: estimated poses, and refined ones in each light."""
+    by_light = {light: own for (light,), own in groups(complete(rows), "light").items()}
     if "studio" not in by_light:
         return []
-    lines = [
-        {"measure": name, "before": format(median(by_light["studio"], "before", key), form),
-         **{light: format(median(own, "after", key), form) for light, own in by_light.items()}}
-        for name, key, form in MEASURES
+
+    def line(name: str, words: Callable[[list[Row]], str]) -> Row:
+        return {"measure": name, **{light: words(own) for light, own in by_light.items()}}
+
+    def median(own: list[Row], part: str, column: Column) -> str:
+        return column.text(percentiles((row[part][column.value] for row in own), (50,))[0])
+
+    return [
+        *(line(each.heading, lambda own, each=each: median(own, "after", each))
+          | {"before": median(by_light["studio"], "before", each)} for each in MEASURES),
+        line("people whose visible vertices gain",
+             lambda own: percent(mean(row["after"]["px"] < row["before"]["px"] for row in own) or 0)),
+        line("refinements that are taken", lambda own: percent(mean(row["taken"] for row in own) or 0)),
+        line("seconds", lambda own: f"{percentiles((row['seconds'] for row in own), (50,))[0]:.1f}"),
     ]  # fmt: skip
-    gain = {light: mean(r["after"]["px"] < r["before"]["px"] for r in own) for light, own in by_light.items()}
-    shares = {light: f"{100 * (share or 0):.0f} %" for light, share in gain.items()}
-    return [*lines, {"measure": "people whose visible vertices gain", **shares}]
 
 
-def summary(rows: list[Row]) -> list[Row]:
-    """Share of refinements that were taken, and seconds, for each light and factor; and PSNR."""
-    found = []
-    for (light, factor), own in groups([row for row in complete(rows) if "before" in row], "light", "factor").items():
-        seconds = percentiles((row["seconds"] for row in own), (50,))[0]
-        taken = 100 * (mean(row["accepted"] for row in own) or 0)
-        found.append({"of": f"{light}, errors x {factor:g}", "found": f"{taken:.0f} % taken, {seconds:.2f} s a photo"})
-    avatars = [row for row in complete(rows) if "surface" in row]
-    for (light, factor, surface, stage), own in groups(avatars, "light", "factor", "surface", "stage").items():
-        psnr = mean(row["psnr"] for row in own) or 0
-        of = f"{light}, errors x {factor:g}, {stage} on the {surface} surface"
-        found.append({"of": of, "found": f"{psnr:.2f} dB"})
-    return found
-
-
-SECTIONS = (
-    Section("estimator.md", "refinement", table(
-        (
-            Column("", "measure"), Column("estimated", "before"), Column("refined, even light", "studio"),
-            Column("a room", "same"), Column("any light", "wild"),
-        ),
-        table_rows,
-    )),
-    Section(None, "summary", table((Column("", "of"), Column("", "found")), summary)),
+COLUMNS = (
+    Column("", "measure"), Column("estimated", "before"), Column("refined, even light", "studio"),
+    Column("a room", "same"), Column("any light", "wild"),
 )  # fmt: skip
+SECTIONS = (Section("estimator.md", "refinement", table(COLUMNS, lines)),)

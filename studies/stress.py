@@ -1,9 +1,8 @@
-"""What becomes of avatars of damaged photos, and of one photo with the same and with other seeds.
+"""What becomes of avatars of damaged photos.
 
-The table is that of docs/detail.md (stress): likeness of each avatar to its own, damaged photo, inside the outline;
-likeness of its open hand, from the photo's side and from behind, after one gain per channel, to the avatar of the
-undamaged photo; what was refused without `force`, and what is newly warned about. With `--repeats` and `--seeds` the
-photo is done again with one seed, which must give the same bits, and with other seeds.
+Fills docs/detail.md (stress): likeness of each avatar to its own, damaged photo, inside the outline; likeness of its
+open hand, from the photo's side and from behind, after one gain per channel, to the avatar of the undamaged photo; what
+was refused without `force`, and what is newly warned about.
 """
 
 import math
@@ -37,13 +36,9 @@ LARGEST = 0.05
 class Options(AvatarOptions):
     """Options of this study."""
 
-    selecting: ClassVar[frozenset[str]] = frozenset({"photos", "repeats", "seeds"})
+    selecting: ClassVar[frozenset[str]] = frozenset({"photos"})
     photos: tuple[str, ...] = ("palm_open_left_02.png",)
     """Photos of the tests, files, or synthetic:K."""
-    repeats: int = 0
-    """Fits with one seed, instead of damage."""
-    seeds: int = 0
-    """Fits with other seeds, instead of damage."""
 
 
 def make(damaged: DamagedInput, config: ReconstructConfig, *, force: bool) -> Reconstruction:
@@ -100,39 +95,16 @@ def measure(name: str, config: ReconstructConfig) -> list[Row]:
 def row_of(name: str, damage: str, made: Reconstruction, base: Reconstruction, refused: str) -> Row:
     """What is measured of one avatar."""
     return {
-        "photo": name,
-        "damage": damage,
-        "refusal": refused,
-        "own_db": made.errors["input_psnr_inner_db"],
+        "photo": name, "damage": damage, "refusal": refused, "own_db": made.errors["input_psnr_inner_db"],
         "like_db": None if made is base else likeness(base.avatar, made.avatar),
-        "mask_iou": made.errors["mask_iou"],
-        "seen": made.errors["seen_percent"],
+        "mask_iou": made.errors["mask_iou"], "seen": made.errors["seen_percent"],
         "sane": is_sane(made.avatar.gaussians),
         "warnings": [words for words in made.warnings if damage == "none" or words not in base.warnings],
-    }
-
-
-def repeat(name: str, config: ReconstructConfig, repeats: int, seeds: int) -> Row:
-    """Whether `repeats` fits with one seed have the same bits, and how far `seeds` others spread the input PSNR."""
-    photo = photo_named(name, device=config.device)
-    first, same = reconstruct(photo, config), True
-    for _ in range(repeats - 1):
-        again = reconstruct(photo, config).avatar.gaussians
-        same &= all(torch.equal(a, b) for a, b in zip(first.avatar.gaussians, again, strict=True))
-    found = [reconstruct(photo, replace(config, seed=k)).errors["input_psnr_inner_db"] for k in range(seeds)]
-    spread = max(found) - min(found) if found else 0.0
-    return {"photo": name, "repeats": repeats, "same_bits": same, "seeds": seeds, "spread_db": spread}
+    }  # fmt: skip
 
 
 def run(options: Options) -> list[Row]:
-    """Damage every photo, or repeat it."""
-    if options.repeats or options.seeds:
-        cases = {
-            f"{name}, {options.repeats} repeats, {options.seeds} seeds": (
-                name, options.config(), options.repeats, options.seeds
-            ) for name in options.photos
-        }  # fmt: skip
-        return measured("stress", cases, repeat, options)
+    """Damage every photo."""
     return measured("stress", {name: (name, options.config()) for name in options.photos}, measure, options)
 
 
@@ -143,21 +115,9 @@ def said(row: Row) -> str:
     return "; ".join([*refusal, *row.get("warnings", []), *broken])
 
 
-SECTIONS = (
-    Section("detail.md", "stress", table(
-        (
-            Column("damage", "damage"), Column("own photo, dB", "own_db", ".1f"),
-            Column("undamaged avatar, dB", "like_db", ".1f"), Column("overlap of fit and mask", "mask_iou", ".2f"),
-            Column("seen, %", "seen", ".0f"), Column("said", said),
-        ),
-        lambda rows: [row for row in rows if "damage" in row],
-    )),
-    Section(None, "seeds", table(
-        (
-            Column("photo", "photo"), Column("fits with one seed", "repeats"),
-            Column("same bits", lambda row: "yes" if row["same_bits"] else "no"), Column("other seeds", "seeds"),
-            Column("their spread, dB", "spread_db", ".3f"),
-        ),
-        lambda rows: [row for row in rows if "same_bits" in row],
-    )),
+COLUMNS = (
+    Column("damage", "damage"), Column("own photo, dB", "own_db", ".1f"),
+    Column("undamaged avatar, dB", "like_db", ".1f"), Column("overlap of fit and mask", "mask_iou", ".2f"),
+    Column("seen, %", "seen", ".0f"), Column("said", said),
 )  # fmt: skip
+SECTIONS = (Section("detail.md", "stress", table(COLUMNS)),)
