@@ -1,11 +1,10 @@
 """What is measured of the avatars of all photos of the tests, with the learned prior and without.
 
-Fills docs/results.md (estimator, avatar, single, pairs) and docs/prior.md (photos). Avatars stay in OUT/photos/avatars.
+Fills docs/results.md (avatar, single) and docs/prior.md (photos). Avatars stay in OUT/photos/avatars.
 """
 
 import resource
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -13,22 +12,12 @@ from typing import ClassVar
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
-from oasis_warp.estimation.estimator import choose_hand
 from oasis_warp.evaluation.metrics import coverage
-from oasis_warp.evaluation.same_hand import compare_pairs
-from oasis_warp.hand_avatar import Avatar
 from oasis_warp.reconstruction import reconstruct
 from studies.harness import Row, StudyOptions, measured, prior_choice
-from studies.inputs import PHOTOS, SAME_HAND, estimator, photos_below, photos_in
-from studies.tables import Column, Section, complete, distribution, groups, mean, percentiles, table
+from studies.inputs import PHOTOS, SAME_HAND, photos_below, photos_in
+from studies.tables import Column, Section, complete, distribution, groups, percentiles, table
 
-ESTIMATOR = (
-    Column("reprojection, % of the box", "reprojection_percent", ".2f"),
-    Column("fitted mesh against mask, IoU above the wrist", "mask_iou", ".3f"),
-    Column("seconds: landmarks", "landmarks_s", ".2f"),
-    Column("seconds: fit", "fit_s", ".2f"),
-    Column("seconds: outline", "outline_s", ".2f"),
-)
 AVATAR = (
     Column("PSNR inside the mask, dB", "input_psnr_db", ".1f"),
     Column("PSNR 2 px inside the mask, dB", "input_psnr_inner_db", ".1f"),
@@ -37,14 +26,6 @@ AVATAR = (
     Column("seconds: adaptation", "adaptation_s", ".1f"),
     Column("seconds: photo to avatar, warm", "total_s", ".1f"),
     Column("peak memory of the process, GiB", "peak_gib", ".2f"),
-)
-PAIRS = (
-    Column("PSNR with one gain a channel, dB", "psnr_db", ".1f"),
-    Column("PSNR without it, dB", "psnr_plain_db", ".1f"),
-    Column("overlap (IoU) of drawn hand and mask", "overlap", ".3f"),
-    Column("colour error of the palm [sRGB]", "error_palm", ".3f"),
-    Column("colour error of the back [sRGB]", "error_back", ".3f"),
-    Column("colour error of the nails [sRGB]", "error_nail", ".3f"),
 )
 SINGLE = (
     Column("PSNR dB", "input_psnr_db", ".1f"),
@@ -61,16 +42,10 @@ class Options(StudyOptions):
     priors: tuple[str, ...] = ("none", "learned")
     """none, learned, or weights files."""
     folders: tuple[Path, ...] = (PHOTOS, SAME_HAND)
-    """Folders of photos; where a folder holds none itself, its subfolders show one hand each, and photos of one hand
-    are compared with each other."""
+    """Folders of photos, or of folders of photos."""
     seed: int = 0
     size: int | None = None
     """Side of the crop [px]; that of the photo by default."""
-
-
-def avatar_file(options: Options, prior: str, path: Path) -> Path:
-    """Where the avatar of a photo is kept."""
-    return options.out / "photos" / "avatars" / Path(prior).stem / path.parent.name / f"{path.stem}.safetensors"
 
 
 def measure(path: Path, prior: str, options: Options) -> Row:
@@ -84,9 +59,10 @@ def measure(path: Path, prior: str, options: Options) -> Row:
         made = reconstruct(read_photo(path), config)
     except InputError as error:
         return {**about, "result": str(error)}
-    total_s, shares, file = time.perf_counter() - start, coverage(made.avatar), avatar_file(options, prior, path)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    made.avatar.save(file)
+    total_s, shares = time.perf_counter() - start, coverage(made.avatar)
+    folder = options.out / "photos" / "avatars" / Path(prior).stem / path.parent.name
+    folder.mkdir(parents=True, exist_ok=True)
+    made.avatar.save(folder / f"{path.stem}.safetensors")
     return {
         **about, "result": "ok", "side": made.fit.side, **made.errors, "coverage_worst": float(shares.min()),
         "coverage_mean": float(shares.mean()), **{f"{stage}_s": value for stage, value in made.stages.items()},
@@ -95,32 +71,11 @@ def measure(path: Path, prior: str, options: Options) -> Row:
     }  # fmt: skip
 
 
-def measure_pairs(folder: Path, prior: str, options: Options) -> Iterator[Row]:
-    """A row for every ordered pair of photos in `folder`."""
-    photos, avatars = {}, {}
-    for path in photos_in(folder):
-        photo = read_photo(path)
-        photos[path.stem] = photo, choose_hand(estimator().find(photo), "largest", photo.name)
-        if (file := avatar_file(options, prior, path)).exists():
-            avatars[path.stem] = {"avatar": Avatar.load(file)}
-    for pair in compare_pairs(estimator(), photos, avatars, ReconstructConfig()):
-        found = pair.scores["avatar"]
-        yield {
-            "prior": prior, "source": f"{folder.name}/{pair.source}", "target": f"{folder.name}/{pair.target}",
-            "psnr_db": found.psnr, "psnr_plain_db": found.psnr_plain, "overlap": found.overlap,
-            **{f"error_{name}": value for name, value in found.region_errors.items()},
-        }  # fmt: skip
-
-
 def run(options: Options) -> list[Row]:
-    """Measure every photo with every prior, and pairs of photos of one hand."""
+    """Measure every photo with every prior."""
     paths = [path for folder in options.folders for path in photos_in(folder) or photos_below(folder)]
     cases = {f"{path}, {prior}": (path, prior, options) for prior in options.priors for path in paths}
-    rows = measured("photos", cases, measure, options)
-    of_hands = (folder for folder in options.folders if not photos_in(folder))
-    hands = sorted({path.parent for folder in of_hands for path in photos_below(folder)})
-    pairs = {f"pairs of {folder}, {prior}": (folder, prior, options) for prior in options.priors for folder in hands}
-    return rows + measured("photos", pairs, measure_pairs, options)
+    return measured("photos", cases, measure, options)
 
 
 # ---- tables
@@ -131,34 +86,10 @@ def reconstructed(rows: list[Row], prior: str | None = None) -> list[Row]:
     return [row for row in complete(rows) if row.get("result") == "ok" and prior in (None, row["prior"])]
 
 
-def estimator_text(rows: list[Row]) -> str | None:
-    """The estimator's measures over all hands."""
-    found = reconstructed(rows, "none")
-    return distribution(found, ESTIMATOR, f"all {len(found)} hands", extremes=True)
-
-
 def avatar_text(rows: list[Row]) -> str | None:
     """The avatars' measures over all hands."""
     title = f"all {len(reconstructed(rows, 'none'))} hands"
     return distribution(reconstructed(rows), AVATAR, title, by="prior", extremes=True)
-
-
-def pairs_text(rows: list[Row]) -> str | None:
-    """The pairs' measures, and on which share of them the learned prior is better."""
-    pairs = [row for row in complete(rows) if "target" in row]
-    psnr = {
-        prior: {(row["source"], row["target"]): row["psnr_db"] for row in own}
-        for (prior,), own in groups(pairs, "prior").items()
-    }
-    made = distribution(pairs, PAIRS, f"{len(psnr.get('none', ()))} ordered pairs", by="prior", extremes=True)
-    if {"none", "learned"} <= set(psnr):
-        both = psnr["none"].keys() & psnr["learned"].keys()
-        won = mean(psnr["learned"][pair] > psnr["none"][pair] for pair in both)
-        made = (
-            f"{made}\n\nOf two avatars of one photo, the one made with the learned prior is nearer to photo B on "
-            f"{won:.0%} of the pairs, by\nPSNR with one gain a channel."
-        )
-    return made
 
 
 def single_rows(rows: list[Row]) -> list[Row]:
@@ -190,7 +121,6 @@ def by_prior_rows(rows: list[Row]) -> list[Row]:
 
 
 SECTIONS = (
-    Section("results.md", "estimator", estimator_text),
     Section("results.md", "avatar", avatar_text),
     Section("results.md", "single", table(
         (
@@ -203,7 +133,6 @@ SECTIONS = (
         ),
         single_rows,
     )),
-    Section("results.md", "pairs", pairs_text),
     Section("prior.md", "photos", table(
         (
             Column("", "name"), Column("PSNR of the input view, dB", "input_psnr_db", ".1f"),
