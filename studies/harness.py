@@ -160,11 +160,3 @@ def write_rows(folder: Path, rows: Iterable[Row]) -> list[Row]:
     made = [{"commit": commit(), **row} for row in rows]
     write_file(folder / ROWS, "".join(json.dumps(row) + "\n" for row in made).encode())
     return made
-
-
-def seconds(device: torch.device) -> float:
-    """A clock: the process's own time on the CPU, which other work hardly changes; wall time on a GPU."""
-    if device.type == "cpu":
-        return time.process_time()
-    torch.cuda.synchronize()
-    return time.perf_counter()

@@ -4,7 +4,6 @@ import functools
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -81,21 +80,6 @@ def fit_largest(photo: Photo, *, force: bool = True) -> HandFit:
 def people(count: int, first: int = 0) -> range:
     """Numbers of held-out synthetic people."""
     return range(FIRST_PERSON + first, FIRST_PERSON + first + count)
-
-
-def scaled(photo: Photo, factor: float) -> Photo:
-    """The photo with `factor` times as many pixels along each side; at most 1."""
-    height, width = photo.rgb.shape[:2]
-    size = round(width * factor), round(height * factor)
-
-    def smaller(plane: Tensor) -> Tensor:
-        return torch.from_numpy(cv2.resize(plane.numpy(), size, interpolation=cv2.INTER_AREA))
-
-    return photo._replace(
-        rgb=smaller(photo.rgb),
-        alpha=None if photo.alpha is None else smaller(photo.alpha),
-        focal=None if photo.focal is None else photo.focal * factor,
-    )
 
 
 def read_masks(path: str | Path, *, cut_at_wrist: bool = False) -> dict[str, Coverage]:

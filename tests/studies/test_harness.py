@@ -16,9 +16,11 @@ from oasis_warp.evaluation.summary import summarise
 from studies import __main__ as command
 from studies import evaluation, tables
 from studies.harness import ROWS, StudyOptions, measured, read_rows, write_rows
+from studies.seeded_bugs import BUGS
 from studies.tables import Column, Section, fill, markdown, medians, power, short, table
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 NAMES = sorted(command.studies())
 
 
@@ -61,6 +63,11 @@ def test_every_section_of_a_page_is_filled_by_one_study():
         for marker in re.findall(r"<!-- (?!end of)(.+?)(?: \([^)]*\))? -->", page.read_text())
     ]  # fmt: skip
     assert set(marked) == set(filled)
+
+
+def test_every_seeded_bug_still_has_its_place_and_its_tests():
+    assert [bug.name for bug in BUGS if (ROOT / bug.path).read_text().count(bug.old) != 1] == []
+    assert [bug.name for bug in BUGS if not (ROOT / bug.tests[0]).is_file()] == []
 
 
 def test_studies_are_listed_with_a_line_each(capsys):
