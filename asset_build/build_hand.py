@@ -16,7 +16,7 @@ from pathlib import Path
 
 import igl
 import numpy as np
-from hand_build import anatomy, rig, shapes, subdivision
+from hand_build import anatomy, quality, rig, shapes, subdivision
 from hand_build.anatomy import Array, Index
 from hand_build.source import Source, write_npz
 
@@ -37,17 +37,15 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
 
     # The wrist is closed by a fan around one more vertex, the last: weights and volumes need a closed surface.
     rim = igl.boundary_loop(faces)
-    cap = np.stack([np.roll(rim, -1), rim, np.full(len(rim), n)], 1)
-    closed = np.vstack([vertices, vertices[rim].mean(0)])
+    closed, closed_faces = quality.closed(vertices, faces, rim)
     many = np.concatenate([many, many[:, rim].mean(1, keepdims=True)], 1)
 
     shares = {finger: np.vstack([s, [1, 0, 0]]) for finger, s in source.phalanx_shares().items()}
-    closed_faces = np.vstack([faces, cap])
     weights = rig.skinning_weights(closed, closed_faces, points, shares)
     nail = np.append(_nail(source, source.uv, faces, uv_faces, n), 0)
-    # Before the proportions are mended, so that the HD faces stay the same when those are tuned again.
+    # Before the proportions are corrected, so that the HD faces stay the same when those are tuned again.
     hd = subdivision.hd_mesh(vertices, quads, source.uv, source.uv_quads)
-    closed, points = shapes.mend(closed, points, weights, nail)
+    closed, points = shapes.correct_proportions(closed, points, weights, nail)
     weights = rig.skinning_weights(closed, closed_faces, points, shares)
     weights[n] = np.eye(16)[0]
     vertices = closed[:n]
@@ -70,7 +68,7 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
     return {
         "v_template": closed.astype(single),
         "faces": faces.astype(np.int32),
-        "cap_faces": cap.astype(np.int32),
+        "cap_faces": closed_faces[len(faces) :].astype(np.int32),
         "quads": quads.astype(np.int32),
         "weights": weights.astype(single),
         "joints": points[:16].astype(single),

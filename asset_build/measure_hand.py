@@ -11,19 +11,14 @@ import cv2
 import igl
 import numpy as np
 import torch
-from elastic_hand import truths
 from hand_build.anatomy import Array, Index
-from hand_build.quality import enclosed_volume, section_girth, self_crossings
+from hand_build.quality import enclosed_volume, self_crossings
 
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import HandPose, PosedHand
+from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
-from oasis_warp.hand.skinning import bone_transforms, rest_hand, skin
+from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
-
-GIRTH_JOINT = "index2"
-GIRTH_ANGLES = (0, 30, 60, 80)
-N_GESTURES, SEED = 12, 77
 
 Image = np.ndarray
 """Blue, green, red in 8 bits, [H, W, 3]."""
@@ -44,45 +39,17 @@ SUBPIXEL_BITS = 4
 CORRECTED_POSES = ("fist", "thumbs_up", "pinch", "ok", "open")
 
 
-def at_origin(hand: HandModel, angles: torch.Tensor) -> tuple[PosedHand, HandPose]:
-    """The mean hand with joint `angles`, not moved as a whole."""
+def posed(hand: HandModel, angles: torch.Tensor) -> Array:
+    """Vertices of the mean hand with joint `angles`, not moved as a whole."""
     pose = HandPose(angles, torch.eye(3).to(angles), torch.zeros(3).to(angles))
-    return skin(hand, rest_hand(hand, torch.zeros(len(hand.shape_names)).to(angles)), pose), pose
+    return skin(hand, rest_hand(hand, torch.zeros(len(hand.shape_names)).to(angles)), pose).vertices.numpy()
 
 
 def pose_row(hand: HandModel, name: str) -> tuple[float, int]:
     """Volume [cm^3] and crossing edges of a named pose."""
-    vertices = at_origin(hand, named_pose(hand, name))[0].vertices.numpy()
+    vertices = posed(hand, named_pose(hand, name))
     faces = hand.faces.numpy()
     return 1e6 * enclosed_volume(vertices, faces, hand.rim.numpy()), self_crossings(vertices, faces)
-
-
-def joint_crossings(hand: HandModel, share: float) -> int:
-    """Crossing edges, summed over all joints, each bent alone to `share` of its limit."""
-    total = 0
-    for joint in range(15):
-        angles = torch.zeros_like(hand.pose_axes[1:, 0])
-        angles[joint, 0] = share * hand.pose_limits[joint + 1, 0, 1]
-        total += self_crossings(at_origin(hand, angles)[0].vertices.numpy(), hand.faces.numpy())
-    return total
-
-
-def gesture_crossings(hand: HandModel) -> int:
-    """Crossing edges, summed over sampled gestures, as drawn and with their parts pushed apart."""
-    found = (torch.from_numpy(angles) for angles in truths.gestures(hand, N_GESTURES, SEED))
-    return sum(self_crossings(at_origin(hand, angles)[0].vertices.numpy(), hand.faces.numpy()) for angles in found)
-
-
-def girth(hand: HandModel, degrees: float) -> float:
-    """Girth [mm] of a finger at its middle joint, in the plane that halves the bend."""
-    joint = hand.joint_names.index(GIRTH_JOINT)
-    angles = torch.zeros_like(hand.pose_axes[1:, 0])
-    angles[joint - 1, 0] = np.radians(degrees) / 2
-    half, _ = bone_transforms(hand, hand.joints, at_origin(hand, angles)[1])
-    angles[joint - 1, 0] = np.radians(degrees)
-    posed, _ = at_origin(hand, angles)
-    normal = (half[joint] @ hand.pose_axes[joint, 2]).numpy()
-    return 1e3 * section_girth(posed.vertices.numpy(), hand.faces.numpy(), posed.joints[joint].numpy(), normal)
 
 
 def draw(vertices: Array, faces: Index, view: Array, size: int) -> Image:
@@ -105,7 +72,7 @@ def draw(vertices: Array, faces: Index, view: Array, size: int) -> Image:
 
 def pose_strip(hand: HandModel, name: str, size: int) -> Image:
     """A named pose from all sides, side by side."""
-    vertices = at_origin(hand, named_pose(hand, name))[0].vertices.numpy()
+    vertices = posed(hand, named_pose(hand, name))
     return np.hstack([draw(vertices, hand.faces.numpy(), view, size) for view in VIEWS])
 
 
@@ -138,13 +105,6 @@ def main() -> None:
     for name in POSE_NAMES:
         (volume, crossings), (volume_after, crossings_after) = pose_row(plain, name), pose_row(full, name)
         print(f"| {name} | {volume:.0f} | {volume_after:.0f} | {crossings} | {crossings_after} |")
-    for share in (0.5, 0.75, 1.0):
-        before, after = joint_crossings(plain, share), joint_crossings(full, share)
-        print(f"| each joint alone at {share:.0%} of its limit | | | {before} | {after} |")
-    print(f"| {2 * N_GESTURES} gestures | | | {gesture_crossings(plain)} | {gesture_crossings(full)} |")
-    print("\n| girth of the index at its middle joint, bent by | before [mm] | after |\n|---|---|---|")
-    for degrees in GIRTH_ANGLES:
-        print(f"| {degrees} degrees | {girth(plain, degrees):.1f} | {girth(full, degrees):.1f} |")
     if args.pictures is not None:
         write_pictures(args.pictures, plain, full)
 

@@ -1,1 +1,1 @@
-"""The bundled hand as a solid piece of flesh on rigid bones: a truth that skinning can be measured against."""
+"""The bundled hand as a solid piece of flesh on rigid bones: a reference that skinning is fitted to."""

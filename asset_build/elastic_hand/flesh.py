@@ -161,19 +161,19 @@ class Flesh:
         value, gradient = self.energy(at, contacts)
         moves: list[tuple[Array, Array]] = []
         for _ in range(STEPS):
-            way = self._downhill(gradient[self.free], moves)
-            slope = float((gradient[self.free] * way).sum())
+            direction = self._downhill(gradient[self.free], moves)
+            slope = float((gradient[self.free] * direction).sum())
             if -slope < SETTLED * value:
                 return at, True
             step = 1.0
             while True:
                 trial = at.copy()
-                trial[self.free] += step * way
+                trial[self.free] += step * direction
                 new_value, new_gradient = self.energy(trial, contacts)
                 if new_value <= value + 1e-4 * step * slope or step < 1e-3:
                     break
                 step /= 2
-            moves.append((step * way, (new_gradient - gradient)[self.free]))
+            moves.append((step * direction, (new_gradient - gradient)[self.free]))
             moves = moves[-MEMORY:]
             at, value, gradient = trial, new_value, new_gradient
         return at, False
@@ -188,10 +188,10 @@ class Flesh:
                 factor = float((s * q).sum()) / curvature
                 q -= factor * y
                 kept.append((s, y, curvature, factor))
-        way = self._factor.solve(q) / (2 * MU + LAMBDA / 3)
+        direction = self._factor.solve(q) / (2 * MU + LAMBDA / 3)
         for s, y, curvature, factor in reversed(kept):
-            way += s * (factor - float((y * way).sum()) / curvature)
-        return -way
+            direction += s * (factor - float((y * direction).sum()) / curvature)
+        return -direction
 
 
 def nearest_rotations(matrices: Array) -> Array:

@@ -49,8 +49,8 @@ class Solid:
     """Vertex of the hand that each of the first nodes is, [M]."""
 
 
-def fill(hand: HandModel, bone_share: float = BONE_SHARE) -> Solid:
-    """The mean hand at rest as a solid; `bone_share` as `BONE_SHARE`."""
+def fill(hand: HandModel) -> Solid:
+    """The mean hand at rest as a solid."""
     vertices = hand.template.double().numpy() * MILLIMETRES
     shell, faces = closed(vertices, hand.faces.numpy(), hand.rim.numpy())
     chosen = _thinned(vertices, SURFACE_SPACING)
@@ -73,7 +73,7 @@ def fill(hand: HandModel, bone_share: float = BONE_SHARE) -> Solid:
     used, renumbered = np.unique(tetrahedra, return_inverse=True)
     nodes, tetrahedra = nodes[used], renumbered.reshape(-1, 4)
     return Solid(
-        nodes, tetrahedra, outer_faces(tetrahedra), _bones(hand, nodes, bone_share), chosen[used[used < len(chosen)]]
+        nodes, tetrahedra, outer_faces(tetrahedra), _bones(hand, nodes), chosen[used[used < len(chosen)]]
     )
 
 
@@ -120,7 +120,7 @@ def outer_faces(tetrahedra: Index) -> Index:
     return faces[first[count == 1]]
 
 
-def _bones(hand: HandModel, nodes: Array, bone_share: float) -> Index:
+def _bones(hand: HandModel, nodes: Array) -> Index:
     points = torch.cat([hand.joints, hand.tips]).double().numpy() * MILLIMETRES
     shell = hand.template.double().numpy() * MILLIMETRES
     ends = bone_ends(points)
@@ -136,7 +136,7 @@ def _bones(hand: HandModel, nodes: Array, bone_share: float) -> Index:
         start, end = points[joint], ends[joint]
         along = (end - start) / np.linalg.norm(end - start)
         axis = start + np.linspace(0.25, 0.75, 5)[:, None] * (end - start)
-        radius = bone_share * skin_tree.query(axis)[0].min()
+        radius = BONE_SHARE * skin_tree.query(axis)[0].min()
         last = joint in {FIRST[f] + 2 for f in FINGERS}
         cover(joint, start + BONE_START * radius * along, end - (2.5 * radius * along if last else 0), radius)
     for finger in FINGERS:

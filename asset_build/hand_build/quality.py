@@ -1,4 +1,4 @@
-"""How good a posed surface is: enclosed volume, edges that cross other faces, girth of a section."""
+"""How good a posed surface is: enclosed volume, and edges that cross other faces."""
 
 import numpy as np
 import trimesh
@@ -31,26 +31,17 @@ def self_crossings(vertices: Array, faces: Index) -> int:
     apart = (faces[face][:, :, None] != edges[:, None, :]).all((1, 2))
     edges, face = edges[apart], face[apart]
     origin = vertices[edges[:, 0]]
-    way = vertices[edges[:, 1]] - origin
+    direction = vertices[edges[:, 1]] - origin
     a, b, c = vertices[faces[face]].transpose(1, 0, 2)
     ab, ac = b - a, c - a
-    across = np.cross(way, ac)
+    across = np.cross(direction, ac)
     slope = (ab * across).sum(1)
-    size = np.linalg.norm(way, axis=1) * np.linalg.norm(ab, axis=1) * np.linalg.norm(ac, axis=1)
+    size = np.linalg.norm(direction, axis=1) * np.linalg.norm(ab, axis=1) * np.linalg.norm(ac, axis=1)
     slope[np.abs(slope) < FLAT * size] = np.nan
     offset = origin - a
     u = (offset * across).sum(1) / slope
     turned = np.cross(offset, ab)
-    v = (way * turned).sum(1) / slope
+    v = (direction * turned).sum(1) / slope
     place = (ac * turned).sum(1) / slope
     hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (place >= 0) & (place <= 1)
     return len(np.unique(edges[hit], axis=0))
-
-
-def section_girth(vertices: Array, faces: Index, point: Array, normal: Array) -> float:
-    """Length [m] of the closed curve around `point` in which a plane cuts the surface."""
-    section = trimesh.Trimesh(vertices, faces, process=False).section(plane_normal=normal, plane_origin=point)
-    assert section is not None, "the plane goes through a joint, inside the surface"
-    loops = [loop for loop in section.discrete if np.allclose(loop[0], loop[-1])]
-    nearest = min(loops, key=lambda loop: float(np.linalg.norm(loop.mean(0) - point)))
-    return float(np.linalg.norm(np.diff(nearest, axis=0), axis=1).sum())

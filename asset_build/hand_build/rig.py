@@ -83,7 +83,7 @@ def _heat_weights(vertices: Array, faces: Index, bones: list[list[tuple[Array, A
 def skinning_weights(vertices: Array, faces: Index, points: Array, phalanx_shares: dict[str, Array]) -> Array:
     """Skinning weights [V, 16], rows sum to one.
 
-    Heat decides between the palm and each whole finger, which mends what moving the pivots broke; the split of a
+    Heat decides between the palm and each whole finger, which repairs what moving the pivots broke; the split of a
     finger over its phalanges stays the artists' (`phalanx_shares`), which follows the creases. The palm and its
     metacarpals are one bone, the wrist's.
     """

@@ -90,9 +90,9 @@ def sample_adults(source: Source, n: int, points: Array, rng: np.random.Generato
         part = slice(start, start + BATCH)
         hands = source.hands({k: v[part] for k, v in phenotype.items()}, {k: v[part] for k, v in local.items()})
         for vertices, hand_points in zip(*hands, strict=True):
-            turn = best_rotation(hand_points[PALM_ANCHORS], points[PALM_ANCHORS])
-            all_vertices.append((vertices - hand_points[0]) @ turn.T)
-            all_points.append((hand_points - hand_points[0]) @ turn.T)
+            rotation = best_rotation(hand_points[PALM_ANCHORS], points[PALM_ANCHORS])
+            all_vertices.append((vertices - hand_points[0]) @ rotation.T)
+            all_points.append((hand_points - hand_points[0]) @ rotation.T)
     return np.array(all_vertices), np.array(all_points)
 
 
@@ -119,11 +119,11 @@ def anatomical_shapes(vertices: Array, points: Array, weights: Array) -> list[Sh
         *(phalanx_length(vertices, points, weights, joint, LENGTH) for joint in range(1, 16)),
         *(_girth(vertices, points, weights, finger) for finger in FINGERS),
         *_palm_shapes(vertices, points, weights),
-        *(_thumb_base(vertices, weights, name, way) for name, way in _THUMB_WAYS.items()),
+        *(_thumb_base(vertices, weights, name, axis) for name, axis in _THUMB_DIRECTIONS.items()),
     ]
 
 
-_THUMB_WAYS = {"thumb_base_palmar": np.array([0, -1.0, 0]), "thumb_base_radial": np.array([0, 0, 1.0])}
+_THUMB_DIRECTIONS = {"thumb_base_palmar": np.array([0, -1.0, 0]), "thumb_base_radial": np.array([0, 0, 1.0])}
 
 
 def _blend(weights: Array, fields: dict[int, Array]) -> Array:
@@ -175,14 +175,14 @@ def _palm_shapes(vertices: Array, points: Array, weights: Array) -> list[Shape]:
     knuckles = points[[FIRST[finger] for finger in FINGERS[1:]]]
 
     def shape(name: str, displacement: Callable[[Array], Array]) -> Shape:
-        """The palm moved by a field; every finger rides rigidly on its first joint."""
+        """The palm moved by a field; every finger moves rigidly with its first joint."""
         fields, moved = {0: displacement(vertices)}, np.zeros((21, 3))
         for k, finger in enumerate(FINGERS):
             first = FIRST[finger]
-            ride = displacement(points[[first]])[0]
+            shift = displacement(points[[first]])[0]
             for joint in range(first, first + 3):
-                fields[joint], moved[joint] = np.broadcast_to(ride, vertices.shape), ride
-            moved[16 + k] = ride
+                fields[joint], moved[joint] = np.broadcast_to(shift, vertices.shape), shift
+            moved[16 + k] = shift
         return Shape(name, _blend(weights, fields), moved)
 
     def ray(k: int) -> Callable[[Array], Array]:
@@ -205,16 +205,16 @@ def _palm_shapes(vertices: Array, points: Array, weights: Array) -> list[Shape]:
     ]
 
 
-def _thumb_base(vertices: Array, weights: Array, name: str, way: Array) -> Shape:
+def _thumb_base(vertices: Array, weights: Array, name: str, axis: Array) -> Shape:
     thumb = range(FIRST["thumb"], FIRST["thumb"] + 3)
     moved = np.zeros((21, 3))
-    moved[[*thumb, 16]] = THUMB_BASE_SHIFT * way
-    shift = np.broadcast_to(THUMB_BASE_SHIFT * way, vertices.shape)
+    moved[[*thumb, 16]] = THUMB_BASE_SHIFT * axis
+    shift = np.broadcast_to(THUMB_BASE_SHIFT * axis, vertices.shape)
     return Shape(name, _blend(weights, dict.fromkeys(thumb, shift)), moved)
 
 
-def mend(vertices: Array, points: Array, weights: Array, nail: Array) -> tuple[Array, Array]:
-    """Vertices [V, 3] and 21 points [m] of the hand with mended proportions, as long as before.
+def correct_proportions(vertices: Array, points: Array, weights: Array, nail: Array) -> tuple[Array, Array]:
+    """Vertices [V, 3] and 21 points [m] of the hand with corrected proportions, as long as before.
 
     anny's end phalanges are 5 mm too long, the first ones 4 mm too short.
 

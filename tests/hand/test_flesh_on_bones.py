@@ -1,9 +1,11 @@
-"""The measuring stick of skinning keeps the laws of elasticity, and what is measured keeps those of skinning."""
+"""Simulated flesh keeps the laws of elasticity, and correctives are fitted to what it does."""
 
 import numpy as np
 import pytest
-from elastic_hand import flesh, methods, truths
-from elastic_hand.methods import ways_out
+import scipy.sparse as sp
+import torch
+from elastic_hand import flesh, simulations
+from elastic_hand.correctives import fit_to_flesh, overlaps, strengths, unposed
 from elastic_hand.solid import Solid, outer_faces, skinned
 from hand_build.quality import self_crossings
 from scipy.spatial import Delaunay
@@ -97,37 +99,40 @@ def test_a_rigid_motion_leaves_nothing_to_correct(hand):
     moved = bones(turn, shift)
     moved[0] = moved[1]
     want = turn.apply(rest) + shift
-    mush = methods.DeltaMush(rest, hand.faces.numpy(), hand.rim.numpy(), 3)
-    np.testing.assert_allclose(mush(want), want, atol=1e-12)
-    np.testing.assert_allclose(methods.dual_quaternions(rest, weights, moved), want, atol=1e-7)
-    np.testing.assert_allclose(methods.unposed(want, rest, weights, moved), 0, atol=1e-7)
+    np.testing.assert_allclose(unposed(want, rest, weights, moved), 0, atol=1e-7)
 
 
-def test_fitted_shapes_find_the_shapes_that_made_the_poses(hand):
-    exact = hand.to(dtype=hand.template.double().dtype)
-    features = methods.flexion_features(exact)
-    rng = np.random.default_rng(3)
-    angles, made = rng.uniform(-0.4, 1.6, (120, 15, 3)), rng.normal(0, 1, (30, 7, 3))
-    wanted = np.stack([np.tensordot(features(a), made, 1) for a in angles])
-    fitted = methods.fit_shapes(features, angles, wanted, np.arange(120))
-    np.testing.assert_allclose(fitted.displacement(angles[5]), wanted[5], atol=0.02)
-    whole = methods.low_rank(fitted, 21)  # all there are: 7 points x 3
-    np.testing.assert_allclose(whole.displacement(angles[5]), fitted.displacement(angles[5]), atol=1e-10)
+def test_fitted_shapes_correct_the_poses_that_they_were_fitted_to(hand):
+    exact = hand.to(dtype=torch.float64)
+    rest, weights = 1e3 * exact.template.numpy(), exact.weights.numpy()
+    bend = next(bend for bend in simulations.bends(exact) if bend.name == "index2")
+    bulge = np.where(hand.segment.numpy() == hand.joint_names.index("index2"), 1.0, 0.0)[:, None] * [0, 1.0, 0]
+    states = np.stack([bend.angles * share for share in (0.5, 1.0)])
+    surfaces = [
+        skinned(rest + (1 - np.cos(a[1, 0])) * bulge, weights, simulations.bones(exact, a)) for a in states
+    ]
+    made = simulations.Simulation("index2", "train", states, np.stack(surfaces) / 1e3, np.ones(2), np.zeros(2))
+    shapes = fit_to_flesh(exact, sp.eye(len(rest), format="csr"), [made], [])
+    found = np.tensordot(strengths(exact, states[1]), shapes, 1)
+    wanted = unposed(surfaces[1], rest, weights, simulations.bones(exact, states[1]))
+    free = bulge[:, 1] > 0
+    assert np.linalg.norm(found - wanted, axis=1)[free].mean() < 0.5 * np.linalg.norm(wanted, axis=1)[free].mean()
+    assert np.abs(shapes).max(2)[:, hand.nail.numpy() > 0.5].max() == 0
 
 
 def test_a_hand_at_rest_lies_nowhere_inside_itself(hand):
     rest = 1e3 * hand.template.double().numpy()
-    inside, _ = ways_out(rest, rest, hand.faces.numpy())
+    inside, _ = overlaps(rest, rest, hand.faces.numpy())
     assert not len(inside)
 
 
-def test_ways_out_lead_out_of_a_fist_that_crosses_itself(hand):
+def test_shifts_of_overlaps_lead_out_of_a_fist_that_crosses_itself(hand):
     exact = hand.to(dtype=hand.template.double().dtype)
     rest, faces = 1e3 * exact.template.numpy(), hand.faces.numpy()
-    fist = skinned(rest, exact.weights.numpy(), truths.bones(exact, named_pose(exact, "fist").numpy()))
+    fist = skinned(rest, exact.weights.numpy(), simulations.bones(exact, named_pose(exact, "fist").numpy()))
     crossings = self_crossings(fist, faces)
     for _ in range(4):
-        inside, way = ways_out(fist, rest, faces)
-        assert np.linalg.norm(way, axis=1).max() < 4.2
-        fist[inside] += way
+        inside, shift = overlaps(fist, rest, faces)
+        assert np.linalg.norm(shift, axis=1).max() < 4.2
+        fist[inside] += shift
     assert self_crossings(fist, faces) < crossings / 2

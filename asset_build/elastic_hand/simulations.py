@@ -1,4 +1,4 @@
-"""Which poses the flesh is bent to, and the files that keep the outcome."""
+"""Which poses the flesh is bent to, and the files that keep the results."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,8 +33,8 @@ class Bend:
 
 
 @dataclass(frozen=True)
-class Truth:
-    """What became of a `Bend`."""
+class Simulation:
+    """Flesh on the way to the pose of a `Bend`."""
 
     name: str
     part: str
@@ -97,21 +97,20 @@ def bones(hand: HandModel, angles: Array) -> Array:
     return torch.cat([rotation, translation[..., None] * MILLIMETRES], -1).numpy()
 
 
-def save(folder: Path, truth: Truth) -> None:
+def save(folder: Path, simulation: Simulation) -> None:
     """Write `NAME.npz`."""
     np.savez(
-        folder / f"{truth.name}.npz", part=truth.part, angles=truth.angles, kept=truth.kept, inverted=truth.inverted,
-        vertices=truth.vertices.astype(np.float32),
+        folder / f"{simulation.name}.npz", part=simulation.part, angles=simulation.angles, kept=simulation.kept,
+        inverted=simulation.inverted, vertices=simulation.vertices.astype(np.float32),
     )  # fmt: skip
 
 
-def load(folder: Path) -> list[Truth]:
-    """All truths of a folder."""
+def load(folder: Path) -> list[Simulation]:
+    """All simulations in a folder."""
     found = []
     for path in sorted(folder.glob("*.npz")):
         with np.load(path) as stored:
+            arrays = {name: stored[name] for name in ("angles", "kept", "inverted")}
             vertices = stored["vertices"].astype(np.float64)
-            found.append(
-                Truth(path.stem, str(stored["part"]), stored["angles"], vertices, stored["kept"], stored["inverted"])
-            )
+            found.append(Simulation(path.stem, str(stored["part"]), vertices=vertices, **arrays))
     return found
