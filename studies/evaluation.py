@@ -1,7 +1,7 @@
 """What `oasis evaluate` measures: synthetic people, poses that are off, and photos of the same hands.
 
-Fills docs/evaluation.md (synthetic, noise, same-hand; and the sheets beside them) and docs/prior.md (measurements) from
-OUT/evaluation and OUT/same_hand_photos, where these commands leave their results:
+Fills docs/evaluation.md (synthetic, noise, same-hand; and the sheets beside them) from OUT/evaluation and
+OUT/same_hand_photos, where these commands leave their results:
 
     oasis evaluate --dataset synthetic --seed 1 --device cuda --workers 8 --out out/evaluation
     oasis evaluate --dataset same-hand tests/data/photos/same_hand --out out/same_hand_photos
@@ -36,21 +36,6 @@ PICTURES = {"evaluation_sheet": "evaluation/sheet.png", "evaluation_attention": 
 """Pictures of docs/_static and where they come from."""
 ROWS_SHOWN = 1300
 """Of a picture [px]."""
-METHODS = {
-    ("mean", "calibrated"): "no prior: colour-matched mean hand",
-    ("mean", "one_shot"): "no prior, one-shot",
-    ("learned", "raw"): "the prior's guess",
-    ("learned", "calibrated"): "its guess, colours matched",
-    ("learned", "even_one_shot"): "the prior, one-shot without the photo's light",
-    ("learned", "keep_one_shot"): "the prior, one-shot with the photo's light on the skin",
-    ("learned", "one_shot"): "the prior, one-shot",
-}
-"""As docs/prior.md calls them."""
-MEASURES = {
-    name: SYNTHETIC[name]
-    for name in ("psnr", "gain", "gain_error", "better", "psnr_visible", "psnr_hidden", "ssim_mask")
-}  # fmt: skip
-
 
 @dataclass(frozen=True, kw_only=True)
 class Options(StudyOptions):
@@ -134,24 +119,8 @@ def photos(found: dict[str, Any]) -> str:
     return f"{markdown(headings, [[name_of(row), *cells(row, shown)] for row in rows])}\n\n{words}"
 
 
-def measurements(found: dict[str, Any]) -> str:
-    """For the prior's card: a table for each light and group, with estimated poses."""
-    parts = []
-    for light, words in LIGHTS.items():
-        for group in dict.fromkeys(row["group"] for row in found["summary"]):
-            rows = select(found["summary"], group=group, light=light, noise=1, colors=COLORS[light])
-            if not rows:
-                continue
-            by_method, first = {(row["prior"], row["stage"]): row for row in rows}, rows[0]
-            title = f"**{GROUPS[group]}, {words}**: {first['people']} people, {first['pictures']} pictures"
-            lines = [[name, *cells(by_method[key], MEASURES)] for key, name in METHODS.items() if key in by_method]
-            parts.append(f"{title}\n\n{markdown(['', *(column.heading for column in MEASURES.values())], lines)}")
-    return "\n\n".join(parts)
-
-
 SECTIONS = (
     section_of("evaluation.md", "synthetic", lambda row: synthetic(row["found"]), dataset="synthetic"),
     section_of("evaluation.md", "noise", lambda row: noise(row["found"]), dataset="synthetic"),
     section_of("evaluation.md", "same-hand", lambda row: photos(row["found"]), dataset="same-hand"),
-    section_of("prior.md", "measurements", lambda row: measurements(row["found"]), dataset="synthetic"),
 )

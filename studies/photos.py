@@ -1,6 +1,6 @@
 """What is measured of the avatars of all photos of the tests, with the learned prior and without.
 
-Fills docs/results.md (avatar, single) and docs/prior.md (photos). Avatars stay in OUT/photos/avatars.
+Fills docs/results.md (avatar, single). Avatars stay in OUT/photos/avatars.
 """
 
 import resource
@@ -16,7 +16,7 @@ from oasis_warp.evaluation.metrics import coverage
 from oasis_warp.reconstruction import reconstruct
 from studies.harness import Row, StudyOptions, measured, prior_choice
 from studies.inputs import PHOTOS, SAME_HAND, photos_below, photos_in
-from studies.tables import Column, Section, complete, distribution, groups, percentiles, table
+from studies.tables import Column, Section, complete, distribution, groups, table
 
 AVATAR = (
     Column("PSNR inside the mask, dB", "input_psnr_db", ".1f"),
@@ -105,21 +105,6 @@ def single_rows(rows: list[Row]) -> list[Row]:
     return sorted(found, key=lambda row: row["photo"])
 
 
-def by_prior_rows(rows: list[Row]) -> list[Row]:
-    """Medians over the single photos of which both priors made an avatar."""
-    own = [row for row in reconstructed(rows) if row["folder"] == PHOTOS.name]
-    by_prior = {prior: {row["photo"]: row for row in part} for (prior,), part in groups(own, "prior").items()}
-    if not {"none", "learned"} <= set(by_prior):
-        return []
-    both = by_prior["none"].keys() & by_prior["learned"].keys()
-    keys = ("input_psnr_db", "coverage_worst", "render_mask_iou")
-    return [
-        {"name": words, "count": len(both),
-         **{key: percentiles((by_prior[prior][photo][key] for photo in both), (50,))[0] for key in keys}}
-        for prior, words in (("none", "no prior"), ("learned", "the prior"))
-    ]  # fmt: skip
-
-
 SECTIONS = (
     Section("results.md", "avatar", avatar_text),
     Section("results.md", "single", table(
@@ -132,13 +117,5 @@ SECTIONS = (
             ),
         ),
         single_rows,
-    )),
-    Section("prior.md", "photos", table(
-        (
-            Column("", "name"), Column("PSNR of the input view, dB", "input_psnr_db", ".1f"),
-            Column("coverage, the worst of 32 views", "coverage_worst", ".3f"),
-            Column("overlap with the mask", "render_mask_iou", ".3f"),
-        ),
-        by_prior_rows, after=lambda rows: f"{by_prior_rows(rows)[0]['count']} photos, medians.",
     )),
 )  # fmt: skip

@@ -1,7 +1,6 @@
 """What the prior that ships is: its file, its training, and what its Gaussians are like on synthetic photos.
 
-Fills docs/prior.md (file, training, gaussians). Its other sections come from the studies `evaluation`, `photos` and
-`timing`.
+Fills docs/prior.md (file, training, gaussians).
 """
 
 import hashlib
