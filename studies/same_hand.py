@@ -19,6 +19,7 @@ from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.adapt import adapt, add_detail
 from oasis_warp.adaptation.reliability import observe_photos
+from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit
@@ -36,13 +37,14 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
 from oasis_warp.reconstruction import composite_over_photo, make_avatar, reconstruct_same_hand
-from studies.detail import inside_outline
 from studies.harness import AvatarOptions, Row, measured
 from studies.inputs import SAME_HAND, estimator, prior_named
 from studies.tables import Column, Section, groups, table
 
 MOST = 4
 """Photos of one avatar."""
+RIM = 1 / 64
+"""Share of the crop's side, at the outline, that is not judged."""
 WINDOW = 9
 """What differs over more than this is light, or a surface that is a little off [px]."""
 DETAILED = {
@@ -107,6 +109,17 @@ def measure_hand(name: str, paths: list[Path], options: Options) -> Iterator[Row
 
 
 # ---- detail
+
+
+def inside_outline(crop: HandCrop) -> Tensor:
+    """Pixels away from the outlines of mask and surface and above the wrist.
+
+    Between fingers that touch in the photo the surface may have a gap, which no Gaussian fills.
+    """
+    camera, faces = crop.camera, bundled_hand().faces
+    seen = depth_map(crop.posed.vertices, faces, camera.viewmat, camera.K, camera.width, camera.height)
+    hand = crop.mask * (seen.face_ids >= 0)
+    return inner_mask(hand, max(1, round(RIM * len(hand)))) * crop.above_wrist > 0.5
 
 
 @torch.no_grad()
