@@ -14,6 +14,7 @@ from oasis_warp.core.types import HandFit, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.held_out import FIRST_PERSON, CaptureConfig, capture_person
+from oasis_warp.evaluation.same_hand import photos_in
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import choose_prior
 from studies.harness import prior_choice
@@ -22,7 +23,6 @@ PHOTOS = Path("tests/data/photos")
 SAME_HAND = PHOTOS / "same_hand"
 OUTLINES = Path("tests/data/masks/outlines.json")
 SYNTHETIC = "synthetic:"
-SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 SUPERSAMPLING = 4
 """Samples per pixel along each axis of a hand-drawn mask: finer than an edge that is drawn by hand."""
 
@@ -31,12 +31,7 @@ Coverage = npt.NDArray[np.float32]
 
 def photos_below(folder: Path) -> list[Path]:
     """Every photo in `folder` and its subfolders."""
-    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-
-
-def photos_in(folder: Path) -> list[Path]:
-    """The photos in `folder` itself."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    return sorted(photo for inner in [folder, *folder.rglob("*")] if inner.is_dir() for photo in photos_in(inner))
 
 
 def photo_named(name: str, folder: Path = PHOTOS, size: int = 512, device: str = "cpu") -> Photo:

@@ -1,9 +1,8 @@
 """What each part of the network is worth: trained with one part removed at a time (the paper's table 2).
 
-Fills docs/evaluation.md (network). Every variant is trained without point evidence, which is ours and does part of the
-work of the paper's parts, and with it. All are trained on the very same batches. A run that was stopped, or has used up
-its `--minutes`, goes on from its checkpoints when the same command comes again. With `--only` several processes share
-the training; a run without it trains what is left and evaluates all.
+Fills docs/evaluation.md (network). All variants are trained on the very same batches. A run that was stopped, or has
+used up its `--minutes`, goes on from its checkpoints when the same command comes again. With `--only` several processes
+share the training; a run without it trains what is left and evaluates all.
 """
 
 import math
@@ -54,8 +53,6 @@ VARIANTS = {
     "literal": Variant("visibility as printed", {"visibility": "literal"}),
 }
 """The paper's rows, then one of ours."""
-WITH = "_with_evidence"
-"""Ends the names of networks that have point evidence."""
 TABLES = (("studio", "raw"), ("studio", "matched"), ("wild", "matched"))
 """Light and colours; matched ones say less of the hand's tone, and so more of everything else."""
 
@@ -74,8 +71,8 @@ class Options(StudyOptions):
     size: int = 256
     seed: int = 0
     profile: str = "compact"
-    evidence: Literal["off", "on", "both"] = "both"
-    """Networks without point evidence, with it, or both."""
+    evidence: Literal["off", "on"] = "off"
+    """Networks without point evidence, which is ours and does part of the work of the paper's parts, or with it."""
     precision: Literal["bfloat16", "float32"] = "bfloat16"
     baked: Path | None = None
     """Folder of people that were baked before, as of `oasis pretrain`."""
@@ -89,24 +86,9 @@ class Options(StudyOptions):
     """To train; the rest waits for the next run."""
 
 
-def network_names(options: Options) -> list[str]:
-    """Names of the networks to train, which are those of their folders."""
-    endings = {"off": ("",), "on": (WITH,), "both": ("", WITH)}[options.evidence]
-    return [name + ending for ending in endings for name in VARIANTS]
-
-
 def network_config(name: str, options: Options) -> NetworkConfig:
     """The network of that name."""
-    switches = VARIANTS[name.removesuffix(WITH)].switches
-    return replace(PROFILES[options.profile], point_evidence="on" if name.endswith(WITH) else "off", **switches)
-
-
-def row_titles(names: list[str], ending: str) -> dict[str, str]:
-    """Titles of a table's rows: networks that end so, and in the first table what point evidence itself is worth."""
-    titles = {name + ending: variant.title for name, variant in VARIANTS.items() if name + ending in names}
-    if not ending and FULL + WITH in names:
-        titles[FULL + WITH] = "with point evidence"
-    return titles
+    return replace(PROFILES[options.profile], point_evidence=options.evidence, **VARIANTS[name].switches)
 
 
 def train(name: str, hands: SyntheticHands, folder: Path, options: Options, deadline: float) -> bool:
@@ -137,7 +119,7 @@ def evaluate_all(names: list[str], folder: Path, options: Options) -> list[Recor
 
 def run(options: Options) -> list[Row]:
     """Train, and evaluate when all are trained."""
-    deadline, everything = time.monotonic() + 60 * options.minutes, network_names(options)
+    deadline, everything = time.monotonic() + 60 * options.minutes, list(VARIANTS)
     if unknown := set(options.only) - set(everything):
         raise SystemExit(f"--only: expected some of {', '.join(everything)}, got {', '.join(sorted(unknown))}")
     folder = options.out / "network_parts"
@@ -156,13 +138,10 @@ def run(options: Options) -> list[Row]:
             return []
     if options.only:
         return []
-    records, rows = evaluate_all(everything, folder, options), []
-    for ending in ("", WITH):
-        variants = {name: (title, Method(name, RAW)) for name, title in row_titles(everything, ending).items()}
-        if FULL + ending in variants:
-            for kind in TABLES:
-                rows += ablation_rows(records, *kind, RAW, variants, FULL + ending)
+    records = evaluate_all(everything, folder, options)
+    variants = {name: (variant.title, Method(name, RAW)) for name, variant in VARIANTS.items()}
     settings = {**options.settings(), "held_out": options.held_out}
+    rows = [row for kind in TABLES for row in ablation_rows(records, *kind, RAW, variants, FULL)]
     return write_rows(folder, ({"settings": settings, **row} for row in rows))
 
 

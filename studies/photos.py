@@ -13,9 +13,10 @@ from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.evaluation.metrics import coverage
+from oasis_warp.evaluation.same_hand import photos_in
 from oasis_warp.reconstruction import reconstruct
 from studies.harness import Row, StudyOptions, measured, prior_choice
-from studies.inputs import PHOTOS, SAME_HAND, photos_below, photos_in
+from studies.inputs import PHOTOS, SAME_HAND, photos_below
 from studies.tables import Column, Section, complete, distribution, groups, table
 
 AVATAR = (

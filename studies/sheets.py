@@ -26,12 +26,13 @@ from oasis_warp.data.pictures import to_uint8
 from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.editing import edit
 from oasis_warp.estimation.hand_crop import CROP_MARGIN, crop_hand, detail_size, initial_offsets
+from oasis_warp.evaluation.same_hand import photos_in
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.reconstruction import Reconstruction, make_avatar, reconstruct, reconstruct_same_hand
 from studies.harness import AvatarOptions, Row
-from studies.inputs import PHOTOS, SAME_HAND, fit_largest, photo_named, photos_in, prior_named
+from studies.inputs import PHOTOS, SAME_HAND, fit_largest, photo_named, prior_named
 from studies.painted_truth import Chart, encoded, paint_photo, photographed
 from studies.tables import write_jpeg
 

@@ -182,9 +182,9 @@ def photos_of_hands(folder: Path) -> dict[str, list[Path]]:
         raise InputError(f"{folder}: expected a folder with a subfolder of photos for each hand, found {found}.")
     hands = {}
     for inner in sorted(path for path in folder.iterdir() if path.is_dir()):
-        if len(photos := _photos_in(inner)) > 1:
+        if len(photos := photos_in(inner)) > 1:
             hands[inner.name] = photos
-    if not hands and len(photos := _photos_in(folder)) > 1:
+    if not hands and len(photos := photos_in(folder)) > 1:
         hands[folder.resolve().name] = photos
     if not hands:
         raise InputError(
@@ -193,7 +193,8 @@ def photos_of_hands(folder: Path) -> dict[str, list[Path]]:
     return hands
 
 
-def _photos_in(folder: Path) -> list[Path]:
+def photos_in(folder: Path) -> list[Path]:
+    """The photos in `folder` itself, by name."""
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
 
 
