@@ -169,15 +169,15 @@ def _swapped(given: FaultyInput) -> tuple[Photo, Landmarks]:
     return given.photo, given.landmarks._replace(xy=xy, world=world)
 
 
-def _finger_moved(given: FaultyInput, *, world: bool, turned: bool = False) -> tuple[Photo, Landmarks]:
+def _finger_moved(given: FaultyInput, *, world: bool, bent: bool = False) -> tuple[Photo, Landmarks]:
     landmarks, rng = given.landmarks, given.rng
-    rows = list(FINGERS.values())[rng.integers(5)][int(turned) :]
+    rows = list(FINGERS.values())[rng.integers(5)][int(bent) :]
     angle, xy = rng.uniform(0, 2 * np.pi), landmarks.xy.numpy().astype(float)
     assert landmarks.world is not None
     points, centred = landmarks.world.numpy().astype(float), xy - xy.mean(0)
     pixels_per_metre = np.sqrt((centred**2).sum() / ((points - points.mean(0))[:, :2] ** 2).sum())
     shift = MOVED * box_size(xy) * np.array([np.cos(angle), np.sin(angle)])
-    share = np.linspace(1 / len(rows), 1, len(rows))[:, None] if turned else 1
+    share = np.linspace(1 / len(rows), 1, len(rows))[:, None] if bent else 1
     xy[rows] += share * shift
     points[rows, :2] += share * shift / pixels_per_metre * world
     moved = landmarks._replace(xy=torch.from_numpy(xy).float(), world=torch.from_numpy(points).float())
@@ -201,7 +201,7 @@ FAULTS: dict[str, Fault] = {
     "index and little finger swapped": _swapped,
     "a finger moved by 20 % of the hand, in the photo": partial(_finger_moved, world=False),
     "the same, in the photo and the world points": partial(_finger_moved, world=True),
-    "a finger turned about its root, its tip by 20 %": partial(_finger_moved, world=True, turned=True),
+    "a finger turned about its root, its tip by 20 %": partial(_finger_moved, world=True, bent=True),
     "landmarks of another photo": _of_other_photo,
     "half of the cut-out missing": _half_cutout,
 }

@@ -110,8 +110,8 @@ def make_truth(hand: HandModel, prior: Prior, *, back: bool, size: int, steps: i
     camera = Camera(torch.eye(4), K, size, size)
     random = torch.Generator().manual_seed(0)
     lengths = torch.exp(torch.empty(WAVES).uniform_(*map(math.log, WAVE_LENGTHS), generator=random))
-    ways = torch.nn.functional.normalize(torch.randn(3, WAVES, generator=random), dim=0)
-    waves = (2 * math.pi * ways / lengths, 2 * math.pi * torch.rand(WAVES, generator=random),
+    directions = torch.nn.functional.normalize(torch.randn(3, WAVES, generator=random), dim=0)
+    waves = (2 * math.pi * directions / lengths, 2 * math.pi * torch.rand(WAVES, generator=random),
              WAVE_SIZE * torch.randn(WAVES, 3, generator=random))  # fmt: skip
     drawn = _draw(hand, waves, None, posed.vertices, camera)
     pixels = drawn.image + (1 - drawn.alpha)[..., None] * torch.tensor(GROUND)
@@ -141,8 +141,8 @@ def _skin(hand: HandModel, waves: tuple[Tensor, Tensor, Tensor], on: Surface) ->
     fields = torch.cat([region_colors(label_regions(hand), MELANIN), hand.template], 1)
     colors, points = _at(fields, hand.faces, Surface(on.face_ids[shown], on.barycentrics[shown])).split(3, -1)
     picture = torch.zeros(*shown.shape, 3)
-    for way, phase, size in zip(waves[0].T, waves[1], waves[2], strict=True):  # one by one: the picture is large
-        colors = colors + torch.sin(points @ way + phase)[:, None] * size
+    for direction, phase, size in zip(waves[0].T, waves[1], waves[2], strict=True):  # one by one: the picture is large
+        colors = colors + torch.sin(points @ direction + phase)[:, None] * size
     picture[shown] = colors
     return picture
 
@@ -179,8 +179,8 @@ def _paint(known: KnownHand, kind: str, chart: Chart) -> Float[Tensor, "H W 4"]:
         start, end = rest.joints[RING_FINGER], rest.joints[RING_FINGER + 1]
         along = (rest.vertices - start) @ (end - start) / (end - start).norm()
         on_finger = hand.weights[:, RING_FINGER : RING_FINGER + 3].sum(1)
-        place, finger = _at(torch.stack([along, on_finger], 1), hand.faces, chart.on).unbind(-1)
-        off = (place - RING_PLACE * (end - start).norm()).abs() / (RING_WIDTH / 2)
+        position, finger = _at(torch.stack([along, on_finger], 1), hand.faces, chart.on).unbind(-1)
+        off = (position - RING_PLACE * (end - start).norm()).abs() / (RING_WIDTH / 2)
         edge = (off > 0.7)[..., None]
         color = torch.where(edge, torch.tensor(DARK_GOLD), torch.tensor(GOLD))
         inside = (off < 1) & (finger > 0.5) & (chart.on.face_ids >= 0)
@@ -216,8 +216,8 @@ def _draw_writing(size: tuple[int, int], x: float, y: float, mm: float) -> np.nd
     lines, text, font = np.zeros(size, np.uint8), "oasis", cv2.FONT_HERSHEY_SIMPLEX
     (width, height), _ = cv2.getTextSize(text, font, 10.0, 1)
     scale = 36 * mm / width
-    place = round(x - 18 * mm), round(y + scale * height / 2)
-    cv2.putText(lines, text, place, font, 10.0 * scale, 255, max(1, round(mm)), cv2.LINE_AA)
+    origin = round(x - 18 * mm), round(y + scale * height / 2)
+    cv2.putText(lines, text, origin, font, 10.0 * scale, 255, max(1, round(mm)), cv2.LINE_AA)
     return np.dstack([np.full((*size, 3), INK, np.float32), lines / np.float32(255)])
 
 

@@ -108,9 +108,9 @@ def prior_rows(config: ReconstructConfig, width: int) -> Rows:
         for name in ("none", "learned"):
             guess = prior_named(name)(crop)
             adapted = adapt(hand, [guess], [crop])
-            for words, gaussians, light in (("guess", guess, None), ("adapted", adapted.gaussians, adapted.light)):
+            for label, gaussians, light in (("guess", guess, None), ("adapted", adapted.gaussians, adapted.light)):
                 avatar = make_avatar(fit, offsets, crop, gaussians, light)
-                pose, caption = avatar.source_pose, f"{name}: {words}"
+                pose, caption = avatar.source_pose, f"{name}: {label}"
                 row.append(view(avatar, pose, avatar.source_camera, side, caption))
                 row += [around(avatar, pose, math.radians(azimuth), side, caption) for azimuth in AZIMUTHS]
         yield row
@@ -137,7 +137,7 @@ def facing(avatar: Avatar) -> HandPose:
 def detail_rows(config: ReconstructConfig, width: int) -> Rows:
     """Around some landmarks: photo, avatar of 256 px and of the photo's own size, and the latter from beside."""
     known, side = {}, panel_side(4, width)
-    for name, landmark, words in CLOSE:
+    for name, landmark, label in CLOSE:
         if name not in known:
             photo = photo_named(name, size=SYNTHETIC_SIZE, device=config.device)
             known[name] = photo, *(reconstruct(photo, replace(config, size=size)) for size in (256, "auto"))
@@ -147,7 +147,7 @@ def detail_rows(config: ReconstructConfig, width: int) -> Rows:
         square = float(xy[0]) - length / 2, float(xy[1]) - length / 2, length
         camera = crop_camera(fit.camera, *square, side)
         yield [
-            cut(photo, square, side, f"{words}: photo, {size} px"),
+            cut(photo, square, side, f"{label}: photo, {size} px"),
             view(plain.avatar, fit.pose, camera, side, "avatar, 256 px"),
             view(fine.avatar, fit.pose, camera, side, f"avatar, {size} px"),
             view(fine.avatar, fit.pose, turned_about(fine, xy, camera), side, "from beside"),
@@ -155,7 +155,7 @@ def detail_rows(config: ReconstructConfig, width: int) -> Rows:
 
 
 def turned_about(made: Reconstruction, xy: Tensor, camera: Camera) -> Camera:
-    """`camera`, turned by `TURNED` about the place of the surface that the photo shows at `xy` [px]."""
+    """`camera`, turned by `TURNED` about the point of the surface that the photo shows at `xy` [px]."""
     vertices = made.avatar.mesh(made.fit.pose).vertices.cpu()
     uv, _ = project(made.fit.camera, vertices)
     hidden = made.quality.visibility.cpu() == 0

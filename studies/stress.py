@@ -99,7 +99,7 @@ def row_of(name: str, damage: str, made: Reconstruction, base: Reconstruction, r
         "like_db": None if made is base else likeness(base.avatar, made.avatar),
         "mask_iou": made.errors["mask_iou"], "seen": made.errors["seen_percent"],
         "sane": is_sane(made.avatar.gaussians),
-        "warnings": [words for words in made.warnings if damage == "none" or words not in base.warnings],
+        "warnings": [warning for warning in made.warnings if damage == "none" or warning not in base.warnings],
     }  # fmt: skip
 
 

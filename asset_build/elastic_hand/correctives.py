@@ -16,7 +16,7 @@ from hand_build.anatomy import FINGERS, FIRST, Array, Index
 from scipy.spatial import cKDTree
 
 from elastic_hand.simulations import Simulation, bones
-from elastic_hand.solid import MILLIMETRES, skinned
+from elastic_hand.solid import MILLIMETRES, facing_skin, skinned
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.hand.correctives import corrective_coefficients
 
@@ -30,7 +30,6 @@ POSE_WEIGHT = 2.0
 CONTACT_WEIGHT = 10.0
 """Of giving way at a vertex in a pose, against following the flesh of one joint there."""
 ROUNDS = 5
-NEIGHBOURS = 24
 APART, DEEPEST, MARGIN = 5.0, 8.0, 0.2
 """Skin touches skin that is at least so far off at rest, is at most so deep inside, and is moved so far out [mm]."""
 OPPOSED = -0.3
@@ -103,13 +102,7 @@ def fit_to_flesh(
 def overlaps(surface: Array, rest: Array, faces: Index) -> tuple[Index, Array]:
     """Vertices inside another part of the surface, [n], and half of the shifts that lead out of it [mm], [n, 3]."""
     normals = np.asarray(igl.per_vertex_normals(surface, faces))
-    _, near = cKDTree(surface).query(surface, k=NEIGHBOURS, distance_upper_bound=DEEPEST)
-    found = near < len(surface)
-    near = np.where(found, near, 0)
-    opposed = (normals[:, None] * normals[near]).sum(-1) < OPPOSED
-    touches = found & opposed & (np.linalg.norm(rest[:, None] - rest[near], axis=-1) > APART)
-    vertex = np.flatnonzero(touches.any(1))
-    other = near[vertex, touches[vertex].argmax(1)]
+    vertex, other = facing_skin(surface, normals, rest, reach=DEEPEST, cosine=OPPOSED, apart=APART)
     depth = ((surface[other] - surface[vertex]) * normals[other]).sum(-1)
     inside = (depth > -MARGIN) & (depth < DEEPEST)
     return vertex[inside], normals[other[inside]] * ((depth[inside] + MARGIN) / 2)[:, None]

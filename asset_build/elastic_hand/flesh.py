@@ -12,9 +12,8 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
 from hand_build.anatomy import Array, Index
-from scipy.spatial import cKDTree
 
-from elastic_hand.solid import Solid
+from elastic_hand.solid import Solid, facing_skin
 
 MU = 1.0
 LAMBDA = 9.0
@@ -114,18 +113,9 @@ class Flesh:
         skin = self.solid.skin
         normals = np.asarray(igl.per_vertex_normals(at, skin, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_AREA))
         areas = np.bincount(skin.ravel(), np.repeat(np.asarray(igl.doublearea(at, skin)) / 6, 3), len(at))
-        distance, near = cKDTree(at[nodes]).query(at[nodes], 24, distance_upper_bound=CONTACT_REACH)
-        node = np.repeat(nodes, 24)[np.isfinite(distance).ravel()]
-        other = nodes[near[np.isfinite(distance)]]
-        distance = distance[np.isfinite(distance)]
-        rest = self.solid.nodes
-        facing = (normals[node] * normals[other]).sum(1) < -0.2
-        apart = np.linalg.norm(rest[node] - rest[other], axis=1) > CONTACT_APART
-        node, other, distance = (a[facing & apart] for a in (node, other, distance))
-        order = np.argsort(distance, kind="stable")
-        node, other = node[order], other[order]
-        node, first = np.unique(node, return_index=True)
-        other = other[first]
+        node, other = nodes[np.stack(facing_skin(
+            at[nodes], normals[nodes], self.solid.nodes[nodes], reach=CONTACT_REACH, cosine=-0.2, apart=CONTACT_APART
+        ))]  # fmt: skip
         normal = normals[other]
         height = ((at[node] - at[other]) * normal).sum(1)
         close = (height > -CONTACT_DEPTH) & (height < CONTACT_GAP + 1)

@@ -33,6 +33,10 @@ FIRMNESS = 1e-3
 """Of the mean against the bent Laplacian: keeps the system definite."""
 
 
+NEIGHBOURS = 24
+"""Points among which skin looks for other skin that it faces."""
+
+
 @dataclass(frozen=True)
 class Solid:
     """Nodes [mm] and tetrahedra of the hand at rest."""
@@ -182,6 +186,22 @@ class SkinMap:
     def surface(self, nodes: Array, bones: Array) -> Array:
         """Posed vertices of the hand [mm], [V, 3]."""
         return skinned(self.rest + self.displacements(nodes, bones), self.weights, bones)
+
+
+def facing_skin(
+    points: Array, normals: Array, rest: Array, *, reach: float, cosine: float, apart: float
+) -> tuple[Index, Index]:
+    """Points of the skin that face other skin within `reach`, and the nearest point that each of them faces, [n] each.
+
+    Their normals have at most that cosine, and at rest they are at least so far apart.
+    """
+    _, near = cKDTree(points).query(points, NEIGHBOURS, distance_upper_bound=reach)
+    found = near < len(points)
+    near = np.where(found, near, 0)
+    opposed = (normals[:, None] * normals[near]).sum(-1) < cosine
+    facing = found & opposed & (np.linalg.norm(rest[:, None] - rest[near], axis=-1) > apart)
+    index = np.flatnonzero(facing.any(1))
+    return index, near[index, facing[index].argmax(1)]
 
 
 def skinned(points: Array, weights: Array, bones: Array) -> Array:

@@ -42,7 +42,7 @@ class Labels(NamedTuple):
     side: Index
     """0 palm, 1 back, 2 flank."""
     bone_t: Array
-    """Place along the bone of `segment`: 0 at the joint, 1 at the next."""
+    """Position along the bone of `segment`: 0 at the joint, 1 at the next."""
     bone_theta: Array
     """Angle of the normal about that bone [rad]: 0 back, +-pi palm."""
 
@@ -161,15 +161,15 @@ def labels(vertices: Array, faces: Index, points: Array, weights: Array, axes: A
     segment = weights.argmax(1)
     normals = igl.per_vertex_normals(vertices, faces)
     ends = bone_ends(points) | {0: points[FIRST["middle"]]}
-    place, theta = np.zeros(len(vertices)), np.zeros(len(vertices))
+    along_bone, theta = np.zeros(len(vertices)), np.zeros(len(vertices))
     for joint, end in ends.items():
         on = segment == joint
         along = end - points[joint]
-        place[on] = (vertices[on] - points[joint]) @ along / (along @ along)
+        along_bone[on] = (vertices[on] - points[joint]) @ along / (along @ along)
         theta[on] = np.arctan2(normals[on] @ axes[joint, 0], normals[on] @ axes[joint, 1])
     turned = np.abs(theta)
     side = np.where(turned < np.radians(60), 1, np.where(turned > np.radians(120), 0, 2))
-    return Labels(segment, side, place, theta)
+    return Labels(segment, side, along_bone, theta)
 
 
 def tip_vertices(vertices: Array, points: Array) -> Index:

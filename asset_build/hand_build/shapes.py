@@ -139,12 +139,12 @@ def phalanx_length(
 ) -> Shape:
     """The bone of `joint` longer by `share` of its length, all beyond it carried along.
 
-    The flesh stretches evenly, or only up to the place `stretch_end` (0 at the joint, 1 at the bone's end).
+    The flesh stretches evenly, or only up to the position `stretch_end` (0 at the joint, 1 at the bone's end).
     """
     end = bone_ends(points)[joint]
     along, length = unit(end - points[joint]), np.linalg.norm(end - points[joint])
-    place = np.maximum((vertices - points[joint]) @ along, 0) / length
-    grown = place if stretch_end == np.inf else np.minimum(place / stretch_end, 1)
+    position = np.maximum((vertices - points[joint]) @ along, 0) / length
+    grown = position if stretch_end == np.inf else np.minimum(position / stretch_end, 1)
     fields = {joint: share * length * grown[:, None] * along}
     moved = np.zeros((21, 3))
     for child in descendants(joint):

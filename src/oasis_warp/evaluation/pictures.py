@@ -46,8 +46,8 @@ def write_sheet(path: Path, strips: Sequence[Path], columns: Sequence[str]) -> N
     parts = [read_photo(strip).rgb for strip in strips]
     heading = np.full((HEADING, parts[0].shape[1], 3), PAPER, np.uint8)
     for k, name in enumerate(columns):
-        place = (k * TILE + 4, HEADING - 7)
-        cv2.putText(heading, name, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (INK, INK, INK), 1, cv2.LINE_AA)
+        position = (k * TILE + 4, HEADING - 7)
+        cv2.putText(heading, name, position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (INK, INK, INK), 1, cv2.LINE_AA)
     write_picture(path, torch.cat([torch.from_numpy(heading), *parts]))
 
 

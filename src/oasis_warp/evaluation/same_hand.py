@@ -231,9 +231,9 @@ def evaluate_photos(
     open_resumable_folder(out, SETTINGS, settings, "an evaluation")
     (out / HANDS).mkdir(exist_ok=True)
     for name, paths in hands.items():
-        place = out / HANDS / f"{name}.json"
-        if not place.exists():
-            _measure_hand(name, paths, priors, methods, config, place, progress)
+        file = out / HANDS / f"{name}.json"
+        if not file.exists():
+            _measure_hand(name, paths, priors, methods, config, file, progress)
     found = [json.loads((out / HANDS / f"{name}.json").read_text()) for name in hands]
     pairs = [pair for hand in found for pair in hand["pairs"]]
     if not pairs:
@@ -248,7 +248,7 @@ def evaluate_photos(
 
 def _measure_hand(
     name: str, paths: Sequence[Path], priors: Mapping[str, Prior], methods: Sequence[Method],
-    config: ReconstructConfig, place: Path, progress: Progress,
+    config: ReconstructConfig, file: Path, progress: Progress,
 ) -> None:  # fmt: skip
     """Write pictures of a few pairs, then the records of one hand."""
     estimator = HandEstimator(bundled_hand())
@@ -274,8 +274,8 @@ def _measure_hand(
             rows.append((pair.source, [tile(picture) for picture in (crops[pair.source], pair.photo, *drawn)]))
         progress(f"pairs of {name}", k + 1, total)
     if rows:
-        write_strip(place.with_suffix(".png"), [tiles for _, tiles in rows])
-    write_file(place, json.dumps({"pairs": records, "left_out": left_out}, allow_nan=False).encode())
+        write_strip(file.with_suffix(".png"), [tiles for _, tiles in rows])
+    write_file(file, json.dumps({"pairs": records, "left_out": left_out}, allow_nan=False).encode())
 
 
 def make_avatars(

@@ -121,16 +121,16 @@ def evaluate_people(
     open_resumable_folder(folder, SETTINGS, settings, "an evaluation")
     (folder / PEOPLE).mkdir(exist_ok=True)
     everybody = [(group, FIRST_PERSON + k) for group in config.groups for k in range(config.people)]
-    missing = [who for who in everybody if not _place(folder, *who).exists()]
+    missing = [who for who in everybody if not _person_file(folder, *who).exists()]
     measured = _measured(_Setup(priors, config, perceptual), folder, missing, device, workers)
     for done in range(len(everybody) - len(missing), len(everybody)):
         progress("evaluation", done, len(everybody))
         next(measured)
     progress("evaluation", len(everybody), len(everybody))
-    records = [record for who in everybody for record in json.loads(_place(folder, *who).read_text())]
+    records = [record for who in everybody for record in json.loads(_person_file(folder, *who).read_text())]
     strips = [
         path for group in config.groups for k in range(min(SHOWN, config.people))
-        if (path := _place(folder, group, FIRST_PERSON + k).with_suffix(".png")).exists()
+        if (path := _person_file(folder, group, FIRST_PERSON + k).with_suffix(".png")).exists()
     ]  # fmt: skip
     write_sheet(folder / SHEET, strips, ["photo", "truth", *map(method_name, available_methods(priors, config))])
     maps = sorted((folder / PEOPLE).glob("*_attention.png"))
@@ -141,7 +141,7 @@ def evaluate_people(
     return found
 
 
-def _place(folder: Path, group: Group, number: int) -> Path:
+def _person_file(folder: Path, group: Group, number: int) -> Path:
     return folder / PEOPLE / f"{group}_{number}.json"
 
 
@@ -200,7 +200,7 @@ def _measure_in_worker(packed: bytes, folder: Path, device: torch.device, group:
 
 def measure_person(setup: _Setup, folder: Path, device: torch.device, group: Group, number: int) -> None:
     """Write pictures of the first few people, then the records of one person."""
-    config, hand, place = setup.config, bundled_hand().to(device), _place(folder, group, number)
+    config, hand, file = setup.config, bundled_hand().to(device), _person_file(folder, group, number)
     perceptual = setup.perceptual.to(device) if setup.perceptual else None
     person = capture_person(config.capture, group, number, device)
     records, rows, shown = [], [], number < FIRST_PERSON + SHOWN
@@ -218,10 +218,10 @@ def measure_person(setup: _Setup, folder: Path, device: torch.device, group: Gro
             if factor == config.noise[-1]:
                 rows.append(row)
         if shown and (group, light) == (config.groups[0], config.lights[0]):
-            write_attention(place.with_name(f"{number}_attention.png"), setup.priors, exact)
+            write_attention(file.with_name(f"{number}_attention.png"), setup.priors, exact)
     if shown:
-        write_strip(place.with_suffix(".png"), rows)
-    write_file(place, json.dumps(records, allow_nan=False).encode())
+        write_strip(file.with_suffix(".png"), rows)
+    write_file(file, json.dumps(records, allow_nan=False).encode())
 
 
 def draw_methods(
