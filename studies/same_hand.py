@@ -20,7 +20,7 @@ from torch.nn.functional import avg_pool2d
 from oasis_warp.adaptation.adapt import adapt, add_detail
 from oasis_warp.adaptation.reliability import observe_photos
 from oasis_warp.avatar.observation import inner_mask
-from oasis_warp.core.config import AdaptConfig, ReconstructConfig
+from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit
 from oasis_warp.data.photo import read_photo
@@ -30,6 +30,7 @@ from oasis_warp.estimation.hand_crop import (
     crop_hand,
     crop_hands,
     initial_surfaces,
+    refine_surfaces,
     resolutions,
 )
 from oasis_warp.evaluation.same_hand import compare_with_photo, draw_as_photo, photos_of_hands
@@ -66,10 +67,6 @@ class Options(AvatarOptions):
     """Names of those subfolders; all by default."""
     held_out: int = 3
     """Photos of each hand that are held out."""
-    light: Literal["fit", "even", "keep"] = "fit"
-    """What becomes of the photos' light; see `AdaptConfig`."""
-    size: int = 256
-    """Side of the crop [px]."""
 
 
 # ---- photos of real hands
@@ -77,7 +74,7 @@ class Options(AvatarOptions):
 
 def measure_hand(name: str, paths: list[Path], options: Options) -> Iterator[Row]:
     """Rows of every photo held out: avatars of each that follows it, and of the first 2, 3, ... of those."""
-    config = ReconstructConfig(size=options.size, light=options.light, steps=options.steps)
+    config = options.config()
     photos, alone = [], []
     for path in paths:
         try:
@@ -140,14 +137,15 @@ def measure_detail(name: str, options: Options) -> Iterator[Row]:
     """A row for each photo of a hand of `DETAILED`."""
     folder, stems = DETAILED[name]
     paths = [options.photos / folder / f"{stem}.jpg" for stem in stems]
-    config, hand, prior = ReconstructConfig(steps=options.steps), bundled_hand(), prior_named(options.prior)
+    config, hand, prior = options.config(), bundled_hand(), prior_named(options.prior)
     photos = [read_photo(path) for path in paths]
     landmarks = [choose_hand(estimator().find(photo), "largest", photo.name) for photo in photos]
     fits = fit_together(estimator(), photos, landmarks)
-    surfaces = initial_surfaces(bundled_hand(), fits)
+    surfaces = initial_surfaces(hand, fits)
     crops = crop_hands(photos, fits, surfaces, config)
-    start = time.perf_counter()
     guesses = [prior(crop) for crop in crops]
+    surfaces = refine_surfaces(hand, photos, fits, surfaces, guesses, config)
+    crops, start = crop_hands(photos, fits, surfaces, config), time.perf_counter()
     settings = AdaptConfig(texture_steps=config.steps)
     fusion = adapt(hand, guesses, crops, settings, resolutions=resolutions(fits, crops))
     fused = time.perf_counter()
