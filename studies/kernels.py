@@ -5,7 +5,7 @@ docs/gpu.md, its pictures included (which need matplotlib), from OUT/gpu. Runnin
 `cuda`; these commands do the same:
 
     oasis bench kernels --json out/speed.json               # --threads 2 --json out/speed_threads.json
-    oasis bench kernels --device cuda --json out/gpu/kernels.json            # --peer gsplat
+    oasis bench kernels --device cuda --json out/gpu/kernels.json
     oasis bench scaling --device cuda --out out/gpu
     oasis bench roofline --device cuda --json out/gpu/roofline.json
 
@@ -46,16 +46,13 @@ class Options(StudyOptions):
 
     parts: tuple[Literal["kernels", "scaling", "roofline"], ...] = ("kernels", "scaling", "roofline")
     """Of the GPU's."""
-    peer: Literal["none", "gsplat"] = "none"
-    """Another rasterizer to time beside the kernels."""
 
 
 def measure_part(part: str, options: Options) -> Sequence[Any]:
     """The rows of one part."""
     device = torch.device(options.device)
     if part == "kernels":
-        peers = {"gsplat": gpu_speed.gsplat_draw()} if options.peer == "gsplat" else {}
-        return gpu_speed.measure_cases(gpu_cases.choose(""), device, groups=GROUPS, peers=peers, progress=report)
+        return gpu_speed.measure_cases(gpu_cases.choose(""), device, groups=GROUPS, progress=report)
     if part == "scaling":
         return scaling.measure_scaling(scaling.points(quick=False), device, seconds=SECONDS, progress=report)
     return roofline.measure_roofline(device, progress=report)
@@ -148,13 +145,6 @@ CASES = (
     Column("of 99.99 %", "most_abs", power), Column("rel-L2", "rel_l2", power),
     Column("gradient", "gradient_rel_l2", power), Column("same bits", "bit_equal", yes),
 )  # fmt: skip
-PEERS = (
-    Column("case", "case"), Column("pass", "pass_"), Column("peer", "way"), Column("wall ms", "our_wall_ms", short),
-    Column("peer's", "wall_ms", short), Column("ratio", lambda row: row["wall_ms"] / row["our_wall_ms"], times),
-    Column("kernels ms", "our_kernels_ms", short), Column("peer's", "kernels_ms", short),
-    Column("ratio", lambda row: ratio(row["kernels_ms"], row["our_kernels_ms"]), times),
-    Column("peer's error of 99.99 %", "most_abs", power), Column("peer's gradient", "gradient_rel_l2", power),
-)  # fmt: skip
 GROWTH = (
     Column("axis", "axis"), Column("of", "series"), Column("pass", "pass_"), Column("time over work", "ratio", ".2f"),
     Column("between", lambda row: f"{row['before']:,} and {row['after']:,}"),
@@ -176,11 +166,6 @@ ROOFLINE = (
 )  # fmt: skip
 
 
-def ratio(one: float | None, other: float | None) -> float | None:
-    """Their quotient; None where either is missing."""
-    return None if one is None or other is None else one / other
-
-
 def provenance(row: GpuRow | ScalingRow | KernelRow) -> str:
     """What a table was measured with."""
     made = f", commit {row.commit}" if row.commit else ""
@@ -193,16 +178,6 @@ def case_text(rows: Sequence[GpuRow]) -> str:
     missing = [f"No graph holds {row.case}, {row.pass_}: {row.not_captured}" for row in ours if row.not_captured]
     about = f"{provenance(rows[0])} Medians of {rows[0].groups} groups of calls."
     return "\n\n".join([table(CASES)(list(map(asdict, ours))) or "", about, *missing])
-
-
-def peer_text(rows: Sequence[GpuRow]) -> str:
-    """Ours beside each peer, on the host's clock and in kernels."""
-    ours = {(row.case, row.pass_): row for row in rows if row.way == OURS}
-    lines = [
-        asdict(row) | {f"our_{name}": getattr(ours[row.case, row.pass_], name) for name in ("wall_ms", "kernels_ms")}
-        for row in rows if row.way != OURS
-    ]  # fmt: skip
-    return table(PEERS)(lines) or "No other rasterizer was installed where this was measured."
 
 
 def growth_text(rows: Sequence[ScalingRow]) -> str:
@@ -256,7 +231,7 @@ class Part(NamedTuple):
 
 
 PARTS = {
-    "kernels": Part(GpuRow, {"kernels": case_text, "peers": peer_text}, plot_speed),
+    "kernels": Part(GpuRow, {"kernels": case_text}, plot_speed),
     "scaling": Part(ScalingRow, {"growth": growth_text, "points": point_text}, plot_scaling),
     "roofline": Part(KernelRow, {"roofline": roofline_text}, plot_roofline),
 }

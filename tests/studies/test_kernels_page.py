@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from gpu_rows import FRAME, GPU, KERNELS, SPEED, STUDY
+from gpu_rows import KERNELS, SPEED, STUDY
 
 from oasis_warp.bench import plots
 from oasis_warp.bench.rows import json_text
@@ -42,7 +42,6 @@ def test_every_table_of_the_page_is_filled(out, docs):
     assert "Not measured yet." not in text
     assert "| 37k at 512 x 512 | forward + backward | 0.25 | 0.1 | 0.11 |" in text
     assert "No graph holds avatar at 512 x 512, pose + draw: operation not permitted" in text
-    assert "| gsplat | 0.25 | 0.75 | 3.0x | 0.09 | 0.45 | 5.0x |" in text
     assert "Cliffs: 512 x 512, forward; 512 x 512, forward + backward." in text
     assert "`blend_tiles_backward_3` | 1 | 50 |" in text
     assert "Memset" not in text  # a thousandth of the time, and no formula
@@ -61,7 +60,7 @@ def test_what_was_not_measured_stays_on_the_page(monkeypatch, out, docs):
     blank = part.sub(r"\1Not measured yet.\n\2", (docs / "gpu.md").read_text())
     (docs / "gpu.md").write_text(blank)
     render(["kernels"], out, docs)
-    assert blank.count("Not measured yet.") == 5
+    assert blank.count("Not measured yet.") == 4
     assert (docs / "gpu.md").read_text().count("Not measured yet.") == 3
 
 
@@ -70,10 +69,6 @@ def test_without_matplotlib_no_picture_is_drawn(monkeypatch, out):
     with pytest.raises(SystemExit, match="matplotlib is not installed"):
         kernels.draw(kernels.load(out), out)
     assert not list(out.glob("*.png"))
-
-
-def test_the_page_says_so_where_no_peer_was_there():
-    assert kernels.peer_text([GPU, FRAME]).startswith("No other rasterizer")
 
 
 def test_no_step_is_called_a_cliff_where_none_is():
