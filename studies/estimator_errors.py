@@ -4,7 +4,7 @@ Synthetic pictures are estimated as `reconstruction.reconstruct` does, and what 
 in OUT/estimator_errors/pictures; left hands are kept as the right ones that they are in the mirror. From these come
 assets/training/estimator_errors.safetensors (with `--asset`), which training draws from, and docs/estimator.md
 (errors): tables of the estimate's parts; of found surfaces beside those that training sees, where each measured hand
-comes once more with the error of another one, so that none is compared with itself; and of masks, likewise.
+comes once more with the error of another one, so that none is compared with itself.
 """
 
 import json
@@ -22,27 +22,21 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandPose
 from oasis_warp.data.output_files import write_file
-from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.estimation.estimator import choose_hand
-from oasis_warp.estimation.hand_crop import CROP_MARGIN
-from oasis_warp.estimation.outline import wrist_line
+from oasis_warp.estimation.hand_crop import crop_side
 from oasis_warp.estimation.surface_offsets import outline_offsets
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map, depth_visibility
 from oasis_warp.pretraining.estimator_errors import (
     ALIKE,
-    MASK_NUMBERS,
     MeasuredErrors,
-    cut_at_wrist,
     looks,
-    perturb_outline,
     picture_frames,
     simulate_estimate,
     surface_fields,
 )
 from oasis_warp.pretraining.hand_batch import PosedHands, pose_hands
-from oasis_warp.pretraining.training_batch import crop_to_mask, mirror_left_hands
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shots import PICTURES_EACH
 from studies.harness import ROWS, Row, StudyOptions, measured, read_rows
@@ -50,9 +44,7 @@ from studies.inputs import estimator, synthetic_photo
 from studies.tables import Section, markdown, percentiles
 
 CROP = 256
-"""Side of the crop whose pixels errors are given in, and of the masks that are kept [px]."""
-RENDERED = 320
-"""Side of the pictures whose masks are made [px]: that of training."""
+"""Side of the crop whose pixels errors are given in [px]."""
 MARGIN = 0.0015
 """Of visibility, as the network sees it [m]."""
 PARTS = ("angles", "orientation", "translation", "shape", "K")
@@ -63,7 +55,7 @@ Arrays = dict[str, Any]
 class Options(StudyOptions):
     """Options of this study."""
 
-    selecting: ClassVar[frozenset[str]] = frozenset({"count", "first", "asset", "masks"})
+    selecting: ClassVar[frozenset[str]] = frozenset({"count", "first", "asset"})
     count: int = 224
     first: int = 0
     """Number of the first picture; several runs may share the work."""
@@ -73,8 +65,6 @@ class Options(StudyOptions):
     """Of a world that is not the training's."""
     size: int = 384
     """Side of the pictures [px]."""
-    masks: int = 64
-    """Masks of training to compare with."""
     asset: Path | None = None
     """Where to write the asset that training draws from."""
     threads: int | None = 1
@@ -110,21 +100,13 @@ def measure(number: int, options: Options) -> Row:
     true = {name: getattr(batch, name)[0].double().numpy() for name in PARTS}
     estimate = {**fit.pose._asdict(), "shape": fit.shape, "K": fit.camera.K}
     found = {name: tensor.double().numpy() for name, tensor in estimate.items()}
-    above = torch.from_numpy(wrist_line(fit.landmarks.xy.numpy()).above_mask((size, size))).float()
-    masks = {"true_mask": batch.mask[0], "found_mask": fit.mask, "above": above}
     if side == "left":
         true, found = mirrored(true, size), mirrored(found, size)
-        masks = {name: mask.flip(1) for name, mask in masks.items()}
-    square = square_around(masks["found_mask"], CROP_MARGIN)
     arrays: Arrays = {
-        "size": size, "offsets": outline_offsets(bundled_hand(), fit).half().numpy(), "square": np.array(square),
-        "true_square": np.array(square_around(masks["true_mask"], CROP_MARGIN)),
+        "size": size, "offsets": outline_offsets(bundled_hand(), fit).half().numpy(), "side": crop_side(fit),
         **{f"true_{name}": value for name, value in true.items()},
         **{f"found_{name}": value for name, value in found.items()},
     }  # fmt: skip
-    for name, mask in masks.items():
-        cut = resample_square(mask.contiguous(), *square, CROP).clamp(0, 1)
-        arrays[name] = (255 * cut).round().to(torch.uint8).numpy()
     folder = options.out / "estimator_errors" / "pictures"
     folder.mkdir(exist_ok=True)
     np.savez_compressed(folder / f"{number:05d}.npz", **arrays)
@@ -288,62 +270,6 @@ def aligned_errors(true: Hands, found: Hands) -> Tensor:
     return 1e3 * (scale[:, None, None] * a @ rotation.transpose(1, 2) - b).norm(dim=-1).mean(1)
 
 
-def mask_errors(true: Tensor, found: Tensor, above: Tensor, side: Tensor) -> dict[str, Tensor]:
-    """Errors of whole masks, of what is `above` the wrist line, and of the crops, `side` times the true ones."""
-    hand = (true & above).flatten(1).sum(1)
-    return {
-        "IoU with the true mask": iou(true, found),
-        "the same above the wrist line": iou(true & above, found & above),
-        "of the hand above it, left out [%]": 100 * (true & ~found & above).flatten(1).sum(1) / hand,
-        "as much of what is not hand, taken in [%]": 100 * (found & ~true & above).flatten(1).sum(1) / hand,
-        "side of the crop, over that of the true one [%]": 100 * (side - 1),
-    }
-
-
-def found_mask_errors(rows: list[Arrays]) -> dict[str, Tensor]:
-    """Of the masks that the estimator cut."""
-    names, sides = ("true_mask", "found_mask", "above"), [row["square"][2] / row["true_square"][2] for row in rows]
-    masks = (torch.from_numpy(np.stack([row[name] for row in rows])) > 127 for name in names)
-    return mask_errors(*masks, torch.tensor(sides).float())
-
-
-def training_mask_errors(hand: HandModel, seed: int, count: int) -> dict[str, Tensor]:
-    """Of the masks of `training_batch`, for one picture of each person of a world."""
-    random = torch.Generator().manual_seed(seed)
-    parts = []
-    for k in range(count):
-        photo = render_batch(seed, [PICTURES_EACH * k], RENDERED)
-        _, alpha, mask, orientation, translation, K = mirror_left_hands(photo)
-        landmarks = pose_hands(hand, photo.shape, photo.angles, orientation, translation).landmarks
-        numbers = torch.randn(1, 1 + MASK_NUMBERS, generator=random)
-        made = cut_at_wrist(mask, alpha, landmarks, K, numbers[:, 0])
-        crop = crop_to_mask(torch.stack([mask, made], -1), made, K, CROP)
-        found = perturb_outline(crop.planes[..., 1], numbers[:, 1:])
-        seen = project(landmarks, crop.K)[0].numpy()
-        above = torch.from_numpy(wrist_line(seen).above_mask((CROP, CROP)))[None]
-        side = crop_to_mask(mask[..., None], mask, K, CROP).K[:, 0, 0] / crop.K[:, 0, 0]
-        parts.append((crop.planes[..., 0] > 0.5, found > 0.5, above, side))
-    return mask_errors(*(torch.cat(part) for part in zip(*parts, strict=True)))
-
-
-def correlations(true: Hands, found: Hands) -> dict[str, float]:
-    """Of errors that hang together."""
-    angles = (found.angles - true.angles)[:, :12].unflatten(1, (4, 3))[..., 0]
-    knuckle, middle, end = (angles[:, :, k].flatten() for k in range(3))
-    turn = turn_vectors(found.orientation @ true.orientation.transpose(1, 2))
-    bent = angles[:, :, 0].mean(1)
-    across = torch.linalg.lstsq(turn, bent[:, None]).solution[:, 0]
-    focal = (found.focal / true.focal).log()
-    pairs = {
-        "flexion of a finger's knuckle and middle joint": (knuckle, middle),
-        "flexion of its middle and end joint": (middle, end),
-        "flexion of knuckles and the hand's turn": (bent, turn @ across),
-        "focal length and size": (focal, log_size(true, found)),
-        "focal length and distance": (focal, (found.distance / true.distance).log()),
-    }
-    return {name: float(torch.corrcoef(torch.stack(pair))[0, 1]) for name, pair in pairs.items()}
-
-
 def spread(columns: dict[str, dict[str, Tensor]]) -> str:
     """A table of percentiles of measures, three for each column."""
     headings = [f"{name} {share} %".strip() for name in columns for share in (10, 50, 90)]
@@ -364,25 +290,20 @@ def text(every: list[Row], rows: list[Arrays], options: Options) -> str:
         fixed = surface_fields(hand)
         stored = {name: part.half().contiguous() for name, part in measured._asdict().items() if name not in fixed}
         write_file(options.asset, save(stored))
-    scale = CROP / torch.tensor([float(row["square"][2]) for row in rows])
+    scale = CROP / torch.tensor([float(row["side"]) for row in rows])
     truth = Surfaces(hand, true.posed.posed, true.K, size)
     surfaces = {
         "found": Surfaces(hand, with_offsets(hand, rows, found), found.K, size),
         "in training": Surfaces(hand, *leave_one_out(hand, true, measured, 0), size),
     }
-    masks = {"found": found_mask_errors(rows), "in training": training_mask_errors(hand, options.seed, options.masks)}
     results = [row["result"] for row in every]
     outcome = ", ".join(f"{results.count(name)} {name}" for name in sorted(set(results)))
-    hang = "; ".join(f"{name} {value:.2f}" for name, value in correlations(true, found).items())
     return "\n\n".join([
         f"{len(every)} pictures: {outcome}; {sum(row.get('warned', False) for row in every)} fits are warned about. "
         f"Pixels are those of the {CROP} px crop.",
         spread({"": errors_of_parts(true, found, scale)}),
-        f"Correlations: {hang}.",
         "Surfaces, and those that training gives the network:",
         spread({name: compare(truth, those, scale) for name, those in surfaces.items()}),
-        f"Masks, and {options.masks} that training gives it:",
-        spread(masks),
     ])  # fmt: skip
 
 
