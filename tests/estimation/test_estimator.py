@@ -154,7 +154,7 @@ def test_two_hands_in_one_photo_have_masks_of_their_own(estimator, photos):
 
 @pytest.mark.slow
 def test_a_synthetic_photo_is_fitted_as_it_was_rendered(hand, estimator):
-    batch = render_batch(6006, [0], 384)
+    batch = render_batch(6006, [16], 384)
     photo = Photo((batch.image[0] * 255).round().to(torch.uint8), None, None, "synthetic", 1.0)
     fit = estimator.fit(photo, choose_hand(estimator.find(photo), "largest", photo.name))
     assert fit.side == ("left" if batch.left[0] else "right")

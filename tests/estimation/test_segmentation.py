@@ -28,7 +28,8 @@ def reading_of(hand, arm, front=None):
         shares[row] = cv2.GaussianBlur(cv2.resize(mask.astype(np.float32), (SIDE, SIDE)), (0, 0), 1.5)
     shares[0] = 1 - shares[1:].sum(0)
     nothing = np.zeros((6, SIDE, SIDE), np.float32)
-    return PixelReading(np.zeros(2), scale, shares, nothing[:3], nothing[0], nothing[:3], nothing[:3], nothing)
+    three, image = nothing[:3], np.zeros((SIDE, SIDE, 3), np.uint8)
+    return PixelReading(np.zeros(2), scale, image, shares, three, nothing[0], three, three, nothing)
 
 
 @pytest.fixture(scope="module")

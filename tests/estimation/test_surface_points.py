@@ -18,7 +18,8 @@ def reading(surface, spread=0.002, hand=0.99):
     shares = np.stack([(1 - hand) * ones, hand * ones, 0 * ones, 0 * ones])
     place = np.array(surface, np.float32)[:, None, None] * ones
     finger = np.zeros((6, SIDE, SIDE), np.float32)
-    return PixelReading(np.array([10.0, 20.0]), 2.0, shares, place, spread * ones, place, place, finger)
+    image = np.zeros((SIDE, SIDE, 3), np.uint8)
+    return PixelReading(np.array([10.0, 20.0]), 2.0, image, shares, place, spread * ones, place, place, finger)
 
 
 def test_a_pixel_shows_the_place_on_the_surface_that_is_nearest(kinematics):

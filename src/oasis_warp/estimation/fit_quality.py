@@ -32,8 +32,8 @@ _MIN_PRESENCE = 0.5
 _STRAY = 0.06
 """Distance of a pixel from its place on the model, as a fraction of the box, beyond which it strays."""
 STRAY_SHARE = 0.35
-"""Share of all pixels that stray from which a fit is refused. At most .07 on 16 good fits."""
-_STRAY_WARNED, _STRAY_FINGER = 0.15, 0.5
+"""Share of all pixels that stray from which a fit is refused. At most .19 where the fit looks right."""
+_STRAY_WARNED, _STRAY_FINGER = 0.2, 0.65
 """Shares of all pixels, and of those of a finger, about which a warning is given."""
 _FEWEST_PIXELS = 12
 """Of a finger that is judged."""
@@ -45,7 +45,7 @@ _BORDER = 0.08
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of the numbers of a fit. 63 correct fits keep them, most damaged ones do not."""
+    """Bounds of the numbers of a fit. Fits that look right keep them, most damaged ones do not."""
 
     reprojection: float
     worst_point: float
@@ -53,8 +53,8 @@ class Bounds:
     cost: float
 
 
-WARN_BOUNDS = Bounds(reprojection=3.5, worst_point=10.0, mask_iou=0.90, cost=450.0)
-REFUSE_BOUNDS = Bounds(reprojection=6.0, worst_point=np.inf, mask_iou=0.85, cost=900.0)
+WARN_BOUNDS = Bounds(reprojection=4.5, worst_point=11.0, mask_iou=0.91, cost=450.0)
+REFUSE_BOUNDS = Bounds(reprojection=6.5, worst_point=np.inf, mask_iou=0.85, cost=900.0)
 
 
 @dataclass(frozen=True)
