@@ -158,10 +158,9 @@ def rasterization(
             and while a CUDA graph is being captured.
 
     Returns:
-        render: Shape [C, H, W, X], X being D, 1 or D + 1.
-        alphas: Shape [C, H, W, 1], in [0, 1).
-        meta: means2d [C, N, 2], depths [C, N] (both with gradients, so that `retain_grad` works), conics [C, N, 3],
-            radii [C, N, 2], opacities [C, N], camera_ids and gaussian_ids (None), tile_size, width, height, n_cameras.
+        Images, shape [C, H, W, X] with X = D, 1 or D + 1; alphas, shape [C, H, W, 1], in [0, 1); and a dictionary of
+        means2d [C, N, 2], depths [C, N] (both with gradients, so that `retain_grad` works), conics [C, N, 3], radii
+        [C, N, 2], opacities [C, N], camera_ids and gaussian_ids (None), tile_size, width, height and n_cameras.
 
     Raises:
         ValueError: names the argument, what was expected and what it was.

@@ -80,7 +80,7 @@ def spherical_harmonics(
     *,
     validate: bool = True,
 ) -> Float[Tensor, "*batch 3"]:
-    """Sums of real spherical harmonics, sum_k c_k Y_k(d / |d|), as gsplat's function of the same name.
+    """Sums of real spherical harmonics, sum_k c_k Y_k(d) with d a unit vector, as gsplat's function of the same name.
 
     The basis and its order are those of 3DGS (Kerbl et al. 2023, section 5): constant, then -y, z, -x, and so on. Add
     0.5 and cut at 0 to get the colours that 3DGS draws; `rasterization` with `sh_degree` does.
