@@ -7,9 +7,8 @@ import torch
 from hand_build.quality import enclosed_volume, self_crossings
 
 from oasis_warp.core.types import HandPose
-from oasis_warp.hand.correctives import corrective_coefficients
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.skinning import bone_transforms, rest_hand, skin
+from oasis_warp.hand.skinning import bone_transforms, corrective_coefficients, rest_hand, skin
 
 HINGES = [2, 3, 5, 6, 8, 9, 11, 12, 14, 15]
 

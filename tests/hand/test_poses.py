@@ -6,18 +6,12 @@ from hand_build.quality import self_crossings
 
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import POSE_NAMES, named_pose, pose_sequence
-from oasis_warp.hand.skinning import clamp_angles, hand21, rest_hand, skin
+from oasis_warp.hand.skinning import hand21, rest_hand, skin
 
 
 def posed(hand, name):
     pose = HandPose(named_pose(hand, name), torch.eye(3), torch.zeros(3))
     return skin(hand, rest_hand(hand, torch.zeros(40)), pose)
-
-
-@pytest.mark.parametrize("name", POSE_NAMES)
-def test_every_named_pose_keeps_the_limits(hand, name):
-    angles = named_pose(hand, name)
-    torch.testing.assert_close(angles, clamp_angles(hand, angles), rtol=0, atol=1e-6)
 
 
 def test_rest_is_zero_and_open_is_straight(hand):
@@ -96,8 +90,9 @@ def test_a_sequence_can_be_repeated_without_a_jump(hand):
 
 
 def test_every_frame_of_a_sequence_keeps_the_limits(hand):
-    for angles in pose_sequence(hand, POSE_NAMES, 3):
-        torch.testing.assert_close(angles, clamp_angles(hand, angles), rtol=0, atol=1e-6)
+    low, high = hand.pose_limits[1:].unbind(-1)
+    for angles in pose_sequence(hand, POSE_NAMES, 3):  # each third one is a named pose
+        assert ((angles >= low - 1e-6) & (angles <= high + 1e-6)).all()
 
 
 def test_a_sequence_of_nothing_is_refused(hand):

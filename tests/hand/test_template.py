@@ -169,8 +169,9 @@ def test_pose_axes_are_right_handed_frames_along_the_bones(hand):
         assert hand.pose_axes[joint, 2] @ along > 0.999 * along.norm()
 
 
-def test_limits_are_ordered(hand):
-    assert (hand.pose_limits[..., 0] < hand.pose_limits[..., 1]).all()
+def test_rest_lies_within_the_limits_of_each_angle(hand):
+    low, high = hand.pose_limits.unbind(-1)
+    assert (low < high).all() and (low <= 0).all() and (high >= 0).all()
 
 
 def test_texture_coordinates_lie_in_the_unit_square_without_overlap(hand):

@@ -8,8 +8,7 @@ from operator_calls import gradients, mesh
 
 from oasis_warp.core.rotation import from_axis_angle, from_matrix, multiply
 from oasis_warp.core.types import HandPose
-from oasis_warp.hand.correctives import corrective_coefficients
-from oasis_warp.hand.skinning import rest_hand, skin
+from oasis_warp.hand.skinning import corrective_coefficients, rest_hand, skin
 from oasis_warp.ops import RestMesh, face_rotations, rest_mesh
 from oasis_warp.reference import posing as reference
 

@@ -12,7 +12,7 @@ import torch
 
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
-from oasis_warp.hand.correctives import corrective_coefficients
+from oasis_warp.hand.skinning import corrective_coefficients
 
 # Offsets of the network's landmarks from the hand's joints and tips, in millimetres on a hand of 190 mm: along the bone
 # to the tip, towards the back of the hand, and along the cross product of both. From least squares over 63 photos, then

@@ -1,4 +1,4 @@
-"""Pose the hand: shape and joint angles -> surface, joints and finger tips; clamp angles."""
+"""Pose the hand: shape and joint angles -> surface, joints and finger tips."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,6 @@ from torch import Tensor
 from oasis_warp import ops
 from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
 from oasis_warp.core.types import HandPose, PosedHand
-from oasis_warp.hand.correctives import has_correctives
 from oasis_warp.ops import BoneTransforms
 
 
@@ -32,6 +31,34 @@ def bone_transforms(
 
 def _bones(hand: HandModel, joints: Tensor, pose: HandPose) -> BoneTransforms:
     return ops.bone_transforms(*pose, joints, hand.pose_axes, hand.parents, validate=False)
+
+
+def has_correctives(hand: HandModel) -> bool:
+    """Whether `hand` changes its rest surface with its pose.
+
+    Raises:
+        ValueError: it does, but with other than two correctives a joint.
+    """
+    size, expected = hand.corrective_basis.shape[-1], 2 * (len(hand.parents) - 1)
+    if size not in (0, expected):
+        raise ValueError(f"hand: expected 0 or {expected} pose correctives, got {size}. Two for each joint.")
+    return size > 0
+
+
+def corrective_coefficients(hand: HandModel, angles: Float[Tensor, "15 3"]) -> Float[Tensor, "C"]:
+    """Strengths of the pose correctives at joint `angles` [rad]; empty if the hand has none.
+
+    Correctives are displacements of the rest surface that restore what linear blend skinning loses at bent joints. Two
+    per joint, from its flexion: c and c^2 with c = 1 - cos(flexion). Blend skinning shrinks a joint by c to leading
+    order, and both vanish at rest with their derivatives. `ops.bone_transforms` computes the same for many poses.
+
+    Raises:
+        ValueError: `hand` has correctives, but not two a joint.
+    """
+    if not has_correctives(hand):
+        return angles.new_zeros(0)
+    c = 1 - torch.cos(angles[:, 0])
+    return torch.stack([c, c * c], -1).flatten()
 
 
 def skin_surface(hand: HandModel, rest: PosedHand, pose: HandPose) -> Float[Tensor, "*B V 3"]:
@@ -77,9 +104,3 @@ def _transformed(transforms: Tensor, bones: Sequence[int], points: Tensor) -> Te
 def hand21(posed: PosedHand, hand: HandModel) -> Float[Tensor, "21 3"]:
     """The 21 landmarks [m]: wrist, then base to tip of thumb, index, middle, ring, little."""
     return torch.cat([posed.joints, posed.tips])[hand.keypoint_index]
-
-
-def clamp_angles(hand: HandModel, angles: Float[Tensor, "15 3"]) -> Float[Tensor, "15 3"]:
-    """`angles` [rad], clamped to the limits of their joints."""
-    low, high = hand.pose_limits[1:].unbind(-1)
-    return torch.minimum(torch.maximum(angles, low), high)

@@ -9,7 +9,7 @@ from torch import Tensor
 from oasis_warp.avatar.anchors import inset_offsets
 from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
 from oasis_warp.core.rotation import from_axis_angle
-from oasis_warp.hand.correctives import corrective_coefficients
+from oasis_warp.hand.skinning import corrective_coefficients
 
 FINGERS, BONES = 5, 3
 """The bones of a finger follow each other in `HandModel`. All fingers are posed together, from the palm outwards."""

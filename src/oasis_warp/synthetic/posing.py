@@ -63,7 +63,7 @@ def pose_people(body: Body, people: Sequence[Person], numbers: ShotTensors) -> P
     rest, joints, tips, ring = (torch.stack([getattr(p, name) for p in people])
                                 for name in ("rest", "joints", "tips", "ring"))  # fmt: skip
     bend = 1 - torch.cos(numbers.angles[..., 0])
-    correctives = torch.stack([bend, bend * bend], -1).flatten(1)  # `hand.correctives.corrective_coefficients`
+    correctives = torch.stack([bend, bend * bend], -1).flatten(1)  # `hand.skinning.corrective_coefficients`
     skinned = batched_lbs(
         rest, hand.corrective_basis, correctives, body.normals[: body.n_hand], body.knuckle_rise, numbers.knuckles,
         hand.weights, numbers.rotations, numbers.translations,
