@@ -20,6 +20,7 @@ from torch.nn.functional import avg_pool2d
 from oasis_warp.adaptation.adapt import adapt, add_detail
 from oasis_warp.adaptation.reliability import observe_photos
 from oasis_warp.avatar.observation import inner_mask
+from oasis_warp.avatar.quality import over_photo
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit
@@ -33,11 +34,11 @@ from oasis_warp.estimation.hand_crop import (
     refine_surfaces,
     resolutions,
 )
-from oasis_warp.evaluation.same_hand import compare_with_photo, draw_as_photo, photos_of_hands
+from oasis_warp.evaluation.same_hand import compare_with_photo, photos_of_hands
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.hand_avatar import Avatar
+from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
 from oasis_warp.ops import depth_map
-from oasis_warp.reconstruction import composite_over_photo, make_avatar, reconstruct_same_hand
+from oasis_warp.reconstruction import reconstruct_same_hand
 from studies.harness import AvatarOptions, Row, measured
 from studies.inputs import SAME_HAND, estimator, prior_named
 from studies.tables import Column, Section, groups, table
@@ -124,7 +125,7 @@ def fine_errors(
     gaussians: CanonicalGaussians, fit: HandFit, offsets: Tensor, crop: HandCrop, best: Tensor
 ) -> tuple[float, float]:
     """Root mean square of fine structure [1/255]: wherever the photo shows the hand, and where it is `best` [V]."""
-    picture = composite_over_photo(make_avatar(fit, offsets, crop, gaussians), crop)
+    picture = over_photo(draw_as_photo(make_avatar(fit, offsets, crop, gaussians), crop, fit.pose), crop)
     difference = (picture - crop.image).permute(2, 0, 1)
     fine = (difference - avg_pool2d(difference, WINDOW, stride=1, padding=WINDOW // 2)).square().mean(0)
     faces, camera, inside = bundled_hand().faces, crop.camera, inside_outline(crop)

@@ -11,14 +11,16 @@ from oasis_warp.avatar.pose import in_even_light, pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.checks import check_shape
-from oasis_warp.core.config import WHITE
+from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.mirror import mirror_canonical, mirror_hand, mirror_light, mirror_points
+from oasis_warp.core.mirror import mirror_camera, mirror_canonical, mirror_hand, mirror_light, mirror_points
 from oasis_warp.core.types import (
     Camera,
     CanonicalGaussians,
     Color,
     Gaussians,
+    HandCrop,
+    HandFit,
     HandLight,
     HandPose,
     PosedHand,
@@ -132,7 +134,8 @@ class Avatar:
         Raises:
             ValueError: a part of the pose has another shape or is not finite.
         """
-        posed = skin_surface(self._model, self._rest, self._checked(pose, validate))
+        checked = self._checked(pose, validate)
+        posed = skin_surface(self._model, self._rest, checked)
         return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light)
 
     def render(
@@ -162,21 +165,20 @@ class Avatar:
             color = plain_background(tuple(color.tolist()), 1, like=self.shape)[0]
         named = {**pose._asdict(), "viewmat": camera.viewmat, "K": camera.K}
         inputs = (*named.values(), color)
-        if self.shape.dtype != torch.float32 or not replayable(self.device, (*inputs, *self._fixed)):
-            if validate:
-                check_finite(**named)
-            return render(self.pose(pose, validate=False), camera, background=background)
 
         def draw(*parts: Tensor) -> tuple[Tensor, ...]:
             *posed, viewmat, K, color = (part.to(self.shape) for part in parts)
-            seen = Camera(viewmat, K, camera.width, camera.height)
-            return tuple(render(self.pose(HandPose(*posed), validate=False), seen, background=color))
+            gaussians = self.pose(HandPose(*posed), validate=False)
+            return tuple(render(gaussians, Camera(viewmat, K, *size), background=color))
 
-        looking = validate and all(tensor.is_cuda for tensor in named.values())  # while the picture is drawn
-        if validate and not looking:
-            check_finite(**named)
         size = camera.width, camera.height
-        with DeferredFiniteCheck(**named) if looking else nullcontext():
+        replays = self.shape.dtype == torch.float32 and replayable(self.device, (*inputs, *self._fixed))
+        meanwhile = replays and validate and all(tensor.is_cuda for tensor in named.values())
+        if validate and not meanwhile:
+            check_finite(**named)
+        if not replays:
+            return Render(*draw(*inputs))
+        with DeferredFiniteCheck(**named) if meanwhile else nullcontext():  # while the picture is drawn
             return Render(*replayed(self._graphs, size, lambda: CapturedGraph(draw, inputs, self.shape), draw, inputs))
 
     def in_even_light(self) -> "Avatar":
@@ -236,3 +238,31 @@ class Avatar:
             source_camera=Camera(**group("source_camera."), **header["source_camera"]),
             light=HandLight(**light) if (light := group("light.")) else None,
         )
+
+
+def make_avatar(
+    fit: HandFit,
+    offsets: Float[Tensor, "V 3"],
+    crop: HandCrop,
+    gaussians: CanonicalGaussians,
+    light: HandLight | None = None,
+) -> Avatar:
+    """The hand of `fit` with the looks of `gaussians` in `light`; `offsets` and `crop` are those of its making."""
+    camera = crop.camera
+    return Avatar(
+        side=fit.side,
+        shape=fit.shape.to(crop.image),
+        surface_offsets=offsets.to(crop.image),
+        gaussians=gaussians,
+        source_pose=fit.pose,
+        source_camera=mirror_camera(camera) if fit.side == "left" else camera,
+        light=light,
+    )
+
+
+@torch.no_grad()
+def draw_as_photo(avatar: Avatar, crop: HandCrop, pose: HandPose) -> Render:
+    """`avatar` in the `pose` and camera of a photo, over black; a left hand is mirrored, as in its crop."""
+    left = avatar.side == "left"
+    drawn = avatar.render(mirror_camera(crop.camera) if left else crop.camera, pose, BLACK)
+    return Render(drawn.image.flip(1), drawn.alpha.flip(1)) if left else drawn

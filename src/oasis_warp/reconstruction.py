@@ -8,30 +8,29 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
-from oasis_warp.adaptation.reliability import VertexObservations
 from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.avatar.quality import (
-    SEEN,
     SurfaceQuality,
     assess_surface,
     combine_quality,
+    coverage_of_photos,
     coverage_percent,
     coverage_warnings,
+    over_photo,
     photo_warnings,
 )
 from oasis_warp.core import surface
-from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
+from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.mirror import mirror_camera, mirror_pose
-from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, HandLight, Landmarks, Photo, Render
+from oasis_warp.core.mirror import mirror_pose
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, Landmarks, Photo, Render
 from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_hand, fit_together
 from oasis_warp.estimation.fit_quality import keeps_quality, with_pose
 from oasis_warp.estimation.hand_crop import (
@@ -49,7 +48,7 @@ from oasis_warp.estimation.hand_crop import (
 from oasis_warp.estimation.keypoints import read_keypoints
 from oasis_warp.estimation.refine import refine
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.hand_avatar import Avatar
+from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.ops import warm_up
@@ -208,22 +207,22 @@ def _run(
     with stage("outline"):
         surfaces = refine_surfaces(hand, photos, fits, surfaces, guesses, config)
         crops = crop_hands(photos, fits, surfaces, config)
+        close = crop_hands(photos, fits, surfaces, config, finer=True)
+        scales, close_scales = resolutions(fits, crops), resolutions(fits, close)
     with stage("adaptation"):
         if is_low_resolution(config, *fits):
             guesses = [coarsen(hand, guess, crops[0].rest) for guess in guesses]
         settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
-        adaptation = adapt(
-            hand, guesses, crops, settings, resolutions=resolutions(fits, crops), progress=progress
-        )
+        adaptation = adapt(hand, guesses, crops, settings, resolutions=scales, progress=progress)
     with stage("detail"):
-        close = crop_hands(photos, fits, surfaces, config, finer=True)
-        adaptation = add_detail(hand, adaptation, close, resolutions(fits, close), COARSE_SIZE, progress)
+        adaptation = add_detail(hand, adaptation, close, close_scales, COARSE_SIZE, progress)
     avatar = make_avatar(fits[0], surfaces.shared, crops[0], adaptation.gaussians, adaptation.light)
     with stage("quality"):
+        areas = surface.vertex_areas(crops[0].rest.vertices, hand.faces.to(config.device))
         parts = [_assess(hand, adaptation, k, fits[k], surfaces, crops[k], close[k]) for k in range(len(photos))]
         quality = combine_quality([part[0] for part in parts])
-        coverage = coverage_percent(hand, crops[0].rest.vertices, quality)
-        shares = surface_shares(hand, crops[0], adaptation.observations)
+        coverage = coverage_percent(hand, areas, quality)
+        shares = coverage_of_photos(areas, adaptation.observations.confidence, adaptation.observations.share)
         doubts = [photo_warnings(near.image, near.mask, crop_side(fit)) for near, fit in zip(close, fits, strict=True)]
     measured = [{"refined_px": px} | part[1] | own for px, part, own in zip(moved, parts, shares, strict=True)]
     about = tuple(map(PhotoOfHand, (photo.name for photo in photos), fits, _tuples(adaptation.gains), measured))
@@ -250,26 +249,6 @@ def _refine_fits(
     return refined, moved
 
 
-def make_avatar(
-    fit: HandFit,
-    offsets: torch.Tensor,
-    crop: HandCrop,
-    gaussians: CanonicalGaussians,
-    light: HandLight | None = None,
-) -> Avatar:
-    """The hand of `fit` with the looks of `gaussians` in `light`; `offsets` and `crop` are those of its making."""
-    camera = crop.camera
-    return Avatar(
-        side=fit.side,
-        shape=fit.shape.to(crop.image),
-        surface_offsets=offsets.to(crop.image),
-        gaussians=gaussians,
-        source_pose=fit.pose,
-        source_camera=mirror_camera(camera) if fit.side == "left" else camera,
-        light=light,
-    )
-
-
 def _assess(
     hand: HandModel, adaptation: Adaptation, k: int, fit: HandFit, surfaces: Surfaces, crop: HandCrop, close: HandCrop
 ) -> tuple[SurfaceQuality, dict[str, float]]:
@@ -278,34 +257,19 @@ def _assess(
     as_bright = gaussians._replace(colors=(gaussians.colors * adaptation.gains[k]).clamp(0, 1))
     light = adaptation.lights[k] if adaptation.lights else None
     avatar = make_avatar(fit, surfaces.own[k], crop, as_bright, light)
+    drawn, near = draw_as_photo(avatar, crop, fit.pose), draw_as_photo(avatar, close, fit.pose)
     errors = {
         "reprojection_percent": fit.reprojection,
         "worst_point_percent": fit.worst_point,
         "mask_iou": fit.mask_iou,
-        **input_errors(avatar, close),
+        **input_errors(near, close),
     }
-    return assess_surface(hand, crop, composite_over_photo(avatar, crop)), errors
+    return assess_surface(hand, crop, over_photo(drawn, crop)), errors
 
 
-def _input_view(avatar: Avatar, crop: HandCrop) -> Render:
-    """The avatar over black as `crop` shows the hand; a left hand is mirrored."""
-    if avatar.side == "right":
-        return avatar.render(crop.camera, avatar.source_pose, BLACK)
-    image, alpha = avatar.render(mirror_camera(crop.camera), avatar.source_pose, BLACK)
-    return Render(image.flip(1), alpha.flip(1))
-
-
-@torch.no_grad()
-def composite_over_photo(avatar: Avatar, crop: HandCrop) -> Float[Tensor, "S S 3"]:
-    """The avatar drawn over its own photo."""
-    image, alpha = _input_view(avatar, crop)
-    return image + (1 - alpha)[..., None] * crop.image
-
-
-@torch.no_grad()
-def input_errors(avatar: Avatar, crop: HandCrop) -> dict[str, float]:
-    """How well the avatar explains its own photo: over black, inside the mask above the wrist line, in the crop."""
-    image, alpha = _input_view(avatar, crop)
+def input_errors(drawn: Render, crop: HandCrop) -> dict[str, float]:
+    """How well an avatar, drawn over black as `crop` shows it, explains its photo inside the mask above the wrist."""
+    image, alpha = drawn
     judged = crop.above_wrist > 0.5
     inside = ((crop.mask > 0.5) & judged).to(image)
     covered = (alpha > 0.5) & judged
@@ -315,20 +279,6 @@ def input_errors(avatar: Avatar, crop: HandCrop) -> dict[str, float]:
         "input_psnr_inner_db": masked_psnr(image, crop.image, inner_mask(inside)),
         "render_mask_iou": float((covered & (inside > 0)).sum() / union),
     }
-
-
-def surface_shares(hand: HandModel, crop: HandCrop, observations: VertexObservations) -> list[dict[str, float]]:
-    """Of the hand's surface at rest [%]: what each photo shows, and what it shows best of all."""
-    areas = surface.vertex_areas(crop.rest.vertices, hand.faces.to(crop.image.device))
-    seen = observations.confidence >= SEEN
-    best = (observations.confidence * observations.share).argmax(0)
-
-    def percent(where: Tensor) -> float:
-        return 100 * float((areas * where).sum() / areas.sum())
-
-    return [
-        {"seen_percent": percent(shown), "best_percent": percent(shown & (best == k))} for k, shown in enumerate(seen)
-    ]
 
 
 def _name_warnings(photos: Sequence[PhotoOfHand], doubts: Sequence[Sequence[str]]) -> list[str]:

@@ -81,7 +81,7 @@ def test_what_is_uncertain_is_more_often_wrong(hand, case):
 
 def test_shares_of_the_surface_add_up(hand, case):
     crop, _, quality = case
-    found = coverage_percent(hand, crop.rest.vertices, quality)
+    found = coverage_percent(hand, surface.vertex_areas(crop.rest.vertices, hand.faces), quality)
     assert sum(found[f"{kind}_percent"] for kind in ("seen", "grazed", "extrapolated")) == pytest.approx(100)
     assert found["palm_seen_percent"] > 60 and found["back_seen_percent"] < 10
     assert 0 < found["uncertainty_mean"] < 1
@@ -100,7 +100,7 @@ def test_a_hand_of_which_nothing_is_seen_is_guessed_throughout(hand, case):
     crop, _, _ = case
     quality = assess_surface(hand, crop._replace(mask=torch.zeros_like(crop.mask)), crop.image)
     assert (quality.visibility == 0).all() and (quality.uncertainty == 1).all()
-    found = coverage_percent(hand, crop.rest.vertices, quality)
+    found = coverage_percent(hand, surface.vertex_areas(crop.rest.vertices, hand.faces), quality)
     assert found["extrapolated_percent"] == 100
     assert "little was seen" in coverage_warnings(found)[0]
 
@@ -144,7 +144,7 @@ def test_shares_are_shares_of_area(hand, case, name):
     rest = case[0].rest.vertices
     area, region = surface.vertex_areas(rest, hand.faces), region_masks(label_regions(hand))[name]
     seen = (area > area[region > 0.5].median()).float()  # the larger half of the region's vertices
-    found = coverage_percent(hand, rest, SurfaceQuality(seen, 1 - seen))
+    found = coverage_percent(hand, area, SurfaceQuality(seen, 1 - seen))
     of_area = float((area * region * seen).sum() / (area * region).sum())
     assert of_area > float((region * seen).sum() / region.sum()) + 0.05, "vertices are unlike enough to tell"
     assert found[f"{name}_seen_percent"] == pytest.approx(100 * of_area, abs=0.01)

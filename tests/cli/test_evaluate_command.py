@@ -21,10 +21,10 @@ from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
 from oasis_warp.evaluation.same_hand import (
     compare_pairs,
     compare_with_photo,
-    draw_as_photo,
     photos_of_hands,
     summarise_pairs,
 )
+from oasis_warp.hand_avatar import draw_as_photo
 from oasis_warp.reconstruction import reconstruct
 
 SMALL = ReconstructConfig(size=96)

@@ -15,7 +15,7 @@ from oasis_warp.avatar.appearance import label_regions, region_masks
 from oasis_warp.avatar.observation import inner_mask, observe
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import HandCrop
+from oasis_warp.core.types import HandCrop, Render
 
 SEEN = 0.5
 """Confidence of an observation from which a place counts as seen; below it the photo only grazes it."""
@@ -73,16 +73,23 @@ def assess_surface(hand: HandModel, crop: HandCrop, drawn: Float[Tensor, "S S 3"
     return SurfaceQuality(seen.confidence, uncertainty)
 
 
+def over_photo(drawn: Render, crop: HandCrop) -> Float[Tensor, "S S 3"]:
+    """What was drawn over black, over the photo instead."""
+    return drawn.image + (1 - drawn.alpha)[..., None] * crop.image
+
+
 def combine_quality(qualities: Sequence[SurfaceQuality]) -> SurfaceQuality:
     """How well each vertex is known from several photos: as from the one that says most of it."""
     visibility, uncertainty = (torch.stack(values) for values in zip(*qualities, strict=True))
     return SurfaceQuality(visibility.amax(0), uncertainty.amin(0))
 
 
-def coverage_percent(hand: HandModel, rest: Float[Tensor, "V 3"], quality: SurfaceQuality) -> dict[str, float]:
-    """Shares of the surface [%]: seen, grazed, not seen; seen of palm, back and nails; and the mean uncertainty."""
-    area = surface.vertex_areas(rest, hand.faces.to(rest.device)).cpu()
-    visibility = quality.visibility.cpu()
+def coverage_percent(hand: HandModel, areas: Float[Tensor, "V"], quality: SurfaceQuality) -> dict[str, float]:
+    """Shares of the surface [%]: seen, grazed, not seen; seen of palm, back and nails; and the mean uncertainty.
+
+    `areas` are those of the vertices at rest.
+    """
+    area, visibility = areas.cpu(), quality.visibility.cpu()
     seen, grazed = (visibility >= SEEN).float(), ((visibility > 0) & (visibility < SEEN)).float()
 
     def mean(values: Tensor, weight: Tensor) -> float:
@@ -94,6 +101,21 @@ def coverage_percent(hand: HandModel, rest: Float[Tensor, "V 3"], quality: Surfa
         found[f"{name}_seen_percent"] = 100 * mean(seen, area * weight)
     found["uncertainty_mean"] = mean(quality.uncertainty.cpu(), area)
     return found
+
+
+def coverage_of_photos(
+    areas: Float[Tensor, "V"], confidence: Float[Tensor, "K V"], share: Float[Tensor, "K V"]
+) -> list[dict[str, float]]:
+    """Of the surface [%]: what each of K photos shows, and what it shows best of all; see `VertexObservations`."""
+    best = (confidence * share).argmax(0)
+
+    def percent(where: Tensor) -> float:
+        return 100 * float((areas * where).sum() / areas.sum())
+
+    return [
+        {"seen_percent": percent(shown), "best_percent": percent(shown & (best == k))}
+        for k, shown in enumerate(confidence >= SEEN)
+    ]
 
 
 def coverage_warnings(found: dict[str, float]) -> list[str]:

@@ -17,10 +17,9 @@ from oasis_warp import __version__
 from oasis_warp.avatar.appearance import label_regions, region_masks
 from oasis_warp.avatar.observation import Observation, inner_mask, observe
 from oasis_warp.avatar.prior import Prior
-from oasis_warp.core.config import BLACK, ReconstructConfig
+from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.mirror import mirror_camera
 from oasis_warp.core.types import HandCrop, HandPose, Landmarks, Photo, Render
 from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.data.photo import read_photo
@@ -31,9 +30,9 @@ from oasis_warp.evaluation.metrics import COVERED, color_gain
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, select
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.hand_avatar import Avatar
+from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
 from oasis_warp.losses.image import masked_psnr, ssim_map
-from oasis_warp.reconstruction import Reconstruction, make_avatar, reconstruct
+from oasis_warp.reconstruction import Reconstruction, reconstruct
 
 PHOTO_METHODS = (
     Method("mean", ONE_SHOT),
@@ -116,14 +115,6 @@ def compare_pairs(
             }
             shown = next(iter(crops.values())).image
             yield Pair(source, target, shown, {name: what.image for name, what in drawn.items()}, scores)
-
-
-@torch.no_grad()
-def draw_as_photo(avatar: Avatar, crop: HandCrop, pose: HandPose) -> Render:
-    """`avatar` in the `pose`, in its photo's own frame, and camera of another photo; a left hand is mirrored."""
-    left = avatar.side == "left"
-    drawn = avatar.render(mirror_camera(crop.camera) if left else crop.camera, pose, BLACK)
-    return Render(drawn.image.flip(1), drawn.alpha.flip(1)) if left else drawn
 
 
 @torch.no_grad()
