@@ -10,7 +10,6 @@ from torch import Tensor
 from oasis_warp.avatar.pose import in_even_light, pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.backgrounds import plain_background
-from oasis_warp.core.checks import check_shape
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_camera, mirror_canonical, mirror_hand, mirror_light, mirror_points
@@ -31,6 +30,7 @@ from oasis_warp.data.avatar_file import load_avatar, save_avatar
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import DeferredFiniteCheck, check_finite, rest_mesh
+from oasis_warp.ops.checks import check_shape
 from oasis_warp.render.render import render
 from oasis_warp.render.replay import CapturedGraph, GraphCache, replayable, replayed
 

@@ -1,1 +1,1 @@
-"""The nouns that stages hand to each other, and the checks at the public border."""
+"""The nouns that stages hand to each other, and what needs nothing but torch."""

@@ -16,10 +16,10 @@ from safetensors.torch import save
 from torch import Tensor
 
 from oasis_warp import __version__
-from oasis_warp.core.checks import check_finite, check_shape
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import write_file
 from oasis_warp.data.tensor_file import open_tensors
+from oasis_warp.ops.checks import check_finite, check_shape
 
 FORMAT = "oasis-avatar"
 VERSION = 4

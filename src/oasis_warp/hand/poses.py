@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.core.checks import check_choice
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.ops.checks import check_choice
 
 Finger = tuple[float, float, float, float]
 """Flexion of a finger's three joints from the knuckle outwards, and abduction of the knuckle [degrees]."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_origin
 
-from oasis_warp.core.checks import check_choice
+from oasis_warp.ops.checks import check_choice
 
 
 @dataclass(frozen=True, kw_only=True)

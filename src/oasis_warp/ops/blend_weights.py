@@ -10,11 +10,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from oasis_kernels import constants
-from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.rasterization_checks import check_cameras, check_gaussians
 from oasis_warp.ops._runtime.records import Splats
 from oasis_warp.ops._runtime.weigh import weigh
+from oasis_warp.ops.checks import check_float, check_shape
 from oasis_warp.ops.projection import project
 
 

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_warp.core.checks import check_choice, check_positive
 from oasis_warp.ops._runtime.declaration import Array, Operator
 from oasis_warp.ops._runtime.depth_buffer import draw, plane_size
 from oasis_warp.ops._runtime.depth_scene import BufferParts, DepthScene
 from oasis_warp.ops._runtime.incidence import incidence
+from oasis_warp.ops.checks import check_choice, check_positive
 
 
 class DepthMap(NamedTuple):

@@ -8,11 +8,11 @@ from torch import Tensor
 
 from oasis_kernels.posing import face_rotation as kernels
 from oasis_kernels.posing import face_rotation_native as native_kernels
-from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.ops._runtime import launch
 from oasis_warp.ops._runtime.declaration import Array, Operator, empty_gradients, needs_gradient
 from oasis_warp.ops._runtime.incidence import Incidence, incidence, sum_at_items
 from oasis_warp.ops._runtime.launch import launch_ranges
+from oasis_warp.ops.checks import check_float, check_shape
 
 
 class RestMesh(NamedTuple):

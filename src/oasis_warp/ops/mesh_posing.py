@@ -6,7 +6,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels.posing import face_stretch as stretch_kernels
-from oasis_warp.core.checks import check_choice
 from oasis_warp.ops._runtime.declaration import Array, Operator, empty_gradients
 from oasis_warp.ops._runtime.incidence import gaussians_at_vertices, incidence, sum_at_items
 from oasis_warp.ops._runtime.launch import contiguous, has_cuda_kernels, has_vectors, launch_ranges
@@ -18,6 +17,7 @@ from oasis_warp.ops._runtime.mesh_gaussians import (
     pose_float32,
     pose_float64,
 )
+from oasis_warp.ops.checks import check_choice
 
 HALF_POWERS = {"sqrt_area": 1, "area": 2, "none": 0}
 """Twice the exponent of the area ratio in each scale law."""

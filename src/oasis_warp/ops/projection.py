@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float, Float64, Int32, UInt8
 from torch import Tensor
 
-from oasis_warp.core.checks import check_finite
 from oasis_warp.ops._runtime.declaration import Array, Operator, empty_gradients
 from oasis_warp.ops._runtime.launch import contiguous, has_cuda_kernels, has_vectors
 from oasis_warp.ops._runtime.projection_backends import (
@@ -28,6 +27,7 @@ from oasis_warp.ops._runtime.projection_backends import (
     project_vectors,
 )
 from oasis_warp.ops._runtime.records import Tables, tables
+from oasis_warp.ops.checks import check_finite
 
 
 class Projection(NamedTuple):

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from oasis_kernels import constants
 from oasis_warp.core.backgrounds import plain_background
-from oasis_warp.core.checks import check_choice
 from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.rasterization_checks import (
@@ -22,6 +21,7 @@ from oasis_warp.ops._runtime.rasterization_checks import (
 )
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 from oasis_warp.ops.blending import blend
+from oasis_warp.ops.checks import check_choice
 from oasis_warp.ops.gsplat_options import compensated_opacities, record_absolute_gradients
 from oasis_warp.ops.projection import Projection, project
 from oasis_warp.ops.spherical_harmonics import sh_to_rgb

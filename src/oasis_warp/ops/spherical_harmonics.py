@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels.rasterize import spherical_harmonics as kernels
-from oasis_warp.core.checks import check_float
 from oasis_warp.ops._runtime.declaration import Array, Operator, empty_gradients
 from oasis_warp.ops._runtime.launch import (
     SCALAR,
@@ -19,6 +18,7 @@ from oasis_warp.ops._runtime.launch import (
     run_cuda,
     vectors,
 )
+from oasis_warp.ops.checks import check_float
 
 MAX_DEGREE = 3
 

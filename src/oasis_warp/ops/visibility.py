@@ -5,11 +5,11 @@ from typing import NamedTuple
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from oasis_warp.core.checks import check_integer, check_positive
 from oasis_warp.ops._runtime.declaration import Array, Operator, needs_gradient
 from oasis_warp.ops._runtime.depth_buffer import draw, gradients
 from oasis_warp.ops._runtime.depth_scene import BufferParts, DepthScene, Query
 from oasis_warp.ops._runtime.incidence import incidence
+from oasis_warp.ops.checks import check_integer, check_positive
 from oasis_warp.ops.depth_map import MESH_AND_CAMERA, check_picture, expand_batch
 
 MARGIN_TAUS = 3.0

@@ -21,9 +21,9 @@ from torch import Tensor
 from torch.autograd.function import Function
 from torch.nn import Parameter
 
-from oasis_warp.core.checks import check_float, check_shape
 from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime.values import check_finite
+from oasis_warp.ops.checks import check_float, check_shape
 
 NAMESPACE = "oasis_warp"
 BATCH = "*B"

@@ -12,13 +12,13 @@ from torch import Tensor
 from oasis_kernels.depth import depth_buffer as kernels
 from oasis_kernels.depth import depth_buffer_native as vectors
 from oasis_kernels.depth.depth_buffer_native import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
-from oasis_warp.core.checks import check_index, check_positive
 from oasis_warp.ops._runtime import depth_cuda
 from oasis_warp.ops._runtime.depth_scene import Buffer, BufferParts, DepthScene, Query, Scores, restrict, shared
 from oasis_warp.ops._runtime.incidence import _transposed, sum_at_items
 from oasis_warp.ops._runtime.launch import SCALAR_NAMES, launch, run_shared, view
 from oasis_warp.ops._runtime.pair_counts import own_slot
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
+from oasis_warp.ops.checks import check_index, check_positive
 
 Drawn = tuple[Buffer, Scores | None]
 MAX_FRACTION_BITS = 22

@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from oasis_kernels.posing import incidence as kernels
-from oasis_warp.core.checks import check_index
 from oasis_warp.ops._runtime.launch import launch_ranges
+from oasis_warp.ops.checks import check_index
 
 
 class Incidence(NamedTuple):

@@ -14,7 +14,6 @@ from oasis_kernels.rasterize import projection as generic
 from oasis_kernels.rasterize import projection_native
 from oasis_kernels.rasterize.projection_native import CHUNK
 from oasis_kernels.runtime.native import PHASE_WORDS
-from oasis_warp.core.checks import FINITE_LIMIT
 from oasis_warp.ops._runtime.launch import (
     SCALAR,
     block_count,
@@ -31,6 +30,7 @@ from oasis_warp.ops._runtime.pair_counts import own_slot
 from oasis_warp.ops._runtime.records import counters_size, empty_records, table_params, tables
 from oasis_warp.ops._runtime.rules import current_rules
 from oasis_warp.ops._runtime.values import refuse_capture
+from oasis_warp.ops.checks import FINITE_LIMIT
 
 CAMERA_SUM_BLOCK = 1024
 """Gaussians whose camera gradients one thread adds up; fixed, so that the number of threads changes no sum."""

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from oasis_warp.core.checks import check_float, check_like, check_positive, check_shape
+from oasis_warp.ops.checks import check_float, check_like, check_positive, check_shape
 from oasis_warp.ops.spherical_harmonics import check_degree
 
 MAX_CHANNELS = 32

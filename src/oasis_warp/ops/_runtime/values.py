@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from oasis_kernels.runtime import finite
-from oasis_warp.core import checks
+from oasis_warp.ops import checks
 from oasis_warp.ops._runtime.launch import current_stream, has_vectors, run_cuda, run_native
 from oasis_warp.ops._runtime.pair_counts import slots
 

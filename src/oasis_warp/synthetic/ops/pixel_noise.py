@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels.scene import pixel_noise as kernels
-from oasis_warp.core.checks import check_shape
 from oasis_warp.ops._runtime.launch import launch_ranges
+from oasis_warp.ops.checks import check_shape
 from oasis_warp.synthetic.ops.views import integers
 
 

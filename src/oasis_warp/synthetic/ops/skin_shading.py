@@ -8,10 +8,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels.scene import skin_light, skin_shading
-from oasis_warp.core.checks import check_positive, check_shape
 from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.incidence import incidence
 from oasis_warp.ops._runtime.launch import launch_ranges, view
+from oasis_warp.ops.checks import check_positive, check_shape
 from oasis_warp.ops.depth_map import DepthMap
 from oasis_warp.synthetic.ops.views import Lamps, integers, matrices, scalars, vectors
 

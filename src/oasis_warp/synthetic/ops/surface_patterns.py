@@ -9,9 +9,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels.scene import surface_patterns as kernels
-from oasis_warp.core.checks import check_index, check_positive, check_shape
 from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.launch import launch, launch_ranges
+from oasis_warp.ops.checks import check_index, check_positive, check_shape
 from oasis_warp.synthetic.ops.views import integers, scalars, vectors
 
 

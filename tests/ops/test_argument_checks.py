@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from oasis_warp.core.checks import (
+from oasis_warp.ops.checks import (
     check_choice,
     check_finite,
     check_float,
