@@ -5,9 +5,11 @@ import torch
 from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.mirror import mirror_camera, mirror_pose
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.render.render import render
 
 PALM_TO_CAMERA = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # fingers up, thumb to the right
@@ -28,3 +30,20 @@ def crop_of(hand, vertex_colors, size=96, **pose) -> tuple[HandCrop, CanonicalGa
     camera = orbit_camera(posed.vertices, 0.0, size=size)
     drawn = render(pose_gaussians(truth, hand.faces, rest.vertices, posed.vertices), camera)
     return HandCrop(drawn.image, drawn.alpha, torch.ones_like(drawn.alpha), camera, rest, posed), truth, hand_pose
+
+
+def avatar_of(hand, gaussians, pose, camera, light=None):
+    """A right hand of mean shape."""
+    return Avatar(
+        side="right", shape=torch.zeros(len(hand.shape_names)), surface_offsets=torch.zeros_like(hand.template),
+        gaussians=gaussians, source_pose=pose, source_camera=camera, light=light,
+    )  # fmt: skip
+
+
+def as_left_hand(right):
+    """The left hand that is the mirror image of a right one."""
+    return Avatar(
+        side="left", shape=right.shape, surface_offsets=right.surface_offsets, gaussians=right.gaussians,
+        source_pose=mirror_pose(right.source_pose), source_camera=mirror_camera(right.source_camera),
+        light=right.light,
+    )  # fmt: skip

@@ -4,13 +4,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from synthetic import as_left_hand
 
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.cli import main
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.mirror import mirror_camera, mirror_pose
 from oasis_warp.core.types import HandLight, Photo
 from oasis_warp.editing import edit
 from oasis_warp.hand_avatar import Avatar
@@ -83,11 +83,7 @@ def test_a_transparent_layer_is_paint(truth, chart, made):
 
 def test_a_left_hand_is_the_mirror_image_of_a_right_one(truth, painted, made):
     avatar = truth.avatar
-    left = Avatar(
-        side="left", shape=avatar.shape, surface_offsets=avatar.surface_offsets, gaussians=avatar.gaussians,
-        source_pose=mirror_pose(avatar.source_pose), source_camera=mirror_camera(avatar.source_camera),
-        light=avatar.light,
-    )  # fmt: skip
+    left = as_left_hand(avatar)
     photos = (picture._replace(rgb=picture.rgb.flip(1).contiguous()) for picture in (painted, truth.photo))
     mirrored = edit(left, next(photos), photo=next(photos), config=QUICK)
     assert mirrored.measures["new_gaussians"] == pytest.approx(made.measures["new_gaussians"], rel=0.05)
@@ -170,10 +166,7 @@ def test_paint_is_worn_as_it_was_painted_whatever_the_light_of_the_photo(truth):
     bare = truth.avatar
     light = HandLight(torch.tensor([[0.45, 0.4, 0.35], *[[0.0] * 3] * 3]), torch.tensor([[0.1] * 3, [1.0] * 3]),
                       torch.ones(3))  # fmt: skip
-    avatar = Avatar(
-        side=bare.side, shape=bare.shape, surface_offsets=bare.surface_offsets, gaussians=bare.gaussians,
-        source_pose=bare.source_pose, source_camera=bare.source_camera, light=light,
-    )  # fmt: skip
+    avatar = bare.with_looks(bare.gaussians, light)
     image, alpha = avatar.render(avatar.source_camera, avatar.source_pose, BLACK)
     ground = torch.tensor([0.3, 0.4, 0.35])
     before = image + (1 - alpha)[..., None] * ground

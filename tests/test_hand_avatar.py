@@ -2,13 +2,13 @@ import copy
 
 import pytest
 import torch
-from synthetic import PALM_TO_CAMERA, crop_of
+from synthetic import PALM_TO_CAMERA, as_left_hand, avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import rotation
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.mirror import mirror_camera, mirror_points, mirror_pose
+from oasis_warp.core.mirror import mirror_points
 from oasis_warp.core.types import CanonicalGaussians, HandPose
 from oasis_warp.data.avatar_file import save_avatar
 from oasis_warp.evaluation.metrics import coverage
@@ -19,26 +19,12 @@ from oasis_warp.hand_avatar import Avatar
 @pytest.fixture(scope="module")
 def right(hand):
     crop, truth, pose = crop_of(hand, region_colors(label_regions(hand), 0.03), size=64)
-    return Avatar(
-        side="right",
-        shape=torch.zeros(len(hand.shape_names)),
-        surface_offsets=torch.zeros_like(hand.template),
-        gaussians=truth,
-        source_pose=pose,
-        source_camera=crop.camera,
-    )
+    return avatar_of(hand, truth, pose, crop.camera)
 
 
 @pytest.fixture(scope="module")
 def left(right):
-    return Avatar(
-        side="left",
-        shape=right.shape,
-        surface_offsets=right.surface_offsets,
-        gaussians=right.gaussians,
-        source_pose=mirror_pose(right.source_pose),
-        source_camera=mirror_camera(right.source_camera),
-    )
+    return as_left_hand(right)
 
 
 def test_a_left_hand_is_the_mirror_image_of_a_right_hand(left, right):
@@ -245,8 +231,5 @@ def test_fewer_gaussians_make_a_smaller_file_and_still_an_avatar(right):
         right.gaussians.vertex_index, right.gaussians.offsets, empty, torch.zeros(0, 3),
         *(part[:n] for part in right.gaussians[4:8]),
     )  # fmt: skip
-    avatar = Avatar(
-        side="right", shape=right.shape, surface_offsets=right.surface_offsets, gaussians=few,
-        source_pose=right.source_pose, source_camera=right.source_camera,
-    )  # fmt: skip
+    avatar = right.with_looks(few, None)
     assert len(avatar.pose(avatar.source_pose).means) == n

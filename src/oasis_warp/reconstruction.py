@@ -223,12 +223,12 @@ def _run(
         quality = combine_quality([part[0] for part in parts])
         coverage = coverage_percent(hand, areas, quality)
         shares = coverage_of_photos(areas, adaptation.observations.confidence, adaptation.observations.share)
-        doubts = [photo_warnings(near.image, near.mask, crop_side(fit)) for near, fit in zip(close, fits, strict=True)]
+        warnings = [photo_warnings(c.image, c.mask, crop_side(fit)) for c, fit in zip(close, fits, strict=True)]
     measured = [{"refined_px": px} | part[1] | own for px, part, own in zip(moved, parts, shares, strict=True)]
     about = tuple(map(PhotoOfHand, (photo.name for photo in photos), fits, _tuples(adaptation.gains), measured))
     coverage["n_gaussians"] = float(len(avatar.gaussians.opacities))
     fused = FusedReconstruction(avatar, about, prior.about, stages, coverage, (), quality)
-    return _Outcome(fused, doubts, coverage_warnings(coverage))
+    return _Outcome(fused, warnings, coverage_warnings(coverage))
 
 
 def _tuples(gains: Float[Tensor, "K 3"]) -> list[tuple[float, float, float]]:
@@ -281,11 +281,11 @@ def input_errors(drawn: Render, crop: HandCrop) -> dict[str, float]:
     }
 
 
-def _name_warnings(photos: Sequence[PhotoOfHand], doubts: Sequence[Sequence[str]]) -> list[str]:
-    """Of the fits, the photos (`doubts`) and how they go together; each begins with the photo's name."""
+def _name_warnings(photos: Sequence[PhotoOfHand], warnings: Sequence[Sequence[str]]) -> list[str]:
+    """Warnings of the fits, the photos and their differences; each begins with the photo's name."""
     messages = [
         f"{photo.name}: {warning}"
-        for photo, own in zip(photos, doubts, strict=True)
+        for photo, own in zip(photos, warnings, strict=True)
         for warning in (*photo.fit.warnings, *own)
     ]
     for photo in photos[1:]:

@@ -2,15 +2,15 @@ import math
 
 import pytest
 import torch
-from synthetic import crop_of
+from synthetic import as_left_hand, avatar_of, crop_of
 
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.sh_lighting import (
+    ALBEDO_SHARE,
     SKIN_DEVIATION,
-    STAYS,
     add_shade,
     fit_light,
-    marks,
+    mark_probability,
     split_albedo_shading,
     weighted_deviation,
     without_light,
@@ -30,7 +30,7 @@ from oasis_warp.avatar.pose import (
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.config import AdaptConfig
-from oasis_warp.core.mirror import mirror_camera, mirror_light, mirror_points, mirror_pose
+from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import HandLight
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
@@ -52,15 +52,6 @@ def scene(hand):
     drawn = render(there, even.camera)
     behind = (1 - drawn.alpha)[..., None]
     return even, truth, pose, even._replace(image=drawn.image + behind * even.image)
-
-
-def avatar(truth, pose, crop, light, hand, side="right"):
-    left = side == "left"
-    return Avatar(
-        side=side, shape=torch.zeros(len(hand.shape_names)), surface_offsets=torch.zeros_like(hand.template),
-        gaussians=truth, source_pose=mirror_pose(pose) if left else pose,
-        source_camera=mirror_camera(crop.camera) if left else crop.camera, light=light,
-    )  # fmt: skip
 
 
 def test_light_is_found_and_taken_off(hand, scene):
@@ -107,10 +98,10 @@ def test_what_light_does_to_a_photo_is_drawn_again(hand, scene):
     _, _, pose, lit = scene
     adapted = adapt(hand, [MeanPrior(hand)(lit)], [lit], AdaptConfig(texture_steps=20))
     assert adapted.light is not None
-    drawn = avatar(adapted.gaussians, pose, lit, adapted.light, hand).render(lit.camera, pose)
+    drawn = avatar_of(hand, adapted.gaussians, pose, lit.camera, adapted.light).render(lit.camera, pose)
     kept = adapt(hand, [MeanPrior(hand)(lit)], [lit], AdaptConfig(texture_steps=20, light="keep"))
     assert kept.light is None
-    baked = avatar(kept.gaussians, pose, lit, None, hand).render(lit.camera, pose)
+    baked = avatar_of(hand, kept.gaussians, pose, lit.camera, None).render(lit.camera, pose)
     inside = lit.mask > 0.99
     errors = [float((image - lit.image)[inside].square().mean().sqrt()) for image in (drawn.image, baked.image)]
     assert errors[0] < 1.1 * errors[1]
@@ -118,12 +109,12 @@ def test_what_light_does_to_a_photo_is_drawn_again(hand, scene):
 
 def test_light_stays_when_the_hand_turns(hand, scene):
     even, truth, pose, _ = scene
-    lit = avatar(truth, pose, even, LIGHT, hand)
+    lit = avatar_of(hand, truth, pose, even.camera, LIGHT)
     half = rotation.from_axis_angle(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(torch.pi))
     turned = pose._replace(orientation=half @ pose.orientation)
     before, after = lit.pose(pose).colors, lit.pose(turned).colors
     assert float((before - after).abs().max()) > 0.1
-    follows = avatar(truth, pose, even, turn_light(LIGHT, half), hand)
+    follows = avatar_of(hand, truth, pose, even.camera, turn_light(LIGHT, half))
     torch.testing.assert_close(follows.pose(turned).colors, before, atol=1e-5, rtol=0)
 
 
@@ -147,7 +138,7 @@ def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene, of):
     even, truth, pose, _ = scene
     shady, light = in_shade(hand, even, truth, of)
     assert light.facing is not None
-    plain, shaded = avatar(truth, pose, even, LIGHT, hand), avatar(shady, pose, even, light, hand)
+    plain, shaded = avatar_of(hand, truth, pose, even.camera, LIGHT), avatar_of(hand, shady, pose, even.camera, light)
 
     def ratio(degrees):
         there = turn(pose, degrees)
@@ -198,7 +189,7 @@ def test_where_a_photo_may_show_something_else_that_is_shade(hand, scene):
 def test_many_poses_are_lit_as_each_alone(hand, scene, of):
     even, truth, pose, _ = scene
     shady, light = in_shade(hand, even, truth, of)
-    lit = avatar(shady, pose, even, light, hand)
+    lit = avatar_of(hand, shady, pose, even.camera, light)
     poses = [pose, pose._replace(angles=named_pose(hand, "fist"))]
     together = lit.pose(type(pose)(*map(torch.stack, zip(*poses, strict=True))))
     for k, one in enumerate(poses):
@@ -207,7 +198,8 @@ def test_many_poses_are_lit_as_each_alone(hand, scene, of):
 
 def test_a_left_hand_is_lit_in_the_mirror(hand, scene):
     even, truth, pose, _ = scene
-    right, left = (avatar(truth, pose, even, LIGHT, hand, side) for side in ("right", "left"))
+    right = avatar_of(hand, truth, pose, even.camera, LIGHT)
+    left = as_left_hand(right)
     torch.testing.assert_close(left.pose(left.source_pose).colors, right.pose(pose).colors, atol=1e-5, rtol=0)
     direction = torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, 0.7]]), dim=1)
     assert torch.equal(shading(mirror_light(LIGHT), mirror_points(direction)), shading(LIGHT, direction))
@@ -216,7 +208,7 @@ def test_a_left_hand_is_lit_in_the_mirror(hand, scene):
 def test_the_file_keeps_the_light(hand, scene, tmp_path):
     even, truth, pose, _ = scene
     shady, light = in_shade(hand, even, truth, "gaussians")
-    lit = avatar(shady, pose, even, light, hand)
+    lit = avatar_of(hand, shady, pose, even.camera, light)
     lit.save(tmp_path / "a.safetensors")
     back = Avatar.load(tmp_path / "a.safetensors")
     assert all(torch.equal(a, b) for a, b in zip(back.light, light, strict=True))
@@ -229,7 +221,7 @@ def test_the_file_keeps_the_light(hand, scene, tmp_path):
 
 def test_gradients_go_through_the_light(hand, scene):
     even, truth, pose, _ = scene
-    lit = avatar(truth, pose, even, LIGHT, hand)
+    lit = avatar_of(hand, truth, pose, even.camera, LIGHT)
     orientation = pose.orientation.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(lit.pose(pose._replace(orientation=orientation)).colors.sum(), orientation)
     assert bool(gradient.isfinite().all()) and float(gradient.abs().max()) > 1
@@ -336,7 +328,7 @@ def test_a_shadow_goes_and_marks_stay(hand, albedo_scene):
         before, after = ((g.colors / guess.colors).log()[there] for g in (learned, parted))
         return float(after.norm() / before.norm())
 
-    assert share_that_stays(SHADOW) == pytest.approx(STAYS, abs=0.02)
+    assert share_that_stays(SHADOW) == pytest.approx(ALBEDO_SHARE, abs=0.02)
     assert share_that_stays(HALF_INK) > 0.4
     assert share_that_stays(INK) > 0.95 and share_that_stays(POLISH) > 0.95  # but for faces at the border
 
@@ -348,7 +340,7 @@ def test_what_is_finer_than_the_vertices_is_shade_too(hand, albedo_scene):
     colors[n_vertices::2] *= 0.8
     parted = split_albedo_shading(hand, guess.colors, guess._replace(colors=colors))
     left = (parted.colors / guess.colors).log()[n_vertices::2]
-    torch.testing.assert_close(left, torch.full_like(left, STAYS).mul(torch.tensor(0.8).log()), atol=1e-4, rtol=0)
+    torch.testing.assert_close(left, torch.full_like(left, ALBEDO_SHARE * math.log(0.8)), atol=1e-4, rtol=0)
 
 
 def test_what_was_not_learned_does_not_change(hand, albedo_scene):
@@ -361,10 +353,10 @@ def test_what_was_not_learned_does_not_change(hand, albedo_scene):
 
 def test_marks_are_told_from_light_by_what_lies_across():
     line = torch.tensor([[0.364, 0.574, 0.734]])  # from dark and red to bright and pale
-    assert float(marks(-2 * line)) < 0.05 and float(marks(0.5 * line)) < 0.05
-    assert float(marks(torch.tensor([[-1.0, -0.6, -0.1]]))) == 1
-    assert float(marks(torch.tensor([[0.65, 0.75, 0.85]]))) == 1  # white paint on skin that is not pale
-    assert float(marks(torch.zeros(1, 3))) == 0
+    assert float(mark_probability(-2 * line)) < 0.05 and float(mark_probability(0.5 * line)) < 0.05
+    assert float(mark_probability(torch.tensor([[-1.0, -0.6, -0.1]]))) == 1
+    assert float(mark_probability(torch.tensor([[0.65, 0.75, 0.85]]))) == 1  # white paint on skin that is not pale
+    assert float(mark_probability(torch.zeros(1, 3))) == 0
 
 
 def test_ink_on_single_gaussians_is_no_mark(hand, albedo_scene):
@@ -379,4 +371,4 @@ def test_ink_on_single_gaussians_is_no_mark(hand, albedo_scene):
     ratio = ((parted.colors / guess.colors).log().norm(dim=1) / (learned.colors / guess.colors).log().norm(dim=1))
     there = clear & (torch.arange(len(clear)) % 2 == n_vertices % 2)
     assert int(there.sum()) > 100
-    assert ratio[there].max() < STAYS + 0.1
+    assert ratio[there].max() < ALBEDO_SHARE + 0.1

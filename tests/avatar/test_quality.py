@@ -130,8 +130,8 @@ def test_an_ordinary_photo_raises_no_doubt():
     ],
 )
 def test_what_ails_a_photo_is_said_and_nothing_else(pictured, said):
-    doubts = photo_warnings(*pictured, SIDE)
-    assert len(doubts) == 1 and said in doubts[0]
+    found = photo_warnings(*pictured, SIDE)
+    assert len(found) == 1 and said in found[0]
 
 
 def test_a_mask_of_a_few_pixels_is_said_to_hold_the_background():

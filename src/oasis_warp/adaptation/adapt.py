@@ -158,7 +158,7 @@ def adapt(
     evenly_exposed = [crop.image / gain for crop, gain in zip(photos.unlit, photos.gains, strict=True)]
     trust = [inner_mask(crop.mask, 1) * share for crop, share in zip(photos.unlit, photos.belief, strict=True)]
     repeated = guess.colors.repeat(len(crops), 1)
-    calibration = _calibration(photos.stacked, repeated, torch.cat(evenly_exposed), torch.cat(trust), config)
+    calibration = calibrate(photos.stacked, repeated, torch.cat(evenly_exposed), torch.cat(trust), config)
     calibrated = gaussians = guess._replace(colors=calibration.apply(guess.colors))
     progress("calibration", 1, 1)
     shading = torch.zeros_like(photos.observations.colors)
@@ -196,7 +196,7 @@ def remove_photo_light(
     """
 
     def calibrated_picture(crop: HandCrop) -> Tensor:
-        calibration = _calibration(weights, guess.colors, crop.image, _trusted(weights, crop), config)
+        calibration = calibrate(weights, guess.colors, crop.image, _trusted(weights, crop), config)
         return _picture(weights, calibration.apply(guess.colors))
 
     if config.light == "keep":
@@ -391,14 +391,6 @@ def _shading_corrections(
     ])  # fmt: skip
     mean = (confidence[..., None] * smooth).sum(0) / (confidence.sum(0) + GUESS_LIGHT)[:, None]
     return torch.where(confidence[..., None] > 0, mean - smooth, 0.0)
-
-
-def _calibration(
-    weights: BlendWeights, colors: Tensor, picture: Tensor, trusted: Tensor, config: AdaptConfig
-) -> Calibration:
-    if config.calibration == "on":
-        return calibrate(weights, colors, picture, trusted, config)
-    return Calibration(torch.ones_like(colors[0]), torch.zeros_like(colors[0]))
 
 
 @torch.no_grad()

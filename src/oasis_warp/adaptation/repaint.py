@@ -71,7 +71,7 @@ def repaint(
     """Replace the Gaussians under the paint, and a few rings of faces around it, by finer ones that show it.
 
     Their colours minimise the squared difference of pictures that are linear in them: in the photo's view the painted
-    picture where there is paint and the old avatar elsewhere, in views beside it the same carried over by the surface.
+    picture where there is paint and the old avatar elsewhere, in views beside it the same reprojected over the surface.
     What the photo shows on a slant, behind an edge or not at all keeps its look.
 
     Args:

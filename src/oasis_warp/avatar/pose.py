@@ -9,7 +9,8 @@ from torch.nn.functional import avg_pool2d
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.core import rotation, surface
-from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandLight
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandCrop, HandLight
 from oasis_warp.ops import RestMesh, depth_map, face_rotations, pose_on_mesh
 
 GAMMA = 2.2
@@ -40,16 +41,6 @@ def _stays(facing: Float[Tensor, "V 3"], normals: Float[Tensor, "*B V 3"]) -> Fl
     """Share of shade that is left."""
     cosine = (normals * facing).sum(-1, keepdim=True)
     return ((cosine - TURNED_AWAY) / (AS_IN_PHOTO - TURNED_AWAY)).clamp(0, 1)
-
-
-def lit_colors(
-    canonical: CanonicalGaussians,
-    faces: Int[Tensor, "F 3"],
-    light: HandLight,
-    normals: Float[Tensor, "*B V 3"],
-) -> Float[Tensor, "*B N 3"]:
-    """Colours of Gaussians in `light`, where the vertices face `normals`."""
-    return (canonical.colors * shading_factors(canonical, faces, light, normals)).clamp(0, 1)
 
 
 def shading_factors(
@@ -116,15 +107,11 @@ def posed_normals(
     return rotation.rotate(turned.vertex_quats, surface.vertex_normals(rest, faces))
 
 
-def shading_picture(
-    light: HandLight,
-    rest: Float[Tensor, "V 3"],
-    posed: Float[Tensor, "V 3"],
-    faces: Int[Tensor, "F 3"],
-    camera: Camera,
-) -> Float[Tensor, "H W 3"]:
-    """What `light` multiplies the colours of a picture of the hand with; goes on a little beyond it, then 1."""
-    factor = shading(light, posed_normals(rest, posed, faces))
+def shading_picture(hand: HandModel, crop: HandCrop, light: HandLight) -> Float[Tensor, "H W 3"]:
+    """What `light` multiplies the colours of the photo of `crop` with; goes on a little beyond the hand, then 1."""
+    camera, posed = crop.camera, crop.posed.vertices
+    faces = hand.faces.to(posed.device)
+    factor = shading(light, posed_normals(crop.rest.vertices, posed, faces))
     seen = depth_map(posed, faces, camera.viewmat, camera.K, camera.width, camera.height, validate=False)
     on_hand = (seen.face_ids >= 0).to(factor)[..., None]
     inside = (factor[faces[seen.face_ids.clamp_min(0).long()]] * seen.barycentrics[..., None]).sum(-2)
@@ -178,5 +165,5 @@ def pose_gaussians(
     if light is not None:
         source, normals = light
         directions = rotation.rotate(turned.vertex_quats, normals.expand_as(posed_vertices))
-        colors = lit_colors(canonical, faces, source, directions)
+        colors = (colors * shading_factors(canonical, faces, source, directions)).clamp(0, 1)
     return Gaussians(means, quats, scales, canonical.opacities, colors)

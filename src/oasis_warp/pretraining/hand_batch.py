@@ -41,9 +41,9 @@ def pose_hands(
     offset = origin - (rotation @ joints[..., None])[..., 0]
     blended = torch.einsum("vj,njk->nvk", hand.weights, torch.cat([rotation.flatten(2), offset], dim=2))
     strengths = torch.vmap(lambda a: corrective_coefficients(hand, a))(angles)
-    flesh = rest + torch.einsum("vdc,nc->nvd", hand.corrective_basis, strengths)
+    corrected = rest + torch.einsum("vdc,nc->nvd", hand.corrective_basis, strengths)
     rotations = blended[..., :9].unflatten(2, (3, 3))
-    posed = (rotations * flesh[:, :, None]).sum(-1) + blended[..., 9:]
+    posed = (rotations * corrected[:, :, None]).sum(-1) + blended[..., 9:]
     last = [torch.stack([part[:, bone] for bone in TIP_JOINTS], 1) for part in (rotation, offset)]
     ends = (last[0] @ tips[..., None])[..., 0] + last[1]
     return PosedHands(rest, posed, torch.cat([origin, ends], 1)[:, hand.keypoint_index], rotations)
