@@ -9,14 +9,15 @@ keeps and other poses lose. Only marks, whose colours light cannot give to skin,
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import observe
-from oasis_warp.avatar.pose import GAMMA, posed_normals, shading, shading_picture, split_shade
+from oasis_warp.avatar.pose import GAMMA, posed_normals, shading, split_shade
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
-from oasis_warp.ops import BlendWeights, blend_colors
+from oasis_warp.ops import BlendWeights, blend_colors, depth_map
 
 MEAN_HARMONICS = (1.0, 0.0, -0.12, -0.15)
 """Mean harmonics of the light where the tone of a photo is even: more from above, and from the camera's side."""
@@ -46,12 +47,14 @@ MIN_COLOR = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
 MIN_LIGHT = 0.05
 """Least light relative to the mean, because colours are divided by it."""
+OUTLINE_MARGIN = 1 / 32
+"""Width over which light is continued beyond the outline of the surface, over the side of the picture."""
 
 
 def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) -> HandLight:
     """The light in which `drawn` looks most like the photo.
 
-    Weighted least squares of photo = drawn (h_0 + h . n) over the visible vertices, in linear light and for all channels
+    Weighted least squares of photo = drawn (h_0 + h . n) over the visible vertices, in linear light, for all channels
     at once: the first two bands of the harmonics of irradiance (Ramamoorthi and Hanrahan 2001). A photo shows only skin
     that faces it, so a normal prior on the harmonics constrains the rest (maximum a posteriori). If nothing is visible,
     the light is even.
@@ -110,6 +113,24 @@ def add_shade(
     occluded = inpaint(rest, faces, missing, seen.confidence - believed, OCCLUDER_FADE / 3, OCCLUDER_FADE)
     facing = posed_normals(rest, crop.posed.vertices, faces)
     return light._replace(shade=occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp(), facing=facing)
+
+
+def shading_picture(hand: HandModel, crop: HandCrop, light: HandLight) -> Float[Tensor, "H W 3"]:
+    """What `light` multiplies the colours of the photo of `crop` with; continued a little beyond the hand, then 1."""
+    camera, posed = crop.camera, crop.posed.vertices
+    faces = hand.faces.to(posed.device)
+    factor = shading(light, posed_normals(crop.rest.vertices, posed, faces))
+    seen = depth_map(posed, faces, camera.viewmat, camera.K, camera.width, camera.height, validate=False)
+    on_hand = (seen.face_ids >= 0).to(factor)[..., None]
+    inside = (factor[faces[seen.face_ids.clamp_min(0).long()]] * seen.barycentrics[..., None]).sum(-2)
+    # the outlines of picture and surface may differ by a few pixels
+    window = 2 * round(OUTLINE_MARGIN * camera.width) + 1
+    planes = torch.cat([inside * on_hand, on_hand], -1).permute(2, 0, 1)[None]
+    for size in ((1, window), (window, 1)):  # rows, then columns: the same mean
+        planes = avg_pool2d(planes, size, stride=1, padding=(size[0] // 2, size[1] // 2))
+    spread = planes[0].permute(1, 2, 0)
+    beyond = torch.where(spread[..., 3:] > 0, spread[..., :3] / spread[..., 3:].clamp_min(1e-6), 1)
+    return torch.where(on_hand > 0, inside, beyond)
 
 
 def without_light(hand: HandModel, crop: HandCrop, light: HandLight) -> HandCrop:

@@ -65,10 +65,10 @@ def source_photos(batch: TrainingBatch) -> CropBatch:
 
 def observe(hand: HandModel, crop: HandCrop) -> Observation:
     """`observe_batch` of one crop."""
-    faces = hand.faces.to(crop.image.device)
+    batch, faces = batch_of_crop(crop), hand.faces.to(crop.image.device)
     n_vertices = len(crop.posed.vertices)
     everything = torch.arange(n_vertices, device=faces.device)
-    seen = observe_batch(batch_of_crop(crop), faces, surface.faces_of_vertices(faces, n_vertices), everything)
+    seen = observe_batch(batch, faces, surface.faces_of_vertices(faces, n_vertices), everything)
     return Observation(*(part[0] for part in seen))
 
 
@@ -94,10 +94,10 @@ def observe_batch(
         vertices, vertices, faces, crops.K, crops.viewmat, size, size, margin=VISIBILITY_MARGIN,
         literal=vertex_index is None, point_vertices=vertex_index, validate=False,
     ).visibility * inside  # fmt: skip
-    cosine = facing(vertices, surface.gathered_normals(vertices, faces, vertex_faces), crops.viewmat)
-    trust = ((cosine - GRAZING) / (FACING - GRAZING)).clamp(0, 1)
     inner = inner_mask(crops.mask)[:, None]
     read = sample(torch.cat([crops.image.permute(0, 3, 1, 2), inner], dim=1), uv)
+    cosine = facing(vertices, surface.gathered_normals(vertices, faces, vertex_faces), crops.viewmat)
+    trust = ((cosine - GRAZING) / (FACING - GRAZING)).clamp(0, 1)
     confidence = visibility * trust * read[..., 3].clamp(0, 1)
     return Observation(uv, inside, visibility, cosine, read[..., :3], confidence)
 

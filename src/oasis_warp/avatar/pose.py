@@ -5,13 +5,11 @@ import math
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.core import rotation, surface
-from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandCrop, HandLight
-from oasis_warp.ops import RestMesh, depth_map, face_rotations, pose_on_mesh
+from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
+from oasis_warp.ops import RestMesh, face_rotations, pose_on_mesh
 
 GAMMA = 2.2
 """Light is sRGB to this power, nearly."""
@@ -20,8 +18,6 @@ AS_IN_PHOTO, TURNED_AWAY = math.cos(math.radians(5)), math.cos(math.radians(20))
 from which it is gone."""
 MIN_COLOR = 1e-3
 """Least colour that has shade: it is a factor."""
-RIM = 1 / 32
-"""Width over which light goes on beyond the surface's outline, over the picture's side."""
 
 
 def shading(light: HandLight, normals: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B V 3"]:
@@ -105,24 +101,6 @@ def posed_normals(
     """The normals of the rest surface, turned as Gaussians are."""
     turned = face_rotations(rest, posed, faces, validate=False)
     return rotation.rotate(turned.vertex_quats, surface.vertex_normals(rest, faces))
-
-
-def shading_picture(hand: HandModel, crop: HandCrop, light: HandLight) -> Float[Tensor, "H W 3"]:
-    """What `light` multiplies the colours of the photo of `crop` with; goes on a little beyond the hand, then 1."""
-    camera, posed = crop.camera, crop.posed.vertices
-    faces = hand.faces.to(posed.device)
-    factor = shading(light, posed_normals(crop.rest.vertices, posed, faces))
-    seen = depth_map(posed, faces, camera.viewmat, camera.K, camera.width, camera.height, validate=False)
-    on_hand = (seen.face_ids >= 0).to(factor)[..., None]
-    inside = (factor[faces[seen.face_ids.clamp_min(0).long()]] * seen.barycentrics[..., None]).sum(-2)
-    # the outlines of picture and surface may differ by a few pixels
-    window = 2 * round(RIM * camera.width) + 1
-    planes = torch.cat([inside * on_hand, on_hand], -1).permute(2, 0, 1)[None]
-    for size in ((1, window), (window, 1)):  # rows, then columns: the same mean
-        planes = avg_pool2d(planes, size, stride=1, padding=(size[0] // 2, size[1] // 2))
-    spread = planes[0].permute(1, 2, 0)
-    beyond = torch.where(spread[..., 3:] > 0, spread[..., :3] / spread[..., 3:].clamp_min(1e-6), 1)
-    return torch.where(on_hand > 0, inside, beyond)
 
 
 def turn_light(light: HandLight, rotation: Float[Tensor, "3 3"]) -> HandLight:
