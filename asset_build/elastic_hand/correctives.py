@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from elastic_hand.simulations import Simulation, bones
 from elastic_hand.solid import MILLIMETRES, facing_skin, skinned
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.hand.correctives import corrective_coefficients
+from oasis_warp.hand.skinning import corrective_coefficients
 
 RIDGE = 1.0
 ELSEWHERE = 1e6
