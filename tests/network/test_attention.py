@@ -16,11 +16,11 @@ def literal(q, k, v, row, column):
 def test_a_bias_in_spare_dimensions_is_a_bias_on_the_logits(random):
     q, k, v = draw(random, 2, 3, 7, 16), draw(random, 2, 3, 11, 16), draw(random, 2, 3, 11, 16)
     row, column = 3 * draw(random, 2, 7), draw(random, 2, 11).sign()
-    carried = draw(random, 2, 11, 2)
-    out, mean = attend(q, k, v, row, column, carried)
+    extra = draw(random, 2, 11, 2)
+    out, mean = attend(q, k, v, row, column, extra)
     weights = literal(q, k, v, row, column)
     torch.testing.assert_close(out, weights @ v, atol=2e-6, rtol=1e-5)
-    torch.testing.assert_close(mean, weights.mean(1) @ carried, atol=2e-6, rtol=1e-5)
+    torch.testing.assert_close(mean, weights.mean(1) @ extra, atol=2e-6, rtol=1e-5)
 
 
 def test_gradients_are_those_of_the_biased_softmax(random):
@@ -29,12 +29,12 @@ def test_gradients_are_those_of_the_biased_softmax(random):
         tensors = [draw(g, 1, 2, 5, 8), draw(g, 1, 2, 6, 8), draw(g, 1, 2, 6, 8), draw(g, 1, 5)]
         return [t.requires_grad_(True) for t in tensors]
 
-    column, carried, sign = draw(random, 1, 6).sign(), draw(random, 1, 6, 2), draw(random, 1, 2, 5, 8)
+    column, extra, sign = draw(random, 1, 6).sign(), draw(random, 1, 6, 2), draw(random, 1, 2, 5, 8)
     ours, theirs = leaves(), leaves()
-    out, mean = attend(*ours, column, carried)
+    out, mean = attend(*ours, column, extra)
     ((out * sign).sum() + mean.sum()).backward()
     weights = literal(*theirs, column)
-    ((weights @ theirs[2] * sign).sum() + (weights.mean(1) @ carried).sum()).backward()
+    ((weights @ theirs[2] * sign).sum() + (weights.mean(1) @ extra).sum()).backward()
     for a, b in zip(ours, theirs, strict=True):
         torch.testing.assert_close(a.grad, b.grad, atol=1e-5, rtol=1e-4)
 

@@ -19,11 +19,11 @@ def attend(
     values: Float[Tensor, "B h S D"],
     row: Float[Tensor, "B L"],
     column: Float[Tensor, "B S"],
-    carried: Float[Tensor, "B S E"] | None = None,
+    extra: Float[Tensor, "B S E"] | None = None,
 ) -> tuple[Float[Tensor, "B h L D"], Float[Tensor, "B L E"] | None]:
-    """softmax(Q K^T / sqrt(D) + row column^T) V, and the mean over the heads of the same softmax times `carried`.
+    """softmax(Q K^T / sqrt(D) + row column^T) V, and the mean over the heads of the same softmax times `extra`.
 
-    The rank-one bias rides in spare dimensions of the queries and keys and `carried` in those of the values, so that
+    The rank-one bias rides in spare dimensions of the queries and keys and `extra` in those of the values, so that
     no mask of L x S exists and every fused kernel serves. Where inputs are rounded to bfloat16, the bias keeps 16 bits:
     it is split in two, and the kernels add the products up in float32. `column` must be exact in bfloat16.
     """
@@ -40,11 +40,11 @@ def attend(
         return torch.cat([tensor, filled[:, None].expand(-1, heads, -1, -1)], dim=-1)
 
     mixed = scaled_dot_product_attention(
-        widen(queries, left), widen(keys, right), widen(values, carried), scale=1 / math.sqrt(dimension)
+        widen(queries, left), widen(keys, right), widen(values, extra), scale=1 / math.sqrt(dimension)
     )
-    if carried is None:
+    if extra is None:
         return mixed[..., :dimension], None
-    return mixed[..., :dimension], mixed[..., dimension : dimension + carried.shape[-1]].mean(1)
+    return mixed[..., :dimension], mixed[..., dimension : dimension + extra.shape[-1]].mean(1)
 
 
 def split_heads(x: Float[Tensor, "B N C"], heads: int) -> Float[Tensor, "B h N D"]:

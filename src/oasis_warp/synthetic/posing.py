@@ -92,8 +92,8 @@ def pose_people(body: Body, people: Sequence[Person], numbers: ShotTensors) -> P
         parts.append(torch.where(numbers.wears[:, k, None, None] > 0, move(points), _away(points.device)))
 
     carriers = _carriers(rest.device)[hand.keypoint_index]
-    carried = torch.cat([joints, tips], 1)[:, hand.keypoint_index]
-    marks = _rotate(numbers.rotations[:, carriers], carried) + numbers.translations[:, carriers]
+    points = torch.cat([joints, tips], 1)[:, hand.keypoint_index]
+    marks = _rotate(numbers.rotations[:, carriers], points) + numbers.translations[:, carriers]
     return PosedPeople(
         torch.cat(parts, 1),
         move(marks),
