@@ -1,5 +1,6 @@
 """Photos of real hands, from files to an avatar."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -162,7 +163,7 @@ def test_a_photo_in_much_less_light_is_brought_to_the_first_one_s(palm, alone):
     dark = palm._replace(rgb=(palm.rgb.float() * 0.4).to(torch.uint8), name="dark.jpg")
     made = reconstruct_same_hand([palm, dark], SMALL)
     assert made.photos[1].gain == pytest.approx((0.4, 0.4, 0.4), abs=0.04)
-    assert any(warning.startswith("dark.jpg: its light is another, 2.5 times darker") for warning in made.warnings)
+    assert any(re.match(r"dark.jpg: its light is another, 2\.[3-7] times darker", said) for said in made.warnings)
     mean = [avatar.gaussians.colors.mean(0) for avatar in (alone.avatar, made.avatar)]
     assert torch.allclose(*mean, atol=0.04)
 

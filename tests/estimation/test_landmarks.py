@@ -5,7 +5,15 @@ import pytest
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation import networks as module
-from oasis_warp.estimation.landmarks import FINGERS, box_size, crop_of_landmarks, detect_hands, read_crop
+from oasis_warp.estimation.landmarks import (
+    FINGERS,
+    DetectedHand,
+    _turned_back,
+    box_size,
+    crop_of_landmarks,
+    detect_hands,
+    read_crop,
+)
 from oasis_warp.estimation.networks import Networks, check_networks, drawn_hand, networks
 
 HANDS = {
@@ -54,6 +62,19 @@ def test_a_hand_in_the_dark_is_found_by_a_fallback_rung_in_its_own_place(photos)
     assert (hand.xy > 0).all()
     assert (hand.xy < picture.shape[1::-1]).all()
     assert hand.xy[[8, 12], 1].max() < hand.xy[0, 1], "two fingers up"
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_points_of_a_turned_search_lie_where_they_are_in_the_photo(turns):
+    marked = np.zeros((5, 8))
+    marked[1, 6] = 1
+    row, column = np.argwhere(np.rot90(marked, turns))[0]
+    xy = np.tile([[column + 0.5, row + 0.5]], (21, 1))
+    down = np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), turns) @ [0, 1]  # "down" of the photo, turned
+    seen = DetectedHand(xy, np.tile([[*down, 2.0]], (21, 1)), 1.0, 1.0, 1.0, "")
+    back = _turned_back(seen, turns, marked.shape, margin=1)
+    np.testing.assert_allclose(back.xy[0], [6.5 - 1, 1.5 - 1])
+    np.testing.assert_allclose(back.world[0], [0, 1, 2])
 
 
 def test_landmarks_turn_with_the_photo(photos):

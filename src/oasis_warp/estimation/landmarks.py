@@ -1,9 +1,11 @@
 """Photo -> hands, each with 21 landmarks: palm detector, rotated crop, landmark network, a second tighter crop.
 
-The method of MediaPipe Hands (Zhang et al. 2020), with fallback searches for hands that fill the frame or are dark.
+The method of MediaPipe Hands (Zhang et al. 2020), with fallback searches for hands that fill the frame, are dark, or
+lie sideways.
 """
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,6 +23,9 @@ _MIN_GUESS = 0.8
 """Least presence and side score in fallback searches, in which the palm detector finds false hands."""
 _MARGIN = 0.35
 """Border replicated around the photo in fallback searches, as a fraction of its longer side."""
+
+_BRIGHTENED = {1.0: "", 0.5: ", brightened", 0.3: ", much brightened"}
+"""Exponents of gray levels in fallback searches, and how their source names them."""
 
 
 @dataclass(frozen=True)
@@ -60,19 +65,30 @@ def detect_hands(rgb: np.ndarray, nets: Networks, *, most: int = 8) -> list[Dete
         return hands
     margin = int(_MARGIN * max(rgb.shape[:2]))
     wide = cv2.copyMakeBorder(rgb, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
-    light = cv2.LUT(wide, np.round(255 * (np.arange(256) / 255) ** 0.5).astype(np.uint8))
-    searches = (
-        (wide, 0.5, "network (margin)"),
-        (light, 0.5, "network (margin, brightened)"),
-        (wide, 0.25, "network (margin, weak)"),
-        (light, 0.25, "network (margin, brightened, weak)"),
-    )
-    for image, min_score, source in searches:
-        hands = [h for h in _search(image, nets, min_score, most, source)
-                 if min(h.presence, h.side_score) >= _MIN_GUESS]  # fmt: skip
-        if hands:
-            return [DetectedHand(h.xy - margin, h.world, h.presence, h.right, h.palm_score, h.source) for h in hands]
+    for turns, min_score, (exponent, light) in itertools.product(range(4), (0.5, 0.25), _BRIGHTENED.items()):
+        image = cv2.LUT(np.ascontiguousarray(np.rot90(wide, turns)), _curve(exponent))
+        turned = f", turned by {90 * turns} degrees" if turns else ""
+        weak = ", weak" if min_score < 0.5 else ""
+        found = _search(image, nets, min_score, most, f"network (margin{light}{turned}{weak})")
+        sure = [hand for hand in found if min(hand.presence, hand.side_score) >= _MIN_GUESS]
+        if sure:
+            return [_turned_back(hand, turns, wide.shape[:2], margin) for hand in sure]
     return []
+
+
+def _curve(exponent: float) -> np.ndarray:
+    """A table of gray levels that brightens where `exponent` is below 1."""
+    return np.round(255 * (np.arange(256) / 255) ** exponent).astype(np.uint8)
+
+
+def _turned_back(hand: DetectedHand, turns: int, size: tuple[int, int], margin: int) -> DetectedHand:
+    """A hand found after counter-clockwise right angles, in the image of `size` before them, without its margin."""
+    xy, world = hand.xy, hand.world
+    for turn in range(turns, 0, -1):
+        height = size[turn % 2]  # of the image after this turn
+        xy = np.stack([height - xy[:, 1], xy[:, 0]], 1)
+        world = np.stack([-world[:, 1], world[:, 0], world[:, 2]], 1)
+    return replace(hand, xy=xy - margin, world=world)
 
 
 def _search(rgb: np.ndarray, nets: Networks, min_score: float, most: int, source: str) -> list[DetectedHand]:

@@ -7,7 +7,7 @@ outline, and a guided filter (He et al. 2013) on their shares.
 import cv2
 import numpy as np
 
-from oasis_warp.estimation.landmarks import box_size
+from oasis_warp.estimation.landmarks import FINGERS, box_size
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.pixel_reading import PixelReading
 from oasis_warp.network.dense_network import ARM, BACKGROUND
@@ -20,6 +20,9 @@ _BAND = 3.0
 """Half the width of the band in which the colours decide [px of the network's crop]."""
 _SURE_HAND, _SURE_BACKGROUND = 0.8, 0.1
 """Probabilities of the hand above and below which a pixel outside the band is decided."""
+_BONE, _FINGER, _POSSIBLE = 0.045, 0.11, 0.03
+"""Where the network of pixels is in doubt, that of landmarks has seen a finger. Widths of the line along its bones that is
+hand, and of the one in which colours decide, over the box of the landmarks; least probability of the hand there."""
 _SURE = 0.9
 """Probability from which the network's word counts against an alpha channel."""
 _LEAST = 20
@@ -45,7 +48,11 @@ def mask_from_reading(rgb: np.ndarray, reading: PixelReading, xy: np.ndarray) ->
         cut = np.ascontiguousarray(plane[part])
         return cut if factor == 1 else cv2.resize(cut, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
 
-    soft = _along_edges(smaller(rgb), smaller(hand), smaller(arm), _BAND * factor / reading.scale)
+    possible = smaller(hand) > np.maximum(_POSSIBLE, smaller(reading.in_photo(reading.front, size)))
+    bones, fingers = (_lines((xy - [left, top]) * factor, width, possible.shape) for width in (_BONE, _FINGER))
+    soft = _along_edges(
+        smaller(rgb), smaller(hand), smaller(arm), bones & possible, fingers, _BAND * factor / reading.scale
+    )  # fmt: skip
     mask = np.zeros(size[::-1], np.float32)
     mask[part] = cv2.resize(soft, (right - left, bottom - top), interpolation=cv2.INTER_LINEAR)
     return mask
@@ -67,7 +74,18 @@ def mask_from_alpha(alpha: np.ndarray, reading: PixelReading, xy: np.ndarray, sc
     return np.where(_touching(mask > 0.5, inside) | (mask <= 0.5), mask, 0)
 
 
-def _along_edges(rgb: np.ndarray, hand: np.ndarray, arm: np.ndarray, band: float) -> np.ndarray:
+def _lines(xy: np.ndarray, width: float, shape: tuple[int, int]) -> np.ndarray:
+    """Lines along the fingers' bones, `width` times as wide as the box of the landmarks, [h, w]."""
+    drawn = np.zeros(shape, np.uint8)
+    for rows in FINGERS.values():
+        points = np.round(16 * (xy[rows] - 0.5)).astype(np.int32)  # in sixteenths of a pixel
+        cv2.polylines(drawn, [points], False, 1, max(1, round(width * box_size(xy))), cv2.LINE_8, 4)
+    return drawn > 0
+
+
+def _along_edges(
+    rgb: np.ndarray, hand: np.ndarray, arm: np.ndarray, bones: np.ndarray, fingers: np.ndarray, band: float
+) -> np.ndarray:
     """The soft mask of probabilities `hand`, drawn along the edges of the image; `band` in its pixels."""
     inside, outside = (
         cv2.distanceTransform((side > 0.5).astype(np.uint8), cv2.DIST_L2, 3)
@@ -77,13 +95,16 @@ def _along_edges(rgb: np.ndarray, hand: np.ndarray, arm: np.ndarray, band: float
     labels[(inside > band) & (hand > _SURE_HAND)] = cv2.GC_FGD
     labels[(outside > band) & (hand < _SURE_BACKGROUND)] = cv2.GC_BGD
     labels[arm > 0.5] = cv2.GC_PR_FGD  # skin, too
+    beside = cv2.dilate((bones & (hand < 0.5)).astype(np.uint8), np.ones((2 * round(2 * band) + 1,) * 2)) > 0
+    labels[fingers & beside & (labels == cv2.GC_BGD)] = cv2.GC_PR_FGD
+    labels[bones] = cv2.GC_FGD
     if (labels == cv2.GC_FGD).sum() < _LEAST or (labels == cv2.GC_BGD).sum() < _LEAST:
         return hand
     cv2.setRNGSeed(0)  # GrabCut starts from random clusters
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(rgb[..., ::-1].copy(), labels, None, *models, 1, cv2.GC_INIT_WITH_MASK)
     mask = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)) & (arm < np.maximum(hand, 0.3))
-    mask = _touching(mask, hand > _SURE).astype(np.float32)
+    mask = _touching(mask, (hand > _SURE) | bones).astype(np.float32)
     soft = cv2.ximgproc.guidedFilter(rgb, mask, max(2, round(1.5 * band)), 1e-4 * 255**2)
     return np.clip((soft - 0.1) / 0.8, 0, 1)
 
