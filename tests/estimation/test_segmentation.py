@@ -72,6 +72,21 @@ def test_slits_between_fingers_stay_open(drawing):
     assert (mask[slits] > 0.5).mean() < 0.1
 
 
+def test_a_finger_that_the_dense_network_doubts_is_taken_where_landmarks_have_seen_it(drawing):
+    picture, xy, _, hand, arm = drawing
+    reading = reading_of(hand, arm)
+    y, x = np.mgrid[0:SIDE, 0:SIDE] / reading.scale
+    base, tip = xy[18], xy[20]
+    little = (np.stack([x - base[0], y - base[1]], -1) @ (tip - base) > 0) & (np.hypot(x - tip[0], y - tip[1]) < 60)
+    doubted = reading.shares.copy()
+    doubted[HAND][little] *= 0.05
+    doubted[0] = 1 - doubted[1:].sum(0)
+    mask = mask_from_reading(picture, replace(reading, shares=doubted), xy)
+    row, column = np.round(xy[19]).astype(int)[::-1]
+    assert mask[row, column] > 0.5
+    assert iou(mask > 0.5, hand) > 0.96
+
+
 def test_a_thing_in_front_of_the_hand_is_left_out_although_it_has_the_colour_of_skin(drawing):
     picture, xy, _, hand, arm = drawing
     x, y = xy[KNUCKLES].mean(0).astype(int)

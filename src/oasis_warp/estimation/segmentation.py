@@ -21,7 +21,7 @@ _BAND = 3.0
 _SURE_HAND, _SURE_BACKGROUND = 0.8, 0.1
 """Probabilities of the hand above and below which a pixel outside the band is decided."""
 _BONE, _FINGER, _POSSIBLE = 0.045, 0.11, 0.03
-"""Where the network of pixels is in doubt, that of landmarks has seen a finger. Widths of the line along its bones that is
+"""Where the dense network is in doubt, the landmarks have seen a finger. Widths of the line along its bones that is
 hand, and of the one in which colours decide, over the box of the landmarks; least probability of the hand there."""
 _SURE = 0.9
 """Probability from which the network's word counts against an alpha channel."""
