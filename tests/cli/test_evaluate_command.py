@@ -8,15 +8,17 @@ import torch
 
 from oasis_warp import reconstruction
 from oasis_warp.avatar.prior import MeanPrior
+from oasis_warp.avatar.quality import SurfaceQuality
 from oasis_warp.cli import evaluate as command
 from oasis_warp.cli import main
 from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
+from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.hand_crop import crop_hand
-from oasis_warp.evaluation import same_hand
+from oasis_warp.evaluation import look_measures, looks, same_hand
 from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
 from oasis_warp.evaluation.same_hand import (
     compare_pairs,
@@ -25,7 +27,7 @@ from oasis_warp.evaluation.same_hand import (
     summarise_pairs,
 )
 from oasis_warp.hand_avatar import draw_as_photo
-from oasis_warp.reconstruction import reconstruct
+from oasis_warp.reconstruction import Reconstruction, reconstruct
 
 SMALL = ReconstructConfig(size=96)
 
@@ -164,6 +166,39 @@ def test_photos_of_the_same_hand_are_measured_and_the_run_is_not_done_twice(hand
     assert json.loads((out / "metrics.json").read_text()) == found
 
 
+def test_looks_are_measured_and_drawn_and_the_run_is_not_done_twice(hands, scene, tmp_path, capsys, monkeypatch):
+    _, fit, avatar = scene
+    shown = torch.linspace(0, 1, len(avatar.rest.vertices))
+    made = Reconstruction(
+        avatar, fit, {}, {}, {"input_psnr_inner_db": 30.0, "seen_percent": 40.0}, (), SurfaceQuality(shown, 1 - shown)
+    )
+
+    def ship(photo, config, prior):
+        assert config == ReconstructConfig(steps=1)  # all else as it ships
+        if photo.name.startswith("no_hand"):
+            raise InputError(f"{photo.name}: found no hand.")
+        return made
+
+    monkeypatch.setattr(looks, "reconstruct", ship)
+    monkeypatch.setattr(look_measures, "hand_features", lambda image, mask: {"half": [0.0]})  # takes seconds
+    monkeypatch.setattr(looks, "HandEstimator", lambda hand: KnownEstimator(fit))
+    for name in ("first.png", "no_hand.png"):
+        (hands / name).write_bytes((hands / "mine" / "a.png").read_bytes())
+    arguments = ["evaluate", str(hands), "--dataset", "looks", "--out", str(tmp_path / "found"), "--prior", "none",
+                 "--steps", "1"]  # fmt: skip
+    assert main(arguments) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "of 1 avatars" in said and "too few real hands" in said and "photos left out: 1" in said
+    found = json.loads((tmp_path / "found" / "metrics.json").read_text())
+    record = found["photos"]["first.png"]
+    assert record["contrast"]["seen"][0] > 0 and record["haze"] >= 0 and record["lpips"] is None
+    assert list(found["left_out"]) == ["no_hand.png"] and found["kernel_distance"] == []
+    assert read_photo(tmp_path / "found" / "sheets" / "first.jpg").rgb.shape == (3 * 512 + 4, 6 * 512 + 10, 3)
+    monkeypatch.setattr(looks, "reconstruct", lambda *arguments, **options: pytest.fail("made again"))
+    assert main(arguments) == 0
+    assert json.loads((tmp_path / "found" / "metrics.json").read_text()) == found
+
+
 def test_a_folder_of_photos_is_one_hand_and_photos_of_one_stem_are_two(hands):
     mine = hands / "mine"
     (mine / "b.png").rename(mine / "a.webp")
@@ -196,7 +231,10 @@ def test_folders_without_pairs_are_refused_in_one_sentence(hands, tmp_path, caps
         (["--steps", "-1"], "--steps: expected 0 or more, got -1"),
         (["--prior", "nowhere.safetensors"], "nowhere.safetensors: expected a network's weights, found no such file"),
         (["--lpips", "a.pth", "b.pth"], "a.pth: expected weights of LPIPS, found no such file"),
-        (["photos", "--dataset", "same-hand", "--lpips", "a.pth", "b.pth"], "--lpips: is measured on synthetic"),
+        (["photos", "--dataset", "same-hand", "--lpips", "a.pth", "b.pth"], "--lpips: is not measured on photos of"),
+        (["photos", "--dataset", "looks", "--size", "512"], "--size: looks are measured in pictures of 256 pixels"),
+        (["--dataset", "looks"], "--dataset looks: expected a folder of photos; name it"),
+        (["photos", "--dataset", "looks"], "photos: expected a folder with photos of hands, found none there"),
     ],
 )
 def test_wrong_options_are_one_sentence(tmp_path, capsys, arguments, words):

@@ -1,4 +1,4 @@
-"""`oasis evaluate`: measure avatars on synthetic hands, where the truth is known, and on photos of the same hands."""
+"""`oasis evaluate`: measure avatars on synthetic hands, on photos of the same hands, and by their looks."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -13,20 +13,27 @@ from oasis_warp.cli.options import Evaluate
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
+from oasis_warp.evaluation.band_energy import SIZE
 from oasis_warp.evaluation.columns import (
+    BLEMISHES,
     COLORS,
     GROUPS,
     LIGHTS,
+    LOOKS,
     PHOTOS,
+    REGIONS,
     SYNTHETIC,
     Measure,
     cells,
     format_number,
+    kernel_cells,
     noise_rows,
     pose_name,
     with_values,
 )
 from oasis_warp.evaluation.held_out import HELD_OUT_SEED, CaptureConfig
+from oasis_warp.evaluation.kernel_distance import LAYERS
+from oasis_warp.evaluation.looks import evaluate_looks
 from oasis_warp.evaluation.methods import Method, method_name
 from oasis_warp.evaluation.same_hand import METRICS, evaluate_photos
 from oasis_warp.evaluation.summary import Record, select
@@ -54,7 +61,7 @@ def run(options: Evaluate) -> int:
     chosen = choose_prior(options.prior, options.backbone_weights)
     if options.prior != "none":
         priors["learned"] = chosen
-    tables = {"synthetic": on_synthetic_hands, "same-hand": on_photos}
+    tables = {"synthetic": on_synthetic_hands, "same-hand": on_photos, "looks": on_looks}
     try:
         with show_progress(Console(stderr=True)) as progress:
             made = tables[options.dataset](options, priors, progress)
@@ -71,13 +78,16 @@ def check_options(options: Evaluate) -> None:
     Raises:
         InputError: a number out of its range, or a folder too many or missing.
     """
-    photos = options.dataset == "same-hand"
+    photos = options.dataset != "synthetic"
     if photos and options.folder is None:
-        raise InputError("--dataset same-hand: expected a folder of photos, or one with a subfolder a hand; name it.")
+        kind = "a folder of photos" + (", or one with a subfolder a hand" if options.dataset == "same-hand" else "")
+        raise InputError(f"--dataset {options.dataset}: expected {kind}; name it.")
     if not photos and options.folder is not None:
         raise InputError(f"{options.folder}: synthetic hands need no folder; leave it out, or use --dataset same-hand.")
-    if photos and options.lpips is not None:
-        raise InputError("--lpips: is measured on synthetic hands only; leave it out.")
+    if options.dataset == "same-hand" and options.lpips is not None:
+        raise InputError("--lpips: is not measured on photos of the same hand; leave it out.")
+    if options.dataset == "looks" and options.size != SIZE:
+        raise InputError(f"--size: looks are measured in pictures of {SIZE} pixels, got {options.size}; leave it out.")
     if options.people < 1:
         raise InputError(f"--people: expected 1 or more, got {options.people}.")
     if not 1 <= options.targets <= PICTURES_EACH:
@@ -136,6 +146,39 @@ def on_photos(options: Evaluate, priors: dict[str, Prior], progress: Progress) -
     if n_out:
         table.caption = f"photos left out: {n_out}, see {METRICS}"
     return [table]
+
+
+def on_looks(options: Evaluate, priors: dict[str, Prior], progress: Progress) -> list[Table]:
+    """Contrasts, kernel distances and blemishes."""
+    assert options.folder is not None  # checked with the other options
+    config = ReconstructConfig(steps=options.steps, seed=options.seed, device=options.device)
+    perceptual = None if options.lpips is None else load_lpips(*options.lpips)
+    prior = priors.get("learned", priors["mean"])
+    found = evaluate_looks(prior, options.folder, options.out, config, perceptual=perceptual, progress=progress)
+    contrast, distance, spoilt = (
+        Table(title=title)
+        for title in (
+            f"contrast of the skin of {len(found['photos'])} avatars by size of detail, and over the yardstick's",
+            "kernel distance to real hands, by resolution of the features", "blemishes, medians",
+        )
+    )  # fmt: skip
+    shown = with_values(found["summary"]["contrast"], LOOKS) if found["summary"]["contrast"] else {}
+    for heading in ("skin", *(column.heading for column in shown.values())):
+        contrast.add_column(heading, justify="left" if heading == "skin" else "right", no_wrap=heading == "skin")
+    for row in found["summary"]["contrast"]:
+        contrast.add_row(REGIONS[row["region"]], *cells(row, shown))
+    for heading in ("pictures", "all", *LAYERS):
+        distance.add_column(heading, justify="left" if heading == "pictures" else "right", no_wrap=True)
+    for row in found["kernel_distance"]:
+        distance.add_row(row["name"], *kernel_cells(row))
+    if not found["kernel_distance"]:
+        distance.caption = "too few real hands in the folder"
+    blemishes = with_values([found["summary"]["blemishes"]], BLEMISHES)
+    for column in blemishes.values():
+        spoilt.add_column(column.heading, justify="right")
+    spoilt.add_row(*cells(found["summary"]["blemishes"], blemishes))
+    spoilt.caption = f"photos left out: {len(found['left_out'])}, see {METRICS}" if found["left_out"] else None
+    return [contrast, distance, spoilt]
 
 
 def make_table(title: str, rows: Sequence[Record], columns: Mapping[str, Measure]) -> Table:

@@ -292,15 +292,17 @@ class Pretrain:
 class Evaluate:
     """Measure what avatars are worth: metrics.json with every number, sheet.png, and a table.
 
-    On synthetic hands that no training has met, in poses and from sides that the photo does not show; or on a folder of
-    photos with a subfolder for each hand, where the avatar of one photo is held against the others. A run that was
-    stopped goes on when it is started again with the same options.
+    On synthetic hands that no training has met, in poses and from sides that the photo does not show; on a folder of
+    photos with a subfolder for each hand, where the avatar of one photo is held against the others; or by their looks,
+    where avatars of single photos are drawn from all sides and in other poses and held against real hands. A run that
+    was stopped goes on when it is started again with the same options.
     """
 
     folder: Positional[Path | None] = None
-    """With a subfolder of photos for each hand, or with photos of one, for same-hand."""
+    """With a subfolder of photos for each hand, or with photos of one, for same-hand; with photos of hands, for looks,
+    where its subfolders may hold more real hands to compare with."""
     out: OutputFolder
-    dataset: Literal["synthetic", "same-hand"] = "synthetic"
+    dataset: Literal["synthetic", "same-hand", "looks"] = "synthetic"
     """What to measure on."""
     prior: Literal["learned", "none"] | Path = "learned"
     """The learned prior to hold against the mean hand, as for `oasis reconstruct`; none for the mean hand alone."""
@@ -312,7 +314,7 @@ class Evaluate:
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     size: int = 256
-    """Side of the pictures [px]; a multiple of 16 for synthetic ones."""
+    """Side of the pictures [px]; a multiple of 16 for synthetic ones, and 256 for looks."""
     seed: int = 0
     """Of people, pictures and adaptation."""
     lpips: tuple[Path, Path] | None = None

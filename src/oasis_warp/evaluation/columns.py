@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from oasis_warp.evaluation.band_energy import BANDS
+from oasis_warp.evaluation.kernel_distance import LAYERS
 from oasis_warp.evaluation.summary import Record
 
 
@@ -43,6 +45,28 @@ PHOTOS = {
     "beaten_error": Measure("by colours", ".0%"),
 }
 """Of `same_hand.summarise_pairs`."""
+LOOKS = {
+    "photos": Measure("photos", ".0f"),
+    **{f"contrast {band}": Measure(f"{band} px: %", ".2f") for band in BANDS},
+    **{f"ratio {band}": Measure(f"ratio {band}", ".2f") for band in BANDS},
+}
+"""Of the contrasts of `looks.summarise_looks`."""
+REGIONS = {
+    "seen": "seen, in the photo's view", "turned": "seen, in other poses", "hidden_palm": "palm that the photo hides",
+    "hidden_back": "back that the photo hides",
+}  # fmt: skip
+BLEMISHES = {
+    "input_psnr_db": Measure("PSNR of the photo's view, dB", ".1f"),
+    "lpips": Measure("LPIPS of it", ".3f"),
+    "haze": Measure("haze", ".4f"),
+    "haze_ratio": Measure("over the mean prior's", ".1f"),
+    "palm_minus_back": Measure("palm minus back, a*", "+.1f"),
+    "darkest": Measure("darkest 1 % of the opened palm over its median", ".2f"),
+    "back_over_front red": Measure("back over front: red", ".2f"),
+    "back_over_front green": Measure("green", ".2f"),
+    "back_over_front blue": Measure("blue", ".2f"),
+}
+"""Of the blemishes of `looks.summarise_looks`."""
 COLORS = {"same": "raw", "studio": "raw", "wild": "matched"}
 """How colours are compared in each light: a photo in another light does not show the colours of even light."""
 GROUPS = {"ordinary": "People as in training", "tattoo": "The same people with a tattoo", "ring": "And with a ring"}
@@ -70,9 +94,14 @@ def cells(row: Record, columns: Mapping[str, Measure]) -> list[str]:
     return [format_number(row[name], column.form) for name, column in columns.items()]
 
 
-def format_number(number: float | None, form: str) -> str:
+def format_number(number: float | int | None, form: str) -> str:
     """The formatted number, or an empty string."""
     return "" if number is None else format(number, form)
+
+
+def kernel_cells(row: Record) -> list[str]:
+    """Distance and standard error of a row of `looks.kernel_rows`, of all layers and of each."""
+    return [f"{row[layer]:.2f} ± {row[f'{layer}_error']:.2f}" for layer in ("all", *LAYERS)]
 
 
 def noise_rows(

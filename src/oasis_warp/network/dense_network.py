@@ -144,16 +144,7 @@ class DenseNetwork(nn.Module):
             image: sRGB in [0, 1] of a right hand, or of a mirrored left one; sides are multiples of `STRIDE`.
             landmarks: In pixels of `image`; NaN for those that are not known.
         """
-        rows, columns = (side // 2 for side in image.shape[2:])
-        skipped, x = [], self.stem(image * 2 - 1)
-        for level, blocks in enumerate(self.encoder):
-            if level:
-                x = self.down[level - 1](x)
-            if level == 1:
-                x = x + self.landmark_stem(heat_maps(landmarks / 2, rows, columns).to(x.dtype))
-            x = blocks(x)
-            skipped.append(x)
-        x = self.attention(skipped.pop())
+        *skipped, x = self.encode(image, landmarks)
         for join, block in zip(self.up, self.decoder, strict=True):
             x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
             x = block(join(torch.cat([x, skipped.pop()], 1)))
@@ -162,6 +153,19 @@ class DenseNetwork(nn.Module):
         parts["normal"] = F.normalize(parts["normal"], dim=1, eps=1e-4)
         parts["albedo"] = parts["albedo"].sigmoid()
         return DensePrediction(**parts)
+
+    def encode(self, image: Float[Tensor, "B 3 H W"], landmarks: Float[Tensor, "B 21 2"]) -> list[Tensor]:
+        """Features at full size, a half, a quarter, an eighth and a sixteenth, the last after the self-attention."""
+        rows, columns = (side // 2 for side in image.shape[2:])
+        found, x = [], self.stem(image * 2 - 1)
+        for level, blocks in enumerate(self.encoder):
+            if level:
+                x = self.down[level - 1](x)
+            if level == 1:
+                x = x + self.landmark_stem(heat_maps(landmarks / 2, rows, columns).to(x.dtype))
+            x = blocks(x)
+            found.append(x)
+        return [*found[:-1], self.attention(found[-1])]
 
 
 def heat_maps(landmarks: Float[Tensor, "B N 2"], height: int, width: int) -> Float[Tensor, "B N H W"]:

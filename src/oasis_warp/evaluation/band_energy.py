@@ -1,0 +1,71 @@
+"""How much contrast skin has, by the size of its detail: what tells a hand from one of clay.
+
+The logarithm of the luminance is split by differences of Gaussians. Each Gaussian is a normalised convolution (Knutsson
+and Westin 1993): the sum of the weighted values over the sum of the weights. So what lies outside of the skin adds
+nothing, its outline included.
+"""
+
+import functools
+import itertools
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from oasis_warp.core.color import luminance
+
+SIZE = 256
+"""Side of the square pictures in which contrasts are measured [px]."""
+SIGMAS = (1.0, 2.0, 4.0, 8.0)
+"""Standard deviations of the Gaussians between the bands [px]."""
+BANDS = ("<1", "1-2", "2-4", "4-8")
+"""Names of the bands: detail that a Gaussian of the larger sigma blurs and one of the smaller does not."""
+DARKEST = 0.002
+"""Least luminance whose logarithm is taken: half of what the sRGB code 8 of 255 shows, below which is noise."""
+
+KEPT = 0.95
+"""Share of the pixels that count, those of least contrast: in photos the rest are mostly outlines inside the hand, as a
+fitted mesh misses them by a few pixels."""
+FEWEST_PIXELS = 800
+"""Fewest pixels whose contrasts are measured: some 4 % of a hand that fills its picture."""
+
+Contrasts = tuple[float, ...]
+"""Of each of `BANDS`: root mean square of the logarithm of the luminance over the pixels that count, in percent."""
+
+
+def log_brightness(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
+    """Natural logarithm of the luminance of sRGB colours: a gain of the light changes no contrast."""
+    return luminance(image.clamp(0, 1)).clamp_min(DARKEST).log()
+
+
+def split_bands(values: Float[Tensor, "H W"], weight: Float[Tensor, "H W"]) -> Float[Tensor, "4 H W"]:
+    """`values` in each of `BANDS`, where `weight` is not 0; what has no weight adds nothing."""
+    levels = [values, *(_smooth(values, weight, sigma) for sigma in SIGMAS)]
+    return torch.stack([fine - coarse for fine, coarse in itertools.pairwise(levels)])
+
+
+def contrasts(parts: Sequence[tuple[Float[Tensor, "4 H W"], Bool[Tensor, "H W"]]]) -> Contrasts | None:
+    """Contrasts over some pixels of one or several pictures together; None of fewer than `FEWEST_PIXELS`.
+
+    Args:
+        parts: Bands of each picture, from `split_bands`, and the pixels that count.
+    """
+    values = torch.cat([bands[:, where] for bands, where in parts], 1).double()
+    if values.shape[1] < FEWEST_PIXELS:
+        return None
+    kept = values.square().sort(1).values[:, : round(KEPT * values.shape[1])]
+    return tuple(100 * value for value in kept.mean(1).sqrt().tolist())
+
+
+def _smooth(values: Tensor, weight: Tensor, sigma: float) -> Tensor:
+    rows, columns = (_gaussian(n, sigma).to(values) for n in values.shape)
+    total = rows @ weight @ columns
+    return (rows @ (values * weight) @ columns) / total.clamp_min(1e-12)
+
+
+@functools.cache
+def _gaussian(size: int, sigma: float) -> Float[Tensor, "n n"]:
+    """Weights of a Gaussian from each pixel of a line to each other; the normalised convolution scales them."""
+    x = torch.arange(size, dtype=torch.float64)
+    return torch.exp(-0.5 * ((x[:, None] - x) / sigma) ** 2)

@@ -1,0 +1,122 @@
+"""The pictures by which looks are judged: the photo's view, eight sides and eight poses, and what each pixel shows."""
+
+import math
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
+
+from oasis_warp.avatar.observation import inner_mask
+from oasis_warp.core.camera import crop_camera, orbit_camera, project
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import Camera, HandPose, Render
+from oasis_warp.estimation.hand_crop import CROP_MARGIN
+from oasis_warp.evaluation.band_energy import SIZE
+from oasis_warp.hand.poses import POSE_NAMES, named_pose
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.ops import depth_map
+
+FINE = 2
+"""Pictures are drawn so many times as large as they are measured."""
+DRAWN_SIZE = FINE * SIZE
+"""Side of the pictures that are looked at [px]."""
+GROUND = (0.93, 0.93, 0.92)
+"""Colour behind the hand."""
+AZIMUTHS = tuple(range(0, 360, 45))
+"""Of the sides [degrees]: 0 is that of the photo."""
+POSES = POSE_NAMES[1:]
+"""All named ones but rest, which is nearly that of relaxed."""
+RIM = 4
+"""Pixels at outlines that are not judged: the mask of a photo is some two pixels off, and the fit as much."""
+JUMP = 0.005
+"""Difference of the depth of neighbouring pixels that makes an outline inside the hand [m]: half a finger."""
+
+Kind = Literal["input", "side", "pose", "back"]
+
+
+class View(NamedTuple):
+    """A picture to be drawn."""
+
+    kind: Kind
+    name: str
+    """Azimuth in degrees, or a pose."""
+    camera: Camera
+    pose: HandPose
+
+
+class Surface(NamedTuple):
+    """What the pixels of a picture of `SIZE` show of the posed mesh."""
+
+    silhouette: Bool[Tensor, "S S"]
+    interior: Bool[Tensor, "S S"]
+    """Farther than `RIM` from all outlines, those of fingers before the hand included."""
+    visibility: Float[Tensor, "S S"]
+    """1 where the avatar's photo shows this skin well, 0 where it does not."""
+    palm: Float[Tensor, "S S"]
+    """1 on the palm's side, 0 on the back."""
+
+
+def views_of(avatar: Avatar) -> list[View]:
+    """The photo's view, the source pose from eight sides, eight poses from the photo's side, the open hand from behind.
+
+    All but the first are framed as crops of photos are: squares around the hand with the same margin.
+    """
+    pose, source = avatar.source_pose, avatar.source_camera
+    views = [View("input", "photo", crop_camera(source, 0.0, 0.0, float(source.width), DRAWN_SIZE), pose)]
+    views += [View("side", str(degrees), frame(avatar, pose, float(degrees)), pose) for degrees in AZIMUTHS]
+    held = {name: pose._replace(angles=named_pose(avatar.hand, name).to(pose.angles)) for name in POSES}
+    views += [View("pose", name, frame(avatar, each, 0.0), each) for name, each in held.items()]
+    return [*views, View("back", "open", frame(avatar, held["open"], 180.0), held["open"])]
+
+
+def frame(avatar: Avatar, pose: HandPose, degrees: float) -> Camera:
+    """A camera from the side `degrees` that frames the posed hand as `crop_hand` frames a photo's."""
+    vertices = avatar.mesh(pose).vertices
+    camera = orbit_camera(vertices, math.radians(degrees), size=DRAWN_SIZE)
+    xy, _ = project(camera, vertices)
+    low, high = xy.amin(0), xy.amax(0)
+    side = CROP_MARGIN * float((high - low).max())
+    left, top = ((low + high - side) / 2).tolist()
+    return crop_camera(camera, left, top, side, DRAWN_SIZE)
+
+
+def shrink(planes: Float[Tensor, "H W *C"]) -> Float[Tensor, "h w *C"]:
+    """A drawn picture at the size in which it is measured: means of blocks."""
+    flat = planes.reshape(*planes.shape[:2], -1).permute(2, 0, 1)
+    return avg_pool2d(flat, FINE).permute(1, 2, 0).reshape(SIZE, SIZE, *planes.shape[2:])
+
+
+@torch.no_grad()
+def draw(avatar: Avatar, view: View) -> Render:
+    """The picture of `DRAWN_SIZE` over `GROUND`."""
+    return avatar.render(view.camera, view.pose, GROUND)
+
+
+@torch.no_grad()
+def read_surface(
+    hand: HandModel, vertices: Float[Tensor, "V 3"], camera: Camera, visibility: Float[Tensor, "V"],
+    palm: Float[Tensor, "V"],
+) -> Surface:  # fmt: skip
+    """What `camera`, whatever its size, sees of the posed mesh in a picture of `SIZE`."""
+    small, faces = crop_camera(camera, 0.0, 0.0, float(camera.width), SIZE), hand.faces
+    seen = depth_map(vertices, faces, small.viewmat.to(vertices), small.K.to(vertices), SIZE, SIZE)
+    silhouette = seen.face_ids >= 0
+    values = torch.stack([visibility.to(vertices), palm.to(vertices)], -1)[faces[seen.face_ids.clamp_min(0).long()]]
+    shown, side = (values * seen.barycentrics[..., None]).sum(-2).unbind(-1)
+    return Surface(silhouette, silhouette & clear_of_outlines(seen.depth), shown, side)
+
+
+def silhouette(faces: Int[Tensor, "F 3"], vertices: Float[Tensor, "V 3"], camera: Camera) -> Bool[Tensor, "H W"]:
+    """Whether `camera` sees the mesh in each pixel."""
+    size = camera.width, camera.height
+    return depth_map(vertices, faces, camera.viewmat.to(vertices), camera.K.to(vertices), *size,
+                     outputs=("face_ids",)).face_ids >= 0  # fmt: skip
+
+
+def clear_of_outlines(depth: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
+    """Pixels with no jump of the depth within `RIM`; `depth` is infinite beside the surface."""
+    plane = depth.clamp_max(1e3)[None, None]
+    jumps = max_pool2d(plane, 3, 1, 1) + max_pool2d(-plane, 3, 1, 1) > JUMP
+    return inner_mask((~jumps[0, 0]).to(depth), RIM - 1) > 0.5
