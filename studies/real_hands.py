@@ -7,7 +7,6 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.evaluation.band_energy import BANDS
