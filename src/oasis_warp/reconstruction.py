@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
+from oasis_warp.adaptation.unseen_skin import paint_unseen
 from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.prior import Prior
@@ -216,11 +217,19 @@ def _run(
         adaptation = adapt(hand, guesses, crops, settings, resolutions=scales, progress=progress)
     with stage("detail"):
         adaptation = add_detail(hand, adaptation, close, close_scales, COARSE_SIZE, progress)
+    invented = None
+    if config.unseen == "painted":
+        with stage("painting"):
+            confidence = adaptation.observations.confidence.amax(0)
+            painted = paint_unseen(
+                hand, adaptation.gaussians, adaptation.guess, crops[0], confidence, seed=config.seed
+            )
+            adaptation, invented = adaptation._replace(gaussians=painted.gaussians), painted.invented
     avatar = make_avatar(fits[0], surfaces.shared, crops[0], adaptation.gaussians, adaptation.light)
     with stage("quality"):
         areas = surface.vertex_areas(crops[0].rest.vertices, hand.faces.to(config.device))
         parts = [_assess(hand, adaptation, k, fits[k], surfaces, crops[k], close[k]) for k in range(len(photos))]
-        quality = combine_quality([part[0] for part in parts])
+        quality = combine_quality([part[0] for part in parts])._replace(invented=invented)
         coverage = coverage_percent(hand, areas, quality)
         shares = coverage_of_photos(areas, adaptation.observations.confidence, adaptation.observations.share)
         warnings = [photo_warnings(c.image, c.mask, crop_side(fit)) for c, fit in zip(close, fits, strict=True)]

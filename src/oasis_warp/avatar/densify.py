@@ -147,12 +147,12 @@ def _cut(parts: Tensor, cut: Tensor, dtype: torch.dtype) -> tuple[Int[Tensor, "M
         if n:
             on = torch.nonzero(wanted == n)[:, 0]
             index.append(on.repeat_interleave(n * n))
-            place.append(_part_centers(n).to(dtype).repeat(len(on), 1))
+            place.append(part_centers(n).to(dtype).repeat(len(on), 1))
     return torch.cat(index).to(parts.device), torch.cat(place).to(parts.device)
 
 
 @functools.cache
-def _part_centers(n: int) -> Float[Tensor, "P 3"]:
+def part_centers(n: int) -> Float[Tensor, "P 3"]:
     """Barycentrics of the centres of the n^2 parts of a face: those that stand like it, then those upside down."""
     i, j = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
     upright, turned = i + j < n, i + j < n - 1

@@ -43,6 +43,8 @@ class SurfaceQuality(NamedTuple):
     """1 seen by the photo from the front, falling to 0 where it grazes the surface or does not show it."""
     uncertainty: Float[Tensor, "V"]
     """0 where the avatar is as the photo shows it, 1 where only the prior knows anything."""
+    invented: Float[Tensor, "V"] | None = None
+    """1 where skin is painted because no photo shows it well, 0 where it is as a photo shows it; None if none is."""
 
 
 @torch.no_grad()
@@ -80,12 +82,12 @@ def over_photo(drawn: Render, crop: HandCrop) -> Float[Tensor, "S S 3"]:
 
 def combine_quality(qualities: Sequence[SurfaceQuality]) -> SurfaceQuality:
     """How well each vertex is known from several photos: as from the one that says most of it."""
-    visibility, uncertainty = (torch.stack(values) for values in zip(*qualities, strict=True))
+    visibility, uncertainty = (torch.stack([quality[k] for quality in qualities]) for k in range(2))
     return SurfaceQuality(visibility.amax(0), uncertainty.amin(0))
 
 
 def coverage_percent(hand: HandModel, areas: Float[Tensor, "V"], quality: SurfaceQuality) -> dict[str, float]:
-    """Shares of the surface [%]: seen, grazed, not seen; seen of palm, back and nails; and the mean uncertainty.
+    """Shares of the surface [%]: seen, grazed, not seen, painted; seen of palm, back, nails; and the mean uncertainty.
 
     `areas` are those of the vertices at rest.
     """
@@ -99,6 +101,8 @@ def coverage_percent(hand: HandModel, areas: Float[Tensor, "V"], quality: Surfac
     found["extrapolated_percent"] = 100 - found["seen_percent"] - found["grazed_percent"]
     for name, weight in region_masks(label_regions(hand)).items():
         found[f"{name}_seen_percent"] = 100 * mean(seen, area * weight)
+    if quality.invented is not None:
+        found["invented_percent"] = 100 * mean(quality.invented.cpu(), area)
     found["uncertainty_mean"] = mean(quality.uncertainty.cpu(), area)
     return found
 

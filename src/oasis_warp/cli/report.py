@@ -29,6 +29,7 @@ MEASURES = {
     "palm_seen_percent": ("palm that it shows", "{:.0f} %"),
     "back_seen_percent": ("back that it shows", "{:.0f} %"),
     "nail_seen_percent": ("nails that it shows", "{:.0f} %"),
+    "invented_percent": ("skin that is painted", "{:.0f} %"),
     "uncertainty_mean": ("mean uncertainty", "{:.2f}"),
     "n_gaussians": ("Gaussians", "{:.0f}"),
 }

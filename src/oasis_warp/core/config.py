@@ -61,6 +61,9 @@ class ReconstructConfig:
     light: Literal["fit", "keep", "even"] = "fit"
     """The photo's light: fit it, so that it stays where it is when the hand turns; keep it on the skin, shadows too; or
     leave it out wherever one can tell."""
+    unseen: Literal["painted", "plain"] = "painted"
+    """Skin that no photo shows: paint folds, veins and nails of a plausible person in the tone of the hand, another for
+    every seed; or leave the smooth colours of the prior."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     seed: int = 0

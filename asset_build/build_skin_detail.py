@@ -1,0 +1,202 @@
+"""Make `assets/skin`: what is fine on real hands' skin, and where nails are, over the texture coordinates of the hand.
+
+    python asset_build/build_skin_detail.py FOLDER
+
+FOLDER holds the crops that `box` cuts from MakeHuman's body textures of 2048 px (CC0): the hand model was cut from the
+same body and kept its texture coordinates, moved and scaled, so nothing needs to be registered. Three hands have detail
+of their own and are taken; the light man's, on which several of the other textures are built, is left out to judge by.
+"""
+
+import hashlib
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import scipy.sparse as sparse
+import torch
+from scipy.sparse.linalg import splu
+
+from oasis_warp.adaptation.inpainting import laplacian_and_mass
+from oasis_warp.avatar.appearance import label_regions
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.synthetic.body import bundled_body
+from oasis_warp.synthetic.identity import Population, sample_identity
+from oasis_warp.synthetic.skin_plan import plan_skin
+from oasis_warp.synthetic.skin_texture import nail_maps
+from oasis_warp.synthetic.texels import draw_lines, texels_on
+
+HANDS = {
+    "young_lightskinned_female_diffuse2": 1.4,
+    "middleage_lightskinned_male_diffuse2": 1.4,
+    "skin_male_african_middleage": 0.65,
+}
+"""With each the gain of its detail: folds of dark skin are darker than those of light skin."""
+LOW, SPAN = (0.361408, 0.011539), 0.192729
+"""Corner and side of the hand's texture coordinates in those of the body."""
+BOX = (732, 1621, 411, 412)
+"""Column, row, width and height of the crops in the body's texture [px]."""
+BODY_SIZE = 2048
+SMOOTH = 0.008
+"""Length l of the low-pass 1 / (1 + (k l)^4) that is taken off: half of what repeats every 50 mm goes. Folds, vessels
+and red knuckles stay [m]."""
+AROUND = 3
+"""Harmonics of the angle about each bone of a finger that are taken off before: the light and dark sides of fingers
+are light left in the photos."""
+FINE, FINE_GAIN = 1.2, 2.0
+"""Blur [texels of .45 mm] and the gain of what is finer: Gaussians blur it again when they are drawn."""
+DARKER, COLOUR = (0.82, 1.06, 1.12), 0.3
+"""How much each channel's logarithm changes in the shade of a fold, the colour of all that is fine but for a share: the
+maps' own is that of blocks of JPEG."""
+RIM = 3.0
+"""Width of the islands' rims over which detail fades in: what lies beside them bled into them [texels]."""
+GREY, UNIT = 128, 400
+"""Value of the maps that stands for none, and steps to one of the natural logarithm."""
+PEOPLE, LOUDEST_LINE = (3, 8), 2.0
+"""People of the synthetic world whose folds over the joints are taken, and the first one's veins; the strength of a
+line that is stored as 255. The photos' own folds are blurred on the backs."""
+NAIL_REACH = 1.0
+"""Share of the nail's label from which on a texture's own nail is left out."""
+DARKEST = 0.02
+"""Of sRGB: below it the logarithm is noise."""
+
+
+def main(folder: Path) -> None:
+    """Read the crops, write the maps beside the other assets."""
+    target = Path(__file__).parents[1] / "src/oasis_warp/assets/skin"
+    hand = bundled_hand()
+    faces, places = rasterize(texel_corners(hand), BOX[3], BOX[2])
+    for k, (name, gain) in enumerate(HANDS.items()):
+        picture = cv2.imread(str(folder / f"{name}.png"))[..., ::-1] / 255
+        detail = band_pass(hand, np.log(np.maximum(picture, DARKEST)), faces, places)
+        stored = np.rint(GREY + UNIT * gain * detail).clip(0, 255).astype(np.uint8)
+        write(target / f"detail_{k}.png", spread_out(stored, faces >= 0))
+    people = [painted_lines(hand, number) for number in PEOPLE]
+    folds_and_veins = torch.stack([people[0]["fold"], people[1]["fold"], people[0]["vein"]], 1)
+    lines = 255 * resampled(folds_and_veins / LOUDEST_LINE, faces, places)
+    write(target / "lines.png", spread_out(np.rint(np.clip(lines, 0, 255)).astype(np.uint8), faces >= 0, fill=0))
+    write(target / "nails.png", spread_out(nails(hand, faces, places), faces >= 0))
+    sums = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}" for path in sorted(target.glob("*.png"))]
+    (target / "SHA256").write_text("\n".join(sums) + "\n")
+
+
+def write(path: Path, rgb: np.ndarray) -> None:
+    """A PNG, as small as it gets."""
+    cv2.imwrite(str(path), rgb[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    print(path.name, path.stat().st_size)
+
+
+def texel_corners(hand: HandModel) -> np.ndarray:
+    """Column and row of the corners of each face in the crops, [F, 3, 2]; the first pixel's centre is at .5."""
+    atlas = np.array(LOW) + (hand.uv.double().numpy() - 0.01) / 0.98 * SPAN
+    place = np.stack([atlas[:, 0] * BODY_SIZE - BOX[0], (1 - atlas[:, 1]) * BODY_SIZE - BOX[1]], 1)
+    return place[hand.uv_faces.numpy()]
+
+
+def rasterize(corners: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Face of each texel, -1 for none, [H, W], and its barycentrics there, [H, W, 3]."""
+    faces, places = np.full((height, width), -1), np.zeros((height, width, 3))
+    for face, points in enumerate(corners):
+        low = np.maximum(np.floor(points.min(0)).astype(int), 0)
+        high = np.minimum(np.ceil(points.max(0)).astype(int) + 1, (width, height))
+        column, row = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+        system = np.concatenate([points.T, np.ones((1, 3))])
+        target = np.stack([column.ravel() + 0.5, row.ravel() + 0.5, np.ones(column.size)])
+        weight = (
+            np.linalg.solve(system, target).T if abs(np.linalg.det(system)) > 1e-9 else np.full((column.size, 3), -1)
+        )
+        inside = (weight >= -1e-6).all(1)
+        faces[row.ravel()[inside], column.ravel()[inside]] = face
+        places[row.ravel()[inside], column.ravel()[inside]] = weight[inside]
+    return faces, places
+
+
+def band_pass(hand: HandModel, texture: np.ndarray, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """The texture, logarithms, without what is smooth along the skin."""
+    on, corners = faces >= 0, hand.faces.numpy()[np.maximum(faces, 0)]
+    n_vertices = len(hand.template)
+    laplacian, mass = laplacian_and_mass(hand.template.double().numpy(), hand.faces.numpy())
+    weight = places[on].ravel()
+    count = np.bincount(corners[on].ravel(), weight, n_vertices)
+    at_vertices = np.stack([
+        np.bincount(corners[on].ravel(), weight * np.repeat(texture[on][:, c], 3), n_vertices) for c in range(3)
+    ], 1) / np.maximum(count, 1e-9)[:, None]  # fmt: skip
+    around = light_around_bones(hand, at_vertices)
+    at_vertices = at_vertices - around
+    texture = texture - (around[corners] * places[..., None]).sum(2)
+    known = mass * np.minimum(count, 1) * (hand.nail.numpy() < NAIL_REACH / 2)
+    bending = SMOOTH**4 * laplacian @ sparse.diags_array(1 / mass) @ laplacian
+    smooth = splu((sparse.diags_array(known + 1e-9 * mass) + bending).tocsc()).solve(known[:, None] * at_vertices)
+    detail = sharpened(np.where(on[..., None], texture - (smooth[corners] * places[..., None]).sum(2), 0), on)
+    nail = (label_regions(hand).nail.double().numpy()[corners] * places).sum(2)
+    inner = np.clip(cv2.distanceTransform(on.astype(np.uint8), cv2.DIST_L2, 5) / RIM, 0, 1)
+    share = inner * (1 - np.clip(2 * nail / NAIL_REACH, 0, 1))
+    return detail * share[..., None]
+
+
+def sharpened(detail: np.ndarray, on: np.ndarray) -> np.ndarray:
+    """The detail with more of what is fine, in the colour of shade."""
+    weight = cv2.GaussianBlur(on.astype(np.float64), (0, 0), FINE)
+    coarse = cv2.GaussianBlur(detail * on[..., None], (0, 0), FINE) / np.maximum(weight, 1e-6)[..., None]
+    fine = np.where(on[..., None], detail - coarse, 0)
+    grey = fine.mean(2, keepdims=True)
+    return np.where(on[..., None], coarse, 0) + FINE_GAIN * (grey * np.array(DARKER) + COLOUR * (fine - grey))
+
+
+def light_around_bones(hand: HandModel, colors: np.ndarray) -> np.ndarray:
+    """Least squares of the colours on the fingers by harmonics of the angle about each bone, without its mean."""
+    fitted, theta = np.zeros_like(colors), hand.bone_theta.double().numpy()
+    waves = [f(k * theta) for k in range(1, AROUND + 1) for f in (np.cos, np.sin)]
+    basis = np.stack([np.ones_like(theta), *waves], 1)
+    for bone in range(1, len(hand.parents)):
+        here = (hand.segment == bone).numpy()
+        skin = here & (hand.nail.numpy() < NAIL_REACH / 2)
+        part = np.linalg.lstsq(basis[skin], colors[skin], rcond=None)[0]
+        fitted[here] = basis[here, 1:] @ part[1:]
+    laplacian, mass = laplacian_and_mass(hand.template.double().numpy(), hand.faces.numpy())
+    return splu((sparse.diags_array(mass) + SMOOTH**2 * laplacian).tocsc()).solve(mass[:, None] * fitted)
+
+
+def painted_lines(hand: HandModel, number: int) -> dict[str, torch.Tensor]:
+    """The lines of one person of the synthetic world, clear ones, at its texels."""
+    person = sample_identity(hand, 0, number, Population(hair=0))._replace(knuckles=1.1, age=0.45)
+    lines, texels = draw_lines(plan_skin(person).lines, texels_on("cpu").grid), texels_on("cpu")
+    palm = ((texels.palm - 0.28) / 0.52).clamp(0, 1)
+    return {name: line * (1 - palm) for name, line in lines.items()}
+
+
+def resampled(values: torch.Tensor, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Values at the synthetic world's texels, read over the texture coordinates of the hand, [H, W, C]."""
+    body = bundled_body()
+    maps = texels_on("cpu").image(values.half()).float()
+    at_corners = body.uv[body.uv_faces[: body.n_hand_faces]].double().numpy()[np.maximum(faces, 0)]
+    place = (at_corners * places[..., None]).sum(2)
+    grid = torch.from_numpy(2 * place - 1).float()[None]
+    read = torch.nn.functional.grid_sample(maps.permute(2, 0, 1)[None], grid, align_corners=False)
+    return read[0].permute(1, 2, 0).numpy()
+
+
+def nails(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Plate, lunula and free edge, and fold around the plate, of a person with short round nails, [H, W, 3]."""
+    texels = texels_on("cpu")
+    identity = sample_identity(hand, 0, 0, Population())._replace(nail_length=0.4, nail_shape=2.6, lunula=0.7)
+    own = nail_maps(texels, identity, np.zeros(5))
+    read = resampled(torch.stack([own.plate, own.plate * (own.lunula - own.free), own.rim], 1), faces, places)
+    corners = hand.faces.numpy()[np.maximum(faces, 0)]
+    back = 1 - (label_regions(hand).palm.double().numpy()[corners] * places).sum(2)  # the painter's fold goes round
+    values = read * back[..., None] * np.array([255, 127, 255]) + np.array([0, GREY, 0])
+    return np.rint(np.clip(np.where((faces >= 0)[..., None], values, [0, GREY, 0]), 0, 255)).astype(np.uint8)
+
+
+def spread_out(picture: np.ndarray, on: np.ndarray, fill: int = GREY) -> np.ndarray:
+    """Every texel beside the islands takes the nearest one's value, so that sampling at their rims reads no gap."""
+    _, nearest = cv2.distanceTransformWithLabels((~on).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    values = np.zeros((nearest.max() + 1, 3), np.uint8)
+    values[nearest[on]] = picture[on]
+    away = cv2.distanceTransform((~on).astype(np.uint8), cv2.DIST_L2, 5) > 4
+    return np.where(away[..., None], np.uint8(fill), values[nearest])
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,126 @@
+"""What is fine on skin, read from maps of real hands: folds, vessels, spots, and where nails are.
+
+The maps are made by `asset_build/build_skin_detail.py` over the texture coordinates of the bundled hand.
+"""
+
+import functools
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from oasis_warp.assets import asset
+from oasis_warp.core import surface
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import CanonicalGaussians
+
+HANDS = 3
+GREY, UNIT = 128, 400
+"""Value of the detail maps that stands for none, and steps to one of the natural logarithm."""
+LOUDEST_LINE = 2.0
+"""Strength of a line that is stored as 255."""
+BOX, BODY = (732, 1621, 411, 412), 2048
+"""Column, row, width and height of the maps in the texture of the whole body, and that one's side [px]."""
+LOW, SPAN = (0.361408, 0.011539), 0.192729
+"""Corner and side of the hand's texture coordinates in those of the body."""
+MIX_PASSES, MIX_SHARPNESS = 60, 3.0
+"""Smoothings of the noise that chooses between the hands, about 20 mm, and its strength: most places show one hand,
+since the mean of several is blurred."""
+WARP = 1.5
+"""Standard deviation by which the maps are moved, smoothly over the hand [texels of .45 mm]."""
+
+
+class SkinDetail(NamedTuple):
+    """What is fine at each Gaussian."""
+
+    skin: Float[Tensor, "N 3"]
+    """Added to the logarithm of sRGB; 0 on nails."""
+    fold: Float[Tensor, "N"]
+    """Depth of the folds over the joints, 1 for a clear one."""
+    vein: Float[Tensor, "N"]
+    """Strength of the veins on the back."""
+    plate: Float[Tensor, "N"]
+    """Share of nail."""
+    pale: Float[Tensor, "N"]
+    """1 on a nail's lunula, -1 on its free edge."""
+    rim: Float[Tensor, "N"]
+    """Share of the fold around a nail."""
+
+
+class Places(NamedTuple):
+    """Places on the surface: vertices, then points of faces; fields as in `CanonicalGaussians`."""
+
+    vertex_index: Int[Tensor, "P"]
+    face_index: Int[Tensor, "Q"]
+    barycentrics: Float[Tensor, "Q 3"]
+
+
+def sample_detail(hand: HandModel, gaussians: CanonicalGaussians | Places, seed: int) -> SkinDetail:
+    """Read the maps of three hands, mixed place by place and a little warped as `seed` says, at every Gaussian."""
+    device = gaussians.barycentrics.device
+    noise = _smooth_noise(hand, seed)
+    weights = torch.softmax(MIX_SHARPNESS * noise[:, :HANDS], 1)
+    of_vertices = torch.cat([weights, WARP * noise[:, HANDS:]], 1).to(device)
+    first = _first_corner(hand.faces, len(hand.template)).to(device)
+    faces, uv = hand.faces.to(device), _texels(hand).to(device)
+    uv_faces = hand.uv_faces.to(device)
+    corners = first[gaussians.vertex_index]
+    on_points = torch.cat([uv[uv_faces.flatten()[corners]], of_vertices[gaussians.vertex_index]], 1)
+    at_corners = torch.cat([uv[uv_faces[gaussians.face_index]], of_vertices[faces[gaussians.face_index]]], -1)
+    on_faces = (at_corners * gaussians.barycentrics[..., None]).sum(1)
+    read = torch.cat([on_points, on_faces])
+    place, share, shift = read[:, :2], read[:, 2 : 2 + HANDS], read[:, 2 + HANDS :]
+    share = share.square() / share.square().sum(1, keepdim=True)
+    maps = _maps().to(device)
+    moved = _sample(maps[: 3 * HANDS], place + shift).unflatten(1, (HANDS, 3))
+    own = _sample(maps[3 * HANDS :], place)  # not moved: folds and nails belong to their joints
+    plate, bare = own[:, 3], 1 - own[:, 3:4]
+    fold = torch.lerp(own[:, 0], own[:, 1], share[:, 0])
+    skin = (moved * share[..., None]).sum(1)
+    return SkinDetail(skin * bare, fold * bare[:, 0], own[:, 2], plate, own[:, 4], own[:, 5])
+
+
+def _smooth_noise(hand: HandModel, seed: int) -> Float[Tensor, "V C"]:
+    """Fields of mean 0 and standard deviation 1: one a hand, two of the warp. On the CPU, for equal bits."""
+    noise = torch.randn(len(hand.template), HANDS + 2, generator=torch.Generator().manual_seed(seed))
+    smooth = surface.smooth_over_mesh(noise, surface.mesh_edges(hand.faces.cpu()), MIX_PASSES)
+    return (smooth - smooth.mean(0)) / smooth.std(0)
+
+
+def _first_corner(faces: Int[Tensor, "F 3"], n_vertices: int) -> Int[Tensor, "V"]:
+    """Of each vertex, the first place among the faces' corners."""
+    flat = faces.flatten().cpu()
+    place = torch.full((n_vertices,), len(flat))
+    return place.scatter_reduce_(0, flat, torch.arange(len(flat)), "amin")
+
+
+def _texels(hand: HandModel) -> Float[Tensor, "U 2"]:
+    """Column and row of the texture coordinates in the maps; the first texel's centre is at .5."""
+    atlas = hand.uv.new_tensor(LOW) + (hand.uv - 0.01) / 0.98 * SPAN
+    return torch.stack([atlas[:, 0] * BODY - BOX[0], (1 - atlas[:, 1]) * BODY - BOX[1]], 1)
+
+
+def _sample(maps: Float[Tensor, "C H W"], place: Float[Tensor, "N 2"]) -> Float[Tensor, "N C"]:
+    if not len(place):
+        return place.new_zeros(0, len(maps))
+    size = place.new_tensor([maps.shape[2], maps.shape[1]])
+    grid = (2 * place / size - 1)[None, None]
+    return grid_sample(maps[None], grid, padding_mode="border", align_corners=False)[0, :, 0].T
+
+
+@functools.cache
+def _maps() -> Float[Tensor, "C H W"]:
+    """The detail of all hands, then two persons' folds, veins, and plate, paleness and rim of nails."""
+
+    def read(name: str) -> np.ndarray:
+        stored = np.frombuffer(asset("skin", name).read_bytes(), np.uint8)
+        return cv2.imdecode(stored, cv2.IMREAD_COLOR)[..., ::-1].astype(np.float32)
+
+    detail = [(read(f"detail_{k}.png") - GREY) / UNIT for k in range(HANDS)]
+    lines = read("lines.png") * (LOUDEST_LINE / 255)
+    nails = (read("nails.png") - np.float32([0, GREY, 0])) / np.float32([255, 127, 255])
+    return torch.from_numpy(np.concatenate([*detail, lines, nails], 2)).permute(2, 0, 1).contiguous()

@@ -1,0 +1,180 @@
+"""Paint what no photo shows: a plausible skin in the person's tone, joined to the seen skin without a seam."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from oasis_warp.adaptation.inpainting import inpaint
+from oasis_warp.adaptation.sharpen import FADE_REACH
+from oasis_warp.adaptation.skin_detail import Places, SkinDetail, sample_detail
+from oasis_warp.adaptation.skin_tone import SkinTone, infer_tone
+from oasis_warp.avatar.anchors import RIM_FADE, vertex_colors, vertex_to_gaussians
+from oasis_warp.avatar.appearance import label_regions
+from oasis_warp.avatar.densify import densify, part_centers
+from oasis_warp.avatar.observation import observe
+from oasis_warp.core import surface
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import CanonicalGaussians, HandCrop
+
+SEEN = 0.5
+"""Confidence of an observation from which skin is left as the photo shows it."""
+RIM_PASSES = 3
+"""Smoothings over the mesh of the border between seen and painted skin, about 4 mm."""
+JOIN_DETAIL, JOIN_REACH = 0.004, 0.04
+"""Length below which seen colours are averaged for the join, and distance over which the painted skin leaves them for
+the person's mean colours [m]."""
+MOST_DIFFERENT = 0.3
+"""Difference of the logarithms from the person's mean colours that is carried on: more is dirt, a ring or a shadow."""
+MORE = 1.5
+"""Gaussians after painting over those before, at most."""
+PARTS = 2
+"""An edge, of faces that are cut for the painting."""
+ON_PALM, ON_BACK = 1.0, 1.0
+"""Gain of the maps' detail on palms and on backs."""
+FOLD, VEIN = (-0.15, -0.20, -0.21), (-0.10, -0.05, -0.05)
+"""What a fold and a vein add to the logarithms of the colours."""
+GRAIN = 0.02
+"""Standard deviation of what each Gaussian on a face has of its own: pores and the mesh of fine wrinkles."""
+LUNULA, FREE_EDGE, NAIL_RIM = 0.07, 0.12, 0.16
+"""How much paler a nail's lunula and its free edge are than its bed, and how much darker the fold around it."""
+KNOWN_NAIL = 0.05
+"""Share of all nails that must be seen to count as much as the mean person's."""
+MIN_COLOR = 0.01
+
+
+class PaintedSkin(NamedTuple):
+    """Gaussians with skin wherever no photo shows any."""
+
+    gaussians: CanonicalGaussians
+    invented: Float[Tensor, "V"]
+    """1 where the skin is painted, 0 where it is as a photo shows it."""
+    tone: SkinTone
+
+
+@torch.no_grad()
+def paint_unseen(
+    hand: HandModel,
+    gaussians: CanonicalGaussians,
+    guess: CanonicalGaussians,
+    crop: HandCrop,
+    confidence: Float[Tensor, "V"],
+    *,
+    seed: int,
+) -> PaintedSkin:
+    """Replace the colours of what was not seen.
+
+    A painted place is exp(t + x + d): the mean colour t of the region in the person's tone (`infer_tone`), what the
+    seen skin differs from it, carried on as the screened membrane x (`inpaint`), and the detail d of real hands
+    (`sample_detail`). Where the seen skin ends, t + x is its own smooth colour, so that gradients go on and no seam
+    shows. Seen Gaussians stay bit for bit; the largest unseen faces are cut into finer ones.
+
+    Args:
+        hand: Whose surface it is.
+        gaussians: Fitted to the photos, in even light.
+        guess: Of the prior, before adaptation.
+        crop: The first photo.
+        confidence: How well the photos together show each vertex, 0 to 1.
+        seed: Of the detail.
+    """
+    rest = crop.rest.vertices
+    faces = hand.faces.to(rest.device)
+    first = observe(hand, crop)
+    shown = first.visibility * (first.facing > 0)
+    invented = _unseen_share(hand, confidence)
+    seen = vertex_colors(gaussians, len(rest))
+    tone = infer_tone(hand, vertex_colors(guess, len(rest)), seen, confidence)
+    difference = seen.clamp_min(MIN_COLOR).log() - tone.log_skin
+    regions = label_regions(hand)
+    nail, palm = regions.nail.to(rest), regions.palm.to(rest)
+    sure = ((confidence - SEEN) / (1 - SEEN)).clamp(0, 1) * (1 - nail)
+    difference = difference.clamp(-MOST_DIFFERENT, MOST_DIFFERENT)
+    smooth = inpaint(rest, faces, difference, sure, detail=JOIN_DETAIL, fade=JOIN_REACH)
+    bed = _nail_color(tone, seen, confidence * nail, nail.sum())
+
+    fine = densify(
+        gaussians, rest, faces, _parts(hand, gaussians, rest, torch.minimum(invented, 1 - shown), seed)
+    ).gaussians
+    read = vertex_to_gaussians(
+        torch.cat([tone.log_skin + smooth, smooth, torch.stack([palm, invented, shown], 1)], 1), faces, fine
+    )
+    amplitude = ON_BACK + (ON_PALM - ON_BACK) * read[:, 6:7]
+    painted = _paint(sample_detail(hand, fine, seed), amplitude, read[:, :3] + _grain(fine, seed), bed + read[:, 3:6])
+    looks = _mix(fine, painted, *read[:, 7:].clamp(0, 1).split(1, 1))
+    return PaintedSkin(looks, invented, tone)
+
+
+def _mix(
+    gaussians: CanonicalGaussians, painted: Float[Tensor, "N 3"], invented: Float[Tensor, "N 1"], shown: Tensor
+) -> CanonicalGaussians:
+    """The Gaussians with the painted colours where they are invented.
+
+    What the first photo shows there, on a slant or unreliably, becomes shade: it stays in the photo's own view and goes
+    when the skin turns. Without shade it stays as it is.
+    """
+    if gaussians.shade is None:
+        invented = invented * (1 - shown)
+    logs = gaussians.colors.clamp_min(MIN_COLOR).log()
+    colors = torch.where(invented > 0, torch.lerp(logs, painted, invented).exp().clamp(MIN_COLOR, 1), gaussians.colors)
+    if gaussians.shade is None:
+        return gaussians._replace(colors=colors)
+    beyond = shown * (logs - colors.clamp_min(MIN_COLOR).log())
+    shade = torch.where(invented > 0, gaussians.shade * beyond.exp(), gaussians.shade)
+    return gaussians._replace(colors=colors, shade=shade)
+
+
+def _unseen_share(hand: HandModel, confidence: Float[Tensor, "V"]) -> Float[Tensor, "V"]:
+    """1 unseen, 0 seen, smooth along the border, all on the side that the photo hardly shows."""
+    hidden = (1 - confidence / SEEN).clamp(0, 1)[:, None]
+    smooth = surface.smooth_over_mesh(hidden, surface.mesh_edges(hand.faces).to(hidden.device), RIM_PASSES)
+    return torch.minimum(smooth, (hidden > 0).to(smooth))[:, 0]
+
+
+def _nail_color(tone: SkinTone, seen: Tensor, weight: Float[Tensor, "V"], total: Tensor) -> Float[Tensor, "3"]:
+    """Logarithm of a nail's colour: the mean person's, or that of the nails that were seen."""
+    known = weight.sum() / total
+    own = (weight[:, None] * seen.clamp_min(MIN_COLOR).log()).sum(0) / weight.sum().clamp_min(1e-9)
+    return torch.lerp(tone.log_nail, own, known / (known + KNOWN_NAIL))
+
+
+def _parts(
+    hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], invented: Float[Tensor, "V"], seed: int
+) -> Int[Tensor, "F"]:
+    """Parts an edge: `PARTS` for the unseen faces of one Gaussian with most detail in them, as many as `MORE` allows.
+
+    Where the wrist ends parts would not fade, so that faces stay as they are.
+    """
+    faces = hand.faces.to(rest.device)
+    fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
+    n_own = torch.bincount(gaussians.face_index, minlength=len(faces))
+    may = torch.nonzero((invented[faces].amin(1) > 0.5) & (n_own == 1) & ~fading[faces].any(1))[:, 0]
+    count = min(len(may), int((MORE - 1) * len(gaussians.opacities) / (PARTS**2 - 1)))
+    centers = part_centers(PARTS).to(rest)
+    places = Places(may[:0], may.repeat_interleave(len(centers)), centers.repeat(len(may), 1))
+    detail = _skin_detail(sample_detail(hand, places, seed), ON_BACK).mean(1).view(len(may), len(centers))
+    _, areas = surface.face_normals(rest, faces)
+    chosen = (detail.var(1) * areas[may]).argsort(descending=True, stable=True)[:count]
+    return torch.ones_like(n_own).index_fill(0, may[chosen], PARTS)
+
+
+def _grain(gaussians: CanonicalGaussians, seed: int) -> Float[Tensor, "N 1"]:
+    """White noise; none on vertices, whose Gaussians lie below those of faces. On the CPU, for equal bits."""
+    noise = torch.randn(len(gaussians.face_index), generator=torch.Generator().manual_seed(seed + 1))
+    none = gaussians.colors.new_zeros(len(gaussians.vertex_index))
+    return GRAIN * torch.cat([none, noise.to(none)])[:, None]
+
+
+def _skin_detail(detail: SkinDetail, amplitude: Float[Tensor, "N 1"] | float) -> Float[Tensor, "N 3"]:
+    """What is added to the logarithms of smooth skin's colours."""
+    lines = detail.fold[:, None] * detail.skin.new_tensor(FOLD) + detail.vein[:, None] * detail.skin.new_tensor(VEIN)
+    return amplitude * detail.skin + lines
+
+
+def _paint(
+    detail: SkinDetail, amplitude: Float[Tensor, "N 1"], skin: Float[Tensor, "N 3"], nail: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
+    """Logarithms of the colours of skin and nails with their detail."""
+    pale = LUNULA * detail.pale.clamp_min(0) + FREE_EDGE * (-detail.pale).clamp_min(0)
+    skin = skin + _skin_detail(detail, amplitude)
+    return torch.lerp(skin, nail + pale[:, None], detail.plate[:, None]) - NAIL_RIM * detail.rim[:, None]

@@ -1,0 +1,150 @@
+import pytest
+import torch
+from synthetic import PALM_TO_CAMERA, crop_of
+
+from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.adaptation.skin_detail import Places, sample_detail
+from oasis_warp.adaptation.skin_tone import infer_tone, tone_colors
+from oasis_warp.adaptation.unseen_skin import MORE, SEEN, paint_unseen
+from oasis_warp.avatar.anchors import vertex_colors
+from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.observation import observe
+from oasis_warp.avatar.pose import pose_gaussians, with_shade_baked
+from oasis_warp.avatar.prior import MeanPrior
+from oasis_warp.core import surface
+from oasis_warp.core.config import AdaptConfig
+from oasis_warp.render.render import render
+
+
+@pytest.fixture(scope="module")
+def palm_photo(hand):
+    crop, _, _ = crop_of(hand, region_colors(label_regions(hand), 0.03), orientation=PALM_TO_CAMERA)
+    prior = MeanPrior(hand)(crop)
+    return crop, adapt(hand, [prior], [crop], AdaptConfig(texture_steps=5))
+
+
+def paint(hand, palm_photo, gaussians=None, seed=0):
+    crop, adapted = palm_photo
+    confidence = adapted.observations.confidence.amax(0)
+    return paint_unseen(hand, gaussians or adapted.gaussians, adapted.guess, crop, confidence, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def painted(hand, palm_photo):
+    return paint(hand, palm_photo)
+
+
+def unseen_back(hand, painted):
+    regions = label_regions(hand)
+    return (painted.invented > 0.99) & (regions.palm < 0.05) & (regions.nail < 0.05)
+
+
+def detail_of(hand, colors, where):
+    edges = surface.mesh_edges(hand.faces)
+    logs = colors.clamp_min(0.01).log()
+    return (logs - surface.smooth_over_mesh(logs, edges, 4))[where].std()
+
+
+def test_seen_skin_stays_bit_for_bit(hand, palm_photo, painted):
+    _, adapted = palm_photo
+    seen = adapted.observations.confidence[0] >= SEEN
+    before, after = (vertex_colors(g, len(seen)) for g in (adapted.gaussians, painted.gaussians))
+    assert int(seen.sum()) > 2000
+    assert torch.equal(before[seen], after[seen])
+    assert bool((painted.invented[seen] == 0).all())
+
+
+def test_the_unseen_back_gets_detail_that_a_mean_has_not(hand, palm_photo, painted):
+    where = unseen_back(hand, painted)
+    before, after = (vertex_colors(g, len(where)) for g in (palm_photo[1].gaussians, painted.gaussians))
+    assert detail_of(hand, after, where) > 1.5 * detail_of(hand, before, where)
+
+
+def test_the_photo_looks_as_before_in_its_own_view(hand, palm_photo, painted):
+    crop, adapted = palm_photo
+    drawn = [
+        render(
+            pose_gaussians(with_shade_baked(g), hand.faces, crop.rest.vertices, crop.posed.vertices), crop.camera
+        ).image
+        for g in (adapted.gaussians, painted.gaussians)
+    ]
+    inside = crop.mask > 0.99
+    assert float((drawn[1] - drawn[0])[inside].square().mean().sqrt()) < 0.01
+
+
+def test_one_seed_gives_one_skin_and_another_seed_another(hand, palm_photo, painted):
+    again, other = paint(hand, palm_photo), paint(hand, palm_photo, seed=1)
+    assert torch.equal(again.gaussians.colors, painted.gaussians.colors)
+    where = unseen_back(hand, painted)
+    one, two = (vertex_colors(made.gaussians, len(where))[where] for made in (painted, other))
+    assert float((one - two).square().mean().sqrt()) > 0.01
+
+
+def test_painting_adds_at_most_half_as_many_gaussians(palm_photo, painted):
+    before, after = len(palm_photo[1].gaussians.colors), len(painted.gaussians.colors)
+    assert 1.2 * before < after <= MORE * before
+
+
+def test_no_step_shows_where_painted_skin_meets_seen_skin(hand, palm_photo):
+    _, adapted = palm_photo
+    tinted = adapted.gaussians._replace(colors=(adapted.gaussians.colors * torch.tensor([0.8, 1.0, 0.9])).clamp(0, 1))
+    made = paint(hand, palm_photo, tinted)
+    nail = label_regions(hand).nail > 0.02
+    colors = vertex_colors(made.gaussians, len(nail)).clamp_min(0.01).log()
+    edges = surface.mesh_edges(hand.faces)
+    edges = edges[~nail[edges].any(1)]
+    share = made.invented[edges]
+    crossing, inside = share.amin(1) == 0, share.amin(1) == 1
+    crossing = crossing & (share.amax(1) > 0)
+    step = (colors[edges[:, 0]] - colors[edges[:, 1]]).abs().mean(1)
+    assert int(crossing.sum()) > 100
+    assert float(step[crossing].mean()) < 1.5 * float(step[inside].mean())
+
+
+@pytest.mark.parametrize("melanin", [0.012, 0.05, 0.2])
+def test_a_palm_tells_the_back_of_the_same_person(hand, melanin):
+    """The back of a dark hand must not come out as light as its palm, nor that of a light one brown."""
+    regions = label_regions(hand)
+    true, _ = tone_colors(regions, melanin)
+    cast = torch.tensor([0.9, 0.85, 0.8])
+    tone = infer_tone(hand, true, true * cast, regions.palm)
+    back = regions.palm < 0.05
+    error = (tone.log_skin - (true * cast).log())[back].mean(0)
+    assert float(error.abs().max()) < 0.07  # the posterior mean leans towards the middle: half a tone of the table
+    assert tone.melanin == pytest.approx(melanin, rel=0.35)
+
+
+@pytest.mark.parametrize("melanin", [0.008, 0.03, 0.12])
+def test_palms_are_redder_than_backs_and_no_darker(hand, melanin):
+    regions = label_regions(hand)
+    colors, _ = tone_colors(regions, melanin)
+    palm, back = ((colors * w[:, None]).sum(0) / w.sum() for w in (regions.palm, 1 - regions.palm))
+    assert float(palm[0] / palm[1]) > float(back[0] / back[1]) or melanin > 0.1
+    assert float(palm.mean()) > 0.95 * float(back.mean())
+
+
+def test_nails_are_where_the_hand_model_has_them(hand):
+    index = torch.arange(len(hand.template))
+    detail = sample_detail(hand, Places(index, index[:0], torch.zeros(0, 3)), 0)
+    assert float(detail.plate[hand.nail > 0.95].mean()) > 0.8
+    assert float(detail.plate[label_regions(hand).palm > 0.9].max()) < 0.1
+
+
+def test_the_same_place_has_the_same_detail_as_a_vertex_and_on_a_face(hand):
+    """A wrong corner of the texture coordinates would show another place's skin; islands' rims have two."""
+    index = torch.arange(len(hand.template))
+    faces = torch.arange(0, len(hand.faces), 7)
+    corner = torch.tensor([[1.0, 0.0, 0.0]]).repeat(len(faces), 1)
+    detail = sample_detail(hand, Places(index, faces, corner), 0).skin
+    apart = (detail[len(index) :] - detail[hand.faces[faces, 0]]).abs().amax(1)
+    assert float((apart < 1e-5).float().mean()) > 0.97
+
+
+def test_without_shade_what_the_photo_shows_on_a_slant_stays(hand, palm_photo):
+    crop, adapted = palm_photo
+    bare = adapted.gaussians._replace(shade=None)
+    made = paint(hand, palm_photo, bare)
+    first = observe(hand, crop)
+    shown = (first.visibility == 1) & (first.facing > 0)
+    on = shown[bare.vertex_index]
+    assert torch.equal(*(g.colors[: len(on)][on] for g in (bare, made.gaussians)))
