@@ -68,7 +68,10 @@ def main(folder: Path) -> None:
     hand = bundled_hand()
     faces, places = rasterize(texel_corners(hand), BOX[3], BOX[2])
     for k, (name, gain) in enumerate(HANDS.items()):
-        picture = cv2.imread(str(folder / f"{name}.png"))[..., ::-1] / 255
+        bgr = cv2.imread(str(folder / f"{name}.png"))
+        if bgr is None:
+            raise FileNotFoundError(f"{folder / name}.png: expected a picture; give the folder of the crops.")
+        picture = bgr[..., ::-1] / 255
         detail = band_pass(hand, np.log(np.maximum(picture, DARKEST)), faces, places)
         stored = np.rint(GREY + UNIT * gain * detail).clip(0, 255).astype(np.uint8)
         write(target / f"detail_{k}.png", spread_out(stored, faces >= 0))

@@ -118,7 +118,9 @@ def _maps() -> Float[Tensor, "C H W"]:
 
     def read(name: str) -> np.ndarray:
         stored = np.frombuffer(asset("skin", name).read_bytes(), np.uint8)
-        return cv2.imdecode(stored, cv2.IMREAD_COLOR)[..., ::-1].astype(np.float32)
+        bgr = cv2.imdecode(stored, cv2.IMREAD_COLOR)
+        assert bgr is not None, name
+        return bgr[..., ::-1].astype(np.float32)
 
     detail = [(read(f"detail_{k}.png") - GREY) / UNIT for k in range(HANDS)]
     lines = read("lines.png") * (LOUDEST_LINE / 255)
