@@ -15,6 +15,7 @@ from oasis_warp.core.camera import orbit_camera, project
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_pose
+from oasis_warp.core.processes import using_threads
 from oasis_warp.core.types import Landmarks, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_hand
@@ -97,6 +98,16 @@ def test_even_light_is_asked_for_of_several_photos_as_of_one(palm, monkeypatch):
         with pytest.raises(InterruptedError):
             reconstruct_same_hand([palm], replace(SMALL, light=light))
     assert asked == ["keep", "even"]
+
+
+@pytest.mark.slow
+def test_bits_do_not_depend_on_the_number_of_threads(palm, alone):
+    with using_threads(torch.get_num_threads() + 2):
+        again = reconstruct(palm, SMALL)
+        assert torch.get_num_threads() > 2
+    for one, other in zip(alone.avatar.gaussians, again.avatar.gaussians, strict=True):
+        assert one is other is None or torch.equal(one, other)
+    assert torch.equal(alone.fit.mask, again.fit.mask)
 
 
 @pytest.mark.slow

@@ -31,6 +31,7 @@ from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_pose
+from oasis_warp.core.processes import single_threaded_torch
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, Landmarks, Photo, Render
 from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_hand, fit_together
 from oasis_warp.estimation.fit_quality import keeps_quality, with_pose
@@ -171,6 +172,7 @@ def reconstruct_same_hand(
     return fused._replace(warnings=(*_name_warnings(fused.photos, of_photos), *of_coverage))
 
 
+@single_threaded_torch()
 def _run(
     photos: Sequence[Photo], config: ReconstructConfig, keypoints: Path | None, prior: Prior | None, progress: Progress
 ) -> _Outcome:

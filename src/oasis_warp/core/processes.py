@@ -5,6 +5,7 @@ import signal
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
 
@@ -32,3 +33,26 @@ def using_threads(threads: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+_set_aside: ContextVar[int | None] = ContextVar("threads that torch does not use", default=None)
+
+
+def kernel_threads() -> int:
+    """How many CPU threads our kernels may use: as many as torch, or as it had before `single_threaded_torch`."""
+    return _set_aside.get() or torch.get_num_threads()
+
+
+@contextmanager
+def single_threaded_torch() -> Iterator[None]:
+    """Run torch's operators on one thread inside the block, and our kernels on as many as before.
+
+    The bits of torch's convolutions, norms and products depend on the number of its threads, and its waiting threads
+    spin: where others need the core, two of them take ten times as long as one. Our kernels do neither.
+    """
+    before = _set_aside.set(kernel_threads())
+    try:
+        with using_threads(1):
+            yield
+    finally:
+        _set_aside.reset(before)

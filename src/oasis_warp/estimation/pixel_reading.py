@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from oasis_warp.assets import asset
+from oasis_warp.core.processes import using_threads
 from oasis_warp.network.dense_network import FRONT, HAND, SURFACE_UNIT, DenseNetwork
 from oasis_warp.network.dense_weights import load_dense_network
 
@@ -87,7 +88,7 @@ def read_pixels(rgb: np.ndarray, xy: np.ndarray, network: DenseNetwork | None = 
     side = MARGIN * max(float((high - low).max()), 1.0)
     corner, scale = (low + high) / 2 - side / 2, SIDE / side
     crop = _crop(rgb, corner, scale)
-    with torch.inference_mode():
+    with torch.inference_mode(), using_threads(1):  # several share sums out differently, and bits would change
         image = torch.from_numpy(crop).permute(2, 0, 1)[None].float() / 255
         points = torch.from_numpy((xy - corner) * scale)[None].float()
         out = network(image.contiguous(memory_format=torch.channels_last), points)

@@ -12,6 +12,7 @@ from torch import Tensor
 from oasis_kernels.depth import depth_buffer as kernels
 from oasis_kernels.depth import depth_buffer_native as vectors
 from oasis_kernels.depth.depth_buffer_native import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
+from oasis_warp.core.processes import kernel_threads
 from oasis_warp.ops._runtime import depth_cuda
 from oasis_warp.ops._runtime.depth_scene import Buffer, BufferParts, DepthScene, Query, Scores, restrict, shared
 from oasis_warp.ops._runtime.incidence import _transposed, sum_at_items
@@ -81,7 +82,7 @@ def draw_by_vectors(scene: DepthScene, query: Query | None, outputs: BufferParts
     """`draw` on the CPU."""
     batch, n_vertices, _ = scene.vertices.shape
     width, height = scene.width, scene.height
-    parts = max(1, min(-(-torch.get_num_threads() // max(batch, 1)), scene.faces.shape[0] // FACES_A_PART))
+    parts = max(1, min(-(-kernel_threads() // max(batch, 1)), scene.faces.shape[0] // FACES_A_PART))
     drawn = outputs._replace(depth=True, face_ids=True)
     buffer = scene.empty_buffer(drawn)
     # One allocation: camera_vertices, screen_vertices and planes, in numbers of 4 bytes.
@@ -114,8 +115,8 @@ def draw_by_vectors(scene: DepthScene, query: Query | None, outputs: BufferParts
 
 
 def _run_all(job: Job, dtype: str) -> None:
-    """Run the stages of a forward pass on as many of torch's threads as they have tasks for."""
-    if torch.get_num_threads() == 1:
+    """Run the stages of a forward pass on as many of our threads as they have tasks for."""
+    if kernel_threads() == 1:
         _run("all", dtype, job, 1)
         return
     _run("transform", dtype, job, -(-job.n_vertices // VERTICES_A_TASK))

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from oasis_kernels.runtime.cuda_native import CudaNative
 from oasis_kernels.runtime.native import TASK, Native
+from oasis_warp.core.processes import kernel_threads
 
 _start_lock = threading.Lock()
 _load_lock = threading.Lock()
@@ -149,7 +150,7 @@ def _pool(process: int, n_threads: int) -> ThreadPoolExecutor:
 
 def even_cuts(n: int) -> list[int]:
     """Bounds 0 .. n of ranges for `launch_ranges`: one for each thread, none with fewer than `LEAST_TASKS`."""
-    parts = max(1, min(torch.get_num_threads(), n // LEAST_TASKS))
+    parts = max(1, min(kernel_threads(), n // LEAST_TASKS))
     return [n * k // parts for k in range(parts + 1)]
 
 
@@ -159,7 +160,7 @@ def launch_ranges(
     """Launch `kernel(first, *inputs)` over the tasks 0 .. cuts[-1]; thread t does task first + t.
 
     On the CPU, where a launch is one loop on the calling thread with the GIL released, the ranges between `cuts` are
-    shared out over `torch.get_num_threads()` threads; those of so many tasks are `even_cuts`. A task must write only
+    shared out over `kernel_threads()` threads; those of so many tasks are `even_cuts`. A task must write only
     what is its own; then results do not depend on the cuts. On CUDA it is one launch. With `lanes` the launch has a
     second axis of that size. Inputs are as in `launch`.
     """
@@ -174,7 +175,7 @@ def launch_ranges(
         dim = end - first if lanes is None else (end - first, lanes)
         wp.launch(kernel, dim=dim, inputs=[first, *inputs], device=device, stream=stream, block_dim=256)
 
-    n_threads = min(torch.get_num_threads(), len(ranges))
+    n_threads = min(kernel_threads(), len(ranges))
     if device.is_cuda or n_threads < 2:
         for bounds in ranges:
             run(bounds)
@@ -207,11 +208,11 @@ def _replay(kernel: Any, block: int) -> None:
 def run_shared(kernel: Any, block: int, n_tasks: int) -> None:
     """Run a CPU kernel of one argument, the address of a parameter block, and return when it is done.
 
-    Up to `n_tasks` of torch's threads run it together, including this one. The kernel deals out its tasks, so a thread
+    Up to `n_tasks` of our threads run it together, including this one. The kernel deals out its tasks, so a thread
     that comes late, or never, costs only time.
     """
     start()
-    helpers = min(torch.get_num_threads(), n_tasks) - 1
+    helpers = min(kernel_threads(), n_tasks) - 1
     if helpers < 1:
         _replay(kernel, block)
         return

@@ -7,6 +7,7 @@ from jaxtyping import Int32, Int64
 from torch import Tensor
 
 from oasis_kernels.rasterize import tiles
+from oasis_warp.core.processes import kernel_threads
 from oasis_warp.ops._runtime.launch import launch_ranges, vectors
 
 MAX_PAIRS = 2**31 - 1
@@ -92,8 +93,8 @@ def check_pairs(n_pairs: int) -> None:
 def even_work(starts: Tensor) -> list[int]:
     """Bounds of ranges of tiles with about equally many pairs; an empty tile counts a little too."""
     n_tiles = len(starts) - 1
-    parts = min(RANGES_A_THREAD * torch.get_num_threads(), n_tiles)
-    if starts.is_cuda or torch.get_num_threads() == 1:
+    parts = min(RANGES_A_THREAD * kernel_threads(), n_tiles)
+    if starts.is_cuda or kernel_threads() == 1:
         return [0, n_tiles]
     work = starts + torch.arange(n_tiles + 1) * 4
     targets = torch.arange(1, parts) * int(work[-1]) // parts
