@@ -28,8 +28,6 @@ from oasis_warp.hand.template import bundled_hand
 PALM, BACK = 0.7, 0.3
 """Share of the palm from which, and up to which, a pixel counts as palm or back."""
 SIDES = ("palm", "back")
-LEAST_SHARE = 0.25
-"""Least share of the hand's pixels that a side has where its contrasts are measured: slivers are mostly outlines."""
 LEAST_SIDE = 0.75 * SIZE
 """Least side of the square around a hand in its photo [px]: of smaller hands the finest band is empty."""
 DIGITS = 3
@@ -51,25 +49,25 @@ def real_photos(folder: Path) -> dict[Path, str]:
 
 
 def measure_real(photo: Photo, estimator: HandEstimator) -> Record:
-    """Contrasts by side, features, the darkest palm over its median, and the size of the largest hand of a photo.
+    """Contrasts of the side that a photo mostly shows, features, the darkest palm over its median, and the hand's size.
+
+    Of the other side a photo shows slivers, which are mostly outlines and the backs of bent fingers.
 
     Raises:
         InputError: it shows no hand, or no pose fits.
     """
     fit = estimator.fit(photo, choose_hand(estimator.find(photo), "largest", photo.name))
     crop = crop_hand(photo, fit, initial_offsets(bundled_hand(), fit), ReconstructConfig(size=SIZE))
-    surface, found = read_crop(crop), {}
+    surface = read_crop(crop)
+    sides = {side: where & (surface.visibility >= SEEN) for side, where in side_masks(surface).items()}
+    mostly = "palm" if float(surface.palm[surface.interior].mean()) > 0.5 else "back"
     bands = split_bands(log_brightness(crop.image), surface.interior.float())
-    for side, where in side_masks(surface).items():
-        seen = where & (surface.visibility >= SEEN)
-        if float(seen.sum()) >= LEAST_SHARE * float(surface.interior.sum()) and (made := contrasts([(bands, seen)])):
-            found[side] = made
-    palm = side_masks(surface)["palm"] & (surface.visibility >= SEEN)
+    found = contrasts([(bands, sides[mostly])]) if crop_side(fit) >= LEAST_SIDE else None
     return {
         "crop_px": round(crop_side(fit)),
-        "contrast": found if crop_side(fit) >= LEAST_SIDE else {},
-        "mostly": "palm" if float(surface.palm[surface.interior].mean()) > 0.5 else "back",
-        "darkest": darkest_over_median(crop.image, palm),
+        "mostly": mostly,
+        "contrast": {} if found is None else {mostly: found},
+        "darkest": darkest_over_median(crop.image, sides["palm"]),
         "features": hand_features(over_ground(crop), crop.mask),
     }
 
