@@ -91,7 +91,7 @@ def distances(rows: list[Row]) -> str | None:
     return markdown(["pictures", "version", "number", "all", *LAYERS], lines) if lines else None
 
 
-FLOORS = ("halves of the real hands", "real palms and real backs")
+FLOORS = ("halves of the real hands", "real palms to real backs")
 """Rows of the kernel distance that depend on no avatar."""
 
 

@@ -51,7 +51,8 @@ def test_the_distance_is_the_formula_of_the_paper():
 
 def samples(shift, names):
     random = np.random.default_rng(len(names))
-    return [Sample(name, {layer: (random.normal(size=4) * 100 + shift).tolist() for layer in LAYERS}) for name in names]
+    values = [{layer: (random.normal(size=4) * 100 + shift).tolist() for layer in LAYERS} for _ in names]
+    return [Sample(name, "palm", features) for name, features in zip(names, values, strict=True)]
 
 
 def test_layers_are_scaled_and_too_few_hands_are_refused():

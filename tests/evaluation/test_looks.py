@@ -1,9 +1,14 @@
 """Views, regions, the table of real hands, and how records of photos become tables."""
 
 
+import math
+
 import pytest
 import torch
 
+from oasis_warp.avatar.appearance import label_regions
+from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.mirror import mirror_points
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.evaluation.band_energy import BANDS, SIZE
@@ -11,7 +16,7 @@ from oasis_warp.evaluation.contact_sheet import GAP, SMALL, write_cells, write_o
 from oasis_warp.evaluation.kernel_distance import LAYERS
 from oasis_warp.evaluation.looks import hand_of, kernel_rows, summarise_looks
 from oasis_warp.evaluation.real_hands import real_photos, reference_contrasts, summarise_real
-from oasis_warp.evaluation.views import RIM, clear_of_outlines, shrink
+from oasis_warp.evaluation.views import RIM, clear_of_outlines, read_surface, shrink
 
 
 def test_pixels_near_the_outline_of_a_finger_before_the_hand_do_not_count():
@@ -22,6 +27,22 @@ def test_pixels_near_the_outline_of_a_finger_before_the_hand_do_not_count():
     rows = clear[:, 120].nonzero()[:, 0].tolist()
     inside = [*range(40 + RIM, 100 - RIM), *range(100 + RIM, 140 - RIM), *range(140 + RIM, 200 - RIM)]
     assert rows == [row for row in range(SIZE) if row in inside or row < 40 - RIM or row >= 200 + RIM]
+
+
+@pytest.mark.parametrize("left", [False, True])
+def test_the_outside_of_the_skin_counts_and_the_inside_of_the_wrist_does_not(hand, left):
+    vertices = mirror_points(hand.template) if left else hand.template
+    ones, palm = torch.ones(len(vertices)), label_regions(hand).palm
+    wrist = 0
+    for k in range(8):
+        camera = orbit_camera(vertices, k * math.pi / 4)
+        outside = read_surface(hand, vertices, camera, ones, palm, left=left)
+        inside = read_surface(hand, vertices, camera, ones, palm, left=not left)  # as if the skin were inside out
+        least = 0.1 * int(outside.silhouette.sum())
+        assert int(outside.interior.sum()) > least > int(inside.interior.sum())
+        assert not (outside.interior & inside.interior).any()
+        wrist += int(inside.interior.sum())
+    assert wrist > 500  # one of the views looks into it
 
 
 def test_shrinking_takes_means_of_blocks():
@@ -94,7 +115,7 @@ def test_halves_of_real_hands_are_the_floor_and_palms_and_backs_are_apart():
     values = torch.randn(16, generator=random) + 5 * (torch.arange(16) % 2)
     crowd = [real(f"{k}", [], float(value), ("palm", "back")[k % 2]) for k, value in enumerate(values)]
     rows = {row["name"]: row for row in kernel_rows({"input": [], "side": [], "pose": []}, crowd)}
-    floor, apart = rows["halves of the real hands"], rows["real palms and real backs"]
+    floor, apart = rows["halves of the real hands"], rows["real palms to real backs"]
     assert abs(floor["half"]) < 3 * floor["half_error"] and apart["half"] > 3 * apart["half_error"]
 
 

@@ -7,7 +7,7 @@ standard error is that of the groups.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -28,6 +28,8 @@ FEWEST_GROUPS = 4
 """Fewest groups on either side of which a distance is measured."""
 SPREAD_FLOOR = 1e-3
 """Least standard deviation of a channel, over the largest, that it is divided by."""
+MOST_SPREADS = 3.0
+"""Standard deviations to which channels are clipped: cubed, one odd picture would outweigh all others."""
 
 Features = dict[str, list[float]]
 """Of one picture, by `LAYERS`."""
@@ -37,6 +39,8 @@ class Sample(NamedTuple):
     """Features of one picture and what it is a picture of."""
 
     group: str
+    mostly: Literal["palm", "back"]
+    """The side of the hand that it mostly shows."""
     features: Features
 
 
@@ -150,4 +154,5 @@ def _matrix(crowd: Sequence[Sample], layer: str) -> np.ndarray:
 def _standardised(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     center, spread = scale.mean(0), scale.std(0)
     spread = np.maximum(spread, SPREAD_FLOOR * spread.max())
-    return (x - center) / spread, (y - center) / spread
+    first, second = (np.clip((values - center) / spread, -MOST_SPREADS, MOST_SPREADS) for values in (x, y))
+    return first, second

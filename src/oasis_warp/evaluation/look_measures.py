@@ -17,7 +17,7 @@ from oasis_warp.evaluation.band_energy import SIZE, Contrasts, contrasts, log_br
 from oasis_warp.evaluation.blemishes import darkest_over_median, haze, mean_light, redness
 from oasis_warp.evaluation.contact_sheet import Cell
 from oasis_warp.evaluation.kernel_distance import Sample, hand_features
-from oasis_warp.evaluation.real_hands import read_crop, side_masks
+from oasis_warp.evaluation.real_hands import mostly_shows, read_crop, side_masks
 from oasis_warp.evaluation.summary import Record
 from oasis_warp.evaluation.views import DRAWN_SIZE, Surface, View, draw, read_surface, shrink, silhouette, views_of
 from oasis_warp.hand.template import bundled_hand
@@ -84,7 +84,7 @@ def measure_looks(
         if picture.view.kind in samples and picture.view.name != "0":
             planes = (picture.image, picture.alpha)
             features = hand_features(*(plane.flip(1) for plane in planes) if left else planes)
-            samples[picture.view.kind].append(Sample(group, features))
+            samples[picture.view.kind].append(Sample(group, mostly_shows(picture.surface), features))
     large = crops[1].image.flip(1) if left else crops[1].image
     cells = [(large, photo.name)] + [(p.large.image, _words(p.view)) for p in pictures if p.view.kind != "back"]
     return Looks(record, samples, cells)
@@ -97,10 +97,11 @@ def _words(view: View) -> str:
 def draw_pictures(avatar: Avatar, visibility: Float[Tensor, "V"]) -> list[Picture]:
     """Every view of `views_of`, in their order; `visibility` is that of `SurfaceQuality`."""
     hand, pictures = bundled_hand(), []
-    palm = label_regions(hand).palm
+    palm, left = label_regions(hand).palm, avatar.side == "left"
     for view in views_of(avatar):
         drawn = draw(avatar, view)
-        surface = read_surface(hand, avatar.mesh(view.pose).vertices.cpu(), view.camera, visibility, palm)
+        vertices = avatar.mesh(view.pose).vertices.cpu()
+        surface = read_surface(hand, vertices, view.camera, visibility, palm, left=left)
         large = Render(drawn.image.cpu().clamp(0, 1), drawn.alpha.cpu())
         pictures.append(Picture(view, shrink(large.image), shrink(large.alpha), surface, large))
     return pictures

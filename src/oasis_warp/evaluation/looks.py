@@ -26,7 +26,7 @@ from oasis_warp.evaluation.kernel_distance import (
 )
 from oasis_warp.evaluation.look_measures import measure_looks
 from oasis_warp.evaluation.methods import prior_digest
-from oasis_warp.evaluation.real_hands import SIDES, measure_real, real_photos, reference_contrasts
+from oasis_warp.evaluation.real_hands import measure_real, real_photos, reference_contrasts
 from oasis_warp.evaluation.same_hand import photos_in
 from oasis_warp.evaluation.summary import Record
 from oasis_warp.hand.template import bundled_hand
@@ -91,7 +91,7 @@ def evaluate_looks(
             left_out[path.name] = made["left_out"]
             continue
         for kind in KINDS:
-            samples[kind] += [Sample(group, features) for features in made["features"][kind]]
+            samples[kind] += [Sample(group, *sample) for sample in made["features"][kind]]
         found[path.name] = {name: value for name, value in made.items() if name != "features"}
     progress("avatars", len(photos), len(photos))
     if not found:
@@ -151,7 +151,7 @@ def _measured(
             record: Record = {"left_out": str(error)}
         else:
             write_cells(out / SHEETS / f"{path.stem}.jpg", looks.cells)
-            features = {kind: [sample.features for sample in own] for kind, own in looks.samples.items()}
+            features = {kind: [sample[1:] for sample in own] for kind, own in looks.samples.items()}
             record = {**looks.record, "features": features}
         write_file(file, json.dumps(record, allow_nan=False).encode())
     return json.loads(file.read_text())
@@ -205,14 +205,21 @@ def kernel_rows(samples: Mapping[str, Sequence[Sample]], real: Sequence[Record],
 
     No rows where there are too few real hands; none of the avatars where there are too few avatars.
     """
-    crowd = [Sample(record["hand"], record["features"]) for record in real]
+    crowd = [Sample(record["hand"], record["mostly"], record["features"]) for record in real]
+    backs, palms = ([sample for sample in crowd if sample.mostly == side] for side in ("back", "palm"))
     groups = sorted({sample.group for sample in crowd})
     if len(groups) < 2 * FEWEST_GROUPS:
         return []
     rows = []
-    for kind, name in KINDS.items():
-        if len({sample.group for sample in samples[kind]}) >= FEWEST_GROUPS:
-            rows.append(_kernel_row(name, len(samples[kind]), kernel_distances(samples[kind], crowd, crowd, seed)))
+    drawn_backs = [sample for sample in samples["side"] if sample.mostly == "back"]
+    pairs = {
+        **{name: (samples[kind], crowd) for kind, name in KINDS.items()},
+        "novel sides that show the back, to real backs": (drawn_backs, backs),
+        "real palms to real backs": (palms, backs),
+    }
+    for name, (drawn, others) in pairs.items():
+        if min(len({sample.group for sample in part}) for part in (drawn, others)) >= FEWEST_GROUPS:
+            rows.append(_kernel_row(name, len(drawn), kernel_distances(drawn, others, crowd, seed)))
     random, halves = np.random.default_rng(seed), []
     for _ in range(SPLITS):
         half = set(random.permutation(groups)[: len(groups) // 2].tolist())
@@ -222,12 +229,7 @@ def kernel_rows(samples: Mapping[str, Sequence[Sample]], real: Sequence[Record],
         layer: KernelDistance(statistics.fmean(values), statistics.stdev(values))
         for layer in halves[0] if (values := [half[layer].value for half in halves])
     }  # fmt: skip
-    rows.append(_kernel_row("halves of the real hands", len(crowd), floor))
-    shown = [record["mostly"] for record in real]
-    sides = [[sample for sample, of in zip(crowd, shown, strict=True) if of == side] for side in SIDES]
-    if all(len({sample.group for sample in side}) >= FEWEST_GROUPS for side in sides):
-        rows.append(_kernel_row("real palms and real backs", len(crowd), kernel_distances(*sides, crowd, seed)))
-    return rows
+    return [*rows, _kernel_row("halves of the real hands", len(crowd), floor)]
 
 
 def _kernel_row(name: str, pictures: int, distances: Mapping[str, KernelDistance]) -> Record:

@@ -5,6 +5,7 @@ import json
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from jaxtyping import Float
 from torch import Tensor
@@ -60,7 +61,7 @@ def measure_real(photo: Photo, estimator: HandEstimator) -> Record:
     crop = crop_hand(photo, fit, initial_offsets(bundled_hand(), fit), ReconstructConfig(size=SIZE))
     surface = read_crop(crop)
     sides = {side: where & (surface.visibility >= SEEN) for side, where in side_masks(surface).items()}
-    mostly = "palm" if float(surface.palm[surface.interior].mean()) > 0.5 else "back"
+    mostly = mostly_shows(surface)
     bands = split_bands(log_brightness(crop.image), surface.interior.float())
     found = contrasts([(bands, sides[mostly])]) if crop_side(fit) >= LEAST_SIDE else None
     return {
@@ -90,6 +91,11 @@ def over_ground(crop: HandCrop) -> Float[Tensor, "S S 3"]:
 def side_masks(surface: Surface) -> dict[str, Tensor]:
     """Pixels of the interior by `SIDES`; those in between belong to neither."""
     return {"palm": surface.interior & (surface.palm >= PALM), "back": surface.interior & (surface.palm <= BACK)}
+
+
+def mostly_shows(surface: Surface) -> Literal["palm", "back"]:
+    """The side of the hand that a picture mostly shows."""
+    return "palm" if float(surface.palm[surface.interior].mean()) > 0.5 else "back"
 
 
 def summarise_real(records: Sequence[Record]) -> Record:

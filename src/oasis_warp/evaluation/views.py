@@ -8,9 +8,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
-from oasis_warp.avatar.observation import inner_mask
+from oasis_warp.avatar.observation import facing, inner_mask
 from oasis_warp.core.camera import crop_camera, orbit_camera, project
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.surface import face_normals
 from oasis_warp.core.types import Camera, HandPose, Render
 from oasis_warp.estimation.hand_crop import CROP_MARGIN
 from oasis_warp.evaluation.band_energy import SIZE
@@ -51,7 +52,7 @@ class Surface(NamedTuple):
 
     silhouette: Bool[Tensor, "S S"]
     interior: Bool[Tensor, "S S"]
-    """Farther than `RIM` from all outlines, those of fingers before the hand included."""
+    """The skin's outside, farther than `RIM` from all outlines, those of fingers before the hand included."""
     visibility: Float[Tensor, "S S"]
     """1 where the avatar's photo shows this skin well, 0 where it does not."""
     palm: Float[Tensor, "S S"]
@@ -97,15 +98,20 @@ def draw(avatar: Avatar, view: View) -> Render:
 @torch.no_grad()
 def read_surface(
     hand: HandModel, vertices: Float[Tensor, "V 3"], camera: Camera, visibility: Float[Tensor, "V"],
-    palm: Float[Tensor, "V"],
+    palm: Float[Tensor, "V"], *, left: bool = False,
 ) -> Surface:  # fmt: skip
-    """What `camera`, whatever its size, sees of the posed mesh in a picture of `SIZE`."""
+    """What `camera`, whatever its size, sees of the posed mesh in a picture of `SIZE`; faces of a left hand wind back.
+
+    The inside of the open wrist is no skin.
+    """
     small, faces = crop_camera(camera, 0.0, 0.0, float(camera.width), SIZE), hand.faces
     seen = depth_map(vertices, faces, small.viewmat.to(vertices), small.K.to(vertices), SIZE, SIZE)
-    silhouette = seen.face_ids >= 0
-    values = torch.stack([visibility.to(vertices), palm.to(vertices)], -1)[faces[seen.face_ids.clamp_min(0).long()]]
+    silhouette, ids = seen.face_ids >= 0, seen.face_ids.clamp_min(0).long()
+    values = torch.stack([visibility.to(vertices), palm.to(vertices)], -1)[faces[ids]]
     shown, side = (values * seen.barycentrics[..., None]).sum(-2).unbind(-1)
-    return Surface(silhouette, silhouette & clear_of_outlines(seen.depth), shown, side)
+    normals, _ = face_normals(vertices, faces)
+    outside = facing(vertices[faces].mean(1), -normals if left else normals, small.viewmat.to(vertices))[ids] > 0
+    return Surface(silhouette, silhouette & outside & clear_of_outlines(seen.depth), shown, side)
 
 
 def silhouette(faces: Int[Tensor, "F 3"], vertices: Float[Tensor, "V 3"], camera: Camera) -> Bool[Tensor, "H W"]:
