@@ -24,8 +24,10 @@ from studies.tables import Column, Section, markdown, table, write_jpeg
 
 FOLDERS = {"0.2.0": "looks_0.2.0", "now": "looks"}
 """Folders of results by what they are called in tables."""
-SHOWN = {"looks_best": "ok_sign_left_10", "looks_worst_1": "fist_front_right_08", "looks_worst_2": "backs_two_left_05",
-         "looks_worst_3": "thumb_up_left_06"}  # fmt: skip
+SHOWN = {
+    "looks_best": "back_flat_right_04", "looks_worst_1": "thumb_up_cutout_right_07",
+    "looks_worst_2": "fist_front_right_08", "looks_worst_3": "backs_two_left_05",
+}  # fmt: skip
 """Pictures of docs/_static and the photos whose sheets they are."""
 WIDTH, QUALITY = 1500, 80
 """Of these pictures [px], and of their JPEG: 100 to 250 KB each."""
