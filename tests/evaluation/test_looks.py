@@ -86,7 +86,7 @@ def test_the_table_of_real_hands_holds_quartiles_of_photos():
 def record(contrast, **changes):
     return {
         "contrast": contrast, "input_psnr_db": 30.0, "haze": 0.02, "haze_of_mean": 0.01, "palm_minus_back": None,
-        "darkest": 0.5, "lpips": None, "back_over_front": [1.0, 1.1, 1.2], **changes,
+        "darkest": 0.5, "lpips": None, "back_over_front": [1.0, 1.05, 1.25], **changes,
     }  # fmt: skip
 
 
@@ -103,7 +103,10 @@ def test_hidden_skin_is_compared_with_real_hands_and_seen_skin_with_its_photo():
     assert rows["seen"]["photos"] == 2 and rows["seen"]["ratio <1"] == 1.0 and rows["seen"]["contrast <1"] == 4.0
     spoilt = found["blemishes"]
     assert spoilt["haze_ratio"] == pytest.approx(4) and spoilt["darkest"] == 0.5 and spoilt["palm_minus_back"] is None
-    assert spoilt["back_over_front blue"] == 1.2
+    assert (spoilt["wounded"], spoilt["back_brightness"], spoilt["back_hue"]) == (0, 1.1, 1.25)
+    dark = record({}, darkest=0.1, back_over_front=[0.5, 0.4, 0.3])
+    spoilt = summarise_looks([dark, record({})], reference)["blemishes"]
+    assert spoilt["wounded"] == 0.5 and spoilt["back_brightness"] == pytest.approx((2.5 + 1.1) / 2)
 
 
 def test_few_real_hands_give_no_distance():

@@ -61,10 +61,10 @@ BLEMISHES = {
     "haze": Measure("haze", ".4f"),
     "haze_ratio": Measure("over the mean prior's", ".1f"),
     "palm_minus_back": Measure("palm minus back, a*", "+.1f"),
-    "darkest": Measure("darkest 1 % of the opened palm over its median", ".2f"),
-    "back_over_front red": Measure("back over front: red", ".2f"),
-    "back_over_front green": Measure("green", ".2f"),
-    "back_over_front blue": Measure("blue", ".2f"),
+    "darkest": Measure("darkest 1 % of the opened palm", ".2f"),
+    "wounded": Measure("palms with a wound", ".0%"),
+    "back_brightness": Measure("back brighter or darker, times", ".2f"),
+    "back_hue": Measure("its hue, times", ".2f"),
 }
 """Of the blemishes of `looks.summarise_looks`."""
 COLORS = {"same": "raw", "studio": "raw", "wild": "matched"}

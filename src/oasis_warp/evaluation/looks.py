@@ -42,6 +42,9 @@ REGIONS = ("seen", "turned", "hidden_palm", "hidden_back")
 KINDS = {"input": "the photo's view", "side": "novel sides", "pose": "novel poses"}
 SPLITS = 20
 """Random halves of the real hands whose distance is the floor."""
+WOUND = 0.4
+"""Brightness of the darkest percent of an opened palm, over its median, below which that is a wound: the least of seven
+real palms, open or nearly so, is .41."""
 DIGITS = 4
 
 
@@ -187,16 +190,23 @@ def summarise_looks(records: Sequence[Record], reference: Record) -> Record:
 
 
 def summarise_blemishes(records: Sequence[Record]) -> Record:
-    """Medians over photos, and the ratio of the sums of haze."""
+    """Medians over photos; the ratio of the sums of haze; and the share of opened palms with a wound.
+
+    `back_brightness` is the factor by which the back is brighter or darker than the front, `back_hue` that by which its
+    brightest channel changes more than the others.
+    """
     found: Record = {
         name: _median([record[name] for record in records if record[name] is not None])
         for name in ("input_psnr_db", "haze", "palm_minus_back", "darkest", "lpips")
     }
     of_mean = sum(record["haze_of_mean"] for record in records)
     found["haze_ratio"] = sum(record["haze"] for record in records) / max(of_mean, 1e-9)
+    dark = [record["darkest"] < WOUND for record in records if record["darkest"] is not None]
+    found["wounded"] = sum(dark) / len(dark) if dark else None
     light = [record["back_over_front"] for record in records if record["back_over_front"] is not None]
-    for k, channel in enumerate(("red", "green", "blue")):
-        found[f"back_over_front {channel}"] = _median([ratios[k] for ratios in light])
+    means = [statistics.fmean(ratios) for ratios in light]
+    found["back_brightness"] = _median([max(ratio, 1 / ratio) for ratio in means])
+    found["back_hue"] = _median([max(ratios) / min(ratios) for ratios in light])
     return found
 
 
