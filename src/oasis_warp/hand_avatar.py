@@ -7,12 +7,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.pose import in_even_light, pose_gaussians
-from oasis_warp.core import surface
+from oasis_warp.avatar.pose import (
+    GAMMA,
+    SurfaceLight,
+    hidden_by_hand,
+    in_even_light,
+    pose_gaussians,
+    with_photo,
+)
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.mirror import mirror_camera, mirror_canonical, mirror_hand, mirror_light, mirror_points
+from oasis_warp.core.mirror import mirror_camera, mirror_canonical, mirror_hand, mirror_light, mirror_points, mirror_pose
 from oasis_warp.core.types import (
     Camera,
     CanonicalGaussians,
@@ -26,7 +32,7 @@ from oasis_warp.core.types import (
     Render,
     Side,
 )
-from oasis_warp.data.avatar_file import load_avatar, save_avatar
+from oasis_warp.data.avatar_file import LIGHT_HIDDEN, load_avatar, save_avatar
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import DeferredFiniteCheck, check_finite, rest_mesh
@@ -85,10 +91,16 @@ class Avatar:
         )
         self._light = None
         if light is not None:
-            normals = surface.vertex_normals(self.rest.vertices, self.hand.faces)
-            self._light = (mirror_light(light), mirror_points(normals)) if left else (light, normals)
+            known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces)
+            mirrored = SurfaceLight(mirror_light(light), mirror_points(known.normals), known.seen)
+            self._light = mirrored if left else known
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
         self._graphs = GraphCache()
+
+    def _photo_surface(self) -> Float[Tensor, "V 3"]:
+        """Vertices in the photo's pose; of a left hand in the mirror, where faces wind outwards."""
+        source = mirror_pose(self.source_pose) if self.side == "left" else self.source_pose
+        return skin_surface(self.hand, self.rest, HandPose(*(part.to(self.shape) for part in source)))
 
     @property
     def gaussians(self) -> CanonicalGaussians:
@@ -229,7 +241,7 @@ class Avatar:
         def group(prefix: str) -> dict[str, Tensor]:
             return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
 
-        return cls(
+        avatar = cls(
             side=header["side"],
             shape=tensors["shape"],
             surface_offsets=tensors["surface_offsets"],
@@ -238,6 +250,16 @@ class Avatar:
             source_camera=Camera(**group("source_camera."), **header["source_camera"]),
             light=HandLight(**light) if (light := group("light.")) else None,
         )
+        return avatar._with_hidden_light() if header["version"] < LIGHT_HIDDEN else avatar
+
+    @torch.no_grad()
+    def _with_hidden_light(self) -> "Avatar":
+        """The same from the time when light knew no hollows; the photo's own view stays."""
+        if self.light is None:
+            return self
+        albedo = (self.gaussians.colors.mean(0) ** GAMMA * self.light.even).clamp(0, 1)
+        light = hidden_by_hand(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
+        return self.with_looks(self.gaussians, light)
 
 
 def make_avatar(

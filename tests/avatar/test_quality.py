@@ -5,7 +5,7 @@ from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.avatar.appearance import label_regions, region_colors, region_masks
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.pose import pose_gaussians, with_photo
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.avatar.quality import (
     REACH,
@@ -69,7 +69,7 @@ def test_what_is_uncertain_is_more_often_wrong(hand, case):
     crop, truth, _ = case
     adapted = adapt(hand, [MeanPrior(hand)(crop)], [crop], AdaptConfig(texture_steps=20, reference_views=0))
     assert adapted.light is not None
-    light = adapted.light, surface.vertex_normals(crop.rest.vertices, hand.faces)
+    light = with_photo(adapted.light, crop.rest.vertices, crop.posed.vertices, hand.faces)
     posed = pose_gaussians(adapted.gaussians, hand.faces, crop.rest.vertices, crop.posed.vertices, light)
     quality = assess_surface(hand, crop, render(posed, crop.camera).image)
     n = len(truth.vertex_index)

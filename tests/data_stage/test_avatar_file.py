@@ -7,9 +7,21 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.avatar_file import FORMAT, LIGHT, SHADE, TENSORS, UNITS, VERSION, load_avatar, save_avatar
+from oasis_warp.data.avatar_file import (
+    ALBEDO,
+    FINE_SHADE,
+    FORMAT,
+    LIGHT,
+    SHADE,
+    TENSORS,
+    UNITS,
+    VERSION,
+    load_avatar,
+    save_avatar,
+)
 from oasis_warp.data.avatar_file import HEADER as FILE_HEADER
 
+LIGHT_SHAPES = {"light.harmonics": (4, 3), "light.limits": (2, 3), "light.even": (3,)}
 SIZES = {"S": 4, "V": 30, "P": 5, "Q": 7, "N": 12}
 HEADER = {
     "side": "left",
@@ -132,7 +144,7 @@ def test_a_newer_version_is_refused_with_the_remedy(written):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"version": 0}, "expected version 1 to 4, got 0"),
+        ({"version": 0}, f"expected version 1 to {VERSION}, got 0"),
         ({"version": "1"}, "expected 'version' of type int, got '1'"),
         ({"side": "both"}, "expected side 'left' or 'right', got 'both'"),
         ({"hand_model": None}, "expected 'hand_model' of type str, got None"),
@@ -178,7 +190,7 @@ def test_another_format_is_refused(tmp_path):
 
 def test_the_documentation_lists_every_tensor_and_header_key():
     page = (Path(__file__).parents[2] / "docs" / "avatar_file.md").read_text()
-    for name, entry in (TENSORS | LIGHT | SHADE).items():
+    for name, entry in (TENSORS | LIGHT | SHADE | FINE_SHADE | ALBEDO).items():
         shape = ", ".join(map(str, entry.shape))
         assert f"| `{name}` | {str(entry.dtype).removeprefix('torch.')} | {shape} |" in page
     for key in FILE_HEADER:
@@ -186,16 +198,21 @@ def test_the_documentation_lists_every_tensor_and_header_key():
 
 
 def test_light_comes_as_a_whole_or_not_at_all(tmp_path, tensors):
-    light = {name: torch.rand(entry.shape) + 0.1 for name, entry in LIGHT.items()}
+    light = {name: torch.rand(shape) + 0.1 for name, shape in LIGHT_SHAPES.items()}
     light["light.limits"] = torch.tensor([[0.5] * 3, [1.5] * 3])
     save_avatar(tmp_path / "lit", {**tensors, **light}, HEADER)
     back, _ = load_avatar(tmp_path / "lit")
     assert back.keys() == tensors.keys() | light.keys()
+    light |= {"light.harmonics": torch.rand(9, 3), "light.albedo": torch.full((3,), 0.4)}
+    save_avatar(tmp_path / "around", {**tensors, **light}, HEADER)
+    assert load_avatar(tmp_path / "around")[0].keys() == tensors.keys() | light.keys()
     for change in (
         {"light.limits": light["light.limits"].flip(0)},
         {"light.limits": torch.zeros(2, 3)},
         {"light.even": torch.zeros(3)},
         {"light.harmonics": torch.full((4, 3), torch.nan)},
+        {"light.harmonics": torch.ones(5, 3)},
+        {"light.albedo": torch.full((3,), 1.5)},
     ):
         with pytest.raises(ValueError, match=next(iter(change))):
             save_avatar(tmp_path / "bad", {**tensors, **light, **change}, HEADER)
@@ -206,7 +223,7 @@ def test_light_comes_as_a_whole_or_not_at_all(tmp_path, tensors):
 
 def test_shade_comes_with_light_as_a_whole_or_not_at_all(tmp_path, tensors):
     n = len(tensors["surface_offsets"])
-    light = {name: torch.ones(entry.shape) for name, entry in LIGHT.items()}
+    light = {name: torch.ones(shape) for name, shape in LIGHT_SHAPES.items()}
     shade = {"light.shade": torch.full((n, 3), 0.9), "light.facing": torch.eye(3)[torch.arange(n) % 3]}
     save_avatar(tmp_path / "shaded", {**tensors, **light, **shade}, HEADER)
     assert load_avatar(tmp_path / "shaded")[0].keys() == tensors.keys() | light.keys() | shade.keys()
@@ -225,7 +242,7 @@ def test_shade_comes_with_light_as_a_whole_or_not_at_all(tmp_path, tensors):
 
 def test_shade_of_gaussians_comes_with_that_of_vertices(tmp_path, tensors):
     n = len(tensors["surface_offsets"])
-    light = {name: torch.ones(entry.shape) for name, entry in LIGHT.items()}
+    light = {name: torch.ones(shape) for name, shape in LIGHT_SHAPES.items()}
     light |= {"light.shade": torch.ones(n, 3), "light.facing": torch.eye(3)[torch.arange(n) % 3]}
     fine = {"gaussians.shade": torch.full_like(tensors["gaussians.colors"], 0.9)}
     save_avatar(tmp_path / "shaded", {**tensors, **light, **fine}, HEADER)
@@ -237,7 +254,7 @@ def test_shade_of_gaussians_comes_with_that_of_vertices(tmp_path, tensors):
         save_avatar(tmp_path / "bad", {**tensors, **fine}, HEADER)
 
 
-@pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize("version", [1, 2, 3, 4])
 def test_an_older_file_is_read(written, version):
     rewrite(written, version=version)
     assert load_avatar(written)[1]["version"] == version

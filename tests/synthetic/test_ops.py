@@ -5,11 +5,12 @@ import trimesh
 
 from oasis_warp.core import surface
 from oasis_warp.ops import depth_map
+from oasis_warp.ops.smoothing import smooth_over_faces
 from oasis_warp.synthetic.illumination import look_at
 from oasis_warp.synthetic.ops.batched_lbs import batched_lbs
 from oasis_warp.synthetic.ops.pixel_noise import pixel_noise
 from oasis_warp.synthetic.ops.room_tracing import PATTERNS, SHAPES, SOLID_WORDS, trace_rooms
-from oasis_warp.synthetic.ops.skin_shading import sky_transfer, smooth_over_faces, surface_state
+from oasis_warp.synthetic.ops.skin_shading import sky_transfer, surface_state
 from oasis_warp.synthetic.ops.surface_patterns import NoiseField, point_grid, surface_dabs, surface_noise
 from oasis_warp.synthetic.ops.views import Lamps
 from oasis_warp.synthetic.view_and_light import sphere

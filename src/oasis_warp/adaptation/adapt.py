@@ -17,13 +17,14 @@ from oasis_warp.adaptation.sh_lighting import (
     fit_light,
     light_evenly,
     split_albedo_shading,
+    trust_in_albedo,
     without_light,
 )
 from oasis_warp.adaptation.sharpen import sharpen
 from oasis_warp.adaptation.texture import Targets, learn_lora, learn_texture, make_targets, reference_azimuths
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import inner_mask, observe
-from oasis_warp.avatar.pose import in_even_light, pose_gaussians, posed_normals, shading_factors
+from oasis_warp.avatar.pose import in_even_light, pose_gaussians, posed_lighting, shading_factors
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
@@ -104,6 +105,8 @@ class _Photos(NamedTuple):
     """Of all views, one below the other."""
     belief: Sequence[Float[Tensor, "S S"]]
     """How far each pixel counts beside the other photos; 0 where the guess does not cover it."""
+    trust: Float[Tensor, "K V"]
+    """Of `trust_in_albedo`; 1 where light is kept."""
 
 
 def view_in_photo(hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop) -> PhotoView:
@@ -176,7 +179,9 @@ def adapt(
         texture = learn_lora(lora, calibration, targets, config, progress)
     gaussians = gaussians._replace(colors=texture.colors)
     if photos.lights is not None:
-        gaussians = split_albedo_shading(hand, calibrated.colors, gaussians)
+        weight = photos.observations.confidence * photos.observations.share
+        trust = ((weight * photos.trust).sum(0) + UNSEEN) / (weight.sum(0) + UNSEEN)
+        gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust)
     return result._replace(gaussians=gaussians, losses=texture.losses)
 
 
@@ -211,18 +216,19 @@ def remove_photo_light(
 def unlit_detail(
     hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, weights: BlendWeights, light: HandLight | None,
     *, several: bool = False,
-) -> HandCrop:  # fmt: skip
-    """What a photo, perhaps a larger one than was adapted to, shows of the skin of `gaussians`.
+) -> tuple[HandCrop, Float[Tensor, "V"]]:  # fmt: skip
+    """What a photo, perhaps a larger one than was adapted to, shows of the skin of `gaussians`, and how far it is skin.
 
-    As `remove_photo_light`: in even light, with a mask of reliable pixels. The photo itself where no light is apart. Of
-    `several` photos all pixels count: with reliable ones only, a second photo's detail takes less off the error.
+    In even light, and `trust_in_albedo`. The photo itself where no light is apart. Of `several` photos all pixels
+    count: with reliable ones only, a second photo's detail takes less off the error.
     """
     if light is None:
-        return crop
-    if several:
-        return without_light(hand, crop, light)
-    lit = apply_light(hand, _picture(weights, gaussians.colors), crop, light._replace(shade=None))
-    return without_light(hand, mask_unreliable(hand, lit, crop), light)
+        return crop, crop.rest.vertices.new_ones(len(crop.rest.vertices))
+    sure = crop
+    if not several:
+        lit = apply_light(hand, _picture(weights, gaussians.colors), crop, light._replace(shade=None))
+        sure = mask_unreliable(hand, lit, crop)
+    return without_light(hand, crop, light), trust_in_albedo(hand, crop, sure, light)
 
 
 def add_detail(
@@ -247,18 +253,20 @@ def add_detail(
     if all(len(crop.image) <= size for crop in crops):
         return adaptation
     gaussians, lights = adaptation.gaussians, adaptation.lights or [None] * len(crops)
-    unlit, finer = [], []
+    unlit, finer, trust = [], [], []
     for k, (crop, light, gain) in enumerate(zip(crops, lights, adaptation.gains, strict=True)):
         as_bright = gaussians._replace(colors=gaussians.colors * gain)
         weights = view_in_photo(hand, gaussians, crop).weights
-        unlit.append(unlit_detail(hand, as_bright, crop, weights, light, several=len(crops) > 1))
+        shown, trusted = unlit_detail(hand, as_bright, crop, weights, light, several=len(crops) > 1)
+        unlit.append(shown)
         if len(crop.image) > size:
+            trust.append(trusted)
             image = _in_first_light(hand, unlit[k].image, weights, gaussians, gain, adaptation.shading[k])
             finer.append((k, unlit[k]._replace(image=image)))
     share = observe_photos(hand, unlit, resolutions).share ** DETAIL_SHARPNESS
     share = share / share.sum(0)
     indices, pictures = zip(*finer, strict=True)
-    fine = sharpen(hand, gaussians, pictures, share[list(indices)], progress).gaussians
+    fine = sharpen(hand, gaussians, pictures, share[list(indices)], torch.stack(trust), progress).gaussians
     return adaptation._replace(gaussians=fine)
 
 
@@ -267,7 +275,7 @@ def light_factors(
 ) -> Float[Tensor, "N 3"]:
     """What the light of a photo multiplies the colours of `gaussians` with in it."""
     rest, faces = crop.rest.vertices, hand.faces.to(crop.image.device)
-    return shading_factors(gaussians, faces, light, posed_normals(rest, crop.posed.vertices, faces))
+    return shading_factors(gaussians, faces, light, posed_lighting(rest, crop.posed.vertices, faces, light))
 
 
 def _gather(
@@ -296,7 +304,14 @@ def _gather(
     lights = tuple(photo.light for photo in read if photo.light is not None) or None
     gains = photo_gains(seen, vertex_colors(guess, len(hand.template)))
     stacked = stack_weights([view.weights for view in views])
-    return guess, _Photos(crops, unlit, lights, seen, gains, views, stacked, belief)
+    trust = torch.stack([_trust(hand, crop, photo) for crop, photo in zip(crops, read, strict=True)])
+    return guess, _Photos(crops, unlit, lights, seen, gains, views, stacked, belief, trust)
+
+
+def _trust(hand: HandModel, crop: HandCrop, photo: Unlit) -> Float[Tensor, "V"]:
+    if photo.light is None:
+        return crop.rest.vertices.new_ones(len(crop.rest.vertices))
+    return trust_in_albedo(hand, crop, photo.crop, photo.light)
 
 
 def _complete(
@@ -335,7 +350,7 @@ def _complete(
             for picture, own, view, *at_vertices in zip(pictures, drawn, views, missing, seen.confidence, strict=True)
         ]
         missing = differences()
-    weight = seen.confidence * seen.share
+    weight = seen.confidence * seen.share * photos.trust
     missing = ((weight / weight.sum(0).clamp_min(1e-12))[..., None] * missing).sum(0)
     change = vertex_to_gaussians(inpaint(rest, faces, missing, weight.amax(0)), faces, gaussians)
     return gaussians._replace(colors=(gaussians.colors + change).clamp(0, 1)), shading

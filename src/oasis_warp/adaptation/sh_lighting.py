@@ -13,8 +13,9 @@ from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
-from oasis_warp.avatar.observation import observe
-from oasis_warp.avatar.pose import GAMMA, posed_normals, shading, split_shade
+from oasis_warp.avatar.observation import Observation, observe
+from oasis_warp.avatar.pose import GAMMA, Lighting, posed_lighting, shading
+from oasis_warp.avatar.sky import bounced, harmonic_basis
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors, depth_map
@@ -31,7 +32,14 @@ HARMONICS_COVARIANCE = (
 HUE_CORRELATION = 0.95
 """Correlation of a harmonic's three channels: rooms have dark and bright sides, but hardly any light is green on one
 side and pink on the other. In 3,000 synthetic rooms it is .99; coloured walls near the hand leave some freedom."""
-PRIOR_WEIGHT = 0.001
+HIDDEN, OPEN = 0.4, 0.75
+"""Shares of the sky below which skin in the photo shows nothing of its colour, and above which it shows all: between
+bent fingers the light that arrives depends on a millimetre of the fit, and beside what hides it shadows are sharp."""
+ROUNDS = 2
+"""Fits of the light, each with the shares of the one before; a third changes shares by less than .01."""
+ALBEDOS = 0.02, 0.8
+"""Least and greatest reflectance of skin."""
+PRIOR_WEIGHT = 0.01
 """Weight of this prior, against a light of which every direction is seen."""
 MIN_CONFIDENCE = 0.1
 """Confidence from which a vertex counts as visible."""
@@ -39,12 +47,14 @@ LIMIT_QUANTILES = 0.03, 0.97
 """Quantiles of the light on visible vertices, between which all light is clamped."""
 WHITE_QUANTILE = 0.995
 """Quantile of unlit skin colours that is scaled to 1 where it exceeds it."""
-MAX_LOG_SHADE = 1.5
+MAX_LOG_SHADE = 3.0
 """Largest absolute logarithm of shade."""
 OCCLUDER_FADE = 0.001
 """Distance over which the shade of pixels that may not show the skin ends [m]."""
 MIN_COLOR = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
+MIN_SHOWN = 1e-3
+"""Least colour that comes out of colours and shade, which is a factor above 0."""
 MIN_LIGHT = 0.05
 """Least light relative to the mean, because colours are divided by it."""
 OUTLINE_MARGIN = 1 / 32
@@ -54,10 +64,11 @@ OUTLINE_MARGIN = 1 / 32
 def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) -> HandLight:
     """The light in which `drawn` looks most like the photo.
 
-    Weighted least squares of photo = drawn (h_0 + h . n) over the visible vertices, in linear light, for all channels
-    at once: the first two bands of the harmonics of irradiance (Ramamoorthi and Hanrahan 2001). A photo shows only skin
-    that faces it, so a normal prior on the harmonics constrains the rest (maximum a posteriori). If nothing is visible,
-    the light is even.
+    Weighted least squares of photo = drawn (h_0 + h . n) e over the visible vertices, in linear light, for all channels
+    at once: the first two bands of the harmonics of irradiance (Ramamoorthi and Hanrahan 2001), and the share e of this
+    light that the hand lets through in the photo's pose, so that soft shadows between fingers are no skin. The share
+    depends on the light: it is that of an even one at first. A photo shows only skin that faces it, so a normal prior on
+    the harmonics constrains the rest (maximum a posteriori). If nothing is visible, the light is even.
 
     Args:
         hand: Whose surface it is.
@@ -65,32 +76,77 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) ->
         crop: The photo.
     """
     seen, known = observe(hand, crop), observe(hand, crop._replace(image=drawn)).colors.clamp(0, 1) ** GAMMA
-    light, weight = seen.colors.clamp(0, 1) ** GAMMA, seen.confidence
-    faces = hand.faces.to(weight.device)
-    normals = posed_normals(crop.rest.vertices, crop.posed.vertices, faces)
-    basis = torch.cat([torch.ones_like(normals[:, :1]), normals], 1)
-    terms = basis * known.T[..., None]  # of each channel, [3, V, 4]
-    scale = (weight[:, None] * known.square()).sum(0).clamp_min(torch.finfo(known.dtype).eps)
-    weighted = terms * weight[:, None] / scale[:, None, None]
-    colors = torch.linalg.inv((1 - HUE_CORRELATION) * torch.eye(3) + HUE_CORRELATION * torch.ones(3, 3)).to(known)
-    ridge = PRIOR_WEIGHT * torch.kron(colors, torch.linalg.inv(known.new_tensor(HARMONICS_COVARIANCE)))
-    right = (weighted.mT @ light.T[..., None]).flatten() + ridge @ known.new_tensor(MEAN_HARMONICS).repeat(3)
-    harmonics = torch.linalg.solve(torch.block_diag(*(weighted.mT @ terms)) + ridge, right).view(3, 4).T
-    shown = weight > MIN_CONFIDENCE
+    shown = seen.confidence > MIN_CONFIDENCE
+    even = _even_light(known[shown].mean(0) if bool(shown.any()) else known.mean(0))
     if not bool(shown.any()):
-        harmonics = torch.zeros_like(harmonics)
-        harmonics[0] = 1
-        return HandLight(harmonics, torch.ones_like(harmonics[:2]), torch.ones_like(harmonics[0]))
-    received = basis[shown] @ harmonics
-    share = weight[shown, None]
-    mean = ((received * share).sum(0) / share.sum()).clamp_min(MIN_LIGHT)
+        return even
+    rest, faces = crop.rest.vertices, hand.faces.to(known.device)
+    light, on = even, posed_lighting(rest, crop.posed.vertices, faces, even)
+    basis = harmonic_basis(on.normals, 4)
+    for _ in range(ROUNDS):
+        weighted = seen._replace(confidence=seen.confidence * exposed(on))
+        harmonics = _solve_harmonics(basis, known * _arriving(light, on), weighted)
+        light = light._replace(harmonics=harmonics)
+        on = posed_lighting(rest, crop.posed.vertices, faces, light)
+    received, arriving = basis[shown] @ light.harmonics, _arriving(light, on)[shown]
+    share = seen.confidence[shown, None]
+    mean = ((received * arriving * share).sum(0) / share.sum()).clamp_min(MIN_LIGHT)
     limits = torch.stack([torch.quantile(received, level, dim=0) / mean for level in LIMIT_QUANTILES])
-    limits = limits.clamp_min(MIN_LIGHT)
-    relative = HandLight(harmonics / mean, limits, torch.ones_like(mean))
+    relative = light._replace(harmonics=light.harmonics / mean, limits=limits.clamp_min(MIN_LIGHT))
     # Colours end at 1. If unlit skin were brighter, the whole light is scaled up instead.
-    ratio = seen.colors[shown] / shading(relative, normals[shown])
+    ratio = seen.colors[shown] / shading(relative, on)[shown]
     brightest = torch.quantile(ratio.amax(1), WHITE_QUANTILE).clamp_min(1) ** GAMMA
-    return HandLight(relative.harmonics * brightest, relative.limits * brightest, relative.even * brightest)
+    return relative._replace(
+        harmonics=relative.harmonics * brightest, limits=relative.limits * brightest, even=even.even * brightest
+    )
+
+
+def exposed(on: Lighting) -> Float[Tensor, "V"]:
+    """How far the photo shows the colour of skin there, by the share of the sky that it sees: 0 to 1."""
+    if on.exposure is None:
+        return torch.ones_like(on.normals[..., 0])
+    t = ((on.exposure[..., 0] - HIDDEN) / (OPEN - HIDDEN)).clamp(0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def trust_in_albedo(hand: HandModel, crop: HandCrop, sure: HandCrop, light: HandLight) -> Float[Tensor, "V"]:
+    """How far what a photo shows beyond a guess is skin and not shadow, or another part of the hand: 0 to 1.
+
+    Args:
+        hand: Whose surface it is.
+        crop: The photo.
+        sure: The same with the mask of `mask_unreliable`.
+        light: Of the photo.
+    """
+    on = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces.to(crop.image.device), light)
+    every, believed = (observe(hand, which).confidence for which in (crop, sure))
+    return exposed(on) * torch.where(every > 0, believed / every.clamp_min(1e-6), 1).clamp(0, 1)
+
+
+def _even_light(albedo: Float[Tensor, "3"]) -> HandLight:
+    """The same from all around, on skin of this mean reflectance."""
+    harmonics = torch.zeros_like(albedo).repeat(4, 1)
+    harmonics[0] = 1
+    return HandLight(harmonics, torch.ones_like(harmonics[:2]), harmonics[0], albedo=albedo.clamp(*ALBEDOS))
+
+
+def _arriving(light: HandLight, on: Lighting) -> Float[Tensor, "V 3"]:
+    assert on.exposure is not None and light.albedo is not None, "this light is hidden by the hand"
+    return bounced(on.exposure[..., 1:], light.albedo)
+
+
+def _solve_harmonics(
+    basis: Float[Tensor, "V 4"], reflected: Float[Tensor, "V 3"], seen: Observation
+) -> Float[Tensor, "4 3"]:
+    """The most likely harmonics of a photo in which light of 1 from all around would be `reflected`."""
+    weight, light = seen.confidence, seen.colors.clamp(0, 1) ** GAMMA
+    terms = basis * reflected.T[..., None]  # of each channel, [3, V, 4]
+    scale = (weight[:, None] * reflected.square()).sum(0).clamp_min(torch.finfo(reflected.dtype).eps)
+    weighted = terms * weight[:, None] / scale[:, None, None]
+    colors = torch.linalg.inv((1 - HUE_CORRELATION) * torch.eye(3) + HUE_CORRELATION * torch.ones(3, 3)).to(reflected)
+    ridge = PRIOR_WEIGHT * torch.kron(colors, torch.linalg.inv(reflected.new_tensor(HARMONICS_COVARIANCE)))
+    right = (weighted.mT @ light.T[..., None]).flatten() + ridge @ reflected.new_tensor(MEAN_HARMONICS).repeat(3)
+    return torch.linalg.solve(torch.block_diag(*(weighted.mT @ terms)) + ridge, right).view(3, 4).T
 
 
 def add_shade(
@@ -109,17 +165,20 @@ def add_shade(
     lit = apply_light(hand, drawn, crop, light)
     seen, known = observe(hand, crop), observe(hand, crop._replace(image=lit)).colors
     missing = (seen.colors.clamp_min(MIN_COLOR) / known.clamp_min(MIN_COLOR)).log()
-    believed = observe(hand, sure).confidence
+    on = posed_lighting(rest, crop.posed.vertices, faces, light)
+    believed = observe(hand, sure).confidence * exposed(on)
     occluded = inpaint(rest, faces, missing, seen.confidence - believed, OCCLUDER_FADE / 3, OCCLUDER_FADE)
-    facing = posed_normals(rest, crop.posed.vertices, faces)
-    return light._replace(shade=occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp(), facing=facing)
+    return light._replace(shade=occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp(), facing=on.normals)
 
 
 def shading_picture(hand: HandModel, crop: HandCrop, light: HandLight) -> Float[Tensor, "H W 3"]:
     """What `light` multiplies the colours of the photo of `crop` with; continued a little beyond the hand, then 1."""
     camera, posed = crop.camera, crop.posed.vertices
     faces = hand.faces.to(posed.device)
-    factor = shading(light, posed_normals(crop.rest.vertices, posed, faces))
+    on = posed_lighting(crop.rest.vertices, posed, faces, light)
+    factor = shading(light, on)
+    if light.shade is not None:
+        factor = factor * light.shade
     seen = depth_map(posed, faces, camera.viewmat, camera.K, camera.width, camera.height, validate=False)
     on_hand = (seen.face_ids >= 0).to(factor)[..., None]
     inside = (factor[faces[seen.face_ids.clamp_min(0).long()]] * seen.barycentrics[..., None]).sum(-2)
@@ -209,7 +268,7 @@ MARK_BRIGHTNESSES = 0.45, 0.7
 
 
 def split_albedo_shading(
-    hand: HandModel, guess: Float[Tensor, "N 3"], learned: CanonicalGaussians
+    hand: HandModel, guess: Float[Tensor, "N 3"], learned: CanonicalGaussians, trust: Float[Tensor, "V"] | None = None
 ) -> CanonicalGaussians:
     """The learned Gaussians with part of their colours split off as shade; colours times shade are as before.
 
@@ -217,13 +276,17 @@ def split_albedo_shading(
         hand: Whose surface it is.
         guess: Colours of the Gaussians before they were learned.
         learned: In even light.
+        trust: Of `trust_in_albedo`, 1 if not given: the rest of what was learned is all shade, marks or not.
     """
     ratio = learned.colors.clamp_min(MIN_COLOR) / guess.clamp_min(MIN_COLOR)
     beyond = ratio.log().clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE)
     of_vertices = vertex_colors(learned._replace(colors=beyond), len(hand.template))
-    marked = vertex_to_gaussians(mark_probability(of_vertices), hand.faces.to(guess.device), learned)
-    colors, shade = split_shade(learned.colors, ((1 - ALBEDO_SHARE) * (1 - marked) * beyond).exp())
-    return learned._replace(colors=colors, shade=shade)
+    stays = 1 - (1 - ALBEDO_SHARE) * (1 - mark_probability(of_vertices))
+    if trust is not None:
+        stays = stays * trust[:, None]
+    stays = vertex_to_gaussians(stays, hand.faces.to(guess.device), learned)
+    colors = (guess.clamp_min(MIN_COLOR) * (stays * beyond).exp()).clamp(max=1)
+    return learned._replace(colors=colors, shade=learned.colors.clamp_min(MIN_SHOWN) / colors)
 
 
 def mark_probability(beyond: Float[Tensor, "V 3"]) -> Float[Tensor, "V 1"]:

@@ -74,6 +74,7 @@ def sharpen(
     gaussians: CanonicalGaussians,
     crops: Sequence[HandCrop],
     believed: Float[Tensor, "K V"] | None = None,
+    trust: Float[Tensor, "K V"] | None = None,
     progress: Progress = silent,
 ) -> SharpenResult:
     """Replace Gaussians by finer ones where pictures of the hand show more than they do.
@@ -89,6 +90,8 @@ def sharpen(
         gaussians: Fitted to the photos, perhaps in smaller pictures of them.
         crops: Of K photos, as large as their detail, with one surface at rest and in one light.
         believed: How far to believe each at each vertex, at most 1 in all; a single photo wholly.
+        trust: How far what each shows is skin, 0 to 1, wholly if not given: the rest of the detail is shade, if there is
+            any shade.
         progress: Called as work goes on.
     """
     rest = crops[0].rest.vertices
@@ -125,7 +128,9 @@ def sharpen(
         views = _views(sources, k, points, faces, old[k], new[k], still)
         learned, own = fit_colors(views, colors[mine], mine, STEPS, progress)
         colors, losses = still.masked_scatter(mine[:, None], learned), [*losses, *own]
-    return SharpenResult(with_photo_colors(dense, changed, colors[changed]), n_new, tuple(losses))
+    if trust is not None:
+        trust = vertex_to_gaussians(trust.T, faces, dense).gather(1, whose[:, None])[changed]
+    return SharpenResult(with_photo_colors(dense, changed, colors[changed], trust), n_new, tuple(losses))
 
 
 def _source(

@@ -1,55 +1,134 @@
 """Canonical Gaussians in a pose and in a light; no network, no image."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
+from oasis_warp.avatar.sky import bounced, exposure, harmonic_basis
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
 from oasis_warp.ops import RestMesh, face_rotations, pose_on_mesh
+from oasis_warp.ops.sky_exposure import sky_directions
 
 GAMMA = 2.2
 """Light is sRGB to this power, nearly."""
 AS_IN_PHOTO, TURNED_AWAY = math.cos(math.radians(5)), math.cos(math.radians(20))
 """Cosines of the angle by which skin has turned from where the photo shows it, up to which its shade stays as it is and
 from which it is gone."""
+SAME_SKY, OTHER_SKY = 0.08, 0.25
+"""Changes of the share of the sky that skin sees, up to which its shade stays and from which it is gone: what cast it has
+moved. Buffers of 3 mm err by .05; a finger that lies on the palm hides .5 and more."""
 MIN_COLOR = 1e-3
 """Least colour that has shade: it is a factor."""
 
 
-def shading(light: HandLight, normals: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B V 3"]:
-    """Factor of the sRGB colours of vertices that face `normals` (unit, in the world of the photo's camera).
+class SurfaceLight(NamedTuple):
+    """Light, and what of the surface it falls on does not depend on the pose."""
 
-    Without the shade of Gaussians.
+    light: HandLight
+    normals: Float[Tensor, "V 3"]
+    """Of the surface at rest, unit."""
+    seen: Float[Tensor, "V"] | None = None
+    """Share of the sky that each vertex saw in the photo; None where no shade depends on it."""
+
+
+class Lighting(NamedTuple):
+    """Of the vertices of posed surfaces."""
+
+    normals: Float[Tensor, "*B V 3"]
+    """Unit, in the world of the photo's camera."""
+    exposure: Float[Tensor, "*B V 4"] | None
+    """As `sky.exposure`; None where the hand hides nothing of the light."""
+
+
+def posed_lighting(
+    rest: Float[Tensor, "V 3"], posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], light: HandLight
+) -> Lighting:
+    """The vertices of a posed surface in `light`; normals are those of the rest surface, turned as Gaussians are."""
+    turned = face_rotations(rest, posed, faces, validate=False).vertex_quats
+    return lighting(posed, turned, surface.vertex_normals(rest, faces), light)
+
+
+def lighting(
+    posed: Float[Tensor, "*B V 3"], quats: Float[Tensor, "*B V 4"], normals: Float[Tensor, "V 3"], light: HandLight
+) -> Lighting:
+    """The same for vertices that have turned by `quats`; exposure is a constant to derivatives."""
+    facing = rotation.rotate(quats, normals.expand_as(posed))
+    return Lighting(facing, None if light.albedo is None else exposure(posed, facing, quats, light))
+
+
+def with_photo(
+    light: HandLight, rest: Float[Tensor, "V 3"], photo: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+) -> SurfaceLight:
+    """`light` on a surface, given its vertices at rest and in the photo that the light's shade is of."""
+    normals = surface.vertex_normals(rest, faces)
+    if light.albedo is None or light.shade is None:
+        return SurfaceLight(light, normals)
+    seen = posed_lighting(rest, photo, faces, light).exposure
+    return SurfaceLight(light, normals, None if seen is None else seen[..., 0])
+
+
+def hidden_by_hand(
+    light: HandLight,
+    albedo: Float[Tensor, "3"],
+    rest: Float[Tensor, "V 3"],
+    photo: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+) -> HandLight:
+    """A light that was fitted without what the hand hides of it, with that; the photo's own view stays as it is.
+
+    There the shade makes up for what is hidden, and elsewhere it goes.
     """
-    received = light.harmonics[0] + normals @ light.harmonics[1:]
+    hidden = light._replace(albedo=albedo)
+    on = posed_lighting(rest, photo, faces, hidden)
+    assert on.exposure is not None, "there is an albedo"
+    before = 1 if light.shade is None else light.shade
+    shade = before / bounced(on.exposure[..., 1:], albedo).clamp_min(MIN_COLOR).pow(1 / GAMMA)
+    return hidden._replace(shade=shade, facing=on.normals if light.facing is None else light.facing)
+
+
+def shading(light: HandLight, on: Lighting) -> Float[Tensor, "*B V 3"]:
+    """Factor of the sRGB colours of vertices, without any shade."""
+    received = harmonic_basis(on.normals, len(light.harmonics)) @ light.harmonics
     least, most = light.limits.unbind(0)
-    factor = torch.minimum(torch.maximum(received, least), most).pow(1 / GAMMA)
-    if light.shade is None or light.facing is None:
-        return factor
-    return factor * (1 + _stays(light.facing, normals) * (light.shade - 1))
+    received = torch.minimum(torch.maximum(received, least), most)
+    if on.exposure is not None and light.albedo is not None:
+        received = received * bounced(on.exposure[..., 1:], light.albedo)
+    return received.pow(1 / GAMMA)
 
 
-def _stays(facing: Float[Tensor, "V 3"], normals: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B V 1"]:
-    """Share of shade that is left."""
-    cosine = (normals * facing).sum(-1, keepdim=True)
-    return ((cosine - TURNED_AWAY) / (AS_IN_PHOTO - TURNED_AWAY)).clamp(0, 1)
+def share_that_stays(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None) -> Float[Tensor, "*B V 1"]:
+    """Share of the photo's shade that is left on vertices which saw so much of the sky in the photo."""
+    assert light.facing is not None, "comes with any shade"
+    cosine = (on.normals * light.facing).sum(-1, keepdim=True)
+    stays = ((cosine - TURNED_AWAY) / (AS_IN_PHOTO - TURNED_AWAY)).clamp(0, 1)
+    if on.exposure is None or seen is None:
+        return stays
+    change = (on.exposure[..., 0] - seen).abs()[..., None]
+    return stays * ((OTHER_SKY - change) / (OTHER_SKY - SAME_SKY)).clamp(0, 1)
 
 
 def shading_factors(
     canonical: CanonicalGaussians,
     faces: Int[Tensor, "F 3"],
     light: HandLight,
-    normals: Float[Tensor, "*B V 3"],
+    on: Lighting,
+    seen: Float[Tensor, "V"] | None = None,
 ) -> Float[Tensor, "*B N 3"]:
-    """What `light` multiplies the colours of Gaussians with, where the vertices face `normals`."""
-    of_vertices = shading(light, normals)
-    if canonical.shade is None or light.facing is None:
+    """What `light` multiplies the colours of Gaussians with; in the photo itself without `seen`."""
+    of_vertices = shading(light, on)
+    if light.facing is None:
         return _at_gaussians(of_vertices, faces, canonical)
-    read = _at_gaussians(torch.cat([of_vertices, _stays(light.facing, normals)], -1), faces, canonical)
+    stays = share_that_stays(light, on, seen)
+    if light.shade is not None:
+        of_vertices = of_vertices * (1 + stays * (light.shade - 1))
+    if canonical.shade is None:
+        return _at_gaussians(of_vertices, faces, canonical)
+    read = _at_gaussians(torch.cat([of_vertices, stays], -1), faces, canonical)
     return read[..., :3] * (1 + read[..., 3:] * (canonical.shade - 1))
 
 
@@ -78,35 +157,40 @@ def split_shade(
     shown: Float[Tensor, "M 3"], shade: Float[Tensor, "M 3"]
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
     """Colours and shade that come to `shown` together; where colours would end at 1, with more shade than `shade`."""
+    shown = shown.clamp_min(MIN_COLOR)
     colors = (shown / shade).clamp(MIN_COLOR, 1)
-    return colors, shown.clamp_min(MIN_COLOR) / colors
+    return colors, shown / colors
 
 
 def with_photo_colors(
-    canonical: CanonicalGaussians, changed: Bool[Tensor, "N"], shown: Float[Tensor, "M 3"]
+    canonical: CanonicalGaussians,
+    changed: Bool[Tensor, "N"],
+    shown: Float[Tensor, "M 3"],
+    trust: Float[Tensor, "M 1"] | None = None,
 ) -> CanonicalGaussians:
-    """The same with other looks of some Gaussians in the photo, in the shade that they have there."""
+    """The same with other looks of some Gaussians in the photo, in the shade that they have there.
+
+    Of what is new about them a share `trust` becomes colour, all if not given, and the rest shade.
+    """
     if canonical.shade is None:
         return canonical._replace(colors=canonical.colors.masked_scatter(changed[:, None], shown))
-    colors, shade = split_shade(shown, canonical.shade[changed])
+    shade = canonical.shade[changed]
+    if trust is not None:
+        news = shown.clamp_min(MIN_COLOR) / (canonical.colors[changed] * shade).clamp_min(MIN_COLOR)
+        shade = shade * news.pow(1 - trust)
+    colors, shade = split_shade(shown, shade)
     return canonical._replace(
         colors=canonical.colors.masked_scatter(changed[:, None], colors),
         shade=canonical.shade.masked_scatter(changed[:, None], shade),
     )
 
 
-def posed_normals(
-    rest: Float[Tensor, "V 3"], posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
-) -> Float[Tensor, "V 3"]:
-    """The normals of the rest surface, turned as Gaussians are."""
-    turned = face_rotations(rest, posed, faces, validate=False)
-    return rotation.rotate(turned.vertex_quats, surface.vertex_normals(rest, faces))
-
-
 def turn_light(light: HandLight, rotation: Float[Tensor, "3 3"]) -> HandLight:
     """The same light in a world that `rotation` leads to."""
     facing = None if light.facing is None else light.facing @ rotation.T
-    return light._replace(harmonics=torch.cat([light.harmonics[:1], rotation @ light.harmonics[1:]]), facing=facing)
+    directions = sky_directions(rotation.device).directions.to(light.harmonics)
+    before, after = (harmonic_basis(d, len(light.harmonics)) for d in (directions, directions @ rotation.T))
+    return light._replace(harmonics=torch.linalg.lstsq(after, before @ light.harmonics).solution, facing=facing)
 
 
 def pose_gaussians(
@@ -114,7 +198,7 @@ def pose_gaussians(
     faces: Int[Tensor, "F 3"],
     rest_vertices: Float[Tensor, "V 3"] | RestMesh,
     posed_vertices: Float[Tensor, "*B V 3"],
-    light: tuple[HandLight, Float[Tensor, "V 3"]] | None = None,
+    light: SurfaceLight | None = None,
 ) -> Gaussians:
     """Gaussians that follow the surface from `rest_vertices` to `posed_vertices` (the paper's appendix B.1).
 
@@ -122,7 +206,7 @@ def pose_gaussians(
     of the face's area; vertex Gaussians turn with their vertex and grow with the faces around it together. Values are
     not checked here: who poses has checked the pose. A surface that is posed many times is given as its `rest_mesh`.
     With an axis of poses before `posed_vertices`, means, quats and scales have it too, and colours where there is a
-    `light`: it comes with the unit normals of the rest surface, and colours are drawn in it.
+    `light`: they are drawn in it, past what the posed surface hides of it.
     """
     turned = face_rotations(rest_vertices, posed_vertices, faces, validate=False)
     means, quats, scales = pose_on_mesh(
@@ -141,7 +225,6 @@ def pose_gaussians(
     )
     colors = canonical.colors
     if light is not None:
-        source, normals = light
-        directions = rotation.rotate(turned.vertex_quats, normals.expand_as(posed_vertices))
-        colors = (colors * shading_factors(canonical, faces, source, directions)).clamp(0, 1)
+        on = lighting(posed_vertices, turned.vertex_quats, light.normals, light.light)
+        colors = (colors * shading_factors(canonical, faces, light.light, on, light.seen)).clamp(0, 1)
     return Gaussians(means, quats, scales, canonical.opacities, colors)

@@ -17,6 +17,8 @@ from oasis_warp.core.types import Camera, CanonicalGaussians, HandFit, HandLight
 
 MIRROR = (-1.0, 1.0, 1.0)
 """Diagonal of M."""
+ODD_IN_X = (1, 4, 7)
+"""Rows of `HandLight.harmonics` that change sign: x, xy and xz."""
 
 
 def mirror_points(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -107,6 +109,7 @@ def mirror_canonical(canonical: CanonicalGaussians) -> CanonicalGaussians:
 
 def mirror_light(light: HandLight) -> HandLight:
     """The same light in the mirrored world."""
-    ambient, x, y, z = light.harmonics.unbind(0)
+    flips = torch.ones_like(light.harmonics[:, :1])
+    flips[[k for k in ODD_IN_X if k < len(flips)]] = -1
     facing = None if light.facing is None else mirror_points(light.facing)
-    return light._replace(harmonics=torch.stack([ambient, -x, y, z]), facing=facing)
+    return light._replace(harmonics=flips * light.harmonics, facing=facing)

@@ -155,13 +155,14 @@ class Render(NamedTuple):
 class HandLight(NamedTuple):
     """Light that falls on a hand; it stays in the world when the hand turns.
 
-    The light that skin reflects is multiplied with `[1, n] @ harmonics`, kept within `limits`, where n is the direction
-    in which skin faces in the world of the photo's camera. What that does not tell, shadows and gloss, stays on skin
-    for as long as it faces as in the photo: `shade` here and that of the Gaussians.
+    The light that skin reflects is multiplied with the harmonics in the direction n in which it faces, in the world of
+    the photo's camera, kept within `limits`; and with the share of it that the hand lets through in its pose
+    (`avatar.sky`). What that does not tell, gloss and wrinkles, stays on skin for as long as it faces as in the photo and
+    sees as much of the sky: `shade` here and that of the Gaussians.
     """
 
-    harmonics: Float[Tensor, "4 3"]
-    """Of degree 0, then x, y and z; a column a colour."""
+    harmonics: Float[Tensor, "K 3"]
+    """Irradiance of 1, x, y, z, and if K = 9 of xy, yz, 3 z^2 - 1, xz, x^2 - y^2; a column a colour."""
     limits: Float[Tensor, "2 3"]
     """Least and most of it that the photo shows, above 0: no more is guessed of what it does not show."""
     even: Float[Tensor, "3"]
@@ -170,6 +171,8 @@ class HandLight(NamedTuple):
     """Factor of the sRGB colours of vertices that face as in the photo, where that may show something else there."""
     facing: Float[Tensor, "V 3"] | None = None
     """Where they faced there, unit; comes with any shade."""
+    albedo: Float[Tensor, "3"] | None = None
+    """Mean reflectance of the skin, from which light bounces into the hollows of the hand. None: nothing is hidden."""
 
 
 class TrainingBatch(NamedTuple):

@@ -1,8 +1,8 @@
 """The avatar file: safetensors with a JSON header, so that loading one executes no code.
 
-The tables `TENSORS`, `LIGHT`, `SHADE` and `FINE_SHADE` describe the tensors. The metadata have one entry,
-"oasis-avatar": the header, a JSON object whose `version` is 4, or less in files without light (1), shade (2) or shade
-per Gaussian (3). Files of newer versions are refused. There is only one entry because safetensors writes several in any
+The tables `TENSORS`, `LIGHT`, `SHADE`, `FINE_SHADE` and `ALBEDO` describe the tensors. The metadata have one entry,
+"oasis-avatar": the header, a JSON object whose `version` is 5, or less in files without light (1), shade (2), shade per
+Gaussian (3) or light that the hand hides from itself (4). Files of newer versions are refused. There is only one entry because safetensors writes several in any
 order, and the same avatar must give the same bytes.
 """
 
@@ -22,7 +22,11 @@ from oasis_warp.data.tensor_file import open_tensors
 from oasis_warp.ops.checks import check_finite, check_shape
 
 FORMAT = "oasis-avatar"
-VERSION = 4
+VERSION = 5
+LIGHT_HIDDEN = 5
+"""First version whose light is fitted with what the hand hides of it."""
+HARMONICS = (4, 9)
+"""Rows that `light.harmonics` may have."""
 UNIT_TOLERANCE = 1e-3
 UNITS = {"length": "m", "angle": "rad", "quaternion": "wxyz", "color": "sRGB in [0, 1]", "camera": "OpenCV"}
 
@@ -57,7 +61,7 @@ TENSORS = {
 }
 LIGHT = {
     # The photo's light, where it is not part of the colours: all of it or nothing.
-    "light.harmonics": Entry(torch.float32, (4, 3)),
+    "light.harmonics": Entry(torch.float32, ("K", 3)),
     "light.limits": Entry(torch.float32, (2, 3)),
     "light.even": Entry(torch.float32, (3,)),
 }
@@ -70,6 +74,10 @@ FINE_SHADE = {
     # As SHADE, of each Gaussian: with it, or not at all.
     "gaussians.shade": Entry(torch.float32, ("N", 3)),
 }
+ALBEDO = {
+    # Where the hand hides light from itself: with any light, or not at all.
+    "light.albedo": Entry(torch.float32, (3,)),
+}
 HEADER = {"version": int, "side": str, "hand_model": str, "hand_licence": str, "source_camera": dict}
 """Required keys of a header and their types; `source_camera` holds `width` and `height` [px]."""
 
@@ -80,7 +88,7 @@ def save_avatar(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping
     Args:
         path: Path of the file; an existing one is replaced.
         tensors: One for every name of `TENSORS`, of `LIGHT` or none of them, then of `SHADE` or none, then of
-            `FINE_SHADE` or none, on any device.
+            `FINE_SHADE` or none, and with `LIGHT` that of `ALBEDO` or none, on any device.
         header: The keys of `HEADER` and any others; `version`, `units`, `counts` and `creator` are filled in.
 
     Raises:
@@ -159,6 +167,8 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> dict[str, int]:
     for k, part in enumerate(parts):  # each needs those before it
         if tensors.keys() & set().union(*parts[k:]):
             table |= part
+    if tensors.keys() & ALBEDO.keys():
+        table |= LIGHT | ALBEDO
     missing, unknown = table.keys() - tensors.keys(), tensors.keys() - table.keys()
     if missing or unknown:
         found = {"missing": missing, "unknown": unknown}
@@ -191,9 +201,14 @@ def _check_gaussians(tensors: Mapping[str, Tensor]) -> None:
         ),
     }
     if "light.limits" in tensors:
+        rows = len(tensors["light.harmonics"])
+        if rows not in HARMONICS:
+            raise ValueError(f"light.harmonics: expected {HARMONICS[0]} or {HARMONICS[1]} rows, got {rows}")
         limits = tensors["light.limits"]
         good["light.limits"] = (limits > 0) & (limits[0] <= limits[1]), "the least, above 0, over the most"
         good["light.even"] = tensors["light.even"] > 0, "light"
+    if "light.albedo" in tensors:
+        good["light.albedo"] = (tensors["light.albedo"] >= 0) & (tensors["light.albedo"] <= 1), "reflectances in [0, 1]"
     if "light.shade" in tensors:
         good["light.shade"] = (tensors["light.shade"] > 0).all(1), "factors above 0"
         good["light.facing"] = (tensors["light.facing"].norm(dim=1) - 1).abs() < UNIT_TOLERANCE, "unit vectors"

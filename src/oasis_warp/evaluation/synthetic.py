@@ -21,9 +21,8 @@ from torch import Tensor
 
 from oasis_warp import __version__
 from oasis_warp.avatar.observation import source_photos
-from oasis_warp.avatar.pose import pose_gaussians, turn_light
+from oasis_warp.avatar.pose import pose_gaussians, turn_light, with_photo
 from oasis_warp.avatar.prior import Prior
-from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
@@ -244,14 +243,15 @@ def draw_targets(
     The photo's light falls on targets after `rotations` (`CapturedPerson.light_rotations`); without, light is even.
     """
     rest, size = batch.rest[0], batch.target_images.shape[2]
-    normals, images = surface.vertex_normals(rest, hand.faces), []
+    images = []
     for k, (posed, viewmat, K) in enumerate(
         zip(batch.target_posed[0], batch.target_viewmats[0], batch.target_Ks[0], strict=True)
     ):
         if made.light is None or rotations is None:
             posed_gaussians = pose_gaussians(made.without_light(), hand.faces, rest, posed)
         else:
-            light = turn_light(made.light, rotations[k].to(normals)), normals
+            light = turn_light(made.light, rotations[k].to(rest))
+            light = with_photo(light, rest, batch.posed[0], hand.faces)
             posed_gaussians = pose_gaussians(made.gaussians, hand.faces, rest, posed, light)
         images.append(render(posed_gaussians, Camera(viewmat, K, size, size)).image)
     return images

@@ -7,8 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.ops import depth_map
+from oasis_warp.ops.smoothing import smooth_over_faces
 from oasis_warp.synthetic.body import Body
-from oasis_warp.synthetic.ops.skin_shading import sky_transfer, smooth_over_faces
+from oasis_warp.synthetic.ops.skin_shading import sky_transfer
 from oasis_warp.synthetic.ops.views import Lamps
 from oasis_warp.synthetic.posing import PosedPeople
 from oasis_warp.synthetic.shot_table import ShotTensors

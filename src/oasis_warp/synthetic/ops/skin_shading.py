@@ -86,26 +86,6 @@ def surface_state(vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]) -
     return SurfaceState(normals, areas)
 
 
-_SMOOTH = Declaration(
-    "smooth_over_faces", inputs={"values": Array("B V C"), "faces": Array("F 3", index="V")}, public=False
-)
-
-
-@torch.no_grad()
-def smooth_over_faces(values: Float[Tensor, "B V C"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "B V C"]:
-    """Mean over the corners of the faces around each vertex, itself counted once per face; lonely vertices stay.
-
-    Raises:
-        ValueError: a wrong shape or index.
-    """
-    sizes = _SMOOTH.check(values=values, faces=faces)
-    index = incidence("faces", faces, sizes["V"], "vertices")
-    out = torch.empty_like(values, memory_format=torch.contiguous_format)
-    inputs = [scalars(values), *index, out]
-    launch_ranges(skin_light.smooth, values.numel(), inputs, like=values)
-    return out
-
-
 _SKY_TRANSFER = Declaration(
     "sky_transfer",
     inputs={

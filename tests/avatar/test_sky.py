@@ -1,0 +1,101 @@
+import pytest
+import torch
+from synthetic import avatar_of, crop_of
+
+from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.pose import posed_lighting, turn_light
+from oasis_warp.avatar.sky import bounced, harmonic_basis, radiance, sky_mesh
+from oasis_warp.core import rotation
+from oasis_warp.core.mirror import mirror_light, mirror_points
+from oasis_warp.core.types import HandLight
+from oasis_warp.hand.poses import named_pose
+
+EVEN = HandLight(
+    torch.tensor([[1.0] * 3, *[[0.0] * 3] * 3]), torch.tensor([[0.1] * 3, [2.0] * 3]), torch.ones(3),
+    albedo=torch.tensor([0.5, 0.35, 0.3]),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene(hand):
+    """A fist in its photo."""
+    return crop_of(hand, 0.8 * region_colors(label_regions(hand), 0.03), pose_name="fist", size=48)
+
+
+def seen(hand, crop, posed):
+    return posed_lighting(crop.rest.vertices, posed, hand.faces, EVEN).exposure[:, 0]
+
+
+def test_the_coarse_mesh_is_that_of_the_hand(hand):
+    mesh = sky_mesh(torch.device("cpu"))
+    assert int(mesh.vertices.max()) < len(hand.template) and int(mesh.faces.max()) < len(mesh.vertices)
+    read = (hand.template[mesh.vertices][mesh.corners] * mesh.weights[..., None]).sum(1)
+    assert float((read - hand.template).norm(dim=1).max()) < 0.003
+    assert float(hand.weights[mesh.still, 0]) > 0.99
+
+
+def test_a_fist_hides_the_palm_and_an_open_hand_does_not(hand, scene):
+    crop, _, pose = scene
+    avatar = avatar_of(hand, scene[1], pose, crop.camera, None)
+    opened = avatar.mesh(pose._replace(angles=named_pose(hand, "open"))).vertices
+    palm = (label_regions(hand).palm > 0.9) & (hand.segment == 0) & (hand.template[:, 0] < -0.05)
+    in_fist, in_open = (seen(hand, crop, posed)[palm].median() for posed in (crop.posed.vertices, opened))
+    assert float(in_fist) < 0.35 and float(in_open) > 0.85
+
+
+def test_a_stiff_hand_sees_the_same_share_however_it_turns(hand, scene):
+    crop, _, _ = scene
+    turn = rotation.from_axis_angle(torch.tensor([0.6, 0.0, 0.8]), torch.tensor(1.9))
+    before, after = (seen(hand, crop, posed) for posed in (crop.posed.vertices, crop.posed.vertices @ turn.T))
+    assert float((before - after).abs().max()) < 2e-3
+
+
+def test_shade_goes_when_what_cast_it_has_moved(hand, scene):
+    """An opened palm kept the shadows of the fingers of its fist: its own normals had not turned."""
+    crop, truth, pose = scene
+    facing = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces, EVEN).normals
+    shaded = EVEN._replace(shade=torch.full_like(facing, 0.4), facing=facing)
+    plain, dark = (avatar_of(hand, truth, pose, crop.camera, light) for light in (EVEN, shaded))
+    opened = pose._replace(angles=named_pose(hand, "open"))
+    palm = (label_regions(hand).palm > 0.9) & (hand.segment == 0) & (hand.template[:, 0] < -0.05)
+    palm = palm[truth.vertex_index].nonzero()[:, 0]
+    ratios = [(dark.pose(p).colors / plain.pose(p).colors)[palm].median() for p in (pose, opened)]
+    assert float(ratios[0]) == pytest.approx(0.4, abs=1e-3)
+    assert float(ratios[1]) > 0.95
+
+
+def test_a_light_without_albedo_reaches_everything(hand, scene):
+    crop, truth, pose = scene
+    lit = avatar_of(hand, truth, pose, crop.camera, EVEN._replace(albedo=None))
+    torch.testing.assert_close(lit.pose(pose).colors, truth.colors)
+    hidden = avatar_of(hand, truth, pose, crop.camera, EVEN).pose(pose).colors
+    assert float((hidden / truth.colors).min()) < 0.6
+
+
+def test_light_bounces_more_off_bright_skin_and_never_takes_any_away():
+    share = torch.linspace(0, 1, 21)[:, None].expand(-1, 3)
+    found = bounced(share, torch.tensor([0.05, 0.3, 0.7]))
+    assert bool((found >= share).all()) and bool((found[1:] >= found[:-1]).all())
+    assert float(found[10, 2]) > float(found[10, 1]) > float(found[10, 0]) >= 0.5
+    torch.testing.assert_close(found[-1], torch.ones(3), atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("rows", [4, 9])
+def test_harmonics_turn_and_mirror_with_the_world(rows):
+    generator = torch.Generator().manual_seed(rows)
+    light = EVEN._replace(harmonics=torch.randn(rows, 3, generator=generator))
+    n = torch.nn.functional.normalize(torch.randn(20, 3, generator=generator), dim=1)
+    turn = rotation.from_axis_angle(torch.tensor([0.0, 0.6, 0.8]), torch.tensor(0.9))
+    before = harmonic_basis(n, rows) @ light.harmonics
+    after = harmonic_basis(n @ turn.T, rows) @ turn_light(light, turn).harmonics
+    torch.testing.assert_close(after, before, atol=1e-5, rtol=1e-4)
+    mirrored = harmonic_basis(mirror_points(n), rows) @ mirror_light(light).harmonics
+    torch.testing.assert_close(mirrored, before)
+
+
+def test_radiance_is_what_the_cosine_lobe_blurs():
+    light = EVEN._replace(harmonics=torch.tensor([[1.0] * 3, [0.2] * 3, [0.0] * 3, [-0.4] * 3]))
+    along = radiance(light, torch.eye(3))
+    torch.testing.assert_close(along[:, 0], torch.tensor([1.3, 1.0, 0.4]))
+    against = radiance(light._replace(harmonics=3 * light.harmonics - 2 * EVEN.harmonics), torch.eye(3))
+    assert float(against.min()) == 0
