@@ -18,7 +18,14 @@ from oasis_warp.avatar.pose import (
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.mirror import mirror_camera, mirror_canonical, mirror_hand, mirror_light, mirror_points, mirror_pose
+from oasis_warp.core.mirror import (
+    mirror_camera,
+    mirror_canonical,
+    mirror_hand,
+    mirror_light,
+    mirror_points,
+    mirror_pose,
+)
 from oasis_warp.core.types import (
     Camera,
     CanonicalGaussians,

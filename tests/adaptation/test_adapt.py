@@ -4,9 +4,10 @@ import pytest
 import torch
 from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, crop_of
 
-from oasis_warp.adaptation.adapt import adapt, unlit_detail, view_in_photo
+from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.mixture import mix_guesses
 from oasis_warp.adaptation.reliability import observe_photos, photo_gains
+from oasis_warp.adaptation.unlit import unlit_detail, view_in_photo
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians, with_photo

@@ -30,7 +30,7 @@ from oasis_warp.avatar.pose import (
     with_photo,
 )
 from oasis_warp.avatar.prior import MeanPrior
-from oasis_warp.core import rotation, surface
+from oasis_warp.core import rotation
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import HandLight

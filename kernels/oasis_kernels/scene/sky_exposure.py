@@ -55,7 +55,7 @@ def sky_exposure(
             top = int(wp.floor(y))
             u = x - float(left)
             w = y - float(top)
-            share = float(0.0)
+            share = wp.float32(0.0)
             for corner in range(4):
                 column = wp.clamp(left + corner % 2, 0, last)
                 row = wp.clamp(top + corner // 2, 0, last)

@@ -10,32 +10,31 @@ from torch import Tensor
 from oasis_warp.adaptation.calibrate import Calibration, calibrate
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.mixture import mix_guesses
-from oasis_warp.adaptation.reliability import VertexObservations, mask_unreliable, observe_photos, photo_gains
-from oasis_warp.adaptation.sh_lighting import (
-    add_shade,
-    apply_light,
-    fit_light,
-    light_evenly,
-    split_albedo_shading,
-    trust_in_albedo,
-    without_light,
-)
+from oasis_warp.adaptation.reliability import VertexObservations, observe_photos, photo_gains
+from oasis_warp.adaptation.sh_lighting import light_evenly, split_albedo_shading
 from oasis_warp.adaptation.sharpen import sharpen
 from oasis_warp.adaptation.texture import Targets, learn_lora, learn_texture, make_targets, reference_azimuths
+from oasis_warp.adaptation.unlit import (
+    MIN_ALPHA,
+    PhotoView,
+    picture_of,
+    remove_photo_light,
+    trust_in_photo,
+    unlit_detail,
+    view_in_photo,
+)
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import inner_mask, observe
-from oasis_warp.avatar.pose import in_even_light, pose_gaussians, posed_lighting, shading_factors
+from oasis_warp.avatar.pose import in_even_light, posed_lighting, shading_factors
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandCrop, HandLight
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.network.heads import ColorHeads
 from oasis_warp.ops import BlendWeights, blend_colors, stack_weights
 from oasis_warp.render.render import view_weights
 
-MIN_ALPHA = 0.05
-"""Below it a pixel says nothing about the colour of the hand."""
 SHADING_LENGTH = 0.01
 """Differences between photos that change over a longer distance along the skin may be light and are averaged [m]."""
 SHADING_REACH = 0.1
@@ -73,24 +72,6 @@ class Adaptation(NamedTuple):
         return self.lights[0] if self.lights else None
 
 
-class PhotoView(NamedTuple):
-    """Gaussians as a photo shows them."""
-
-    posed: Gaussians
-    weights: BlendWeights
-    trusted: Float[Tensor, "H W"]
-    """1 where the photo's colours are those of the hand."""
-
-
-class Unlit(NamedTuple):
-    """A photo as the skin is read from it."""
-
-    crop: HandCrop
-    """As in even light, its mask where the photo surely shows the surface. The photo itself with the light "keep"."""
-    light: HandLight | None
-    """Of the photo; None where it is kept."""
-
-
 class _Photos(NamedTuple):
     """K photos, and one guess of the hand as each of them shows it."""
 
@@ -107,18 +88,6 @@ class _Photos(NamedTuple):
     """How far each pixel counts beside the other photos; 0 where the guess does not cover it."""
     trust: Float[Tensor, "K V"]
     """Of `trust_in_albedo`; 1 where light is kept."""
-
-
-def view_in_photo(hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop) -> PhotoView:
-    """Pose `gaussians` as in the photo and blend them once."""
-    faces = hand.faces.to(crop.image.device)
-    posed = pose_gaussians(gaussians, faces, crop.rest.vertices, crop.posed.vertices)
-    weights = view_weights(posed, crop.camera)
-    return PhotoView(posed, weights, _trusted(weights, crop))
-
-
-def _trusted(weights: BlendWeights, crop: HandCrop) -> Float[Tensor, "H W"]:
-    return inner_mask(crop.mask, 1) * (weights.alphas[..., 0] > 0.5)
 
 
 def adapt(
@@ -183,52 +152,6 @@ def adapt(
         trust = ((weight * photos.trust).sum(0) + UNSEEN) / (weight.sum(0) + UNSEEN)
         gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust)
     return result._replace(gaussians=gaussians, losses=texture.losses)
-
-
-def remove_photo_light(
-    hand: HandModel, guess: CanonicalGaussians, crop: HandCrop, weights: BlendWeights, config: AdaptConfig
-) -> Unlit:
-    """Fit the light of one photo and take it off.
-
-    The shaded side of a hand before a dark wall is no wall: reliable pixels are found in a first guess of the light.
-
-    Args:
-        hand: The model.
-        guess: What the prior makes of the photo.
-        crop: The photo.
-        weights: Of `guess` in the photo.
-        config: Options.
-    """
-
-    def calibrated_picture(crop: HandCrop) -> Tensor:
-        calibration = calibrate(weights, guess.colors, crop.image, _trusted(weights, crop), config)
-        return _picture(weights, calibration.apply(guess.colors))
-
-    if config.light == "keep":
-        return Unlit(crop, None)
-    picture = calibrated_picture(crop)
-    reliable = mask_unreliable(hand, apply_light(hand, picture, crop, fit_light(hand, picture, crop)), crop)
-    light = fit_light(hand, calibrated_picture(reliable), reliable)
-    light = add_shade(hand, calibrated_picture(without_light(hand, reliable, light)), crop, reliable, light)
-    return Unlit(without_light(hand, reliable, light), light)
-
-
-def unlit_detail(
-    hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, weights: BlendWeights, light: HandLight | None,
-    *, several: bool = False,
-) -> tuple[HandCrop, Float[Tensor, "V"]]:  # fmt: skip
-    """What a photo, perhaps a larger one than was adapted to, shows of the skin of `gaussians`, and how far it is skin.
-
-    In even light, and `trust_in_albedo`. The photo itself where no light is apart. Of `several` photos all pixels
-    count: with reliable ones only, a second photo's detail takes less off the error.
-    """
-    if light is None:
-        return crop, crop.rest.vertices.new_ones(len(crop.rest.vertices))
-    sure = crop
-    if not several:
-        lit = apply_light(hand, _picture(weights, gaussians.colors), crop, light._replace(shade=None))
-        sure = mask_unreliable(hand, lit, crop)
-    return without_light(hand, crop, light), trust_in_albedo(hand, crop, sure, light)
 
 
 def add_detail(
@@ -304,14 +227,8 @@ def _gather(
     lights = tuple(photo.light for photo in read if photo.light is not None) or None
     gains = photo_gains(seen, vertex_colors(guess, len(hand.template)))
     stacked = stack_weights([view.weights for view in views])
-    trust = torch.stack([_trust(hand, crop, photo) for crop, photo in zip(crops, read, strict=True)])
+    trust = torch.stack([trust_in_photo(hand, crop, photo) for crop, photo in zip(crops, read, strict=True)])
     return guess, _Photos(crops, unlit, lights, seen, gains, views, stacked, belief, trust)
-
-
-def _trust(hand: HandModel, crop: HandCrop, photo: Unlit) -> Float[Tensor, "V"]:
-    if photo.light is None:
-        return crop.rest.vertices.new_ones(len(crop.rest.vertices))
-    return trust_in_albedo(hand, crop, photo.crop, photo.light)
 
 
 def _complete(
@@ -328,7 +245,7 @@ def _complete(
     seen, views = photos.observations, photos.views
     rest, faces = photos.crops[0].rest.vertices, hand.faces.to(seen.colors.device)
     # Not the Gaussians' own colours: those of a learned prior need not agree where they overlap.
-    drawn = [_picture(view.weights, gaussians.colors) for view in views]
+    drawn = [picture_of(view.weights, gaussians.colors) for view in views]
 
     def differences() -> Float[Tensor, "K V 3"]:
         return torch.stack([
@@ -406,9 +323,3 @@ def _shading_corrections(
     ])  # fmt: skip
     mean = (confidence[..., None] * smooth).sum(0) / (confidence.sum(0) + GUESS_LIGHT)[:, None]
     return torch.where(confidence[..., None] > 0, mean - smooth, 0.0)
-
-
-@torch.no_grad()
-def _picture(weights: BlendWeights, colors: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 3"]:
-    """The picture without its background."""
-    return blend_colors(weights, colors) / weights.alphas.clamp_min(MIN_ALPHA)

@@ -67,8 +67,8 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) ->
     Weighted least squares of photo = drawn (h_0 + h . n) e over the visible vertices, in linear light, for all channels
     at once: the first two bands of the harmonics of irradiance (Ramamoorthi and Hanrahan 2001), and the share e of this
     light that the hand lets through in the photo's pose, so that soft shadows between fingers are no skin. The share
-    depends on the light: it is that of an even one at first. A photo shows only skin that faces it, so a normal prior on
-    the harmonics constrains the rest (maximum a posteriori). If nothing is visible, the light is even.
+    depends on the light: it is that of an even one at first. A photo shows only skin that faces it, so a normal prior
+    on the harmonics constrains the rest (maximum a posteriori). If nothing is visible, the light is even.
 
     Args:
         hand: Whose surface it is.

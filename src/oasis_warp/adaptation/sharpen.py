@@ -90,8 +90,8 @@ def sharpen(
         gaussians: Fitted to the photos, perhaps in smaller pictures of them.
         crops: Of K photos, as large as their detail, with one surface at rest and in one light.
         believed: How far to believe each at each vertex, at most 1 in all; a single photo wholly.
-        trust: How far what each shows is skin, 0 to 1, wholly if not given: the rest of the detail is shade, if there is
-            any shade.
+        trust: How far what each shows is skin, 0 to 1, wholly if not given: the rest of the detail is shade, if there
+            is any shade.
         progress: Called as work goes on.
     """
     rest = crops[0].rest.vertices

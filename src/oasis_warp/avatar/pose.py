@@ -20,8 +20,8 @@ AS_IN_PHOTO, TURNED_AWAY = math.cos(math.radians(5)), math.cos(math.radians(20))
 """Cosines of the angle by which skin has turned from where the photo shows it, up to which its shade stays as it is and
 from which it is gone."""
 SAME_SKY, OTHER_SKY = 0.08, 0.25
-"""Changes of the share of the sky that skin sees, up to which its shade stays and from which it is gone: what cast it has
-moved. Buffers of 3 mm err by .05; a finger that lies on the palm hides .5 and more."""
+"""Changes of the share of the sky that skin sees, up to which its shade stays and from which it is gone: what cast it
+has moved. Buffers of 3 mm err by .05; a finger that lies on the palm hides .5 and more."""
 MIN_COLOR = 1e-3
 """Least colour that has shade: it is a factor."""
 

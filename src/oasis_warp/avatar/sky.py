@@ -58,7 +58,7 @@ def harmonic_basis(directions: Float[Tensor, "*B 3"], count: int) -> Float[Tenso
 
 
 def radiance(light: HandLight, directions: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-    """The light that comes from unit `directions`; as irradiance, but not blurred by the cosine lobe, and never below 0."""
+    """The light that comes from unit `directions`: irradiance without the blur of the cosine lobe, never below 0."""
     count = len(light.harmonics)
     degrees = [0] + 3 * [1] + 5 * [2]
     blur = torch.cat([torch.full_like(light.harmonics[:1], LOBE[degree]) for degree in degrees[:count]])

@@ -157,8 +157,8 @@ class HandLight(NamedTuple):
 
     The light that skin reflects is multiplied with the harmonics in the direction n in which it faces, in the world of
     the photo's camera, kept within `limits`; and with the share of it that the hand lets through in its pose
-    (`avatar.sky`). What that does not tell, gloss and wrinkles, stays on skin for as long as it faces as in the photo and
-    sees as much of the sky: `shade` here and that of the Gaussians.
+    (`avatar.sky`). What that does not tell, gloss and wrinkles, stays on skin for as long as it faces as in the photo
+    and sees as much of the sky: `shade` here and that of the Gaussians.
     """
 
     harmonics: Float[Tensor, "K 3"]

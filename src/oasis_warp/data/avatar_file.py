@@ -2,8 +2,8 @@
 
 The tables `TENSORS`, `LIGHT`, `SHADE`, `FINE_SHADE` and `ALBEDO` describe the tensors. The metadata have one entry,
 "oasis-avatar": the header, a JSON object whose `version` is 5, or less in files without light (1), shade (2), shade per
-Gaussian (3) or light that the hand hides from itself (4). Files of newer versions are refused. There is only one entry because safetensors writes several in any
-order, and the same avatar must give the same bytes.
+Gaussian (3) or light that the hand hides from itself (4). Files of newer versions are refused. There is only one entry
+because safetensors writes several in any order, and the same avatar must give the same bytes.
 """
 
 import json

@@ -79,9 +79,9 @@ def sky_exposure(
 ) -> Float[Tensor, "B V 4"]:
     """Share of the light from all around that reaches each vertex past the surface itself: 1 where nothing hides.
 
-    The irradiance sum_d w_d max(0, n . d) L(d) V(d) over the same without the visibility V, from a depth buffer for each
-    direction of `sky_directions`; then a mean over the faces around. Values are trusted; not differentiable. The same on
-    every device up to rounding, and in a batch as alone.
+    The irradiance sum_d w_d max(0, n . d) L(d) V(d) over the same without the visibility V, from a depth buffer for
+    each direction of `sky_directions`; then a mean over the faces around. Values are trusted; not differentiable. The
+    same on every device up to rounding, and in a batch as alone.
 
     Args:
         vertices: Of posed surfaces [m], float32, [B, V, 3].
