@@ -23,7 +23,9 @@ def scene(hand):
 
 
 def seen(hand, crop, posed):
-    return posed_lighting(crop.rest.vertices, posed, hand.faces, EVEN).exposure[:, 0]
+    exposure = posed_lighting(crop.rest.vertices, posed, hand.faces, EVEN).exposure
+    assert exposure is not None
+    return exposure[:, 0]
 
 
 def test_the_coarse_mesh_is_that_of_the_hand(hand):
