@@ -11,10 +11,9 @@ from oasis_warp.adaptation.sharpen import sharpen
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
-from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
 from oasis_warp.reconstruction import reconstruct
-from studies.damage import DAMAGES, DamagedInput, hand_size
+from studies.damage import DAMAGES
 from studies.stress import is_sane, likeness, make
 
 PHOTO = Path(__file__).parent / "data" / "photos" / "palm_open_left_02.png"
@@ -79,15 +78,6 @@ def test_a_damaged_photo_makes_a_hand_and_the_report_says_what_ails_it(whole, na
     assert is_sane(made.avatar.gaussians)
     assert likeness(base.avatar, made.avatar) > (LIKE_IN_THE_DARK if name == "dark" else LIKE)
     assert SAID[name] in "; ".join(made.warnings)
-
-
-@pytest.mark.slow
-def test_a_tiny_hand_is_refused_unless_forced(whole):
-    photo, base = whole
-    damaged = DAMAGES["tiny"](photo, base)
-    assert isinstance(damaged, DamagedInput) and hand_size(base) > 200
-    with pytest.raises(InputError, match="pixels large"):
-        make(damaged, FEW, force=False)
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ from oasis_warp.avatar.quality import (
     over_photo,
     photo_warnings,
 )
+from oasis_warp.avatar.wrist import close_wrist
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.hand_model import HandModel
@@ -227,7 +228,9 @@ def _run(
                 hand, adaptation.gaussians, adaptation.guess, crops[0], confidence, seed=config.seed
             )
             adaptation, invented = adaptation._replace(gaussians=painted.gaussians), painted.invented
-    avatar = make_avatar(fits[0], surfaces.shared, crops[0], adaptation.gaussians, adaptation.light)
+    closed = close_wrist(hand, adaptation.gaussians, crops[0].rest.vertices)
+    adaptation = adaptation._replace(gaussians=closed)
+    avatar = make_avatar(fits[0], surfaces.shared, crops[0], closed, adaptation.light)
     with stage("quality"):
         areas = surface.vertex_areas(crops[0].rest.vertices, hand.faces.to(config.device))
         parts = [_assess(hand, adaptation, k, fits[k], surfaces, crops[k], close[k]) for k in range(len(photos))]

@@ -207,9 +207,21 @@ def test_a_small_hand_is_warned_about_and_a_tiny_one_refused(estimator, photos):
     photo = read_photo(photos / "small_pointing_right_13.jpg")
     found = estimator.find(photo)
     assert any("small hand" in warning for warning in estimator.fit(photo, found[0]).warnings)
-    small = cv2.resize(photo.rgb.numpy(), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    with pytest.raises(InputError, match=r"the hand is 7\d pixels large, at least 80 are needed; give"):
-        estimator.fit(photo._replace(rgb=torch.from_numpy(small)), found[0]._replace(xy=found[0].xy / 2))
+    with pytest.raises(InputError, match=r"the hand is 3\d pixels large, at least 40 are needed; give"):
+        estimator.fit(*shrunk(photo, found[0], 0.25))
+
+
+def shrunk(photo, found, factor):
+    small = cv2.resize(photo.rgb.numpy(), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    return photo._replace(rgb=torch.from_numpy(small)), found._replace(xy=found.xy * factor)
+
+
+def test_a_hand_of_60_pixels_is_fitted_and_said_to_have_little_detail(estimator, fitted):
+    photo, landmarks, whole = fitted(RIGHT)
+    factor = 60 / box_size(landmarks.xy.numpy())
+    fit = estimator.fit(*shrunk(photo, landmarks, factor))
+    assert any("60 pixels, the avatar has little detail" in warning for warning in fit.warnings)
+    assert fit.reprojection < 2 * whole.reprojection + 1
 
 
 def test_a_hand_cut_by_the_border_is_noticed(estimator, fitted):

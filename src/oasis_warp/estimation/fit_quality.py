@@ -18,8 +18,10 @@ from oasis_warp.estimation.networks import Networks
 from oasis_warp.estimation.outline import silhouette, wrist_line
 from oasis_warp.hand.kinematics import HandKinematics
 
-SMALL_HAND, TINY_HAND = 150, 80
-"""Longer side of the landmarks' box [px] below which a hand gets a warning, and is refused."""
+SMALL_HAND, LOW_DETAIL, TINY_HAND = 150, 80, 40
+"""Longer side of the landmarks' box [px] below which a hand gets a warning, a stronger one, and is refused. 22 photos,
+shrunk to hands of 40 px, give surfaces that lie 1.3 % of the box from the whole photos' in the median, 2 % at the 80th
+percentile; at 80 px it is .5 and .8 %. One of the 22 is refused for its fit at 40 px."""
 MANY_FINGERS = 4
 """A hand with this many doubtful fingers is somewhere else."""
 _SIDE_RATIO = 1.15
@@ -210,7 +212,9 @@ def framing_warnings(target: FitTarget, mask: np.ndarray) -> list[str]:
     """Whether the hand is small, or cut by the photo's border."""
     warnings = []
     if target.box < SMALL_HAND:
-        warnings.append(f"small hand: {target.box:.0f} pixels, the avatar will be blurred below {SMALL_HAND}")
+        low = target.box < LOW_DETAIL
+        what = "has little detail and its pose may be off" if low else f"will be blurred below {SMALL_HAND}"
+        warnings.append(f"small hand: {target.box:.0f} pixels, the avatar {what}")
     width, height = target.size
     hand = (mask > 0.5) & wrist_line(target.xy).above_mask(target.size)
     touching = sum(int(line.sum()) for line in (hand[0], hand[-1], hand[:, 0], hand[:, -1]))
