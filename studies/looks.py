@@ -117,11 +117,9 @@ def photos(rows: list[Row]) -> list[Row]:
     reference, found = reference_contrasts(), []
     for name, record in (rows[-1]["found"]["photos"] if rows else {}).items():
         ratios = relative_contrasts(record, reference)
-        hidden = ratios.get("hidden_back") or ratios.get("hidden_palm")
         found.append({
             "photo": Path(name).stem, "psnr": record["input_psnr_db"], "side": record["side"],
-            "hidden": "" if hidden is None else " / ".join(f"{ratio:.2f}" for ratio in hidden),
-            "turned": " / ".join(f"{ratio:.2f}" for ratio in ratios.get("turned", [])),
+            **{region: " / ".join(f"{ratio:.2f}" for ratio in own) for region, own in ratios.items()},
             "haze": record["haze"] / max(record["haze_of_mean"], 1e-9), "palm": record["palm_minus_back"],
             "darkest": record["darkest"],
             "light": " / ".join(f"{ratio:.2f}" for ratio in record["back_over_front"] or []),
@@ -135,8 +133,9 @@ SECTIONS = (
     Section("looks.md", "blemishes", blemishes),
     Section("looks.md", "each-photo", table(
         (
-            Column("photo", "photo"), Column("PSNR dB", "psnr", ".1f"), Column("hidden skin, ratios", "hidden"),
-            Column("seen skin in other poses", "turned"), Column("haze ratio", "haze", ".0f"),
+            Column("photo", "photo"), Column("PSNR dB", "psnr", ".1f"),
+            *(Column(REGIONS[name], name) for name in ("turned", "hidden_palm", "hidden_back")),
+            Column("haze ratio", "haze", ".0f"),
             Column("palm minus back, a*", "palm", "+.1f"), Column("darkest palm", "darkest", ".2f"),
             Column("back over front, R / G / B", "light"),
         ),
