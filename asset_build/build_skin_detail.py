@@ -38,13 +38,15 @@ LOW, SPAN = (0.361408, 0.011539), 0.192729
 BOX = (732, 1621, 411, 412)
 """Column, row, width and height of the crops in the body's texture [px]."""
 BODY_SIZE = 2048
-SMOOTH = 0.008
-"""Length l of the low-pass 1 / (1 + (k l)^4) that is taken off: half of what repeats every 50 mm goes. Folds, vessels
-and red knuckles stay [m]."""
+SMOOTH, ON_FINGERS = 0.008, 0.0045
+"""Length l of the low-pass 1 / (1 + (k l)^4) that is taken off, on the palm and back and on fingers [m]: half of what
+repeats every 50 mm and every 28 mm goes. Folds, vessels and red knuckles stay; the gloss along fingers goes."""
+LOUDEST = 0.16
+"""Logarithm that detail tends to."""
 AROUND = 3
 """Harmonics of the angle about each bone of a finger that are taken off before: the light and dark sides of fingers
 are light left in the photos."""
-FINE, FINE_GAIN = 1.2, 2.0
+FINE, FINE_GAIN = 1.2, 2.5
 """Blur [texels of .45 mm] and the gain of what is finer: Gaussians blur it again when they are drawn."""
 DARKER, COLOUR = (0.82, 1.06, 1.12), 0.3
 """How much each channel's logarithm changes in the shade of a fold, the colour of all that is fine but for a share: the
@@ -73,7 +75,7 @@ def main(folder: Path) -> None:
             raise FileNotFoundError(f"{folder / name}.png: expected a picture; give the folder of the crops.")
         picture = bgr[..., ::-1] / 255
         detail = band_pass(hand, np.log(np.maximum(picture, DARKEST)), faces, places)
-        stored = np.rint(GREY + UNIT * gain * detail).clip(0, 255).astype(np.uint8)
+        stored = np.rint(GREY + UNIT * LOUDEST * np.tanh(gain * detail / LOUDEST)).clip(0, 255).astype(np.uint8)
         write(target / f"detail_{k}.png", spread_out(stored, faces >= 0))
     people = [painted_lines(hand, number) for number in PEOPLE]
     folds_and_veins = torch.stack([people[0]["fold"], people[1]["fold"], people[0]["vein"]], 1)
@@ -129,6 +131,7 @@ def band_pass(hand: HandModel, texture: np.ndarray, faces: np.ndarray, places: n
     at_vertices = at_vertices - around
     texture = texture - (around[corners] * places[..., None]).sum(2)
     known = mass * np.minimum(count, 1) * (hand.nail.numpy() < NAIL_REACH / 2)
+    known = known * np.where(hand.segment.numpy() > 0, SMOOTH / ON_FINGERS, 1) ** 4
     bending = SMOOTH**4 * laplacian @ sparse.diags_array(1 / mass) @ laplacian
     smooth = splu((sparse.diags_array(known + 1e-9 * mass) + bending).tocsc()).solve(known[:, None] * at_vertices)
     detail = sharpened(np.where(on[..., None], texture - (smooth[corners] * places[..., None]).sum(2), 0), on)

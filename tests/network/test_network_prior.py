@@ -15,12 +15,13 @@ from oasis_warp.avatar.anchors import OPACITY, RIM_FADE
 from oasis_warp.avatar.observation import batch_of_crop
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior, Prior
-from oasis_warp.core import rotation
+from oasis_warp.core import rotation, surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network import prior as home
 from oasis_warp.network.prior import (
+    MOST_SCALE,
     RIM_FIRST,
     RIM_LAST,
     NetworkPrior,
@@ -30,6 +31,7 @@ from oasis_warp.network.prior import (
     canonical_gaussians,
     choose_prior,
     color_sources,
+    hold_to_surface,
 )
 from oasis_warp.network.weights_file import read_header, save_network
 from oasis_warp.render.render import render
@@ -107,6 +109,21 @@ def test_at_the_wrists_end_gaussians_have_the_shapes_of_their_anchors(network, h
     for name in ("quats", "scales", "opacities"):
         torch.testing.assert_close(getattr(settled, name)[0, far], getattr(prediction, name)[0, far])
     assert torch.equal(settled.offsets[0, far[: len(rest)]], prediction.offsets[0, far[: len(rest)]])
+
+
+def test_no_gaussian_floats_off_the_skin(network, hand, crops):
+    """Large ones, and ones far above the surface, were haze between the fingers."""
+    prior, crop = NetworkPrior(network), crops[0]
+    with torch.no_grad():
+        wild = prior._predict(crop)
+    wild = wild._replace(offsets=0.006 * torch.sign(wild.offsets + 1e-9), scales=wild.scales + 0.004)
+    rest = crop.rest.vertices
+    held = hold_to_surface(wild, rest, network.faces, network.vertex_faces)
+    above = (held.offsets[0] * surface.vertex_normals(rest, network.faces)).sum(-1)
+    assert float(above.max()) < 1e-6
+    assert float(held.scales.max()) <= 1.001 * MOST_SCALE
+    guess = prior(crop)
+    assert float(guess.scales.max()) <= 1.001 * MOST_SCALE
 
 
 def test_faint_gaussians_are_left_out_of_an_avatar_and_kept_for_training(untrained, hand, crops):

@@ -24,6 +24,8 @@ BLOOD = 0.0125
 PALM_BLOOD, TIP_BLOOD, KNUCKLE_BLOOD = 0.9, 0.7, 1.1
 """How much more of it palms, finger tips and knuckles have. With it palm minus back in CIELAB's a* is +2 to +6, as on
 real hands."""
+KNUCKLE_MELANIN = 0.15
+"""How much more melanin knuckles have."""
 PALM_HORN = 1.04
 """Brightness of palms over that of the table, as their horn is thick: light palms are paler than backs, not darker."""
 LEAST_COLOURFUL = 0.4
@@ -108,7 +110,8 @@ def tone_colors(regions: Regions, melanin: float) -> tuple[Float[Tensor, "V 3"],
     """
     palm, tip, knuckle = regions.palm, regions.finger_tip, regions.knuckle
     palm_melanin = min(0.6 * melanin, 0.006 + 0.33 * melanin)
-    amount = ((1 - palm) * math.log(1.15 * melanin) + palm * math.log(palm_melanin)).exp() * (1 + 0.3 * knuckle)
+    amount = ((1 - palm) * math.log(1.15 * melanin) + palm * math.log(palm_melanin)).exp()
+    amount = amount * (1 + KNUCKLE_MELANIN * knuckle)
     blood = BLOOD * (1 + PALM_BLOOD * palm + TIP_BLOOD * tip * (0.4 + 0.6 * palm) + KNUCKLE_BLOOD * knuckle)
     bed = skin_color(amount.new_tensor([0.5 * melanin]), amount.new_tensor([1.9 * BLOOD]))[0]
     return skin_color(amount, blood) * (1 + (PALM_HORN - 1) * palm)[:, None], 0.86 * bed + 0.14

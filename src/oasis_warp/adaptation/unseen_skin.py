@@ -31,11 +31,11 @@ MORE = 1.5
 """Gaussians after painting over those before, at most."""
 PARTS = 2
 """An edge, of faces that are cut for the painting."""
-ON_PALM, ON_BACK = 1.0, 1.0
+ON_PALM, ON_BACK = 1.2, 1.1
 """Gain of the maps' detail on palms and on backs."""
-FOLD, VEIN = (-0.15, -0.20, -0.21), (-0.10, -0.05, -0.05)
+FOLD, VEIN = (-0.10, -0.14, -0.15), (-0.07, -0.04, -0.04)
 """What a fold and a vein add to the logarithms of the colours."""
-GRAIN = 0.02
+GRAIN = 0.025
 """Standard deviation of what each Gaussian on a face has of its own: pores and the mesh of fine wrinkles."""
 LUNULA, FREE_EDGE, NAIL_RIM = 0.07, 0.12, 0.16
 """How much paler a nail's lunula and its free edge are than its bed, and how much darker the fold around it."""

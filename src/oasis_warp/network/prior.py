@@ -18,6 +18,7 @@ from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import MIN_OPACITY, OPACITY, RIM_FADE, batch_anchors
 from oasis_warp.avatar.observation import batch_of_crop
 from oasis_warp.avatar.prior import MeanPrior, Prior
+from oasis_warp.core import surface
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians, HandCrop
 from oasis_warp.hand.template import bundled_hand
@@ -59,6 +60,24 @@ def blend_rim(
         scales=scales * (prediction.scales / scales) ** share,
         opacities=torch.lerp(OPACITY * fade, prediction.opacities, share[..., 0]),
         colors=prediction.colors[:, color_sources(rest, faces, from_rim)],
+    )
+
+
+MOST_SCALE, MOST_ALONG = 0.0013, 0.0025
+"""Largest standard deviation of a Gaussian, and farthest from its vertex along the surface [m]. The network's vertex
+Gaussians have up to 4.7 mm and lie up to 6 mm off: over other sides' outlines and between fingers they are haze."""
+
+
+def hold_to_surface(
+    prediction: Prediction, rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], vertex_faces: Int[Tensor, "V M"]
+) -> Prediction:
+    """The prediction with no Gaussian above the surface, far from its vertex or larger than skin can hide."""
+    normals = surface.gathered_normals(rest, faces, vertex_faces)
+    above = (prediction.offsets * normals).sum(-1, keepdim=True)
+    along = prediction.offsets - above * normals
+    along = along * (MOST_ALONG / along.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1)
+    return prediction._replace(
+        offsets=along + above.clamp(max=0) * normals, scales=prediction.scales.clamp(max=MOST_SCALE)
     )
 
 
@@ -139,7 +158,8 @@ class NetworkPrior:
 
     def _gaussians(self, prediction: Prediction, crop: HandCrop) -> CanonicalGaussians:
         network, rest = self.network, crop.rest.vertices
-        return canonical_gaussians(blend_rim(prediction, rest, network.faces, network.vertex_faces, network.rim), 0)
+        held = hold_to_surface(prediction, rest, network.faces, network.vertex_faces)
+        return canonical_gaussians(blend_rim(held, rest, network.faces, network.vertex_faces, network.rim), 0)
 
     def _predict(self, crop: HandCrop) -> Prediction:
         device, inputs = crop.image.device, batch_of_crop(crop)
