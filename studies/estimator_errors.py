@@ -37,8 +37,8 @@ from oasis_warp.pretraining.estimator_errors import (
     surface_fields,
 )
 from oasis_warp.pretraining.hand_batch import PosedHands, pose_hands
-from oasis_warp.synthetic.picture import render_batch
-from oasis_warp.synthetic.shots import PICTURES_EACH
+from oasis_warp.synthetic.picture import SyntheticBatch, render_batch
+from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH, cached_identity
 from studies.harness import ROWS, Row, StudyOptions, measured, read_rows
 from studies.inputs import estimator, synthetic_photo
 from studies.tables import Section, markdown, percentiles
@@ -48,6 +48,11 @@ CROP = 256
 MARGIN = 0.0015
 """Of visibility, as the network sees it [m]."""
 PARTS = ("angles", "orientation", "translation", "shape", "K")
+OUTCOMES = {
+    "a hand found": ("fitted", "refused", "wrong side"),
+    "of the right side": ("fitted", "refused"),
+    "fitted": ("fitted",),
+}
 Arrays = dict[str, Any]
 
 
@@ -84,7 +89,14 @@ def mirrored(values: Arrays, width: int) -> Arrays:
 def measure(number: int, options: Options) -> Row:
     """Estimate one picture; writes what is true and what was found."""
     index = PICTURES_EACH * (number // options.each) + number % options.each
-    batch, size = render_batch(options.seed, [index], options.size), options.size
+    batch = render_batch(options.seed, [index], options.size)
+    melanin = cached_identity(options.seed, int(batch.person[0]), EVERYBODY).melanin
+    return {"melanin": melanin, **estimate_picture(batch, number, index, options)}
+
+
+def estimate_picture(batch: SyntheticBatch, number: int, index: int, options: Options) -> Row:
+    """`measure`, but for the person."""
+    size = options.size
     side = "left" if int(batch.left[0]) else "right"
     photo = synthetic_photo(batch.image[0], f"picture {index}")
     hands = estimator().find(photo)
@@ -281,6 +293,16 @@ def spread(columns: dict[str, dict[str, Tensor]]) -> str:
     return markdown(["", *headings], lines)
 
 
+def by_skin(every: list[Row]) -> str:
+    """What became of the pictures of the lightest, middle and darkest third of people."""
+    rows, thirds = sorted(every, key=lambda row: row["melanin"]), []
+    for k, name in enumerate(("lightest third", "middle", "darkest third")):
+        own = [row["result"] for row in rows[k * len(rows) // 3 : (k + 1) * len(rows) // 3]]
+        shares = {label: sum(result in which for result in own) / len(own) for label, which in OUTCOMES.items()}
+        thirds.append([name, str(len(own)), *(f"{100 * share:.1f} %" for share in shares.values())])
+    return markdown(["skin", "pictures", *OUTCOMES], thirds)
+
+
 def text(every: list[Row], rows: list[Arrays], options: Options) -> str:
     """The section; with `--asset` the asset is written, too."""
     hand, size = bundled_hand(), int(rows[0]["size"])
@@ -301,6 +323,7 @@ def text(every: list[Row], rows: list[Arrays], options: Options) -> str:
     return "\n\n".join([
         f"{len(every)} pictures: {outcome}; {sum(row.get('warned', False) for row in every)} fits are warned about. "
         f"Pixels are those of the {CROP} px crop.",
+        by_skin(every),
         spread({"": errors_of_parts(true, found, scale)}),
         "Surfaces, and those that training gives the network:",
         spread({name: compare(truth, those, scale) for name, those in surfaces.items()}),
