@@ -65,6 +65,26 @@ def test_no_photo_is_an_error_of_the_caller():
         reconstruct_same_hand([])
 
 
+def test_a_photo_may_be_given_as_its_file():
+    with pytest.raises(InputError, match="^no_hand_cup_15.jpg: found no hand"):
+        reconstruct(str(PHOTOS / "no_hand_cup_15.jpg"), SMALL)
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"light": "nope"}, "light nope: expected one of fit, keep, even"),
+    ({"refine": "nope"}, "refine nope: expected one of on, off"),
+    ({"steps": -1}, "steps -1: expected 0 or more"),
+    ({"size": 3}, "size 3: expected 64 to 1024 pixels"),
+    ({"size": 99999}, "size 99999: expected 64 to 1024 pixels"),
+])  # fmt: skip
+def test_options_are_checked_before_any_work_from_python_too(options, message):
+    config = ReconstructConfig()
+    for name, value in options.items():
+        object.__setattr__(config, name, value)  # as without the type checker of these tests
+    with pytest.raises(InputError, match=message):
+        reconstruct("there is no such file.jpg", config)
+
+
 def test_photos_of_two_hands_are_refused_before_the_long_work():
     with pytest.raises(InputError, match="03_ring_closed.jpg: shows a left hand, the other photos a right one"):
         reconstruct_same_hand([read_photo(path) for path in (PALM, OTHER_SIDE)], SMALL)

@@ -11,7 +11,7 @@ from oasis_warp.adaptation.repaint import RepaintResult, repaint
 from oasis_warp.adaptation.reprojection import Canvas
 from oasis_warp.adaptation.sh_lighting import without_light
 from oasis_warp.core.camera import crop_camera
-from oasis_warp.core.config import BLACK, EditConfig
+from oasis_warp.core.config import BLACK, EditConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_camera, mirror_pose
@@ -80,6 +80,7 @@ def edit(
         InputError: neither `photo` nor `mask` is given, the pictures have different proportions, they show another
             hand, or there is no paint on it.
     """
+    check_config(config)
     if photo is None and mask is None:
         raise InputError(
             f"{painted.name}: what is paint cannot be told; give the photo from before as well, or a mask."

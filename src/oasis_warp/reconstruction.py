@@ -28,12 +28,13 @@ from oasis_warp.avatar.quality import (
 )
 from oasis_warp.avatar.wrist import close_wrist
 from oasis_warp.core import surface
-from oasis_warp.core.config import AdaptConfig, ReconstructConfig
+from oasis_warp.core.config import AdaptConfig, ReconstructConfig, check_config
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.processes import single_threaded_torch
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, Landmarks, Photo, Render
+from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_hand, fit_together
 from oasis_warp.estimation.fit_quality import keeps_quality, with_pose
 from oasis_warp.estimation.hand_crop import (
@@ -120,7 +121,7 @@ class _Outcome(NamedTuple):
 
 
 def reconstruct(
-    photo: Photo,
+    photo: Photo | Path | str,
     config: ReconstructConfig = ReconstructConfig(),  # noqa: B008 - frozen
     *,
     keypoints: Path | None = None,
@@ -130,7 +131,7 @@ def reconstruct(
     """Make an avatar of one hand of `photo`.
 
     Args:
-        photo: From `oasis_warp.read_photo`.
+        photo: From `oasis_warp.read_photo`, or its file.
         config: Options.
         keypoints: A JSON file with 21 landmarks, or with pose and camera, to use instead of the networks.
         prior: What to assume of a hand before its photo is fitted; the one that `config.prior` names when not given.
@@ -147,7 +148,7 @@ def reconstruct(
 
 
 def reconstruct_same_hand(
-    photos: Sequence[Photo],
+    photos: Sequence[Photo | Path | str],
     config: ReconstructConfig = ReconstructConfig(),  # noqa: B008 - frozen
     *,
     prior: Prior | None = None,
@@ -156,8 +157,9 @@ def reconstruct_same_hand(
     """Make one avatar of one hand of which there are several photos, of any poses.
 
     Args:
-        photos: From `oasis_warp.read_photo`. The first decides on exposure and white balance, the source pose and the
-            source camera. One photo alone gives the avatar of `reconstruct`; shading of several is evened out.
+        photos: From `oasis_warp.read_photo`, or their files. The first decides on exposure and white balance, the
+            source pose and the source camera. One photo alone gives the avatar of `reconstruct`; shading of several is
+            evened out.
         config: Options, for every photo.
         prior: What to assume of a hand before its photos are fitted; the one that `config.prior` names when not given.
         progress: Called as work goes on.
@@ -175,11 +177,17 @@ def reconstruct_same_hand(
 
 @single_threaded_torch()
 def _run(
-    photos: Sequence[Photo], config: ReconstructConfig, keypoints: Path | None, prior: Prior | None, progress: Progress
+    given: Sequence[Photo | Path | str],
+    config: ReconstructConfig,
+    keypoints: Path | None,
+    prior: Prior | None,
+    progress: Progress,
 ) -> _Outcome:
     """All stages, in their order. `keypoints` are those of a single photo."""
     stages: dict[str, float] = {}
     stage = functools.partial(timed_stage, seconds=stages, progress=progress)
+    check_config(config)
+    photos = [read_photo(photo) if isinstance(photo, str | Path) else photo for photo in given]
     hand = bundled_hand()
     estimator = HandEstimator(hand)
     with stage("prior"):  # first, because a wrong file must fail before the long work

@@ -13,7 +13,7 @@ from oasis_warp.cli.options import Edit as Options
 from oasis_warp.cli.report import measures_table, print_warnings, to_json
 from oasis_warp.cli.summary import GROUND, WIDTH, Panel, make_sheet, panel_side
 from oasis_warp.core.camera import crop_camera, orbit_camera
-from oasis_warp.core.config import EditConfig
+from oasis_warp.core.config import EditConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, HandPose
 from oasis_warp.data.output_files import write_file
@@ -24,8 +24,6 @@ from oasis_warp.editing import Edit, edit
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 
-SIDES = (64, 4096)
-"""Smallest and largest side of the square around the hand [px]."""
 ANGLE = 0.5
 """Angle of the other views in the summary [rad]."""
 POSES = ("open", "fist", "point")
@@ -47,11 +45,8 @@ def run(options: Options) -> int:
         InputError: a wrong file or option, an output that exists, or no paint on the hand.
     """
     check_device(options.device)
-    low, high = SIDES
-    if not low <= options.size <= high:
-        raise InputError(f"--size {options.size}: expected {low} to {high} pixels; choose another size.")
-    if options.steps < 0:
-        raise InputError(f"--steps {options.steps}: expected 0 or more; leave it out for the default.")
+    config = EditConfig(steps=options.steps, size=options.size)
+    check_config(config, "--")
     out = options.out or options.avatar.with_name(f"{options.avatar.stem}-{options.painted.stem}.safetensors")
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: expected a name that ends in .safetensors; rename the output.")
@@ -69,7 +64,7 @@ def run(options: Options) -> int:
             read_photo(options.painted),
             photo=read_photo(options.photo) if options.photo else None,
             mask=read_photo(options.mask) if options.mask else None,
-            config=EditConfig(steps=options.steps, size=options.size),
+            config=config,
             progress=progress,
         )
     report, summary = _report(options, made), draw_edit(before, made, options.painted.name)

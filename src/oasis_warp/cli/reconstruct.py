@@ -15,7 +15,7 @@ from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED, check_device, show_pr
 from oasis_warp.cli.options import Reconstruct
 from oasis_warp.cli.report import make_report, print_report, to_json
 from oasis_warp.cli.summary import GROUND, draw_quality, draw_summary
-from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.config import ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import timed_stage
 from oasis_warp.data.output_files import output_folder
@@ -24,8 +24,6 @@ from oasis_warp.data.pictures import write_picture, write_video
 from oasis_warp.network.weights_file import read_header
 from oasis_warp.reconstruction import reconstruct, reconstruct_same_hand
 
-CROP_SIDES = (64, 1024)
-"""Smallest and largest useful side of the crop [px]: fewer show no fingers, more take too long."""
 TURNTABLE_FRAMES, TURNTABLE_FPS, TURNTABLE_SIZE = 48, 16.0, 320
 
 
@@ -37,10 +35,10 @@ def run(options: Reconstruct) -> int:
     """
     check_device(options.device)
     _check_photos(options)
-    _check_numbers(options)
+    config = ReconstructConfig(**{field.name: getattr(options, field.name) for field in fields(ReconstructConfig)})
+    check_config(config, "--")
     if isinstance(options.prior, Path):
         read_header(options.prior)  # check it once, not for every photo
-    config = ReconstructConfig(**{field.name: getattr(options, field.name) for field in fields(ReconstructConfig)})
     if len(options.photos) == 1 or options.same_hand:
         print_report(Console(), _reconstruct(options.photos, options.out, config, options.keypoints))
         return 0
@@ -57,16 +55,6 @@ def _check_photos(options: Reconstruct) -> None:
     counts = Counter(photo.stem for photo in options.photos)
     if twins := [str(photo) for photo in options.photos if counts[photo.stem] > 1]:
         raise InputError(f"photos: {' and '.join(twins)} would share one output folder; run them one by one.")
-
-
-def _check_numbers(options: Reconstruct) -> None:
-    low, high = CROP_SIDES
-    if options.size != "auto" and not low <= options.size <= high:
-        raise InputError(f"--size {options.size}: expected {low} to {high} pixels; choose another size.")
-    if options.steps is not None and options.steps < 0:
-        raise InputError(f"--steps {options.steps}: expected 0 or more; leave it out to stop by itself.")
-    if isinstance(options.hand, int) and options.hand < 0:
-        raise InputError(f"--hand {options.hand}: expected 0 or more; 0 is the best hand found.")
 
 
 def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:

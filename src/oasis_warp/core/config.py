@@ -5,7 +5,12 @@ The command line imports this module, so that it must stay free of torch: `oasis
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args, get_origin, get_type_hints
+
+from oasis_warp.core.errors import InputError
+
+CROP_SIDES, PAINT_SIDES = (64, 1024), (64, 4096)
+"""Smallest and largest side of a photo's crop, and of a painted one's [px]: fewer show no fingers, more take long."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +90,31 @@ class EditConfig:
     """Steps of the colours' fit; each is worth many of a plain optimiser's."""
     size: int = 1024
     """Side of the square around the hand above which the painted picture is scaled down [px]."""
+
+
+def check_config(config: AdaptConfig | ReconstructConfig | EditConfig, flag: str = "") -> None:
+    """Check the options of a run before any work; `flag` stands before names in messages: "--" on the command line.
+
+    Raises:
+        InputError: a choice that there is not, a size out of range, or a negative number of steps or of the hand.
+    """
+    for name, hint in get_type_hints(type(config)).items():
+        value = getattr(config, name)
+        choices = [c for part in (hint, *get_args(hint)) if get_origin(part) is Literal for c in get_args(part)]
+        if isinstance(value, str) and choices and Path not in get_args(hint) and value not in choices:
+            listed = ", ".join(map(str, choices))
+            raise InputError(f"{flag}{name} {value}: expected one of {listed}; choose one of them.")
+    size: int | str = getattr(config, "size", "auto")
+    low, high = PAINT_SIDES if isinstance(config, EditConfig) else CROP_SIDES
+    if isinstance(size, int) and not low <= size <= high:
+        raise InputError(f"{flag}size {size}: expected {low} to {high} pixels; choose another size.")
+    for name, hint in (
+        ("steps", "leave it out for the default"), ("texture_steps", "leave it out to stop by itself"),
+        ("calibration_steps", "0 takes the closed form"), ("hand", "0 is the best hand found"),
+    ):  # fmt: skip
+        value = getattr(config, name, None)
+        if isinstance(value, int) and value < 0:
+            raise InputError(f"{flag}{name} {value}: expected 0 or more; {hint}.")
 
 
 WHITE = (1.0, 1.0, 1.0)
