@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -68,6 +69,15 @@ def test_a_training_that_was_killed_ends_with_the_same_bits(hand, source, unbrok
     pretrain(PriorTrainer(small_network(hand), CONFIG, ALONE), source, tmp_path)
     for name in (CHECKPOINT, WEIGHTS, SHEET):
         assert (tmp_path / name).read_bytes() == (unbroken[0] / name).read_bytes(), name
+
+
+def test_a_training_killed_after_its_last_checkpoint_still_leaves_the_weights(hand, source, unbroken, tmp_path):
+    shutil.copy(unbroken[0] / CHECKPOINT, tmp_path)
+    lines = (unbroken[0] / METRICS).read_text()
+    (tmp_path / METRICS).write_text(lines + lines[:20])
+    assert pretrain(PriorTrainer(small_network(hand), CONFIG, ALONE), source, tmp_path) == 4
+    assert (tmp_path / WEIGHTS).read_bytes() == (unbroken[0] / WEIGHTS).read_bytes()
+    assert (tmp_path / METRICS).read_text() == lines
 
 
 def test_what_is_left_in_the_folder_says_what_happened(hand, unbroken):

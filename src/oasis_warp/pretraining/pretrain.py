@@ -219,6 +219,9 @@ def pretrain(
     start, first = time.perf_counter(), trainer.step
     batches = source(trainer.step, process.rank, process.world)
     stopping = trainer.step >= config.steps
+    notes = {**about, **asdict(config)}
+    if stopping and process.rank == 0:  # it may have been stopped between the checkpoint and the weights
+        trainer.save_weights(folder / WEIGHTS, {"step": trainer.step, **notes})
     progress("pretraining", 0, config.steps - first)
     while not stopping:
         batch = next(batches)
@@ -240,7 +243,7 @@ def pretrain(
                     file.write(json.dumps({"step": trainer.step, "seconds_per_step": seconds, **numbers}) + "\n")
         if process.rank == 0 and save_now:
             trainer.save(folder / CHECKPOINT)
-            trainer.save_weights(folder / WEIGHTS, {"step": trainer.step, **about, **asdict(config)})
+            trainer.save_weights(folder / WEIGHTS, {"step": trainer.step, **notes})
             columns = [column[:SHEET_ROWS].flatten(0, 1) for column in trainer.sheet(batch, result)]
             write_picture(folder / SHEET, to_uint8(torch.cat(columns, dim=1)))
     return trainer.step
@@ -253,7 +256,8 @@ def _mean_metrics(result: StepResult, world: int) -> dict[str, float]:
 
 
 def _drop_lines_after(path: Path, step: int) -> None:
-    """Drop the lines of steps that will be repeated."""
+    """Drop the lines of steps that will be repeated, and a last line that was cut when training was killed."""
     if path.is_file():
-        lines = [line for line in path.read_text().splitlines() if json.loads(line)["step"] <= step]
-        write_file(path, "".join(line + "\n" for line in lines).encode())
+        *lines, _ = path.read_text().split("\n")
+        kept = [line for line in lines if json.loads(line)["step"] <= step]
+        write_file(path, "".join(line + "\n" for line in kept).encode())
