@@ -20,9 +20,11 @@ def test_haze_is_the_alpha_beyond_its_reach_over_the_silhouette():
     silhouette[20:40, 20:40] = True
     alpha = silhouette.float()
     alpha[20, 40 : 40 + HAZE_REACH] = 1  # a soft outline is none
-    assert haze(alpha, silhouette) == 0
+    nowhere = torch.zeros_like(silhouette)
+    assert haze(alpha, silhouette, nowhere) == 0
     alpha[20, 40 + HAZE_REACH : 50] = 0.5
-    assert haze(alpha, silhouette) == pytest.approx(0.5 * (10 - HAZE_REACH) / 400)
+    assert haze(alpha, silhouette, nowhere) == pytest.approx(0.5 * (10 - HAZE_REACH) / 400)
+    assert haze(alpha, silhouette, alpha == 0.5) == 0
 
 
 def test_a_gash_of_two_percent_of_the_palm_is_a_wound_and_a_speck_is_none():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from oasis_warp.avatar.appearance import label_regions
-from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.camera import orbit_camera, project
 from oasis_warp.core.mirror import mirror_points
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
@@ -16,7 +16,7 @@ from oasis_warp.evaluation.contact_sheet import GAP, SMALL, write_cells, write_o
 from oasis_warp.evaluation.kernel_distance import LAYERS
 from oasis_warp.evaluation.looks import hand_of, kernel_rows, summarise_looks
 from oasis_warp.evaluation.real_hands import real_photos, reference_contrasts, summarise_real
-from oasis_warp.evaluation.views import RIM, clear_of_outlines, read_surface, shrink
+from oasis_warp.evaluation.views import RIM, WRIST_REACH, clear_of_outlines, read_surface, shrink, wrist_end
 
 
 def test_pixels_near_the_outline_of_a_finger_before_the_hand_do_not_count():
@@ -43,6 +43,19 @@ def test_the_outside_of_the_skin_counts_and_the_inside_of_the_wrist_does_not(han
         assert not (outside.interior & inside.interior).any()
         wrist += int(inside.interior.sum())
     assert wrist > 500  # one of the views looks into it
+
+
+def test_the_end_of_the_wrist_is_where_its_rim_is_seen(hand):
+    camera = orbit_camera(hand.template, 0.0, size=256)
+    end = wrist_end(hand, hand.template, camera)
+    rim, depth = project(camera, hand.template[hand.rim])
+    tips, _ = project(camera, hand.tips)
+    x, y = rim.long().unbind(-1)
+    assert end[y, x].all() and not end[tips[:, 1].long(), tips[:, 0].long()].any()
+    rows, columns = end.nonzero().unbind(-1)
+    reach = WRIST_REACH * float(camera.K[0, 0] / depth.mean())
+    beyond = rim[:, 0].min() - columns.min(), rows.max() + 1 - rim[:, 1].max()
+    assert all(abs(float(pixels) - reach) < 2 for pixels in beyond)
 
 
 def test_shrinking_takes_means_of_blocks():

@@ -14,13 +14,16 @@ FEWEST = 300
 """Fewest pixels of a place that is measured."""
 
 
-def haze(alpha: Float[Tensor, "H W"], silhouette: Bool[Tensor, "H W"]) -> float:
-    """Sum of the alpha farther than `HAZE_REACH` outside the silhouette, over the silhouette's pixels."""
+def haze(alpha: Float[Tensor, "H W"], silhouette: Bool[Tensor, "H W"], elsewhere: Bool[Tensor, "H W"]) -> float:
+    """Sum of the alpha farther than `HAZE_REACH` outside the silhouette, over the silhouette's pixels.
+
+    What lies `elsewhere`, at the end of the wrist, does not count.
+    """
     window, near = 2 * HAZE_REACH + 1, silhouette.to(alpha)[None, None]
     for size, padding in (((window, 1), (HAZE_REACH, 0)), ((1, window), (0, HAZE_REACH))):
         near = max_pool2d(near, size, 1, padding)
     near = near[0, 0] > 0
-    return float(alpha[~near].sum() / silhouette.sum().clamp_min(1))
+    return float(alpha[~near & ~elsewhere].sum() / silhouette.sum().clamp_min(1))
 
 
 def darkest_over_median(image: Float[Tensor, "H W 3"], where: Bool[Tensor, "H W"]) -> float | None:

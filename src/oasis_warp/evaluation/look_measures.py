@@ -19,7 +19,17 @@ from oasis_warp.evaluation.contact_sheet import Cell
 from oasis_warp.evaluation.kernel_distance import Sample, hand_features
 from oasis_warp.evaluation.real_hands import mostly_shows, read_crop, side_masks
 from oasis_warp.evaluation.summary import Record
-from oasis_warp.evaluation.views import DRAWN_SIZE, Surface, View, draw, read_surface, shrink, silhouette, views_of
+from oasis_warp.evaluation.views import (
+    DRAWN_SIZE,
+    Surface,
+    View,
+    draw,
+    read_surface,
+    shrink,
+    silhouette,
+    views_of,
+    wrist_end,
+)
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.pretraining.objective import Perceptual
@@ -154,8 +164,9 @@ def blemish_measures(avatar: Avatar, pictures: Sequence[Picture]) -> Record:
         if picture.view.kind in ("side", "pose"):
             vertices = avatar.mesh(picture.view.pose).vertices.cpu()
             outline = silhouette(avatar.hand.faces.cpu(), vertices, picture.view.camera)
+            wrist = wrist_end(avatar.hand, vertices, picture.view.camera)
             alphas = picture.large.alpha, draw(plain, picture.view).alpha.cpu()
-            hazes.append([haze(alpha, outline) for alpha in alphas])
+            hazes.append([haze(alpha, outline, wrist) for alpha in alphas])
     own, of_mean = (sum(values) / len(values) for values in zip(*hazes, strict=True))
     by_name: Mapping[tuple[str, str], Picture] = {(p.view.kind, p.view.name): p for p in pictures}
     front, behind = by_name["side", "0"], by_name["side", "180"]

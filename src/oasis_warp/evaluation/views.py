@@ -3,6 +3,8 @@
 import math
 from typing import Literal, NamedTuple
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -33,6 +35,10 @@ RIM = 4
 """Pixels at outlines that are not judged: the mask of a photo is some two pixels off, and the fit as much."""
 JUMP = 0.005
 """Difference of the depth of neighbouring pixels that makes an outline inside the hand [m]: half a finger."""
+
+WRIST_REACH = 0.015
+"""Distance from the wrist's opening within which a hand ends [m]: opacity fades over 8 mm before it, and the skin
+is rounded over 6 mm past it."""
 
 Kind = Literal["input", "side", "pose", "back"]
 
@@ -119,6 +125,19 @@ def silhouette(faces: Int[Tensor, "F 3"], vertices: Float[Tensor, "V 3"], camera
     size = camera.width, camera.height
     return depth_map(vertices, faces, camera.viewmat.to(vertices), camera.K.to(vertices), *size,
                      outputs=("face_ids",)).face_ids >= 0  # fmt: skip
+
+
+def wrist_end(hand: HandModel, vertices: Float[Tensor, "V 3"], camera: Camera) -> Bool[Tensor, "H W"]:
+    """Pixels within `WRIST_REACH` of the opening of the wrist."""
+    rim = vertices[hand.rim.to(vertices.device)]
+    viewed = Camera(camera.viewmat.to(rim), camera.K.to(rim), camera.width, camera.height)
+    xy, depth = project(viewed, rim)
+    plane = np.zeros((camera.height, camera.width), np.uint8)
+    hull = cv2.convexHull(xy.cpu().numpy().astype(np.float32)).round().astype(np.int32)
+    cv2.fillConvexPoly(plane, hull, 1)
+    reach = math.ceil(WRIST_REACH * float(viewed.K[0, 0] / depth.mean()))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return torch.from_numpy(cv2.dilate(plane, disc) > 0)
 
 
 def clear_of_outlines(depth: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
