@@ -231,9 +231,8 @@ def _run(
     invented = None
     if config.unseen == "painted":
         with stage("painting"):
-            confidence = adaptation.observations.confidence.amax(0)
             painted = paint_unseen(
-                hand, adaptation.gaussians, adaptation.guess, crops[0], confidence, seed=config.seed
+                hand, adaptation.gaussians, adaptation.guess, crops[0], adaptation.observations, seed=config.seed
             )
             adaptation, invented = adaptation._replace(gaussians=painted.gaussians), painted.invented
     closed = close_wrist(hand, adaptation.gaussians, crops[0].rest.vertices)

@@ -21,12 +21,12 @@ SIGMA_EXPOSURE, SIGMA_CAST = 0.18, 0.155
 over theirs, as in `avatar.prior`."""
 BLOOD = 0.0125
 """Share of blood in the skin of a back."""
-PALM_BLOOD, TIP_BLOOD, KNUCKLE_BLOOD = 0.9, 0.7, 1.1
+PALM_BLOOD, TIP_BLOOD, KNUCKLE_BLOOD = 1.3, 0.7, 1.1
 """How much more of it palms, finger tips and knuckles have. With it palm minus back in CIELAB's a* is +2 to +6, as on
 real hands."""
 KNUCKLE_MELANIN = 0.15
 """How much more melanin knuckles have."""
-PALM_HORN = 1.04
+PALM_HORN = 1.06
 """Brightness of palms over that of the table, as their horn is thick: light palms are paler than backs, not darker."""
 LEAST_COLOURFUL = 0.4
 """Least saturation of a photo over that of skin in even light: less is taken for a cast of grey light."""

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_warp.adaptation.inpainting import inpaint
+from oasis_warp.adaptation.reliability import VertexObservations
 from oasis_warp.adaptation.sharpen import FADE_REACH
 from oasis_warp.adaptation.skin_detail import Places, SkinDetail, sample_detail
 from oasis_warp.adaptation.skin_tone import SkinTone, infer_tone
@@ -35,6 +36,12 @@ ON_PALM, ON_BACK = 1.2, 1.1
 """Gain of the maps' detail on palms and on backs."""
 FOLD, VEIN = (-0.10, -0.14, -0.15), (-0.07, -0.04, -0.04)
 """What a fold and a vein add to the logarithms of the colours."""
+USUAL_CONTRAST = 0.02
+"""Median difference of a vertex of painted skin from its surroundings, as the logarithm of sRGB, with a gain of 1."""
+FINE_PASSES, SURELY_SEEN, FEWEST = 3, 0.97, 200
+"""Smoothings over the mesh that leave a vertex's surroundings, 3 mm; confidence there from which it counts; fewest."""
+CLARITIES = 0.5, 1.2
+"""Least and most gain of detail."""
 GRAIN = 0.025
 """Standard deviation of what each Gaussian on a face has of its own: pores and the mesh of fine wrinkles."""
 LUNULA, FREE_EDGE, NAIL_RIM = 0.07, 0.12, 0.16
@@ -59,7 +66,7 @@ def paint_unseen(
     gaussians: CanonicalGaussians,
     guess: CanonicalGaussians,
     crop: HandCrop,
-    confidence: Float[Tensor, "V"],
+    observations: VertexObservations,
     *,
     seed: int,
 ) -> PaintedSkin:
@@ -75,13 +82,14 @@ def paint_unseen(
         gaussians: Fitted to the photos, in even light.
         guess: Of the prior, before adaptation.
         crop: The first photo.
-        confidence: How well the photos together show each vertex, 0 to 1.
+        observations: What the photos show.
         seed: Of the detail.
     """
     rest = crop.rest.vertices
     faces = hand.faces.to(rest.device)
     first = observe(hand, crop)
     shown = first.visibility * (first.facing > 0)
+    confidence = observations.confidence.amax(0)
     invented = _unseen_share(hand, confidence)
     seen = vertex_colors(gaussians, len(rest))
     tone = infer_tone(hand, vertex_colors(guess, len(rest)), seen, confidence)
@@ -99,8 +107,8 @@ def paint_unseen(
     read = vertex_to_gaussians(
         torch.cat([tone.log_skin + smooth, smooth, torch.stack([palm, invented, shown], 1)], 1), faces, fine
     )
-    amplitude = ON_BACK + (ON_PALM - ON_BACK) * read[:, 6:7]
-    painted = _paint(sample_detail(hand, fine, seed), amplitude, read[:, :3] + _grain(fine, seed), bed + read[:, 3:6])
+    detail = _skin_detail(sample := sample_detail(hand, fine, seed), read[:, 6:7]) + _grain(fine, seed)
+    painted = _paint(sample, read[:, :3] + _clarity(hand, observations) * detail, bed + read[:, 3:6])
     looks = _mix(fine, painted, *read[:, 7:].clamp(0, 1).split(1, 1))
     return PaintedSkin(looks, invented, tone)
 
@@ -152,7 +160,7 @@ def _parts(
     count = min(len(may), int((MORE - 1) * len(gaussians.opacities) / (PARTS**2 - 1)))
     centers = part_centers(PARTS).to(rest)
     places = Places(may[:0], may.repeat_interleave(len(centers)), centers.repeat(len(may), 1))
-    detail = _skin_detail(sample_detail(hand, places, seed), ON_BACK).mean(1).view(len(may), len(centers))
+    detail = _skin_detail(sample_detail(hand, places, seed), 0.0).mean(1).view(len(may), len(centers))
     _, areas = surface.face_normals(rest, faces)
     chosen = (detail.var(1) * areas[may]).argsort(descending=True, stable=True)[:count]
     return torch.ones_like(n_own).index_fill(0, may[chosen], PARTS)
@@ -165,16 +173,29 @@ def _grain(gaussians: CanonicalGaussians, seed: int) -> Float[Tensor, "N 1"]:
     return GRAIN * torch.cat([none, noise.to(none)])[:, None]
 
 
-def _skin_detail(detail: SkinDetail, amplitude: Float[Tensor, "N 1"] | float) -> Float[Tensor, "N 3"]:
-    """What is added to the logarithms of smooth skin's colours."""
+def _skin_detail(detail: SkinDetail, palm: Float[Tensor, "N 1"] | float) -> Float[Tensor, "N 3"]:
+    """What is added to the logarithms of smooth skin's colours; `palm` is its share."""
     lines = detail.fold[:, None] * detail.skin.new_tensor(FOLD) + detail.vein[:, None] * detail.skin.new_tensor(VEIN)
-    return amplitude * detail.skin + lines
+    return (ON_BACK + (ON_PALM - ON_BACK) * palm) * detail.skin + lines
 
 
-def _paint(
-    detail: SkinDetail, amplitude: Float[Tensor, "N 1"], skin: Float[Tensor, "N 3"], nail: Float[Tensor, "N 3"]
-) -> Float[Tensor, "N 3"]:
-    """Logarithms of the colours of skin and nails with their detail."""
+def _clarity(hand: HandModel, observations: VertexObservations) -> float:
+    """Gain of detail: painted skin beside the smooth skin of a soft or bright photo looks old and dirty.
+
+    The root of the ratio of contrasts from vertex to vertex, that of the photo that shows most over `USUAL_CONTRAST`:
+    a third of what tells photos apart here is noise and relief.
+    """
+    best = int(observations.confidence.sum(1).argmax())
+    edges = surface.mesh_edges(hand.faces).to(observations.colors.device)
+    logs = observations.colors[best].clamp_min(MIN_COLOR).log().mean(1, keepdim=True)
+    fine = (logs - surface.smooth_over_mesh(logs, edges, FINE_PASSES))[:, 0].abs()
+    inner = surface.smooth_over_mesh(observations.confidence[best][:, None], edges, FINE_PASSES)[:, 0] > SURELY_SEEN
+    if int(inner.sum()) < FEWEST:
+        return 1.0
+    return float((fine[inner].median() / USUAL_CONTRAST).sqrt().clamp(*CLARITIES))
+
+
+def _paint(detail: SkinDetail, skin: Float[Tensor, "N 3"], nail: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Logarithms of the colours of skin, and of nails with their parts."""
     pale = LUNULA * detail.pale.clamp_min(0) + FREE_EDGE * (-detail.pale).clamp_min(0)
-    skin = skin + _skin_detail(detail, amplitude)
     return torch.lerp(skin, nail + pale[:, None], detail.plate[:, None]) - NAIL_RIM * detail.rim[:, None]
