@@ -27,6 +27,8 @@ CAP_HEIGHT = 0.006
 """Height of the cap over the rim [m]."""
 CAP_RINGS = 12
 """Steps of the cap's rings from the rim to its middle: about as far apart as the rim's vertices."""
+INDENT = 0.003
+"""How far the cap's widest Gaussians stay inside the rim, where they would make a collar [m]."""
 CAP_SPREAD = 1.9
 """Standard deviations of the cap's Gaussians over those of vertex Gaussians: no face Gaussians fill their gaps."""
 
@@ -96,6 +98,7 @@ def rim_cap(
     axis = normalize(torch.linalg.cross(arms, arms.roll(-1, 0)).sum(0), dim=0)
     axis = axis * torch.sign((axis * (center - rest.mean(0))).sum())  # away from the hand
     radius, circumference = arms.norm(dim=1).mean(), (edge - edge.roll(1, 0)).norm(dim=1).sum()
+    arms = arms * (1 - INDENT / radius)
     index, offsets, normals, along, spreads = [], [], [], [], []
     for k in range(CAP_RINGS + 1):
         share = 1 - k / CAP_RINGS
