@@ -87,6 +87,16 @@ def test_an_avatar_survives_its_file_bit_for_bit(left, tmp_path):
     assert (loaded.source_camera.width, loaded.source_camera.height) == (64, 64)
 
 
+def test_an_avatar_knows_what_of_it_is_invented_after_its_file_and_in_other_light(left, tmp_path):
+    assert left.invented is None
+    left.invented = torch.linspace(0, 1, len(left.surface_offsets))
+    left.save(tmp_path / "a.safetensors")
+    share, left.invented = left.invented, None
+    loaded = Avatar.load(tmp_path / "a.safetensors")
+    for avatar in (loaded, loaded.in_even_light()):
+        assert avatar.invented is not None and torch.equal(avatar.invented, share)
+
+
 def test_an_avatar_can_be_copied(left):
     twin = copy.deepcopy(left)
     assert torch.equal(twin.pose(left.source_pose).means, left.pose(left.source_pose).means)

@@ -68,6 +68,7 @@ class Avatar:
         source_pose: HandPose,
         source_camera: Camera,
         light: HandLight | None = None,
+        invented: Float[Tensor, "V"] | None = None,
     ):
         self.side: Side = side
         self.shape = shape
@@ -83,6 +84,8 @@ class Avatar:
         self.light = light
         """The photo's light, in which the hand is posed and drawn; of a left hand in the mirror. None where light is
         part of the colours, or even."""
+        self.invented = invented
+        """Share of each vertex's skin that is painted because no photo shows it; None where none is."""
         self.hand = bundled_hand().to(self.device)
         plain = rest_hand(self.hand, shape)
         self.rest = plain._replace(vertices=plain.vertices + surface_offsets)
@@ -208,7 +211,7 @@ class Avatar:
         """The same hand with other Gaussians, in `light`."""
         return Avatar(
             side=self.side, shape=self.shape, surface_offsets=self.surface_offsets, gaussians=gaussians,
-            source_pose=self.source_pose, source_camera=self.source_camera, light=light,
+            source_pose=self.source_pose, source_camera=self.source_camera, light=light, invented=self.invented,
         )  # fmt: skip
 
     def save(self, path: Path | str) -> None:
@@ -225,6 +228,8 @@ class Avatar:
         if self.light is not None:
             light = self.light._asdict()
             tensors |= {f"light.{name}": value for name, value in light.items() if value is not None}
+        if self.invented is not None:
+            tensors["invented"] = self.invented
         header = {
             "side": self.side,
             "hand_model": self.hand.name,
@@ -256,6 +261,7 @@ class Avatar:
             source_pose=HandPose(**group("source_pose.")),
             source_camera=Camera(**group("source_camera."), **header["source_camera"]),
             light=HandLight(**light) if (light := group("light.")) else None,
+            invented=tensors.get("invented"),
         )
         return avatar._with_hidden_light() if header["version"] < LIGHT_HIDDEN else avatar
 
@@ -275,6 +281,7 @@ def make_avatar(
     crop: HandCrop,
     gaussians: CanonicalGaussians,
     light: HandLight | None = None,
+    invented: Float[Tensor, "V"] | None = None,
 ) -> Avatar:
     """The hand of `fit` with the looks of `gaussians` in `light`; `offsets` and `crop` are those of its making."""
     camera = crop.camera
@@ -286,6 +293,7 @@ def make_avatar(
         source_pose=fit.pose,
         source_camera=mirror_camera(camera) if fit.side == "left" else camera,
         light=light,
+        invented=invented,
     )
 
 

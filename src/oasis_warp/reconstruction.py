@@ -237,7 +237,7 @@ def _run(
             adaptation, invented = adaptation._replace(gaussians=painted.gaussians), painted.invented
     closed = close_wrist(hand, adaptation.gaussians, crops[0].rest.vertices)
     adaptation = adaptation._replace(gaussians=closed)
-    avatar = make_avatar(fits[0], surfaces.shared, crops[0], closed, adaptation.light)
+    avatar = make_avatar(fits[0], surfaces.shared, crops[0], closed, adaptation.light, invented)
     with stage("quality"):
         areas = surface.vertex_areas(crops[0].rest.vertices, hand.faces.to(config.device))
         parts = [_assess(hand, adaptation, k, fits[k], surfaces, crops[k], close[k]) for k in range(len(photos))]

@@ -11,6 +11,7 @@ from oasis_warp.data.avatar_file import (
     ALBEDO,
     FINE_SHADE,
     FORMAT,
+    INVENTED,
     LIGHT,
     SHADE,
     TENSORS,
@@ -190,7 +191,7 @@ def test_another_format_is_refused(tmp_path):
 
 def test_the_documentation_lists_every_tensor_and_header_key():
     page = (Path(__file__).parents[2] / "docs" / "avatar_file.md").read_text()
-    for name, entry in (TENSORS | LIGHT | SHADE | FINE_SHADE | ALBEDO).items():
+    for name, entry in (TENSORS | LIGHT | SHADE | FINE_SHADE | ALBEDO | INVENTED).items():
         shape = ", ".join(map(str, entry.shape))
         assert f"| `{name}` | {str(entry.dtype).removeprefix('torch.')} | {shape} |" in page
     for key in FILE_HEADER:
@@ -252,6 +253,15 @@ def test_shade_of_gaussians_comes_with_that_of_vertices(tmp_path, tensors):
             save_avatar(tmp_path / "bad", {**tensors, **light, "gaussians.shade": change}, HEADER)
     with pytest.raises(ValueError, match=r"missing light\.even"):
         save_avatar(tmp_path / "bad", {**tensors, **fine}, HEADER)
+
+
+def test_what_is_invented_is_in_the_file_for_every_vertex_or_not_at_all(tmp_path, tensors):
+    invented = torch.linspace(0, 1, len(tensors["surface_offsets"]))
+    save_avatar(tmp_path / "painted", {**tensors, "invented": invented}, HEADER)
+    assert torch.equal(load_avatar(tmp_path / "painted")[0]["invented"], invented)
+    for bad in (invented + 0.5, invented[1:]):
+        with pytest.raises(ValueError, match="invented"):
+            save_avatar(tmp_path / "bad", {**tensors, "invented": bad}, HEADER)
 
 
 @pytest.mark.parametrize("version", [1, 2, 3, 4])

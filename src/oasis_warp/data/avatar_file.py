@@ -1,9 +1,9 @@
 """The avatar file: safetensors with a JSON header, so that loading one executes no code.
 
-The tables `TENSORS`, `LIGHT`, `SHADE`, `FINE_SHADE` and `ALBEDO` describe the tensors. The metadata have one entry,
-"oasis-avatar": the header, a JSON object whose `version` is 5, or less in files without light (1), shade (2), shade per
-Gaussian (3) or light that the hand hides from itself (4). Files of newer versions are refused. There is only one entry
-because safetensors writes several in any order, and the same avatar must give the same bytes.
+The tables `TENSORS`, `LIGHT`, `SHADE`, `FINE_SHADE`, `ALBEDO` and `INVENTED` describe the tensors. The metadata have
+one entry, "oasis-avatar": the header, a JSON object whose `version` is 5, or less in files without light (1), shade
+(2), shade per Gaussian (3) or light that the hand hides from itself (4). Files of newer versions are refused. There is
+only one entry because safetensors writes several in any order, and the same avatar must give the same bytes.
 """
 
 import json
@@ -78,6 +78,10 @@ ALBEDO = {
     # Where the hand hides light from itself: with any light, or not at all.
     "light.albedo": Entry(torch.float32, (3,)),
 }
+INVENTED = {
+    # Where skin is painted because no photo shows it: with anything, or not at all.
+    "invented": Entry(torch.float32, ("V",)),
+}
 HEADER = {"version": int, "side": str, "hand_model": str, "hand_licence": str, "source_camera": dict}
 """Required keys of a header and their types; `source_camera` holds `width` and `height` [px]."""
 
@@ -88,7 +92,7 @@ def save_avatar(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping
     Args:
         path: Path of the file; an existing one is replaced.
         tensors: One for every name of `TENSORS`, of `LIGHT` or none of them, then of `SHADE` or none, then of
-            `FINE_SHADE` or none, and with `LIGHT` that of `ALBEDO` or none, on any device.
+            `FINE_SHADE` or none, and with `LIGHT` that of `ALBEDO` or none; that of `INVENTED` or none. On any device.
         header: The keys of `HEADER` and any others; `version`, `units`, `counts` and `creator` are filled in.
 
     Raises:
@@ -169,6 +173,8 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> dict[str, int]:
             table |= part
     if tensors.keys() & ALBEDO.keys():
         table |= LIGHT | ALBEDO
+    if tensors.keys() & INVENTED.keys():
+        table |= INVENTED
     missing, unknown = table.keys() - tensors.keys(), tensors.keys() - table.keys()
     if missing or unknown:
         found = {"missing": missing, "unknown": unknown}
@@ -209,6 +215,8 @@ def _check_gaussians(tensors: Mapping[str, Tensor]) -> None:
         good["light.even"] = tensors["light.even"] > 0, "light"
     if "light.albedo" in tensors:
         good["light.albedo"] = (tensors["light.albedo"] >= 0) & (tensors["light.albedo"] <= 1), "reflectances in [0, 1]"
+    if "invented" in tensors:
+        good["invented"] = (tensors["invented"] >= 0) & (tensors["invented"] <= 1), "shares in [0, 1]"
     if "light.shade" in tensors:
         good["light.shade"] = (tensors["light.shade"] > 0).all(1), "factors above 0"
         good["light.facing"] = (tensors["light.facing"].norm(dim=1) - 1).abs() < UNIT_TOLERANCE, "unit vectors"
