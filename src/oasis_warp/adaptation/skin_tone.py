@@ -21,13 +21,11 @@ SIGMA_EXPOSURE, SIGMA_CAST = 0.18, 0.155
 over theirs, as in `avatar.prior`."""
 BLOOD = 0.0125
 """Share of blood in the skin of a back."""
-PALM_BLOOD, TIP_BLOOD, KNUCKLE_BLOOD = 1.3, 0.7, 1.1
+PALM_BLOOD, TIP_BLOOD, KNUCKLE_BLOOD = 1.1, 0.7, 1.1
 """How much more of it palms, finger tips and knuckles have. With it palm minus back in CIELAB's a* is +2 to +6, as on
 real hands."""
 KNUCKLE_MELANIN = 0.15
 """How much more melanin knuckles have."""
-PALM_HORN = 1.06
-"""Brightness of palms over that of the table, as their horn is thick: light palms are paler than backs, not darker."""
 LEAST_COLOURFUL = 0.4
 """Least saturation of a photo over that of skin in even light: less is taken for a cast of grey light."""
 MIN_COLOR = 0.01
@@ -114,4 +112,4 @@ def tone_colors(regions: Regions, melanin: float) -> tuple[Float[Tensor, "V 3"],
     amount = amount * (1 + KNUCKLE_MELANIN * knuckle)
     blood = BLOOD * (1 + PALM_BLOOD * palm + TIP_BLOOD * tip * (0.4 + 0.6 * palm) + KNUCKLE_BLOOD * knuckle)
     bed = skin_color(amount.new_tensor([0.5 * melanin]), amount.new_tensor([1.9 * BLOOD]))[0]
-    return skin_color(amount, blood) * (1 + (PALM_HORN - 1) * palm)[:, None], 0.86 * bed + 0.14
+    return skin_color(amount, blood), 0.86 * bed + 0.14
