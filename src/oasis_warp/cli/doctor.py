@@ -190,7 +190,7 @@ def check_kernels() -> str:
     """The rasterizer draws one Gaussian according to its formula, on every device."""
     import torch
 
-    from oasis_warp.ops._runtime.launch import kernel_cache
+    from oasis_warp.ops._runtime.kernel_cache import kernel_cache
 
     cache = kernel_cache()
     if not _can_write(cache):

@@ -9,7 +9,6 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,6 +18,7 @@ from torch import Tensor
 from oasis_kernels.runtime.cuda_native import CudaNative
 from oasis_kernels.runtime.native import TASK, Native
 from oasis_warp.core.processes import kernel_threads
+from oasis_warp.ops._runtime.kernel_cache import load_module, writable_cache
 
 _start_lock = threading.Lock()
 _load_lock = threading.Lock()
@@ -33,15 +33,6 @@ LEAST_TASKS = 2048
 """Of a generic kernel, for which another thread is worth its while."""
 SCALAR_NAMES = {torch.float32: "float", torch.float64: "double"}
 SCALAR = {torch.float32: wp.float32, torch.float64: wp.float64, torch.int32: wp.int32, torch.int64: wp.int64}
-
-
-def kernel_cache() -> Path:
-    """Folder that holds the compiled kernels: $OASIS_WARP_CACHE, else $XDG_CACHE_HOME/oasis_warp, else ~/.cache/..."""
-    explicit = os.environ.get("OASIS_WARP_CACHE")
-    if explicit:
-        return Path(explicit)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "oasis_warp"
 
 
 @contextmanager
@@ -67,7 +58,7 @@ def start() -> None:
         if _started:
             return
         wp.config.log_level = wp.LOG_WARNING
-        wp.config.kernel_cache_dir = str(kernel_cache())
+        wp.config.kernel_cache_dir = str(writable_cache())
         with nullcontext() if torch.cuda.is_available() else _native_stderr_closed():
             wp.init()
         _started = True
@@ -126,6 +117,17 @@ def has_cuda_kernels(tensor: Tensor) -> bool:
     return tensor.is_cuda and tensor.dtype == torch.float32
 
 
+_loaded: set[tuple[Any, str]] = set()  # modules and devices
+
+
+def _load(kernel: Any, device: "wp.Device", block_dim: int = 256) -> None:
+    """Load the module of a kernel before its first launch: threads that meet at an unbuilt one would each build it."""
+    if (kernel.module, device.alias) not in _loaded:
+        with _load_lock:
+            load_module(kernel.module, device, 1 if device.is_cpu else block_dim)
+            _loaded.add((kernel.module, device.alias))
+
+
 def _seen_by_warp(inputs: Sequence[Any]) -> list[Any]:
     """`inputs` of a kernel, with views of tensors."""
     return [view(value) if isinstance(value, Tensor) else value for value in inputs]
@@ -139,6 +141,7 @@ def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], like: T
     if 0 in ([dim] if isinstance(dim, int) else list(dim)):
         return
     device, stream = device_and_stream(like)
+    _load(kernel, device)
     wp.launch(kernel, dim=dim, inputs=_seen_by_warp(inputs), device=device, stream=stream, block_dim=256)
 
 
@@ -170,6 +173,8 @@ def launch_ranges(
         cuts = [0, cuts[-1]]
     ranges = [(a, b) for a, b in itertools.pairwise(cuts) if b > a]
 
+    _load(kernel, device)
+
     def run(bounds: tuple[int, int]) -> None:
         first, end = bounds
         dim = end - first if lanes is None else (end - first, lanes)
@@ -180,8 +185,6 @@ def launch_ranges(
         for bounds in ranges:
             run(bounds)
         return
-    with _load_lock:  # threads that meet at an unbuilt kernel would each build it
-        kernel.module.load(device, 1)
     list(_pool(os.getpid(), n_threads).map(run, ranges))
 
 
@@ -198,6 +201,7 @@ _recorded = _Recorded()
 def _replay(kernel: Any, block: int) -> None:
     launch: Any = _recorded.launches.get(kernel)
     if launch is None:
+        _load(kernel, wp.get_device("cpu"))
         with _load_lock:
             launch = wp.launch(kernel, dim=1, inputs=[block], device="cpu", record_cmd=True)
         _recorded.launches[kernel] = launch
@@ -309,6 +313,7 @@ def run_cuda(native: CudaNative, params: Parameters, n_blocks: int, stream: "wp.
     key = native.kernel, stream.device.ordinal
     recorded = _cuda_launches.launches.get(key)
     if recorded is None:
+        _load(native.kernel, stream.device, native.block)
         with _load_lock:
             launch = wp.launch(
                 native.kernel, dim=native.block, inputs=[native.kernel.adj.args[0].type()], device=stream.device,
