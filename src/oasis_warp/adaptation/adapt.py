@@ -184,12 +184,15 @@ def add_detail(
         unlit.append(shown)
         if len(crop.image) > size:
             trust.append(trusted)
+            if len(crops) == 1:
+                fine = sharpen(hand, gaussians, crops, None, torch.stack(trust), light, progress).gaussians
+                return adaptation._replace(gaussians=fine)
             image = _in_first_light(hand, unlit[k].image, weights, gaussians, gain, adaptation.shading[k])
             finer.append((k, unlit[k]._replace(image=image)))
     share = observe_photos(hand, unlit, resolutions).share ** DETAIL_SHARPNESS
     share = share / share.sum(0)
     indices, pictures = zip(*finer, strict=True)
-    fine = sharpen(hand, gaussians, pictures, share[list(indices)], torch.stack(trust), progress).gaussians
+    fine = sharpen(hand, gaussians, pictures, share[list(indices)], torch.stack(trust), None, progress).gaussians
     return adaptation._replace(gaussians=fine)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
@@ -23,6 +23,9 @@ BEHIND_REACH = 5 / PRIOR_SIZE
 """From the outline of what lies before, over the picture's side."""
 BEHIND_GAP = 0.01
 """Depth by which something must lie behind an outline to be another part of the hand [m]."""
+FINGER_GAP = 0.003
+"""The same to the two outer phalanges of another finger [m]: a tip that lies on the palm is no more than half as thick
+there. Skin that goes on from one part to the other is no finger's outline."""
 STAIN_REACH = 6 / PRIOR_SIZE
 """From the mask's border, over the picture's side."""
 STAIN_WINDOW = 13 / PRIOR_SIZE
@@ -66,14 +69,29 @@ def _background_share(drawn: Float[Tensor, "S S 3"], crop: HandCrop) -> Float[Te
 def _behind_outline(hand: HandModel, crop: HandCrop) -> Tensor:
     """Whether a pixel lies just past the outline of something nearer than it, [S, S]."""
     camera, vertices = crop.camera, crop.posed.vertices
+    faces = hand.faces.to(vertices.device)
     seen = depth_map(
-        vertices, hand.faces.to(vertices.device), camera.viewmat, camera.K, camera.width, camera.height, validate=False
-    )
+        vertices, faces, camera.viewmat, camera.K, camera.width, camera.height,
+        outputs=("depth", "face_ids"), validate=False,
+    )  # fmt: skip
     on_hand = seen.face_ids >= 0
     reach = max(1, round(BEHIND_REACH * camera.width))
-    nearness = torch.where(on_hand, -seen.depth, -torch.inf)[None, None]
-    nearest = -max_pool2d(nearness, 2 * reach + 1, stride=1, padding=reach)[0, 0]
-    return on_hand & (seen.depth - nearest > BEHIND_GAP)
+    segment = hand.segment.to(faces.device)[faces[seen.face_ids.clamp_min(0).long(), 0]]
+    finger = torch.where(on_hand & (segment > 0), (segment - 1) // 3, -1)
+    bent = on_hand & (segment > 0) & ((segment - 1) % 3 > 0)  # not the first phalanx, which joins the palm
+    behind = on_hand & (seen.depth - _nearest(seen.depth, on_hand, reach) > BEHIND_GAP)
+    for number in range(5):
+        nearest = _nearest(seen.depth, bent & (finger == number), reach)
+        behind |= on_hand & (finger != number) & (seen.depth - nearest > FINGER_GAP)
+    return behind
+
+
+def _nearest(depth: Float[Tensor, "S S"], where: Bool[Tensor, "S S"], reach: int) -> Float[Tensor, "S S"]:
+    """Least depth of `where` within `reach` pixels of each, along both axes; +inf where there is none."""
+    nearness = torch.where(where, -depth, -torch.inf)[None, None]
+    for size in ((1, 2 * reach + 1), (2 * reach + 1, 1)):  # rows, then columns: the same maximum
+        nearness = max_pool2d(nearness, size, stride=1, padding=(size[0] // 2, size[1] // 2))
+    return -nearness[0, 0]
 
 
 SHARPNESS = 2.0

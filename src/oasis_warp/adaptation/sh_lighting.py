@@ -35,6 +35,9 @@ side and pink on the other. In 3,000 synthetic rooms it is .99; coloured walls n
 HIDDEN, OPEN = 0.4, 0.75
 """Shares of the sky below which skin in the photo shows nothing of its colour, and above which it shows all: between
 bent fingers the light that arrives depends on a millimetre of the fit, and beside what hides it shadows are sharp."""
+SHADED = 0.3
+"""Logarithm of a vertex's shade from which it shows nothing of the colour: beside a dark crease that lies a pixel off,
+the photo without that shade is as bright as the crease is dark."""
 ROUNDS = 2
 """Fits of the light, each with the shares of the one before; a third changes shares by less than .01."""
 ALBEDOS = 0.02, 0.8
@@ -120,7 +123,10 @@ def trust_in_albedo(hand: HandModel, crop: HandCrop, sure: HandCrop, light: Hand
     """
     on = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces.to(crop.image.device), light)
     every, believed = (observe(hand, which).confidence for which in (crop, sure))
-    return exposed(on) * torch.where(every > 0, believed / every.clamp_min(1e-6), 1).clamp(0, 1)
+    trust = exposed(on) * torch.where(every > 0, believed / every.clamp_min(1e-6), 1).clamp(0, 1)
+    if light.shade is None:
+        return trust
+    return trust * (1 - light.shade.log().mean(-1).abs() / SHADED).clamp(0, 1)
 
 
 def _even_light(albedo: Float[Tensor, "3"]) -> HandLight:

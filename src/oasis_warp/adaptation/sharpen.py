@@ -24,11 +24,18 @@ from oasis_warp.adaptation.reprojection import (
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_to_gaussians
 from oasis_warp.avatar.densify import densify, parts_for_spacing
 from oasis_warp.avatar.observation import inner_mask
-from oasis_warp.avatar.pose import pose_gaussians, with_photo_colors, with_shade_baked
+from oasis_warp.avatar.pose import (
+    Lighting,
+    pose_gaussians,
+    posed_lighting,
+    shading_factors,
+    with_photo_colors,
+    with_shade_baked,
+)
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandCrop
+from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandCrop, HandLight
 from oasis_warp.ops import blend_colors
 from oasis_warp.render.render import render, view_weights
 
@@ -50,6 +57,8 @@ which coarse ones reach because they are thick: with thin ones fingers lose half
 but outlines get rough."""
 MIN_ALPHA = 0.05
 """Below it a pixel says nothing about the colour of the hand."""
+MIN_FACTOR = 0.02
+"""Least factor of the light by which colours are divided."""
 STEPS = 15
 """Of the colours' fit, which starts at the colours of the photo; 40 come to the same."""
 SHRUNK = 2
@@ -75,6 +84,7 @@ def sharpen(
     crops: Sequence[HandCrop],
     believed: Float[Tensor, "K V"] | None = None,
     trust: Float[Tensor, "K V"] | None = None,
+    light: HandLight | None = None,
     progress: Progress = silent,
 ) -> SharpenResult:
     """Replace Gaussians by finer ones where pictures of the hand show more than they do.
@@ -92,6 +102,8 @@ def sharpen(
         believed: How far to believe each at each vertex, at most 1 in all; a single photo wholly.
         trust: How far what each shows is skin, 0 to 1, wholly if not given: the rest of the detail is shade, if there
             is any shade.
+        light: Of a single photo, which is then given as taken. Without, photos are in even light. Divided by a picture
+            of its light, a photo would be wrong where a bright finger and a dark hollow share a pixel.
         progress: Called as work goes on.
     """
     rest = crops[0].rest.vertices
@@ -100,7 +112,8 @@ def sharpen(
     fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
     fading = with_neighbours(fading[faces].any(1), faces, len(rest))
     sources = [_source(e, faces, fading, own) for e, own in zip(crops, believed, strict=True)]
-    old = [pose_gaussians(with_shade_baked(gaussians), faces, rest, source.posed) for source in sources]
+    on = None if light is None else posed_lighting(rest, sources[0].posed, faces, light)
+    old = [pose_gaussians(_as_shown(gaussians, faces, light, on), faces, rest, source.posed) for source in sources]
     spacing = torch.stack([
         _wanted_spacing(source, render(there, source.canvas.camera).image, faces)
         for source, there in zip(sources, old, strict=True)
@@ -112,7 +125,7 @@ def sharpen(
     # A face of one part would keep its vertices' Gaussians, which reach into the faces beside it.
     parts = torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
     dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
-    shown = with_shade_baked(dense)
+    shown = _as_shown(dense, faces, light, on)
     new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
     start = overlay_pictures(shown.colors[changed], sources, [there.means[changed] for there in new])
     colors = shown.colors.masked_scatter(changed[:, None], start)
@@ -130,7 +143,19 @@ def sharpen(
         colors, losses = still.masked_scatter(mine[:, None], learned), [*losses, *own]
     if trust is not None:
         trust = vertex_to_gaussians(trust.T, faces, dense).gather(1, whose[:, None])[changed]
+    if light is not None and on is not None:
+        colors = colors / shading_factors(dense._replace(shade=None), faces, light, on).clamp_min(MIN_FACTOR)
     return SharpenResult(with_photo_colors(dense, changed, colors[changed], trust), n_new, tuple(losses))
+
+
+def _as_shown(
+    gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"], light: HandLight | None, on: Lighting | None
+) -> CanonicalGaussians:
+    """With the colours that photos show, in `light` if there is one."""
+    if light is None or on is None:
+        return with_shade_baked(gaussians)
+    lit = (gaussians.colors * shading_factors(gaussians, faces, light, on)).clamp(0, 1)
+    return gaussians._replace(colors=lit, shade=None)
 
 
 def _source(
