@@ -22,6 +22,9 @@ from which it is gone."""
 SAME_SKY, OTHER_SKY = 0.08, 0.25
 """Changes of the share of the sky that skin sees, up to which its shade stays and from which it is gone: what cast it
 has moved. Buffers of 3 mm err by .05; a finger that lies on the palm hides .5 and more."""
+MOST_DETAIL = 0.3
+"""Difference of the logarithms of colours up to which detail is skin where it goes against the shade: bright beside a
+shadow that is a pixel off, skin would be white where that shadow goes."""
 MIN_COLOR = 1e-3
 """Least colour that has shade: it is a factor."""
 
@@ -170,14 +173,17 @@ def with_photo_colors(
 ) -> CanonicalGaussians:
     """The same with other looks of some Gaussians in the photo, in the shade that they have there.
 
-    Of what is new about them a share `trust` becomes colour, all if not given, and the rest shade.
+    Of what is new about them a share `trust` becomes colour, all if not given, and the rest shade. With `trust`, what
+    only takes back the shade that they have becomes no colour either.
     """
     if canonical.shade is None:
         return canonical._replace(colors=canonical.colors.masked_scatter(changed[:, None], shown))
     shade = canonical.shade[changed]
     if trust is not None:
-        news = shown.clamp_min(MIN_COLOR) / (canonical.colors[changed] * shade).clamp_min(MIN_COLOR)
-        shade = shade * news.pow(1 - trust)
+        news = (shown.clamp_min(MIN_COLOR) / (canonical.colors[changed] * shade).clamp_min(MIN_COLOR)).log()
+        most = -shade.log()
+        back = (news - news.clamp(-MOST_DETAIL, MOST_DETAIL)).clamp(most.clamp(max=0), most.clamp(min=0))
+        shade = shade * (back + (1 - trust) * (news - back)).exp()
     colors, shade = split_shade(shown, shade)
     return canonical._replace(
         colors=canonical.colors.masked_scatter(changed[:, None], colors),
