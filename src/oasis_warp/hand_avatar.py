@@ -47,6 +47,9 @@ from oasis_warp.ops.checks import check_shape
 from oasis_warp.render.render import render
 from oasis_warp.render.replay import CapturedGraph, GraphCache, replayable, replayed
 
+LEAST_LIGHT, MOST_LIGHT = 0.05, 10.0
+"""Limits of a light from all around, over its mean: nine harmonics of a small lamp fall below 0 behind it."""
+
 
 class Avatar:
     """A hand made from a photo; see `oasis_warp.reconstruct`.
@@ -207,6 +210,30 @@ class Avatar:
         """The same hand without its photo's light, as far as that is known."""
         return self.with_looks(in_even_light(self.gaussians, self.light) if self.light else self.gaussians, None)
 
+    def in_light(self, harmonics: Float[Tensor, "9 3"]) -> "Avatar":
+        """The same hand in another light instead of its photo's, as bright on average.
+
+        The photo's shade stays where skin faces as in the photo. Light that is part of the colours stays too.
+
+        Args:
+            harmonics: Of `avatar.environment.environment_light` or `studio_light`, in the world of the photo's camera.
+        """
+        level = self.shape.new_ones(3) if self.light is None else self.light.even
+        around = harmonics.to(level) * level.mean()
+        limits = around[0].mean() * around.new_tensor([LEAST_LIGHT, MOST_LIGHT])[:, None].expand(2, 3)
+        albedo = None if self.light is None else self.light.albedo
+        if albedo is None:
+            albedo = self._mean_albedo(level)
+        light = HandLight(around, limits.contiguous(), around[0].clamp_min(LEAST_LIGHT), albedo=albedo)
+        if self.side == "left":
+            light = mirror_light(light)
+        if self.light is not None:
+            light = light._replace(shade=self.light.shade, facing=self.light.facing)
+        return self.with_looks(self.gaussians, light)
+
+    def _mean_albedo(self, level: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+        return (self.gaussians.colors.mean(0) ** GAMMA * level).clamp(0, 1)
+
     def with_looks(self, gaussians: CanonicalGaussians, light: HandLight | None) -> "Avatar":
         """The same hand with other Gaussians, in `light`."""
         return Avatar(
@@ -270,7 +297,7 @@ class Avatar:
         """The same from the time when light knew no hollows; the photo's own view stays."""
         if self.light is None:
             return self
-        albedo = (self.gaussians.colors.mean(0) ** GAMMA * self.light.even).clamp(0, 1)
+        albedo = self._mean_albedo(self.light.even)
         light = hidden_by_hand(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
         return self.with_looks(self.gaussians, light)
 

@@ -1,8 +1,9 @@
 import pytest
 import torch
-from synthetic import avatar_of, crop_of
+from synthetic import as_left_hand, avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.environment import environment_light, studio_light
 from oasis_warp.avatar.pose import posed_lighting, turn_light
 from oasis_warp.avatar.sky import bounced, harmonic_basis, radiance, sky_mesh
 from oasis_warp.core import rotation
@@ -101,3 +102,37 @@ def test_radiance_is_what_the_cosine_lobe_blurs():
     torch.testing.assert_close(along[:, 0], torch.tensor([1.3, 1.0, 0.4]))
     against = radiance(light._replace(harmonics=3 * light.harmonics - 2 * EVEN.harmonics), torch.eye(3))
     assert float(against.min()) == 0
+
+
+def test_an_environment_map_lights_what_faces_its_bright_side():
+    """Rows are from above to below (-y to y), the middle column is where the camera looks (z), right is x."""
+    n = torch.eye(3)
+    for middle, axis, sign in (((0.1, 0.5), 1, -1), ((0.5, 0.5), 2, 1), ((0.5, 0.75), 0, 1), ((0.5, 0.25), 0, -1)):
+        rows, columns = torch.arange(32)[:, None] / 32, torch.arange(64) / 64
+        spot = ((rows - middle[0]).abs() < 0.12) & (((columns - middle[1]).abs() < 0.06) | (middle[0] < 0.2))
+        light = environment_light(0.5 + 20 * spot[..., None].float().repeat(1, 1, 3))
+        towards, away = (harmonic_basis(s * sign * n[axis : axis + 1], 9) @ light for s in (1, -1))
+        across = harmonic_basis(n[(axis + 1) % 3][None], 9) @ light
+        assert float(towards.min()) > 1.5 * float(across.max()) and float(across.min()) > float(away.max())
+        torch.testing.assert_close(light[0], torch.ones(3))
+
+
+def test_even_surroundings_are_even_light_and_hue_stays():
+    light = environment_light(torch.tensor([0.2, 0.4, 0.8]).expand(16, 32, 3))
+    torch.testing.assert_close(light[0] / light[0, 1], torch.tensor([0.5, 1.0, 2.0]))
+    assert float(light[1:].abs().max()) < 5e-3  # of rows
+    assert float(studio_light()[:, 0] @ studio_light()[:, 0]) > 1.1
+
+
+@pytest.mark.parametrize("left", [False, True])
+def test_another_light_comes_from_the_same_side_for_both_hands(hand, scene, left):
+    crop, truth, pose = scene
+    avatar = avatar_of(hand, truth, pose, crop.camera, EVEN)
+    avatar = as_left_hand(avatar) if left else avatar
+    rows = torch.zeros(9, 3)
+    rows[0], rows[1] = 1, -0.8  # from the left
+    posed = avatar.in_light(rows).pose(avatar.source_pose)
+    lighter = (posed.colors / truth.colors).mean(1)
+    x = posed.means[:, 0]
+    on_left, on_right = (lighter[where].mean() for where in (x < x.quantile(0.1), x > x.quantile(0.9)))
+    assert float(on_left) > 1.2 * float(on_right)

@@ -134,3 +134,23 @@ def test_a_film_in_even_light_is_without_the_light_of_the_photo(scene, tmp_path,
     for even, photo, wanted in zip(kept["even"], kept["photo"], film, strict=True):
         assert torch.equal(even, wanted)
         assert photo.float().mean() < even.float().mean() - 5
+
+
+def test_light_from_all_around_comes_from_a_studio_or_a_file(avatar_file, capsys):
+    around = np.full((16, 32, 3), 0.2, np.float32)
+    around[:, :10, 2] = 4  # red, from the left
+    file = avatar_file.with_name("around.hdr")
+    assert cv2.imwrite(str(file), around)
+    plain = draw(avatar_file)
+    for light in ("studio", str(file)):
+        assert np.abs(draw(avatar_file, "--light", light) - plain).max() > 10
+    square, black = np.ones((8, 8, 3), np.uint8), np.zeros((8, 16, 3), np.uint8)
+    wrong = {"missing.hdr": None, "square.png": square, "black.png": black, "text.hdr": b"no picture"}
+    for name, pixels in wrong.items():
+        path = avatar_file.with_name(name)
+        if isinstance(pixels, bytes):
+            path.write_bytes(pixels)
+        elif pixels is not None:
+            cv2.imwrite(str(path), pixels)
+        assert main(["render", str(avatar_file), "-o", str(path.with_name("y.png")), "--light", str(path)]) != 0
+        assert name in capsys.readouterr().err

@@ -26,8 +26,11 @@ Device = Annotated[Literal["cpu", "cuda"], arg(help="Where to compute.")]
 Threads = Annotated[int, arg(help="CPU threads.")]
 Elevation = Annotated[float, arg(help="Degrees above the hand.")]
 Light = Annotated[
-    Literal["photo", "even"],
-    arg(help="The photo's light, as far as it is known apart from the skin, or even light."),
+    Literal["photo", "even", "studio"] | Path,
+    arg(
+        help="The photo's light, as far as it is known apart from the skin; even light; that of a studio; or of an "
+        "environment map, a file such as FILE.hdr."
+    ),
 ]
 FamilyName = Literal[
     "rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "skin"

@@ -1,15 +1,18 @@
 """`oasis render`: one picture of an avatar."""
 
 import math
+from pathlib import Path
 
 import torch
 
+from oasis_warp.avatar.environment import environment_light, studio_light
 from oasis_warp.cli.console import check_device
 from oasis_warp.cli.options import Animate, Render
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandPose
+from oasis_warp.data.environment_map import read_environment
 from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, to_uint8, write_picture
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
@@ -35,9 +38,15 @@ def load_avatar(options: Render | Animate) -> Avatar:
     """Load the avatar in the chosen light.
 
     Raises:
-        InputError: no avatar file.
+        InputError: no avatar file, or no environment map.
     """
+    if isinstance(options.light, Path):
+        around = environment_light(read_environment(options.light))
+    else:
+        around = studio_light() if options.light == "studio" else None
     avatar = Avatar.load(options.avatar, options.device)
+    if around is not None:
+        return avatar.in_light(around)
     return avatar.in_even_light() if options.light == "even" else avatar
 
 
