@@ -91,6 +91,8 @@ def test_a_film_has_the_length_that_was_asked_for(avatar_file, motion, suffix, c
         (["render", "-o", "x.png", "--background", "mauve"], "--background mauve: expected white, black or six hex"),
         (["render", "-o", "x.png", "--size", "0"], "--size 0: expected 16 to"),
         (["render", "-o", "x.png", "--size", "100000"], "--size 100000: expected 16 to"),
+        (["render", "-o", "x.png", "--azimuth", "nan"], "--azimuth nan: expected a number of degrees"),
+        (["animate", "-o", "x.gif", "--elevation", "inf"], "--elevation inf: expected a number of degrees"),
         (["render", "-o", "none/x.png"], "found no such folder"),
         (["animate", "-o", "x.avi"], "ends in .mp4 or .gif"),
         (["animate", "-o", "x.mp4", "--fps", "0"], "--fps 0: expected 1 to 120"),

@@ -26,11 +26,15 @@ def check_output(options: Render | Animate, suffixes: tuple[str, ...]) -> None:
     """Check device, size and output of a command before any work.
 
     Raises:
-        InputError: no such device, a picture too small or too large, or another suffix.
+        InputError: no such device, a picture too small or too large, an angle that is no number, or another suffix.
     """
     check_device(options.device)
     if not 16 <= options.size <= MAX_SIDE:
         raise InputError(f"--size {options.size}: expected 16 to {MAX_SIDE} pixels; choose another size.")
+    for name in ("azimuth", "elevation"):
+        angle = getattr(options, name, 0.0)
+        if not math.isfinite(angle):
+            raise InputError(f"--{name} {angle}: expected a number of degrees; write e.g. --{name} 45.")
     check_suffix(options.out, suffixes)
 
 
