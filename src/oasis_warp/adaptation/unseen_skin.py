@@ -157,6 +157,8 @@ def _parts(
     fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
     n_own = torch.bincount(gaussians.face_index, minlength=len(faces))
     may = torch.nonzero((invented[faces].amin(1) > 0.5) & (n_own == 1) & ~fading[faces].any(1))[:, 0]
+    if not len(may):  # all is seen, or none of a small photo's Gaussians are on faces
+        return torch.ones_like(n_own)
     count = min(len(may), int((MORE - 1) * len(gaussians.opacities) / (PARTS**2 - 1)))
     centers = part_centers(PARTS).to(rest)
     places = Places(may[:0], may.repeat_interleave(len(centers)), centers.repeat(len(may), 1))
