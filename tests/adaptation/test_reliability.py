@@ -4,6 +4,7 @@ import pytest
 import torch
 from synthetic import crop_of
 
+from oasis_warp.adaptation import reliability
 from oasis_warp.adaptation.reliability import mask_unreliable
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import inner_mask
@@ -67,3 +68,15 @@ def test_what_lies_just_behind_a_finger_does_not_count(hand, shown):
     image = drawn.clone()
     lost = mask_unreliable(hand, drawn, before._replace(image=image)).mask < 0.5
     assert 100 < int(lost.sum()) < 0.1 * side * side
+
+
+def test_the_palm_beside_a_finger_that_lies_on_it_is_unreliable(hand, monkeypatch):
+    """Finger tips that touch the palm lie less than `BEHIND_GAP` above it: their picture stayed on the opened palm."""
+    shares = {}
+    for name in ("fist", "open"):
+        crop, _, _ = crop_of(hand, torch.full_like(hand.template, 0.5), pose_name=name, size=128)
+        with monkeypatch.context() as patch:
+            sure = mask_unreliable(hand, crop.image, crop).mask
+            patch.setattr(reliability, "FINGER_GAP", torch.inf)
+            shares[name] = float((mask_unreliable(hand, crop.image, crop).mask - sure).sum() / crop.mask.sum())
+    assert shares["fist"] > 0.02 and shares["open"] < 0.01

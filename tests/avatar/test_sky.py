@@ -1,15 +1,19 @@
+import math
+
 import pytest
 import torch
 from synthetic import as_left_hand, avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.environment import environment_light, studio_light
-from oasis_warp.avatar.pose import posed_lighting, turn_light
+from oasis_warp.avatar.pose import posed_lighting, turn_light, with_photo_colors
 from oasis_warp.avatar.sky import bounced, harmonic_basis, radiance, sky_mesh
 from oasis_warp.core import rotation
 from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import HandLight
+from oasis_warp.data import avatar_file
 from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand_avatar import Avatar
 
 EVEN = HandLight(
     torch.tensor([[1.0] * 3, *[[0.0] * 3] * 3]), torch.tensor([[0.1] * 3, [2.0] * 3]), torch.ones(3),
@@ -136,3 +140,32 @@ def test_another_light_comes_from_the_same_side_for_both_hands(hand, scene, left
     x = posed.means[:, 0]
     on_left, on_right = (lighter[where].mean() for where in (x < x.quantile(0.1), x > x.quantile(0.9)))
     assert float(on_left) > 1.2 * float(on_right)
+
+
+def test_an_older_file_looks_as_before_in_its_photo_and_gains_elsewhere(hand, scene, tmp_path, monkeypatch):
+    crop, truth, pose = scene
+    old = avatar_of(hand, truth, pose, crop.camera, EVEN._replace(albedo=None))
+    monkeypatch.setattr(avatar_file, "VERSION", 4)
+    for k, avatar in enumerate((old, as_left_hand(old))):
+        avatar.save(tmp_path / f"{k}.safetensors")
+    monkeypatch.undo()
+    for k, avatar in enumerate((old, as_left_hand(old))):
+        read = Avatar.load(tmp_path / f"{k}.safetensors")
+        source, opened = avatar.source_pose, avatar.source_pose._replace(angles=named_pose(hand, "pinch"))
+        torch.testing.assert_close(read.pose(source).colors, avatar.pose(source).colors, atol=1e-5, rtol=0)
+        assert float((read.pose(opened).colors / avatar.pose(opened).colors).min()) < 0.8
+
+
+def test_detail_that_takes_back_a_shadow_is_no_white_skin(hand, scene):
+    """Bright detail beside a crease that lies a pixel off stayed white when the crease's shade was gone."""
+    _, truth, _ = scene
+    colors, shade = torch.full_like(truth.colors, 0.5), torch.full_like(truth.colors, 0.3)
+    shaded, every = truth._replace(colors=colors, shade=shade), torch.ones(len(colors), dtype=torch.bool)
+    trust = torch.ones(len(colors), 1)
+    for shown, wanted in ((0.5, 0.5 * math.exp(0.3)), (0.16, 0.5 * 0.16 / 0.15), (0.075, 0.25)):
+        made = with_photo_colors(shaded, every, torch.full_like(colors, shown), trust)
+        assert made.shade is not None
+        torch.testing.assert_close(made.colors, torch.full_like(colors, wanted))
+        torch.testing.assert_close(made.colors * made.shade, torch.full_like(colors, shown))
+        doubted = with_photo_colors(shaded, every, torch.full_like(colors, shown), 0 * trust)
+        torch.testing.assert_close(doubted.colors, colors)

@@ -15,6 +15,8 @@ from oasis_warp.ops._runtime.launch import launch_ranges, vectors, view
 from oasis_warp.ops.depth_map import depth_map
 from oasis_warp.ops.smoothing import smooth_over_faces
 
+N_DIRECTIONS = 32
+"""Of `sky_directions`."""
 SIZE = 64
 """Side of the depth buffers [px]: 3 mm of a hand's 20 cm."""
 DISTANCE = 50.0
@@ -98,9 +100,9 @@ def sky_exposure(
     """
     sky = sky_directions(vertices.device)
     sizes = _SKY_EXPOSURE.check(
-        {"D": len(sky.directions)}, vertices=vertices, normals=normals, faces=faces, frames=frames, radiance=radiance
+        {"D": N_DIRECTIONS}, vertices=vertices, normals=normals, faces=faces, frames=frames, radiance=radiance
     )
-    batch, n = sizes["B"], len(sky.directions)
+    batch, n = sizes["B"], N_DIRECTIONS
     own = vertices @ frames  # in axes that turn with the surface
     middle = (own.amin(1) + own.amax(1)) / 2
     radius = MARGIN * (own - middle[:, None]).norm(dim=-1).amax(1)

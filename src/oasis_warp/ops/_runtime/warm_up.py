@@ -7,6 +7,7 @@ from oasis_warp.ops.face_rotations import face_rotations
 from oasis_warp.ops.mesh_posing import pose_on_mesh
 from oasis_warp.ops.rasterization import rasterization
 from oasis_warp.ops.skinning import skin
+from oasis_warp.ops.sky_exposure import N_DIRECTIONS, sky_exposure
 from oasis_warp.ops.visibility import depth_visibility
 
 
@@ -29,6 +30,7 @@ def warm_up(device: torch.device | str = "cpu") -> None:
         turned = face_rotations(vertices, vertices, faces)
         each = torch.arange(4, device=device)
         posed = pose_on_mesh(vertices, faces, each, thirds, turned.vertex_quats, turned.area_ratio, quats, scales)
+        sky_exposure(vertices[None], vertices[None], faces, viewmat[None, :3, :3], ones.new_ones(1, N_DIRECTIONS, 3))
         depth_visibility(vertices, vertices, faces, K, viewmat, 16, 16)
         blend_weights(*posed, ones, viewmat, K, 16, 16)
         rasterization(*posed, ones, thirds, viewmat[None], K[None], 16, 16, backgrounds=ones[None, :3])
