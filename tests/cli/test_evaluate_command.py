@@ -18,7 +18,7 @@ from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.hand_crop import crop_hand
-from oasis_warp.evaluation import look_measures, looks, same_hand
+from oasis_warp.evaluation import look_measures, looks, real_hands, same_hand, views
 from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
 from oasis_warp.evaluation.same_hand import (
     compare_pairs,
@@ -168,6 +168,11 @@ def test_photos_of_the_same_hand_are_measured_and_the_run_is_not_done_twice(hand
 
 def test_looks_are_measured_and_drawn_and_the_run_is_not_done_twice(hands, scene, tmp_path, capsys, monkeypatch):
     _, fit, avatar = scene
+    kinds = [view.kind for view in views.views_of(avatar)]
+    assert [kinds.count(kind) for kind in ("input", "side", "pose", "back")] == [1, 8, 8, 1]
+    monkeypatch.setattr(views, "AZIMUTHS", (0, 180))
+    monkeypatch.setattr(views, "POSES", ("open",))
+    monkeypatch.setattr(looks, "IN_OVERVIEW", (0, 4))
     shown = torch.linspace(0, 1, len(avatar.rest.vertices))
     made = Reconstruction(
         avatar, fit, {}, {}, {"input_psnr_inner_db": 30.0, "seen_percent": 40.0}, (), SurfaceQuality(shown, 1 - shown)
@@ -180,7 +185,8 @@ def test_looks_are_measured_and_drawn_and_the_run_is_not_done_twice(hands, scene
         return made
 
     monkeypatch.setattr(looks, "reconstruct", ship)
-    monkeypatch.setattr(look_measures, "hand_features", lambda image, mask: {"half": [0.0]})  # takes seconds
+    for module in (look_measures, real_hands):
+        monkeypatch.setattr(module, "hand_features", lambda image, mask: {"half": [0.0]})  # takes seconds
     monkeypatch.setattr(looks, "HandEstimator", lambda hand: KnownEstimator(fit))
     for name in ("first.png", "no_hand.png"):
         (hands / name).write_bytes((hands / "mine" / "a.png").read_bytes())
@@ -193,7 +199,7 @@ def test_looks_are_measured_and_drawn_and_the_run_is_not_done_twice(hands, scene
     record = found["photos"]["first.png"]
     assert record["contrast"]["seen"][0] > 0 and record["haze"] >= 0 and record["lpips"] is None
     assert list(found["left_out"]) == ["no_hand.png"] and found["kernel_distance"] == []
-    assert read_photo(tmp_path / "found" / "sheets" / "first.jpg").rgb.shape == (3 * 512 + 4, 6 * 512 + 10, 3)
+    assert read_photo(tmp_path / "found" / "sheets" / "first.jpg").rgb.shape == (512, 6 * 512 + 10, 3)
     monkeypatch.setattr(looks, "reconstruct", lambda *arguments, **options: pytest.fail("made again"))
     assert main(arguments) == 0
     assert json.loads((tmp_path / "found" / "metrics.json").read_text()) == found
