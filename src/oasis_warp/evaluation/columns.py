@@ -58,7 +58,7 @@ REGIONS = {
 BLEMISHES = {
     "input_psnr_db": Measure("PSNR of the photo's view, dB", ".1f"),
     "lpips": Measure("LPIPS of it", ".3f"),
-    "haze": Measure("haze", ".5f"),
+    "haze": Measure("haze", ".1e"),
     "haze_ratio": Measure("over the mean prior's", ".1f"),
     "palm_minus_back": Measure("palm minus back, a*", "+.1f"),
     "darkest": Measure("darkest 1 % of the opened palm", ".2f"),
