@@ -140,6 +140,9 @@ def reconstruct(
     Raises:
         InputError: no such hand in the photo, a fit too poor to go on (see `ReconstructConfig.force`), a wrong file.
     """
+    check_config(config)  # before a file is read
+    if isinstance(photo, str | Path):
+        photo = read_photo(photo)
     fused, (of_photo,), of_coverage = _run([photo], config, keypoints, prior, progress)
     (own,) = fused.photos
     errors = {name: value for name, value in own.errors.items() if name != "best_percent"} | fused.errors
@@ -171,23 +174,19 @@ def reconstruct_same_hand(
     """
     if not photos:
         raise ValueError("photos: expected at least one, got none. Read them with oasis_warp.read_photo.")
+    check_config(config)
+    photos = [read_photo(photo) if isinstance(photo, str | Path) else photo for photo in photos]
     fused, of_photos, of_coverage = _run(photos, config, None, prior, progress)
     return fused._replace(warnings=(*_name_warnings(fused.photos, of_photos), *of_coverage))
 
 
 @single_threaded_torch()
 def _run(
-    given: Sequence[Photo | Path | str],
-    config: ReconstructConfig,
-    keypoints: Path | None,
-    prior: Prior | None,
-    progress: Progress,
+    photos: Sequence[Photo], config: ReconstructConfig, keypoints: Path | None, prior: Prior | None, progress: Progress
 ) -> _Outcome:
     """All stages, in their order. `keypoints` are those of a single photo."""
     stages: dict[str, float] = {}
     stage = functools.partial(timed_stage, seconds=stages, progress=progress)
-    check_config(config)
-    photos = [read_photo(photo) if isinstance(photo, str | Path) else photo for photo in given]
     hand = bundled_hand()
     estimator = HandEstimator(hand)
     with stage("prior"):  # first, because a wrong file must fail before the long work
