@@ -46,6 +46,7 @@ WOUND = 0.4
 """Brightness of the darkest percent of an opened palm, over its median, below which that is a wound: the least of seven
 real palms, open or nearly so, is .41."""
 DIGITS = 4
+"""Of numbers over all photos: of medians those that count, of distances those behind the point."""
 
 
 def evaluate_looks(
@@ -249,4 +250,4 @@ def _kernel_row(name: str, pictures: int, distances: Mapping[str, KernelDistance
 
 
 def _median(values: Sequence[float]) -> float | None:
-    return round(statistics.median(values), DIGITS) if values else None
+    return float(f"{statistics.median(values):.{DIGITS}g}") if values else None
