@@ -176,7 +176,9 @@ def fill(page: str, marker: str, text: str, commit: str = "") -> str:
 
 def render(sections: Sequence[Section], rows: list[Row], docs: Path) -> list[str]:
     """Fill the sections of a study into the pages below `docs`, and return what was filled."""
-    commits = dict.fromkeys(str(row["commit"]) for row in rows if row.get("commit"))
+    commits = list(dict.fromkeys(str(row["commit"]) for row in rows if row.get("commit")))
+    if len(commits) > 2:  # a run that went on while work was committed
+        commits = [f"{commits[0]} to {commits[-1]}"]
     filled = []
     for page, marker, text in sections:
         made = text(rows) if page else None
