@@ -158,8 +158,8 @@ def test_the_detail_of_both_photos_is_in_the_avatar(palm):
 
 
 def shown(avatar, photo, crop):
-    """The avatar over a photo, in the first photo's light."""
-    avatar = make_avatar(photo.fit, avatar.surface_offsets, crop, avatar.gaussians)
+    """The avatar over a photo, in the photo's own light."""
+    avatar = make_avatar(photo.fit, avatar.surface_offsets, crop, avatar.gaussians, photo.light)
     return over_photo(draw_as_photo(avatar, crop, photo.fit.pose), crop)
 
 

@@ -33,7 +33,7 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.processes import single_threaded_torch
-from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, Landmarks, Photo, Render
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, HandLight, Landmarks, Photo, Render
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_hand, fit_together
 from oasis_warp.estimation.fit_quality import keeps_quality, with_pose
@@ -92,6 +92,8 @@ class PhotoOfHand(NamedTuple):
     errors: dict[str, float]
     """As `Reconstruction.errors`, in the photo's own light; and of the surface [%] seen_percent, what it shows, and
     best_percent, what it shows better than the others."""
+    light: HandLight | None
+    """The photo's own light, in the frame of its camera; None where light is even or part of the colours."""
 
 
 class FusedReconstruction(NamedTuple):
@@ -245,7 +247,9 @@ def _run(
         shares = coverage_of_photos(areas, adaptation.observations.confidence, adaptation.observations.share)
         warnings = [photo_warnings(c.image, c.mask, crop_side(fit)) for c, fit in zip(close, fits, strict=True)]
     measured = [{"refined_px": px} | part[1] | own for px, part, own in zip(moved, parts, shares, strict=True)]
-    about = tuple(map(PhotoOfHand, (photo.name for photo in photos), fits, _tuples(adaptation.gains), measured))
+    lights = adaptation.lights or [None] * len(photos)
+    names = [photo.name for photo in photos]
+    about = tuple(map(PhotoOfHand, names, fits, _tuples(adaptation.gains), measured, lights))
     coverage["n_gaussians"] = float(len(avatar.gaussians.opacities))
     fused = FusedReconstruction(avatar, about, prior.about, stages, coverage, (), quality)
     return _Outcome(fused, warnings, coverage_warnings(coverage))

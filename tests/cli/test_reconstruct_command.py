@@ -134,7 +134,7 @@ def fusion(monkeypatch, made, scene):
         calls.append(photos)
         shares = {"seen_percent": 30.0, "best_percent": 20.0, "input_psnr_db": 25.0}
         errors = {"reprojection_percent": 1.0, "mask_iou": 0.9, **shares}
-        about = tuple(PhotoOfHand(photo.name, scene[1], (1.0, 1.0, 1.0), errors) for photo in photos)
+        about = tuple(PhotoOfHand(photo.name, scene[1], (1.0, 1.0, 1.0), errors, None) for photo in photos)
         return FusedReconstruction(
             made.avatar, about, made.prior, {"fusion": 1.0}, {"seen_percent": 50.0}, ("b.png: small",),
             made.quality,
