@@ -1,4 +1,6 @@
 import json
+import sys
+from pathlib import Path
 
 import cv2
 import pytest
@@ -143,6 +145,34 @@ def fusion(monkeypatch, made, scene):
     calls = []
     monkeypatch.setattr(command, "reconstruct_same_hand", answer)
     return calls
+
+
+HAND = Path(__file__).parents[1] / "data" / "photos" / "same_hand" / "a1_wood_right"
+PALM, BACK = str(HAND / "02_flat_closed.jpg"), str(HAND / "03_flat_closed_back.jpg")
+FINGERS = str(HAND / "08_two_fingers.jpg")
+
+
+@pytest.mark.parametrize(("answer", "is_one"), [("\n", True), ("y\n", True), ("n\n", False), ("", False)])
+def test_palm_and_back_become_one_avatar_when_the_user_says_so(
+    pipeline, fusion, tmp_path, monkeypatch, capsys, answer, is_one
+):
+    for stream in ("stdin", "stderr"):
+        monkeypatch.setattr(getattr(sys, stream), "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(sys.stdin, "readline", lambda: answer, raising=False)
+    assert main(["reconstruct", PALM, BACK, "-o", str(tmp_path / "out")]) == 0
+    assert "the palm and the back of a right hand. Are both of one hand" in capsys.readouterr().err
+    assert names(tmp_path / "out") == (FILES if is_one else {"02_flat_closed", "03_flat_closed_back"})
+
+
+def test_without_a_terminal_palm_and_back_stay_apart_and_the_option_is_named(pipeline, tmp_path, capsys):
+    assert main(["reconstruct", PALM, BACK, "-o", str(tmp_path / "out")]) == 0
+    assert "--same-hand makes one avatar of them" in capsys.readouterr().err
+    assert len(pipeline) == 2
+
+
+def test_two_palms_are_not_asked_about(pipeline, tmp_path, capsys):
+    assert main(["reconstruct", PALM, FINGERS, "-o", str(tmp_path / "out")]) == 0
+    assert "same-hand" not in capsys.readouterr().err
 
 
 def test_several_photos_of_the_same_hand_make_one_avatar(fusion, photo_file, tmp_path, capsys):

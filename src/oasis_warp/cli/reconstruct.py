@@ -21,6 +21,8 @@ from oasis_warp.core.logging import timed_stage
 from oasis_warp.data.output_files import output_folder
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture, write_video
+from oasis_warp.estimation.estimator import HandEstimator, choose_hand, palm_and_back
+from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.weights_file import read_header
 from oasis_warp.reconstruction import reconstruct, reconstruct_same_hand
 
@@ -39,7 +41,7 @@ def run(options: Reconstruct) -> int:
     check_config(config, "--")
     if isinstance(options.prior, Path):
         read_header(options.prior)  # check it once, not for every photo
-    if len(options.photos) == 1 or options.same_hand:
+    if len(options.photos) == 1 or options.same_hand or _is_one_hand(options):
         print_report(Console(), _reconstruct(options.photos, options.out, config, options.keypoints))
         return 0
     return _reconstruct_all(options, config)
@@ -55,6 +57,27 @@ def _check_photos(options: Reconstruct) -> None:
     counts = Counter(photo.stem for photo in options.photos)
     if twins := [str(photo) for photo in options.photos if counts[photo.stem] > 1]:
         raise InputError(f"photos: {' and '.join(twins)} would share one output folder; run them one by one.")
+
+
+def _is_one_hand(options: Reconstruct) -> bool:
+    """Ask on a terminal whether a palm and a back are of one hand; without a terminal say how to make one avatar."""
+    if len(options.photos) != 2:
+        return False
+    estimator = HandEstimator(bundled_hand())
+    try:
+        one, other = (
+            choose_hand(estimator.find(photo), options.hand, photo.name) for photo in map(read_photo, options.photos)
+        )
+    except InputError:  # said where each photo is reconstructed
+        return False
+    if not palm_and_back(one, other):
+        return False
+    seen = f"The photos show the palm and the back of a {one.side} hand."
+    if sys.stdin.isatty() and sys.stderr.isatty():
+        print(f"{seen} Are both of one hand, to make one avatar of them? [Y/n] ", end="", file=sys.stderr, flush=True)
+        return sys.stdin.readline().lower() in ("\n", "y\n", "yes\n")
+    print(f"{seen} If both are of one hand, --same-hand makes one avatar of them.", file=sys.stderr)
+    return False
 
 
 def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
