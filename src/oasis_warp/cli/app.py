@@ -18,6 +18,7 @@ Command = (
     Annotated[options.Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[options.Render, tyro.conf.subcommand("render")]
     | Annotated[options.Animate, tyro.conf.subcommand("animate")]
+    | Annotated[options.Export, tyro.conf.subcommand("export")]
     | Annotated[options.Edit, tyro.conf.subcommand("edit")]
     | Annotated[options.Synthesize, tyro.conf.subcommand("synthesize")]
     | Annotated[options.Pretrain, tyro.conf.subcommand("pretrain")]

@@ -107,6 +107,23 @@ class Animate:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write an avatar for other programs; the ending of the name says the format.
+
+    Gaussians for splat viewers: .ply.
+    """
+
+    avatar: AvatarFile
+    out: Output
+    """File to write."""
+    pose: PoseName | None = None
+    """Pose of the hand. That of the photo when not given, and in files that can be posed the rest pose."""
+    light: Literal["baked", "none"] | None = None
+    """Colours as in the avatar's light, or as in even light for programs with lights of their own. Baked into Gaussians
+    and left out of meshes when not given."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Gradcheck:
     """Certify the operators on this machine: values, gradients and bits, against finite differences and float64 twins.
 

@@ -1,0 +1,54 @@
+"""`export_avatar`: the file formats and their writers, by the ending of a name."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import HandPose
+from oasis_warp.export.request import ExportRequest, Light
+from oasis_warp.export.splat_ply import write_ply
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.ops.checks import check_choice
+
+Writer = Callable[[ExportRequest, Path], None]
+"""Writes a file atomically. Raises an InputError where it cannot."""
+
+WRITERS: dict[str, Writer] = {
+    ".ply": write_ply,
+}
+"""By the ending of the file's name; the longest that fits wins."""
+
+
+def choose_writer(path: Path | str) -> Writer:
+    """The writer for the name of `path`; capitals mean nothing.
+
+    Raises:
+        InputError: no format has this ending.
+    """
+    name = Path(path).name.lower()
+    fitting = [ending for ending in WRITERS if name.endswith(ending) and name != ending]
+    if not fitting:
+        raise InputError(f"{path}: expected a name that ends in {', '.join(WRITERS)}; rename the output.")
+    return WRITERS[max(fitting, key=len)]
+
+
+def export_avatar(
+    avatar: Avatar, path: Path | str, *, pose: HandPose | None = None, light: Light | None = None
+) -> None:
+    """Write `avatar` in the format that the ending of `path` says; docs/export.md lists them.
+
+    Args:
+        avatar: Whose Gaussians or skin are written.
+        path: File to write; an existing one is replaced when the new one is complete.
+        pose: Pose of the hand. By default that of the photo, and in files that can be posed the rest pose.
+        light: "baked" to write colours as they are in the avatar's light, "none" as in even light, for programs with
+            lights of their own. By default "baked" for Gaussians, and "none" for meshes.
+
+    Raises:
+        InputError: an unknown ending, a value that is not finite, or `path` cannot be written.
+        ValueError: a part of the pose has another shape or is not finite, or another light.
+    """
+    writer = choose_writer(path)
+    if light is not None:
+        check_choice("light", light, ("baked", "none"))
+    writer(ExportRequest(avatar, pose, light), Path(path))

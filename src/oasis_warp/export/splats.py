@@ -1,0 +1,72 @@
+"""The Gaussians that splat files hold: posed, in the photo's axes, with values that every viewer can draw."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.core import rotation
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.logging import logger
+from oasis_warp.core.types import Camera, Gaussians
+from oasis_warp.export.request import ExportRequest
+
+LEAST_SCALE, MOST_SCALE = 1e-6, 0.02
+"""Standard deviations that leave [m]: thinner than any skin, wider than a finger. Larger ones have made viewers hang."""
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 f_dc (Kerbl et al. 2023)."""
+HALF_TURN = (1.0, -1.0, -1.0)
+"""Diagonal of the half turn about x, from y down and z forward to y up and z to the viewer, and back."""
+
+
+@torch.no_grad()
+def posed_splats(request: ExportRequest) -> Gaussians:
+    """The hand upright as in its photo: x right, y up, z to the viewer [m], the wrist at the origin. On the CPU.
+
+    Raises:
+        InputError: a value is not finite.
+    """
+    avatar, pose = request.avatar, request.pose or request.avatar.source_pose
+    shown = avatar.in_even_light() if request.light == "none" else avatar
+    turn, wrist = photo_axes(avatar.source_camera), avatar.mesh(pose).joints[0]
+    return checked(moved(shown.pose(pose), turn, wrist))
+
+
+def photo_axes(camera: Camera) -> Float[Tensor, "3 3"]:
+    """Rotation from the world to the axes of the photo's picture: x right, y up, z to the viewer."""
+    return torch.diag(camera.viewmat.new_tensor(HALF_TURN)) @ camera.viewmat[:3, :3]
+
+
+def moved(gaussians: Gaussians, turn: Float[Tensor, "3 3"], origin: Float[Tensor, "3"]) -> Gaussians:
+    """The same in axes that `turn` leads to, about `origin`; on the CPU, quaternions with w >= 0."""
+    means = (gaussians.means - origin) @ turn.to(gaussians.means).T
+    about = rotation.from_matrix(turn).to(gaussians.quats).expand_as(gaussians.quats)
+    quats = rotation.multiply(about, gaussians.quats)
+    quats = quats / quats.norm(dim=-1, keepdim=True)
+    quats = torch.where(quats[..., :1] < 0, -quats, quats)
+    return Gaussians(*(part.cpu() for part in gaussians._replace(means=means, quats=quats)))
+
+
+def y_down(gaussians: Gaussians) -> Gaussians:
+    """Half a turn about x: what files of trained scenes have, whose y points down and z forward."""
+    turn = torch.diag(gaussians.means.new_tensor(HALF_TURN))
+    return moved(gaussians, turn, gaussians.means.new_zeros(3))
+
+
+def checked(gaussians: Gaussians) -> Gaussians:
+    """The same with scales and opacities within limits.
+
+    Raises:
+        InputError: a value is not finite.
+    """
+    finite = torch.stack([part.flatten(1).isfinite().all(1) for part in map(_rows, gaussians)]).all(0)
+    if bad := int((~finite).sum()):
+        raise InputError(f"export: expected finite Gaussians, got {bad} that are not; reconstruct the avatar again.")
+    scales = gaussians.scales.clamp(LEAST_SCALE, MOST_SCALE)
+    if changed := int((scales != gaussians.scales).any(1).sum()):
+        limits = f"{LEAST_SCALE * 1e3:g} to {MOST_SCALE * 1e3:g} mm"
+        logger.warning("%d of %d Gaussians are held to standard deviations of %s", changed, len(scales), limits)
+    return gaussians._replace(scales=scales, opacities=gaussians.opacities.clamp(0, 1))
+
+
+def _rows(values: Tensor) -> Tensor:
+    return values[:, None] if values.ndim == 1 else values

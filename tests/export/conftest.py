@@ -1,0 +1,25 @@
+import pytest
+import torch
+from synthetic import as_left_hand, avatar_of, crop_of
+
+from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.core.types import HandLight
+
+
+@pytest.fixture(scope="session")
+def right_hand(hand):
+    """A hand whose regions differ in colour, in a light from the left, its palm to the camera."""
+    crop, truth, pose = crop_of(hand, region_colors(label_regions(hand), 0.03), size=64)
+    harmonics = torch.tensor([[0.9, 0.9, 0.8], [-0.3, -0.3, -0.3], [-0.2, -0.2, -0.1], [-0.1, -0.1, 0]])
+    light = HandLight(harmonics, torch.tensor([[0.2] * 3, [1.6] * 3]), torch.full((3,), 0.9))
+    return avatar_of(hand, truth, pose, crop.camera, light)
+
+
+@pytest.fixture(scope="session")
+def left_hand(right_hand):
+    return as_left_hand(right_hand)
+
+
+@pytest.fixture(params=["left", "right"])
+def avatar(request, left_hand, right_hand):
+    return {"left": left_hand, "right": right_hand}[request.param]

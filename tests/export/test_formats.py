@@ -1,0 +1,62 @@
+import pytest
+import torch
+
+from oasis_warp.cli import main
+from oasis_warp.core.errors import InputError
+from oasis_warp.export import export_avatar
+from oasis_warp.export.formats import WRITERS, choose_writer
+
+
+@pytest.mark.parametrize("ending", WRITERS)
+def test_the_longest_ending_chooses_the_writer_whatever_its_case(ending):
+    assert choose_writer(f"some.folder/My.Hand{ending.upper()}") is WRITERS[ending]
+
+
+@pytest.mark.parametrize("name", ["hand.xyz", "hand", ".ply"])
+def test_an_unknown_ending_is_refused_and_the_known_ones_are_named(right_hand, tmp_path, name):
+    with pytest.raises(InputError, match=r"expected a name that ends in .*\.ply"):
+        export_avatar(right_hand, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_light_is_refused(right_hand, tmp_path, as_shipped):
+    with pytest.raises(ValueError, match="light: expected one of 'baked', 'none', got 'moon'"):
+        export_avatar(right_hand, tmp_path / "hand.ply", light="moon")
+
+
+def test_values_that_are_not_finite_never_leave(right_hand, tmp_path):
+    """A file from before must stay, and nothing half-written beside it."""
+    (tmp_path / "hand.ply").write_bytes(b"before")
+    scales = right_hand.gaussians.scales.clone()
+    scales[7] = torch.nan
+    broken = right_hand.with_looks(right_hand.gaussians._replace(scales=scales), None)
+    with pytest.raises(InputError, match="expected finite Gaussians, got 1 that are not"):
+        export_avatar(broken, tmp_path / "hand.ply")
+    assert (tmp_path / "hand.ply").read_bytes() == b"before"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_huge_gaussians_are_held_to_the_width_of_a_finger(right_hand, tmp_path, caplog):
+    from splat_readers import gaussians_of_ply
+
+    scales = right_hand.gaussians.scales.clone()
+    scales[7] = 5.0
+    broken = right_hand.with_looks(right_hand.gaussians._replace(scales=scales), None)
+    export_avatar(broken, tmp_path / "hand.ply")
+    assert gaussians_of_ply(tmp_path / "hand.ply")[2].max() <= 0.0200001
+    assert "1 of" in caplog.text and "20 mm" in caplog.text
+
+
+def test_the_command_writes_a_pose_in_a_light(left_hand, tmp_path):
+    left_hand.save(tmp_path / "avatar.safetensors")
+    out = tmp_path / "hand.ply"
+    assert main(["export", str(tmp_path / "avatar.safetensors"), "-o", str(out)]) == 0
+    plain = out.read_bytes()
+    arguments = ["--pose", "fist", "--light", "none"]
+    assert main(["export", str(tmp_path / "avatar.safetensors"), "-o", str(out), *arguments]) == 0
+    assert len(out.read_bytes()) == len(plain) and out.read_bytes() != plain
+
+
+def test_the_command_names_a_wrong_ending_before_it_reads_the_avatar(tmp_path, capsys):
+    assert main(["export", str(tmp_path / "missing.safetensors"), "-o", str(tmp_path / "hand.doc")]) == 2
+    assert "expected a name that ends in" in capsys.readouterr().err
