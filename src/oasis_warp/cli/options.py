@@ -110,7 +110,8 @@ class Animate:
 class Export:
     """Write an avatar for other programs; the ending of the name says the format.
 
-    Gaussians for splat viewers: .ply.
+    Gaussians for splat viewers: .ply, .compressed.ply, .splat, .spz, .splats.glb and .splats.gltf (glTF's
+    KHR_gaussian_splatting).
     """
 
     avatar: AvatarFile

@@ -5,8 +5,12 @@ from pathlib import Path
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandPose
+from oasis_warp.export.compressed_ply import write_compressed_ply
 from oasis_warp.export.request import ExportRequest, Light
+from oasis_warp.export.splat_gltf import write_splat_gltf
 from oasis_warp.export.splat_ply import write_ply
+from oasis_warp.export.splat_rows import write_splat
+from oasis_warp.export.splat_spz import write_spz
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops.checks import check_choice
 
@@ -15,6 +19,11 @@ Writer = Callable[[ExportRequest, Path], None]
 
 WRITERS: dict[str, Writer] = {
     ".ply": write_ply,
+    ".compressed.ply": write_compressed_ply,
+    ".splat": write_splat,
+    ".spz": write_spz,
+    ".splats.glb": write_splat_gltf,
+    ".splats.gltf": write_splat_gltf,
 }
 """By the ending of the file's name; the longest that fits wins."""
 

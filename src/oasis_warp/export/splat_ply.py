@@ -32,10 +32,15 @@ def write_ply(request: ExportRequest, path: Path) -> None:
         splats.scales.log(), splats.quats,
     )  # fmt: skip
     rows = torch.cat(parts, 1).numpy().astype("<f4")
-    write_file(path, ply_header(len(rows), COLUMNS) + np.ascontiguousarray(rows).tobytes())
+    write_file(path, ply_header(("vertex", len(rows), "float", COLUMNS)) + np.ascontiguousarray(rows).tobytes())
 
 
-def ply_header(n_vertices: int, columns: tuple[str, ...]) -> bytes:
-    """Of a binary PLY of floats. Without comments: importers of some engines stumble over them."""
-    properties = "".join(f"property float {name}\n" for name in columns)
-    return f"ply\nformat binary_little_endian 1.0\nelement vertex {n_vertices}\n{properties}end_header\n".encode()
+def ply_header(*elements: tuple[str, int, str, tuple[str, ...]]) -> bytes:
+    """Of a binary PLY, for elements of a name, a number of rows, a type and columns.
+
+    Without comments: importers of some engines stumble over them.
+    """
+    lines = ["ply", "format binary_little_endian 1.0"]
+    for name, n_rows, kind, columns in elements:
+        lines += [f"element {name} {n_rows}", *(f"property {kind} {column}" for column in columns)]
+    return "\n".join([*lines, "end_header\n"]).encode()

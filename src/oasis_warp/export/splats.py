@@ -1,5 +1,6 @@
 """The Gaussians that splat files hold: posed, in the photo's axes, with values that every viewer can draw."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -70,3 +71,21 @@ def checked(gaussians: Gaussians) -> Gaussians:
 
 def _rows(values: Tensor) -> Tensor:
     return values[:, None] if values.ndim == 1 else values
+
+
+def morton_order(means: np.ndarray) -> np.ndarray:
+    """Indices that sort points, [N, 3], along a Morton curve: neighbours in files are neighbours in space."""
+    least, most = means.min(0), means.max(0)
+    cells = ((means - least) / np.maximum(most - least, 1e-12).max() * 1023).astype(np.uint64)
+    key = np.zeros(len(means), np.uint64)
+    for bit in range(10):
+        for axis in range(3):
+            key |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return np.argsort(key, kind="stable")
+
+
+def largest_component(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index of the largest component of unit quaternions, [N], and the other three in order where it is positive."""
+    largest = np.abs(quats).argmax(1)
+    positive = quats * np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1, 1)
+    return largest, positive[np.arange(4) != largest[:, None]].reshape(-1, 3)

@@ -1,0 +1,58 @@
+"""The .spz of Gaussians, version 3: 20 bytes a Gaussian, zipped (github.com/nianticlabs/spz)."""
+
+import gzip
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from oasis_warp.data.output_files import write_file
+from oasis_warp.export.request import ExportRequest
+from oasis_warp.export.splats import SH_C0, largest_component, morton_order, posed_splats
+
+MAGIC, VERSION = 0x5053474E, 3
+FRACTION_BITS = 20
+"""Of means: steps of 0.95 um and a reach of 8 m. The reference encoder's 12 are steps of 0.24 mm, as far apart as the
+lines of skin."""
+COLOR_SCALE = 0.15
+"""A byte holds 0.5 + COLOR_SCALE f_dc."""
+SCALE_STEPS, SCALE_ZERO = 16, -10
+"""A byte holds SCALE_STEPS (log scale - SCALE_ZERO): steps of 6 %, from 45 um on."""
+QUAT_STEPS = 511
+"""Of the three smaller components, each of which has 9 bits and a sign."""
+
+
+def write_spz(request: ExportRequest, path: Path) -> None:
+    """Means in fixed point, quaternions as their three smaller components, all else as bytes; y up. See VERSION.
+
+    Raises:
+        InputError: a value is not finite, or `path` cannot be written.
+    """
+    means, quats, scales, opacities, colors = (part.double().numpy() for part in posed_splats(request))
+    order = morton_order(means)
+    fixed = np.round(means[order] * (1 << FRACTION_BITS)).astype("<i4")
+    parts = (
+        fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3],
+        to_bytes(255 * opacities[order]),
+        to_bytes(255 * (COLOR_SCALE * (colors[order] - 0.5) / SH_C0 + 0.5)),
+        to_bytes(SCALE_STEPS * (np.log(scales[order]) - SCALE_ZERO)),
+        pack_quats(quats[order]),
+    )
+    header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(means), 0, FRACTION_BITS, 0, 0)
+    body = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+    write_file(path, gzip.compress(header + body, 9, mtime=0))  # no time, so that equal avatars are equal bytes
+
+
+def to_bytes(values: np.ndarray) -> np.ndarray:
+    """The nearest bytes."""
+    return np.clip(np.round(values), 0, 255).astype(np.uint8)
+
+
+def pack_quats(quats: np.ndarray) -> np.ndarray:
+    """Unit quaternions wxyz, [N, 4], as 32 bits: the index of the largest of xyzw, then sign and size of the others."""
+    largest, others = largest_component(quats[:, [1, 2, 3, 0]])
+    packed = largest.astype(np.uint32)
+    for column in others.T:
+        size = np.round(np.abs(column) * np.sqrt(2) * QUAT_STEPS).astype(np.uint32)
+        packed = packed << 10 | (column < 0).astype(np.uint32) << 9 | np.minimum(size, QUAT_STEPS)
+    return packed.astype("<u4")

@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+from splat_readers import READERS
+
+from oasis_warp.core.types import Camera, Gaussians
+from oasis_warp.export import export_avatar
+from oasis_warp.hand.poses import named_pose
+from oasis_warp.render.render import render
+
+LOSSLESS = {".ply", ".splats.glb", ".splats.gltf"}
+STEPS = {".spz": 2**-20, ".compressed.ply": 1e-4}
+"""Of means [m]. A chunk of neighbours may span the 0.2 m of a hand, and the coarsest axis has 1023 steps in it."""
+
+
+def redraw(avatar, pose, gaussians):
+    """Draw what was read (y up, the wrist at the origin) as the photo's camera sees it, and the avatar itself."""
+    camera, wrist = avatar.source_camera, avatar.mesh(pose).joints[0]
+    viewmat = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    viewmat[:3, 3] = camera.viewmat[:3, :3] @ wrist + camera.viewmat[:3, 3]
+    parts = (torch.from_numpy(np.array(part, np.float32)) for part in gaussians)
+    drawn = render(Gaussians(*parts), Camera(viewmat, *camera[1:])).image
+    return drawn, render(avatar.pose(pose), camera).image
+
+
+def psnr(a, b):
+    return float(-10 * (a - b).square().mean().log10())
+
+
+def posed(avatar, name):
+    return avatar.source_pose._replace(angles=named_pose(avatar.hand, name))
+
+
+@pytest.mark.parametrize("ending", READERS)
+def test_what_a_file_holds_looks_as_the_avatar_does(left_hand, ending, tmp_path):
+    """A wrong axis, sign, order of a quaternion or colour curve shows."""
+    pose = posed(left_hand, "victory")
+    export_avatar(left_hand, tmp_path / f"hand{ending}", pose=pose)
+    drawn, expected = redraw(left_hand, pose, READERS[ending](tmp_path / f"hand{ending}"))
+    assert psnr(drawn, expected) > (45 if ending in LOSSLESS else 35)
+
+
+@pytest.mark.parametrize("ending", READERS)
+def test_means_lie_about_the_wrist_within_the_formats_steps(avatar, ending, tmp_path):
+    export_avatar(avatar, tmp_path / f"hand{ending}")
+    means, quats, scales, *_ = READERS[ending](tmp_path / f"hand{ending}")
+    pose, turn = avatar.source_pose, torch.diag(torch.tensor([1.0, -1, -1])) @ avatar.source_camera.viewmat[:3, :3]
+    expected = ((avatar.pose(pose).means - avatar.mesh(pose).joints[0]) @ turn.T).numpy()
+    if ending in LOSSLESS:
+        assert np.abs(means - expected).max() <= 1e-6
+    else:  # in another order
+        for here, there in ((means, expected), (expected, means)):
+            assert cKDTree(here).query(there)[0].max() <= STEPS.get(ending, 1e-6)
+    assert np.abs(np.linalg.norm(quats, axis=1) - 1).max() < 1e-5
+    assert len(scales) == len(avatar.gaussians.scales)
+
+
+@pytest.mark.parametrize("ending", READERS)
+def test_equal_avatars_are_equal_bytes(right_hand, ending, tmp_path):
+    """A time in a gzip header would differ."""
+    for name in ("a", "b"):
+        export_avatar(right_hand, tmp_path / f"{name}{ending}")
+    assert (tmp_path / f"a{ending}").read_bytes() == (tmp_path / f"b{ending}").read_bytes()
+
+
+def test_without_its_light_a_file_holds_the_colours_of_even_light(right_hand, tmp_path):
+    colors = {}
+    for light in ("baked", "none", None):
+        export_avatar(right_hand, tmp_path / "hand.ply", light=light)
+        colors[light] = READERS[".ply"](tmp_path / "hand.ply")[-1]
+    np.testing.assert_allclose(colors["none"], right_hand.in_even_light().gaussians.colors.numpy(), atol=1e-6)
+    assert np.array_equal(colors["baked"], colors[None])
+    assert np.abs(colors["baked"] - colors["none"]).max() > 0.1
