@@ -3,12 +3,12 @@ import math
 import pytest
 import torch
 
-from oasis_warp.avatar.anchors import RIM_FADE, place_anchors
+from oasis_warp.avatar.anchors import RIM_FADE, place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.densify import densify
-from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.pose import pose_gaussians, with_photo
 from oasis_warp.avatar.wrist import close_wrist
 from oasis_warp.core.camera import orbit_camera
-from oasis_warp.core.types import HandPose
+from oasis_warp.core.types import HandLight, HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.render.render import render
@@ -69,3 +69,37 @@ def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_cap_goes_with_the_wrist
     posed = skin(hand, rest_hand(hand, torch.zeros(hand.shape_basis.shape[-1])), fist).vertices
     still, moved = (pose_gaussians(after, hand.faces, rest, to).means[cap] for to in (rest, posed))
     assert (moved - still).norm(dim=1).max() < 0.004  # the rim itself moves by less than that
+
+
+def test_light_falls_on_the_cap_as_on_one_end(hand, hands):
+    """It came with the rim's vertices, whose sides made a cone of dark and bright wedges."""
+    rest, _, after = hands
+    cap = after.offsets.norm(dim=1) > 2e-3
+    above = torch.tensor([[1.0], [0.0], [0.8], [0.0]]).expand(4, 3)
+    lamp = HandLight(above, torch.tensor([[0.1] * 3, [3.0] * 3]), torch.ones(3))
+    lit = pose_gaussians(after, hand.faces, rest, rest, with_photo(lamp, rest, rest, hand.faces)).colors
+    on_cap = (lit / after.colors)[: len(cap)][cap]
+    assert on_cap.amax() - on_cap.amin() < 1e-3
+    beside = (lit / after.colors)[: len(cap)][~cap]
+    assert beside.amax() - beside.amin() > 0.3
+
+
+def test_two_colours_of_the_arm_meet_gradually_on_the_cap(hand, hands):
+    """With one width of averaging its middle was cut in two: far from all skin, the nearest alone counted."""
+    rest, before, _ = hands
+    side = (rest[:, 1] > rest[hand.rim, 1].mean()).float()[:, None]
+    two = before._replace(colors=torch.where(vertex_to_gaussians(side, hand.faces, before) > 0.5, SKIN, PALM))
+    after = close_wrist(hand, two, rest)
+    cap = torch.nonzero(after.offsets.norm(dim=1) > 2e-3)[:, 0]
+    at = (rest[after.vertex_index] + after.offsets)[cap]
+    near = torch.cdist(at, at) < 0.0035
+    steps = (after.colors[cap][:, None] - after.colors[cap][None]).abs().amax(-1)[near]
+    assert steps.max() < 0.25 * (SKIN - PALM).abs().max()
+
+
+def test_shade_of_the_arm_ends_before_the_cap(hand, hands):
+    rest, before, _ = hands
+    shaded = before._replace(shade=torch.full_like(before.colors, 0.4))
+    after = close_wrist(hand, shaded, rest)
+    cap = torch.nonzero(after.offsets.norm(dim=1) > 2e-3)[:, 0]
+    assert after.shade[cap].min() > 0.999 and after.shade.min() == pytest.approx(0.4)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.inpainting import inpaint
-from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
+from oasis_warp.avatar.anchors import rim_fade, vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import Observation, observe
 from oasis_warp.avatar.pose import GAMMA, Lighting, posed_lighting, shading
 from oasis_warp.avatar.sky import bounced, harmonic_basis
@@ -174,7 +174,8 @@ def add_shade(
     missing = (seen.colors.clamp_min(MIN_COLOR) / known.clamp_min(MIN_COLOR)).log()
     on = posed_lighting(rest, crop.posed.vertices, faces, light)
     believed = observe(hand, sure).confidence * exposed(on)
-    occluded = inpaint(rest, faces, missing, seen.confidence - believed, OCCLUDER_FADE / 3, OCCLUDER_FADE)
+    doubt = (seen.confidence - believed) * rim_fade(rest[None], hand.rim.to(rest.device))[0]  # the cap has no shade
+    occluded = inpaint(rest, faces, missing, doubt, OCCLUDER_FADE / 3, OCCLUDER_FADE)
     return light._replace(shade=occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp(), facing=on.normals)
 
 

@@ -34,7 +34,7 @@ class SurfaceLight(NamedTuple):
 
     light: HandLight
     normals: Float[Tensor, "V 3"]
-    """Of the surface at rest, unit."""
+    """Of the surface at rest, unit; the wrist's rim has that of its closed end."""
     seen: Float[Tensor, "V"] | None = None
     """Share of the sky that each vertex saw in the photo; None where no shade depends on it."""
 
@@ -51,9 +51,12 @@ class Lighting(NamedTuple):
 def posed_lighting(
     rest: Float[Tensor, "V 3"], posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], light: HandLight
 ) -> Lighting:
-    """The vertices of a posed surface in `light`; normals are those of the rest surface, turned as Gaussians are."""
+    """The vertices of a posed surface in `light`; normals are those of the rest surface, turned as Gaussians are.
+
+    On the rim of the wrist they are those of its end, whose Gaussians ride there: its sides would shade it in wedges.
+    """
     turned = face_rotations(rest, posed, faces, validate=False).vertex_quats
-    return lighting(posed, turned, surface.vertex_normals(rest, faces), light)
+    return lighting(posed, turned, surface.closed_normals(rest, faces), light)
 
 
 def lighting(
@@ -68,7 +71,7 @@ def with_photo(
     light: HandLight, rest: Float[Tensor, "V 3"], photo: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
 ) -> SurfaceLight:
     """`light` on a surface, given its vertices at rest and in the photo that the light's shade is of."""
-    normals = surface.vertex_normals(rest, faces)
+    normals = surface.closed_normals(rest, faces)
     if light.albedo is None or light.shade is None:
         return SurfaceLight(light, normals)
     seen = posed_lighting(rest, photo, faces, light).exposure

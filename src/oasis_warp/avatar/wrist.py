@@ -29,6 +29,8 @@ CAP_RINGS = 12
 """Steps of the cap's rings from the rim to its middle: about as far apart as the rim's vertices."""
 INDENT = 0.003
 """How far the cap's widest Gaussians stay inside the rim, where they would make a collar [m]."""
+WHOLE_DISC = math.sqrt(2)
+"""Times by which the rim's vertex Gaussians are wider than for the skin on their one side: half discs are teeth."""
 CAP_SPREAD = 1.9
 """Standard deviations of the cap's Gaussians over those of vertex Gaussians: no face Gaussians fill their gaps."""
 
@@ -54,9 +56,15 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     vertices, on_faces = (torch.nonzero(part < OVERLAP)[:, 0] for part in (at_vertices, at_faces))
     rows = vertices, len(rest) + on_faces
     index, offsets, cap_quats, cap_scales = rim_cap(rest, rim)
+    scales = full.scales[0].index_copy(0, rim, WHOLE_DISC * full.scales[0, rim])
     points = torch.cat([rest[vertices], rest[index] + offsets])
     looks = gaussians.colors if gaussians.shade is None else torch.cat([gaussians.colors, gaussians.shade], 1)
     read = [_smoothed(gaussians, looks, own, rest, faces, rim, at) for at in (points, rest[faces[on_faces]].mean(1))]
+    # towards the end shade fades too: that of a sleeve or an arm beside it is not the cap's
+    shares = torch.cat([at_vertices[vertices], torch.zeros_like(rest[index, 0])]), at_faces[on_faces]
+    read = [
+        torch.cat([part[:, :3], part[:, 3:] ** share[:, None]], 1) for part, share in zip(read, shares, strict=True)
+    ]
 
     def joined(old: Tensor, of_points: Tensor, of_faces: Tensor) -> Tensor:
         return torch.cat([old[:n_kept], of_points, old[n_kept:], of_faces])
@@ -68,7 +76,7 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
         torch.cat([kept.face_index, on_faces]),
         torch.cat([kept.barycentrics, rest.new_full((len(on_faces), 3), 1 / 3)]),
         joined(kept.quats, torch.cat([full.quats[0, rows[0]], cap_quats]), full.quats[0, rows[1]]),
-        joined(kept.scales, torch.cat([full.scales[0, rows[0]], cap_scales]), full.scales[0, rows[1]]),
+        joined(kept.scales, torch.cat([scales[rows[0]], cap_scales]), scales[rows[1]]),
         joined(kept.opacities, *(rest.new_full((len(part),), OPACITY) for part in (points, on_faces))),
         joined(colors, *(part[:, :3] for part in read)),
         None if shade is None else joined(shade, *(part[:, 3:] for part in read)),
@@ -78,12 +86,16 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
 def _smoothed(
     gaussians: CanonicalGaussians, looks: Tensor, fade: Tensor, rest: Tensor, faces: Tensor, rim: Tensor, points: Tensor
 ) -> Float[Tensor, "M D"]:
-    """The looks of Gaussians just before the fade, averaged around `points`."""
+    """The looks of Gaussians just before the fade, averaged around `points`.
+
+    The wider the farther away these are: with one width the middle of the cap would have wedges, each of one colour.
+    """
     on_faces = (rest[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
     centers = torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, on_faces])
     before = (fade >= 1) & (torch.cdist(centers, rest[rim]).amin(1) < 2 * RIM_FADE)
-    near = torch.cdist(points, centers[before])
-    return torch.softmax(-0.5 * (near / SMOOTHING).square(), 1) @ looks[before]
+    near = torch.cdist(points, centers[before]).square()
+    spread = SMOOTHING**2 + near.amin(1, keepdim=True)
+    return torch.softmax(-0.5 * near / spread, 1) @ looks[before]
 
 
 def rim_cap(

@@ -1,7 +1,7 @@
 """Areas, normals and neighbourhoods of triangle meshes in torch."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
@@ -29,6 +29,22 @@ def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) ->
     """Unit area-weighted vertex normals."""
     normals, areas = face_normals(vertices, faces)
     return normalize(scatter_to_vertices(normals * areas[:, None], faces, len(vertices)), dim=-1, eps=1e-30)
+
+
+def closed_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
+    """`vertex_normals` of a surface with one opening as if it were closed: on the opening's rim that of a flat lid.
+
+    All area vectors of a closed surface add up to 0, so the lid's is what the others lack.
+    """
+    lid = normalize(-face_crosses(vertices, faces).sum(0), dim=0, eps=1e-30)
+    return torch.where(open_vertices(faces, len(vertices))[:, None], lid, vertex_normals(vertices, faces))
+
+
+def open_vertices(faces: Int[Tensor, "F 3"], n_vertices: int) -> Bool[Tensor, "V"]:
+    """Whether the faces around each vertex leave a gap: in a closed ring every neighbour comes once and goes once."""
+    come_less_gone = (faces.roll(-1, 1) - faces.roll(1, 1)).flatten().long()
+    total = torch.zeros(n_vertices, dtype=torch.int64, device=faces.device)
+    return total.index_add_(0, faces.flatten().long(), come_less_gone) != 0
 
 
 def vertex_areas(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V"]:
