@@ -102,4 +102,4 @@ def test_shade_of_the_arm_ends_before_the_cap(hand, hands):
     shaded = before._replace(shade=torch.full_like(before.colors, 0.4))
     after = close_wrist(hand, shaded, rest)
     cap = torch.nonzero(after.offsets.norm(dim=1) > 2e-3)[:, 0]
-    assert after.shade[cap].min() > 0.999 and after.shade.min() == pytest.approx(0.4)
+    assert after.shade is not None and after.shade[cap].min() > 0.999 and after.shade.min() == pytest.approx(0.4)
