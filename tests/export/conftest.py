@@ -4,6 +4,7 @@ from synthetic import as_left_hand, avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.core.types import HandLight
+from oasis_warp.export import texture
 
 
 @pytest.fixture(scope="session")
@@ -23,3 +24,11 @@ def left_hand(right_hand):
 @pytest.fixture(params=["left", "right"])
 def avatar(request, left_hand, right_hand):
     return {"left": left_hand, "right": right_hand}[request.param]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def small_textures():
+    """A large one takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(texture, "SIZE", 256)
+        yield

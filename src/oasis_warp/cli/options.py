@@ -111,7 +111,8 @@ class Export:
     """Write an avatar for other programs; the ending of the name says the format.
 
     Gaussians for splat viewers: .ply, .compressed.ply, .splat, .spz, .splats.glb and .splats.gltf (glTF's
-    KHR_gaussian_splatting).
+    KHR_gaussian_splatting). A mesh with bones, texture and a clip for each named pose, for engines and Blender: .glb
+    and .gltf.
     """
 
     avatar: AvatarFile

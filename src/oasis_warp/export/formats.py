@@ -7,6 +7,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandPose
 from oasis_warp.export.compressed_ply import write_compressed_ply
 from oasis_warp.export.request import ExportRequest, Light
+from oasis_warp.export.skinned_gltf import write_skinned_gltf
 from oasis_warp.export.splat_gltf import write_splat_gltf
 from oasis_warp.export.splat_ply import write_ply
 from oasis_warp.export.splat_rows import write_splat
@@ -24,6 +25,8 @@ WRITERS: dict[str, Writer] = {
     ".spz": write_spz,
     ".splats.glb": write_splat_gltf,
     ".splats.gltf": write_splat_gltf,
+    ".glb": write_skinned_gltf,
+    ".gltf": write_skinned_gltf,
 }
 """By the ending of the file's name; the longest that fits wins."""
 

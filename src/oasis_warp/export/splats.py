@@ -1,5 +1,7 @@
 """The Gaussians that splat files hold: posed, in the photo's axes, with values that every viewer can draw."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -59,9 +61,7 @@ def checked(gaussians: Gaussians) -> Gaussians:
     Raises:
         InputError: a value is not finite.
     """
-    finite = torch.stack([part.flatten(1).isfinite().all(1) for part in map(_rows, gaussians)]).all(0)
-    if bad := int((~finite).sum()):
-        raise InputError(f"export: expected finite Gaussians, got {bad} that are not; reconstruct the avatar again.")
+    check_finite(gaussians)
     scales = gaussians.scales.clamp(LEAST_SCALE, MOST_SCALE)
     if changed := int((scales != gaussians.scales).any(1).sum()):
         limits = f"{LEAST_SCALE * 1e3:g} to {MOST_SCALE * 1e3:g} mm"
@@ -69,8 +69,15 @@ def checked(gaussians: Gaussians) -> Gaussians:
     return gaussians._replace(scales=scales, opacities=gaussians.opacities.clamp(0, 1))
 
 
-def _rows(values: Tensor) -> Tensor:
-    return values[:, None] if values.ndim == 1 else values
+def check_finite(parts: Iterable[Tensor]) -> None:
+    """Check values of Gaussians, a row each.
+
+    Raises:
+        InputError: some are not finite.
+    """
+    finite = torch.stack([part.flatten(1).isfinite().all(1) for part in (p.unflatten(0, (-1, 1)) for p in parts)])
+    if bad := int((~finite.all(0)).sum()):
+        raise InputError(f"export: expected finite Gaussians, got {bad} that are not; reconstruct the avatar again.")
 
 
 def morton_order(means: np.ndarray) -> np.ndarray:
