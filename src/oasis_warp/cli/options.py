@@ -110,9 +110,9 @@ class Animate:
 class Export:
     """Write an avatar for other programs; the ending of the name says the format.
 
-    Gaussians for splat viewers: .ply, .compressed.ply, .splat, .spz, .splats.glb and .splats.gltf (glTF's
-    KHR_gaussian_splatting). A mesh with bones, texture and a clip for each named pose, for engines and Blender: .glb
-    and .gltf.
+    Gaussians for splat viewers: .ply, .compressed.ply, .splat, .spz, and .splats.glb (glTF's KHR_gaussian_splatting).
+    A mesh with bones, texture and named poses, for engines and Blender: .glb, .gltf. In one pose: .obj. Either in
+    OpenUSD: .usdc, .usdz, and .splats.usdc, .splats.usdz. Shape, pose and camera as numbers: .json.
     """
 
     avatar: AvatarFile

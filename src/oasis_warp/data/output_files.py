@@ -10,7 +10,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,17 @@ def write_file(path: Path | str, data: bytes) -> None:
     """
     with output_file(path) as part:
         part.write_bytes(data)
+
+
+def write_files(contents: Mapping[Path, bytes]) -> None:
+    """Write files that belong together: they appear when all are complete, the first one last.
+
+    Raises:
+        InputError: see `output_file`.
+    """
+    with contextlib.ExitStack() as files:  # ends in reverse
+        for path, data in contents.items():
+            files.enter_context(output_file(path)).write_bytes(data)
 
 
 @contextlib.contextmanager

@@ -5,13 +5,18 @@ from pathlib import Path
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandPose
+from oasis_warp.export import usd_stage
 from oasis_warp.export.compressed_ply import write_compressed_ply
+from oasis_warp.export.hand_parameters import write_parameters
 from oasis_warp.export.request import ExportRequest, Light
 from oasis_warp.export.skinned_gltf import write_skinned_gltf
+from oasis_warp.export.skinned_usd import write_skinned_usd
 from oasis_warp.export.splat_gltf import write_splat_gltf
 from oasis_warp.export.splat_ply import write_ply
 from oasis_warp.export.splat_rows import write_splat
 from oasis_warp.export.splat_spz import write_spz
+from oasis_warp.export.splat_usd import write_splat_usd
+from oasis_warp.export.wavefront import write_obj
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops.checks import check_choice
 
@@ -27,6 +32,10 @@ WRITERS: dict[str, Writer] = {
     ".splats.gltf": write_splat_gltf,
     ".glb": write_skinned_gltf,
     ".gltf": write_skinned_gltf,
+    ".obj": write_obj,
+    ".json": write_parameters,
+    **{ending: write_skinned_usd for ending in usd_stage.ENDINGS},
+    **{f".splats{ending}": write_splat_usd for ending in usd_stage.ENDINGS},
 }
 """By the ending of the file's name; the longest that fits wins."""
 

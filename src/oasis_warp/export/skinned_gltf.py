@@ -5,7 +5,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -13,19 +12,15 @@ from torch import Tensor
 
 from oasis_warp.core import rotation
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import PosedHand
+from oasis_warp.core.types import Side
 from oasis_warp.export import texture
 from oasis_warp.export.gltf import INDICES, VERTICES, GltfBuffer, write_gltf
 from oasis_warp.export.request import ExportRequest
-from oasis_warp.export.surface_mesh import Topology, at_mesh, mesh_normals, mesh_points, model_of, topology
-from oasis_warp.export.webxr_rig import TO_WEBXR, Rig, local_bind, local_quats, webxr_rig
+from oasis_warp.export.skinned_mesh import SkinnedMesh, skinned_mesh
+from oasis_warp.export.webxr_rig import Rig, local_bind, local_quats
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.skinning import corrective_coefficients
-from oasis_warp.hand_avatar import Avatar
 
-INFLUENCES = 8
-"""Joints that move a vertex, in two sets of four, the stronger ones first; of the bundled hand's vertices all have
-fewer. Programs that read one set lose up to 13 % of a vertex's weight."""
 ROUGHNESS = 0.5
 """Of the material: between dry and oily skin, whose highlight glTF's model has no more parameters for."""
 KEYS, SECONDS = 8, 0.5
@@ -38,38 +33,35 @@ def write_skinned_gltf(request: ExportRequest, path: Path) -> None:
     Each clip leads from the rest pose to the one that it is named after; "poses" goes through all of them. Pose
     correctives are morph targets, which clips drive too. With baked light the material needs none.
 
+    Vertices have two sets of four influences. Programs that read one set lose up to 13 % of a vertex's weight.
+
     Raises:
         InputError: a value is not finite, or `path` cannot be written.
     """
-    avatar, buffer = request.avatar, GltfBuffer()
-    light = request.light or "none"
-    hand, rest = model_of(avatar)
-    rig, mesh = webxr_rig(hand, rest, avatar.side), topology(avatar)
+    buffer, light = GltfBuffer(), request.light or "none"
+    made = skinned_mesh(request.avatar)
     first = 2  # node of the wrist
-    joints = list(range(first, first + len(rig.names)))
-    inverse = torch.linalg.inv(rig.bind).mT.flatten(1)
-    geometry = _primitive(buffer, avatar, hand, rest, rig, mesh)
-    pose_weights, nodes = [0.0] * hand.corrective_basis.shape[2], _joint_nodes(rig, first)
+    nodes, bends = _joint_nodes(made.rig, first), [0.0] * len(made.correctives)
     if request.pose is not None:
-        angles = request.pose.angles.to(rest.joints)
-        pose_weights = corrective_coefficients(hand, angles).tolist()
-        for node, quat in zip(nodes, local_quats(rig, hand, rest, angles[None], avatar.side)[0], strict=True):
+        angles = request.pose.angles.to(made.points)
+        bends = corrective_coefficients(made.hand, angles).tolist()
+        quats = local_quats(made.rig, made.hand, made.rest, angles[None], request.avatar.side)[0]
+        for node, quat in zip(nodes, quats, strict=True):
             node["rotation"] = _xyzw(quat).tolist()
-    bends = [f"{name} bend{power}" for name in hand.joint_names[1:] for power in ("", " squared")]
+    mesh = {
+        "name": "skin", "primitives": [_primitive(buffer, made)], "weights": bends,
+        "extras": {"targetNames": made.corrective_names},
+    }  # fmt: skip
+    inverse = torch.linalg.inv(made.rig.bind).mT.flatten(1)
+    skin = {"joints": [first + k for k in range(len(nodes))], "skeleton": first}
     document: dict[str, Any] = {
         "scene": 0,
         "scenes": [{"name": "hand", "nodes": [0, 1]}],
-        "nodes": [
-            {"name": "hand", "children": [first]},
-            {"name": "skin", "mesh": 0, "skin": 0},
-            *nodes,
-        ],
-        "meshes": [
-            {"name": "skin", "primitives": [geometry], "weights": pose_weights, "extras": {"targetNames": bends}}
-        ],
-        "skins": [{"joints": joints, "skeleton": first, "inverseBindMatrices": buffer.add(_array(inverse), "MAT4")}],
+        "nodes": [{"name": "hand", "children": [first]}, {"name": "skin", "mesh": 0, "skin": 0}, *nodes],
+        "meshes": [mesh],
+        "skins": [{**skin, "inverseBindMatrices": buffer.add(_array(inverse), "MAT4")}],
         **_material(buffer, texture.bake_texture(request, light, texture.SIZE), unlit=light == "baked"),
-        "animations": _clips(buffer, hand, rest, rig, avatar.side),
+        "animations": _clips(buffer, made, request.avatar.side),
     }
     write_gltf(path, document, buffer)
 
@@ -82,27 +74,20 @@ def _xyzw(quats: Tensor) -> Tensor:
     return quats[..., [1, 2, 3, 0]]
 
 
-def _primitive(
-    buffer: GltfBuffer, avatar: Avatar, hand: HandModel, rest: PosedHand, rig: Rig, mesh: Topology
-) -> dict[str, Any]:
-    to_file = torch.tensor(TO_WEBXR[avatar.side]).to(rest.vertices)
-    points = mesh_points(rest.vertices, hand, mesh) @ to_file.T
-    joint_of_bone = torch.tensor([rig.bones.index(bone) for bone in range(len(hand.parents))])  # the first, no tip
-    strongest = at_mesh(hand.weights, mesh).topk(INFLUENCES, dim=1)
-    weights = strongest.values / strongest.values.sum(1, keepdim=True)
-    joints = torch.where(weights > 0, joint_of_bone[strongest.indices], 0).numpy().astype("u1")
+def _primitive(buffer: GltfBuffer, made: SkinnedMesh) -> dict[str, Any]:
+    place = torch.stack([made.mesh.uv[:, 0], 1 - made.mesh.uv[:, 1]], 1)  # glTF's v points down
     attributes = {
-        "POSITION": buffer.add(_array(points), "VEC3", target=VERTICES),
-        "NORMAL": buffer.add(_array(mesh_normals(points, mesh)), "VEC3", target=VERTICES),
-        "TEXCOORD_0": buffer.add(_array(torch.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], 1)), "VEC2", target=VERTICES),
+        "POSITION": buffer.add(_array(made.points), "VEC3", target=VERTICES),
+        "NORMAL": buffer.add(_array(made.normals), "VEC3", target=VERTICES),
+        "TEXCOORD_0": buffer.add(_array(place), "VEC2", target=VERTICES),
     }
-    for k in range(INFLUENCES // 4):
+    joints, weights = made.joints.numpy().astype("u1"), _array(made.weights)
+    for k in range(joints.shape[1] // 4):
         part = slice(4 * k, 4 * k + 4)
         attributes[f"JOINTS_{k}"] = buffer.add(joints[:, part], "VEC4", target=VERTICES)
-        attributes[f"WEIGHTS_{k}"] = buffer.add(_array(weights[:, part]), "VEC4", target=VERTICES)
-    moves = at_mesh(hand.corrective_basis, mesh).permute(2, 0, 1) @ to_file.T
-    targets = [{"POSITION": buffer.add(_array(move), "VEC3", target=VERTICES)} for move in moves]
-    indices = buffer.add(mesh.faces.flatten().numpy().astype("<u4"), "SCALAR", target=INDICES)
+        attributes[f"WEIGHTS_{k}"] = buffer.add(weights[:, part], "VEC4", target=VERTICES)
+    targets = [{"POSITION": buffer.add(_array(move), "VEC3", target=VERTICES)} for move in made.correctives]
+    indices = buffer.add(made.mesh.faces.flatten().numpy().astype("<u4"), "SCALAR", target=INDICES)
     return {"attributes": attributes, "indices": indices, "material": 0, "targets": targets}
 
 
@@ -123,7 +108,6 @@ def _joint_nodes(rig: Rig, first: int) -> list[dict[str, Any]]:
 
 
 def _material(buffer: GltfBuffer, picture: Tensor, *, unlit: bool) -> dict[str, Any]:
-    _, png = cv2.imencode(".png", cv2.cvtColor(picture.numpy(), cv2.COLOR_RGB2BGR), (cv2.IMWRITE_PNG_COMPRESSION, 9))
     looks = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": ROUGHNESS}
     material: dict[str, Any] = {"name": "skin", "pbrMetallicRoughness": looks}
     if unlit:
@@ -132,7 +116,7 @@ def _material(buffer: GltfBuffer, picture: Tensor, *, unlit: bool) -> dict[str, 
         "materials": [material],
         "textures": [{"source": 0, "sampler": 0}],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
-        "images": [{"name": "skin", "mimeType": "image/png", "bufferView": buffer.add_bytes(png.tobytes())}],
+        "images": [{"name": "skin", "mimeType": "image/png", "bufferView": buffer.add_bytes(texture.encoded(picture))}],
         **({"extensionsUsed": ["KHR_materials_unlit"]} if unlit else {}),
     }
 
@@ -152,12 +136,13 @@ def _eased(stops: list[Tensor]) -> Float[Tensor, "T 15 3"]:
     return torch.stack(frames)
 
 
-def _clips(buffer: GltfBuffer, hand: HandModel, rest: PosedHand, rig: Rig, side: str) -> list[dict[str, Any]]:
+def _clips(buffer: GltfBuffer, made: SkinnedMesh, side: Side) -> list[dict[str, Any]]:
+    hand, rig = made.hand, made.rig
     moving = [j for j, name in enumerate(rig.names) if rig.bones[j] and not name.endswith("tip")]
     clips = []
     for name, angles in clip_angles(hand).items():
         times = buffer.add(np.arange(len(angles), dtype="<f4") * np.float32(SECONDS / KEYS), "SCALAR")
-        quats = _array(_xyzw(local_quats(rig, hand, rest, angles, side)))
+        quats = _array(_xyzw(local_quats(rig, hand, made.rest, angles, side)))
         bends = _array(torch.stack([corrective_coefficients(hand, frame) for frame in angles]))
         outputs = [buffer.add(np.ascontiguousarray(quats[:, j]), "VEC4") for j in moving]
         targets = [{"node": 2 + j, "path": "rotation"} for j in moving] + [{"node": 1, "path": "weights"}]

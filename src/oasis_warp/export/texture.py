@@ -2,6 +2,7 @@
 
 from typing import cast
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -61,6 +62,12 @@ def bake_texture(request: ExportRequest, light: str, size: int) -> UInt8[Tensor,
     corner = round(2 * (1 - CAP_CORNER[1]) * size)
     picture[:corner, :corner] = picture[-1, -1]  # of the cap, as all that belongs to no chart
     return to_uint8(picture)
+
+
+def encoded(picture: UInt8[Tensor, "S S 3"]) -> bytes:
+    """The picture as PNG."""
+    pixels = cv2.cvtColor(picture.numpy(), cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".png", pixels, (cv2.IMWRITE_PNG_COMPRESSION, 9))[1].tobytes()
 
 
 def texel_points(avatar: Avatar, size: int) -> tuple[Float[Tensor, "M 3"], Tensor]:

@@ -1,0 +1,77 @@
+"""The hand's parameters as JSON: shape, pose and camera, ours and as MANO's, and the joints that they give."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.core import rotation
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import HandPose
+from oasis_warp.data.output_files import write_file
+from oasis_warp.export.request import ExportRequest
+from oasis_warp.export.surface_mesh import model_of
+from oasis_warp.hand.skinning import bone_transforms, hand21
+from oasis_warp.ops import check_finite
+
+VERSION = 1
+LANDMARKS = (
+    "wrist",
+    *(f"{finger}{k}" for finger in ("thumb", "index", "middle", "ring", "little") for k in range(1, 5)),
+)
+
+
+def write_parameters(request: ExportRequest, path: Path) -> None:
+    """docs/export.md explains each key; lengths in metres, angles in radians, the photo camera's axes (OpenCV's).
+
+    Raises:
+        InputError: `path` cannot be written.
+        ValueError: the pose is not finite.
+    """
+    avatar, camera = request.avatar, request.avatar.source_camera
+    pose = HandPose(*(part.to(avatar.shape) for part in request.pose or avatar.source_pose))
+    check_finite(**pose._asdict())
+    hand, rest = model_of(avatar)
+    points = hand21(avatar.mesh(pose), hand)
+    found: dict[str, Any] = {
+        "oasis_hand": VERSION,
+        "side": avatar.side,
+        "hand_model": {"name": hand.name, "licence": hand.licence},
+        "shape": dict(zip(hand.shape_names, avatar.shape.tolist(), strict=True)),
+        "pose": {
+            "angles": {
+                name: dict(zip(("flexion", "abduction", "twist"), row, strict=True))
+                for name, row in zip(hand.joint_names[1:], pose.angles.tolist(), strict=True)
+            },
+            "orientation": pose.orientation.tolist(),
+            "translation": pose.translation.tolist(),
+        },
+        "as_mano": {
+            "joint_names": list(hand.joint_names),
+            "global_orient": rotation_vectors(pose.orientation[None])[0].tolist(),
+            "hand_pose": rotation_vectors(_local_rotations(hand, rest.joints, pose)).tolist(),
+            "transl": pose.translation.tolist(),
+            "rest_joints": rest.joints.tolist(),
+        },
+        "landmarks": dict(zip(LANDMARKS, points.tolist(), strict=True)),
+        "camera": {
+            "viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height,
+        },
+    }  # fmt: skip
+    write_file(path, (json.dumps(found, indent=1, allow_nan=False) + "\n").encode())
+
+
+def _local_rotations(hand: HandModel, joints: Float[Tensor, "16 3"], pose: HandPose) -> Float[Tensor, "15 3 3"]:
+    """Rotation of each bone but the wrist's in the frame of its parent at rest."""
+    turns, _ = bone_transforms(hand, joints, pose)
+    return turns[list(hand.parents[1:])].mT @ turns[1:]
+
+
+def rotation_vectors(matrices: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3"]:
+    """Axis times angle [rad] of rotation matrices."""
+    quats = rotation.from_matrix(matrices)
+    half = quats[:, 1:].norm(dim=1, keepdim=True)
+    return quats[:, 1:] * torch.where(half > 1e-6, 2 * torch.atan2(half, quats[:, :1]) / half.clamp_min(1e-6), 2.0)

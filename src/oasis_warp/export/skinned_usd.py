@@ -1,0 +1,136 @@
+"""The avatar's skin in OpenUSD: a UsdSkel mesh with blend shapes, texture and an animation through the named poses."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from oasis_warp.export import texture
+from oasis_warp.export.request import ExportRequest
+from oasis_warp.export.skinned_gltf import KEYS, ROUGHNESS, SECONDS, clip_angles
+from oasis_warp.export.skinned_mesh import SkinnedMesh, skinned_mesh
+from oasis_warp.export.usd_stage import new_stage, quatf, usd, vec3f, write_stage
+from oasis_warp.export.webxr_rig import Rig, local_bind, local_quats
+from oasis_warp.hand.skinning import corrective_coefficients
+
+
+def write_skinned_usd(request: ExportRequest, path: Path) -> None:
+    """The mesh of `write_skinned_gltf` with its clip "poses", or with `pose` in that pose; texture in NAME_skin.png.
+
+    Names of joints have _ for WebXR's -, which no USD path may hold.
+
+    Raises:
+        InputError: usd-core is missing, a value is not finite, or a file cannot be written.
+    """
+    Usd, UsdSkel = usd(path, "Usd"), usd(path, "UsdSkel")
+    light = request.light or "none"
+    made = skinned_mesh(request.avatar)
+    stage, root = new_stage(path)
+    stage.SetTimeCodesPerSecond(KEYS / SECONDS)
+    skel_root = UsdSkel.Root.Define(stage, root)
+    stage.SetDefaultPrim(skel_root.GetPrim())
+    skeleton = UsdSkel.Skeleton.Define(stage, f"{root}/skeleton")
+    joints = _joint_paths(made.rig)
+    skeleton.CreateJointsAttr(joints)
+    skeleton.CreateJointNamesAttr(list(made.rig.names))
+    skeleton.CreateBindTransformsAttr(_matrices(path, made.rig.bind))
+    skeleton.CreateRestTransformsAttr(_matrices(path, local_bind(made.rig)))
+    shapes = [name.replace(" ", "_") for name in made.corrective_names]
+    animation = UsdSkel.Animation.Define(stage, f"{root}/skeleton/poses")
+    animation.CreateJointsAttr(joints)
+    animation.CreateBlendShapesAttr(shapes)
+    animation.CreateTranslationsAttr(vec3f(path, local_bind(made.rig)[:, :3, 3].numpy()))
+    animation.CreateScalesAttr(usd(path, "Vt").Vec3hArray(len(joints), usd(path, "Gf").Vec3h(1, 1, 1)))
+    clip = clip_angles(made.hand)["poses"] if request.pose is None else request.pose.angles[None].to(made.points)
+    quats = local_quats(made.rig, made.hand, made.rest, clip, request.avatar.side).numpy()
+    weights = torch.stack([corrective_coefficients(made.hand, angles) for angles in clip]).tolist()
+    rotations, bends = animation.CreateRotationsAttr(), animation.CreateBlendShapeWeightsAttr()
+    for frame in range(len(clip)):
+        time = Usd.TimeCode(frame) if len(clip) > 1 else Usd.TimeCode.Default()
+        rotations.Set(quatf(path, quats[frame]), time)
+        bends.Set(weights[frame], time)
+    if len(clip) > 1:
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(len(clip) - 1)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    mesh = _mesh(stage, f"{root}/skin", path, made)
+    _bind(stage, mesh, skeleton, path, made, shapes)
+    picture = f"{path.stem}_skin.png"
+    _material(stage, mesh, root, path, picture, unlit=light == "baked")
+    write_stage(stage, path, {picture: texture.encoded(texture.bake_texture(request, light, texture.SIZE))})
+
+
+def _joint_paths(rig: Rig) -> list[str]:
+    paths: list[str] = []
+    for name, parent in zip(rig.names, rig.parents, strict=True):
+        plain = name.replace("-", "_")
+        paths.append(plain if parent < 0 else f"{paths[parent]}/{plain}")
+    return paths
+
+
+def _matrices(path: Path, matrices: torch.Tensor) -> Any:
+    """USD multiplies rows from the left."""
+    Gf = usd(path, "Gf")
+    return [Gf.Matrix4d(*matrix.T.double().flatten().tolist()) for matrix in matrices]
+
+
+def _mesh(stage: Any, at: str, path: Path, made: SkinnedMesh) -> Any:
+    UsdGeom, Sdf, Vt = (usd(path, module) for module in ("UsdGeom", "Sdf", "Vt"))
+    mesh = UsdGeom.Mesh.Define(stage, at)
+    points, faces = made.points.numpy(), made.mesh.faces.numpy().astype(np.int32)
+    mesh.CreatePointsAttr(vec3f(path, points))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.ravel()))
+    mesh.CreateNormalsAttr(vec3f(path, made.normals.numpy()))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateExtentAttr(vec3f(path, np.stack([points.min(0), points.max(0)])))
+    place = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
+    place.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(made.mesh.uv.numpy(), np.float32)))
+    return mesh
+
+
+def _bind(stage: Any, mesh: Any, skeleton: Any, path: Path, made: SkinnedMesh, shapes: list[str]) -> None:
+    UsdSkel, Gf, Vt = (usd(path, module) for module in ("UsdSkel", "Gf", "Vt"))
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
+    n = made.weights.shape[1]
+    joints = made.joints.numpy().astype(np.int32).ravel()
+    binding.CreateJointIndicesPrimvar(False, n).Set(Vt.IntArray.FromNumpy(joints))
+    binding.CreateJointWeightsPrimvar(False, n).Set(Vt.FloatArray.FromNumpy(made.weights.numpy().ravel()))
+    targets = []
+    for name, offsets in zip(shapes, made.correctives.numpy(), strict=True):
+        shape = UsdSkel.BlendShape.Define(stage, mesh.GetPath().AppendChild(name))
+        shape.CreateOffsetsAttr(vec3f(path, offsets))
+        shape.CreateNormalOffsetsAttr(vec3f(path, np.zeros_like(offsets)))
+        targets.append(shape.GetPath())
+    binding.CreateBlendShapesAttr(shapes)
+    binding.CreateBlendShapeTargetsRel().SetTargets(targets)
+
+
+def _material(stage: Any, mesh: Any, root: str, path: Path, picture: str, *, unlit: bool) -> None:
+    UsdShade, Sdf = usd(path, "UsdShade"), usd(path, "Sdf")
+    kinds = Sdf.ValueTypeNames
+    material = UsdShade.Material.Define(stage, f"{root}/material")
+
+    def shader(name: str, kind: str) -> Any:
+        made = UsdShade.Shader.Define(stage, f"{root}/material/{name}")
+        made.CreateIdAttr(kind)
+        return made
+
+    place, image = shader("st", "UsdPrimvarReader_float2"), shader("picture", "UsdUVTexture")
+    surface = shader("surface", "UsdPreviewSurface")
+    place.CreateInput("varname", kinds.String).Set("st")
+    image.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(picture))
+    image.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB")
+    image.CreateInput("st", kinds.Float2).ConnectToSource(place.CreateOutput("result", kinds.Float2))
+    color = image.CreateOutput("rgb", kinds.Float3)
+    surface.CreateInput("emissiveColor" if unlit else "diffuseColor", kinds.Color3f).ConnectToSource(color)
+    if unlit:
+        surface.CreateInput("diffuseColor", kinds.Color3f).Set((0, 0, 0))
+    surface.CreateInput("roughness", kinds.Float).Set(ROUGHNESS)
+    surface.CreateInput("metallic", kinds.Float).Set(0.0)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
