@@ -36,7 +36,8 @@ FamilyName = Literal[
     "rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "skin"
 ]
 Kind = Literal["freckles", "hair", "polish", "tattoo", "ring", "plaster"]
-PoseName = Literal["photo", "rest", "open", "relaxed", "fist", "pinch", "thumbs_up", "victory", "point", "ok"]
+NamedPose = Literal["rest", "open", "relaxed", "fist", "pinch", "thumbs_up", "victory", "point", "ok"]
+PoseName = Literal["photo"] | NamedPose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,6 +244,30 @@ class Bench:
 @dataclass(frozen=True, kw_only=True)
 class Doctor:
     """Check that everything is there and computes what it should; each failing line says what to do."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Text:
+    """Make an avatar from words, with an image generator of your own.
+
+    Writes depth, normals, edges and mask of a posed hand, asks the generator for a picture that follows them, checks
+    that it shows this hand in this pose, and reconstructs it. Without --generator it leaves these files for you.
+    """
+
+    words: Positional[str]
+    """The person's hand, e.g. "an old fisherman's tanned hand"."""
+    out: OutputFolder
+    generator: str | None = None
+    """A picture you made from the files, a folder with a diffusers ControlNet pipeline, or a command with {out} in it;
+    also {depth}, {normal}, {canny}, {mask}, {folder}, {prompt} and {seed}."""
+    pose: NamedPose = "open"
+    view: Literal["palm", "back"] = "palm"
+    side: Literal["left", "right"] = "right"
+    tries: int = 4
+    """Pictures to ask for until one shows the hand."""
+    seed: int = 0
+    size: int = 1024
+    """Side of the pictures [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)

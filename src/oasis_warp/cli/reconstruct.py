@@ -42,7 +42,7 @@ def run(options: Reconstruct) -> int:
     if isinstance(options.prior, Path):
         read_header(options.prior)  # check it once, not for every photo
     if len(options.photos) == 1 or options.same_hand or _is_one_hand(options):
-        print_report(Console(), _reconstruct(options.photos, options.out, config, options.keypoints))
+        print_report(Console(), reconstruct_folder(options.photos, options.out, config, options.keypoints))
         return 0
     return _reconstruct_all(options, config)
 
@@ -89,7 +89,7 @@ def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
             for number, photo in enumerate(options.photos, 1):
                 print(f"{photo}, {number} of {n_photos}", file=sys.stderr)
                 try:
-                    report = _reconstruct([photo], options.out / photo.stem, config)
+                    report = reconstruct_folder([photo], options.out / photo.stem, config)
                 except InputError as error:
                     print(f"oasis: {error}", file=sys.stderr)
                     failed.append(str(photo))
@@ -120,7 +120,7 @@ def _shared_folder(path: Path) -> Iterator[None]:
             path.rmdir()
 
 
-def _reconstruct(
+def reconstruct_folder(
     paths: Sequence[Path], folder: Path, config: ReconstructConfig, keypoints: Path | None = None
 ) -> dict[str, Any]:
     """Reconstruct one avatar of the hand on all photos, and write its folder; its report."""

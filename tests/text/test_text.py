@@ -1,0 +1,149 @@
+"""From words to an avatar: what steers a generator, and what is done with its picture."""
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from oasis_warp.cli import main
+from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.data.photo import read_photo
+from oasis_warp.estimation.estimator import HandEstimator
+from oasis_warp.estimation.keypoints import read_keypoints
+from oasis_warp.reconstruction import reconstruct
+from oasis_warp.text import choose_generator, imagine, make_conditioning
+from oasis_warp.text.conditioning import FARTHEST, NEAREST, write_conditioning
+
+PAINTER = Path(__file__).parent / "paint_hand.py"
+PAINT = f"{sys.executable} {PAINTER} {{folder}} {{prompt}} {{seed}} {{out}}"
+
+
+@pytest.fixture(scope="module", params=["right", "left"])
+def asked(request, hand):
+    return make_conditioning(hand, side=request.param, size=256)
+
+
+def test_the_pose_file_puts_the_hand_where_the_pictures_show_it(asked, hand, tmp_path):
+    write_conditioning(tmp_path, asked)
+    photo = read_photo(tmp_path / "depth.png")
+    fit = read_keypoints(tmp_path / "pose.json", photo, hand=hand)
+    assert fit.side == asked.side
+    assert torch.allclose(fit.landmarks.xy, asked.landmarks, atol=0.1)
+    tips = asked.landmarks[4::4].round().long()
+    assert (asked.mask[tips[:, 1], tips[:, 0]] == 1).all()
+    thumb, little = asked.landmarks[4, 0], asked.landmarks[20, 0]
+    assert (thumb > little) == (asked.side == "right")  # of a palm with its fingers up
+
+
+def test_near_is_bright_and_normals_point_to_the_viewer(asked):
+    on = asked.mask > 0
+    assert asked.depth[~on].max() == 0 and asked.depth[on].min() > FARTHEST - 0.2
+    assert asked.depth.max() == pytest.approx(NEAREST, abs=0.01)
+    assert asked.normals[on][:, 2].min() >= 0.5
+    columns = asked.mask.sum(0).nonzero()[:, 0]
+    row = int(asked.landmarks[9, 1])  # through the middle knuckle
+    across = asked.normals[row, :, 0][on[row]]
+    assert across[0] < 0.3 and across[-1] > 0.7, columns  # left edges face left
+
+
+def test_the_forearm_leaves_the_picture(asked):
+    assert asked.mask[-1].sum() > 40
+
+
+def test_the_generator_is_asked_again_until_the_hand_is_there(hand, tmp_path):
+    asked = make_conditioning(hand, size=256)
+    write_conditioning(tmp_path, asked)
+    made = imagine(choose_generator(PAINT), HandEstimator(hand), asked, tmp_path, "a pale hand", seed=13, tries=2)
+    assert made.seed == 14 and made.distance < 5
+    with pytest.raises(InputError, match=r"no picture shows a right hand .*seed 13: no right hand found\); try other"):
+        imagine(choose_generator(PAINT), HandEstimator(hand), asked, tmp_path, "a pale hand", seed=13, tries=1)
+
+
+def test_another_pose_and_another_side_are_refused(hand, tmp_path):
+    write_conditioning(tmp_path, make_conditioning(hand, "victory", size=256))
+    estimator, paint = HandEstimator(hand), choose_generator(PAINT)
+    with pytest.raises(InputError, match="the landmarks are [1-9][0-9]* % of the hand's size off"):
+        imagine(paint, estimator, make_conditioning(hand, size=256), tmp_path, "a pale hand", tries=1)
+    with pytest.raises(InputError, match="no left hand found"):
+        left = make_conditioning(hand, "victory", side="left", size=256)
+        imagine(paint, estimator, left, tmp_path, "a pale hand", tries=1)
+
+
+@pytest.mark.slow
+def test_the_skin_of_the_avatar_follows_the_words(hand, tmp_path):
+    asked, estimator, colors = make_conditioning(hand, size=256), HandEstimator(hand), {}
+    write_conditioning(tmp_path, asked)
+    for skin in ("dark", "pale"):
+        made = imagine(choose_generator(PAINT), estimator, asked, tmp_path, f"a {skin} hand")
+        avatar = reconstruct(made.photo, ReconstructConfig(size=96, steps=10), keypoints=tmp_path / "pose.json").avatar
+        colors[skin] = avatar.gaussians.colors.mean(0)
+        assert torch.equal(avatar.source_pose.angles, asked.pose.angles)
+    assert (colors["pale"] - colors["dark"]).min() > 0.25
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("nothing", "expected a picture, a folder with a diffusers pipeline, or a command with {out} in it"),
+        ("paint 'unfinished {out}", "cannot be read as a command"),
+    ],
+)
+def test_what_is_no_generator_is_refused(given, said):
+    with pytest.raises(InputError, match=said.replace("{", r"\{").replace("}", r"\}")):
+        choose_generator(given)
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("no_such_program {out}", "cannot be started"),
+        (f'{sys.executable} -c "raise SystemExit(chr(110))" {{out}}', "wrote no picture .exit code 1: n"),
+        (f'{sys.executable} -c "" {{out}}', "wrote no picture .exit code 0: it said nothing"),
+    ],
+)
+def test_a_command_that_fails_is_said(command, said, tmp_path):
+    with pytest.raises(InputError, match=said):
+        choose_generator(command)(tmp_path, "words", 0)
+
+
+def test_words_reach_the_command_as_they_are_and_no_shell(tmp_path):
+    program = (
+        "import sys, cv2, numpy; cv2.imwrite(sys.argv[1], numpy.zeros((32, 32, 3)));"
+        "open(sys.argv[2], 'w').write(sys.argv[3])"
+    )
+    noted = tmp_path / "said.txt"
+    words = "$(touch x); 'quoted' {seed} {out}"
+    picture = choose_generator(f'{sys.executable} -c "{program}" {{out}} {noted} {{prompt}}')(tmp_path, words, 7)
+    assert picture.rgb.shape == (32, 32, 3)
+    assert noted.read_text() == words
+
+
+def test_without_a_generator_the_files_are_left_and_the_next_step_is_said(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["text", "an old fisherman's tanned hand", "-o", str(out), "--view", "back", "--size", "256"]) == 0
+    assert {path.name for path in out.iterdir()} == {
+        "depth.png", "normal.png", "canny.png", "mask.png", "pose.json", "prompt.txt",
+    }  # fmt: skip
+    assert "--generator PICTURE" in capsys.readouterr().err
+    assert (out / "prompt.txt").read_text().startswith("an old fisherman's tanned hand, photo of the back of one right")
+    assert json.loads((out / "pose.json").read_text())["side"] == "right"
+    assert np.ptp(cv2.imread(str(out / "canny.png"))) == 255
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--size", "64"], "--size 64: expected 256 to 4096 pixels"),
+        (["--tries", "0"], "--tries 0: expected at least 1"),
+        (["--generator", "nothing"], "--generator nothing: expected a picture"),
+    ],
+)
+def test_wrong_options_are_refused_before_anything_is_written(options, said, tmp_path, capsys):
+    assert main(["text", "a hand", "-o", str(tmp_path / "out"), *options]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
