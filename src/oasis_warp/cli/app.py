@@ -20,6 +20,7 @@ Command = (
     | Annotated[options.Animate, tyro.conf.subcommand("animate")]
     | Annotated[options.Export, tyro.conf.subcommand("export")]
     | Annotated[options.Edit, tyro.conf.subcommand("edit")]
+    | Annotated[options.Info, tyro.conf.subcommand("info")]
     | Annotated[options.Text, tyro.conf.subcommand("text")]
     | Annotated[options.Synthesize, tyro.conf.subcommand("synthesize")]
     | Annotated[options.Pretrain, tyro.conf.subcommand("pretrain")]

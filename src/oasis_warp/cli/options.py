@@ -108,6 +108,15 @@ class Animate:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Info:
+    """Say what is in avatar files: size, Gaussians, light, how much is painted; a column for each."""
+
+    avatars: Positional[tuple[Path, ...]]
+    """avatar.safetensors of `oasis reconstruct`."""
+    json: JsonFile = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Export:
     """Write an avatar for other programs; the ending of the name says the format.
 
