@@ -11,8 +11,8 @@ LIGHT = np.array([0.3, 0.5, 0.81])  # from above the viewer's right shoulder
 TABLE = (70, 96, 110)
 
 folder, prompt, seed, out = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), sys.argv[4]
-normals = cv2.imread(str(folder / "normal.png"))[..., ::-1] / 127.5 - 1
-mask = cv2.imread(str(folder / "mask.png"))[..., :1] / 255
+normals = np.asarray(cv2.imread(str(folder / "normal.png")))[..., ::-1] / 127.5 - 1
+mask = np.asarray(cv2.imread(str(folder / "mask.png")))[..., :1] / 255
 skin = next((color for name, color in SKINS.items() if name in prompt), SKINS["pale"])
 shade = 0.45 + 0.55 * np.clip(normals @ LIGHT, 0, 1)[..., None]
 grain = np.random.default_rng(seed).normal(0, 2, mask.shape)
