@@ -2,6 +2,7 @@
 
 from contextlib import nullcontext
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -18,6 +19,7 @@ from oasis_warp.avatar.pose import (
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.mirror import (
     mirror_camera,
     mirror_canonical,
@@ -49,6 +51,15 @@ from oasis_warp.render.replay import CapturedGraph, GraphCache, replayable, repl
 
 LEAST_LIGHT, MOST_LIGHT = 0.05, 10.0
 """Limits of a light from all around, over its mean: nine harmonics of a small lamp fall below 0 behind it."""
+
+
+class AvatarParts(NamedTuple):
+    """What is posed and drawn; of a left hand all of it in the mirror, where faces wind the other way."""
+
+    hand: HandModel
+    rest: PosedHand
+    gaussians: CanonicalGaussians
+    light: SurfaceLight | None
 
 
 class Avatar:
@@ -119,6 +130,11 @@ class Avatar:
     def gaussians(self) -> CanonicalGaussians:
         """Canonical, on the right-handed rest surface."""
         return self._gaussians
+
+    @property
+    def parts(self) -> AvatarParts:
+        """What `pose` works with, for programs that pose by themselves."""
+        return AvatarParts(self._model, self._rest, self._canonical, self._light)
 
     @property
     def device(self) -> torch.device:

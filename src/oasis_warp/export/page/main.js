@@ -1,0 +1,50 @@
+// Start: the worker opens the data, then the panel is filled and the first picture drawn.
+"use strict";
+
+const text = (id) => byId(id).textContent;
+const makeWorker = (id) => new Worker(URL.createObjectURL(new Blob([text(id)], { type: "text/javascript" })));
+
+// How pictures are drawn; the address may end in #graphics or #processor to choose.
+function makeDrawing(canvas) {
+  const graphics = { "#graphics": true, "#processor": false }[location.hash] ?? hasGraphicsCard();
+  if (!graphics) byId("status").textContent = "Drawn without a graphics card.";
+  return graphics ? makeGraphics(canvas) : makeProcessor(canvas, makeWorker("raster"));
+}
+
+function start() {
+  const worker = makeWorker("worker");
+  return new Promise((resolve, reject) => {
+    worker.onerror = (event) => reject(new Problem(event.message || "The page's worker does not start in this browser."));
+    worker.onmessage = ({ data }) => {
+      if (data.failed) return reject(new Problem(data.failed));
+      byId("status").textContent = "";
+      const viewer = makeViewer(byId("canvas"), data.opened, worker, makeDrawing(byId("canvas")));
+      viewer.player = fillPanel(viewer);
+      listenToGestures(viewer);
+      if (matchMedia("(max-width: 46rem)").matches) byId("fold").click();
+      viewer.first = () => {
+        viewer.first = null;
+        performance.mark("first-picture");
+        resolve(viewer);
+      };
+      show(viewer);
+    };
+    worker.postMessage({ open: text("data") });
+  });
+}
+
+const fail = (error) => {
+  byId("status").textContent = error instanceof Problem ? error.message : `Something went wrong: ${error.message}`;
+};
+window.addEventListener("error", (event) => fail(event.error ?? event));
+window.addEventListener("unhandledrejection", (event) => fail(event.reason));
+
+// For scripts and tests: `await oasis.ready`, then `await oasis.picture({ pose: "fist", azimuth: 0.5, width: 512 ... })`.
+window.oasis = { ready: start() };
+window.oasis.ready.then((viewer) => {
+  window.oasis.viewer = viewer;
+  window.oasis.picture = ({ pose, ...options } = {}) => {
+    const angles = viewer.facts.poses.find(({ name }) => name === pose)?.angles;
+    return takePicture(viewer, { angles, ...options });
+  };
+}, () => {});

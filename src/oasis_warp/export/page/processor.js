@@ -1,0 +1,16 @@
+// Pictures from the worker of raster.js, put on the canvas.
+"use strict";
+
+function makeProcessor(canvas, worker) {
+  const context = canvas.getContext("2d"), waiting = [];
+  worker.onmessage = ({ data: pixels }) => {
+    const { width, height, done } = waiting.shift();
+    sizeCanvas(canvas, width, height);
+    context.putImageData(new ImageData(pixels, width, height), 0, 0);
+    done();
+  };
+  return ({ ellipses, count, hurry }, width, height) => new Promise((done) => {
+    waiting.push({ width, height, done });
+    worker.postMessage({ ellipses, count, hurry, width, height }, [ellipses.buffer]);
+  });
+}

@@ -1,0 +1,82 @@
+// Light on the posed surface, and the colours of the Gaussians in it (avatar/pose.py): harmonics in the direction that
+// skin faces, past what the hand hides of it, then the photo's shade for as long as skin faces as in the photo.
+"use strict";
+
+const GAMMA = 2.2; // light is sRGB to this power, nearly
+const AS_IN_PHOTO = Math.cos((5 * Math.PI) / 180), TURNED_AWAY = Math.cos((20 * Math.PI) / 180);
+const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
+const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
+
+function makeShading(body, gaussians) {
+  return {
+    normals: new Float32Array(3 * body.nVertices), factors: new Float32Array(4 * body.nVertices),
+    colors: new Uint32Array(gaussians.count), sky: makeSky(body),
+  };
+}
+
+const between = (x, low, high) => Math.min(Math.max((x - low) / (high - low), 0), 1);
+
+// Factors of the colours of every vertex and the share of the photo's shade that is left, into shading.factors.
+function lightVertices(body, shading, light, hurry = false) {
+  const { shade, facing } = body.data.arrays, { normals, factors, sky } = shading, { harmonics, limits, albedo, seen } = light;
+  if (albedo) exposeVertices(body, sky, normals, harmonics, hurry);
+  const bounce = albedo && albedo.map((a) => [2.0404 * a - 0.3324, -4.7951 * a + 0.6417, 2.7552 * a + 0.6903]);
+  for (let v = 0; v < body.nVertices; v++) {
+    const x = normals[3 * v], y = normals[3 * v + 1], z = normals[3 * v + 2], exposure = sky.exposure;
+    let stays = facing ? between(x * facing[3 * v] + y * facing[3 * v + 1] + z * facing[3 * v + 2], TURNED_AWAY, AS_IN_PHOTO) : 0;
+    if (albedo && seen) stays *= 1 - between(Math.abs(exposure[4 * v] - seen[v]), SAME_SKY, OTHER_SKY);
+    const xy = x * y, yz = y * z, zz = 3 * z * z - 1, xz = x * z, xx = x * x - y * y;
+    for (let c = 0; c < 3; c++) {
+      const h = harmonics;
+      let got = h[c] + h[3 + c] * x + h[6 + c] * y + h[9 + c] * z + h[12 + c] * xy + h[15 + c] * yz + h[18 + c] * zz +
+        h[21 + c] * xz + h[24 + c] * xx;
+      got = Math.min(Math.max(got, limits[c]), limits[3 + c]);
+      if (albedo) {
+        const e = exposure[4 * v + 1 + c], [p, q, r] = bounce[c];
+        got *= Math.max(e, ((e * p + q) * e + r) * e); // what bounces in (Jimenez et al. 2016)
+      }
+      const factor = got ** (1 / GAMMA);
+      factors[4 * v + c] = shade ? factor * (1 + stays * (shade[3 * v + c] - 1)) : factor;
+    }
+    factors[4 * v + 3] = stays;
+  }
+}
+
+// Colours and opacities of all Gaussians, a byte each, into shading.colors. `light` is null for even light.
+function colorGaussians(body, gaussians, shading, light) {
+  const { colors: own, fineShade, even } = body.data.arrays, { count, corners, shares, heaviest, shown, opacities } = gaussians;
+  const { factors, colors } = shading;
+  for (let i = 0; i < count; i++) {
+    if (!shown[heaviest[i]]) continue;
+    const a = 3 * i, p = shares[a], q = shares[a + 1], r = shares[a + 2];
+    const u = 4 * corners[a], v = 4 * corners[a + 1], w = 4 * corners[a + 2];
+    const stays = light && fineShade ? p * factors[u + 3] + q * factors[v + 3] + r * factors[w + 3] : 0;
+    let packed = Math.round(255 * opacities[i]) << 24;
+    for (let c = 0; c < 3; c++) {
+      let factor = even[c];
+      if (light) {
+        factor = p * factors[u + c] + q * factors[v + c] + r * factors[w + c];
+        if (stays) factor *= 1 + stays * (fineShade[a + c] - 1);
+      }
+      packed |= Math.round(255 * Math.min(Math.max(own[a + c] * factor, 0), 1)) << (8 * c);
+    }
+    colors[i] = packed;
+  }
+}
+
+// Which skin a photo showed and which is painted, instead of colours.
+function mapGaussians(body, gaussians, shading) {
+  const { invented, colors: own } = body.data.arrays, { corners, shares, heaviest, shown } = gaussians;
+  for (let i = 0; i < gaussians.count; i++) {
+    if (!shown[heaviest[i]]) continue;
+    let share = 0;
+    for (let k = 3 * i; k < 3 * i + 3; k++) share += shares[k] * invented[corners[k]];
+    const skin = (own[3 * i] + own[3 * i + 1] + own[3 * i + 2]) / 3;
+    let packed = Math.round(255 * gaussians.opacities[i]) << 24;
+    for (let c = 0; c < 3; c++) {
+      const mark = MAP_SEEN[c] + share * (MAP_INVENTED[c] - MAP_SEEN[c]);
+      packed |= Math.round(255 * Math.min(mark * (1 - MAP_SKIN) + MAP_SKIN * skin, 1)) << (8 * c);
+    }
+    shading.colors[i] = packed;
+  }
+}

@@ -1,0 +1,64 @@
+// The worker: poses, lights, projects and sorts. A message asks for one picture; the answer holds its ellipses.
+"use strict";
+
+let hand = null;
+
+async function openHand(base64) {
+  const data = await readData(base64);
+  for (const light of Object.values(data.lights)) light.seen = light.albedo ? data.arrays.seen : null;
+  const body = makeBody(data), gaussians = makeGaussians(body);
+  return {
+    body, gaussians, shading: makeShading(body, gaussians), projection: makeProjection(gaussians), angles: "", look: "",
+    partly: false, // whether a hurry left something out of the pose
+  };
+}
+
+function poseHand({ body, shading }, angles) {
+  poseSurface(body, angles);
+  rotateFaces(body);
+  rotateVertices(body);
+  turnWithVertices(body.quats, body.data.arrays.normals, shading.normals);
+}
+
+// In even light and on the map colours do not depend on the pose.
+function paintHand({ body, gaussians, shading }, look, hurry) {
+  if (look === "map") return mapGaussians(body, gaussians, shading);
+  const light = body.data.lights[look] ?? null;
+  if (light) lightVertices(body, shading, light, hurry);
+  return colorGaussians(body, gaussians, shading, light);
+}
+
+// One picture. Nothing is computed again that did not change. In a hurry skin that faces away is left out, and shadows
+// may lag behind; the next picture without a hurry makes up for it.
+function drawHand(hand, { angles, look, camera, hurry = false }) {
+  const { body, gaussians, shading, projection } = hand, key = angles.join(), moved = key !== hand.angles;
+  if (moved) poseHand(hand, angles);
+  const { target, radius } = camera.target ? camera : frameSurface(body.posed);
+  const distance = (camera.zoom * radius * body.data.orbitMargin) / Math.sin(camera.fieldOfView / 2);
+  const view = orbitCamera({ ...camera, target, distance }), partly = moved && hurry;
+  markShown(body, gaussians, shading.normals, view.eye, partly);
+  if (moved || hand.partly) poseGaussians(body, gaussians);
+  if (moved || hand.partly || look !== hand.look) paintHand(hand, look, partly && look === hand.look);
+  Object.assign(hand, { angles: key, look, partly });
+  if (hurry && !partly) markShown(body, gaussians, shading.normals, view.eye, true);
+  const count = projectGaussians(gaussians, projection, view);
+  return { ellipses: sortEllipses(projection, shading.colors, count), count };
+}
+
+if (typeof self !== "undefined" && typeof WorkerGlobalScope !== "undefined") {
+  self.onmessage = async ({ data: message }) => {
+    try {
+      if (message.open) {
+        hand = await openHand(message.open);
+        const { arrays, ...facts } = hand.body.data;
+        self.postMessage({ opened: { ...facts, count: hand.gaussians.count } });
+        return;
+      }
+      const start = performance.now(), { ellipses, count } = drawHand(hand, message);
+      const took = performance.now() - start;
+      self.postMessage({ id: message.id, ellipses, count, hurry: message.hurry, took }, [ellipses.buffer]);
+    } catch (error) {
+      self.postMessage({ failed: String(error.stack ?? error) });
+    }
+  };
+}
