@@ -19,6 +19,7 @@ Command = (
     | Annotated[options.Render, tyro.conf.subcommand("render")]
     | Annotated[options.Animate, tyro.conf.subcommand("animate")]
     | Annotated[options.Export, tyro.conf.subcommand("export")]
+    | Annotated[options.View, tyro.conf.subcommand("view")]
     | Annotated[options.Edit, tyro.conf.subcommand("edit")]
     | Annotated[options.Info, tyro.conf.subcommand("info")]
     | Annotated[options.Text, tyro.conf.subcommand("text")]

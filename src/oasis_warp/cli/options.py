@@ -122,7 +122,8 @@ class Export:
 
     Gaussians for splat viewers: .ply, .compressed.ply, .splat, .spz, and .splats.glb (glTF's KHR_gaussian_splatting).
     A mesh with bones, texture and named poses, for engines and Blender: .glb, .gltf. In one pose: .obj. Either in
-    OpenUSD: .usdc, .usdz, and .splats.usdc, .splats.usdz. Shape, pose and camera as numbers: .json.
+    OpenUSD: .usdc, .usdz, and .splats.usdc, .splats.usdz. Shape, pose and camera as numbers: .json. A page that shows
+    and poses the avatar in a browser, offline: .html.
     """
 
     avatar: AvatarFile
@@ -133,6 +134,21 @@ class Export:
     light: Literal["baked", "none"] | None = None
     """Colours as in the avatar's light, or as in even light for programs with lights of their own. Baked into Gaussians
     and left out of meshes when not given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Show an avatar in the browser: turn it, pose it, light it. Ctrl-C ends it.
+
+    The page comes from this machine and is for it alone: its address holds a token. `oasis export -o hand.html` writes
+    the same page as a file.
+    """
+
+    avatar: AvatarFile
+    port: int = 0
+    """Port on 127.0.0.1; 0 takes a free one."""
+    no_browser: bool = False
+    """Print the address and open no browser."""
 
 
 @dataclass(frozen=True, kw_only=True)

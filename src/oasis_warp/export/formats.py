@@ -8,6 +8,7 @@ from oasis_warp.core.types import HandPose
 from oasis_warp.export import usd_stage
 from oasis_warp.export.compressed_ply import write_compressed_ply
 from oasis_warp.export.hand_parameters import write_parameters
+from oasis_warp.export.page_file import write_page
 from oasis_warp.export.request import ExportRequest, Light
 from oasis_warp.export.skinned_gltf import write_skinned_gltf
 from oasis_warp.export.skinned_usd import write_skinned_usd
@@ -34,6 +35,7 @@ WRITERS: dict[str, Writer] = {
     ".gltf": write_skinned_gltf,
     ".obj": write_obj,
     ".json": write_parameters,
+    ".html": write_page,
     **{ending: write_skinned_usd for ending in usd_stage.ENDINGS},
     **{f".splats{ending}": write_splat_usd for ending in usd_stage.ENDINGS},
 }

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.environment import studio_light
@@ -37,18 +38,20 @@ WALK_FRAMES, WALK_SECONDS = 12, 7.5
 
 
 class Packed(NamedTuple):
-    """An array as whole numbers: value = number * step, one step for all or one for each column."""
+    """An array as whole numbers: value = number * step."""
 
     numbers: np.ndarray
-    step: list[float]
+    step: float
 
 
-def page_facts(avatar: Avatar, pose: str, look: str) -> tuple[dict[str, Any], dict[str, np.ndarray | Packed]]:
+def page_facts(
+    avatar: Avatar, angles: Float[Tensor, "15 3"] | None, look: str
+) -> tuple[dict[str, Any], dict[str, np.ndarray | Packed]]:
     """Facts for the header of the page's data, and its arrays; both on the CPU.
 
     Args:
         avatar: Any.
-        pose: One that the page begins with: "photo" or one of `POSE_NAMES`.
+        angles: That the page begins with; those of the photo when not given.
         look: "photo" or "even" light to begin with; an avatar without light of its own begins in even light.
     """
     parts = avatar.parts
@@ -58,6 +61,7 @@ def page_facts(avatar: Avatar, pose: str, look: str) -> tuple[dict[str, Any], di
     studio = avatar.in_light(studio_light()).parts.light
     assert studio is not None, "in_light gives one"
     lights["studio"] = studio
+    begin = poses["photo"] if angles is None else angles.cpu()
     walk = pose_sequence(avatar.hand, WALK, WALK_FRAMES)
     facts = {
         "side": avatar.side,
@@ -72,10 +76,18 @@ def page_facts(avatar: Avatar, pose: str, look: str) -> tuple[dict[str, Any], di
         "orbitMargin": ORBIT_MARGIN,
         "fieldOfView": ORBIT_FIELD_OF_VIEW,
         "frame": _frame(avatar, list(poses.values())),
-        "start": {"pose": pose, "angles": _flat(poses[pose]), "look": look if look in lights else "even"},
+        "start": {
+            "pose": _name_of(begin, poses),
+            "angles": _flat(begin),
+            "look": look if look in lights else "even",
+        },
         "hasInvented": avatar.invented is not None,
     }
     return facts, _arrays(avatar, studio if parts.light is None else parts.light)
+
+
+def _name_of(angles: Tensor, poses: dict[str, Tensor]) -> str | None:
+    return next((name for name, known in poses.items() if torch.allclose(angles, known.to(angles), atol=1e-6)), None)
 
 
 def _label(name: str) -> str:
@@ -106,11 +118,12 @@ def joint_sliders(hand: HandModel) -> list[dict[str, Any]]:
             joint = hand.joint_names.index(f"{finger}{k + 1}")
             for axis, movement in enumerate(AXES):
                 low, high = hand.pose_limits[joint, axis].tolist()
-                if high - low < max(LEAST_RANGE, 0):
+                if high - low < LEAST_RANGE:
                     continue
                 shown = joint_name if axis == 0 else movement.capitalize()
                 rest = float(hand.rest_bend[joint]) if axis == 0 else 0.0
-                sliders.append({"label": shown, "index": 3 * (joint - 1) + axis, "low": low, "high": high, "rest": rest})
+                index = 3 * (joint - 1) + axis
+                sliders.append({"label": shown, "index": index, "low": low, "high": high, "rest": rest})
         groups.append({"finger": finger.capitalize(), "joints": sliders})
     return groups
 
@@ -183,7 +196,7 @@ def _pack(values: Tensor, kind: str, most: float | None = None) -> Packed:
     array = values.detach().cpu().double().numpy()
     largest = float(np.abs(array).max(initial=0)) if most is None else most
     step = largest / np.iinfo(kind).max if largest else 1.0
-    return Packed(np.rint(array / step).astype(f"<{kind}"), [step])
+    return Packed(np.rint(array / step).astype(f"<{kind}"), step)
 
 
 def _weights(weights: Tensor) -> Packed:
@@ -192,7 +205,7 @@ def _weights(weights: Tensor) -> Packed:
     numbers = np.rint(weights.detach().cpu().double().numpy() * whole).astype(np.int64)
     rows = np.arange(len(numbers))
     numbers[rows, numbers.argmax(1)] += whole - numbers.sum(1)
-    return Packed(numbers.astype("<u2"), [1 / whole])
+    return Packed(numbers.astype("<u2"), 1 / whole)
 
 
 def pack_data(facts: dict[str, Any], arrays: dict[str, np.ndarray | Packed]) -> str:
@@ -220,7 +233,7 @@ def pack_data(facts: dict[str, Any], arrays: dict[str, np.ndarray | Packed]) -> 
     room = (len(header_of(0)) + 4096) // 4 * 4  # for the offsets' digits; filled with spaces
     header = header_of(4 + room).ljust(room)
     stream = len(header).to_bytes(4, "little") + header + b"".join(blobs)
-    return base64.b64encode(gzip.compress(stream, compresslevel=9, mtime=0)).decode()
+    return base64.b64encode(gzip.compress(stream, compresslevel=6, mtime=0)).decode()
 
 
 def unpack_data(text: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -230,5 +243,5 @@ def unpack_data(text: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     arrays = {}
     for name, entry in header["arrays"].items():
         stored = np.frombuffer(stream, f"<{entry['type']}", entry["count"], entry["offset"])
-        arrays[name] = stored * np.float64(entry["step"][0]) if "step" in entry else stored
+        arrays[name] = stored * np.float64(entry["step"]) if "step" in entry else stored
     return header["facts"], arrays

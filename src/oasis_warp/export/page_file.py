@@ -7,6 +7,7 @@ from importlib import resources
 from pathlib import Path
 
 from oasis_warp import __version__
+from oasis_warp.core.types import HandPose
 from oasis_warp.data.output_files import write_file
 from oasis_warp.export.page_data import pack_data, page_facts
 from oasis_warp.export.request import ExportRequest
@@ -36,13 +37,13 @@ def page_policy(style: str, script: str) -> str:
     )
 
 
-def page_html(avatar: Avatar, title: str, *, pose: str = "photo", look: str = "photo") -> str:
+def page_html(avatar: Avatar, title: str, *, pose: HandPose | None = None, look: str = "photo") -> str:
     """The page of `avatar`: it poses, lights and draws the hand by the same rules as `Avatar.render`.
 
     Args:
         avatar: Any.
         title: Shown above the controls and by the browser.
-        pose: That the page begins with: "photo" or one of `hand.poses.POSE_NAMES`.
+        pose: Whose angles the page begins with; those of the photo when not given.
         look: "photo" or "even": light that it begins with.
     """
     style = page_text("page.css")
@@ -55,7 +56,7 @@ def page_html(avatar: Avatar, title: str, *, pose: str = "photo", look: str = "p
         "worker": worker,
         "raster": raster,
         "script": script,
-        "data": pack_data(*page_facts(avatar, pose, look)),
+        "data": pack_data(*page_facts(avatar, None if pose is None else pose.angles, look)),
     }
     page = page_text("page.html")
     for name, text in parts.items():
@@ -70,4 +71,4 @@ def write_page(request: ExportRequest, path: Path) -> None:
         InputError: `path` cannot be written.
     """
     look = "even" if request.light == "none" else "photo"
-    write_file(path, page_html(request.avatar, f"Hand avatar: {path.stem}", look=look).encode())
+    write_file(path, page_html(request.avatar, path.stem, pose=request.pose, look=look).encode())

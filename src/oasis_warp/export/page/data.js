@@ -1,5 +1,5 @@
 // The data of the page: one stream of gzip in base64, written by page_data.py. Arrays of whole numbers with a "step"
-// are values over that step; a step for each column or one for all.
+// are values over that step.
 "use strict";
 
 const ARRAYS = {
@@ -24,6 +24,6 @@ async function readData(base64) {
 
 function inUnits(stored, step) {
   const out = new Float32Array(stored.length);
-  for (let i = 0; i < stored.length; i++) out[i] = stored[i] * step[i % step.length];
+  for (let i = 0; i < stored.length; i++) out[i] = stored[i] * step;
   return out;
 }

@@ -45,7 +45,7 @@ function nonZeroTriples(correctives, rows) {
   for (let first = 0; first < correctives.length; first += 3 * rows) {
     const index = [], moves = [];
     for (let v = 0; v < rows; v++) {
-      const [x, y, z] = correctives.subarray(first + 3 * v, first + 3 * v + 3);
+      const x = correctives[first + 3 * v], y = correctives[first + 3 * v + 1], z = correctives[first + 3 * v + 2];
       if (x || y || z) index.push(v), moves.push(x, y, z);
     }
     out.push({ index: Uint32Array.from(index), moves: Float32Array.from(moves) });

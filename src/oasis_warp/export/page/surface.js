@@ -7,19 +7,23 @@ function restPlanes({ rest, faces, nFaces }) {
   const planes = new Float64Array(PLANE * nFaces);
   for (let f = 0; f < nFaces; f++) {
     const a = 3 * faces[3 * f], b = 3 * faces[3 * f + 1], c = 3 * faces[3 * f + 2];
-    const e1 = [0, 1, 2].map((k) => rest[b + k] - rest[a + k]), e2 = [0, 1, 2].map((k) => rest[c + k] - rest[a + k]);
-    const n = cross(e1, e2), twice = Math.hypot(...n), longest = longestSquared(e1, e2);
+    const e1 = [rest[b] - rest[a], rest[b + 1] - rest[a + 1], rest[b + 2] - rest[a + 2]];
+    const e2 = [rest[c] - rest[a], rest[c + 1] - rest[a + 1], rest[c + 2] - rest[a + 2]];
+    const e3 = [e2[0] - e1[0], e2[1] - e1[1], e2[2] - e1[2]], n = cross(e1, e2), twice = Math.sqrt(dot(n, n));
+    const longest = Math.max(dot(e1, e1), dot(e2, e2), dot(e3, e3));
     const area = twice > FLAT * longest ? twice / 2 : 0; // 0 marks a flat face
-    const length = Math.hypot(...e1) || 1;
-    const t = e1.map((x) => x / length), normal = n.map((x) => x / (twice || 1)), across = cross(normal, t);
-    planes.set([...t, ...across, ...normal, length, dot(e2, t), dot(e2, across), area, longest], PLANE * f);
+    const length = Math.sqrt(dot(e1, e1)) || 1, t = [e1[0] / length, e1[1] / length, e1[2] / length];
+    const normal = [n[0] / (twice || 1), n[1] / (twice || 1), n[2] / (twice || 1)], across = cross(normal, t);
+    planes.set(t, PLANE * f);
+    planes.set(across, PLANE * f + 3);
+    planes.set(normal, PLANE * f + 6);
+    planes.set([length, dot(e2, t), dot(e2, across), area, longest], PLANE * f + 9);
   }
   return planes;
 }
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const longestSquared = (e1, e2) => Math.max(dot(e1, e1), dot(e2, e2), ...[e1.map((x, k) => x - e2[k])].map((d) => dot(d, d)));
 
 // The faces at each vertex, the largest at rest first: it decides the signs of the others.
 function facesAround({ faces, planes, nFaces, nVertices }) {

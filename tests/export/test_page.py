@@ -1,0 +1,259 @@
+import base64
+import contextlib
+import hashlib
+import html
+import json
+import os
+import queue
+import re
+import shutil
+import signal
+import subprocess
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from oasis_warp.avatar.environment import studio_light
+from oasis_warp.core.camera import orbit_camera
+from oasis_warp.export import export_avatar
+from oasis_warp.export.page_data import joint_sliders, unpack_data
+from oasis_warp.export.page_file import page_html
+from oasis_warp.hand.poses import POSE_NAMES, named_pose
+from oasis_warp.ops import bone_transforms, skin
+
+LARGEST = 8_000_000
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+NODE = shutil.which("node")
+
+
+@pytest.fixture(scope="module")
+def pages(left_hand, right_hand):
+    return {avatar.side: page_html(avatar, "A <hand>") for avatar in (left_hand, right_hand)}
+
+
+def section(page, name):
+    return re.search(f'<script id="{name}" type="text/plain">(.*?)</script>', page, re.DOTALL)[1]
+
+
+def in_pose(avatar, name):
+    return avatar.source_pose._replace(angles=named_pose(avatar.hand, name))
+
+
+def test_the_page_is_one_file_that_fetches_nothing(pages):
+    page = pages["right"]
+    assert len(page.encode()) <= LARGEST
+    assert "{{" not in page
+    assert "<title>A &lt;hand&gt;</title>" in page
+    code = page.replace(section(page, "data"), "")
+    assert not re.findall(r"https?://|\bfetch\(|XMLHttpRequest|WebSocket|import\(|eval\(", code)
+    assert not re.findall(r"<(?:link|img|iframe|object|embed)\b|\bsrc=|\bstyle=|\son\w+=\"", code)
+
+
+def test_its_policy_allows_only_its_own_style_and_script(pages):
+    page = pages["right"]
+    policy = html.unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1])
+    assert policy.startswith("default-src 'none';")
+    for tag in ("style", "script"):
+        (text,) = re.findall(f"<{tag}>(.*?)</{tag}>", page, re.DOTALL)
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"{tag}-src 'sha256-{digest}';" in policy
+    assert "unsafe" not in policy
+
+
+def test_every_control_has_a_label(pages):
+    page = pages["right"]
+    for identity in re.findall(r'<(?:select|canvas)[^>]*id="(\w+)"', page):
+        assert re.search(f'id="{identity}"[^>]*aria-label="', page), identity
+    for slider in re.findall(r"<input[^>]*>", page):
+        assert re.search(f"<label[^>]*><span>[^<]+</span>{re.escape(slider)}", page), slider
+    for identity in re.findall(r'aria-(?:labelledby|controls|describedby)="(\w[\w-]*)"', page):
+        assert f'id="{identity}"' in page
+    assert "prefers-reduced-motion" in page
+
+
+@pytest.mark.parametrize("name", ["fist", "point", "open"])
+def test_what_the_page_reads_poses_the_same_surface(avatar, pages, name):
+    facts, arrays = unpack_data(section(pages[avatar.side], "data"))
+    part = {key: torch.from_numpy(np.array(value, np.float32)) for key, value in arrays.items()}
+    vertices = part["vertices"].view(-1, 3)
+    (angles,) = [pose["angles"] for pose in facts["poses"] if pose["name"] == name]
+    bones = bone_transforms(
+        torch.tensor(angles).view(15, 3), torch.tensor(facts["orientation"]).view(3, 3),
+        torch.tensor(facts["translation"]), part["joints"].view(16, 3), part["axes"].view(16, 3, 3), facts["parents"],
+    )  # fmt: skip
+    correctives = part["correctives"].view(-1, *vertices.shape).permute(1, 2, 0).contiguous()
+    posed = skin(
+        vertices, None, part["weights"].view(-1, 16), bones.transforms, displacements=correctives, strengths=bones.bends
+    )
+    expected = avatar.mesh(in_pose(avatar, name)).vertices
+    assert (posed.means - expected).abs().max() < 2e-5  # 16 bit for weights and correctives
+
+
+def test_what_the_page_reads_are_the_gaussians(avatar, pages):
+    facts, arrays = unpack_data(section(pages[avatar.side], "data"))
+    stored = avatar.parts.gaussians
+    assert np.array_equal(arrays["vertexIndex"], stored.vertex_index)
+    assert np.array_equal(arrays["faceIndex"], stored.face_index)
+    for name, step in {"scales": 1e-4 * float(stored.scales.max()), "opacities": 2e-3, "colors": 2e-3}.items():
+        assert np.abs(arrays[name] - getattr(stored, name).flatten().numpy()).max() <= step, name
+    assert facts["side"] == avatar.side
+    assert facts["lights"].keys() == {"photo", "studio"}
+
+
+def test_sliders_move_what_they_say_within_the_limits(hand):
+    groups = joint_sliders(hand)
+    assert [group["finger"] for group in groups] == ["Thumb", "Index", "Middle", "Ring", "Little"]
+    sliders = [slider for group in groups for slider in group["joints"]]
+    assert len({slider["index"] for slider in sliders}) == len(sliders)
+    for group in groups:
+        for slider in group["joints"]:
+            joint, axis = divmod(slider["index"], 3)
+            assert hand.joint_names[joint + 1].startswith(group["finger"].lower())
+            assert hand.pose_limits[joint + 1, axis].tolist() == [slider["low"], slider["high"]]
+    assert [len(group["joints"]) for group in groups] == [7, 5, 5, 5, 5]
+
+
+def test_the_page_begins_with_the_pose_and_light_that_were_asked_for(right_hand, tmp_path):
+    out = tmp_path / "hand.html"
+    export_avatar(right_hand, out, pose=in_pose(right_hand, "fist"), light="none")
+    start = unpack_data(section(out.read_text(), "data"))[0]["start"]
+    assert (start["pose"], start["look"]) == ("fist", "even")
+    assert np.allclose(start["angles"], named_pose(right_hand.hand, "fist").flatten(), atol=1e-6)
+
+
+def test_an_avatar_without_light_of_its_own_begins_in_even_light(right_hand):
+    facts, arrays = unpack_data(section(page_html(right_hand.in_even_light(), "x"), "data"))
+    assert facts["start"]["look"] == "even"
+    assert facts["lights"].keys() == {"studio"}
+    assert (arrays["even"] == 1).all()
+
+
+NODE_CHECK = """
+const fs = require("fs"), read = (path) => fs.readFileSync(path, "utf8");
+const [folder, jobs] = [process.argv[1], JSON.parse(process.argv[2])];
+const run = new Function(read(folder + "/worker.js") + "; return { openHand, drawHand };")();
+run.openHand(read(folder + "/data.txt")).then((hand) => {
+  for (const [k, job] of jobs.entries()) {
+    const { facts, ...wish } = { ...job, camera: { ...job.camera, target: null } };
+    wish.angles = hand.body.data.poses.find(({ name }) => name === job.pose).angles;
+    run.drawHand(hand, wish);
+    const bytes = (array) => Buffer.from(array.buffer, array.byteOffset, array.byteLength);
+    fs.writeFileSync(`${folder}/means${k}`, bytes(hand.gaussians.means));
+    fs.writeFileSync(`${folder}/covars${k}`, bytes(hand.gaussians.covariances));
+    fs.writeFileSync(`${folder}/colors${k}`, bytes(hand.shading.colors));
+  }
+});
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(NODE is None, reason="needs node")
+def test_the_pages_script_poses_and_lights_as_python_does(avatar, pages, tmp_path):
+    for name, file in (("worker", "worker.js"), ("data", "data.txt")):
+        (tmp_path / file).write_text(section(pages[avatar.side], name))
+    camera = {"azimuth": 0, "elevation": 0, "zoom": 1, "fieldOfView": 0.5, "width": 64, "height": 64}
+    lights = {"photo": avatar, "studio": avatar.in_light(studio_light()), "even": avatar.in_even_light()}
+    jobs = [{"pose": pose, "look": look, "camera": camera} for pose in ("fist", "victory") for look in lights]
+    subprocess.run([NODE, "-e", NODE_CHECK, str(tmp_path), json.dumps(jobs)], check=True, timeout=200)
+    for k, job in enumerate(jobs):
+        expected = lights[job["look"]].pose(in_pose(avatar, job["pose"]))
+        means = np.fromfile(tmp_path / f"means{k}", "<f4").reshape(-1, 3)
+        assert np.abs(means - expected.means.numpy()).max() < 3e-5
+        variances = np.fromfile(tmp_path / f"covars{k}", "<f4").reshape(-1, 6)[:, [0, 3, 5]].sum(1)
+        growth = variances / expected.scales.square().sum(1).numpy()
+        assert np.quantile(np.abs(growth - 1), 0.99) < 0.02  # 16 bits move the corners of small faces
+        bytes_ = np.fromfile(tmp_path / f"colors{k}", np.uint8).reshape(-1, 4)
+        error = np.abs(bytes_[:, :3] - 255 * expected.colors.numpy())
+        assert np.quantile(error, 0.99) < 2.5, job  # a pixel of a depth buffer decides about single vertices
+        assert error.mean() < 0.5, job
+
+
+REPORT = """
+<script>oasis.ready.then(async () => {
+  for (const [k, job] of JOBS.entries()) await fetch("/" + k, { method: "POST", body: await oasis.picture(job) });
+}, (error) => fetch("/failed", { method: "POST", body: String(error) }))</script>
+"""
+"""What the test adds to a page, so that it sends its pictures back."""
+FLAGS = (
+    "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
+    "--disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader"
+)
+
+
+class PictureServer(ThreadingHTTPServer):
+    """Serves a page and keeps what it sends."""
+
+    def __init__(self, page):
+        self.page, self.received = page.encode(), queue.Queue()
+        super().__init__(("127.0.0.1", 0), PictureHandler)
+
+
+class PictureHandler(BaseHTTPRequestHandler):
+    def do_GET(self):
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html; charset=utf-8")
+        self.end_headers()
+        self.wfile.write(self.server.page)
+
+    def do_POST(self):
+        self.server.received.put((self.path, self.rfile.read(int(self.headers["Content-Length"]))))
+        self.send_response(204)
+        self.end_headers()
+
+    def log_message(self, format, *args):
+        pass
+
+
+@contextlib.contextmanager
+def browser_with(page, drawing, profile):
+    """What a headless browser sends back from the page."""
+    with PictureServer(page) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}/#{drawing}"
+        command = [CHROMIUM, *FLAGS.split(), f"--user-data-dir={profile}", "--remote-debugging-port=0", address]
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        process = subprocess.Popen(command, start_new_session=True, **silent)
+        try:
+            yield server.received
+        finally:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            server.shutdown()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+@pytest.mark.parametrize("drawing", ["graphics", "processor"])
+def test_a_browser_draws_the_page_as_we_do(avatar, pages, tmp_path, drawing):
+    photo, even, studio = "photo", "even", "studio"
+    views = [
+        ("photo", 0, photo),
+        ("fist", 30, photo),
+        ("victory", -45, studio),
+        ("point", 180, photo),
+        ("ok", 90, even),
+    ]
+    square = {"elevation": 0, "width": 256, "height": 256, "fit": True}
+    jobs = [{"pose": pose, "azimuth": np.radians(angle), "look": look, **square} for pose, angle, look in views]
+    page = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", pages[avatar.side])
+    page = page.replace("</body>", REPORT.replace("JOBS", json.dumps(jobs)) + "</body>")
+    lights = {"photo": avatar, "studio": avatar.in_light(studio_light()), "even": avatar.in_even_light()}
+    with browser_with(page, drawing, tmp_path / "profile") as received:
+        for k, (name, degrees, look) in enumerate(views):
+            path, body = received.get(timeout=100)
+            assert path == f"/{k}", body
+            shown = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]] / 255
+            shown = shown[..., :3] * shown[..., 3:] + 1 - shown[..., 3:]
+            pose = avatar.source_pose if name == "photo" else in_pose(avatar, name)
+            camera = orbit_camera(avatar.mesh(pose).vertices, np.radians(degrees), 0.0, 256)
+            drawn = lights[look].render(camera, pose).image.clamp(0, 1).numpy()
+            assert -10 * np.log10(np.mean((shown - drawn) ** 2)) > 40, (name, look)
+
+
+def test_all_named_poses_are_on_the_page(pages):
+    facts, _ = unpack_data(section(pages["left"], "data"))
+    assert [pose["name"] for pose in facts["poses"]] == ["photo", *POSE_NAMES]
