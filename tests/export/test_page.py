@@ -36,7 +36,8 @@ def pages(left_hand, right_hand):
 
 
 def section(page, name):
-    return re.search(f'<script id="{name}" type="text/plain">(.*?)</script>', page, re.DOTALL)[1]
+    (text,) = re.findall(f'<script id="{name}" type="text/plain">(.*?)</script>', page, re.DOTALL)
+    return text
 
 
 def in_pose(avatar, name):
@@ -55,7 +56,8 @@ def test_the_page_is_one_file_that_fetches_nothing(pages):
 
 def test_its_policy_allows_only_its_own_style_and_script(pages):
     page = pages["right"]
-    policy = html.unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1])
+    (escaped,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', page)
+    policy = html.unescape(escaped)
     assert policy.startswith("default-src 'none';")
     for tag in ("style", "script"):
         (text,) = re.findall(f"<{tag}>(.*?)</{tag}>", page, re.DOTALL)
@@ -246,7 +248,8 @@ def test_a_browser_draws_the_page_as_we_do(avatar, pages, tmp_path, drawing):
         for k, (name, degrees, look) in enumerate(views):
             path, body = received.get(timeout=100)
             assert path == f"/{k}", body
-            shown = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]] / 255
+            picture = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
+            shown = np.asarray(picture)[..., [2, 1, 0, 3]] / 255
             shown = shown[..., :3] * shown[..., 3:] + 1 - shown[..., 3:]
             pose = avatar.source_pose if name == "photo" else in_pose(avatar, name)
             camera = orbit_camera(avatar.mesh(pose).vertices, np.radians(degrees), 0.0, 256)
