@@ -288,9 +288,9 @@ class Avatar:
         Raises:
             InputError: not an avatar file, damaged, of a newer version, or made with another hand model.
         """
-        tensors, header = load_avatar(Path(path))
-        if header["hand_model"] != "bundled":
-            raise InputError(f"{path}: made with the hand model {header['hand_model']!r}, which is not installed.")
+        hand = bundled_hand()
+        sizes = {"S": hand.shape_basis.shape[2], "V": len(hand.template), "F": len(hand.faces)}
+        tensors, header = load_avatar(Path(path), hand.name, sizes)
         tensors = {name: value.to(device) for name, value in tensors.items()}
 
         def group(prefix: str) -> dict[str, Tensor]:

@@ -138,11 +138,11 @@ def test_wrong_options_are_one_sentence(tmp_path, tiny, capsys, arguments, words
     assert not out.exists()
 
 
-@pytest.mark.parametrize(("name", "words"), [("file", "found a file"), ("none/prior", "make it first")])
-def test_a_place_that_is_no_folder_is_refused(tmp_path, tiny, capsys, name, words):
+@pytest.mark.parametrize("name", ["file", "file/prior"])
+def test_a_place_that_is_no_folder_is_refused(tmp_path, tiny, capsys, name):
     (tmp_path / "file").write_text("mine")
     assert main(["pretrain", str(tmp_path / name), *SMALL]) == BAD_INPUT
-    assert words in capsys.readouterr().err
+    assert "found a file" in capsys.readouterr().err
     assert (tmp_path / "file").read_text() == "mine"
 
 

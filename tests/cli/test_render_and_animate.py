@@ -93,7 +93,7 @@ def test_a_film_has_the_length_that_was_asked_for(avatar_file, motion, suffix, c
         (["render", "-o", "x.png", "--size", "100000"], "--size 100000: expected 16 to"),
         (["render", "-o", "x.png", "--azimuth", "nan"], "--azimuth nan: expected a number of degrees"),
         (["animate", "-o", "x.gif", "--elevation", "inf"], "--elevation inf: expected a number of degrees"),
-        (["render", "-o", "none/x.png"], "found no such folder"),
+        (["render", "-o", "avatar.safetensors/x.png"], "found a file; choose another name"),
         (["animate", "-o", "x.avi"], "ends in .mp4 or .gif"),
         (["animate", "-o", "x.mp4", "--fps", "0"], "--fps 0: expected 1 to 120"),
         (["animate", "-o", "x.mp4", "--seconds", "0"], "--seconds 0: expected 1 to"),

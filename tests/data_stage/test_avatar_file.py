@@ -1,4 +1,5 @@
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,7 @@ from oasis_warp.data.avatar_file import HEADER as FILE_HEADER
 
 LIGHT_SHAPES = {"light.harmonics": (4, 3), "light.limits": (2, 3), "light.even": (3,)}
 SIZES = {"S": 4, "V": 30, "P": 5, "Q": 7, "N": 12}
+HAND = {"S": 4, "V": 30, "F": 50}
 HEADER = {
     "side": "left",
     "hand_model": "bundled",
@@ -41,8 +43,13 @@ def tensors():
         if entry.dtype == torch.int64:
             made[name] = torch.randint(0, SIZES["V"], shape, generator=generator)
         else:
-            made[name] = torch.rand(shape, generator=generator) + 0.01
-    made["gaussians.opacities"].clamp_(0, 1)
+            share = torch.rand(shape, generator=generator)
+            low, high = max(entry.low, 1e-3), min(entry.high, 1)
+            made[name] = low + (high - low) * share
+    made["gaussians.barycentrics"] /= made["gaussians.barycentrics"].sum(1, keepdim=True)
+    for name, size in (("source_pose.orientation", 3), ("source_camera.viewmat", 4)):
+        made[name] = torch.eye(size)
+    made["source_camera.K"] = torch.tensor([[300.0, 0, 100], [0, 300, 128], [0, 0, 1]])
     return made
 
 
@@ -72,10 +79,10 @@ def test_an_avatar_comes_back_as_it_was(written, tensors):
 
 def test_tensors_that_carry_gradients_or_strides_are_stored(tmp_path, tensors):
     tensors["gaussians.colors"].requires_grad_()
-    tensors["source_camera.K"] = tensors["source_camera.K"].T
+    tensors["gaussians.offsets"] = tensors["gaussians.offsets"].T.contiguous().T
     save_avatar(tmp_path / "a.safetensors", tensors, HEADER)
     back, _ = load_avatar(tmp_path / "a.safetensors")
-    assert torch.equal(back["source_camera.K"], tensors["source_camera.K"])
+    assert torch.equal(back["gaussians.offsets"], tensors["gaussians.offsets"])
 
 
 def test_the_same_avatar_is_the_same_file(tmp_path, tensors):
@@ -102,23 +109,34 @@ def test_nothing_wrong_is_ever_written(tmp_path, tensors):
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("gaussians.scales", torch.full((12, 3), torch.nan), "scales: expected finite values"),
-        ("gaussians.scales", torch.zeros(12, 3), "scales: expected positive scales, got 12 bad rows"),
-        ("gaussians.offsets", torch.full((5, 3), torch.inf), "offsets: expected finite values"),
-        ("gaussians.quats", torch.zeros(12, 4), "quats: expected no zero quaternion"),
+        ("gaussians.scales", torch.full((12, 3), torch.nan), "scales: expected values from 1e-08 to 0.1, got 36 of 36"),
+        ("gaussians.scales", torch.zeros(12, 3), "scales: expected values from 1e-08 to 0.1"),
+        ("gaussians.offsets", torch.full((5, 3), torch.inf), "offsets: expected values.*such as inf"),
+        ("gaussians.offsets", torch.ones(1, 3) / 20, r"offsets: expected shape \[5, 3\], got \[1, 3\]"),
+        ("gaussians.quats", torch.zeros(12, 4), "quats: expected quaternions, about of length 1, got 12 bad"),
         ("gaussians.quats", torch.ones(12, 3), r"quats: expected shape \[N, 4\], got \[12, 3\]"),
-        ("gaussians.opacities", torch.full((12,), 1.5), r"opacities: expected opacities in \[0, 1\]"),
-        ("gaussians.vertex_index", torch.full((5,), 30), "vertex_index: expected indices of 30 vertices"),
-        ("gaussians.face_index", torch.full((7,), -1), "face_index: expected no negative index"),
+        ("gaussians.opacities", torch.full((12,), 1.5), "opacities: expected values from 0 to 1"),
+        ("gaussians.vertex_index", torch.full((5,), 30), "vertex_index: expected values from 0 to 29"),
+        ("gaussians.face_index", torch.full((7,), -1), "face_index: expected values from 0"),
+        ("gaussians.face_index", torch.full((7,), 50), "face_index: expected values from 0 to 49"),
         ("gaussians.face_index", torch.zeros(7), "face_index: expected torch.int64, got torch.float32"),
+        ("gaussians.barycentrics", torch.full((7, 3), 0.5), "barycentrics: expected weights that sum to 1"),
         ("gaussians.colors", torch.ones(11, 3), r"colors: expected shape \[12, 3\]"),
+        ("gaussians.colors", torch.full((12, 3), -1.0), "colors: expected values from -0.001"),
+        ("shape", torch.full((4,), 1e14), "shape: expected values from -10 to 10"),
+        ("shape", torch.zeros(5), r"shape: expected shape \[4\], got \[5\]"),
+        ("surface_offsets", torch.zeros(1, 3), r"surface_offsets: expected shape \[30, 3\], got \[1, 3\]"),
+        ("surface_offsets", torch.ones(30, 3), "surface_offsets: expected values from -0.05 to 0.05"),
+        ("source_pose.orientation", -torch.eye(3), "orientation: expected a rotation"),
+        ("source_camera.viewmat", torch.zeros(4, 4), "viewmat: expected a rotation and a shift"),
         ("source_camera.K", torch.eye(3, dtype=torch.float64), "K: expected torch.float32"),
+        ("source_camera.K", torch.ones(3, 3), "K: expected a camera in pixels"),
     ],
 )
 def test_a_tensor_that_cannot_be_right_is_named(written, tensors, name, value, expected):
     rewrite(written, {**tensors, name: value})
     with pytest.raises(InputError, match=f"damaged avatar file.*{expected}"):
-        load_avatar(written)
+        load_avatar(written, "bundled", HAND)
 
 
 def test_rows_that_do_not_add_up_are_refused(written, tensors):
@@ -150,6 +168,11 @@ def test_a_newer_version_is_refused_with_the_remedy(written):
         ({"side": "both"}, "expected side 'left' or 'right', got 'both'"),
         ({"hand_model": None}, "expected 'hand_model' of type str, got None"),
         ({"source_camera": {"width": 0, "height": 9}}, "positive width and height"),
+        ({"source_camera": {"width": 46_340, "height": 46_340}}, "height up to 4096, got"),
+        ({"source_camera": {"width": True, "height": 9}}, "positive width and height"),
+        ({"source_camera": {"width": 9, "height": 9, "K": 3}}, "positive width and height"),
+        ({"version": True}, "expected 'version' of type int"),
+        ({"side": "l" * 100_000}, "expected side 'left' or 'right', got 'lll"),
     ],
 )
 def test_a_header_that_cannot_be_right_is_refused(written, changes, expected):
@@ -158,11 +181,40 @@ def test_a_header_that_cannot_be_right_is_refused(written, changes, expected):
         load_avatar(written)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "1"])
+@pytest.mark.parametrize("text", ["", "{", "[]", "1", "[" * 100_000, '{"version": NaN}', f'{{"version": {"1" * 5000}}}'])
 def test_a_header_that_is_no_json_object_is_refused(written, tensors, text):
     save_file(tensors, written, {FORMAT: text})
     with pytest.raises(InputError, match="damaged avatar file"):
         load_avatar(written)
+
+
+def test_what_a_message_quotes_of_a_file_is_short_and_printable(written, tensors):
+    rewrite(written, tensors | {f"\x1b[31m\n{k}": torch.zeros(1) for k in range(2000)})
+    with pytest.raises(InputError, match="unknown") as caught:
+        load_avatar(written)
+    assert len(str(caught.value)) < 500
+    assert str(caught.value).isprintable()
+    rewrite(written, tensors, hand_model="h" * 100_000)
+    with pytest.raises(InputError, match="which is not installed") as caught:
+        load_avatar(written, "bundled", HAND)
+    assert len(str(caught.value)) < 500
+
+
+def test_no_memory_is_taken_for_more_gaussians_than_a_hand_can_have(tmp_path):
+    entries, place, n = {}, 0, 5_000_000
+    for name, entry in TENSORS.items():
+        kind = "I64" if entry.dtype == torch.int64 else "F32"
+        shape = [{"P": n, "Q": 0, "N": n, "S": 4, "V": 30}.get(size, size) for size in entry.shape]
+        size = entry.dtype.itemsize * math.prod(shape)
+        entries[name] = {"dtype": kind, "shape": shape, "data_offsets": [place, place + size]}
+        place += size
+    header = {**HEADER, "version": VERSION}
+    text = json.dumps({"__metadata__": {FORMAT: json.dumps(header)}, **entries}).encode()
+    with (tmp_path / "huge").open("wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        file.truncate(8 + len(text) + place)  # a hole, which takes no room
+    with pytest.raises(InputError, match="1 to 4000000, got 5000000"):
+        load_avatar(tmp_path / "huge")
 
 
 def test_another_safetensors_file_is_no_avatar(tmp_path):
@@ -210,6 +262,7 @@ def test_light_comes_as_a_whole_or_not_at_all(tmp_path, tensors):
     for change in (
         {"light.limits": light["light.limits"].flip(0)},
         {"light.limits": torch.zeros(2, 3)},
+        {"light.limits": torch.full((2, 3), 1e30)},
         {"light.even": torch.zeros(3)},
         {"light.harmonics": torch.full((4, 3), torch.nan)},
         {"light.harmonics": torch.ones(5, 3)},

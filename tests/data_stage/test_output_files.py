@@ -1,5 +1,8 @@
 import errno
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -109,19 +112,107 @@ def test_an_error_names_the_place_that_the_user_knows(tmp_path):
 
 def test_a_place_that_cannot_be_written_is_refused_before_the_work_begins(tmp_path):
     (tmp_path / "file").touch()
-    for path, expected in [
-        (tmp_path / "none" / "out", "found no such folder; make it first"),
-        (tmp_path / "file" / "out", "found a file; make it first"),
-    ]:
-        for writer in (output_file, output_folder):
-            with pytest.raises(InputError, match=expected), writer(path):
-                pytest.fail("the block must not run")
+    for writer in (output_file, output_folder):
+        with pytest.raises(InputError, match="found a file; choose another name"), writer(tmp_path / "file" / "out"):
+            pytest.fail("the block must not run")
+        with pytest.raises(InputError, match="too long for this disk; choose a shorter"), writer(tmp_path / ("a" * 256)):
+            pytest.fail("the block must not run")
     with pytest.raises(InputError, match="found a folder; add a file name"), output_file(tmp_path):
         pytest.fail("the block must not run")
     with pytest.raises(InputError, match="found a device or pipe"), output_file("/dev/null"):
         pytest.fail("the block must not run")
     with pytest.raises(InputError, match="found a file; choose another name"), output_folder(tmp_path / "file"):
         pytest.fail("the block must not run")
+
+
+@pytest.mark.parametrize("writer", [output_file, output_folder])
+def test_missing_folders_are_made_and_removed_again_when_the_work_fails(tmp_path, writer):
+    place = tmp_path / "new" / "newer" / "out"
+    with pytest.raises(RuntimeError), writer(place):
+        raise RuntimeError
+    assert everything(tmp_path) == {}
+    with writer(place):
+        pass
+    assert place.exists()
+
+
+@pytest.mark.parametrize("name", ["n" * 251 + ".png", "\N{RAISED HAND}" * 62 + ".png", "[/b].png"])
+def test_names_as_long_as_the_disk_allows_can_be_written(tmp_path, name):
+    write_file(tmp_path / name, b"whole")
+    with output_folder(tmp_path / "f" / name.removesuffix(".png")) as part:
+        fill(part)
+    assert (tmp_path / name).read_bytes() == b"whole"
+    assert (tmp_path / "f" / name.removesuffix(".png") / "b.txt").exists()
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from oasis_warp.data.output_files import output_file, output_folder
+kind, place = sys.argv[1], Path(sys.argv[2])
+replace = os.replace
+def stop(source, final):
+    if kind == "commit" and Path(final).name == "b.txt":
+        os.kill(os.getpid(), signal.SIGKILL)
+    replace(source, final)
+os.replace = stop
+with (output_file if kind == "file" else output_folder)(place) as part:
+    if kind == "file":
+        part.write_text("half")
+    else:
+        (part / "a.txt").write_text("new a")
+        (part / "b.txt").write_text("new b")
+    if kind != "commit":
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def killed(kind: str, place: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", KILLED, kind, str(place)], capture_output=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+
+
+def test_the_next_run_removes_what_a_killed_one_left(tmp_path):
+    (tmp_path / "there").mkdir()
+    for kind, place in (("file", "x.png"), ("folder", "new"), ("folder", "there")):
+        killed(kind, tmp_path / place)
+    assert len([name for name in everything(tmp_path) if name.endswith((".part", ".part.png"))]) == 3
+    (tmp_path / ".mine.png").touch()
+    write_file(tmp_path / "x.png", b"whole")
+    for folder in ("new", "there"):
+        with output_folder(tmp_path / folder) as part:
+            fill(part)
+    assert not [name for name in everything(tmp_path) if ".part" in name]
+    assert (tmp_path / ".mine.png").exists()
+
+
+def test_files_that_were_whole_when_their_run_was_killed_appear_with_the_next(tmp_path):
+    (tmp_path / "a.txt").write_text("old a")
+    (tmp_path / "b.txt").write_text("old b")
+    killed("commit", tmp_path)
+    with pytest.raises(RuntimeError), output_folder(tmp_path):
+        assert (tmp_path / "a.txt").read_text() == "new a"
+        assert (tmp_path / "b.txt").read_text() == "new b"
+        raise RuntimeError
+    assert everything(tmp_path) == {"a.txt": b"new a", "b.txt": b"new b"}
+
+
+def test_a_run_that_goes_on_keeps_its_temporary_files(tmp_path):
+    with output_file(tmp_path / "x.png") as part, output_folder(tmp_path / "out") as folder:
+        part.write_text("slow")
+        write_file(tmp_path / "x.png", b"quick")
+        with output_folder(tmp_path / "out") as other:
+            (other / "a.txt").write_text("quick")
+        assert part.exists() and folder.exists()
+    assert (tmp_path / "x.png").read_text() == "slow"
+    assert everything(tmp_path / "out") == {"a.txt": b"quick"}
+
+
+def test_nothing_is_moved_where_a_folder_stands_in_the_way_of_a_file(tmp_path):
+    (tmp_path / "b.txt").mkdir()
+    with pytest.raises(InputError, match="found a folder"), output_folder(tmp_path) as part:
+        fill(part)
+    assert everything(tmp_path) == {"b.txt": None}
 
 
 def test_a_closed_folder_is_refused_before_the_work_begins(tmp_path, monkeypatch):

@@ -1,7 +1,9 @@
 """The command line, `oasis`: read it, run the command, turn what goes wrong into one sentence and an exit code."""
 
 import importlib
+import io
 import logging
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -35,6 +37,7 @@ Command = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that `arguments` (the process's own when not given) ask for; the exit code."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    open_standard_streams()
     if arguments == ["--version"]:
         print(f"oasis_warp {__version__}")
         return 0
@@ -58,3 +61,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("oasis: stopped, nothing written.", file=sys.stderr)
         return INTERRUPTED
+    except Exception as error:
+        if not is_out_of_memory(error):
+            raise
+        device = getattr(chosen, "device", "cpu")
+        print(f"oasis: the memory of {device} is full; give smaller sizes, or fewer at once.", file=sys.stderr)
+        return BAD_INPUT
+
+
+def open_standard_streams() -> None:
+    """Open the streams that whoever started this closed, or files opened next would get their numbers.
+
+    Names of files that are no text can be printed.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:  # the lowest free number is taken
+            os.open(os.devnull, os.O_RDWR)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether Python, OpenCV or torch, on the CPU or CUDA, found no memory."""
+    return isinstance(error, MemoryError) or any(
+        sign in f"{type(error).__name__} {error}" for sign in ("OutOfMemory", "can't allocate memory", "Insufficient memory")
+    )

@@ -24,6 +24,11 @@ LINE_EVERY = 5.0
 """Seconds between two lines of one stage without a terminal."""
 
 
+def plain_console() -> Console:
+    """The console for results: brackets in the names of files are no markup."""
+    return Console(markup=False)
+
+
 @contextlib.contextmanager
 def show_progress(console: Console) -> Iterator[Progress]:
     """Show a `Progress` on `console` while the block runs: bars on a terminal, else lines."""
@@ -69,8 +74,9 @@ def line_progress(write: Callable[[str], object], clock: Callable[[], float] = t
 
 def print_tables(tables: Iterable[Table], width: int) -> None:
     """Print tables, on a terminal narrower than `width` characters as if it had these, so that no number is cut."""
-    console = Console()
-    console = console if console.width >= width else Console(width=width)
+    console = plain_console()
+    if console.width < width:
+        console.width = width
     for table in tables:
         console.print(table)
 

@@ -8,7 +8,7 @@ import torch
 from rich.console import Console
 
 from oasis_warp import __version__
-from oasis_warp.cli.console import check_device, show_progress
+from oasis_warp.cli.console import check_device, plain_console, show_progress
 from oasis_warp.cli.options import Edit as Options
 from oasis_warp.cli.report import measures_table, print_warnings, to_json
 from oasis_warp.cli.summary import GROUND, WIDTH, Panel, make_sheet, panel_side
@@ -16,7 +16,7 @@ from oasis_warp.core.camera import crop_camera, orbit_camera
 from oasis_warp.core.config import EditConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, HandPose
-from oasis_warp.data.output_files import write_file
+from oasis_warp.data.output_files import output_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8, write_picture
 from oasis_warp.data.square_crop import resample_square
@@ -39,7 +39,7 @@ MEASURES = {
 
 
 def run(options: Options) -> int:
-    """Write the new avatar, its summary and its report.
+    """Write the new avatar, its summary and its report: all three, or none.
 
     Raises:
         InputError: a wrong file or option, an output that exists, or no paint on the hand.
@@ -50,14 +50,8 @@ def run(options: Options) -> int:
     out = options.out or options.avatar.with_name(f"{options.avatar.stem}-{options.painted.stem}.safetensors")
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: expected a name that ends in .safetensors; rename the output.")
-    files = out, out.with_suffix(".png"), out.with_suffix(".json")
-    given = {path.resolve() for path in (options.avatar, options.painted, options.photo, options.mask) if path}
-    for file in files:
-        if file.resolve() in given:
-            raise InputError(f"{file}: would replace an input of the edit; choose another name with --out.")
-        if file.exists() and not options.overwrite:
-            raise InputError(f"{file}: exists already; choose another name with --out, or give --overwrite.")
-    with show_progress(Console(stderr=True)) as progress:
+    with output_folder(out.parent) as part, show_progress(Console(stderr=True)) as progress:
+        _check_outputs(options, out)
         before = Avatar.load(options.avatar, options.device)
         made = edit(
             before,
@@ -67,12 +61,26 @@ def run(options: Options) -> int:
             config=config,
             progress=progress,
         )
-    report, summary = _report(options, made), draw_edit(before, made, options.painted.name)
-    write_picture(files[1], summary)
-    write_file(files[2], to_json(report).encode())
-    made.avatar.save(files[0])
-    _print(Console(), report, out)
+        report, summary = _report(options, made), draw_edit(before, made, options.painted.name)
+        picture, notes, avatar = (part / file.name for file in _outputs(out))
+        write_picture(picture, summary)
+        write_file(notes, to_json(report).encode())
+        made.avatar.save(avatar)
+    _print(plain_console(), report, out)
     return 0
+
+
+def _outputs(out: Path) -> tuple[Path, Path, Path]:
+    return out.with_suffix(".png"), out.with_suffix(".json"), out
+
+
+def _check_outputs(options: Options, out: Path) -> None:
+    given = {path.resolve() for path in (options.avatar, options.painted, options.photo, options.mask) if path}
+    for file in _outputs(out):
+        if file.resolve() in given:
+            raise InputError(f"{file}: would replace an input of the edit; choose another name with --out.")
+        if file.exists() and not options.overwrite:
+            raise InputError(f"{file}: exists already; choose another name with --out, or give --overwrite.")
 
 
 def _report(options: Options, made: Edit) -> dict[str, Any]:

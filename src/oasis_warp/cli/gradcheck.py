@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 
 import torch
 from rich import box
@@ -18,7 +19,7 @@ from oasis_warp.cli.console import FAULT, show_progress
 from oasis_warp.cli.options import Gradcheck
 from oasis_warp.cli.report import to_json
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.output_files import write_file
+from oasis_warp.data.output_files import output_file
 
 SHOWN = 20
 """Failures that are printed one by one."""
@@ -30,13 +31,15 @@ def run(options: Gradcheck) -> int:
     names = (options.family,) if options.family else tuple(FAMILIES)
     device = torch.device(options.device)
     start, verdict = time.monotonic(), Verdict()
-    with show_progress(Console(stderr=True)) as progress:
-        for stage, done, total, measured in measurements(options, names, device):
-            verdict.add(measured)
-            progress(stage, done, total)
-    seconds = time.monotonic() - start
-    if options.json:
-        write_file(options.json, report(options, verdict, device, seconds).encode())
+    # The file is opened first: what cannot be written is refused before a minute of work.
+    with output_file(options.json) if options.json else nullcontext() as part:
+        with show_progress(Console(stderr=True)) as progress:
+            for stage, done, total, measured in measurements(options, names, device):
+                verdict.add(measured)
+                progress(stage, done, total)
+        seconds = time.monotonic() - start
+        if part is not None:
+            part.write_text(report(options, verdict, device, seconds))
     print_verdict(Console(), verdict, options, seconds)
     return 0 if verdict.passed else FAULT
 
@@ -50,8 +53,6 @@ def check(options: Gradcheck) -> None:
         raise InputError(f"--seed: expected 0 or more, got {options.seed}.")
     if options.device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device: no CUDA device found; leave it out to certify the CPU.")
-    if options.json and not options.json.parent.is_dir():
-        raise InputError(f"{options.json}: its folder does not exist; make it first.")
 
 
 def measurements(

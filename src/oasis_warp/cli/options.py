@@ -13,9 +13,7 @@ from oasis_warp.core.config import EditConfig, ReconstructConfig
 
 # Options that several commands share, with their help.
 Output = Annotated[Path, arg(aliases=["-o"], metavar="PATH")]
-OutputFolder = Annotated[
-    Path, arg(aliases=["-o"], metavar="PATH", help="Folder for the results; its parent must exist.")
-]
+OutputFolder = Annotated[Path, arg(aliases=["-o"], metavar="PATH", help="Folder for the results.")]
 AvatarFile = Positional[Annotated[Path, arg(help="avatar.safetensors of `oasis reconstruct`.")]]
 BackboneWeights = Annotated[
     Path | None, arg(help="DINOv2's model.safetensors, for a network of your own in the paper's profile.")
@@ -304,7 +302,7 @@ class Synthesize:
     """
 
     out: Positional[Path]
-    """Folder for the shards, or the picture to write with --sheet; the parent must exist."""
+    """Folder for the shards, or the picture to write with --sheet."""
     count: int = 64
     """How many pictures; eight in a row show one person."""
     seed: int = 0
@@ -330,7 +328,7 @@ class Pretrain:
     """
 
     out: Positional[Path]
-    """Folder for what training leaves; its parent must exist."""
+    """Folder for what training leaves."""
     task: Literal["prior", "dense"] = "prior"
     """The learned prior, which predicts Gaussians, or the estimator's dense network, which reads every pixel."""
     profile: Literal["compact", "paper"] = "compact"

@@ -3,7 +3,7 @@
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,14 @@ from typing import Any
 from rich.console import Console
 
 from oasis_warp.cli.animate import turntable
-from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED, check_device, show_progress
+from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED, check_device, plain_console, show_progress
 from oasis_warp.cli.options import Reconstruct
 from oasis_warp.cli.report import make_report, print_report, to_json
 from oasis_warp.cli.summary import GROUND, draw_quality, draw_summary
 from oasis_warp.core.config import ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import timed_stage
-from oasis_warp.data.output_files import output_folder
+from oasis_warp.data.output_files import make_folders, output_folder
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture, write_video
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand, palm_and_back
@@ -42,7 +42,7 @@ def run(options: Reconstruct) -> int:
     if isinstance(options.prior, Path):
         read_header(options.prior)  # check it once, not for every photo
     if len(options.photos) == 1 or options.same_hand or _is_one_hand(options):
-        print_report(Console(), reconstruct_folder(options.photos, options.out, config, options.keypoints))
+        print_report(plain_console(), reconstruct_folder(options.photos, options.out, config, options.keypoints))
         return 0
     return _reconstruct_all(options, config)
 
@@ -94,7 +94,7 @@ def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
                     print(f"oasis: {error}", file=sys.stderr)
                     failed.append(str(photo))
                 else:
-                    print_report(Console(), report)
+                    print_report(plain_console(), report)
                     n_done += 1
         except KeyboardInterrupt:
             print(f"oasis: stopped; {n_done} of {n_photos} photos are done.", file=sys.stderr)
@@ -107,17 +107,14 @@ def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
 
 @contextmanager
 def _shared_folder(path: Path) -> Iterator[None]:
-    """Create the folder of all results, and remove it again if it stays empty."""
-    if path.exists():
-        yield
-        return
-    with output_folder(path):
-        pass
+    """Create the folder of all results and those above it, and remove those again that stay empty."""
+    made = make_folders(path, path)
     try:
         yield
     finally:
-        if not any(path.iterdir()):
-            path.rmdir()
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 def reconstruct_folder(

@@ -1,8 +1,25 @@
 """The error for users."""
 
+MOST_LETTERS, MOST_QUOTED = 1000, 80
+"""Longest message and longest quotation: a file's own words may go on for megabytes."""
+
+
+def one_line(text: object) -> str:
+    """The text with what no terminal should get, such as line breaks and escape codes, written out."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+
+
+def shortened(text: str, most: int = MOST_QUOTED) -> str:
+    """At most `most` letters of what a message quotes, the middle left out."""
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-(most // 2) :]}"
+
 
 class InputError(ValueError):
     """Invalid input of the user; the message is one sentence: where, what is wrong, what to do.
 
-    The command line prints it without a traceback and exits with code 2.
+    The command line prints it without a traceback and exits with code 2. Messages quote files and names that others
+    made, so they are cut to a length, and what is not printable is written out.
     """
+
+    def __init__(self, message: str = ""):
+        super().__init__(one_line(shortened(message, MOST_LETTERS)))

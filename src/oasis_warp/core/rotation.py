@@ -1,7 +1,7 @@
 """Rotations in torch: wxyz quaternions and matrices."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
@@ -69,3 +69,9 @@ def from_axis_angle(axes: Float[Tensor, "*batch 3"], angles: Float[Tensor, "*bat
     sin, cos = torch.sin(angles)[..., None, None], torch.cos(angles)[..., None, None]
     eye = torch.eye(3, dtype=axes.dtype, device=axes.device)
     return eye + sin * cross + (1 - cos) * (cross @ cross)
+
+
+def is_rotation(matrix: Float[Tensor, "3 3"], tolerance: float = 1e-3) -> Bool[Tensor, ""]:
+    """Whether a finite matrix is a rotation: orthonormal rows, determinant 1."""
+    off = (matrix @ matrix.T - torch.eye(3).to(matrix)).abs().amax()
+    return (off < tolerance) & (torch.linalg.det(matrix) > 0)

@@ -182,11 +182,17 @@ def _captured_stderr() -> Iterator[IO[bytes]]:
     with _stderr_lock, tempfile.TemporaryFile() as caught:
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        original = os.dup(2)
+        try:
+            original = os.dup(2)
+        except OSError:  # a closed stream
+            original = None
         os.dup2(caught.fileno(), 2)
         try:
             yield caught
         finally:
-            os.dup2(original, 2)
-            os.close(original)
+            if original is None:
+                os.close(2)
+            else:
+                os.dup2(original, 2)
+                os.close(original)
             cv2.utils.logging.setLogLevel(level)

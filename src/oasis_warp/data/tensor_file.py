@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 
 from oasis_warp.core.errors import InputError
@@ -35,3 +36,15 @@ def open_tensors(path: Path, content: str, source: str, remedy: str = "copy it a
         ) from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the file's permissions.") from error
+
+
+DTYPES = {
+    "F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "I64": torch.int64,
+    "I32": torch.int32, "I16": torch.int16, "I8": torch.int8, "U8": torch.uint8, "BOOL": torch.bool,
+}  # fmt: skip
+
+
+def tensor_shapes(file: Any) -> dict[str, tuple[torch.dtype | None, list[int]]]:
+    """Type, None where it is a rare one, and shape of every tensor, without reading any."""
+    slices = {name: file.get_slice(name) for name in file.keys()}
+    return {name: (DTYPES.get(part.get_dtype()), part.get_shape()) for name, part in slices.items()}

@@ -66,7 +66,7 @@ def evaluate_looks(
     Args:
         prior: Of the avatars.
         folder: Of photos, each of another hand; a subfolder holds photos of one hand.
-        out: Output folder; its parent must exist.
+        out: Output folder.
         config: Its steps, seed and device are used; all else is as `reconstruct` ships it.
         perceptual: LPIPS, where its weights are at hand.
         progress: Called for photos.

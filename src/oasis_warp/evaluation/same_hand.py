@@ -204,7 +204,7 @@ def evaluate_photos(
     Args:
         priors: By the names of methods' priors: "mean" and, if there is one, "learned".
         folder: See `photos_of_hands`.
-        out: Output folder; its parent must exist.
+        out: Output folder.
         config: Its steps, seed and device are used, and its size for the pictures that are compared.
         progress: Called for photos and pairs.
 

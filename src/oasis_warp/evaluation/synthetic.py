@@ -100,7 +100,7 @@ def evaluate_people(
     Args:
         priors: By the names of methods' priors.
         config: What to measure.
-        folder: Output folder; its parent must exist.
+        folder: Output folder.
         device: Device to compute on.
         perceptual: LPIPS, if its weights are available.
         workers: Processes that measure people in parallel after the first one; 0 for none. One process leaves a GPU

@@ -40,7 +40,7 @@ def write_shards(
     Shards that exist already stay. A stopped run continues where it was, and ends with the same files.
 
     Args:
-        folder: Created if needed; its parent must exist.
+        folder: Created if needed.
         count: Number of pictures.
         seed: Seed of the world.
         size: Side of the pictures [px].

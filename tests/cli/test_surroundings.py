@@ -1,0 +1,73 @@
+"""What surrounds a command: closed streams, odd names, folders that are not there, no memory."""
+
+import os
+import subprocess
+import sys
+
+import cv2
+import pytest
+import torch
+from disk import full_disk
+
+from oasis_warp.cli import main
+from oasis_warp.cli.app import is_out_of_memory
+from oasis_warp.cli.console import plain_console
+from oasis_warp.cli.report import measures_table
+
+CLOSED = """
+import os, sys
+os.closerange(0, 3)
+sys.stdin = sys.stdout = sys.stderr = None  # as Python starts without them
+from oasis_warp.cli.app import open_standard_streams
+open_standard_streams()
+assert os.open(sys.argv[1], os.O_RDONLY) > 2
+print("nobody reads this")
+print("nor this", file=sys.stderr)
+os.close(2)
+from oasis_warp.data.photo import read_photo
+assert read_photo(sys.argv[1]).rgb.shape == (48, 64, 3)
+os._exit(7)
+"""
+
+
+def test_closed_streams_are_opened_so_that_no_file_gets_their_numbers(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), torch.zeros(48, 64, 3, dtype=torch.uint8).numpy())
+    assert subprocess.run([sys.executable, "-c", CLOSED, str(tmp_path / "a.png")]).returncode == 7
+
+
+@pytest.mark.parametrize("name", ["[/b]", "[red]", "a" * 250])
+def test_a_picture_with_an_odd_name_in_a_folder_that_is_not_there_is_drawn(avatar_file, tmp_path, name):
+    out = tmp_path / "new" / f"{name}.png"
+    assert main(["render", str(avatar_file), "-o", str(out), "--size", "16"]) == 0
+    assert [file.name for file in out.parent.iterdir()] == [out.name]
+
+
+def test_brackets_in_the_name_of_a_photo_are_no_markup(capsys):
+    plain_console().print(measures_table("a[/b].png on [red]", {"total": 1.0}, {}, {}))
+    assert "a[/b].png on [red]" in capsys.readouterr().out
+
+
+def test_names_that_are_no_text_can_be_printed():
+    code = "import sys; from oasis_warp.cli.app import open_standard_streams as o; o(); print(sys.argv[1])"
+    done = subprocess.run([sys.executable, "-c", code, b"a\xff.png"], capture_output=True, env=os.environ | {"PYTHONUTF8": "1"})
+    assert done.stdout == b"a\\udcff.png\n"
+
+
+def test_a_full_disk_is_told_and_leaves_no_picture(avatar_file, capsys):
+    with full_disk(500):
+        assert main(["render", str(avatar_file), "-o", str(avatar_file.with_name("x.png")), "--size", "64"]) == 2
+    assert "no room left" in capsys.readouterr().err
+    assert [file.name for file in avatar_file.parent.iterdir()] == [avatar_file.name]
+
+
+def test_full_memory_is_told_in_one_sentence(avatar_file, tmp_path, monkeypatch, capsys):
+    from oasis_warp.cli import render
+
+    def fail(*_):
+        torch.empty(1 << 60, dtype=torch.uint8)
+
+    monkeypatch.setattr(render, "orbit_camera", fail)
+    assert main(["render", str(avatar_file), "-o", str(tmp_path / "x.png")]) == 2
+    assert capsys.readouterr().err == "oasis: the memory of cpu is full; give smaller sizes, or fewer at once.\n"
+    assert is_out_of_memory(MemoryError()) and is_out_of_memory(torch.OutOfMemoryError("CUDA"))
+    assert not is_out_of_memory(RuntimeError("a bug"))
