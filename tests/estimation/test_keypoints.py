@@ -1,4 +1,5 @@
 import json
+import os
 
 import numpy as np
 import pytest
@@ -86,8 +87,16 @@ def test_a_pose_elsewhere_is_warned_about(fitted, tmp_path):
         ({"xy": [[1, 2]] * 20}, r'"xy" must be 21 x 2 numbers'),
         ({"xy": [[1, 2]] * 20 + [[1, "a"]]}, r'"xy" must be 21 x 2 numbers'),
         ({"xy": [[1, 2]] * 20 + [[1]]}, r'"xy" must be 21 x 2 numbers'),
-        ({"xy": [[1, 2]] * 20 + [[1, float("nan")]]}, r'"xy" must be 21 x 2 numbers, all finite'),
-        ({"xy": [[-5, -5]] * 21}, r'none of the points of "xy" lies in'),
+        ({"xy": [[1, 2]] * 20 + [[1, float("nan")]]}, "NaN is no number"),
+        ({"xy": [[-5, -5]] * 21}, r'"xy": none of the points lies in'),
+        ({"xy": [[60, 60]] * 20 + [[1e6, 10]]}, r'"xy": a point lies far beyond the border'),
+        ({"xy": [[60, 60]] * 20 + [[1e39, 10]]}, r'"xy" must be 21 x 2 numbers from -1e\+09'),
+        ({"xy": [[60, 60]] * 21}, r'"xy": all points lie within 8 pixels'),
+        ({"xy": [[10**400, 0]] * 21}, r'"xy" must be 21 x 2 numbers'),
+        ({"xy": [[True, False]] * 21}, r'"xy" must be 21 x 2 numbers'),
+        ({"world": [[0, 0, 1e6]] * 21}, r'"world" must be 21 x 3 numbers from -1 to 1'),
+        ({"side": "\x1b[31m" * 10_000}, r'"side" must be "left" or "right"'),
+        ({"k" * 10_000: 1}, "is not known here"),
         ({"world": [[0, 0]] * 21}, r'"world" must be 21 x 3 numbers'),
         ({"angles": [[0, 0, 0]] * 15}, r'either "xy" .* or "angles"'),
         ({"depth": 3}, r'the key "depth" is not known'),
@@ -109,6 +118,16 @@ def test_wrong_landmarks_get_one_sentence_that_names_the_key(fitted, tmp_path, c
         ({"focal": -1}, r'"focal" must be a positive number'),
         ({"orientation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "must be a rotation matrix"),
         ({"translation": [0, 0, -0.5]}, "behind the camera"),
+        ({"translation": [0, 0, 0.03]}, "puts fingers behind the camera"),
+        ({"translation": [0, 0, 1e6]}, r'"translation" must be 3 numbers from -100 to 100'),
+        ({"translation": [-1e6, 0, 0.5]}, r'"translation" must be 3 numbers from -100 to 100'),
+        ({"translation": [-50, 0, 0.5]}, "none of the points lies in"),
+        ({"translation": [0, 0, 99]}, "all points lie within 8 pixels"),
+        ({"focal": 1e-300}, r'"focal" must be a positive number of pixels, [0-9]+ to [0-9]+ for this'),
+        ({"focal": 1e9}, r'"focal" must be a positive number'),
+        ({"centre": [1e9, 0]}, r'"centre" must be 2 numbers from'),
+        ({"angles": [[1e3] * 3] * 15}, r'"angles" must be 15 x 3 numbers from'),
+        ({"shape": [1e5] * 40}, r'"shape" must be 40 numbers from -10 to 10'),
         ({"shape": [0, 0]}, r'"shape" must be 40 numbers'),
         ({"angles": [0] * 45}, r'"angles" must be 15 x 3 numbers'),
         ({"centre": "middle"}, r'"centre" must be 2 numbers'),
@@ -138,8 +157,21 @@ def test_what_is_no_object_of_json_is_refused(fitted, tmp_path, text):
 
 def test_a_missing_file_is_named(fitted, tmp_path):
     photo, _, _ = fitted(NAME)
-    with pytest.raises(InputError, match=r"gone\.json: cannot be read"):
+    with pytest.raises(InputError, match=r"gone\.json: expected a JSON file of one hand, found no such file"):
         read_keypoints(tmp_path / "gone.json", photo)
+
+
+@pytest.mark.timeout(10)
+def test_a_pipe_and_an_endless_file_are_not_read(fitted, tmp_path):
+    photo, _, _ = fitted(NAME)
+    os.mkfifo(tmp_path / "pipe.json")
+    for path in (tmp_path / "pipe.json", "/dev/zero"):
+        with pytest.raises(InputError, match="found a device or pipe"):
+            read_keypoints(path, photo)
+    with (tmp_path / "big.json").open("w") as file:
+        file.truncate(1 << 40)  # a hole
+    with pytest.raises(InputError, match="more than 1 MB"):
+        read_keypoints(tmp_path / "big.json", photo)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

@@ -1,6 +1,7 @@
 """Read landmarks, or a pose and camera, from another tool's JSON file: one object per hand (docs/estimator.md)."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,10 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from oasis_warp.core.errors import InputError
+from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.mirror import mirror_landmarks
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
+from oasis_warp.data.json_text import MOST_LETTERS, read_json
 from oasis_warp.estimation.fit_problem import MirroredInput, mirrored_state, real
 from oasis_warp.estimation.fit_quality import fit_quality, framing_warnings
 from oasis_warp.estimation.pixel_reading import read_pixels
@@ -21,7 +23,18 @@ from oasis_warp.hand.template import bundled_hand
 
 _LANDMARK_KEYS = {"side", "xy", "world"}
 _POSE_KEYS = {"side", "angles", "orientation", "translation", "shape", "focal", "centre"}
-_MAX_BYTES = 1 << 20
+FAR_OUT = 1.0
+"""Farthest landmark beyond the border of the photo, over its longer side: a hand may be cut, not far away."""
+FEWEST_PIXELS = 8
+"""Least extent of a hand, of which nothing can be seen below [px of the photo as read]."""
+FOCALS = (0.05, 1000.0)
+"""Least and greatest focal length over the photo's longer side: a fisheye, and a crop from far away."""
+DEPTHS = (0.02, 100.0)
+"""Nearest and farthest hand [m]."""
+REACH, MOST_SHAPE, MOST_ANGLE = 1.0, 10.0, 2 * math.pi
+"""Bounds of `world` [m], `shape` [standard deviations] and `angles` [rad]."""
+MOST_NUMBER = 1e9
+"""Of all others, so that float32 holds their squares."""
 
 
 def read_keypoints(path: Path | str, photo: Photo, *, hand: HandModel | None = None) -> Landmarks | HandFit:
@@ -37,22 +50,20 @@ def read_keypoints(path: Path | str, photo: Photo, *, hand: HandModel | None = N
     data = _read_object(path)
     side = data.get("side")
     if side not in ("left", "right"):
-        raise InputError(f'{path}: "side" must be "left" or "right", got {json.dumps(side)}; add it.')
+        raise InputError(f'{path}: "side" must be "left" or "right", got {shortened(json.dumps(side))}; add it.')
     if ("xy" in data) == ("angles" in data):
         raise InputError(f'{path}: expected either "xy" (21 landmarks) or "angles" (a pose); see docs/estimator.md.')
     if unknown := sorted(set(data) - (_LANDMARK_KEYS if "xy" in data else _POSE_KEYS)):
-        raise InputError(f'{path}: the key "{unknown[0]}" is not known here; see docs/estimator.md for those that are.')
+        raise InputError(f'{path}: the key "{shortened(unknown[0])}" is not known here; see docs/estimator.md for those that are.')
     if "xy" in data:
         return _landmarks(path, data, side, photo)
     return _pose(path, data, side, photo, hand or bundled_hand())
 
 
 def _landmarks(path: Path, data: dict[str, Any], side: Side, photo: Photo) -> Landmarks:
-    height, width = photo.rgb.shape[:2]
     xy = _numbers(path, data, "xy", (21, 2)) * photo.shrink
-    if not ((xy >= 0) & (xy <= [width, height])).all(1).any():
-        raise InputError(f'{path}: none of the points of "xy" lies in {photo.name}; give pixels of the upright photo.')
-    world = _numbers(path, data, "world", (21, 3)) if "world" in data else None
+    _check_points(f'{path}: "xy"', xy, photo)
+    world = _numbers(path, data, "world", (21, 3), REACH) if "world" in data else None
     return Landmarks(real(xy), None if world is None else real(world), side, 1.0, 1.0, "file")
 
 
@@ -61,20 +72,45 @@ def _pose(path: Path, data: dict[str, Any], side: Side, photo: Photo, hand: Hand
     rotation = _numbers(path, data, "orientation", (3, 3))
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise InputError(f'{path}: "orientation" must be a rotation matrix (orthonormal, determinant 1); correct it.')
-    translation = _numbers(path, data, "translation", (3,))
-    if translation[2] <= 0.02:
+    translation = _numbers(path, data, "translation", (3,), DEPTHS[1])
+    if translation[2] <= DEPTHS[0]:
         raise InputError(f'{path}: "translation" puts the hand behind the camera; z points forward, in metres.')
+    longer = max(width, height)
     focal = float(_numbers(path, data, "focal", ())) * photo.shrink
-    if focal <= 0:
-        raise InputError(f'{path}: "focal" must be a positive number of pixels, got {data["focal"]}; correct it.')
+    if not FOCALS[0] * longer <= focal <= FOCALS[1] * longer:
+        low, high = (factor * longer / photo.shrink for factor in FOCALS)
+        raise InputError(
+            f'{path}: "focal" must be a positive number of pixels, {low:.0f} to {high:.0f} for this photo; correct it.'
+        )
     size = hand.shape_basis.shape[2]
-    shape = _numbers(path, data, "shape", (size,)) if "shape" in data else np.zeros(size)
+    shape = _numbers(path, data, "shape", (size,), MOST_SHAPE) if "shape" in data else np.zeros(size)
     centre = np.array([width, height]) / 2
     if "centre" in data:
-        centre = _numbers(path, data, "centre", (2,)) * photo.shrink
-    pose = HandPose(real(_numbers(path, data, "angles", (15, 3))), real(rotation), real(translation))
+        centre = _numbers(path, data, "centre", (2,), FOCALS[1] * longer / photo.shrink) * photo.shrink
+    pose = HandPose(real(_numbers(path, data, "angles", (15, 3), MOST_ANGLE)), real(rotation), real(translation))
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
-    return fit_of_pose(hand, photo, side, shape, pose, Camera(torch.eye(4), real(K), width, height))
+    camera = Camera(torch.eye(4), real(K), width, height)
+    kinematics = HandKinematics(hand)
+    state = mirrored_state(kinematics, side, shape, pose, camera)
+    points = kinematics.landmarks(kinematics.pose_joints(state.angles, state.shape))[0]
+    if state.in_camera(points)[:, 2].min() <= DEPTHS[0]:
+        raise InputError(f'{path}: "translation" puts fingers behind the camera; z points forward, in metres.')
+    xy = state.project(points)
+    xy[:, 0] = width - xy[:, 0] if side == "left" else xy[:, 0]
+    _check_points(f"{path}: this pose and camera", xy, photo)
+    return fit_of_pose(hand, photo, side, shape, pose, camera)
+
+
+def _check_points(name: str, xy: np.ndarray, photo: Photo) -> None:
+    """Refuse landmarks that show no hand of the photo."""
+    height, width = photo.rgb.shape[:2]
+    if not ((xy >= 0) & (xy <= [width, height])).all(1).any():
+        raise InputError(f"{name}: none of the points lies in {photo.name}; give pixels of the upright photo.")
+    beyond = FAR_OUT * max(width, height)
+    if not ((xy >= -beyond) & (xy <= np.array([width, height]) + beyond)).all():
+        raise InputError(f"{name}: a point lies far beyond the border of {photo.name}; give pixels of the whole photo.")
+    if np.ptp(xy, 0).max() < FEWEST_PIXELS:
+        raise InputError(f"{name}: all points lie within {FEWEST_PIXELS} pixels; give 21 different ones of a hand.")
 
 
 def fit_of_pose(
@@ -120,19 +156,24 @@ def fit_of_pose(
 
 def _read_object(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > _MAX_BYTES:
+        if not path.is_file():
+            found = "a folder" if path.is_dir() else "a device or pipe" if path.exists() else "no such file"
+            raise InputError(f"{path}: expected a JSON file of one hand, found {found}; check the name.")
+        if path.stat().st_size > MOST_LETTERS:
             raise InputError(f"{path}: expected a JSON file of one hand, got more than 1 MB; give the right file.")
-        data = json.loads(path.read_text(encoding="utf-8"))
+        return read_json(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the name and the permissions.") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected JSON, got something else; see docs/estimator.md for the format.") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a JSON object with the keys of one hand; see docs/estimator.md.")
-    return data
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; see docs/estimator.md for the format.") from error
 
 
-def _numbers(path: Path, data: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
+def _numbers(
+    path: Path, data: dict[str, Any], key: str, shape: tuple[int, ...], most: float = MOST_NUMBER
+) -> np.ndarray:
+    """The numbers of a key, none beyond `most` in size."""
     expected = " x ".join(map(str, shape)) + " numbers" if shape else "a number"
     if key not in data:
         raise InputError(f'{path}: the key "{key}" is missing; add {expected}.')
@@ -142,4 +183,6 @@ def _numbers(path: Path, data: dict[str, Any], key: str, shape: tuple[int, ...])
         values = np.array(None)
     if values.dtype.kind not in "iuf" or values.shape != shape or not np.isfinite(values).all():
         raise InputError(f'{path}: "{key}" must be {expected}, all finite; correct it.')
+    if np.abs(values.astype(np.float64)).max() > most:
+        raise InputError(f'{path}: "{key}" must be {expected} from {-most:.6g} to {most:.6g}; correct it.')
     return values.astype(np.float64)
