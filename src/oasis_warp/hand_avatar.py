@@ -18,7 +18,6 @@ from oasis_warp.avatar.pose import (
 )
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.config import BLACK, WHITE
-from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.mirror import (
     mirror_camera,

@@ -70,18 +70,18 @@ def test_kernels_prints_a_table_and_writes_json(monkeypatch, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["error-time", "-o", "{}/no/folder"], "expected the folder"),
+        (["error-time", "-o", "/dev/null/folder"], "expected the folder"),
         (["error-time", "-o", "{}/o", "--repeats", "1"], "--repeats: expected 2 or more, got 1"),
         (["error-time", "-o", "{}/o", "--size", "30"], "--size: expected a multiple of 4 from 16 to 4096"),
         (["error-time", "-o", "{}/o", "--threads", "0"], "--threads: expected 1 to"),
         (["kernels", "--size", "5000"], "--size: expected 16 to 4096"),
         (["kernels", "--gaussians", "40000"], "--gaussians: expected 1 to 36881, as many as the hand has, got 40000"),
-        (["kernels", "--json", "{}/no/k.json"], "expected the folder"),
-        (["kernels", "--csv", "{}/no/k.csv"], "expected the folder"),
+        (["kernels", "--json", "/dev/null/k.json"], "expected the folder"),
+        (["kernels", "--csv", "/dev/null/k.csv"], "expected the folder"),
         (["kernels", "--plot", "{}/k.jpeg"], "k.jpeg: expected a name that ends in .png or .svg."),
         (["kernels", "--peer", "gsplat"], "--peer gsplat: it draws on CUDA devices only; add --device cuda."),
         (["kernels", "--only", "nothing"], "--only nothing: expected part of one of rasterization, blend_weights"),
-        (["scaling", "-o", "{}/no/folder"], "expected the folder"),
+        (["scaling", "-o", "/dev/null/folder"], "expected the folder"),
         (["scaling", "-o", "{}/o", "--seconds", "0"], "--seconds: expected more than 0, got 0."),
         (["scaling", "-o", "{}/o", "--threads", "0"], "--threads: expected 1 to"),
     ],
@@ -147,7 +147,7 @@ def test_kernels_on_a_gpu_are_its_own_cases_on_both_clocks(gpu, tmp_path, capsys
         (["--only", "nothing"], "--only nothing: expected part of one of 37k at 512 x 512, 12k at 256 x 256"),
         (["--repeats", "1"], "--repeats: expected 2 or more, got 1"),
         (["--peer", "gsplat"], "--peer gsplat: the package is not installed; `pip install gsplat` brings it."),
-        (["--json", "{}/no/k.json"], "expected the folder"),
+        (["--json", "/dev/null/k.json"], "expected the folder"),
     ],
 )
 def test_what_cannot_be_measured_on_a_gpu_is_refused_in_one_sentence(

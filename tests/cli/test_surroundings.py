@@ -49,7 +49,8 @@ def test_brackets_in_the_name_of_a_photo_are_no_markup(capsys):
 
 def test_names_that_are_no_text_can_be_printed():
     code = "import sys; from oasis_warp.cli.app import open_standard_streams as o; o(); print(sys.argv[1])"
-    done = subprocess.run([sys.executable, "-c", code, b"a\xff.png"], capture_output=True, env=os.environ | {"PYTHONUTF8": "1"})
+    utf8 = os.environ | {"PYTHONUTF8": "1"}
+    done = subprocess.run([sys.executable, "-c", code, b"a\xff.png"], capture_output=True, env=utf8)
     assert done.stdout == b"a\\udcff.png\n"
 
 

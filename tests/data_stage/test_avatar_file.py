@@ -181,7 +181,9 @@ def test_a_header_that_cannot_be_right_is_refused(written, changes, expected):
         load_avatar(written)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "1", "[" * 100_000, '{"version": NaN}', f'{{"version": {"1" * 5000}}}'])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "1", "[" * 100_000, '{"version": NaN}', f'{{"version": {"1" * 5000}}}']
+)
 def test_a_header_that_is_no_json_object_is_refused(written, tensors, text):
     save_file(tensors, written, {FORMAT: text})
     with pytest.raises(InputError, match="damaged avatar file"):

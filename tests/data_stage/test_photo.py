@@ -213,7 +213,7 @@ def test_what_is_no_photo_is_refused_in_one_sentence(read, data, expected):
 def test_random_damage_gives_a_photo_or_one_sentence(read, suffix):
     rng = np.random.default_rng(5)
     whole = encode(suffix, picture(), exif(6, 28) if suffix in (".jpg", ".png", ".webp") else None)
-    for _ in range(40):
+    for _ in range(4 if suffix == ".avif" else 40):  # each in a process of its own
         data = bytearray(whole)
         for place in rng.integers(0, min(len(data), 400), rng.integers(1, 5)):  # most of what can go wrong is in front
             data[place] = rng.integers(256)

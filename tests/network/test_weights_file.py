@@ -1,6 +1,7 @@
 """Weights files: what goes in comes out, and what does not fit is refused in one sentence."""
 
 import json
+import resource
 from dataclasses import replace
 
 import pytest
@@ -106,9 +107,40 @@ def not_finite(tensors):
     tensors["vertex_head.last.bias"] = tensors["vertex_head.last.bias"] * float("nan")
 
 
+def many_tokens(header):
+    header["config"]["n_tokens"] = 6_000_000
+
+
+def many_layers(header):
+    header["config"]["refine_layers"] = 30
+    header["config"]["width"] = 2048
+
+
+def true_layers(header):
+    header["config"]["refine_layers"] = True
+
+
+def half_a_version(header):
+    header["version"] = 1.5
+
+
+def long_name(header):
+    header["hand_model"] = "\x1b[31m" * 100_000
+
+
+def whole_numbers(tensors):
+    tensors["vertex_head.last.bias"] = tensors["vertex_head.last.bias"].to(torch.int32)
+
+
 @pytest.mark.parametrize(
     ("header", "tensors", "message"),
     [
+        (many_tokens, None, "n_tokens: expected a whole number from 1 to 4096, got 6000000"),
+        (many_layers, None, "holds fewer weights than the network that its header describes; copy it again"),
+        (true_layers, None, "refine_layers: expected a whole number from 1 to 32, got True"),
+        (half_a_version, None, "damaged, its header has no valid version"),
+        (long_name, None, "trained for the hand model"),
+        (None, whole_numbers, "vertex_head.last.bias holds torch.int32 instead of real numbers"),
         (newer, None, "a network of version 2, but 1 is the last known here; update oasis-warp."),
         (nameless, None, "damaged, its header has no valid hand_model; copy it again."),
         (unknown_switch, None, "its header describes no network known here .*magic"),
@@ -124,7 +156,22 @@ def test_files_that_do_not_fit_are_refused(stored, tmp_path, hand, header, tenso
     with pytest.raises(InputError, match=message) as caught:
         load_network(path, hand)
     assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 1100
+
+
+@pytest.mark.parametrize("text", ["", "[" * 100_000, "[]", f'{{"version": {"1" * 5000}}}', '{"version": NaN}'])
+def test_a_header_that_cannot_be_read_is_refused(stored, tmp_path, hand, text):
+    save_file(load_file(stored), tmp_path / "own.safetensors", {FORMAT: text})
+    with pytest.raises(InputError, match="damaged, its header cannot be read"):
+        load_network(tmp_path / "own.safetensors", hand)
+
+
+def test_no_memory_is_taken_for_a_network_larger_than_its_file(stored, tmp_path, hand):
+    path = rewritten(stored, tmp_path, many_layers, None)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match="holds fewer weights"):
+        load_network(path, hand)
+    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10 < 300 << 20
 
 
 def test_what_is_no_weights_file_is_refused(stored, tmp_path, hand):

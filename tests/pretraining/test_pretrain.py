@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 import torch
 from painted_hands import PaintedHands
-from safetensors.torch import load_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.network.config import COMPACT
@@ -74,7 +75,7 @@ def test_a_training_that_was_killed_ends_with_the_same_bits(hand, source, unbrok
 def test_a_training_killed_after_its_last_checkpoint_still_leaves_the_weights(hand, source, unbroken, tmp_path):
     shutil.copy(unbroken[0] / CHECKPOINT, tmp_path)
     lines = (unbroken[0] / METRICS).read_text()
-    (tmp_path / METRICS).write_text(lines + lines[:20])
+    (tmp_path / METRICS).write_text(lines[:50] + "\n[]\n3\n\n" + "[" * 10_000 + "\n" + lines + lines[:20])
     assert pretrain(PriorTrainer(small_network(hand), CONFIG, ALONE), source, tmp_path) == 4
     assert (tmp_path / WEIGHTS).read_bytes() == (unbroken[0] / WEIGHTS).read_bytes()
     assert (tmp_path / METRICS).read_text() == lines
@@ -95,6 +96,32 @@ def test_what_is_left_in_the_folder_says_what_happened(hand, unbroken):
 def test_the_checkpoint_of_another_network_is_refused(hand, source, unbroken):
     with pytest.raises(InputError, match="the checkpoint of a network with other sizes or switches"):
         pretrain(PriorTrainer(small_network(hand, vpia="no_bias"), CONFIG, ALONE), source, unbroken[0])
+
+
+@pytest.mark.parametrize(
+    ("header", "tensors", "words"),
+    [
+        ({"step": -1}, {}, "its step is -1; remove it"), ({"step": 1.5}, {}, "its step is 1.5"),
+        ({"step": "NaN"}, {}, "its step is 'NaN'"), ({"step": True}, {}, "its step is True"),
+        (None, {}, "its header cannot be read"), ("[" * 100_000, {}, "its header cannot be read"),
+        ({}, {"weights.vertex_head.last.bias": None}, "1 tensors do not fit"),
+        ({}, {"exp_avg.vertex_head.last.bias": torch.zeros(3)}, "1 tensors do not fit"),
+        ({}, {"more": torch.zeros(3)}, "1 tensors do not fit"),
+        ({}, {"weights.vertex_head.last.bias": torch.nan}, "not finite"),
+    ],
+)  # fmt: skip
+def test_a_damaged_checkpoint_is_refused_in_one_sentence(hand, source, unbroken, tmp_path, header, tensors, words):
+    with safe_open(unbroken[0] / CHECKPOINT, framework="pt") as file:
+        ((name, text),) = file.metadata().items()
+        stored = {key: file.get_tensor(key) for key in file.keys()}
+    for key, value in tensors.items():
+        stored[key] = stored[key] * value if isinstance(value, float) else value
+    stored = {key: value for key, value in stored.items() if value is not None}
+    text = json.dumps(json.loads(text) | header) if isinstance(header, dict) else header or ""
+    save_file(stored, tmp_path / CHECKPOINT, {name: text})
+    with pytest.raises(InputError, match=words) as caught:
+        pretrain(PriorTrainer(small_network(hand), CONFIG, ALONE), source, tmp_path)
+    assert str(tmp_path / CHECKPOINT) in str(caught.value)
 
 
 def test_the_learning_rate_rises_and_falls_or_stays():

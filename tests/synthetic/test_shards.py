@@ -1,4 +1,5 @@
 import json
+import shutil
 import tarfile
 
 import cv2
@@ -98,6 +99,19 @@ def _folder_of_pictures(tmp_path):
     pixels[..., 1] = 200
     write_picture(folder / "green.png", pixels)
     return folder
+
+
+def test_a_cut_shard_is_written_again_and_unreadable_settings_are_others(whole, tmp_path):
+    folder = tmp_path / "hands"
+    shutil.copytree(whole, folder)
+    shard = folder / "hands-000002.tar"
+    shard.write_bytes(shard.read_bytes()[:700])
+    assert write_shards(folder, **JOB) == 1
+    assert _files(folder) == _files(whole)
+    for text in (b"[1]", b"", b"\xff", b"[" * 100_000):
+        (folder / "dataset.json").write_bytes(text)
+        with pytest.raises(InputError, match=r"made with other settings \(see dataset.json\)"):
+            write_shards(folder, **JOB)
 
 
 def test_a_folder_of_pictures_stands_behind_the_hands(tmp_path):

@@ -87,6 +87,5 @@ def open_standard_streams() -> None:
 
 def is_out_of_memory(error: Exception) -> bool:
     """Whether Python, OpenCV or torch, on the CPU or CUDA, found no memory."""
-    return isinstance(error, MemoryError) or any(
-        sign in f"{type(error).__name__} {error}" for sign in ("OutOfMemory", "can't allocate memory", "Insufficient memory")
-    )
+    said, signs = f"{type(error).__name__} {error}", ("OutOfMemory", "can't allocate memory", "Insufficient memory")
+    return isinstance(error, MemoryError) or any(sign in said for sign in signs)

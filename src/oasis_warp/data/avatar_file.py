@@ -136,8 +136,8 @@ def load_avatar(
         sizes: What the letters S and V must be, and F, the number of faces: those of that hand model.
 
     Raises:
-        InputError: the file is missing, no avatar, of a newer version, of another hand model or truncated, or a tensor or header key is
-            missing, unknown or out of bounds.
+        InputError: the file is missing, no avatar, of a newer version, of another hand model or truncated, or a tensor
+            or header key is missing, unknown or out of bounds.
     """
     path = Path(path)
     with open_tensors(path, "an avatar file", "`oasis reconstruct` writes one") as file:
@@ -251,7 +251,7 @@ def _check_units(tensors: Mapping[str, Tensor]) -> None:
         "gaussians.barycentrics": (_is_near(tensors["gaussians.barycentrics"].sum(1), 1.0), "weights that sum to 1"),
         "source_pose.orientation": (is_rotation(tensors["source_pose.orientation"]), "a rotation"),
         "source_camera.viewmat": (
-            is_rotation(view[:3, :3]) & _is_near(view[3], view.new_tensor([0, 0, 0, 1])).all(), "a rotation and a shift",
+            is_rotation(view[:3, :3]) & (view[3] == view.new_tensor([0, 0, 0, 1])).all(), "a rotation and a shift",
         ),
         "source_camera.K": (
             (K.diagonal() >= 1).all() & (K == K.new_tensor(PINHOLE) * K).all() & (K[2, 2] == 1), "a camera in pixels",

@@ -1,9 +1,14 @@
 """Read format, size, orientation and focal length from the first bytes of an image file, before decoding it."""
 
+import re
 import struct
+from collections.abc import Iterator
+from itertools import islice
 from typing import NamedTuple
 
-WIDTH, HEIGHT, BITS, SAMPLES = 0x0100, 0x0101, 0x0102, 0x0115
+WIDTH, HEIGHT, BITS, SAMPLES, TILE_WIDTH, TILE_HEIGHT = 0x0100, 0x0101, 0x0102, 0x0115, 0x0142, 0x0143
+MOST_TILE = 1 << 26
+"""Largest tile of a TIFF [px]."""
 ORIENTATION, EXIF_IFD, FOCAL_35MM = 0x0112, 0x8769, 0xA405
 _LAYOUTS = {1: "B", 3: "H", 4: "I"}
 """TIFF field types read here: BYTE, SHORT, LONG."""
@@ -11,6 +16,16 @@ _LAYOUTS = {1: "B", 3: "H", 4: "I"}
 FILM_DIAGONAL = 43.2666
 """Diagonal of a 36 x 24 mm frame [mm]."""
 READABLE = "JPEG, PNG, WebP, AVIF, BMP or TIFF"
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_PNG_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"eXIf", b"IEND")
+"""Chunks of a PNG that say what a photo shows."""
+_FILL = re.compile(rb"\xff+")
+_WITHOUT_LENGTH = (0x01, *range(0xD0, 0xDA))
+"""Markers of a JPEG that stand alone."""
+MOST_CHUNKS = 200_000
+"""Of a PNG: three times what the largest has, whose pixels come in chunks of 8 KB."""
+MOST_SEGMENTS = 10_000
+"""Of a file's header: more than any camera writes, few enough to be read at once."""
 _AVIF_BRANDS = (b"avif", b"avis")
 _HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 
@@ -48,7 +63,8 @@ def _read_directory(tiff: bytes, start: int, order: str) -> dict[int, int]:
             layout, place = order + _LAYOUTS[kind], entry + 8
             if n_values * struct.calcsize(layout) > 4:  # the entry holds an offset instead of the values
                 (place,) = struct.unpack_from(order + "I", tiff, place)
-            (tags[tag],) = struct.unpack_from(layout, tiff, place)
+            (value,) = struct.unpack_from(layout, tiff, place)
+            tags.setdefault(tag, value)  # of a repeated tag libtiff takes the first
     except struct.error:
         pass  # the directory is truncated: keep the tags before
     return tags
@@ -79,6 +95,8 @@ class ImageHeader(NamedTuple):
     height: int
     pixel_bytes: int
     """Upper bound of the memory of one decoded pixel [bytes]."""
+    passes: int = 1
+    """How often the decoder goes through all pixels."""
 
 
 def read_header(data: bytes) -> ImageHeader | None:
@@ -86,9 +104,8 @@ def read_header(data: bytes) -> ImageHeader | None:
     try:
         if data.startswith(b"\xff\xd8\xff"):
             return _jpeg(data)
-        if data.startswith(b"\x89PNG\r\n\x1a\n"):
-            width, height, depth = struct.unpack_from(">IIB", data, 16)
-            return ImageHeader("PNG", width, height, 8 if depth == 16 else 4)
+        if is_png(data):
+            return _png(data)
         if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
             return ImageHeader("WebP", *_webp_size(data), 4)
         if data[4:8] == b"ftyp" and data[8:12] in _AVIF_BRANDS:
@@ -97,9 +114,14 @@ def read_header(data: bytes) -> ImageHeader | None:
             return ImageHeader("BMP", *_bmp_size(data), 4)
         if data[:4] in (b"II*\0", b"MM\0*"):
             return _tiff(data)
-    except (struct.error, KeyError, IndexError):
+    except (struct.error, KeyError, IndexError, ValueError):
         pass  # truncated
     return None
+
+
+def is_png(data: bytes) -> bool:
+    """Whether `data` begins like a PNG."""
+    return data.startswith(_PNG_MAGIC)
 
 
 def looks_readable(data: bytes) -> bool:
@@ -119,17 +141,45 @@ def unsupported_format(data: bytes) -> str | None:
     return next((name for magic, name in magics.items() if data.startswith(magic)), None)
 
 
-def _jpeg(data: bytes) -> ImageHeader:
+def _jpeg(data: bytes) -> ImageHeader | None:
     place = 2
-    while True:
-        while data[place] == 0xFF:  # fill bytes before a marker
-            place += 1
-        marker = data[place]
+    for _ in range(MOST_SEGMENTS):
+        # Garbage before a marker is skipped, as by decoders, and fill bytes are.
+        fill = _FILL.match(data, data.index(b"\xff", place))
+        place = fill.end() + 1 if fill else place
+        marker = data[place - 1]
+        if marker == 0:
+            continue
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
-            height, width = struct.unpack_from(">HH", data, place + 4)
-            return ImageHeader("JPEG", width, height, 3)
-        (length,) = struct.unpack_from(">H", data, place + 1)
-        place += 1 + length
+            height, width = struct.unpack_from(">HH", data, place + 3)
+            progressive = marker in (0xC2, 0xC6, 0xCA, 0xCE)
+            return ImageHeader("JPEG", width, height, 3, data.count(b"\xff\xda", place) if progressive else 1)
+        if marker not in _WITHOUT_LENGTH:
+            place += struct.unpack_from(">H", data, place)[0]
+    return None
+
+
+def _png(data: bytes) -> ImageHeader | None:
+    chunks = list(islice(_png_chunks(data), MOST_CHUNKS))
+    if len(chunks) == MOST_CHUNKS or any(place + length + 12 > len(data) for _, place, length in chunks):
+        return None  # a decoder would take memory for all that a chunk claims to have
+    width, height, depth = struct.unpack_from(">IIB", data, 16)
+    return ImageHeader("PNG", width, height, 8 if depth == 16 else 4)
+
+
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, place and length of every chunk; the last may reach beyond the file."""
+    place = len(_PNG_MAGIC)
+    while place + 8 <= len(data):
+        (length,) = struct.unpack_from(">I", data, place)
+        yield data[place + 4 : place + 8], place, length
+        place += length + 12
+
+
+def pixels_of_png(data: bytes) -> bytes:
+    """A PNG without texts, colour profiles and further frames, of which 8 KB can take a decoder seconds."""
+    parts = [data[at : at + n + 12] for kind, at, n in _png_chunks(data) if kind in _PNG_CHUNKS]
+    return _PNG_MAGIC + b"".join(parts)
 
 
 def _webp_size(data: bytes) -> tuple[int, int]:
@@ -143,14 +193,16 @@ def _webp_size(data: bytes) -> tuple[int, int]:
     return width & 0x3FFF, height & 0x3FFF
 
 
-def _avif(data: bytes) -> ImageHeader:
+def _avif(data: bytes) -> ImageHeader | None:
     # A tiled picture has one "ispe" box per tile and one for the whole.
-    sizes, place = [], data.index(b"ispe") if b"ispe" in data else -1
-    while place >= 0:
-        sizes.append(struct.unpack_from(">II", data, place + 8))
+    place, largest = data.find(b"ispe"), (0, 0)
+    for _ in range(MOST_SEGMENTS):
+        if place < 0:
+            return ImageHeader("AVIF", *largest, 8) if largest != (0, 0) else None
+        width, height = struct.unpack_from(">II", data, place + 8)
+        largest = max(largest, (width, height), key=lambda size: size[0] * size[1])
         place = data.find(b"ispe", place + 4)
-    largest = sorted(sizes, key=lambda size: size[0] * size[1])[-1]
-    return ImageHeader("AVIF", *largest, 8)
+    return None
 
 
 def _bmp_size(data: bytes) -> tuple[int, int]:
@@ -159,7 +211,20 @@ def _bmp_size(data: bytes) -> tuple[int, int]:
     return width, abs(height)  # a negative height means rows from the top
 
 
-def _tiff(data: bytes) -> ImageHeader:
+def _tiff(data: bytes) -> ImageHeader | None:
     tags = read_tags(data)
     samples, bits = tags.get(SAMPLES, 1), tags.get(BITS, 8)
+    tile = tags.get(TILE_WIDTH, 1) * tags.get(TILE_HEIGHT, 1)
+    if tile > MOST_TILE or _count_unread(data):
+        return None
     return ImageHeader("TIFF", tags[WIDTH], tags[HEIGHT], max(samples, 4) * max(bits, 8) // 8)
+
+
+def _count_unread(tiff: bytes) -> int:
+    """How many tags about sizes have a type that is not read here, though libtiff may."""
+    order = "<" if tiff[:2] == b"II" else ">"
+    (start,) = struct.unpack_from(order + "I", tiff, 4)
+    (count,) = struct.unpack_from(order + "H", tiff, start)
+    entries = (struct.unpack_from(order + "HH", tiff, start + 2 + 12 * k) for k in range(count))
+    sizes = (WIDTH, HEIGHT, BITS, SAMPLES, TILE_WIDTH, TILE_HEIGHT)
+    return sum(tag in sizes and kind not in _LAYOUTS for tag, kind in entries)

@@ -1,7 +1,7 @@
 """Read JSON that others wrote: one object, of bounded length and depth, without NaN."""
 
 import json
-from typing import Any
+from typing import Any, TypeGuard
 
 from oasis_warp.core.errors import shortened
 
@@ -28,7 +28,7 @@ def read_json(text: str | bytes) -> dict[str, Any]:
     return value
 
 
-def whole(value: object, low: int, high: int) -> bool:
+def whole(value: object, low: int, high: int) -> TypeGuard[int]:
     """Whether a value of JSON is a whole number from `low` to `high`; `true` is none."""
     return type(value) is int and low <= value <= high
 

@@ -20,10 +20,12 @@ from oasis_warp.data.image_header import (
     ImageHeader,
     focal_pixels,
     looks_readable,
+    pixels_of_png,
     read_exif,
     read_header,
     unsupported_format,
 )
+from oasis_warp.data.limited_decoding import decode_limited
 
 MAX_PIXELS = 24_000_000
 """Largest photo kept in memory; larger ones are scaled down and still show a hand in enough pixels."""
@@ -32,6 +34,8 @@ MAX_FILE_PIXELS = 250_000_000
 MAX_DECODED_BYTES = 1 << 30
 """Largest decoded picture; only JPEG can be decoded at a fraction of its size."""
 MAX_FILE_BYTES = 1 << 29
+MAX_WORK = 4_000_000_000
+"""Most pixels that are gone through, counted again for each scan of a progressive JPEG: it has about ten."""
 MIN_SIDE = 32
 """Fewer pixels than this cannot show a hand with fingers."""
 OPAQUE = 0.99
@@ -60,11 +64,13 @@ def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> Photo:
         InputError: the file is missing, unreadable, no image, truncated, damaged, too small or too large.
     """
     path = Path(path)
-    data = _read_bytes(path)
+    data = read_bytes(path)
     header = read_header(data)
     if header is None:
         raise _not_an_image(path, data)
     _check_size(path, header)
+    if header.format == "PNG":
+        data = pixels_of_png(data)
     factor = 1
     while header.width * header.height > max_pixels * factor**2:
         factor += 1
@@ -92,26 +98,30 @@ def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> Photo:
     )
 
 
-def _read_bytes(path: Path) -> bytes:
+def read_bytes(path: Path, content: str = "a photo") -> bytes:
+    """The bytes of a file of bounded size.
+
+    Raises:
+        InputError: no such file, or none that ends; too large, empty or not readable.
+    """
     try:
         if path.is_dir():
-            raise InputError(f"{path}: expected a photo, got a folder; give the files in it instead.")
+            raise InputError(f"{path}: expected {content}, got a folder; give the files in it instead.")
         if not path.exists():
-            raise InputError(f"{path}: expected a photo, found no such file; check the name and the folder.")
+            raise InputError(f"{path}: expected {content}, found no such file; check the name and the folder.")
         if not path.is_file():
-            raise InputError(f"{path}: expected a photo, got a device or pipe; save the photo to a file first.")
+            raise InputError(f"{path}: expected {content}, got a device or pipe; save it to a file first.")
         size = path.stat().st_size
         if size > MAX_FILE_BYTES:
-            raise InputError(
-                f"{path}: expected a photo of at most {MAX_FILE_BYTES >> 20} MB, got {size >> 20} MB; save it as JPEG."
-            )
+            most = MAX_FILE_BYTES >> 20
+            raise InputError(f"{path}: expected {content} of at most {most} MB, got {size >> 20} MB; save it as JPEG.")
         data = path.read_bytes()
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); check the file's permissions and the disk."
         ) from error
     if not data:
-        raise InputError(f"{path}: expected a photo, got an empty file (0 bytes); copy or download it again.")
+        raise InputError(f"{path}: expected {content}, got an empty file (0 bytes); copy or download it again.")
     return data
 
 
@@ -134,7 +144,7 @@ def _check_size(path: Path, header: ImageHeader) -> None:
             f"{path}: expected at least {MIN_SIDE} x {MIN_SIDE} pixels, got {width} x {height}; give a larger photo."
         )
     decoded = 0 if header.format == "JPEG" else width * height * header.pixel_bytes
-    if width * height > MAX_FILE_PIXELS or decoded > MAX_DECODED_BYTES:
+    if width * height > MAX_FILE_PIXELS or decoded > MAX_DECODED_BYTES or header.passes * width * height > MAX_WORK:
         raise InputError(
             f"{path}: {width} x {height} pixels of {header.format} are too many to decode; scale the photo down first."
         )
@@ -142,6 +152,11 @@ def _check_size(path: Path, header: ImageHeader) -> None:
 
 def _decode(path: Path, data: bytes, format: str, flags: int) -> tuple[np.ndarray, Exif]:
     """The pixels as stored in the file (BGR, not yet upright) and the EXIF tags."""
+    if format == "AVIF":  # its video frame may be larger than its header says
+        decoded = decode_limited(data, flags)
+        if decoded is None:
+            raise _cut_short(path, len(data))
+        return decoded[0], read_exif(decoded[1].removeprefix(b"Exif\0\0"))
     with _captured_stderr() as captured:
         try:
             pixels, kinds, chunks = cv2.imdecodeWithMetadata(np.frombuffer(data, np.uint8), flags)

@@ -54,7 +54,8 @@ def read_keypoints(path: Path | str, photo: Photo, *, hand: HandModel | None = N
     if ("xy" in data) == ("angles" in data):
         raise InputError(f'{path}: expected either "xy" (21 landmarks) or "angles" (a pose); see docs/estimator.md.')
     if unknown := sorted(set(data) - (_LANDMARK_KEYS if "xy" in data else _POSE_KEYS)):
-        raise InputError(f'{path}: the key "{shortened(unknown[0])}" is not known here; see docs/estimator.md for those that are.')
+        key = shortened(unknown[0])
+        raise InputError(f'{path}: the key "{key}" is not known here; see docs/estimator.md for those that are.')
     if "xy" in data:
         return _landmarks(path, data, side, photo)
     return _pose(path, data, side, photo, hand or bundled_hand())

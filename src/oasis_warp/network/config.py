@@ -3,7 +3,16 @@
 from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_origin
 
+from oasis_warp.core.errors import shortened
 from oasis_warp.ops.checks import check_choice
+
+MOST = {
+    "image_size": 1024, "width": 2048, "heads": 64, "n_tokens": 4096, "n_coarse": 16384, "refine_layers": 32,
+    "head_width": 4096, "frequencies": 32, "neighborhood": 15,
+}  # fmt: skip
+"""Largest sizes, a few times the paper's: a weights file may say anything, and memory is taken by what it says."""
+MOST_LETTERS = 80
+"""Of a profile's name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +63,11 @@ class NetworkConfig:
             if get_origin(field.type) is Literal:
                 check_choice(field.name, value, get_args(field.type))
             elif field.name != "profile" and not (value is None and field.name == "n_coarse"):
-                if not isinstance(value, int) or value < 1:
-                    raise ValueError(f"{field.name}: expected a positive whole number, got {value!r}.")
+                if type(value) is not int or not 1 <= value <= MOST[field.name]:
+                    got = shortened(repr(value))
+                    raise ValueError(f"{field.name}: expected a whole number from 1 to {MOST[field.name]}, got {got}.")
+        if not isinstance(self.profile, str) or len(self.profile) > MOST_LETTERS:
+            raise ValueError(f"profile: expected a name, got {shortened(repr(self.profile))}.")
         if self.width % self.heads or self.width // self.heads % 8:
             raise ValueError(
                 f"heads: expected a number that splits width {self.width} into multiples of 8, got {self.heads}."

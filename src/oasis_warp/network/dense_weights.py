@@ -8,15 +8,13 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors.torch import save
 
 from oasis_warp import __version__
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import write_file
-from oasis_warp.data.tensor_file import open_tensors
+from oasis_warp.data.tensor_file import open_tensors, read_entry, read_tensors
 from oasis_warp.network.dense_network import DEPTHS, WIDTHS, DenseNetwork
-from oasis_warp.network.encoders import differing_tensors
 
 FORMAT = "oasis-dense"
 VERSION = 1
@@ -48,13 +46,8 @@ def load_dense_network(path: Path | str) -> DenseNetwork:
     path = Path(path)
     with _opened(path) as file:
         _checked_header(path, file)
-        tensors = {name: file.get_tensor(name).float() for name in file.keys()}
-    network = DenseNetwork()
-    if differing_tensors(network.state_dict(), tensors):
-        raise InputError(f"{path}: its weights are not those of a dense network; copy it again.")
-    if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
-        raise InputError(f"{path}: expected finite weights of a dense network, got others; copy it again.")
-    network.load_state_dict(tensors)
+        network = DenseNetwork()
+        network.load_state_dict(read_tensors(path, file, network.state_dict(), "copy it again"))
     return network.eval()
 
 
@@ -74,12 +67,9 @@ def _opened(path: Path) -> AbstractContextManager[Any]:
 
 
 def _checked_header(path: Path, file: Any) -> dict[str, Any]:
-    try:
-        header = json.loads((file.metadata() or {}).get(FORMAT, "null"))
-    except json.JSONDecodeError:
-        header = None
+    header = read_entry(path, file, FORMAT, "copy it again")
     expected = {"version": VERSION, "widths": list(WIDTHS), "depths": list(DEPTHS)}
-    if not isinstance(header, dict) or not expected.items() <= header.items():
+    if header is None or not expected.items() <= header.items():
         raise InputError(
             f"{path}: expected the weights of a dense network of version {VERSION}, got another file; give one that "
             "`oasis pretrain --task dense` wrote."

@@ -2,7 +2,6 @@
 
 import functools
 import hashlib
-import json
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -21,6 +20,7 @@ from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core import surface
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians, HandCrop
+from oasis_warp.data.json_text import read_json
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.hand_network import Described, HandNetwork, Prediction
 from oasis_warp.network.heads import ColorHeads, cache_head
@@ -230,8 +230,8 @@ def _identity(name: str, path: Path) -> dict[str, str | int]:
     with path.open("rb") as file:
         about: dict[str, str | int] = {"name": name, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
     try:
-        about["step"] = int(json.loads(read_header(path)["notes"])["step"])
-    except (KeyError, TypeError, ValueError):
+        about["step"] = int(read_json(read_header(path)["notes"])["step"])
+    except (KeyError, TypeError, ValueError, OverflowError):
         pass  # notes are free text
     return about
 

@@ -6,7 +6,9 @@ not in it: they lie in a file of their own.
 """
 
 import json
-from contextlib import AbstractContextManager
+import math
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -14,19 +16,24 @@ from typing import Any, Literal
 import torch
 from safetensors.torch import save
 from torch import Tensor
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from oasis_warp import __version__
-from oasis_warp.core.errors import InputError
+from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.data.output_files import write_file
-from oasis_warp.data.tensor_file import open_tensors
+from oasis_warp.data.tensor_file import open_tensors, read_entry, read_tensors, tensor_shapes
 from oasis_warp.network.config import NetworkConfig
-from oasis_warp.network.encoders import DinoV2Encoder, differing_tensors
+from oasis_warp.network.encoders import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
 
 FORMAT = "oasis-network"
 VERSION = 1
 PRECISIONS = {"float16": torch.float16, "float32": torch.float32}
+BACKBONE = 400_000_000
+"""More weights than any DINOv2 that is known here has, which lie in a file of their own."""
+SLACK = 1_000_000
+"""Weights beyond twice those of the file up to which a network is made, to say which of its tensors do not fit."""
 HEADER = {"version": int, "config": dict, "hand_model": str, "n_vertices": int, "n_faces": int}
 """Keys that a header has at least, and their types."""
 
@@ -72,17 +79,18 @@ def load_network(path: Path | str, hand: HandModel, *, backbone_weights: Path | 
     path = Path(path)
     with _opened(path) as file:
         header = _checked_header(path, file)
-        tensors = {name: file.get_tensor(name).float() for name in file.keys()}
-    config = _config_of(path, header["config"])
-    got = (header["hand_model"], header["n_vertices"], header["n_faces"])
-    want = (hand.name, len(hand.template), len(hand.faces))
-    if got != want:
-        raise InputError(
-            f"{path}: trained for the hand model {got[0]!r} ({got[1]} vertices, {got[2]} faces), but the one in use is "
-            f"{want[0]!r} ({want[1]}, {want[2]}); give weights that fit."
-        )
-    network = HandNetwork(config, hand)
-    _fill(path, network, tensors)
+        config = _config_of(path, header["config"])
+        got = (header["hand_model"], header["n_vertices"], header["n_faces"])
+        want = (hand.name, len(hand.template), len(hand.faces))
+        if got != want:
+            raise InputError(
+                f"{path}: trained for the hand model {shortened(got[0])!r} ({got[1]} vertices, {got[2]} faces), but "
+                f"the one in use is {want[0]!r} ({want[1]}, {want[2]}); give weights that fit."
+            )
+        held = sum(math.prod(shape) for _, shape in tensor_shapes(file).values())
+        with _at_most(path, 2 * held + SLACK + (0 if config.backbone == "convolutional" else BACKBONE)):
+            network = HandNetwork(config, hand)
+        network.load_state_dict(read_tensors(path, file, trained_state(network), "copy it again"), strict=False)
     if isinstance(network.encoder, DinoV2Encoder):
         if backbone_weights is None:
             raise InputError(f"{path}: reads photos with {config.backbone}; give the file of its weights too.")
@@ -125,23 +133,18 @@ def _opened(path: Path) -> AbstractContextManager[Any]:
 
 
 def _checked_header(path: Path, file: Any) -> dict[str, Any]:
-    text = (file.metadata() or {}).get(FORMAT)
-    if text is None:
+    header = read_entry(path, file, FORMAT, "copy it again")
+    if header is None:
         raise InputError(f"{path}: a safetensors file, but no network of ours; give the one `oasis pretrain` wrote.")
-    try:
-        header = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: damaged, its header is no JSON ({error}); copy it again.") from error
-    version = header.get("version") if isinstance(header, dict) else None
-    if isinstance(version, int) and version > VERSION:
+    version = header.get("version")
+    if type(version) is int and version > VERSION:
         raise InputError(
             f"{path}: a network of version {version}, but {VERSION} is the last known here; update oasis-warp."
         )
-    known = header if isinstance(header, dict) else {}
-    wrong = [key for key, kind in HEADER.items() if not isinstance(known.get(key), kind)]
+    wrong = [key for key, kind in HEADER.items() if type(header.get(key)) is not kind]
     if wrong or version != VERSION:
         raise InputError(f"{path}: damaged, its header has no valid {(wrong or ['version'])[0]}; copy it again.")
-    return known
+    return header
 
 
 def _config_of(path: Path, stored: dict[str, Any]) -> NetworkConfig:
@@ -151,13 +154,19 @@ def _config_of(path: Path, stored: dict[str, Any]) -> NetworkConfig:
         raise InputError(f"{path}: its header describes no network known here ({error}); update oasis-warp.") from error
 
 
-def _fill(path: Path, network: HandNetwork, tensors: dict[str, Tensor]) -> None:
-    if wrong := differing_tensors(trained_state(network), tensors):
-        raise InputError(
-            f"{path}: {len(wrong)} tensors do not fit the network that the header describes, {wrong[0]} first; "
-            "copy it again."
-        )
-    bad = [name for name, tensor in tensors.items() if not bool(tensor.isfinite().all())]
-    if bad:
-        raise InputError(f"{path}: damaged, {bad[0]} holds values that are not finite; copy it again.")
-    network.load_state_dict(tensors, strict=False)
+@contextmanager
+def _at_most(path: Path, weights: int) -> Iterator[None]:
+    """Let no network grow beyond so many weights, whatever its header says."""
+    left = weights
+
+    def count(module: torch.nn.Module, name: str, parameter: torch.nn.Parameter | None) -> None:
+        nonlocal left
+        left -= 0 if parameter is None else parameter.numel()
+        if left < 0:
+            raise InputError(f"{path}: holds fewer weights than the network that its header describes; copy it again.")
+
+    hook = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        hook.remove()

@@ -9,12 +9,15 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from oasis_warp.core.errors import InputError
+from oasis_warp.core.errors import InputError, shortened
+from oasis_warp.data.json_text import whole
 from oasis_warp.data.output_files import write_file
-from oasis_warp.data.tensor_file import open_tensors
+from oasis_warp.data.tensor_file import open_tensors, read_entry, read_tensors
 
 FORMAT = "oasis-pretraining"
 MOMENTS = ("exp_avg", "exp_avg_sq")
+MOST_STEPS = 1 << 24
+"""Of a training; float32 counts no further, and Adam counts in it."""
 
 
 def save_checkpoint(
@@ -35,24 +38,29 @@ def load_checkpoint(path: Path, network: nn.Module, optimizer: torch.optim.Adam,
     """Load a file of `save_checkpoint` into network and optimizer; the number of steps done.
 
     Raises:
-        InputError: another format, or a checkpoint of another network.
+        InputError: another format, a damaged file, or a checkpoint of another network.
     """
     with open_tensors(path, "a checkpoint", "choose another folder", "remove it") as file:
-        header = json.loads((file.metadata() or {}).get(FORMAT, "null"))
+        header = read_entry(path, file, FORMAT, "remove it")
         if header is None:
             raise InputError(f"{path}: expected a checkpoint, got another safetensors file; remove it.")
-        if header != {"step": header["step"], **identity}:
+        step = header.get("step")
+        if not whole(step, 0, MOST_STEPS):
+            raise InputError(f"{path}: damaged, its step is {shortened(repr(step))}; remove it.")
+        if header != json.loads(json.dumps({"step": step, **identity})):
             raise InputError(
                 f"{path}: the checkpoint of a network with other sizes or switches; choose another folder."
             )
-        tensors = {name: file.get_tensor(name) for name in file.keys()}
+        trained, parts = _trained(network), ("weights", *MOMENTS)
+        expected = {f"{part}.{name}": parameter for name, parameter in trained.items() for part in parts}
+        tensors = read_tensors(path, file, expected, "remove it")
     state = {}
-    for k, (name, parameter) in enumerate(_trained(network).items()):
+    for k, (name, parameter) in enumerate(trained.items()):
         parameter.data.copy_(tensors[f"weights.{name}"])
         moments = {moment: tensors[f"{moment}.{name}"] for moment in MOMENTS}
-        state[k] = {"step": torch.tensor(float(header["step"])), **moments}
+        state[k] = {"step": torch.tensor(float(step)), **moments}
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    return header["step"]
+    return step
 
 
 def _trained(network: nn.Module) -> dict[str, nn.Parameter]:

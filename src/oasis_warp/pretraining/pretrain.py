@@ -256,8 +256,16 @@ def _mean_metrics(result: StepResult, world: int) -> dict[str, float]:
 
 
 def _drop_lines_after(path: Path, step: int) -> None:
-    """Drop the lines of steps that will be repeated, and a last line that was cut when training was killed."""
+    """Drop the lines of steps that will be repeated, and those that were cut when training was killed."""
     if path.is_file():
-        *lines, _ = path.read_text().split("\n")
-        kept = [line for line in lines if json.loads(line)["step"] <= step]
-        write_file(path, "".join(line + "\n" for line in kept).encode())
+        kept = [line for line in path.read_bytes().split(b"\n") if _step_of(line) <= step]
+        write_file(path, b"".join(line + b"\n" for line in kept))
+
+
+def _step_of(line: bytes) -> int | float:
+    """The step of a line of metrics; infinite where it cannot be read."""
+    try:
+        step = json.loads(line)["step"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return math.inf
+    return step if type(step) is int else math.inf

@@ -78,9 +78,12 @@ def write_shards(
 
 
 def _count_pictures(path: Path) -> int:
-    """Number of pictures in a shard."""
-    with tarfile.open(path) as tar:
-        return sum(name.endswith(".json") for name in tar.getnames())
+    """Number of pictures in a shard; none in a damaged one, which is written again."""
+    try:
+        with tarfile.open(path, "r:") as tar:
+            return sum(name.endswith(".json") for name in tar.getnames())
+    except (tarfile.TarError, OSError):
+        return 0
 
 
 def encode(batch: SyntheticBatch, k: int) -> dict[str, bytes]:
