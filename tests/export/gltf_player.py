@@ -1,7 +1,7 @@
 """What a glTF program does with a skinned mesh: play a clip, move the vertices. In numpy, from the specification."""
 
 import numpy as np
-from splat_readers import accessor
+from tests.export.splat_readers import accessor
 
 
 def matrix_of(node):

@@ -37,7 +37,7 @@ def test_values_that_are_not_finite_never_leave(right_hand, tmp_path):
 
 
 def test_huge_gaussians_are_held_to_the_width_of_a_finger(right_hand, tmp_path, caplog):
-    from splat_readers import read_ply
+    from tests.export.splat_readers import read_ply
 
     scales = right_hand.gaussians.scales.clone()
     scales[7] = 5.0

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from gltf_player import joint_matrices, play, pose_of_clip
-from splat_readers import accessor, read_gltf
+from tests.export.gltf_player import joint_matrices, play, pose_of_clip
+from tests.export.splat_readers import accessor, read_gltf
 
 from oasis_warp.core.types import HandPose
 from oasis_warp.export import export_avatar

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
-from splat_readers import READERS
+from tests.export.splat_readers import READERS
 
 from oasis_warp.core.types import Camera, Gaussians
 from oasis_warp.export import export_avatar

@@ -2,8 +2,8 @@ import sys
 
 import numpy as np
 import pytest
-from splat_readers import read_ply
 from test_skinned_gltf import surface
+from tests.export.splat_readers import read_ply
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.export import export_avatar
