@@ -62,23 +62,30 @@ def page_facts(
     assert studio is not None, "in_light gives one"
     lights["studio"] = studio
     begin = poses["photo"] if angles is None else angles.cpu()
+    *reached, at_start = _reached(avatar, [*poses.values(), begin])
+    everywhere = torch.cat(reached)
+    middle = _middle(everywhere)
     walk = pose_sequence(avatar.hand, WALK, WALK_FRAMES)
     facts = {
         "side": avatar.side,
         "parents": list(parts.hand.parents),
         "orientation": _flat(avatar.source_pose.orientation),
         "translation": _flat(avatar.source_pose.translation),
-        "poses": [{"name": k, "label": _label(k), "angles": _flat(v)} for k, v in poses.items()],
+        "poses": [
+            {"name": name, "label": _label(name), "angles": _flat(angles), "target": _flat(_middle(vertices))}
+            for (name, angles), vertices in zip(poses.items(), reached, strict=True)
+        ],
         "motions": [{"label": "Through poses", "seconds": WALK_SECONDS, "frames": [_flat(frame) for frame in walk]}],
         "joints": joint_sliders(parts.hand),
         "lights": {name: _light_facts(light) for name, light in lights.items()},
         "still": sky_mesh(torch.device("cpu")).still,
         "orbitMargin": ORBIT_MARGIN,
         "fieldOfView": ORBIT_FIELD_OF_VIEW,
-        "frame": _frame(avatar, list(poses.values())),
+        "frame": {"target": _flat(middle), "radius": float((everywhere - middle).norm(dim=-1).amax())},
         "start": {
             "pose": _name_of(begin, poses),
             "angles": _flat(begin),
+            "target": _flat(_middle(at_start)),
             "look": look if look in lights else "even",
         },
         "hasInvented": avatar.invented is not None,
@@ -91,7 +98,7 @@ def _name_of(angles: Tensor, poses: dict[str, Tensor]) -> str | None:
 
 
 def _label(name: str) -> str:
-    return name.replace("_", " ").capitalize()
+    return "OK" if name == "ok" else name.replace("_", " ").capitalize()
 
 
 def _flat(values: Tensor) -> list[float]:
@@ -129,17 +136,19 @@ def joint_sliders(hand: HandModel) -> list[dict[str, Any]]:
 
 
 @torch.no_grad()
-def _frame(avatar: Avatar, angles: Sequence[Tensor]) -> dict[str, Any]:
-    """Middle and radius of the sphere that `orbit_camera` would frame for all of these poses together."""
+def _reached(avatar: Avatar, angles: Sequence[Tensor]) -> Float[Tensor, "B V 3"]:
     source, many = avatar.source_pose, len(angles)
     poses = HandPose(
         torch.stack([each.to(avatar.shape) for each in angles]),
         source.orientation.expand(many, 3, 3),
         source.translation.expand(many, 3),
     )
-    reached = avatar.mesh(poses).vertices.flatten(0, 1)
-    middle = (reached.amin(0) + reached.amax(0)) / 2
-    return {"target": _flat(middle), "radius": float((reached - middle).norm(dim=-1).amax())}
+    return avatar.mesh(poses).vertices
+
+
+def _middle(vertices: Float[Tensor, "N 3"]) -> Float[Tensor, "3"]:
+    """Of the box around them, at which `orbit_camera` looks."""
+    return (vertices.amin(0) + vertices.amax(0)) / 2
 
 
 @torch.no_grad()

@@ -17,9 +17,9 @@ function fillPanel(viewer) {
   const { facts } = viewer;
   byId("facts").textContent = `${facts.side === "left" ? "Left" : "Right"} hand, ${facts.count.toLocaleString("en")} Gaussians`;
   const player = { viewer, playing: false, time: 0, last: 0, ease: null, sliders: [], chips: new Map() };
-  for (const { name, label, angles } of facts.poses) {
-    const chip = make("button", { type: "button", textContent: label, onclick: () => changePose(player, name, angles) });
-    player.chips.set(name, chip);
+  for (const pose of facts.poses) {
+    const chip = make("button", { type: "button", textContent: pose.label, onclick: () => changePose(player, pose) });
+    player.chips.set(pose.name, chip);
     byId("poses").append(chip);
   }
   markPose(player, facts.start.pose);
@@ -35,12 +35,18 @@ function markPose({ chips }, name) {
   for (const [of, chip] of chips) chip.setAttribute("aria-pressed", String(of === name));
 }
 
-function changePose(player, name, angles) {
+// Ease to a pose, and move the view to its middle.
+function changePose(player, { name, angles, target }) {
   stop(player);
   markPose(player, name);
-  const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
-  if (still) setAngles(player, angles);
-  else player.ease = { from: player.viewer.angles.slice(), to: angles, start: performance.now() };
+  easeTo(player, angles, target);
+}
+
+function easeTo(player, angles, target) {
+  const { viewer } = player, start = performance.now();
+  const span = matchMedia("(prefers-reduced-motion: reduce)").matches ? 0 : EASE;
+  player.ease = { from: viewer.angles.slice(), to: angles ?? viewer.angles.slice(), away: viewer.camera.target, target, start, span };
+  show(viewer, true);
 }
 
 function setAngles(player, angles, moving = false) {
@@ -57,8 +63,10 @@ const mix = (a, b, share) => a.map((x, k) => x + share * (b[k] - x));
 // Before each picture: ease towards a pose, or play on.
 function advance(player, now) {
   if (player.ease) {
-    const { from, to, start } = player.ease, share = Math.min((now - start) / EASE, 1);
-    setAngles(player, mix(from, to, 0.5 - 0.5 * Math.cos(Math.PI * share)), true);
+    const { from, to, away, target, start, span } = player.ease, share = span ? Math.min((now - start) / span, 1) : 1;
+    const blend = 0.5 - 0.5 * Math.cos(Math.PI * share);
+    player.viewer.camera.target = mix(away, target, blend);
+    setAngles(player, mix(from, to, blend), true);
     if (share === 1) player.ease = null;
   }
   if (!player.playing || player.viewer.waiting > 1) return; // no faster than pictures come
@@ -77,6 +85,7 @@ function showTime(player) {
     player.viewer.camera.azimuth = player.from + 2 * Math.PI * player.time;
     return show(player.viewer, true);
   }
+  player.viewer.camera.target = player.viewer.facts.frame.target; // the middle of all poses
   const at = player.time * motion.frames.length, first = Math.floor(at) % motion.frames.length;
   markPose(player, null);
   setAngles(player, mix(motion.frames[first], motion.frames[(first + 1) % motion.frames.length], at - Math.floor(at)), true);

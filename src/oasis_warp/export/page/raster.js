@@ -2,8 +2,10 @@
 // behind opaque skin costs next to nothing. The rules are those of the fragment shader of graphics.js.
 "use strict";
 
-const EXACT = { opaque: 1 / 100, reach: 3.33 }; // what is let through where nothing more is drawn; largest radius [sigmas]
-const HURRIED = { opaque: 1 / 16, reach: 2.1 };
+// What is let through where nothing more is drawn; the largest radius [sigmas]; what alpha is divided by. In a hurry skin
+// that faces away is missing, so that the background would shine through: alpha is raised, and outlines are a bit harder.
+const EXACT = { opaque: 1 / 100, reach: 3.33, cover: 1 };
+const HURRIED = { opaque: 1 / 16, reach: 2.1, cover: 0.7 };
 const TILE = 8; // pixels a side of the tiles that count where the picture is still open
 const EXP_STEPS = 4096, EXP_END = 3.33 ** 2; // table of exp(-x / 2)
 const EXP = Float32Array.from({ length: EXP_STEPS + 2 }, (_, k) => Math.exp((-(k + 0.5) / EXP_STEPS) * EXP_END / 2));
@@ -70,11 +72,11 @@ function drawEllipse(raster, bytes, i, opacity, x, y, ax, ay, thin, far, left, r
 }
 
 // As the browser wants it: a byte a channel, colours not multiplied with alpha.
-function pixelsOf({ clear, sums, width, height }, { opaque }) {
+function pixelsOf({ clear, sums, width, height }, { opaque, cover }) {
   const out = new Uint8ClampedArray(4 * width * height);
   for (let i = 0; i < clear.length; i++) {
     if (clear[i] === 1) continue;
-    const alpha = clear[i] < opaque ? 1 : 1 - clear[i], scale = 1 / (1 - clear[i]);
+    const alpha = clear[i] < opaque ? 1 : Math.min((1 - clear[i]) / cover, 1), scale = 1 / (1 - clear[i]);
     out[4 * i] = sums[3 * i] * scale;
     out[4 * i + 1] = sums[3 * i + 1] * scale;
     out[4 * i + 2] = sums[3 * i + 2] * scale;

@@ -8,7 +8,7 @@ const MOST_SCALE = 2; // of CSS pixels: more are not seen
 
 function makeViewer(canvas, facts, worker, draw) {
   const viewer = {
-    canvas, facts, draw, worker, angles: Float32Array.from(facts.start.angles), look: facts.start.look, camera: homeCamera(),
+    canvas, facts, draw, worker, angles: Float32Array.from(facts.start.angles), look: facts.start.look, camera: { ...homeCamera(), target: facts.start.target },
     wishes: new Map(), wanted: false, waiting: 0, next: 1, scale: 1, moving: 0, shown: 0, drawn: 0, times: [],
   };
   worker.onmessage = ({ data }) => {
@@ -79,7 +79,7 @@ function ask(viewer, camera, look, angles, hurry = false) {
 }
 
 function cameraOf({ camera, facts }, width, height) {
-  const { azimuth, elevation, zoom, shift: [right, down] } = camera, { target, radius } = facts.frame;
+  const { azimuth, elevation, zoom, target, shift: [right, down] } = camera, { radius } = facts.frame;
   const ca = Math.cos(azimuth), sa = Math.sin(azimuth), ce = Math.cos(elevation), se = Math.sin(elevation);
   const axes = [[ca, 0, -sa], [sa * se, ce, ca * se]];
   const middle = target.map((x, k) => x - right * axes[0][k] - down * axes[1][k]);
