@@ -7,7 +7,9 @@ import base64
 import gzip
 import json
 import struct
+import zipfile
 
+import cv2
 import numpy as np
 
 C0 = 0.28209479177387814
@@ -64,7 +66,7 @@ def unpack(words, *bits):
 def fill_in(largest, others):
     quats = np.zeros((len(others), 4))
     quats[np.arange(4) != largest[:, None]] = others.ravel()
-    quats[np.arange(len(quats)), largest] = np.sqrt(1 - (others**2).sum(1))
+    quats[np.arange(len(quats)), largest] = np.sqrt(np.maximum(1 - (others**2).sum(1), 0))
     return quats
 
 
@@ -110,6 +112,27 @@ def read_spz(path):
     return means, quats, np.exp(scales / 16 - 10), opacities[:, 0] / 255, 0.5 + C0 * (colors / 255 - 0.5) / 0.15
 
 
+def read_sog(path):
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(files["meta.json"])
+    assert meta["version"] == 2
+
+    def pixels(name, k=0):
+        picture = cv2.imdecode(np.frombuffer(files[meta[name]["files"][k]], np.uint8), cv2.IMREAD_UNCHANGED)
+        order = [2, 1, 0, 3][: picture.shape[2]]
+        return picture[..., order].reshape(-1, len(order))[: meta["count"]].astype(np.int64)
+
+    share = (pixels("means", 0) + 256 * pixels("means", 1)) / 65535
+    least, most = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
+    places = least + share * (most - least)
+    turns, looks = pixels("quats"), pixels("sh0")
+    quats = fill_in(turns[:, 3] - 252, (turns[:, :3] / 255 - 0.5) * np.sqrt(2))
+    means, quats = turned_up(np.sign(places) * np.expm1(np.abs(places)), quats)
+    scales = np.exp(np.array(meta["scales"]["codebook"])[pixels("scales")])
+    return means, quats, scales, looks[:, 3] / 255, 0.5 + C0 * np.array(meta["sh0"]["codebook"])[looks[:, :3]]
+
+
 def read_gltf(path):
     """The JSON and the buffer of a .glb or a .gltf in one file."""
     data = path.read_bytes()
@@ -153,6 +176,7 @@ READERS = {
     ".compressed.ply": read_compressed_ply,
     ".splat": read_splat,
     ".spz": read_spz,
+    ".sog": read_sog,
     ".splats.glb": read_splat_gltf,
     ".splats.gltf": read_splat_gltf,
 }

@@ -10,8 +10,9 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.render.render import render
 
 LOSSLESS = {".ply", ".splats.glb", ".splats.gltf"}
-STEPS = {".spz": 2**-20, ".compressed.ply": 1e-4}
-"""Of means [m]. A chunk of neighbours may span the 0.2 m of a hand, and the coarsest axis has 1023 steps in it."""
+STEPS = {".spz": 2**-20, ".sog": 4e-6, ".compressed.ply": 1e-4}
+"""Of means [m]. A chunk of neighbours may span the 0.2 m of a hand, and the coarsest axis has 1023 steps in it;
+.sog has 65535 for the hand."""
 
 
 def redraw(avatar, pose, gaussians):

@@ -118,7 +118,8 @@ class Info:
 class Export:
     """Write an avatar for other programs; the ending of the name says the format.
 
-    Gaussians for splat viewers: .ply, .compressed.ply, .splat, .spz, and .splats.glb (glTF's KHR_gaussian_splatting).
+    Gaussians for splat viewers: .ply, .compressed.ply, .splat, .spz, .sog, and .splats.glb (glTF's
+    KHR_gaussian_splatting).
     A mesh with bones, texture and named poses, for engines and Blender: .glb, .gltf. In one pose: .obj. Either in
     OpenUSD: .usdc, .usdz, and .splats.usdc, .splats.usdz. Shape, pose and camera as numbers: .json. A page that shows
     and poses the avatar in a browser, offline: .html.

@@ -15,6 +15,7 @@ from oasis_warp.export.skinned_usd import write_skinned_usd
 from oasis_warp.export.splat_gltf import write_splat_gltf
 from oasis_warp.export.splat_ply import write_ply
 from oasis_warp.export.splat_rows import write_splat
+from oasis_warp.export.splat_sog import write_sog
 from oasis_warp.export.splat_spz import write_spz
 from oasis_warp.export.splat_usd import write_splat_usd
 from oasis_warp.export.wavefront import write_obj
@@ -29,6 +30,7 @@ WRITERS: dict[str, Writer] = {
     ".compressed.ply": write_compressed_ply,
     ".splat": write_splat,
     ".spz": write_spz,
+    ".sog": write_sog,
     ".splats.glb": write_splat_gltf,
     ".splats.gltf": write_splat_gltf,
     ".glb": write_skinned_gltf,
