@@ -119,7 +119,8 @@ def read_sog(path):
     assert meta["version"] == 2
 
     def pixels(name, k=0):
-        picture = cv2.imdecode(np.frombuffer(files[meta[name]["files"][k]], np.uint8), cv2.IMREAD_UNCHANGED)
+        data = np.frombuffer(files[meta[name]["files"][k]], np.uint8)
+        picture = np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED))
         order = [2, 1, 0, 3][: picture.shape[2]]
         return picture[..., order].reshape(-1, len(order))[: meta["count"]].astype(np.int64)
 
