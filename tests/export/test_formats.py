@@ -5,6 +5,7 @@ from oasis_warp.cli import main
 from oasis_warp.core.errors import InputError
 from oasis_warp.export import export_avatar
 from oasis_warp.export.formats import WRITERS, choose_writer
+from oasis_warp.hand_avatar import Avatar
 
 
 @pytest.mark.parametrize("ending", WRITERS)
@@ -22,6 +23,30 @@ def test_an_unknown_ending_is_refused_and_the_known_ones_are_named(right_hand, t
 def test_an_unknown_light_is_refused(right_hand, tmp_path, as_shipped):
     with pytest.raises(ValueError, match="light: expected one of 'baked', 'none', got 'moon'"):
         export_avatar(right_hand, tmp_path / "hand.ply", light="moon")
+
+
+@pytest.mark.parametrize("ending", [".glb", ".ply", ".json", ".obj"])
+def test_a_wrong_pose_is_refused_in_every_format(right_hand, ending, tmp_path, as_shipped):
+    """Meshes with bones take its angles only, and would write what they give."""
+    pose = right_hand.source_pose
+    broken = pose.angles.clone()
+    broken[3, 0] = torch.nan
+    for angles, message in ((torch.zeros(2, 15, 3), r"expected shape \[15, 3\]"), (broken, "angles")):
+        with pytest.raises(ValueError, match=message):
+            export_avatar(right_hand, tmp_path / f"hand{ending}", pose=pose._replace(angles=angles))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", [".glb", ".spz", ".obj", ".json"])
+def test_avatars_on_a_device_or_with_gradients_are_the_same_files(left_hand, ending, device, tmp_path):
+    left_hand.save(tmp_path / "avatar.safetensors")
+    other = Avatar.load(tmp_path / "avatar.safetensors", device)
+    colors = other.gaussians.colors.clone().requires_grad_()
+    other = other.with_looks(other.gaussians._replace(colors=colors), other.light)
+    for name, avatar in (("a", left_hand), ("b", other)):
+        (tmp_path / name).mkdir()
+        export_avatar(avatar, tmp_path / name / f"hand{ending}")
+    assert (tmp_path / f"a/hand{ending}").read_bytes() == (tmp_path / f"b/hand{ending}").read_bytes()
 
 
 def test_values_that_are_not_finite_never_leave(right_hand, tmp_path):

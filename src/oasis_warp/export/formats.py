@@ -2,9 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.types import HandPose
+from oasis_warp.core.types import Camera, CanonicalGaussians, HandLight, HandPose
 from oasis_warp.export import usd_stage
 from oasis_warp.export.compressed_ply import write_compressed_ply
 from oasis_warp.export.hand_parameters import write_parameters
@@ -20,7 +24,8 @@ from oasis_warp.export.splat_spz import write_spz
 from oasis_warp.export.splat_usd import write_splat_usd
 from oasis_warp.export.wavefront import write_obj
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.ops.checks import check_choice
+from oasis_warp.ops import check_finite
+from oasis_warp.ops.checks import check_choice, check_shape
 
 Writer = Callable[[ExportRequest, Path], None]
 """Writes a file atomically. Raises an InputError where it cannot."""
@@ -57,6 +62,7 @@ def choose_writer(path: Path | str) -> Writer:
     return WRITERS[max(fitting, key=len)]
 
 
+@torch.no_grad()
 def export_avatar(
     avatar: Avatar, path: Path | str, *, pose: HandPose | None = None, light: Light | None = None
 ) -> None:
@@ -76,4 +82,27 @@ def export_avatar(
     writer = choose_writer(path)
     if light is not None:
         check_choice("light", light, ("baked", "none"))
-    writer(ExportRequest(avatar, pose, light), Path(path))
+    if pose is not None:
+        check_shape("pose.angles", pose.angles, 15, 3, hint="One pose a file.")
+        check_shape("pose.orientation", pose.orientation, 3, 3)
+        check_shape("pose.translation", pose.translation, 3)
+        check_finite(**pose._asdict())
+        pose = HandPose(*(part.detach().to(avatar.shape).cpu() for part in pose))
+    writer(ExportRequest(on_cpu(avatar), pose, light), Path(path))
+
+
+def on_cpu(avatar: Avatar) -> Avatar:
+    """The same avatar on the CPU, where files are made, and without gradients."""
+    light, parts = avatar.light, (*avatar.gaussians, avatar.shape, avatar.surface_offsets)
+    if avatar.device.type == "cpu" and not any(part is not None and part.requires_grad for part in parts):
+        return avatar
+
+    def moved(part: Any) -> Any:
+        return part.detach().cpu() if isinstance(part, Tensor) else part
+
+    return Avatar(
+        side=avatar.side, shape=moved(avatar.shape), surface_offsets=moved(avatar.surface_offsets),
+        gaussians=CanonicalGaussians(*map(moved, avatar.gaussians)),
+        source_pose=HandPose(*map(moved, avatar.source_pose)), source_camera=Camera(*map(moved, avatar.source_camera)),
+        light=None if light is None else HandLight(*map(moved, light)), invented=moved(avatar.invented),
+    )  # fmt: skip
