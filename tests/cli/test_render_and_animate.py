@@ -9,6 +9,7 @@ from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.logging import silent
 from oasis_warp.core.types import HandLight
 from oasis_warp.data.pictures import to_uint8
+from oasis_warp.hand.poses import named_pose, pose_sequence
 from oasis_warp.hand_avatar import Avatar
 
 LOOK = {"elevation": 0.0, "background": (1.0, 1.0, 1.0), "progress": silent}
@@ -62,7 +63,7 @@ def test_a_turntable_turns_once_and_starts_at_the_photo(scene):
 
 
 def test_a_pose_film_keeps_every_pose_in_the_picture(scene):
-    frames = list(pose_frames(scene[2], ["open", "fist"], 8, 64, **LOOK))
+    frames = list(pose_frames(scene[2], pose_sequence(scene[2].hand, ["open", "fist"], 4), 64, **LOOK))
     assert len(frames) == 8
     for frame in frames:
         border = torch.cat([frame[0], frame[-1], frame[:, 0], frame[:, -1]])
@@ -83,6 +84,20 @@ def test_a_film_has_the_length_that_was_asked_for(avatar_file, motion, suffix, c
     assert f"{motion}: " in capsys.readouterr().err
 
 
+def test_a_motion_of_ones_own_is_played_over_nothing(scene, avatar_file):
+    avatar = scene[2]
+    angles = np.stack([named_pose(avatar.hand, name).numpy() for name in ("open", "fist")])
+    motion, out = avatar_file.with_name("motion.npz"), avatar_file.with_name("pictures")
+    np.savez(motion, angles=angles, fps=10)
+    arguments = ["--motion", str(motion), "--fps", "10", "--size", "64", "--background", "transparent"]
+    assert main(["animate", str(avatar_file), "-o", str(out), *arguments]) == 0
+    found = [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)) for file in sorted(out.iterdir())]
+    look = LOOK | {"background": None}
+    for frame, drawn in zip(found, pose_frames(avatar, [*map(torch.from_numpy, angles)], 64, **look), strict=True):
+        assert np.array_equal(frame[..., [2, 1, 0, 3]], drawn)
+        assert frame[0, 0, 3] == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -95,12 +110,14 @@ def test_a_film_has_the_length_that_was_asked_for(avatar_file, motion, suffix, c
         (["animate", "-o", "x.gif", "--elevation", "inf"], "--elevation inf: expected a number of degrees"),
         (["render", "-o", "avatar.safetensors/x.png"], "found a file; choose another name"),
         (["animate", "-o", "x.avi"], "ends in .mp4 or .gif"),
+        (["animate", "-o", "x.gif", "--loop", "-1"], "--loop -1: expected 0"),
+        (["animate", "-o", "x.mp4", "--motion", "none.npz"], "none.npz: cannot be read"),
         (["animate", "-o", "x.mp4", "--fps", "0"], "--fps 0: expected 1 to 120"),
         (["animate", "-o", "x.mp4", "--seconds", "0"], "--seconds 0: expected 1 to"),
         (["animate", "-o", "x.mp4", "--seconds", "nan"], "--seconds nan: expected 1 to"),
         (["animate", "-o", "x.mp4", "--motion", "poses", "--poses", "fist,frog"], "got frog"),
         (["animate", "-o", "x.mp4", "--motion", "poses", "--poses", ","], "got none"),
-        (["animate", "-o", "x.mp4", "--background", "transparent"], "--background transparent: expected white"),
+        (["animate", "-o", "x.mp4", "--background", "transparent"], "has no transparency; write .webp"),
     ],
 )
 def test_a_wrong_option_is_refused_in_one_sentence(avatar_file, arguments, expected, capsys, monkeypatch):
@@ -127,12 +144,15 @@ def test_a_film_in_even_light_is_without_the_light_of_the_photo(scene, tmp_path,
         side=plain.side, shape=plain.shape, surface_offsets=plain.surface_offsets, gaussians=plain.gaussians,
         source_pose=plain.source_pose, source_camera=plain.source_camera, light=dark,
     ).save(path)  # fmt: skip
-    monkeypatch.setattr("oasis_warp.cli.animate.write_video", lambda out, frames, fps: kept.update({how: list(frames)}))
+    keep = lambda out, frames, fps, loops: kept.update({how: list(frames)})  # noqa: E731
+    monkeypatch.setattr("oasis_warp.cli.animate.write_video", keep)
     given = ["--motion", motion, "--poses", "open", "--seconds", "0.2", "--fps", "10", "--size", "48"]
     for how in ("photo", "even"):
         assert main(["animate", str(path), "-o", str(tmp_path / "x.mp4"), "--light", how, *given]) == 0
-    film = {"turntable": lambda: turntable(plain, plain.source_pose, 2, 48, **LOOK),
-            "poses": lambda: pose_frames(plain, ["open"], 2, 48, **LOOK)}[motion]()  # fmt: skip
+    if motion == "turntable":
+        film = turntable(plain, plain.source_pose, 2, 48, **LOOK)
+    else:
+        film = pose_frames(plain, pose_sequence(plain.hand, ["open"], 2), 48, **LOOK)
     for even, photo, wanted in zip(kept["even"], kept["photo"], film, strict=True):
         assert torch.equal(even, wanted)
         assert photo.float().mean() < even.float().mean() - 5

@@ -81,27 +81,30 @@ class Render:
 
 @dataclass(frozen=True, kw_only=True)
 class Animate:
-    """Make a film of an avatar: a turn around it, or a walk through poses. Both loop."""
+    """Make a film of an avatar: a turn around it, a walk through poses, or a motion of your own. The first two loop."""
 
     avatar: AvatarFile
     out: Output
-    """Film to write: .mp4 or .gif."""
-    motion: Literal["turntable", "poses"] = "turntable"
-    """Turn around the hand in one pose, or stand still and change poses."""
+    """Film to write: .mp4, .gif, .webp, or a folder of PNG pictures if the name has no ending."""
+    motion: Literal["turntable", "poses"] | Path = "turntable"
+    """Turn around the hand in one pose, or stand still and change poses, or play a .json or .npz with `angles`,
+    [T, 15, 3] in radians, and `fps`."""
     pose: PoseName = "photo"
     """Pose of the hand on the turntable."""
     poses: str = "open,fist,victory,point,ok"
     """Poses to walk through, with commas between them."""
     seconds: float = 4.0
-    """Length of the film."""
+    """Length of the film; a motion of your own has its own."""
     fps: float = 24.0
     """Frames a second."""
+    loop: int = 0
+    """How often a .gif or .webp is shown; 0 for ever."""
     elevation: Elevation = 0.0
     size: int = 384
     """Side of the picture [px]."""
     light: Light = "photo"
     background: str = "white"
-    """white, black, or a colour as rrggbb."""
+    """white, black, a colour as rrggbb, or, for .webp and pictures, transparent."""
     device: Device = "cpu"
 
 

@@ -4,6 +4,8 @@ import math
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from oasis_warp.avatar.environment import environment_light, studio_light
 from oasis_warp.cli.console import check_device
@@ -12,6 +14,7 @@ from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandPose
+from oasis_warp.core.types import Render as Drawn
 from oasis_warp.data.environment_map import read_environment
 from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, to_uint8, write_picture
 from oasis_warp.hand.poses import named_pose
@@ -22,11 +25,11 @@ MAX_SIDE = 8192
 COLORS = {"white": WHITE, "black": BLACK}
 
 
-def check_output(options: Render | Animate, suffixes: tuple[str, ...]) -> None:
-    """Check device, size and output of a command before any work.
+def check_numbers(options: Render | Animate) -> None:
+    """Check device, size and angles of a command before any work.
 
     Raises:
-        InputError: no such device, a picture too small or too large, an angle that is no number, or another suffix.
+        InputError: no such device, a picture too small or too large, or an angle that is no number.
     """
     check_device(options.device)
     if not 16 <= options.size <= MAX_SIDE:
@@ -35,7 +38,11 @@ def check_output(options: Render | Animate, suffixes: tuple[str, ...]) -> None:
         angle = getattr(options, name, 0.0)
         if not math.isfinite(angle):
             raise InputError(f"--{name} {angle}: expected a number of degrees; write e.g. --{name} 45.")
-    check_suffix(options.out, suffixes)
+
+
+def straight_alpha(drawn: Drawn) -> Float[Tensor, "H W 4"]:
+    """A picture over black as RGBA whose colours are not multiplied with alpha."""
+    return torch.cat([drawn.image / drawn.alpha.clamp_min(1e-6)[..., None], drawn.alpha[..., None]], -1)
 
 
 def load_avatar(options: Render | Animate) -> Avatar:
@@ -83,7 +90,8 @@ def run(options: Render) -> int:
     Raises:
         InputError: a wrong avatar file, option or output.
     """
-    check_output(options, PICTURE_SUFFIXES)
+    check_numbers(options)
+    check_suffix(options.out, PICTURE_SUFFIXES)
     transparent = options.background == "transparent"
     background = BLACK if transparent else read_color(options.background)
     avatar = load_avatar(options)
@@ -91,8 +99,6 @@ def run(options: Render) -> int:
     camera = orbit_camera(
         avatar.mesh(pose).vertices, math.radians(options.azimuth), math.radians(options.elevation), options.size
     )
-    image, alpha = avatar.render(camera, pose, background)
-    if transparent:  # convert premultiplied to straight alpha
-        image = torch.cat([image / alpha.clamp_min(1e-6)[..., None], alpha[..., None]], -1)
-    write_picture(options.out, to_uint8(image))
+    drawn = avatar.render(camera, pose, background)
+    write_picture(options.out, to_uint8(straight_alpha(drawn) if transparent else drawn.image))
     return 0
