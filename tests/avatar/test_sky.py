@@ -6,7 +6,7 @@ from synthetic import as_left_hand, avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.environment import environment_light, studio_light
-from oasis_warp.avatar.pose import posed_lighting, turn_light, with_photo_colors
+from oasis_warp.avatar.pose import posed_lighting, shading_factors, shares_that_stay, turn_light, with_photo_colors
 from oasis_warp.avatar.sky import bounced, harmonic_basis, radiance, sky_mesh
 from oasis_warp.core import rotation
 from oasis_warp.core.mirror import mirror_light, mirror_points
@@ -69,6 +69,33 @@ def test_shade_goes_when_what_cast_it_has_moved(hand, scene):
     ratios = [(dark.pose(p).colors / plain.pose(p).colors)[palm].median() for p in (pose, opened)]
     assert float(ratios[0]) == pytest.approx(0.4, abs=1e-3)
     assert float(ratios[1]) > 0.95
+
+
+def test_deep_shade_beside_a_finger_that_lay_there_goes_with_it_and_weak_shade_stays(hand, scene):
+    """Palms opened from a fist kept the gaps between its fingers, a pixel off, where the skin sees as much sky."""
+    crop, truth, _ = scene
+    on = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces, EVEN)
+    assert on.exposure is not None
+    shared = on.exposure[:, 0]
+    place = hand.template[(label_regions(hand).palm > 0.9) & (hand.segment == 0)].mean(0)
+    away = (hand.template - place).norm(dim=1)
+    was = torch.where(away < 0.003, shared + 0.5, shared)  # there something lay, or has come to lie
+    stays = shares_that_stay(EVEN._replace(facing=on.normals), on, was)
+    beside, far = (away > 0.006) & (away < 0.008), away > 0.03
+    assert float(stays[beside, 0].max()) < 0.1 and float(stays[beside, 1].min()) == 1
+    assert float(stays[far].min()) == 1
+    dark, relief = (
+        truth._replace(colors=torch.full_like(truth.colors, 0.5), shade=torch.full_like(truth.colors, factor))
+        for factor in (0.4, 0.9)
+    )
+    light = EVEN._replace(facing=on.normals)
+    left = [
+        shading_factors(g, hand.faces, light, on, was) / shading_factors(g._replace(shade=None), hand.faces, light, on)
+        for g in (dark, relief)
+    ]
+    at = beside[truth.vertex_index].nonzero()[:, 0]
+    assert float(left[0][at].min()) > 0.9
+    torch.testing.assert_close(left[1][at], torch.full_like(left[1][at], 0.9))
 
 
 def test_a_light_without_albedo_reaches_everything(hand, scene):

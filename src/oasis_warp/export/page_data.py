@@ -154,7 +154,7 @@ def _middle(vertices: Float[Tensor, "N 3"]) -> Float[Tensor, "3"]:
 @torch.no_grad()
 def _arrays(avatar: Avatar, light: SurfaceLight) -> dict[str, np.ndarray | Packed]:
     hand, rest, gaussians, own_light = avatar.parts
-    normals = surface.vertex_normals(avatar.rest.vertices, avatar.hand.faces)
+    normals = surface.closed_normals(avatar.rest.vertices, avatar.hand.faces)
     sky, mesh = sky_directions(torch.device("cpu")), sky_mesh(torch.device("cpu"))
     even = torch.ones(3) if own_light is None else own_light.light.even.cpu() ** (1 / GAMMA)
     correctives = hand.corrective_basis.permute(2, 0, 1)

@@ -5,26 +5,34 @@
 const GAMMA = 2.2; // light is sRGB to this power, nearly
 const AS_IN_PHOTO = Math.cos((5 * Math.PI) / 180), TURNED_AWAY = Math.cos((20 * Math.PI) / 180);
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
+const WEAK = 0.15, DEEP = 0.4; // differences of shade from 1, up to which it is the skin's own, and from which it is not
 const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
 
 function makeShading(body, gaussians) {
   return {
     normals: new Float32Array(3 * body.nVertices), factors: new Float32Array(4 * body.nVertices),
+    change: new Float32Array(body.nVertices), nearby: new Float32Array(body.nVertices), deep: new Float32Array(body.nVertices),
     colors: new Uint32Array(gaussians.count), sky: makeSky(body),
   };
 }
 
 const between = (x, low, high) => Math.min(Math.max((x - low) / (high - low), 0), 1);
 
-// Factors of the colours of every vertex and the share of the photo's shade that is left, into shading.factors.
+// Factors of the colours of every vertex and the share of the photo's weak shade that is left, into shading.factors; that
+// of deep shade into shading.deep: for it the change of the sky is the largest nearby.
 function lightVertices(body, shading, light, hurry = false) {
-  const { shade, facing } = body.data.arrays, { normals, factors, sky } = shading, { harmonics, limits, albedo, seen } = light;
+  const { shade, facing } = body.data.arrays, { normals, factors, sky, change, nearby, deep } = shading, { harmonics, limits, albedo, seen } = light;
   if (albedo) exposeVertices(body, sky, normals, harmonics, hurry);
+  if (albedo && seen) {
+    for (let v = 0; v < body.nVertices; v++) change[v] = Math.abs(sky.exposure[4 * v] - seen[v]);
+    largestNearby(body, sky, change, nearby);
+  }
   const bounce = albedo && albedo.map((a) => [2.0404 * a - 0.3324, -4.7951 * a + 0.6417, 2.7552 * a + 0.6903]);
   for (let v = 0; v < body.nVertices; v++) {
     const x = normals[3 * v], y = normals[3 * v + 1], z = normals[3 * v + 2], exposure = sky.exposure;
-    let stays = facing ? between(x * facing[3 * v] + y * facing[3 * v + 1] + z * facing[3 * v + 2], TURNED_AWAY, AS_IN_PHOTO) : 0;
-    if (albedo && seen) stays *= 1 - between(Math.abs(exposure[4 * v] - seen[v]), SAME_SKY, OTHER_SKY);
+    const kept = facing ? between(x * facing[3 * v] + y * facing[3 * v + 1] + z * facing[3 * v + 2], TURNED_AWAY, AS_IN_PHOTO) : 0;
+    const left = (moved) => (albedo && seen ? kept * (1 - between(moved, SAME_SKY, OTHER_SKY)) : kept);
+    deep[v] = left(nearby[v]);
     const xy = x * y, yz = y * z, zz = 3 * z * z - 1, xz = x * z, xx = x * x - y * y;
     for (let c = 0; c < 3; c++) {
       const h = harmonics;
@@ -36,21 +44,27 @@ function lightVertices(body, shading, light, hurry = false) {
         got *= Math.max(e, ((e * p + q) * e + r) * e); // what bounces in (Jimenez et al. 2016)
       }
       const factor = got ** (1 / GAMMA);
-      factors[4 * v + c] = shade ? factor * (1 + stays * (shade[3 * v + c] - 1)) : factor;
+      factors[4 * v + c] = shade ? factor * (1 + deep[v] * (shade[3 * v + c] - 1)) : factor;
     }
-    factors[4 * v + 3] = stays;
+    factors[4 * v + 3] = left(change[v]);
   }
 }
 
 // Colours and opacities of all Gaussians, a byte each, into shading.colors. `light` is null for even light.
 function colorGaussians(body, gaussians, shading, light) {
   const { colors: own, fineShade, even } = body.data.arrays, { count, corners, shares, heaviest, shown, opacities } = gaussians;
-  const { factors, colors } = shading;
+  const { factors, colors, deep } = shading;
   for (let i = 0; i < count; i++) {
     if (!shown[heaviest[i]]) continue;
     const a = 3 * i, p = shares[a], q = shares[a + 1], r = shares[a + 2];
     const u = 4 * corners[a], v = 4 * corners[a + 1], w = 4 * corners[a + 2];
-    const stays = light && fineShade ? p * factors[u + 3] + q * factors[v + 3] + r * factors[w + 3] : 0;
+    let stays = 0;
+    if (light && fineShade) {
+      const red = Math.abs(fineShade[a] - 1), green = Math.abs(fineShade[a + 1] - 1), blue = Math.abs(fineShade[a + 2] - 1);
+      const share = between(Math.max(red, green, blue), WEAK, DEEP);
+      stays = (1 - share) * (p * factors[u + 3] + q * factors[v + 3] + r * factors[w + 3]) +
+        share * (p * deep[corners[a]] + q * deep[corners[a + 1]] + r * deep[corners[a + 2]]);
+    }
     let packed = Math.round(255 * opacities[i]) << 24;
     for (let c = 0; c < 3; c++) {
       let factor = even[c];

@@ -8,6 +8,7 @@ const MARGIN = 1.03; // radius that a buffer shows, in radii of the surface
 const LIFT = 0.002; // off the surface from which points look, and length of the ramp from seen to hidden [m]
 const STEEPEST = 3; // tangent up to which depth may differ by a texel's slope
 const LEAST_LIGHT = 1e-6;
+const NEARBY = 2; // rings of coarse faces within which what hid the sky counts as having moved, as in avatar/sky.py
 const HURRY = 4;
 const LOBE = [1, 2 / 3, 2 / 3, 2 / 3, 1 / 4, 1 / 4, 1 / 4, 1 / 4, 1 / 4]; // what a cosine lobe leaves of each harmonic
 
@@ -182,6 +183,26 @@ function smoothOverFaces(sky, faces) {
   }
   for (let i = 0; i < count; i++) {
     for (let k = 4 * i; k < 4 * i + 4; k++) smooth[k] = touching[i] ? smooth[k] / (3 * touching[i]) : seen[k];
+  }
+}
+
+// The largest of values, none below 0, over NEARBY rings of coarse faces around each vertex, into out.
+function largestNearby(body, { count }, values, out) {
+  const { skyVertices, skyFaces, skyCorners, skyShares } = body.data.arrays;
+  let on = Float32Array.from(skyVertices, (v) => values[v]);
+  for (let ring = 0; ring < NEARBY; ring++) {
+    const next = new Float32Array(count);
+    for (let f = 0; f < skyFaces.length; f += 3) {
+      const a = skyFaces[f], b = skyFaces[f + 1], c = skyFaces[f + 2], most = Math.max(on[a], on[b], on[c]);
+      next[a] = Math.max(next[a], most);
+      next[b] = Math.max(next[b], most);
+      next[c] = Math.max(next[c], most);
+    }
+    on = next;
+  }
+  for (let v = 0; v < body.nVertices; v++) {
+    out[v] = 0;
+    for (let c = 3 * v; c < 3 * v + 3; c++) out[v] += skyShares[c] * on[skyCorners[c]];
   }
 }
 
