@@ -15,6 +15,7 @@ from torch.nn.functional import normalize
 
 from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import MIN_OPACITY, OPACITY, RIM_FADE, batch_anchors
+from oasis_warp.avatar.densify import GROUND_DEPTH
 from oasis_warp.avatar.observation import batch_of_crop
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core import surface
@@ -81,6 +82,49 @@ def hold_to_surface(
     )
 
 
+LEAST_OPACITY = 0.8
+"""Of a vertex's Gaussian. That is what the network gives to nine in ten on faces; half of those on vertices have less
+than .35, and where a bent finger stretched its skin a quarter of what was drawn was the inside of its other side."""
+
+
+def cover_surface(
+    prediction: Prediction,
+    rest: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    vertex_faces: Int[Tensor, "V M"],
+    rim: Int[Tensor, "R"],
+) -> Prediction:
+    """The prediction of one hand with opaque Gaussians on all vertices, but for the fade at the wrist.
+
+    Faint ones were never seen in training: they stand out of the skin and are black as often as not. For what they lack
+    of `LEAST_OPACITY` they become their anchors' discs in the colours of the faces around, below the surface: on it the
+    discs would be teeth in outlines. Without Gaussians on faces nothing changes.
+    """
+    n = len(rest)
+    if prediction.colors.shape[1] == n:
+        return prediction
+    colors, on_faces = prediction.colors.split([n, prediction.colors.shape[1] - n], 1)
+    count = (vertex_faces < on_faces.shape[1]).sum(1)[:, None].clamp_min(1)
+    around = surface.gather_to_vertices(on_faces, vertex_faces) / count
+    anchors = batch_anchors(rest[None], faces, vertex_faces, rim)
+    quats, scales, fade = (part[:, :n] for part in anchors)
+    own, least = prediction.opacities[:, :n], LEAST_OPACITY * fade
+    share = (own / least.clamp_min(MIN_OPACITY)).clamp(max=1)[..., None]
+    sunk = -GROUND_DEPTH * surface.gathered_normals(rest, faces, vertex_faces)
+    same = torch.where((quats * prediction.quats[:, :n]).sum(-1, keepdim=True) < 0, -quats, quats)
+
+    def replaced(disc: Tensor, every: Tensor) -> Tensor:
+        return torch.cat([torch.lerp(disc, every[:, :n], share), every[:, n:]], 1)
+
+    return prediction._replace(
+        offsets=torch.lerp(sunk.expand_as(prediction.offsets), prediction.offsets, share),
+        quats=normalize(replaced(same, prediction.quats), dim=-1),
+        scales=replaced(scales, prediction.scales),
+        colors=torch.cat([torch.lerp(around, colors, share), on_faces], 1),
+        opacities=torch.cat([torch.maximum(own, least), prediction.opacities[:, n:]], 1),
+    )
+
+
 def distance_from_rim(
     rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], rim: Int[Tensor, "R"]
 ) -> Float[Tensor, "N"]:
@@ -137,10 +181,13 @@ class NetworkPrior:
 
     @torch.no_grad()
     def with_heads(self, crop: HandCrop) -> tuple[CanonicalGaussians, ColorHeads]:
-        """The same, and the heads that its colours come from with all that they are asked: LoRA trains them."""
+        """The same, and the heads that its colours come from with all that they are asked: LoRA trains them.
+
+        Faint Gaussians stay as they are: their heads would say other colours than `cover_surface`.
+        """
         network, inputs = self.network.to(crop.image.device), batch_of_crop(crop)
         described = network.describe(inputs)
-        guess = self._gaussians(network.decode(*described, inputs.rest), crop)
+        guess = self._gaussians(network.decode(*described, inputs.rest), crop, covered=False)
         return guess, self._heads(guess, described, crop)
 
     def _heads(self, guess: CanonicalGaussians, described: Described, crop: HandCrop) -> ColorHeads:
@@ -156,9 +203,11 @@ class NetworkPrior:
         seen = None if seen is None else seen[network.faces].mean(1)
         return on_vertices, cache_head(network.face_head, features, colors, seen, rows[n:][guess.face_index] - n)
 
-    def _gaussians(self, prediction: Prediction, crop: HandCrop) -> CanonicalGaussians:
+    def _gaussians(self, prediction: Prediction, crop: HandCrop, *, covered: bool = True) -> CanonicalGaussians:
         network, rest = self.network, crop.rest.vertices
         held = hold_to_surface(prediction, rest, network.faces, network.vertex_faces)
+        if covered:
+            held = cover_surface(held, rest, network.faces, network.vertex_faces, network.rim)
         return canonical_gaussians(blend_rim(held, rest, network.faces, network.vertex_faces, network.rim), 0)
 
     def _predict(self, crop: HandCrop) -> Prediction:
