@@ -18,11 +18,14 @@ import torch
 from scipy.sparse.linalg import splu
 
 from oasis_warp.adaptation.inpainting import laplacian_and_mass
+from oasis_warp.adaptation.skin_relief import UNIT
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.surface import mesh_edges, smooth_over_mesh
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.identity import Population, sample_identity
+from oasis_warp.synthetic.relief import relief_forms
 from oasis_warp.synthetic.skin_plan import plan_skin
 from oasis_warp.synthetic.skin_texture import nail_maps
 from oasis_warp.synthetic.texels import draw_lines, texels_on
@@ -53,11 +56,13 @@ DARKER, COLOUR = (0.82, 1.06, 1.12), 0.3
 maps' own is that of blocks of JPEG."""
 RIM = 3.0
 """Width of the islands' rims over which detail fades in: what lies beside them bled into them [texels]."""
-GREY, UNIT = 128, 400
+GREY, STEPS = 128, 400
 """Value of the maps that stands for none, and steps to one of the natural logarithm."""
 PEOPLE, LOUDEST_LINE = (3, 8), 2.0
 """People of the synthetic world whose folds over the joints are taken, and the first one's veins; the strength of a
 line that is stored as 255. The photos' own folds are blurred on the backs."""
+AROUND_PASSES = 20
+"""Smoothings over the mesh that leave the skin around, some 10 mm: half of what a knuckle of 17 mm stands out stays."""
 NAIL_REACH = 1.0
 """Share of the nail's label from which on a texture's own nail is left out."""
 DARKEST = 0.02
@@ -75,15 +80,25 @@ def main(folder: Path) -> None:
             raise FileNotFoundError(f"{folder / name}.png: expected a picture; give the folder of the crops.")
         picture = bgr[..., ::-1] / 255
         detail = band_pass(hand, np.log(np.maximum(picture, DARKEST)), faces, places)
-        stored = np.rint(GREY + UNIT * LOUDEST * np.tanh(gain * detail / LOUDEST)).clip(0, 255).astype(np.uint8)
+        stored = np.rint(GREY + STEPS * LOUDEST * np.tanh(gain * detail / LOUDEST)).clip(0, 255).astype(np.uint8)
         write(target / f"detail_{k}.png", spread_out(stored, faces >= 0))
     people = [painted_lines(hand, number) for number in PEOPLE]
     folds_and_veins = torch.stack([people[0]["fold"], people[1]["fold"], people[0]["vein"]], 1)
     lines = 255 * resampled(folds_and_veins / LOUDEST_LINE, faces, places)
     write(target / "lines.png", spread_out(np.rint(np.clip(lines, 0, 255)).astype(np.uint8), faces >= 0, fill=0))
     write(target / "nails.png", spread_out(nails(hand, faces, places), faces >= 0))
-    sums = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}" for path in sorted(target.glob("*.png"))]
+    write_relief(hand, target / "relief.npz")
+    maps = sorted([*target.glob("*.png"), *target.glob("*.npz")])
+    sums = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}" for path in maps]
     (target / "SHA256").write_text("\n".join(sums) + "\n")
+
+
+def write_relief(hand: HandModel, path: Path) -> None:
+    """The heights of the synthetic world's forms on the backs of hands above the skin around them, for each vertex."""
+    heights, edges = torch.from_numpy(relief_forms()).float(), mesh_edges(hand.faces)
+    stands_out = (heights - smooth_over_mesh(heights, edges, AROUND_PASSES)) * (1 - label_regions(hand).palm)[:, None]
+    np.savez_compressed(path, forms=np.rint(stands_out.T.numpy() / UNIT).clip(-127, 127).astype(np.int8))
+    print(path.name, path.stat().st_size)
 
 
 def write(path: Path, rgb: np.ndarray) -> None:

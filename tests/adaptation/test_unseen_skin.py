@@ -4,6 +4,7 @@ from synthetic import PALM_TO_CAMERA, crop_of
 
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.skin_detail import Places, sample_detail
+from oasis_warp.adaptation.skin_relief import relief_on_back
 from oasis_warp.adaptation.skin_tone import infer_tone, tone_colors
 from oasis_warp.adaptation.unseen_skin import MORE, SEEN, paint_unseen
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
@@ -14,6 +15,10 @@ from oasis_warp.avatar.pose import with_shade_baked
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
+from oasis_warp.hand.template import bundled_hand
+
+MIDDLE, RING = 4, 10
+"""First joints of these fingers."""
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +64,19 @@ def test_the_unseen_back_gets_detail_that_a_mean_has_not(hand, palm_photo, paint
     where = unseen_back(hand, painted)
     before, after = (vertex_colors(g, len(where)) for g in (palm_photo[1].gaussians, painted.gaussians))
     assert detail_of(hand, after, where) > 1.5 * detail_of(hand, before, where)
+
+
+def test_knuckles_stand_out_of_an_unseen_back_and_the_palm_has_none():
+    """Painted backs were slabs: detail of 4 to 8 px, where tendons and knuckles are, was at .4 of real hands'."""
+    hand = bundled_hand()
+    palm, n = label_regions(hand).palm, len(hand.template)
+    first, other = (relief_on_back(seed, n) for seed in (0, 1))
+    at_knuckle = (hand.template - hand.joints[MIDDLE]).norm(dim=1)
+    knuckle = first[(at_knuckle < 0.015) & (palm < 0.05)].max()
+    between = first[(hand.template - hand.joints[[RING, MIDDLE]].mean(0)).norm(dim=1) < 0.015].min()
+    assert float(knuckle) > 0.2 and float(between) < -0.2
+    assert float(first[palm > 0.999].abs().max()) < 0.01
+    assert not torch.equal(first, other) and torch.equal(first, relief_on_back(0, n))
 
 
 def test_a_photo_with_crisp_skin_gets_crisper_skin_painted(hand, palm_photo):

@@ -10,6 +10,7 @@ from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.reliability import VertexObservations
 from oasis_warp.adaptation.sharpen import FADE_REACH
 from oasis_warp.adaptation.skin_detail import Places, SkinDetail, sample_detail
+from oasis_warp.adaptation.skin_relief import relief_shade
 from oasis_warp.adaptation.skin_tone import SkinTone, infer_tone
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions
@@ -74,8 +75,9 @@ def paint_unseen(
 
     A painted place is exp(t + x + d): the mean colour t of the region in the person's tone (`infer_tone`), what the
     seen skin differs from it, carried on as the screened membrane x (`inpaint`), and the detail d of real hands
-    (`sample_detail`). Where the seen skin ends, t + x is its own smooth colour, so that gradients go on and no seam
-    shows. Seen Gaussians stay bit for bit; the largest unseen faces are cut into finer ones.
+    (`sample_detail`) with the relief of a back (`relief_shade`). Where the seen skin ends, t + x is its own smooth
+    colour, so that gradients go on and no seam shows. Seen Gaussians stay bit for bit; the largest unseen faces are cut
+    into finer ones.
 
     Args:
         hand: Whose surface it is.
@@ -104,8 +106,9 @@ def paint_unseen(
     fine = densify(
         gaussians, rest, faces, _parts(hand, gaussians, rest, torch.minimum(invented, 1 - shown), seed)
     ).gaussians
+    relief = relief_shade(seed, len(rest)).to(rest) * (1 - nail)[:, None]
     read = vertex_to_gaussians(
-        torch.cat([tone.log_skin + smooth, smooth, torch.stack([palm, invented, shown], 1)], 1), faces, fine
+        torch.cat([tone.log_skin + relief + smooth, smooth, torch.stack([palm, invented, shown], 1)], 1), faces, fine
     )
     detail = _skin_detail(sample := sample_detail(hand, fine, seed), read[:, 6:7]) + _grain(fine, seed)
     painted = _paint(sample, read[:, :3] + _clarity(hand, observations) * detail, bed + read[:, 3:6])

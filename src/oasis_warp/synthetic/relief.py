@@ -22,7 +22,7 @@ def _step(low: float, high: float, x: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
-def _forms() -> np.ndarray:
+def relief_forms() -> np.ndarray:
     """Heights of the hand's vertices [mm], [V, 4]: constant, and per unit of bony, tendons, and bony x tendons."""
     body = bundled_body()
     n = body.n_hand
@@ -76,7 +76,7 @@ def _forms() -> np.ndarray:
 
 @functools.cache
 def _forms_on(device: str) -> Float[Tensor, "V 4"]:
-    return torch.from_numpy(_forms()).float().to(device)
+    return torch.from_numpy(relief_forms()).float().to(device)
 
 
 def relief(identity: Identity, device: str) -> Float[Tensor, "V"]:
