@@ -151,8 +151,8 @@ def test_large_values_below_the_limit_are_no_error():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"width": 0}, "width: expected 1 or more pixels, got 0."),
-        ({"height": -3}, "height: expected 1 or more pixels, got -3."),
+        ({"width": 0}, "width: expected a whole number of pixels from 1 to 8388608, got 0."),
+        ({"height": -3}, "height: expected a whole number of pixels from 1 to 8388608, got -3."),
         ({"near_plane": 0.0}, "near_plane: expected a positive"),
         ({"tau": 0.0}, "tau: expected a positive"),
         ({"tau": math.nan}, "tau: expected a positive"),

@@ -2,20 +2,23 @@
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from oasis_kernels import constants
+from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.rasterization_checks import check_cameras, check_gaussians
 from oasis_warp.ops._runtime.records import Splats
+from oasis_warp.ops._runtime.transforms import in_forward_mode, refuse_forward_mode
+from oasis_warp.ops._runtime.values import check_finite
 from oasis_warp.ops._runtime.weigh import weigh
 from oasis_warp.ops.checks import check_float, check_shape
-from oasis_warp.ops.projection import project
+from oasis_warp.ops.projection import check_focal_lengths, project
 
 
 class BlendWeights(NamedTuple):
@@ -84,6 +87,13 @@ def blend_weights(
     check_shape("viewmat", viewmat, 4, 4)
     check_shape("K", K, 3, 3)
     check_gaussians(means, quats, scales, None, opacities)
+    if in_forward_mode():
+        refuse_forward_mode("blend_weights", (means, quats, scales, opacities, viewmat, K))
+    for name, tensor in (("viewmat", viewmat), ("K", K)):
+        check_float(name, tensor, like=means)
+    if validate:
+        check_finite(viewmat=viewmat, K=K)
+        check_focal_lengths("K", K)
     check_cameras(viewmat[None], K[None], means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size)
     n, pixels = len(means), width * height
     with torch.no_grad():
@@ -108,6 +118,16 @@ def _csr(starts: Tensor, columns: Tensor, values: Tensor, size: tuple[int, int])
         return torch.sparse_csr_tensor(starts, columns, values, size, check_invariants=False)
 
 
+def check_weights_type(name: str, weights: BlendWeights) -> None:
+    """Refuse what `blend_weights` does not return.
+
+    Raises:
+        TypeError: names the argument.
+    """
+    if not isinstance(weights, BlendWeights):
+        raise TypeError(f"{name}: expected BlendWeights of blend_weights, got {type(weights).__name__}.")
+
+
 def stack_weights(views: Sequence[BlendWeights]) -> BlendWeights:
     """Several pictures, one below the other, as one; the Gaussians of each follow upon those of the one before.
 
@@ -117,10 +137,13 @@ def stack_weights(views: Sequence[BlendWeights]) -> BlendWeights:
         views: Of equal width, on one device.
 
     Raises:
+        TypeError: another type.
         ValueError: none, of different widths, or more weights than int32 can count.
     """
     if not views:
         raise ValueError("views: expected at least one, got none.")
+    for view in views:
+        check_weights_type("views", view)
     width = views[0].alphas.shape[1]
     for view in views[1:]:
         if view.alphas.shape[1] != width:
@@ -147,32 +170,62 @@ def _diagonal(parts: Sequence[Tensor]) -> Tensor:
     return _csr(torch.cat(starts).int(), torch.cat(columns).int(), values, (rows, width))
 
 
+@dataclass(frozen=True)
+class _Matrix:
+    """A sparse matrix and its transpose. Transforms of torch.func, which know no sparse tensors, do not look inside."""
+
+    matrix: Tensor
+    transpose: Tensor
+
+
 class _BlendColors(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, colors: Tensor, matrix: Tensor, transpose: Tensor) -> Tensor:
-        ctx.transpose = transpose
-        return matrix @ colors
+    def forward(colors: Tensor, by: _Matrix) -> Tensor:
+        return by.matrix @ colors
 
     @staticmethod
-    @once_differentiable
+    def setup_context(ctx: Any, inputs: tuple[Tensor, _Matrix], output: Tensor) -> None:
+        ctx.by = inputs[1]
+
+    @staticmethod
     def backward(ctx: Any, g_image: Tensor) -> tuple[Tensor | None, ...]:
         return (
-            ctx.transpose @ g_image.contiguous(),
-            None,  # matrix
-            None,  # transpose
+            _BlendColors.apply(g_image.contiguous(), _Matrix(ctx.by.transpose, ctx.by.matrix)),
+            None,  # by
         )
 
+    @staticmethod
+    def jvp(ctx: Any, colors: Tensor, _: None) -> Any:
+        return _BlendColors.apply(colors.contiguous(), ctx.by)
 
-def blend_colors(weights: BlendWeights, colors: Float[Tensor, "N D"]) -> Float[Tensor, "H W D"]:
-    """The image of Gaussians of these `colors`, shape [N, D], over black; differentiable in them.
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int, None], colors: Tensor, by: _Matrix) -> tuple[Any, int]:
+        columns = colors.movedim(in_dims[0], -1)  # the products of all entries are one of more columns
+        image: Any = _BlendColors.apply(columns.flatten(1), by)
+        return image.view(-1, *columns.shape[1:]), 2
+
+
+def blend_colors(
+    weights: BlendWeights, colors: Float[Tensor, "N D"], *, validate: bool = True
+) -> Float[Tensor, "H W D"]:
+    """The image of Gaussians of these `colors`, shape [N, D], over black; differentiable in them, any number of times.
 
     Torch's own gradient of a sparse product transposes the matrix at every step, at sixty times the cost.
 
+    Args:
+        weights: Of `blend_weights`.
+        colors: One row for each Gaussian.
+        validate: Refuse colours that are not finite. Waits for a CUDA device; switch it off for trusted inputs.
+
     Raises:
-        ValueError: `colors` has another number of rows, or another type than the weights.
+        TypeError: `weights` or `colors` are of another type.
+        ValueError: `colors` has another number of rows, or another dtype than the weights, or is not finite.
     """
+    check_weights_type("weights", weights)
     check_shape("colors", colors, weights.matrix.shape[1], "D", hint="One row for each Gaussian.")
     check_float("colors", colors, like=weights.alphas)
+    if validate and not is_traced():
+        check_finite(colors=colors)
     height, width, _ = weights.alphas.shape
-    image = _BlendColors.apply(colors.contiguous(), weights.matrix, weights.transpose)
+    image: Any = _BlendColors.apply(colors.contiguous(), _Matrix(weights.matrix, weights.transpose))
     return image.view(height, width, colors.shape[1])

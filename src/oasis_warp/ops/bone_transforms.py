@@ -1,6 +1,7 @@
 """Forward kinematics: joint angles to the transforms that carry each bone's rest points."""
 
 import functools
+import reprlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -105,6 +106,26 @@ _OPERATOR = Operator(
 )
 
 
+def check_parents(parents: Sequence[int]) -> int:
+    """Check that `parents` are those of a skeleton.
+
+    Returns:
+        The number of bones.
+
+    Raises:
+        TypeError: no sequence of whole numbers.
+        ValueError: the first is not -1, or another is no earlier bone.
+    """
+    if not isinstance(parents, Sequence) or not all(type(parent) is int for parent in parents):
+        raise TypeError(f"parents: expected a list of int, got {reprlib.repr(parents)}.")
+    earlier = all(0 <= parent < bone for bone, parent in enumerate(parents) if bone)
+    if not parents or parents[0] != -1 or not earlier:
+        raise ValueError(
+            f"parents: expected -1, then an earlier bone for each other one, got {reprlib.repr(list(parents))}."
+        )
+    return len(parents)
+
+
 def bone_transforms(
     angles: Float[Tensor, "*B A 3"],
     orientation: Float[Tensor, "*B 3 3"],
@@ -135,12 +156,10 @@ def bone_transforms(
         validate: Check the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
 
     Raises:
+        TypeError: what should be a tensor, or a list of int, is none.
         ValueError: a wrong shape, dtype or parent, or a value that is not finite.
     """
-    n_joints = len(parents)
-    earlier = all(0 <= parent < bone for bone, parent in enumerate(parents) if bone)
-    if not n_joints or parents[0] != -1 or not earlier:
-        raise ValueError(f"parents: expected -1, then an earlier bone for each other one, got {list(parents)}.")
+    n_joints = check_parents(parents)
     _OPERATOR.check(
         {"A": n_joints - 1, "J": n_joints}, angles=angles, orientation=orientation, translation=translation,
         joints=joints, axes=axes,

@@ -1,17 +1,36 @@
 """Checks of arguments of public functions, with messages of the form `argument: expected X, got Y. Hint`."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 FLOATS = torch.float32, torch.float64
+DEVICES = "cpu", "cuda"
+WHOLE = int, torch.SymInt
+NUMBERS = int, float, torch.SymInt, torch.SymFloat
+MAX_SIDE = 2**23
+"""Of an image or a tile [px]: float32 counts halves of pixels up to there, and products with 2^8 fit in int32."""
 FINITE_LIMIT = 1e15
 """Largest accepted magnitude: its square still fits in float32."""
 
 
 def _sentence(name: str, expected: str, got: str, hint: str) -> str:
     return f"{name}: expected {expected}, got {got}." + (f" {hint}" if hint else "")
+
+
+def check_tensor(name: str, tensor: Tensor, hint: str = "") -> None:
+    """Check that `tensor` is one, and dense.
+
+    Raises:
+        TypeError: it is not.
+    """
+    if not isinstance(tensor, Tensor):
+        raise TypeError(_sentence(name, "a torch.Tensor", type(tensor).__name__, hint))
+    if tensor.layout != torch.strided:
+        got = f"one with layout {str(tensor.layout).removeprefix('torch.')}"
+        raise TypeError(_sentence(name, "a dense tensor", got, "Call its to_dense()."))
 
 
 def check_shape(
@@ -23,8 +42,7 @@ def check_shape(
         TypeError: `tensor` is no tensor.
         ValueError: another shape.
     """
-    if not isinstance(tensor, Tensor):
-        raise TypeError(_sentence(name, "a torch.Tensor", type(tensor).__name__, hint))
+    check_tensor(name, tensor, hint)
     sizes = {} if sizes is None else sizes
     got = tensor.shape
     fits = len(shape) == len(got)
@@ -48,6 +66,8 @@ def check_float(name: str, tensor: Tensor, like: Tensor | None = None) -> None:
     """
     if tensor.dtype not in FLOATS:
         raise ValueError(_sentence(name, "float32 or float64", str(tensor.dtype).removeprefix("torch."), ""))
+    if like is None and tensor.device.type not in DEVICES:
+        raise ValueError(_sentence(name, "a tensor on cpu or cuda", f"one on {tensor.device}", ""))
     if like is not None and (tensor.dtype != like.dtype or tensor.device != like.device):
         raise ValueError(
             _sentence(name, f"{like.dtype} on {like.device}", f"{tensor.dtype} on {tensor.device}",
@@ -62,11 +82,44 @@ def check_like(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor, 
         TypeError: `tensor` is no tensor.
         ValueError: another shape, dtype or device.
     """
-    if isinstance(tensor, Tensor) and tensor.shape == shape:
+    if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.layout == torch.strided:
         if tensor.dtype != like.dtype or tensor.device != like.device:
             check_float(name, tensor, like)
     else:
         check_shape(name, tensor, *shape, hint=hint)
+
+
+def refuse_gradient(caller: str, **tensors: Tensor | None) -> None:
+    """Refuse tensors that require a gradient although the operator `caller` is constant in them.
+
+    Raises:
+        ValueError: one does, and torch records gradients.
+    """
+    for name, tensor in tensors.items():
+        if tensor is not None and tensor.requires_grad and torch.is_grad_enabled():
+            hint = f"{caller} has no derivative with respect to it; pass {name}.detach()."
+            raise ValueError(_sentence(name, "a tensor that needs no gradient", "one with requires_grad", hint))
+
+
+def check_device(name: str, tensor: Tensor | None, like: Tensor | None) -> None:
+    """Check that `tensor` lies where the checked tensor `like` does, where both are there.
+
+    Raises:
+        ValueError: it does not.
+    """
+    if tensor is not None and like is not None and tensor.device != like.device:
+        raise ValueError(_sentence(name, f"a tensor on {like.device}", f"one on {tensor.device}", ""))
+
+
+def check_kinds(names: Sequence[str], arguments: Sequence[Any]) -> None:
+    """Refuse arguments that no custom op takes; torch names them with its schema.
+
+    Raises:
+        TypeError: names the argument.
+    """
+    for name, argument in zip(names, arguments, strict=True):
+        if not isinstance(argument, Tensor | bool | int | float | list | torch.SymInt | torch.SymFloat | None):
+            raise TypeError(f"{name}: expected a tensor, a number or a flag, got {type(argument).__name__}.")
 
 
 def check_finite(**tensors: Tensor | None) -> None:
@@ -96,8 +149,8 @@ def check_integer(name: str, tensor: Tensor) -> None:
         raise ValueError(_sentence(name, "int32 or int64", str(tensor.dtype).removeprefix("torch."), ""))
 
 
-def check_index(name: str, tensor: Tensor, size: int, what: str) -> None:
-    """Check that integer `tensor` lies in [0, size).
+def check_index(name: str, tensor: Tensor, size: int, what: str, least: int = 0) -> None:
+    """Check that integer `tensor` lies in [least, size).
 
     Raises:
         ValueError: not an integer tensor, or an index out of range.
@@ -105,10 +158,29 @@ def check_index(name: str, tensor: Tensor, size: int, what: str) -> None:
     check_integer(name, tensor)
     if tensor.numel():
         low, high = (int(v) for v in torch.aminmax(tensor))
-        if low < 0 or high >= size:
+        if low < least or high >= size:
             raise ValueError(
-                _sentence(name, f"indices in 0 .. {size - 1} ({size} {what})", f"values from {low} to {high}", "")
+                _sentence(name, f"indices in {least} .. {size - 1} ({size} {what})", f"values from {low} to {high}", "")
             )
+
+
+def check_whole(name: str, value: int, what: str, least: int, most: int) -> None:
+    """Check that `value` is a whole number of `what` in [least, most].
+
+    Raises:
+        ValueError: it is not.
+    """
+    if not isinstance(value, WHOLE) or isinstance(value, bool) or not least <= value <= most:
+        raise ValueError(_sentence(name, f"a whole number of {what} from {least} to {most}", repr(value), ""))
+
+
+def check_pixels(name: str, value: int) -> None:
+    """Check that `value` is the length of a side of an image or a tile [px].
+
+    Raises:
+        ValueError: it is not.
+    """
+    check_whole(name, value, "pixels", 1, MAX_SIDE)
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
@@ -121,11 +193,23 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
         raise ValueError(_sentence(name, "one of " + ", ".join(repr(c) for c in choices), repr(value), ""))
 
 
+def check_number(name: str, value: float) -> None:
+    """Check that `value` is a plain number.
+
+    Raises:
+        TypeError: it is not.
+    """
+    if not isinstance(value, NUMBERS) or isinstance(value, bool):
+        raise TypeError(_sentence(name, "a number", type(value).__name__, ""))
+
+
 def check_positive(name: str, value: float) -> None:
     """Check that the number `value` is positive and finite.
 
     Raises:
+        TypeError: it is no number.
         ValueError: it is not.
     """
+    check_number(name, value)
     if not 0 < value < float("inf"):
         raise ValueError(_sentence(name, "a positive finite number", repr(value), ""))

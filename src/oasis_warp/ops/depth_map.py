@@ -11,7 +11,7 @@ from oasis_warp.ops._runtime.declaration import Array, Operator
 from oasis_warp.ops._runtime.depth_buffer import draw, plane_size
 from oasis_warp.ops._runtime.depth_scene import BufferParts, DepthScene
 from oasis_warp.ops._runtime.incidence import incidence
-from oasis_warp.ops.checks import check_choice, check_positive
+from oasis_warp.ops.checks import check_choice, check_pixels, check_positive
 
 
 class DepthMap(NamedTuple):
@@ -43,8 +43,7 @@ def check_picture(width: int, height: int, near_plane: float) -> None:
         ValueError: names the argument.
     """
     for name, size in (("width", width), ("height", height)):
-        if size < 1:
-            raise ValueError(f"{name}: expected 1 or more pixels, got {size}.")
+        check_pixels(name, size)
     if plane_size(width, height) >= 2**31:
         raise ValueError(f"width: expected fewer than 2^31 pixels, got {width} x {height}. Draw the picture in tiles.")
     check_positive("near_plane", near_plane)

@@ -232,7 +232,8 @@ def _pose_covars_backward(
     rows = [rest_vertices.new_empty((q if needed else 0, 9)) for needed in needs[:2]]
     arguments = _stretch_arguments(rest_vertices, posed_vertices, faces, face_index, barycentrics, quats, scales)
     launch_ranges(stretch_kernels.pose_backward, q, [*arguments, *incoming, *rows, *gradients[2:]], like=rest_vertices)
-    at_vertices = gaussians_at_vertices(faces, face_index, None, len(rest_vertices))
+    corners = incidence("faces", faces, len(rest_vertices), "vertices")
+    at_vertices = gaussians_at_vertices(corners, incidence("face_index", face_index, len(faces), "faces"), None)
     for k in range(2):
         if needs[k]:
             gradients[k] = sum_at_items(rows[k].view(-1, 3), at_vertices)

@@ -79,8 +79,17 @@ def check_values(
             raise ValueError(
                 f"opacities: expected values in [0, 1], got {low:g} to {high:g}. Logits go through a sigmoid first."
             )
-    if bool((Ks.detach()[:, [0, 1], [0, 1]] == 0).any()):
-        raise ValueError("Ks: expected focal lengths other than 0, got 0.")
+    check_focal_lengths("Ks", Ks)
+
+
+def check_focal_lengths(name: str, Ks: Tensor) -> None:
+    """Refuse intrinsics [..., 3, 3] with a focal length of 0.
+
+    Raises:
+        ValueError: names the argument.
+    """
+    if bool((Ks.detach()[..., [0, 1], [0, 1]] == 0).any()):
+        raise ValueError(f"{name}: expected focal lengths other than 0, got 0.")
 
 
 def _project(
@@ -162,6 +171,7 @@ _OPERATOR = Operator(
     outputs={"means2d": "C N 2", "covars2d": "C N 3", "depths": "C N"},
     auxiliary={"conics": "C N 3", "radii": "C N 2", "records": "B"},
     validates_itself=True,
+    caller="rasterization",
     public=False,
 )
 

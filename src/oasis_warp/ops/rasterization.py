@@ -21,7 +21,7 @@ from oasis_warp.ops._runtime.rasterization_checks import (
 )
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 from oasis_warp.ops.blending import blend
-from oasis_warp.ops.checks import check_choice
+from oasis_warp.ops.checks import check_choice, refuse_gradient
 from oasis_warp.ops.gsplat_options import compensated_opacities, record_absolute_gradients
 from oasis_warp.ops.projection import Projection, project
 from oasis_warp.ops.spherical_harmonics import sh_to_rgb
@@ -178,12 +178,15 @@ def rasterization(
         quats = scales = None
     check_gaussians(means, quats, scales, covars, opacities)
     check_cameras(viewmats, Ks, means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size)
+    refuse_gradient("rasterization", Ks=Ks)
     n_cameras = viewmats.shape[0]
     if sh_degree is not None:
         check_coefficients(colors, sh_degree, means, n_cameras)
+        if validate and not is_traced():
+            check_finite(colors=colors)  # of which the largest degree may not be read, and -inf would become black
         colors = sh_to_rgb(sh_degree, means, colors, viewmats)
     check_colors(colors, backgrounds, means, n_cameras)
-    if validate and render_mode in ("D", "ED") and not torch.compiler.is_compiling():
+    if validate and render_mode in ("D", "ED") and not is_traced():
         check_finite(colors=colors, backgrounds=backgrounds)  # the blending, which does not get them, cannot check them
 
     # Projection waits for the result of its own checks: another check on the device costs next to nothing meanwhile.

@@ -8,9 +8,11 @@ from torch import Tensor
 
 from oasis_kernels.skinning import skinning as kernels
 from oasis_kernels.skinning import skinning_native as native_kernels
+from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime import launch
 from oasis_warp.ops._runtime.declaration import Array, Operator, empty_gradients
 from oasis_warp.ops._runtime.launch import launch_ranges
+from oasis_warp.ops._runtime.values import check_finite
 
 
 class Skinned(NamedTuple):
@@ -259,6 +261,7 @@ def skin(
         validate: Check the values of the tensors too. Waits for a CUDA device: switch it off for inputs you trust.
 
     Raises:
+        TypeError: what should be a tensor is none.
         ValueError: a wrong shape or dtype, a value that is not finite, `rotation_only` without covariances, or only one
             of the two arguments of correctives.
     """
@@ -267,11 +270,13 @@ def skin(
     if (displacements is None) != (strengths is None):
         missing, given = ("displacements", "strengths") if displacements is None else ("strengths", "displacements")
         raise ValueError(f"{missing}: expected a tensor, got None. It goes with {given}.")
-    rows = 3 if transforms.ndim >= 3 and transforms.shape[-2] == 3 else 4
+    rows = 3 if isinstance(transforms, Tensor) and transforms.ndim >= 3 and transforms.shape[-2] == 3 else 4
     _OPERATOR.check(
         {"R": rows}, means=means, covars=covars, weights=weights, transforms=transforms, displacements=displacements,
         strengths=strengths,
     )  # fmt: skip
     affine = transforms if rows == 3 else transforms[..., :3, :]
+    if validate and rows == 4 and not is_traced():
+        check_finite(transforms=transforms[..., 3, :].contiguous())  # which the operator does not get
     out_means, out_covars = _OPERATOR(means, covars, weights, affine, displacements, strengths, rotation_only, validate)
     return Skinned(out_means, None if covars is None else out_covars)

@@ -18,7 +18,7 @@ from oasis_warp.ops._runtime.launch import (
     run_cuda,
     vectors,
 )
-from oasis_warp.ops.checks import check_float
+from oasis_warp.ops.checks import check_float, check_tensor
 
 MAX_DEGREE = 3
 
@@ -96,6 +96,8 @@ def spherical_harmonics(
     Raises:
         ValueError: a wrong shape, dtype or degree, or a value that is not finite.
     """
+    for name, tensor in (("directions", directions), ("coefficients", coefficients)):
+        check_tensor(name, tensor)
     if directions.shape[-1:] != (3,) or coefficients.dim() < 2 or coefficients.shape[-1] != 3:
         raise ValueError(
             "coefficients: expected shapes [..., 3] of directions and [..., K, 3] of coefficients, "
@@ -199,6 +201,7 @@ _SH_TO_RGB = Operator(
     },
     outputs={"colors": "C N 3"},
     reference="rasterization.sh_to_rgb",
+    caller="rasterization",
     public=False,
 )
 

@@ -8,12 +8,15 @@ from torch import Tensor
 from oasis_warp.ops._runtime.declaration import Array, Operator, needs_gradient
 from oasis_warp.ops._runtime.depth_buffer import draw, gradients
 from oasis_warp.ops._runtime.depth_scene import BufferParts, DepthScene, Query
-from oasis_warp.ops._runtime.incidence import incidence
-from oasis_warp.ops.checks import check_integer, check_positive
+from oasis_warp.ops._runtime.incidence import checked_indices, incidence
+from oasis_warp.ops.checks import check_number, check_positive
 from oasis_warp.ops.depth_map import MESH_AND_CAMERA, check_picture, expand_batch
 
 MARGIN_TAUS = 3.0
 """Default margin in units of tau: without one, half a pixel of slope hides half of the visible points."""
+
+
+OR_NONE = "vertices, or -1 for none"
 
 
 class DepthVisibility(NamedTuple):
@@ -38,7 +41,7 @@ def _visibility(
     table = incidence("faces", faces, vertices.shape[1], "vertices").table
     scene = DepthScene(vertices, table, viewmats, Ks, width, height, near_plane)
     if point_vertices is not None:
-        point_vertices = point_vertices.contiguous()
+        point_vertices = checked_indices("point_vertices", point_vertices, vertices.shape[1], OR_NONE, least=-1)
     query = Query(points, point_vertices, by_identity, tau, margin, keep)
     # The adjoint needs to know the face that each score came from.
     buffer, scores = draw(scene, query, BufferParts(maps, maps or keep, barycentrics=False), validate)
@@ -149,16 +152,15 @@ def depth_visibility(
     check_picture(width, height, near_plane)
     check_positive("tau", tau)
     margin = MARGIN_TAUS * tau if margin is None else margin
+    check_number("margin", margin)
     if not 0 <= margin < float("inf"):
         raise ValueError(f"margin: expected a finite number, 0 or more, got {margin!r}.")
     batch = sizes.get("B", 1)
     keep = needs_gradient(points, vertices)
     by_identity = not literal and point_vertices is not None
-    if point_vertices is not None:
-        check_integer("point_vertices", point_vertices)
     visibility, depth, face_ids, _, _ = _OPERATOR(
-        expand_batch(points, batch), expand_batch(vertices, batch), faces, expand_batch(viewmat.detach(), batch),
-        expand_batch(K.detach(), batch), point_vertices, by_identity, width, height, near_plane, tau,
+        expand_batch(points, batch), expand_batch(vertices, batch), faces, expand_batch(viewmat, batch),
+        expand_batch(K, batch), point_vertices, by_identity, width, height, near_plane, tau,
         0.0 if literal else margin, maps, keep, validate,
     )  # fmt: skip
     if keep and not maps:

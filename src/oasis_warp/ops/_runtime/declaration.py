@@ -22,8 +22,9 @@ from torch.autograd.function import Function
 from torch.nn import Parameter
 
 from oasis_warp.core.tracing import is_traced
+from oasis_warp.ops._runtime import transforms
 from oasis_warp.ops._runtime.values import check_finite
-from oasis_warp.ops.checks import check_float, check_shape
+from oasis_warp.ops.checks import check_device, check_float, check_kinds, check_shape, refuse_gradient
 
 NAMESPACE = "oasis_warp"
 BATCH = "*B"
@@ -84,6 +85,8 @@ class Declaration:
         self.reference = reference
         self._shapes = [(k, a.dims, a.shape[0], a.optional, a.hint) for k, a in inputs.items()]
         self._floats = [k for k, a in inputs.items() if not a.index]
+        self._indices = [k for k, a in inputs.items() if a.index]
+        self._constant = [k for k in self._floats if self.differentiable and not inputs[k].grad]
         if public:
             DECLARATIONS[name] = self
 
@@ -107,8 +110,11 @@ class Declaration:
 
         Raises:
             TypeError: an argument that is not a tensor.
-            ValueError: a wrong shape, dtype or device.
+            ValueError: a wrong shape, dtype or device, or a gradient wanted by an input that has none.
+            RuntimeError: an input carries a derivative in forward mode.
         """
+        if transforms.in_forward_mode():
+            transforms.refuse_forward_mode(self.name, arrays.values())
         sizes = {} if sizes is None else sizes
         batched = None
         for name, dims, batch, optional, hint in self._shapes:
@@ -130,6 +136,9 @@ class Declaration:
             if tensor is not None:
                 check_float(name, tensor, like)
                 like = tensor if like is None else like
+        for name in self._indices:
+            check_device(name, arrays[name], like)
+        refuse_gradient(self.name, **{name: arrays[name] for name in self._constant})
         return sizes
 
 
@@ -184,6 +193,7 @@ class Operator(Declaration):
         self._tensors = [n for n, p in parameters.items() if p.annotation in (Tensor, Tensor | None)]
         checked = [(k, name) for k, name in enumerate(self._parameters) if name in self._floats]
         self.forward = forward
+        self.caller = caller or name
         self._implementation = forward
         if self._parameters[-1] == "validate" and not validates_itself:
             self._implementation = _validating(forward, checked)
@@ -192,17 +202,17 @@ class Operator(Declaration):
         self._fake = fake
         self._traced = getattr(getattr(torch.ops, NAMESPACE), name).default
         self._differentiated: Callable[..., Any] = self._traced  # which raises, or keeps the refusal in the graph
+        self._transformed = self._traced
         self._batched = [name in inputs and inputs[name].shape.startswith(BATCH) for name in self._parameters]
         self._wrt = [k for k, name in enumerate(self._parameters) if name in inputs and inputs[name].grad]
         if backward is not None:
-            self._differentiate(backward, fake_backward, {**outputs, **auxiliary}, caller or name)
+            self._differentiate(backward, fake_backward, {**outputs, **auxiliary})
 
     def _differentiate(
         self,
         backward: Callable[..., Any],
         fake_backward: Callable[..., Any] | None,
         results: Mapping[str, str],
-        caller: str,
     ) -> None:
         """Register the adjoint, and what is saved for it."""
         places = {name: k for k, name in enumerate(self._parameters)}
@@ -220,12 +230,17 @@ class Operator(Declaration):
         self.backward, self._fake_backward = backward, fake_backward
         self.adjoint = Operator(f"{self.name}_backward", backward, fake_backward, inputs={}, outputs={}, public=False)
         self.adjoint.custom_op.register_autograd(self._refuse)
+        as_tuple = lambda *arguments: tuple(self.adjoint._traced(*arguments))  # noqa: E731
+        self.adjoint._transformed = transforms.transformable(
+            self.adjoint.name, self.caller, as_tuple, lambda *_: None, self._refuse
+        )
         save, differentiate = _derivative(
             self.adjoint, len(places), self._wrt, [places[n] for n in inputs], [result_names.index(n) for n in saved],
             [places[n] for n in numbers], [result_names.index(n[2:]) for n in incoming],
-            range(len(self.outputs), len(results)), caller,
+            range(len(self.outputs), len(results)), self.caller,
         )  # fmt: skip
         self.custom_op.register_autograd(differentiate, setup_context=save)
+        self._transformed = transforms.transformable(self.name, self.caller, self._traced, save, differentiate)
         implementation = self._implementation
 
         def run(ctx: Any, *arguments: Any) -> Any:
@@ -239,33 +254,37 @@ class Operator(Declaration):
 
     def _refuse(self, *_: Any) -> Any:
         raise RuntimeError(
-            f"{self.name}: expected one derivative, got a request for the second. "
+            f"{self.caller}: expected one derivative, got a request for the second. "
             "It is differentiable once; detach the gradient before you go on with it."
         )
 
     def __call__(self, *arguments: Any) -> Any:
         """Run the op directly if possible, else through torch."""
+        if transforms.in_forward_mode():
+            transforms.refuse_forward_mode(self.caller, arguments)
         if is_traced():
-            return self._traced(*arguments)
-        tracks = torch.is_grad_enabled()
-        needed = False
+            return self._transformed(*arguments) if transforms.in_transform() else self._traced(*arguments)
+        tracks, needed = torch.is_grad_enabled(), False
         for argument in arguments:
             kind = type(argument)
             if kind is Tensor or kind is Parameter:
                 if argument.is_neg():  # memory holds the opposite of what it stands for: the dispatcher resolves that
-                    return self._traced(*arguments)
-                if tracks and argument.requires_grad:
-                    needed = True
+                    return self._through_torch(arguments)
+                needed = needed or (tracks and argument.requires_grad)
             elif kind is list:
                 for item in argument:
                     if type(item) is Tensor:
                         if item.is_neg() or (tracks and item.requires_grad):
-                            return self._traced(*arguments)
+                            return self._through_torch(arguments)
                     elif type(item) not in _NUMBERS:
-                        return self._traced(*arguments)
+                        return self._through_torch(arguments)
             elif kind not in _NUMBERS:  # a kind of tensor with its own way through ops, such as a fake one
-                return self._traced(*arguments)
+                return self._through_torch(arguments)
         return self._differentiated(*arguments) if needed else self._implementation(*arguments)
+
+    def _through_torch(self, arguments: Sequence[Any]) -> Any:
+        check_kinds(self._parameters, arguments)
+        return self._traced(*arguments)
 
     def each_pose(self, *arguments: Any) -> Any:
         """`forward` of several poses by an implementation that knows only one: pose after pose."""
@@ -378,4 +397,4 @@ def empty_gradients(inputs: Sequence[Tensor | None], needs: Sequence[bool]) -> l
 
 def needs_gradient(*tensors: Tensor | None) -> bool:
     """Whether torch will ask for a gradient by one of `tensors`: otherwise nothing need be saved for the adjoint."""
-    return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    return torch.is_grad_enabled() and any(t is not None and transforms.wants_gradient(t) for t in tensors)

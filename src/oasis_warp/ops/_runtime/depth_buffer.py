@@ -19,7 +19,7 @@ from oasis_warp.ops._runtime.incidence import _transposed, sum_at_items
 from oasis_warp.ops._runtime.launch import SCALAR_NAMES, launch, run_shared, view
 from oasis_warp.ops._runtime.pair_counts import own_slot
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
-from oasis_warp.ops.checks import check_index, check_positive
+from oasis_warp.ops.checks import check_positive
 
 Drawn = tuple[Buffer, Scores | None]
 MAX_FRACTION_BITS = 22
@@ -31,8 +31,7 @@ def draw(scene: DepthScene, query: Query | None, outputs: BufferParts, validate:
     """Fill the depth buffers and score the points, if any.
 
     Raises:
-        ValueError: with `validate`, a value that is not finite, a focal length that is not positive, or a point's
-            vertex that is none.
+        ValueError: with `validate`, a value that is not finite, or a focal length that is not positive.
     """
     if scene.vertices.device.type == "cpu":
         return draw_by_vectors(scene, query, outputs, validate)
@@ -41,16 +40,13 @@ def draw(scene: DepthScene, query: Query | None, outputs: BufferParts, validate:
 
 
 def refuse_bad_values(scene: DepthScene, query: Query | None) -> None:
-    """Refuse values that are not finite, focal lengths that are not positive, and vertices that do not exist."""
+    """Refuse values that are not finite, and focal lengths that are not positive."""
     check_finite(vertices=scene.vertices, viewmat=scene.viewmats, K=scene.Ks)
     for i in (0, 1):
         focal = scene.Ks[:, i, i]
         check_positive(f"K[{i}, {i}]", float(focal.min()) if len(focal) else 1.0)
     if query is not None:
         check_finite(points=query.points)
-        if query.point_vertices is not None:
-            named = query.point_vertices[query.point_vertices != -1]
-            check_index("point_vertices", named, scene.vertices.shape[1], "vertices, or -1 for none")
 
 
 def plane_size(width: int, height: int) -> int:
@@ -99,7 +95,7 @@ def draw_by_vectors(scene: DepthScene, query: Query | None, outputs: BufferParts
         points, job.points_step = shared(query.points)
         job.n_points = query.points.shape[1]
         scores = scene.empty_scores(query)
-        named = None if query.point_vertices is None else query.point_vertices.to(torch.int32)
+        named = query.point_vertices
         job.points = points.data_ptr()
         job.point_vertices = 0 if named is None else named.data_ptr()
         job.identity = query.by_identity
@@ -178,7 +174,7 @@ def _score_points(scene: DepthScene, query: Query, depth: Tensor, face_ids: Tens
     scores.slopes.zero_()
     scores.pixels.fill_(-1)
     inputs = [
-        query.points.contiguous(), face_ids.new_empty(0) if known is None else known.to(torch.int32), scene.faces,
+        query.points.contiguous(), face_ids.new_empty(0) if known is None else known, scene.faces,
         scene.viewmats.contiguous(), scene.Ks.contiguous(), wp.float64(scene.near_plane), wp.float64(query.tau),
         wp.float64(query.margin), depth, face_ids, *scores,
     ]  # fmt: skip

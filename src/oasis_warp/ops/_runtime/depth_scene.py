@@ -50,7 +50,7 @@ class Query(NamedTuple):
     points: Tensor
     """[B, P, 3]."""
     point_vertices: Tensor | None
-    """int32 or int64 [P], contiguous: the vertex that each point is, or -1."""
+    """int32 [P], contiguous, every index in [-1, V): the vertex that each point is, or -1."""
     by_identity: bool
     """Whether points that are vertices of a face in view count as seen."""
     tau: float

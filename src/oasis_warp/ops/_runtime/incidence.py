@@ -1,7 +1,7 @@
 """Transposes of index tables, such as the faces around each vertex; computed once for each tensor."""
 
 import weakref
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,7 +24,31 @@ class Incidence(NamedTuple):
 
 
 _known: WeakIdKeyDictionary = WeakIdKeyDictionary()
-"""Tensor -> (its version, size, incidence). A tensor changed in place has a new version."""
+"""Tensor -> (its state, size, incidence)."""
+_known_indices: WeakIdKeyDictionary = WeakIdKeyDictionary()
+"""Tensor -> (its state, size, its indices as int32)."""
+
+
+def _state(table: Tensor) -> tuple[Any, ...]:
+    """What changes when torch changes a tensor, in place or its memory."""
+    return table._version, table.data_ptr(), table.shape, table.stride()
+
+
+def _remembered(known: WeakIdKeyDictionary, table: Tensor, size: int) -> Any:
+    """What is known of `table` and `size`, or None.
+
+    Tensors of torch.inference_mode do not count their versions. Memory that NumPy shares, which torch then cannot
+    resize, changes without torch: it is compared with the copy.
+    """
+    if table.is_inference() or table not in known:
+        return None
+    state, known_size, found = known[table]
+    if state != _state(table) or known_size != size:
+        return None
+    copy = found.table if isinstance(found, Incidence) else found
+    if table.is_cpu and not table.untyped_storage().resizable() and not bool((copy == table).all()):
+        return None
+    return found
 
 
 def incidence(name: str, table: Tensor, size: int, what: str) -> Incidence:
@@ -33,16 +57,33 @@ def incidence(name: str, table: Tensor, size: int, what: str) -> Incidence:
     Raises:
         ValueError: `table` (called `name`) is not an integer tensor or has an index outside [0, size).
     """
-    cached = not table.is_inference()  # such tensors do not count their versions
-    if cached and table in _known:
-        version, known_size, known = _known[table]
-        if version == table._version and known_size == size:
-            return known
-    check_index(name, table, size, what)
-    found = _transposed(table, size)
-    if cached:
-        _known[table] = (table._version, size, found)
+    found = _remembered(_known, table, size)
+    if found is None:
+        check_index(name, table, size, what)
+        found = _transposed(table, size)
+        if not table.is_inference():
+            _known[table] = (_state(table), size, found)
     return found
+
+
+def checked_indices(name: str, table: Tensor, size: int, what: str, least: int = 0) -> Tensor:
+    """`table` as int32, contiguous, with every index in [least, size); looked at once while the tensor lives.
+
+    Raises:
+        ValueError: `table` (called `name`) is not an integer tensor or has another index.
+    """
+    found = _remembered(_known_indices, table, size)
+    if found is None:
+        check_index(name, table, size, what, least)
+        found = _as_int32(table)
+        if not table.is_inference():
+            _known_indices[table] = (_state(table), size, found)
+    return found
+
+
+def _as_int32(table: Tensor) -> Tensor:
+    # A copy: a cached value that held its own key would never be freed.
+    return table.detach().to(torch.int32, copy=True).contiguous()
 
 
 def _transposed(table: Tensor, size: int) -> Incidence:
@@ -50,34 +91,34 @@ def _transposed(table: Tensor, size: int) -> Incidence:
     order = torch.argsort(flat, stable=True)
     bounds = torch.arange(size + 1, dtype=flat.dtype, device=flat.device)
     offsets = torch.searchsorted(flat[order], bounds)
-    # A copy: a cached value that held its own key would never be freed.
-    table = table.detach().to(torch.int32, copy=True).contiguous()
-    return Incidence(table, offsets.to(torch.int32), order.to(torch.int32))
+    return Incidence(_as_int32(table), offsets.to(torch.int32), order.to(torch.int32))
 
 
 _known_gaussians: WeakIdKeyDictionary = WeakIdKeyDictionary()
-"""Index of faces -> (the other two tensors, weakly; all versions; size; incidence)."""
+"""Table of faces by Gaussian -> (the other two tables, weakly; incidence)."""
 
 
-def gaussians_at_vertices(faces: Tensor, face_index: Tensor, vertex_index: Tensor | None, size: int) -> Incidence:
-    """The Gaussians, bound to vertices and to faces, that depend on each of `size` vertices; cached.
+def gaussians_at_vertices(corners: Incidence, on_faces: Incidence, on_vertices: Incidence | None) -> Incidence:
+    """The Gaussians, bound to vertices and to faces, that depend on each vertex; cached while the tables live.
 
-    The table has P + 3 Q entries: the vertices `vertex_index`, shape [P] or None, then the corners of the faces
-    `face_index`, shape [Q]. All indices have been checked.
+    The table has P + 3 Q entries: the vertices of the first P, then the corners of the faces of the others.
+
+    Args:
+        corners: Of the faces, by vertex.
+        on_faces: The face of each of Q Gaussians.
+        on_vertices: The vertex of each of P Gaussians; None for P = 0.
     """
-    tables = (face_index, faces, *([] if vertex_index is None else [vertex_index]))
-    cached = not any(table.is_inference() for table in tables)
-    versions = tuple(table._version for table in tables) if cached else ()
-    if cached and face_index in _known_gaussians:
-        others, known_versions, known_size, known = _known_gaussians[face_index]
-        same = len(others) == len(tables) - 1 and all(o() is t for o, t in zip(others, tables[1:], strict=True))
-        if same and known_versions == versions and known_size == size:
+    others = corners.table, None if on_vertices is None else on_vertices.table
+    if on_faces.table in _known_gaussians:
+        known_others, known = _known_gaussians[on_faces.table]
+        if all(known_other() is other for known_other, other in zip(known_others, others, strict=True)):
             return known
-    corners = faces[face_index].reshape(-1)
-    found = _transposed(corners if vertex_index is None else torch.cat([vertex_index, corners]), size)
-    if cached:
-        others = tuple(weakref.ref(table) for table in tables[1:])
-        _known_gaussians[face_index] = (others, versions, size, found)
+    indices = corners.table[on_faces.table.long()].reshape(-1)
+    found = _transposed(
+        indices if on_vertices is None else torch.cat([on_vertices.table, indices]), len(corners.offsets) - 1
+    )
+    weak = tuple((lambda: None) if other is None else weakref.ref(other) for other in others)
+    _known_gaussians[on_faces.table] = (weak, found)
     return found
 
 

@@ -99,6 +99,8 @@ def view(tensor: Tensor, dtype: Any = None) -> Any:
     """`tensor` (contiguous) as a Warp array over the same memory; a vector `dtype` folds the last axis."""
     start()
     assert tensor.is_contiguous(), "operators make their tensors contiguous before the launch"
+    if not tensor.numel():  # of any strides for torch
+        tensor = torch.empty_like(tensor, memory_format=torch.contiguous_format)
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=False)
 
 

@@ -57,7 +57,7 @@ def find_gaussians(
     corners = incidence("faces", faces, n_vertices, "vertices")
     on_faces = incidence("face_index", face_index, len(faces), "faces")
     on_vertices = None if vertex_index is None else incidence("vertex_index", vertex_index, n_vertices, "vertices")
-    at_vertices = gaussians_at_vertices(faces, face_index, vertex_index, n_vertices) if transposed else None
+    at_vertices = gaussians_at_vertices(corners, on_faces, on_vertices) if transposed else None
     return MeshGaussians(n_vertices, corners, on_faces, on_vertices, at_vertices)
 
 

@@ -1,14 +1,14 @@
 """Checks of shapes, types and plain numbers for the rasterizer; its operators check the values."""
 
-import torch
 from torch import Tensor
 
-from oasis_warp.ops.checks import check_float, check_like, check_positive, check_shape
+from oasis_warp.ops.checks import check_float, check_like, check_number, check_pixels, check_positive, check_shape
 from oasis_warp.ops.spherical_harmonics import check_degree
 
 MAX_CHANNELS = 32
 MAX_PIXELS = 2**31 - 1
-WHOLE = int, torch.SymInt
+MAX_GAUSSIANS = 2**31 - 1
+"""Over all cameras: kernels number them in int32."""
 
 
 def check_gaussians(
@@ -39,14 +39,20 @@ def check_cameras(
     n_cameras = viewmats.shape[0]
     check_like("Ks", Ks, (n_cameras, 3, 3), means, "One matrix for each viewmat.")
     for name, value in (("width", width), ("height", height), ("tile_size", tile_size)):
-        if not isinstance(value, WHOLE) or isinstance(value, bool) or value < 1:
-            raise ValueError(f"{name}: expected a whole number of pixels, at least 1, got {value!r}.")
+        check_pixels(name, value)
     if n_cameras * width * height > MAX_PIXELS:
         raise ValueError(
             f"width: expected at most {MAX_PIXELS} pixels in all images, got {n_cameras} x {height} x {width}. "
             "Draw fewer cameras a call."
         )
+    if n_cameras * len(means) > MAX_GAUSSIANS:
+        raise ValueError(
+            f"means: expected at most {MAX_GAUSSIANS} Gaussians for all cameras, got {n_cameras} x {len(means)}. "
+            "Draw fewer cameras a call."
+        )
     check_positive("near_plane", near_plane)
+    for name, value in (("far_plane", far_plane), ("radius_clip", radius_clip), ("eps2d", eps2d)):
+        check_number(name, value)
     if not far_plane > near_plane:
         raise ValueError(f"far_plane: expected more than near_plane, {near_plane!r}, got {far_plane!r}.")
     if not radius_clip >= 0:
