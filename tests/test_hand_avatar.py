@@ -47,6 +47,19 @@ def test_the_mesh_carries_the_gaussians(left):
     torch.testing.assert_close(means[:100], vertices[left.gaussians.vertex_index[:100]])
 
 
+def test_a_pose_may_be_given_by_its_name(left, as_shipped):
+    fist = left.source_pose._replace(angles=named_pose(left.hand, "fist"))
+    picture = left.render(left.source_camera, "fist").image
+    assert torch.equal(picture, left.render(left.source_camera, fist).image)
+    assert torch.equal(left.mesh("fist").vertices, left.mesh(fist).vertices)
+    assert torch.equal(left.pose("fist").means, left.pose(fist).means)
+    for call in (left.mesh, left.pose, lambda pose: left.render(left.source_camera, pose)):
+        with pytest.raises(ValueError, match=r"^pose: expected one of rest, .* got 'fits'\. Did you mean 'fist'\?$"):
+            call("fits")
+        with pytest.raises(TypeError, match=r"^pose: expected a HandPose or a pose's name, got tuple\.$"):
+            call(tuple(fist))
+
+
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_many_poses_are_what_as_many_calls_give(side, left, right):
     avatar = {"left": left, "right": right}[side]

@@ -41,6 +41,7 @@ from oasis_warp.core.types import (
     Side,
 )
 from oasis_warp.data.avatar_file import LIGHT_HIDDEN, load_avatar, save_avatar
+from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import DeferredFiniteCheck, check_finite, rest_mesh
@@ -140,8 +141,19 @@ class Avatar:
         """Where the avatar's tensors are."""
         return self.gaussians.colors.device
 
-    def _checked(self, pose: HandPose, validate: bool) -> HandPose:
+    def held(self, name: str) -> HandPose:
+        """The pose called `name`, one of `hand.poses.POSE_NAMES`, turned and placed as the hand in the photo.
+
+        Raises:
+            ValueError: no pose has that name.
+        """
+        return self.source_pose._replace(angles=named_pose(self.hand, name).to(self.source_pose.angles))
+
+    def _checked(self, pose: HandPose | str, validate: bool) -> HandPose:
         """The pose in the avatar's precision and place."""
+        if isinstance(pose, str):
+            pose = self.held(pose)
+        check_pose_type(pose)
         batch, sizes = ("B",) if pose.angles.ndim == 3 else (), {}
         hint = "One row for each joint but the wrist."
         check_shape("pose.angles", pose.angles, *batch, 15, 3, sizes=sizes, hint=hint)
@@ -151,35 +163,37 @@ class Avatar:
             check_finite(angles=pose.angles, orientation=pose.orientation, translation=pose.translation)
         return HandPose(*(part.to(self.shape) for part in pose))
 
-    def mesh(self, pose: HandPose, *, validate: bool = True) -> PosedHand:
+    def mesh(self, pose: HandPose | str, *, validate: bool = True) -> PosedHand:
         """The surface that carries Gaussians, in `pose` [m]; the faces of a left hand wind the other way.
 
         Args:
-            pose: One, or with an axis in front of every part many.
+            pose: One, or with an axis in front of every part many; or the name of one, as in `held`.
             validate: Look at the pose's values too. Waits for a CUDA device if they are there.
 
         Raises:
-            ValueError: a part of the pose has another shape or is not finite.
+            TypeError: `pose` is neither a pose nor a name.
+            ValueError: a part of the pose has another shape or is not finite, or no pose has that name.
         """
         return skin(self._model, self._rest, self._checked(pose, validate))
 
-    def pose(self, pose: HandPose, *, validate: bool = True) -> Gaussians:
+    def pose(self, pose: HandPose | str, *, validate: bool = True) -> Gaussians:
         """The Gaussians in `pose`, in the world of its orientation and translation, where its light stays too.
 
         Args:
             pose: One, or with an axis in front of every part many: then means, quats and scales have it too, and
-                colours where there is a `light`.
+                colours where there is a `light`. Or the name of one, as in `held`.
             validate: Look at the pose's values too. Waits for a CUDA device if they are there.
 
         Raises:
-            ValueError: a part of the pose has another shape or is not finite.
+            TypeError: `pose` is neither a pose nor a name.
+            ValueError: a part of the pose has another shape or is not finite, or no pose has that name.
         """
         checked = self._checked(pose, validate)
         posed = skin_surface(self._model, self._rest, checked)
         return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light)
 
     def render(
-        self, camera: Camera, pose: HandPose, background: Color = WHITE, *, validate: bool = True
+        self, camera: Camera, pose: HandPose | str, background: Color = WHITE, *, validate: bool = True
     ) -> Render:
         """A picture of the hand in `pose` over a plain `background`; differentiable in the pose and the camera.
 
@@ -187,13 +201,17 @@ class Avatar:
 
         Args:
             camera: What sees the hand.
-            pose: One pose.
+            pose: One pose, or the name of one, as in `held`.
             background: What is seen beside it, and through it.
             validate: Look at the values of camera and pose too. Waits for a CUDA device if they are there.
 
         Raises:
-            ValueError: a part of the pose or the camera has another shape or is not finite.
+            TypeError: `pose` is neither a pose nor a name.
+            ValueError: a part of the pose or the camera has another shape or is not finite, or no pose has that name.
         """
+        if isinstance(pose, str):
+            pose = self.held(pose)
+        check_pose_type(pose)
         check_shape("pose.angles", pose.angles, 15, 3, hint="One pose a picture.")
         check_shape("pose.orientation", pose.orientation, 3, 3)
         check_shape("pose.translation", pose.translation, 3)
@@ -315,6 +333,16 @@ class Avatar:
         albedo = self._mean_albedo(self.light.even)
         light = hidden_by_hand(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
         return self.with_looks(self.gaussians, light)
+
+
+def check_pose_type(pose: HandPose) -> None:
+    """Refuse what is no pose.
+
+    Raises:
+        TypeError: it is none.
+    """
+    if not isinstance(pose, HandPose):
+        raise TypeError(f"pose: expected a HandPose or a pose's name, got {type(pose).__name__}.")
 
 
 def make_avatar(

@@ -69,7 +69,7 @@ def test_only_the_named_fingers_stand_out(hand, name, long):
 
 
 def test_an_unknown_pose_is_named_in_the_message(hand):
-    with pytest.raises(ValueError, match=r"name: expected one of 'rest', .*, got 'wave'\."):
+    with pytest.raises(ValueError, match=r"pose: expected one of rest, .*, got 'wave'\.$"):
         named_pose(hand, "wave")
 
 

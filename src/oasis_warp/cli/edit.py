@@ -21,7 +21,6 @@ from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8, write_picture
 from oasis_warp.data.square_crop import resample_square
 from oasis_warp.editing import Edit, edit
-from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 
 ANGLE = 0.5
@@ -132,7 +131,7 @@ def draw_edit(before: Avatar, made: Edit, title: str) -> torch.Tensor:
         Panel(draw(after, orbit_camera(v, angle, 0.0, side), p), f"{math.degrees(angle):.0f}°") for angle, p, v in views
     ]
     for name in POSES:
-        held = pose._replace(angles=named_pose(after.hand, name))
+        held = after.held(name)
         second.append(Panel(draw(after, orbit_camera(after.mesh(held).vertices, 0.0, 0.0, side), held), name))
     measures = made.measures
     words = [MEASURES[name][1].format(measures[name]) for name in ("painted_mm2", "input_psnr_db")]

@@ -17,7 +17,6 @@ from oasis_warp.core.types import HandPose
 from oasis_warp.core.types import Render as Drawn
 from oasis_warp.data.environment_map import read_environment
 from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, to_uint8, write_picture
-from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 
 MAX_SIDE = 8192
@@ -78,9 +77,7 @@ def read_color(text: str) -> tuple[float, float, float]:
 
 def choose_pose(avatar: Avatar, name: str) -> HandPose:
     """The named pose with the orientation and position of the photo; "photo" is the pose in the photo."""
-    if name == "photo":
-        return avatar.source_pose
-    return avatar.source_pose._replace(angles=named_pose(avatar.hand, name))
+    return avatar.source_pose if name == "photo" else avatar.held(name)
 
 
 @torch.no_grad()

@@ -20,7 +20,6 @@ from oasis_warp.core.types import Camera, HandFit, HandPose, Photo, PosedHand
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.estimation.hand_crop import CROP_MARGIN
-from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
 from oasis_warp.reconstruction import FusedReconstruction, Reconstruction
@@ -132,7 +131,7 @@ def draw_summary(
         Panel(draw(orbit_camera(around, 2 * math.pi * k / VIEWS, 0.0, side), first.pose), f"{360 * k // VIEWS}°")
         for k in range(VIEWS)
     ]
-    held = {name: avatar.source_pose._replace(angles=named_pose(avatar.hand, name)) for name in POSES}
+    held = {name: avatar.held(name) for name in POSES}
     # All poses share one camera, so that they can be compared.
     reach = torch.cat([avatar.mesh(pose).vertices for pose in held.values()])
     camera = orbit_camera(reach, 0.0, 0.0, panel_side(len(POSES), WIDTH))

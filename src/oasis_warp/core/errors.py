@@ -1,4 +1,7 @@
-"""The error for users."""
+"""The error for users, and the name that they may have meant."""
+
+import difflib
+from collections.abc import Iterable
 
 MOST_LETTERS, MOST_QUOTED = 1000, 80
 """Longest message and longest quotation: a file's own words may go on for megabytes."""
@@ -23,3 +26,9 @@ class InputError(ValueError):
 
     def __init__(self, message: str = ""):
         super().__init__(one_line(shortened(message, MOST_LETTERS)))
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The question "Did you mean ...?" with the nearest of the `known` names; empty where none is near."""
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f"Did you mean {near[0]!r}?" if near else ""

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.core.errors import did_you_mean
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.ops.checks import check_choice
 
 Finger = tuple[float, float, float, float]
 """Flexion of a finger's three joints from the knuckle outwards, and abduction of the knuckle [degrees]."""
@@ -61,7 +61,9 @@ def named_pose(hand: HandModel, name: str) -> Float[Tensor, "15 3"]:
     Raises:
         ValueError: no pose has that name.
     """
-    check_choice("name", name, POSE_NAMES)
+    if name not in POSE_NAMES:
+        hint = did_you_mean(name, POSE_NAMES)
+        raise ValueError(f"pose: expected one of {', '.join(POSE_NAMES)}, got {name!r}.{hint and ' '}{hint}")
     degrees = torch.zeros(16, 3, dtype=torch.float64)
     if name == "rest":
         return degrees[1:].to(hand.pose_axes)
