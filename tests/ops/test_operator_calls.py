@@ -157,7 +157,7 @@ def test_a_second_derivative_is_refused(name, traced):
     else:
         grads = first()
     assert_same_bits([g.detach() for g in grads], results(name)[-len(leaves) :])
-    with pytest.raises(RuntimeError, match=f"({'|'.join(call.custom_ops)}): expected one derivative, got a"):
+    with pytest.raises(RuntimeError, match=f"^{call.operator}: expected one derivative, got a"):
         torch.autograd.grad(sum(g.sum() for g in grads), leaves)
 
 

@@ -35,15 +35,14 @@ def in_forward_mode() -> bool:
 
 def in_transform() -> bool:
     """Whether a transform of torch.func is active, and torch.compile is not, which has its own way with them."""
-    return torch._C._are_functorch_transforms_active() and not torch.compiler.is_compiling()
+    return not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active()
 
 
 def wants_gradient(tensor: Tensor) -> bool:
     """Whether `tensor`, or what a transform of torch.func wraps in it, requires a gradient."""
-    wanted = tensor.requires_grad
-    if not wanted and torch._C._functorch.is_functorch_wrapped_tensor(tensor):
+    if not tensor.requires_grad and in_transform() and torch._C._functorch.is_functorch_wrapped_tensor(tensor):
         return wants_gradient(torch._C._functorch.get_unwrapped(tensor))
-    return wanted
+    return tensor.requires_grad
 
 
 def transformable(
