@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.adaptation.adam import Adam
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.losses.image import masked_l1, masked_statistics
 from oasis_warp.ops import BlendWeights, blend_colors
@@ -61,7 +62,7 @@ def calibrate(
         alpha = view.alphas
         start = closed_form(picture / alpha.clamp_min(1e-3), target, mask * alpha[..., 0])
     gain, offset = start.gain.clone().requires_grad_(True), start.offset.clone().requires_grad_(True)
-    optimiser = torch.optim.Adam([gain, offset], lr=LEARNING_RATE)
+    optimiser = Adam([gain, offset], LEARNING_RATE)
     goal_mean, goal_std = masked_statistics(target, mask)
     for _ in range(config.calibration_steps):
         image = picture * gain + alpha * offset
@@ -71,7 +72,5 @@ def calibrate(
             + config.weight_mean * (mean - goal_mean).abs().sum()
             + config.weight_std * (std - goal_std).abs().sum()
         )
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
+        optimiser.step(loss)
     return Calibration(gain.detach(), offset.detach())

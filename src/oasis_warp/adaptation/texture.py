@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from oasis_warp.adaptation.adam import Adam
 from oasis_warp.adaptation.calibrate import Calibration
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.core import surface
@@ -95,7 +96,7 @@ def fit_parameters(
     """
     beyond = (1 - targets.weights.alphas) * targets.picture
     order = torch.Generator().manual_seed(config.seed)
-    optimiser = torch.optim.Adam(parameters, lr=learning_rate)
+    optimiser = Adam(parameters, learning_rate)
     total = MAX_STEPS if config.texture_steps is None else config.texture_steps
     losses: list[float] = []
     queue: list[int] = []
@@ -110,9 +111,7 @@ def fit_parameters(
         elif targets.references:
             loss = loss + config.weight_reference * _all_reference_losses(now, targets, config)
         loss = loss + penalty()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
+        optimiser.step(loss)
         for mean, value in zip(means, parameters, strict=True):
             mean.lerp_(value.detach(), max(1 / (step + 1), 1 / AVERAGED))
         losses.append(loss.item())
