@@ -4,6 +4,7 @@ import torch
 from scipy.spatial import cKDTree
 from tests.export.splat_readers import READERS
 
+from oasis_warp.core import rotation
 from oasis_warp.core.types import Camera, Gaussians
 from oasis_warp.export import export_avatar
 from oasis_warp.hand.poses import named_pose
@@ -55,6 +56,30 @@ def test_means_lie_about_the_wrist_within_the_formats_steps(avatar, ending, tmp_
             assert cKDTree(here).query(there)[0].max() <= STEPS.get(ending, 1e-6)
     assert np.abs(np.linalg.norm(quats, axis=1) - 1).max() < 1e-5
     assert len(scales) == len(avatar.gaussians.scales)
+
+
+def covariances(quats, scales):
+    turns = rotation.to_matrix(torch.as_tensor(np.array(quats, float)))
+    parts = turns * torch.as_tensor(np.array(scales, float))[:, None]
+    return (parts @ parts.mT).numpy()
+
+
+@pytest.mark.parametrize("ending", READERS)
+def test_gaussians_keep_their_shapes(avatar, ending, tmp_path):
+    """A picture of many hardly shows that quaternions are in the wrong order or frame."""
+    export_avatar(avatar, tmp_path / f"hand{ending}")
+    means, quats, scales, *_ = READERS[ending](tmp_path / f"hand{ending}")
+    turn = torch.diag(torch.tensor([1.0, -1, -1])) @ avatar.source_camera.viewmat[:3, :3]
+    true = avatar.pose(avatar.source_pose)
+    expected = covariances(true.quats.numpy(), true.scales.numpy())
+    expected = turn.double().numpy() @ expected @ turn.double().numpy().T
+    places = ((true.means - avatar.mesh(avatar.source_pose).joints[0]) @ turn.T).numpy()
+    away, nearest = cKDTree(places).query(means, 2)
+    alone = away[:, 1] > 3 * away[:, 0] + 1e-4  # the others may be taken for a neighbour
+    off = covariances(quats, scales) - expected[nearest[:, 0]]
+    off = np.linalg.norm(off, axis=(1, 2)) / np.linalg.norm(expected[nearest[:, 0]], axis=(1, 2))
+    assert alone.mean() > 0.5
+    assert np.quantile(off[alone], 0.99) < (1e-3 if ending in LOSSLESS else 0.1)
 
 
 @pytest.mark.parametrize("ending", READERS)
