@@ -21,6 +21,7 @@ Command = (
     | Annotated[options.Render, tyro.conf.subcommand("render")]
     | Annotated[options.Animate, tyro.conf.subcommand("animate")]
     | Annotated[options.Export, tyro.conf.subcommand("export")]
+    | Annotated[options.Serve, tyro.conf.subcommand("serve")]
     | Annotated[options.View, tyro.conf.subcommand("view")]
     | Annotated[options.Edit, tyro.conf.subcommand("edit")]
     | Annotated[options.Info, tyro.conf.subcommand("info")]

@@ -139,6 +139,22 @@ class Export:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Serve:
+    """Take photos and give avatars in the browser, one after the other. Ctrl-C ends it.
+
+    The form comes from this machine and is for it alone: its address holds a token. Photos and avatars stay in a
+    folder; started again with the same folder, it goes on with the photos that waited.
+    """
+
+    folder: Path = Path("served")
+    """Folder of photos and avatars."""
+    port: int = 0
+    """Port on 127.0.0.1; 0 takes a free one."""
+    no_browser: bool = False
+    """Print the address and open no browser."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class View:
     """Show an avatar in the browser: turn it, pose it, light it. Ctrl-C ends it.
 
