@@ -124,12 +124,18 @@ def test_what_is_no_photo_is_refused(server, name, headers, status, said):
     assert not list(server.jobs.folder.iterdir())
 
 
+def look(jobs, job):
+    found = jobs.look(job)
+    assert found is not None
+    return found
+
+
 def test_a_full_queue_is_said(program, tmp_path):
     jobs = Jobs(tmp_path / "served")
     first = [jobs.add("a.jpg", b"photo") for _ in range(MOST_WAITING)]
     with pytest.raises(InputError, match="16 photos are waiting already"):
         jobs.add("a.jpg", b"photo")
-    assert [jobs.look(job).ahead for job in first] == list(range(MOST_WAITING))
+    assert [look(jobs, job).ahead for job in first] == list(range(MOST_WAITING))
 
 
 def test_a_restart_goes_on_with_what_waited_and_loses_nothing(server, tmp_path):
@@ -141,8 +147,8 @@ def test_a_restart_goes_on_with_what_waited_and_loses_nothing(server, tmp_path):
     server.jobs.stop()
     (server.jobs.folder / waiting / "photo.jpg").write_bytes(b"photo too")
     again = Jobs(tmp_path / "served")
-    assert again.look(done).state == "done"
-    assert [again.look(job).ahead for job in (slow, waiting)] == [0, 1]
+    assert look(again, done).state == "done"
+    assert [look(again, job).ahead for job in (slow, waiting)] == [0, 1]
 
 
 def test_a_photo_that_takes_too_long_is_ended(program, tmp_path, monkeypatch):
@@ -151,11 +157,11 @@ def test_a_photo_that_takes_too_long_is_ended(program, tmp_path, monkeypatch):
     job = jobs.add("a.jpg", b"slow")
     worker = threading.Thread(target=jobs.work)
     worker.start()
-    while jobs.look(job).state != "failed":
+    while look(jobs, job).state != "failed":
         time.sleep(0.02)
     jobs.stop()
     worker.join()
-    assert jobs.look(job).note.startswith("It took more than")
+    assert look(jobs, job).note.startswith("It took more than")
 
 
 def test_the_command_serves_until_ctrl_c_and_refuses_a_file_for_a_folder(tmp_path, monkeypatch, capsys):
