@@ -7,6 +7,7 @@ import torch
 from synthetic import as_left_hand
 
 from oasis_warp.avatar.prior import MeanPrior
+from oasis_warp.cli import edit as edit_command
 from oasis_warp.cli import main
 from oasis_warp.core.camera import project
 from oasis_warp.core.config import BLACK, EditConfig
@@ -146,6 +147,19 @@ def test_nothing_is_overwritten_without_being_told(files, capsys):
     assert "exists already; choose another name with --out, or give --overwrite" in capsys.readouterr().err
     assert (files / "avatar.safetensors").read_bytes() == before
     assert not (files / "ring.safetensors").exists()
+
+
+def test_an_edit_that_fails_at_its_last_file_leaves_none(files, made, monkeypatch, capsys):
+    def fail(self, path):
+        raise InputError(f"{path}: no room left to write it; free some.")
+
+    monkeypatch.setattr(Avatar, "save", fail)
+    monkeypatch.setattr(edit_command, "edit", lambda *_, **__: made)
+    monkeypatch.setattr(edit_command, "draw_edit", lambda *_: torch.zeros(8, 8, 3, dtype=torch.uint8))
+    before = sorted(path.name for path in files.iterdir())
+    assert command(files, "-o", str(files / "new" / "ring.safetensors")) == 2
+    assert f"{files / 'new' / 'ring.safetensors'}: no room left" in capsys.readouterr().err
+    assert sorted(path.name for path in files.iterdir()) == before
 
 
 @pytest.mark.parametrize(

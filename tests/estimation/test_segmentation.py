@@ -1,10 +1,13 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
+from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import KNUCKLES
+from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.fit_problem import pixels_per_metre
 from oasis_warp.estimation.landmarks import Crop, read_crop
 from oasis_warp.estimation.networks import drawn_hand, networks
@@ -44,6 +47,13 @@ def drawing():
 
 def iou(a, b):
     return (a & b).sum() / (a | b).sum()
+
+
+@pytest.mark.parametrize("change", [("__version__", "4.11.0"), ("ximgproc", SimpleNamespace())])
+def test_another_opencv_over_ours_is_told_before_any_work(hand, monkeypatch, change):
+    monkeypatch.setattr(cv2, *change)
+    with pytest.raises(InputError, match=r"another OpenCV package.*pip uninstall -y opencv-python .*--force-reinstall"):
+        HandEstimator(hand)
 
 
 def test_the_mask_is_the_hand_without_the_arm(drawing):

@@ -31,7 +31,7 @@ from oasis_warp.estimation.landmarks import box_size, detect_hands
 from oasis_warp.estimation.networks import networks
 from oasis_warp.estimation.outline import MaskOutline
 from oasis_warp.estimation.pixel_reading import read_pixels
-from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_reading
+from oasis_warp.estimation.segmentation import check_opencv, mask_from_alpha, mask_from_reading
 from oasis_warp.estimation.surface_points import surface_points
 from oasis_warp.hand.kinematics import HandKinematics
 
@@ -55,6 +55,8 @@ class HandEstimator:
     """Finds hands with the two bundled networks and fits `hand` to them. Same photo, same bits."""
 
     def __init__(self, hand: HandModel):
+        """Raises InputError where OpenCV is another than the estimator needs."""
+        check_opencv()
         self.hand = hand
         self.kinematics = HandKinematics(hand)
 

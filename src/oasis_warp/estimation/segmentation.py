@@ -7,6 +7,7 @@ outline, and a guided filter (He et al. 2013) on their shares.
 import cv2
 import numpy as np
 
+from oasis_warp.core.errors import InputError
 from oasis_warp.estimation.landmarks import FINGERS, box_size
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.pixel_reading import PixelReading
@@ -25,6 +26,8 @@ _BONE, _FINGER, _POSSIBLE = 0.045, 0.11, 0.03
 hand, and of the one in which colours decide, over the box of the landmarks; least probability of the hand there."""
 _SURE = 0.9
 """Probability from which the network's word counts against an alpha channel."""
+OPENCV, PACKAGE = 5, "opencv-contrib-python-headless"
+"""Oldest major version, and the distribution: OpenCV 4 reads the landmark network wrongly, without an error."""
 _LEAST = 20
 """Smallest number of pixels for a colour model."""
 
@@ -107,6 +110,21 @@ def _along_edges(
     mask = _touching(mask, (hand > _SURE) | bones).astype(np.float32)
     soft = cv2.ximgproc.guidedFilter(rgb, mask, max(2, round(1.5 * band)), 1e-4 * 255**2)
     return np.clip((soft - 0.1) / 0.8, 0, 1)
+
+
+def check_opencv() -> None:
+    """Check that OpenCV is the one that the estimator needs, before any work.
+
+    Raises:
+        InputError: an older one, or one without the filters of its contributors, which another package put over it.
+    """
+    if int(cv2.__version__.split(".")[0]) >= OPENCV and hasattr(getattr(cv2, "ximgproc", None), "guidedFilter"):
+        return
+    raise InputError(
+        f"opencv: expected version {OPENCV} or newer with ximgproc.guidedFilter, got {cv2.__version__} without, as "
+        "another OpenCV package lies over ours; run `pip uninstall -y opencv-python opencv-python-headless "
+        f"opencv-contrib-python`, then `pip install --force-reinstall --no-deps {PACKAGE}`."
+    )
 
 
 def _touching(mask: np.ndarray, sure: np.ndarray) -> np.ndarray:

@@ -1,0 +1,172 @@
+"""What damaged files are thrown at. Each says "refused", by one clean sentence, or "taken", with a sane result."""
+
+import json
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from data_stage.image_files import encode, exif, picture, tiff
+from fuzz.mutations import Mutation, damaged_bytes, json_file, tensor_file
+
+from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import Camera, CanonicalGaussians, HandLight, HandPose, Landmarks, Photo
+from oasis_warp.data.photo import read_photo
+from oasis_warp.estimation.estimator import HandEstimator
+from oasis_warp.estimation.keypoints import read_keypoints
+from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.network.config import COMPACT, NetworkConfig
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.weights_file import load_network, save_network
+
+MOST_SECONDS, MOST_GROWTH = 10.0, 1 << 30
+"""Of one file: processor time, and growth of the peak memory [bytes]."""
+LONGEST = 1100
+"""Letters of a sentence."""
+DRAWN = 48
+"""Side of the pictures that are drawn of what is taken [px]."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader, whole files for it, and how they are damaged."""
+
+    files: dict[str, bytes]
+    """By suffix."""
+    mutate: Mutation
+    read: Callable[[Path], None]
+    """Reads the file and asserts that what comes out is sane."""
+
+
+def run(target: Target, seed: int, index: int, folder: Path) -> str:
+    """Read damaged file `index` of a seed; "refused" or "taken".
+
+    Raises:
+        AssertionError: it took too long or too much memory, or the error is not one clean sentence.
+    """
+    rng = np.random.default_rng([seed, index])
+    suffix = sorted(target.files)[index % len(target.files)]
+    path = folder / f"hostile{suffix}"
+    path.write_bytes(target.mutate(rng, target.files[suffix]))
+    start, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    try:
+        target.read(path)
+        outcome = "taken"
+    except InputError as error:
+        said, outcome = str(error), "refused"
+        assert said.isprintable() and said.endswith(".") and len(said) < LONGEST, said
+    seconds = time.process_time() - start
+    growth = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10
+    assert seconds < MOST_SECONDS, f"{seconds:.0f} s"
+    assert growth < MOST_GROWTH, f"{growth >> 20} MB"
+    return outcome
+
+
+def small_avatar(*, lit: bool) -> Avatar:
+    """An avatar of few Gaussians, on vertices and on faces; with `lit` it has all tensors that a file may have."""
+    hand = bundled_hand()
+    generator = torch.Generator().manual_seed(1)
+    on_vertices, on_faces = torch.arange(0, len(hand.template), 20), torch.arange(0, len(hand.faces), 60)
+    n = len(on_vertices) + len(on_faces)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.rand(shape, generator=generator)
+
+    gaussians = CanonicalGaussians(
+        on_vertices, 0.001 * random(len(on_vertices), 3), on_faces, torch.full((len(on_faces), 3), 1 / 3),
+        torch.nn.functional.normalize(random(n, 4) - 0.5, dim=1), 0.002 + 0.002 * random(n, 3), random(n), random(n, 3),
+        0.8 + 0.4 * random(n, 3) if lit else None,
+    )  # fmt: skip
+    turn = torch.tensor([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    pose = HandPose(named_pose(hand, "open"), turn, torch.tensor([0.0, 0.09, 0.6]))
+    K = torch.tensor([[360.0, 0.0, 80.0], [0.0, 360.0, 100.0], [0.0, 0.0, 1.0]])
+    facing = torch.nn.functional.normalize(random(len(hand.template), 3) - 0.5, dim=1)
+    light = HandLight(
+        torch.cat([torch.ones(1, 3), 0.2 * random(8, 3)]), torch.tensor([[0.3] * 3, [2.0] * 3]), torch.ones(3),
+        0.9 + 0.2 * random(len(hand.template), 3), facing, torch.full((3,), 0.4),
+    )  # fmt: skip
+    return Avatar(
+        side="left", shape=random(40) - 0.5, surface_offsets=0.002 * (random(len(hand.template), 3) - 0.5),
+        gaussians=gaussians, source_pose=pose, source_camera=Camera(torch.eye(4), K, 160, 200),
+        light=light if lit else None, invented=random(len(hand.template)) if lit else None,
+    )  # fmt: skip
+
+
+def avatars(folder: Path, *, lit: bool) -> Target:
+    """Avatar files: what is taken is drawn in two poses, in its light and without."""
+    small_avatar(lit=False).save(folder / "plain")
+    files = {".safetensors": (folder / "plain").read_bytes()}
+    if lit:
+        small_avatar(lit=True).save(folder / "lit")
+        files[".lit.safetensors"] = (folder / "lit").read_bytes()
+
+    @torch.no_grad()
+    def read(path: Path) -> None:
+        found = Avatar.load(path)
+        fist = found.source_pose._replace(angles=named_pose(found.hand, "fist"))
+        for drawn, pose in ((found, found.source_pose), (found.in_even_light(), fist)):
+            camera = orbit_camera(drawn.mesh(pose).vertices, 0.5, 0.0, DRAWN)
+            image, alpha = drawn.render(camera, pose)
+            assert bool(image.isfinite().all()) and bool(alpha.isfinite().all()), "a picture that is not finite"
+            assert bool((alpha >= 0).all()) and bool((alpha <= 1 + 1e-5).all())
+
+    return Target(files, tensor_file, read)
+
+
+def weights(folder: Path) -> Target:
+    """Files of a small network's weights: what is taken is finite."""
+    hand = bundled_hand()
+    small = {"width": 32, "heads": 2, "n_tokens": 16, "n_coarse": 64, "refine_layers": 1, "head_width": 16}
+    config = NetworkConfig(**{**COMPACT.__dict__, **small})
+    save_network(folder / "whole", HandNetwork(config, hand), notes=json.dumps({"step": 7}))
+
+    def read(path: Path) -> None:
+        network = load_network(path, hand)
+        assert all(bool(part.isfinite().all()) for part in network.state_dict().values())
+
+    return Target({".safetensors": (folder / "whole").read_bytes()}, tensor_file, read)
+
+
+def plain_photo() -> tuple[Photo, Landmarks]:
+    """A grey photo and 21 points on it: enough to read landmarks, and to give a pose its mask."""
+    photo = Photo(torch.full((200, 160, 3), 128, dtype=torch.uint8), None, None, "photo.png", 1.0)
+    return photo, Landmarks(torch.linspace(30, 130, 42).view(21, 2), None, "right", 1.0, 1.0, "file")
+
+
+def keypoints(photo: Photo, landmarks: Landmarks, pose: HandPose, *, fit: bool) -> Target:
+    """JSON of landmarks and of poses; with `fit` what is taken is fitted too, which takes seconds."""
+    points = {"side": landmarks.side, "xy": landmarks.xy.tolist()}
+    if landmarks.world is not None:
+        points["world"] = landmarks.world.tolist()
+    posed = {"side": landmarks.side, "focal": 300.0, "centre": [80.0, 100.0], "shape": [0.0] * 40}
+    posed |= {name: part.tolist() for name, part in pose._asdict().items()}
+    estimator = HandEstimator(bundled_hand()) if fit else None
+
+    def read(path: Path) -> None:
+        found = read_keypoints(path, photo)
+        if isinstance(found, Landmarks) and estimator is not None:
+            found = estimator.fit(photo, found, force=True)
+        parts = (found.xy,) if isinstance(found, Landmarks) else (found.shape, *found.pose, found.mask, found.camera.K)
+        assert all(bool(part.isfinite().all()) for part in parts)
+
+    files = {".points.json": json.dumps(points).encode(), ".pose.json": json.dumps(posed).encode()}
+    return Target(files, json_file, read)
+
+
+def images(*, avif: bool) -> Target:
+    """Pictures in every format; AVIF, of which each takes a process, only where asked for."""
+    suffixes = (".jpg", ".png", ".webp", ".bmp", *((".avif",) if avif else ()))
+    files = {suffix: encode(suffix, picture(), exif(6, 28) if suffix != ".bmp" else None) for suffix in suffixes}
+    files[".tiff"] = tiff(picture())
+
+    def read(path: Path) -> None:
+        photo = read_photo(path)
+        assert photo.rgb.ndim == 3 and photo.rgb.shape[2] == 3 and photo.rgb.numel() <= 3 * 24_000_000
+
+    return Target(files, damaged_bytes, read)
