@@ -6,6 +6,7 @@ written. Prints a line of JSON.
 """
 
 import argparse
+import contextlib
 import json
 import random
 import signal
@@ -17,6 +18,8 @@ from pathlib import Path
 
 import cv2
 from safetensors import safe_open
+
+from oasis_warp.data.output_files import output_folder
 
 TOP = Path(__file__).parents[2]
 PHOTO = TOP / "src" / "oasis_warp" / "assets" / "photos" / "palm_open_left_02.png"
@@ -56,14 +59,58 @@ def check(folder: Path, whole: set[str]) -> str:
     return "complete" if found else "absent"
 
 
+WRITER = """
+import sys
+from pathlib import Path
+from oasis_warp.data.output_files import output_folder, write_file
+folder, version = Path(sys.argv[1]), int(sys.argv[2])
+print("ready", flush=True)
+while True:
+    version += 1
+    with output_folder(folder) as part:
+        for name in "abc":
+            (part / name).write_text(f"{version} " * 1000)
+    write_file(folder / "d", f"{version} ".encode() * 1000)
+"""
+"""Writes the same files again and again, each time of another version."""
+
+
+def kill_writers(count: int, rng: random.Random) -> dict[str, int]:
+    """Kill a process that does nothing but write: what is left is of one version once the next run has begun."""
+    counts, version = {"one version": 0, "mixed": 0, "cut": 0, "left": 0}, 0
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "out"
+        for _ in range(count):
+            command = [sys.executable, "-c", WRITER, str(folder), str(version)]
+            process = subprocess.Popen(command, stdout=subprocess.PIPE)
+            assert process.stdout is not None
+            process.stdout.readline()
+            time.sleep(rng.uniform(0, 0.05))
+            process.kill()
+            process.wait()
+            process.stdout.close()
+            with contextlib.suppress(InterruptedError), output_folder(folder):
+                raise InterruptedError  # a next run, which fails
+            found = [file.read_text().split() for file in sorted(folder.glob("[abc]"))]
+            whole = [file.read_text().split() for file in sorted(folder.glob("[abcd]"))]
+            counts["cut"] += any(len(words) != 1000 or len(set(words)) != 1 for words in whole)
+            counts["one version" if len({words[0] for words in found}) <= 1 and len(found) in (0, 3) else "mixed"] += 1
+            version = max([version, *(int(words[0]) for words in whole)])
+            counts["left"] += sum(path.name.startswith(".") and ".d." not in path.name for path in folder.glob(".*"))
+    return counts
+
+
 def main() -> None:
     """Read the command line, kill the command again and again, and print what was left."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("command", choices=sorted(WHOLE))
+    parser.add_argument("command", choices=["files", *sorted(WHOLE)])
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     rng = random.Random(options.seed)
+    if options.command == "files":
+        print(json.dumps({"kills": options.count, **kill_writers(options.count, rng)}))
+        return
     counts: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as name:
         top = Path(name)
@@ -71,6 +118,7 @@ def main() -> None:
         if options.command != "reconstruct":
             subprocess.run(command("reconstruct", top / "made"), check=True, capture_output=True)
             picture = cv2.imread(str(PHOTO))
+            assert picture is not None
             height, width = picture.shape[:2]
             cv2.circle(picture, (width // 2, height // 2), width // 20, (0, 0, 255), -1)
             cv2.imwrite(str(top / "painted.png"), picture)

@@ -114,7 +114,7 @@ def tensor_file(rng: np.random.Generator, data: bytes) -> bytes:
             key = choose(rng, sorted(meta))
             try:
                 meta[key] = text_of(rng, mutate_json(rng, json.loads(meta[key])))
-            except ValueError:
+            except (ValueError, RecursionError):  # what the first change left
                 meta[key] = choose(rng, ("", "null", "{}", "[]"))
         elif how < 0.75:
             _change_values(rng, entry, body)
