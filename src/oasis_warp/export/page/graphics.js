@@ -31,7 +31,26 @@ void main() {
 const openGraphics = (canvas) =>
   canvas.getContext("webgl2", { antialias: false, alpha: true, premultipliedAlpha: true, depth: false });
 
+// The function that draws. What the graphics card forgets, as in a sleep of the machine, is set up again.
 function makeGraphics(canvas) {
+  let parts = setUpGraphics(canvas);
+  canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+  canvas.addEventListener("webglcontextrestored", () => {
+    parts = setUpGraphics(canvas);
+    canvas.dispatchEvent(new Event("forgotten"));
+  });
+  return async ({ ellipses, count }, width, height) => {
+    const { gl, size } = parts;
+    sizeCanvas(canvas, width, height);
+    gl.viewport(0, 0, width, height);
+    gl.uniform2f(size, width, height);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.bufferData(gl.ARRAY_BUFFER, ellipses, gl.STREAM_DRAW);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
+  };
+}
+
+function setUpGraphics(canvas) {
   const gl = openGraphics(canvas), program = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
     const shader = gl.createShader(kind);
@@ -55,15 +74,7 @@ function makeGraphics(canvas) {
   gl.enable(gl.BLEND);
   gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   gl.clearColor(0, 0, 0, 0);
-  const place = gl.getUniformLocation(program, "size");
-  return async ({ ellipses, count }, width, height) => {
-    sizeCanvas(canvas, width, height);
-    gl.viewport(0, 0, width, height);
-    gl.uniform2f(place, width, height);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.bufferData(gl.ARRAY_BUFFER, ellipses, gl.STREAM_DRAW);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
-  };
+  return { gl, size: gl.getUniformLocation(program, "size") };
 }
 
 function sizeCanvas(canvas, width, height) {

@@ -4,21 +4,25 @@
 const text = (id) => byId(id).textContent;
 const makeWorker = (id) => new Worker(URL.createObjectURL(new Blob([text(id)], { type: "text/javascript" })));
 
-// How pictures are drawn; the address may end in #graphics or #processor to choose.
+// How pictures are drawn, and whether in a hurry only skin that faces the viewer; the address may end in #graphics or
+// #processor to choose.
 function makeDrawing(canvas) {
   const graphics = { "#graphics": true, "#processor": false }[location.hash] ?? hasGraphicsCard();
-  if (!graphics) byId("status").textContent = "Drawn without a graphics card.";
-  return graphics ? makeGraphics(canvas) : makeProcessor(canvas, makeWorker("raster"));
+  if (graphics) return { draw: makeGraphics(canvas), facing: false, note: "" };
+  const draw = makeProcessor(canvas, makeWorker("raster"));
+  return { draw, facing: true, note: "Drawn without a graphics card." };
 }
 
 function start() {
   const worker = makeWorker("worker");
+  worker.postMessage({ open: text("data") });
+  const drawing = makeDrawing(byId("canvas")); // meanwhile
   return new Promise((resolve, reject) => {
     worker.onerror = (event) => reject(new Problem(event.message || "The page's worker does not start in this browser."));
     worker.onmessage = ({ data }) => {
       if (data.failed) return reject(new Problem(data.failed));
-      byId("status").textContent = "";
-      const viewer = makeViewer(byId("canvas"), data.opened, worker, makeDrawing(byId("canvas")));
+      byId("status").textContent = drawing.note;
+      const viewer = makeViewer(byId("canvas"), data.opened, worker, drawing);
       viewer.player = fillPanel(viewer);
       listenToGestures(viewer);
       if (matchMedia("(max-width: 46rem)").matches) byId("fold").click();
@@ -29,7 +33,6 @@ function start() {
       };
       show(viewer);
     };
-    worker.postMessage({ open: text("data") });
   });
 }
 

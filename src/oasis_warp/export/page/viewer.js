@@ -6,10 +6,10 @@ const REST = 250; // ms without a change after which nothing moves
 const LEAST_SCALE = 0.5; // of the window's own pixels
 const MOST_SCALE = 2; // of CSS pixels: more are not seen
 
-function makeViewer(canvas, facts, worker, draw) {
+function makeViewer(canvas, facts, worker, { draw, facing }) {
   const viewer = {
-    canvas, facts, draw, worker, angles: Float32Array.from(facts.start.angles), look: facts.start.look, camera: { ...homeCamera(), target: facts.start.target },
-    wishes: new Map(), wanted: false, waiting: 0, next: 1, scale: 1, moving: 0, shown: 0, drawn: 0, times: [],
+    canvas, facts, draw, facing, worker, angles: Float32Array.from(facts.start.angles), look: facts.start.look, camera: { ...homeCamera(), target: facts.start.target },
+    wishes: new Map(), wanted: false, waiting: 0, next: 1, scale: 1, moving: 0, shown: 0, times: [],
   };
   worker.onmessage = ({ data }) => {
     if (data.failed) throw new Problem(data.failed);
@@ -18,6 +18,7 @@ function makeViewer(canvas, facts, worker, draw) {
     wish(data);
   };
   new ResizeObserver(() => show(viewer)).observe(canvas);
+  canvas.addEventListener("forgotten", () => show(viewer));
   const loop = () => (requestAnimationFrame(loop), step(viewer));
   loop();
   return viewer;
@@ -59,22 +60,20 @@ async function paint(viewer) {
 function countPicture(viewer) {
   const now = performance.now(), took = now - viewer.shown;
   viewer.shown = now;
-  viewer.drawn++;
   if (!viewer.moving || took > 500) return (viewer.times.length = 0);
   viewer.times.push(took);
   if (viewer.times.length < 12) return;
   const usual = viewer.times.sort((a, b) => a - b)[6];
   viewer.times.length = 0;
-  viewer.rate = 1000 / usual;
-  if (!viewer.steady && usual > SLOW * 1.15) viewer.scale = Math.max(LEAST_SCALE, viewer.scale * 0.85);
-  else if (!viewer.steady && usual < QUICK) viewer.scale = Math.min(1, viewer.scale * 1.1);
+  if (usual > SLOW * 1.15) viewer.scale = Math.max(LEAST_SCALE, viewer.scale * 0.85);
+  else if (usual < QUICK) viewer.scale = Math.min(1, viewer.scale * 1.1);
 }
 
 function ask(viewer, camera, look, angles, hurry = false) {
   return new Promise((resolve) => {
     const id = viewer.next++;
     viewer.wishes.set(id, resolve);
-    viewer.worker.postMessage({ id, camera, look, angles, hurry });
+    viewer.worker.postMessage({ id, camera, look, angles, hurry, facing: viewer.facing });
   });
 }
 

@@ -10,6 +10,7 @@ async function openHand(base64) {
   return {
     body, gaussians, shading: makeShading(body, gaussians), projection: makeProjection(gaussians), angles: "", look: "",
     partly: false, // whether a hurry left something out of the pose
+    skips: false, // whether it left out the colours
   };
 }
 
@@ -28,19 +29,21 @@ function paintHand({ body, gaussians, shading }, look, hurry) {
   return colorGaussians(body, gaussians, shading, light);
 }
 
-// One picture. Nothing is computed again that did not change. In a hurry skin that faces away is left out, and shadows
-// may lag behind; the next picture without a hurry makes up for it.
-function drawHand(hand, { angles, look, camera, hurry = false }) {
+// One picture. Nothing is computed again that did not change. In a hurry colours are new in every other picture and
+// shadows may lag behind, and if `facing` skin that faces away is left out; the next picture without a hurry makes up
+// for it.
+function drawHand(hand, { angles, look, camera, hurry = false, facing = false }) {
   const { body, gaussians, shading, projection } = hand, key = angles.join(), moved = key !== hand.angles;
   if (moved) poseHand(hand, angles);
   const { target, radius } = camera.target ? camera : frameSurface(body.posed);
   const distance = (camera.zoom * radius * body.data.orbitMargin) / Math.sin(camera.fieldOfView / 2);
   const view = orbitCamera({ ...camera, target, distance }), partly = moved && hurry;
-  markShown(body, gaussians, shading.normals, view.eye, partly);
+  markShown(body, gaussians, shading.normals, view.eye, partly && facing);
   if (moved || hand.partly) poseGaussians(body, gaussians);
-  if (moved || hand.partly || look !== hand.look) paintHand(hand, look, partly && look === hand.look);
-  Object.assign(hand, { angles: key, look, partly });
-  if (hurry && !partly) markShown(body, gaussians, shading.normals, view.eye, true);
+  const same = partly && look === hand.look, skips = same && hand.partly && !hand.skips;
+  if ((moved || hand.partly || look !== hand.look) && !skips) paintHand(hand, look, same);
+  Object.assign(hand, { angles: key, look, partly, skips });
+  if (hurry && facing && !partly) markShown(body, gaussians, shading.normals, view.eye, true);
   const count = projectGaussians(gaussians, projection, view);
   return { ellipses: sortEllipses(projection, shading.colors, count), count };
 }
