@@ -30,5 +30,5 @@ def avatar(request, left_hand, right_hand):
 def small_textures():
     """A large one takes seconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(texture, "SIZE", 256)
+        patch.setattr(texture, "SIZE", 128)
         yield

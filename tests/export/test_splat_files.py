@@ -44,7 +44,8 @@ def test_what_a_file_holds_looks_as_the_avatar_does(left_hand, ending, tmp_path)
 
 
 @pytest.mark.parametrize("ending", READERS)
-def test_means_lie_about_the_wrist_within_the_formats_steps(avatar, ending, tmp_path):
+def test_means_lie_about_the_wrist_within_the_formats_steps(right_hand, ending, tmp_path):
+    avatar = right_hand
     export_avatar(avatar, tmp_path / f"hand{ending}")
     means, quats, scales, *_ = READERS[ending](tmp_path / f"hand{ending}")
     pose, turn = avatar.source_pose, torch.diag(torch.tensor([1.0, -1, -1])) @ avatar.source_camera.viewmat[:3, :3]
@@ -65,8 +66,9 @@ def covariances(quats, scales):
 
 
 @pytest.mark.parametrize("ending", READERS)
-def test_gaussians_keep_their_shapes(avatar, ending, tmp_path):
+def test_gaussians_keep_their_shapes(left_hand, ending, tmp_path):
     """A picture of many hardly shows that quaternions are in the wrong order or frame."""
+    avatar = left_hand
     export_avatar(avatar, tmp_path / f"hand{ending}")
     means, quats, scales, *_ = READERS[ending](tmp_path / f"hand{ending}")
     turn = torch.diag(torch.tensor([1.0, -1, -1])) @ avatar.source_camera.viewmat[:3, :3]
@@ -82,9 +84,9 @@ def test_gaussians_keep_their_shapes(avatar, ending, tmp_path):
     assert np.quantile(off[alone], 0.99) < (1e-3 if ending in LOSSLESS else 0.1)
 
 
-@pytest.mark.parametrize("ending", READERS)
+@pytest.mark.parametrize("ending", [".spz", ".sog"])
 def test_equal_avatars_are_equal_bytes(right_hand, ending, tmp_path):
-    """A time in a gzip header would differ."""
+    """A time in the header of a gzip or ZIP would differ."""
     for name in ("a", "b"):
         export_avatar(right_hand, tmp_path / f"{name}{ending}")
     assert (tmp_path / f"a{ending}").read_bytes() == (tmp_path / f"b{ending}").read_bytes()

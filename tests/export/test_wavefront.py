@@ -25,7 +25,7 @@ def test_the_files_name_each_other(right_hand, tmp_path):
     export_avatar(right_hand, tmp_path / "my hand.obj")
     assert (tmp_path / "my hand.obj").read_text().startswith("mtllib my hand.mtl\n")
     assert "map_Kd my hand_skin.png\n" in (tmp_path / "my hand.mtl").read_text()
-    assert np.asarray(cv2.imread(str(tmp_path / "my hand_skin.png"))).shape == (256, 256, 3)
+    assert np.asarray(cv2.imread(str(tmp_path / "my hand_skin.png"))).shape == (128, 128, 3)
     assert len(list(tmp_path.iterdir())) == 3
 
 
