@@ -39,7 +39,7 @@ print(*(name for name in sys.modules if name.startswith(once)))
 """
     arguments = [sys.executable, "-c", code, str(avatar_file), str(tmp_path)]
     done = subprocess.run(arguments, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []
+    assert done.stdout.splitlines() == [f"written: {tmp_path / name}" for name in ("picture.png", "film.gif")] + [""]
 
 
 def test_the_version_is_printed(capsys):
@@ -96,4 +96,15 @@ def test_an_error_of_ours_is_not_dressed_up_as_bad_input(monkeypatch, avatar_fil
 
 
 def test_the_command_line_offers_every_pose():
-    assert get_args(options.PoseName) == ("photo", *POSE_NAMES)
+    names = [name for part in get_args(options.PoseName) for name in get_args(part)]
+    assert names == ["photo", *POSE_NAMES]
+
+
+@pytest.mark.parametrize(
+    ("command", "answer"),
+    [("reconstrct", "did you mean 'reconstruct'?\n"), ("frobnicate", "expected one of reconstruct, render, ")],
+)
+def test_a_mistyped_command_is_answered_with_the_nearest_one(command, answer, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "a.jpg"])
+    assert capsys.readouterr().err.startswith(f"oasis: {command!r} is no command; {answer}")

@@ -102,6 +102,7 @@ def run(options: Animate) -> int:
             count_frames(len(angles) / options.fps, options.fps)
             frames = pose_frames(avatar, angles, options.size, **look)
         write_video(options.out, frames, options.fps, loops=options.loop)
+    print(f"written: {options.out}")
     return 0
 
 

@@ -7,14 +7,14 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, NoReturn, get_args
 
 import tyro
 
 from oasis_warp import __version__
 from oasis_warp.cli import options
 from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
-from oasis_warp.core.errors import InputError
+from oasis_warp.core.errors import InputError, did_you_mean, one_line, shortened
 
 Command = (
     Annotated[options.Reconstruct, tyro.conf.subcommand("reconstruct")]
@@ -34,6 +34,8 @@ Command = (
     | Annotated[options.Doctor, tyro.conf.subcommand("doctor")]
 )
 
+COMMANDS = tuple(get_args(command)[1].name for command in get_args(Command))
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that `arguments` (the process's own when not given) ask for; the exit code."""
@@ -42,10 +44,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"oasis_warp {__version__}")
         return 0
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
+        _refuse_command(arguments[0])
     chosen = tyro.cli(
         Command,
         prog="oasis",
-        description=f"One photo of a hand in, an animatable 3D Gaussian avatar out. oasis_warp {__version__}",
+        description=f"One photo of a hand in, an animatable 3D Gaussian avatar out. oasis_warp {__version__}, as "
+        "`oasis --version` says. `oasis COMMAND --help` explains a command.",
         args=arguments,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
@@ -68,6 +73,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         device = getattr(chosen, "device", "cpu")
         print(f"oasis: the memory of {device} is full; give smaller sizes, or fewer at once.", file=sys.stderr)
         return BAD_INPUT
+
+
+def _refuse_command(name: str) -> NoReturn:
+    """Say which command was meant, or which there are, and exit as after other wrong command lines."""
+    hint = did_you_mean(name, COMMANDS).replace("Did", "did")
+    answer = hint or f"expected one of {', '.join(COMMANDS)}."
+    print(f"oasis: {one_line(shortened(name))!r} is no command; {answer}", file=sys.stderr)
+    raise SystemExit(BAD_INPUT)
 
 
 def open_standard_streams() -> None:

@@ -3,12 +3,15 @@
 import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.console import Console, RenderableType
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 from rich.table import Table
 
+from oasis_warp.cli.progress import Run
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 
@@ -31,13 +34,61 @@ def plain_console() -> Console:
 
 @contextlib.contextmanager
 def show_progress(console: Console) -> Iterator[Progress]:
-    """Show a `Progress` on `console` while the block runs: bars on a terminal, else lines."""
+    """Show a `Progress` without a plan on `console` while the block runs: a bar a stage on a terminal, else lines."""
     if not console.is_terminal:
         yield line_progress(lambda line: console.print(line, highlight=False, soft_wrap=True))
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Bars(SpinnerColumn(), *columns, console=console, transient=True) as bars:
         yield bar_progress(bars)
+
+
+@contextlib.contextmanager
+def show_run(console: Console, run: Run) -> Iterator["Shown"]:
+    """Show a run on `console` while the block runs: one bar with the time left on a terminal, else a line a stage."""
+    if console.is_terminal:
+        with _RunBar(run, console) as bar:
+            yield Shown(run, bar.paused)
+    else:
+        lines = line_progress(lambda line: console.print(line, highlight=False, soft_wrap=True), run=run)
+        yield Shown(lines, contextlib.nullcontext)
+
+
+class Shown(NamedTuple):
+    """A run on the screen."""
+
+    progress: Progress
+    paused: Callable[[], contextlib.AbstractContextManager[Any]]
+    """A context in which other text may be printed."""
+
+
+class _RunBar(Bars):
+    """One bar, which follows a run on its own clock."""
+
+    def __init__(self, run: Run, console: Console) -> None:
+        self._run = run
+        self._bar: TaskID | None = None
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[left]}"))
+        super().__init__(SpinnerColumn(), *columns, console=console, transient=True)
+        self._bar = self.add_task("", total=1.0, left="")
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        if self._bar is not None:
+            self.update(self._bar, completed=self._run.share, description=escape(self._run.what), left=_left(self._run))
+        return super().get_renderables()
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """Take the bar away while the block runs."""
+        self.stop()
+        try:
+            yield
+        finally:
+            self.start()
+
+
+def _left(run: Run) -> str:
+    return f"{100 * run.share:.0f} %, about {max(1, round(run.left))} s left"
 
 
 def bar_progress(bars: Bars) -> Progress:
@@ -52,22 +103,31 @@ def bar_progress(bars: Bars) -> Progress:
     return progress
 
 
-def line_progress(write: Callable[[str], object], clock: Callable[[], float] = time.monotonic) -> Progress:
-    """A `Progress` that writes a line at the end of each stage, and every `LINE_EVERY` seconds before."""
+def line_progress(
+    write: Callable[[str], object], clock: Callable[[], float] = time.monotonic, run: Run | None = None
+) -> Progress:
+    """A `Progress` that writes a line at the end of each stage, and every `LINE_EVERY` seconds before.
+
+    Those between say how much of the stage is done, or of the `run`. Of stages within stages only the outer one counts.
+    """
     started: dict[str, float] = {}
     written: dict[str, float] = {}
 
     def progress(stage: str, done: int, total: int) -> None:
         now = clock()
+        if run is not None:
+            run(stage, done, total)
+        outer = next(iter(started), stage)
         start = started.setdefault(stage, now)
         if done >= total:
-            write(f"{stage}: {now - start:.1f} s")
             del started[stage]
             written.pop(stage, None)
-        elif done and now - written.setdefault(stage, start) >= LINE_EVERY:
-            written[stage] = now
+            if run is None or outer == stage:
+                write(f"{run.part(stage) if run else stage}: {now - start:.1f} s")
+        elif done and now - written.setdefault(outer, start) >= LINE_EVERY:
+            written[outer] = now
             left = (now - start) / done * (total - done)
-            write(f"{stage}: {done} of {total}, about {left:.0f} s left")
+            write(f"{run.what}: {_left(run)}" if run else f"{stage}: {done} of {total}, about {left:.0f} s left")
 
     return progress
 

@@ -8,13 +8,15 @@ import torch
 from rich.console import Console
 
 from oasis_warp import __version__
-from oasis_warp.cli.console import check_device, plain_console, show_progress
+from oasis_warp.cli.console import check_device, plain_console, show_run
 from oasis_warp.cli.options import Edit as Options
+from oasis_warp.cli.progress import EDIT_PLAN, Run
 from oasis_warp.cli.report import measures_table, print_warnings, to_json
 from oasis_warp.cli.summary import GROUND, WIDTH, Panel, make_sheet, panel_side
 from oasis_warp.core.camera import crop_camera, orbit_camera
 from oasis_warp.core.config import EditConfig, check_config
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.logging import timed_stage
 from oasis_warp.core.types import Camera, HandPose
 from oasis_warp.data.output_files import output_folder, write_file
 from oasis_warp.data.photo import read_photo
@@ -49,7 +51,7 @@ def run(options: Options) -> int:
     out = options.out or options.avatar.with_name(f"{options.avatar.stem}-{options.painted.stem}.safetensors")
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: expected a name that ends in .safetensors; rename the output.")
-    with output_folder(out.parent) as part, show_progress(Console(stderr=True)) as progress:
+    with output_folder(out.parent) as part, show_run(Console(stderr=True), Run(EDIT_PLAN)) as shown:
         _check_outputs(options, out)
         before = Avatar.load(options.avatar, options.device)
         made = edit(
@@ -58,9 +60,11 @@ def run(options: Options) -> int:
             photo=read_photo(options.photo) if options.photo else None,
             mask=read_photo(options.mask) if options.mask else None,
             config=config,
-            progress=progress,
+            progress=shown.progress,
         )
-        report, summary = _report(options, made), draw_edit(before, made, options.painted.name)
+        with timed_stage("summary", made.stages, shown.progress):
+            summary = draw_edit(before, made, options.painted.name)
+        report = _report(options, made)
         picture, notes, avatar = (part / file.name for file in _outputs(out))
         write_picture(picture, summary)
         write_file(notes, to_json(report).encode())

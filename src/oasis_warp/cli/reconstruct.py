@@ -1,5 +1,6 @@
 """`oasis reconstruct`: a folder with an avatar for each photo, or for all photos of the same hand."""
 
+import os
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -11,13 +12,14 @@ from typing import Any
 from rich.console import Console
 
 from oasis_warp.cli.animate import turntable
-from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED, check_device, plain_console, show_progress
+from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED, check_device, plain_console, show_run
 from oasis_warp.cli.options import Reconstruct
+from oasis_warp.cli.progress import Run, reconstruct_plan
 from oasis_warp.cli.report import make_report, print_report, to_json
 from oasis_warp.cli.summary import GROUND, draw_quality, draw_summary
 from oasis_warp.core.config import ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.logging import timed_stage
+from oasis_warp.core.logging import Progress, timed_stage
 from oasis_warp.data.films import write_video
 from oasis_warp.data.output_files import make_folders, output_folder
 from oasis_warp.data.photo import read_photo
@@ -43,7 +45,7 @@ def run(options: Reconstruct) -> int:
     if isinstance(options.prior, Path):
         read_header(options.prior)  # check it once, not for every photo
     if len(options.photos) == 1 or options.same_hand or _is_one_hand(options):
-        print_report(plain_console(), reconstruct_folder(options.photos, options.out, config, options.keypoints))
+        _print(reconstruct_folder(options.photos, options.out, config, options.keypoints), options.out)
         return 0
     return _reconstruct_all(options, config)
 
@@ -85,20 +87,25 @@ def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
     """Reconstruct every photo into its own folder; one that fails does not stop the others."""
     n_photos, n_done = len(options.photos), 0
     failed: list[str] = []
-    with _shared_folder(options.out):
+    planned = Run(reconstruct_plan(config, 1), n_photos)
+    with _shared_folder(options.out), show_run(Console(stderr=True), planned) as shown:
         try:
-            for number, photo in enumerate(options.photos, 1):
-                print(f"{photo}, {number} of {n_photos}", file=sys.stderr)
+            for k, photo in enumerate(options.photos):
+                planned.begin(k, f"photo {k + 1} of {n_photos}")
+                folder = options.out / photo.stem
                 try:
-                    report = reconstruct_folder([photo], options.out / photo.stem, config)
+                    report = _write_folder([photo], folder, config, None, shown.progress)
                 except InputError as error:
-                    print(f"oasis: {error}", file=sys.stderr)
+                    with shown.paused():
+                        print(f"oasis: {error}", file=sys.stderr)
                     failed.append(str(photo))
                 else:
-                    print_report(plain_console(), report)
+                    with shown.paused():
+                        _print(report, folder)
                     n_done += 1
         except KeyboardInterrupt:
-            print(f"oasis: stopped; {n_done} of {n_photos} photos are done.", file=sys.stderr)
+            with shown.paused():
+                print(f"oasis: stopped; {n_done} of {n_photos} photos are done.", file=sys.stderr)
             return INTERRUPTED
     if failed:
         print(f"oasis: {n_done} of {n_photos} photos are done; failed: {', '.join(failed)}.", file=sys.stderr)
@@ -121,9 +128,22 @@ def _shared_folder(path: Path) -> Iterator[None]:
 def reconstruct_folder(
     paths: Sequence[Path], folder: Path, config: ReconstructConfig, keypoints: Path | None = None
 ) -> dict[str, Any]:
-    """Reconstruct one avatar of the hand on all photos, and write its folder; its report."""
+    """Reconstruct one avatar of the hand on all photos, and write its folder; its report. Shows progress."""
+    with show_run(Console(stderr=True), Run(reconstruct_plan(config, len(paths)))) as shown:
+        return _write_folder(paths, folder, config, keypoints, shown.progress)
+
+
+def _print(report: dict[str, Any], folder: Path) -> None:
+    console = plain_console()
+    print_report(console, report)
+    console.print(f"written: {folder}{os.sep}", highlight=False, soft_wrap=True)
+
+
+def _write_folder(
+    paths: Sequence[Path], folder: Path, config: ReconstructConfig, keypoints: Path | None, progress: Progress
+) -> dict[str, Any]:
     seconds: dict[str, float] = {}
-    with output_folder(folder) as part, show_progress(Console(stderr=True)) as progress:
+    with output_folder(folder) as part:
         with timed_stage("read", seconds):
             photos = [read_photo(path) for path in paths]
         if len(photos) == 1:
@@ -132,16 +152,16 @@ def reconstruct_folder(
             made = reconstruct_same_hand(photos, config, progress=progress)
         avatar, names = made.avatar, ", ".join(photo.name for photo in photos)
         seconds.update(made.stages)
-        with timed_stage("summary", seconds):
+        with timed_stage("summary", seconds, progress):
             write_picture(part / "summary.png", draw_summary(photos, made, progress=progress))
             write_picture(part / "quality.png", draw_quality(names, avatar, made.quality))
-        with timed_stage("turntable", seconds):
+        with timed_stage("turntable", seconds, progress):
             frames = turntable(
                 avatar, avatar.source_pose, TURNTABLE_FRAMES, TURNTABLE_SIZE, elevation=0.0, background=GROUND,
                 progress=progress,
             )  # fmt: skip
             write_video(part / "turntable.mp4", frames, TURNTABLE_FPS)
-        with timed_stage("save", seconds):
+        with timed_stage("save", seconds, progress):
             avatar.save(part / "avatar.safetensors")
         report = make_report(photos, made, config, seconds)
         (part / "report.json").write_text(to_json(report))

@@ -98,4 +98,5 @@ def run(options: Render) -> int:
     )
     drawn = avatar.render(camera, pose, background)
     write_picture(options.out, to_uint8(straight_alpha(drawn) if transparent else drawn.image))
+    print(f"written: {options.out}")
     return 0
