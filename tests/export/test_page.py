@@ -17,13 +17,16 @@ import numpy as np
 import pytest
 import torch
 
+from oasis_kernels import constants
+from oasis_warp.avatar import pose
 from oasis_warp.avatar.environment import studio_light
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.export import export_avatar
 from oasis_warp.export.page_data import joint_sliders, unpack_data
-from oasis_warp.export.page_file import page_html
+from oasis_warp.export.page_file import page_html, page_text
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
-from oasis_warp.ops import bone_transforms, skin
+from oasis_warp.ops import bone_transforms, skin, sky_exposure
+from oasis_warp.reference import posing
 
 LARGEST = 8_000_000
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -82,7 +85,7 @@ def test_what_the_page_reads_poses_the_same_surface(avatar, pages, name):
     facts, arrays = unpack_data(section(pages[avatar.side], "data"))
     part = {key: torch.from_numpy(np.array(value, np.float32)) for key, value in arrays.items()}
     vertices = part["vertices"].view(-1, 3)
-    (angles,) = [pose["angles"] for pose in facts["poses"] if pose["name"] == name]
+    (angles,) = [known["angles"] for known in facts["poses"] if known["name"] == name]
     bones = bone_transforms(
         torch.tensor(angles).view(15, 3), torch.tensor(facts["orientation"]).view(3, 3),
         torch.tensor(facts["translation"]), part["joints"].view(16, 3), part["axes"].view(16, 3, 3), facts["parents"],
@@ -132,6 +135,32 @@ def test_an_avatar_without_light_of_its_own_begins_in_even_light(right_hand):
     assert facts["start"]["look"] == "even"
     assert facts["lights"].keys() == {"studio"}
     assert (arrays["even"] == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("file", "name", "value"),
+    [
+        ("shading.js", "GAMMA", pose.GAMMA),
+        ("shading.js", "SAME_SKY", pose.SAME_SKY),
+        ("shading.js", "OTHER_SKY", pose.OTHER_SKY),
+        ("shading.js", "WEAK", pose.WEAK),
+        ("shading.js", "DEEP", pose.DEEP),
+        ("sky.js", "BUFFER", sky_exposure.SIZE),
+        ("sky.js", "FAR", sky_exposure.DISTANCE),
+        ("sky.js", "MARGIN", sky_exposure.MARGIN),
+        ("sky.js", "LIFT", sky_exposure.LIFT),
+        ("posing.js", "FLAT", posing.FLAT),
+        ("posing.js", "DAMPING", posing.DAMPING),
+        ("posing.js", "MOST_GROWTH", posing.LIMIT),
+        ("projection.js", "EPS2D", constants.EPS2D),
+        ("projection.js", "JACOBIAN_LIMIT", constants.JACOBIAN_LIMIT),
+        ("raster.js", "EXACT = { opaque: 1 / 100, reach:", constants.EXTENT_SIGMAS),
+    ],
+)
+def test_the_script_has_the_constants_of_the_operators(file, name, value):
+    sign = "" if name.endswith(":") else " ="
+    (found,) = re.findall(rf"\b{re.escape(name)}{sign} ([\d.e-]+)", page_text(file))
+    assert float(found) == pytest.approx(value, rel=1e-12)
 
 
 NODE_CHECK = """

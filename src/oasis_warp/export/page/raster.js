@@ -8,6 +8,7 @@ const EXACT = { opaque: 1 / 100, reach: 3.33, cover: 1 };
 const HURRIED = { opaque: 1 / 16, reach: 2.1, cover: 0.7 };
 const TILE = 8; // pixels a side of the tiles that count where the picture is still open
 const EXP_STEPS = 4096, EXP_END = 3.33 ** 2; // table of exp(-x / 2)
+const FADES = Float32Array.from({ length: 256 }, (_, byte) => 2 * Math.log(Math.max(byte, 1))); // where alpha is 1 / 255
 const EXP = Float32Array.from({ length: EXP_STEPS + 2 }, (_, k) => Math.exp((-(k + 0.5) / EXP_STEPS) * EXP_END / 2));
 
 function makeRaster(width, height) {
@@ -31,10 +32,10 @@ function drawEllipses(raster, ellipses, count, { opaque, reach }) {
   const { width, height, across, open } = raster, bytes = new Uint8Array(ellipses.buffer);
   clearRaster(raster);
   for (let i = count - 1; i >= 0; i--) {
-    const o = 6 * i, opacity = bytes[24 * i + 23] / 255;
-    if (opacity < 1 / 255) continue;
+    const o = 6 * i, byte = bytes[24 * i + 23];
+    if (byte === 0) continue;
     const x = ellipses[o], y = ellipses[o + 1], ax = ellipses[o + 2], ay = ellipses[o + 3], thin = ellipses[o + 4] ** 2;
-    const far = Math.min(reach * reach, 2 * Math.log(255 * opacity)), tall = Math.sqrt(far * (ay * ay + thin * ax * ax));
+    const far = Math.min(reach * reach, FADES[byte]), tall = Math.sqrt(far * (ay * ay + thin * ax * ax));
     const wide = Math.sqrt(far * (ax * ax + thin * ay * ay));
     const left = Math.max(Math.ceil(x - wide - 0.5), 0), right = Math.min(Math.floor(x + wide - 0.5), width - 1);
     const top = Math.max(Math.ceil(y - tall - 0.5), 0), bottom = Math.min(Math.floor(y + tall - 0.5), height - 1);
@@ -42,7 +43,7 @@ function drawEllipses(raster, ellipses, count, { opaque, reach }) {
     let any = 0;
     for (let v = top >> 3; v <= bottom >> 3; v++) for (let u = left >> 3; u <= right >> 3; u++) any |= open[v * across + u];
     if (any === 0) continue;
-    drawEllipse(raster, bytes, i, opacity, x, y, ax, ay, thin, far, left, right, top, bottom, opaque);
+    drawEllipse(raster, bytes, i, byte / 255, x, y, ax, ay, thin, far, left, right, top, bottom, opaque);
   }
 }
 
