@@ -116,6 +116,13 @@ def test_blend_weights_names_its_own_arguments(fault):
         ops.blend_weights(**arguments | bad)
 
 
+def test_harmonics_seen_from_no_place_are_refused():
+    # Their gradient by viewmats was NaN.
+    scene = calls()["rasterization harmonics"].arguments
+    with pytest.raises(ValueError, match="^viewmats: expected rotations, with sh_degree, got a matrix that has no inv"):
+        ops.rasterization(**scene | {"viewmats": torch.full_like(scene["viewmats"], 1e-45)})
+
+
 def test_no_camera_at_all_draws_no_picture(dtype):
     scene = calls(dtype=dtype)["rasterization"].arguments
     none = {name: scene[name][:0] for name in ("viewmats", "Ks", "backgrounds")}

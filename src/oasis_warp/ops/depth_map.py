@@ -127,6 +127,8 @@ def depth_map(
     """
     sizes = _OPERATOR.check(vertices=vertices, faces=faces, viewmat=viewmat, K=K)
     check_picture(width, height, near_plane)
+    if not isinstance(outputs, Sequence) or isinstance(outputs, str):
+        raise TypeError(f"outputs: expected a list of names, got {type(outputs).__name__}.")
     for name in outputs:
         check_choice("outputs", name, DepthMap._fields)
     batch = sizes.get("B", 1)

@@ -18,6 +18,7 @@ from oasis_warp.ops._runtime.rasterization_checks import (
     check_coefficients,
     check_colors,
     check_gaussians,
+    check_invertible,
 )
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 from oasis_warp.ops.blending import blend
@@ -184,6 +185,7 @@ def rasterization(
         check_coefficients(colors, sh_degree, means, n_cameras)
         if validate and not is_traced():
             check_finite(colors=colors)  # of which the largest degree may not be read, and -inf would become black
+            check_invertible(viewmats)
         colors = sh_to_rgb(sh_degree, means, colors, viewmats)
     check_colors(colors, backgrounds, means, n_cameras)
     if validate and render_mode in ("D", "ED") and not is_traced():

@@ -1,5 +1,6 @@
 """Checks of shapes, types and plain numbers for the rasterizer; its operators check the values."""
 
+import torch
 from torch import Tensor
 
 from oasis_warp.ops.checks import check_float, check_like, check_number, check_pixels, check_positive, check_shape
@@ -71,6 +72,12 @@ def check_coefficients(coefficients: Tensor, sh_degree: int, means: Tensor, n_ca
         check_shape("colors", coefficients, "N", "K", 3, sizes=sizes, hint=hint)
     check_float("colors", coefficients, like=means)
     check_degree("sh_degree", sh_degree, coefficients.shape[-2])
+
+
+def check_invertible(viewmats: Tensor) -> None:
+    """Refuse cameras without a place, from which harmonics could be seen."""
+    if bool((torch.linalg.det(viewmats.detach()[:, :3, :3].double()) == 0).any()):
+        raise ValueError("viewmats: expected rotations, with sh_degree, got a matrix that has no inverse.")
 
 
 def check_colors(colors: Tensor, backgrounds: Tensor | None, means: Tensor, n_cameras: int) -> None:
