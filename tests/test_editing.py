@@ -106,6 +106,13 @@ def test_a_photo_without_paint_is_refused(truth):
         edit(truth.avatar, truth.photo, photo=truth.photo)
 
 
+def test_a_wholly_different_picture_is_not_said_to_lack_paint(truth):
+    noise = torch.randint(0, 256, truth.photo.rgb.shape, generator=torch.Generator().manual_seed(0)).to(torch.uint8)
+    other = truth.photo._replace(rgb=noise, name="other.png")
+    with pytest.raises(InputError, match=f"^other.png: is another picture than {truth.photo.name}; paint on a copy"):
+        edit(truth.avatar, other, photo=truth.photo, config=QUICK)
+
+
 def test_a_photo_of_something_else_is_refused(truth):
     noise = torch.randint(0, 256, (200, 260, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     other = Photo(noise, None, None, "noise.png", 1.0)

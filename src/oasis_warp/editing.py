@@ -25,7 +25,8 @@ from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import warm_up
 
 OTHER_PHOTO = 0.06
-"""Median colour difference between avatar and photo from which this is not the photo that the avatar was made from."""
+"""Median colour difference between avatar and photo from which this is not the photo that the avatar was made from, and
+between a photo and the painted one from which one is no copy of the other."""
 MUCH_LEFT_OUT = 0.25
 """Share of the paint on the hand that could not be used, from which it is worth a warning."""
 PAINTED = 0.5
@@ -125,6 +126,10 @@ def _compare(painted: Photo, photo: Photo | None, mask: Photo | None) -> tuple[T
     elif painted.alpha is not None and photo is not None and photo.alpha is None:
         paint = painted.alpha  # a layer of paint alone
     else:
+        if photo is not None and float((image - before).abs().mean(-1).median()) > OTHER_PHOTO:
+            raise InputError(
+                f"{painted.name}: is another picture than {photo.name}; paint on a copy of that one, or give a mask."
+            )
         paint = find_paint(before, image)
     return image, before, paint
 

@@ -134,6 +134,13 @@ def test_what_ails_a_photo_is_said_and_nothing_else(pictured, said):
     assert len(found) == 1 and said in found[0]
 
 
+def test_a_sharp_photo_in_a_smaller_crop_is_not_said_to_be_blurred():
+    # It was stretched back to the photo's size first, as by `--size 64`.
+    image, mask = photo()
+    small, fewer = image[::2, ::2], mask[::2, ::2]
+    assert photo_warnings(small, fewer, 4 * SIDE) == []
+
+
 def test_a_mask_of_a_few_pixels_is_said_to_hold_the_background():
     image, mask = photo()
     assert "background" in photo_warnings(image, mask * 0, SIDE)[0]

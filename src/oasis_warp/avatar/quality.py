@@ -162,7 +162,7 @@ def _blur(image: Tensor, mask: Tensor, side: float) -> float:
 
     Along the worse of both axes (Crete et al. 2007, "The blur effect"), at the photo's own size.
     """
-    size = min(round(side), BLUR_SIDE)
+    size = min(round(side), BLUR_SIDE, len(image))  # a crop that was made smaller is sharp, not blurred
     planes = torch.cat([(image @ image.new_tensor(LUMA))[None, None], mask[None, None]], 1)
     grey, hand = interpolate(planes, size=(size, size), mode="bilinear", antialias=True)[0]
     inside = inner_mask((hand > 0.5).float(), 4) > 0.5
