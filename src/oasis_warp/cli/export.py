@@ -14,6 +14,6 @@ def run(options: Export) -> int:
     """
     choose_writer(options.out)  # refuse a wrong ending before the avatar is read
     avatar = Avatar.load(options.avatar)
-    pose = None if options.pose is None else choose_pose(avatar, options.pose)
-    export_avatar(avatar, options.out, pose=pose, light=options.light)
+    pose = None if options.pose == "auto" else choose_pose(avatar, options.pose)
+    export_avatar(avatar, options.out, pose=pose, light=None if options.light == "auto" else options.light)
     return 0

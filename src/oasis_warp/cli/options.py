@@ -131,11 +131,11 @@ class Export:
     avatar: AvatarFile
     out: Output
     """File to write."""
-    pose: PoseName | None = None
-    """Pose of the hand. That of the photo when not given, and in files that can be posed the rest pose."""
-    light: Literal["baked", "none"] | None = None
-    """Colours as in the avatar's light, or as in even light for programs with lights of their own. Baked into Gaussians
-    and left out of meshes when not given."""
+    pose: PoseName | Literal["auto"] = "auto"
+    """Pose of the hand; "auto" is that of the photo, and in files that can be posed the rest pose."""
+    light: Literal["auto", "baked", "none"] = "auto"
+    """Colours as in the avatar's light, or as in even light for programs with lights of their own; "auto" bakes light
+    into Gaussians and leaves it out of meshes."""
 
 
 @dataclass(frozen=True, kw_only=True)
