@@ -93,6 +93,23 @@ def test_without_a_terminal_a_stage_is_a_line_and_long_ones_tell_the_time_left()
     assert not any("400" in line for line in lines)
 
 
+def test_lines_of_a_photo_begin_anew_after_one_that_failed():
+    clock, lines = Clock(), []
+    plan = reconstruct_plan(ReconstructConfig(), 1)
+    run = Run(plan, 2, clock=clock)
+    progress = line_progress(lines.append, clock=clock, run=run)
+    run.begin(0, "photo 1 of 2")
+    progress("landmarks", 0, 1)
+    clock.now += 7
+    run.begin(1, "photo 2 of 2")
+    for stage in ("landmarks", "fit"):
+        progress(stage, 0, 1)
+        clock.now += 1
+        progress(stage, 1, 1)
+    progress("fit", 1, 1)  # also said by what works within it
+    assert lines == ["photo 2 of 2, landmarks: 1.0 s", "photo 2 of 2, fit: 1.0 s"]
+
+
 def test_on_a_terminal_there_is_one_bar_of_eighty_columns():
     out, plan = io.StringIO(), reconstruct_plan(ReconstructConfig(), 1)
     run = Run(plan, 2)

@@ -112,11 +112,18 @@ def line_progress(
     """
     started: dict[str, float] = {}
     written: dict[str, float] = {}
+    part = ""
 
     def progress(stage: str, done: int, total: int) -> None:
+        nonlocal part
         now = clock()
         if run is not None:
             run(stage, done, total)
+            if run.part("") != part:  # what a photo that failed has begun has not ended
+                part = run.part("")
+                started.clear()
+            if done >= total and stage not in started:  # a stage whose inner part, of the same name, has ended it
+                return
         outer = next(iter(started), stage)
         start = started.setdefault(stage, now)
         if done >= total:
