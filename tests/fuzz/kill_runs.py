@@ -116,7 +116,8 @@ def main() -> None:
         top = Path(name)
         folder = top / "work"
         if options.command != "reconstruct":
-            subprocess.run(command("reconstruct", top / "made"), check=True, capture_output=True)
+            made = [sys.executable, "-m", "oasis_warp", "reconstruct", str(PHOTO), "-o", str(top / "made")]
+            subprocess.run([*made, "--size", "256", "--steps", "2"], check=True, capture_output=True)
             picture = cv2.imread(str(PHOTO))
             assert picture is not None
             height, width = picture.shape[:2]
