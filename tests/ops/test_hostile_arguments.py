@@ -116,6 +116,14 @@ def test_blend_weights_names_its_own_arguments(fault):
         ops.blend_weights(**arguments | bad)
 
 
+def test_points_in_transposed_memory_take_correctives():
+    # Their sum kept that layout, which kernels cannot read: an AssertionError.
+    made = calls(n=1)["skin correctives"].arguments
+    transposed = made | {"means": made["means"].mT.contiguous().mT}
+    assert not transposed["means"].is_contiguous()
+    assert torch.equal(ops.skin(**transposed).means, ops.skin(**made).means)
+
+
 def test_harmonics_seen_from_no_place_are_refused():
     # Their gradient by viewmats was NaN.
     scene = calls()["rasterization harmonics"].arguments

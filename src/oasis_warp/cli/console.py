@@ -112,17 +112,18 @@ def line_progress(
     """
     started: dict[str, float] = {}
     written: dict[str, float] = {}
-    part = ""
+    part, last = "", ""
 
     def progress(stage: str, done: int, total: int) -> None:
-        nonlocal part
+        nonlocal part, last
         now = clock()
         if run is not None:
             run(stage, done, total)
             if run.part("") != part:  # what a photo that failed has begun has not ended
                 part = run.part("")
+                last = ""
                 started.clear()
-            if done >= total and stage not in started:  # a stage whose inner part, of the same name, has ended it
+            if done >= total and stage not in started and stage == last:  # its inner part, of the same name, ended it
                 return
         outer = next(iter(started), stage)
         start = started.setdefault(stage, now)
@@ -130,6 +131,7 @@ def line_progress(
             del started[stage]
             written.pop(stage, None)
             if run is None or outer == stage:
+                last = stage
                 write(f"{run.part(stage) if run else stage}: {now - start:.1f} s")
         elif done and now - written.setdefault(outer, start) >= LINE_EVERY:
             written[outer] = now

@@ -53,7 +53,7 @@ def _corrected(means: Tensor, displacements: Tensor | None, strengths: Tensor | 
     """Rest points with the pose correctives of one pose."""
     if displacements is None or strengths is None:
         return means.contiguous()
-    return means + displacements.contiguous() @ strengths.contiguous()  # whose layout would change their product's bits
+    return means.contiguous() + displacements.contiguous() @ strengths.contiguous()  # whose layout would change their product's bits
 
 
 def _skin(
