@@ -53,7 +53,8 @@ def _corrected(means: Tensor, displacements: Tensor | None, strengths: Tensor | 
     """Rest points with the pose correctives of one pose."""
     if displacements is None or strengths is None:
         return means.contiguous()
-    return means.contiguous() + displacements.contiguous() @ strengths.contiguous()  # whose layout would change their product's bits
+    # Another layout would change the bits of the product.
+    return means.contiguous() + displacements.contiguous() @ strengths.contiguous()
 
 
 def _skin(
