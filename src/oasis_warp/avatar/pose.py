@@ -22,7 +22,7 @@ from which it is gone."""
 SAME_SKY, OTHER_SKY = 0.08, 0.25
 """Changes of the share of the sky that skin sees, up to which its shade stays and from which it is gone: what cast it
 has moved. Buffers of 3 mm err by .05; a finger that lies on the palm hides .5 and more."""
-WEAK, DEEP = 0.15, 0.4
+WEAK, DEEP = 0.3, 0.6
 """Differences of shade from 1 up to which it is relief or tone of the skin itself, and from which it is a sharp shadow,
 gloss, or another part of the hand. Set by eye on one thumb-up photo with gashes, creases and a red spot."""
 MOST_DETAIL = 0.3

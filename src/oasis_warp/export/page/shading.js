@@ -5,7 +5,7 @@
 const GAMMA = 2.2; // light is sRGB to this power, nearly
 const AS_IN_PHOTO = Math.cos((5 * Math.PI) / 180), TURNED_AWAY = Math.cos((20 * Math.PI) / 180);
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
-const WEAK = 0.15, DEEP = 0.4; // differences of shade from 1, up to which it is the skin's own, and from which it is not
+const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
 const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
 
 function makeShading(body, gaussians) {
