@@ -35,6 +35,15 @@ def test_closed_streams_are_opened_so_that_no_file_gets_their_numbers(tmp_path):
     assert subprocess.run([sys.executable, "-c", CLOSED, str(tmp_path / "a.png")]).returncode == 7
 
 
+def test_a_reader_that_goes_away_is_no_error_of_ours():
+    code = "import sys; from oasis_warp.cli import main; sys.exit(main(['--help']))"
+    reading, writing = os.pipe()
+    os.close(reading)
+    ran = subprocess.run([sys.executable, "-c", code], stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (ran.returncode, ran.stderr) == (141, "")
+
+
 @pytest.mark.parametrize("name", ["[/b]", "[red]", "a" * 250])
 def test_a_picture_with_an_odd_name_in_a_folder_that_is_not_there_is_drawn(avatar_file, tmp_path, name):
     out = tmp_path / "new" / f"{name}.png"

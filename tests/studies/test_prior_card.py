@@ -36,7 +36,7 @@ def test_the_file_and_its_training_are_told_from_its_header(weights):
 def test_the_command_that_retrains_is_one_that_the_command_line_takes(weights):
     import tyro
 
-    from oasis_warp.cli.options import Pretrain
+    from oasis_warp.cli.developer_options import Pretrain
 
     line = next(line for line in training_text(weights).splitlines() if line.startswith("oasis pretrain"))
     options = tyro.cli(Pretrain, args=line.split()[2:])

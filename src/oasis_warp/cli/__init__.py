@@ -1,5 +1,6 @@
 """The command line, `oasis`: one module a command."""
 
+import os
 import sys
 from collections.abc import Sequence
 
@@ -13,3 +14,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("oasis: stopped, nothing written.", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # whoever read our output has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python complains when it flushes the rest
+        return 141  # as shells count it: 128 + SIGPIPE

@@ -12,7 +12,7 @@ from typing import Annotated, NoReturn, get_args
 import tyro
 
 from oasis_warp import __version__
-from oasis_warp.cli import options
+from oasis_warp.cli import developer_options, options
 from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.errors import InputError, did_you_mean, one_line, shortened
 
@@ -26,12 +26,12 @@ Command = (
     | Annotated[options.Edit, tyro.conf.subcommand("edit")]
     | Annotated[options.Info, tyro.conf.subcommand("info")]
     | Annotated[options.Text, tyro.conf.subcommand("text")]
-    | Annotated[options.Synthesize, tyro.conf.subcommand("synthesize")]
-    | Annotated[options.Pretrain, tyro.conf.subcommand("pretrain")]
-    | Annotated[options.Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[options.Gradcheck, tyro.conf.subcommand("gradcheck")]
-    | Annotated[options.Bench, tyro.conf.subcommand("bench")]
-    | Annotated[options.Doctor, tyro.conf.subcommand("doctor")]
+    | Annotated[developer_options.Synthesize, tyro.conf.subcommand("synthesize")]
+    | Annotated[developer_options.Pretrain, tyro.conf.subcommand("pretrain")]
+    | Annotated[developer_options.Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[developer_options.Gradcheck, tyro.conf.subcommand("gradcheck")]
+    | Annotated[developer_options.Bench, tyro.conf.subcommand("bench")]
+    | Annotated[developer_options.Doctor, tyro.conf.subcommand("doctor")]
 )
 
 COMMANDS = tuple(get_args(command)[1].name for command in get_args(Command))

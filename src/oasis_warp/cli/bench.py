@@ -23,7 +23,7 @@ from oasis_warp.bench.tables import (
     speed_table,
 )
 from oasis_warp.cli.console import check_device, print_tables, show_progress
-from oasis_warp.cli.options import Bench, ErrorTime, Kernels, Roofline, Scaling
+from oasis_warp.cli.developer_options import Bench, ErrorTime, Kernels, Roofline, Scaling
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.processes import using_threads
 from oasis_warp.data.output_files import output_file, output_folder

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from oasis_warp import __version__
 from oasis_warp.cli.console import FAULT
-from oasis_warp.cli.options import Doctor
+from oasis_warp.cli.developer_options import Doctor
 
 PACKAGES = {
     "warp-lang": ("1.19", "1.20"),

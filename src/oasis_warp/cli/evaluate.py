@@ -9,7 +9,7 @@ from rich.table import Table
 
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.cli.console import INTERRUPTED, check_device, print_tables, show_progress
-from oasis_warp.cli.options import Evaluate
+from oasis_warp.cli.developer_options import Evaluate
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress

@@ -16,7 +16,7 @@ from oasis_warp.certify.compare import Measurement
 from oasis_warp.certify.families import FAMILIES
 from oasis_warp.certify.verdict import Tally, Verdict, as_table, by_condition, describe_machine
 from oasis_warp.cli.console import FAULT, show_progress
-from oasis_warp.cli.options import Gradcheck
+from oasis_warp.cli.developer_options import Gradcheck
 from oasis_warp.cli.report import to_json
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import output_file

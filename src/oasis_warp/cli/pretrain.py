@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 
 from oasis_warp.cli.console import INTERRUPTED, check_device, show_progress
-from oasis_warp.cli.options import Pretrain
+from oasis_warp.cli.developer_options import Pretrain
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.data.output_files import open_resumable_folder

@@ -6,7 +6,7 @@ import torch
 from rich.console import Console
 
 from oasis_warp.cli.console import INTERRUPTED, check_device, show_progress
-from oasis_warp.cli.options import Synthesize
+from oasis_warp.cli.developer_options import Synthesize
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, contact_sheet, to_uint8, write_picture
