@@ -11,7 +11,7 @@ import pytest
 
 from oasis_warp import ops
 from oasis_warp.certify.families import FAMILIES
-from oasis_warp.cli import gradcheck, main, options
+from oasis_warp.cli import developer_options, gradcheck, main
 
 pytestmark = pytest.mark.usefixtures("as_shipped")
 
@@ -101,7 +101,7 @@ def test_a_wrong_command_line_exits_with_two(arguments, capsys):
 
 
 def test_the_command_line_offers_every_operator():
-    assert get_args(options.FamilyName) == tuple(FAMILIES)
+    assert get_args(developer_options.FamilyName) == tuple(FAMILIES)
 
 
 @pytest.mark.slow

@@ -165,8 +165,8 @@ def test_half_precision_keeps_geometry_exact_and_gaussians_near(network, batch):
         ({"vet": "maybe"}, "vet: expected one of 'on', 'no_aggr', 'mlp', 'off', got 'maybe'"),
         ({"heads": 5}, "heads: expected a number that splits width 192 into multiples of 8, got 5"),
         ({"heads": 48}, "heads: expected a number that splits width 192 into multiples of 8, got 48"),
-        ({"n_tokens": 0}, "n_tokens: expected a positive whole number, got 0"),
-        ({"width": 192.0}, "width: expected a positive whole number, got 192.0"),
+        ({"n_tokens": 0}, "n_tokens: expected a whole number from 1 to 4096, got 0"),
+        ({"width": 192.0}, "width: expected a whole number from 1 to 2048, got 192.0"),
         ({"neighborhood": 4}, "neighborhood: expected an odd number, got 4"),
     ],
 )
