@@ -55,7 +55,7 @@ def test_a_photo_becomes_an_avatar_that_looks_like_it(finished):
     assert stages <= report["seconds"].keys()
     assert report["prior"]["name"] == "learned" and len(report["prior"]["sha256"]) == 64
     assert "left hand" in done.stdout
-    assert "texture" in done.stderr
+    assert "adaptation" in done.stderr
 
 
 def test_the_avatar_can_be_drawn_and_animated_without_its_photo(finished, tmp_path):
