@@ -26,6 +26,8 @@ ROOT = Path(__file__).resolve().parent.parent
 TREE = ("kernels/oasis_kernels", "src", "tests", "studies", "asset_build", "pyproject.toml")
 LIMIT = 240
 """Seconds that the tests of one bug may take: a kernel that never ends is caught by it."""
+PLAIN = ("-p", "no:cacheprovider", "-p", "no:randomly")
+"""Options of pytest: nothing is left in the copy, and the order is that of the files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +60,7 @@ def run_tests(folder: Path, cache: Path, tests: Sequence[str]) -> tuple[bool, st
         "OASIS_WARP_CACHE": str(cache),
         "OMP_NUM_THREADS": "1",
     }
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", "-p", "no:randomly", *tests]
+    command = [sys.executable, "-m", "pytest", "--slow", "-x", "-q", "-n0", *PLAIN, *tests]
     try:
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=LIMIT)
     except subprocess.TimeoutExpired:

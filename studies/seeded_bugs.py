@@ -32,7 +32,7 @@ VECTOR_TESTS = {"depth/buffer.h": "tests/ops/test_visibility_vectors.py"}
 def _in(module: str, operator: str, *bugs: tuple[str, str, str]) -> list[Bug]:
     """Bugs in a file of kernels: (what, old, new). On the CPU C++ does float32, the generic kernels do float64."""
     dtype = "float64" if module.endswith(".py") and module != "constants.py" else "float32"
-    tests = (GRID, "--slow", "-k", f"small_scenes and {dtype} and ({FAMILIES[operator]})")
+    tests = (GRID, "-k", f"small_scenes and {dtype} and ({FAMILIES[operator]})")
     if module in VECTOR_TESTS:
         tests = (VECTOR_TESTS[module],)
     return [Bug(f"{module}: {name}", f"{KERNELS}/{module}", old, new, tests) for name, old, new in bugs]

@@ -16,6 +16,8 @@ from oasis_warp.reconstruction import reconstruct
 from studies.damage import DAMAGES
 from studies.stress import is_sane, likeness, make
 
+pytestmark = pytest.mark.slow
+
 PHOTO = Path(__file__).parent / "data" / "photos" / "palm_open_left_02.png"
 FEW = ReconstructConfig(size=256, steps=20)
 SAID = {
@@ -69,7 +71,6 @@ def whole():
     return photo, reconstruct(photo, FEW)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", DAMAGES)
 def test_a_damaged_photo_makes_a_hand_and_the_report_says_what_ails_it(whole, name):
     photo, base = whole
@@ -80,7 +81,6 @@ def test_a_damaged_photo_makes_a_hand_and_the_report_says_what_ails_it(whole, na
     assert SAID[name] in "; ".join(made.warnings)
 
 
-@pytest.mark.slow
 def test_two_reconstructions_with_the_same_seed_have_the_same_bits(whole):
     photo, base = whole
     again = reconstruct(photo, FEW).avatar.gaussians

@@ -12,6 +12,8 @@ from oasis_warp.ops import depth_map
 from oasis_warp.render.render import render
 from studies.painted_truth import Chart, draw_truth, make_truth
 
+pytestmark = pytest.mark.slow
+
 SIZE = 192
 
 

@@ -18,6 +18,8 @@ from oasis_warp.losses.image import masked_psnr
 from oasis_warp.render.render import render
 from studies.painted_truth import make_truth
 
+pytestmark = pytest.mark.slow
+
 SIZE, WRIST = 512, 0.03
 
 

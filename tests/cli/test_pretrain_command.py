@@ -20,6 +20,8 @@ from oasis_warp.network.weights_file import load_network
 from oasis_warp.pretraining.pretrain import CHECKPOINT, METRICS, SHEET, WEIGHTS
 from oasis_warp.synthetic import people
 
+pytestmark = pytest.mark.slow
+
 TINY = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
 SMALL = ("--hands", "1", "--views", "1", "--people", "1", "--size", "32", "--steps", "2", "--workers", "0",
          "--device", "cpu", "--precision", "float32")  # fmt: skip
@@ -168,7 +170,6 @@ def test_sigterm_ends_it_after_the_step_and_so_does_a_second_one():
         assert asked()
 
 
-@pytest.mark.slow
 def test_two_processes_train_one_network_on_people_of_their_own(tmp_path, hand):
     folder, script = tmp_path / "prior", Path(__file__).with_name("pretrain_together.py")
     start = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]

@@ -17,6 +17,8 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.render.render import render
 
+pytestmark = pytest.mark.slow
+
 SIZE = 160
 LAMP = torch.tensor([-0.4, -0.5, -0.75])
 WALL = (0.2, 0.5, 0.3)

@@ -31,6 +31,8 @@ from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior
 
+pytestmark = pytest.mark.slow
+
 CPU = torch.device("cpu")
 TINY = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
 CONFIG = SyntheticEvaluation(
@@ -123,7 +125,6 @@ def test_what_measures_people_travels_whole(hand, network):
     assert all(dict(there.priors[name].about) == dict(prior.about) for name, prior in priors.items())
 
 
-@pytest.mark.slow
 def test_people_measured_by_other_processes_come_out_the_same(left, network, tmp_path):
     config = replace(CONFIG, people=2, lights=("studio",), methods=(METHODS[2],))
     here = evaluate_people(default_priors(network), config, tmp_path / "here", CPU)
