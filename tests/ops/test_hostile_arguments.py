@@ -8,6 +8,7 @@ from operator_calls import calls, mesh
 
 from oasis_warp import ops
 from oasis_warp.ops import DECLARATIONS
+from oasis_warp.ops._runtime import tiles
 
 pytestmark = pytest.mark.usefixtures("as_shipped")
 N_CALLS = 150
@@ -131,7 +132,9 @@ def test_harmonics_seen_from_no_place_are_refused():
         ops.rasterization(**scene | {"viewmats": torch.full_like(scene["viewmats"], 1e-45)})
 
 
-def test_no_camera_at_all_draws_no_picture(dtype):
+@pytest.mark.parametrize("threads", [1, 2])
+def test_no_camera_at_all_draws_no_picture(dtype, threads, monkeypatch):
+    monkeypatch.setattr(tiles, "kernel_threads", lambda: threads)
     scene = calls(dtype=dtype)["rasterization"].arguments
     none = {name: scene[name][:0] for name in ("viewmats", "Ks", "backgrounds")}
     means = scene["means"].clone().requires_grad_()

@@ -94,7 +94,7 @@ def even_work(starts: Tensor) -> list[int]:
     """Bounds of ranges of tiles with about equally many pairs; an empty tile counts a little too."""
     n_tiles = len(starts) - 1
     parts = min(RANGES_A_THREAD * kernel_threads(), n_tiles)
-    if starts.is_cuda or kernel_threads() == 1:
+    if n_tiles == 0 or starts.is_cuda or kernel_threads() == 1:
         return [0, n_tiles]
     work = starts + torch.arange(n_tiles + 1) * 4
     targets = torch.arange(1, parts) * int(work[-1]) // parts
