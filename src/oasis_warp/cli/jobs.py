@@ -16,7 +16,7 @@ from oasis_warp.data.output_files import write_file
 MOST_WAITING = 16
 """Photos in the queue."""
 MOST_SECONDS = 900
-"""Time for one photo, some twenty times what it takes on two cores."""
+"""Time for one photo, some fifty times what it takes on two quiet cores."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".avif", ".bmp", ".tif", ".tiff")
 EXPORTS = (".html", ".glb", ".ply", ".spz")
 """Formats that are written when somebody asks for them."""

@@ -18,8 +18,6 @@ _PLACES = {
     "filmic": 10, "contrast": 11, "saturation": 12, "sharpening": 13, "quality": 14,
 }  # fmt: skip
 """Columns of a sensor's fields in its row."""
-SENSOR_WORDS = 15
-"""Length of a row."""
 _SHARPENED = 1.2
 """Blur of the unsharp mask [px]."""
 _TAPS = 4
@@ -83,7 +81,7 @@ def sample_sensor(rng: np.random.Generator) -> Sensor:
 
 
 def sensor_row(sensor: Sensor) -> list[float]:
-    """A sensor as `SENSOR_WORDS` numbers."""
+    """A sensor as the numbers of its row."""
     return [float(number) for value in sensor for number in np.atleast_1d(value)]
 
 

@@ -19,8 +19,6 @@ Generator = Callable[[Path, str, int], Photo]
 
 PLACES = ("{folder}", "{depth}", "{mask}", "{normal}", "{canny}", "{prompt}", "{seed}", "{out}")
 """What a command may name: the folder and its files, the words, the seed, and the picture to write."""
-DEPTH_WEIGHT = 0.8
-"""Of the ControlNet: at 1 many models draw the mesh's facets; the check asks for the pose anyway."""
 
 
 def choose_generator(given: str) -> Generator:
@@ -106,11 +104,8 @@ def _pipeline(folder: Path) -> Generator:
         from PIL import Image
 
         steer = Image.open(conditioning / "depth.png").convert("RGB")
-        options = {"controlnet_conditioning_scale": DEPTH_WEIGHT} if "controlnet_conditioning_scale" in named else {}
         random = torch.Generator().manual_seed(seed)
-        made = pipeline(
-            prompt=prompt, width=steer.width, height=steer.height, generator=random, **{depth: steer}, **options
-        )
+        made = pipeline(prompt=prompt, width=steer.width, height=steer.height, generator=random, **{depth: steer})
         pixels = torch.from_numpy(np.array(made.images[0].convert("RGB")))
         return Photo(pixels, None, None, f"picture with seed {seed}", 1.0)
 
