@@ -21,12 +21,14 @@ from oasis_kernels import constants
 from oasis_warp.avatar import pose
 from oasis_warp.avatar.environment import studio_light
 from oasis_warp.core.camera import orbit_camera
+from oasis_warp.data.splat_files import read_splats
 from oasis_warp.export import export_avatar
 from oasis_warp.export.page_data import joint_sliders, unpack_data
-from oasis_warp.export.page_file import page_html, page_text
+from oasis_warp.export.page_file import page_html, page_text, splats_html
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.ops import bone_transforms, skin, sky_exposure
 from oasis_warp.reference import posing
+from oasis_warp.render.render import render
 
 LARGEST = 8_000_000
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -256,6 +258,19 @@ def browser_with(page, drawing, profile):
             server.shutdown()
 
 
+def pictures_of(page, drawing, jobs, profile):
+    """What a browser draws of each job, over white."""
+    page = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page)
+    page = page.replace("</body>", REPORT.replace("JOBS", json.dumps(jobs)) + "</body>")
+    with browser_with(page, drawing, profile) as received:
+        for k in range(len(jobs)):
+            path, body = received.get(timeout=100)
+            assert path == f"/{k}", body
+            picture = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
+            shown = np.asarray(picture)[..., [2, 1, 0, 3]] / 255
+            yield shown[..., :3] * shown[..., 3:] + 1 - shown[..., 3:]
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
 @pytest.mark.parametrize("drawing", ["graphics", "processor"])
@@ -270,20 +285,31 @@ def test_a_browser_draws_the_page_as_we_do(avatar, pages, tmp_path, drawing):
     ]
     square = {"elevation": 0, "width": 256, "height": 256, "fit": True}
     jobs = [{"pose": pose, "azimuth": np.radians(angle), "look": look, **square} for pose, angle, look in views]
-    page = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", pages[avatar.side])
-    page = page.replace("</body>", REPORT.replace("JOBS", json.dumps(jobs)) + "</body>")
     lights = {"photo": avatar, "studio": avatar.in_light(studio_light()), "even": avatar.in_even_light()}
-    with browser_with(page, drawing, tmp_path / "profile") as received:
-        for k, (name, degrees, look) in enumerate(views):
-            path, body = received.get(timeout=100)
-            assert path == f"/{k}", body
-            picture = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
-            shown = np.asarray(picture)[..., [2, 1, 0, 3]] / 255
-            shown = shown[..., :3] * shown[..., 3:] + 1 - shown[..., 3:]
-            pose = avatar.source_pose if name == "photo" else in_pose(avatar, name)
-            camera = orbit_camera(avatar.mesh(pose).vertices, np.radians(degrees), 0.0, 256)
-            drawn = lights[look].render(camera, pose).image.clamp(0, 1).numpy()
-            assert -10 * np.log10(np.mean((shown - drawn) ** 2)) > 40, (name, look)
+    pictures = pictures_of(pages[avatar.side], drawing, jobs, tmp_path / "profile")
+    for shown, (name, degrees, look) in zip(pictures, views, strict=True):
+        pose = avatar.source_pose if name == "photo" else in_pose(avatar, name)
+        camera = orbit_camera(avatar.mesh(pose).vertices, np.radians(degrees), 0.0, 256)
+        drawn = lights[look].render(camera, pose).image.clamp(0, 1).numpy()
+        assert -10 * np.log10(np.mean((shown - drawn) ** 2)) > 40, (name, look)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+@pytest.mark.parametrize("drawing", ["graphics", "processor"])
+def test_a_browser_draws_gaussians_of_other_programs_as_we_do(right_hand, tmp_path, drawing):
+    export_avatar(right_hand, tmp_path / "hand.ply")
+    read = read_splats(tmp_path / "hand.ply")
+    page = splats_html(read, "hand")
+    facts, arrays = unpack_data(section(page, "data"))
+    reach, means = facts["frame"]["radius"], torch.from_numpy(arrays["means"].reshape(-1, 3).copy())
+    scale = means.std() / read.means.std()
+    posed = read._replace(means=means, scales=read.scales * scale)
+    jobs = [{"azimuth": angle, "elevation": 0, "width": 256, "height": 256, "fit": True} for angle in (0.0, 2.0)]
+    for shown, job in zip(pictures_of(page, drawing, jobs, tmp_path / "profile"), jobs, strict=True):
+        camera = orbit_camera(torch.tensor([[reach, 0, 0], [-reach, 0, 0]]), job["azimuth"], 0.0, 256)
+        drawn = render(posed, camera, background=(1.0, 1.0, 1.0)).image.clamp(0, 1).numpy()
+        assert -10 * np.log10(np.mean((shown - drawn) ** 2)) > 40, job
 
 
 def test_all_named_poses_are_on_the_page(pages):

@@ -3,7 +3,7 @@ import sys
 import numpy as np
 import pytest
 from test_skinned_gltf import surface
-from tests.export.splat_readers import read_ply
+from tests.export.splat_readers import READERS
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.export import export_avatar
@@ -59,7 +59,7 @@ def test_a_splat_stage_holds_what_a_ply_does(left_hand, tmp_path):
     stage = usd.Stage.Open(str(tmp_path / "hand.splats.usdz"))
     prim = stage.GetPrimAtPath("/hand/splats")
     assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
-    means, quats, scales, opacities, colors = read_ply(tmp_path / "hand.ply")
+    means, quats, scales, opacities, colors = READERS[".ply"](tmp_path / "hand.ply")
     get = {name: np.array(prim.GetAttribute(name).Get()) for name in ("positions", "scales", "opacities")}
     np.testing.assert_allclose(get["positions"], means, atol=1e-6)
     np.testing.assert_allclose(get["scales"], scales, rtol=1e-4)

@@ -25,6 +25,8 @@ def make_target(name: str, folder: Path):
         return targets.avatars(folder, lit=True)
     if name == "weights":
         return targets.weights(folder)
+    if name == "splats":
+        return targets.splats(folder)
     if name == "images":
         return targets.images(avif=True)
     pose = targets.small_avatar(lit=False).source_pose
@@ -51,7 +53,7 @@ def batch(name: str, seed: int, first: int, last: int, report: Callable[[tuple[i
 def main() -> None:
     """Read the command line, run all batches and print what happened."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("target", choices=("avatars", "weights", "keypoints", "fits", "images"))
+    parser.add_argument("target", choices=("avatars", "weights", "keypoints", "fits", "images", "splats"))
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()

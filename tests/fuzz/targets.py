@@ -16,8 +16,11 @@ from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, CanonicalGaussians, HandLight, HandPose, Landmarks, Photo
 from oasis_warp.data.photo import read_photo
+from oasis_warp.data.splat_files import read_splats
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.keypoints import read_keypoints
+from oasis_warp.export import export_avatar
+from oasis_warp.export.page_data import splat_facts
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
@@ -96,6 +99,20 @@ def small_avatar(*, lit: bool) -> Avatar:
         gaussians=gaussians, source_pose=pose, source_camera=Camera(torch.eye(4), K, 160, 200),
         light=light if lit else None, invented=random(len(hand.template)) if lit else None,
     )  # fmt: skip
+
+
+def splats(folder: Path) -> Target:
+    """Files of Gaussians: what is taken goes into the page."""
+    files = {}
+    for ending in (".ply", ".compressed.ply", ".splat", ".spz"):
+        export_avatar(small_avatar(lit=False), folder / f"whole{ending}")
+        files[ending] = (folder / f"whole{ending}").read_bytes()
+
+    def read(path: Path) -> None:
+        _, arrays = splat_facts(read_splats(path))
+        assert all(np.isfinite(getattr(array, "numbers", array)).all() for array in arrays.values())
+
+    return Target(files, damaged_bytes, read)
 
 
 def avatars(folder: Path, *, lit: bool) -> Target:

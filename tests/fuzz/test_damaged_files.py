@@ -16,6 +16,11 @@ def test_damaged_avatars_are_refused_in_one_sentence_or_drawn_sanely(tmp_path):
 
 
 @pytest.mark.timeout(60)
+def test_damaged_gaussians_are_refused_in_one_sentence_or_shown(tmp_path):
+    assert outcomes(targets.splats(tmp_path), 60, tmp_path) == {"refused", "taken"}
+
+
+@pytest.mark.timeout(60)
 def test_damaged_weights_are_refused_in_one_sentence_or_finite(tmp_path):
     assert outcomes(targets.weights(tmp_path), 3, tmp_path) <= {"refused", "taken"}
 

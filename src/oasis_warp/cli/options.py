@@ -149,11 +149,15 @@ class Serve:
 class View:
     """Show an avatar in the browser: turn it, pose it, light it. Ctrl-C ends it.
 
-    The page comes from this machine and is for it alone: its address holds a token. `oasis export -o hand.html` writes
-    the same page as a file.
+    Gaussians of other programs are shown too, and turned: .ply, .compressed.ply, .splat and .spz. The page comes from
+    this machine and is for it alone: its address holds a token. `oasis export -o hand.html` writes the same page as a
+    file.
     """
 
-    avatar: AvatarFile
+    avatar: Positional[Path]
+    """avatar.safetensors of `oasis reconstruct`, or a file of Gaussians."""
+    photo: Path | None = None
+    """Photo to show beside it, such as the one it was made from."""
     port: int = 0
     """Port on 127.0.0.1; 0 takes a free one."""
     no_browser: bool = False

@@ -1,11 +1,14 @@
-"""`oasis view`: an avatar in the browser, served by this machine to itself."""
+"""`oasis view`: an avatar, or Gaussians of another program, in the browser, served by this machine to itself."""
 
 import sys
 import webbrowser
 
 from oasis_warp.cli.loopback import LoopbackHandler, LoopbackServer
 from oasis_warp.cli.options import View
-from oasis_warp.export.page_file import page_html
+from oasis_warp.data.photo import read_photo
+from oasis_warp.data.splat_files import READERS as SPLAT_ENDINGS
+from oasis_warp.data.splat_files import read_splats
+from oasis_warp.export.page_file import page_html, splats_html
 from oasis_warp.hand_avatar import Avatar
 
 
@@ -33,11 +36,16 @@ def run(options: View) -> int:
     """Serve the page until Ctrl-C.
 
     Raises:
-        InputError: a wrong avatar file, or a port that cannot be used.
+        InputError: a wrong avatar file, file of Gaussians or photo, or a port that cannot be used.
     """
-    page = page_html(Avatar.load(options.avatar), options.avatar.resolve().parent.name or options.avatar.stem)
+    photo = None if options.photo is None else read_photo(options.photo)
+    if options.avatar.suffix.lower() in SPLAT_ENDINGS:
+        page = splats_html(read_splats(options.avatar), options.avatar.stem, photo=photo)
+    else:
+        title = options.avatar.resolve().parent.name or options.avatar.stem
+        page = page_html(Avatar.load(options.avatar), title, photo=photo)
     with PageServer(page, options.port) as server:
-        serve(server, f"The avatar is at {server.address} until Ctrl-C.", no_browser=options.no_browser)
+        serve(server, f"{options.avatar.name} is at {server.address} until Ctrl-C.", no_browser=options.no_browser)
     return 0
 
 

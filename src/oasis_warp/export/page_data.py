@@ -19,7 +19,7 @@ from oasis_warp.core import surface
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, ORBIT_MARGIN
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.mirror import mirror_points
-from oasis_warp.core.types import HandPose
+from oasis_warp.core.types import Gaussians, HandPose
 from oasis_warp.hand.poses import POSE_NAMES, named_pose, pose_sequence
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops.sky_exposure import sky_directions
@@ -33,6 +33,10 @@ LEAST_RANGE = math.radians(12)
 """Angles that can move less have no slider."""
 WALK = ("open", "fist", "victory", "point", "ok")
 """Poses of the page's motion."""
+BULK = (0.01, 0.99)
+"""Quantiles of the means of foreign Gaussians, which the view frames: some float far away."""
+SPLATS_RADIUS = 0.1
+"""Of what the view frames then [m], a hand's."""
 WALK_FRAMES, WALK_SECONDS = 12, 7.5
 """Frames from one of them to the next, which the page blends, and length of the motion."""
 
@@ -91,6 +95,27 @@ def page_facts(
         "hasInvented": avatar.invented is not None,
     }
     return facts, _arrays(avatar, studio if parts.light is None else parts.light)
+
+
+def splat_facts(gaussians: Gaussians) -> tuple[dict[str, Any], dict[str, np.ndarray | Packed]]:
+    """Facts and arrays of Gaussians that cannot be posed, moved and scaled as a hand lies in its page."""
+    low, high = np.quantile(gaussians.means.numpy(), BULK, axis=0)
+    middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-9)
+    scale = SPLATS_RADIUS / size
+    facts = {
+        "poses": [], "motions": [], "joints": [], "lights": {}, "hasInvented": False,
+        "orbitMargin": ORBIT_MARGIN, "fieldOfView": ORBIT_FIELD_OF_VIEW,
+        "frame": {"target": [0, 0, 0], "radius": SPLATS_RADIUS},
+        "start": {"pose": None, "angles": [], "target": [0, 0, 0], "look": "file"},
+    }  # fmt: skip
+    arrays: dict[str, np.ndarray | Packed] = {
+        "means": ((gaussians.means.numpy() - middle) * scale).astype("<f4"),
+        "quats": _pack(gaussians.quats, "i2", 1.0),
+        "scales": _numpy(gaussians.scales * scale, "f4"),
+        "opacities": _pack(gaussians.opacities, "u1", 1.0),
+        "colors": _pack(gaussians.colors, "u1", 1.0),
+    }
+    return facts, arrays
 
 
 def _name_of(angles: Tensor, poses: dict[str, Tensor]) -> str | None:

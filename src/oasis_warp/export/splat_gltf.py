@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from oasis_warp.core.color import linear_light
+from oasis_warp.data.splat_files import SH_C0
 from oasis_warp.export.gltf import VERTICES, GltfBuffer, write_gltf
 from oasis_warp.export.request import ExportRequest
-from oasis_warp.export.splats import SH_C0, posed_splats
+from oasis_warp.export.splats import posed_splats
 
 EXTENSION = "KHR_gaussian_splatting"
 

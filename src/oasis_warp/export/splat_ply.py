@@ -6,8 +6,9 @@ import numpy as np
 import torch
 
 from oasis_warp.data.output_files import write_file
+from oasis_warp.data.splat_files import SH_C0
 from oasis_warp.export.request import ExportRequest
-from oasis_warp.export.splats import SH_C0, posed_splats, y_down
+from oasis_warp.export.splats import posed_splats, y_down
 
 LEAST_OPACITY = 1e-6
 """Distance of opacities from 0 and 1, where their logits end."""

@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from oasis_warp.data.output_files import write_file
+from oasis_warp.data.splat_files import SPLAT_ROW
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.splat_spz import to_bytes
 from oasis_warp.export.splats import posed_splats, y_down
-
-ROW = np.dtype([("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
 def write_splat(request: ExportRequest, path: Path) -> None:
@@ -22,7 +21,7 @@ def write_splat(request: ExportRequest, path: Path) -> None:
     """
     means, quats, scales, opacities, colors = (part.numpy() for part in y_down(posed_splats(request)))
     order = np.argsort(-scales.prod(1) * opacities, kind="stable")
-    rows = np.zeros(len(order), ROW)
+    rows = np.zeros(len(order), SPLAT_ROW)
     rows["mean"], rows["scales"] = means[order], scales[order]
     rows["rgba"] = to_bytes(255 * np.concatenate([colors, opacities[:, None]], 1)[order])
     rows["quat"] = to_bytes(128 + 128 * quats[order])

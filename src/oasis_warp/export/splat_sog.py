@@ -11,9 +11,10 @@ import numpy as np
 
 from oasis_warp import __version__
 from oasis_warp.data.output_files import write_file
+from oasis_warp.data.splat_files import SH_C0
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.splat_spz import to_bytes
-from oasis_warp.export.splats import SH_C0, largest_component, morton_order, posed_splats, y_down
+from oasis_warp.export.splats import largest_component, morton_order, posed_splats, y_down
 
 LEVELS = 256
 """Of scales and colours, evenly spaced: steps of 1 to 2 % of a scale, and finer than a byte of a colour."""

@@ -7,15 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from oasis_warp.data.output_files import write_file
+from oasis_warp.data.splat_files import SH_C0, SPZ_COLOR_SCALE, SPZ_MAGIC
 from oasis_warp.export.request import ExportRequest
-from oasis_warp.export.splats import SH_C0, largest_component, morton_order, posed_splats
+from oasis_warp.export.splats import largest_component, morton_order, posed_splats
 
-MAGIC, VERSION = 0x5053474E, 3
+VERSION = 3
 FRACTION_BITS = 20
 """Of means: steps of 0.95 um and a reach of 8 m. The reference encoder's 12 are steps of 0.24 mm, as far apart as the
 lines of skin."""
-COLOR_SCALE = 0.15
-"""A byte holds 0.5 + COLOR_SCALE f_dc."""
 SCALE_STEPS, SCALE_ZERO = 16, -10
 """A byte holds SCALE_STEPS (log scale - SCALE_ZERO): steps of 6 %, from 45 um on."""
 QUAT_STEPS = 511
@@ -34,11 +33,11 @@ def write_spz(request: ExportRequest, path: Path) -> None:
     parts = (
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3],
         to_bytes(255 * opacities[order]),
-        to_bytes(255 * (COLOR_SCALE * (colors[order] - 0.5) / SH_C0 + 0.5)),
+        to_bytes(255 * (SPZ_COLOR_SCALE * (colors[order] - 0.5) / SH_C0 + 0.5)),
         to_bytes(SCALE_STEPS * (np.log(scales[order]) - SCALE_ZERO)),
         pack_quats(quats[order]),
     )
-    header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(means), 0, FRACTION_BITS, 0, 0)
+    header = struct.pack("<IIIBBBB", SPZ_MAGIC, VERSION, len(means), 0, FRACTION_BITS, 0, 0)
     body = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
     write_file(path, gzip.compress(header + body, 9, mtime=0))  # no time, so that equal avatars are equal bytes
 

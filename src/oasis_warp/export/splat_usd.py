@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from oasis_warp.data.splat_files import SH_C0
 from oasis_warp.export.request import ExportRequest
-from oasis_warp.export.splats import SH_C0, posed_splats
+from oasis_warp.export.splats import posed_splats
 from oasis_warp.export.usd_stage import new_stage, quatf, usd, vec3f, write_stage
 
 EXTENT = 3

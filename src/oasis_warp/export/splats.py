@@ -15,8 +15,6 @@ from oasis_warp.export.request import ExportRequest
 
 LEAST_SCALE, MOST_SCALE = 1e-6, 0.02
 """Standard deviations that leave [m]: thinner than any skin, wider than a finger. Viewers hang on huge ones."""
-SH_C0 = 0.28209479177387814
-"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 f_dc (Kerbl et al. 2023)."""
 HALF_TURN = (1.0, -1.0, -1.0)
 """Diagonal of the half turn about x, from y down and z forward to y up and z to the viewer, and back."""
 

@@ -15,7 +15,9 @@ function make(tag, properties, ...children) {
 
 function fillPanel(viewer) {
   const { facts } = viewer;
-  byId("facts").textContent = `${facts.side === "left" ? "Left" : "Right"} hand, ${facts.count.toLocaleString("en")} Gaussians`;
+  const kind = { left: "Left hand, ", right: "Right hand, " }[facts.side] ?? "";
+  byId("facts").textContent = `${kind}${facts.count.toLocaleString("en")} Gaussians`;
+  if (!facts.side) for (const part of ["pose", "look", "joints"]) byId(`${part}-title`).parentElement.hidden = true;
   const player = { viewer, playing: false, time: 0, last: 0, ease: null, sliders: [], chips: new Map() };
   for (const pose of facts.poses) {
     const chip = make("button", { type: "button", textContent: pose.label, onclick: () => changePose(player, pose) });
@@ -24,7 +26,7 @@ function fillPanel(viewer) {
   }
   markPose(player, facts.start.pose);
   fillMotion(player);
-  fillLooks(viewer);
+  if (facts.side) fillLooks(viewer);
   fillJoints(player);
   fillViews(viewer);
   viewer.tick = (now) => advance(player, now);
@@ -161,12 +163,19 @@ function fillJoints(player) {
 }
 
 function fillViews(viewer) {
+  if (!viewer.facts.side) byId("front").textContent = "Front";
   byId("front").onclick = () => goHome(viewer, 0);
   byId("back").onclick = () => goHome(viewer, Math.PI);
   byId("save").onclick = async () => {
     const blob = await takePicture(viewer), link = make("a", { href: URL.createObjectURL(blob), download: "hand.png" });
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  };
+  const photo = byId("photo"), compare = byId("compare");
+  compare.hidden = !photo;
+  compare.onclick = () => {
+    photo.hidden = !photo.hidden;
+    compare.setAttribute("aria-pressed", String(!photo.hidden));
   };
   byId("fold").onclick = () => {
     const folded = byId("panel").classList.toggle("folded");

@@ -5,6 +5,7 @@ let hand = null;
 
 async function openHand(base64) {
   const data = await readData(base64);
+  if (data.arrays.means) return openSplats(data);
   for (const light of Object.values(data.lights)) light.seen = light.albedo ? data.arrays.seen : null;
   const body = makeBody(data), gaussians = makeGaussians(body);
   return {
@@ -32,7 +33,9 @@ function paintHand({ body, gaussians, shading }, look, hurry) {
 // One picture. Nothing is computed again that did not change. In a hurry colours are new in every other picture and
 // shadows may lag behind, and if `facing` skin that faces away is left out; the next picture without a hurry makes up
 // for it.
-function drawHand(hand, { angles, look, camera, hurry = false, facing = false }) {
+function drawHand(hand, wish) {
+  if (!hand.body) return drawSplats(hand, wish);
+  const { angles, look, camera, hurry = false, facing = false } = wish;
   const { body, gaussians, shading, projection } = hand, key = angles.join(), moved = key !== hand.angles;
   if (moved) poseHand(hand, angles);
   const { target, radius } = camera.target ? camera : frameSurface(body.posed);
@@ -53,13 +56,13 @@ if (typeof self !== "undefined" && typeof WorkerGlobalScope !== "undefined") {
     try {
       if (message.open) {
         hand = await openHand(message.open);
-        const { arrays, ...facts } = hand.body.data;
+        const { arrays, ...facts } = (hand.body ?? hand).data;
         self.postMessage({ opened: { ...facts, count: hand.gaussians.count } });
         return;
       }
       const start = performance.now(), { ellipses, count } = drawHand(hand, message);
       const took = performance.now() - start;
-      self.postMessage({ id: message.id, ellipses, count, hurry: message.hurry, took }, [ellipses.buffer]);
+      self.postMessage({ id: message.id, ellipses, count, hurry: message.hurry && Boolean(hand.body), took }, [ellipses.buffer]);
     } catch (error) {
       self.postMessage({ failed: String(error.stack ?? error) });
     }
