@@ -15,6 +15,7 @@ from studies.harness import Row, StudyOptions
 from studies.tables import markdown, section_of
 
 REPORTS = ("certification", "grid")
+FILES = tuple(f"{name}.json" for name in REPORTS)
 
 
 @dataclass(frozen=True, kw_only=True)

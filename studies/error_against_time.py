@@ -20,6 +20,7 @@ from studies.tables import Section, markdown, power
 FORWARD, BOTH = "forward", "forward + backward"
 Groups = dict[tuple[str, str, str], Group]
 """By operator, scene and pass."""
+FILES = ("error_time/error_time.json",)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,6 +48,7 @@ CROP = 256
 MARGIN = 0.0015
 """Of visibility, as the network sees it [m]."""
 PARTS = ("angles", "orientation", "translation", "shape", "K")
+FILES = ("estimator_errors/tables.json",)
 OUTCOMES = {
     "a hand found": ("fitted", "refused", "wrong side"),
     "of the right side": ("fitted", "refused"),

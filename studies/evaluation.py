@@ -31,6 +31,7 @@ from studies.harness import Row, StudyOptions
 from studies.tables import markdown, section_of, write_jpeg
 
 FOLDERS = {"synthetic": "evaluation", "same-hand": "same_hand_photos"}
+FILES = tuple(f"{folder}/metrics.json" for folder in FOLDERS.values())
 PICTURES = {"evaluation_sheet": "evaluation/sheet.png", "evaluation_attention": "evaluation/attention.png",
             "same_hand_sheet": "same_hand_photos/sheet.png"}  # fmt: skip
 """Pictures of docs/_static and where they come from."""

@@ -5,10 +5,12 @@ A study is a module of this package. The first line of its docstring describes i
 - `Options`, a dataclass derived from `StudyOptions`: its fields are the flags of the command;
 - `run(options)`, which measures and returns rows, dictionaries that JSON can hold;
 - `SECTIONS`, what it fills in the pages of docs (see `tables`);
-- where its rows do not come from `run`, `load(out)`, which reads them from the files that another command has left;
+- where its rows do not come from `run`, `load(out)`, which reads them from the files that another command has left, and
+  `FILES`, the names of these files;
 - where it draws pictures from rows, `draw(rows, static)`, which writes them below docs/_static.
 
 Results stand in the folder OUT/NAME. A study that is interrupted goes on where it stopped when it is run again.
+`python -m studies render` copies them to studies/results and fills the pages from there; `age` says how old they are.
 """
 
 import json

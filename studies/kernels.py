@@ -35,6 +35,7 @@ from studies.tables import Column, Section, power, section_of, short, table, yes
 
 GROUPS, SECONDS = 11, 2.0
 """Groups of calls of each case, and seconds for each point of the scaling: those of `oasis bench`."""
+FILES = ("speed.json", "speed_threads.json", "gpu/kernels.json", "gpu/scaling.json", "gpu/roofline.json")
 
 
 times = "{:.1f}x".format

@@ -24,6 +24,7 @@ from studies.tables import Column, Section, markdown, table, write_jpeg
 
 FOLDERS = {"0.2.0": "looks_0.2.0", "now": "looks"}
 """Folders of results by what they are called in tables."""
+FILES = (f"{FOLDERS['now']}/metrics.json",)
 SHOWN = {
     "looks_best": "back_flat_right_04", "looks_worst_1": "thumb_up_left_06",
     "looks_worst_2": "pointing_side_right_11", "looks_worst_3": "backs_two_left_05",

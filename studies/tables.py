@@ -174,18 +174,23 @@ def fill(page: str, marker: str, text: str, commit: str = "") -> str:
     return parts.sub(lambda _: f"{begin}\n{text}\n<!-- end of {marker} -->", page)
 
 
-def render(sections: Sequence[Section], rows: list[Row], docs: Path) -> list[str]:
-    """Fill the sections of a study into the pages below `docs`, and return what was filled."""
+def commits_of(rows: Iterable[Row]) -> str:
+    """The commits that rows were measured at."""
     commits = list(dict.fromkeys(str(row["commit"]) for row in rows if row.get("commit")))
     if len(commits) > 2:  # a run that went on while work was committed
         commits = [f"{commits[0]} to {commits[-1]}"]
+    return ", ".join(commits)
+
+
+def render(sections: Sequence[Section], rows: list[Row], docs: Path) -> list[str]:
+    """Fill the sections of a study into the pages below `docs`, and return what was filled."""
     filled = []
     for page, marker, text in sections:
         made = text(rows) if page else None
         if page is None or made is None:
             continue
         path = docs / page
-        write_file(path, fill(path.read_text(), marker, made, ", ".join(commits)).encode())
+        write_file(path, fill(path.read_text(), marker, made, commits_of(rows)).encode())
         filled.append(f"{page}: {marker}")
     return filled
 

@@ -74,7 +74,7 @@ def test_studies_are_listed_with_a_line_each(capsys):
     assert command.main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == NAMES and all(line.endswith(".") for line in lines)
-    with pytest.raises(SystemExit, match="expected list, render or the name of a study, got fitt"):
+    with pytest.raises(SystemExit, match="expected list, render, age or the name of a study, got fitt"):
         command.main(["fitt"])
 
 
@@ -189,11 +189,11 @@ def test_evaluations_fill_their_pages(tmp_path):
     (tmp_path / "evaluation" / "metrics.json").write_text(json.dumps(found))
     for name in ("evaluation.md", "prior.md"):
         (tmp_path / name).write_text((DOCS / name).read_text())
-    command.render(["evaluation"], tmp_path, tmp_path)
+    command.render(["evaluation"], tmp_path, tmp_path, tmp_path / "kept")
     filled = (tmp_path / "evaluation.md").read_text()
     assert "| mean one-shot | true pose | 21.00 | +1.00 | 0.00 | 100% |" in filled
     assert "| method | true pose | estimated | errors x 2 |" in filled
     assert "| mean calibrated | 20.00 | 20.00 | 20.00 |" in filled
     assert "2 people, 1 targets each, 64 px." in filled and evaluation.FOLDERS["same-hand"] in filled
-    command.render(["evaluation"], tmp_path, tmp_path)
+    command.render(["evaluation"], tmp_path, tmp_path, tmp_path / "kept")
     assert (tmp_path / "evaluation.md").read_text() == filled

@@ -37,7 +37,7 @@ def docs(tmp_path):
 
 def test_every_table_of_the_page_is_filled(out, docs):
     pytest.importorskip("matplotlib")
-    render(["kernels"], out, docs)
+    render(["kernels"], out, docs, out / "kept")
     text = (docs / "gpu.md").read_text()
     assert "Not measured yet." not in text
     assert "| 37k at 512 x 512 | forward + backward | 0.25 | 0.1 | 0.11 |" in text
@@ -48,7 +48,7 @@ def test_every_table_of_the_page_is_filled(out, docs):
     pictures = {p.name for p in (docs / "_static").iterdir()}
     assert pictures == {"gpu_kernels.png", "gpu_scaling.png", "gpu_roofline.png"}
     assert all(f"(_static/{name})" in text for name in pictures)
-    render(["kernels"], out, docs)
+    render(["kernels"], out, docs, out / "kept")
     assert (docs / "gpu.md").read_text() == text
 
 
@@ -59,7 +59,7 @@ def test_what_was_not_measured_stays_on_the_page(monkeypatch, out, docs):
     part = re.compile(r"(<!-- (?!end of)[a-z]+ -->\n).*?(<!-- end)", re.DOTALL)
     blank = part.sub(r"\1Not measured yet.\n\2", (docs / "gpu.md").read_text())
     (docs / "gpu.md").write_text(blank)
-    render(["kernels"], out, docs)
+    render(["kernels"], out, docs, out / "kept")
     assert blank.count("Not measured yet.") == 4
     assert (docs / "gpu.md").read_text().count("Not measured yet.") == 3
 
