@@ -6,6 +6,7 @@ twice along uneven paths; haemoglobin (70 % oxygenated) absorbs in the dermis, w
 eight measured skin colours from CIELAB L 72 to L 30, all within 1.6 units.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -92,8 +93,10 @@ def _bump(x: Tensor, center: float, width: float) -> Tensor:
     return torch.exp(-(((x - center) / width) ** 2))
 
 
+@functools.lru_cache(4)
+@torch.inference_mode(False)  # what is kept may be read where gradients are wanted
 def label_regions(hand: HandModel) -> Regions:
-    """Soft region labels from the model's bone coordinates."""
+    """Soft region labels from the model's bone coordinates; kept, so not to be written to."""
     edges = surface.mesh_edges(hand.faces)
     toward_palm = 0.5 - 0.5 * torch.cos(hand.bone_theta)
     palm = surface.smooth_over_mesh(toward_palm[:, None], edges, PALM_SMOOTHING)[:, 0]

@@ -1,5 +1,6 @@
 """What a hand looks like before its photo is fitted: the interface, and the prior that knows mean colours only."""
 
+import functools
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -51,6 +52,15 @@ class MeanHand(NamedTuple):
     """Logarithm of the photo's colours over `colors`, posterior mean."""
 
 
+@functools.lru_cache(4)
+@torch.inference_mode(False)
+def tone_table(hand: HandModel) -> tuple[Float[Tensor, "T"], Float[Tensor, "T V 3"]]:
+    """Logarithms of the melanin of `TONES` skin tones, and the colours of the hand in each; kept, not to be written."""
+    tones = torch.linspace(math.log(LIGHTEST), math.log(DARKEST), TONES)
+    regions = label_regions(hand)
+    return tones, torch.stack([region_colors(regions, math.exp(tone)) for tone in tones.tolist()])
+
+
 class MeanHands(nn.Module):
     """Skin tones and mean colours from observed colours; nothing to learn, nothing that is saved."""
 
@@ -59,9 +69,7 @@ class MeanHands(nn.Module):
 
     def __init__(self, hand: HandModel):
         super().__init__()
-        tones = torch.linspace(math.log(LIGHTEST), math.log(DARKEST), TONES)
-        regions = label_regions(hand)
-        colors = torch.stack([region_colors(regions, math.exp(tone)) for tone in tones.tolist()])
+        tones, colors = tone_table(hand)
         self.register_buffer("log_tones", tones, persistent=False)
         self.register_buffer("table", colors, persistent=False)
 
