@@ -5,6 +5,7 @@ Fills docs/prior.md (file, training, gaussians).
 
 import hashlib
 import json
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -13,7 +14,7 @@ import torch
 
 from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import INSET
-from oasis_warp.avatar.observation import source_photos
+from oasis_warp.avatar.observation import CropBatch, source_photos
 from oasis_warp.core import surface
 from oasis_warp.evaluation.held_out import CaptureConfig, capture_person, estimated_batch
 from oasis_warp.hand.template import bundled_hand
@@ -77,24 +78,30 @@ def shown(value: object) -> str:
     return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
 
 
+def estimated_photos(count: int) -> Iterator[CropBatch]:
+    """A synthetic photo of each of so many people."""
+    capture = CaptureConfig(targets=1)
+    for number in people(count):
+        person = capture_person(capture, "ordinary", number, torch.device("cpu"))
+        yield source_photos(estimated_batch(bundled_hand(), person, "wild", capture, 1.0))
+
+
 @torch.no_grad()
-def gaussian_table(network: HandNetwork, photos: int) -> str:
-    """What the Gaussians of the guess are like: quantiles over those of so many synthetic photos.
+def gaussian_table(network: HandNetwork, photos: Iterable[CropBatch]) -> str:
+    """What the Gaussians of the guess are like: quantiles over those of photos of one hand each.
 
     The distance under the skin is along its normal. A face's Gaussian may leave the middle of its face, and the face's
     features need not be the mean of its corners' (the paper's Feature-on-Mesh, equation 7).
     """
-    hand, capture = bundled_hand(), CaptureConfig(targets=1)
+    hand = bundled_hand()
     found: dict[str, list[torch.Tensor]] = {}
 
     def add(kind: str, values: dict[str, torch.Tensor]) -> None:
         for name, each in values.items():
             found.setdefault(f"{kind}: {name}", []).append(each)
 
-    for number in people(photos):
-        person = capture_person(capture, "ordinary", number, torch.device("cpu"))
-        batch = estimated_batch(hand, person, "wild", capture, 1.0)
-        guess, rest = network(source_photos(batch)), batch.rest[0]
+    for batch in photos:
+        guess, rest = network(batch), batch.rest[0]
         n = guess.offsets.shape[1]
         deep = INSET - (guess.offsets[0] * surface.vertex_normals(rest, hand.faces)).sum(-1)
         shapes = _shapes(guess.opacities[0, :n], guess.scales[0, :n])
@@ -124,7 +131,7 @@ def run(options: Options) -> list[Row]:
         network = load_network(weights, bundled_hand()).eval()
         texts = {
             "file": file_table(weights), "training": training_text(weights),
-            "gaussians": gaussian_table(network, options.people),
+            "gaussians": gaussian_table(network, estimated_photos(options.people)),
         }  # fmt: skip
     return write_rows(options.out / "prior_card", [{"section": name, "text": text} for name, text in texts.items()])
 

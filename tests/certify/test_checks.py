@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures(
 )  # thousands of small calls, and the type checks cost more than they do
 
 
-@pytest.mark.parametrize("repeats", [17, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("repeats", [5, pytest.param(60, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FAMILIES)
 def test_repeats_on_one_two_and_three_threads_give_the_same_bits(name, repeats, device):
     family = FAMILIES[name]

@@ -1,5 +1,6 @@
 """An operator is what torch expects of a custom op: one node of a graph, whose plain calls bypass the dispatcher."""
 
+import contextlib
 import gc
 import importlib
 import inspect
@@ -69,8 +70,11 @@ def test_functions_without_a_gradient_compile_into_one_graph(as_shipped):
     [*((name, torch.float32) for name in ONE_OF_EACH), *((name, torch.float64) for name in OTHERS_IN_FLOAT64)],
 )
 def test_what_torch_is_told_of_an_operator_is_true(name, dtype):
-    call = calls(dtype=dtype, n_poses=2)[name]
+    call = calls(n=2, dtype=dtype, n_poses=2)[name]
     leaves = call.leaves()
+    checked = ["test_schema", "test_faketensor"]
+    if dtype == torch.float32:  # traced, which takes longest, both precisions are alike
+        checked += ["test_autograd_registration", "test_aot_dispatch_dynamic"]
     with Watched() as watched:
         gradients(call.function(*leaves), leaves)
     for op, arguments in watched.seen:
@@ -81,7 +85,7 @@ def test_what_torch_is_told_of_an_operator_is_true(name, dtype):
             a.detach().requires_grad_(needs_gradient and a.is_floating_point()) if isinstance(a, torch.Tensor) else a
             for a in arguments
         ]
-        torch.library.opcheck(getattr(torch.ops.oasis_warp, op).default, tuple(arguments))
+        torch.library.opcheck(getattr(torch.ops.oasis_warp, op).default, tuple(arguments), test_utils=checked)
 
 
 def test_what_torch_is_told_of_ops_that_need_no_gradient_is_true(dtype):
@@ -105,18 +109,14 @@ def test_a_plain_call_has_the_bits_of_the_custom_op(name):
     assert_same_bits(results(name), through_torch)
 
 
-@EACH
-def test_a_plain_call_does_not_pass_through_the_dispatcher(name):
-    def ours(run):
-        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
-            run()
-        return [event.key for event in profile.key_averages() if event.key.startswith("oasis_warp::")]
+def test_plain_calls_do_not_pass_through_the_dispatcher():
+    def dispatched(mode):
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile, mode:
+            for name in ONE_OF_EACH:
+                results(name)
+        return {event.key for event in profile.key_averages() if event.key.startswith("oasis_warp::")}
 
-    def watched():
-        with Watched():
-            results(name)
-
-    assert ours(watched) and not ours(lambda: results(name))
+    assert len(dispatched(Watched())) >= len(ONE_OF_EACH) and not dispatched(contextlib.nullcontext())
 
 
 @EACH
@@ -188,7 +188,6 @@ def test_inputs_that_changed_under_the_graph_are_refused(name):
 @EACH
 def test_nothing_lives_longer_than_its_graph(name, backward):
     call = calls()[name]
-    gc.collect()
     gc.disable()  # reference counts alone have to do it: a cycle would hold the memory until the next collection
     try:
         leaves = call.leaves()

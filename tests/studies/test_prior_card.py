@@ -4,7 +4,10 @@ import json
 from dataclasses import replace
 
 import pytest
+import torch
+from synthetic import crop_of
 
+from oasis_warp.avatar.observation import batch_of_crop
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, save_network
@@ -19,7 +22,7 @@ NOTES = {
 @pytest.fixture(scope="module")
 def weights(hand, tmp_path_factory):
     path = tmp_path_factory.mktemp("weights") / "network.safetensors"
-    small = replace(COMPACT, width=32, heads=2, n_tokens=16, n_coarse=64, refine_layers=1, head_width=16)
+    small = replace(COMPACT, image_size=32, width=32, heads=2, n_tokens=16, n_coarse=64, refine_layers=1, head_width=16)
     save_network(path, HandNetwork(small, hand), notes=json.dumps(NOTES))
     return path
 
@@ -45,7 +48,8 @@ def test_the_command_that_retrains_is_one_that_the_command_line_takes(weights):
 
 
 def test_an_untrained_prior_has_the_gaussians_of_the_mean_hand(weights, hand):
-    lines = gaussian_table(load_network(weights, hand).eval(), 1).splitlines()
+    crop, _, _ = crop_of(hand, torch.full_like(hand.template, 0.5), size=32)
+    lines = gaussian_table(load_network(weights, hand).eval(), [batch_of_crop(crop)]).splitlines()
     rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in lines}
     assert [float(cell) for cell in rows["on vertices: opacity"]] == [0.95] * 3
     assert [float(cell) for cell in rows["on vertices: under the skin, mm"]] == [0.8] * 3
