@@ -102,7 +102,7 @@ def test_the_command_line_offers_every_pose():
 
 @pytest.mark.parametrize(
     ("command", "answer"),
-    [("reconstrct", "did you mean 'reconstruct'?\n"), ("frobnicate", "expected one of reconstruct, render, ")],
+    [("reconstrct", "did you mean 'reconstruct'?\n"), ("frobnicate", "expected one of reconstruct, batch, render, ")],
 )
 def test_a_mistyped_command_is_answered_with_the_nearest_one(command, answer, capsys):
     with pytest.raises(SystemExit):

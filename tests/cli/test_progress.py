@@ -4,7 +4,7 @@ import pytest
 from rich.console import Console
 
 from oasis_warp.cli.console import line_progress, show_run
-from oasis_warp.cli.progress import EDIT_PLAN, USUAL_STEPS, Run, reconstruct_plan
+from oasis_warp.cli.progress import EDIT_PLAN, USUAL_STEPS, ManyPhotos, Run, reconstruct_plan
 from oasis_warp.core.config import ReconstructConfig
 
 
@@ -108,6 +108,22 @@ def test_lines_of_a_photo_begin_anew_after_one_that_failed():
         progress(stage, 1, 1)
     progress("fit", 1, 1)  # also said by what works within it
     assert lines == ["photo 2 of 2, landmarks: 1.0 s", "photo 2 of 2, fit: 1.0 s"]
+
+
+def test_the_time_left_for_many_photos_follows_those_that_took_work():
+    clock = Clock()
+    run = ManyPhotos(1000, ReconstructConfig(), 2, clock=clock)
+    planned = 1000 * sum(step.seconds for step in reconstruct_plan(ReconstructConfig(), 1)) / 2
+    assert run.left == pytest.approx(planned)
+    run.count(0, 400)  # found done, at once
+    assert run.left == pytest.approx(0.6 * planned)
+    for made in range(1, 201):
+        clock.now += 3.0 if made < 100 else 1.0  # more workers came
+        run.count(made, 400)
+    assert run.share == 0.6 and run.what == "600 of 1000 photos"
+    assert run.left == pytest.approx(400, rel=0.1)
+    clock.now += 5
+    assert run.left == pytest.approx(395, rel=0.1)
 
 
 def test_on_a_terminal_there_is_one_bar_of_eighty_columns():

@@ -9,7 +9,7 @@ import pytest
 from disk import full_disk
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.data.output_files import output_file, output_folder, write_file
+from oasis_warp.data.output_files import new_folder, output_file, output_folder, remove_leftovers, write_file
 
 
 def everything(folder: Path) -> dict[str, bytes | None]:
@@ -235,3 +235,19 @@ def test_an_error_that_has_nothing_to_do_with_the_output_passes_unchanged(tmp_pa
         with pytest.raises(FileNotFoundError), writer(tmp_path / "out"):
             (tmp_path / "some input").read_text()
     assert everything(tmp_path) == {}
+
+
+def test_of_two_runs_that_make_a_new_folder_the_first_makes_it(tmp_path):
+    with new_folder(tmp_path / "ab" / "key") as late:
+        (late / "file").write_text("late")
+        with new_folder(tmp_path / "ab" / "key") as first:
+            (first / "file").write_text("first")
+    assert [path.read_text() for path in tmp_path.rglob("*") if path.is_file()] == ["first"]
+
+
+def test_what_killed_runs_left_of_any_output_can_be_removed(tmp_path):
+    for name in (".one.01234567.part", ".two.89abcdef.part.json", "whole", ".hidden"):
+        (tmp_path / name).touch()
+    with output_file(tmp_path / "now") as part:
+        remove_leftovers(tmp_path)
+        assert {path.name for path in tmp_path.iterdir()} == {part.name, "whole", ".hidden"}

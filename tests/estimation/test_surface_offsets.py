@@ -6,7 +6,7 @@ import torch
 from oasis_warp.estimation.fit_problem import mirrored_fit
 from oasis_warp.estimation.fit_quality import iou_above_wrist
 from oasis_warp.estimation.outline import silhouette
-from oasis_warp.estimation.surface_offsets import LONGEST, outline_offsets
+from oasis_warp.estimation.surface_offsets import LONGEST, crossing, outline_offsets
 
 RIGHT, LEFT = "victory_right_09.jpg", "ok_sign_left_10.jpg"
 
@@ -132,3 +132,8 @@ def test_two_photos_share_one_surface_between_their_outlines(hand, kinematics, f
     assert np.all(np.diff([part[told].mean() for part in out]) > 1e-4)
     assert iou(kinematics, fit, shared) > iou(kinematics, fit, thinner)
     assert iou(kinematics, thin, shared) > iou(kinematics, thin, alone)
+
+
+def test_a_hand_of_so_few_pixels_that_no_vertex_is_on_its_outline_has_no_crossings():
+    nowhere = np.zeros((0, 2))
+    assert crossing(np.ones((64, 64), np.float32), nowhere, nowhere, 3.0).shape == (0,)

@@ -18,6 +18,7 @@ from oasis_warp.core.errors import InputError, did_you_mean, one_line, shortened
 
 Command = (
     Annotated[options.Reconstruct, tyro.conf.subcommand("reconstruct")]
+    | Annotated[options.Batch, tyro.conf.subcommand("batch")]
     | Annotated[options.Render, tyro.conf.subcommand("render")]
     | Annotated[options.Animate, tyro.conf.subcommand("animate")]
     | Annotated[options.Export, tyro.conf.subcommand("export")]

@@ -88,7 +88,10 @@ class _RunBar(Bars):
 
 
 def _left(run: Run) -> str:
-    return f"{100 * run.share:.0f} %, about {max(1, round(run.left))} s left"
+    minutes, seconds = divmod(max(1, round(run.left)), 60)
+    hours, minutes = divmod(minutes, 60)
+    left = f"{hours} h {minutes} min" if hours else f"{minutes} min" if minutes > 9 else f"{60 * minutes + seconds} s"
+    return f"{100 * run.share:.0f} %, about {left} left"
 
 
 def bar_progress(bars: Bars) -> Progress:

@@ -51,6 +51,29 @@ class Reconstruct(ReconstructConfig, _Photos):
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Batch:
+    source: Positional[Path]
+    """Folder with photos, at any depth, or a text file with the name of a photo on each line."""
+    out: OutputFolder
+    workers: int | None = None
+    """Processes on this machine, of one thread and about 1 GB each; as many as it has cores when not given."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler, tcp://HOST:8786, whose workers take the photos; all see the same folders."""
+    pictures: bool = False
+    """Write summary.png, quality.png and turntable.mp4 of every photo too."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch(ReconstructConfig, _Batch):
+    """Turn thousands of photos into avatars, on all cores or on a cluster. Needs the extra "batch".
+
+    A photo's results go into a folder whose name is made from the photo, the settings and the version;
+    --out/manifest.jsonl says which, or in words why there is none. Whatever stops the work, the same command goes on
+    with the photos that are missing.
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
 class Render:
     """Draw an avatar: one picture of any pose from any side."""
 

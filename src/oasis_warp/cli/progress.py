@@ -1,6 +1,7 @@
 """The progress of a whole run: its share that is done, and the time that the rest takes."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -10,6 +11,8 @@ FAMILIAR = 0.3
 """Seconds of work after which what a run has taken counts as much for its speed as what a plan says."""
 NEARLY = 0.95
 """Most of a step that counts as done while it is not."""
+LAST_PHOTOS = 100
+"""Photos by which the pace of several workers is judged, and one more that takes its time by plan."""
 USUAL_STEPS = 84
 """Steps of texture learning of 5 of 6 photos of the tests; its limit is 400."""
 
@@ -135,3 +138,49 @@ class Run:
         """Seconds that the rest of the run takes."""
         done, here, pace = self._work()
         return (self._total - done) * pace - min(self._clock() - self._since, NEARLY * here * pace)
+
+
+class ManyPhotos(Run):
+    """The progress of photos that several workers make: a number of them and not their stages.
+
+    The rest takes as long as the last photos that took any work, whichever workers came or went.
+    """
+
+    def __init__(
+        self, n_photos: int, config: ReconstructConfig, n_workers: int, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        step = Step("photos", sum(step.seconds for step in reconstruct_plan(config, 1)) / n_workers)
+        super().__init__([step], clock=clock)
+        self._n = max(1, n_photos)
+        self._ready = 0
+        self._ended = deque([(0, self._started)], maxlen=LAST_PHOTOS)
+
+    def count(self, made: int, kept: int) -> None:
+        """Say how many photos have been worked on in this run, and how many were there before."""
+        if made > self._ended[-1][0]:
+            self._ended.append((made, self._clock()))
+        self._ready = made + kept
+
+    @property
+    def done(self) -> tuple[int, int]:
+        """Photos that are done, and all."""
+        return self._ready, self._n
+
+    @property
+    def what(self) -> str:
+        """The same in words."""
+        return f"{self._ready} of {self._n} photos"
+
+    @property
+    def share(self) -> float:
+        """Of the photos that are done, 0 to 1."""
+        self._shown = max(self._shown, self._ready / self._n)
+        return self._shown
+
+    @property
+    def left(self) -> float:
+        """Seconds that the rest of the run takes."""
+        (first, since), (last, until) = self._ended[0], self._ended[-1]
+        planned = self._plan[0].seconds
+        pace = (until - since + planned) / (last - first + 1)
+        return max(0.0, (self._n - self._ready) * pace - (self._clock() - until))

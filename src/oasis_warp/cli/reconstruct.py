@@ -19,7 +19,8 @@ from oasis_warp.cli.report import make_report, print_report, to_json
 from oasis_warp.cli.summary import GROUND, draw_quality, draw_summary
 from oasis_warp.core.config import ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.logging import Progress, timed_stage
+from oasis_warp.core.logging import Progress, silent, timed_stage
+from oasis_warp.core.types import Photo
 from oasis_warp.data.films import write_video
 from oasis_warp.data.output_files import make_folders, output_folder
 from oasis_warp.data.photo import read_photo
@@ -27,7 +28,7 @@ from oasis_warp.data.pictures import write_picture
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand, palm_and_back
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.weights_file import read_header
-from oasis_warp.reconstruction import reconstruct, reconstruct_same_hand
+from oasis_warp.reconstruction import FusedReconstruction, Reconstruction, reconstruct, reconstruct_same_hand
 
 TURNTABLE_FRAMES, TURNTABLE_FPS, TURNTABLE_SIZE = 48, 16.0, 320
 
@@ -150,19 +151,31 @@ def _write_folder(
             made = reconstruct(photos[0], config, keypoints=keypoints, progress=progress)
         else:
             made = reconstruct_same_hand(photos, config, progress=progress)
-        avatar, names = made.avatar, ", ".join(photo.name for photo in photos)
-        seconds.update(made.stages)
+        return write_results(part, photos, made, config, seconds, progress=progress)
+
+
+def write_results(
+    folder: Path, photos: Sequence[Photo], made: Reconstruction | FusedReconstruction, config: ReconstructConfig,
+    seconds: dict[str, float], *, pictures: bool = True, progress: Progress = silent,
+) -> dict[str, Any]:  # fmt: skip
+    """Write the avatar, its report and, if asked for, its pictures to a folder that is there; the report.
+
+    `seconds` of what came before are continued.
+    """
+    avatar, names = made.avatar, ", ".join(photo.name for photo in photos)
+    seconds.update(made.stages)
+    if pictures:
         with timed_stage("summary", seconds, progress):
-            write_picture(part / "summary.png", draw_summary(photos, made, progress=progress))
-            write_picture(part / "quality.png", draw_quality(names, avatar, made.quality))
+            write_picture(folder / "summary.png", draw_summary(photos, made, progress=progress))
+            write_picture(folder / "quality.png", draw_quality(names, avatar, made.quality))
         with timed_stage("turntable", seconds, progress):
             frames = turntable(
                 avatar, avatar.source_pose, TURNTABLE_FRAMES, TURNTABLE_SIZE, elevation=0.0, background=GROUND,
                 progress=progress,
             )  # fmt: skip
-            write_video(part / "turntable.mp4", frames, TURNTABLE_FPS)
-        with timed_stage("save", seconds, progress):
-            avatar.save(part / "avatar.safetensors")
-        report = make_report(photos, made, config, seconds)
-        (part / "report.json").write_text(to_json(report))
+            write_video(folder / "turntable.mp4", frames, TURNTABLE_FPS)
+    with timed_stage("save", seconds, progress):
+        avatar.save(folder / "avatar.safetensors")
+    report = make_report(photos, made, config, seconds)
+    (folder / "report.json").write_text(to_json(report))
     return report

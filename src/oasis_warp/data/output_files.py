@@ -101,6 +101,32 @@ def output_folder(path: Path | str) -> Iterator[Path]:
             _move_files(part, final)
 
 
+@contextlib.contextmanager
+def new_folder(path: Path | str) -> Iterator[Path]:
+    """Yield a temporary folder that becomes `path` when the block ends, unless `path` is there by then.
+
+    For folders whose names say what is in them: of several processes that make the same one, the first makes it.
+
+    Raises:
+        InputError: see `output_folder`.
+    """
+    final = Path(os.path.realpath(path))
+    with _explained(path, final), _folder(path, final.parent), _part(Path.mkdir, final.parent, final.name) as part:
+        yield part
+        for file in part.iterdir():
+            _flush(file)
+        try:
+            os.rename(part, final)
+        except OSError:
+            if not final.is_dir():
+                raise
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what killed runs left in `folder`, of whatever output; what another process works on stays."""
+    _recover(folder, None)
+
+
 def _check_file(path: Path | str, final: Path) -> None:
     if final.is_dir():
         raise InputError(f"{path}: expected a file to write, found a folder; add a file name.")
@@ -143,9 +169,9 @@ def _part(make: Callable[[Path], object], folder: Path, stem: str, suffix: str =
         os.close(lock)
 
 
-def _recover(folder: Path, stem: str, suffix: str = "") -> None:
-    """Remove what killed runs left of the same output, and move what was whole."""
-    start, end = re.escape(f".{stem[:_LONGEST]}."), re.escape(suffix[:_LONGEST])
+def _recover(folder: Path, stem: str | None, suffix: str = "") -> None:
+    """Remove what killed runs left of the same output, or of any, and move what was whole."""
+    start, end = (r"\..*\.", ".*") if stem is None else map(re.escape, (f".{stem[:_LONGEST]}.", suffix[:_LONGEST]))
     name = re.compile(f"{start}[0-9a-f]{{8}}({PART}{end}|{DONE})")
     with contextlib.suppress(OSError):  # a folder that may not be listed
         for left in [file for file in folder.iterdir() if name.fullmatch(file.name)]:

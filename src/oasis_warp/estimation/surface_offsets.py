@@ -216,6 +216,8 @@ def _compare_rendered(
 
 def crossing(image: np.ndarray, start: np.ndarray, outward: np.ndarray, reach: float) -> np.ndarray:
     """Signed distance from each `start` along `outward` to the nearest place where `image` falls through .5, or NaN."""
+    if not len(start):  # a few pixels of hand have no outline, and OpenCV reads no empty list
+        return np.zeros(0)
     t = np.arange(-reach, reach + _STEP, _STEP)
     x, y = (start[:, k, None] + outward[:, k, None] * t - 0.5 for k in (0, 1))
     values = cv2.remap(image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
