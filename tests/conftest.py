@@ -52,6 +52,21 @@ def as_shipped():
 
 
 @pytest.fixture(scope="session")
+def mano_dir(tmp_path_factory):
+    """A folder with files in MANO's format."""
+    from mano_files import write_mano
+
+    return write_mano(tmp_path_factory.mktemp("mano"))
+
+
+@pytest.fixture(scope="session")
+def mano(mano_dir):
+    from oasis_warp.hand.mano_hand import mano_hand
+
+    return mano_hand(mano_dir)
+
+
+@pytest.fixture(scope="session")
 def hand():
     from oasis_warp.hand.template import bundled_hand
 

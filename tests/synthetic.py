@@ -37,6 +37,7 @@ def avatar_of(hand, gaussians, pose, camera, light=None):
     return Avatar(
         side="right", shape=torch.zeros(len(hand.shape_names)), surface_offsets=torch.zeros_like(hand.template),
         gaussians=gaussians, source_pose=pose, source_camera=camera, light=light,
+        hand=hand,
     )  # fmt: skip
 
 
@@ -45,5 +46,5 @@ def as_left_hand(right):
     return Avatar(
         side="left", shape=right.shape, surface_offsets=right.surface_offsets, gaussians=right.gaussians,
         source_pose=mirror_pose(right.source_pose), source_camera=mirror_camera(right.source_camera),
-        light=right.light,
+        light=right.light, hand=right.hand,
     )  # fmt: skip

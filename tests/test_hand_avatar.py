@@ -124,8 +124,8 @@ def test_an_avatar_of_another_hand_model_is_refused(right, tmp_path, monkeypatch
 
     monkeypatch.setattr("oasis_warp.hand_avatar.save_avatar", keep)
     right.save(path)
-    save_avatar(path, written["t"], {**written["h"], "hand_model": "mano"})
-    with pytest.raises(InputError, match="mano"):
+    save_avatar(path, written["t"], {**written["h"], "hand_model": "nimble"})
+    with pytest.raises(InputError, match="nimble"):
         Avatar.load(path)
 
 

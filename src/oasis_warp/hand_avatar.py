@@ -41,9 +41,10 @@ from oasis_warp.core.types import (
     Side,
 )
 from oasis_warp.data.avatar_file import LIGHT_HIDDEN, load_avatar, save_avatar
+from oasis_warp.hand.mano import N_SHAPES
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
-from oasis_warp.hand.template import bundled_hand
+from oasis_warp.hand.template import bundled_hand, chosen_hand
 from oasis_warp.ops import DeferredFiniteCheck, check_finite, rest_mesh
 from oasis_warp.ops.checks import check_shape
 from oasis_warp.render.render import render
@@ -83,6 +84,7 @@ class Avatar:
         source_camera: Camera,
         light: HandLight | None = None,
         invented: Float[Tensor, "V"] | None = None,
+        hand: HandModel | None = None,
     ):
         self.side: Side = side
         self.shape = shape
@@ -100,7 +102,7 @@ class Avatar:
         part of the colours, or even."""
         self.invented = invented
         """Share of each vertex's skin that is painted because no photo shows it; None where none is."""
-        self.hand = bundled_hand().to(self.device)
+        self.hand = (hand or bundled_hand()).to(self.device)
         plain = rest_hand(self.hand, shape)
         self.rest = plain._replace(vertices=plain.vertices + surface_offsets)
         """The right-handed surface at rest [m]."""
@@ -272,6 +274,7 @@ class Avatar:
         return Avatar(
             side=self.side, shape=self.shape, surface_offsets=self.surface_offsets, gaussians=gaussians,
             source_pose=self.source_pose, source_camera=self.source_camera, light=light, invented=self.invented,
+            hand=self.hand,
         )  # fmt: skip
 
     def save(self, path: Path | str) -> None:
@@ -299,15 +302,24 @@ class Avatar:
         save_avatar(Path(path), {name: value.detach().cpu() for name, value in tensors.items()}, header)
 
     @classmethod
-    def load(cls, path: Path | str, device: torch.device | str = "cpu") -> "Avatar":
+    def load(
+        cls, path: Path | str, device: torch.device | str = "cpu", *, mano_dir: Path | str | None = None
+    ) -> "Avatar":
         """Read an avatar file.
 
+        Args:
+            path: Path of the file.
+            device: Where its tensors shall be.
+            mano_dir: Folder with MANO's files, for an avatar that was made with them; see `chosen_hand`.
+
         Raises:
-            InputError: not an avatar file, damaged, of a newer version, or made with another hand model.
+            InputError: not an avatar file, damaged, of a newer version, or made with a hand model that is not here.
         """
         hand = bundled_hand()
         sizes = {"S": hand.shape_basis.shape[2], "V": len(hand.template), "F": len(hand.faces)}
-        tensors, header = load_avatar(Path(path), hand.name, sizes)
+        tensors, header = load_avatar(Path(path), {hand.name: sizes, "mano": sizes | {"S": N_SHAPES}})
+        if header["hand_model"] != hand.name:
+            hand = chosen_hand("mano", mano_dir)
         tensors = {name: value.to(device) for name, value in tensors.items()}
 
         def group(prefix: str) -> dict[str, Tensor]:
@@ -322,6 +334,7 @@ class Avatar:
             source_camera=Camera(**group("source_camera."), **header["source_camera"]),
             light=HandLight(**light) if (light := group("light.")) else None,
             invented=tensors.get("invented"),
+            hand=hand,
         )
         return avatar._with_hidden_light() if header["version"] < LIGHT_HIDDEN else avatar
 
@@ -352,8 +365,13 @@ def make_avatar(
     gaussians: CanonicalGaussians,
     light: HandLight | None = None,
     invented: Float[Tensor, "V"] | None = None,
+    *,
+    hand: HandModel | None = None,
 ) -> Avatar:
-    """The hand of `fit` with the looks of `gaussians` in `light`; `offsets` and `crop` are those of its making."""
+    """The hand of `fit` with the looks of `gaussians` in `light`; `offsets` and `crop` are those of its making.
+
+    `hand` is the model of the fit, the bundled one by default.
+    """
     camera = crop.camera
     return Avatar(
         side=fit.side,
@@ -364,6 +382,7 @@ def make_avatar(
         source_camera=mirror_camera(camera) if fit.side == "left" else camera,
         light=light,
         invented=invented,
+        hand=hand,
     )
 
 

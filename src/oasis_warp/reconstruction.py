@@ -51,7 +51,7 @@ from oasis_warp.estimation.hand_crop import (
 )
 from oasis_warp.estimation.keypoints import read_keypoints
 from oasis_warp.estimation.refine import refine
-from oasis_warp.hand.template import bundled_hand
+from oasis_warp.hand.template import chosen_hand
 from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network.prior import choose_prior
@@ -189,13 +189,15 @@ def _run(
     """All stages, in their order. `keypoints` are those of a single photo."""
     stages: dict[str, float] = {}
     stage = functools.partial(timed_stage, seconds=stages, progress=progress)
-    hand = bundled_hand()
+    hand = chosen_hand(config.hand_model, config.mano_dir)
     estimator = HandEstimator(hand)
     with stage("prior"):  # first, because a wrong file must fail before the long work
         prior = prior or choose_prior(config.prior, config.backbone_weights)
     with stage("landmarks"):
         found = [
-            read_keypoints(keypoints, p) if keypoints else choose_hand(estimator.find(p), config.hand, p.name)
+            read_keypoints(keypoints, p, hand=hand)
+            if keypoints
+            else choose_hand(estimator.find(p), config.hand, p.name)
             for p in photos
         ]
         check_sides(photos, found)
@@ -238,7 +240,7 @@ def _run(
             adaptation, invented = adaptation._replace(gaussians=painted.gaussians), painted.invented
     closed = close_wrist(hand, adaptation.gaussians, crops[0].rest.vertices)
     adaptation = adaptation._replace(gaussians=closed)
-    avatar = make_avatar(fits[0], surfaces.shared, crops[0], closed, adaptation.light, invented)
+    avatar = make_avatar(fits[0], surfaces.shared, crops[0], closed, adaptation.light, invented, hand=hand)
     with stage("quality"):
         areas = surface.vertex_areas(crops[0].rest.vertices, hand.faces.to(config.device))
         parts = [_assess(hand, adaptation, k, fits[k], surfaces, crops[k], close[k]) for k in range(len(photos))]
@@ -280,7 +282,7 @@ def _assess(
     gaussians = adaptation.gaussians
     as_bright = gaussians._replace(colors=(gaussians.colors * adaptation.gains[k]).clamp(0, 1))
     light = adaptation.lights[k] if adaptation.lights else None
-    avatar = make_avatar(fit, surfaces.own[k], crop, as_bright, light)
+    avatar = make_avatar(fit, surfaces.own[k], crop, as_bright, light, hand=hand)
     drawn, near = draw_as_photo(avatar, crop, fit.pose), draw_as_photo(avatar, close, fit.pose)
     errors = {
         "reprojection_percent": fit.reprojection,

@@ -136,7 +136,7 @@ def test_nothing_wrong_is_ever_written(tmp_path, tensors):
 def test_a_tensor_that_cannot_be_right_is_named(written, tensors, name, value, expected):
     rewrite(written, {**tensors, name: value})
     with pytest.raises(InputError, match=f"damaged avatar file.*{expected}"):
-        load_avatar(written, "bundled", HAND)
+        load_avatar(written, {"bundled": HAND})
 
 
 def test_rows_that_do_not_add_up_are_refused(written, tensors):
@@ -198,7 +198,7 @@ def test_what_a_message_quotes_of_a_file_is_short_and_printable(written, tensors
     assert str(caught.value).isprintable()
     rewrite(written, tensors, hand_model="h" * 100_000)
     with pytest.raises(InputError, match="which is not installed") as caught:
-        load_avatar(written, "bundled", HAND)
+        load_avatar(written, {"bundled": HAND})
     assert len(str(caught.value)) < 500
 
 

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from synthetic import avatar_of, crop_of
 
 from oasis_kernels import constants
 from oasis_warp.avatar import pose
@@ -183,15 +184,31 @@ run.openHand(read(folder + "/data.txt")).then((hand) => {
 """
 
 
+def run_script(page, jobs, folder):
+    """Pose and light the page's hand with its own script; means, covariances and colours as files of `folder`."""
+    for name, file in (("worker", "worker.js"), ("data", "data.txt")):
+        (folder / file).write_text(section(page, name))
+    camera = {"azimuth": 0, "elevation": 0, "zoom": 1, "fieldOfView": 0.5, "width": 64, "height": 64}
+    jobs = [job | {"camera": camera} for job in jobs]
+    subprocess.run([NODE, "-e", NODE_CHECK, str(folder), json.dumps(jobs)], check=True, timeout=200)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(NODE is None, reason="needs node")
+def test_the_pages_script_poses_a_hand_of_mano_with_all_of_its_correctives(mano, tmp_path):
+    crop, truth, pose = crop_of(mano, torch.full((len(mano.template), 3), 0.5), size=64)
+    avatar = avatar_of(mano, truth, pose, crop.camera)
+    run_script(page_html(avatar, "MANO"), [{"pose": "fist", "look": "photo"}], tmp_path)
+    means = np.fromfile(tmp_path / "means0", "<f4").reshape(-1, 3)
+    assert np.abs(means - avatar.pose(in_pose(avatar, "fist")).means.numpy()).max() < 3e-5
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(NODE is None, reason="needs node")
 def test_the_pages_script_poses_and_lights_as_python_does(avatar, pages, tmp_path):
-    for name, file in (("worker", "worker.js"), ("data", "data.txt")):
-        (tmp_path / file).write_text(section(pages[avatar.side], name))
-    camera = {"azimuth": 0, "elevation": 0, "zoom": 1, "fieldOfView": 0.5, "width": 64, "height": 64}
     lights = {"photo": avatar, "studio": avatar.in_light(studio_light()), "even": avatar.in_even_light()}
-    jobs = [{"pose": pose, "look": look, "camera": camera} for pose in ("fist", "victory") for look in lights]
-    subprocess.run([NODE, "-e", NODE_CHECK, str(tmp_path), json.dumps(jobs)], check=True, timeout=200)
+    jobs = [{"pose": pose, "look": look} for pose in ("fist", "victory") for look in lights]
+    run_script(pages[avatar.side], jobs, tmp_path)
     for k, job in enumerate(jobs):
         expected = lights[job["look"]].pose(in_pose(avatar, job["pose"]))
         means = np.fromfile(tmp_path / f"means{k}", "<f4").reshape(-1, 3)

@@ -60,9 +60,9 @@ def test_a_hand_without_correctives_keeps_its_rest_surface(plain):
 
 def test_a_hand_with_other_correctives_is_refused(hand):
     odd = dataclasses.replace(hand, corrective_basis=hand.corrective_basis[..., :7])
-    with pytest.raises(ValueError, match="hand: expected 0 or 30 pose correctives, got 7"):
+    with pytest.raises(ValueError, match="hand: expected 0 or 30 or 135 pose correctives, got 7"):
         corrective_coefficients(odd, torch.zeros(15, 3))
-    with pytest.raises(ValueError, match="hand: expected 0 or 30 pose correctives, got 7"):
+    with pytest.raises(ValueError, match="hand: expected 0 or 30 or 135 pose correctives, got 7"):
         surface(odd, torch.zeros(15, 3))
 
 

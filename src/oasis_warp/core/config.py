@@ -61,6 +61,10 @@ class ReconstructConfig:
     colours in its skin tone, or what your own network sees: network.safetensors of `oasis pretrain`."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
+    hand_model: Literal["bundled", "mano"] = "bundled"
+    """The hand that comes with the package, or MANO from your own files."""
+    mano_dir: Path | None = None
+    """Folder with MANO_RIGHT.pkl, for --hand-model mano; the one that OASIS_MANO_DIR names when not given."""
     refine: Literal["on", "off"] = "off"
     """Move the fitted hand to where what the prior saw in the photo explains it better, and look again; or leave it."""
     light: Literal["fit", "keep", "even"] = "fit"

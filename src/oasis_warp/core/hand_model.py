@@ -1,6 +1,7 @@
 """`HandModel`: the skinned, shape-adjustable surface that every stage shares. Data only; `oasis_warp.hand` loads it."""
 
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -13,6 +14,17 @@ TIP_JOINTS = (15, 3, 6, 12, 9)
 """Last joints of thumb, index, middle, ring and little finger, whose bones end at the tips."""
 KNUCKLES = [5, 9, 13, 17]
 """Rows of the 21 landmarks that are the knuckles of index, middle, ring and little finger."""
+
+
+class ModelOrigin(NamedTuple):
+    """How another hand was brought into the triangulation of the bundled one; float64 on the CPU."""
+
+    rest_angles: Float[Tensor, "16 3"]
+    """Angles of the bundled hand whose bones point as this one's at rest [rad]."""
+    landmark_offsets: Float[Tensor, "21 3"]
+    """From `keypoint_index`'s joints and tips at rest to where the landmark network sees them [m]."""
+    wrist: Float[Tensor, "3"]
+    """Where its own files have the wrist, which is the origin here [m]."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +61,7 @@ class HandModel:
     keypoint_index: Int[Tensor, "21"]
     """Rows of concat(joints, tips) that are the 21 landmarks, in landmark order."""
     corrective_basis: Float[Tensor, "V 3 C"]
-    """Displacement of the rest surface by each pose corrective at full strength [m]; C may be 0."""
+    """Displacement of the rest surface by each pose corrective at full strength [m]; C is 0, 30 or 135."""
     uv: Float[Tensor, "U 2"]
     uv_faces: Int[Tensor, "F 3"]
     rim: Int[Tensor, "R"]
@@ -65,6 +77,8 @@ class HandModel:
     nail: Float[Tensor, "V"]
     """1 on a nail, 0 off it."""
     licence: str
+    origin: ModelOrigin | None = None
+    """None for the bundled hand."""
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "HandModel":
         """The same hand on another device, its real numbers in another precision; indices stay int64."""

@@ -71,6 +71,26 @@ def from_axis_angle(axes: Float[Tensor, "*batch 3"], angles: Float[Tensor, "*bat
     return eye + sin * cross + (1 - cos) * (cross @ cross)
 
 
+def euler_rotations(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotations by the third angle about z, then the second about y, then the first about x [rad]."""
+    (ca, cb, cc), (sa, sb, sc) = angles.cos().unbind(-1), angles.sin().unbind(-1)
+    rows = [
+        cb * cc, -cb * sc, sb,
+        ca * sc + sa * sb * cc, ca * cc - sa * sb * sc, -sa * cb,
+        sa * sc - ca * sb * cc, sa * cc + ca * sb * sc, ca * cb,
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def euler_angles(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """The angles of `euler_rotations`, the second within a quarter turn [rad]."""
+    m = matrices
+    first = torch.atan2(-m[..., 1, 2], m[..., 2, 2])
+    second = torch.atan2(m[..., 0, 2], torch.hypot(m[..., 0, 0], m[..., 0, 1]))
+    third = torch.atan2(-m[..., 0, 1], m[..., 0, 0])
+    return torch.stack([first, second, third], -1)
+
+
 def is_rotation(matrix: Float[Tensor, "3 3"], tolerance: float = 1e-3) -> Bool[Tensor, ""]:
     """Whether a finite matrix is a rotation: orthonormal rows, determinant 1."""
     off = (matrix @ matrix.T - torch.eye(3).to(matrix)).abs().amax()

@@ -126,14 +126,14 @@ def save_avatar(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping
 
 
 def load_avatar(
-    path: Path | str, hand_model: str = "", sizes: Mapping[str, int] = MappingProxyType({})
+    path: Path | str, hand_models: Mapping[str, Mapping[str, int]] = MappingProxyType({})
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors of an avatar file, on the CPU, and its header.
 
     Args:
         path: Path of the file.
-        hand_model: Name of the hand model that it must belong to; any if empty.
-        sizes: What the letters S and V must be, and F, the number of faces: those of that hand model.
+        hand_models: Of those that it may belong to, what the letters S and V must be, and F, the number of faces; any
+            if empty.
 
     Raises:
         InputError: the file is missing, no avatar, of a newer version, of another hand model or truncated, or a tensor
@@ -145,9 +145,10 @@ def load_avatar(
         if text is None:
             raise InputError(f"{path}: a safetensors file, but no avatar; give the one `oasis reconstruct` wrote.")
         header = _read_header(path, text)
-        if hand_model not in ("", header["hand_model"]):
+        if hand_models and header["hand_model"] not in hand_models:
             name = shortened(repr(header["hand_model"]))
             raise InputError(f"{path}: made with the hand model {name}, which is not installed; reconstruct it again.")
+        sizes = hand_models.get(header["hand_model"], {})
         try:
             found = _check_shapes(tensor_shapes(file), sizes)  # before memory is taken for them
             tensors = {name: file.get_tensor(name) for name in file.keys()}

@@ -18,7 +18,7 @@ from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.surface_offsets import outline_offsets, rendered_outline_offsets
 from oasis_warp.hand.skinning import rest_hand, skin
-from oasis_warp.hand.template import bundled_hand
+from oasis_warp.hand.template import chosen_hand
 
 CROP_MARGIN = 1.12
 """Side of the crop over the longer extent of the mask."""
@@ -106,13 +106,13 @@ def crop_hand(
         photo: The photo.
         fit: Of its hand.
         offsets: From the fitted rest surface to the one that carries Gaussians [m].
-        config: Size and device.
+        config: Size, device and the hand model of `fit`.
         size: Side of the crop [px]; if not given, what `config` wants, up to `COARSE_SIZE`.
 
     Raises:
         InputError: the mask is empty.
     """
-    hand = bundled_hand()
+    hand = chosen_hand(config.hand_model, config.mano_dir)
     if size is None:
         size = COARSE_SIZE if config.size == "auto" else min(config.size, COARSE_SIZE)
     image, right = photo.rgb.float() / 255, as_right_hand(fit)
@@ -153,7 +153,7 @@ def crop_hands(
 
     All have one size, or with `finer` each that of its detail, if that is larger.
     """
-    plain = rest_hand(bundled_hand(), fits[0].shape)
+    plain = rest_hand(chosen_hand(config.hand_model, config.mano_dir), fits[0].shape)
     shared = plain._replace(vertices=plain.vertices + surfaces.shared)
     crops = []
     for photo, fit, own in zip(photos, fits, surfaces.own, strict=True):

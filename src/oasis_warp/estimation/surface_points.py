@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 from oasis_warp.estimation.fit import SurfacePoints
 from oasis_warp.estimation.pixel_reading import PixelReading
 from oasis_warp.hand.kinematics import HandKinematics
+from oasis_warp.hand.template import bundled_hand
 
 _HAND = 0.6
 """Least probability of the hand at a pixel that is used."""
@@ -15,6 +16,11 @@ _SPREAD = 0.015
 """Largest spread of the surface point at a pixel that is used [m]."""
 _MOST_POINTS = 500
 """More do not fit better: the errors of neighbouring pixels are alike."""
+
+
+@functools.cache
+def _bundled() -> HandKinematics:
+    return HandKinematics(bundled_hand())
 
 
 @functools.cache
@@ -32,10 +38,13 @@ def surface_points(kinematics: HandKinematics, reading: PixelReading, scale: flo
     rows, columns = np.nonzero(good[step // 2 :: step, step // 2 :: step])
     rows, columns = rows * step + step // 2, columns * step + step // 2
     places = reading.surface[:, rows, columns].T.astype(np.float64)
-    _, vertex = _rest_places(kinematics.template.tobytes()).query(places)
-    normal = kinematics.rest_normals[vertex]
-    offset = places - kinematics.template[vertex]
+    learned = kinematics if kinematics.hand.origin is None else _bundled()  # the network knows places on this hand
+    _, vertex = _rest_places(learned.template.tobytes()).query(places)
+    normal = learned.rest_normals[vertex]
+    offset = places - learned.template[vertex]
     offset -= normal * (offset * normal).sum(1, keepdims=True)
+    if learned is not kinematics:
+        offset[:] = 0  # below half an edge, and turned as the two hands rest differently
     return SurfacePoints(
         vertex=vertex,
         offset=offset,

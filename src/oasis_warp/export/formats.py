@@ -105,4 +105,5 @@ def on_cpu(avatar: Avatar) -> Avatar:
         gaussians=CanonicalGaussians(*map(moved, avatar.gaussians)),
         source_pose=HandPose(*map(moved, avatar.source_pose)), source_camera=Camera(*map(moved, avatar.source_camera)),
         light=None if light is None else HandLight(*map(moved, light)), invented=moved(avatar.invented),
+        hand=avatar.hand.to("cpu"),
     )  # fmt: skip

@@ -10,11 +10,15 @@ from torch import Tensor
 
 from oasis_warp.core import rotation
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.types import HandPose
 from oasis_warp.data.output_files import write_file
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.surface_mesh import model_of
+from oasis_warp.hand.mano import mirror_mano_pose
+from oasis_warp.hand.mano_hand import mano_of_hand_pose
 from oasis_warp.hand.skinning import bone_transforms, hand21
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import check_finite
 
 VERSION = 1
@@ -55,6 +59,7 @@ def write_parameters(request: ExportRequest, path: Path) -> None:
             "hand_pose": rotation_vectors(_local_rotations(hand, rest.joints, pose)).tolist(),
             "transl": pose.translation.tolist(),
             "rest_joints": rest.joints.tolist(),
+            **_parameters_of_mano(avatar, pose),
         },
         "landmarks": dict(zip(LANDMARKS, points.tolist(), strict=True)),
         "camera": {
@@ -62,6 +67,16 @@ def write_parameters(request: ExportRequest, path: Path) -> None:
         },
     }  # fmt: skip
     write_file(path, (json.dumps(found, indent=1, allow_nan=False) + "\n").encode())
+
+
+def _parameters_of_mano(avatar: Avatar, pose: HandPose) -> dict[str, Any]:
+    """What smplx's layer of the avatar's side needs for its hand; empty where the hand is not MANO's."""
+    if avatar.hand.origin is None:
+        return {}
+    left = avatar.side == "left"
+    found = mano_of_hand_pose(avatar.hand, avatar.shape, mirror_pose(pose) if left else pose)
+    found = mirror_mano_pose(found) if left else found
+    return {name: values.tolist() for name, values in found._asdict().items()}
 
 
 def _local_rotations(hand: HandModel, joints: Float[Tensor, "16 3"], pose: HandPose) -> Float[Tensor, "15 3 3"]:

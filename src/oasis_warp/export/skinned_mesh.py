@@ -10,6 +10,7 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import PosedHand
 from oasis_warp.export.surface_mesh import Topology, at_mesh, mesh_normals, mesh_points, model_of, topology
 from oasis_warp.export.webxr_rig import TO_WEBXR, Rig, webxr_rig
+from oasis_warp.hand.skinning import correctives_per_joint
 from oasis_warp.hand_avatar import Avatar
 
 INFLUENCES = 8
@@ -44,10 +45,11 @@ def skinned_mesh(avatar: Avatar) -> SkinnedMesh:
     joint_of_bone = torch.tensor([rig.bones.index(bone) for bone in range(len(hand.parents))])  # the first, no tip
     strongest = at_mesh(hand.weights, mesh).topk(INFLUENCES, dim=1)
     weights = strongest.values / strongest.values.sum(1, keepdim=True)
+    parts = ("bend", "bend squared") if correctives_per_joint(hand) == 2 else [f"turn{k}" for k in range(9)]
     return SkinnedMesh(
         hand, rest, rig, mesh, points, mesh_normals(points, mesh),
         joints=torch.where(weights > 0, joint_of_bone[strongest.indices], 0),
         weights=weights,
         correctives=at_mesh(hand.corrective_basis, mesh).permute(2, 0, 1) @ to_file.T,
-        corrective_names=tuple(f"{name} bend{power}" for name in hand.joint_names[1:] for power in ("", " squared")),
+        corrective_names=tuple(f"{name} {part}" for name in hand.joint_names[1:] for part in parts),
     )  # fmt: skip

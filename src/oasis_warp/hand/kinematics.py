@@ -69,7 +69,7 @@ class HandKinematics:
         self.points = np.concatenate([self.joints, real(hand.tips)])[keypoints]
         self.points_basis = np.concatenate([self.joint_basis, real(hand.tip_basis)])[keypoints]
         self.point_joint = np.concatenate([np.arange(16), TIP_JOINTS])[keypoints]
-        self.offsets = self._landmark_offsets()
+        self.offsets = self._landmark_offsets() if hand.origin is None else real(hand.origin.landmark_offsets)
         self.dofs = np.array([(j, a) for j in range(1, 16) for a in self._free_axes(j)])
         """Joint and axis of each of the 26 angles."""
         self.below = np.zeros((16, 16))

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from oasis_warp.core.errors import did_you_mean
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.rotation import euler_angles, euler_rotations
 
 Finger = tuple[float, float, float, float]
 """Flexion of a finger's three joints from the knuckle outwards, and abduction of the knuckle [degrees]."""
@@ -76,7 +77,11 @@ def named_pose(hand: HandModel, name: str) -> Float[Tensor, "15 3"]:
     degrees[first] = torch.tensor(base)
     degrees[first + 1 : first + 3, 0] = torch.tensor([middle, end])
     angles = degrees.deg2rad()
-    angles[:, 0] -= hand.rest_bend.cpu().double()  # 0 is a straight finger in the table, the rest pose in the model
+    rest = torch.zeros_like(angles) if hand.origin is None else hand.origin.rest_angles
+    # 0 is a straight finger in the table, the rest pose in the model.
+    angles[:, 0] -= hand.rest_bend.cpu().double() - rest[:, 0]
+    if hand.origin is not None:
+        angles = euler_angles(euler_rotations(angles) @ euler_rotations(rest).mT)
     return angles[1:].to(hand.pose_axes)
 
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from oasis_warp import ops
 from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
+from oasis_warp.core.rotation import euler_rotations
 from oasis_warp.core.types import HandPose, PosedHand
 from oasis_warp.ops import BoneTransforms
 
@@ -33,48 +34,59 @@ def _bones(hand: HandModel, joints: Tensor, pose: HandPose) -> BoneTransforms:
     return ops.bone_transforms(*pose, joints, hand.pose_axes, hand.parents, validate=False)
 
 
-def has_correctives(hand: HandModel) -> bool:
-    """Whether `hand` changes its rest surface with its pose.
+PER_JOINT = (0, 2, 9)
+"""Pose correctives a joint: none; of its flexion; or of its whole rotation, as MANO has them."""
+
+
+def correctives_per_joint(hand: HandModel) -> int:
+    """Number of pose correctives of each joint but the wrist, one of `PER_JOINT`.
 
     Raises:
-        ValueError: it does, but with other than two correctives a joint.
+        ValueError: it is another.
     """
-    size, expected = hand.corrective_basis.shape[-1], 2 * (len(hand.parents) - 1)
-    if size not in (0, expected):
-        raise ValueError(f"hand: expected 0 or {expected} pose correctives, got {size}. Two for each joint.")
-    return size > 0
+    size, n_joints = hand.corrective_basis.shape[-1], len(hand.parents) - 1
+    if size not in [n_joints * each for each in PER_JOINT]:
+        expected = " or ".join(str(n_joints * each) for each in PER_JOINT)
+        raise ValueError(f"hand: expected {expected} pose correctives, got {size}. They belong to joints 1 to 15.")
+    return size // n_joints
 
 
-def corrective_coefficients(hand: HandModel, angles: Float[Tensor, "15 3"]) -> Float[Tensor, "C"]:
+def corrective_coefficients(hand: HandModel, angles: Float[Tensor, "*B 15 3"]) -> Float[Tensor, "*B C"]:
     """Strengths of the pose correctives at joint `angles` [rad]; empty if the hand has none.
 
-    Correctives are displacements of the rest surface that restore what linear blend skinning loses at bent joints. Two
-    per joint, from its flexion: c and c^2 with c = 1 - cos(flexion). Blend skinning shrinks a joint by c to leading
-    order, and both vanish at rest with their derivatives. `ops.bone_transforms` computes the same for many poses.
+    Correctives are displacements of the rest surface that restore what linear blend skinning loses at bent joints. The
+    bundled hand has two per joint, from its flexion: c and c^2 with c = 1 - cos(flexion). Blend skinning shrinks a
+    joint by c to leading order, and both vanish at rest with their derivatives. `ops.bone_transforms` computes the same
+    for many poses. MANO has nine per joint: R - 1, row by row, R the joint's rotation in the basis of its axes (Loper
+    et al. 2015, eq. 9).
 
     Raises:
-        ValueError: `hand` has correctives, but not two a joint.
+        ValueError: `hand` has another number of correctives.
     """
-    if not has_correctives(hand):
-        return angles.new_zeros(0)
-    c = 1 - torch.cos(angles[:, 0])
-    return torch.stack([c, c * c], -1).flatten()
+    each = correctives_per_joint(hand)
+    if each == 0:
+        return angles.new_zeros((*angles.shape[:-2], 0))
+    if each == 9:
+        return (euler_rotations(angles) - torch.eye(3, dtype=angles.dtype, device=angles.device)).flatten(-3)
+    c = 1 - torch.cos(angles[..., 0])
+    return torch.stack([c, c * c], -1).flatten(-2)
 
 
 def skin_surface(hand: HandModel, rest: PosedHand, pose: HandPose) -> Float[Tensor, "*B V 3"]:
     """The vertices of `skin` alone."""
-    return _surface(hand, rest, _bones(hand, rest.joints, pose))
+    return _surface(hand, rest, pose, _bones(hand, rest.joints, pose))
 
 
-def _surface(hand: HandModel, rest: PosedHand, bones: BoneTransforms) -> Tensor:
-    corrected = has_correctives(hand)
+def _surface(hand: HandModel, rest: PosedHand, pose: HandPose, bones: BoneTransforms) -> Tensor:
+    each = correctives_per_joint(hand)
+    strengths = bones.bends if each == 2 else corrective_coefficients(hand, pose.angles)
     return ops.skin(
         rest.vertices,
         None,
         hand.weights,
         bones.transforms,
-        displacements=hand.corrective_basis if corrected else None,
-        strengths=bones.bends if corrected else None,
+        displacements=hand.corrective_basis if each else None,
+        strengths=strengths if each else None,
         validate=False,
     ).means
 
@@ -88,7 +100,7 @@ def skin(hand: HandModel, rest: PosedHand, pose: HandPose) -> PosedHand:
     bones = _bones(hand, rest.joints, pose)
     every_bone = range(len(hand.parents))
     return PosedHand(
-        vertices=_surface(hand, rest, bones),
+        vertices=_surface(hand, rest, pose, bones),
         joints=_transformed(bones.transforms, every_bone, rest.joints),
         tips=_transformed(bones.transforms, TIP_JOINTS, rest.tips),
     )

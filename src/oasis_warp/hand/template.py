@@ -1,13 +1,40 @@
-"""Load the bundled hand."""
+"""Load the bundled hand, or the one that was chosen."""
 
 import functools
+import os
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from oasis_warp.assets import asset
+from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
+
+HandName = Literal["bundled", "mano"]
+MANO_DIR = "OASIS_MANO_DIR"
+"""Environment variable that names the folder with MANO's files."""
+
+
+def chosen_hand(name: HandName, mano_dir: Path | str | None = None) -> HandModel:
+    """The bundled hand, or MANO's from `mano_dir`, else from the folder that the variable `MANO_DIR` names.
+
+    Raises:
+        InputError: MANO is wanted but no folder is given, or `hand.mano_hand.mano_hand` refuses it.
+    """
+    if name == "bundled":
+        return bundled_hand()
+    from oasis_warp.hand.mano_hand import mano_hand  # most programs never need it
+
+    folder = mano_dir or os.environ.get(MANO_DIR)
+    if not folder:
+        raise InputError(
+            f"the hand model MANO: expected the folder with MANO_RIGHT.pkl, got none; set {MANO_DIR} to it, or give "
+            "it to `oasis reconstruct` as --mano-dir."
+        )
+    return mano_hand(Path(folder).absolute())
 
 
 @functools.cache

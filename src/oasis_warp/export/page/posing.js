@@ -56,15 +56,21 @@ function nonZeroTriples(correctives, rows) {
 // Rotation and place (rows of 3 x 4) of every bone, and the strengths of the correctives.
 function boneTransforms(body, angles) {
   const { parents, orientation, translation } = body.data, { joints, axes } = body.data.arrays;
-  const transforms = new Float64Array(12 * body.nBones), bends = new Float64Array(2 * (body.nBones - 1));
+  const transforms = new Float64Array(12 * body.nBones), bends = new Float64Array(body.bends.length);
+  const each = bends.length / (body.nBones - 1); // correctives a bone: 2 of its flexion, or 9 of its whole rotation
   for (let j = 0; j < body.nBones; j++) {
     let own = orientation;
     if (j > 0) {
       const at = 3 * (j - 1), turn = (k) => axisRotation(axes.subarray(9 * j + 3 * k, 9 * j + 3 * k + 3), angles[at + k]);
       own = product(product(turn(0), turn(1)), turn(2));
-      const c = 1 - Math.cos(angles[at]);
-      bends[2 * j - 2] = c;
-      bends[2 * j - 1] = c * c;
+      if (each === 9) {
+        const about = (k) => axisRotation([+(k === 0), +(k === 1), +(k === 2)], angles[at + k]);
+        bends.set(product(product(about(0), about(1)), about(2)).map((r, k) => r - +(k % 4 === 0)), 3 * at);
+      } else {
+        const c = 1 - Math.cos(angles[at]);
+        bends[2 * j - 2] = c;
+        bends[2 * j - 1] = c * c;
+      }
     }
     const parent = j > 0 ? transforms.subarray(12 * parents[j], 12 * parents[j] + 12) : null;
     const joint = joints.subarray(3 * j, 3 * j + 3);
