@@ -28,8 +28,8 @@ from oasis_warp.export import export_avatar, texture
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.splats import posed_splats
 from oasis_warp.export.surface_mesh import mesh_points, topology
-from oasis_warp.export.webxr_rig import TO_WEBXR
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
+from oasis_warp.hand.webxr_rig import TO_WEBXR
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.ops import depth_map

@@ -67,7 +67,7 @@ PIPELINE = [
         "quats[:, [1, 2, 3, 0]]", "quats"),
     _of("export/skinned_mesh", "export/test_skinned_gltf", "clip_ends", "vertices moved by a joint's parent",
         "rig.bones.index(bone)", "max(rig.bones.index(bone) - 1, 0)"),
-    _of("export/webxr_rig", "export/test_skinned_gltf", "clip_ends", "a joint's rotation in the room, not its parent",
+    _of("hand/webxr_rig", "export/test_skinned_gltf", "clip_ends", "a joint's rotation in the room, not its parent",
         "rotation.from_matrix(upper.mT @ world)", "rotation.from_matrix(world)"),
     _of("export/surface_mesh", "export/test_skinned_gltf", "closed", "faces of left hands inside out",
         'faces.flip(1) if avatar.side == "left" else faces', "faces"),

@@ -55,7 +55,7 @@ def test_the_module_runs_as_the_command_does():
 @pytest.mark.parametrize(
     "arguments",
     [[], ["frobnicate"], ["reconstruct", "a.jpg"], ["reconstruct", "a.jpg", "-o", "x", "--hand", "both"],
-     ["render", "a.safetensors", "-o", "x.png", "--pose", "frog"]],
+     ["render", "a.safetensors", "-o", "x.png", "--device", "frog"]],
 )  # fmt: skip
 def test_a_wrong_command_line_exits_with_two(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:

@@ -1,3 +1,5 @@
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -5,9 +7,10 @@ import torch
 
 from oasis_warp.cli import main
 from oasis_warp.cli.animate import pose_frames, turntable
+from oasis_warp.core import rotation
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.logging import silent
-from oasis_warp.core.types import HandLight
+from oasis_warp.core.types import HandLight, HandPose
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.hand.poses import named_pose, pose_sequence
 from oasis_warp.hand_avatar import Avatar
@@ -31,6 +34,12 @@ def test_a_picture_shows_the_photos_pose_from_where_it_was_taken(scene, avatar_f
 @pytest.mark.parametrize("arguments", [["--pose", "fist"], ["--azimuth", "90"], ["--elevation", "45"]])
 def test_pose_and_place_change_the_picture(avatar_file, arguments):
     assert np.abs(draw(avatar_file, *arguments) - draw(avatar_file)).max() > 100
+
+
+def test_a_pose_comes_from_a_file(scene, avatar_file):
+    file = avatar_file.with_name("fist.json")
+    file.write_text(json.dumps({"angles": [named_pose(scene[2].hand, "fist").tolist()]}))
+    assert np.array_equal(draw(avatar_file, "--pose", str(file)), draw(avatar_file, "--pose", "fist"))
 
 
 def test_a_full_turn_is_none(avatar_file):
@@ -98,12 +107,78 @@ def test_a_motion_of_ones_own_is_played_over_nothing(scene, avatar_file):
         assert frame[0, 0, 3] == 0
 
 
+def frames_of(out):
+    return [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)) for file in sorted(out.iterdir())]
+
+
+def test_two_hands_stand_side_by_side_in_the_order_given(scene, avatar_file):
+    """Without a shift they would lie in one another, with one of the wrong sign in the other order."""
+    plain, out = scene[2], avatar_file.with_name("both")
+    blue = plain.with_looks(plain.gaussians._replace(colors=torch.tensor([[0.1, 0.2, 0.9]]).expand(
+        len(plain.gaussians.colors), 3)), None)  # fmt: skip
+    blue.save(avatar_file.with_name("blue.safetensors"))
+    files = [str(avatar_file), str(avatar_file.with_name("blue.safetensors"))]
+    for order in (files, files[::-1]):
+        arguments = ["--motion", "poses", "--poses", "open,fist", "--seconds", ".4", "--fps", "10", "--size", "96"]
+        assert main(["animate", *order, "-o", str(out), *arguments, "--background", "transparent"]) == 0
+        for frame in frames_of(out):
+            seen = frame[..., 3] > 128
+            first = frame[..., 0] > frame[..., 2] if order is not files else frame[..., 0] < frame[..., 2]
+            mine, others = np.nonzero(seen & first)[1], np.nonzero(seen & ~first)[1]
+            assert len(mine) > 200 and len(others) > 200
+            assert mine.max() < others.min()
+
+
+def test_a_motion_of_the_wrist_is_seen_by_a_camera_of_ones_own(scene, avatar_file):
+    avatar, camera = scene[2], scene[2].source_camera
+    angles = torch.stack([named_pose(avatar.hand, name) for name in ("open", "fist")])
+    turns = rotation.from_axis_angle(torch.tensor([0.0, 0, 1]), torch.tensor(0.4)) @ avatar.source_pose.orientation
+    places = avatar.source_pose.translation + torch.tensor([[0.0, 0, 0.1], [0.05, 0, 0]])
+    motion, out, view = (avatar_file.with_name(name) for name in ("motion.npz", "out", "camera.json"))
+    np.savez(motion, angles=angles, global_orient=torch.stack([turns, turns]), transl=places, fps=10)
+    second = camera.viewmat.clone()
+    second[0, 3] += 0.05
+    path = {"viewmat": [camera.viewmat.tolist(), second.tolist()], "K": camera.K.tolist()}
+    view.write_text(json.dumps({"camera": path | {"width": camera.width, "height": camera.height}}))
+    arguments = ["--motion", str(motion), "--wrist", "moves", "--camera", str(view), "--fps", "10"]
+    assert main(["animate", str(avatar_file), "-o", str(out), *arguments]) == 0
+    for k, frame in enumerate(frames_of(out)):
+        viewmat = (camera.viewmat, second)[k]
+        drawn = avatar.render(camera._replace(viewmat=viewmat), HandPose(angles[k], turns, places[k])).image
+        assert np.abs(frame[..., ::-1].astype(int) - to_uint8(drawn).numpy()).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (None, "no such file"),
+        ("[]", "expected a JSON object"),
+        ('{"width": 64, "height": 64}', "finite numbers in `viewmat`"),
+        ('{"width": 0, "height": 64}', "`width` and `height`"),
+        ('{"width": 64, "height": 64, "K": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "viewmat": "x"}', "not a camera"),
+        (json.dumps({"width": 64, "height": 64, "K": [[1] * 3] * 3, "viewmat": [[1] * 4] * 4}), "rotations in"),
+    ],
+)
+def test_what_is_no_camera_is_refused_in_one_sentence(avatar_file, content, expected, capsys):
+    file = avatar_file.with_name("camera.json")
+    if content is not None:
+        file.write_text(content)
+    arguments = ["-o", str(avatar_file.with_name("x.mp4")), "--motion", "poses", "--camera", str(file)]
+    assert main(["animate", str(avatar_file), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert expected in error and error.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
+        (["animate", "-o", "x.mp4", "--camera", "avatar.safetensors"], "not a camera"),
+        (["animate", "avatar.safetensors", "avatar.safetensors", "-o", "x.mp4"], "expected one, or two for one scene"),
         (["render", "-o", "x.bmp"], "ends in .png or .webp"),
         (["render", "-o", "x.jpg", "--background", "transparent"], "JPEG has no transparency"),
         (["render", "-o", "x.png", "--background", "mauve"], "--background mauve: expected white, black or six hex"),
+        (["render", "-o", "x.png", "--pose", "fits"], "Did you mean 'fist'?"),
+        (["render", "-o", "x.png", "--pose", "none.json"], "none.json: cannot be read"),
         (["render", "-o", "x.png", "--size", "0"], "--size 0: expected 16 to"),
         (["render", "-o", "x.png", "--size", "100000"], "--size 100000: expected 16 to"),
         (["render", "-o", "x.png", "--azimuth", "nan"], "--azimuth nan: expected a number of degrees"),

@@ -27,6 +27,8 @@ def make_target(name: str, folder: Path):
         return targets.weights(folder)
     if name == "splats":
         return targets.splats(folder)
+    if name == "motions":
+        return targets.motions(folder)
     if name == "images":
         return targets.images(avif=True)
     pose = targets.small_avatar(lit=False).source_pose
@@ -53,7 +55,7 @@ def batch(name: str, seed: int, first: int, last: int, report: Callable[[tuple[i
 def main() -> None:
     """Read the command line, run all batches and print what happened."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("target", choices=("avatars", "weights", "keypoints", "fits", "images", "splats"))
+    parser.add_argument("target", choices=("avatars", "weights", "keypoints", "fits", "images", "splats", "motions"))
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()

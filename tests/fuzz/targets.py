@@ -24,6 +24,7 @@ from oasis_warp.export.page_data import splat_facts
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
+from oasis_warp.motion import read_motion
 from oasis_warp.network.config import COMPACT, NetworkConfig
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, save_network
@@ -113,6 +114,44 @@ def splats(folder: Path) -> Target:
         assert all(np.isfinite(getattr(array, "numbers", array)).all() for array in arrays.values())
 
     return Target(files, damaged_bytes, read)
+
+
+BVH = """HIERARCHY
+ROOT wrist
+{{
+OFFSET 0 0 0
+CHANNELS 3 Zrotation Yrotation Xrotation
+{fingers}}}
+MOTION
+Frames: 2
+Frame Time: 0.04
+{row}
+{row}
+"""
+
+
+def motions(folder: Path) -> Target:
+    """Motions of every kind but videos: what is taken is finite and within the limits of angles."""
+    avatar, finger = small_avatar(lit=False), "JOINT {0}1\n{{\nOFFSET 5 0 {1}\nCHANNELS 1 Zrotation\n}}\n"
+    fingers = "".join(finger.format(name, k) for k, name in enumerate(("index", "middle", "ring", "little", "thumb")))
+    tracked = {"orientations": [[[0.1, 0.2, 0.3, 0.9]] * 25] * 2, "positions": [[[0, 0, 0.1]] * 25] * 2}
+    mano = {"hand_pose": [[0.1] * 45] * 2, "global_orient": [[1, 0, 0]] * 2, "transl": [[0, 0, 0.5]] * 2}
+    np.savez(folder / "mano.npz", **{name: np.array(value) for name, value in mano.items()})
+    files = {
+        ".bvh": BVH.format(fingers=fingers, row=" ".join(["10"] * 8)).encode(),
+        ".tracked.json": json.dumps(tracked).encode(),
+        ".mano.json": json.dumps(mano).encode(),
+        ".npz": (folder / "mano.npz").read_bytes(),
+    }
+
+    def read(path: Path) -> None:
+        motion = read_motion(path, avatar)
+        assert bool(motion.angles.isfinite().all()) and float(motion.angles.abs().max()) < 7
+
+    def mutate(rng: np.random.Generator, data: bytes) -> bytes:
+        return (json_file if data[:1] == b"{" else damaged_bytes)(rng, data)
+
+    return Target(files, mutate, read)
 
 
 def avatars(folder: Path, *, lit: bool) -> Target:

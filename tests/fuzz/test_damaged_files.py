@@ -21,6 +21,11 @@ def test_damaged_gaussians_are_refused_in_one_sentence_or_shown(tmp_path):
 
 
 @pytest.mark.timeout(60)
+def test_damaged_motions_are_refused_in_one_sentence_or_played(tmp_path):
+    assert outcomes(targets.motions(tmp_path), 60, tmp_path) == {"refused", "taken"}
+
+
+@pytest.mark.timeout(60)
 def test_damaged_weights_are_refused_in_one_sentence_or_finite(tmp_path):
     assert outcomes(targets.weights(tmp_path), 3, tmp_path) <= {"refused", "taken"}
 

@@ -1,4 +1,4 @@
-"""`oasis animate`: a video of an avatar."""
+"""`oasis animate`: a film of an avatar, or of two in one scene."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -16,12 +16,13 @@ from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
-from oasis_warp.core.types import Color, HandPose
+from oasis_warp.core.types import Camera, Color, Gaussians, HandPose
+from oasis_warp.data.camera_file import read_cameras
 from oasis_warp.data.films import check_film, write_video
-from oasis_warp.data.motion_file import read_motion, resample
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.hand.poses import POSE_NAMES, pose_sequence
 from oasis_warp.hand_avatar import Avatar
+from oasis_warp.motion import read_motion, resample
 from oasis_warp.render.render import render
 
 MAX_FRAMES = 10_000
@@ -29,9 +30,36 @@ MOST_LOOPS = 65_535
 """What a GIF can count to."""
 MOST_FRAMED = 60
 """About so many poses of a film decide what its camera sees."""
+GAP = 0.03
+"""Between two hands that stand side by side [m]: a finger's breadth and a half."""
 
 
 @torch.no_grad()
+def draw_frames(
+    hands: Sequence[tuple[Avatar, Sequence[HandPose]]],
+    cameras: Sequence[Camera],
+    *,
+    background: Color | None,
+    progress: Progress,
+    stage: str,
+) -> Iterator[UInt8[Tensor, "H W C"]]:
+    """A frame for each of the `cameras` and of the poses of every hand; transparent without a `background`.
+
+    Nothing is posed again while every hand keeps its pose.
+    """
+    color = BLACK if background is None else background
+    last, gaussians = None, None
+    for frame, camera in enumerate(cameras):
+        poses = [own[frame] for _, own in hands]
+        if last is None or any(one is not other for one, other in zip(poses, last, strict=True)):
+            posed = [avatar.pose(pose) for (avatar, _), pose in zip(hands, poses, strict=True)]
+            last, gaussians = poses, Gaussians(*map(torch.cat, zip(*posed, strict=True)))
+        assert gaussians is not None
+        drawn = render(gaussians, camera, background=color)
+        yield to_uint8(drawn.image if background is not None else straight_alpha(drawn))
+        progress(stage, frame + 1, len(cameras))
+
+
 def turntable(
     avatar: Avatar,
     pose: HandPose,
@@ -43,15 +71,20 @@ def turntable(
     progress: Progress,
 ) -> Iterator[UInt8[Tensor, "size size C"]]:
     """`n_frames` views around the hand in `pose`, from the photo's view on, `elevation` [rad] above the hand."""
-    gaussians, vertices = avatar.pose(pose), avatar.mesh(pose).vertices
-    for frame in range(n_frames):
-        camera = orbit_camera(vertices, 2 * math.pi * frame / n_frames, elevation, size)
-        drawn = render(gaussians, camera, background=BLACK if background is None else background)
-        yield to_uint8(drawn.image if background is not None else straight_alpha(drawn))
-        progress("turntable", frame + 1, n_frames)
+    hands = [(avatar, [pose] * n_frames)]
+    cameras = around(hands, n_frames, size, elevation)
+    return draw_frames(hands, cameras, background=background, progress=progress, stage="turntable")
 
 
 @torch.no_grad()
+def around(
+    hands: Sequence[tuple[Avatar, Sequence[HandPose]]], n_frames: int, size: int, elevation: float
+) -> list[Camera]:
+    """Cameras on a circle around hands that stand still."""
+    vertices = torch.cat([avatar.mesh(poses[0]).vertices for avatar, poses in hands])
+    return [orbit_camera(vertices, 2 * math.pi * frame / n_frames, elevation, size) for frame in range(n_frames)]
+
+
 def pose_frames(
     avatar: Avatar,
     angles: Sequence[Float[Tensor, "15 3"]],
@@ -61,24 +94,29 @@ def pose_frames(
     background: Color | None,
     progress: Progress,
 ) -> Iterator[UInt8[Tensor, "size size C"]]:
-    """A frame for each of the joint `angles`, from the direction of the photo; transparent without a `background`.
+    """A frame for each of the joint `angles`, from the direction of the photo; transparent without a `background`."""
+    hands = [(avatar, [avatar.source_pose._replace(angles=each.to(avatar.shape)) for each in angles])]
+    camera = still_camera(hands, size, elevation)
+    return draw_frames(hands, [camera] * len(angles), background=background, progress=progress, stage="poses")
 
-    The camera does not move and sees the hand completely in every frame.
-    """
-    poses = [avatar.source_pose._replace(angles=each.to(avatar.shape)) for each in angles]
-    few = poses[:: max(1, len(poses) // MOST_FRAMED)]
-    camera = orbit_camera(torch.cat([avatar.mesh(pose).vertices for pose in few]), 0.0, elevation, size)
-    for frame, pose in enumerate(poses):
-        drawn = avatar.render(camera, pose, BLACK if background is None else background)
-        yield to_uint8(drawn.image if background is not None else straight_alpha(drawn))
-        progress("poses", frame + 1, len(poses))
+
+@torch.no_grad()
+def still_camera(hands: Sequence[tuple[Avatar, Sequence[HandPose]]], size: int, elevation: float) -> Camera:
+    """A camera that sees the hands completely in every frame."""
+    seen = [avatar.mesh(pose).vertices for avatar, poses in hands for pose in few(poses)]
+    return orbit_camera(torch.cat(seen), 0.0, elevation, size)
+
+
+def few(poses: Sequence[HandPose]) -> Sequence[HandPose]:
+    """About `MOST_FRAMED` of them."""
+    return poses[:: max(1, len(poses) // MOST_FRAMED)]
 
 
 def run(options: Animate) -> int:
     """Write the film.
 
     Raises:
-        InputError: a wrong avatar file, motion, option or output.
+        InputError: a wrong avatar file, motion, camera, option or output.
     """
     check_numbers(options)
     transparent = options.background == "transparent"
@@ -86,24 +124,64 @@ def run(options: Animate) -> int:
     background = None if transparent else read_color(options.background)
     if not 0 <= options.loop <= MOST_LOOPS:
         raise InputError(f"--loop {options.loop}: expected 0, for ever, to {MOST_LOOPS}; choose another number.")
+    if not 1 <= len(options.avatars) <= 2:
+        raise InputError(f"avatars: expected one, or two for one scene, got {len(options.avatars)}; change them.")
     n_frames = count_frames(options.seconds, options.fps)
     names = read_names(options.poses)
-    motion = read_motion(options.motion) if isinstance(options.motion, Path) else None
-    avatar = load_avatar(options)
+    path = None if options.camera is None else read_cameras(options.camera)
+    if path is not None and options.motion == "turntable":
+        raise InputError("--camera: belongs to a moving hand, a turntable turns its own; choose another --motion.")
+    avatars = [load_avatar(options, file) for file in options.avatars]
     with show_progress(Console(stderr=True)) as progress:
-        look = {"elevation": math.radians(options.elevation), "background": background, "progress": progress}
+        hands = [(avatar, _poses(avatar, options, n_frames, names, progress)) for avatar in avatars]
+        hands = _together(hands, options)
+        n_frames = len(hands[0][1])
         if options.motion == "turntable":
-            frames = turntable(avatar, choose_pose(avatar, options.pose), n_frames, options.size, **look)
-        elif motion is None:
-            angles = pose_sequence(avatar.hand, names, max(1, round(n_frames / len(names))))
-            frames = pose_frames(avatar, angles, options.size, **look)
+            cameras = around(hands, n_frames, options.size, math.radians(options.elevation))
+        elif path is None:
+            cameras = [still_camera(hands, options.size, math.radians(options.elevation))] * n_frames
         else:
-            angles = resample(motion, options.fps)
-            count_frames(len(angles) / options.fps, options.fps)
-            frames = pose_frames(avatar, angles, options.size, **look)
+            cameras = [path[min(frame, len(path) - 1)] for frame in range(n_frames)]
+        stage = "turntable" if options.motion == "turntable" else "poses"
+        frames = draw_frames(hands, cameras, background=background, progress=progress, stage=stage)
         write_video(options.out, frames, options.fps, loops=options.loop)
     print(f"written: {options.out}")
     return 0
+
+
+def _poses(avatar: Avatar, options: Animate, n_frames: int, names: list[str], progress: Progress) -> list[HandPose]:
+    """The poses of one hand in all frames."""
+    if options.motion == "turntable":
+        return [choose_pose(avatar, options.pose)] * n_frames
+    if not isinstance(options.motion, Path):
+        angles = pose_sequence(avatar.hand, names, max(1, round(n_frames / len(names))))
+        return [avatar.source_pose._replace(angles=each) for each in angles]
+    motion = resample(read_motion(options.motion, avatar, progress=progress), options.fps)
+    count_frames(len(motion.angles) / options.fps, options.fps)
+    if options.wrist == "still":
+        return motion.poses(avatar.source_pose)
+    if motion.orientations is None or motion.translations is None:
+        raise InputError(f"{options.motion}: says nothing of the wrist's place; leave out --wrist moves.")
+    return [HandPose(*(part.to(avatar.shape) for part in each)) for each in
+            zip(motion.angles, motion.orientations, motion.translations, strict=True)]  # fmt: skip
+
+
+@torch.no_grad()
+def _together(hands: list[tuple[Avatar, list[HandPose]]], options: Animate) -> list[tuple[Avatar, list[HandPose]]]:
+    """Hands that keep their place stand side by side, in the order given; the shorter motion waits at its end."""
+    longest = max(len(poses) for _, poses in hands)
+    hands = [(avatar, [*poses, *[poses[-1]] * (longest - len(poses))]) for avatar, poses in hands]
+    if len(hands) == 1 or (options.wrist == "moves" and isinstance(options.motion, Path)):
+        return hands
+    placed, left = [], 0.0
+    for avatar, poses in hands:
+        seen = torch.cat([avatar.mesh(pose).vertices for pose in few(poses)])
+        wrist = avatar.mesh(poses[0]).joints[0]
+        shift = torch.stack([left - seen[:, 0].amin(), -wrist[1], -wrist[2]])
+        left += float(seen[:, 0].amax() - seen[:, 0].amin()) + GAP
+        moved = {id(pose): pose._replace(translation=pose.translation + shift) for pose in poses}
+        placed.append((avatar, [moved[id(pose)] for pose in poses]))
+    return placed
 
 
 def count_frames(seconds: float, fps: float) -> int:

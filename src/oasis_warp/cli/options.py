@@ -80,8 +80,8 @@ class Render:
     avatar: AvatarFile
     out: Output
     """Picture to write: .png, .webp or .jpg."""
-    pose: PoseName = "photo"
-    """Pose of the hand; "photo" is the one in the photo."""
+    pose: PoseName | Path = "photo"
+    """Pose of the hand; "photo" is the one in the photo. Or a file with one, as --motion of `oasis animate` takes."""
     azimuth: float = 0.0
     """Degrees around the hand; 0 is where the photo was taken from."""
     elevation: Elevation = 0.0
@@ -95,16 +95,24 @@ class Render:
 
 @dataclass(frozen=True, kw_only=True)
 class Animate:
-    """Make a film of an avatar: a turn around it, a walk through poses, or a motion of your own. The first two loop."""
+    """Make a film of an avatar: a turn around it, a walk through poses, or a motion of your own. The first two loop.
 
-    avatar: AvatarFile
+    Two avatars come into one scene.
+    """
+
+    avatars: Positional[tuple[Path, ...]]
+    """avatar.safetensors of `oasis reconstruct`, one or two."""
     out: Output
     """Film to write: .mp4, .gif, .webp, or a folder of PNG pictures if the name has no ending."""
     motion: Literal["turntable", "poses"] | Path = "turntable"
-    """Turn around the hand in one pose, or stand still and change poses, or play a .json or .npz with `angles`,
-    [T, 15, 3] in radians, and `fps`."""
-    pose: PoseName = "photo"
-    """Pose of the hand on the turntable."""
+    """Turn around the hand in one pose, or stand still and change poses, or play a file: joint angles, MANO's
+    parameters or tracked joints of WebXR and OpenXR in .json or .npz, a .bvh, or a video of a hand."""
+    wrist: Literal["still", "moves"] = "still"
+    """Whether the wrist stays as in the photo, or moves as the file says; then two hands stand as in the file."""
+    camera: Path | None = None
+    """JSON file with `viewmat`, `K`, `width` and `height` of a camera to see a motion or poses from."""
+    pose: PoseName | Path = "photo"
+    """Pose of the hand on the turntable, or a file with one."""
     poses: str = "open,fist,victory,point,ok"
     """Poses to walk through, with commas between them."""
     seconds: float = 4.0
@@ -145,8 +153,8 @@ class Export:
     avatar: AvatarFile
     out: Output
     """File to write."""
-    pose: PoseName | Literal["auto"] = "auto"
-    """Pose of the hand; "auto" is that of the photo, and in files that can be posed the rest pose."""
+    pose: PoseName | Literal["auto"] | Path = "auto"
+    """Pose of the hand, or a file with one; "auto" is that of the photo, in files that can be posed the rest pose."""
     light: Literal["auto", "baked", "none"] = "auto"
     """Colours as in the avatar's light, or as in even light for programs with lights of their own; "auto" bakes light
     into Gaussians and leaves it out of meshes."""

@@ -12,12 +12,14 @@ from oasis_warp.cli.console import check_device
 from oasis_warp.cli.options import Animate, Render
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK, WHITE
-from oasis_warp.core.errors import InputError
+from oasis_warp.core.errors import InputError, did_you_mean
 from oasis_warp.core.types import HandPose
 from oasis_warp.core.types import Render as Drawn
 from oasis_warp.data.environment_map import read_environment
 from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, to_uint8, write_picture
+from oasis_warp.hand.poses import POSE_NAMES
 from oasis_warp.hand_avatar import Avatar
+from oasis_warp.motion import read_motion
 
 MAX_SIDE = 8192
 """Largest side of a picture [px]."""
@@ -44,8 +46,8 @@ def straight_alpha(drawn: Drawn) -> Float[Tensor, "H W 4"]:
     return torch.cat([drawn.image / drawn.alpha.clamp_min(1e-6)[..., None], drawn.alpha[..., None]], -1)
 
 
-def load_avatar(options: Render | Animate) -> Avatar:
-    """Load the avatar in the chosen light.
+def load_avatar(options: Render | Animate, path: Path) -> Avatar:
+    """Load the avatar of a file in the chosen light.
 
     Raises:
         InputError: no avatar file, or no environment map.
@@ -54,7 +56,7 @@ def load_avatar(options: Render | Animate) -> Avatar:
         around = environment_light(read_environment(options.light))
     else:
         around = studio_light() if options.light == "studio" else None
-    avatar = Avatar.load(options.avatar, options.device)
+    avatar = Avatar.load(path, options.device)
     if around is not None:
         return avatar.in_light(around)
     return avatar.in_even_light() if options.light == "even" else avatar
@@ -75,9 +77,18 @@ def read_color(text: str) -> tuple[float, float, float]:
     return red / 255, green / 255, blue / 255
 
 
-def choose_pose(avatar: Avatar, name: str) -> HandPose:
-    """The named pose with the orientation and position of the photo; "photo" is the pose in the photo."""
-    return avatar.source_pose if name == "photo" else avatar.held(name)
+def choose_pose(avatar: Avatar, pose: str | Path) -> HandPose:
+    """The pose of a name or a file, turned and placed as in the photo; "photo" is the pose in the photo.
+
+    Raises:
+        InputError: no such name or file, or no pose in it.
+    """
+    if isinstance(pose, Path) and not pose.suffix:
+        hint = did_you_mean(str(pose), POSE_NAMES)
+        raise InputError(f"--pose {pose}: expected {', '.join(POSE_NAMES)} or a file. {hint or 'Choose one.'}")
+    if isinstance(pose, Path):
+        return read_motion(pose, avatar).poses(avatar.source_pose)[0]
+    return avatar.source_pose if pose == "photo" else avatar.held(pose)
 
 
 @torch.no_grad()
@@ -91,7 +102,7 @@ def run(options: Render) -> int:
     check_suffix(options.out, PICTURE_SUFFIXES)
     transparent = options.background == "transparent"
     background = BLACK if transparent else read_color(options.background)
-    avatar = load_avatar(options)
+    avatar = load_avatar(options, options.avatar)
     pose = choose_pose(avatar, options.pose)
     camera = orbit_camera(
         avatar.mesh(pose).vertices, math.radians(options.azimuth), math.radians(options.elevation), options.size

@@ -91,6 +91,19 @@ def euler_angles(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch
     return torch.stack([first, second, third], -1)
 
 
+def from_vector(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrices of axes times angles [rad]."""
+    angles = vectors.norm(dim=-1)
+    return from_axis_angle(vectors / angles.clamp_min(1e-12)[..., None], angles)
+
+
+def to_vector(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Axis times angle [rad] of rotation matrices."""
+    quats = from_matrix(matrices)
+    half = quats[..., 1:].norm(dim=-1, keepdim=True)
+    return quats[..., 1:] * torch.where(half > 1e-6, 2 * torch.atan2(half, quats[..., :1]) / half.clamp_min(1e-6), 2.0)
+
+
 def is_rotation(matrix: Float[Tensor, "3 3"], tolerance: float = 1e-3) -> Bool[Tensor, ""]:
     """Whether a finite matrix is a rotation: orthonormal rows, determinant 1."""
     off = (matrix @ matrix.T - torch.eye(3).to(matrix)).abs().amax()

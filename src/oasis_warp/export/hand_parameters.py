@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,7 +13,6 @@ from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.types import HandPose
 from oasis_warp.data.output_files import write_file
 from oasis_warp.export.request import ExportRequest
-from oasis_warp.export.surface_mesh import model_of
 from oasis_warp.hand.mano import mirror_mano_pose
 from oasis_warp.hand.mano_hand import mano_of_hand_pose
 from oasis_warp.hand.skinning import bone_transforms, hand21
@@ -38,7 +36,7 @@ def write_parameters(request: ExportRequest, path: Path) -> None:
     avatar, camera = request.avatar, request.avatar.source_camera
     pose = HandPose(*(part.to(avatar.shape) for part in request.pose or avatar.source_pose))
     check_finite(**pose._asdict())
-    hand, rest = model_of(avatar)
+    hand, rest = avatar.parts[:2]
     points = hand21(avatar.mesh(pose), hand)
     found: dict[str, Any] = {
         "oasis_hand": VERSION,
@@ -55,8 +53,8 @@ def write_parameters(request: ExportRequest, path: Path) -> None:
         },
         "as_mano": {
             "joint_names": list(hand.joint_names),
-            "global_orient": rotation_vectors(pose.orientation[None])[0].tolist(),
-            "hand_pose": rotation_vectors(_local_rotations(hand, rest.joints, pose)).tolist(),
+            "global_orient": rotation.to_vector(pose.orientation[None])[0].tolist(),
+            "hand_pose": rotation.to_vector(_local_rotations(hand, rest.joints, pose)).tolist(),
             "transl": pose.translation.tolist(),
             "rest_joints": rest.joints.tolist(),
             **_parameters_of_mano(avatar, pose),
@@ -83,10 +81,3 @@ def _local_rotations(hand: HandModel, joints: Float[Tensor, "16 3"], pose: HandP
     """Rotation of each bone but the wrist's in the frame of its parent at rest."""
     turns, _ = bone_transforms(hand, joints, pose)
     return turns[list(hand.parents[1:])].mT @ turns[1:]
-
-
-def rotation_vectors(matrices: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3"]:
-    """Axis times angle [rad] of rotation matrices."""
-    quats = rotation.from_matrix(matrices)
-    half = quats[:, 1:].norm(dim=1, keepdim=True)
-    return quats[:, 1:] * torch.where(half > 1e-6, 2 * torch.atan2(half, quats[:, :1]) / half.clamp_min(1e-6), 2.0)

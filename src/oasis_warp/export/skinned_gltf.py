@@ -17,9 +17,9 @@ from oasis_warp.export import texture
 from oasis_warp.export.gltf import INDICES, VERTICES, GltfBuffer, write_gltf
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.skinned_mesh import SkinnedMesh, skinned_mesh
-from oasis_warp.export.webxr_rig import Rig, local_bind, local_quats
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.skinning import corrective_coefficients
+from oasis_warp.hand.webxr_rig import Rig, local_bind, local_quats
 
 ROUGHNESS = 0.5
 """Of the material: between dry and oily skin, whose highlight glTF's model has no more parameters for."""

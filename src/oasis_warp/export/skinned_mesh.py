@@ -8,9 +8,9 @@ from torch import Tensor
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import PosedHand
-from oasis_warp.export.surface_mesh import Topology, at_mesh, mesh_normals, mesh_points, model_of, topology
-from oasis_warp.export.webxr_rig import TO_WEBXR, Rig, webxr_rig
+from oasis_warp.export.surface_mesh import Topology, at_mesh, mesh_normals, mesh_points, topology
 from oasis_warp.hand.skinning import correctives_per_joint
+from oasis_warp.hand.webxr_rig import TO_WEBXR, Rig, webxr_rig
 from oasis_warp.hand_avatar import Avatar
 
 INFLUENCES = 8
@@ -38,7 +38,7 @@ class SkinnedMesh(NamedTuple):
 @torch.no_grad()
 def skinned_mesh(avatar: Avatar) -> SkinnedMesh:
     """The mesh of an avatar."""
-    hand, rest = model_of(avatar)
+    hand, rest = avatar.parts[:2]
     rig, mesh = webxr_rig(hand, rest, avatar.side), topology(avatar)
     to_file = torch.tensor(TO_WEBXR[avatar.side]).to(rest.vertices)
     points = mesh_points(rest.vertices, hand, mesh) @ to_file.T

@@ -11,8 +11,8 @@ from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.skinned_gltf import KEYS, ROUGHNESS, SECONDS, clip_angles
 from oasis_warp.export.skinned_mesh import SkinnedMesh, skinned_mesh
 from oasis_warp.export.usd_stage import new_stage, quatf, usd, vec3f, write_stage
-from oasis_warp.export.webxr_rig import Rig, local_bind, local_quats
 from oasis_warp.hand.skinning import corrective_coefficients
+from oasis_warp.hand.webxr_rig import Rig, local_bind, local_quats
 
 
 def write_skinned_usd(request: ExportRequest, path: Path) -> None:

@@ -9,9 +9,7 @@ from torch.nn.functional import normalize
 
 from oasis_warp.avatar.wrist import CAP_HEIGHT
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.mirror import mirror_hand, mirror_points
 from oasis_warp.core.surface import vertex_normals
-from oasis_warp.core.types import PosedHand
 from oasis_warp.hand_avatar import Avatar
 
 CAP_CORNER = (0.0125, 0.9875)
@@ -28,13 +26,6 @@ class Topology(NamedTuple):
     """v points up in the picture."""
     faces: Int[Tensor, "F 3"]
     """Counter-clockwise seen from outside."""
-
-
-def model_of(avatar: Avatar) -> tuple[HandModel, PosedHand]:
-    """The hand model of the avatar's side, and its surface at rest [m]."""
-    if avatar.side == "right":
-        return avatar.hand, avatar.rest
-    return mirror_hand(avatar.hand), PosedHand(*map(mirror_points, avatar.rest))
 
 
 def topology(avatar: Avatar) -> Topology:

@@ -1,0 +1,265 @@
+"""What other programs write comes back as the joint angles that it was made from."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from oasis_warp.core import rotation
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import HandPose
+from oasis_warp.export import export_avatar
+from oasis_warp.hand.mano import ManoPose, hand_pose, mano_surface, read_mano
+from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand.skinning import bone_transforms
+from oasis_warp.hand.webxr_rig import TO_WEBXR, webxr_rig
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.motion import read_motion
+from oasis_warp.motion.mano import WRIST
+
+ANGLES = np.linspace(-1, 1, 4 * 45).reshape(4, 15, 3)
+NAMES = ("open", "fist", "ok", "point")
+
+
+def motion_of(avatar):
+    """Named poses, and the wrist somewhere else in each."""
+    generator = torch.Generator().manual_seed(3)
+    angles = torch.stack([named_pose(avatar.hand, name) for name in NAMES])
+    low, high = avatar.hand.pose_limits[1:].unbind(-1)
+    angles = torch.minimum(torch.maximum(angles + 0.2 * torch.randn(4, 15, 3, generator=generator), low), high)
+    turns = rotation.to_matrix(torch.randn(4, 4, generator=generator))
+    return HandPose(angles, turns, 0.3 * torch.randn(4, 3, generator=generator))
+
+
+def world_turns(avatar, poses):
+    hand, rest = avatar.parts[:2]
+    return bone_transforms(hand, rest.joints, poses)[0]
+
+
+def local_turns(avatar, poses):
+    turns = world_turns(avatar, poses)
+    return turns[:, list(avatar.hand.parents[1:])].mT @ turns[:, 1:]
+
+
+def places_as_smplx(avatar, poses):
+    """Of a hand that turns about its wrist, which MANO's file has at WRIST."""
+    at = torch.tensor(WRIST) * (torch.tensor([-1.0, 1, 1]) if avatar.side == "left" else 1)
+    return poses.translation + poses.orientation @ avatar.parts.rest.joints[0] - at
+
+
+def check(found, expected, atol=1e-5):
+    assert np.allclose(found.angles, expected.angles, atol=atol)
+    assert np.allclose(found.orientations, expected.orientation, atol=atol)
+    assert np.allclose(found.translations, expected.translation, atol=atol)
+
+
+def test_json_and_npz_hold_the_same_motion(tmp_path, avatar):
+    (tmp_path / "a.json").write_text(json.dumps({"fps": 12, "angles": ANGLES.tolist()}))
+    np.savez(tmp_path / "a.npz", angles=ANGLES, fps=12)
+    np.savez(tmp_path / "b.npz", angles=ANGLES)
+    for name, fps in (("a.json", 12), ("a.npz", 12), ("b.npz", 30)):
+        motion = read_motion(tmp_path / name, avatar)
+        assert motion.fps == fps
+        assert np.allclose(motion.angles, ANGLES)
+
+
+def test_the_parameters_that_we_export_give_the_pose_back(tmp_path, avatar):
+    poses = motion_of(avatar)
+    for k in range(4):
+        pose = HandPose(*(part[k] for part in poses))
+        export_avatar(avatar, tmp_path / "hand.json", pose=pose)
+        check(read_motion(tmp_path / "hand.json", avatar), HandPose(*(part[None] for part in pose)))
+
+
+@pytest.mark.parametrize("form", ["matrices", "vectors", "with the wrist", "components", "about a mean"])
+def test_mano_is_read_in_all_the_forms_that_programs_write(tmp_path, avatar, form):
+    poses = motion_of(avatar)
+    local, wrist = local_turns(avatar, poses), poses.orientation
+    vectors, turn = rotation.to_vector(local.double()).reshape(4, 45), rotation.to_vector(wrist)
+    places = places_as_smplx(avatar, poses)
+    mean = torch.linspace(-0.3, 0.3, 45).double()
+    basis = torch.linalg.qr(torch.randn(45, 45, generator=torch.Generator().manual_seed(1)).double()).Q
+    parts = {
+        "matrices": {"hand_pose": local, "global_orient": wrist[:, None], "transl": places},
+        "vectors": {"hand_pose": vectors, "global_orient": turn, "transl": places},
+        "with the wrist": {"poses": torch.cat([turn.double(), vectors], 1), "trans": places},
+        "components": {"hand_pose": vectors @ basis.T, "hands_components": basis, "global_orient": turn,
+                       "transl": places},
+        "about a mean": {"pose": vectors - mean, "hands_mean": mean, "root_orient": turn, "trans": places},
+    }[form]  # fmt: skip
+    if form == "components":  # a full basis, of which files often have the first rows
+        parts["hand_pose"] = vectors @ torch.linalg.inv(basis)
+    np.savez(tmp_path / "mano.npz", **{name: part.numpy() for name, part in parts.items()})
+    check(read_motion(tmp_path / "mano.npz", avatar), poses, 1e-4)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_an_avatar_of_mano_plays_smplx_parameters_and_components(tmp_path, avatars, mano_dir, mano, monkeypatch, side):
+    """Its joints lie where MANO's layer has them; 6 numbers are of the files' own components, about their mean."""
+    monkeypatch.setenv("OASIS_MANO_DIR", str(mano_dir))
+    some, plain = np.random.default_rng(4), avatars["left"]
+    avatar = Avatar(
+        side=side, shape=torch.from_numpy(some.normal(size=10)).float(), surface_offsets=torch.zeros_like(mano.template),
+        gaussians=plain.gaussians, source_pose=plain.source_pose, source_camera=plain.source_camera, hand=mano,
+    )  # fmt: skip
+    model, few = read_mano(mano_dir, side), 0.5 * some.normal(size=6)
+    orient, place = np.array([0.3, -0.5, 0.2]), np.array([0.1, 0.2, 0.6])
+    layer = ManoPose(avatar.shape.numpy(), orient, hand_pose(model, few, flat_hand_mean=False), place)
+    np.savez(tmp_path / "m.npz", hand_pose=few[None], global_orient=orient[None], transl=place[None])
+    motion = read_motion(tmp_path / "m.npz", avatar)
+    assert motion.orientations is not None and motion.translations is not None
+    found = avatar.mesh(HandPose(motion.angles[0], motion.orientations[0], motion.translations[0])).joints
+    np.testing.assert_allclose(found, mano_surface(model, layer)[1], atol=2e-5)
+
+
+@pytest.mark.parametrize("palm", [False, True], ids=["webxr", "openxr"])
+def test_tracked_joints_give_the_pose_back_and_the_place_of_the_wrist(tmp_path, avatar, palm):
+    """A transposed rotation, a wrong order of quaternions or an axis of the room would show."""
+    hand, rest = avatar.parts[:2]
+    poses, rig = motion_of(avatar), webxr_rig(hand, rest, avatar.side)
+    turns, shifts = bone_transforms(hand, rest.joints, poses)
+    to_file, bones = torch.tensor(TO_WEBXR[avatar.side]).float(), list(rig.bones)
+    room = torch.diag(torch.tensor([1.0, -1, -1]))  # y up, z to the viewer
+    joints = rig.bind[:, :3, 3] @ to_file
+    places = ((turns[:, bones] @ joints[..., None])[..., 0] + shifts[:, bones]) @ room
+    quats = rotation.from_matrix(room @ turns[:, bones] @ to_file.T @ rig.bind[:, :3, :3])[..., [1, 2, 3, 0]]
+    if palm:
+        places, quats = torch.cat([places[:, :1], places], 1), torch.cat([quats.flip(1)[:, :1], quats], 1)
+    parts = {"orientations": quats.tolist(), "positions": places.tolist(), "fps": 72}
+    other = {"orientations": quats.flip(0).tolist(), "positions": places.tolist()}
+    sides = {avatar.side: parts, {"left": "right", "right": "left"}[avatar.side]: other}
+    for name, content in (("one.json", parts), ("both.json", sides)):
+        (tmp_path / name).write_text(json.dumps(content))
+        motion = read_motion(tmp_path / name, avatar)
+        check(motion, poses, 1e-4)
+        assert motion.fps == 72
+
+
+def test_the_other_hands_motion_is_done_by_the_same_fingers(tmp_path, avatars):
+    """A left hand that plays a right hand's rotations must close where that one closes."""
+    poses = motion_of(avatars["right"])
+    vectors = rotation.to_vector(local_turns(avatars["right"], poses).double())
+    (tmp_path / "right.json").write_text(json.dumps({"side": "right", "hand_pose": vectors.tolist()}))
+    assert np.allclose(read_motion(tmp_path / "right.json", avatars["left"]).angles, poses.angles, atol=1e-4)
+
+
+NAMINGS = {
+    "mixamo": ("mixamorig:{Side}Hand", "mixamorig:{Side}Hand{Finger}{k}"),
+    "unreal": ("hand_{s}", "{finger}_0{k}_{s}"),
+    "cmu": ("{S}Hand", "{S}{Finger}{k}"),
+    "one hand": ("wrist", "{finger}{k}"),
+}
+
+
+def bvh_of(avatar, poses, naming):
+    """The hand as a skeleton in centimetres that is laid elsewhere in its world, below an arm that moves too."""
+    hand, rest = avatar.parts[:2]
+    laid = rotation.to_matrix(torch.tensor([0.4, -0.3, 0.8, 0.2]))
+    joints = 100 * rest.joints @ laid.T
+    local = torch.cat([torch.eye(3).expand(len(poses.angles), 1, 3, 3), local_turns(avatar, poses)], 1)
+    local = laid @ local @ laid.T
+    arm = rotation.to_matrix(torch.tensor([[0.9, 0.1 * k, 0.2, -0.1] for k in range(len(local))]))
+    local[:, 0] = arm
+    wrist, joint = NAMINGS[naming]
+    words = {"s": avatar.side[0], "S": avatar.side[0].upper(), "Side": avatar.side.capitalize(), "side": avatar.side}
+    tips = dict(zip((15, 3, 6, 12, 9), 100 * rest.tips @ laid.T, strict=True))
+    lines, frames = ["HIERARCHY", "ROOT Hips", "{", "OFFSET 0 0 0", "CHANNELS 3 Xposition Yposition Zposition"], []
+
+    def offset(vector):
+        return "OFFSET " + " ".join(f"{float(value):.6f}" for value in vector)
+
+    def write(bone):
+        if bone == 0:
+            name = wrist.format(**words)
+        else:
+            finger = hand.joint_names[bone][:-1]
+            finger = "pinky" if finger == "little" and naming != "one hand" else finger
+            name = joint.format(finger=finger, Finger=finger.capitalize(), k=(bone - 1) % 3 + 1, **words)
+        lines.extend([f"JOINT {name}", "{"])
+        lines.append(offset(joints[bone] - (joints[hand.parents[bone]] if bone else 0)))
+        lines.append("CHANNELS 3 Zrotation Yrotation Xrotation")
+        m = local[:, bone].double()
+        x, y, z = (torch.atan2(m[:, 2, 1], m[:, 2, 2]), torch.asin(-m[:, 2, 0]), torch.atan2(m[:, 1, 0], m[:, 0, 0]))
+        frames.append(torch.stack([z, y, x], 1).rad2deg())
+        for child in [k for k in range(16) if hand.parents[k] == bone]:
+            write(child)
+        if bone in tips:
+            lines.extend(["End Site", "{", offset(tips[bone] - joints[bone]), "}"])
+        lines.append("}")
+
+    write(0)
+    numbers = torch.cat([torch.zeros(len(local), 3), *frames], 1)
+    rows = [" ".join(f"{float(value):.6f}" for value in row) for row in numbers]
+    return "\n".join([*lines, "}", "MOTION", f"Frames: {len(rows)}", "Frame Time: 0.0166667", *rows]) + "\n"
+
+
+@pytest.mark.parametrize("naming", NAMINGS)
+def test_a_skeleton_that_moves_as_our_hand_gives_its_angles(tmp_path, avatar, naming):
+    poses = motion_of(avatar)
+    (tmp_path / "a.bvh").write_text(bvh_of(avatar, poses, naming))
+    motion = read_motion(tmp_path / "a.bvh", avatar)
+    assert np.allclose(motion.angles, poses.angles, atol=2e-3)
+    assert motion.fps == pytest.approx(60, rel=1e-4)
+
+
+def test_a_skeleton_of_the_other_side_only_is_refused(tmp_path, avatars):
+    (tmp_path / "a.bvh").write_text(bvh_of(avatars["left"], motion_of(avatars["left"]), "mixamo"))
+    with pytest.raises(InputError, match="fingers of a right hand are expected"):
+        read_motion(tmp_path / "a.bvh", avatars["right"])
+
+
+def test_fingers_point_where_those_of_a_skeleton_with_bent_fingers_at_rest_point(tmp_path, avatars):
+    """Rotations count from the skeleton's own rest pose, here a relaxed hand."""
+    avatar = avatars["right"]
+    relaxed = named_pose(avatar.hand, "relaxed")[None]
+    still = HandPose(relaxed, torch.eye(3)[None], torch.zeros(1, 3))
+    posed = avatar.mesh(still)
+    rest = avatar.rest
+    bent = rest._replace(joints=posed.joints[0], tips=posed.tips[0])
+
+    class Laid:
+        side, hand = avatar.side, avatar.hand
+        parts = (avatar.hand, bent)
+
+    text = bvh_of(Laid, HandPose(torch.zeros(1, 15, 3), torch.eye(3)[None], torch.zeros(1, 3)), "mixamo")
+    (tmp_path / "a.bvh").write_text(text)
+    found = read_motion(tmp_path / "a.bvh", avatar).angles[0]
+    flexion = torch.tensor([k for k in range(12)])
+    assert np.allclose(found[flexion, 0], relaxed[0, flexion, 0], atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "expected"),
+    [
+        ("a.fbx", b"Kaydara", "expected a motion in .json, .npz, .bvh"),
+        ("none.npz", None, "cannot be read"),
+        ("none.mp4", None, "cannot be read"),
+        ("a.mp4", b"no video", "expected a video"),
+        ("a.json", b"{", "not a motion"),
+        ("a.json", b"[1]", "not a motion"),
+        ("a.json", b"{}", "`angles`, `hand_pose` or `orientations` are expected"),
+        ("a.json", b'{"angles": [[1, 2]]}', "expected angles of shape"),
+        ("a.json", b'{"angles": "x"}', "not a motion"),
+        ("a.json", b'{"angles": [[1], [2, 3]]}', "not a motion"),
+        ("a.json", json.dumps({"angles": (40 * ANGLES).tolist()}).encode(), "expected angles in radians"),
+        ("a.json", json.dumps({"angles": ANGLES.tolist(), "fps": 0}).encode(), "1 to 1000 frames"),
+        ("a.json", json.dumps({"angles": ANGLES.tolist(), "fps": [1, 2]}).encode(), "not a motion"),
+        ("a.json", json.dumps({"angles": ANGLES.tolist(), "transl": [[0, 0, 0]]}).encode(), "a finite place of"),
+        ("a.json", json.dumps({"hand_pose": [[0] * 12]}).encode(), "need `hands_components`"),
+        ("a.json", json.dumps({"orientations": [[[0, 0, 0, 1]] * 21]}).encode(), "orientations of shape"),
+        ("a.json", json.dumps({"orientations": [[[0, 0, 0, 0]] * 25]}).encode(), "leave out frames"),
+        ("a.json", json.dumps({"side": "up", "angles": ANGLES.tolist()}).encode(), "the side left or right"),
+        ("a.npz", b"no zip", "not a motion"),
+        ("a.npz", b"PK\x03\x04 cut", "not a motion"),
+        ("a.bvh", b"HIERARCHY", "HIERARCHY and MOTION are expected"),
+        ("a.bvh", b"HIERARCHY ROOT a { OFFSET 0 0 } MOTION Frames: 1 Frame Time: 1 ", "not a motion"),
+        ("a.bvh", b"HIERARCHY ROOT a { CHANNELS 1 Xrotation } MOTION\nFrames: 2\nFrame Time: .1\n1", "2 frames of 1"),
+    ],
+)
+def test_what_is_no_motion_is_refused_in_one_sentence(tmp_path, avatars, name, content, expected):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=expected) as error:
+        read_motion(tmp_path / name, avatars["left"])
+    assert "\n" not in str(error.value)
