@@ -21,6 +21,11 @@ def closing(avatar, n, fps=30.0):
     return Motion(torch.lerp(start, end, share[:, None, None]), fps, turns, places)
 
 
+def poses(motion):
+    assert motion.orientations is not None and motion.translations is not None
+    return HandPose(motion.angles, motion.orientations, motion.translations)
+
+
 def test_another_rate_blends_between_frames_and_holds_the_last():
     motion = Motion(torch.arange(3.0)[:, None, None].expand(3, 15, 3), 10.0)
     for fps, expected in ((20.0, [0, 0.5, 1, 1.5, 2, 2]), (10.0, [0, 1, 2]), (1.0, [0])):
@@ -31,9 +36,9 @@ def test_another_rate_blends_between_frames_and_holds_the_last():
 
 def test_another_rate_turns_the_wrist_the_short_way(avatars):
     motion = closing(avatars["left"], 90)
-    twice = resample(motion, 60.0)
-    assert torch.allclose(twice.orientations[::2][:90], motion.orientations, atol=1e-6)
-    steps = rotation.to_vector(twice.orientations[:-1].mT @ twice.orientations[1:]).norm(dim=1)
+    turns = poses(resample(motion, 60.0)).orientation
+    assert torch.allclose(turns[::2][:90], poses(motion).orientation, atol=1e-6)
+    steps = rotation.to_vector(turns[:-1].mT @ turns[1:]).norm(dim=1)
     assert float(steps.max()) < 0.06  # quaternions of other signs would turn by pi
 
 
@@ -44,7 +49,7 @@ def test_the_filter_keeps_the_motion_and_takes_away_the_noise(avatars):
     shaken = motion._replace(angles=motion.angles + noise)
 
     def points(of):
-        posed = avatar.mesh(HandPose(of.angles, of.orientations, of.translations))
+        posed = avatar.mesh(poses(of))
         return torch.cat([posed.joints, posed.tips], 1)
 
     true, found = points(motion), points(smooth(shaken))
@@ -75,7 +80,7 @@ def seen_in(monkeypatch, avatar, lost):
     def fit(estimator, photo, avatar, focal):
         k = len(calls)
         calls.append(focal)
-        pose = HandPose(motion.angles[k], motion.orientations[k], motion.translations[k])
+        pose = HandPose(*(part[k] for part in poses(motion)))
         return (None if k in lost else pose), 500.0
 
     monkeypatch.setattr(recording, "_fit_frame", fit)
@@ -92,7 +97,8 @@ def test_frames_without_the_hand_are_bridged_and_said(film, avatars, monkeypatch
     assert torch.allclose(found.angles[seen], motion.angles[seen], atol=1e-6)
     assert torch.allclose(found.angles[4], torch.lerp(motion.angles[3], motion.angles[6], 1 / 3), atol=1e-6)
     assert torch.allclose(found.angles[[0, 11]], motion.angles[[1, 10]], atol=1e-6)
-    assert torch.allclose(found.translations[5], torch.lerp(*motion.translations[[3, 6]], 2 / 3), atol=1e-6)
+    before, after = poses(motion).translation[[3, 6]]
+    assert torch.allclose(poses(found).translation[5], torch.lerp(before, after, 2 / 3), atol=1e-6)
     assert focals[1:] == [500.0] * 11  # that of the first frame
 
 
@@ -112,5 +118,5 @@ def test_a_hand_that_moves_through_the_picture_is_followed(avatars, tmp_path):
     found = read_motion(tmp_path / "film.mp4", avatars["left"])
     assert len(found.angles) == 10
     assert (found.angles - found.angles.mean(0)).abs().max() < 0.2  # the hand itself does not move
-    shift = found.translations[:, 0] / found.translations[:, 2]
-    assert (shift.diff() > 0).all()
+    places = poses(found).translation
+    assert ((places[:, 0] / places[:, 2]).diff() > 0).all()
