@@ -101,7 +101,8 @@ def test_an_avatar_of_mano_plays_smplx_parameters_and_components(tmp_path, avata
     some, plain = np.random.default_rng(4), avatars["left"]
     avatar = Avatar(
         side=side, shape=torch.from_numpy(some.normal(size=10)).float(), gaussians=plain.gaussians,
-        surface_offsets=torch.zeros_like(mano.template), source_pose=plain.source_pose, source_camera=plain.source_camera, hand=mano,
+        surface_offsets=torch.zeros_like(mano.template), source_pose=plain.source_pose,
+        source_camera=plain.source_camera, hand=mano,
     )  # fmt: skip
     model, few = read_mano(mano_dir, side), 0.5 * some.normal(size=6)
     orient, place = np.array([0.3, -0.5, 0.2]), np.array([0.1, 0.2, 0.6])
