@@ -135,7 +135,8 @@ def reconstruct(
     Args:
         photo: From `oasis_warp.read_photo`, or its file.
         config: Options.
-        keypoints: A JSON file with 21 landmarks, or with pose and camera, to use instead of the networks.
+        keypoints: A file with 21 landmarks, or with pose and camera, to use instead of the networks:
+            `estimation.keypoints.read_keypoints`.
         prior: What to assume of a hand before its photo is fitted; the one that `config.prior` names when not given.
         progress: Called as work goes on.
 
@@ -195,7 +196,7 @@ def _run(
         prior = prior or choose_prior(config.prior, config.backbone_weights)
     with stage("landmarks"):
         found = [
-            read_keypoints(keypoints, p, hand=hand)
+            read_keypoints(keypoints, p, hand=hand, which=config.hand)
             if keypoints
             else choose_hand(estimator.find(p), config.hand, p.name)
             for p in photos

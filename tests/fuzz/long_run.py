@@ -31,6 +31,8 @@ def make_target(name: str, folder: Path):
         return targets.motions(folder)
     if name == "images":
         return targets.images(avif=True)
+    if name == "estimates":
+        return targets.estimates()
     pose = targets.small_avatar(lit=False).source_pose
     if name == "keypoints":
         return targets.keypoints(*targets.plain_photo(), pose, fit=False)

@@ -1,6 +1,8 @@
 """What damaged files are thrown at. Each says "refused", by one clean sentence, or "taken", with a sane result."""
 
+import io
 import json
+import pickle
 import resource
 import time
 from collections.abc import Callable
@@ -213,6 +215,26 @@ def keypoints(photo: Photo, landmarks: Landmarks, pose: HandPose, *, fit: bool) 
 
     files = {".points.json": json.dumps(points).encode(), ".pose.json": json.dumps(posed).encode()}
     return Target(files, json_file, read)
+
+
+def estimates() -> Target:
+    """Hands of an estimator of MANO as .npz and as pickles of several protocols."""
+    photo, _ = plain_photo()
+    turns = np.stack([np.eye(3)] * 16)
+    arrays = {
+        "right": np.ones(1), "pred_cam_t_full": np.array([[0.0, 0.0, 40.0]]), "scaled_focal_length": np.array(3906.0),
+        "pred_keypoints_3d": np.random.default_rng(0).normal(0, 0.05, (1, 21, 3)), "betas": np.zeros((1, 10)),
+        "global_orient": turns[None, :1], "hand_pose": turns[None, 1:],
+    }  # fmt: skip
+    archive = io.BytesIO()
+    np.savez(archive, **arrays)
+    files = {f".{protocol}.pkl": pickle.dumps(arrays, protocol) for protocol in (0, 2, 4, 5)}
+
+    def read(path: Path) -> None:
+        found = read_keypoints(path, photo)
+        assert isinstance(found, Landmarks) and bool(found.xy.isfinite().all())
+
+    return Target(files | {".npz": archive.getvalue()}, damaged_bytes, read)
 
 
 def images(*, avif: bool) -> Target:

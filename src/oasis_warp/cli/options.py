@@ -36,8 +36,9 @@ class _Photos:
     out: OutputFolder
     same_hand: bool = False
     """All photos show one hand: make one avatar of them, in the first one's light."""
-    keypoints: Path | None = None
-    """JSON file with 21 landmarks, or with pose and camera, to use instead of the networks; for one photo only."""
+    keypoints: Annotated[Path | None, arg(aliases=["--fit"])] = None
+    """JSON file with 21 landmarks, or with pose and camera, or what WiLoR or HaMeR found, as .npz or .pkl, to use
+    instead of the networks; for one photo only."""
 
 
 @dataclass(frozen=True, kw_only=True)

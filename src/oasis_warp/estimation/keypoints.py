@@ -14,8 +14,17 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.mirror import mirror_landmarks
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
 from oasis_warp.data.json_text import MOST_LETTERS, read_json
-from oasis_warp.estimation.fit_problem import MirroredInput, mirrored_state, real
+from oasis_warp.estimation.fit_problem import FitState, MirroredInput, mirrored_state, real
 from oasis_warp.estimation.fit_quality import fit_quality, framing_warnings
+from oasis_warp.estimation.mano_estimates import (
+    SUFFIXES,
+    Estimate,
+    Which,
+    estimate_of_entries,
+    landmarks_of,
+    pose_of,
+    read_estimate,
+)
 from oasis_warp.estimation.pixel_reading import read_pixels
 from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_reading
 from oasis_warp.hand.kinematics import HandKinematics
@@ -37,17 +46,24 @@ MOST_NUMBER = 1e9
 """Of all others, so that float32 holds their squares."""
 
 
-def read_keypoints(path: Path | str, photo: Photo, *, hand: HandModel | None = None) -> Landmarks | HandFit:
-    """Landmarks from `{"side", "xy", "world"?}`, a fit from `{"side", "angles", ...}`.
+def read_keypoints(
+    path: Path | str, photo: Photo, *, hand: HandModel | None = None, which: Which = "largest"
+) -> Landmarks | HandFit:
+    """Landmarks from `{"side", "xy", "world"?}`, a fit from `{"side", "angles", ...}`, either from MANO's parameters.
 
     Pixels are those of the photo's file, upright; they are scaled to `photo` where that was shrunk. `hand` is the model
-    that a pose belongs to, the bundled one by default.
+    that a pose belongs to, the bundled one by default. Files of estimators of MANO, .npz and .pkl, may have several
+    hands, of which `which` is taken (`mano_estimates`).
 
     Raises:
         InputError: no such file, no JSON, or values that cannot be a hand; the sentence names the key.
     """
-    path = Path(path)
+    path, hand = Path(path), hand or bundled_hand()
+    if path.suffix in SUFFIXES:
+        return _of_mano(path, read_estimate(path, photo, which), photo, hand)
     data = _read_object(path)
+    if "global_orient" in data or "pred_keypoints_3d" in data:
+        return _of_mano(path, estimate_of_entries(path, data, photo), photo, hand)
     side = data.get("side")
     if side not in ("left", "right"):
         raise InputError(f'{path}: "side" must be "left" or "right", got {shortened(json.dumps(side))}; add it.')
@@ -58,7 +74,17 @@ def read_keypoints(path: Path | str, photo: Photo, *, hand: HandModel | None = N
         raise InputError(f'{path}: the key "{key}" is not known here; see docs/estimator.md for those that are.')
     if "xy" in data:
         return _landmarks(path, data, side, photo)
-    return _pose(path, data, side, photo, hand or bundled_hand())
+    return _pose(path, data, side, photo, hand)
+
+
+def _of_mano(path: Path, found: Estimate, photo: Photo, hand: HandModel) -> Landmarks | HandFit:
+    """The estimate's pose for MANO, its points for any other hand."""
+    if hand.name == "mano":
+        shape, pose, camera = pose_of(path, found, hand, photo)
+        return _checked_fit(path, hand, photo, found.side, shape, pose, camera)
+    landmarks = landmarks_of(path, found, photo)
+    _check_points(f"{path}: its points and camera", landmarks.xy.double().numpy(), photo)
+    return landmarks
 
 
 def _landmarks(path: Path, data: dict[str, Any], side: Side, photo: Photo) -> Landmarks:
@@ -91,8 +117,16 @@ def _pose(path: Path, data: dict[str, Any], side: Side, photo: Photo, hand: Hand
     pose = HandPose(real(_numbers(path, data, "angles", (15, 3), MOST_ANGLE)), real(rotation), real(translation))
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
     camera = Camera(torch.eye(4), real(K), width, height)
+    return _checked_fit(path, hand, photo, side, shape, pose, camera)
+
+
+def _checked_fit(
+    path: Path, hand: HandModel, photo: Photo, side: Side, shape: np.ndarray, pose: HandPose, camera: Camera
+) -> HandFit:
+    """The fit of a pose that puts the hand into the photo."""
+    width = camera.width
     kinematics = HandKinematics(hand)
-    state = mirrored_state(kinematics, side, shape, pose, camera)
+    state = _state(kinematics, side, shape, pose, camera)
     points = kinematics.landmarks(kinematics.pose_joints(state.angles, state.shape))[0]
     if state.in_camera(points)[:, 2].min() <= DEPTHS[0]:
         raise InputError(f'{path}: "translation" puts fingers behind the camera; z points forward, in metres.')
@@ -114,6 +148,14 @@ def _check_points(name: str, xy: np.ndarray, photo: Photo) -> None:
         raise InputError(f"{name}: all points lie within {FEWEST_PIXELS} pixels; give 21 different ones of a hand.")
 
 
+def _state(
+    kinematics: HandKinematics, side: Side, shape: np.ndarray, pose: HandPose, camera: Camera
+) -> FitState:
+    """`mirrored_state` with all 45 angles of the pose."""
+    table = np.concatenate([np.zeros((1, 3)), pose.angles.double().numpy()])
+    return replace(mirrored_state(kinematics, side, shape, pose, camera), angles=table)
+
+
 def fit_of_pose(
     hand: HandModel, photo: Photo, side: Side, shape: np.ndarray, pose: HandPose, camera: Camera
 ) -> HandFit:
@@ -130,7 +172,7 @@ def fit_of_pose(
         camera: Of the photo, with an identity viewmat.
     """
     kinematics = HandKinematics(hand)
-    state = mirrored_state(kinematics, side, shape, pose, camera)
+    state = _state(kinematics, side, shape, pose, camera)
     points = kinematics.landmarks(kinematics.pose_joints(state.angles, state.shape))[0]
     xy, world = torch.from_numpy(state.project(points)), torch.from_numpy(state.in_camera(points))
     landmarks = Landmarks(xy.float(), (world - world.mean(0)).float(), "right", 1.0, 1.0, "file")

@@ -97,13 +97,15 @@ class HandKinematics:
         return np.einsum("kab,ka->kb", frames, _LANDMARK_OFFSETS / 190 * size)
 
     def all_angles(self, angles: np.ndarray) -> np.ndarray:
-        """The 26 angles in a table of all angles, [16, 3]."""
+        """The 26 angles in a table of all angles, [16, 3]; such a table as it is."""
+        if angles.shape == (16, 3):
+            return angles
         table = np.zeros((16, 3))
         table[self.dofs[:, 0], self.dofs[:, 1]] = angles
         return table
 
     def pose_joints(self, angles: np.ndarray, shape: np.ndarray) -> PosedJoints:
-        """Pose the joints by the 26 angles of the fit."""
+        """Pose the joints by the 26 angles of the fit, or by all, [16, 3]."""
         return self.pose_all_joints(self.all_angles(angles), shape)
 
     def pose_all_joints(self, table: np.ndarray, shape: np.ndarray) -> PosedJoints:

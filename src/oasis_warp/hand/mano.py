@@ -173,6 +173,11 @@ def rotations(vectors: np.ndarray) -> np.ndarray:
     return np.stack([cv2.Rodrigues(vector)[0] for vector in np.asarray(vectors, np.float64).reshape(-1, 3)])
 
 
+def rotation_vectors(matrices: np.ndarray) -> np.ndarray:
+    """The inverse of `rotations`, of matrices that are nearly rotations too, [N, 3, 3] -> [N, 3]."""
+    return np.stack([cv2.Rodrigues(matrix)[0][:, 0] for matrix in np.asarray(matrices, np.float64)])
+
+
 def mano_surface(model: ManoModel, pose: ManoPose) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] and joints [16, 3] as smplx's layer has them [m]; the wrist turns about its own joint."""
     turns = rotations(np.concatenate([pose.global_orient.reshape(1, 3), pose.hand_pose.reshape(15, 3)]))

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import igl
 import numpy as np
 import torch
@@ -25,7 +24,16 @@ from oasis_warp.core.hand_model import HandModel, ModelOrigin
 from oasis_warp.core.rotation import euler_angles, euler_rotations
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.kinematics import HandKinematics, unit
-from oasis_warp.hand.mano import PARENTS, TIP_VERTICES, ManoModel, ManoPose, mano_hd, read_mano, rotations
+from oasis_warp.hand.mano import (
+    PARENTS,
+    TIP_VERTICES,
+    ManoModel,
+    ManoPose,
+    mano_hd,
+    read_mano,
+    rotation_vectors,
+    rotations,
+)
 from oasis_warp.hand.surface_fit import PlacedHand, align, step_to_points
 from oasis_warp.hand.template import bundled_hand
 
@@ -244,7 +252,7 @@ def mano_of_hand_pose(hand: HandModel, shape: torch.Tensor, pose: HandPose) -> M
     shape, angles, orientation, translation = (part.double().cpu() for part in (shape, *pose))
     axes = hand.pose_axes.double().cpu()[1:]
     turns = torch.cat([orientation[None], axes.mT @ euler_rotations(angles) @ axes]).numpy()
-    vectors = np.stack([cv2.Rodrigues(turn)[0][:, 0] for turn in turns])
+    vectors = rotation_vectors(turns)
     wrist, moved = _wrist(hand, shape.numpy())
     return ManoPose(shape.numpy(), vectors[0], vectors[1:], (translation - wrist + orientation @ moved).numpy())
 
