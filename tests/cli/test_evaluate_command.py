@@ -12,6 +12,7 @@ from oasis_warp.avatar.quality import SurfaceQuality
 from oasis_warp.cli import evaluate as command
 from oasis_warp.cli import main
 from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli.developer_options import Evaluate
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
@@ -20,6 +21,7 @@ from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.hand_crop import crop_hand
 from oasis_warp.evaluation import look_measures, looks, real_hands, same_hand, views
 from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
+from oasis_warp.evaluation.partial_results import read_result
 from oasis_warp.evaluation.same_hand import (
     compare_pairs,
     compare_with_photo,
@@ -200,9 +202,39 @@ def test_looks_are_measured_and_drawn_and_the_run_is_not_done_twice(hands, scene
     assert record["contrast"]["seen"][0] > 0 and record["haze"] >= 0 and record["lpips"] is None
     assert list(found["left_out"]) == ["no_hand.png"] and found["kernel_distance"] == []
     assert read_photo(tmp_path / "found" / "sheets" / "first.jpg").rgb.shape == (512, 6 * 512 + 10, 3)
+    damaged = [tmp_path / "found" / name for name in ("real/mine_a.json", "sheets/first.jpg")]
+    for file in damaged:
+        file.write_bytes(file.read_bytes()[:99])
+    assert main(arguments) == 0
+    assert json.loads((tmp_path / "found" / "metrics.json").read_text()) == found
+    assert all(len(file.read_bytes()) > 99 for file in damaged)
     monkeypatch.setattr(looks, "reconstruct", lambda *arguments, **options: pytest.fail("made again"))
     assert main(arguments) == 0
     assert json.loads((tmp_path / "found" / "metrics.json").read_text()) == found
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[", "[]", "7", "null", '{"psnr": 1}', '[{"psnr": 1, "hand": 2}, {}]', "[" * 10**5, "\0", "[1]", "{}"]
+)
+def test_damaged_results_are_measured_again(tmp_path, text):
+    file = tmp_path / "one.json"
+    assert read_result(file, ("psnr", "hand")) is None
+    file.write_text(text)
+    assert read_result(file, ("psnr", "hand")) is None
+    for whole in ({"psnr": 1, "hand": 2}, [{"psnr": 1, "hand": 2, "more": 3}], {"left_out": "no hand"}):
+        file.write_text(json.dumps(whole))
+        assert read_result(file, ("psnr", "hand")) == whole
+
+
+@pytest.mark.parametrize(
+    ("dataset", "stages"),
+    [("same-hand", ["avatars of mine", "pairs of mine"]), ("looks", ["real hands", "avatars"]),
+     ("synthetic", ["evaluation"])],
+)  # fmt: skip
+def test_one_bar_knows_all_stages_of_an_evaluation(hands, dataset, stages):
+    (hands / "first.png").write_bytes((hands / "mine" / "a.png").read_bytes())
+    options = Evaluate(folder=None if dataset == "synthetic" else hands, dataset=dataset, out=hands)
+    assert [step.stage for step in command.plan(options, 2)] == stages
 
 
 def test_a_folder_of_photos_is_one_hand_and_photos_of_one_stem_are_two(hands):

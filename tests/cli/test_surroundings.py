@@ -1,6 +1,7 @@
 """What surrounds a command: closed streams, odd names, folders that are not there, no memory."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -54,6 +55,12 @@ def test_a_picture_with_an_odd_name_in_a_folder_that_is_not_there_is_drawn(avata
 def test_brackets_in_the_name_of_a_photo_are_no_markup(capsys):
     plain_console().print(measures_table("a[/b].png on [red]", {"total": 1.0}, {}, {}))
     assert "a[/b].png on [red]" in capsys.readouterr().out
+
+
+def test_a_program_that_calls_a_command_keeps_its_own_answer_to_sigterm(avatar_file, tmp_path):
+    before = signal.getsignal(signal.SIGTERM)
+    assert main(["render", str(avatar_file), "-o", str(tmp_path / "a.png"), "--size", "16"]) == 0
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_names_that_are_no_text_can_be_printed():

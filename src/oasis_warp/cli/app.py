@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     logging.basicConfig(format="oasis: %(message)s")
     # A batch system's SIGTERM ends the work as Ctrl-C does: what is half-written is taken away.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         # The command's module imports torch and Warp, which take seconds: only now.
         command = importlib.import_module(f"oasis_warp.cli.{type(chosen).__name__.lower()}")
@@ -74,6 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         device = getattr(chosen, "device", "cpu")
         print(f"oasis: the memory of {device} is full; give smaller sizes, or fewer at once.", file=sys.stderr)
         return BAD_INPUT
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _refuse_command(name: str) -> NoReturn:

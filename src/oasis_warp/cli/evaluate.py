@@ -8,8 +8,9 @@ from rich.console import Console
 from rich.table import Table
 
 from oasis_warp.avatar.prior import MeanPrior, Prior
-from oasis_warp.cli.console import INTERRUPTED, check_device, print_tables, show_progress
+from oasis_warp.cli.console import INTERRUPTED, check_device, print_tables, show_run
 from oasis_warp.cli.developer_options import Evaluate
+from oasis_warp.cli.progress import Run, Step
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
@@ -35,7 +36,8 @@ from oasis_warp.evaluation.held_out import HELD_OUT_SEED, CaptureConfig
 from oasis_warp.evaluation.kernel_distance import LAYERS
 from oasis_warp.evaluation.looks import evaluate_looks
 from oasis_warp.evaluation.methods import Method, method_name
-from oasis_warp.evaluation.same_hand import METRICS, evaluate_photos
+from oasis_warp.evaluation.real_hands import real_photos
+from oasis_warp.evaluation.same_hand import METRICS, evaluate_photos, photos_in, photos_of_hands
 from oasis_warp.evaluation.summary import Record, select
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate_people
 from oasis_warp.hand.template import bundled_hand
@@ -45,6 +47,11 @@ from oasis_warp.pretraining.synthetic_source import MULTIPLE
 from oasis_warp.synthetic.shots import PICTURES_EACH
 
 SIZES = range(64, 1025)
+REAL_SECONDS, LOOKS_SECONDS, AVATAR_SECONDS, PAIR_SECONDS = 2.5, 17.0, 10.0, 0.6
+"""To measure a real hand, to make an avatar and draw its looks, to make an avatar in one way, to compare a pair: of the
+process with one thread, for two photos of the tests, in November 2026. Only ratios matter."""
+WAYS = 4
+"""Avatars made of each photo for pairs: without the learned prior, and with it in each of three lights."""
 TABLE_WIDTH = 120
 """Of tables where there is no terminal, or a narrow one [characters]."""
 
@@ -63,8 +70,8 @@ def run(options: Evaluate) -> int:
         priors["learned"] = chosen
     tables = {"synthetic": on_synthetic_hands, "same-hand": on_photos, "looks": on_looks}
     try:
-        with show_progress(Console(stderr=True)) as progress:
-            made = tables[options.dataset](options, priors, progress)
+        with show_run(Console(stderr=True), Run(plan(options, len(priors)))) as shown:
+            made = tables[options.dataset](options, priors, shown.progress)
     except KeyboardInterrupt:
         print(f"oasis: stopped; what is whole stays in {options.out}, the same command goes on.", file=sys.stderr)
         return INTERRUPTED
@@ -99,6 +106,27 @@ def check_options(options: Evaluate) -> None:
         value = getattr(options, name)
         if value is not None and value < 0:
             raise InputError(f"--{name}: expected 0 or more, got {value}.")
+
+
+def plan(options: Evaluate, n_priors: int) -> tuple[Step, ...]:
+    """The steps of an evaluation, in seconds of one core.
+
+    Raises:
+        InputError: a folder without photos.
+    """
+    if options.folder is None or (options.dataset == "looks" and not options.folder.is_dir()):
+        return (Step("evaluation", 1.0),)
+    if options.dataset == "looks":
+        return (
+            Step("real hands", REAL_SECONDS * len(real_photos(options.folder))),
+            Step("avatars", LOOKS_SECONDS * len(photos_in(options.folder))),
+        )
+    steps = []
+    for name, photos in photos_of_hands(options.folder).items():
+        n, ways = len(photos), 1 if n_priors == 1 else WAYS
+        avatars, pairs = AVATAR_SECONDS * ways * n, PAIR_SECONDS * n * (n - 1)
+        steps += [Step(f"avatars of {name}", avatars), Step(f"pairs of {name}", pairs)]
+    return tuple(steps)
 
 
 def on_synthetic_hands(options: Evaluate, priors: dict[str, Prior], progress: Progress) -> list[Table]:

@@ -26,6 +26,7 @@ from oasis_warp.evaluation.kernel_distance import (
 )
 from oasis_warp.evaluation.look_measures import measure_looks
 from oasis_warp.evaluation.methods import prior_digest
+from oasis_warp.evaluation.partial_results import read_result
 from oasis_warp.evaluation.real_hands import measure_real, real_photos, reference_contrasts
 from oasis_warp.evaluation.same_hand import photos_in
 from oasis_warp.evaluation.summary import Record
@@ -127,13 +128,14 @@ def measure_all_real(
         progress("real hands", k, len(groups))
         name = f"{hand}/{path.name}"
         file = folder / f"{hand}_{path.stem}.json"
-        if not file.exists():
+        record = read_result(file, ("hand", "mostly", "features"))
+        if record is None:
             try:
                 record = {"hand": hand, "photo": path.name, **measure_real(read_photo(path), estimator)}
             except InputError as error:
                 record = {"left_out": str(error)}
             write_file(file, json.dumps(record, allow_nan=False).encode())
-        record = json.loads(file.read_text())
+            record = json.loads(file.read_bytes())  # with lists, as a kept one has them
         if "left_out" in record:
             left_out[name] = record["left_out"]
         else:
@@ -146,19 +148,21 @@ def _measured(
     path: Path, group: str, prior: Prior, config: ReconstructConfig, out: Path, perceptual: Perceptual | None
 ) -> Record:
     """The record of one photo's avatar, from its file if there is one; its sheet is drawn first."""
-    file = out / AVATARS / f"{path.stem}.json"
-    if not file.exists():
-        try:
-            photo = read_photo(path)
-            looks = measure_looks(photo, reconstruct(photo, config, prior=prior), group, perceptual)
-        except InputError as error:
-            record: Record = {"left_out": str(error)}
-        else:
-            write_cells(out / SHEETS / f"{path.stem}.jpg", looks.cells)
-            features = {kind: [sample[1:] for sample in own] for kind, own in looks.samples.items()}
-            record = {**looks.record, "features": features}
-        write_file(file, json.dumps(record, allow_nan=False).encode())
-    return json.loads(file.read_text())
+    file, sheet = out / AVATARS / f"{path.stem}.json", out / SHEETS / f"{path.stem}.jpg"
+    record: Record | None = read_result(file, ("contrast", "features", "haze"), [sheet])
+    if record is not None:
+        return record
+    try:
+        photo = read_photo(path)
+        looks = measure_looks(photo, reconstruct(photo, config, prior=prior), group, perceptual)
+    except InputError as error:
+        record = {"left_out": str(error)}
+    else:
+        write_cells(sheet, looks.cells)
+        features = {kind: [sample[1:] for sample in own] for kind, own in looks.samples.items()}
+        record = {**looks.record, "features": features}
+    write_file(file, json.dumps(record, allow_nan=False).encode())
+    return json.loads(file.read_bytes())
 
 
 def relative_contrasts(record: Record, reference: Record) -> dict[str, list[float]]:

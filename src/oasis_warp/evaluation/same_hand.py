@@ -27,6 +27,7 @@ from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
 from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, method_name, prior_digest
 from oasis_warp.evaluation.metrics import COVERED, color_gain
+from oasis_warp.evaluation.partial_results import read_result
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, select
 from oasis_warp.hand.template import bundled_hand
@@ -223,9 +224,9 @@ def evaluate_photos(
     (out / HANDS).mkdir(exist_ok=True)
     for name, paths in hands.items():
         file = out / HANDS / f"{name}.json"
-        if not file.exists():
+        if _kept(file) is None:
             _measure_hand(name, paths, priors, methods, config, file, progress)
-    found = [json.loads((out / HANDS / f"{name}.json").read_text()) for name in hands]
+    found = [kept for name in hands if (kept := _kept(out / HANDS / f"{name}.json")) is not None]
     pairs = [pair for hand in found for pair in hand["pairs"]]
     if not pairs:
         raise InputError(f"{folder}: of no hand are there two photos that avatars can be made of; see {out / HANDS}.")
@@ -235,6 +236,11 @@ def evaluate_photos(
     whole = {"settings": settings, "summary": summarise_pairs(pairs), "left_out": left_out, "pairs": pairs}
     write_file(out / METRICS, json.dumps(whole, allow_nan=False).encode())
     return whole
+
+
+def _kept(file: Path) -> Record | None:
+    """The pairs of one hand, where they have been measured."""
+    return read_result(file, ("pairs", "left_out"), [path for path in (file.with_suffix(".png"),) if path.exists()])
 
 
 def _measure_hand(

@@ -40,6 +40,7 @@ from oasis_warp.evaluation.held_out import (
 )
 from oasis_warp.evaluation.methods import METHODS, LitGaussians, Method, method_name, prior_digest, reconstructions
 from oasis_warp.evaluation.metrics import TargetTruth, match_colors, score
+from oasis_warp.evaluation.partial_results import read_result
 from oasis_warp.evaluation.pictures import (
     ATTENTION_COLUMNS,
     draw_attention,
@@ -63,6 +64,8 @@ SHOWN = 4
 """People of each group on the sheet, and hands on the picture of attention."""
 DIGITS = 5
 """Of the numbers in files."""
+KEYS = ("group", "person", "light", "noise", "prior", "stage", "target", "colors", "psnr")
+"""Of every record."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,13 +123,13 @@ def evaluate_people(
     open_resumable_folder(folder, SETTINGS, settings, "an evaluation")
     (folder / PEOPLE).mkdir(exist_ok=True)
     everybody = [(group, FIRST_PERSON + k) for group in config.groups for k in range(config.people)]
-    missing = [who for who in everybody if not _person_file(folder, *who).exists()]
+    missing = [who for who in everybody if _kept(folder, *who) is None]
     measured = _measured(_Setup(priors, config, perceptual), folder, missing, device, workers)
     for done in range(len(everybody) - len(missing), len(everybody)):
         progress("evaluation", done, len(everybody))
         next(measured)
     progress("evaluation", len(everybody), len(everybody))
-    records = [record for who in everybody for record in json.loads(_person_file(folder, *who).read_text())]
+    records = [record for who in everybody for record in _kept(folder, *who) or ()]
     strips = [
         path for group in config.groups for k in range(min(SHOWN, config.people))
         if (path := _person_file(folder, group, FIRST_PERSON + k).with_suffix(".png")).exists()
@@ -142,6 +145,17 @@ def evaluate_people(
 
 def _person_file(folder: Path, group: Group, number: int) -> Path:
     return folder / PEOPLE / f"{group}_{number}.json"
+
+
+def _kept(folder: Path, group: Group, number: int) -> list[Record] | None:
+    """The records of one person, where they have been measured."""
+    file = _person_file(folder, group, number)
+    strips = [path for path in (file.with_suffix(".png"), _attention_file(file, number)) if path.exists()]
+    return read_result(file, KEYS, strips)
+
+
+def _attention_file(file: Path, number: int) -> Path:
+    return file.with_name(f"{number}_attention.png")
 
 
 def available_methods(priors: Mapping[str, Prior], config: SyntheticEvaluation) -> list[Method]:
@@ -218,7 +232,7 @@ def measure_person(setup: _Setup, folder: Path, device: torch.device, group: Gro
             if factor == config.noise[-1]:
                 rows.append(row)
         if shown and (group, light) == (config.groups[0], config.lights[0]):
-            write_attention(file.with_name(f"{number}_attention.png"), setup.priors, exact)
+            write_attention(_attention_file(file, number), setup.priors, exact)
     if shown:
         write_strip(file.with_suffix(".png"), rows)
     write_file(file, json.dumps(records, allow_nan=False).encode())
