@@ -4,16 +4,19 @@ import os
 import signal
 import subprocess
 import sys
+from importlib import resources
 
 import cv2
 import pytest
 import torch
 from disk import full_disk
 
+from oasis_warp.assets import asset
 from oasis_warp.cli import main
 from oasis_warp.cli.app import is_out_of_memory
 from oasis_warp.cli.console import plain_console
 from oasis_warp.cli.report import measures_table
+from oasis_warp.hand_avatar import Avatar
 
 CLOSED = """
 import os, sys
@@ -88,3 +91,33 @@ def test_full_memory_is_told_in_one_sentence(avatar_file, tmp_path, monkeypatch,
     assert capsys.readouterr().err == "oasis: the memory of cpu is full; give smaller sizes, or fewer at once.\n"
     assert is_out_of_memory(MemoryError()) and is_out_of_memory(torch.OutOfMemoryError("CUDA"))
     assert not is_out_of_memory(RuntimeError("a bug"))
+
+
+SMALL = ["--size", "64", "--steps", "2", "--prior", "none"]
+
+
+def reconstructing(out, **environment):
+    """A process that makes a small avatar of the bundled photo, with at most 32 open files."""
+    with resources.as_file(asset("photos", "palm_open_left_02.png")) as photo:
+        command = [sys.executable, "-m", "oasis_warp", "reconstruct", str(photo), "-o", str(out), *SMALL]
+    limited = ["sh", "-c", 'ulimit -n 32; exec "$@"', "sh", *command]
+    given = {name: value for name, value in {**os.environ, **environment}.items() if value}
+    return subprocess.Popen(limited, env=given, stdout=subprocess.DEVNULL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("home", ["", "/proc", "missing"])
+def test_a_home_that_is_missing_or_cannot_be_written_and_few_descriptors_do_no_harm(tmp_path, home):
+    where = str(tmp_path / home) if home == "missing" else home
+    process = reconstructing(tmp_path / "out", HOME=where, OASIS_WARP_CACHE="")
+    assert (process.wait(), (tmp_path / "out" / "avatar.safetensors").is_file()) == (0, True)
+
+
+@pytest.mark.slow
+def test_two_processes_write_one_output_one_after_the_other(tmp_path):
+    out = tmp_path / "out"
+    processes = [reconstructing(out) for _ in range(2)]
+    assert [process.wait() for process in processes] == [0, 0]
+    whole = {"avatar.safetensors", "quality.png", "report.json", "summary.png", "turntable.mp4"}
+    assert {path.name for path in out.iterdir()} == whole and list(tmp_path.iterdir()) == [out]
+    Avatar.load(out / "avatar.safetensors")

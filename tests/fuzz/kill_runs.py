@@ -1,49 +1,150 @@
-"""Kill commands at random moments: `python tests/fuzz/kill_runs.py render --count 60 --seed 1`.
+"""Stop commands at random moments: `python tests/fuzz/kill_runs.py edit export --count 60 --seed 1`.
 
-After each SIGKILL the output must be complete or absent, as far as its final name goes; after one whole run at the end
-nothing else may be left beside it. Each run ends at a moment of its own, most of them near the end, where files are
-written. Prints a line of JSON.
+Each run is a fork of this process, so that none of it is imports, and ends at a moment of its own, spread over its
+whole length: by SIGKILL, by SIGTERM or Ctrl-C, or because no file may grow beyond a random size, as on a full disk.
+After that the output of most commands must be complete or absent as far as its final name goes, and after one whole run
+at the end nothing else may be left beside it. `pretrain` and `synthesize` are started again until they end, and must
+leave the same bits as a run that nothing stopped; photos given to `serve` must all become avatars. Prints a line of
+JSON a command.
 """
 
 import argparse
+import collections
 import contextlib
+import hashlib
+import importlib
 import json
+import os
 import random
+import resource
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
+import torch
 from safetensors import safe_open
 
+from oasis_warp.cli import jobs, main
+from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
 from oasis_warp.data.output_files import output_folder
 
-TOP = Path(__file__).parents[2]
-PHOTO = TOP / "src" / "oasis_warp" / "assets" / "photos" / "palm_open_left_02.png"
-WHOLE = {
-    "render": {"out.png"},
-    "edit": {"out.safetensors", "out.png", "out.json"},
-    "reconstruct": {"avatar.safetensors", "summary.png", "quality.png", "turntable.mp4", "report.json"},
-}
+PHOTO = Path(__file__).parents[2] / "src" / "oasis_warp" / "assets" / "photos" / "palm_open_left_02.png"
+SMALL = ["--size", "64", "--steps", "2"]
+TRAINING = ["--hands", "1", "--views", "1", "--people", "1", "--size", "32", "--steps", "6", "--workers", "0",
+            "--device", "cpu", "--precision", "float32"]  # fmt: skip
+FAULTS = {"SIGKILL": 5, "SIGTERM": 2, "SIGINT": 2, "full disk": 1}
+"""What ends runs, with weights."""
+PATIENCE = 300.0
+"""Seconds in which a run must end after Ctrl-C, and one that nothing stops."""
+TRACEBACK = 70
+"""Exit code of a run that ended with a traceback."""
 
 
-def command(name: str, folder: Path) -> list[str]:
-    """The command, whose output goes to `folder`/out."""
-    oasis, inputs, out = [sys.executable, "-m", "oasis_warp"], folder.parent, folder / "out"
-    if name == "reconstruct":
-        return [*oasis, "reconstruct", str(PHOTO), "-o", str(folder), "--size", "64", "--steps", "2"]
-    avatar = str(inputs / "made" / "avatar.safetensors")
-    if name == "render":
-        return [*oasis, "render", avatar, "-o", f"{out}.png", "--size", "128"]
-    painted = [str(inputs / "painted.png"), "--photo", str(PHOTO), "--steps", "2", "--size", "64", "--overwrite"]
-    return [*oasis, "edit", avatar, *painted, "-o", f"{out}.safetensors"]
+class Command(NamedTuple):
+    """A command that is stopped."""
+
+    arguments: Callable[[Path, Path], list[str]]
+    """Of the folder of inputs and that of outputs."""
+    whole: frozenset[str]
+    """Names of its complete output."""
+    goes_on: bool = False
+    """Whether it goes on where it was stopped; then these files must have the same bits."""
 
 
-def check(folder: Path, whole: set[str]) -> str:
-    """"complete" or "absent"; anything else says what is wrong."""
+def on_avatar(command: str, ending: str, *more: str) -> Command:
+    """A command that makes one file of an avatar."""
+
+    def arguments(inputs: Path, out: Path) -> list[str]:
+        return [command, str(inputs / "made" / "avatar.safetensors"), "-o", str(out / f"out{ending}"), *more]
+
+    return Command(arguments, frozenset({f"out{ending}"}))
+
+
+COMMANDS = {
+    "reconstruct": Command(
+        lambda inputs, out: ["reconstruct", str(PHOTO), "-o", str(out), *SMALL],
+        frozenset({"avatar.safetensors", "summary.png", "quality.png", "turntable.mp4", "report.json"}),
+    ),
+    "render": on_avatar("render", ".png", "--size", "128"),
+    "animate": on_avatar("animate", ".gif", "--size", "64"),
+    "export": on_avatar("export", ".glb"),
+    "edit": Command(
+        lambda inputs, out: [
+            "edit", str(inputs / "made" / "avatar.safetensors"), str(inputs / "painted.png"), "--photo", str(PHOTO),
+            *SMALL, "--overwrite", "-o", str(out / "out.safetensors"),
+        ],
+        frozenset({"out.safetensors", "out.png", "out.json"}),
+    ),
+    "pretrain": Command(
+        lambda inputs, out: ["pretrain", str(out), *TRAINING], frozenset({"network.safetensors"}), goes_on=True
+    ),
+    "synthesize": Command(
+        lambda inputs, out: ["synthesize", str(out), "--count", "80", "--size", "32"],
+        frozenset({"synthetic-000000.tar", "synthetic-000001.tar"}), goes_on=True,
+    ),
+}  # fmt: skip
+SERVED = f"from sys import argv, exit; from oasis_warp.cli import main; exit(main([*argv[1:], *{SMALL}]))"
+"""What `serve` runs for each photo here."""
+
+
+def launch(arguments: Sequence[str], n_bytes: int | None = None) -> int:
+    """Run a command in a fork of this process, in which files may have `n_bytes`; the number of the process."""
+    child = os.fork()
+    if child:
+        return child
+    code = TRACEBACK
+    try:
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        for stream in (0, 1, 2):
+            os.dup2(nowhere, stream)
+        if n_bytes is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, n_bytes))
+        code = main(arguments)
+    except KeyboardInterrupt:  # before the command has begun
+        code = INTERRUPTED
+    finally:
+        os._exit(code)
+
+
+def ended(process: int, seconds: float) -> int | None:
+    """The exit code of a process, negative for a signal; None if it still runs after so many seconds."""
+    end = time.monotonic() + seconds
+    while True:
+        found, status = os.waitpid(process, os.WNOHANG)
+        if found:
+            return os.waitstatus_to_exitcode(status)
+        if time.monotonic() > end:
+            return None
+        time.sleep(0.002)
+
+
+def stop(process: int, fault: str, seconds: float) -> str:
+    """Let a process run for so long, then stop it; "stopped", "ended", or what was wrong with its end."""
+    code = ended(process, PATIENCE if fault == "full disk" else seconds)
+    if code is None and fault != "full disk":
+        os.kill(process, getattr(signal, fault))
+        code = ended(process, PATIENCE)
+        if code in (-signal.SIGKILL, -signal.SIGTERM, INTERRUPTED):
+            return "stopped"
+    if code is None:
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+        return "hang"
+    if code == BAD_INPUT and fault == "full disk":
+        return "stopped"
+    return "ended" if code == 0 else f"exit code {code} after {fault}"
+
+
+def check(folder: Path, whole: frozenset[str]) -> str:
+    """ "complete" or "absent"; anything else says what is wrong."""
     found = {path.name for path in folder.iterdir() if not path.name.startswith(".")} if folder.is_dir() else set()
     if found and found != whole:
         return f"half: {sorted(found)}"
@@ -57,6 +158,81 @@ def check(folder: Path, whole: set[str]) -> str:
             with safe_open(path, framework="np") as file:
                 file.keys()
     return "complete" if found else "absent"
+
+
+def hidden(*folders: Path) -> list[str]:
+    """Names of hidden files."""
+    return sorted(path.name for folder in folders if folder.is_dir() for path in folder.glob(".*"))
+
+
+def digests(folder: Path, names: frozenset[str]) -> dict[str, str]:
+    """Digests of files that exist."""
+    return {
+        name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names if (folder / name).is_file()
+    }
+
+
+def run_whole(command: Command, inputs: Path, out: Path) -> float:
+    """Run a command that nothing stops; its seconds."""
+    start = time.monotonic()
+    code = ended(launch(command.arguments(inputs, out)), PATIENCE)
+    if code != 0:
+        raise SystemExit(f"{command.arguments(inputs, out)}: ends with {code} where nothing stops it.")
+    return time.monotonic() - start
+
+
+def stop_runs(command: Command, count: int, inputs: Path, rng: random.Random) -> dict[str, object]:
+    """Stop a command `count` times; what was found."""
+    out, counts = inputs / "work", collections.Counter()
+    run_whole(command, inputs, out)  # builds kernels
+    shutil.rmtree(out)
+    seconds = run_whole(command, inputs, out)
+    expected = digests(out, command.whole)
+    largest = max(path.stat().st_size for path in out.iterdir() if path.is_file())
+    while count > 0:
+        if not command.goes_on or expected == digests(out, command.whole):
+            for path in out.glob("[!.]*"):  # each run meets what those before left hidden, and no output
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        (fault,) = rng.choices(list(FAULTS), list(FAULTS.values()))
+        n_bytes = rng.randrange(largest) if fault == "full disk" else None
+        how = stop(launch(command.arguments(inputs, out), n_bytes), fault, rng.uniform(0, seconds))
+        counts[fault if how == "stopped" else how] += 1
+        count -= how != "ended"
+        if not command.goes_on:
+            counts[check(out, command.whole)] += 1
+        elif how == "ended":
+            counts["same bits" if digests(out, command.whole) == expected else "other bits"] += 1
+    before = len(hidden(out, inputs))
+    run_whole(command, inputs, out)
+    same = digests(out, command.whole) == expected if command.goes_on else check(out, command.whole) == "complete"
+    return {
+        "seconds": round(seconds, 1),
+        **counts,
+        "hidden before": before,
+        "whole": same,
+        "hidden": hidden(out, inputs),
+    }
+
+
+def stop_servers(count: int, inputs: Path, rng: random.Random) -> dict[str, object]:
+    """Stop `oasis serve` at random moments of its work on a photo, and look whether the next one finishes it."""
+    jobs.PROGRAM = (sys.executable, "-c", SERVED)
+    counts: collections.Counter[str] = collections.Counter()
+    for k in range(count):
+        folder = inputs / f"served_{k}"
+        home = folder / f"{k:022d}"
+        home.mkdir(parents=True)
+        shutil.copy(PHOTO, home / "photo.png")
+        arguments = ["serve", "--folder", str(folder), "--no-browser"]
+        (fault,) = rng.choices(list(FAULTS)[:3], list(FAULTS.values())[:3])
+        counts[f"{fault}, {stop(launch(arguments), fault, rng.uniform(0, 15))}"] += 1
+        server, end = launch(arguments), time.monotonic() + PATIENCE
+        while time.monotonic() < end and not (home / "out" / "report.json").is_file():
+            time.sleep(0.1)
+        done = (home / "out" / "report.json").is_file() and check(home / "out", COMMANDS["reconstruct"].whole)
+        counts[f"avatar {done}"] += 1
+        stop(server, "SIGINT", 0)
+    return dict(counts)
 
 
 WRITER = """
@@ -100,53 +276,44 @@ def kill_writers(count: int, rng: random.Random) -> dict[str, int]:
     return counts
 
 
-def main() -> None:
-    """Read the command line, kill the command again and again, and print what was left."""
+def make_inputs(folder: Path) -> None:
+    """The avatar that commands read, and the photo with paint on it."""
+    code = ended(
+        launch(["reconstruct", str(PHOTO), "-o", str(folder / "made"), "--size", "256", "--steps", "2"]), 300.0
+    )
+    assert code == 0, code
+    picture = cv2.imread(str(PHOTO))
+    assert picture is not None
+    height, width = picture.shape[:2]
+    cv2.circle(picture, (width // 2, height // 2), width // 20, (0, 0, 255), -1)
+    cv2.imwrite(str(folder / "painted.png"), picture)
+
+
+def run_all() -> None:
+    """Read the command line, stop the commands again and again, and print what was left."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("command", choices=["files", *sorted(WHOLE)])
+    parser.add_argument("commands", nargs="+", choices=["files", "serve", *sorted(COMMANDS)])
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    rng = random.Random(options.seed)
-    if options.command == "files":
-        print(json.dumps({"kills": options.count, **kill_writers(options.count, rng)}))
-        return
-    counts: dict[str, int] = {}
+    torch.set_num_threads(1)  # forks of a process with threads may wait for ever
+    cv2.setNumThreads(0)
     with tempfile.TemporaryDirectory() as name:
-        top = Path(name)
-        folder = top / "work"
-        if options.command != "reconstruct":
-            made = [sys.executable, "-m", "oasis_warp", "reconstruct", str(PHOTO), "-o", str(top / "made")]
-            subprocess.run([*made, "--size", "256", "--steps", "2"], check=True, capture_output=True)
-            picture = cv2.imread(str(PHOTO))
-            assert picture is not None
-            height, width = picture.shape[:2]
-            cv2.circle(picture, (width // 2, height // 2), width // 20, (0, 0, 255), -1)
-            cv2.imwrite(str(top / "painted.png"), picture)
-        start = time.monotonic()
-        subprocess.run(command(options.command, folder), check=True, capture_output=True)
-        seconds = time.monotonic() - start
-        for _ in range(options.count):
-            for path in folder.glob("[!.]*"):  # each kill meets what the kills before left hidden, and no output
-                path.unlink()
-            process = subprocess.Popen(
-                command(options.command, folder), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-            )
-            try:
-                process.wait(seconds * (rng.uniform(0, 1.1) if rng.random() < 0.3 else rng.uniform(0.8, 1.1)))
-                counts["not killed"] = counts.get("not killed", 0) + 1
-            except subprocess.TimeoutExpired:
-                process.send_signal(signal.SIGKILL)
-                process.wait()
-            left = check(folder, WHOLE[options.command])
-            counts[left] = counts.get(left, 0) + 1
-        hidden = sum(path.name.startswith(".") for path in (*folder.glob(".*"), *top.glob(".*")))
-        done = subprocess.run(command(options.command, folder), capture_output=True)
-        after = check(folder, WHOLE[options.command])
-        rest = [path.name for path in (*folder.glob(".*"), *top.glob(".*"))]
-    report = {"command": options.command, "kills": options.count, "seconds": round(seconds, 1), **counts}
-    print(json.dumps({**report, "hidden before": hidden, "exit": done.returncode, "after": after, "hidden": rest}))
+        if set(options.commands) - {"files", "serve", "pretrain", "synthesize"}:
+            make_inputs(Path(name))
+        for command in options.commands:
+            if command != "files":
+                importlib.import_module(f"oasis_warp.cli.{command}")
+            rng = random.Random(options.seed)
+            if command == "files":
+                found = kill_writers(options.count, rng)
+            elif command == "serve":
+                found = stop_servers(options.count, Path(name), rng)
+            else:
+                found = stop_runs(COMMANDS[command], options.count, Path(name), rng)
+                shutil.rmtree(Path(name) / "work")
+            print(json.dumps({"command": command, "faults": options.count, **found}), flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    run_all()
