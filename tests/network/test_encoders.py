@@ -112,7 +112,7 @@ def test_a_backbone_is_frozen(small_dino, photo):
 
 
 def test_files_that_hold_no_such_backbone_are_refused(small_dino, tmp_path):
-    with pytest.raises(InputError, match=r"none: expected the weights of DINOv2, found no such file"):
+    with pytest.raises(InputError, match=r"none: expected DINOv2 ViT-./14, found no such file"):
         small_dino.load(tmp_path / "none")
     text = tmp_path / "text.safetensors"
     text.write_text("hello")

@@ -11,6 +11,14 @@ from oasis_warp.cli.options import Device, JsonFile, OutputFolder
 BackboneWeights = Annotated[
     Path | None, arg(help="DINOv2's model.safetensors, for a network of your own in the paper's profile.")
 ]
+LpipsWeights = Annotated[
+    tuple[Path, Path] | None,
+    arg(
+        help="Weights of LPIPS: alexnet-owt-7be5be79.pth of torchvision and alex.pth of LPIPS, or vgg16-397923af.pth "
+        "and vgg.pth. Without them evaluation has no LPIPS, and training a term of its own in that place."
+    ),
+]
+AllowDownload = Annotated[bool, arg(help="Download published weights that are missing from where their authors are.")]
 CsvFile = Annotated[Path | None, arg(help="The same as a table.")]
 Threads = Annotated[int, arg(help="CPU threads.")]
 FamilyName = Literal[
@@ -200,6 +208,8 @@ class Pretrain:
     """Processes that bake people and plan pictures ahead, for each GPU; 0 for none."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for the paper's profile."""
+    lpips: LpipsWeights = None
+    allow_download: AllowDownload = False
     initial_weights: Annotated[Path | None, arg(aliases=["--start"])] = None  # torchrun takes --start for its own
     """Weights to begin with: a network.safetensors of the same task and profile. From nothing when not given."""
 
@@ -233,8 +243,8 @@ class Evaluate:
     """Side of the pictures [px]; a multiple of 16 for synthetic ones, and 256 for looks."""
     seed: int = 0
     """Of people, pictures and adaptation."""
-    lpips: tuple[Path, Path] | None = None
-    """Weights of LPIPS: alexnet-owt-7be5be79.pth of torchvision and alex.pth of LPIPS; no LPIPS without them."""
+    lpips: LpipsWeights = None
+    allow_download: AllowDownload = False
     device: Device = "cpu"
     workers: int = 0
     """Processes that measure synthetic people side by side; 0 for none."""

@@ -137,7 +137,7 @@ def on_synthetic_hands(options: Evaluate, priors: dict[str, Prior], progress: Pr
         adapt=AdaptConfig(texture_steps=options.steps, seed=options.seed),
     )
     device = torch.device(options.device)
-    perceptual = None if options.lpips is None else load_lpips(*options.lpips)
+    perceptual = None if options.lpips is None else load_lpips(*options.lpips, allow_download=options.allow_download)
     found = evaluate_people(
         priors, config, options.out, device, perceptual=perceptual, workers=options.workers, progress=progress
     )
@@ -180,7 +180,7 @@ def on_looks(options: Evaluate, priors: dict[str, Prior], progress: Progress) ->
     """Contrasts, kernel distances and blemishes."""
     assert options.folder is not None  # checked with the other options
     config = ReconstructConfig(steps=options.steps, seed=options.seed, device=options.device)
-    perceptual = None if options.lpips is None else load_lpips(*options.lpips)
+    perceptual = None if options.lpips is None else load_lpips(*options.lpips, allow_download=options.allow_download)
     prior = priors.get("learned", priors["mean"])
     found = evaluate_looks(prior, options.folder, options.out, config, perceptual=perceptual, progress=progress)
     contrast, distance, spoilt = (

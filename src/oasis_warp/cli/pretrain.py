@@ -17,8 +17,10 @@ from oasis_warp.cli.console import INTERRUPTED, check_device, show_progress
 from oasis_warp.cli.developer_options import Pretrain
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.published_files import published_file
 from oasis_warp.data.output_files import open_resumable_folder
 from oasis_warp.hand.template import bundled_hand
+from oasis_warp.losses.lpips import load_lpips
 from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.dense_network import DenseNetwork
 from oasis_warp.network.dense_weights import load_dense_network
@@ -85,7 +87,7 @@ def check_options(options: Pretrain) -> None:
     if options.task == "prior":
         check_prior_options(options)
     else:
-        for name in ("profile", "views", "hold_out", "backbone_weights"):
+        for name in ("profile", "views", "hold_out", "backbone_weights", "lpips"):
             if getattr(options, name) != getattr(Pretrain, name, None):
                 raise InputError(f"--{name.replace('_', '-')}: is for --task prior, got it with dense; leave it out.")
 
@@ -104,8 +106,10 @@ def check_prior_options(options: Pretrain) -> None:
             f"--profile {options.profile}: reads photos with {backbone}; give its model.safetensors by "
             "--backbone-weights."
         )
-    if weights is not None and not weights.is_file():
-        raise InputError(f"--backbone-weights {weights}: no such file; download model.safetensors of {backbone}.")
+    if weights is not None:
+        published_file(weights, backbone, allow_download=options.allow_download)
+    if options.lpips is not None:
+        load_lpips(*options.lpips, allow_download=options.allow_download)
     start = options.initial_weights
     if start is not None and read_config(start) != PROFILES[options.profile]:
         raise InputError(f"--initial-weights {start}: of another network than --profile {options.profile}.")
@@ -166,7 +170,9 @@ def make_trainer(options: Pretrain, process: ProcessInfo) -> Trainer:
         return DenseTrainer(make_dense_network(options.seed, options.initial_weights), config, process)
     config = PretrainConfig(steps=options.steps, precision=precision)
     network = make_network(PROFILES[options.profile], options.seed, options.backbone_weights, options.initial_weights)
-    return PriorTrainer(network, config, process)
+    if options.lpips is None:
+        return PriorTrainer(network, config, process)
+    return PriorTrainer(network, config, process, perceptual=load_lpips(*options.lpips).to(process.device))
 
 
 def make_dense_network(seed: int, start: Path | None) -> DenseNetwork:
@@ -207,7 +213,10 @@ def settings_of(options: Pretrain, processes: int) -> dict[str, Any]:
     else:
         settings |= {name: getattr(options, name) for name in ("profile", "views")}
         settings["hold_out"] = sorted(options.hold_out)
-    for name, path in {"backbone": options.backbone_weights, "start": options.initial_weights}.items():
+    files = {"backbone": options.backbone_weights, "start": options.initial_weights}
+    if options.lpips is not None:
+        files |= dict(zip(("lpips_trunk", "lpips"), options.lpips, strict=True))
+    for name, path in files.items():
         if path is not None:
             with path.open("rb") as file:
                 settings[f"{name}_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()

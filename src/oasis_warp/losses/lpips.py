@@ -1,33 +1,66 @@
-"""LPIPS (Zhang et al. 2018) on AlexNet, from weights on the user's disk; nothing is downloaded, no code is executed."""
+"""LPIPS (Zhang et al. 2018) on AlexNet or VGG-16, from weights on the user's disk; no code of theirs is executed."""
 
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.published_files import published_file
 
-LAYERS = (
-    # channels, kernel, stride, padding, whether a pooling comes before
-    (64, 11, 4, 2, False), (192, 5, 1, 2, True), (384, 3, 1, 1, True), (256, 3, 1, 1, False), (256, 3, 1, 1, False),
-)  # fmt: skip
-PLACES = (0, 3, 6, 8, 10)
-"""Of the convolutions in torchvision's `features`."""
+Trunk = Literal["alex", "vgg"]
+
+
+class Layer(NamedTuple):
+    """A convolution of a trunk, with what comes before and after it."""
+
+    place: int
+    """Of the convolution in torchvision's `features`."""
+    channels: int
+    kernel: int
+    stride: int
+    padding: int
+    pooled: bool
+    """Whether a pooling comes before."""
+    compared: bool
+    """Whether its result is compared."""
+
+
+LAYERS: dict[Trunk, tuple[Layer, ...]] = {
+    "alex": (
+        Layer(0, 64, 11, 4, 2, False, True), Layer(3, 192, 5, 1, 2, True, True), Layer(6, 384, 3, 1, 1, True, True),
+        Layer(8, 256, 3, 1, 1, False, True), Layer(10, 256, 3, 1, 1, False, True),
+    ),
+    "vgg": tuple(
+        Layer(place, channels, 3, 1, 1, pooled, compared)
+        for place, channels, pooled, compared in (
+            (0, 64, False, False), (2, 64, False, True), (5, 128, True, False), (7, 128, False, True),
+            (10, 256, True, False), (12, 256, False, False), (14, 256, False, True),
+            (17, 512, True, False), (19, 512, False, False), (21, 512, False, True),
+            (24, 512, True, False), (26, 512, False, False), (28, 512, False, True),
+        )
+    ),
+}  # fmt: skip
+POOLING = {"alex": (3, 2), "vgg": (2, 2)}
+"""Kernel and stride."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Of LPIPS's input layer, for images in [-1, 1]."""
 
 
 class Lpips(nn.Module):
-    """Distance of two images in AlexNet's features; frozen, differentiable in the images."""
+    """Distance of two images in a trunk's features; frozen, differentiable in the images."""
 
-    def __init__(self):
+    def __init__(self, trunk: Trunk = "alex"):
         super().__init__()
+        self.layers, self.pooling = LAYERS[trunk], POOLING[trunk]
         before, self.convolutions, self.lines = 3, nn.ModuleList(), nn.ParameterList()
-        for channels, kernel, stride, padding, _ in LAYERS:
-            self.convolutions.append(nn.Conv2d(before, channels, kernel, stride, padding))
-            self.lines.append(nn.Parameter(torch.zeros(channels)))
-            before = channels
+        for layer in self.layers:
+            self.convolutions.append(nn.Conv2d(before, layer.channels, layer.kernel, layer.stride, layer.padding))
+            if layer.compared:
+                self.lines.append(nn.Parameter(torch.zeros(layer.channels)))
+            before = layer.channels
         self.requires_grad_(False)
 
     def forward(
@@ -36,35 +69,44 @@ class Lpips(nn.Module):
         """LPIPS of the pictures, what lies outside `masks` made equal."""
         both = torch.cat([images * masks[..., None], targets * masks[..., None]]).permute(0, 3, 1, 2)
         shift, scale = (both.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
-        x, total = (2 * both - 1 - shift) / scale, images.new_zeros(len(images))
-        for convolution, line, (*_, pooled) in zip(self.convolutions, self.lines, LAYERS, strict=True):
-            x = convolution(nn.functional.max_pool2d(x, 3, 2) if pooled else x).relu()
-            unit = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
-            a, b = unit.chunk(2)
-            total = total + ((a - b).square() * line[:, None, None]).sum(1).mean((1, 2))
+        x, total, lines = (2 * both - 1 - shift) / scale, images.new_zeros(len(images)), iter(self.lines)
+        for convolution, layer in zip(self.convolutions, self.layers, strict=True):
+            x = convolution(nn.functional.max_pool2d(x, *self.pooling) if layer.pooled else x).relu()
+            if layer.compared:
+                unit = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
+                a, b = unit.chunk(2)
+                total = total + ((a - b).square() * next(lines)[:, None, None]).sum(1).mean((1, 2))
         return total
 
 
-def load_lpips(backbone: Path, heads: Path) -> Lpips:
-    """LPIPS from torchvision's AlexNet (alexnet-owt-7be5be79.pth) and LPIPS's own linear layers (alex.pth, 6 KB).
+def load_lpips(backbone: Path, heads: Path, *, allow_download: bool = False) -> Lpips:
+    """LPIPS from torchvision's AlexNet or VGG-16 and LPIPS's own linear layers.
+
+    Args:
+        backbone: alexnet-owt-7be5be79.pth or vgg16-397923af.pth; VGG-16 where the name begins with vgg, or holds it.
+        heads: alex.pth or vgg.pth, 6 to 7 KB.
+        allow_download: Download what is missing.
 
     Raises:
-        InputError: a file is missing, or holds something else.
+        InputError: a file is missing, cut short, or holds something else.
     """
-    network = Lpips()
-    trunk, lines = _read(backbone), _read(heads)
+    trunk: Trunk = "vgg" if "vgg" in backbone.name else "alex"
+    network = Lpips(trunk)
+    published_file(backbone, trunk, allow_download=allow_download)
+    published_file(heads, f"{trunk}-lines", allow_download=allow_download)
+    weights, lines = _read(backbone), _read(heads)
     try:
-        for k, (place, convolution) in enumerate(zip(PLACES, network.convolutions, strict=True)):
-            convolution.load_state_dict({key: trunk[f"features.{place}.{key}"] for key in ("weight", "bias")})
-            network.lines[k].data.copy_(lines[f"lin{k}.model.1.weight"].flatten())
+        for layer, convolution in zip(network.layers, network.convolutions, strict=True):
+            convolution.load_state_dict({key: weights[f"features.{layer.place}.{key}"] for key in ("weight", "bias")})
+        for k, line in enumerate(network.lines):
+            line.data.copy_(lines[f"lin{k}.model.1.weight"].flatten())
     except (KeyError, RuntimeError) as error:
-        raise InputError(f"{backbone}, {heads}: expected AlexNet and LPIPS's layers, missing {error}.") from error
+        names = "AlexNet" if trunk == "alex" else "VGG-16"
+        raise InputError(f"{backbone}, {heads}: expected {names} and LPIPS's layers, missing {error}.") from error
     return network
 
 
 def _read(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise InputError(f"{path}: expected weights of LPIPS, found no such file; leave LPIPS out or give its path.")
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises what its readers do: pickle, zip and runtime errors

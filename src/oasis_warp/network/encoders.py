@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, scaled_dot_product_attention
 
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.published_files import published_file
 from oasis_warp.network.attention import join_heads, split_heads
 
 
@@ -167,7 +168,7 @@ class DinoV2Encoder(nn.Module):
         if image_size % PATCH:
             raise ValueError(f"image_size: expected a multiple of {PATCH}, got {image_size}. Patches are that wide.")
         width, layers, heads = SIZES[name]
-        self.image_size = image_size
+        self.image_size, self.name = image_size, name
         self.aligned_channels = self.deep_channels = width
         self.cls = nn.Parameter(torch.zeros(1, 1, width))
         self.position = nn.Parameter(torch.zeros(1, GRID * GRID + 1, width))
@@ -196,10 +197,9 @@ class DinoV2Encoder(nn.Module):
         """Fill in published weights.
 
         Raises:
-            InputError: no such file, another format, or weights of another network.
+            InputError: no such file, another SHA-256 than it should have, another format, or another network's.
         """
-        if not path.is_file():
-            raise InputError(f"{path}: expected the weights of DINOv2, found no such file; download model.safetensors.")
+        published_file(path, self.name)
         try:
             published = load_file(path)
         except SafetensorError as error:
