@@ -1,3 +1,6 @@
+import json
+import shlex
+import shutil
 import subprocess
 import sys
 from typing import get_args
@@ -5,7 +8,7 @@ from typing import get_args
 import pytest
 
 from oasis_warp import __version__
-from oasis_warp.cli import main, options
+from oasis_warp.cli import app, main, options
 from oasis_warp.hand.poses import POSE_NAMES
 
 LIST_IMPORTS = """
@@ -62,6 +65,57 @@ def test_a_wrong_command_line_exits_with_two(arguments, capsys):
         main(arguments)
     assert stopped.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_every_command_takes_json_quiet_and_verbose():
+    for command in get_args(app.Command):
+        kinds = get_args(command)
+        if kinds[1].name != "bench":  # its own commands write tables
+            assert {"json", "quiet", "verbose"} <= set(kinds[0].__dataclass_fields__), kinds[1].name
+
+
+def test_json_holds_the_exact_command_and_what_it_wrote_or_what_went_wrong(avatar_file, tmp_path, capsys):
+    record, out = tmp_path / "record.json", tmp_path / "a picture.png"
+    arguments = ["render", str(avatar_file), "-o", str(out), "--size", "32", "--json", str(record)]
+    assert main(arguments) == 0
+    found = json.loads(record.read_text())
+    assert shlex.split(found["command"]) == ["oasis", *arguments]
+    assert found["written"] == [str(out)] and found["exit_code"] == 0 and found["error"] is None
+    assert found["options"]["size"] == 32 and found["seconds"] > 0
+    assert main([*arguments, "--background", "mauve"]) == 2
+    found = json.loads(record.read_text())
+    assert found["exit_code"] == 2 and f"oasis: {found['error']}\n" == capsys.readouterr().err
+    assert "written" not in found
+    assert main([*arguments[:-1], str(tmp_path)]) == 2
+    assert "found a folder" in capsys.readouterr().err
+
+
+def test_quiet_says_only_what_is_wrong_and_verbose_where(avatar_file, tmp_path, capsys):
+    arguments = ["animate", str(avatar_file), "-o", str(tmp_path / "x.gif"), "--size", "32", "--seconds", "0.1"]
+    assert main([*arguments, "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert main([*arguments, "--quiet", "--fps", "0"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main([*arguments, "--verbose", "--fps", "0"]) == 2
+    said = capsys.readouterr().err
+    assert "in count_frames" in said and said.splitlines()[-1].startswith("oasis: --fps 0")
+
+
+COMPLETE = """
+source {script}
+shown() {{ COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMPREPLY=(); _tyro_oasis; echo "${{COMPREPLY[@]}}"; }}
+shown oasis re
+shown oasis render --po
+"""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_a_shell_completes_commands_and_options(tmp_path):
+    command = [sys.executable, "-m", "oasis_warp", "--tyro-print-completion", "bash"]
+    (tmp_path / "script").write_bytes(subprocess.run(command, capture_output=True, check=True).stdout)
+    code = COMPLETE.format(script=shlex.quote(str(tmp_path / "script")))
+    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["reconstruct render", "--pose"]
 
 
 def test_bad_input_is_one_sentence_and_exits_with_two(capsys, tmp_path):

@@ -6,6 +6,7 @@ import pytest
 from rich.console import Console
 
 from oasis_warp.cli.console import line_progress, show_progress
+from oasis_warp.cli.record import recorded
 from oasis_warp.cli.report import make_report, print_report, to_json
 from oasis_warp.core.config import ReconstructConfig
 
@@ -13,7 +14,9 @@ from oasis_warp.core.config import ReconstructConfig
 def test_a_report_holds_the_run(scene, made):
     made = made._replace(warnings=("the thumb is hidden",))
     photo = scene[0]._replace(shrink=0.5)
-    report = json.loads(to_json(make_report([photo], made, ReconstructConfig(seed=3), {"fit": 0.25, "save": 0.5})))
+    with recorded(None, ["reconstruct", "my hand.png", "--seed", "3"]):
+        report = json.loads(to_json(make_report([photo], made, ReconstructConfig(seed=3), {"fit": 0.25, "save": 0.5})))
+    assert report["command"] == "oasis reconstruct 'my hand.png' --seed 3"
     assert report["photo"]["name"] == "known.png" and report["photo"]["shrink"] == 0.5
     assert report["hand"] == {"side": "right", "side_score": 0.99, "presence": 0.98, "landmarks_from": "network"}
     assert report["config"]["seed"] == 3

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from oasis_warp.cli.console import show_progress
 from oasis_warp.cli.options import Animate
+from oasis_warp.cli.record import written
 from oasis_warp.cli.render import check_numbers, choose_pose, load_avatar, read_color, straight_alpha
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK
@@ -145,7 +146,7 @@ def run(options: Animate) -> int:
         stage = "turntable" if options.motion == "turntable" else "poses"
         frames = draw_frames(hands, cameras, background=background, progress=progress, stage=stage)
         write_video(options.out, frames, options.fps, loops=options.loop)
-    print(f"written: {options.out}")
+    written(options.out)
     return 0
 
 

@@ -6,14 +6,17 @@ import logging
 import os
 import signal
 import sys
+import time
+import traceback
 from collections.abc import Sequence
-from typing import Annotated, NoReturn, get_args
+from typing import Annotated, Any, NoReturn, get_args
 
 import tyro
 
 from oasis_warp import __version__
 from oasis_warp.cli import developer_options, options
 from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli.record import recorded, write_record
 from oasis_warp.core.errors import InputError, did_you_mean, one_line, shortened
 
 Command = (
@@ -26,6 +29,7 @@ Command = (
     | Annotated[options.View, tyro.conf.subcommand("view")]
     | Annotated[options.Edit, tyro.conf.subcommand("edit")]
     | Annotated[options.Info, tyro.conf.subcommand("info")]
+    | Annotated[options.Compare, tyro.conf.subcommand("compare")]
     | Annotated[options.Text, tyro.conf.subcommand("text")]
     | Annotated[developer_options.Synthesize, tyro.conf.subcommand("synthesize")]
     | Annotated[developer_options.Pretrain, tyro.conf.subcommand("pretrain")]
@@ -35,6 +39,8 @@ Command = (
     | Annotated[developer_options.Doctor, tyro.conf.subcommand("doctor")]
 )
 
+OWN_JSON = (options.Info, developer_options.Gradcheck)
+"""Commands whose --json holds what they found."""
 COMMANDS = tuple(get_args(command)[1].name for command in get_args(Command))
 
 
@@ -56,26 +62,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     logging.basicConfig(format="oasis: %(message)s")
+    verbose = getattr(chosen, "verbose", False)
+    logging.getLogger("oasis_warp").setLevel(logging.INFO if verbose else logging.WARNING)
     # A batch system's SIGTERM ends the work as Ctrl-C does: what is half-written is taken away.
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before, start = signal.signal(signal.SIGTERM, signal.default_int_handler), time.monotonic()
+    try:
+        with recorded(chosen, arguments) as record:
+            code, said = _run(chosen, verbose)
+            if getattr(chosen, "json", None) is not None and not isinstance(chosen, OWN_JSON):
+                write_record(chosen, record, code, said, start)
+    except InputError as error:  # of the record
+        code, said = BAD_INPUT, str(error)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    if said is not None:
+        print(f"oasis: {said}", file=sys.stderr)
+    return code
+
+
+def _run(chosen: Any, verbose: bool) -> tuple[int, str | None]:
+    """Run a command; its exit code, and a sentence about what went wrong."""
     try:
         # The command's module imports torch and Warp, which take seconds: only now.
         command = importlib.import_module(f"oasis_warp.cli.{type(chosen).__name__.lower()}")
-        return command.run(chosen)
+        return command.run(chosen), None
     except InputError as error:
-        print(f"oasis: {error}", file=sys.stderr)
-        return BAD_INPUT
+        if verbose:
+            traceback.print_exc()
+        return BAD_INPUT, str(error)
     except KeyboardInterrupt:
-        print("oasis: stopped, nothing written.", file=sys.stderr)
-        return INTERRUPTED
+        return INTERRUPTED, "stopped, nothing written."
     except Exception as error:
         if not is_out_of_memory(error):
             raise
         device = getattr(chosen, "device", "cpu")
-        print(f"oasis: the memory of {device} is full; give smaller sizes, or fewer at once.", file=sys.stderr)
-        return BAD_INPUT
-    finally:
-        signal.signal(signal.SIGTERM, before)
+        return BAD_INPUT, f"the memory of {device} is full; give smaller sizes, or fewer at once."
 
 
 def _refuse_command(name: str) -> NoReturn:

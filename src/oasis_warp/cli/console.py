@@ -12,8 +12,9 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 
 from oasis_warp.cli.progress import Run
+from oasis_warp.cli.record import is_quiet
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.logging import Progress
+from oasis_warp.core.logging import Progress, silent
 
 FAULT = 1
 """`oasis doctor` found something broken, `oasis gradcheck` an error beyond its bound."""
@@ -29,12 +30,15 @@ LINE_EVERY = 5.0
 
 def plain_console() -> Console:
     """The console for results: brackets in the names of files are no markup."""
-    return Console(markup=False)
+    return Console(markup=False, quiet=is_quiet())
 
 
 @contextlib.contextmanager
 def show_progress(console: Console) -> Iterator[Progress]:
     """Show a `Progress` without a plan on `console` while the block runs: a bar a stage on a terminal, else lines."""
+    if is_quiet():
+        yield silent
+        return
     if not console.is_terminal:
         yield line_progress(lambda line: console.print(line, highlight=False, soft_wrap=True))
         return
@@ -46,7 +50,9 @@ def show_progress(console: Console) -> Iterator[Progress]:
 @contextlib.contextmanager
 def show_run(console: Console, run: Run) -> Iterator["Shown"]:
     """Show a run on `console` while the block runs: one bar with the time left on a terminal, else a line a stage."""
-    if console.is_terminal:
+    if is_quiet():
+        yield Shown(run, contextlib.nullcontext)
+    elif console.is_terminal:
         with _RunBar(run, console) as bar:
             yield Shown(run, bar.paused)
     else:

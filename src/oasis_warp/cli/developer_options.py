@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from oasis_warp.cli.options import Device, JsonFile, OutputFolder
+from oasis_warp.cli.options import Device, JsonFile, OutputFolder, command
 
 BackboneWeights = Annotated[
     Path | None, arg(help="DINOv2's model.safetensors, for a network of your own in the paper's profile.")
@@ -27,7 +27,7 @@ FamilyName = Literal[
 Kind = Literal["freckles", "hair", "polish", "tattoo", "ring", "plaster"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Gradcheck:
     """Certify the operators on this machine: values, gradients and bits, against finite differences and float64 twins.
 
@@ -142,12 +142,12 @@ class Bench:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Doctor:
     """Check that everything is there and computes what it should; each failing line says what to do."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Synthesize:
     """Make pictures of synthetic hands, with mask, depth, pose, shape, camera and landmarks.
 
@@ -172,7 +172,7 @@ class Synthesize:
     device: Device = "cpu"
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Pretrain:
     """Train a network on synthetic hands: network.safetensors, metrics.jsonl and pictures.png.
 
@@ -214,7 +214,7 @@ class Pretrain:
     """Weights to begin with: a network.safetensors of the same task and profile. From nothing when not given."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Evaluate:
     """Measure what avatars are worth: metrics.json with every number, sheet.png, and a table.
 

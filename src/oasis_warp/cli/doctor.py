@@ -18,6 +18,7 @@ from rich.console import Console
 from oasis_warp import __version__
 from oasis_warp.cli.console import FAULT
 from oasis_warp.cli.developer_options import Doctor
+from oasis_warp.cli.record import note
 
 PACKAGES = {
     "warp-lang": ("1.19", "1.20"),
@@ -55,8 +56,7 @@ Check = Callable[[], str]
 
 def run(options: Doctor) -> int:
     """Print a line for every check; the exit code."""
-    del options
-    console, faults, to_do = Console(), 0, checks()
+    console, faults, to_do, found = Console(quiet=options.quiet), 0, checks(), {}
     width = max(map(len, to_do))
     for name, check in to_do.items():
         try:
@@ -65,9 +65,11 @@ def run(options: Doctor) -> int:
             remedy = error.remedy if isinstance(error, FaultError) else "reinstall with `pip install -e .`"
             mark, text = "[red]FAIL[/]", f"{error or type(error).__name__}; {remedy}"
             faults += 1
+        found[name] = {"ok": "ok" in mark, "text": text}
         console.print(mark, f"{name:{width}}", text, highlight=False, soft_wrap=True)
     if faults:
         console.print(f"{faults} of {len(to_do)} checks failed.", style="red")
+    note(checks=found)
     return FAULT if faults else 0
 
 

@@ -11,6 +11,7 @@ from oasis_warp import __version__
 from oasis_warp.cli.console import check_device, plain_console, show_run
 from oasis_warp.cli.options import Edit as Options
 from oasis_warp.cli.progress import EDIT_PLAN, Run
+from oasis_warp.cli.record import exact_command, written
 from oasis_warp.cli.report import measures_table, print_warnings, to_json
 from oasis_warp.cli.summary import GROUND, WIDTH, Panel, make_sheet, panel_side
 from oasis_warp.core.camera import crop_camera, orbit_camera
@@ -90,6 +91,7 @@ def _report(options: Options, made: Edit) -> dict[str, Any]:
     given = {name: path.name for name in ("avatar", "painted", "photo", "mask") if (path := getattr(options, name))}
     return {
         "creator": f"oasis_warp {__version__}",
+        "command": exact_command(),
         **given,
         "square": made.square._asdict(),
         "config": {"steps": options.steps, "size": options.size},
@@ -102,7 +104,7 @@ def _report(options: Options, made: Edit) -> dict[str, Any]:
 def _print(console: Console, report: dict[str, Any], out: Path) -> None:
     title = f"{report['painted']} on {report['avatar']}"
     console.print(measures_table(title, report["seconds"], report["measures"], MEASURES))
-    console.print(f"written: {out}", highlight=False, soft_wrap=True)
+    written(out)
     print_warnings(console, report["warnings"])
 
 

@@ -11,7 +11,6 @@ from oasis_warp.cli.options import Info
 from oasis_warp.cli.report import to_json
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.surface import vertex_areas
-from oasis_warp.data.avatar_file import load_avatar
 from oasis_warp.data.output_files import write_file
 from oasis_warp.hand_avatar import Avatar
 
@@ -42,7 +41,7 @@ def run(options: Info) -> int:
     """
     if not options.avatars:
         raise InputError("avatars: expected at least one avatar.safetensors, got none; name it after `oasis info`.")
-    facts = {str(path): describe(path) for path in options.avatars}
+    facts = {str(path): describe(path)[1] for path in options.avatars}
     table = Table(show_header=len(facts) > 1)
     for heading in ("", *facts):
         table.add_column(heading, overflow="fold")
@@ -55,20 +54,19 @@ def run(options: Info) -> int:
 
 
 @torch.no_grad()
-def describe(path: Path) -> dict[str, Any]:
-    """The facts of one avatar; None where it has none.
+def describe(path: Path) -> tuple[Avatar, dict[str, Any]]:
+    """An avatar and its facts; None where it has none.
 
     Raises:
         InputError: it is no avatar file.
     """
-    _, header = load_avatar(path)
-    avatar = Avatar.load(path)
+    avatar, header = Avatar.read(path)
     rest, hand = avatar.rest, avatar.hand
     painted = None
     if avatar.invented is not None:
         areas = vertex_areas(rest.vertices, hand.faces)
         painted = float((areas * avatar.invented).sum() / areas.sum() * 100)
-    return {
+    return avatar, {
         "side": avatar.side,
         "hand_model": header["hand_model"],
         "hand_licence": header["hand_licence"],

@@ -5,7 +5,7 @@ Nothing heavy is imported here, so that `oasis --help` answers at once.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, dataclass_transform
 
 from tyro.conf import Positional, arg
 
@@ -25,8 +25,21 @@ Light = Annotated[
         "environment map, a file such as FILE.hdr."
     ),
 ]
+Quiet = Annotated[bool, arg(help="Say only what is wrong.")]
+Verbose = Annotated[bool, arg(help="Say more, and where in the program an error arose.")]
+Record = Annotated[Path | None, arg(help="JSON file for what was done: the command, what it wrote, what went wrong.")]
 NamedPose = Literal["rest", "open", "relaxed", "fist", "pinch", "thumbs_up", "victory", "point", "ok"]
 PoseName = Literal["photo"] | NamedPose
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+def command(options: type) -> type:
+    """A frozen dataclass of a command's options, and last those that all commands have."""
+    for name, kind, default in (("json", Record, None), ("quiet", Quiet, False), ("verbose", Verbose, False)):
+        if name not in options.__annotations__:
+            options.__annotations__[name] = kind
+            setattr(options, name, default)
+    return dataclass(frozen=True, kw_only=True)(options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +54,7 @@ class _Photos:
     instead of the networks; for one photo only."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Reconstruct(ReconstructConfig, _Photos):
     """Turn photos of a hand into avatars: avatar.safetensors, summary.png, quality.png, turntable.mp4 and report.json.
 
@@ -64,7 +77,7 @@ class _Batch:
     """Write summary.png, quality.png and turntable.mp4 of every photo too."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Batch(ReconstructConfig, _Batch):
     """Turn thousands of photos into avatars, on all cores or on a cluster. Needs the extra "batch".
 
@@ -74,7 +87,7 @@ class Batch(ReconstructConfig, _Batch):
     """
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Render:
     """Draw an avatar: one picture of any pose from any side."""
 
@@ -94,7 +107,7 @@ class Render:
     device: Device = "cpu"
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Animate:
     """Make a film of an avatar: a turn around it, a walk through poses, or a motion of your own. The first two loop.
 
@@ -131,7 +144,7 @@ class Animate:
     device: Device = "cpu"
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Info:
     """Say what is in avatar files: size, Gaussians, light, how much is painted; a column for each."""
 
@@ -140,7 +153,19 @@ class Info:
     json: JsonFile = None
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
+class Compare:
+    """Say what two avatars differ in: settings and measures of the reports beside them, numbers, and likeness."""
+
+    one: Positional[Path]
+    """avatar.safetensors of `oasis reconstruct`."""
+    other: Positional[Path]
+    """Another one."""
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="PATH")] = None
+    """Picture to write with both and their differences: .png, .webp or .jpg."""
+
+
+@command
 class Export:
     """Write an avatar for other programs; the ending of the name says the format.
 
@@ -161,7 +186,7 @@ class Export:
     into Gaussians and leaves it out of meshes."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Serve:
     """Take photos and give avatars in the browser, one after the other. Ctrl-C ends it.
 
@@ -177,7 +202,7 @@ class Serve:
     """Print the address and open no browser."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class View:
     """Show an avatar in the browser: turn it, pose it, light it. Ctrl-C ends it.
 
@@ -196,7 +221,7 @@ class View:
     """Print the address and open no browser."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Text:
     """Make an avatar from words, with an image generator of your own.
 
@@ -236,7 +261,7 @@ class _Painting:
     device: Device = "cpu"
 
 
-@dataclass(frozen=True, kw_only=True)
+@command
 class Edit(EditConfig, _Painting):
     """Bring what was painted on an avatar's photo into the avatar.
 

@@ -15,6 +15,7 @@ from oasis_warp.cli.animate import turntable
 from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED, check_device, plain_console, show_run
 from oasis_warp.cli.options import Reconstruct
 from oasis_warp.cli.progress import Run, reconstruct_plan
+from oasis_warp.cli.record import written
 from oasis_warp.cli.report import make_report, print_report, to_json
 from oasis_warp.cli.summary import GROUND, draw_quality, draw_summary
 from oasis_warp.core.config import ReconstructConfig, check_config
@@ -135,9 +136,8 @@ def reconstruct_folder(
 
 
 def _print(report: dict[str, Any], folder: Path) -> None:
-    console = plain_console()
-    print_report(console, report)
-    console.print(f"written: {folder}{os.sep}", highlight=False, soft_wrap=True)
+    print_report(plain_console(), report)
+    written(f"{folder}{os.sep}")
 
 
 def _write_folder(

@@ -10,6 +10,7 @@ from torch import Tensor
 from oasis_warp.avatar.environment import environment_light, studio_light
 from oasis_warp.cli.console import check_device
 from oasis_warp.cli.options import Animate, Render
+from oasis_warp.cli.record import written
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError, did_you_mean
@@ -109,5 +110,5 @@ def run(options: Render) -> int:
     )
     drawn = avatar.render(camera, pose, background)
     write_picture(options.out, to_uint8(straight_alpha(drawn) if transparent else drawn.image))
-    print(f"written: {options.out}")
+    written(options.out)
     return 0

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from oasis_warp import __version__
+from oasis_warp.cli.record import exact_command
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import HandFit, Photo
 from oasis_warp.reconstruction import FusedReconstruction, Reconstruction
@@ -66,6 +67,7 @@ def make_report(
         inputs = {"photos": each, "hand": {"side": made.avatar.side}}
     return {
         "creator": f"oasis_warp {__version__}",
+        "command": exact_command(),
         **inputs,
         "prior": dict(made.prior),
         "config": asdict(config),

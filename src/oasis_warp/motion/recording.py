@@ -28,7 +28,7 @@ def follow_video(path: Path, avatar: Avatar, *, progress: Progress = silent) -> 
     Raises:
         InputError: no video, or too few frames show the hand.
     """
-    poses, fps = _fit_frames(path, avatar, progress)
+    poses, fps = fit_frames(path, avatar, progress)
     seen = [k for k, pose in enumerate(poses) if pose is not None]
     if len(seen) < max(1, LEAST_SEEN * len(poses)):
         raise InputError(
@@ -37,14 +37,14 @@ def follow_video(path: Path, avatar: Avatar, *, progress: Progress = silent) -> 
         )
     if len(seen) < len(poses):
         logger.warning("%s: no %s hand in frames %s of %d; bridged", path, avatar.side, _listed(poses), len(poses))
-    shaken = _bridged(poses, fps)
+    shaken = bridged(poses, fps)
     motion = smooth(shaken)
     before, after = (_jitter(avatar, each) for each in (shaken, motion))
     logger.info("%s: the joints' mean acceleration is %.1f m/s², %.1f before the filter", path, after, before)
     return motion
 
 
-def _fit_frames(path: Path, avatar: Avatar, progress: Progress) -> tuple[list[HandPose | None], float]:
+def fit_frames(path: Path, avatar: Avatar, progress: Progress) -> tuple[list[HandPose | None], float]:
     """The pose in every frame, None where no hand is found or fitted; and frames a second."""
     if not path.is_file():
         raise InputError(f"{path}: cannot be read (no such file); check the path.")
@@ -87,7 +87,7 @@ def _fit_frame(
     return fit.pose, float(fit.camera.K[0, 0])
 
 
-def _bridged(poses: list[HandPose | None], fps: float) -> Motion:
+def bridged(poses: list[HandPose | None], fps: float) -> Motion:
     """The motion with what lies between seen frames blended from them; before and after them it stands still."""
     seen = [k for k, pose in enumerate(poses) if pose is not None]
     parts = [torch.stack(list(part)) for part in zip(*(poses[k] for k in seen), strict=True)]
