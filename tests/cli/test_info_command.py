@@ -1,6 +1,7 @@
 import json
 
 import cv2
+import numpy as np
 import pytest
 
 from oasis_warp.cli import main
@@ -43,7 +44,7 @@ def test_a_comparison_names_what_differs_and_nothing_else(scene, avatar_file, tm
     assert facts["different"]["their median size"] == pytest.approx([3, 2.7])
     assert "side" not in facts["different"]
     assert all(20 < value < 60 for value in facts["likeness_db"])
-    assert cv2.imread(str(tmp_path / "both.png")).shape[1] == 1200
+    assert np.asarray(cv2.imread(str(tmp_path / "both.png"))).shape[1] == 1200
 
 
 def test_an_avatar_differs_in_nothing_from_itself(avatar_file, tmp_path, capsys):
