@@ -2,7 +2,7 @@
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -305,18 +305,7 @@ class Avatar:
     def load(
         cls, path: Path | str, device: torch.device | str = "cpu", *, mano_dir: Path | str | None = None
     ) -> "Avatar":
-        """Read an avatar file; see `read`.
-
-        Raises:
-            InputError: not an avatar file, damaged, of a newer version, or made with a hand model that is not here.
-        """
-        return cls.read(path, device, mano_dir=mano_dir)[0]
-
-    @classmethod
-    def read(
-        cls, path: Path | str, device: torch.device | str = "cpu", *, mano_dir: Path | str | None = None
-    ) -> tuple["Avatar", dict[str, Any]]:
-        """An avatar and the header of its file.
+        """Read an avatar file.
 
         Args:
             path: Path of the file.
@@ -347,7 +336,7 @@ class Avatar:
             invented=tensors.get("invented"),
             hand=hand,
         )
-        return avatar._with_hidden_light() if header["version"] < LIGHT_HIDDEN else avatar, header
+        return avatar._with_hidden_light() if header["version"] < LIGHT_HIDDEN else avatar
 
     @torch.no_grad()
     def _with_hidden_light(self) -> "Avatar":

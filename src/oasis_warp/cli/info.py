@@ -11,6 +11,7 @@ from oasis_warp.cli.options import Info
 from oasis_warp.cli.report import to_json
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.surface import vertex_areas
+from oasis_warp.data.avatar_file import read_avatar_header
 from oasis_warp.data.output_files import write_file
 from oasis_warp.hand_avatar import Avatar
 
@@ -60,7 +61,7 @@ def describe(path: Path) -> tuple[Avatar, dict[str, Any]]:
     Raises:
         InputError: it is no avatar file.
     """
-    avatar, header = Avatar.read(path)
+    header, avatar = read_avatar_header(path), Avatar.load(path)
     rest, hand = avatar.rest, avatar.hand
     painted = None
     if avatar.invented is not None:

@@ -125,6 +125,23 @@ def save_avatar(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping
     write_file(path, save(stored, {FORMAT: json.dumps(full, allow_nan=False, sort_keys=True)}))
 
 
+def read_avatar_header(path: Path | str) -> dict[str, Any]:
+    """The header of an avatar file.
+
+    Raises:
+        InputError: the file is missing, or no avatar of a version that is known.
+    """
+    with open_tensors(Path(path), "an avatar file", "`oasis reconstruct` writes one") as file:
+        return _header_of(Path(path), file)
+
+
+def _header_of(path: Path, file: Any) -> dict[str, Any]:
+    text = (file.metadata() or {}).get(FORMAT)
+    if text is None:
+        raise InputError(f"{path}: a safetensors file, but no avatar; give the one `oasis reconstruct` wrote.")
+    return _read_header(path, text)
+
+
 def load_avatar(
     path: Path | str, hand_models: Mapping[str, Mapping[str, int]] = MappingProxyType({})
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -141,10 +158,7 @@ def load_avatar(
     """
     path = Path(path)
     with open_tensors(path, "an avatar file", "`oasis reconstruct` writes one") as file:
-        text = (file.metadata() or {}).get(FORMAT)
-        if text is None:
-            raise InputError(f"{path}: a safetensors file, but no avatar; give the one `oasis reconstruct` wrote.")
-        header = _read_header(path, text)
+        header = _header_of(path, file)
         if hand_models and header["hand_model"] not in hand_models:
             name = shortened(repr(header["hand_model"]))
             raise InputError(f"{path}: made with the hand model {name}, which is not installed; reconstruct it again.")
