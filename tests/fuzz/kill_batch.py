@@ -6,6 +6,7 @@ one line in the manifest and one folder, and nothing else may be left. Prints a 
 """
 
 import argparse
+import contextlib
 import json
 import random
 import subprocess
@@ -98,20 +99,33 @@ def check_end(photos: Path, out: Path, counts: Counter[str]) -> None:
     counts["left"] += sum(path.name.startswith(".") for path in out.rglob("*")) + (out / "tries").is_dir()
 
 
+def is_working(out: Path, since: float) -> bool:
+    """Whether a photo was begun after that time."""
+    for path in out.glob("tries/*"):
+        with contextlib.suppress(FileNotFoundError):  # it has ended
+            if path.stat().st_mtime > since:
+                return True
+    return False
+
+
 def kill_once(cluster: Cluster, victim: str, rng: random.Random, out: Path) -> bool:
     """Wait until photos are in work and a little longer, and kill; False if the work ends before."""
-    end = time.monotonic() + LONGEST
-    while not any((out / "tries").glob("*")):
+    begun = time.time()
+    while not is_working(out, begun):
         if cluster.client.poll() is not None:
             return False
-        assert time.monotonic() < end, "hangs"
+        assert time.time() < begun + LONGEST, "hangs"
         time.sleep(0.05)
     try:
         cluster.client.wait(rng.uniform(0, 5))
         return False
     except psutil.TimeoutExpired:
         pass
-    workers = cluster.workers() if victim != "scheduler" else []
+    workers = [] if victim == "scheduler" else cluster.workers()
+    while victim == "worker" and not workers:  # those that were killed are being started again
+        if cluster.client.poll() is not None:
+            return False
+        workers = cluster.workers()
     if victim == "worker":
         rng.choice(workers).kill()
         psutil.wait_procs(workers, timeout=0.2)

@@ -105,8 +105,8 @@ def adapt(
     Colours are calibrated, then inpainted beyond the rim of the seen region, then learned with reference views. With
     `config.light` "fit" the first two steps look at photos without their light, where they surely show the hand; the
     last one draws colours in that light, and most of what it learns beyond the prior is shade, which goes when the hand
-    turns. With "even" other likely light is left out too, and nothing is learned. With `config.texture` "lora" nothing
-    is inpainted, as in the paper. Several photos count in each pixel by how well they show the place there.
+    turns. With "even" other likely light is left out too, and nothing is learned. With `config.texture` "lora" or
+    "full" nothing is inpainted, as in the paper. Several photos count in each pixel by how well they show the place.
 
     Args:
         hand: The model.
@@ -114,17 +114,18 @@ def adapt(
         crops: The photos, with one surface at rest, on one device, of one size.
         config: Options.
         resolutions: Pixels of each photo for one pixel of its crop, along a line; 1 if not given.
-        heads: Of the one guess, for "lora": see `network.prior.guess_with_heads`.
+        heads: Of the one guess, for these two: see `network.prior.guess_with_heads`.
         progress: Called as work goes on.
 
     Raises:
-        ValueError: "lora" without heads, or for several photos.
+        ValueError: one of these without heads, or for several photos.
     """
-    if config.texture == "lora" and len(crops) > 1:
-        raise ValueError(f"texture 'lora': is for one photo, got {len(crops)}. Choose 'field'.")
-    if config.texture == "lora" and heads is None:
-        raise ValueError("texture 'lora': expected the heads of the prior, got none. Ask it with guess_with_heads.")
-    lora = heads if config.texture == "lora" and config.light != "even" else None
+    of_heads, name = config.texture != "field", f"texture {config.texture!r}"
+    if of_heads and len(crops) > 1:
+        raise ValueError(f"{name}: is for one photo, got {len(crops)}. Choose 'field'.")
+    if of_heads and heads is None:
+        raise ValueError(f"{name}: expected the heads of the prior, got none. Ask it with guess_with_heads.")
+    lora = heads if of_heads and config.light != "even" else None
     progress("calibration", 0, 1)
     guess, photos = _gather(hand, guesses, crops, resolutions, config)
     evenly_exposed = [crop.image / gain for crop, gain in zip(photos.unlit, photos.gains, strict=True)]

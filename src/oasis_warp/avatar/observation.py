@@ -110,7 +110,7 @@ def facing(
     return (normals * normalize(center.mT - vertices, dim=-1)).sum(-1)
 
 
-def inner_mask(mask: Float[Tensor, "*B S S"], pixels: int = RIM_PIXELS) -> Float[Tensor, "*B S S"]:
+def inner_mask(mask: Float[Tensor, "*B H W"], pixels: int = RIM_PIXELS) -> Float[Tensor, "*B H W"]:
     """The mask without its outermost `pixels`."""
     planes = -mask.reshape(-1, 1, *mask.shape[-2:])
     return -max_pool2d(planes, 2 * pixels + 1, stride=1, padding=pixels).view(mask.shape)

@@ -24,9 +24,10 @@ class AdaptConfig:
     light: Literal["fit", "keep", "even"] = "fit"
     """Fit the photo's light, which stays where it is when the hand turns, and take over all that the photo shows beyond
     it; take over light and shadows as if they were skin; or only what is likelier skin than light."""
-    texture: Literal["field", "lora"] = "field"
+    texture: Literal["field", "lora", "full"] = "field"
     """What learns the photo's detail: a field over the surface, after the seen colours were carried over its rim; or,
-    as in the paper, low-rank updates of the heads of a learned prior, from its calibrated guess on."""
+    as in the paper, low-rank updates of the heads of a learned prior, from its calibrated guess on; or, as in its
+    ablation, all weights of these heads."""
     lora_rank: int = 8
     """Of those updates."""
     texture_steps: int | None = None

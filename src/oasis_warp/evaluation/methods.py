@@ -83,7 +83,7 @@ def prior_guess(prior: Prior, crop: HandCrop, config: AdaptConfig) -> tuple[Cano
     Raises:
         InputError: the heads are to be trained, and the prior is no network.
     """
-    return guess_with_heads(prior, crop) if config.texture == "lora" else (prior(crop), None)
+    return guess_with_heads(prior, crop) if config.texture != "field" else (prior(crop), None)
 
 
 def reconstructions(

@@ -196,20 +196,25 @@ def cache_head(
     )
 
 
-def zero_updates(cache: HeadCache, rank: int, random: torch.Generator) -> LowRank:
+def zero_updates(cache: HeadCache, rank: int | None, random: torch.Generator) -> LowRank:
     """Updates of the three layers that change nothing yet: A uniform up to 1 / sqrt(inputs), B zero.
+
+    Without a rank A is the identity, and wants no gradient: B A may be any matrix.
 
     Args:
         cache: Of the head.
-        rank: Of B A.
+        rank: Of B A; None for all weights.
         random: On the CPU, so that every device starts alike.
     """
     hidden = cache.first.shape[1]
     sizes = (cache.inputs.shape[1], hidden), (hidden, hidden), (hidden, len(cache.last[1]))
     updates = []
     for inputs, outputs in sizes:
-        down = (2 * torch.rand(rank, inputs, generator=random) - 1) / math.sqrt(inputs)
-        updates.append((down.to(cache.first).requires_grad_(), cache.first.new_zeros(rank, outputs).requires_grad_()))
+        down = torch.eye(inputs)
+        if rank is not None:
+            down = (2 * torch.rand(rank, inputs, generator=random) - 1) / math.sqrt(inputs)
+        up = cache.first.new_zeros(len(down), outputs)
+        updates.append((down.to(cache.first).requires_grad_(rank is not None), up.requires_grad_()))
     return updates
 
 

@@ -1,0 +1,297 @@
+"""Evaluate avatars on data sets: made of one picture of a person, drawn in the pose and camera of the others.
+
+A data set has many pictures of few people, each with the hand that its annotations tell. Some pictures of each person
+become avatars, evenly spaced over all, and for each of them others are compared with, evenly spaced too.
+"""
+
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from oasis_warp import __version__
+from oasis_warp.avatar.prior import Prior
+from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
+from oasis_warp.core.errors import InputError
+from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo
+from oasis_warp.data.output_files import open_resumable_folder, write_file
+from oasis_warp.estimation.estimator import HandEstimator
+from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
+from oasis_warp.estimation.outline import wrist_line
+from oasis_warp.evaluation.methods import Method, prior_digest, reconstructions
+from oasis_warp.evaluation.metrics import TargetTruth, score
+from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
+from oasis_warp.evaluation.summary import Record, mean
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.hand_avatar import Avatar, make_avatar
+from oasis_warp.pretraining.objective import Perceptual
+
+SETTINGS, METRICS, SHEET, AVATARS = "evaluation.json", "metrics.json", "sheet.png", "avatars"
+"""Files that an evaluation writes; the last is a folder with the results of each avatar."""
+MEASURES = ("psnr", "psnr_whole", "ssim", "ssim_box", "ssim_mask", "lpips")
+DIGITS = 5
+WARM, FRAMES = 3, 20
+"""Frames that are drawn before the clock starts, and that are timed."""
+ERROR_STREAM = 7
+"""Stream of the random numbers of wrong poses."""
+
+
+class Key(NamedTuple):
+    """Which picture of a data set."""
+
+    subject: str
+    frame: str
+    """With its sequence."""
+    camera: str
+
+    @property
+    def name(self) -> str:
+        """Of files."""
+        return "_".join(self).replace("/", "-")
+
+
+class Sample(NamedTuple):
+    """One picture with one hand, as the data set cuts it out for evaluation."""
+
+    photo: Photo
+    """With the data set's own mask as alpha, where it has one, and its focal length."""
+    hand: Landmarks | HandFit
+    """21 annotated points, which our hand is fitted to, or the annotated pose of it."""
+
+
+@runtime_checkable
+class DataSet(Protocol):
+    """What an evaluation needs of a data set."""
+
+    @property
+    def keys(self) -> Sequence[Key]:
+        """All pictures that are evaluated, in the order of the recording."""
+        ...
+
+    def read(self, key: Key) -> Sample:
+        """One of them.
+
+        Raises:
+            InputError: it is missing or broken.
+        """
+        ...
+
+
+class Row(NamedTuple):
+    """A way to make avatars, a row of a table."""
+
+    name: str
+    prior: str
+    """Name among the priors."""
+    stage: str
+    """One of `methods.STAGES`."""
+    adapt: AdaptConfig
+    pose_error: float = 0.0
+    """Standard deviation of errors that joint angles and the hand's orientation are given [degrees]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """Which pictures are looked at."""
+
+    photos: int = 16
+    """Of each person, that avatars are made of."""
+    targets: int = 4
+    """That each avatar is compared with; the photo itself where a person has no other."""
+    seed: int = 0
+    """Of wrong poses."""
+
+
+def evenly(items: Sequence[Any], count: int) -> list[Any]:
+    """At most `count` of `items`, from the first to the last."""
+    n = min(count, len(items))
+    return [items[round(k * (len(items) - 1) / max(n - 1, 1))] for k in range(n)]
+
+
+def choose(keys: Sequence[Key], choice: Choice) -> list[tuple[Key, list[Key]]]:
+    """The photos that avatars are made of, and with what each is compared."""
+    chosen = []
+    for subject in dict.fromkeys(key.subject for key in keys):
+        own = [key for key in keys if key.subject == subject]
+        for photo in evenly(own, choice.photos):
+            others = [key for key in own if key != photo]
+            chosen.append((photo, evenly(others, choice.targets) or [photo]))
+    return chosen
+
+
+def evaluate_data_set(
+    data: DataSet, priors: Mapping[str, Prior], rows: Sequence[Row], choice: Choice, out: Path, *,
+    device: str = "cpu", perceptual: Perceptual | None = None, progress: Progress = silent,
+) -> dict[str, Any]:  # fmt: skip
+    """Make avatars of every row, compare them with other pictures of the person, and return the contents of METRICS.
+
+    An interrupted run goes on with the avatars that are missing. Pictures that cannot be read or that no pose fits are
+    left out and named in METRICS.
+
+    Raises:
+        InputError: a folder that cannot be used, or no picture that an avatar could be made of.
+    """
+    settings = {
+        "version": __version__, "priors": {name: prior_digest(prior) for name, prior in priors.items()},
+        "lpips": perceptual is not None, **asdict(choice),
+        "rows": [{**row._asdict(), "adapt": asdict(row.adapt)} for row in rows],
+    }  # fmt: skip
+    open_resumable_folder(out, SETTINGS, settings, "an evaluation")
+    (out / AVATARS).mkdir(exist_ok=True)
+    chosen = choose(data.keys, choice)
+    measuring = _Measuring(data, priors, rows, choice, ReconstructConfig(device=device), perceptual)
+    for k, (photo, targets) in enumerate(chosen):
+        progress("evaluation", k, len(chosen))
+        if not (out / AVATARS / f"{photo.name}.json").exists():
+            measuring.measure(photo, targets, out / AVATARS)
+    progress("evaluation", len(chosen), len(chosen))
+    found = [json.loads((out / AVATARS / f"{photo.name}.json").read_text()) for photo, _ in chosen]
+    pictures = [picture for one in found for picture in one["pictures"]]
+    left_out = {name: why for one in found for name, why in one["left_out"].items()}
+    if not pictures:
+        first = next(iter(left_out.values()), "it has no pictures")
+        raise InputError(f"{out}: of no picture of the data set could an avatar be made: {first}")
+    strips = [path for photo, _ in chosen if (path := out / AVATARS / f"{photo.name}.png").exists()]
+    write_sheet(out / SHEET, strips, ["photo", "truth", *(row.name for row in rows)])
+    whole = {"settings": settings, "summary": summarise(pictures), "left_out": left_out, "pictures": pictures}
+    write_file(out / METRICS, json.dumps(whole, allow_nan=False).encode())
+    return whole
+
+
+def summarise(pictures: Sequence[Record]) -> list[Record]:
+    """A row for each way to make avatars: means over pictures, of times over avatars."""
+    summary = []
+    for name in dict.fromkeys(picture["row"] for picture in pictures):
+        own = [picture for picture in pictures if picture["row"] == name]
+        avatars = list({picture["photo"]: picture for picture in own}.values())
+        summary.append({
+            "row": name, "avatars": len(avatars), "pictures": len(own), **{key: mean(own, key) for key in MEASURES},
+            "seconds": mean(avatars, "seconds"), "fps": mean(avatars, "fps"),
+        })  # fmt: skip
+    return summary
+
+
+class _Measuring(NamedTuple):
+    """What every avatar is measured with."""
+
+    data: DataSet
+    priors: Mapping[str, Prior]
+    rows: Sequence[Row]
+    choice: Choice
+    config: ReconstructConfig
+    perceptual: Perceptual | None
+
+    @torch.no_grad()
+    def measure(self, photo: Key, targets: Sequence[Key], folder: Path) -> None:
+        """Write the pictures of one photo's avatars, then their records."""
+        estimator, pictures, left_out = HandEstimator(bundled_hand()), [], {}
+        strip: list[list[Tensor]] = []
+        try:
+            source = self.data.read(photo)
+            fit = fitted(estimator, source)
+            truths = {}
+            for target in targets:
+                try:
+                    truths[target] = target_truth(estimator, self.data.read(target), fit, self.config.device)
+                except InputError as error:
+                    left_out[target.name] = str(error)
+            drawn = {target: [source.photo.rgb / 255, truth.image] for target, (truth, _, _) in truths.items()}
+            for row in self.rows:
+                avatar, seconds = self.make(row, source.photo, fit)
+                for target, (truth, camera, pose) in truths.items():
+                    image = avatar.render(camera, pose, BLACK).image
+                    drawn[target].append(image)
+                    about = {"row": row.name, "photo": photo.name, "target": target.name, "seconds": seconds}
+                    pictures.append({**about, "fps": None, **_measured(image, truth, self.perceptual)})
+                if truths:
+                    pictures[-1]["fps"] = frames_per_second(avatar)
+            strip = [[tile(image) for image in images] for images in list(drawn.values())[:1]]
+        except InputError as error:
+            left_out[photo.name] = str(error)
+        if strip:
+            write_strip(folder / f"{photo.name}.png", strip)
+        found = {"pictures": pictures, "left_out": left_out}
+        write_file(folder / f"{photo.name}.json", json.dumps(found, allow_nan=False).encode())
+
+    @torch.enable_grad()
+    def make(self, row: Row, photo: Photo, fit: HandFit) -> tuple[Avatar, float]:
+        """One avatar and how long the guess and its adaptation took [s]."""
+        hand, fit = bundled_hand(), misposed(fit, row.pose_error, self.choice.seed)
+        offsets = initial_offsets(hand, fit)
+        crop = crop_hand(photo, fit, offsets, self.config)
+        start = time.perf_counter()
+        methods = [Method(row.prior, row.stage)]
+        ((_, made),) = reconstructions(hand, crop, {row.prior: self.priors[row.prior]}, methods, row.adapt)
+        _wait(self.config.device)
+        seconds = time.perf_counter() - start
+        return make_avatar(fit, offsets, crop, made.gaussians, made.light), round(seconds, 2)
+
+
+def fitted(estimator: HandEstimator, sample: Sample, shape: Tensor | None = None) -> HandFit:
+    """The hand of a sample by our model, with the shape of another picture of the person where it is given."""
+    if isinstance(sample.hand, HandFit):
+        return sample.hand if shape is None else sample.hand._replace(shape=shape)
+    return estimator.fit(sample.photo, sample.hand, shape=shape, force=True)
+
+
+def misposed(fit: HandFit, degrees: float, seed: int) -> HandFit:
+    """The fit with errors of joint angles, within the limits of joints, and of the orientation; the same every time."""
+    if not degrees:
+        return fit
+    hand, random = bundled_hand(), torch.Generator().manual_seed(seed * 1000 + ERROR_STREAM)
+    errors = math.radians(degrees) * torch.randn(16, 3, generator=random)
+    low, high = hand.pose_limits[1:].unbind(-1)
+    angles = torch.minimum(torch.maximum(fit.pose.angles + errors[1:], low), high)
+    turn = torch.linalg.matrix_exp(torch.cross(torch.eye(3), errors[0].expand(3, 3), dim=-1))
+    return fit._replace(pose=fit.pose._replace(angles=angles, orientation=fit.pose.orientation @ turn))
+
+
+def target_truth(
+    estimator: HandEstimator, sample: Sample, source: HandFit, device: str
+) -> tuple[TargetTruth, Camera, HandPose]:
+    """What the whole picture must look like, its camera, and the hand's pose in it.
+
+    Raises:
+        InputError: another side than the photo's, or a hand that cannot be fitted.
+    """
+    fit = fitted(estimator, sample, source.shape)
+    if fit.side != source.side:
+        raise InputError(f"{sample.photo.name}: shows a {fit.side} hand, the photo a {source.side} one; left out.")
+    camera = fit.camera._replace(viewmat=fit.camera.viewmat.to(device), K=fit.camera.K.to(device))
+    above = wrist_line(fit.landmarks.xy.numpy()).above_mask((camera.width, camera.height))
+    known = torch.from_numpy(above).to(device, torch.float32)
+    mask, nowhere = fit.mask.to(device) * known, torch.zeros_like(known, dtype=torch.bool)
+    image = sample.photo.rgb.to(device) / 255 * mask[..., None]
+    return TargetTruth(image, mask, known, nowhere, nowhere, nowhere), camera, fit.pose
+
+
+def _measured(image: Tensor, truth: TargetTruth, perceptual: Perceptual | None) -> Record:
+    found = score(image, truth, perceptual)
+    error = float((image.clamp(0, 1) * truth.known[..., None] - truth.image).square().mean())
+    found["psnr_whole"] = -10 * math.log10(max(error, 1e-12))
+    return {name: None if (value := found[name]) is None else round(value, DIGITS) for name in MEASURES}
+
+
+@torch.no_grad()
+def frames_per_second(avatar: Avatar) -> float:
+    """Of posing and drawing, in the photo's camera."""
+    device = avatar.device.type
+    for k in range(WARM + FRAMES):
+        if k == WARM:
+            _wait(device)
+            start = time.perf_counter()
+        avatar.render(avatar.source_camera, avatar.source_pose)
+    _wait(device)
+    return round(FRAMES / (time.perf_counter() - start), 2)
+
+
+def _wait(device: str) -> None:
+    if device == "cuda":
+        torch.cuda.synchronize()
