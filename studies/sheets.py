@@ -1,6 +1,7 @@
-"""The sheets of pictures in the documentation: priors' guesses, several photos of a hand, detail, and painted hands.
+"""The sheets of pictures in the documentation: photos, priors' guesses, several photos of a hand, detail, paint.
 
-Draws docs/_static/priors.jpg, fusion.jpg, detail.jpg and edits.jpg, or those named by `--of`. Nothing is measured.
+Draws docs/_static/photographing.jpg, priors.jpg, fusion.jpg, detail.jpg and edits.jpg, or those named by `--of`.
+Nothing is measured.
 """
 
 import math
@@ -36,7 +37,7 @@ from studies.inputs import PHOTOS, SAME_HAND, fit_largest, photo_named, prior_na
 from studies.painted_truth import Chart, encoded, paint_photo, photographed
 from studies.tables import write_jpeg
 
-Name = Literal["priors", "fusion", "detail", "edits"]
+Name = Literal["photographing", "priors", "fusion", "detail", "edits"]
 Rows = Iterator[list[Panel]]
 FINER = 3
 """Avatars are drawn so many times as large and averaged."""
@@ -47,6 +48,13 @@ FUSED = tuple(
 )
 FACING = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """Fingers up, palm to the camera."""
+PHOTOGRAPHED = (
+    ("palm_open_left_02.png", "good: sharp, even light, fingers apart"), ("back_flat_right_04.jpg", "good: the back"),
+    ("ok_sign_left_10.jpg", "good: a pose of your own"), ("backlit_victory_14.jpg", "light from behind: a dark avatar"),
+    ("thumb_up_left_06.jpg", "a closed hand: its palm is guessed"),
+    ("small_pointing_right_13.jpg", "far away: little detail"),
+)  # fmt: skip
+"""Photos of the tests and what is said below them."""
 CLOSE = (
     ("synthetic:2", 12, "nail"), ("synthetic:7", 10, "creases"), ("back_flat_right_04.jpg", 10, "knuckle"),
     ("back_flat_right_04.jpg", 12, "nail"),
@@ -69,7 +77,7 @@ PAINTED_POSES = (("open", 0.5), ("fist", 0.0), ("point", -0.3))
 class Options(AvatarOptions):
     """Options of this study."""
 
-    of: tuple[Name, ...] = ("priors", "fusion", "detail", "edits")
+    of: tuple[Name, ...] = ("photographing", "priors", "fusion", "detail", "edits")
     static: Path = Path("docs/_static")
     """Folder to draw to."""
 
@@ -90,6 +98,18 @@ def view(avatar: Avatar, pose: HandPose, camera: Camera, side: int, caption: str
 def around(avatar: Avatar, pose: HandPose, azimuth: float, side: int, caption: str) -> Panel:
     """The avatar from an azimuth [rad]."""
     return view(avatar, pose, orbit_camera(avatar.mesh(pose).vertices, azimuth, 0.0, side), side, caption)
+
+
+def photographing_rows(config: ReconstructConfig, width: int) -> Rows:
+    """Photos that are good, and photos that are less so."""
+    side, panels = panel_side(3, width), []
+    for name, words in PHOTOGRAPHED:
+        photo = read_photo(PHOTOS / name)
+        height, length = photo.rgb.shape[0], min(photo.rgb.shape[:2])
+        square = ((photo.rgb.shape[1] - length) / 2, (height - length) / 2, float(length))
+        panels.append(cut(photo, square, side, words))
+    yield panels[:3]
+    yield panels[3:]
 
 
 def prior_rows(config: ReconstructConfig, width: int) -> Rows:
@@ -195,6 +215,7 @@ class Sheet(NamedTuple):
 
 
 SHEETS: dict[Name, Sheet] = {
+    "photographing": Sheet(photographing_rows, 1100, "Photos of hands", "good ones, and three that cost quality"),
     "priors": Sheet(prior_rows, 1800, "Priors", "their guesses, and what adaptation makes of them"),
     "fusion": Sheet(fusion_rows, 1000, "Avatars of one photo each, and of all"),
     "detail": Sheet(detail_rows, 1000, "Detail", "before and after, and from beside"),

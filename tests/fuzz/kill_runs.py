@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -99,7 +100,7 @@ def launch(arguments: Sequence[str], n_bytes: int | None = None) -> int:
     child = os.fork()
     if child:
         return child
-    code = TRACEBACK
+    code, shown = TRACEBACK, os.fdopen(os.dup(2), "w")
     try:
         nowhere = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
@@ -110,7 +111,10 @@ def launch(arguments: Sequence[str], n_bytes: int | None = None) -> int:
         code = main(arguments)
     except KeyboardInterrupt:  # before the command has begun
         code = INTERRUPTED
+    except Exception:
+        traceback.print_exc(file=shown)
     finally:
+        shown.flush()
         os._exit(code)
 
 
