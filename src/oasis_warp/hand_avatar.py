@@ -219,10 +219,10 @@ class Avatar:
         check_shape("pose.translation", pose.translation, 3)
         check_shape("camera.viewmat", camera.viewmat, 4, 4)
         check_shape("camera.K", camera.K, 3, 3)
-        color = torch.as_tensor(background, dtype=self.shape.dtype)
+        color = background if isinstance(background, Tensor) else torch.tensor(background)
         check_shape("background", color, 3)
         if not isinstance(background, Tensor):
-            color = plain_background(tuple(color.tolist()), 1, like=self.shape)[0]
+            color = plain_background(tuple(background), 1, like=self.shape)[0]
         named = {**pose._asdict(), "viewmat": camera.viewmat, "K": camera.K}
         inputs = (*named.values(), color)
 

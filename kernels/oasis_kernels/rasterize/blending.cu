@@ -83,10 +83,10 @@ __global__ void blend(
             next_index = list[first + lane];
             next_center = centers[next_index];
             next_whitening = whitenings[next_index];
-            next_opacity = opacities[next_index];
+            next_opacity = own_opacities[next_index];
             if (CHANNELS <= 4) {
 #pragma unroll
-                for (int k = 0; k < CHANNELS; k++) next_color[k] = colors[(long long)next_index * CHANNELS + k];
+                for (int k = 0; k < CHANNELS; k++) next_color[k] = own_colors[(long long)next_index * CHANNELS + k];
             }
         }
     };
@@ -99,7 +99,7 @@ __global__ void blend(
         const bool hits = first + lane < count && reaches(l, y_low, y_high);
         const unsigned hitting = __ballot_sync(all, hits);
         const int m = __popc(hitting), slot = __popc(hitting & ((1u << lane) - 1u));
-        const float* const color = CHANNELS <= 4 ? next_color : colors + (long long)next_index * CHANNELS;
+        const float* const color = CHANNELS <= 4 ? next_color : own_colors + (long long)next_index * CHANNELS;
         if (hits) put(slot, l, first + lane, color);
         if (lane >= m && lane < ((m + 3) & ~3)) put_nothing(lane);
         __syncwarp();

@@ -103,7 +103,7 @@ __global__ void blend_backward(
                 const int4 t = tile_box(boxes[g]);
                 const int number = pair_starts[g] + (top / 8 - t.y) * (t.z - t.x) + left / 8 - t.x;
                 record = pair_records + (long long)number * RECORD;
-                l = layer(centers[g], whitenings[g], opacities[g]);
+                l = layer(centers[g], whitenings[g], own_opacities[g]);
                 hits = first + lane < last && reaches(l, 0.f, 7.f);
                 if (!hits) {
 #pragma unroll
@@ -113,7 +113,7 @@ __global__ void blend_backward(
             const unsigned hitting = __ballot_sync(all, hits);
             const int m = __popc(hitting), slot = __popc(hitting & ((1u << lane) - 1u));
             if (hits) {
-                put(slot, l, first + lane, colors + (long long)g * CHANNELS);
+                put(slot, l, first + lane, own_colors + (long long)g * CHANNELS);
                 layer_records[slot] = record;
             }
             if (lane >= m && lane < ((m + 3) & ~3)) put_nothing(lane);
@@ -205,7 +205,8 @@ __global__ void gather(
     const int* pair_starts,     // [C * n]
     const float* pair_records,  // [pairs, record size]
     const float4* whitenings,
-    const float* opacities,
+    const float* opacities,  // [total], or [opacities_given] for each camera in turn
+    int opacities_given,
     float2* g_means2d,
     double* g_covars2d,
     float* g_opacities,
@@ -244,6 +245,7 @@ __global__ void gather(
         by_covariance[0] = 0.5 * (w0 * (w0 * m3 + w2 * m4) + w2 * (w0 * m4 + w2 * m5));
         by_covariance[1] = w1 * (w0 * m3 + w2 * m4) + w3 * (w0 * m4 + w2 * m5);
         by_covariance[2] = 0.5 * (w1 * (w1 * m3 + w3 * m4) + w3 * (w1 * m4 + w3 * m5));
-        g_opacities[thread] = count ? sums[0] / opacities[thread] : 0.f;
+        g_opacities[thread] =
+            count ? sums[0] / opacities[opacities_given == total ? thread : thread % opacities_given] : 0.f;
     }
 }

@@ -28,10 +28,20 @@ __global__ void project(
     int* counters,        // of the tiles, to be cleared
     int n_counters,
     int n_threads,
-    long long* bad  // made 1 where an input is not finite, too large or outside its range; or null
+    long long* bad,       // made 1 where an input is not finite, too large or outside its range; or null
+    const float* colors,  // [n_colors], only to be checked; or null, as the next
+    long long n_colors,
+    const float* backgrounds,  // [n_backgrounds]
+    long long n_backgrounds
 ) {
 #include "projection_cuda.h"
     for (int k = thread; k < n_counters; k += n_threads) counters[k] = 0;
+    if (bad) {
+        bool odd = false;
+        for (long long k = thread; k < n_colors; k += n_threads) odd |= !(fabsf(colors[k]) <= largest);
+        for (long long k = thread; k < n_backgrounds; k += n_threads) odd |= !(fabsf(backgrounds[k]) <= largest);
+        if (odd) *bad = 1;
+    }
     if (thread >= n * n_cameras) return;
     const int c = n_cameras == 1 ? 0 : thread / n, i = thread - c * n;
     bool flaw = false;

@@ -7,6 +7,9 @@ const int4 own = tiles[block_index];  // column, start and length of the list, r
 const int start = own.y, count = own.z;
 const int camera = n_cameras == 1 ? 0 : own.w / tiles_y;
 const int left = own.x * 8, top = (own.w - camera * tiles_y) * 8;
+// Those of this camera, by number over all cameras.
+const float* const own_opacities = opacities + (long long)camera * (opacity_step - n);
+const float* const own_colors = colors + (long long)camera * (color_step - n) * CHANNELS;
 const long long first_pixel = ((long long)camera * height + top) * width + left;
 // Segments of the list, of 32 layers or a multiple.
 const int segment = max(32, ((count + SEGMENTS - 1) / SEGMENTS + 31) & ~31);

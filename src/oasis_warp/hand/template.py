@@ -2,6 +2,7 @@
 
 import functools
 import os
+import warnings
 from pathlib import Path
 from typing import Literal
 
@@ -47,12 +48,12 @@ def bundled_hand() -> HandModel:
         arrays = {key: stored[key] for key in stored.files}
     n_fine, n_base = (int(n) for n in arrays["hd_shape"])
     rows = np.repeat(np.arange(n_fine), np.diff(arrays["hd_indptr"]))
-    subdivision = torch.sparse_coo_tensor(
-        torch.from_numpy(np.stack([rows, arrays["hd_indices"].astype(np.int64)])),
-        torch.from_numpy(arrays["hd_data"]).double(),
-        (n_fine, n_base),
-        check_invariants=True,
-    )
+    places = torch.from_numpy(np.stack([rows, arrays["hd_indices"].astype(np.int64)]))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Sparse invariant checks are implicitly disabled")  # torch 2.11: always
+        subdivision = torch.sparse_coo_tensor(
+            places, torch.from_numpy(arrays["hd_data"]).double(), (n_fine, n_base), check_invariants=True
+        )
 
     def subdivide(key: str) -> Tensor:
         """An array of the base vertices on the HD mesh. The last base vertex only closes the wrist and is dropped."""

@@ -26,6 +26,11 @@ def _backend(colors: Tensor) -> ModuleType:
     return blend_tiles
 
 
+def _splats(records: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor) -> Splats:
+    rows = blend_cuda.contiguous if _backend(colors) is blend_cuda else Tensor.contiguous
+    return Splats(records, rows(opacities), rows(colors), backgrounds.contiguous())
+
+
 # Sizes and flags come in lists: each argument of an op costs torch time.
 def _blend(
     means2d: Tensor, covars2d: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor, records: Tensor,
@@ -34,7 +39,7 @@ def _blend(
     if validate:
         shared = colors.stride(0) == 0  # by the cameras: each value counts once
         check_finite(colors=colors[:1] if shared else colors, backgrounds=backgrounds)
-    splats = Splats(records, *contiguous(opacities, colors, backgrounds))
+    splats = _splats(records, opacities, colors, backgrounds)
     image, alphas, saved = _backend(colors).draw(splats, Frame(*frame), keep)
     return image, alphas, [] if saved is None else list(saved)
 
@@ -53,7 +58,7 @@ def _blend_backward(
     opacities: Tensor, colors: Tensor, backgrounds: Tensor, records: Tensor, saved: list[Tensor], frame: list[int],
     g_image: Tensor | None, g_alphas: Tensor | None, needs: list[bool],
 ) -> list[Tensor]:  # fmt: skip
-    splats = Splats(records, *contiguous(opacities, colors, backgrounds))
+    splats = _splats(records, opacities, colors, backgrounds)
     backend, flags = _backend(colors), GradientFlags(any(needs[:3]), *needs[3:])
     gradients = backend.draw_backward(
         *contiguous(g_image, g_alphas), splats, Frame(*frame), backend.SavedTensors(*saved), flags

@@ -80,6 +80,7 @@ class _CapturedRasterization:
                     self._zero = [True for _ in outputs]
                     if self._leaves:
                         back(outputs)
+            del outputs  # with the nodes that accumulate gradients on the side stream
             torch.cuda.current_stream().wait_stream(side_stream)
             self._forward, self._backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
             with watch_overflow() as self.overflow:

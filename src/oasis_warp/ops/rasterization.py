@@ -12,7 +12,9 @@ from torch import Tensor
 from oasis_kernels import constants
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.tracing import is_traced
+from oasis_warp.ops._runtime import picture_node
 from oasis_warp.ops._runtime.declaration import Array, Declaration
+from oasis_warp.ops._runtime.picture_call import Options, Scene
 from oasis_warp.ops._runtime.rasterization_checks import (
     check_cameras,
     check_coefficients,
@@ -24,7 +26,7 @@ from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 from oasis_warp.ops.blending import blend
 from oasis_warp.ops.checks import check_choice, refuse_gradient
 from oasis_warp.ops.gsplat_options import compensated_opacities, record_absolute_gradients
-from oasis_warp.ops.projection import Projection, project
+from oasis_warp.ops.projection import Projection, check_values, project
 from oasis_warp.ops.spherical_harmonics import sh_to_rgb
 
 UNSUPPORTED: dict[str, tuple[Any, str]] = {
@@ -177,6 +179,15 @@ def rasterization(
     check_choice("camera_model", camera_model, CAMERA_MODELS)
     if covars is not None:
         quats = scales = None
+    together = not absgrad and rasterize_mode == "classic" and isinstance(means, Tensor) and means.is_cuda
+    options = Options(
+        width, height, near_plane, far_plane, radius_clip, eps2d, tile_size, render_mode, camera_model == "ortho"
+    )
+    if together and sh_degree is None:
+        scene = Scene(means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds)
+        drawn = draw_together(scene, options, validate)
+        if drawn is not None:
+            return drawn
     check_gaussians(means, quats, scales, covars, opacities)
     check_cameras(viewmats, Ks, means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size)
     refuse_gradient("rasterization", Ks=Ks)
@@ -187,6 +198,11 @@ def rasterization(
             check_finite(colors=colors)  # of which the largest degree may not be read, and -inf would become black
             check_invertible(viewmats)
         colors = sh_to_rgb(sh_degree, means, colors, viewmats)
+        if together:
+            scene = Scene(means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds)
+            drawn = draw_together(scene, options, validate)
+            if drawn is not None:
+                return drawn
     check_colors(colors, backgrounds, means, n_cameras)
     if validate and render_mode in ("D", "ED") and not is_traced():
         check_finite(colors=colors, backgrounds=backgrounds)  # the blending, which does not get them, cannot check them
@@ -214,6 +230,32 @@ def rasterization(
     return render, alphas, meta
 
 
+def draw_together(scene: Scene, options: Options, validate: bool) -> tuple[Tensor, Tensor, dict[str, Any]] | None:
+    """Images, alpha and meta by one node of autograd; None where the operators apart must draw them."""
+    plan = picture_node.plan_for(scene, options)
+    if plan is None:
+        return None
+    drawn = picture_node.draw(plan, scene, validate)
+    if drawn is None:
+        means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds = scene
+        check_values(means, quats, scales, covars, opacities, viewmats, Ks)
+        check_finite(colors=colors, backgrounds=backgrounds)
+        raise AssertionError("the kernels have met a bad value that is not in their inputs")
+    image, alphas, meta = drawn
+    return expect_depth(image, options.render_mode), alphas, meta
+
+
+def expect_depth(render: Tensor, render_mode: str) -> Tensor:
+    """Images whose last two channels are depth and the weights' sum, if the mode asks for the expected depth."""
+    if render_mode not in ("ED", "RGB+ED"):
+        return render
+    # Alpha, as 1 - T, has lost digits where little was drawn.
+    depth, cover = render[..., -2:-1], render[..., -1:]
+    drawn = cover > 0
+    expected = torch.where(drawn, depth / torch.where(drawn, cover, 1), 0)
+    return torch.cat([render[..., :-2], expected], -1)
+
+
 def blend_layers(
     projection: Projection, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, frame: tuple[int, int, int],
     render_mode: str, absgrad: bool, validate: bool,
@@ -231,13 +273,7 @@ def blend_layers(
         render, alphas = record_absolute_gradients(
             render, alphas, projection, opacities, channels, backgrounds, frame[2]
         )
-    if render_mode in ("ED", "RGB+ED"):
-        # Over the weights' own sum: alpha, as 1 - T, has lost digits where little was drawn.
-        depth, cover = render[..., -2:-1], render[..., -1:]
-        drawn = cover > 0
-        expected = torch.where(drawn, depth / torch.where(drawn, cover, 1), 0)
-        render = torch.cat([render[..., :-2], expected], -1)
-    return render, alphas
+    return expect_depth(render, render_mode), alphas
 
 
 def refuse_unsupported(values: Sequence[Any]) -> None:

@@ -83,7 +83,7 @@ def sky_exposure(
 
     The irradiance sum_d w_d max(0, n . d) L(d) V(d) over the same without the visibility V, from a depth buffer for
     each direction of `sky_directions`; then a mean over the faces around. Values are trusted; not differentiable. The
-    same on every device up to rounding, and in a batch as alone.
+    same on every device and in a batch as alone up to rounding; to the bit on the CPU.
 
     Args:
         vertices: Of posed surfaces [m], float32, [B, V, 3].

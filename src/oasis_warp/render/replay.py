@@ -78,11 +78,14 @@ class CapturedGraph:
 
     def __call__(self, inputs: Sequence[Tensor]) -> Outputs | None:
         """The function's outputs, in fresh memory; None where that for its rasterizations did not suffice."""
-        with torch.cuda.device(self._flat.device), torch.inference_mode(False), torch.no_grad():
+        if torch.is_inference_mode_enabled() or torch.cuda.current_device() != self._flat.get_device():
+            with torch.cuda.device(self._flat.device), torch.inference_mode(False):
+                return self(inputs)
+        with torch.no_grad():
             self._fill(inputs)
             self._graph.replay()
             outputs = tuple(output.clone() for output in self._outputs)
-            torch.cuda.current_stream().synchronize()  # only then is it known whether the picture is whole
+        torch.cuda.current_stream().synchronize()  # only then is it known whether the picture is whole
         return None if self._overflow.happened() else outputs
 
 

@@ -57,8 +57,8 @@ class Layout(NamedTuple):
         return (4 + tiles_cuda.spread_of(self.n_tiles)) * self.n_tiles + self.n_cameras * self.n
 
 
-def _layout(colors: Tensor, frame: Frame) -> Layout:
-    n_cameras, n, channels = colors.shape
+def layout_of(n_cameras: int, n: int, channels: int, frame: Frame) -> Layout:
+    """Sizes for so many cameras, Gaussians and channels."""
     width, height, _ = frame
     across, down = -(-width // tiles_cuda.TILE), -(-height // tiles_cuda.TILE)
     n_tiles = n_cameras * across * down
@@ -72,16 +72,27 @@ def _params(splats: Splats, layout: Layout, lists: Tensor, planes: Tensor | None
     n_cameras, n, _, tiles_x, tiles_y, width, height, n_tiles, pixels, _ = layout
     spread = tiles_cuda.spread_of(n_tiles)
     return {
-        **splats.params(), "n": n, "n_cameras": n_cameras, "total": n_cameras * n,
+        **splats.params(), "opacity_step": _step(splats.opacities), "color_step": _step(splats.colors), "n": n,
+        "n_cameras": n_cameras, "total": n_cameras * n,
         "tiles_x": tiles_x, "tiles_y": tiles_y, "width": width, "height": height, "n_tiles": n_tiles, "tiles": first,
         "cursors": first + 16 * n_tiles, "pair_starts": first + (16 + 4 * spread) * n_tiles, "spread": spread,
         "transmittance": plane, "stops": plane and plane + 4 * pixels, "checkpoints": plane and plane + 8 * pixels,
     }  # fmt: skip
 
 
+def contiguous(tensor: Tensor) -> Tensor:
+    """`tensor` [C, N, ...] with contiguous rows, which all cameras may share."""
+    return tensor if tensor.stride(0) == 0 and tensor[0].is_contiguous() else tensor.contiguous()
+
+
+def _step(tensor: Tensor) -> int:
+    """Rows from a camera's Gaussians to those of the next."""
+    return 0 if tensor.stride(0) == 0 else tensor.shape[1]
+
+
 def fake_saved(colors: Tensor, frame: Frame) -> SavedTensors:
     """Empty tensors of the shapes that `draw` saves."""
-    layout = _layout(colors, frame)
+    layout = layout_of(*colors.shape, frame)
     return SavedTensors(
         colors.new_empty(layout.size_of_planes()),
         colors.new_empty(layout.size_of_lists(), dtype=torch.int32),
@@ -96,7 +107,7 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Save
         ValueError: more pairs of a Gaussian and a tile than can be numbered.
         RuntimeError: a graph captures this without an eager call before, or without a watch.
     """
-    layout, new = _layout(splats.colors, frame), splats.colors
+    layout, new = layout_of(*splats.colors.shape, frame), splats.colors
     n_cameras, n, channels = new.shape
     device, stream = new.device, current_stream(new.device)
     lists = torch.empty(layout.size_of_lists(), dtype=torch.int32, device=device)
@@ -137,7 +148,7 @@ def draw_backward(
 ) -> Gradients:  # fmt: skip
     """Gradients from those by image and alpha, None standing for zeros."""
     with_shape, with_colors, with_backgrounds = flags
-    layout, new = _layout(splats.colors, frame), splats.colors
+    layout, new = layout_of(*splats.colors.shape, frame), splats.colors
     n_cameras, n, channels = new.shape
     stream = current_stream(new.device)
     capacity = saved.gaussians.untyped_storage().nbytes() // 4 - 1
@@ -151,6 +162,7 @@ def draw_backward(
         "capacity": capacity, "tile_gaussians": saved.gaussians, "pair_records": new.new_empty(capacity * size),
         "g_image": g_image, "g_alpha": g_alpha, "tile_backgrounds": tile_backgrounds, "g_means2d": g_means2d,
         "g_covars2d": g_covars2d, "g_opacities": g_opacities, "g_colors": g_colors,
+        "opacities_given": n if _step(splats.opacities) == 0 else n_cameras * n,
     }  # fmt: skip
     rules = current_rules()
     backward = tiles_cuda.blend_backward(channels, layout.segments, with_shape, with_colors, rules)

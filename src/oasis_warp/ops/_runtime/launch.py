@@ -18,6 +18,7 @@ from torch import Tensor
 from oasis_kernels.runtime.cuda_native import CudaNative
 from oasis_kernels.runtime.native import TASK, Native
 from oasis_warp.core.processes import kernel_threads
+from oasis_warp.ops._runtime.cuda_launch import CudaLaunch
 from oasis_warp.ops._runtime.kernel_cache import load_module, writable_cache
 
 _start_lock = threading.Lock()
@@ -290,13 +291,28 @@ def aligned(*tensors: Tensor | None) -> list[Any]:
 
 
 class _CudaLaunches(threading.local):
-    """Launches of CUDA kernels, recorded once per thread."""
+    """Launches of CUDA kernels: one for each thread, as it owns the memory of its parameters."""
 
     def __init__(self) -> None:
-        self.launches: dict[Any, list[Any]] = {}  # by kernel and device: the launch, and its number of blocks
+        self.launches: dict[tuple[Any, int], CudaLaunch] = {}  # by kernel and device
 
 
 _cuda_launches = _CudaLaunches()
+
+
+def cuda_launch(native: CudaNative, device: "wp.Device") -> CudaLaunch:
+    """This thread's launch of a kernel on a device; loads the kernel at the first call."""
+    key = native.kernel, device.ordinal
+    launch = _cuda_launches.launches.get(key)
+    if launch is None:
+        _load(native.kernel, device, native.block)
+        with _load_lock:
+            recorded = wp.launch(
+                native.kernel, dim=native.block, inputs=[native.kernel.adj.args[0].type()], device=device,
+                block_dim=native.block, record_cmd=True,
+            )  # fmt: skip
+        launch = _cuda_launches.launches[key] = CudaLaunch(recorded, native)
+    return launch
 
 
 def run_cuda(native: CudaNative, params: Parameters, n_blocks: int, stream: "wp.Stream") -> None:
@@ -304,27 +320,15 @@ def run_cuda(native: CudaNative, params: Parameters, n_blocks: int, stream: "wp.
 
     Args:
         native: The kernel.
-        params: A number or contiguous tensor for each of its parameters; others are ignored.
+        params: A number or contiguous tensor for each of its parameters, none of which is an array; others are
+            ignored.
         n_blocks: Of `native.block` threads.
         stream: A `current_stream`.
     """
     if not n_blocks:
         return
-    values = [params[name] for name in native.parameters]
-    block = native.block_type(*[v.data_ptr() if isinstance(v, Tensor) else v or 0 for v in values])
-    key = native.kernel, stream.device.ordinal
-    recorded = _cuda_launches.launches.get(key)
-    if recorded is None:
-        _load(native.kernel, stream.device, native.block)
-        with _load_lock:
-            launch = wp.launch(
-                native.kernel, dim=native.block, inputs=[native.kernel.adj.args[0].type()], device=stream.device,
-                block_dim=native.block, record_cmd=True,
-            )  # fmt: skip
-        recorded = _cuda_launches.launches[key] = [launch, 1]
-    launch: Any = recorded[0]
-    if recorded[1] != n_blocks:
-        launch.set_dim(n_blocks * native.block)
-        recorded[1] = n_blocks
-    launch.set_param_at_index_from_ctype(0, block)
-    launch.launch(stream)
+    words = []
+    for name in native.parameters:
+        value = params[name]
+        words.append(value.data_ptr() if isinstance(value, Tensor) else value or 0)
+    cuda_launch(native, stream.device)(n_blocks, stream.cuda_stream, *words)

@@ -5,6 +5,7 @@ much. A call that a CUDA graph captures cannot wait: it allocates what the last 
 more. If a replay needs more, lists that do not fit stay empty, and `Overflow.happened` returns True.
 """
 
+import ctypes
 import threading
 import weakref
 from collections.abc import Iterator
@@ -20,6 +21,12 @@ from oasis_warp.ops._runtime.tiles import MAX_PAIRS
 
 PAGE = 4096
 """Words of host memory per allocation for reports."""
+
+
+SORTED = LONGEST, RUN, MAX_PAIRS
+"""Lengths of a tile's list up to which one way of sorting does."""
+SPINS = 2000
+"""Looks at words that the device is about to write, some 0.1 ms, before the thread sleeps."""
 
 
 class Counts(NamedTuple):
@@ -84,6 +91,23 @@ def own_slot() -> Tensor:
     return _own.slot
 
 
+class PolledWords:
+    """Page-locked words that kernels write and the host looks at while later kernels still run."""
+
+    def __init__(self, count: int) -> None:
+        self._memory = torch.zeros(count, dtype=torch.int64, pin_memory=True)
+        self.address = self._memory.data_ptr()
+        self.values = (ctypes.c_longlong * count).from_address(self.address)
+
+    def wait(self, device: int) -> None:
+        """Wait until the first two, which were made negative before, are not; or until the current stream is done."""
+        values = self.values
+        for _ in range(SPINS):
+            if values[0] >= 0 and values[1] >= 0:
+                return
+        torch.cuda.current_stream(device).synchronize()
+
+
 class Overflow:
     """Whether watched graphs have met more pairs than they have memory for."""
 
@@ -138,7 +162,7 @@ def capacity_of(kind: Kind, slack: float) -> Counts:
         )
     last = _last[kind]
     longest = int(slack * last.longest)
-    sorted_ = next(limit for limit in (LONGEST, RUN, MAX_PAIRS) if limit >= longest)
+    sorted_ = next(limit for limit in SORTED if limit >= longest)
     return Counts(min(int(slack * last.pairs) + 4096, MAX_PAIRS), sorted_)
 
 

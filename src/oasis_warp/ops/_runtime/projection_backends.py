@@ -148,7 +148,7 @@ def project_cuda(
         opacities=opacities, bad=bad, n_threads=n_blocks * projection_native.BLOCK, n_counters=n_counters,
         near=as_float32(limits.near_plane), far=as_float32(limits.far_plane), radius_clip=limits.radius_clip,
         eps2d=as_float32(limits.eps2d), alpha_min=as_float32(rules.alpha_min), extent_sigmas=rules.extent_sigmas,
-        largest=FINITE_LIMIT,
+        largest=FINITE_LIMIT, colors=None, n_colors=0, backgrounds=None, n_backgrounds=0,
     )  # fmt: skip
     run_cuda(projection_native.cuda_project, params, n_blocks, stream)
     if bad is None:
@@ -205,7 +205,7 @@ def backward_cuda(
     n_blocks = block_count(n, projection_native.BLOCK)
     run_cuda(projection_native.cuda_project_backward, params, n_blocks, current_stream(radii.device))
     if sums is not None:
-        _fill_viewmats(gradients.viewmats, _sum_rows(sums, n, CAMERA_SUM_BLOCK))
+        fill_viewmats(gradients.viewmats, sums, n)
 
 
 def backward_vectors(
@@ -248,7 +248,7 @@ def backward_generic(
         like=scene.means,
     )  # fmt: skip
     if needs_cameras:
-        _fill_viewmats(gradients.viewmats, _sum_rows(sums, n, CAMERA_SUM_BLOCK))
+        fill_viewmats(gradients.viewmats, sums, n)
 
 
 def _gaussian_views(scene: ProjectionInputs) -> list[object]:
@@ -260,9 +260,9 @@ def _gaussian_views(scene: ProjectionInputs) -> list[object]:
     return [vectors(means), vectors(quats), vectors(scales), covars, int(scene.covars is not None)]
 
 
-def _fill_viewmats(g_viewmats: Tensor, sums: Tensor) -> None:
-    """Add up sums over parts of the Gaussians, camera by camera, to the upper three rows; the last row is not read."""
-    n_cameras = len(g_viewmats)
+def fill_viewmats(g_viewmats: Tensor, by_gaussian: Tensor, n: int) -> None:
+    """Add up the parts [C * n, 12] of the Gaussians, camera by camera, to the upper rows; the last row is not read."""
+    n_cameras, sums = len(g_viewmats), _sum_rows(by_gaussian, n, CAMERA_SUM_BLOCK)
     parts = len(sums) // n_cameras
     g_viewmats[:, :3] = _sum_rows(sums, parts, parts).view(n_cameras, 3, 4)
     g_viewmats[:, 3] = 0

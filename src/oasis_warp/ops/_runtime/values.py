@@ -1,5 +1,6 @@
 """Checks for finite values that are fast enough to be part of every call of an operator."""
 
+import ctypes
 from typing import Any
 
 import torch
@@ -7,7 +8,7 @@ from torch import Tensor
 
 from oasis_kernels.runtime import finite
 from oasis_warp.ops import checks
-from oasis_warp.ops._runtime.launch import current_stream, has_vectors, run_cuda, run_native
+from oasis_warp.ops._runtime.launch import cuda_launch, current_stream, has_vectors, run_native
 from oasis_warp.ops._runtime.pair_counts import slots
 
 
@@ -52,23 +53,27 @@ class DeferredFiniteCheck:
         refuse_capture()
         tensors = list(self._given.values())
         self._device = tensors[0].device
-        self._found = slots.take()
-        self._found[0] = 0
+        self._slot = slots.take()
+        address = self._slot.data_ptr()
+        self._found = ctypes.c_longlong.from_address(address)
+        self._found.value = 0
         stream = current_stream(self._device)
+        launch = cuda_launch(finite.cuda_all_finite(), stream.device)
         for first in range(0, len(tensors), finite.ARRAYS):
             some = tensors[first : first + finite.ARRAYS]
-            params = {
-                "found": self._found, "largest": checks.FINITE_LIMIT,
-                "arrays": tuple(t.data_ptr() for t in some), "counts": tuple(t.numel() for t in some),
-                "wide": tuple(t.dtype == torch.float64 for t in some),
-            }  # fmt: skip
-            n_blocks = sum(-(-t.numel() // finite.CHUNK) for t in some)
-            run_cuda(finite.cuda_all_finite(), params, n_blocks, stream)
+            counts = [t.numel() for t in some]
+            n_blocks = sum(-(-count // finite.CHUNK) for count in counts)
+            if n_blocks:
+                others = (0,) * (finite.ARRAYS - len(some))
+                launch(
+                    n_blocks, stream.cuda_stream, address, checks.FINITE_LIMIT, *[t.data_ptr() for t in some], *others,
+                    *counts, *others, *[t.dtype is torch.float64 for t in some], *others,
+                )  # fmt: skip
 
     def __exit__(self, kind: Any, *_: Any) -> None:
         torch.cuda.current_stream(self._device).synchronize()  # even after an error: the kernel writes to the slot
-        bad = bool(self._found[0])
-        slots.give(self._found)
+        bad = self._found.value
+        slots.give(self._slot)
         if bad and kind is None:
             checks.check_finite(**self._given)
             raise AssertionError("the kernel has met a bad value that is not in its inputs")

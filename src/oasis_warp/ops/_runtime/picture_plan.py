@@ -1,0 +1,361 @@
+"""The plan of float32 pictures on CUDA: all that calls of one kind share, so that a call is little but its launches."""
+
+import threading
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from oasis_kernels import constants
+from oasis_kernels.constants import Rules
+from oasis_kernels.rasterize import projection_native, tiles_cuda
+from oasis_kernels.runtime.cuda_native import CudaNative
+from oasis_warp.ops._runtime import blend_cuda
+from oasis_warp.ops._runtime.cuda_launch import CudaLaunch
+from oasis_warp.ops._runtime.launch import block_count, cuda_launch, current_stream
+from oasis_warp.ops._runtime.pair_counts import SORTED, Counts, PolledWords, remember
+from oasis_warp.ops._runtime.picture_call import ORDERS, Drawn, Gradients, Needs, Options, Scene
+from oasis_warp.ops._runtime.projection_backends import as_float32, fill_viewmats
+from oasis_warp.ops._runtime.records import Frame
+from oasis_warp.ops._runtime.tiles import MAX_PAIRS, check_pairs
+from oasis_warp.ops.checks import FINITE_LIMIT
+
+ALIGNMENT = 256
+"""Of the arrays in a workspace [bytes]."""
+SLACK = 1.25
+"""Memory for pairs of a Gaussian and a tile, relative to what the last call of a kind had."""
+FIRST_PAIRS = 4
+"""Pairs a Gaussian that the first call of a kind has memory for."""
+
+
+class Plan:
+    """How pictures of one kind are drawn by one thread; `Scene` and `Options` have been checked."""
+
+    def __init__(self, scene: Scene, options: Options, rules: Rules) -> None:
+        self.n, self.n_cameras = n, n_cameras = len(scene.means), len(scene.viewmats)
+        self.total, self.options = n * n_cameras, options
+        self.device = scene.means.device
+        self._index = scene.means.get_device()
+        self.n_colors = scene.colors.shape[-1]
+        depths = {"RGB": 0, "D": 1, "ED": 2, "RGB+D": 1, "RGB+ED": 2}[options.render_mode]
+        self.draws_colors, self.n_depths = options.render_mode.startswith("RGB"), depths
+        self.n_drawn = self.n_colors * self.draws_colors + depths
+        self.channels = next(c for c in constants.CHANNELS if c >= self.n_drawn)
+        self.as_given = self.n_depths == 0 and self.channels == self.n_drawn
+        frame = Frame(options.width, options.height, options.tile_size)
+        self._layout = blend_cuda.layout_of(n_cameras, n, self.channels, frame)
+        self._spread = tiles_cuda.spread_of(self._layout.n_tiles)
+        self._limits = (
+            as_float32(options.near_plane), as_float32(options.far_plane), float(options.radius_clip),
+            as_float32(options.eps2d), as_float32(rules.alpha_min), float(rules.extent_sigmas), FINITE_LIMIT,
+        )  # fmt: skip
+        self._kind = self.device, n_cameras, n, options.width, options.height
+        self._expected = Counts(min(FIRST_PAIRS * self.total, MAX_PAIRS), tiles_cuda.LONGEST)
+        self._lay_out()
+        self._load(rules)
+
+    def _lay_out(self) -> None:
+        """Places of the arrays in a workspace [bytes]; those that only an adjoint reads come last."""
+        total, tiles, pixels = self.total, self._layout.n_tiles, self._layout.pixels
+        counters = 8 * tiles_cuda.COUNTERS + 4 * tiles * self._spread
+        self._n_counters = counters // 4
+        always = {
+            "centers": 16 * total, "whitenings": 16 * total, "boxes": 16 * total, "sort_depths": 8 * total,
+            "counters": counters, "means2d": 8 * total, "covars2d": 24 * total, "depths": 4 * total,
+            "conics": 12 * total, "radii": 8 * total, "tiles": 16 * tiles, "cursors": 4 * self._spread * tiles,
+            "pair_starts": 4 * total,
+        }  # fmt: skip
+        segments = self._layout.segments - 1
+        kept = {
+            "transmittance": 4 * pixels, "stops": 4 * pixels,
+            "checkpoints": 4 * tiles * segments * (self.channels + 1) * tiles_cuda.TILE**2,
+        }  # fmt: skip
+        self._at: dict[str, int] = {}
+        end = 0
+        for name, size in always.items():
+            self._at[name], end = end, end + -(-size // ALIGNMENT) * ALIGNMENT
+        self._size = end
+        for name, size in kept.items():
+            self._at[name], end = end, end + -(-size // ALIGNMENT) * ALIGNMENT
+        self._size_with_kept = end
+
+    def _load(self, rules: Rules) -> None:
+        """Kernels, and how many blocks of them run."""
+        tiles, total = self._layout.n_tiles, self.total
+        self._project_blocks = block_count(total, projection_native.BLOCK)
+        self._unproject_blocks = block_count(self.n, projection_native.BLOCK)
+        self._count_blocks = block_count(total, tiles_cuda.COUNT_BLOCK)
+        self._place_blocks = block_count(tiles, tiles_cuda.PLACE_BLOCK)
+        self._gather_blocks = block_count(total, tiles_cuda.GATHER_BLOCK)
+        self._project = self._launch("project_gaussians", projection_native.cuda_project)
+        self._count = self._launch("count_pairs", tiles_cuda.count_pairs())
+        self._place = self._launch("place_tiles", tiles_cuda.place_tiles())
+        self._fill = self._launch("fill_tiles", tiles_cuda.fill_tiles())
+        self._sort_long = self._launch("sort_long_lists", tiles_cuda.sort_long_lists())
+        self._blend = self._launch("blend", tiles_cuda.blend(self.channels, self._layout.segments, rules))
+        self._rules = rules
+        self._adjoints: dict[tuple[bool, bool], tuple[CudaLaunch, CudaLaunch | None]] = {}
+        self._unproject: CudaLaunch | None = None
+
+    def _launch(self, name: str, native: CudaNative) -> CudaLaunch:
+        assert " ".join(native.parameters) == ORDERS[name], f"{name}: parameters"
+        return cuda_launch(native, current_stream(self.device).device)
+
+    def part(self, workspace: Tensor, name: str, dtype: torch.dtype, *row: int) -> Tensor:
+        """An array of a workspace with a row for each camera and Gaussian, [C, N, *row]."""
+        start, numbers = self._at[name], 1
+        for size in row:
+            numbers *= size
+        flat = workspace[start : start + self.total * numbers * dtype.itemsize]
+        return flat.view(dtype).view(self.n_cameras, self.n, *row)
+
+    def _blended(self, scene: Scene, workspace: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Colours and backgrounds to blend, with depths and padded as the kernels want them."""
+        colors, backgrounds = scene.colors.contiguous(), scene.backgrounds
+        if self.as_given:
+            return colors, None if backgrounds is None else backgrounds.contiguous()
+        shape = self.n_cameras, self.n
+        parts = []
+        if self.draws_colors:
+            parts.append(colors.expand(*shape, self.n_colors))
+        if self.n_depths:
+            parts.append(self.part(workspace, "depths", torch.float32, 1))
+        if self.n_depths == 2:
+            parts.append(colors.new_ones(*shape, 1))
+        if self.channels > self.n_drawn:
+            parts.append(colors.new_zeros(*shape, self.channels - self.n_drawn))
+        if backgrounds is not None and self.draws_colors:
+            backgrounds = torch.nn.functional.pad(backgrounds, (0, self.channels - self.n_colors))
+        else:
+            backgrounds = None
+        return torch.cat(parts, -1), backgrounds
+
+    def draw(self, scene: Scene, keep: bool, validate: bool) -> Drawn | None:
+        """The picture; None where `validate` finds a bad value. Waits for the count of pairs, not for the picture."""
+        options, at, layout = self.options, self._at, self._layout
+        n, total, n_cameras = self.n, self.total, self.n_cameras
+        stream = torch._C._cuda_getCurrentRawStream(self._index)
+        means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds = _contiguous(scene)
+        workspace = torch.empty(self._size_with_kept if keep else self._size, dtype=torch.uint8, device=self.device)
+        base = workspace.data_ptr()
+        words = _polled.words
+        values, report = words.values, words.address
+        values[0] = values[1] = -1
+        values[2] = 0
+        bad = report + 16 if validate else 0
+        behind, n_behind = (0, 0) if backgrounds is None else (backgrounds.data_ptr(), backgrounds.numel())
+        try:
+            boxes, counters = base + at["boxes"], base + at["counters"]
+            centers, whitenings = base + at["centers"], base + at["whitenings"]
+            self._project(
+                self._project_blocks, stream, n, n_cameras, options.width, options.height, means.data_ptr(),
+                quats.data_ptr() if quats is not None else 0, scales.data_ptr() if scales is not None else 0,
+                covars.data_ptr() if covars is not None else 0, viewmats.data_ptr(), Ks.data_ptr(), options.ortho,
+                opacities.data_ptr(), *self._limits, base + at["means2d"], base + at["covars2d"], base + at["depths"],
+                base + at["conics"], base + at["radii"], base + at["sort_depths"], centers, whitenings, boxes, counters,
+                self._n_counters, self._project_blocks * projection_native.BLOCK, bad,
+                colors.data_ptr(), colors.numel(), behind, n_behind,
+            )  # fmt: skip
+            if not self.as_given:
+                colors, backgrounds = self._blended(scene, workspace)
+                behind = 0 if backgrounds is None else backgrounds.data_ptr()
+            image = torch.empty(
+                (n_cameras, options.height, options.width, self.channels), dtype=torch.float32, device=self.device
+            )
+            alphas = torch.empty((n_cameras, options.height, options.width, 1), dtype=torch.float32, device=self.device)
+            color_step = n if colors.dim() == 3 else 0
+            capacity, longest = self._expected
+            while True:
+                long = longest > tiles_cuda.LONGEST
+                # One more than there may be, as an empty tensor has no address.
+                keys = torch.empty(capacity + 1, dtype=torch.int64, device=self.device)
+                lists = torch.empty(capacity + 1, dtype=torch.int32, device=self.device) if keep or long else None
+                order = 0 if lists is None else lists.data_ptr()
+                self._count(
+                    self._count_blocks, stream, n, total, boxes, layout.tiles_x, layout.tiles_y,
+                    base + at["pair_starts"], self._spread, counters,
+                )  # fmt: skip
+                self._place(
+                    self._place_blocks, stream, layout.n_tiles, layout.tiles_x, capacity, longest, counters,
+                    base + at["tiles"], self._spread, base + at["cursors"], report,
+                )  # fmt: skip
+                self._fill(
+                    self._count_blocks, stream, n, total, boxes, base + at["sort_depths"], layout.tiles_x,
+                    layout.tiles_y, capacity, self._spread, base + at["cursors"], keys.data_ptr(),
+                )  # fmt: skip
+                if long:
+                    spare = torch.empty_like(keys) if longest > tiles_cuda.RUN else None
+                    self._sort_long(
+                        layout.n_tiles, stream, n, base + at["tiles"], layout.tiles_y, keys.data_ptr(),
+                        0 if spare is None else spare.data_ptr(), order,
+                    )  # fmt: skip
+                self._blend(
+                    layout.n_tiles, stream, n, base + at["tiles"], n_cameras, centers, whitenings, opacities.data_ptr(),
+                    colors.data_ptr(), 0, color_step, behind, layout.tiles_x, layout.tiles_y, options.width,
+                    options.height, order, *self._kept(base, keep), keys.data_ptr(), image.data_ptr(),
+                    alphas.data_ptr(),
+                )  # fmt: skip
+                words.wait(self._index)
+                counts = Counts(values[0], values[1])
+                if values[2]:
+                    return None
+                check_pairs(counts.pairs)
+                if counts.pairs <= capacity and counts.longest <= longest:
+                    break
+                capacity = max(capacity, counts.pairs)
+                longest = _sorted(max(longest, counts.longest))
+                values[0] = values[1] = -1
+        except BaseException:  # kernels that are on their way still write to the words
+            torch.cuda.current_stream(self._index).synchronize()
+            raise
+        remember(self._kind, counts)
+        self._expected = Counts(min(int(SLACK * counts.pairs) + ALIGNMENT, MAX_PAIRS), _sorted(counts.longest))
+        return Drawn(image, alphas, colors, backgrounds, workspace, lists, counts.pairs)
+
+    def _kept(self, base: int, keep: bool) -> tuple[int, int, int]:
+        """Addresses of what blending keeps for its adjoint."""
+        at = self._at
+        return (base + at["transmittance"], base + at["stops"], base + at["checkpoints"]) if keep else (0, 0, 0)
+
+    def _adjoint(self, shape: bool, colors: bool) -> tuple[CudaLaunch, CudaLaunch | None]:
+        launches = self._adjoints.get((shape, colors))
+        if launches is None:
+            blend = tiles_cuda.blend_backward(self.channels, self._layout.segments, shape, colors, self._rules)
+            back = self._launch("blend_backward", blend)
+            gathers = shape or colors
+            gather = self._launch("gather", tiles_cuda.gather(self.channels, shape, colors)) if gathers else None
+            launches = self._adjoints[shape, colors] = back, gather
+        return launches
+
+    def draw_backward(
+        self, scene: Scene, drawn: Drawn, g_image: Tensor | None, g_alphas: Tensor | None, needs: Needs,
+        retains: bool,
+    ) -> tuple[Gradients, Tensor | None]:  # fmt: skip
+        """Gradients, None where they are not wanted; and with `retains` that by means2d, [C, N, 2]."""
+        with_shape = any(needs[:5]) or needs.viewmats
+        with_colors = (needs.colors and self.draws_colors) or (with_shape and self.n_depths > 0)
+        back, gather = self._adjoint(with_shape, with_colors)
+        options, at, layout, device = self.options, self._at, self._layout, self.device
+        n, total, n_cameras = self.n, self.total, self.n_cameras
+        stream = torch._C._cuda_getCurrentRawStream(self._index)
+        base = drawn.workspace.data_ptr()
+        opacities = scene.opacities.contiguous()
+        channels, behind, lists = drawn.channels, drawn.backgrounds, drawn.lists
+        g_image = None if g_image is None else _padded(g_image, self.channels).contiguous()
+        g_alphas = None if g_alphas is None else g_alphas.contiguous()
+        shared = scene.colors.dim() == 2
+        # One tensor for all that is only passed on: by covars2d (float64) and means2d, then the records.
+        record = tiles_cuda.record_size(self.channels, with_shape, with_colors)
+        passed = torch.empty(8 * total * with_shape + drawn.pairs * record + 4, dtype=torch.float32, device=device)
+        g_covars2d = passed.data_ptr() if with_shape else 0
+        g_means2d = g_covars2d and g_covars2d + 24 * total
+        records = passed.data_ptr() + 32 * total * with_shape
+        by_tile = None
+        if needs.backgrounds:
+            by_tile = torch.empty((n_cameras, layout.n_tiles // n_cameras, self.channels), device=device)
+        back(
+            layout.n_tiles, stream, n, base + at["tiles"], n_cameras, base + at["centers"], base + at["whitenings"],
+            opacities.data_ptr(), channels.data_ptr(), 0, n if channels.dim() == 3 else 0,
+            0 if behind is None else behind.data_ptr(), layout.tiles_x, layout.tiles_y, options.width, options.height,
+            0 if lists is None else lists.data_ptr(), *self._kept(base, True), base + at["pair_starts"],
+            base + at["boxes"], 0 if g_image is None else g_image.data_ptr(),
+            0 if g_alphas is None else g_alphas.data_ptr(), records,
+            0 if by_tile is None else by_tile.data_ptr(),
+        )  # fmt: skip
+        one, only = n_cameras == 1, n_cameras == 1 and shared and self.as_given
+        g_opacities = g_channels = None
+        if with_shape:
+            g_opacities = torch.empty((n,) if one else (n_cameras, n), dtype=torch.float32, device=device)
+        if with_colors:
+            shape = (n, self.channels) if only else (n_cameras, n, self.channels)
+            g_channels = torch.empty(shape, dtype=torch.float32, device=device)
+        if gather is not None:
+            gather(
+                self._gather_blocks, stream, total, drawn.pairs, base + at["boxes"], base + at["pair_starts"],
+                records, base + at["whitenings"], opacities.data_ptr(), n, g_means2d, g_covars2d,
+                0 if g_opacities is None else g_opacities.data_ptr(),
+                0 if g_channels is None else g_channels.data_ptr(),
+            )  # fmt: skip
+        g_depths = None
+        if g_channels is not None and self.n_depths and with_shape:
+            g_depths = g_channels[..., self.n_drawn - self.n_depths].contiguous()
+        means, quats, scales, covars, viewmats = self.unproject(
+            scene, drawn.workspace, g_means2d, g_covars2d, 0 if g_depths is None else g_depths.data_ptr(), needs
+        )
+        g_colors = None
+        if needs.colors and self.draws_colors and g_channels is not None:
+            g_colors = g_channels if self.as_given else g_channels[..., : self.n_colors]
+            g_colors = _over_cameras(g_colors) if shared and not only else g_colors
+        if g_opacities is not None and not one:
+            g_opacities = g_opacities.sum(0)
+        g_backgrounds = None
+        if by_tile is not None and self.draws_colors:
+            g_backgrounds = by_tile.sum(1)[:, : self.n_colors]
+        gradients = Gradients(
+            means, quats, scales, covars, g_opacities if needs.opacities else None, g_colors, viewmats, None,
+            g_backgrounds,
+        )  # fmt: skip
+        by_means2d = passed[6 * total : 8 * total] if with_shape and retains else None
+        return gradients, None if by_means2d is None else by_means2d.view(n_cameras, n, 2)
+
+    def unproject(
+        self, scene: Scene, workspace: Tensor, g_means2d: int, g_covars2d: int, g_depths: int, needs: Needs
+    ) -> tuple[Tensor | None, ...]:
+        """Gradients by means, quats, scales, covars and viewmats from those by the projection: addresses, or 0."""
+        means, quats, scales, covars, _, _, viewmats, Ks, _ = _contiguous(scene)
+        wanted: list[Tensor | None] = [None] * 4
+        for k, tensor in enumerate((means, quats, scales, covars)):
+            if needs[k] and tensor is not None:
+                wanted[k] = torch.empty(tensor.shape, dtype=torch.float32, device=self.device)
+        sums = g_viewmats = None
+        if needs.viewmats:
+            sums = torch.empty((self.total, 12), dtype=torch.float64, device=self.device)
+        if needs.viewmats or any(gradient is not None for gradient in wanted):
+            if self._unproject is None:
+                self._unproject = self._launch("project_gaussians_backward", projection_native.cuda_project_backward)
+            self._unproject(
+                self._unproject_blocks, torch._C._cuda_getCurrentRawStream(self._index), self.n, self.n_cameras,
+                self.options.width, self.options.height,
+                *[0 if t is None else t.data_ptr() for t in (means, quats, scales, covars, viewmats, Ks)],
+                self.options.ortho, workspace.data_ptr() + self._at["radii"], g_means2d, g_covars2d, g_depths,
+                *[0 if t is None else t.data_ptr() for t in (*wanted, sums)],
+            )  # fmt: skip
+        if sums is not None:
+            g_viewmats = torch.empty(viewmats.shape, dtype=torch.float32, device=self.device)
+            fill_viewmats(g_viewmats, sums, self.n)
+        return *wanted, g_viewmats
+
+
+class _Polled(threading.local):
+    """Words that this thread's kernels write and it polls."""
+
+    def __init__(self) -> None:
+        self._words: PolledWords | None = None
+
+    @property
+    def words(self) -> PolledWords:
+        if self._words is None:  # not at import: page-locked memory needs a device
+            self._words = PolledWords(3)
+        return self._words
+
+
+_polled = _Polled()
+
+
+def _contiguous(scene: Scene) -> Any:
+    return [t if t is None or t.is_contiguous() else t.contiguous() for t in scene]
+
+
+def _sorted(longest: int) -> int:
+    """Longest list that will be sorted, for one so long."""
+    return next(limit for limit in SORTED if limit >= longest)
+
+
+def _padded(tensor: Tensor, channels: int) -> Tensor:
+    missing = channels - tensor.shape[-1]
+    return torch.nn.functional.pad(tensor, (0, missing)) if missing else tensor
+
+
+def _over_cameras(gradient: Tensor) -> Tensor:
+    """The sum of a gradient [C, ...] over the cameras."""
+    return gradient[0] if len(gradient) == 1 else gradient.sum(0)
