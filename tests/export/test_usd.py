@@ -31,6 +31,7 @@ def test_usds_own_checks_find_nothing(right_hand, ending, tmp_path):
     assert [f"{error.GetName()}: {error.GetMessage()}" for error in found] == []
 
 
+@pytest.mark.slow
 def test_usds_own_skinning_gives_our_poses(avatar, tmp_path):
     usd, skel = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdSkel")
     vt = pytest.importorskip("pxr.Vt")

@@ -160,8 +160,8 @@ def _read_splat(data: bytes) -> Parts:
 
 def _read_spz(data: bytes) -> Parts:
     """Versions 2 and 3, whose y points up."""
-    unzip = zlib.decompressobj(zlib.MAX_WBITS | 16)
-    data = unzip.decompress(data, MOST_BYTES)
+    if data[:4] != SPZ_MAGIC.to_bytes(4, "little"):  # version 4 is not zipped as a whole
+        data = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(data, MOST_BYTES)
     magic, version, count, _, bits = struct.unpack("<IIIBB", data[:14])
     if magic != SPZ_MAGIC or version not in (2, 3):
         raise ValueError(f"versions 2 and 3 are read, not {version}" if magic == SPZ_MAGIC else "it is no .spz")
