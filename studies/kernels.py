@@ -181,6 +181,28 @@ def case_text(rows: Sequence[GpuRow]) -> str:
     return "\n\n".join([table(CASES)(list(map(asdict, ours))) or "", about, *missing])
 
 
+PEERS = (
+    Column("case", "case"), Column("pass", "pass_"), Column("wall ms", "wall_ms", short),
+    Column("theirs", "their_ms", short), Column("ratio", lambda row: row["wall_ms"] / row["their_ms"], ".2f"),
+    Column("max error", "max_abs", power), Column("theirs", "their_max_abs", power),
+    Column("gradient", "gradient_rel_l2", power), Column("theirs", "their_gradient", power),
+)  # fmt: skip
+
+
+def peer_text(rows: Sequence[GpuRow]) -> str:
+    """Eager calls of ours beside a peer's, of the cases that both have."""
+    theirs = {(row.case, row.pass_): row for row in rows if row.way != OURS}
+    lines = []
+    for row in rows:
+        peer = theirs.get((row.case, row.pass_))
+        if row.way == OURS and peer is not None:
+            their = {"their_ms": peer.wall_ms, "their_max_abs": peer.max_abs, "their_gradient": peer.gradient_rel_l2}
+            lines.append({**asdict(row), **their})
+    if not lines:
+        return "No peer was installed."
+    return f"{table(PEERS)(lines)}\n\n{provenance(rows[0])}"
+
+
 def growth_text(rows: Sequence[ScalingRow]) -> str:
     """The steepest step of every line."""
     steps = steepest(rows)
@@ -232,7 +254,7 @@ class Part(NamedTuple):
 
 
 PARTS = {
-    "kernels": Part(GpuRow, {"kernels": case_text}, plot_speed),
+    "kernels": Part(GpuRow, {"kernels": case_text, "peers": peer_text}, plot_speed),
     "scaling": Part(ScalingRow, {"growth": growth_text, "points": point_text}, plot_scaling),
     "roofline": Part(KernelRow, {"roofline": roofline_text}, plot_roofline),
 }

@@ -23,7 +23,7 @@ from oasis_warp.ops import RecordedRasterization
 
 OURS = "warp"
 UNVALIDATED = {"validate": False}
-"""Options of our operators: a check of the values waits for the GPU, and other rasterizers do not check."""
+"""Options of our operators while a graph is captured, which cannot check values. Eager calls check them."""
 RASTERIZATION = OPERATORS["rasterization"]
 PASSES: tuple[Pass, ...] = ("forward", "forward + backward")
 Peers = Mapping[str, Call]
@@ -118,7 +118,7 @@ def operator_case(
     def run(call: Call, options: Mapping[str, Any]) -> Callable[[], Results]:
         return one_pass(operator, call, scene, pass_, options, truth.weights)
 
-    ours = run(operator.call, UNVALIDATED)
+    ours = Implementation(run(operator.call, {}), run(operator.call, UNVALIDATED))
     others = {name: Implementation(run(call, {}), None) for name, call in peers.items()}
     drawn = isinstance(scene, GaussianScene)
     return GpuCase(
@@ -130,7 +130,7 @@ def operator_case(
         width=scene.width,
         height=scene.height,
         seed=scene.seed,
-        implementations={OURS: Implementation(ours, ours), **others},
+        implementations={OURS: ours, **others},
         truth=truth if pass_ != "forward" else truth._replace(gradients=()),
         image=operator.image,
     )

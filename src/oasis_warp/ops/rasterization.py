@@ -162,8 +162,10 @@ def rasterization(
 
     Returns:
         Images, shape [C, H, W, X] with X = D, 1 or D + 1; alphas, shape [C, H, W, 1], in [0, 1); and a dictionary of
-        means2d [C, N, 2], depths [C, N] (both with gradients, so that `retain_grad` works), conics [C, N, 3], radii
-        [C, N, 2], opacities [C, N], camera_ids and gaussian_ids (None), tile_size, width, height and n_cameras.
+        means2d [C, N, 2], depths [C, N] (both with gradients, and `retain_grad` works; hooks on means2d and
+        torch.autograd.grad by it need `absgrad=True`, as float32 on CUDA is else one node of autograd), conics
+        [C, N, 3], radii [C, N, 2], opacities [C, N], camera_ids and gaussian_ids (None), tile_size, width, height and
+        n_cameras.
 
     Raises:
         ValueError: names the argument, what was expected and what it was.
