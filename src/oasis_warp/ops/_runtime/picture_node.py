@@ -260,6 +260,9 @@ class Meta(dict[str, Any]):
         self._unmade.pop(key, None)
         super().__setitem__(key, value)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (dict(self),)
+
     def __iter__(self) -> Iterator[str]:  # without it, dict(meta) and **meta would read past __getitem__
         return super().__iter__()
 
@@ -276,5 +279,5 @@ def _reading(name: str) -> Callable[..., Any]:
 
 
 for _name in ("get", "values", "items", "pop", "popitem", "setdefault", "copy", "update", "clear", "__delitem__",
-              "__eq__", "__ne__", "__or__", "__ror__", "__ior__", "__repr__", "__reduce_ex__"):  # fmt: skip
+              "__eq__", "__ne__", "__or__", "__ror__", "__ior__", "__repr__"):  # fmt: skip
     setattr(Meta, _name, _reading(_name))

@@ -14,7 +14,7 @@ from oasis_warp.ops._runtime import blend_cuda
 from oasis_warp.ops._runtime.cuda_launch import CudaLaunch
 from oasis_warp.ops._runtime.launch import block_count, cuda_launch, current_stream
 from oasis_warp.ops._runtime.pair_counts import SORTED, Counts, PolledWords, remember
-from oasis_warp.ops._runtime.picture_call import ORDERS, Drawn, Gradients, Needs, Options, Scene
+from oasis_warp.ops._runtime.picture_call import Drawn, Gradients, Needs, Options, Scene
 from oasis_warp.ops._runtime.projection_backends import as_float32, fill_viewmats
 from oasis_warp.ops._runtime.records import Frame
 from oasis_warp.ops._runtime.tiles import MAX_PAIRS, check_pairs
@@ -36,6 +36,7 @@ class Plan:
         self.total, self.options = n * n_cameras, options
         self.device = scene.means.device
         self._index = scene.means.get_device()
+        self._warp_device = current_stream(self.device).device
         self.n_colors = scene.colors.shape[-1]
         depths = {"RGB": 0, "D": 1, "ED": 2, "RGB+D": 1, "RGB+ED": 2}[options.render_mode]
         self.draws_colors, self.n_depths = options.render_mode.startswith("RGB"), depths
@@ -87,19 +88,17 @@ class Plan:
         self._count_blocks = block_count(total, tiles_cuda.COUNT_BLOCK)
         self._place_blocks = block_count(tiles, tiles_cuda.PLACE_BLOCK)
         self._gather_blocks = block_count(total, tiles_cuda.GATHER_BLOCK)
-        self._project = self._launch("project_gaussians", projection_native.cuda_project)
-        self._count = self._launch("count_pairs", tiles_cuda.count_pairs())
-        self._place = self._launch("place_tiles", tiles_cuda.place_tiles())
-        self._fill = self._launch("fill_tiles", tiles_cuda.fill_tiles())
-        self._sort_long = self._launch("sort_long_lists", tiles_cuda.sort_long_lists())
-        self._blend = self._launch("blend", tiles_cuda.blend(self.channels, self._layout.segments, rules))
+        self._project = self._launch(projection_native.cuda_project)
+        self._count = self._launch(tiles_cuda.count_pairs())
+        self._place = self._launch(tiles_cuda.place_tiles())
+        self._fill = self._launch(tiles_cuda.fill_tiles())
+        self._sort_long = self._launch(tiles_cuda.sort_long_lists())
+        self._blend = self._launch(tiles_cuda.blend(self.channels, self._layout.segments, rules))
         self._rules = rules
-        self._adjoints: dict[tuple[bool, bool], tuple[CudaLaunch, CudaLaunch | None]] = {}
-        self._unproject: CudaLaunch | None = None
 
-    def _launch(self, name: str, native: CudaNative) -> CudaLaunch:
-        assert " ".join(native.parameters) == ORDERS[name], f"{name}: parameters"
-        return cuda_launch(native, current_stream(self.device).device)
+    def _launch(self, native: CudaNative) -> CudaLaunch:
+        """This thread's launch of a kernel, whose parameters come in the order of `picture_call.ORDERS`."""
+        return cuda_launch(native, self._warp_device)
 
     def part(self, workspace: Tensor, name: str, dtype: torch.dtype, *row: int) -> Tensor:
         """An array of a workspace with a row for each camera and Gaussian, [C, N, *row]."""
@@ -217,16 +216,6 @@ class Plan:
         at = self._at
         return (base + at["transmittance"], base + at["stops"], base + at["checkpoints"]) if keep else (0, 0, 0)
 
-    def _adjoint(self, shape: bool, colors: bool) -> tuple[CudaLaunch, CudaLaunch | None]:
-        launches = self._adjoints.get((shape, colors))
-        if launches is None:
-            blend = tiles_cuda.blend_backward(self.channels, self._layout.segments, shape, colors, self._rules)
-            back = self._launch("blend_backward", blend)
-            gathers = shape or colors
-            gather = self._launch("gather", tiles_cuda.gather(self.channels, shape, colors)) if gathers else None
-            launches = self._adjoints[shape, colors] = back, gather
-        return launches
-
     def draw_backward(
         self, scene: Scene, drawn: Drawn, g_image: Tensor | None, g_alphas: Tensor | None, needs: Needs,
         retains: bool,
@@ -234,7 +223,11 @@ class Plan:
         """Gradients, None where they are not wanted; and with `retains` that by means2d, [C, N, 2]."""
         with_shape = any(needs[:5]) or needs.viewmats
         with_colors = (needs.colors and self.draws_colors) or (with_shape and self.n_depths > 0)
-        back, gather = self._adjoint(with_shape, with_colors)
+        # Adjoints run on a thread of autograd, which has launches of its own.
+        native = tiles_cuda.blend_backward(
+            self.channels, self._layout.segments, with_shape, with_colors, self._rules
+        )
+        back = self._launch(native)
         options, at, layout, device = self.options, self._at, self._layout, self.device
         n, total, n_cameras = self.n, self.total, self.n_cameras
         stream = torch._C._cuda_getCurrentRawStream(self._index)
@@ -269,7 +262,8 @@ class Plan:
         if with_colors:
             shape = (n, self.channels) if only else (n_cameras, n, self.channels)
             g_channels = torch.empty(shape, dtype=torch.float32, device=device)
-        if gather is not None:
+        if with_shape or with_colors:
+            gather = self._launch(tiles_cuda.gather(self.channels, with_shape, with_colors))
             gather(
                 self._gather_blocks, stream, total, drawn.pairs, base + at["boxes"], base + at["pair_starts"],
                 records, base + at["whitenings"], opacities.data_ptr(), n, g_means2d, g_covars2d,
@@ -311,9 +305,8 @@ class Plan:
         if needs.viewmats:
             sums = torch.empty((self.total, 12), dtype=torch.float64, device=self.device)
         if needs.viewmats or any(gradient is not None for gradient in wanted):
-            if self._unproject is None:
-                self._unproject = self._launch("project_gaussians_backward", projection_native.cuda_project_backward)
-            self._unproject(
+            unproject = self._launch(projection_native.cuda_project_backward)
+            unproject(
                 self._unproject_blocks, torch._C._cuda_getCurrentRawStream(self._index), self.n, self.n_cameras,
                 self.options.width, self.options.height,
                 *[0 if t is None else t.data_ptr() for t in (means, quats, scales, covars, viewmats, Ks)],
