@@ -170,8 +170,8 @@ def test_meta_is_a_dictionary_of_tensors_to_whoever_reads_it():
 
     want = read(lambda meta: {name: meta[name] for name in meta})
     assert isinstance(want["means2d"], torch.Tensor) and want["radii"].shape == (1, 300, 2)
-    for reader in (dict, lambda meta: dict(**meta), lambda meta: dict(meta.items()), lambda meta: meta | {},
-                   lambda meta: {name: meta.get(name) for name in meta}, lambda meta: meta.copy(), deepcopy):  # fmt: skip
+    for reader in (dict, deepcopy, lambda meta: dict(**meta), lambda meta: dict(meta.items()), lambda meta: meta | {},
+                   lambda meta: {name: meta.get(name) for name in meta}, lambda meta: meta.copy()):  # fmt: skip
         got = read(reader)
         assert list(got) == list(want)
         assert all(torch.equal(got[k], v) if isinstance(v, torch.Tensor) else got[k] == v for k, v in want.items())
