@@ -6,6 +6,7 @@ import pytest
 import torch
 from synthetic import as_left_hand
 
+from oasis_warp import editing
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.cli import edit as edit_command
 from oasis_warp.cli import main
@@ -13,6 +14,7 @@ from oasis_warp.core.camera import project
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandLight, Photo
+from oasis_warp.data.square_crop import find_square
 from oasis_warp.editing import edit
 from oasis_warp.hand_avatar import Avatar
 from studies.painted_truth import Chart, make_truth, paint_photo
@@ -22,7 +24,22 @@ QUICK = EditConfig(steps=10)
 
 @pytest.fixture(scope="module")
 def truth(hand):
-    return make_truth(hand, MeanPrior(hand), back=False, size=224, steps=20)
+    return make_truth(hand, MeanPrior(hand), back=False, size=224, steps=8)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def each_photo_is_searched_once():
+    found = {}
+
+    def find_once(picture, alpha, photo):
+        key = photo.numpy().tobytes()
+        if key not in found:
+            found[key] = find_square(picture, alpha, photo)
+        return found[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(editing, "find_square", find_once)
+        yield
 
 
 @pytest.fixture(scope="module")

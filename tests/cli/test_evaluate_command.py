@@ -124,9 +124,23 @@ def test_the_share_of_pairs_on_which_one_shot_is_better():
     assert learned["beaten_psnr"] is None
 
 
+@pytest.fixture(scope="module")
+def made():
+    """Reconstructions by photo and options."""
+    return {}
+
+
 @pytest.fixture
-def hands(scene, tmp_path, monkeypatch):
-    """A folder with two photos of one hand and one of another, one of them of no hand."""
+def hands(scene, made, tmp_path, monkeypatch):
+    """A folder with two photos of one hand and one of another, one of them of no hand; equal photos are made once."""
+
+    def reconstruct_once(photo, config, *, prior):
+        key = photo.rgb.numpy().tobytes(), config, prior.about["name"]
+        if key not in made:
+            made[key] = reconstruct(photo, config, prior=prior)
+        return made[key]
+
+    monkeypatch.setattr(same_hand, "reconstruct", reconstruct_once)
     folder = tmp_path / "hands"
     for name in ("mine/a.png", "mine/b.png", "mine/no_hand.png", "single/a.png", "empty/note.txt"):
         path = folder / name

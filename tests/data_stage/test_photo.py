@@ -268,7 +268,7 @@ print(*photo.rgb.shape, photo.shrink, peak() - before)
 """
 
 
-@pytest.mark.parametrize(("suffix", "limit"), [(".jpg", 250e6), (".png", 450e6)])
+@pytest.mark.parametrize(("suffix", "limit"), [(".jpg", 250e6), pytest.param(".png", 450e6, marks=pytest.mark.slow)])
 def test_a_hundred_megapixels_are_scaled_down_in_bounded_memory(tmp_path, suffix, limit):
     # A JPEG is decoded at half its size (75 MB), then averaged; of a PNG the whole 300 MB are in memory once.
     if suffix == ".jpg":
