@@ -43,7 +43,7 @@ def by_setting(rows, pass_="forward"):
 def layers():
     """Rows of the rasterizer on the layered scene."""
     half = Setting("Gaussians", "50%", share=0.5)
-    return sweep(layered(), "rasterization", COARSE_STOP, knobs.FLOAT64, knobs.TORCH, half, knobs.SIZES[0])
+    return sweep(layered(size=32), "rasterization", COARSE_STOP, knobs.FLOAT64, knobs.TORCH, half, knobs.SIZES[0])
 
 
 def test_there_is_one_row_a_setting_and_pass(layers):
@@ -95,7 +95,7 @@ def test_gradients_of_smaller_images_are_not_compared(layers):
 
 
 def test_fragile_pixels_are_told(layers):
-    share = 100 * float(draw_in_torch(layered().to(dtype=torch.float64)).fragile.double().mean())
+    share = 100 * float(draw_in_torch(layered(size=32).to(dtype=torch.float64)).fragile.double().mean())
     assert layers[0].fragile_percent == pytest.approx(share)
     assert 0 < share < 10
 
@@ -108,7 +108,7 @@ def test_threads_change_no_bit():
 
 @pytest.mark.parametrize("make", [layered, equal_depths])
 def test_another_order_of_the_list_draws_the_same(make):
-    scene = make().to(dtype=torch.float64)
+    scene = make(size=16).to(dtype=torch.float64)
     other = in_other_order(scene)
     assert not torch.equal(other.means, scene.means)
     torch.testing.assert_close(draw_in_torch(other).image, draw_in_torch(scene).image, rtol=0, atol=1e-12)
