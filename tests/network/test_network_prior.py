@@ -26,6 +26,7 @@ from oasis_warp.network.prior import (
     RIM_FIRST,
     RIM_LAST,
     NetworkPrior,
+    RestSurface,
     all_gaussians,
     blend_rim,
     bundled_prior,
@@ -47,6 +48,10 @@ def covariances(gaussians):
 @pytest.fixture(scope="module")
 def untrained(make_network, tiny):
     return NetworkPrior(make_network(tiny, awake=False))
+
+
+def surface_of(network, crop):
+    return RestSurface(crop.rest.vertices, network.faces, network.vertex_faces, network.rim)
 
 
 def on_gpu(value):
@@ -100,7 +105,7 @@ def test_at_the_wrists_end_gaussians_have_the_shapes_of_their_anchors(network, h
     with torch.no_grad():
         prediction = network(batch_of_crop(crops[0]))
     rest = crops[0].rest.vertices
-    settled = blend_rim(prediction, rest, network.faces, network.vertex_faces, network.rim)
+    settled = blend_rim(prediction, surface_of(network, crops[0]))
     at_vertices = torch.cdist(rest, rest[hand.rim]).amin(1)
     from_rim = torch.cat([at_vertices, at_vertices[hand.faces].amin(1)])
     near, far = from_rim <= RIM_FIRST * RIM_FADE, from_rim >= RIM_LAST * RIM_FADE
@@ -120,7 +125,7 @@ def test_no_gaussian_floats_off_the_skin(network, hand, crops):
         wild = prior._predict(crop)
     wild = wild._replace(offsets=0.006 * torch.sign(wild.offsets + 1e-9), scales=wild.scales + 0.004)
     rest = crop.rest.vertices
-    held = hold_to_surface(wild, rest, network.faces, network.vertex_faces)
+    held = hold_to_surface(wild, surface_of(network, crop))
     above = (held.offsets[0] * surface.vertex_normals(rest, network.faces)).sum(-1)
     assert float(above.max()) < 1e-6
     assert float(held.scales.max()) <= 1.001 * MOST_SCALE
@@ -137,7 +142,7 @@ def test_faint_black_gaussians_leave_no_holes_and_no_specks_in_the_skin(network,
     opacities, colors = prediction.opacities.clone(), torch.full_like(prediction.colors, 0.6)
     opacities[0, :n][faint], colors[0, :n][faint] = 1e-4, 0.0
     holes = prediction._replace(opacities=opacities, colors=colors)
-    covered = cover_surface(holes, crop.rest.vertices, network.faces, network.vertex_faces, network.rim)
+    covered = cover_surface(holes, surface_of(network, crop))
     fade = rim_fade(crop.rest.vertices[None], network.rim)[0]
     assert float((covered.opacities[0, :n] - LEAST_OPACITY * fade).min()) > -1e-6
     assert float((covered.colors[0, :n][fade > 0.1] - 0.6).abs().max()) < 1e-3

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -33,22 +33,18 @@ RIM_FIRST, RIM_LAST = 0.5, 1.25
 on those that the network gave them. Nearer than that its colours may be too dark."""
 
 
-def blend_rim(
-    prediction: Prediction,
-    rest: Float[Tensor, "V 3"],
-    faces: Int[Tensor, "F 3"],
-    vertex_faces: Int[Tensor, "V M"],
-    rim: Int[Tensor, "R"],
-) -> Prediction:
-    """The prediction of one hand, with anchors in the colours of the skin next to them at the wrist's end.
+class RestSurface(NamedTuple):
+    """One hand at rest: vertices [m], corners, `core.surface.faces_of_vertices`, and the vertices of the open wrist."""
 
-    Args:
-        prediction: B is 1.
-        rest: Vertices at rest [m].
-        faces: Corners.
-        vertex_faces: From `core.surface.faces_of_vertices`.
-        rim: Vertices of the open wrist.
-    """
+    rest: Float[Tensor, "V 3"]
+    faces: Int[Tensor, "F 3"]
+    vertex_faces: Int[Tensor, "V M"]
+    rim: Int[Tensor, "R"]
+
+
+def blend_rim(prediction: Prediction, on: RestSurface) -> Prediction:
+    """The prediction of one hand, with anchors in the colours of the skin next to them at the wrist's end."""
+    rest, faces, vertex_faces, rim = on
     count = prediction.colors.shape[1]
     from_rim = distance_from_rim(rest, faces, rim)[:count]
     share = ((from_rim / RIM_FADE - RIM_FIRST) / (RIM_LAST - RIM_FIRST)).clamp(0, 1)
@@ -69,11 +65,9 @@ MOST_SCALE, MOST_ALONG = 0.0013, 0.0025
 Gaussians have up to 4.7 mm and lie up to 6 mm off: over other sides' outlines and between fingers they are haze."""
 
 
-def hold_to_surface(
-    prediction: Prediction, rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], vertex_faces: Int[Tensor, "V M"]
-) -> Prediction:
+def hold_to_surface(prediction: Prediction, on: RestSurface) -> Prediction:
     """The prediction with no Gaussian above the surface, far from its vertex or larger than skin can hide."""
-    normals = surface.gathered_normals(rest, faces, vertex_faces)
+    normals = surface.gathered_normals(*on[:3])
     above = (prediction.offsets * normals).sum(-1, keepdim=True)
     along = prediction.offsets - above * normals
     along = along * (MOST_ALONG / along.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1)
@@ -87,19 +81,14 @@ LEAST_OPACITY = 0.8
 than .35, and where a bent finger stretched its skin a quarter of what was drawn was the inside of its other side."""
 
 
-def cover_surface(
-    prediction: Prediction,
-    rest: Float[Tensor, "V 3"],
-    faces: Int[Tensor, "F 3"],
-    vertex_faces: Int[Tensor, "V M"],
-    rim: Int[Tensor, "R"],
-) -> Prediction:
+def cover_surface(prediction: Prediction, on: RestSurface) -> Prediction:
     """The prediction of one hand with opaque Gaussians on all vertices, but for the fade at the wrist.
 
     Faint ones were never seen in training: they stand out of the skin and are black as often as not. For what they lack
     of `LEAST_OPACITY` they become their anchors' discs in the colours of the faces around, below the surface: on it the
     discs would be teeth in outlines. Without Gaussians on faces nothing changes.
     """
+    rest, faces, vertex_faces, rim = on
     n = len(rest)
     if prediction.colors.shape[1] == n:
         return prediction
@@ -204,11 +193,12 @@ class NetworkPrior:
         return on_vertices, cache_head(network.face_head, features, colors, seen, rows[n:][guess.face_index] - n)
 
     def _gaussians(self, prediction: Prediction, crop: HandCrop, *, covered: bool = True) -> CanonicalGaussians:
-        network, rest = self.network, crop.rest.vertices
-        held = hold_to_surface(prediction, rest, network.faces, network.vertex_faces)
+        network = self.network
+        on = RestSurface(crop.rest.vertices, network.faces, network.vertex_faces, network.rim)
+        held = hold_to_surface(prediction, on)
         if covered:
-            held = cover_surface(held, rest, network.faces, network.vertex_faces, network.rim)
-        return canonical_gaussians(blend_rim(held, rest, network.faces, network.vertex_faces, network.rim), 0)
+            held = cover_surface(held, on)
+        return canonical_gaussians(blend_rim(held, on), 0)
 
     def _predict(self, crop: HandCrop) -> Prediction:
         device, inputs = crop.image.device, batch_of_crop(crop)
