@@ -109,11 +109,16 @@ def edit(
             raise InputError(message) from error
     edited = avatar.with_looks(painting.gaussians, avatar.light)
     measures = _measure(avatar, edited, painting, canvas)
-    warnings = () if painting.left_out < MUCH_LEFT_OUT else (
-        f"{100 * painting.left_out:.0f} % of the paint lies on a slant or beside an edge and was left out; paint where "
-        "the photo shows the skin from the front.",
-    )  # fmt: skip
-    return Edit(edited, square, shown, share, stages, measures, warnings)
+    return Edit(edited, square, shown, share, stages, measures, _warnings(painting.left_out))
+
+
+def _warnings(left_out: float) -> tuple[str, ...]:
+    if left_out < MUCH_LEFT_OUT:
+        return ()
+    return (
+        f"{100 * left_out:.0f} % of the paint lies on a slant or beside an edge and was left out; paint where the "
+        "photo shows the skin from the front.",
+    )
 
 
 def _compare(painted: Photo, photo: Photo | None, mask: Photo | None) -> tuple[Tensor, Tensor, Tensor]:

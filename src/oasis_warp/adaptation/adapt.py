@@ -120,12 +120,7 @@ def adapt(
     Raises:
         ValueError: one of these without heads, or for several photos.
     """
-    of_heads, name = config.texture != "field", f"texture {config.texture!r}"
-    if of_heads and len(crops) > 1:
-        raise ValueError(f"{name}: is for one photo, got {len(crops)}. Choose 'field'.")
-    if of_heads and heads is None:
-        raise ValueError(f"{name}: expected the heads of the prior, got none. Ask it with guess_with_heads.")
-    lora = heads if of_heads and config.light != "even" else None
+    lora = _heads_to_train(config, heads, len(crops))
     progress("calibration", 0, 1)
     guess, photos = _gather(hand, guesses, crops, resolutions, config)
     evenly_exposed = [crop.image / gain for crop, gain in zip(photos.unlit, photos.gains, strict=True)]
@@ -153,6 +148,15 @@ def adapt(
         trust = ((weight * photos.trust).sum(0) + UNSEEN) / (weight.sum(0) + UNSEEN)
         gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust)
     return result._replace(gaussians=gaussians, losses=texture.losses)
+
+
+def _heads_to_train(config: AdaptConfig, heads: ColorHeads | None, n_photos: int) -> ColorHeads | None:
+    of_heads, name = config.texture != "field", f"texture {config.texture!r}"
+    if of_heads and n_photos > 1:
+        raise ValueError(f"{name}: is for one photo, got {n_photos}. Choose 'field'.")
+    if of_heads and heads is None:
+        raise ValueError(f"{name}: expected the heads of the prior, got none. Ask it with guess_with_heads.")
+    return heads if of_heads and config.light != "even" else None
 
 
 def add_detail(

@@ -30,9 +30,8 @@ from oasis_warp.estimation.fit_quality import (
 from oasis_warp.estimation.landmarks import box_size, detect_hands
 from oasis_warp.estimation.networks import networks
 from oasis_warp.estimation.outline import MaskOutline
-from oasis_warp.estimation.pixel_reading import read_pixels
+from oasis_warp.estimation.pixel_reading import read_pixels, surface_points
 from oasis_warp.estimation.segmentation import check_opencv, mask_from_alpha, mask_from_reading
-from oasis_warp.estimation.surface_points import surface_points
 from oasis_warp.hand.kinematics import HandKinematics
 
 _NO_HAND = 16
@@ -49,6 +48,16 @@ class _FittedPixels(NamedTuple):
     mask: np.ndarray
     points: SurfacePoints
     warnings: list[str]
+
+
+def _check_landmarks(landmarks: Landmarks, name: str, least: float) -> None:
+    if not bool(landmarks.xy.isfinite().all()):
+        raise ValueError("landmarks: expected finite pixels, got others. Leave out a hand that is not found.")
+    size = box_size(array(landmarks.xy))
+    if size < least:
+        raise InputError(
+            f"{name}: the hand is {size:.0f} pixels large, at least {least} are needed; give a closer or larger photo."
+        )
 
 
 class HandEstimator:
@@ -104,15 +113,7 @@ class HandEstimator:
             ValueError: landmarks that are not finite.
             InputError: the hand is too small, or the model does not explain it.
         """
-        if not bool(landmarks.xy.isfinite().all()):
-            raise ValueError("landmarks: expected finite pixels, got others. Leave out a hand that is not found.")
-        size = box_size(array(landmarks.xy))
-        least = _NO_HAND if force else TINY_HAND
-        if size < least:
-            raise InputError(
-                f"{photo.name}: the hand is {size:.0f} pixels large, at least {least} are needed; "
-                "give a closer or larger photo."
-            )
+        _check_landmarks(landmarks, photo.name, _NO_HAND if force else TINY_HAND)
         view = MirroredInput(photo, landmarks, focal)
         known_shape = None if shape is None else array(shape)
         fitter = Fitter(self.kinematics, view.target, shape=known_shape)
