@@ -44,7 +44,7 @@ def _of(room: str, tests: str, only: str, name: str, old: str, new: str) -> Bug:
 
 
 PIPELINE = [
-    _of("avatar/observation", "avatar/test_observation", "projects_to", "the photo read half a pixel off",
+    _of("avatar/observation", "avatar/test_quality", "projects_to", "the photo read half a pixel off",
         "(2 * uv - 1)[:, None], align_corners=False", "(2 * uv - 1)[:, None], align_corners=True"),
     _of("data/square_crop", "data_stage/test_square_crop", "resampled or sees", "the crop half a pixel off in y",
         "-top * scale + 0.5 * scale - 0.5]", "-top * scale + 0.5 * scale]"),
@@ -57,7 +57,7 @@ PIPELINE = [
         "state.rotation @ self.start.rotation.T", "self.start.rotation @ state.rotation.T"),
     _of("evaluation/band_energy", "evaluation/test_band_energy", "outline or beside", "what is not skin has weight",
         "(values * weight)", "values"),
-    _of("evaluation/kernel_distance", "evaluation/test_kernel_distance", "halves", "pairs of one hand counted",
+    _of("evaluation/kernel_distance", "evaluation/test_band_energy", "halves", "pairs of one hand counted",
         "return sums * (1 - np.eye(n_groups))", "return sums"),
     _of("export/splat_ply", "export/test_splat_files", "looks_as", "scales, not their logarithms",
         "splats.scales.log()", "splats.scales"),
@@ -117,11 +117,11 @@ PIPELINE = [
         'options.light == "even"', 'options.light == "none"'),
     _of("core/camera", "core/test_camera", "horizon", "azimuth and elevation exchanged",
         "(turn @ tilt)", "(tilt @ turn)"),
-    _of("estimation/fit_quality", "estimation/test_fit_quality", "reaches_a_border", "the right border not looked at",
+    _of("estimation/fit_quality", "estimation/test_fit", "reaches_a_border", "the right border not looked at",
         "hand[:, 0], hand[:, -1])", "hand[:, 0])"),
     _of("estimation/hand_crop", "test_crop_hand", "mirrored_photo or wrist_line", "a left wrist not mirrored",
         "image, above = image.flip(1), above.flip(1)", "image = image.flip(1)"),
-    _of("ops/_runtime/tiles", "ops/test_rasterization", "opaque_front_layer", "farthest first",
+    _of("ops/_runtime/tiles", "certify/test_grid", "small_scenes and rasterization", "farthest first",
         "torch.argsort(depths.view(-1)[drawn], stable=True)", "torch.argsort(-depths.view(-1)[drawn], stable=True)"),
 ]  # fmt: skip
 

@@ -5,6 +5,7 @@ from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.avatar.appearance import label_regions, region_colors, region_masks
+from oasis_warp.avatar.observation import observe
 from oasis_warp.avatar.pose import pose_gaussians, with_photo
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.avatar.quality import (
@@ -17,6 +18,7 @@ from oasis_warp.avatar.quality import (
     photo_warnings,
 )
 from oasis_warp.core import surface
+from oasis_warp.core.camera import project
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.render.render import render
 
@@ -157,3 +159,15 @@ def test_shares_are_shares_of_area(hand, case, name):
     assert found[f"{name}_seen_percent"] == pytest.approx(100 * of_area, abs=0.01)
     assert found["seen_percent"] == pytest.approx(100 * float((area * seen).sum() / area.sum()), abs=0.01)
     assert found["uncertainty_mean"] == pytest.approx(1 - found["seen_percent"] / 100, abs=1e-4)
+
+
+@pytest.mark.parametrize("size", [95, 96])
+def test_a_vertex_has_the_color_of_the_place_it_projects_to(hand, size):
+    crop, _, _ = crop_of(hand, torch.full_like(hand.template, 0.5), size=size)
+    x = (torch.arange(size) + 0.5) / size  # of pixel centres
+    ramp = torch.stack([x.expand(size, size), x[:, None].expand(size, size), torch.zeros(size, size)], -1)
+    seen = observe(hand, crop._replace(image=ramp))
+    uv, _ = project(crop.camera, crop.posed.vertices)
+    shown = seen.confidence > 0
+    assert int(shown.sum()) > 1000
+    torch.testing.assert_close(seen.colors[shown, :2], uv[shown] / size, atol=1e-4, rtol=0)

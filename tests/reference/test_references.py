@@ -13,6 +13,7 @@ from oasis_warp.certify.families import FAMILIES
 from oasis_warp.core.rotation import from_axis_angle, from_matrix, to_matrix
 from oasis_warp.core.types import Camera
 from oasis_warp.reference import posing, rasterization, visibility
+from oasis_warp.reference.errors import largest_error, psnr, relative_error, same_bits
 
 DOUBLE = torch.float64
 EYE = torch.eye(4, dtype=DOUBLE)
@@ -154,3 +155,34 @@ def test_posing_at_a_corner_follows_that_vertex():
     torch.testing.assert_close(means[n:], given["posed_vertices"][corner])
     expected = to_matrix(given["vertex_quats"][corner]) @ to_matrix(given["quats"][n:])
     torch.testing.assert_close(to_matrix(quats[n:]), expected)
+
+
+def test_relative_error_is_norm_over_norm_where_judged():
+    exact = torch.tensor([3.0, 4.0, 100.0])
+    got = torch.tensor([3.0, 4.5, 0.0])
+    judged = torch.tensor([True, True, False])
+    assert relative_error(got, exact, judged) == 0.1
+    assert largest_error(got, exact) == 100
+
+
+def test_relative_error_of_nothing():
+    zero = torch.zeros(2)
+    assert relative_error(zero, zero) == 0
+    assert relative_error(zero + 1, zero) == math.inf
+
+
+def test_psnr_of_a_tenth_is_twenty_decibels():
+    image = torch.zeros(4, 4, 3, dtype=torch.float64)
+    assert math.isclose(psnr(image + 0.1, image), 20)
+    assert psnr(image, image) == math.inf
+
+
+def test_bits_tell_what_equality_does_not():
+    one = torch.tensor([1.0, 0.0])
+    assert same_bits([one], [one.clone()])
+    assert not same_bits([one], [torch.tensor([1.0, -0.0])])
+    assert not same_bits([one], [one.double()])
+    assert not same_bits([one], [torch.nextafter(one, torch.tensor(2.0))])
+    assert not same_bits([one], [])
+    nan = torch.tensor([math.nan])
+    assert same_bits([nan], [nan])
