@@ -18,7 +18,7 @@ import torch
 from scipy.sparse.linalg import splu
 
 from oasis_warp.adaptation.inpainting import laplacian_and_mass
-from oasis_warp.adaptation.skin_relief import UNIT
+from oasis_warp.adaptation.skin_detail import FORM_UNIT
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.surface import mesh_edges, smooth_over_mesh
@@ -97,7 +97,7 @@ def write_relief(hand: HandModel, path: Path) -> None:
     """The heights of the synthetic world's forms on the backs of hands above the skin around them, for each vertex."""
     heights, edges = torch.from_numpy(relief_forms()).float(), mesh_edges(hand.faces)
     stands_out = (heights - smooth_over_mesh(heights, edges, AROUND_PASSES)) * (1 - label_regions(hand).palm)[:, None]
-    np.savez_compressed(path, forms=np.rint(stands_out.T.numpy() / UNIT).clip(-127, 127).astype(np.int8))
+    np.savez_compressed(path, forms=np.rint(stands_out.T.numpy() / FORM_UNIT).clip(-127, 127).astype(np.int8))
     print(path.name, path.stat().st_size)
 
 

@@ -16,10 +16,10 @@ import pytest
 import torch
 
 from oasis_warp.bench import speed
+from oasis_warp.bench.knobs import timed_pass
 from oasis_warp.bench.operators import OPERATORS, exact
 from oasis_warp.bench.scenes import GaussianScene, hand_scenes, surfels
 from oasis_warp.bench.timing import synchronise
-from oasis_warp.bench.variants import timed_pass
 
 DEVICE = torch.device(os.environ.get("BENCH_DEVICE", "cpu"))
 SIZE = int(os.environ.get("BENCH_SIZE", "256"))

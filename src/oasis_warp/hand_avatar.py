@@ -251,7 +251,7 @@ class Avatar:
         The photo's shade stays where skin faces as in the photo. Light that is part of the colours stays too.
 
         Args:
-            harmonics: Of `avatar.environment.environment_light` or `studio_light`, in the world of the photo's camera.
+            harmonics: Of `avatar.sky.environment_light` or `studio_light`, in the world of the photo's camera.
         """
         level = self.shape.new_ones(3) if self.light is None else self.light.even
         around = harmonics.to(level) * level.mean()

@@ -5,9 +5,8 @@ import torch
 from synthetic import as_left_hand, avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.environment import environment_light, studio_light
 from oasis_warp.avatar.pose import posed_lighting, shading_factors, shares_that_stay, turn_light, with_photo_colors
-from oasis_warp.avatar.sky import bounced, harmonic_basis, radiance, sky_mesh
+from oasis_warp.avatar.sky import bounced, environment_light, harmonic_basis, radiance, sky_mesh, studio_light
 from oasis_warp.core import rotation
 from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import HandLight

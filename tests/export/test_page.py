@@ -20,7 +20,7 @@ from synthetic import avatar_of, crop_of
 
 from oasis_kernels import constants
 from oasis_warp.avatar import pose
-from oasis_warp.avatar.environment import studio_light
+from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.data.splat_files import read_splats
 from oasis_warp.export import export_avatar

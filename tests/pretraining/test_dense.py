@@ -7,8 +7,13 @@ import pytest
 import torch
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.network.dense_network import HEADS, DenseNetwork, DensePrediction
-from oasis_warp.network.dense_weights import load_dense_network, save_dense_network
+from oasis_warp.network.dense_network import (
+    HEADS,
+    DenseNetwork,
+    DensePrediction,
+    load_dense_network,
+    save_dense_network,
+)
 from oasis_warp.pretraining.dense_source import DensePhotos, detected
 from oasis_warp.pretraining.dense_trainer import DenseTrainer, dense_loss
 from oasis_warp.pretraining.distributed import ProcessInfo

@@ -9,8 +9,7 @@ from torch import Tensor
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.reliability import VertexObservations
 from oasis_warp.adaptation.sharpen import FADE_REACH
-from oasis_warp.adaptation.skin_detail import Places, SkinDetail, sample_detail
-from oasis_warp.adaptation.skin_relief import relief_shade
+from oasis_warp.adaptation.skin_detail import Places, SkinDetail, relief_shade, sample_detail
 from oasis_warp.adaptation.skin_tone import SkinTone, infer_tone
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 
 from oasis_warp.bench import knobs
-from oasis_warp.bench.knobs import Setting
+from oasis_warp.bench.knobs import Measured, Setting, cost_ms, measure_settings_of
 from oasis_warp.bench.operators import OPERATORS, Exact, Operator, Results, forward
 from oasis_warp.bench.rows import provenance, scene_columns
 from oasis_warp.bench.scenes import (
@@ -21,7 +21,6 @@ from oasis_warp.bench.scenes import (
     opaque,
     slivers,
 )
-from oasis_warp.bench.variants import Measured, cost_ms, measure_settings_of
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.reference.errors import largest_error, psnr, relative_error, same_bits
 

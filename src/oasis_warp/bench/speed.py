@@ -5,11 +5,10 @@ from dataclasses import dataclass
 
 import torch
 
-from oasis_warp.bench.knobs import DEFAULT, GENERIC, TORCH, Setting
+from oasis_warp.bench.knobs import DEFAULT, GENERIC, TORCH, Setting, measure_settings_of
 from oasis_warp.bench.operators import Operator, Pass
 from oasis_warp.bench.rows import provenance, scene_columns
 from oasis_warp.bench.scenes import GaussianScene, MeshScene, hand_scenes, surfels
-from oasis_warp.bench.variants import measure_settings_of
 from oasis_warp.core.logging import Progress, silent
 
 

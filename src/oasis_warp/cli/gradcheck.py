@@ -11,10 +11,18 @@ from rich.console import Console
 from rich.table import Table
 
 from oasis_warp import __version__
-from oasis_warp.certify.certification import grid_scenes, run_grid, steps
+from oasis_warp.certify.certification import (
+    Tally,
+    Verdict,
+    as_table,
+    by_condition,
+    describe_machine,
+    grid_scenes,
+    run_grid,
+    steps,
+)
 from oasis_warp.certify.compare import Measurement
 from oasis_warp.certify.families import FAMILIES
-from oasis_warp.certify.verdict import Tally, Verdict, as_table, by_condition, describe_machine
 from oasis_warp.cli.console import FAULT, show_progress
 from oasis_warp.cli.developer_options import Gradcheck
 from oasis_warp.cli.report import to_json

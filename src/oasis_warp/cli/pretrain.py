@@ -22,8 +22,7 @@ from oasis_warp.data.output_files import open_resumable_folder
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.lpips import load_lpips
 from oasis_warp.network.config import PROFILES, NetworkConfig
-from oasis_warp.network.dense_network import DenseNetwork
-from oasis_warp.network.dense_weights import load_dense_network
+from oasis_warp.network.dense_network import DenseNetwork, load_dense_network
 from oasis_warp.network.encoders import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, read_config

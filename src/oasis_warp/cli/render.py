@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.environment import environment_light, studio_light
+from oasis_warp.avatar.sky import environment_light, studio_light
 from oasis_warp.cli.console import check_device
 from oasis_warp.cli.options import Animate, Render
 from oasis_warp.cli.record import written

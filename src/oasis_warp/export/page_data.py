@@ -12,9 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.environment import studio_light
 from oasis_warp.avatar.pose import GAMMA, SurfaceLight
-from oasis_warp.avatar.sky import sky_mesh
+from oasis_warp.avatar.sky import sky_mesh, studio_light
 from oasis_warp.core import surface
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, ORBIT_MARGIN
 from oasis_warp.core.hand_model import HandModel

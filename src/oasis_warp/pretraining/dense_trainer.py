@@ -10,8 +10,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
-from oasis_warp.network.dense_network import DEPTHS, HAND, SURFACE_UNIT, WIDTHS, DenseNetwork, DensePrediction
-from oasis_warp.network.dense_weights import save_dense_network
+from oasis_warp.network.dense_network import (
+    DEPTHS,
+    HAND,
+    SURFACE_UNIT,
+    WIDTHS,
+    DenseNetwork,
+    DensePrediction,
+    save_dense_network,
+)
 from oasis_warp.pretraining.pretrain import StepResult, Trainer
 from oasis_warp.synthetic.dense_pictures import DenseBatch
 from oasis_warp.synthetic.sensor import srgb
