@@ -18,7 +18,7 @@ from oasis_warp.losses.image import masked_psnr
 from oasis_warp.render.render import render
 
 CAST = torch.tensor([0.90, 0.85, 0.80])  # a little dim and warm
-STEPS = AdaptConfig(texture_steps=60)
+STEPS = AdaptConfig(texture_steps=25)
 
 
 @pytest.fixture(scope="module")

@@ -104,10 +104,10 @@ def test_light_on_nothing_is_even(hand, scene):
 
 def test_what_light_does_to_a_photo_is_drawn_again(hand, scene):
     _, _, pose, lit = scene
-    adapted = adapt(hand, [MeanPrior(hand)(lit)], [lit], AdaptConfig(texture_steps=20))
+    adapted = adapt(hand, [MeanPrior(hand)(lit)], [lit], AdaptConfig(texture_steps=8))
     assert adapted.light is not None
     drawn = avatar_of(hand, adapted.gaussians, pose, lit.camera, adapted.light).render(lit.camera, pose)
-    kept = adapt(hand, [MeanPrior(hand)(lit)], [lit], AdaptConfig(texture_steps=20, light="keep"))
+    kept = adapt(hand, [MeanPrior(hand)(lit)], [lit], AdaptConfig(texture_steps=8, light="keep"))
     assert kept.light is None
     baked = avatar_of(hand, kept.gaussians, pose, lit.camera, None).render(lit.camera, pose)
     inside = lit.mask > 0.99

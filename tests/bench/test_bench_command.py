@@ -45,7 +45,7 @@ def test_an_interrupted_measurement_leaves_nothing(short, monkeypatch, tmp_path,
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(error_time, "error_columns", interrupt)
+    monkeypatch.setattr(error_time, "measure_settings_of", interrupt)
     assert main(["bench", "error-time", "-o", str(tmp_path / "out"), "--repeats", "2"]) == 130
     assert list(tmp_path.iterdir()) == []
     assert capsys.readouterr().err.endswith("oasis: stopped, nothing written.\n")

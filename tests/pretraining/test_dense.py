@@ -27,7 +27,7 @@ CONFIG = PretrainConfig(steps=4, learning_rate=1e-3, warmup=1, decay="cooldown",
 
 @pytest.fixture(scope="module")
 def photos():
-    return DensePhotos(seed=3, people=2, hands=2, size=64, device=CPU)
+    return DensePhotos(seed=3, people=1, hands=2, size=64, device=CPU)
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,12 @@ from oasis_warp.pretraining.synthetic_source import EVEN_EVERY, SyntheticHands
 from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH
 
 CPU = torch.device("cpu")
+BARE = replace(EVERYBODY, tattoo=0.0, ring=0.0)
 
 
 def source(**changes):
-    return SyntheticHands(**{"seed": 13, "people": 1, "hands": 1, "views": 2, "size": 32, "device": CPU} | changes)
+    usual = {"seed": 13, "people": 1, "hands": 1, "views": 2, "size": 32, "device": CPU, "population": BARE}
+    return SyntheticHands(**usual | changes)
 
 
 def test_a_batch_is_the_same_wherever_training_is_taken_up():
@@ -88,7 +90,7 @@ def test_the_errors_of_an_estimator_differ_from_batch_to_batch_and_seed_to_seed(
 
 
 def test_a_kind_that_is_held_out_is_not_shown_and_nothing_else_changes():
-    bare, ringed = (replace(EVERYBODY, tattoo=0.0, ring=share) for share in (0.0, 1.0))
-    without, with_ring = (next(source(population=kinds, views=1)(0, 0, 1)) for kinds in (bare, ringed))
+    kinds = BARE, replace(BARE, ring=1.0)
+    without, with_ring = (next(source(population=each, views=1)(0, 0, 1)) for each in kinds)
     assert torch.equal(without.rest, with_ring.rest) and torch.equal(without.target_posed, with_ring.target_posed)
     assert not torch.equal(without.target_images, with_ring.target_images)

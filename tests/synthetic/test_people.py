@@ -1,8 +1,6 @@
 """People: identities, the colour of skin, baked textures and their files."""
 
 import pickle
-import subprocess
-import sys
 
 import cv2
 import numpy as np
@@ -27,8 +25,6 @@ from oasis_warp.synthetic.texels import draw_lines, texels_on
 SEED = 13
 KINDS_OF_PAINT = ("freckles", "hair", "polish", "tattoo", "ring", "plaster")
 PAINTED, BARE = (Population(**dict.fromkeys(KINDS_OF_PAINT, share)) for share in (1.0, 0.0))
-NEEDLESS = ("igl", "trimesh", "tyro", "rich")
-NEEDLESS_TO_PLAN = ("warp", "oasis_kernels", "scipy.ndimage")
 
 
 @pytest.fixture(scope="module")
@@ -151,20 +147,6 @@ def test_a_gpu_needs_no_kernel_for_the_cpu(monkeypatch):
     for cached in (bundled_atlas, bundled_body, texels_on):
         cached.cache_clear()
     people.person(SEED, 4, EVERYBODY, "cuda")
-
-
-def test_baking_imports_nothing_that_is_not_needed_and_planning_still_less():
-    code = f"""
-import sys
-sys.modules.update(dict.fromkeys({(*NEEDLESS, *NEEDLESS_TO_PLAN)}))
-from oasis_warp.core import processes
-from oasis_warp.synthetic import skin_plan
-skin_plan.bundled_atlas()
-for name in {NEEDLESS_TO_PLAN}:
-    del sys.modules[name]
-import oasis_warp.synthetic.picture
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_lines_of_the_palm_lie_on_the_palm():

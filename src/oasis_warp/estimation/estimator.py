@@ -50,7 +50,7 @@ class _FittedPixels(NamedTuple):
     warnings: list[str]
 
 
-def _check_landmarks(landmarks: Landmarks, name: str, least: float) -> None:
+def _check_landmarks(landmarks: Landmarks, name: str, least: int) -> None:
     if not bool(landmarks.xy.isfinite().all()):
         raise ValueError("landmarks: expected finite pixels, got others. Leave out a hand that is not found.")
     size = box_size(array(landmarks.xy))
