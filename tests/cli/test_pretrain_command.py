@@ -202,3 +202,19 @@ def test_weights_of_another_profile_are_no_start(unbroken, tmp_path, capsys):
     assert main(["pretrain", str(tmp_path / "on"), *SMALL, "--initial-weights", str(start)]) == BAD_INPUT
     assert "of another network than --profile compact" in capsys.readouterr().err
     assert not (tmp_path / "on").exists()
+
+
+def test_a_data_set_is_mixed_in_and_noted(tiny, mano_dir, tmp_path, capsys):
+    from datasets.trees import photos  # a small tree of photos with an estimator's files
+
+    from oasis_warp.hand.mano import read_mano
+
+    photos(tmp_path / "data", {side: read_mano(mano_dir, side) for side in ("right", "left")})
+    data = ("--data", "photos", "--root", str(tmp_path / "data"), "--mano-dir", str(mano_dir))
+    assert main(["pretrain", str(tmp_path / "prior"), *SMALL, *data, "--data-weight", "1"]) == 0
+    noted = json.loads((tmp_path / "prior" / command.SETTINGS).read_text())
+    assert noted["data"] == "photos" and noted["samples"] == 3 and noted["data_weight"] == 1
+    assert "3 samples of photos, 0 left out" in capsys.readouterr().err
+    assert main(["pretrain", str(tmp_path / "prior"), *SMALL, *data]) == BAD_INPUT  # another mixture
+    assert main(["pretrain", str(tmp_path / "other"), *SMALL, *data[:2]]) == BAD_INPUT
+    assert "--data and --root belong together" in capsys.readouterr().err

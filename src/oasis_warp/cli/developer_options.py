@@ -187,6 +187,14 @@ class Pretrain:
     """The learned prior, which predicts Gaussians, or the estimator's dense network, which reads every pixel."""
     profile: Literal["compact", "paper"] = "compact"
     """Sizes of the prior: ours, or the paper's."""
+    data: Literal["interhand", "hanco", "freihand", "ho3d", "coco-hand", "whim", "photos"] | None = None
+    """For the prior: a data set with MANO's parameters, beside the synthetic people."""
+    root: Path | None = None
+    """Its folder."""
+    mano_dir: Path | None = None
+    """Folder with MANO_RIGHT.pkl and MANO_LEFT.pkl, for --data; the one that OASIS_MANO_DIR names when not given."""
+    data_weight: float = 0.5
+    """Share of batches that are of the data set, 0 to 1."""
     steps: int = 20_000
     """Batches that each process sees."""
     hands: int = 16

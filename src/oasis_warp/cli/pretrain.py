@@ -19,7 +19,10 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.published_files import published_file
 from oasis_warp.data.output_files import open_resumable_folder
-from oasis_warp.hand.template import bundled_hand
+from oasis_warp.datasets.readers import read_dataset
+from oasis_warp.datasets.training_source import DatasetHands, MixedHands
+from oasis_warp.hand.mano import read_mano
+from oasis_warp.hand.template import MANO_DIR, bundled_hand, chosen_hand
 from oasis_warp.losses.lpips import load_lpips
 from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.dense_network import DenseNetwork, load_dense_network
@@ -29,7 +32,7 @@ from oasis_warp.network.weights_file import load_network, read_config
 from oasis_warp.pretraining.dense_source import DensePhotos
 from oasis_warp.pretraining.dense_trainer import DenseTrainer
 from oasis_warp.pretraining.distributed import ProcessInfo, join_processes, wait_for_all
-from oasis_warp.pretraining.pretrain import CHECKPOINT, PretrainConfig, Trainer, pretrain
+from oasis_warp.pretraining.pretrain import CHECKPOINT, BatchSource, PretrainConfig, Trainer, pretrain
 from oasis_warp.pretraining.prior_trainer import PriorTrainer
 from oasis_warp.pretraining.synthetic_source import MULTIPLE, SyntheticHands
 from oasis_warp.synthetic.people import max_people_cached
@@ -40,6 +43,8 @@ SETTINGS, PEOPLE = "training.json", "people"
 PRECISIONS = {"bf16": "bfloat16", "float32": "float32"}
 DENSE_SCHEDULE: dict[str, Any] = {"learning_rate": 1e-3, "warmup": 300, "decay": "cooldown"}
 """Of the dense network's training; a cooldown lets a training go on from weights before it."""
+SHOWN_REASONS = 5
+"""Of samples that were left out; evaluation and Python give all."""
 AHEAD = 4
 """Batches that a GPU renders together."""
 SIZES = range(32, 1025, MULTIPLE)
@@ -83,10 +88,14 @@ def check_options(options: Pretrain) -> None:
         raise InputError(
             f"--size: expected a multiple of {MULTIPLE} from {SIZES[0]} to {SIZES[-1]} pixels, got {options.size}."
         )
+    if not 0 <= options.data_weight <= 1:
+        raise InputError(f"--data-weight: expected 0 to 1, got {options.data_weight:g}.")
+    if (options.data is None) != (options.root is None):
+        raise InputError("--data and --root belong together: the name of a data set, and its folder; give both.")
     if options.task == "prior":
         check_prior_options(options)
     else:
-        for name in ("profile", "views", "hold_out", "backbone_weights", "lpips"):
+        for name in ("profile", "views", "hold_out", "backbone_weights", "lpips", "data"):
             if getattr(options, name) != getattr(Pretrain, name, None):
                 raise InputError(f"--{name.replace('_', '-')}: is for --task prior, got it with dense; leave it out.")
 
@@ -121,6 +130,7 @@ def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
         InputError: a folder that cannot be used, weights that do not fit, or a loss that is not finite.
     """
     hands = prior_hands(options, process.device) if options.task == "prior" else dense_photos(options, process.device)
+    source, counts = mixed(options, hands, process.device)
     met = hands.people_met(process.rank, process.world, options.steps)
     most = max_people_cached(str(process.device))
     if len(met) > most:
@@ -129,7 +139,7 @@ def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
             "each takes 23 MB there."
         )
     trainer = make_trainer(options, process)
-    settings = settings_of(options, process.world)
+    settings = settings_of(options, process.world) | counts
     if process.rank == 0:
         claim(options.out, settings)
         if process.device.type == "cpu":
@@ -137,7 +147,7 @@ def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
     wait_for_all(process)
     hands.bake(met, options.out / PEOPLE, options.workers, progress)
     with stop_signals(can_force=process.world == 1) as should_stop:
-        return pretrain(trainer, hands, options.out, about=settings, should_stop=should_stop, progress=progress)
+        return pretrain(trainer, source, options.out, about=settings, should_stop=should_stop, progress=progress)
 
 
 def prior_hands(options: Pretrain, device: torch.device) -> SyntheticHands:
@@ -147,6 +157,33 @@ def prior_hands(options: Pretrain, device: torch.device) -> SyntheticHands:
         device=device, population=replace(EVERYBODY, **dict.fromkeys(options.hold_out, 0.0)),
         workers=options.workers, ahead=AHEAD if device.type == "cuda" else 1,
     )  # fmt: skip
+
+
+def mixed(
+    options: Pretrain, hands: SyntheticHands | DensePhotos, device: torch.device
+) -> tuple[BatchSource[Any], dict[str, Any]]:
+    """The synthetic source, mixed with the data set where one is asked for, and what to note of that.
+
+    Raises:
+        InputError: no data set there, or no files of MANO.
+    """
+    if options.data is None or options.root is None or not isinstance(hands, SyntheticHands):
+        return hands, {}
+    hand = chosen_hand("mano", options.mano_dir)
+    folder = Path(options.mano_dir or os.environ[MANO_DIR])
+    catalogue = read_dataset(options.data, options.root, folder)
+    n_samples, left_out = len(catalogue.samples), catalogue.left_out
+    print(f"oasis: {n_samples} samples of {options.data}, {len(left_out)} left out", file=sys.stderr)
+    for reason in list(left_out.values())[:SHOWN_REASONS]:
+        print(f"oasis: left out: {reason}", file=sys.stderr)
+    real = DatasetHands(
+        catalogue=catalogue, models={side: read_mano(folder, side) for side in ("right", "left")}, hand=hand,
+        seed=options.seed, hands=options.hands, views=options.views, size=options.size, device=device,
+        workers=options.workers,
+    )  # fmt: skip
+    names = hashlib.sha256("\n".join(sample.name for sample in catalogue.samples).encode()).hexdigest()
+    about = {"data": options.data, "data_weight": options.data_weight, "samples": n_samples, "samples_sha256": names}
+    return MixedHands(real=real, synthetic=hands, weight=options.data_weight), about
 
 
 def dense_photos(options: Pretrain, device: torch.device) -> DensePhotos:

@@ -4,7 +4,7 @@ MANO_RIGHT.pkl and MANO_LEFT.pkl come from mano.is.tue.mpg.de under a licence of
 `hand.mano_hand` makes one into the hand that all stages share.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -193,6 +193,12 @@ def mano_surface(model: ManoModel, pose: ManoPose) -> tuple[np.ndarray, np.ndarr
     blended = np.tensordot(model.weights, turns, 1)
     vertices = (blended @ points[..., None])[..., 0] + model.weights @ shifts
     return vertices + pose.transl, place + pose.transl
+
+
+def thinned(model: ManoModel, step: int = 20) -> ManoModel:
+    """The same joints with every `step`-th vertex, for checks; its faces are those of the whole surface."""
+    names = ("template", "shape_basis", "pose_basis", "weights")
+    return replace(model, **{name: getattr(model, name)[::step] for name in names})
 
 
 def mirror_mano(model: ManoModel) -> ManoModel:

@@ -14,6 +14,7 @@ from oasis_warp.core.types import TrainingBatch
 from oasis_warp.pretraining.estimator_errors import (
     ALIKE,
     MASK_NUMBERS,
+    EstimatedHands,
     bundled_errors,
     cut_at_wrist,
     perturb_outline,
@@ -145,9 +146,12 @@ def training_batch(
         torch.cat([orientation, place[0]]), torch.cat([translation, place[1]]),
     )  # fmt: skip
     true = PosedHands(*(part[:count] for part in both))
-    errors = bundled_errors(like.device).scaled(noise.surface)
     choice = torch.randint(ALIKE, (count,), generator=random).to(like.device, non_blocking=True)
-    seen = simulate_estimate(hand, true, photos.shape, photos.angles, orientation, K, errors, choice)
+    if noise.surface == 0:
+        seen = EstimatedHands(true.posed, K)
+    else:
+        errors = bundled_errors(like.device).scaled(noise.surface)
+        seen = simulate_estimate(hand, true, photos.shape, photos.angles, orientation, K, errors, choice)
     numbers = torch.randn(count, 1 + MASK_NUMBERS, generator=random).to(like, non_blocking=True)
     mask = cut_at_wrist(mask, alpha, true.landmarks, K, numbers[:, 0], noise.mask)
     crop = crop_to_mask(torch.cat([image, mask[..., None]], dim=-1), mask, seen.K, size)

@@ -1,0 +1,205 @@
+"""What every data set is read into: samples, and those that were left out, with the reason."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from oasis_warp.core.errors import InputError, shortened
+from oasis_warp.core.mirror import mirror_camera
+from oasis_warp.core.types import Camera, Side
+from oasis_warp.data.photo import read_photo
+from oasis_warp.data.square_crop import resample_square
+from oasis_warp.hand.mano import ManoModel, ManoPose, mano_surface, mirror_mano_pose
+
+MARGIN = 1.3
+"""Side of the crop over the longer side of the box; the paper's."""
+LEAST_BOX, FARTHEST = 8.0, 100.0
+"""Smallest box [px] and most distant hand [m] that are taken."""
+Models = dict[Side, ManoModel]
+
+
+class Sample(NamedTuple):
+    """One hand of one photo."""
+
+    name: str
+    """Path of the photo below the data set's root, and the side."""
+    image: Path
+    mask: Path | None
+    """White where the hand is."""
+    side: Side
+    subject: str
+    """Samples of one subject show the same person."""
+    viewmat: np.ndarray
+    """World to camera [m], [4, 4]."""
+    K: np.ndarray
+    """[px], [3, 3]."""
+    mano: ManoPose
+    """Of the model of its side, in the world; the mean pose included."""
+    box: np.ndarray | None
+    """Left, top, width, height of the annotated box [px]; None where the surface's own is taken."""
+
+
+class Picture(NamedTuple):
+    """A square crop of a sample as a right hand; left ones are mirrored."""
+
+    image: Float[Tensor, "S S 3"]
+    mask: Float[Tensor, "S S"] | None
+    camera: Camera
+    mano: ManoPose
+
+
+@dataclass
+class Catalogue:
+    """The samples of a data set."""
+
+    samples: list[Sample] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
+    """By name, in words."""
+
+    @contextmanager
+    def reading(self, name: str) -> Iterator[None]:
+        """Leave a sample out where reading it fails, and go on."""
+        try:
+            yield
+        except InputError as error:
+            self.left_out[name] = str(error)
+        except KeyError as error:
+            self.left_out[name] = f"{name}: the annotation {shortened(str(error))} is missing."
+        except (ValueError, TypeError, IndexError, OverflowError, AttributeError) as error:
+            self.left_out[name] = f"{name}: a damaged annotation ({shortened(str(error))})."
+
+    def add(self, sample: Sample, models: Models) -> None:
+        """Check and keep a sample.
+
+        Raises:
+            InputError: no photo, a camera or parameters that are none, or a hand that its camera does not see.
+        """
+        if not sample.image.is_file():
+            raise InputError(f"{sample.name}: the photo {sample.image.name} is missing.")
+        if sample.mask is not None and not sample.mask.is_file():
+            raise InputError(f"{sample.name}: the mask {sample.mask.name} is missing.")
+        xy = projected(sample, models)[1]
+        if sample.box is not None and (xy.max(0) < sample.box[:2]).any():
+            raise InputError(f"{sample.name}: the hand lies outside its box.")
+        self.samples.append(sample)
+
+
+def numbers(value: Any, *shape: int, what: str) -> np.ndarray:
+    """Finite numbers of a shape, float64; a size of -1 is any.
+
+    Raises:
+        ValueError: anything else.
+    """
+    try:
+        array = np.asarray(value, np.float64)
+    except (ValueError, TypeError):
+        array = np.zeros(())
+    sizes = zip(array.shape, shape, strict=False)
+    if array.ndim != len(shape) or any(want not in (-1, got) for got, want in sizes):
+        raise ValueError(f"{what}: expected {' x '.join(map(str, shape)) or 'one'} numbers")
+    if not np.isfinite(array).all() or np.abs(array).max(initial=0) > 1e7:
+        raise ValueError(f"{what}: expected finite numbers")
+    return array
+
+
+def pose_of_48(
+    model: ManoModel, pose: Any, betas: Any, transl: Any, *, with_mean: bool
+) -> ManoPose:
+    """MANO's parameters from 48 angles, 10 shapes and a translation [m].
+
+    Args:
+        model: Of the side.
+        pose: Wrist and 15 joints, axis times angle [rad].
+        betas: Shapes.
+        transl: Translation.
+        with_mean: Whether the angles hold the mean pose already; else it is added, as smplx does without
+            flat_hand_mean.
+    """
+    angles = numbers(pose, 48, what="pose").reshape(16, 3)
+    mean = 0 if with_mean else model.pose_mean
+    return ManoPose(numbers(betas, 10, what="shape"), angles[0], angles[1:] + mean, numbers(transl, 3, what="trans"))
+
+
+def projected(sample: Sample, models: Models) -> tuple[np.ndarray, np.ndarray]:
+    """The model's vertices in the camera's frame [m], [V, 3], and in the photo [px], [V, 2].
+
+    Raises:
+        InputError: some lie behind the camera or too far away.
+    """
+    vertices = mano_surface(models[sample.side], sample.mano)[0] @ sample.viewmat[:3, :3].T + sample.viewmat[:3, 3]
+    if vertices[:, 2].min() <= 0 or vertices[:, 2].max() > FARTHEST:
+        raise InputError(f"{sample.name}: its camera does not see the hand; check units and axes.")
+    seen = vertices @ sample.K.T
+    return vertices, seen[:, :2] / seen[:, 2:]
+
+
+def read_table(path: Path) -> Any:
+    """The value of a JSON file of annotations.
+
+    Raises:
+        InputError: missing or no JSON.
+    """
+    try:
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give the folder that holds it.") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: expected JSON, got {shortened(str(error))}; download it again.") from error
+
+
+def entry(table: Any, *keys: Any, what: str) -> Any:
+    """A value of nested tables; whole numbers are looked up as JSON's texts too.
+
+    Raises:
+        KeyError: it is missing.
+    """
+    for key in keys:
+        if isinstance(table, dict):
+            key = key if key in table else str(key)
+        try:
+            table = table[key]
+        except (KeyError, IndexError, TypeError):
+            raise KeyError(f"{what} {key}") from None
+    return table
+
+
+def load_picture(sample: Sample, models: Models, size: int, margin: float = MARGIN) -> Picture:
+    """The square around a sample's box, `margin` times as large, at `size` pixels.
+
+    Raises:
+        InputError: the photo or mask cannot be read, or the box is too small.
+    """
+    photo = read_photo(sample.image)
+    box = sample.box
+    if box is None:
+        xy = projected(sample, models)[1]
+        box = np.concatenate([xy.min(0), np.ptp(xy, axis=0)])
+    side = margin * float(max(box[2:]))
+    if side < LEAST_BOX:
+        raise InputError(f"{sample.name}: a box of {side:.0f} pixels is too small.")
+    left, top = (float(v) for v in box[:2] + box[2:] / 2 - side / 2)
+    left, top, side = left * photo.shrink, top * photo.shrink, side * photo.shrink
+    image = resample_square(photo.rgb.float() / 255, left, top, side, size).clamp(0, 1)
+    mask = None
+    if sample.mask is not None:
+        white = read_photo(sample.mask)
+        if white.rgb.shape != photo.rgb.shape:
+            raise InputError(f"{sample.name}: its mask has another size than the photo.")
+        mask = resample_square((white.rgb[..., 0].float() / 255).contiguous(), left, top, side, size).clamp(0, 1)
+    K = torch.from_numpy(sample.K.copy())
+    K[:2] *= photo.shrink
+    K[:2, 2] -= torch.tensor([left, top], dtype=K.dtype)
+    K[:2] *= size / side
+    camera = Camera(torch.from_numpy(sample.viewmat.copy()), K, size, size)
+    if sample.side == "right":
+        return Picture(image, mask, camera, sample.mano)
+    mirrored = None if mask is None else mask.flip(1)
+    return Picture(image.flip(1), mirrored, mirror_camera(camera), mirror_mano_pose(sample.mano))
