@@ -180,8 +180,8 @@ def age_note(kept: dict[str, Kept], digest: str, commits: str) -> str:
 
 
 def noted_page(page: str, marker: str, note: str) -> str:
-    """A page with `note` as the last line of a section, instead of the note that stood there."""
+    """A page with `note` as the last line of a section, instead of the note that stood there; an empty one is left."""
     name, last = re.escape(marker), f"\n{note}\n" if note else ""
     old = r"(?:\n\*Measured [^\n]*\*\n)?"
-    parts = re.compile(rf"(<!-- {name}(?: \([^)]*\))? -->\n.*?){old}(<!-- end of {name} -->)", re.DOTALL)
-    return parts.sub(lambda found: f"{found[1]}{last}{found[2]}", page)
+    parts = re.compile(rf"(<!-- {name}(?: \([^)]*\))? -->\n)(.*?){old}(<!-- end of {name} -->)", re.DOTALL)
+    return parts.sub(lambda found: f"{found[1]}{found[2]}{last if found[2].strip() else ''}{found[3]}", page)
