@@ -63,7 +63,7 @@ def note_ages(names: list[str], docs: Path, results: Path, write: bool) -> list[
                 note = age.age_note(kept if rows and text(rows) else {}, age.code_digest(name), commits)
                 old = (docs / page).read_text()
                 new = age.noted_page(old, marker, note)
-                missing += [f"{page}: {marker}"] if note and age.noted_page(old, marker, "") == old else []
+                missing += [f"{page}: {marker}"] if new != old and age.noted_page(old, marker, "") == old else []
                 if write and new != old:
                     write_file(docs / page, new.encode())
     return missing

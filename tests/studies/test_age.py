@@ -80,7 +80,7 @@ def test_tables_say_when_their_code_has_changed(repository, monkeypatch):
     def check():
         return command.note_ages(["count"], docs, results, write=False)
 
-    assert age.noted_page("<!-- b -->\n<!-- end of b -->\n", "b", "*Measured long ago.*").count("\n") == 2  # still empty
+    assert age.noted_page("<!-- b -->\n<!-- end of b -->\n", "b", "*Measured long ago.*").count("\n") == 2
     assert check() == ["page.md: a"]
     command.render(["count"], out, docs, results)
     assert "*Measured with an older version, whose results were not kept.*\n<!-- end" in page.read_text()
