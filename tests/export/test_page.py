@@ -230,7 +230,7 @@ REPORT = """
 """What the test adds to a page, so that it sends its pictures back."""
 FLAGS = (
     "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
-    "--disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader"
+    "--disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader --window-size=852,750"
 )
 
 
@@ -327,6 +327,38 @@ def test_a_browser_draws_gaussians_of_other_programs_as_we_do(right_hand, tmp_pa
         camera = orbit_camera(torch.tensor([[reach, 0, 0], [-reach, 0, 0]]), job["azimuth"], 0.0, 256)
         drawn = render(posed, camera, background=(1.0, 1.0, 1.0)).image.clamp(0, 1).numpy()
         assert -10 * np.log10(np.mean((shown - drawn) ** 2)) > 40, job
+
+
+COUNT = """
+<script>oasis.ready.then(async (viewer) => {
+  const draw = viewer.draw, wait = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+  let count = 0;
+  viewer.draw = (...given) => draw(...given).finally(() => count++);
+  byId("play").click();
+  await wait(3000); // the resolution follows
+  const start = performance.now(), before = count;
+  await wait(5000);
+  const rate = (1000 * (count - before)) / (performance.now() - start);
+  fetch("/rate", { method: "POST", body: `${rate} ${viewer.canvas.clientWidth} ${viewer.canvas.clientHeight}` });
+}, (error) => fetch("/failed", { method: "POST", body: String(error) }))</script>
+"""
+QUIET_RATE = 25
+"""Pictures a second that two free cores draw of a moving hand (docs/viewing.md)."""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_a_moving_hand_is_fluent_without_a_graphics_card(pages, tmp_path):
+    """Half of what two free cores draw, times the share that other processes leave of them."""
+    page = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", pages["right"])
+    with browser_with(page.replace("</body>", COUNT + "</body>"), "processor", tmp_path / "profile") as received:
+        path, body = received.get(timeout=100)
+    assert path == "/rate", body
+    rate, width, height = map(float, body.split())
+    assert min(width, height) >= 500
+    cores, load = os.cpu_count() or 1, os.getloadavg()[0]
+    assert rate > QUIET_RATE / 2 * min(1, cores / 2) * min(1, cores / max(load, 1)), (rate, load)
+    print(f"{rate:.1f} pictures a second of {width:.0f} x {height:.0f}, load {load:.1f} on {cores} cores")
 
 
 def test_all_named_poses_are_on_the_page(pages):

@@ -10,7 +10,7 @@ from collections import deque
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from oasis_warp.core.errors import InputError
+from oasis_warp.core.errors import InputError, last_line
 from oasis_warp.data.output_files import write_file
 
 MOST_WAITING = 16
@@ -18,6 +18,7 @@ MOST_WAITING = 16
 MOST_SECONDS = 900
 """Time for one photo, some fifty times what it takes on two quiet cores."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".avif", ".bmp", ".tif", ".tiff")
+SILENT = "The program said nothing."
 EXPORTS = (".html", ".glb", ".ply", ".spz")
 """Formats that are written when somebody asks for them."""
 PROGRAM = (sys.executable, "-m", "oasis_warp")
@@ -117,7 +118,7 @@ class Jobs:
                 command = [*PROGRAM, "export", str(out / "avatar.safetensors"), "-o", str(path)]
                 ran = subprocess.run(command, capture_output=True, text=True, timeout=MOST_SECONDS, check=False)
                 if ran.returncode:
-                    raise InputError(_last_line(ran.stderr))
+                    raise InputError(last_line(ran.stderr, SILENT, 500))
         return path
 
     def work(self) -> None:
@@ -164,10 +165,5 @@ class Jobs:
         if code == 0 or self._stopped:
             return
         late = time.monotonic() - started >= MOST_SECONDS
-        said = f"It took more than {MOST_SECONDS // 60} minutes." if late else _last_line(line)
+        said = f"It took more than {MOST_SECONDS // 60} minutes." if late else last_line(line, SILENT, 500)
         write_file(home / "error.txt", said.replace(str(photo), "the photo").replace(photo.name, "the photo").encode())
-
-
-def _last_line(said: str) -> str:
-    line = (said.strip().splitlines() or ["The program said nothing."])[-1]
-    return line.removeprefix("oasis: ")[:500]

@@ -17,6 +17,11 @@ def shortened(text: str, most: int = MOST_QUOTED) -> str:
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-(most // 2) :]}"
 
 
+def last_line(said: str, nothing: str = "it said nothing", most: int = 300) -> str:
+    """What a program, ours too, said last before it failed, at most so many letters; `nothing` if it was silent."""
+    return (said.strip().splitlines() or [nothing])[-1].removeprefix("oasis: ")[:most]
+
+
 class InputError(ValueError):
     """Invalid input of the user; the message is one sentence: where, what is wrong, what to do.
 

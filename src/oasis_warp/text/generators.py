@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from oasis_warp.core.errors import InputError
+from oasis_warp.core.errors import InputError, last_line
 from oasis_warp.core.types import Photo
 from oasis_warp.data.photo import read_photo
 
@@ -60,10 +60,8 @@ def _command(line: str) -> Generator:
                     f"--generator {words[0]}: cannot be started ({error.strerror}); check its name."
                 ) from error
             if ran.returncode or not out.is_file():
-                said = (ran.stderr.strip().splitlines() or ["it said nothing"])[-1][:300]
-                raise InputError(
-                    f"--generator {words[0]}: wrote no picture (exit code {ran.returncode}: {said}); run it alone."
-                )
+                said = f"exit code {ran.returncode}: {last_line(ran.stderr)}"
+                raise InputError(f"--generator {words[0]}: wrote no picture ({said}); run it alone.")
             return read_photo(out)
 
     return generate
