@@ -6,6 +6,7 @@ become avatars, evenly spaced over all, and for each of them others are compared
 
 import json
 import math
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -19,6 +20,7 @@ from oasis_warp import __version__
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo
 from oasis_warp.data.output_files import open_resumable_folder, write_file
@@ -29,7 +31,7 @@ from oasis_warp.evaluation.methods import Method, prior_digest, reconstructions
 from oasis_warp.evaluation.metrics import TargetTruth, score
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, mean
-from oasis_warp.hand.template import bundled_hand
+from oasis_warp.hand.template import chosen_hand
 from oasis_warp.hand_avatar import Avatar, make_avatar
 from oasis_warp.pretraining.objective import Perceptual
 
@@ -47,14 +49,13 @@ class Key(NamedTuple):
     """Which picture of a data set."""
 
     subject: str
-    frame: str
-    """With its sequence."""
-    camera: str
+    name: str
+    """Of the picture; no other has it."""
 
     @property
-    def name(self) -> str:
-        """Of files."""
-        return "_".join(self).replace("/", "-")
+    def file(self) -> str:
+        """What its files are called."""
+        return re.sub(r"[^\w.-]+", "-", self.name)
 
 
 class Sample(NamedTuple):
@@ -128,37 +129,48 @@ def choose(keys: Sequence[Key], choice: Choice) -> list[tuple[Key, list[Key]]]:
 
 def evaluate_data_set(
     data: DataSet, priors: Mapping[str, Prior], rows: Sequence[Row], choice: Choice, out: Path, *,
-    device: str = "cpu", perceptual: Perceptual | None = None, progress: Progress = silent,
+    config: ReconstructConfig = ReconstructConfig(),  # noqa: B008 - frozen
+    perceptual: Perceptual | None = None, progress: Progress = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """Make avatars of every row, compare them with other pictures of the person, and return the contents of METRICS.
 
     An interrupted run goes on with the avatars that are missing. Pictures that cannot be read or that no pose fits are
     left out and named in METRICS.
 
+    Args:
+        data: The data set.
+        priors: By the names that rows have for them.
+        rows: Ways to make avatars.
+        choice: Which pictures are looked at.
+        out: Output folder.
+        config: Its device and hand model are used; poses that the data set knows are of that model.
+        perceptual: LPIPS, if its weights are available.
+        progress: Called for each photo.
+
     Raises:
         InputError: a folder that cannot be used, or no picture that an avatar could be made of.
     """
     settings = {
         "version": __version__, "priors": {name: prior_digest(prior) for name, prior in priors.items()},
-        "lpips": perceptual is not None, **asdict(choice),
+        "lpips": perceptual is not None, "hand_model": config.hand_model, **asdict(choice),
         "rows": [{**row._asdict(), "adapt": asdict(row.adapt)} for row in rows],
     }  # fmt: skip
     open_resumable_folder(out, SETTINGS, settings, "an evaluation")
     (out / AVATARS).mkdir(exist_ok=True)
     chosen = choose(data.keys, choice)
-    measuring = _Measuring(data, priors, rows, choice, ReconstructConfig(device=device), perceptual)
+    measuring = _Measuring(data, priors, rows, choice, config, perceptual)
     for k, (photo, targets) in enumerate(chosen):
         progress("evaluation", k, len(chosen))
-        if not (out / AVATARS / f"{photo.name}.json").exists():
+        if not (out / AVATARS / f"{photo.file}.json").exists():
             measuring.measure(photo, targets, out / AVATARS)
     progress("evaluation", len(chosen), len(chosen))
-    found = [json.loads((out / AVATARS / f"{photo.name}.json").read_text()) for photo, _ in chosen]
+    found = [json.loads((out / AVATARS / f"{photo.file}.json").read_text()) for photo, _ in chosen]
     pictures = [picture for one in found for picture in one["pictures"]]
     left_out = {name: why for one in found for name, why in one["left_out"].items()}
     if not pictures:
         first = next(iter(left_out.values()), "it has no pictures")
         raise InputError(f"{out}: of no picture of the data set could an avatar be made: {first}")
-    strips = [path for photo, _ in chosen if (path := out / AVATARS / f"{photo.name}.png").exists()]
+    strips = [path for photo, _ in chosen if (path := out / AVATARS / f"{photo.file}.png").exists()]
     write_sheet(out / SHEET, strips, ["photo", "truth", *(row.name for row in rows)])
     whole = {"settings": settings, "summary": summarise(pictures), "left_out": left_out, "pictures": pictures}
     write_file(out / METRICS, json.dumps(whole, allow_nan=False).encode())
@@ -188,10 +200,14 @@ class _Measuring(NamedTuple):
     config: ReconstructConfig
     perceptual: Perceptual | None
 
+    @property
+    def hand(self) -> HandModel:
+        return chosen_hand(self.config.hand_model, self.config.mano_dir)
+
     @torch.no_grad()
     def measure(self, photo: Key, targets: Sequence[Key], folder: Path) -> None:
         """Write the pictures of one photo's avatars, then their records."""
-        estimator, pictures, left_out = HandEstimator(bundled_hand()), [], {}
+        estimator, pictures, left_out = HandEstimator(self.hand), [], {}
         strip: list[list[Tensor]] = []
         try:
             source = self.data.read(photo)
@@ -216,14 +232,14 @@ class _Measuring(NamedTuple):
         except InputError as error:
             left_out[photo.name] = str(error)
         if strip:
-            write_strip(folder / f"{photo.name}.png", strip)
+            write_strip(folder / f"{photo.file}.png", strip)
         found = {"pictures": pictures, "left_out": left_out}
-        write_file(folder / f"{photo.name}.json", json.dumps(found, allow_nan=False).encode())
+        write_file(folder / f"{photo.file}.json", json.dumps(found, allow_nan=False).encode())
 
     @torch.enable_grad()
     def make(self, row: Row, photo: Photo, fit: HandFit) -> tuple[Avatar, float]:
         """One avatar and how long the guess and its adaptation took [s]."""
-        hand, fit = bundled_hand(), misposed(fit, row.pose_error, self.choice.seed)
+        hand, fit = self.hand, misposed(self.hand, fit, row.pose_error, self.choice.seed)
         offsets = initial_offsets(hand, fit)
         crop = crop_hand(photo, fit, offsets, self.config)
         start = time.perf_counter()
@@ -231,7 +247,7 @@ class _Measuring(NamedTuple):
         ((_, made),) = reconstructions(hand, crop, {row.prior: self.priors[row.prior]}, methods, row.adapt)
         _wait(self.config.device)
         seconds = time.perf_counter() - start
-        return make_avatar(fit, offsets, crop, made.gaussians, made.light), round(seconds, 2)
+        return make_avatar(fit, offsets, crop, made.gaussians, made.light, hand=hand), round(seconds, 2)
 
 
 def fitted(estimator: HandEstimator, sample: Sample, shape: Tensor | None = None) -> HandFit:
@@ -241,11 +257,11 @@ def fitted(estimator: HandEstimator, sample: Sample, shape: Tensor | None = None
     return estimator.fit(sample.photo, sample.hand, shape=shape, force=True)
 
 
-def misposed(fit: HandFit, degrees: float, seed: int) -> HandFit:
+def misposed(hand: HandModel, fit: HandFit, degrees: float, seed: int) -> HandFit:
     """The fit with errors of joint angles, within the limits of joints, and of the orientation; the same every time."""
     if not degrees:
         return fit
-    hand, random = bundled_hand(), torch.Generator().manual_seed(seed * 1000 + ERROR_STREAM)
+    random = torch.Generator().manual_seed(seed * 1000 + ERROR_STREAM)
     errors = math.radians(degrees) * torch.randn(16, 3, generator=random)
     low, high = hand.pose_limits[1:].unbind(-1)
     angles = torch.minimum(torch.maximum(fit.pose.angles + errors[1:], low), high)
