@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from datasets.trees import WRITERS
 
+from oasis_warp.cli import main
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
@@ -12,8 +14,11 @@ from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.evaluation.data_sets import Choice, Key, Row, Sample, choose, evaluate_data_set, misposed
 from oasis_warp.evaluation.methods import RAW
 from oasis_warp.evaluation.paper_tables import as_latex, letter_of, make_tables, rows_of_tables, write_tables
+from oasis_warp.hand.mano import read_mano
 from oasis_warp.network.config import COMPACT, NetworkConfig
+from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import choose_prior
+from oasis_warp.network.weights_file import save_network
 
 PHOTOS = Path(__file__).parents[1] / "data" / "photos" / "same_hand" / "a1_wood_right"
 RECORD = {"psnr": 20.0, "psnr_whole": 26.0, "ssim": 0.9, "ssim_box": 0.8, "ssim_mask": 0.7, "lpips": 0.125}
@@ -24,7 +29,7 @@ class PhotosOfOneHand:
 
     def __init__(self, names, estimator):
         self.keys = [Key("a1", name) for name in names]
-        self.estimator = estimator
+        self.estimator, self.left_out = estimator, {}
 
     def read(self, key):
         photo = read_photo(PHOTOS / f"{key.name}.jpg")
@@ -124,3 +129,52 @@ def test_every_row_of_the_papers_tables_is_measured(hand, tmp_path):
     assert not found["left_out"] and all(line[1] for table in tables if table.name != "model" for line in table.lines)
     by_name = {row["row"]: row for row in json.loads((tmp_path / "metrics.json").read_text())["summary"]}
     assert by_name["pose 10"]["psnr"] < by_name["ours"]["psnr"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("name", "tree", "split"),
+    [("interhand", "interhand", "test"), ("hanco", "hanco", "train"), ("whim", "photos", "train")],
+)
+def test_the_command_fills_the_papers_tables_from_stand_ins_of_data_sets(
+    name, tree, split, mano_dir, tmp_path, capsys, weights_of
+):
+    models = {side: read_mano(mano_dir, side) for side in ("right", "left")}
+    WRITERS[tree](tmp_path / "root", models, split)
+    command = ["evaluate", "--dataset", name, "--root", str(tmp_path / "root"), "--mano-dir", str(mano_dir)]
+    few = ["--people", "1", "--targets", "1", "--steps", "2", "--ablations", str(weights_of(fom="off"))]
+    assert main([*command, "--out", str(tmp_path / "out"), *few]) == 0
+    text = (tmp_path / "out" / "tables.md").read_text()
+    measured = [line for line in text.splitlines() if line.startswith(("| ours |", "| d w/o FoM", "| f w/o LoRA"))]
+    assert len(measured) == 3 and all(line.split("|")[5].strip() for line in measured)
+    assert "Ablation of one-shot" in capsys.readouterr().out
+    assert {"results.csv", "tables.tex", "sheet.png", "metrics.json"} <= {p.name for p in (tmp_path / "out").iterdir()}
+
+
+@pytest.fixture
+def weights_of(hand, tmp_path):
+    """Weights of a small network with a switch turned, which knows nothing yet."""
+
+    def write(**switches):
+        small = dict(width=32, heads=2, n_tokens=16, n_coarse=64, refine_layers=1, head_width=16)
+        config = NetworkConfig(**{**vars(COMPACT), **small, **switches})
+        save_network(tmp_path / "network.safetensors", HandNetwork(config, hand))
+        return tmp_path / "network.safetensors"
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--dataset", "hanco"], "expected its folder, --root, and a learned prior"),
+        (["--dataset", "hanco", "--root", "x", "--prior", "none"], "expected its folder, --root, and a learned prior"),
+        (["--root", "x"], "--root: is for interhand, hanco"),
+        (["folder", "--dataset", "hanco", "--root", "x"], "a data set has --root"),
+        (["--dataset", "hanco", "--root", "x", "--targets", "0"], "--targets"),
+    ],
+)
+def test_options_that_do_not_belong_together_are_refused(options, said, tmp_path, capsys):
+    assert main(["evaluate", *options, "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err

@@ -227,24 +227,32 @@ class Evaluate:
     """Measure what avatars are worth: metrics.json with every number, sheet.png, and a table.
 
     On synthetic hands that no training has met, in poses and from sides that the photo does not show; on a folder of
-    photos with a subfolder for each hand, where the avatar of one photo is held against the others; or by their looks,
-    where avatars of single photos are drawn from all sides and in other poses and held against real hands. A run that
-    was stopped goes on when it is started again with the same options.
+    photos with a subfolder for each hand, where the avatar of one photo is held against the others; by their looks,
+    where avatars of single photos are drawn from all sides and in other poses and held against real hands; or on a
+    published data set with MANO's parameters, by the paper's tables: tables.md, tables.tex and .csv. A run that was
+    stopped goes on when it is started again with the same options.
     """
 
     folder: Positional[Path | None] = None
     """With a subfolder of photos for each hand, or with photos of one, for same-hand; with photos of hands, for looks,
     where its subfolders may hold more real hands to compare with."""
     out: OutputFolder
-    dataset: Literal["synthetic", "same-hand", "looks"] = "synthetic"
+    dataset: Literal["synthetic", "same-hand", "looks", "interhand", "hanco", "coco-hand", "whim"] = "synthetic"
     """What to measure on."""
+    root: Path | None = None
+    """Folder of a published data set."""
+    mano_dir: Path | None = None
+    """Folder with MANO_RIGHT.pkl and MANO_LEFT.pkl, for these; the one that OASIS_MANO_DIR names when not given."""
+    ablations: tuple[Path, ...] = ()
+    """For these: weights of networks that were trained with one part switched off, for the paper's ablation."""
     prior: Literal["learned", "none"] | Path = "learned"
     """The learned prior to hold against the mean hand, as for `oasis reconstruct`; none for the mean hand alone."""
     backbone_weights: BackboneWeights = None
     people: int = 16
-    """Synthetic people without tattoo or ring, and as many with each."""
+    """Synthetic people without tattoo or ring, and as many with each; or photos of each person of a data set that
+    avatars are made of."""
     targets: int = 4
-    """Pictures of each of them to compare with, 1 to 8."""
+    """Pictures to compare each of them with; of synthetic people 1 to 8."""
     steps: int | None = None
     """Steps of texture learning; stops by itself when not given."""
     size: int = 256

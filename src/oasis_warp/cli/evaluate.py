@@ -32,10 +32,13 @@ from oasis_warp.evaluation.columns import (
     pose_name,
     with_values,
 )
+from oasis_warp.evaluation.data_sets import Choice, evaluate_data_set
 from oasis_warp.evaluation.held_out import HELD_OUT_SEED, CaptureConfig
 from oasis_warp.evaluation.kernel_distance import LAYERS
 from oasis_warp.evaluation.looks import evaluate_looks
 from oasis_warp.evaluation.methods import Method, method_name
+from oasis_warp.evaluation.paper_tables import make_tables, rows_of_tables, write_tables
+from oasis_warp.evaluation.published_data import CatalogueData
 from oasis_warp.evaluation.real_hands import real_photos
 from oasis_warp.evaluation.same_hand import METRICS, evaluate_photos, photos_in, photos_of_hands
 from oasis_warp.evaluation.summary import Record, select
@@ -52,6 +55,7 @@ REAL_SECONDS, LOOKS_SECONDS, AVATAR_SECONDS, PAIR_SECONDS = 2.5, 17.0, 10.0, 0.6
 process with one thread, for two photos of the tests, in November 2026. Only ratios matter."""
 WAYS = 4
 """Avatars made of each photo for pairs: without the learned prior, and with it in each of three lights."""
+PUBLISHED = ("interhand", "hanco", "coco-hand", "whim")
 TABLE_WIDTH = 120
 """Of tables where there is no terminal, or a narrow one [characters]."""
 
@@ -68,7 +72,8 @@ def run(options: Evaluate) -> int:
     chosen = choose_prior(options.prior, options.backbone_weights)
     if options.prior != "none":
         priors["learned"] = chosen
-    tables = {"synthetic": on_synthetic_hands, "same-hand": on_photos, "looks": on_looks}
+    tables = dict.fromkeys(PUBLISHED, on_data_set)
+    tables |= {"synthetic": on_synthetic_hands, "same-hand": on_photos, "looks": on_looks}
     try:
         with show_run(Console(stderr=True), Run(plan(options, len(priors)))) as shown:
             made = tables[options.dataset](options, priors, shown.progress)
@@ -85,19 +90,25 @@ def check_options(options: Evaluate) -> None:
     Raises:
         InputError: a number out of its range, or a folder too many or missing.
     """
-    photos = options.dataset != "synthetic"
+    photos, published = options.dataset in ("same-hand", "looks"), options.dataset in PUBLISHED
+    if published and (options.root is None or options.prior == "none"):
+        raise InputError(f"--dataset {options.dataset}: expected its folder, --root, and a learned prior; give both.")
+    for name in ("root", "mano_dir", "ablations"):
+        if getattr(options, name) and not published:
+            raise InputError(f"--{name.replace('_', '-')}: is for {', '.join(PUBLISHED)}; leave it out.")
     if photos and options.folder is None:
         kind = "a folder of photos" + (", or one with a subfolder a hand" if options.dataset == "same-hand" else "")
         raise InputError(f"--dataset {options.dataset}: expected {kind}; name it.")
     if not photos and options.folder is not None:
-        raise InputError(f"{options.folder}: synthetic hands need no folder; leave it out, or use --dataset same-hand.")
+        kind = "a data set has --root" if published else "synthetic hands need no folder"
+        raise InputError(f"{options.folder}: {kind}; leave it out, or use --dataset same-hand.")
     if options.dataset == "same-hand" and options.lpips is not None:
         raise InputError("--lpips: is not measured on photos of the same hand; leave it out.")
     if options.dataset == "looks" and options.size != SIZE:
         raise InputError(f"--size: looks are measured in pictures of {SIZE} pixels, got {options.size}; leave it out.")
     if options.people < 1:
         raise InputError(f"--people: expected 1 or more, got {options.people}.")
-    if not 1 <= options.targets <= PICTURES_EACH:
+    if not 1 <= options.targets <= (options.targets if published else PICTURES_EACH):
         raise InputError(f"--targets: expected 1 to {PICTURES_EACH}, got {options.targets}; more people do the same.")
     if options.size not in SIZES or (not photos and options.size % MULTIPLE):
         kind = "pixels" if photos else f"pixels in steps of {MULTIPLE}"
@@ -162,6 +173,31 @@ def noise_table(summary: Sequence[Record], config: SyntheticEvaluation) -> Table
     for method, found in noise_rows(summary, group, light, factors).items():
         table.add_row(method_name(Method(*method)), *(format_number(psnr, ".2f") for psnr in found))
     return table
+
+
+def on_data_set(options: Evaluate, priors: dict[str, Prior], progress: Progress) -> list[Table]:
+    """The paper's tables on a published data set, also written as files."""
+    assert options.root is not None  # checked with the other options
+    config = ReconstructConfig(hand_model="mano", mano_dir=options.mano_dir, device=options.device)
+    data = CatalogueData.open(options.dataset, options.root, config, options.size)
+    ablated = [choose_prior(path, options.backbone_weights) for path in options.ablations]
+    rows = rows_of_tables(priors, ablated, options.steps, options.seed)
+    perceptual = None if options.lpips is None else load_lpips(*options.lpips, allow_download=options.allow_download)
+    found = evaluate_data_set(
+        data, priors, rows, Choice(photos=options.people, targets=options.targets, seed=options.seed), options.out,
+        config=config, perceptual=perceptual, progress=progress,
+    )  # fmt: skip
+    tables = make_tables(options.dataset, found["summary"])
+    write_tables(options.out, tables)
+    n_out, shown = len(found["left_out"]), []
+    for table in tables:
+        shown.append(Table(title=table.title))
+        for heading in table.headings:
+            shown[-1].add_column(heading, justify="right" if shown[-1].columns else "left")
+        for line in table.lines:
+            shown[-1].add_row(*line)
+    shown[0].caption = f"pictures left out: {n_out}, see {METRICS}" if n_out else None
+    return shown
 
 
 def on_photos(options: Evaluate, priors: dict[str, Prior], progress: Progress) -> list[Table]:

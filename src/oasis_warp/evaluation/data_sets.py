@@ -76,6 +76,11 @@ class DataSet(Protocol):
         """All pictures that are evaluated, in the order of the recording."""
         ...
 
+    @property
+    def left_out(self) -> Mapping[str, str]:
+        """Pictures that are not among them, by name, and why in words."""
+        ...
+
     def read(self, key: Key) -> Sample:
         """One of them.
 
@@ -166,7 +171,7 @@ def evaluate_data_set(
     progress("evaluation", len(chosen), len(chosen))
     found = [json.loads((out / AVATARS / f"{photo.file}.json").read_text()) for photo, _ in chosen]
     pictures = [picture for one in found for picture in one["pictures"]]
-    left_out = {name: why for one in found for name, why in one["left_out"].items()}
+    left_out = {**data.left_out, **{name: why for one in found for name, why in one["left_out"].items()}}
     if not pictures:
         first = next(iter(left_out.values()), "it has no pictures")
         raise InputError(f"{out}: of no picture of the data set could an avatar be made: {first}")
