@@ -114,7 +114,7 @@ class DatasetHands:
         raise InputError(f"{TRIES} photos of {group[0].subject} could not be read, the last: {reason}")
 
     def _pictures(self, hand: HandModel, pictures: list[Picture]) -> _Pictures:
-        poses = [_in_camera(hand, picture) for picture in pictures]
+        poses = [in_camera(hand, picture) for picture in pictures]
 
         def stacked(tensors: list[Tensor]) -> Tensor:
             return torch.stack(tensors).float().to(self.device)
@@ -136,7 +136,7 @@ class DatasetHands:
         return (seen.face_ids >= 0).float()
 
 
-def _in_camera(hand: HandModel, picture: Picture) -> HandPose:
+def in_camera(hand: HandModel, picture: Picture) -> HandPose:
     """The right hand's pose in the frame of the picture's camera."""
     pose, view = hand_pose_of_mano(hand, picture.mano), picture.camera.viewmat.double()
     turn, shift = view[:3, :3], view[:3, 3]
