@@ -282,7 +282,7 @@ def test_folders_without_pairs_are_refused_in_one_sentence(hands, tmp_path, caps
         (["--size", "100"], "--size: expected 64 to 1024 pixels in steps of 16, got 100"),
         (["--steps", "-1"], "--steps: expected 0 or more, got -1"),
         (["--prior", "nowhere.safetensors"], "nowhere.safetensors: expected a network's weights, found no such file"),
-        (["--lpips", "a.pth", "b.pth"], "a.pth: expected weights of LPIPS, found no such file"),
+        (["--lpips", "a.pth", "b.pth"], "a.pth: expected AlexNet, found no such file"),
         (["photos", "--dataset", "same-hand", "--lpips", "a.pth", "b.pth"], "--lpips: is not measured on photos of"),
         (["photos", "--dataset", "looks", "--size", "512"], "--size: looks are measured in pictures of 256 pixels"),
         (["--dataset", "looks"], "--dataset looks: expected a folder of photos; name it"),
