@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import igl
 import numpy as np
 import torch
 from scipy import sparse
@@ -43,6 +42,8 @@ _SAME_PLACE, _SAME_NORMAL, _SAME_BONE = 1.0, 0.01, 0.04
 neighbouring fingers would be confused."""
 _STIFFNESS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1)
 """Weights of smoothness over closeness, from round to round; as usual in non-rigid registration it falls."""
+_NEAR_VERTICES = 3
+"""Around which the nearest face of a point is looked for at last; edges of MANO-HD are 2 mm long."""
 _RIM = 10.0
 """Weight of the wrist's rim."""
 MOST_TURNED = 40.0
@@ -132,17 +133,15 @@ def register(model: ManoModel) -> Registration:
     fine, kinematics = mano_hd(model), HandKinematics(bundled_hand())
     placed = _fitted(kinematics, model, fine)
     start = placed.vertices(kinematics)
-    distance = np.sqrt(igl.point_mesh_squared_distance(start, fine.template, fine.faces)[0])
-    fit_error = float(np.sqrt((distance**2).mean()))
+    fit_error = float(np.sqrt(((_on_surface(start, fine)[1] - start) ** 2).sum(1).mean()))
     if fit_error > WORST_FIT:
         raise InputError(
             f"MANO's template: the bundled hand lies {1e3 * fit_error:.1f} mm from it, expected up to "
             f"{1e3 * WORST_FIT:.0f}; give MANO's own files, in metres, fingers to -x, palm to -y."
         )
     moved = _moved_onto(kinematics, fine, start)
-    _, face, place = igl.point_mesh_squared_distance(moved, fine.template, fine.faces)
-    shares = _barycentrics(place, fine.template[fine.faces[face]])
-    return Registration(np.asarray(face), shares, placed, fit_error)
+    face, place = _on_surface(moved, fine, _NEAR_VERTICES)
+    return Registration(face, _barycentrics(place, fine.template[fine.faces[face]]), placed, fit_error)
 
 
 def _fitted(kinematics: HandKinematics, model: ManoModel, fine: ManoModel) -> PlacedHand:
@@ -206,7 +205,7 @@ def _moved_onto(kinematics: HandKinematics, fine: ManoModel, start: np.ndarray) 
     rim_goal = _rim_goal(start[kinematics.rim], fine)
     moved = start
     for stiffness in _STIFFNESS:
-        _, face, place = igl.point_mesh_squared_distance(moved, fine.template, fine.faces)
+        face, place = _on_surface(moved, fine)
         agrees = (unit(goal_normals[face]) * _normals(moved, kinematics.faces)).sum(1) > 0.5
         weight = (agrees & ~at_rim[face]).astype(np.float64)
         goal = place.copy()
@@ -214,6 +213,31 @@ def _moved_onto(kinematics: HandKinematics, fine: ManoModel, start: np.ndarray) 
         solver = splu((stiffness * laplacian + sparse.diags_array(weight)).tocsc())
         moved = start + solver.solve(weight[:, None] * (goal - start))
     return moved
+
+
+def _on_surface(points: np.ndarray, fine: ManoModel, n_near: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest face of each point, [P], and the place on it, [P, 3]; of the faces around its nearest vertices."""
+    near = cKDTree(fine.template).query(points, range(1, n_near + 1))[1]
+    around = surface.faces_of_vertices(torch.from_numpy(fine.faces), len(fine.template)).numpy()
+    faces = around[near].reshape(len(points), -1)
+    faces = np.where(faces < len(fine.faces), faces, faces[:, :1])  # rows are filled up with one past the last face
+    places = _nearest_in_triangles(points[:, None], fine.template[fine.faces[faces]])
+    best = ((places - points[:, None]) ** 2).sum(2).argmin(1)
+    rows = np.arange(len(points))
+    return faces[rows, best], places[rows, best]
+
+
+def _nearest_in_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """The point of each triangle, [P, M, 3, 3], that is nearest to a point, [P, 1, 3]: inside it or on an edge."""
+    starts, edges = corners, np.roll(corners, -1, axis=2) - corners
+    along = ((points[:, :, None] - starts) * edges).sum(-1) / (edges**2).sum(-1).clip(1e-30)
+    on_edges = starts + along.clip(0, 1)[..., None] * edges
+    nearest = ((on_edges - points[:, :, None]) ** 2).sum(-1).argmin(2)
+    on_edge = np.take_along_axis(on_edges, nearest[..., None, None], 2)[:, :, 0]
+    normal = unit(np.cross(edges[:, :, 0], edges[:, :, 1]))
+    in_plane = points - ((points - starts[:, :, 0]) * normal).sum(-1, keepdims=True) * normal
+    side = (np.cross(edges, in_plane[:, :, None] - starts) * normal[:, :, None]).sum(-1)
+    return np.where((side >= 0).all(2, keepdims=True), in_plane, on_edge)
 
 
 def _rim_goal(rim: np.ndarray, fine: ManoModel) -> np.ndarray:
