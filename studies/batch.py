@@ -71,7 +71,7 @@ def measure(setting: str, workers: int, n: int, device: str) -> Row:
         size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     made, total = said.count("made"), stages.pop("total")
     return {
-        "setting": setting, "workers": workers, "photos": n, "made": made, "refused": said.count("refused"),
+        "setting": setting, "workers": workers, "photos": n, "made": made, "declined": said.count("refused"),
         "cpu_s": (cpu - start) / n, "wall_s": wall - again, "start_s": start, "start_wall_s": again, "peak_gib": peak,
         "megabytes": size / made / 1e6, "stages": {stage: value / total for stage, value in stages.most_common()},
     }  # fmt: skip
