@@ -17,7 +17,7 @@ from oasis_warp.core.errors import InputError
 # In the program's place: "bad" in a photo is refused, "slow" takes its time, and everything else becomes an avatar.
 PROGRAM = """
 import pathlib, sys, time
-_, command, source, _, out = sys.argv
+_, command, source, _, out, *others = sys.argv
 print("landmarks: 0.1 s", file=sys.stderr, flush=True)
 data, out = pathlib.Path(source).read_bytes(), pathlib.Path(out)
 if b"slow" in data:
@@ -25,6 +25,8 @@ if b"slow" in data:
 if b"bad" in data:
     sys.exit(f"oasis: {source}: found no hand; give another photo.")
 if command == "export":
+    assert not others or (others[0] == "--photo" and pathlib.Path(others[1]).read_bytes() == data)
+    assert bool(others) == (out.suffix == ".html")
     out.write_bytes(b"page of " + data)
 else:
     out.mkdir()

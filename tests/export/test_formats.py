@@ -1,3 +1,5 @@
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -70,6 +72,16 @@ def test_huge_gaussians_are_held_to_the_width_of_a_finger(right_hand, tmp_path, 
     export_avatar(broken, tmp_path / "hand.ply")
     assert READERS[".ply"](tmp_path / "hand.ply")[2].max() <= 0.0200001
     assert "1 of" in caplog.text and "20 mm" in caplog.text
+
+
+def test_a_page_has_the_photo_beside_the_hand_and_other_formats_refuse_it(left_hand, tmp_path, capsys):
+    left_hand.save(tmp_path / "avatar.safetensors")
+    cv2.imwrite(str(tmp_path / "photo.png"), np.zeros((40, 36, 3), np.uint8))
+    for name, code in (("hand.html", 0), ("hand.ply", 2)):
+        given = ["-o", str(tmp_path / name), "--photo", str(tmp_path / "photo.png")]
+        assert main(["export", str(tmp_path / "avatar.safetensors"), *given]) == code
+    assert "hand.ply: has no room for --photo" in capsys.readouterr().err
+    assert '<img id="photo"' in (tmp_path / "hand.html").read_text()
 
 
 def test_the_command_writes_a_pose_in_a_light(left_hand, tmp_path):

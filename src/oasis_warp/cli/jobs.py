@@ -116,6 +116,8 @@ class Jobs:
         with self._exporting:
             if not path.is_file():
                 command = [*PROGRAM, "export", str(out / "avatar.safetensors"), "-o", str(path)]
+                if path.suffix == ".html":
+                    command += ["--photo", str(next((self.folder / job).glob("photo.*")))]
                 ran = subprocess.run(command, capture_output=True, text=True, timeout=MOST_SECONDS, check=False)
                 if ran.returncode:
                     raise InputError(last_line(ran.stderr, SILENT, 500))

@@ -184,6 +184,8 @@ class Export:
     light: Literal["auto", "baked", "none"] = "auto"
     """Colours as in the avatar's light, or as in even light for programs with lights of their own; "auto" bakes light
     into Gaussians and leaves it out of meshes."""
+    photo: Path | None = None
+    """Photo to show beside the hand in a .html page."""
 
 
 @command

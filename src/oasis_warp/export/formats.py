@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.types import Camera, CanonicalGaussians, HandLight, HandPose
+from oasis_warp.core.types import Camera, CanonicalGaussians, HandLight, HandPose, Photo
 from oasis_warp.export import usd_stage
 from oasis_warp.export.compressed_ply import write_compressed_ply
 from oasis_warp.export.hand_parameters import write_parameters
@@ -64,7 +64,12 @@ def choose_writer(path: Path | str) -> Writer:
 
 @torch.no_grad()
 def export_avatar(
-    avatar: Avatar, path: Path | str, *, pose: HandPose | None = None, light: Light | None = None
+    avatar: Avatar,
+    path: Path | str,
+    *,
+    pose: HandPose | None = None,
+    light: Light | None = None,
+    photo: Photo | None = None,
 ) -> None:
     """Write `avatar` in the format that the ending of `path` says; docs/export.md lists them.
 
@@ -74,6 +79,7 @@ def export_avatar(
         pose: Pose of the hand. By default that of the photo, and in files that can be posed the rest pose.
         light: "baked" to write colours as they are in the avatar's light, "none" as in even light, for programs with
             lights of their own. By default "baked" for Gaussians, and "none" for meshes.
+        photo: Shown beside the hand in a .html page; other formats have no place for it.
 
     Raises:
         InputError: an unknown ending, a value that is not finite, or `path` cannot be written.
@@ -88,7 +94,7 @@ def export_avatar(
         check_shape("pose.translation", pose.translation, 3)
         check_finite(**pose._asdict())
         pose = HandPose(*(part.detach().to(avatar.shape).cpu() for part in pose))
-    writer(ExportRequest(on_cpu(avatar), pose, light), Path(path))
+    writer(ExportRequest(on_cpu(avatar), pose, light, photo), Path(path))
 
 
 def on_cpu(avatar: Avatar) -> Avatar:

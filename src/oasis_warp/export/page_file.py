@@ -100,4 +100,4 @@ def write_page(request: ExportRequest, path: Path) -> None:
         InputError: `path` cannot be written.
     """
     look = "even" if request.light == "none" else "photo"
-    write_file(path, page_html(request.avatar, path.stem, pose=request.pose, look=look).encode())
+    write_file(path, page_html(request.avatar, path.stem, pose=request.pose, look=look, photo=request.photo).encode())

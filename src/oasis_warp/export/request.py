@@ -2,7 +2,7 @@
 
 from typing import Literal, NamedTuple
 
-from oasis_warp.core.types import HandPose
+from oasis_warp.core.types import HandPose, Photo
 from oasis_warp.hand_avatar import Avatar
 
 Light = Literal["baked", "none"]
@@ -18,3 +18,5 @@ class ExportRequest(NamedTuple):
     light: Light | None = None
     """"baked": colours as the avatar is drawn in its light; "none": as in even light, for engines that light it.
     None: "baked" for Gaussians, "none" for meshes."""
+    photo: Photo | None = None
+    """To show beside the hand, where a format has a place for it."""
