@@ -158,6 +158,7 @@ def test_named_poses_turn_its_bones_as_those_of_the_bundled_hand(mano, name):
     assert (frame @ goal @ frame.mT - turns[2]).abs().max() < 1e-5
 
 
+@pytest.mark.slow
 def test_our_hand_fits_its_surface_and_back(mano, hand):
     """Millimetres that docs/hand.md states."""
     ours, other = HandKinematics(hand), HandKinematics(mano)

@@ -22,7 +22,7 @@ COMPARED = {"alex": [0, 3, 6, 8, 10], "vgg": [2, 7, 14, 21, 28]}
 """Of torchvision's layers, those that the published LPIPS compares."""
 
 
-@pytest.fixture(params=["alex", "vgg"])
+@pytest.fixture(params=["alex", pytest.param("vgg", marks=pytest.mark.slow)])
 def files(request, tmp_path):
     random, name = torch.Generator().manual_seed(0), request.param
     trunk, heads, before = {"classifier.6.bias": torch.zeros(3)}, {}, 3
