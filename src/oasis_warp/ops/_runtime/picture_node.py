@@ -204,8 +204,8 @@ def _versions(tensors: Any) -> list[int]:
     return [tensor._version for tensor in tensors if tensor is not None]
 
 
-UNPROJECTED = "opacities", "colors", "backgrounds"
-"""Tensors of a scene that projection does not read."""
+UNPROJECTED = "colors", "backgrounds"
+"""Tensors of a scene that are not arguments of the projection."""
 UNMADE = {"means2d": "_project", "depths": "_project", "opacities": "_opacities", "conics": "_read", "radii": "_read"}
 """How `Meta` makes its tensors. By name: a bound method would keep a picture alive until garbage is collected."""
 
@@ -219,7 +219,7 @@ class Meta(dict[str, Any]):
             camera_ids=None, gaussian_ids=None, means2d=None, depths=None, conics=None, radii=None, opacities=None,
             tile_size=options.tile_size, width=options.width, height=options.height, n_cameras=plan.n_cameras,
         )  # fmt: skip
-        versions = [] if shown is None else _versions((*scene[:4], *scene[6:8]))
+        versions = [] if shown is None else _versions((*scene[:5], *scene[6:8]))
         self._unmade = dict(UNMADE)
         self._call = plan, scene, workspace, shown, versions
 
