@@ -101,3 +101,15 @@ def test_flipped_bits_in_a_real_cache_are_found_and_built_anew(tmp_path):
         flip(path)
     assert run() == right
     assert [path.read_bytes() for path in objects] == before
+
+
+def test_what_a_killed_build_has_left_is_removed_after_an_hour(tmp_path, monkeypatch):
+    monkeypatch.setenv("OASIS_WARP_CACHE", str(tmp_path))
+    old, young, whole = (tmp_path / name for name in ("wp_a_1_p12_t34", "wp_b_2_p12_t34", "wp_c_3"))
+    for folder in (old, young, whole):
+        folder.mkdir()
+        (folder / "a.o").write_bytes(b"half")
+    for folder in (old, whole):
+        os.utime(folder, (0, 0))
+    assert writable_cache() == tmp_path
+    assert sorted(path.name for path in tmp_path.iterdir()) == [young.name, whole.name]

@@ -4,6 +4,7 @@ import hashlib
 import os
 import shutil
 import tempfile
+import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ import warp as wp
 
 DIGESTS = "sha256"
 """File beside the compiled files of a module: their digests."""
+ABANDONED = 3600.0
+"""Age after which no process is still building a kernel [s]."""
 
 
 def kernel_cache() -> Path:
@@ -29,9 +32,20 @@ def writable_cache() -> Path:
         cache = kernel_cache()
         cache.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=cache):
+            remove_abandoned(cache)
             return cache
     except (OSError, RuntimeError) as error:  # RuntimeError: no home
         return _temporary_cache(str(error))
+
+
+def remove_abandoned(cache: Path) -> None:
+    """Remove what builds have left that were killed: folders named after a process and a thread, an hour old."""
+    for folder in cache.glob("wp_*_p*_t*"):
+        try:
+            if time.time() - folder.stat().st_mtime > ABANDONED:
+                shutil.rmtree(folder, ignore_errors=True)
+        except OSError:
+            pass  # its own process has just renamed it
 
 
 _temporary: list[tempfile.TemporaryDirectory[str]] = []
