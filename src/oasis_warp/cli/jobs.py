@@ -155,9 +155,9 @@ class Jobs:
                 self._process = process
                 if self._stopped:
                     process.kill()
+            started, line = time.monotonic(), ""  # before the timer, or what it ends would seem to have been in time
             limit = threading.Timer(MOST_SECONDS, process.kill)
             limit.start()
-            started, line = time.monotonic(), ""
             assert process.stderr is not None
             for line in process.stderr:
                 with self._changed:
