@@ -194,7 +194,7 @@ def test_the_work_of_a_cluster_is_counted_and_a_lost_scheduler_told(pipeline, ph
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("victim", ["worker", "scheduler", "client"])
+@pytest.mark.parametrize("victim", ["worker", "client"])
 def test_nothing_is_lost_double_or_half_when_parts_are_killed(victim):
     pytest.importorskip("distributed")
     script = Path(__file__).parents[1] / "fuzz" / "kill_batch.py"

@@ -22,7 +22,7 @@ from oasis_warp.core.config import BLACK, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo
+from oasis_warp.core.types import Camera, HandCrop, HandFit, HandPose, Landmarks, Photo
 from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
@@ -39,8 +39,8 @@ SETTINGS, METRICS, SHEET, AVATARS = "evaluation.json", "metrics.json", "sheet.pn
 """Files that an evaluation writes; the last is a folder with the results of each avatar."""
 MEASURES = ("psnr", "psnr_whole", "ssim", "ssim_box", "ssim_mask", "lpips")
 DIGITS = 5
-WARM, FRAMES = 3, 20
-"""Frames that are drawn before the clock starts, and that are timed."""
+WARM, FRAMES, LONGEST = 2, 20, 0.5
+"""Frames that are drawn before the clock starts; the most that are timed, and after how long no more begin [s]."""
 ERROR_STREAM = 7
 """Stream of the random numbers of wrong poses."""
 
@@ -195,6 +195,15 @@ def summarise(pictures: Sequence[Record]) -> list[Record]:
     return summary
 
 
+class Crop(NamedTuple):
+    """A photo's hand, ready for reconstruction."""
+
+    fit: HandFit
+    offsets: Tensor
+    """Of the rest surface [V, 3]."""
+    hand: HandCrop
+
+
 class _Measuring(NamedTuple):
     """What every avatar is measured with."""
 
@@ -224,8 +233,11 @@ class _Measuring(NamedTuple):
                 except InputError as error:
                     left_out[target.name] = str(error)
             drawn = {target: [source.photo.rgb / 255, truth.image] for target, (truth, _, _) in truths.items()}
+            crops: dict[float, Crop] = {}
             for row in self.rows:
-                avatar, seconds = self.make(row, source.photo, fit)
+                if row.pose_error not in crops:
+                    crops[row.pose_error] = self.crop(source.photo, fit, row.pose_error)
+                avatar, seconds = self.make(row, crops[row.pose_error])
                 for target, (truth, camera, pose) in truths.items():
                     image = avatar.render(camera, pose, BLACK).image
                     drawn[target].append(image)
@@ -241,12 +253,16 @@ class _Measuring(NamedTuple):
         found = {"pictures": pictures, "left_out": left_out}
         write_file(folder / f"{photo.file}.json", json.dumps(found, allow_nan=False).encode())
 
+    def crop(self, photo: Photo, fit: HandFit, pose_error: float) -> Crop:
+        """What rows with one error of the pose share."""
+        fit = misposed(self.hand, fit, pose_error, self.choice.seed)
+        offsets = initial_offsets(self.hand, fit)
+        return Crop(fit, offsets, crop_hand(photo, fit, offsets, self.config))
+
     @torch.enable_grad()
-    def make(self, row: Row, photo: Photo, fit: HandFit) -> tuple[Avatar, float]:
+    def make(self, row: Row, cropped: Crop) -> tuple[Avatar, float]:
         """One avatar and how long the guess and its adaptation took [s]."""
-        hand, fit = self.hand, misposed(self.hand, fit, row.pose_error, self.choice.seed)
-        offsets = initial_offsets(hand, fit)
-        crop = crop_hand(photo, fit, offsets, self.config)
+        hand, (fit, offsets, crop) = self.hand, cropped
         start = time.perf_counter()
         methods = [Method(row.prior, row.stage)]
         ((_, made),) = reconstructions(hand, crop, {row.prior: self.priors[row.prior]}, methods, row.adapt)
@@ -303,14 +319,16 @@ def _measured(image: Tensor, truth: TargetTruth, perceptual: Perceptual | None) 
 @torch.no_grad()
 def frames_per_second(avatar: Avatar) -> float:
     """Of posing and drawing, in the photo's camera."""
-    device = avatar.device.type
-    for k in range(WARM + FRAMES):
-        if k == WARM:
-            _wait(device)
-            start = time.perf_counter()
+    device, frames = avatar.device.type, 0
+    for _ in range(WARM):
         avatar.render(avatar.source_camera, avatar.source_pose)
     _wait(device)
-    return round(FRAMES / (time.perf_counter() - start), 2)
+    start = time.perf_counter()
+    while frames < FRAMES and time.perf_counter() - start < LONGEST:
+        avatar.render(avatar.source_camera, avatar.source_pose)
+        frames += 1
+    _wait(device)
+    return round(frames / (time.perf_counter() - start), 2)
 
 
 def _wait(device: str) -> None:
