@@ -18,7 +18,7 @@ from oasis_warp.avatar.pose import (
 )
 from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.config import BLACK, WHITE
-from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
 from oasis_warp.core.mirror import (
     mirror_camera,
     mirror_canonical,
@@ -41,7 +41,6 @@ from oasis_warp.core.types import (
     Side,
 )
 from oasis_warp.data.avatar_file import LIGHT_HIDDEN, load_avatar, save_avatar
-from oasis_warp.hand.mano import N_SHAPES
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand, chosen_hand
@@ -317,7 +316,7 @@ class Avatar:
         """
         hand = bundled_hand()
         sizes = {"S": hand.shape_basis.shape[2], "V": len(hand.template), "F": len(hand.faces)}
-        tensors, header = load_avatar(Path(path), {hand.name: sizes, "mano": sizes | {"S": N_SHAPES}})
+        tensors, header = load_avatar(Path(path), {hand.name: sizes, "mano": sizes | {"S": MANO_SHAPES}})
         if header["hand_model"] != hand.name:
             hand = chosen_hand("mano", mano_dir)
         tensors = {name: value.to(device) for name, value in tensors.items()}

@@ -50,6 +50,15 @@ def pipeline(monkeypatch, made):
     return calls
 
 
+def test_settings_name_the_hand_model_and_not_where_its_files_lie(order, tmp_path, monkeypatch):
+    """A path is no JSON, and avatars are the same wherever MANO's files were read from; workers need it absolute."""
+    monkeypatch.chdir(tmp_path)
+    configs = [ReconstructConfig(prior="none", hand_model="mano", mano_dir=Path(name)) for name in ("here", "there")]
+    orders = [Order(source=order.source, out=order.out, config=config) for config in configs]
+    assert orders[0].digest == orders[1].digest != order.digest
+    assert batch._absolute(configs[0]).mano_dir == tmp_path / "here"
+
+
 def rows(order, names):
     return batch_work.read_rows(order.rows_file(names))
 

@@ -54,7 +54,8 @@ def test_batches_depend_on_their_number_alone_and_broken_photos_are_passed_over(
     for sample in hands.catalogue.samples:
         sample.image.write_bytes(b"")
     with pytest.raises(InputError, match=f"{TRIES} photos of 0.* could not be read, the last"):
-        next(batches)
+        for _ in range(2):  # one batch was loaded ahead, perhaps before the photos were gone
+            next(batches)
 
 
 def test_a_mixture_takes_its_share_of_each_source_and_resumes_at_any_step():

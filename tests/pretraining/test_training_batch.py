@@ -1,16 +1,15 @@
 """Pictures of posed hands become training batches whose surfaces lie on their pictures."""
 
 import math
-from typing import NamedTuple
 
 import pytest
 import torch
-from torch import Tensor
 
 from oasis_warp.avatar.anchors import INSET, inset_offsets
 from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import HandPose
+from oasis_warp.datasets.training_source import DatasetPictures
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.ops import depth_map
@@ -26,18 +25,6 @@ from oasis_warp.pretraining.training_batch import (
 SIZE, CROP = 240, 160
 CROP_OF_DOCS = 256
 EXACT = EstimatorNoise(surface=0.0, mask=0.0)
-
-
-class Stub(NamedTuple):
-    image: Tensor
-    alpha: Tensor
-    mask: Tensor
-    angles: Tensor
-    orientation: Tensor
-    translation: Tensor
-    shape: Tensor
-    K: Tensor
-    left: Tensor
 
 
 def turned(angle):
@@ -58,7 +45,7 @@ def photographed(hand, names, left):
         mask = (depth_map(vertices, hand.faces, torch.eye(4), K, SIZE, SIZE).face_ids >= 0).float()
         image = torch.stack([mask, 0.5 * mask, 0.2 * mask], dim=-1)
         made.append((image, mask, mask, pose.angles, pose.orientation, pose.translation, shape, K))
-    return Stub(*(torch.stack(parts) for parts in zip(*made, strict=True)), torch.tensor(left).int())
+    return DatasetPictures(*(torch.stack(parts) for parts in zip(*made, strict=True)), torch.tensor(left).int())
 
 
 @pytest.fixture(scope="module")

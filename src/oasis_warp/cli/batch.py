@@ -68,7 +68,7 @@ def run(options: Batch) -> int:
 
 def _absolute(config: ReconstructConfig) -> ReconstructConfig:
     """With paths that other processes understand."""
-    paths = {name: getattr(config, name) for name in ("prior", "backbone_weights")}
+    paths = {name: getattr(config, name) for name in ("prior", "backbone_weights", "mano_dir")}
     return replace(config, **{name: path.absolute() for name, path in paths.items() if isinstance(path, Path)})
 
 

@@ -66,7 +66,7 @@ class Order:
         about = dict(_prior(self.config.prior, self.config.backbone_weights).about)
         if "sha256" in about:
             about.pop("name")
-        config = asdict(replace(self.config, prior="none", backbone_weights=None))
+        config = asdict(replace(self.config, prior="none", backbone_weights=None, mano_dir=None))
         return {**config, "prior": about, "pictures": self.pictures, "version": self.version}
 
     @functools.cached_property

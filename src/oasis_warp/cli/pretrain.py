@@ -116,8 +116,6 @@ def check_prior_options(options: Pretrain) -> None:
         )
     if weights is not None:
         published_file(weights, backbone, allow_download=options.allow_download)
-    if options.lpips is not None:
-        load_lpips(*options.lpips, allow_download=options.allow_download)
     start = options.initial_weights
     if start is not None and read_config(start) != PROFILES[options.profile]:
         raise InputError(f"--initial-weights {start}: of another network than --profile {options.profile}.")
@@ -208,7 +206,8 @@ def make_trainer(options: Pretrain, process: ProcessInfo) -> Trainer:
     network = make_network(PROFILES[options.profile], options.seed, options.backbone_weights, options.initial_weights)
     if options.lpips is None:
         return PriorTrainer(network, config, process)
-    return PriorTrainer(network, config, process, perceptual=load_lpips(*options.lpips).to(process.device))
+    perceptual = load_lpips(*options.lpips, allow_download=options.allow_download)
+    return PriorTrainer(network, config, process, perceptual=perceptual.to(process.device))
 
 
 def make_dense_network(seed: int, start: Path | None) -> DenseNetwork:

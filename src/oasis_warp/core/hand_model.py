@@ -16,6 +16,10 @@ KNUCKLES = [5, 9, 13, 17]
 """Rows of the 21 landmarks that are the knuckles of index, middle, ring and little finger."""
 
 
+MANO_SHAPES = 10
+"""Shape coefficients of MANO's files."""
+
+
 class ModelOrigin(NamedTuple):
     """How another hand was brought into the triangulation of the bundled one; float64 on the CPU."""
 

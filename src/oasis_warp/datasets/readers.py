@@ -12,7 +12,7 @@ from oasis_warp.core.types import Photo, Side
 from oasis_warp.data.photo import read_photo
 from oasis_warp.datasets.samples import Catalogue, Models, Sample, entry, numbers, pose_of_48, read_table
 from oasis_warp.estimation.mano_estimates import SUFFIXES, Estimate, estimate_of_entries, read_estimate
-from oasis_warp.hand.mano import ManoPose, mano_surface, read_mano, thinned
+from oasis_warp.hand.mano import mano_surface, mirror_mano_pose, read_mano, thinned
 
 DatasetName = Literal["interhand", "hanco", "freihand", "ho3d", "coco-hand", "whim", "photos"]
 Split = Literal["train", "val", "test"]
@@ -184,8 +184,7 @@ def _estimated(name: str, path: Path, estimate: Estimate, photo: Photo) -> Sampl
         raise InputError(f"{name}: its estimate has no parameters of MANO.")
     pose = estimate.pose
     if estimate.side == "left":
-        turned = np.array([1.0, -1.0, -1.0])
-        pose = ManoPose(pose.betas, pose.global_orient * turned, pose.hand_pose * turned, pose.transl)
+        pose = mirror_mano_pose(pose)
     pose = pose._replace(transl=estimate.place)
     K = _intrinsics(estimate.focal, estimate.focal, *estimate.centre)
     return Sample(name, path, None, estimate.side, name, np.eye(4), K, pose, None)

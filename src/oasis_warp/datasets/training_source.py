@@ -29,7 +29,7 @@ NOISE = EstimatorNoise(surface=0.0)
 """Poses of data sets are estimates with errors of their own."""
 
 
-class _Pictures(NamedTuple):
+class DatasetPictures(NamedTuple):
     """As `pretraining.training_batch.LabelledPictures`; all are right hands."""
 
     image: Tensor
@@ -113,7 +113,7 @@ class DatasetHands:
                 self.failed[sample.name] = reason = str(error)
         raise InputError(f"{TRIES} photos of {group[0].subject} could not be read, the last: {reason}")
 
-    def _pictures(self, hand: HandModel, pictures: list[Picture]) -> _Pictures:
+    def _pictures(self, hand: HandModel, pictures: list[Picture]) -> DatasetPictures:
         poses = [in_camera(hand, picture) for picture in pictures]
 
         def stacked(tensors: list[Tensor]) -> Tensor:
@@ -127,7 +127,7 @@ class DatasetHands:
             if picture.mask is not None:
                 mask[k] = picture.mask.to(mask)
         left = torch.zeros(len(image), dtype=torch.int64, device=self.device)
-        return _Pictures(image, mask, mask, angles, orientation, translation, shape, K, left)
+        return DatasetPictures(image, mask, mask, angles, orientation, translation, shape, K, left)
 
     def _silhouettes(self, hand: HandModel, pose: tuple[Tensor, ...], K: Tensor, size: int) -> Tensor:
         posed = pose_hands(hand, *pose).posed

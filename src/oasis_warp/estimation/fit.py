@@ -14,7 +14,7 @@ from oasis_warp.core.hand_model import KNUCKLES
 from oasis_warp.estimation.fit_problem import FitState, FitTarget, Linearized
 from oasis_warp.estimation.landmarks import BONES
 from oasis_warp.estimation.least_squares import Damping, QuadraticModel, cauchy, charbonnier, minimize
-from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, unit
+from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, rotation_between, unit
 
 _PALM = [0, *KNUCKLES]
 _DAMPING = Damping(start=1e-2, grow=4, shrink=3, least=1e-6, floor=1e-6)
@@ -333,9 +333,3 @@ def cross_matrices(vectors: np.ndarray) -> np.ndarray:
     for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         matrices[:, b, a], matrices[:, a, b] = vectors[:, c], -vectors[:, c]
     return matrices
-
-
-def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Rotation that carries the points `a` best onto `b`, after centring (Kabsch 1976)."""
-    u, _, vt = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
-    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 
 from oasis_warp.core.errors import InputError, shortened
-from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
 from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.pickle_reader import MOST_BYTES, read_pickle
 from oasis_warp.core.types import Camera, HandPose, Landmarks, Photo, Side
-from oasis_warp.hand.mano import N_SHAPES, ManoPose, rotation_vectors
+from oasis_warp.hand.mano import ManoPose, rotation_vectors
 from oasis_warp.hand.mano_hand import hand_pose_of_mano
 
 SUFFIXES = (".npz", ".pkl", ".pickle")
@@ -40,8 +40,8 @@ _NAMES = {
     "centre": ("centre", "principal_point"),
     "points": ("pred_keypoints_3d", "keypoints_3d", "joints"),
 }
-_SIZES = {"right": 1, "betas": N_SHAPES, "place": 3, "focal": 1, "weak": 3, "box_center": 2, "box_size": 1, "centre": 2,
-          "points": 63}  # fmt: skip
+_SIZES = {"right": 1, "betas": MANO_SHAPES, "place": 3, "focal": 1, "weak": 3, "box_center": 2, "box_size": 1,
+          "centre": 2, "points": 63}  # fmt: skip
 Which = Literal["left", "right", "largest"] | int
 
 

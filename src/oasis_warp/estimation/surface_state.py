@@ -5,10 +5,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from oasis_warp.estimation.fit import rotation_between
 from oasis_warp.estimation.fit_problem import FitState
 from oasis_warp.estimation.least_squares import Damping, QuadraticModel, charbonnier, minimize
-from oasis_warp.hand.kinematics import HandKinematics
+from oasis_warp.hand.kinematics import HandKinematics, rotation_between
 
 _STRIDE = 16
 """Every so many vertices are compared."""

@@ -16,21 +16,19 @@ class Published(NamedTuple):
     ssim: float
     lpips: float
     """100 times LPIPS."""
-    photos: str = "1"
-    """Pictures of the person that the method was trained on; "-" for none."""
 
 
 RESULTS = {
     "interhand": (
-        Published("SelfRecon", 26.38, 0.879, 14.21, "11,757"),
-        Published("HumanNeRF", 27.64, 0.884, 11.45, "11,757"),
-        Published("HandAvatar", 28.23, 0.894, 10.35, "11,757"),
+        Published("SelfRecon", 26.38, 0.879, 14.21),
+        Published("HumanNeRF", 27.64, 0.884, 11.45),
+        Published("HandAvatar", 28.23, 0.894, 10.35),
         Published("HARP", 19.82, 0.761, 22.49),
         Published("Handy", 25.56, 0.794, 14.98),
         Published("HandAvatar, one photo", 23.79, 0.820, 17.78),
         Published("OHTA", 26.11, 0.864, 12.93),
-        Published("LHM, no fine-tuning", 24.45, 0.901, 13.96, "-"),
-        Published("OASIS, no fine-tuning", 26.48, 0.950, 11.74, "-"),
+        Published("LHM, no fine-tuning", 24.45, 0.901, 13.96),
+        Published("OASIS, no fine-tuning", 26.48, 0.950, 11.74),
         Published("OASIS", 27.38, 0.956, 11.45),
     ),
     "hanco": (

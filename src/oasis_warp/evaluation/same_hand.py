@@ -226,7 +226,7 @@ def evaluate_photos(
         file = out / HANDS / f"{name}.json"
         if _kept(file) is None:
             _measure_hand(name, paths, priors, methods, config, file, progress)
-    found = [kept for name in hands if (kept := _kept(out / HANDS / f"{name}.json")) is not None]
+    found = [json.loads((out / HANDS / f"{name}.json").read_bytes()) for name in hands]
     pairs = [pair for hand in found for pair in hand["pairs"]]
     if not pairs:
         raise InputError(f"{folder}: of no hand are there two photos that avatars can be made of; see {out / HANDS}.")

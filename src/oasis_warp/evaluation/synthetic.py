@@ -129,7 +129,7 @@ def evaluate_people(
         progress("evaluation", done, len(everybody))
         next(measured)
     progress("evaluation", len(everybody), len(everybody))
-    records = [record for who in everybody for record in _kept(folder, *who) or ()]
+    records = [record for who in everybody for record in json.loads(_person_file(folder, *who).read_bytes())]
     strips = [
         path for group in config.groups for k in range(min(SHOWN, config.people))
         if (path := _person_file(folder, group, FIRST_PERSON + k).with_suffix(".png")).exists()

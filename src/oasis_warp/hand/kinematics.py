@@ -201,3 +201,9 @@ class HandKinematics:
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors at length one; a zero vector stays."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Rotation that carries the points `a` best onto `b`, after centring (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
+    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt

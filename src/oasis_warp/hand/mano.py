@@ -15,10 +15,12 @@ from scipy import sparse
 
 from oasis_warp.core import surface
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.hand_model import MANO_SHAPES
 from oasis_warp.core.pickle_reader import read_pickle
+from oasis_warp.core.rotation import from_vector
 from oasis_warp.core.types import Side
 
-N_VERTICES, N_FACES, N_SHAPES = 778, 1538, 10
+N_VERTICES, N_FACES = 778, 1538
 N_HD_VERTICES, N_HD_FACES = 12_337, 24_608
 N_RIM = 16
 PARENTS = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
@@ -106,7 +108,7 @@ def _read(folder: Path, side: Side) -> ManoModel:
     if not isinstance(data, dict):
         raise InputError(f"{path}: expected MANO's model, a dict of arrays, got a {type(data).__name__}; download it.")
     shapes = {
-        "v_template": (N_VERTICES, 3), "shapedirs": (N_VERTICES, 3, N_SHAPES), "posedirs": (N_VERTICES, 3, 135),
+        "v_template": (N_VERTICES, 3), "shapedirs": (N_VERTICES, 3, MANO_SHAPES), "posedirs": (N_VERTICES, 3, 135),
         "weights": (N_VERTICES, 16), "J_regressor": (16, N_VERTICES), "hands_components": (45, 45),
         "hands_mean": (45,),
     }  # fmt: skip
@@ -170,7 +172,7 @@ def hand_pose(model: ManoModel, values: np.ndarray, *, flat_hand_mean: bool) -> 
 
 def rotations(vectors: np.ndarray) -> np.ndarray:
     """Rotations by axis times angle, [N, 3] -> [N, 3, 3] (Rodrigues)."""
-    return np.stack([cv2.Rodrigues(vector)[0] for vector in np.asarray(vectors, np.float64).reshape(-1, 3)])
+    return from_vector(torch.from_numpy(np.asarray(vectors, np.float64).reshape(-1, 3))).numpy()
 
 
 def rotation_vectors(matrices: np.ndarray) -> np.ndarray:
@@ -241,7 +243,7 @@ def mano_hd(model: ManoModel) -> ManoModel:
     template, shapes, poses, weights = np.split(values, np.cumsum([row.shape[1] for row in rows])[:-1], axis=1)
     smooth = surface.smooth_over_mesh(torch.from_numpy(template.copy()), surface.mesh_edges(faces), SMOOTHING_PASSES)
     return ManoModel(**vars(model) | {
-        "template": smooth.numpy(), "faces": faces.numpy(), "shape_basis": shapes.reshape(-1, 3, N_SHAPES),
+        "template": smooth.numpy(), "faces": faces.numpy(), "shape_basis": shapes.reshape(-1, 3, MANO_SHAPES),
         "pose_basis": poses.reshape(-1, 3, 135), "weights": weights,
     })  # fmt: skip
 

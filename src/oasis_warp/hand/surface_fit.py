@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from oasis_warp.hand.kinematics import HandKinematics, PosedJoints
+from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, rotation_between
 
 ROUGH_ANGLE, ROUGH_SHAPE = 1.0, 3.0
 """Sigmas of angles [rad] and shape coefficients: weak, to hold what points do not tell."""
@@ -37,12 +37,9 @@ class PlacedHand:
 
 
 def align(points: np.ndarray, to: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rotation and translation that bring points nearest to others, row by row (Kabsch 1976)."""
-    middle, goal = points.mean(0), to.mean(0)
-    u, _, vt = np.linalg.svd((points - middle).T @ (to - goal))
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-    rotation = vt.T @ flip @ u.T
-    return rotation, goal - rotation @ middle
+    """The rotation and translation that bring points nearest to others, row by row."""
+    rotation = rotation_between(points, to)
+    return rotation, to.mean(0) - rotation @ points.mean(0)
 
 
 def step_to_points(
