@@ -75,11 +75,13 @@ def read_gltf(path):
 def accessor(document, binary, index):
     entry = document["accessors"][index]
     view = document["bufferViews"][entry["bufferView"]]
-    dtype = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}[entry["componentType"]]
+    dtype = {5120: "i1", 5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}[entry["componentType"]]
     width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}[entry["type"]]
-    values = np.frombuffer(binary, dtype, entry["count"] * width, view["byteOffset"])
-    assert values.nbytes == view["byteLength"]
-    return values.reshape(entry["count"], width)
+    stride = view.get("byteStride", width * np.dtype(dtype).itemsize)
+    assert entry["count"] * stride == view["byteLength"]
+    rows = np.frombuffer(binary, "u1", view["byteLength"], view["byteOffset"]).reshape(-1, stride)
+    values = np.ascontiguousarray(rows[:, : width * np.dtype(dtype).itemsize]).view(dtype)
+    return np.maximum(values / 127, -1) if dtype == "i1" else values  # signed bytes are normalised
 
 
 def read_splat_gltf(path):

@@ -93,9 +93,14 @@ def test_what_the_page_reads_poses_the_same_surface(avatar, pages, name):
         torch.tensor(angles).view(15, 3), torch.tensor(facts["orientation"]).view(3, 3),
         torch.tensor(facts["translation"]), part["joints"].view(16, 3), part["axes"].view(16, 3, 3), facts["parents"],
     )  # fmt: skip
-    correctives = part["correctives"].view(-1, *vertices.shape).permute(1, 2, 0).contiguous()
+    correctives = part["correctives"].view(-1, *vertices.shape).permute(1, 2, 0) * part["reach"]
     posed = skin(
-        vertices, None, part["weights"].view(-1, 16), bones.transforms, displacements=correctives, strengths=bones.bends
+        vertices,
+        None,
+        part["weights"].view(-1, 16),
+        bones.transforms,
+        displacements=correctives.contiguous(),
+        strengths=bones.bends,
     )
     expected = avatar.mesh(in_pose(avatar, name)).vertices
     assert (posed.means - expected).abs().max() < 2e-5  # 16 bit for weights and correctives
@@ -198,9 +203,11 @@ def run_script(page, jobs, folder):
 def test_the_pages_script_poses_a_hand_of_mano_with_all_of_its_correctives(mano, tmp_path):
     crop, truth, pose = crop_of(mano, torch.full((len(mano.template), 3), 0.5), size=64)
     avatar = avatar_of(mano, truth, pose, crop.camera)
-    run_script(page_html(avatar, "MANO"), [{"pose": "fist", "look": "photo"}], tmp_path)
+    page = page_html(avatar, "MANO")
+    assert len(page) <= LARGEST  # 16 bits a corrective made it 15 MB
+    run_script(page, [{"pose": "fist", "look": "photo"}], tmp_path)
     means = np.fromfile(tmp_path / "means0", "<f4").reshape(-1, 3)
-    assert np.abs(means - avatar.pose(in_pose(avatar, "fist")).means.numpy()).max() < 3e-5
+    assert np.abs(means - avatar.pose(in_pose(avatar, "fist")).means.numpy()).max() < 1e-4
 
 
 @pytest.mark.slow

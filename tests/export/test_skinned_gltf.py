@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from synthetic import avatar_of, crop_of
 from tests.export.gltf_player import joint_matrices, play, pose_of_clip
 from tests.export.splat_readers import accessor, read_gltf
 
@@ -47,6 +48,27 @@ def test_a_clip_ends_in_the_pose_it_is_named_after(files, side, name):
     at = {document["nodes"][k]["name"]: matrix[:3, 3] for k, matrix in world.items()}
     np.testing.assert_allclose(at["pinky-finger-phalanx-distal"], joints[9], atol=1e-6)
     np.testing.assert_allclose(at["thumb-tip"], tips[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_weights_of_correctives_stay_within_what_programs_allow(files, side):
+    """Blender holds shape keys to 0 to 1: a fist came out too thin."""
+    _, document, binary = files[side]
+    for name in POSE_NAMES[1:]:
+        weights = pose_of_clip(document, binary, name)[1]
+        assert -1e-6 <= min(weights) and max(weights) <= 1 + 1e-6, name
+
+
+@pytest.mark.slow
+def test_a_hand_of_mano_has_all_of_its_correctives_in_few_bytes(mano, tmp_path):
+    crop, truth, pose = crop_of(mano, torch.full((len(mano.template), 3), 0.5), size=64)
+    avatar = avatar_of(mano, truth, pose, crop.camera)
+    export_avatar(avatar, tmp_path / "hand.glb")
+    assert (tmp_path / "hand.glb").stat().st_size < 9e6  # 23 MB as floats
+    document, binary = read_gltf(tmp_path / "hand.glb")
+    points = play(document, binary, *pose_of_clip(document, binary, "fist"))
+    expected = surface(avatar, named_pose(mano, "fist"))[0][topology(avatar).vertex]
+    assert np.abs(points[:-1] - expected).max() < 5e-5
 
 
 def test_there_is_a_clip_for_every_pose(files):

@@ -33,20 +33,25 @@ class GltfBuffer:
         """Append a row for each element, of a type in `COMPONENTS`; the index of its accessor.
 
         Args:
-            values: Rows; little-endian.
+            values: Rows; little-endian. Those of a VEC3 of bytes take four, since vertices begin at whole words.
             kind: What a row is.
             target: VERTICES or INDICES, for what a mesh draws.
-            normalized: Whole numbers stand for [0, 1].
+            normalized: Whole numbers stand for [0, 1], or signed ones for [-1, 1].
         """
+        stored = values
+        if kind == "VEC3" and values.itemsize == 1:
+            stored = np.pad(values, ((0, 0), (0, 1)))
         accessor: dict[str, Any] = {
-            "bufferView": self.add_bytes(np.ascontiguousarray(values).tobytes(), target),
+            "bufferView": self.add_bytes(np.ascontiguousarray(stored).tobytes(), target),
             "componentType": COMPONENTS[values.dtype.str[1:]],
             "count": values.size // WIDTHS[kind],
             "type": kind,
         }
         if normalized:
             accessor["normalized"] = True
-        if kind != "MAT4" and not normalized:
+        if stored is not values:
+            self.views[-1]["byteStride"] = 4
+        if kind != "MAT4" and (not normalized or kind == "VEC3"):
             rows = values.reshape(-1, WIDTHS[kind])
             accessor |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
         self.accessors.append(accessor)

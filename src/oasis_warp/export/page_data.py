@@ -40,6 +40,11 @@ WALK_FRAMES, WALK_SECONDS = 12, 7.5
 """Frames from one of them to the next, which the page blends, and length of the motion."""
 
 
+MOST_SHORTS, FEW_STEPS = 45, 63
+"""Correctives that have 16 bits: three for each joint. MANO's 135 have so many steps to either side, to within .1 mm in
+all: 16 bits would fill 13 MB of the page."""
+
+
 class Packed(NamedTuple):
     """An array as whole numbers: value = number * step."""
 
@@ -182,11 +187,14 @@ def _arrays(avatar: Avatar, light: SurfaceLight) -> dict[str, np.ndarray | Packe
     sky, mesh = sky_directions(torch.device("cpu")), sky_mesh(torch.device("cpu"))
     even = torch.ones(3) if own_light is None else own_light.light.even.cpu() ** (1 / GAMMA)
     correctives = hand.corrective_basis.permute(2, 0, 1)
+    reach = correctives.abs().amax((1, 2))
+    kind, steps = ("i1", FEW_STEPS) if len(correctives) > MOST_SHORTS else ("i2", np.iinfo("i2").max)
     arrays: dict[str, np.ndarray | Packed] = {
         "vertices": _numpy(rest.vertices, "f4"),
         "faces": _numpy(hand.faces, "u2"),
         "weights": _weights(hand.weights),
-        "correctives": _pack(correctives, "i2"),
+        "correctives": _pack(correctives / reach.clamp_min(1e-9)[:, None, None], kind, np.iinfo(kind).max / steps),
+        "reach": _numpy(reach, "f4"),
         "joints": _numpy(rest.joints, "f4"),
         "axes": _numpy(hand.pose_axes, "f4"),
         "normals": _pack(mirror_points(normals) if avatar.side == "left" else normals, "i2", 1.0),

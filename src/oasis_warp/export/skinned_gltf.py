@@ -18,11 +18,12 @@ from oasis_warp.export.gltf import INDICES, VERTICES, GltfBuffer, write_gltf
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.skinned_mesh import SkinnedMesh, skinned_mesh
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
-from oasis_warp.hand.skinning import corrective_coefficients
 from oasis_warp.hand.webxr_rig import Rig, local_bind, local_quats
 
 ROUGHNESS = 0.5
 """Of the material: between dry and oily skin, whose highlight glTF's model has no more parameters for."""
+MOST_FLOATS = 45
+"""Correctives that are written as floats: three for each joint."""
 KEYS, SECONDS = 8, 0.5
 """Steps and length of the way from one pose to the next; it eases in and out by half a cosine."""
 
@@ -44,7 +45,7 @@ def write_skinned_gltf(request: ExportRequest, path: Path) -> None:
     nodes, bends = _joint_nodes(made.rig, first), [0.0] * len(made.correctives)
     if request.pose is not None:
         angles = request.pose.angles.to(made.points)
-        bends = corrective_coefficients(made.hand, angles).tolist()
+        bends = made.corrective_weights(angles).tolist()
         quats = local_quats(made.rig, made.hand, made.rest, angles[None], request.avatar.side)[0]
         for node, quat in zip(nodes, quats, strict=True):
             node["rotation"] = _xyzw(quat).tolist()
@@ -63,6 +64,9 @@ def write_skinned_gltf(request: ExportRequest, path: Path) -> None:
         **_material(buffer, texture.bake_texture(request, light, texture.SIZE), unlit=light == "baked"),
         "animations": _clips(buffer, made, request.avatar.side),
     }
+    if _packs(made):
+        document.setdefault("extensionsUsed", []).append("KHR_mesh_quantization")
+        document["extensionsRequired"] = ["KHR_mesh_quantization"]
     write_gltf(path, document, buffer)
 
 
@@ -86,9 +90,20 @@ def _primitive(buffer: GltfBuffer, made: SkinnedMesh) -> dict[str, Any]:
         part = slice(4 * k, 4 * k + 4)
         attributes[f"JOINTS_{k}"] = buffer.add(joints[:, part], "VEC4", target=VERTICES)
         attributes[f"WEIGHTS_{k}"] = buffer.add(weights[:, part], "VEC4", target=VERTICES)
-    targets = [{"POSITION": buffer.add(_array(move), "VEC3", target=VERTICES)} for move in made.correctives]
+    targets = [{"POSITION": _displacements(buffer, move, as_bytes=_packs(made))} for move in made.correctives]
     indices = buffer.add(made.mesh.faces.flatten().numpy().astype("<u4"), "SCALAR", target=INDICES)
     return {"attributes": attributes, "indices": indices, "material": 0, "targets": targets}
+
+
+def _packs(made: SkinnedMesh) -> bool:
+    """Whether correctives are bytes: MANO's 135 would take 21 MB."""
+    return len(made.correctives) > MOST_FLOATS
+
+
+def _displacements(buffer: GltfBuffer, move: Tensor, *, as_bytes: bool) -> int:
+    """Accessor of a corrective; as bytes in 127ths of a metre (KHR_mesh_quantization)."""
+    moves = np.rint(127 * _array(move)).astype("i1") if as_bytes else _array(move)
+    return buffer.add(moves, "VEC3", target=VERTICES, normalized=as_bytes)
 
 
 def _joint_nodes(rig: Rig, first: int) -> list[dict[str, Any]]:
@@ -143,7 +158,7 @@ def _clips(buffer: GltfBuffer, made: SkinnedMesh, side: Side) -> list[dict[str, 
     for name, angles in clip_angles(hand).items():
         times = buffer.add(np.arange(len(angles), dtype="<f4") * np.float32(SECONDS / KEYS), "SCALAR")
         quats = _array(_xyzw(local_quats(rig, hand, made.rest, angles, side)))
-        bends = _array(torch.stack([corrective_coefficients(hand, frame) for frame in angles]))
+        bends = _array(made.corrective_weights(angles))
         outputs = [buffer.add(np.ascontiguousarray(quats[:, j]), "VEC4") for j in moving]
         targets = [{"node": 2 + j, "path": "rotation"} for j in moving] + [{"node": 1, "path": "weights"}]
         outputs.append(buffer.add(bends.ravel(), "SCALAR"))

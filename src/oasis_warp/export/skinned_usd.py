@@ -11,7 +11,6 @@ from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.skinned_gltf import KEYS, ROUGHNESS, SECONDS, clip_angles
 from oasis_warp.export.skinned_mesh import SkinnedMesh, skinned_mesh
 from oasis_warp.export.usd_stage import new_stage, quatf, usd, vec3f, write_stage
-from oasis_warp.hand.skinning import corrective_coefficients
 from oasis_warp.hand.webxr_rig import Rig, local_bind, local_quats
 
 
@@ -44,7 +43,7 @@ def write_skinned_usd(request: ExportRequest, path: Path) -> None:
     animation.CreateScalesAttr(usd(path, "Vt").Vec3hArray(len(joints), usd(path, "Gf").Vec3h(1, 1, 1)))
     clip = clip_angles(made.hand)["poses"] if request.pose is None else request.pose.angles[None].to(made.points)
     quats = local_quats(made.rig, made.hand, made.rest, clip, request.avatar.side).numpy()
-    weights = torch.stack([corrective_coefficients(made.hand, angles) for angles in clip]).tolist()
+    weights = made.corrective_weights(clip).tolist()
     rotations, bends = animation.CreateRotationsAttr(), animation.CreateBlendShapeWeightsAttr()
     for frame in range(len(clip)):
         time = Usd.TimeCode(frame) if len(clip) > 1 else Usd.TimeCode.Default()

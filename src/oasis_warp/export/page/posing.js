@@ -7,12 +7,12 @@ const DAMPING = 0.5e-6; // added to both areas of a ratio, over the longest rest
 const MOST_GROWTH = 1e4; // limits of area ratios
 
 function makeBody(data) {
-  const { vertices, faces, weights, correctives } = data.arrays;
+  const { vertices, faces, weights, correctives, reach } = data.arrays;
   const body = {
     data, faces, rest: vertices, nVertices: vertices.length / 3, nFaces: faces.length / 3, nBones: data.parents.length,
   };
   body.skin = nonZero(weights, body.nVertices, body.nBones);
-  body.bends = nonZeroTriples(correctives, body.nVertices);
+  body.bends = nonZeroTriples(correctives, reach, body.nVertices);
   body.planes = restPlanes(body);
   Object.assign(body, facesAround(body));
   body.posed = new Float32Array(3 * body.nVertices);
@@ -39,14 +39,14 @@ function nonZero(matrix, rows, width) {
   return { start, columns: Uint8Array.from(columns), values: Float32Array.from(values) };
 }
 
-// For each corrective the vertices that it moves, and how far: correctives are [C, V, 3].
-function nonZeroTriples(correctives, rows) {
+// For each corrective the vertices that it moves, and how far: correctives are [C, V, 3], in units of reach, [C].
+function nonZeroTriples(correctives, reach, rows) {
   const out = [];
   for (let first = 0; first < correctives.length; first += 3 * rows) {
-    const index = [], moves = [];
+    const index = [], moves = [], unit = reach[out.length];
     for (let v = 0; v < rows; v++) {
       const x = correctives[first + 3 * v], y = correctives[first + 3 * v + 1], z = correctives[first + 3 * v + 2];
-      if (x || y || z) index.push(v), moves.push(x, y, z);
+      if (x || y || z) index.push(v), moves.push(x * unit, y * unit, z * unit);
     }
     out.push({ index: Uint32Array.from(index), moves: Float32Array.from(moves) });
   }
