@@ -13,10 +13,11 @@ from disk import full_disk
 
 from oasis_warp.assets import asset
 from oasis_warp.cli import main
-from oasis_warp.cli.app import is_out_of_memory
+from oasis_warp.cli.app import what_ran_out
 from oasis_warp.cli.console import plain_console
 from oasis_warp.cli.report import measures_table
 from oasis_warp.hand_avatar import Avatar
+from oasis_warp.ops._runtime import launch
 
 CLOSED = """
 import os, sys
@@ -89,8 +90,33 @@ def test_full_memory_is_told_in_one_sentence(avatar_file, tmp_path, monkeypatch,
     monkeypatch.setattr(render, "orbit_camera", fail)
     assert main(["render", str(avatar_file), "-o", str(tmp_path / "x.png")]) == 2
     assert capsys.readouterr().err == "oasis: the memory of cpu is full; give smaller sizes, or fewer at once.\n"
-    assert is_out_of_memory(MemoryError()) and is_out_of_memory(torch.OutOfMemoryError("CUDA"))
-    assert not is_out_of_memory(RuntimeError("a bug"))
+    assert what_ran_out(MemoryError()) == what_ran_out(torch.OutOfMemoryError("CUDA error: out of memory"))
+    assert what_ran_out(RuntimeError("a bug")) is None
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (RuntimeError("blend: CUDA error 719: unspecified launch failure"), "cpu failed in the middle of the work"),
+        (OSError(24, "Too many open files"), "too many files are open"),
+        (OSError(28, "No space left on device"), "a disk is full"),
+    ],
+)
+def test_a_launch_that_fails_in_the_middle_is_told_and_leaves_nothing(avatar_file, monkeypatch, capsys, error, said):
+    """A GPU that is lost, no more descriptors, no room for a kernel: they ended in tracebacks."""
+    left, run_shared = [9], launch.run_shared  # of the launches of a clip, more than one frame's
+
+    def run(*arguments):
+        left[0] -= 1
+        if left[0] < 0:
+            raise RuntimeError("a package wraps it") from error
+        return run_shared(*arguments)
+
+    monkeypatch.setattr(launch, "run_shared", run)
+    assert main(["animate", str(avatar_file), "-o", str(avatar_file.with_name("x.gif")), "--size", "16"]) == 2
+    said_last = capsys.readouterr().err.splitlines()[-1]
+    assert said_last.startswith(f"oasis: {said}") and said_last.endswith(".") and left[0] == -1
+    assert [file.name for file in avatar_file.parent.iterdir()] == [avatar_file.name]
 
 
 SMALL = ["--size", "64", "--steps", "2", "--prior", "none"]

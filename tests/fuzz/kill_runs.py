@@ -1,323 +1,243 @@
-"""Stop commands at random moments: `python tests/fuzz/kill_runs.py edit export --count 60 --seed 1`.
+"""Stop commands at random moments: `python3 tests/fuzz/kill_runs.py --jobs 12 --seconds 300 --out kills.jsonl`.
 
-Each run is a fork of this process, so that none of it is imports, and ends at a moment of its own, spread over its
-whole length: by SIGKILL, by SIGTERM or Ctrl-C, or because no file may grow beyond a random size, as on a full disk.
-After that the output of most commands must be complete or absent as far as its final name goes, and after one whole run
-at the end nothing else may be left beside it. `pretrain` and `synthesize` are started again until they end, and must
-leave the same bits as a run that nothing stopped; photos given to `serve` must all become avatars. Prints a line of
-JSON a command.
+Each run is a fork of this process, so that none of it is imports. It ends at a moment of its own, spread over its whole
+length, by SIGKILL, SIGTERM or Ctrl-C; or no file may grow beyond a random size, as on a full disk, or few files may be
+open, or little memory is left, or a second process writes the same output and the first one is killed. After that the
+output of most commands must be complete or absent as far as its final name goes, and after one whole run at the end
+nothing else may be left beside it. `pretrain`, `synthesize` and `batch` are started again until they end, and must
+leave the same bits as a run that nothing stopped; photos given to `serve` must all become avatars. "files" is a process
+that does nothing but write.
+
+Fault k of a seed is always the same. Each adds a line of JSON to --out, and those that stand there are not done again:
+the same command goes on. In the end a line of JSON counts them all; the exit code is 1 if one was not survived. It
+needs no more than the commands do: `batch` runs without Dask, in one process; `kill_batch.py` does the rest of it.
 """
 
 import argparse
 import collections
-import contextlib
-import hashlib
 import importlib
 import json
+import multiprocessing
 import os
 import random
 import resource
 import shutil
-import signal
-import subprocess
 import sys
 import tempfile
 import time
-import traceback
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
-import cv2
-import torch
-from safetensors import safe_open
+TOP = Path(__file__).parents[2]
+PATHS = [str(TOP / "src"), str(TOP / "kernels"), str(TOP / "tests")]
+sys.path[:0] = PATHS
+os.environ["PYTHONPATH"] = os.pathsep.join([*PATHS, os.environ.get("PYTHONPATH", "")])  # of the processes of `serve`
+os.environ["OMP_NUM_THREADS"] = "1"
 
-from oasis_warp.cli import jobs, main
-from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
-from oasis_warp.data.output_files import output_folder
+import cv2  # noqa: E402 - the paths come first
+import torch  # noqa: E402
+from fuzz import victims  # noqa: E402
+from fuzz.victims import COMMANDS, OF_A_PHOTO, SIGNALS  # noqa: E402
 
-PHOTO = Path(__file__).parents[2] / "src" / "oasis_warp" / "assets" / "photos" / "palm_open_left_02.png"
-SMALL = ["--size", "64", "--steps", "2"]
-TRAINING = ["--hands", "1", "--views", "1", "--people", "1", "--size", "32", "--steps", "6", "--workers", "0",
-            "--device", "cpu", "--precision", "float32"]  # fmt: skip
-FAULTS = {"SIGKILL": 5, "SIGTERM": 2, "SIGINT": 2, "full disk": 1}
-"""What ends runs, with weights."""
-PATIENCE = 300.0
-"""Seconds in which a run must end after Ctrl-C, and one that nothing stops."""
-TRACEBACK = 70
-"""Exit code of a run that ended with a traceback."""
-
-
-class Command(NamedTuple):
-    """A command that is stopped."""
-
-    arguments: Callable[[Path, Path], list[str]]
-    """Of the folder of inputs and that of outputs."""
-    whole: frozenset[str]
-    """Names of its complete output."""
-    goes_on: bool = False
-    """Whether it goes on where it was stopped; then these files must have the same bits."""
+FAULTS = {"SIGKILL": 12, "SIGTERM": 3, "SIGINT": 3, "full disk": 2, "few files": 2, "little memory": 1, "two": 1}
+"""What ends runs, with weights: half are SIGKILL."""
+FEW_FILES, LITTLE_MEMORY = 24, 1 << 30
+"""Files that may be opened more than those that are, at most, and bytes of address space."""
+FILES = "files"
+N_FILES = 20
+"""Kills of the writer for one fault: each takes 30 ms."""
 
 
-def on_avatar(command: str, ending: str, *more: str) -> Command:
-    """A command that makes one file of an avatar."""
+class Whole:
+    """What a command does when nothing stops it."""
 
-    def arguments(inputs: Path, out: Path) -> list[str]:
-        return [command, str(inputs / "made" / "avatar.safetensors"), "-o", str(out / f"out{ending}"), *more]
-
-    return Command(arguments, frozenset({f"out{ending}"}))
-
-
-COMMANDS = {
-    "reconstruct": Command(
-        lambda inputs, out: ["reconstruct", str(PHOTO), "-o", str(out), *SMALL],
-        frozenset({"avatar.safetensors", "summary.png", "quality.png", "turntable.mp4", "report.json"}),
-    ),
-    "render": on_avatar("render", ".png", "--size", "128"),
-    "animate": on_avatar("animate", ".gif", "--size", "64"),
-    "export": on_avatar("export", ".glb"),
-    "edit": Command(
-        lambda inputs, out: [
-            "edit", str(inputs / "made" / "avatar.safetensors"), str(inputs / "painted.png"), "--photo", str(PHOTO),
-            *SMALL, "--overwrite", "-o", str(out / "out.safetensors"),
-        ],
-        frozenset({"out.safetensors", "out.png", "out.json"}),
-    ),
-    "pretrain": Command(
-        lambda inputs, out: ["pretrain", str(out), *TRAINING], frozenset({"network.safetensors"}), goes_on=True
-    ),
-    "synthesize": Command(
-        lambda inputs, out: ["synthesize", str(out), "--count", "80", "--size", "32"],
-        frozenset({"synthetic-000000.tar", "synthetic-000001.tar"}), goes_on=True,
-    ),
-}  # fmt: skip
-SERVED = f"from sys import argv, exit; from oasis_warp.cli import main; exit(main([*argv[1:], *{SMALL}]))"
-"""What `serve` runs for each photo here."""
+    def __init__(self, name: str, inputs: Path) -> None:
+        out = inputs / f"whole_{name}"
+        victims.run_whole(name, inputs, out)  # builds kernels
+        shutil.rmtree(out)
+        self.seconds = victims.run_whole(name, inputs, out)
+        self.digests = victims.digests(out, COMMANDS[name].whole)
+        assert len(self.digests) >= len(COMMANDS[name].whole) or not COMMANDS[name].goes_on, os.listdir(out)
+        self.largest = max(path.stat().st_size for path in out.rglob("*") if path.is_file())
 
 
-def launch(arguments: Sequence[str], n_bytes: int | None = None) -> int:
-    """Run a command in a fork of this process, in which files may have `n_bytes`; the number of the process."""
-    child = os.fork()
-    if child:
-        return child
-    code, shown = TRACEBACK, os.fdopen(os.dup(2), "w")
-    try:
-        nowhere = os.open(os.devnull, os.O_RDWR)
-        for stream in (0, 1, 2):
-            os.dup2(nowhere, stream)
-        if n_bytes is not None:
-            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-            resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, n_bytes))
-        code = main(arguments)
-    except KeyboardInterrupt:  # before the command has begun
-        code = INTERRUPTED
-    except Exception:
-        traceback.print_exc(file=shown)
-    finally:
-        shown.flush()
-        os._exit(code)
+def choose_fault(seed: int, number: int, names: list[str]) -> tuple[str, str, random.Random]:
+    """The command and the fault of a number, and what its moment is drawn from."""
+    rng = random.Random(f"{seed} {number}")
+    (name,) = rng.choices(names, [1 if name == FILES else COMMANDS[name].weight for name in names])
+    (fault,) = rng.choices(list(FAULTS), list(FAULTS.values()))
+    if name == FILES:
+        fault = "SIGKILL"
+    if name == "serve" and fault not in SIGNALS:
+        fault = "SIGTERM"
+    return name, fault, rng
 
 
-def ended(process: int, seconds: float) -> int | None:
-    """The exit code of a process, negative for a signal; None if it still runs after so many seconds."""
-    end = time.monotonic() + seconds
-    while True:
-        found, status = os.waitpid(process, os.WNOHANG)
-        if found:
-            return os.waitstatus_to_exitcode(status)
-        if time.monotonic() > end:
-            return None
-        time.sleep(0.002)
+def limits_of(fault: str, whole: Whole, rng: random.Random) -> dict[int, int]:
+    """Limits of resources that a run meets at random moments."""
+    if fault == "full disk":
+        return {resource.RLIMIT_FSIZE: rng.randrange(whole.largest)}
+    if fault == "few files":
+        return {resource.RLIMIT_NOFILE: len(os.listdir("/proc/self/fd")) + rng.randrange(FEW_FILES)}
+    if fault == "little memory":
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        return {resource.RLIMIT_AS: pages * os.sysconf("SC_PAGE_SIZE") + rng.randrange(LITTLE_MEMORY)}
+    return {}
 
 
-def stop(process: int, fault: str, seconds: float) -> str:
-    """Let a process run for so long, then stop it; "stopped", "ended", or what was wrong with its end."""
-    code = ended(process, PATIENCE if fault == "full disk" else seconds)
-    if code is None and fault != "full disk":
-        os.kill(process, getattr(signal, fault))
-        code = ended(process, PATIENCE)
-        if code in (-signal.SIGKILL, -signal.SIGTERM, INTERRUPTED):
-            return "stopped"
-    if code is None:
-        os.kill(process, signal.SIGKILL)
-        os.waitpid(process, 0)
-        return "hang"
-    if code == BAD_INPUT and fault == "full disk":
-        return "stopped"
-    return "ended" if code == 0 else f"exit code {code} after {fault}"
+def stop_once(name: str, fault: str, whole: Whole, inputs: Path, out: Path, rng: random.Random) -> dict[str, Any]:
+    """Start a command, stop it and look at what it left."""
+    command, moment = COMMANDS[name], round(rng.uniform(0, whole.seconds), 3)
+    if not command.goes_on or victims.digests(out, command.whole) == whole.digests:
+        for path in out.glob("[!.]*"):  # each run meets what those before left hidden, and no output
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    if name == "serve":
+        victims.send_photo(out)
+    arguments = command.arguments(inputs, out)
+    second = victims.launch(arguments) if fault == "two" else None
+    process = victims.launch(arguments, limits_of(fault, whole, rng))
+    how = victims.stop(process, "SIGKILL" if second else fault, moment)
+    wrong = "" if how in ("stopped", "ended") else how
+    if second is not None and (code := victims.ended(second, victims.PATIENCE)) != 0:
+        wrong = f"exit code {code} beside another process"
+    if name == "serve":
+        found = victims.finish_photo(out)
+        wrong = wrong or ("" if found == "complete" else found)
+    elif command.goes_on:
+        now = victims.digests(out, command.whole)
+        found = "goes on" if now.items() < whole.digests.items() else "other bits"
+        found = "same bits" if now == whole.digests else found
+        if found == "other bits" or (found == "goes on" and how == "ended"):
+            wrong = wrong or found
+    else:
+        found = victims.check(out, command.whole)
+        wrong = wrong or ("" if found in ("complete", "absent") else found)
+    return {"after": moment if fault in SIGNALS else None, "end": how, "output": found, "wrong": wrong}
 
 
-def check(folder: Path, whole: frozenset[str]) -> str:
-    """ "complete" or "absent"; anything else says what is wrong."""
-    found = {path.name for path in folder.iterdir() if not path.name.startswith(".")} if folder.is_dir() else set()
-    if found and found != whole:
-        return f"half: {sorted(found)}"
-    for name in found:
-        path = folder / name
-        if name.endswith(".png") and cv2.imread(str(path)) is None:
-            return f"broken: {name}"
-        if name.endswith(".json"):
-            json.loads(path.read_text())
-        if name.endswith(".safetensors"):
-            with safe_open(path, framework="np") as file:
-                file.keys()
-    return "complete" if found else "absent"
+def stop_number(
+    number: int, choice: tuple[str, str, random.Random], wholes: dict[str, Whole], inputs: Path, home: Path
+) -> dict[str, Any]:
+    """Do one fault; its line."""
+    name, fault, rng = choice
+    out = home / name
+    out.mkdir(parents=True, exist_ok=True)
+    if name == FILES:
+        found = {victims.kill_writer(out, rng) for _ in range(N_FILES)}
+        line = {"end": "stopped", "output": "complete", "wrong": " ".join(sorted(found - {"complete"}))}
+    else:
+        line = stop_once(name, fault, wholes[name], inputs, out, rng)
+    return {"number": number, "command": name, "fault": fault, **line}
 
 
-def hidden(*folders: Path) -> list[str]:
-    """Names of hidden files."""
-    return sorted(path.name for folder in folders if folder.is_dir() for path in folder.glob(".*"))
+def finish(name: str, whole: Whole, inputs: Path, home: Path) -> dict[str, Any]:
+    """A whole run where others were stopped: what is there after it."""
+    out = home / name
+    if name == "serve":
+        shutil.rmtree(out)
+    before = len(victims.hidden(out))
+    victims.run_whole(name, inputs, out)
+    if COMMANDS[name].goes_on:
+        same = victims.digests(out, COMMANDS[name].whole) == whole.digests
+    else:
+        same = name == "serve" or victims.check(out, COMMANDS[name].whole) == "complete"
+    left = victims.hidden(out)
+    wrong = "" if same and not left else f"left {left}" if left else "other output"
+    return {"command": name, "hidden before": before, "wrong": wrong}
 
 
-def digests(folder: Path, names: frozenset[str]) -> dict[str, str]:
-    """Digests of files that exist."""
-    return {
-        name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names if (folder / name).is_file()
-    }
+def work(
+    options: argparse.Namespace, names: list[str], wholes: dict[str, Whole], inputs: Path, job: int, queue: Any
+) -> None:
+    """Do the faults that the queue names until it is empty or the time is over, then the whole runs."""
+    home, ends = inputs / f"job_{job}", options.end - 1.3 * sum(whole.seconds for whole in wholes.values())
+
+    def write(line: dict[str, Any]) -> None:
+        with options.out.open("a") as file:  # a short line is written at once
+            file.write(json.dumps({"seed": options.seed, **line}) + "\n")
+
+    while time.monotonic() < ends and (number := queue.get()) is not None:
+        write(stop_number(number, choose_fault(options.seed, number, names), wholes, inputs, home))
+    for folder in sorted(home.iterdir()) if home.is_dir() else ():
+        if folder.name != FILES:
+            write(finish(folder.name, wholes[folder.name], inputs, home))
 
 
-def run_whole(command: Command, inputs: Path, out: Path) -> float:
-    """Run a command that nothing stops; its seconds."""
-    start = time.monotonic()
-    code = ended(launch(command.arguments(inputs, out)), PATIENCE)
-    if code != 0:
-        raise SystemExit(f"{command.arguments(inputs, out)}: ends with {code} where nothing stops it.")
-    return time.monotonic() - start
+def read_lines(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """What stands in --out of this seed; a line that was cut off does not count."""
+    lines = []
+    for text in options.out.read_text().splitlines() if options.out.is_file() else ():
+        try:
+            lines.append(json.loads(text))
+        except ValueError:
+            continue
+    return [line for line in lines if line["seed"] == options.seed]
 
 
-def stop_runs(command: Command, count: int, inputs: Path, rng: random.Random) -> dict[str, object]:
-    """Stop a command `count` times; what was found."""
-    out, counts = inputs / "work", collections.Counter()
-    run_whole(command, inputs, out)  # builds kernels
-    shutil.rmtree(out)
-    seconds = run_whole(command, inputs, out)
-    expected = digests(out, command.whole)
-    largest = max(path.stat().st_size for path in out.iterdir() if path.is_file())
-    while count > 0:
-        if not command.goes_on or expected == digests(out, command.whole):
-            for path in out.glob("[!.]*"):  # each run meets what those before left hidden, and no output
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-        (fault,) = rng.choices(list(FAULTS), list(FAULTS.values()))
-        n_bytes = rng.randrange(largest) if fault == "full disk" else None
-        how = stop(launch(command.arguments(inputs, out), n_bytes), fault, rng.uniform(0, seconds))
-        counts[fault if how == "stopped" else how] += 1
-        count -= how != "ended"
-        if not command.goes_on:
-            counts[check(out, command.whole)] += 1
-        elif how == "ended":
-            counts["same bits" if digests(out, command.whole) == expected else "other bits"] += 1
-    before = len(hidden(out, inputs))
-    run_whole(command, inputs, out)
-    same = digests(out, command.whole) == expected if command.goes_on else check(out, command.whole) == "complete"
-    return {
-        "seconds": round(seconds, 1),
-        **counts,
-        "hidden before": before,
-        "whole": same,
-        "hidden": hidden(out, inputs),
-    }
+def count(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """All lines in numbers, and those that were not survived."""
+    stopped = [line for line in lines if "fault" in line and line["end"] != "ended"]
+    of_command = collections.Counter(f"{line['command']}, {line['fault']}" for line in stopped)
+    outputs = collections.Counter(line["output"] for line in lines if "fault" in line)
+    wrong = [line for line in lines if line["wrong"]]
+    faults = {
+        "faults": len(stopped), "SIGKILL": sum(line["fault"] == "SIGKILL" for line in stopped),
+        "ended before": sum("fault" in line for line in lines) - len(stopped),
+        "whole runs after": sum("hidden before" in line for line in lines),
+    }  # fmt: skip
+    return {**faults, "outputs": outputs, "by command": dict(sorted(of_command.items())), "wrong": wrong}
 
 
-def stop_servers(count: int, inputs: Path, rng: random.Random) -> dict[str, object]:
-    """Stop `oasis serve` at random moments of its work on a photo, and look whether the next one finishes it."""
-    jobs.PROGRAM = (sys.executable, "-c", SERVED)
-    counts: collections.Counter[str] = collections.Counter()
-    for k in range(count):
-        folder = inputs / f"served_{k}"
-        home = folder / f"{k:022d}"
-        home.mkdir(parents=True)
-        shutil.copy(PHOTO, home / "photo.png")
-        arguments = ["serve", "--folder", str(folder), "--no-browser"]
-        (fault,) = rng.choices(list(FAULTS)[:3], list(FAULTS.values())[:3])
-        counts[f"{fault}, {stop(launch(arguments), fault, rng.uniform(0, 15))}"] += 1
-        server, end = launch(arguments), time.monotonic() + PATIENCE
-        while time.monotonic() < end and not (home / "out" / "report.json").is_file():
-            time.sleep(0.1)
-        done = (home / "out" / "report.json").is_file() and check(home / "out", COMMANDS["reconstruct"].whole)
-        counts[f"avatar {done}"] += 1
-        stop(server, "SIGINT", 0)
-    return dict(counts)
-
-
-WRITER = """
-import sys
-from pathlib import Path
-from oasis_warp.data.output_files import output_folder, write_file
-folder, version = Path(sys.argv[1]), int(sys.argv[2])
-print("ready", flush=True)
-while True:
-    version += 1
-    with output_folder(folder) as part:
-        for name in "abc":
-            (part / name).write_text(f"{version} " * 1000)
-    write_file(folder / "d", f"{version} ".encode() * 1000)
-"""
-"""Writes the same files again and again, each time of another version."""
-
-
-def kill_writers(count: int, rng: random.Random) -> dict[str, int]:
-    """Kill a process that does nothing but write: what is left is of one version once the next run has begun."""
-    counts, version = {"one version": 0, "mixed": 0, "cut": 0, "left": 0}, 0
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name) / "out"
-        for _ in range(count):
-            command = [sys.executable, "-c", WRITER, str(folder), str(version)]
-            process = subprocess.Popen(command, stdout=subprocess.PIPE)
-            assert process.stdout is not None
-            process.stdout.readline()
-            time.sleep(rng.uniform(0, 0.05))
-            process.kill()
-            process.wait()
-            process.stdout.close()
-            with contextlib.suppress(InterruptedError), output_folder(folder):
-                raise InterruptedError  # a next run, which fails
-            found = [file.read_text().split() for file in sorted(folder.glob("[abc]"))]
-            whole = [file.read_text().split() for file in sorted(folder.glob("[abcd]"))]
-            counts["cut"] += any(len(words) != 1000 or len(set(words)) != 1 for words in whole)
-            counts["one version" if len({words[0] for words in found}) <= 1 and len(found) in (0, 3) else "mixed"] += 1
-            version = max([version, *(int(words[0]) for words in whole)])
-            counts["left"] += sum(path.name.startswith(".") and ".d." not in path.name for path in folder.glob(".*"))
-    return counts
-
-
-def make_inputs(folder: Path) -> None:
-    """The avatar that commands read, and the photo with paint on it."""
-    code = ended(
-        launch(["reconstruct", str(PHOTO), "-o", str(folder / "made"), "--size", "256", "--steps", "2"]), 300.0
-    )
-    assert code == 0, code
-    picture = cv2.imread(str(PHOTO))
-    assert picture is not None
-    height, width = picture.shape[:2]
-    cv2.circle(picture, (width // 2, height // 2), width // 20, (0, 0, 255), -1)
-    cv2.imwrite(str(folder / "painted.png"), picture)
-
-
-def run_all() -> None:
-    """Read the command line, stop the commands again and again, and print what was left."""
+def main() -> int:
+    """Read the command line, stop the commands again and again, and print what was left; the exit code."""
+    known = [FILES, *sorted(COMMANDS)]
     parser = argparse.ArgumentParser()
-    parser.add_argument("commands", nargs="+", choices=["files", "serve", *sorted(COMMANDS)])
-    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("commands", nargs="*", choices=[*known, []], help="All of them by default.")
+    parser.add_argument("--count", type=int, default=500, help="Faults in all.")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="Of the whole run, at most.")
+    parser.add_argument("--jobs", type=int, default=1, help="Faults at the same time.")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("kills.jsonl"))
     options = parser.parse_args()
+    options.end = time.monotonic() + options.seconds
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    photos = int(cv2.__version__.split(".")[0]) >= 5
+    names = [name for name in options.commands or known if photos or name not in OF_A_PHOTO]
     torch.set_num_threads(1)  # forks of a process with threads may wait for ever
     cv2.setNumThreads(0)
-    with tempfile.TemporaryDirectory() as name:
-        if set(options.commands) - {"files", "serve", "pretrain", "synthesize"}:
-            make_inputs(Path(name))
-        for command in options.commands:
-            if command != "files":
-                importlib.import_module(f"oasis_warp.cli.{command}")
-            rng = random.Random(options.seed)
-            if command == "files":
-                found = kill_writers(options.count, rng)
-            elif command == "serve":
-                found = stop_servers(options.count, Path(name), rng)
-            else:
-                found = stop_runs(COMMANDS[command], options.count, Path(name), rng)
-                shutil.rmtree(Path(name) / "work")
-            print(json.dumps({"command": command, "faults": options.count, **found}), flush=True)
+    victims.lend_filter()
+    victims.without_dask()
+    done = {line["number"] for line in read_lines(options) if "fault" in line}
+    context = multiprocessing.get_context("fork")
+    with tempfile.TemporaryDirectory() as folder:
+        inputs = Path(folder)
+        victims.make_inputs(inputs, photos=photos)
+        for name in names:
+            if name != FILES:
+                importlib.import_module(f"oasis_warp.cli.{name}")
+        with context.Pool(options.jobs) as pool:
+            commands = [name for name in names if name != FILES]
+            wholes = dict(zip(commands, pool.starmap(Whole, [(name, inputs) for name in commands], 1), strict=True))
+        queue = context.Queue()
+        for number in range(options.count):
+            if number not in done:
+                queue.put(number)
+        for _ in range(options.jobs):
+            queue.put(None)
+        arguments = [(options, names, wholes, inputs, job, queue) for job in range(options.jobs)]
+        processes = [context.Process(target=work, args=each) for each in arguments]
+        for process in processes:
+            process.start()
+        for process in processes:
+            process.join()
+        queue.cancel_join_thread()
+    found = count(read_lines(options))
+    found["seconds"] = {name: round(whole.seconds, 1) for name, whole in wholes.items()}
+    found["jobs that failed"] = sum(process.exitcode != 0 for process in processes)
+    found["not done, as OpenCV is older"] = [] if photos else list(OF_A_PHOTO)
+    print(json.dumps(found))
+    return int(bool(found["wrong"] or found["jobs that failed"]))
 
 
 if __name__ == "__main__":
-    run_all()
+    sys.exit(main())

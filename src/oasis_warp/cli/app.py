@@ -41,6 +41,16 @@ Command = (
 
 OWN_JSON = (options.Info, developer_options.Gradcheck)
 """Commands whose --json holds what they found."""
+SHORTAGES = {
+    "the memory of {device} is full; give smaller sizes, or fewer at once.": (
+        "MemoryError", "OutOfMemory", "out of memory", "can't allocate memory", "Cannot allocate memory",
+        "Insufficient memory", "Failed to allocate", "failed to map segment", "bad allocation", "bad_alloc",
+    ),
+    "too many files are open; allow this process more of them (`ulimit -n 1024`).": ("Too many open files",),
+    "a disk is full; free some room on it, also where temporary files lie.": ("No space left on device",),
+    "{device} failed in the middle of the work, nothing written; see what `oasis doctor` says.": ("CUDA error",),
+}  # fmt: skip
+"""Sentences, and what the system or packages say instead; the first counts, as CUDA calls full memory an error too."""
 COMMANDS = tuple(get_args(command)[1].name for command in get_args(Command))
 
 
@@ -93,10 +103,9 @@ def _run(chosen: Any, verbose: bool) -> tuple[int, str | None]:
     except KeyboardInterrupt:
         return INTERRUPTED, "stopped, nothing written."
     except Exception as error:
-        if not is_out_of_memory(error):
+        if (said := what_ran_out(error)) is None:
             raise
-        device = getattr(chosen, "device", "cpu")
-        return BAD_INPUT, f"the memory of {device} is full; give smaller sizes, or fewer at once."
+        return BAD_INPUT, said.format(device=getattr(chosen, "device", "cpu"))
 
 
 def _refuse_command(name: str) -> NoReturn:
@@ -123,7 +132,10 @@ def open_standard_streams() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
-def is_out_of_memory(error: Exception) -> bool:
-    """Whether Python, OpenCV or torch, on the CPU or CUDA, found no memory."""
-    said, signs = f"{type(error).__name__} {error}", ("OutOfMemory", "can't allocate memory", "Insufficient memory")
-    return isinstance(error, MemoryError) or any(sign in said for sign in signs)
+def what_ran_out(error: BaseException | None) -> str | None:
+    """What this machine lacked, as a sentence about {device}, if that is why Python, OpenCV, torch or Warp failed."""
+    said = ""
+    while error is not None:  # packages wrap what the system said
+        said += f"{type(error).__name__} {error}\n"
+        error = error.__cause__ or error.__context__
+    return next((sentence for sentence, signs in SHORTAGES.items() if any(sign in said for sign in signs)), None)

@@ -39,10 +39,14 @@ def writable_cache() -> Path:
 
 
 def remove_abandoned(cache: Path) -> None:
-    """Remove what builds have left that were killed: folders named after a process and a thread, an hour old."""
+    """Remove what builds have left that were killed: folders named after a process and a thread, an hour old.
+
+    A clock that jumps ahead makes them all old: those of processes that live stay.
+    """
     for folder in cache.glob("wp_*_p*_t*"):
+        process = folder.name.rpartition("_t")[0].rpartition("_p")[2]
         try:
-            if time.time() - folder.stat().st_mtime > ABANDONED:
+            if time.time() - folder.stat().st_mtime > ABANDONED and not Path("/proc", process).is_dir():
                 shutil.rmtree(folder, ignore_errors=True)
         except OSError:
             pass  # its own process has just renamed it
