@@ -3,8 +3,10 @@
 import pytest
 import torch
 from safetensors.torch import save_file
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from oasis_warp.core.errors import InputError
+from oasis_warp.losses.lpips import Lpips
 from oasis_warp.network.encoders import SIZES, ConvolutionalEncoder, DinoV2Encoder, Size
 
 
@@ -109,6 +111,26 @@ def test_published_weights_land_where_they_belong(small_dino, tmp_path, spelling
 def test_a_backbone_is_frozen(small_dino, photo):
     assert not any(parameter.requires_grad for parameter in small_dino.parameters())
     assert not small_dino(*photo).aligned.requires_grad
+
+
+class Brought(TorchDispatchMode):
+    """Counts tensors that are made of the host's numbers."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += "lift_fresh" in str(func)
+        return func(*args, **(kwargs or {}))
+
+
+def test_frozen_networks_can_be_recorded_on_cuda_since_they_bring_no_numbers_from_the_host(small_dino, photo):
+    (image, mask), lpips = photo, Lpips()
+    with Brought() as brought:
+        small_dino(image, mask)
+        lpips(image, image.flip(1), mask)
+        assert brought.count == 0
+        torch.tensor([1.0])  # is counted
+    assert brought.count == 1
 
 
 def test_files_that_hold_no_such_backbone_are_refused(small_dino, tmp_path):

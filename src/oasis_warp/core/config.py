@@ -51,6 +51,12 @@ class AdaptConfig:
     """Of the order of the reference views, and of LoRA's start."""
 
 
+PAPER_ADAPTATION = AdaptConfig(
+    texture="lora", light="keep", calibration_steps=100, texture_steps=400, references="all", reference_views=7
+)
+"""One-shot reconstruction as in the paper's appendix B.3; it names no number of reference views."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ReconstructConfig:
     """From a photo to an avatar."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 
 from oasis_warp.avatar.prior import Prior
-from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.config import PAPER_ADAPTATION, AdaptConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import write_files
 from oasis_warp.evaluation.data_sets import Row
@@ -22,10 +22,6 @@ from oasis_warp.network.config import NetworkConfig
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import NetworkPrior
 
-PAPER = AdaptConfig(
-    texture="lora", light="keep", calibration_steps=100, texture_steps=400, references="all", reference_views=7
-)
-"""One-shot reconstruction as in the paper's appendix B.3; it names no number of reference views."""
 POSE_ERRORS = (2.0, 5.0, 10.0)
 """Standard deviations [degrees] of the curve."""
 SHIPPED, GUESS = "ours", "ours, no fine-tuning"
@@ -80,7 +76,9 @@ def rows_of_tables(priors: dict[str, Prior], ablated: Sequence[Prior], steps: in
     if not isinstance(learned, NetworkPrior):
         return rows
     priors["untrained"] = untrained(learned, seed)
-    paper = replace(PAPER, seed=seed, texture_steps=PAPER.texture_steps if steps is None else steps)
+    paper = replace(PAPER_ADAPTATION, seed=seed)
+    if steps is not None:
+        paper = replace(paper, texture_steps=steps)
     variants = {
         "a": ("learned", paper),
         "b": ("untrained", replace(paper, texture="full")),

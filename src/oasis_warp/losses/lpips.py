@@ -52,6 +52,9 @@ SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 class Lpips(nn.Module):
     """Distance of two images in a trunk's features; frozen, differentiable in the images."""
 
+    shift: Tensor
+    scale: Tensor
+
     def __init__(self, trunk: Trunk = "alex"):
         super().__init__()
         self.layers, self.pooling = LAYERS[trunk], POOLING[trunk]
@@ -61,6 +64,8 @@ class Lpips(nn.Module):
             if layer.compared:
                 self.lines.append(nn.Parameter(torch.zeros(layer.channels)))
             before = layer.channels
+        for buffer, values in {"shift": SHIFT, "scale": SCALE}.items():  # a recording on CUDA cannot fetch them
+            self.register_buffer(buffer, torch.tensor(values)[:, None, None], persistent=False)
         self.requires_grad_(False)
 
     def forward(
@@ -68,8 +73,7 @@ class Lpips(nn.Module):
     ) -> Float[Tensor, "N"]:
         """LPIPS of the pictures, what lies outside `masks` made equal."""
         both = torch.cat([images * masks[..., None], targets * masks[..., None]]).permute(0, 3, 1, 2)
-        shift, scale = (both.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
-        x, total, lines = (2 * both - 1 - shift) / scale, images.new_zeros(len(images)), iter(self.lines)
+        x, total, lines = (2 * both - 1 - self.shift) / self.scale, images.new_zeros(len(images)), iter(self.lines)
         for convolution, layer in zip(self.convolutions, self.layers, strict=True):
             x = convolution(nn.functional.max_pool2d(x, *self.pooling) if layer.pooled else x).relu()
             if layer.compared:

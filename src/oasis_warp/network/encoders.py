@@ -163,6 +163,9 @@ class TransformerBlock(nn.Module):
 class DinoV2Encoder(nn.Module):
     """Patch features of the last layer; frozen. The background is hidden behind the mean colour."""
 
+    mean: Tensor
+    spread: Tensor
+
     def __init__(self, name: str, image_size: int):
         super().__init__()
         if image_size % PATCH:
@@ -174,14 +177,16 @@ class DinoV2Encoder(nn.Module):
         self.position = nn.Parameter(torch.zeros(1, GRID * GRID + 1, width))
         self.patch, self.norm = nn.Conv2d(3, width, PATCH, PATCH), nn.LayerNorm(width, eps=1e-6)
         self.blocks = nn.ModuleList(TransformerBlock(width, heads) for _ in range(layers))
+        # Buffers, because a recording on CUDA cannot bring numbers of the host to the device.
+        for buffer, values in {"mean": IMAGENET_MEAN, "spread": IMAGENET_SPREAD}.items():
+            self.register_buffer(buffer, torch.tensor(values)[:, None, None], persistent=False)
         self.requires_grad_(False)
 
     @torch.no_grad()
     def forward(self, image: Float[Tensor, "B S S 3"], mask: Float[Tensor, "B S S"]) -> ImageFeatures:
         """Feature maps of crops (sRGB in [0, 1]) and masks."""
         colors, inside = resampled(image, mask, self.image_size)
-        mean, spread = (colors.new_tensor(v)[:, None, None] for v in (IMAGENET_MEAN, IMAGENET_SPREAD))
-        x = self.patch((colors - mean * inside) / spread)
+        x = self.patch((colors - self.mean * inside) / self.spread)
         grid = x.shape[-2:]
         table = self.position[:, 1:].unflatten(1, (GRID, GRID)).permute(0, 3, 1, 2)
         table = interpolate(table, size=grid, mode="bicubic", align_corners=False)
