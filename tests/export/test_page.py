@@ -33,7 +33,13 @@ from oasis_warp.render.render import render
 
 LARGEST = 8_000_000
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+FIREFOX = shutil.which("xvfb-run") and (shutil.which("firefox-esr") or shutil.which("firefox"))
+"""Without a display it has no WebGL."""
 NODE = shutil.which("node")
+with_chromium, with_firefox = (
+    pytest.param(name, marks=pytest.mark.skipif(path is None, reason=f"needs {name}, firefox also xvfb"))
+    for name, path in (("chromium", CHROMIUM), ("firefox", FIREFOX))
+)
 
 
 @pytest.fixture(scope="module")
@@ -266,12 +272,17 @@ class PictureHandler(BaseHTTPRequestHandler):
 
 
 @contextlib.contextmanager
-def browser_with(page, drawing, profile):
+def browser_with(page, drawing, profile, browser="chromium"):
     """What a headless browser sends back from the page."""
     with PictureServer(page) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         address = f"http://127.0.0.1:{server.server_port}/#{drawing}"
-        command = [CHROMIUM, *FLAGS.split(), f"--user-data-dir={profile}", "--remote-debugging-port=0", address]
+        profile.mkdir()
+        command = {
+            "chromium": [CHROMIUM, *FLAGS.split(), f"--user-data-dir={profile}", "--remote-debugging-port=0", address],
+            "firefox": ["xvfb-run", "-a", FIREFOX, "--no-remote", "--profile", str(profile), address],
+        }[browser]
+        (profile / "user.js").write_text('user_pref("webgl.force-enabled", true);')  # Firefox, on llvmpipe
         silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         process = subprocess.Popen(command, start_new_session=True, **silent)
         try:
@@ -282,11 +293,11 @@ def browser_with(page, drawing, profile):
             server.shutdown()
 
 
-def pictures_of(page, drawing, jobs, profile):
+def pictures_of(page, drawing, jobs, profile, browser="chromium"):
     """What a browser draws of each job, over white."""
     page = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page)
     page = page.replace("</body>", REPORT.replace("JOBS", json.dumps(jobs)) + "</body>")
-    with browser_with(page, drawing, profile) as received:
+    with browser_with(page, drawing, profile, browser) as received:
         for k in range(len(jobs)):
             path, body = received.get(timeout=100)
             assert path == f"/{k}", body
@@ -296,9 +307,9 @@ def pictures_of(page, drawing, jobs, profile):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+@pytest.mark.parametrize("browser", [with_chromium, with_firefox])
 @pytest.mark.parametrize("drawing", ["graphics", "processor"])
-def test_a_browser_draws_the_page_as_we_do(avatar, pages, tmp_path, drawing):
+def test_a_browser_draws_the_page_as_we_do(avatar, pages, tmp_path, drawing, browser):
     photo, even, studio = "photo", "even", "studio"
     views = [
         ("photo", 0, photo),
@@ -310,7 +321,7 @@ def test_a_browser_draws_the_page_as_we_do(avatar, pages, tmp_path, drawing):
     square = {"elevation": 0, "width": 256, "height": 256, "fit": True}
     jobs = [{"pose": pose, "azimuth": np.radians(angle), "look": look, **square} for pose, angle, look in views]
     lights = {"photo": avatar, "studio": avatar.in_light(studio_light()), "even": avatar.in_even_light()}
-    pictures = pictures_of(pages[avatar.side], drawing, jobs, tmp_path / "profile")
+    pictures = pictures_of(pages[avatar.side], drawing, jobs, tmp_path / "profile", browser)
     for shown, (name, degrees, look) in zip(pictures, views, strict=True):
         pose = avatar.source_pose if name == "photo" else in_pose(avatar, name)
         camera = orbit_camera(avatar.mesh(pose).vertices, np.radians(degrees), 0.0, 256)

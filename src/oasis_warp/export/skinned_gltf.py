@@ -15,13 +15,12 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Side
 from oasis_warp.export import texture
 from oasis_warp.export.gltf import INDICES, VERTICES, GltfBuffer, write_gltf
+from oasis_warp.export.material_maps import bake_material
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.skinned_mesh import SkinnedMesh, skinned_mesh
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.webxr_rig import Rig, local_bind, local_quats
 
-ROUGHNESS = 0.5
-"""Of the material: between dry and oily skin, whose highlight glTF's model has no more parameters for."""
 MOST_FLOATS = 45
 """Correctives that are written as floats: three for each joint."""
 KEYS, SECONDS = 8, 0.5
@@ -39,7 +38,7 @@ def write_skinned_gltf(request: ExportRequest, path: Path) -> None:
     Raises:
         InputError: a value is not finite, or `path` cannot be written.
     """
-    buffer, light = GltfBuffer(), request.light or "none"
+    buffer = GltfBuffer()
     made = skinned_mesh(request.avatar)
     first = 2  # node of the wrist
     nodes, bends = _joint_nodes(made.rig, first), [0.0] * len(made.correctives)
@@ -61,7 +60,7 @@ def write_skinned_gltf(request: ExportRequest, path: Path) -> None:
         "nodes": [{"name": "hand", "children": [first]}, {"name": "skin", "mesh": 0, "skin": 0}, *nodes],
         "meshes": [mesh],
         "skins": [{**skin, "inverseBindMatrices": buffer.add(_array(inverse), "MAT4")}],
-        **_material(buffer, texture.bake_texture(request, light, texture.SIZE), unlit=light == "baked"),
+        **_material(buffer, bake_material(request, texture.SIZE)),
         "animations": _clips(buffer, made, request.avatar.side),
     }
     if _packs(made):
@@ -122,16 +121,22 @@ def _joint_nodes(rig: Rig, first: int) -> list[dict[str, Any]]:
     return nodes
 
 
-def _material(buffer: GltfBuffer, picture: Tensor, *, unlit: bool) -> dict[str, Any]:
-    looks = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": ROUGHNESS}
+def _material(buffer: GltfBuffer, pictures: dict[str, bytes]) -> dict[str, Any]:
+    looks: dict[str, Any] = {"baseColorTexture": {"index": 0}, "metallicFactor": 0}
     material: dict[str, Any] = {"name": "skin", "pbrMetallicRoughness": looks}
+    unlit = "normal" not in pictures
     if unlit:
         material["extensions"] = {"KHR_materials_unlit": {}}
+    else:
+        material["normalTexture"], looks["metallicRoughnessTexture"] = {"index": 1}, {"index": 2}
     return {
         "materials": [material],
-        "textures": [{"source": 0, "sampler": 0}],
+        "textures": [{"source": k, "sampler": 0} for k in range(len(pictures))],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
-        "images": [{"name": "skin", "mimeType": "image/png", "bufferView": buffer.add_bytes(texture.encoded(picture))}],
+        "images": [
+            {"name": name, "mimeType": "image/png", "bufferView": buffer.add_bytes(data)}
+            for name, data in pictures.items()
+        ],
         **({"extensionsUsed": ["KHR_materials_unlit"]} if unlit else {}),
     }
 

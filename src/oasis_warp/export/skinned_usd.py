@@ -7,15 +7,16 @@ import numpy as np
 import torch
 
 from oasis_warp.export import texture
+from oasis_warp.export.material_maps import bake_material
 from oasis_warp.export.request import ExportRequest
-from oasis_warp.export.skinned_gltf import KEYS, ROUGHNESS, SECONDS, clip_angles
+from oasis_warp.export.skinned_gltf import KEYS, SECONDS, clip_angles
 from oasis_warp.export.skinned_mesh import SkinnedMesh, skinned_mesh
 from oasis_warp.export.usd_stage import new_stage, quatf, usd, vec3f, write_stage
 from oasis_warp.hand.webxr_rig import Rig, local_bind, local_quats
 
 
 def write_skinned_usd(request: ExportRequest, path: Path) -> None:
-    """The mesh of `write_skinned_gltf` with its clip "poses", or with `pose` in that pose; texture in NAME_skin.png.
+    """The mesh of `write_skinned_gltf` with its clip "poses", or with `pose` in that pose; NAME_skin.png beside it.
 
     Names of joints have _ for WebXR's -, which no USD path may hold.
 
@@ -23,7 +24,6 @@ def write_skinned_usd(request: ExportRequest, path: Path) -> None:
         InputError: usd-core is missing, a value is not finite, or a file cannot be written.
     """
     Usd, UsdSkel = usd(path, "Usd"), usd(path, "UsdSkel")
-    light = request.light or "none"
     made = skinned_mesh(request.avatar)
     stage, root = new_stage(path)
     stage.SetTimeCodesPerSecond(KEYS / SECONDS)
@@ -55,9 +55,10 @@ def write_skinned_usd(request: ExportRequest, path: Path) -> None:
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     mesh = _mesh(stage, f"{root}/skin", path, made)
     _bind(stage, mesh, skeleton, path, made, shapes)
-    picture = f"{path.stem}_skin.png"
-    _material(stage, mesh, root, path, picture, unlit=light == "baked")
-    write_stage(stage, path, {picture: texture.encoded(texture.bake_texture(request, light, texture.SIZE))})
+    pictures = bake_material(request, texture.SIZE)
+    files = {name: f"{path.stem}_{name}.png" for name in pictures}
+    _material(stage, mesh, root, path, files)
+    write_stage(stage, path, {files[name]: data for name, data in pictures.items()})
 
 
 def _joint_paths(rig: Rig) -> list[str]:
@@ -109,7 +110,7 @@ def _bind(stage: Any, mesh: Any, skeleton: Any, path: Path, made: SkinnedMesh, s
     binding.CreateBlendShapeTargetsRel().SetTargets(targets)
 
 
-def _material(stage: Any, mesh: Any, root: str, path: Path, picture: str, *, unlit: bool) -> None:
+def _material(stage: Any, mesh: Any, root: str, path: Path, files: dict[str, str]) -> None:
     UsdShade, Sdf = usd(path, "UsdShade"), usd(path, "Sdf")
     kinds = Sdf.ValueTypeNames
     material = UsdShade.Material.Define(stage, f"{root}/material")
@@ -119,17 +120,28 @@ def _material(stage: Any, mesh: Any, root: str, path: Path, picture: str, *, unl
         made.CreateIdAttr(kind)
         return made
 
-    place, image = shader("st", "UsdPrimvarReader_float2"), shader("picture", "UsdUVTexture")
-    surface = shader("surface", "UsdPreviewSurface")
+    place, surface = shader("st", "UsdPrimvarReader_float2"), shader("surface", "UsdPreviewSurface")
     place.CreateInput("varname", kinds.String).Set("st")
-    image.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(picture))
-    image.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB")
-    image.CreateInput("st", kinds.Float2).ConnectToSource(place.CreateOutput("result", kinds.Float2))
-    color = image.CreateOutput("rgb", kinds.Float3)
-    surface.CreateInput("emissiveColor" if unlit else "diffuseColor", kinds.Color3f).ConnectToSource(color)
-    if unlit:
+    at = place.CreateOutput("result", kinds.Float2)
+
+    def picture(name: str, space: str) -> Any:
+        image = shader(name, "UsdUVTexture")
+        image.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(files[name]))
+        image.CreateInput("sourceColorSpace", kinds.Token).Set(space)
+        image.CreateInput("st", kinds.Float2).ConnectToSource(at)
+        return image
+
+    color = picture("skin", "sRGB").CreateOutput("rgb", kinds.Float3)
+    if "normal" in files:
+        surface.CreateInput("diffuseColor", kinds.Color3f).ConnectToSource(color)
+        normal, rough = picture("normal", "raw"), picture("roughness", "raw")
+        normal.CreateInput("scale", kinds.Float4).Set((2, 2, 2, 1))
+        normal.CreateInput("bias", kinds.Float4).Set((-1, -1, -1, 0))
+        surface.CreateInput("normal", kinds.Normal3f).ConnectToSource(normal.CreateOutput("rgb", kinds.Float3))
+        surface.CreateInput("roughness", kinds.Float).ConnectToSource(rough.CreateOutput("g", kinds.Float))
+    else:
+        surface.CreateInput("emissiveColor", kinds.Color3f).ConnectToSource(color)
         surface.CreateInput("diffuseColor", kinds.Color3f).Set((0, 0, 0))
-    surface.CreateInput("roughness", kinds.Float).Set(ROUGHNESS)
     surface.CreateInput("metallic", kinds.Float).Set(0.0)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)

@@ -1,22 +1,22 @@
 """The avatar's colours as a texture of its mesh."""
 
-from typing import cast
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from oasis_warp.core import rotation
+from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.splats import check_finite
 from oasis_warp.export.surface_mesh import CAP_CORNER, rim_cap_center
-from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
 
 SIZE = 1024
@@ -29,9 +29,34 @@ MARGIN = 16
 """Width of the seam around the charts that has their colours [px], for four halvings of the texture."""
 
 
-@torch.no_grad()
+class Texels(NamedTuple):
+    """Where the pixels of a texture lie on the hand; the first row is v = 1."""
+
+    inside: Bool[Tensor, "S S"]
+    """Those that have a place, M in all."""
+    faces: Int[Tensor, "M"]
+    barycentrics: Float[Tensor, "M 3"]
+
+    def read(self, values: Float[Tensor, "V D"], hand: HandModel) -> Float[Tensor, "M D"]:
+        """Values of the hand's vertices there."""
+        return (values[hand.faces[self.faces]] * self.barycentrics[..., None]).sum(1)
+
+    def fill_around(self, picture: Float[Tensor, "S S D"]) -> Float[Tensor, "S S D"]:
+        """The picture with the values at the edges of charts `MARGIN` pixels around them."""
+        around, nearest = cast(
+            tuple[np.ndarray, np.ndarray], ndimage.distance_transform_edt(~self.inside.numpy(), return_indices=True)
+        )
+        return torch.where(torch.from_numpy(around <= MARGIN)[..., None], picture[tuple(nearest)], picture)
+
+
 def bake_texture(request: ExportRequest, light: str, size: int) -> UInt8[Tensor, "S S 3"]:
-    """Colours of the skin at every pixel of the texture, sRGB; the first row is v = 1.
+    """The colours of `bake_colors` in 8 bits."""
+    return to_uint8(bake_colors(request, light, size)[0])
+
+
+@torch.no_grad()
+def bake_colors(request: ExportRequest, light: str, size: int) -> tuple[Float[Tensor, "S S 3"], Texels]:
+    """Colours of the skin at every pixel of the texture, sRGB, and the pixels' places.
 
     A pixel is the mean of the Gaussians around it, weighted by their opacity and their density there at rest: what one
     sees who looks at the skin from everywhere.
@@ -51,17 +76,14 @@ def bake_texture(request: ExportRequest, light: str, size: int) -> UInt8[Tensor,
     else:
         colors = avatar.pose(request.pose or avatar.source_pose).colors
     check_finite((skin.scales, skin.quats, skin.opacities, colors))
-    points, inside = texel_points(avatar, size)
+    texels = make_texels(avatar.hand, size)
     mixed = Mixture(skin, avatar.rest.vertices, avatar.hand.faces, colors)
     picture = mixed(rim_cap_center(avatar.hand, avatar.rest.vertices)[0][None]).expand(size, size, 3).clone()
-    picture[inside] = mixed(points)
-    around, nearest = cast(
-        tuple[np.ndarray, np.ndarray], ndimage.distance_transform_edt(~inside.numpy(), return_indices=True)
-    )
-    picture = torch.where(torch.from_numpy(around <= MARGIN)[..., None], picture[tuple(nearest)], picture)
+    picture[texels.inside] = mixed(texels.read(avatar.rest.vertices, avatar.hand))
+    picture = texels.fill_around(picture)
     corner = round(2 * (1 - CAP_CORNER[1]) * size)
     picture[:corner, :corner] = picture[-1, -1]  # of the cap, as all that belongs to no chart
-    return to_uint8(picture)
+    return picture, texels
 
 
 def encoded(picture: UInt8[Tensor, "S S 3"]) -> bytes:
@@ -70,15 +92,13 @@ def encoded(picture: UInt8[Tensor, "S S 3"]) -> bytes:
     return cv2.imencode(".png", pixels, (cv2.IMWRITE_PNG_COMPRESSION, 9))[1].tobytes()
 
 
-def texel_points(avatar: Avatar, size: int) -> tuple[Float[Tensor, "M 3"], Tensor]:
-    """Points of the right-handed surface at rest [m] under the pixels of its texture, and which pixels have one."""
-    hand = avatar.hand
+def make_texels(hand: HandModel, size: int) -> Texels:
+    """The pixels of a texture of `size` pixels a side."""
     flat = torch.stack([hand.uv[:, 0], 1 - hand.uv[:, 1], torch.ones(len(hand.uv))], 1)
     scale = torch.diag(torch.tensor([float(size), float(size), 1.0]))
     seen = depth_map(flat, hand.uv_faces, torch.eye(4), scale, size, size, outputs=("face_ids", "barycentrics"))
     inside = seen.face_ids >= 0
-    corners = avatar.rest.vertices[hand.faces[seen.face_ids[inside].long()]]
-    return (corners * seen.barycentrics[inside][..., None]).sum(1), inside
+    return Texels(inside, seen.face_ids[inside].long(), seen.barycentrics[inside])
 
 
 class Mixture:

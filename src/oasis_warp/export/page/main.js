@@ -5,9 +5,10 @@ const text = (id) => byId(id).textContent;
 const makeWorker = (id) => new Worker(URL.createObjectURL(new Blob([text(id)], { type: "text/javascript" })));
 
 // How pictures are drawn, and whether in a hurry only skin that faces the viewer; the address may end in #graphics or
-// #processor to choose.
+// #processor to choose. A browser without WebGL 2 has no choice.
 function makeDrawing(canvas) {
-  const graphics = { "#graphics": true, "#processor": false }[location.hash] ?? hasGraphicsCard();
+  const choices = { "#graphics": () => Boolean(openGraphics(document.createElement("canvas"))), "#processor": () => false };
+  const graphics = (choices[location.hash] ?? hasGraphicsCard)();
   if (graphics) return { draw: makeGraphics(canvas), facing: false, note: "" };
   const draw = makeProcessor(canvas, makeWorker("raster"));
   return { draw, facing: true, note: "Drawn without a graphics card." };
