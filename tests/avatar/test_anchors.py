@@ -1,9 +1,33 @@
+"""Gaussians of a hand that nobody has photographed yet: where they lie, their colours, their wrist, their pose."""
+
+
+import math
+
 import pytest
 import torch
+from synthetic import PALM_TO_CAMERA, posed_hand
 
-from oasis_warp.avatar.anchors import MIN_OPACITY, OPACITY, place_anchors, vertex_to_gaussians
+from oasis_warp.avatar.anchors import MIN_OPACITY, OPACITY, RIM_FADE, place_anchors, vertex_to_gaussians
+from oasis_warp.avatar.appearance import (
+    BLOOD,
+    MELANIN,
+    REGION_NAMES,
+    label_regions,
+    region_colors,
+    region_masks,
+    skin_color,
+)
+from oasis_warp.avatar.densify import densify
+from oasis_warp.avatar.pose import pose_gaussians, with_photo
+from oasis_warp.avatar.wrist import close_wrist
 from oasis_warp.core import rotation, surface
-from oasis_warp.hand.skinning import rest_hand
+from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.mirror import mirror_canonical, mirror_points
+from oasis_warp.core.types import HandLight, HandPose
+from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand.skinning import rest_hand, skin
+from oasis_warp.ops import rest_mesh
+from oasis_warp.render.render import render
 
 
 @pytest.fixture(scope="module")
@@ -53,3 +77,237 @@ def test_a_field_over_the_vertices_is_read_at_centres(hand, rest, anchors):
     n = len(anchors.vertex_index)
     assert torch.equal(means[:n], rest.vertices[anchors.vertex_index])
     torch.testing.assert_close(means[n:], rest.vertices[hand.faces[anchors.face_index]].mean(1))
+
+
+def luminance(colors):
+    return colors @ torch.tensor([0.2126, 0.7152, 0.0722])
+
+
+@pytest.fixture(scope="module")
+def regions(hand):
+    return label_regions(hand)
+
+
+def test_the_table_is_met_at_its_knots():
+    colors = skin_color(torch.tensor([MELANIN[3]]), torch.tensor([BLOOD[1]]))
+    torch.testing.assert_close(colors[0] * 255, torch.tensor([177.0, 141.0, 115.0]), atol=1e-3, rtol=0)
+
+
+def test_more_melanin_is_darker_and_more_blood_is_redder():
+    melanin = torch.logspace(-2.3, -0.46, 30)
+    light = luminance(skin_color(melanin, torch.full_like(melanin, 0.0125)))
+    assert bool((light[1:] < light[:-1]).all())
+    pale, red = (skin_color(torch.tensor([0.02]), torch.tensor([b]))[0] for b in (0.006, 0.035))
+    assert float(red[0] / red[1]) > float(pale[0] / pale[1])
+
+
+def test_shares_beyond_the_table_are_clamped():
+    inside = skin_color(torch.tensor([0.35]), torch.tensor([0.04]))
+    torch.testing.assert_close(skin_color(torch.tensor([5.0]), torch.tensor([1.0])), inside)
+
+
+def test_palm_and_back_lie_on_opposite_sides(hand, regions):
+    palm = hand.template[regions.palm > 0.95, 1].mean()
+    back = hand.template[regions.palm < 0.05, 1].mean()
+    assert float(palm) < float(back)  # the palm faces -y
+
+
+def test_five_nails_lie_on_the_back_near_the_tips(hand, regions):
+    nails = regions.nail > 0.5
+    assert sorted(hand.segment[nails].unique().tolist()) == [3, 6, 9, 12, 15]
+    assert float(regions.palm[nails].max()) < 0.1
+
+
+def test_regions_lie_between_zero_and_one(regions):
+    for field in regions[:-1]:
+        assert float(field.min()) >= 0
+        assert float(field.max()) <= 1
+
+
+@pytest.mark.parametrize("melanin", [0.006, 0.04, 0.15, 0.35])
+def test_palms_are_no_darker_than_backs_and_much_lighter_in_dark_skin(regions, melanin):
+    light = luminance(region_colors(regions, melanin))
+    palm, back = float(light[regions.palm > 0.95].mean()), float(light[regions.palm < 0.05].mean())
+    assert palm > back - 0.01
+    if melanin > 0.1:
+        assert palm > back + 0.08
+
+
+def test_region_masks_split_the_surface(regions):
+    masks = region_masks(regions)
+    assert tuple(masks) == REGION_NAMES
+    torch.testing.assert_close(sum(masks.values()), torch.ones_like(regions.palm))
+
+
+def test_skin_is_mottled_the_same_way_every_time(hand, regions):
+    label_regions.cache_clear()
+    assert torch.equal(label_regions(hand).mottle, regions.mottle)
+    assert abs(float(regions.mottle.mean())) < 0.05
+    colors = region_colors(regions, 0.04)
+    back = (regions.palm < 0.05) & (regions.nail < 0.1) & (regions.knuckle < 0.1)
+    assert 0.005 < float(colors[back].std(0).mean()) < 0.04
+
+
+def test_labels_are_the_same_on_any_device(hand, regions, device):
+    found = label_regions(hand.to(device))
+    for name, want in regions._asdict().items():
+        torch.testing.assert_close(getattr(found, name).cpu(), want, rtol=0, atol=1e-5, msg=name)
+
+
+SLEEVE, SKIN, PALM = torch.tensor([0.1, 0.2, 0.6]), torch.tensor([0.8, 0.6, 0.5]), torch.tensor([0.2, 0.5, 0.1])
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["coarse", "fine"])
+def hands(hand, request):
+    """A hand at rest with a sleeve at the rim, then skin, then something else; the same closed."""
+    rest = rest_hand(hand, torch.zeros(hand.shape_basis.shape[-1]))
+    anchors, vertices = place_anchors(hand, rest), rest.vertices
+    away = torch.cdist(vertices, vertices[hand.rim]).amin(1)
+    at = torch.cat([away[anchors.vertex_index], away[hand.faces[anchors.face_index]].amin(1)])[:, None]
+    colors = torch.where(at < 0.6 * RIM_FADE, SLEEVE, torch.where(at < 0.03, SKIN, PALM))
+    gaussians = anchors.with_colors(colors)
+    if request.param:
+        gaussians = densify(gaussians, vertices, hand.faces, torch.full((len(hand.faces),), 2)).gaussians
+    return vertices, gaussians, close_wrist(hand, gaussians, vertices)
+
+
+def centers(hand, rest, gaussians):
+    on_faces = (rest[hand.faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
+    return torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, on_faces])
+
+
+def test_nobody_looks_into_a_hand(hand, hands):
+    rest, before, after = hands
+    camera = orbit_camera(rest, -math.pi / 2, size=96)  # where the arm would be: the hand lies along -x
+    middle = rest[hand.rim].mean(0)
+    points = (middle + 0.6 * (rest[hand.rim] - middle)) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    x, y, _ = (points @ camera.K.T / points[:, 2:]).long().unbind(1)
+    opened, closed = (
+        render(pose_gaussians(g, hand.faces, rest, rest), camera).image[y, x] for g in (before, after)
+    )
+    assert (closed - SKIN).abs().max() < 0.03
+    assert (opened - SKIN).abs().max() > 0.3
+
+
+def test_the_end_is_opaque_and_has_the_colour_of_the_skin_before_it(hand, hands):
+    rest, before, after = hands
+
+    def end(gaussians):
+        return torch.cdist(centers(hand, rest, gaussians), rest[hand.rim]).amin(1) < 0.3 * RIM_FADE
+
+    assert after.opacities[end(after)].min() > 0.9 and before.opacities[end(before)].median() < 0.5
+    assert (after.colors[end(after)] - SKIN).abs().max() < 1e-4
+
+
+def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_cap_goes_with_the_wrist(hand, hands):
+    rest, before, after = hands
+    cap = torch.zeros(len(after.opacities), dtype=torch.bool)
+    cap[: len(after.vertex_index)] = after.offsets.norm(dim=1) > 2e-3
+    beyond = [torch.cdist(centers(hand, rest, g), rest[hand.rim]).amin(1) > 2 * RIM_FADE for g in hands[1:]]
+    for name in ("quats", "scales", "opacities", "colors"):
+        assert torch.equal(getattr(before, name)[beyond[0]], getattr(after, name)[beyond[1] & ~cap])
+    fist = HandPose(named_pose(hand, "fist"), torch.eye(3), torch.zeros(3))
+    posed = skin(hand, rest_hand(hand, torch.zeros(hand.shape_basis.shape[-1])), fist).vertices
+    still, moved = (pose_gaussians(after, hand.faces, rest, to).means[cap] for to in (rest, posed))
+    assert (moved - still).norm(dim=1).max() < 0.004  # the rim itself moves by less than that
+
+
+def test_light_falls_on_the_cap_as_on_one_end(hand, hands):
+    """It came with the rim's vertices, whose sides made a cone of dark and bright wedges."""
+    rest, _, after = hands
+    cap = after.offsets.norm(dim=1) > 2e-3
+    above = torch.tensor([[1.0], [0.0], [0.8], [0.0]]).expand(4, 3)
+    lamp = HandLight(above, torch.tensor([[0.1] * 3, [3.0] * 3]), torch.ones(3))
+    lit = pose_gaussians(after, hand.faces, rest, rest, with_photo(lamp, rest, rest, hand.faces)).colors
+    on_cap = (lit / after.colors)[: len(cap)][cap]
+    assert on_cap.amax() - on_cap.amin() < 1e-3
+    beside = (lit / after.colors)[: len(cap)][~cap]
+    assert beside.amax() - beside.amin() > 0.3
+
+
+def test_two_colours_of_the_arm_meet_gradually_on_the_cap(hand, hands):
+    """With one width of averaging its middle was cut in two: far from all skin, the nearest alone counted."""
+    rest, before, _ = hands
+    side = (rest[:, 1] > rest[hand.rim, 1].mean()).float()[:, None]
+    two = before._replace(colors=torch.where(vertex_to_gaussians(side, hand.faces, before) > 0.5, SKIN, PALM))
+    after = close_wrist(hand, two, rest)
+    cap = torch.nonzero(after.offsets.norm(dim=1) > 2e-3)[:, 0]
+    at = (rest[after.vertex_index] + after.offsets)[cap]
+    near = torch.cdist(at, at) < 0.0035
+    steps = (after.colors[cap][:, None] - after.colors[cap][None]).abs().amax(-1)[near]
+    assert steps.max() < 0.25 * (SKIN - PALM).abs().max()
+
+
+def test_shade_of_the_arm_ends_before_the_cap(hand, hands):
+    rest, before, _ = hands
+    shaded = before._replace(shade=torch.full_like(before.colors, 0.4))
+    after = close_wrist(hand, shaded, rest)
+    cap = torch.nonzero(after.offsets.norm(dim=1) > 2e-3)[:, 0]
+    assert after.shade is not None and after.shade[cap].min() > 0.999 and after.shade.min() == pytest.approx(0.4)
+
+
+def canonical_and_rest(hand):
+    rest, _, _ = posed_hand(hand)
+    anchors = place_anchors(hand, rest)
+    return anchors.with_colors(torch.full((len(anchors.opacities), 3), 0.5)), rest
+
+
+def covariances(gaussians):
+    half = rotation.to_matrix(gaussians.quats) * gaussians.scales[:, None, :]
+    return half @ half.transpose(1, 2)
+
+
+def test_the_rest_pose_returns_the_canonical_gaussians(hand):
+    canonical, rest = canonical_and_rest(hand)
+    posed = pose_gaussians(canonical, hand.faces, rest.vertices, rest.vertices)
+    torch.testing.assert_close(posed.means, vertex_to_gaussians(rest.vertices, hand.faces, canonical))
+    torch.testing.assert_close(posed.scales, canonical.scales, atol=1e-8, rtol=1e-4)
+    dots = (posed.quats * canonical.quats).sum(-1).abs()
+    assert float(dots.min()) > 1 - 1e-5
+
+
+def test_a_rigid_motion_moves_gaussians_rigidly(hand):
+    canonical, rest = canonical_and_rest(hand)
+    shift = torch.tensor([0.1, -0.2, 0.5])
+    posed = pose_gaussians(canonical, hand.faces, rest.vertices, rest.vertices @ PALM_TO_CAMERA.T + shift)
+    still = pose_gaussians(canonical, hand.faces, rest.vertices, rest.vertices)
+    torch.testing.assert_close(posed.means, still.means @ PALM_TO_CAMERA.T + shift, atol=1e-6, rtol=0)
+    turned = PALM_TO_CAMERA @ covariances(still) @ PALM_TO_CAMERA.T
+    torch.testing.assert_close(covariances(posed), turned, atol=1e-10, rtol=1e-3)
+
+
+def test_offsets_turn_with_the_surface(hand):
+    canonical, rest = canonical_and_rest(hand)
+    outwards = torch.zeros_like(canonical.offsets)
+    outwards[:, 1] = 0.002
+    lifted = canonical._replace(offsets=outwards)
+    posed = pose_gaussians(lifted, hand.faces, rest.vertices, rest.vertices @ PALM_TO_CAMERA.T)
+    n = len(canonical.vertex_index)
+    expected = (rest.vertices[canonical.vertex_index] + outwards) @ PALM_TO_CAMERA.T
+    torch.testing.assert_close(posed.means[:n], expected, atol=1e-6, rtol=0)
+
+
+def test_the_mirrored_gaussians_on_the_mirrored_surface_are_the_mirror_image(hand):
+    canonical, rest = canonical_and_rest(hand)
+    generator = torch.Generator().manual_seed(0)
+    canonical = canonical._replace(offsets=0.001 * torch.randn(canonical.offsets.shape, generator=generator))
+    fist = posed_hand(hand, "fist")[2].vertices
+    posed = pose_gaussians(canonical, hand.faces, rest.vertices, fist)
+    mirrored = mirror_canonical(canonical)
+    left = pose_gaussians(mirrored, hand.faces, mirror_points(rest.vertices), mirror_points(fist))
+    flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))
+    torch.testing.assert_close(left.means, posed.means @ flip, atol=1e-7, rtol=0)
+    torch.testing.assert_close(covariances(left), flip @ covariances(posed) @ flip, atol=1e-12, rtol=1e-4)
+    back = mirror_canonical(mirrored)
+    assert back.shade is canonical.shade
+    assert all(torch.equal(a, b) for a, b in zip(back[:-1], canonical[:-1], strict=True))
+
+
+def test_many_poses_are_what_as_many_calls_give_and_a_measured_surface_poses_as_its_vertices(hand):
+    canonical, rest = canonical_and_rest(hand)
+    surfaces = [posed_hand(hand, name)[2].vertices for name in ("fist", "pinch")]
+    still = rest_mesh(rest.vertices, hand.faces)
+    together = pose_gaussians(canonical, hand.faces, still, torch.stack(surfaces))
+    for k, posed in enumerate(surfaces):
+        alone = pose_gaussians(canonical, hand.faces, rest.vertices, posed)
+        assert all(torch.equal(a[k], b) for a, b in zip(together[:3], alone[:3], strict=True))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_rows import ROW
+from test_bench_command import ROW
 
 from oasis_warp.bench import knobs
 from oasis_warp.bench.error_time import (

@@ -1,20 +1,33 @@
-"""The command as a user runs it, with the whole pipeline: minutes, so marked slow."""
+"""Commands as a user runs them, the examples, and what surrounds a command: closed streams, odd names, no memory."""
 
+import importlib.util
 import json
+import os
 import signal
 import subprocess
 import sys
 import time
+import types
+from importlib import resources
 from pathlib import Path
 
 import cv2
 import pytest
+import torch
+from disk import full_disk
+
+from oasis_warp.assets import asset
+from oasis_warp.cli import main
+from oasis_warp.cli.app import what_ran_out
+from oasis_warp.cli.console import plain_console
+from oasis_warp.cli.report import measures_table
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.ops._runtime import launch
 
 PHOTOS = Path(__file__).parents[1] / "data" / "photos"
 FILES = {"avatar.safetensors", "summary.png", "quality.png", "turntable.mp4", "report.json"}
 OASIS = [sys.executable, "-m", "oasis_warp"]
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 def oasis(*arguments, **options):
@@ -44,6 +57,8 @@ def finished(tmp_path_factory):
     return folder, done
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_a_photo_becomes_an_avatar_that_looks_like_it(finished):
     folder, done = finished
     assert names(folder) == FILES
@@ -58,6 +73,8 @@ def test_a_photo_becomes_an_avatar_that_looks_like_it(finished):
     assert "adaptation" in done.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_the_avatar_can_be_drawn_and_animated_without_its_photo(finished, tmp_path):
     avatar = finished[0] / "avatar.safetensors"
     assert oasis("render", avatar, "-o", tmp_path / "fist.png", "--pose", "fist", "--size", 128).returncode == 0
@@ -70,12 +87,16 @@ def test_the_avatar_can_be_drawn_and_animated_without_its_photo(finished, tmp_pa
     assert names(tmp_path) == {"fist.png", "film.gif"}
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize(("photo", "options"), [("no_hand_cup_15.jpg", ()), ("backs_two_left_05.jpg", ("--hand", 7))])
 def test_a_photo_without_the_hand_is_refused(tmp_path, photo, options):
     done = oasis("reconstruct", PHOTOS / photo, "-o", tmp_path / "out", *options)
     assert_refused(done, tmp_path, photo)
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_a_wrong_keypoints_file_is_refused(tmp_path):
     points = tmp_path / "points.json"
     points.write_text("{")
@@ -83,6 +104,8 @@ def test_a_wrong_keypoints_file_is_refused(tmp_path):
     assert_refused(done, tmp_path, "points.json", {"points.json"})
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize(("stage", "stop"), [("landmarks", signal.SIGINT), ("fit", signal.SIGTERM)])
 def test_a_stop_midway_leaves_nothing(tmp_path, stage, stop):
     def heed_interrupts():  # a shell's background jobs, such as a CI's, inherit an ignored Ctrl-C
@@ -104,9 +127,198 @@ def test_a_stop_midway_leaves_nothing(tmp_path, stage, stop):
     assert names(tmp_path) == set()
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_the_example_runs_without_arguments(tmp_path):
     example = Path(__file__).parents[2] / "examples" / "reconstruct.py"
     done = subprocess.run([sys.executable, example], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert names(tmp_path) == {"fist.png", "fist.safetensors"}
     assert "left hand" in done.stdout
+
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture
+def example(monkeypatch, tmp_path):
+    """Loads an example by name; what it writes goes to a temporary folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def load(name):
+        spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    return load
+
+
+def test_gaussians_of_ones_own_are_trained(example, capsys, tmp_path):
+    module = example("train_gaussians")
+    module.main(module.Options(size=48, gaussians=300, steps=60))
+    decibels = [float(line.split()[2]) for line in capsys.readouterr().out.splitlines() if line.startswith("step")]
+    assert decibels[-1] > decibels[0] + 6
+    assert (tmp_path / "fitted.png").is_file()
+
+
+def test_gaussians_go_to_gsplat_and_our_rasterizer_alike(example, capsys, avatar_file):
+    module = example("draw_with_gsplat")
+    module.main(module.Options(avatar=avatar_file))
+    assert "Gaussians cover" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(monkeypatch, tmp_path, capsys):
+    """Cell after cell, as Jupyter does; without Jupyter, whose pictures are counted instead."""
+    shown, jupyter = [], types.ModuleType("IPython.display")
+    jupyter.__dict__.update(HTML=str, Image=lambda data=None, filename=None: data or Path(filename).read_bytes(),
+                            display=shown.append)  # fmt: skip
+    monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
+    monkeypatch.setitem(sys.modules, "IPython.display", jupyter)
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for cell in json.loads((EXAMPLES / "avatar.ipynb").read_text())["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    assert float(capsys.readouterr().out.split()[3]) < 3  # "the tip is 0.9 mm off"
+    assert len(shown) == 6 and all(picture[1:4] == b"PNG" for picture in shown[:4])
+    assert {"avatar.safetensors", "poses.webp", "hand.html", "hand.glb"} <= {file.name for file in tmp_path.iterdir()}
+
+
+def test_an_avatar_is_posed_and_rendered_in_a_loop(example, capsys, tmp_path, avatar_file):
+    module = example("pose_and_render")
+    module.main(module.Options(avatar=avatar_file, frames=2, size=32))
+    assert sorted(file.name for file in (tmp_path / "frames").iterdir()) == ["0000.png", "0001.png"]
+    assert "frames per second" in capsys.readouterr().out
+
+
+CLOSED = """
+import os, sys
+os.closerange(0, 3)
+sys.stdin = sys.stdout = sys.stderr = None  # as Python starts without them
+from oasis_warp.cli.app import open_standard_streams
+open_standard_streams()
+assert os.open(sys.argv[1], os.O_RDONLY) > 2
+print("nobody reads this")
+print("nor this", file=sys.stderr)
+os.close(2)
+from oasis_warp.data.photo import read_photo
+assert read_photo(sys.argv[1]).rgb.shape == (48, 64, 3)
+os._exit(7)
+"""
+
+
+def test_closed_streams_are_opened_so_that_no_file_gets_their_numbers(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), torch.zeros(48, 64, 3, dtype=torch.uint8).numpy())
+    assert subprocess.run([sys.executable, "-c", CLOSED, str(tmp_path / "a.png")]).returncode == 7
+
+
+def test_a_reader_that_goes_away_is_no_error_of_ours():
+    code = "import sys; from oasis_warp.cli import main; sys.exit(main(['--help']))"
+    reading, writing = os.pipe()
+    os.close(reading)
+    ran = subprocess.run([sys.executable, "-c", code], stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (ran.returncode, ran.stderr) == (141, "")
+
+
+@pytest.mark.parametrize("name", ["[/b]", "[red]", "a" * 250])
+def test_a_picture_with_an_odd_name_in_a_folder_that_is_not_there_is_drawn(avatar_file, tmp_path, name):
+    out = tmp_path / "new" / f"{name}.png"
+    assert main(["render", str(avatar_file), "-o", str(out), "--size", "16"]) == 0
+    assert [file.name for file in out.parent.iterdir()] == [out.name]
+
+
+def test_brackets_in_the_name_of_a_photo_are_no_markup(capsys):
+    plain_console().print(measures_table("a[/b].png on [red]", {"total": 1.0}, {}, {}))
+    assert "a[/b].png on [red]" in capsys.readouterr().out
+
+
+def test_a_program_that_calls_a_command_keeps_its_own_answer_to_sigterm(avatar_file, tmp_path):
+    before = signal.getsignal(signal.SIGTERM)
+    assert main(["render", str(avatar_file), "-o", str(tmp_path / "a.png"), "--size", "16"]) == 0
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_names_that_are_no_text_can_be_printed():
+    code = "import sys; from oasis_warp.cli.app import open_standard_streams as o; o(); print(sys.argv[1])"
+    utf8 = os.environ | {"PYTHONUTF8": "1"}
+    done = subprocess.run([sys.executable, "-c", code, b"a\xff.png"], capture_output=True, env=utf8)
+    assert done.stdout == b"a\\udcff.png\n"
+
+
+def test_a_full_disk_is_told_and_leaves_no_picture(avatar_file, capsys):
+    with full_disk(500):
+        assert main(["render", str(avatar_file), "-o", str(avatar_file.with_name("x.png")), "--size", "64"]) == 2
+    assert "no room left" in capsys.readouterr().err
+    assert [file.name for file in avatar_file.parent.iterdir()] == [avatar_file.name]
+
+
+def test_full_memory_is_told_in_one_sentence(avatar_file, tmp_path, monkeypatch, capsys):
+    from oasis_warp.cli import render
+
+    def fail(*_):
+        torch.empty(1 << 60, dtype=torch.uint8)
+
+    monkeypatch.setattr(render, "orbit_camera", fail)
+    assert main(["render", str(avatar_file), "-o", str(tmp_path / "x.png")]) == 2
+    assert capsys.readouterr().err == "oasis: the memory of cpu is full; give smaller sizes, or fewer at once.\n"
+    assert what_ran_out(MemoryError()) == what_ran_out(torch.OutOfMemoryError("CUDA error: out of memory"))
+    assert what_ran_out(RuntimeError("a bug")) is None
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (RuntimeError("blend: CUDA error 719: unspecified launch failure"), "cpu failed in the middle of the work"),
+        (OSError(24, "Too many open files"), "too many files are open"),
+        (OSError(28, "No space left on device"), "a disk is full"),
+    ],
+)
+def test_a_launch_that_fails_in_the_middle_is_told_and_leaves_nothing(avatar_file, monkeypatch, capsys, error, said):
+    """A GPU that is lost, no more descriptors, no room for a kernel: they ended in tracebacks."""
+    left, run_shared = [9], launch.run_shared  # of the launches of a clip, more than one frame's
+
+    def run(*arguments):
+        left[0] -= 1
+        if left[0] < 0:
+            raise RuntimeError("a package wraps it") from error
+        return run_shared(*arguments)
+
+    monkeypatch.setattr(launch, "run_shared", run)
+    assert main(["animate", str(avatar_file), "-o", str(avatar_file.with_name("x.gif")), "--size", "16"]) == 2
+    said_last = capsys.readouterr().err.splitlines()[-1]
+    assert said_last.startswith(f"oasis: {said}") and said_last.endswith(".") and left[0] == -1
+    assert [file.name for file in avatar_file.parent.iterdir()] == [avatar_file.name]
+
+
+SMALL = ["--size", "64", "--steps", "2", "--prior", "none"]
+
+
+def reconstructing(out, **environment):
+    """A process that makes a small avatar of the bundled photo, with at most 32 open files."""
+    with resources.as_file(asset("photos", "palm_open_left_02.png")) as photo:
+        command = [sys.executable, "-m", "oasis_warp", "reconstruct", str(photo), "-o", str(out), *SMALL]
+    limited = ["sh", "-c", 'ulimit -n 32; exec "$@"', "sh", *command]
+    given = {name: value for name, value in {**os.environ, **environment}.items() if value}
+    return subprocess.Popen(limited, env=given, stdout=subprocess.DEVNULL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("home", ["", "/proc", "missing"])
+def test_a_home_that_is_missing_or_cannot_be_written_and_few_descriptors_do_no_harm(tmp_path, home):
+    where = str(tmp_path / home) if home == "missing" else home
+    process = reconstructing(tmp_path / "out", HOME=where, OASIS_WARP_CACHE="")
+    assert (process.wait(), (tmp_path / "out" / "avatar.safetensors").is_file()) == (0, True)
+
+
+@pytest.mark.slow
+def test_two_processes_write_one_output_one_after_the_other(tmp_path):
+    out = tmp_path / "out"
+    processes = [reconstructing(out) for _ in range(2)]
+    assert [process.wait() for process in processes] == [0, 0]
+    whole = {"avatar.safetensors", "quality.png", "report.json", "summary.png", "turntable.mp4"}
+    assert {path.name for path in out.iterdir()} == whole and list(tmp_path.iterdir()) == [out]
+    Avatar.load(out / "avatar.safetensors")

@@ -1,10 +1,35 @@
-import io
+"""What a user sees of a reconstruction: its progress, its report, its summary."""
 
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
 import pytest
+import torch
 from rich.console import Console
 
-from oasis_warp.cli.console import line_progress, show_run
+from oasis_warp.avatar.quality import SurfaceQuality
+from oasis_warp.cli.console import line_progress, show_progress, show_run
 from oasis_warp.cli.progress import EDIT_PLAN, USUAL_STEPS, ManyPhotos, Run, reconstruct_plan
+from oasis_warp.cli.record import recorded
+from oasis_warp.cli.report import make_report, print_report, to_json
+from oasis_warp.cli.summary import (
+    FINGER_COLORS,
+    PAPER,
+    POSES,
+    VIEWS,
+    WIDTH,
+    Panel,
+    draw_landmarks,
+    draw_mesh,
+    draw_quality,
+    draw_summary,
+    make_sheet,
+    panel_side,
+    shade_mesh,
+)
 from oasis_warp.core.config import ReconstructConfig
 
 
@@ -139,3 +164,162 @@ def test_on_a_terminal_there_is_one_bar_of_eighty_columns():
             out.write("a report\n")
     text = out.getvalue()
     assert "photo 1 of 2" in text and "s left" in text and "400" not in text and "a report\n" in text
+
+
+def test_a_report_holds_the_run(scene, made):
+    made = made._replace(warnings=("the thumb is hidden",))
+    photo = scene[0]._replace(shrink=0.5)
+    with recorded(None, ["reconstruct", "my hand.png", "--seed", "3"]):
+        report = json.loads(to_json(make_report([photo], made, ReconstructConfig(seed=3), {"fit": 0.25, "save": 0.5})))
+    assert report["command"] == "oasis reconstruct 'my hand.png' --seed 3"
+    assert report["photo"]["name"] == "known.png" and report["photo"]["shrink"] == 0.5
+    assert report["hand"] == {"side": "right", "side_score": 0.99, "presence": 0.98, "landmarks_from": "network"}
+    assert report["config"]["seed"] == 3
+    assert report["prior"] == {"name": "learned", "sha256": "0a1b", "step": 7}
+    assert report["seconds"] == {"fit": 0.25, "save": 0.5, "total": 0.75}
+    assert report["errors"] == made.errors
+    assert report["warnings"] == ["the thumb is hidden"]
+
+
+def test_numbers_that_json_does_not_know_become_null():
+    text = to_json({"a": [float("nan"), {"b": float("inf")}], "c": 1.5})
+    assert json.loads(text) == {"a": [None, {"b": None}], "c": 1.5}
+
+
+def test_a_path_is_written_as_text(scene, made):
+    config = ReconstructConfig(prior=Path("own") / "network.safetensors")
+    report = json.loads(to_json(make_report([scene[0]], made, config, {})))
+    assert report["config"]["prior"] == str(Path("own") / "network.safetensors")
+
+
+def test_the_table_says_everything_in_words(scene, made):
+    made = made._replace(errors={**made.errors, "new_measure": 0.123456}, warnings=("the thumb is hidden",))
+    out = io.StringIO()
+    print_report(Console(file=out, width=100), make_report([scene[0]], made, ReconstructConfig(), {"fit": 1.234}))
+    text = out.getvalue()
+    said = ("fit", "1.23 s", "total", "likeness to the photo", "30.0 dB", "new_measure", "0.1235")
+    for part in ("prior learned", *said):
+        assert part in text
+    assert "Warning: the thumb is hidden" in text
+
+
+def test_lines_tell_the_time_left_now_and_then_and_the_time_at_the_end():
+    lines, now = [], iter([0.0, 1.0, 6.0, 7.0, 12.0, 20.0])
+    progress = line_progress(lines.append, clock=lambda: next(now))
+    for done in (0, 1, 2, 3, 5, 10):
+        progress("texture", done, 10)
+    assert lines == [
+        "texture: 2 of 10, about 24 s left",
+        "texture: 5 of 10, about 12 s left",
+        "texture: 20.0 s",
+    ]
+
+
+def test_a_stage_that_comes_twice_is_timed_twice():
+    lines, now = [], iter([0.0, 1.0, 5.0, 7.0])
+    progress = line_progress(lines.append, clock=lambda: next(now))
+    for done in (0, 1, 0, 1):
+        progress("views", done, 1)
+    assert lines == ["views: 1.0 s", "views: 2.0 s"]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_progress_is_shown_on_terminals_and_elsewhere(terminal):
+    out = io.StringIO()
+    with show_progress(Console(file=out, force_terminal=terminal, width=80)) as progress:
+        for done in range(4):
+            progress("texture", done, 3)
+        progress("landmarks", 1, 1)
+    assert "texture" in out.getvalue()
+    assert "landmarks" in out.getvalue()
+    assert ("\x1b" in out.getvalue()) == terminal
+
+
+def test_the_summary_has_three_rows_of_panels_that_all_show_something(scene, made):
+    reports = []
+    sheet = draw_summary([scene[0]], made, progress=lambda *report: reports.append(report)).numpy()
+    assert sheet.shape[1] == WIDTH
+    total = 1 + VIEWS + len(POSES)
+    assert reports == [("summary", n, total) for n in range(1, total + 1)]
+    painted = (sheet != PAPER).any(-1)[:, 60].astype(int)  # a column through the first panel of each row
+    rows = np.diff(np.flatnonzero(np.diff(painted)))
+    for n_panels in (4, VIEWS, len(POSES)):
+        assert panel_side(n_panels, WIDTH) in rows
+
+
+def test_the_avatars_panel_matches_the_photos(scene, made):
+    sheet = draw_summary([scene[0]], made).numpy().astype(int)
+    side, top = panel_side(4, WIDTH), 24 + 44
+    photo, _, mask, avatar = (sheet[top : top + side, 24 + k * (side + 12) :][:, :side] for k in range(4))
+    hand = mask[..., 0] > 250
+    assert np.abs(photo[hand] - (200, 150, 120)).max() <= 5  # the edge blends in
+    assert np.abs(avatar[hand].mean(0) - (200, 150, 120)).max() < 15
+    assert (avatar[mask[..., 0] < 5].mean(0) > 220).all()
+
+
+def test_doubts_are_mentioned(scene, made):
+    sure, doubtful = (draw_summary([scene[0]], made._replace(warnings=w)) for w in ((), ("a finger is hidden",)))
+    assert (sure[:68] != doubtful[:68]).any()
+    assert torch.equal(sure[68:], doubtful[68:])
+
+
+def test_a_surface_is_brightest_where_it_faces_the_camera(scene, hand):
+    _, fit, avatar = scene
+    shade, inside = shade_mesh(avatar.mesh(fit.pose), hand.faces, fit.camera)
+    assert torch.equal(inside, fit.mask)
+    assert (shade[inside == 0] == 0).all()
+    assert 0.34 < shade[inside == 1].min() < 0.7
+    assert 0.95 < shade.max() <= 1.0001
+
+
+def test_landmarks_are_drawn_where_they_are():
+    points = np.stack([np.linspace(10, 90, 21), np.tile([20.0, 50.0, 80.0], 7)], 1)
+    drawn = draw_landmarks(np.zeros((100, 100, 3), np.uint8), points)
+    for finger, color in enumerate(FINGER_COLORS):
+        x, y = points[4 * finger + 4]
+        assert tuple(drawn[int(y), int(x)]) == color
+
+
+def test_a_mesh_leaves_the_picture_around_it_alone():
+    picture = np.full((60, 60, 3), 77, np.uint8)
+    inside = np.zeros((60, 60))
+    inside[20:40, 20:40] = 1
+    drawn = draw_mesh(picture, inside, inside)
+    assert (drawn[:18] == 77).all()
+    assert (drawn[25:35, 25:35] != 77).all()
+
+
+def test_panels_stand_beside_each_other_untouched():
+    panels = [Panel(np.full((panel_side(2, 200),) * 2 + (3,), value, np.uint8), "x") for value in (10, 90)]
+    sheet = make_sheet("title", "more", [panels], 200)
+    assert (sheet == 10).all(-1).sum() >= panel_side(2, 200) ** 2
+    assert (sheet == 90).all(-1).sum() >= panel_side(2, 200) ** 2
+
+
+def panels(made, visibility):
+    quality = SurfaceQuality(visibility, 1 - visibility)
+    sheet = draw_quality("a hand", made.avatar, quality).numpy()
+    side, top = panel_side(4, WIDTH), 24 + 44
+    assert sheet.shape[1] == WIDTH
+    return [sheet[top : top + side, 24 + k * (side + 12) :][:, :side].astype(float) for k in range(4)]
+
+
+def hue(panel):
+    """Mean colour of what is no background, as shares."""
+    color = panel[np.ptp(panel, axis=-1) > 12].mean(0)
+    return color / color.sum()
+
+
+def test_each_side_of_the_hand_is_shown_in_the_colours_of_what_is_known_of_it(made):
+    n = len(made.avatar.hand.template)
+    seen, unseen = panels(made, torch.ones(n)), panels(made, torch.full((n,), 0.1))
+    assert hue(seen[0])[1] > 0.42 and hue(seen[1])[1] > 0.42  # green, from both sides
+    assert hue(unseen[0])[0] > hue(unseen[0])[1] > hue(unseen[0])[2]  # yellow
+    assert hue(seen[2])[2] > 0.4 and hue(unseen[2])[2] < 0.25  # blue where it is sure
+
+
+def test_the_palm_and_the_back_are_told_apart(made):
+    palm = (made.avatar.mesh(made.fit.pose).vertices[:, 2] < 0.6).float()  # the camera looks along z
+    front, behind, *_ = panels(made, palm)
+    green = [(np.argmax(panel, -1) == 1).mean() for panel in (front, behind)]
+    assert green[0] > 2 * green[1]

@@ -1,18 +1,27 @@
+"""Pages in the browser: `oasis view`, and the form of `oasis serve` with its strangers, wrong files and restarts."""
+
 import base64
 import gzip
 import http.client
+import json
 import re
 import socket
 import struct
+import sys
 import threading
+import time
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from oasis_warp.cli import jobs as jobs_module
 from oasis_warp.cli import main
+from oasis_warp.cli.jobs import MOST_WAITING, RESULTS, Jobs
+from oasis_warp.cli.serve import MOST_BYTES, FormServer
 from oasis_warp.cli.view import PageServer
+from oasis_warp.core.errors import InputError
 from oasis_warp.export import export_avatar
 from oasis_warp.export.page_data import unpack_data
 
@@ -148,3 +157,167 @@ def test_a_port_that_cannot_be_used_is_refused_in_one_sentence(avatar_file, caps
         for port in (taken.getsockname()[1], 70000):
             assert main(["view", str(avatar_file), "--port", str(port), "--no-browser"]) == 2
             assert f"--port {port}: " in capsys.readouterr().err
+
+
+# In the program's place: "bad" in a photo is refused, "slow" takes its time, and everything else becomes an avatar.
+PROGRAM = """
+import pathlib, sys, time
+_, command, source, _, out, *others = sys.argv
+print("landmarks: 0.1 s", file=sys.stderr, flush=True)
+data, out = pathlib.Path(source).read_bytes(), pathlib.Path(out)
+if b"slow" in data:
+    time.sleep(60)
+if b"bad" in data:
+    sys.exit(f"oasis: {source}: found no hand; give another photo.")
+if command == "export":
+    assert not others or (others[0] == "--photo" and pathlib.Path(others[1]).read_bytes() == data)
+    assert bool(others) == (out.suffix == ".html")
+    out.write_bytes(b"page of " + data)
+else:
+    out.mkdir()
+    for name in %s:
+        (out / name).write_bytes(data)
+"""
+
+
+@pytest.fixture
+def program(tmp_path, monkeypatch):
+    script = tmp_path / "program.py"
+    script.write_text(PROGRAM % (RESULTS,))
+    monkeypatch.setattr(jobs_module, "PROGRAM", (sys.executable, str(script)))
+
+
+@pytest.fixture
+def form_server(program, tmp_path):
+    jobs = Jobs(tmp_path / "served")
+    with FormServer(jobs) as form_server:
+        threads = [
+            threading.Thread(target=form_server.serve_forever, kwargs={"poll_interval": 0.01}),
+            threading.Thread(target=jobs.work),
+        ]
+        for thread in threads:
+            thread.start()
+        yield form_server
+        jobs.stop()
+        form_server.shutdown()
+        for thread in threads:
+            thread.join()
+
+
+def ask_form(form_server, path, method="GET", body=None, token=None, **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", form_server.server_port, timeout=10)
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method, f"/{token or form_server.token}/{path}", body, named)
+    answer = connection.getresponse()
+    got = answer.status, answer.read()
+    connection.close()
+    return got
+
+
+def send(form_server, photo, name="hand.jpg"):
+    status, body = ask_form(form_server, "jobs", "POST", photo, X_Name=name)
+    assert status == 201, body
+    return json.loads(body)["job"]
+
+
+def wait(form_server, job, state):
+    for _ in range(400):
+        found = json.loads(ask_form(form_server, f"jobs/{job}")[1])
+        if found["state"] == state:
+            return found
+        time.sleep(0.02)
+    raise AssertionError(found)
+
+
+def test_a_photo_becomes_an_avatar_whose_files_can_be_had(form_server):
+    job = send(form_server, b"photo", "my%20hand.JPG")
+    wait(form_server, job, "done")
+    assert ask_form(form_server, f"jobs/{job}/avatar.safetensors") == (200, b"photo")
+    for _ in range(2):
+        assert ask_form(form_server, f"jobs/{job}/hand.html") == (200, b"page of photo")
+    for wrong in ("hand.exe", "photo.jpg", "../photo.jpg", "..%2fphoto.jpg", "out/summary.png", ""):
+        assert ask_form(form_server, f"jobs/{job}/{wrong}")[0] == (404 if wrong else 200)
+    assert ask_form(form_server, f"jobs/{job[:-1]}x")[0] == ask_form(form_server, "jobs/../../x")[0] == 404
+
+
+def test_a_refused_photo_gets_the_program_s_sentence_and_the_next_one_its_turn(form_server):
+    bad, good = send(form_server, b"bad"), send(form_server, b"good")
+    assert wait(form_server, bad, "failed")["note"] == "the photo: found no hand; give another photo."
+    assert ask_form(form_server, f"jobs/{bad}/summary.png")[0] == 404
+    wait(form_server, good, "done")
+
+
+def test_strangers_and_other_sites_get_nothing(form_server):
+    assert ask_form(form_server, "")[0] == 200
+    assert ask_form(form_server, "", token="x" * len(form_server.token))[0] == 404
+    for stranger in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
+        assert ask_form(form_server, "jobs", "POST", b"photo", X_Name="a.jpg", **stranger)[0] == 404
+    assert not list(form_server.jobs.folder.iterdir())
+    assert form_server.server_address[0] == "127.0.0.1"
+
+
+@pytest.mark.parametrize(
+    ("name", "headers", "status", "said"),
+    [
+        ("script.py", {}, 422, "script.py: expected a picture, .jpg"),
+        ("", {}, 422, "expected a picture"),
+        ("a.jpg", {"Content_Length": str(MOST_BYTES + 1)}, 413, "more than 64 MB"),
+        ("a.jpg", {"Content_Length": "-1"}, 411, ""),
+    ],
+)
+def test_what_is_no_photo_is_refused(form_server, name, headers, status, said):
+    got, body = ask_form(form_server, "jobs", "POST", b"photo", X_Name=name, **headers)
+    assert got == status and said in body.decode()
+    assert not list(form_server.jobs.folder.iterdir())
+
+
+def look(jobs, job):
+    found = jobs.look(job)
+    assert found is not None
+    return found
+
+
+def test_a_full_queue_is_said(program, tmp_path):
+    jobs = Jobs(tmp_path / "served")
+    first = [jobs.add("a.jpg", b"photo") for _ in range(MOST_WAITING)]
+    with pytest.raises(InputError, match="16 photos are waiting already"):
+        jobs.add("a.jpg", b"photo")
+    assert [look(jobs, job).ahead for job in first] == list(range(MOST_WAITING))
+
+
+def test_a_restart_goes_on_with_what_waited_and_loses_nothing(form_server, tmp_path):
+    done = send(form_server, b"photo")
+    wait(form_server, done, "done")
+    slow = send(form_server, b"slow")
+    assert wait(form_server, slow, "running")["note"] in ("starting", "landmarks")
+    waiting = send(form_server, b"photo too")
+    form_server.jobs.stop()
+    (form_server.jobs.folder / waiting / "photo.jpg").write_bytes(b"photo too")
+    again = Jobs(tmp_path / "served")
+    assert look(again, done).state == "done"
+    assert [look(again, job).ahead for job in (slow, waiting)] == [0, 1]
+
+
+def test_a_photo_that_takes_too_long_is_ended(program, tmp_path, monkeypatch):
+    monkeypatch.setattr(jobs_module, "MOST_SECONDS", 0.5)
+    jobs = Jobs(tmp_path / "served")
+    job = jobs.add("a.jpg", b"slow")
+    worker = threading.Thread(target=jobs.work)
+    worker.start()
+    while look(jobs, job).state != "failed":
+        time.sleep(0.02)
+    jobs.stop()
+    worker.join()
+    assert look(jobs, job).note.startswith("It took more than")
+
+
+def test_the_command_serves_until_ctrl_c_and_refuses_a_file_for_a_folder(tmp_path, monkeypatch, capsys):
+    def stop(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FormServer, "serve_forever", stop)
+    assert main(["serve", "--folder", str(tmp_path / "served"), "--no-browser"]) == 0
+    assert "Photos are taken at http://127.0.0.1:" in capsys.readouterr().out
+    (tmp_path / "file").write_text("")
+    assert main(["serve", "--folder", str(tmp_path / "file"), "--no-browser"]) == 2
+    assert "file: cannot be made" in capsys.readouterr().err

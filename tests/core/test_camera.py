@@ -1,8 +1,16 @@
+"""Cameras, surfaces and backgrounds."""
+
+
 import math
 
+import numpy as np
 import pytest
 import torch
+import trimesh
+from scipy.spatial.transform import Rotation
 
+from oasis_warp.core import backgrounds, rotation, surface
+from oasis_warp.core.backgrounds import plain_background
 from oasis_warp.core.camera import crop_camera, orbit_camera, project
 from oasis_warp.core.mirror import mirror_camera
 from oasis_warp.core.types import Camera
@@ -70,3 +78,126 @@ def test_an_orbit_keeps_its_height_and_its_horizon_all_the_way_round(points, azi
     ])  # fmt: skip
     torch.testing.assert_close(direction, expected, atol=1e-5, rtol=0)
     assert abs(float(camera.viewmat[0, 1])) < 1e-6  # the picture's x axis is level
+
+
+def sphere():
+    mesh = trimesh.creation.icosphere(subdivisions=3)
+    return torch.from_numpy(np.array(mesh.vertices)), torch.from_numpy(np.array(mesh.faces)), mesh
+
+
+def test_normals_of_a_sphere_point_outwards():
+    vertices, faces, _ = sphere()
+    assert float((surface.vertex_normals(vertices, faces) * vertices).sum(-1).min()) > 0.999
+
+
+def test_vertex_areas_add_up_to_the_surface():
+    vertices, faces, mesh = sphere()
+    assert math.isclose(float(surface.vertex_areas(vertices, faces).sum()), mesh.area, rel_tol=1e-12)
+
+
+def test_a_degenerate_face_has_a_zero_normal():
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    normals, areas = surface.face_normals(vertices, torch.tensor([[0, 1, 2]]))
+    assert torch.equal(normals, torch.zeros(1, 3))
+    assert float(areas) == 0
+
+
+def test_every_edge_is_listed_once():
+    _, faces, mesh = sphere()
+    edges = surface.mesh_edges(faces)
+    assert len(edges) == len(mesh.edges_unique)
+    assert bool((edges[:, 0] < edges[:, 1]).all())
+
+
+def test_smoothing_keeps_constants_and_calms_noise():
+    vertices, faces, _ = sphere()
+    edges = surface.mesh_edges(faces)
+    noise = torch.randn(len(vertices), 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    torch.testing.assert_close(surface.smooth_over_mesh(torch.ones_like(noise), edges, 3), torch.ones_like(noise))
+    assert float(surface.smooth_over_mesh(noise, edges, 3).std()) < 0.4 * float(noise.std())
+
+
+def random_quats(n, seed):
+    generator = torch.Generator().manual_seed(seed)
+    q = torch.randn(n, 4, generator=generator, dtype=torch.float64)
+    return q / q.norm(dim=-1, keepdim=True)
+
+
+def test_matrices_agree_with_scipy():
+    q = random_quats(100, 0)
+    theirs = Rotation.from_quat(q[:, [1, 2, 3, 0]].numpy()).as_matrix()  # SciPy's are xyzw
+    torch.testing.assert_close(rotation.to_matrix(q), torch.from_numpy(theirs), atol=1e-14, rtol=0)
+
+
+def test_scaling_a_quaternion_changes_no_matrix():
+    q = random_quats(20, 1)
+    torch.testing.assert_close(rotation.to_matrix(3 * q), rotation.to_matrix(q), atol=1e-14, rtol=0)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 1.0, math.pi - 1e-7, math.pi])
+def test_matrix_to_quaternion_and_back_at_every_angle(angle):
+    axes = random_quats(50, 2)[:, 1:]
+    axes = axes / axes.norm(dim=-1, keepdim=True)
+    matrices = rotation.from_axis_angle(axes, torch.full((50,), angle, dtype=torch.float64))
+    quats = rotation.from_matrix(matrices)
+    torch.testing.assert_close(rotation.to_matrix(quats), matrices, atol=1e-14, rtol=0)
+    assert bool((quats[:, 0] >= 0).all())
+
+
+def test_multiply_composes_rotations():
+    a, b = random_quats(30, 3), random_quats(30, 4)
+    composed = rotation.to_matrix(a) @ rotation.to_matrix(b)
+    torch.testing.assert_close(rotation.to_matrix(rotation.multiply(a, b)), composed, atol=1e-14, rtol=0)
+
+
+COLOR = (0.25, 0.5, 1.0)
+
+
+def test_every_camera_gets_the_color(device):
+    for dtype in (torch.float32, torch.float64):
+        made = plain_background(COLOR, 2, torch.zeros(1, dtype=dtype, device=device))
+        assert torch.equal(made, torch.tensor([COLOR, COLOR], dtype=dtype, device=device))
+
+
+def test_one_color_is_one_tensor_and_others_are_others(device):
+    like = torch.zeros(3, device=device)
+    first = plain_background(COLOR, 1, like)
+    assert plain_background(COLOR, 1, like + 1) is first
+    others = [plain_background((0.25, 0.5, 0.0), 1, like), plain_background(COLOR, 1, like.double())]
+    assert all(other is not first for other in others) and len(plain_background(COLOR, 2, like)) == 2
+
+
+def test_what_inference_mode_made_can_be_saved_for_a_gradient(monkeypatch):
+    monkeypatch.setattr(backgrounds, "_kept", {})
+    with torch.inference_mode():
+        made = plain_background(COLOR, 1, torch.zeros(1))
+    leaf = torch.ones(3, requires_grad=True)
+    assert torch.equal(torch.autograd.grad((leaf * made).sum(), leaf)[0], made[0])
+
+
+def test_a_traced_call_neither_keeps_nor_gets_what_is_kept(monkeypatch):
+    monkeypatch.setattr(backgrounds, "_kept", {})
+    like = torch.zeros(1)
+    with torch.device("meta"):  # a mode, which may be watching
+        made = plain_background(COLOR, 2, like)
+    assert torch.equal(made, torch.tensor([COLOR, COLOR])) and not backgrounds._kept
+
+
+def test_no_more_is_kept_than_the_limit(monkeypatch):
+    monkeypatch.setattr(backgrounds, "_kept", {})
+    like = torch.zeros(1)
+    for value in range(backgrounds.MAX_KEPT + 3):
+        assert plain_background((value / 7,), 1, like).item() == pytest.approx(value / 7)
+    assert len(backgrounds._kept) == backgrounds.MAX_KEPT
+
+
+@pytest.mark.gpu
+def test_a_graph_that_is_captured_fills_its_own(monkeypatch):
+    monkeypatch.setattr(backgrounds, "_kept", {})
+    like = torch.zeros(1, device="cuda")
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        made = plain_background(COLOR, 1, like)
+    assert not backgrounds._kept
+    graph.replay()
+    assert made.tolist() == [list(COLOR)]

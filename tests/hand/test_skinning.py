@@ -1,4 +1,4 @@
-"""Laws of shaping and posing the hand, and agreement with a plain numpy twin."""
+"""Laws of shaping and posing the hand, and agreement with a plain numpy twin; named poses and their limits."""
 
 import dataclasses
 import math
@@ -6,10 +6,14 @@ import math
 import numpy as np
 import pytest
 import torch
+from hand_build.quality import self_crossings
 
 from oasis_warp.core import rotation
 from oasis_warp.core.mirror import mirror_hand, mirror_points, mirror_pose
 from oasis_warp.core.types import HandPose
+from oasis_warp.estimation.fit_problem import FitState
+from oasis_warp.hand.kinematics import HandKinematics
+from oasis_warp.hand.poses import POSE_NAMES, named_pose, pose_sequence
 from oasis_warp.hand.skinning import (
     bone_transforms,
     corrective_coefficients,
@@ -211,3 +215,170 @@ def test_the_hand_moves_to_another_precision_and_device(hand, device):
     pose = at_origin(torch.zeros(15, 3, dtype=F64, device=device))
     posed = skin(moved, rest_hand(moved, torch.zeros(40, dtype=F64, device=device)), pose)
     torch.testing.assert_close(posed.vertices.cpu(), hand.template.double(), rtol=0, atol=1e-7)
+
+
+def posed(hand, name):
+    pose = HandPose(named_pose(hand, name), torch.eye(3), torch.zeros(3))
+    return skin(hand, rest_hand(hand, torch.zeros(40)), pose)
+
+
+def test_rest_is_zero_and_open_is_straight(hand):
+    assert named_pose(hand, "rest").eq(0).all()
+    points = hand21(posed(hand, "open"), hand)
+    for first in (5, 9, 13, 17):
+        reach = (points[first + 3] - points[first]).norm()
+        length = (points[first + 1 : first + 4] - points[first : first + 3]).norm(dim=-1).sum()
+        assert reach > 0.995 * length
+
+
+def test_open_fingers_are_further_apart_than_at_rest(hand):
+    tips = {name: hand21(posed(hand, name), hand)[[4, 8, 12, 16, 20]] for name in ("rest", "open")}
+    gaps = {name: (t[1:] - t[:-1]).norm(dim=-1) for name, t in tips.items()}
+    assert (gaps["open"] > gaps["rest"]).all()
+
+
+@pytest.mark.parametrize("name", ["pinch", "ok"])
+def test_thumb_and_index_meet(hand, name):
+    surface = posed(hand, name)
+    near = hand.weights[:, hand.joint_names.index("thumb3")] > 0.9
+    thumb = surface.vertices[near]
+    index = surface.vertices[hand.weights[:, hand.joint_names.index("index3")] > 0.9]
+    gap = torch.cdist(thumb, index).min()
+    assert gap < 0.003
+    tips = hand21(surface, hand)[[4, 8]]
+    assert (tips[0] - tips[1]).norm() < 0.025  # two half finger thicknesses
+
+
+@pytest.mark.parametrize("name", ["rest", "open", "relaxed", "pinch", "ok"])
+def test_poses_without_a_fist_do_not_cross_themselves(hand, name):
+    assert self_crossings(posed(hand, name).vertices.double().numpy(), hand.faces.numpy()) == 0
+
+
+def test_a_fist_hides_the_finger_tips_in_the_palm_under_the_thumb(hand):
+    points = hand21(posed(hand, "fist"), hand)
+    palm = points[[5, 9, 13, 17]]
+    assert ((points[[8, 12, 16, 20]] - palm).norm(dim=-1) < 0.045).all()
+    # The thumb lies in front of the bent fingers: further to the palm side (-y) than the index's middle bone.
+    assert points[4, 1] < points[6:8, 1].mean()
+
+
+def test_thumbs_up_is_a_fist_with_the_thumb_far_off(hand):
+    fist, up = hand21(posed(hand, "fist"), hand), hand21(posed(hand, "thumbs_up"), hand)
+    torch.testing.assert_close(fist[5:], up[5:])
+    assert (up[4] - up[5]).norm() > 0.06
+
+
+@pytest.mark.parametrize(("name", "long"), [("victory", (8, 12)), ("point", (8,))])
+def test_only_the_named_fingers_stand_out(hand, name, long):
+    points = hand21(posed(hand, name), hand)
+    for tip in (8, 12, 16, 20):
+        reach = (points[tip] - points[tip - 3]).norm()
+        assert (reach > 0.06) == (tip in long)
+
+
+def test_an_unknown_pose_is_named_in_the_message(hand):
+    with pytest.raises(ValueError, match=r"pose: expected one of rest, .*, got 'wave'\.$"):
+        named_pose(hand, "wave")
+
+
+def test_a_sequence_visits_each_pose_and_returns_to_the_first(hand):
+    names = ["open", "fist", "ok"]
+    frames = pose_sequence(hand, names, 8)
+    assert len(frames) == 24
+    for i, name in enumerate(names):
+        torch.testing.assert_close(frames[8 * i], named_pose(hand, name))
+
+
+def test_a_sequence_can_be_repeated_without_a_jump(hand):
+    frames = torch.stack(pose_sequence(hand, ["open", "fist"], 30))
+    steps = (frames.roll(-1, 0) - frames).abs().amax((1, 2))
+    swing = (named_pose(hand, "fist") - named_pose(hand, "open")).abs().max()
+    assert steps.max() < 1.1 * torch.pi / 2 / 30 * swing  # the steepest slope of half a cosine
+    assert steps[[0, 29, 30, 59]].max() < 0.1 * steps.max()  # and it starts and stops gently
+
+
+def test_every_frame_of_a_sequence_keeps_the_limits(hand):
+    low, high = hand.pose_limits[1:].unbind(-1)
+    for angles in pose_sequence(hand, POSE_NAMES, 3):  # each third one is a named pose
+        assert ((angles >= low - 1e-6) & (angles <= high + 1e-6)).all()
+
+
+def test_a_sequence_of_nothing_is_refused(hand):
+    with pytest.raises(ValueError, match="names: expected at least one pose, got none"):
+        pose_sequence(hand, [], 5)
+    with pytest.raises(ValueError, match="frames_per_transition: expected 1 or more, got 0"):
+        pose_sequence(hand, ["rest"], 0)
+
+
+STEP = 1e-6
+
+
+@pytest.fixture(scope="module")
+def kinematics(hand):
+    return HandKinematics(hand)
+
+
+@pytest.fixture
+def angles_and_shape(kinematics):
+    rng = np.random.default_rng(3)
+    return rng.uniform(-0.3, 1.2, len(kinematics.dofs)), rng.normal(size=kinematics.shape_basis.shape[2])
+
+
+def test_surface_is_that_of_skinning_with_its_correctives(hand, kinematics, angles_and_shape):
+    angles, shape = angles_and_shape
+    table = kinematics.all_angles(angles)
+    pose = HandPose(torch.from_numpy(table[1:]).float(), torch.eye(3), torch.zeros(3))
+    posed = skin(hand, rest_hand(hand, torch.from_numpy(shape).float()), pose)
+    joints = kinematics.pose_joints(angles, shape)
+    # float32 of a hand of 0.2 m
+    np.testing.assert_allclose(kinematics.surface(joints), posed.vertices, atol=3e-7)
+    np.testing.assert_allclose(joints.position, posed.joints, atol=3e-7)
+
+
+def test_landmark_derivatives_are_those_of_differences(kinematics, angles_and_shape):
+    angles, shape = angles_and_shape
+
+    def points(step):
+        joints = kinematics.pose_joints(angles + step[:26], shape + step[26:])
+        return kinematics.landmarks(joints)
+
+    _, slope = points(np.zeros(slope_size(angles_and_shape)))
+    check_slope(lambda step: points(step)[0], slope)
+
+
+def test_vertex_derivatives_are_those_of_differences(kinematics, angles_and_shape):
+    angles, shape = angles_and_shape
+    index = np.random.default_rng(1).integers(0, len(kinematics.template), 40)
+    fixed = kinematics.correctives(kinematics.all_angles(angles))
+
+    def points(step):
+        joints = kinematics.pose_joints(angles + step[:26], shape + step[26:])
+        return kinematics.vertices(joints, index, fixed[index])
+
+    _, slope = points(np.zeros(slope_size(angles_and_shape)))
+    check_slope(lambda step: points(step)[0], slope)
+
+
+def test_image_derivatives_are_those_of_differences(kinematics, angles_and_shape):
+    angles, shape = angles_and_shape
+    turn = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    state = FitState(turn, np.array([0.1, -0.2, -0.5]), angles, shape, 600.0, np.array([200.0, 150.0]))
+
+    def seen(state):
+        return state.linearize(*kinematics.landmarks(kinematics.pose_joints(state.angles, state.shape)))
+
+    slope = seen(state).d_image
+    check_slope(lambda step: seen(state.moved(step)).image, slope, scale=1e3)
+
+
+def slope_size(angles_and_shape):
+    return len(angles_and_shape[0]) + len(angles_and_shape[1])
+
+
+def check_slope(function, slope, scale=1.0):
+    n = slope.shape[2]
+    eye = np.eye(n) * STEP
+    differences = np.stack([(function(eye[k]) - function(-eye[k])) / (2 * STEP) for k in range(n)], -1)
+    # Rounding of central differences: 1e-16 * scale / STEP, and the cubic term STEP^2.
+    np.testing.assert_allclose(slope, differences, atol=1e-8 * scale)

@@ -1,21 +1,29 @@
-"""Studies go on where they stopped, and fill the pages that they say they fill."""
+"""Studies go on where they stopped, and fill the pages that they say; pages say which code has measured them."""
 
 import importlib
 import json
 import re
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
 import pytest
+import torch
+from synthetic import crop_of
 
+from oasis_warp.avatar.observation import batch_of_crop
 from oasis_warp.core.errors import InputError
 from oasis_warp.evaluation.columns import SYNTHETIC
 from oasis_warp.evaluation.methods import METHODS
 from oasis_warp.evaluation.summary import summarise
+from oasis_warp.network.config import COMPACT
+from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.weights_file import load_network, save_network
 from studies import __main__ as command
-from studies import evaluation, tables
+from studies import age, evaluation, tables
 from studies.harness import ROWS, StudyOptions, measured, read_rows, write_rows
+from studies.prior_card import file_table, gaussian_table, training_text
 from studies.seeded_bugs import BUGS
 from studies.tables import Column, Section, fill, markdown, medians, power, short, table
 
@@ -197,3 +205,139 @@ def test_evaluations_fill_their_pages(tmp_path):
     assert "2 people, 1 targets each, 64 px." in filled and evaluation.FOLDERS["same-hand"] in filled
     command.render(["evaluation"], tmp_path, tmp_path, tmp_path / "kept")
     assert (tmp_path / "evaluation.md").read_text() == filled
+
+
+NOTE = re.compile(r"\n\*Measured [^\n]*\*\n(?=<!-- end of)")
+
+
+def test_pages_hold_what_the_kept_results_say(tmp_path):
+    for page in command.DOCS.glob("*.md"):
+        shutil.copy(page, tmp_path)
+    for name in command.studies():
+        study = importlib.import_module(f"studies.{name}")
+        if rows := command.load(name, study, age.RESULTS):
+            tables.render(study.SECTIONS, rows, tmp_path)
+    for page in command.DOCS.glob("*.md"):
+        assert NOTE.sub("", (tmp_path / page.name).read_text()) == NOTE.sub("", page.read_text()), page.name
+
+
+@pytest.fixture
+def repository(tmp_path, monkeypatch):
+    """A study that imports a package, which passes on a function of one file beside another file; a kernel."""
+    texts = {
+        "studies/count.py": "from oasis_warp import half\n",
+        "src/oasis_warp/__init__.py": "from oasis_warp.halves import half\nfrom oasis_warp.other import third\n",
+        "src/oasis_warp/halves.py": '"""Half."""\n\ndef half(x):\n    from oasis_kernels.divide.by import by\n',
+        "src/oasis_warp/other.py": "third = 3\n",
+        "kernels/oasis_kernels/divide/__init__.py": "",
+        "kernels/oasis_kernels/divide/by.py": "by = 2\n",
+        "kernels/oasis_kernels/divide/by.cpp": "int by;",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    packages = {name: tmp_path / path.relative_to(age.TOP) for name, path in age.PACKAGES.items()}
+    monkeypatch.setattr(age, "TOP", tmp_path)
+    monkeypatch.setattr(age, "PACKAGES", packages)
+    return tmp_path
+
+
+def digest(change=None):
+    if change:
+        path, text = change
+        path.write_text(text)
+    for cached in (age.parsed, age.imported, age.file_digest, age.code_digest):
+        cached.cache_clear()
+    return age.code_digest("count")
+
+
+def test_a_digest_is_of_the_code_that_a_study_runs(repository):
+    before, source = digest(), repository / "src" / "oasis_warp"
+    text = (source / "halves.py").read_text()
+    same = digest((source / "halves.py", text.replace("Half.", "A half.").replace("    from", "    # why\n    from")))
+    assert same == digest((source / "other.py", "third = 4\n")) == before
+    changed = digest((source / "halves.py", text + "    return x / by\n"))
+    assert changed != before
+    assert digest((repository / "kernels/oasis_kernels/divide/by.cpp", "long by;")) not in (before, changed)
+
+
+def test_tables_say_when_their_code_has_changed(repository, monkeypatch):
+    out, docs, results, before = repository / "out", repository / "docs", repository / "results", digest()
+    study = type("Study", (), {"SECTIONS": (Section("page.md", "a", table((Column("value", "value"),))),)})
+    monkeypatch.setattr(importlib, "import_module", lambda name: study)
+    docs.mkdir()
+    page = docs / "page.md"
+    page.write_text("<!-- a -->\n| old |\n<!-- end of a -->\n")
+
+    def measure():
+        with age.noting_code(out, "count", (f"count/{ROWS}",)):
+            write_rows(out / "count", [{"value": 1, "commit": "0123456789"}])
+
+    def check():
+        return command.note_ages(["count"], docs, results, write=False)
+
+    assert age.noted_page("<!-- b -->\n<!-- end of b -->\n", "b", "*Measured long ago.*").count("\n") == 2
+    assert check() == ["page.md: a"]
+    command.render(["count"], out, docs, results)
+    assert "*Measured with an older version, whose results were not kept.*\n<!-- end" in page.read_text()
+    assert check() == []
+    measure()
+    command.render(["count"], out, docs, results)
+    assert "Measured" not in page.read_text() and check() == []
+    digest((repository / "studies" / "count.py", "value = 2\n"))
+    assert check() == ["page.md: a"]
+    command.note_ages(["count"], docs, results, write=True)
+    assert page.read_text().count("*Measured at 0123456789; the code has changed since.*\n<!-- end of a -->") == 1
+    assert check() == []
+    measure()  # continues rows of the earlier code
+    assert age.read_kept(out, "count")[f"count/{ROWS}"].code == tuple(sorted((before, digest())))
+    (out / "count" / ROWS).unlink()
+    measure()
+    command.render(["count"], out, docs, results)
+    assert "Measured" not in page.read_text()
+
+
+NOTES = {
+    "step": 1234, "steps": 2000, "hands": 16, "people": 512, "seed": 3, "precision": "bfloat16", "profile": "compact",
+    "hold_out": ["tattoo", "ring"], "losses": {"rgb": 10.0},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def weights(hand, tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "network.safetensors"
+    small = replace(COMPACT, image_size=32, width=32, heads=2, n_tokens=16, n_coarse=64, refine_layers=1, head_width=16)
+    save_network(path, HandNetwork(small, hand), notes=json.dumps(NOTES))
+    return path
+
+
+def test_the_file_and_its_training_are_told_from_its_header(weights):
+    text = file_table(weights)
+    assert "12,337 vertices, 24,608 faces" in text and "32 channels, 16 tokens" in text
+    trained = training_text(weights)
+    assert "| step | 1,234 |" in trained and "| losses | rgb 10.0 |" in trained
+    command = "oasis pretrain prior --steps 2000 --hands 16 --people 512 --seed 3 --precision bf16 --profile compact"
+    assert f"{command} --hold-out tattoo ring\n" in trained
+
+
+def test_the_command_that_retrains_is_one_that_the_command_line_takes(weights):
+    import tyro
+
+    from oasis_warp.cli.developer_options import Pretrain
+
+    line = next(line for line in training_text(weights).splitlines() if line.startswith("oasis pretrain"))
+    options = tyro.cli(Pretrain, args=line.split()[2:])
+    assert (options.steps, options.seed, options.precision) == (2000, 3, "bf16")
+    assert options.hold_out == ("tattoo", "ring")
+
+
+def test_an_untrained_prior_has_the_gaussians_of_the_mean_hand(weights, hand):
+    crop, _, _ = crop_of(hand, torch.full_like(hand.template, 0.5), size=32)
+    lines = gaussian_table(load_network(weights, hand).eval(), [batch_of_crop(crop)]).splitlines()
+    rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in lines}
+    assert [float(cell) for cell in rows["on vertices: opacity"]] == [0.95] * 3
+    assert [float(cell) for cell in rows["on vertices: under the skin, mm"]] == [0.8] * 3
+    assert [float(cell) for cell in rows["on faces: from the middle of the face, mm"]] == [0.0] * 3
+    assert [float(cell) for cell in rows["on faces: largest share of a corner in a face's features"]] == [0.33] * 3
+    low, middle, high = (float(cell) for cell in rows["on faces: largest deviation, mm"])
+    assert 0.1 < low < middle < high < 2
