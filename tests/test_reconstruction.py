@@ -1,4 +1,4 @@
-"""Photos of real hands, from files to an avatar."""
+"""Photos of real hands, from files to an avatar; of damaged ones quality falls gently, and the report says so."""
 
 import re
 from dataclasses import replace
@@ -6,13 +6,18 @@ from pathlib import Path
 
 import pytest
 import torch
+from synthetic import crop_of
 from torch.nn.functional import avg_pool2d
 
 from oasis_warp import reconstruction
+from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.adaptation.sharpen import sharpen
+from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import inner_mask
+from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.avatar.quality import over_photo
 from oasis_warp.core.camera import orbit_camera, project
-from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.processes import using_threads
@@ -24,6 +29,8 @@ from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.hand_avatar import draw_as_photo, make_avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.reconstruction import reconstruct, reconstruct_same_hand
+from studies.damage import DAMAGES
+from studies.stress import is_sane, likeness, make
 
 PHOTOS = Path(__file__).parent / "data" / "photos"
 WOOD = PHOTOS / "same_hand" / "a1_wood_right"
@@ -226,3 +233,76 @@ def test_refinement_of_a_left_hand_moves_it_and_keeps_it_on_its_photo(hand):
     assert not torch.equal(on.fit.pose.angles, off.fit.pose.angles)
     assert on.errors["reprojection_percent"] < 2.3
     assert on.errors["render_mask_iou"] > off.errors["render_mask_iou"] - 0.02
+
+
+OPEN_PALM = Path(__file__).parent / "data" / "photos" / "palm_open_left_02.png"
+FEW = ReconstructConfig(size=256, steps=20)
+SAID = {
+    "mask eroded": "", "mask dilated": "", "landmarks off": "poor fit", "half out": "border", "warm light": "",
+    "cold light": "colour of skin", "dark": "dark photo", "blurred": "blurred photo", "tiny": "small hand",
+    "nail polish": "", "tattoo": "", "glove": "colour of skin",
+}  # fmt: skip
+"""What the report must warn about, if anything."""
+LIKE = 18.0
+"""An avatar of a damaged photo is as like that of the whole one as this, at least [dB]."""
+LIKE_IN_THE_DARK = 17.0
+"""The same for a photo with hardly any light, of which less is told apart from skin."""
+
+
+@pytest.fixture(scope="module")
+def crop(hand):
+    return crop_of(hand, region_colors(label_regions(hand), 0.03), size=48)[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damage", ["black", "white", "no mask", "all mask", "one pixel", "noise"])
+def test_no_photo_and_no_mask_makes_colours_that_are_none(hand, crop, damage):
+    image, mask = crop.image, crop.mask
+    one = torch.zeros_like(mask)
+    one[len(mask) // 2, len(mask) // 2] = 1
+    image, mask = {
+        "black": (torch.zeros_like(image), mask),
+        "white": (torch.ones_like(image), mask),
+        "no mask": (image, torch.zeros_like(mask)),
+        "all mask": (image, torch.ones_like(mask)),
+        "one pixel": (image, one),
+        "noise": (torch.rand(image.shape, generator=torch.Generator().manual_seed(0)), mask),
+    }[damage]
+    damaged = crop._replace(image=image, mask=mask)
+    few = AdaptConfig(calibration_steps=5, texture_steps=3, reference_views=1)
+    adapted = adapt(hand, [MeanPrior(hand)(damaged)], [damaged], few)
+    assert is_sane(sharpen(hand, adapted.gaussians, [damaged]).gaussians)
+
+
+@pytest.mark.slow
+def test_gaussians_that_are_no_numbers_no_colours_or_too_large_are_told(hand, crop):
+    gaussians = MeanPrior(hand)(crop)
+    assert is_sane(gaussians)
+    for name, value in (("colors", float("nan")), ("colors", 1.5), ("scales", 1.0), ("opacities", float("inf"))):
+        broken = getattr(gaussians, name).clone()
+        broken.view(-1)[7] = value
+        assert not is_sane(gaussians._replace(**{name: broken})), name
+
+
+@pytest.fixture(scope="module")
+def whole():
+    photo = read_photo(OPEN_PALM)
+    return photo, reconstruct(photo, FEW)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_photo_makes_a_hand_and_the_report_says_what_ails_it(whole, name):
+    photo, base = whole
+    assert base.warnings == ()
+    made = make(DAMAGES[name](photo, base), FEW, force=True)
+    assert is_sane(made.avatar.gaussians)
+    assert likeness(base.avatar, made.avatar) > (LIKE_IN_THE_DARK if name == "dark" else LIKE)
+    assert SAID[name] in "; ".join(made.warnings)
+
+
+@pytest.mark.slow
+def test_two_reconstructions_with_the_same_seed_have_the_same_bits(whole):
+    photo, base = whole
+    again = reconstruct(photo, FEW).avatar.gaussians
+    assert all(map(torch.equal, again, base.avatar.gaussians))
