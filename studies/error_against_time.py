@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from oasis_warp.bench.error_time import BUDGETS, Group, SettingRow, fastest, groups
-from oasis_warp.bench.plots import plot_operator
 from oasis_warp.bench.rows import read_json
+from oasis_warp.bench.tables import plot_operator
 from studies.harness import Row, StudyOptions
 from studies.tables import Section, markdown, power
 

@@ -25,10 +25,10 @@ import torch
 from oasis_warp.bench import gpu_cases, gpu_speed, roofline, scaling
 from oasis_warp.bench.gpu_cases import OURS
 from oasis_warp.bench.gpu_speed import GpuRow
-from oasis_warp.bench.plots import MISSING, can_plot, plot_roofline, plot_scaling, plot_speed
 from oasis_warp.bench.roofline import KernelRow
 from oasis_warp.bench.rows import json_text, read_json
 from oasis_warp.bench.scaling import ScalingRow, steepest
+from oasis_warp.bench.tables import MISSING, can_plot, plot_roofline, plot_scaling, plot_speed
 from oasis_warp.data.output_files import write_file
 from studies.harness import Row, StudyOptions, report
 from studies.tables import Column, Section, power, section_of, short, table, yes

@@ -16,7 +16,7 @@ from oasis_warp.avatar.pose import (
     pose_gaussians,
     with_photo,
 )
-from oasis_warp.core.backgrounds import plain_background
+from oasis_warp.core.color import plain_background
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
 from oasis_warp.core.mirror import (

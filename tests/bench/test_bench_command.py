@@ -11,7 +11,7 @@ import pytest
 import torch
 from gpu_rows import FRAME, GPU, KERNELS, PEER, POINT, SPEED, STUDY
 
-from oasis_warp.bench import error_time, gpu_speed, knobs, plots, roofline, rows, scaling, speed
+from oasis_warp.bench import error_time, gpu_speed, knobs, roofline, rows, scaling, speed, tables
 from oasis_warp.bench.error_time import SettingRow
 from oasis_warp.bench.gpu_speed import GpuRow
 from oasis_warp.bench.rows import csv_text, from_record, json_text, keys, read_json, to_record, write_rows
@@ -31,7 +31,7 @@ def short(monkeypatch, small):
 
 @pytest.mark.slow
 def test_error_time_writes_tables_and_says_that_plots_need_matplotlib(short, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(plots, "find_spec", lambda name: None)
+    monkeypatch.setattr(tables, "find_spec", lambda name: None)
     assert main(["bench", "error-time", "-o", str(tmp_path / "out"), "--repeats", "2"]) == 0
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"error_time.csv", "error_time.json"}
     records = list(csv.DictReader((tmp_path / "out" / "error_time.csv").read_text().splitlines()))
@@ -172,7 +172,7 @@ def test_what_cannot_be_measured_on_a_gpu_is_refused_in_one_sentence(
 
 
 def test_a_plot_without_matplotlib_is_refused_before_anything_is_measured(gpu, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(plots, "find_spec", lambda name: None)
+    monkeypatch.setattr(tables, "find_spec", lambda name: None)
     assert main(["bench", "roofline", "--plot", str(tmp_path / "r.png")]) == 2
     assert capsys.readouterr().err.startswith("oasis: --plot: matplotlib is not installed")
     assert list(tmp_path.iterdir()) == []
@@ -195,7 +195,7 @@ def test_a_profiler_that_sees_nothing_is_told_in_one_sentence(gpu, monkeypatch, 
 
 
 def test_scaling_writes_its_tables_and_tells_the_steepest_steps(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(plots, "find_spec", lambda name: None)
+    monkeypatch.setattr(tables, "find_spec", lambda name: None)
     asked = {}
     monkeypatch.setattr(scaling, "measure_scaling", lambda points, device, **options: asked.update(options) or STUDY)
     assert main(["bench", "scaling", "--quick", "-o", str(tmp_path / "out"), "--seed", "3"]) == 0
@@ -292,14 +292,14 @@ OPERATOR = SpeedRow(
      ("pixels", 512**2, "512²"), ("views", 64, "64")],
 )  # fmt: skip
 def test_amounts_are_written_short(axis, amount, name):
-    assert plots.amount_name(axis, amount) == name
+    assert tables.amount_name(axis, amount) == name
 
 
 def test_pictures_appear_whole_and_nothing_else(tmp_path):
     pytest.importorskip("matplotlib")
     for name, plot, shown in (
-        ("speed", plots.plot_speed, SPEED), ("operators", plots.plot_speed, [OPERATOR]),
-        ("scaling", plots.plot_scaling, STUDY), ("roofline", plots.plot_roofline, KERNELS),
+        ("speed", tables.plot_speed, SPEED), ("operators", tables.plot_speed, [OPERATOR]),
+        ("scaling", tables.plot_scaling, STUDY), ("roofline", tables.plot_roofline, KERNELS),
     ):  # fmt: skip
         plot(shown, tmp_path / f"{name}.png")
         plot(shown, tmp_path / f"{name}.svg")
@@ -322,5 +322,5 @@ def test_a_picture_that_is_interrupted_leaves_the_old_one(monkeypatch, tmp_path)
     (tmp_path / "scaling.png").write_bytes(b"old")
     monkeypatch.setattr(figure.Figure, "savefig", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        plots.plot_scaling(STUDY, tmp_path / "scaling.png")
+        tables.plot_scaling(STUDY, tmp_path / "scaling.png")
     assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"old"]

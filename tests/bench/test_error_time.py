@@ -18,9 +18,9 @@ from oasis_warp.bench.error_time import (
 )
 from oasis_warp.bench.knobs import Setting, in_other_order
 from oasis_warp.bench.operators import OPERATORS, draw_in_torch
-from oasis_warp.bench.plots import plot_operator
 from oasis_warp.bench.rows import write_rows
 from oasis_warp.bench.scenes import equal_depths, hand_scenes, layered
+from oasis_warp.bench.tables import plot_operator
 from oasis_warp.ops._runtime.rules import Rules
 
 COARSE_STOP = Setting("stop", "0.01", Rules(transmittance_stop=1e-2))

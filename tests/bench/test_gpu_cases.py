@@ -5,9 +5,21 @@ import pytest
 import torch
 
 from oasis_warp.bench import cuda, gpu_speed
-from oasis_warp.bench.avatar_scene import Learning, avatar_scene, draw_avatar, make_avatar, many_poses, pose_avatar
 from oasis_warp.bench.cuda import Captured
-from oasis_warp.bench.gpu_cases import CASES, OURS, avatar_case, choose, image_case, visibility_case
+from oasis_warp.bench.gpu_cases import (
+    CASES,
+    OURS,
+    Learning,
+    avatar_case,
+    avatar_scene,
+    choose,
+    draw_avatar,
+    image_case,
+    make_avatar,
+    many_poses,
+    pose_avatar,
+    visibility_case,
+)
 from oasis_warp.bench.gpu_speed import errors, measure_case, measure_cases
 from oasis_warp.bench.operators import OPERATORS, Results
 from oasis_warp.core.config import BLACK

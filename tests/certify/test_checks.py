@@ -6,8 +6,14 @@ import pytest
 import torch
 
 from oasis_warp import ops
-from oasis_warp.certify.certification import full_scene, small_scenes
-from oasis_warp.certify.checks import bit_differences, finite_differences, outputs_and_gradients, refusals
+from oasis_warp.certify.certification import (
+    bit_differences,
+    finite_differences,
+    full_scene,
+    outputs_and_gradients,
+    refusals,
+    small_scenes,
+)
 from oasis_warp.certify.families import FAMILIES
 from oasis_warp.reference.errors import same_bits
 

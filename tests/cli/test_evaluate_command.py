@@ -21,13 +21,13 @@ from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.hand_crop import crop_hand
 from oasis_warp.evaluation import look_measures, looks, real_hands, same_hand, views
 from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
-from oasis_warp.evaluation.partial_results import read_result
 from oasis_warp.evaluation.same_hand import (
     compare_pairs,
     compare_with_photo,
     photos_of_hands,
     summarise_pairs,
 )
+from oasis_warp.evaluation.summary import read_result
 from oasis_warp.hand_avatar import draw_as_photo
 from oasis_warp.reconstruction import Reconstruction, reconstruct
 

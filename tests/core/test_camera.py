@@ -9,9 +9,9 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from oasis_warp.core import backgrounds, rotation, surface
-from oasis_warp.core.backgrounds import plain_background
+from oasis_warp.core import color, rotation, surface
 from oasis_warp.core.camera import crop_camera, orbit_camera, project
+from oasis_warp.core.color import plain_background
 from oasis_warp.core.mirror import mirror_camera
 from oasis_warp.core.types import Camera
 
@@ -168,7 +168,7 @@ def test_one_color_is_one_tensor_and_others_are_others(device):
 
 
 def test_what_inference_mode_made_can_be_saved_for_a_gradient(monkeypatch):
-    monkeypatch.setattr(backgrounds, "_kept", {})
+    monkeypatch.setattr(color, "_kept", {})
     with torch.inference_mode():
         made = plain_background(COLOR, 1, torch.zeros(1))
     leaf = torch.ones(3, requires_grad=True)
@@ -176,28 +176,28 @@ def test_what_inference_mode_made_can_be_saved_for_a_gradient(monkeypatch):
 
 
 def test_a_traced_call_neither_keeps_nor_gets_what_is_kept(monkeypatch):
-    monkeypatch.setattr(backgrounds, "_kept", {})
+    monkeypatch.setattr(color, "_kept", {})
     like = torch.zeros(1)
     with torch.device("meta"):  # a mode, which may be watching
         made = plain_background(COLOR, 2, like)
-    assert torch.equal(made, torch.tensor([COLOR, COLOR])) and not backgrounds._kept
+    assert torch.equal(made, torch.tensor([COLOR, COLOR])) and not color._kept
 
 
 def test_no_more_is_kept_than_the_limit(monkeypatch):
-    monkeypatch.setattr(backgrounds, "_kept", {})
+    monkeypatch.setattr(color, "_kept", {})
     like = torch.zeros(1)
-    for value in range(backgrounds.MAX_KEPT + 3):
+    for value in range(color.MAX_KEPT + 3):
         assert plain_background((value / 7,), 1, like).item() == pytest.approx(value / 7)
-    assert len(backgrounds._kept) == backgrounds.MAX_KEPT
+    assert len(color._kept) == color.MAX_KEPT
 
 
 @pytest.mark.gpu
 def test_a_graph_that_is_captured_fills_its_own(monkeypatch):
-    monkeypatch.setattr(backgrounds, "_kept", {})
+    monkeypatch.setattr(color, "_kept", {})
     like = torch.zeros(1, device="cuda")
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
         made = plain_background(COLOR, 1, like)
-    assert not backgrounds._kept
+    assert not color._kept
     graph.replay()
     assert made.tolist() == [list(COLOR)]

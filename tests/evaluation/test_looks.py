@@ -11,8 +11,7 @@ from oasis_warp.core.color import cielab, linear_light, luminance
 from oasis_warp.core.mirror import mirror_points
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
-from oasis_warp.evaluation.band_energy import BANDS, SIZE
-from oasis_warp.evaluation.blemishes import HAZE_REACH, darkest_over_median, haze, mean_light, redness
+from oasis_warp.evaluation.band_energy import BANDS, HAZE_REACH, SIZE, darkest_over_median, haze, mean_light, redness
 from oasis_warp.evaluation.contact_sheet import GAP, SMALL, write_cells, write_overview
 from oasis_warp.evaluation.kernel_distance import LAYERS
 from oasis_warp.evaluation.looks import hand_of, kernel_rows, summarise_looks

@@ -4,12 +4,14 @@ import pytest
 import torch
 from safetensors.torch import save_file
 from torch.nn.functional import grid_sample
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from oasis_warp.avatar.observation import batch_of_crop, observe_batch, project_batch, sample
 from oasis_warp.core import surface
 from oasis_warp.core.camera import project
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera
+from oasis_warp.losses.lpips import Lpips
 from oasis_warp.network.encoders import SIZES, ConvolutionalEncoder, DinoV2Encoder, ImageFeatures, Size
 from oasis_warp.network.refinement import CoarseLevel, Refinement, place_coarse_points, to_coarse, to_fine
 from oasis_warp.network.tokens import Aggregation, PlaceEncoding, PointFeatures, Tokenizer, encode, grid_places

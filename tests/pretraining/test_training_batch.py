@@ -26,8 +26,7 @@ from oasis_warp.network.dense_network import (
     save_dense_network,
 )
 from oasis_warp.ops import depth_map
-from oasis_warp.pretraining.dense_source import DensePhotos, detected
-from oasis_warp.pretraining.dense_trainer import DenseTrainer, dense_loss
+from oasis_warp.pretraining.dense_trainer import DensePhotos, DenseTrainer, dense_loss, detected
 from oasis_warp.pretraining.distributed import ProcessInfo
 from oasis_warp.pretraining.hand_batch import pose_hands
 from oasis_warp.pretraining.pretrain import CHECKPOINT, METRICS, WEIGHTS, BatchSource, PretrainConfig, pretrain

@@ -10,7 +10,7 @@ import pytest
 import torch
 from gpu_rows import KERNELS, SPEED, STUDY
 
-from oasis_warp.bench import plots
+from oasis_warp.bench import tables as bench_tables
 from oasis_warp.bench.rows import json_text
 from oasis_warp.evaluation.methods import Method
 from oasis_warp.evaluation.metrics import MEASURES
@@ -190,7 +190,7 @@ def test_what_was_not_measured_stays_on_the_page(monkeypatch, out, docs):
 
 
 def test_without_matplotlib_no_picture_is_drawn(monkeypatch, out):
-    monkeypatch.setattr(plots, "find_spec", lambda name: None)
+    monkeypatch.setattr(bench_tables, "find_spec", lambda name: None)
     with pytest.raises(SystemExit, match="matplotlib is not installed"):
         kernels.draw(kernels.load(out), out)
     assert not list(out.glob("*.png"))

@@ -15,10 +15,9 @@ from oasis_warp.synthetic.contact import bundled_skeleton, overlaps, separate
 from oasis_warp.synthetic.gestures import GESTURE_NAMES, GESTURES, sample_gesture
 from oasis_warp.synthetic.illumination import look_at
 from oasis_warp.synthetic.ops.batched_lbs import batched_lbs
-from oasis_warp.synthetic.ops.pixel_noise import pixel_noise
 from oasis_warp.synthetic.ops.room_tracing import PATTERNS, SHAPES, SOLID_WORDS, trace_rooms
 from oasis_warp.synthetic.ops.skin_shading import sky_transfer, surface_state
-from oasis_warp.synthetic.ops.surface_patterns import NoiseField, point_grid, surface_dabs, surface_noise
+from oasis_warp.synthetic.ops.surface_patterns import NoiseField, pixel_noise, point_grid, surface_dabs, surface_noise
 from oasis_warp.synthetic.ops.views import Lamps
 from oasis_warp.synthetic.picture import render_batch, render_capture
 from oasis_warp.synthetic.shot_table import arm_rotations, tabulate

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from oasis_kernels.runtime.native import cpu_options
-from oasis_kernels.runtime.source import defined, header_source, kernel_source
+from oasis_kernels.runtime.native import cpu_options, defined, header_source, kernel_source
 
 VERTICES_A_TASK = 16384
 POINTS_A_TASK = 2048

@@ -11,7 +11,7 @@ import warp as wp
 
 from oasis_kernels import constants
 from oasis_kernels.runtime.arrays import ONE, TWO, matrix33
-from oasis_kernels.runtime.source import defined, header_source
+from oasis_kernels.runtime.native import defined, header_source
 
 JACOBIAN_LIMIT = wp.constant(wp.float64(constants.JACOBIAN_LIMIT))
 

@@ -14,8 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from oasis_kernels.runtime.native import _typed
-from oasis_kernels.runtime.source import defined, kernel_source
+from oasis_kernels.runtime.native import _typed, defined, kernel_source
 
 READS = {"float": "(float)__longlong_as_double(parameters[{}])", "double": "__longlong_as_double(parameters[{}])"}
 

@@ -1,6 +1,7 @@
 """Patterns on a surface: gradient noise, one thread per point, and the dabs of lines and spots, one thread per dab.
 
-Everything is evaluated at points in space, so that a pattern has no seam where its texture has one.
+Everything is evaluated at points in space, so that a pattern has no seam where its texture has one. `pixel_noise` draws
+normal random numbers for pixels, from a seed an image: the same whatever the batch, the device and the threads.
 """
 
 import warp as wp
@@ -84,3 +85,15 @@ def dabs(
                     value = strength * wp.exp(-q)
                     if value > out[kind, numbers[k]]:  # others may write between: the maximum is right all the same
                         wp.atomic_max(out, kind, numbers[k], value)
+
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def normal(first: int, seeds: wp.array[wp.int32], n_each: int, out: wp.array2d[wp.float32]):
+    i = first + wp.tid()
+    b = i // n_each
+    k = i - b * n_each
+    state = wp.rand_init(seeds[b], k)
+    out[b, k] = wp.randn(state)

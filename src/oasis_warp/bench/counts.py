@@ -6,7 +6,7 @@ import torch
 
 from oasis_kernels.constants import EPS2D
 from oasis_kernels.rasterize.tiles_cuda import TILE
-from oasis_warp.bench.avatar_scene import AvatarScene
+from oasis_warp.bench.gpu_cases import AvatarScene
 from oasis_warp.bench.scenes import GaussianScene, MeshScene
 from oasis_warp.ops.projection import project
 

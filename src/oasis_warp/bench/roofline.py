@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 import torch
 
 from oasis_kernels.rasterize.tiles_cuda import record_size
-from oasis_warp.bench.avatar_scene import avatar_scene
 from oasis_warp.bench.counts import Counts, MeshCounts, count, count_avatar, count_mesh
 from oasis_warp.bench.cuda import KernelTime, kernel_times
-from oasis_warp.bench.gpu_cases import RASTERIZATION, UNVALIDATED, posing, size_name
+from oasis_warp.bench.gpu_cases import RASTERIZATION, UNVALIDATED, avatar_scene, posing, size_name
 from oasis_warp.bench.operators import OPERATORS, Results, forward, with_gradients
 from oasis_warp.bench.rows import provenance
 from oasis_warp.bench.scenes import HAND_GAUSSIANS, hand_scenes

@@ -18,8 +18,8 @@ from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.core.types import Camera, Color, Gaussians, HandPose
-from oasis_warp.data.camera_file import read_cameras
 from oasis_warp.data.films import check_film, write_video
+from oasis_warp.data.json_text import read_cameras
 from oasis_warp.data.pictures import to_uint8
 from oasis_warp.hand.poses import POSE_NAMES, pose_sequence
 from oasis_warp.hand_avatar import Avatar

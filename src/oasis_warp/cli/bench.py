@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from oasis_warp.bench import error_time, gpu_cases, gpu_speed, plots, roofline, scaling, speed
+from oasis_warp.bench import error_time, gpu_cases, gpu_speed, roofline, scaling, speed, tables
 from oasis_warp.bench.operators import OPERATORS
 from oasis_warp.bench.rows import csv_text, json_text, write_rows
 from oasis_warp.bench.scenes import HAND_GAUSSIANS
@@ -82,8 +82,8 @@ def check_plot(plot: Path | None) -> None:
         return
     if plot.suffix not in (".png", ".svg"):
         raise InputError(f"--plot {plot}: expected a name that ends in .png or .svg.")
-    if not plots.can_plot():
-        raise InputError(f"--plot: {plots.MISSING}")
+    if not tables.can_plot():
+        raise InputError(f"--plot: {tables.MISSING}")
 
 
 def run_error_time(options: ErrorTime) -> None:
@@ -109,7 +109,7 @@ def run_error_time(options: ErrorTime) -> None:
         write_rows(rows, folder / "error_time.csv", folder / "error_time.json")
         if with_plots:
             for op in dict.fromkeys(row.op for row in rows):
-                plots.plot_operator(rows, op, folder / f"{op}.png")
+                tables.plot_operator(rows, op, folder / f"{op}.png")
     print_tables([*(setting_table(group) for group in error_time.groups(rows)), budget_table(rows)], TABLE_WIDTH)
 
 
@@ -126,7 +126,7 @@ def run_kernels(options: Kernels) -> None:
     operators = [operator for name, operator in OPERATORS.items() if options.only in name]
     if not operators:
         raise InputError(f"--only {options.only}: expected part of one of {', '.join(OPERATORS)}.")
-    with results(options, plots.plot_speed) as write:
+    with results(options, tables.plot_speed) as write:
         with show_progress(Console(stderr=True)) as progress, using_threads(options.threads):
             repeats = options.repeats or REPEATS
             run_options = speed.RunOptions(device=torch.device("cpu"), threads=options.threads, repeats=repeats)
@@ -147,7 +147,7 @@ def run_gpu(options: Kernels) -> None:
         raise InputError(f"--only {options.only}: expected part of one of {names}.")
     peers = {"gsplat": gpu_speed.gsplat_draw()} if options.peer else {}
     notes = Console(stderr=True)
-    with results(options, plots.plot_speed) as write:
+    with results(options, tables.plot_speed) as write:
         with show_progress(notes) as progress, using_threads(options.threads):
             rows = gpu_speed.measure_cases(
                 cases, torch.device("cuda"), groups=options.repeats or GPU_GROUPS, peers=peers, progress=progress
@@ -175,13 +175,13 @@ def run_scaling(options: Scaling) -> None:
             )  # fmt: skip
         write_rows(rows, folder / "scaling.csv", folder / "scaling.json")
         if with_plot:
-            plots.plot_scaling(rows, folder / "scaling.png")
+            tables.plot_scaling(rows, folder / "scaling.png")
     print_tables([scaling_table(rows), growth_table(rows)], TABLE_WIDTH)
 
 
 def run_roofline(options: Roofline) -> None:
     """`oasis bench roofline`."""
-    with results(options, plots.plot_roofline) as write:
+    with results(options, tables.plot_roofline) as write:
         with show_progress(Console(stderr=True)) as progress:
             rows = roofline.measure_roofline(torch.device(options.device), options.seed, progress)
         if not rows:
@@ -220,7 +220,7 @@ def results(
 
 def can_plot(notes: Console) -> bool:
     """Whether plots can be drawn; a note says if they cannot."""
-    if not plots.can_plot():
-        notes.print(f"oasis: {plots.MISSING}", highlight=False, soft_wrap=True, markup=False)
+    if not tables.can_plot():
+        notes.print(f"oasis: {tables.MISSING}", highlight=False, soft_wrap=True, markup=False)
         return False
     return True

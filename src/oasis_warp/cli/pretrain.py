@@ -29,8 +29,7 @@ from oasis_warp.network.dense_network import DenseNetwork, load_dense_network
 from oasis_warp.network.encoders import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, read_config
-from oasis_warp.pretraining.dense_source import DensePhotos
-from oasis_warp.pretraining.dense_trainer import DenseTrainer
+from oasis_warp.pretraining.dense_trainer import DensePhotos, DenseTrainer
 from oasis_warp.pretraining.distributed import ProcessInfo, join_processes, wait_for_all
 from oasis_warp.pretraining.pretrain import CHECKPOINT, BatchSource, PretrainConfig, Trainer, pretrain
 from oasis_warp.pretraining.prior_trainer import PriorTrainer

@@ -1,8 +1,9 @@
-"""How much contrast skin has, by the size of its detail: what tells a hand from one of clay.
+"""How much contrast skin has, by the size of its detail: what tells a hand from one of clay; and its blemishes.
 
 The logarithm of the luminance is split by differences of Gaussians. Each Gaussian is a normalised convolution (Knutsson
 and Westin 1993): the sum of the weighted values over the sum of the weights. So what lies outside of the skin adds
-nothing, its outline included.
+nothing, its outline included. Blemishes spoil a hand at a glance: haze around it, wounds on an opened palm, and a back
+of another colour.
 """
 
 import functools
@@ -12,8 +13,9 @@ from collections.abc import Sequence
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
-from oasis_warp.core.color import luminance
+from oasis_warp.core.color import cielab, linear_light, luminance
 
 SIZE = 256
 """Side of the square pictures in which contrasts are measured [px]."""
@@ -69,3 +71,41 @@ def _gaussian(size: int, sigma: float) -> Float[Tensor, "n n"]:
     """Weights of a Gaussian from each pixel of a line to each other; the normalised convolution scales them."""
     x = torch.arange(size, dtype=torch.float64)
     return torch.exp(-0.5 * ((x[:, None] - x) / sigma) ** 2)
+
+
+HAZE_REACH = 5
+"""Distance from the outline of the mesh beyond which nothing should be drawn [px of a picture of 512]."""
+DARK_SHARE = 0.01
+"""Share of the palm that is compared with its median."""
+FEWEST = 300
+"""Fewest pixels of a place that is measured."""
+
+
+def haze(alpha: Float[Tensor, "H W"], silhouette: Bool[Tensor, "H W"], elsewhere: Bool[Tensor, "H W"]) -> float:
+    """Sum of the alpha farther than `HAZE_REACH` outside the silhouette, over the silhouette's pixels.
+
+    What lies `elsewhere`, at the end of the wrist, does not count.
+    """
+    window, near = 2 * HAZE_REACH + 1, silhouette.to(alpha)[None, None]
+    for size, padding in (((window, 1), (HAZE_REACH, 0)), ((1, window), (0, HAZE_REACH))):
+        near = max_pool2d(near, size, 1, padding)
+    near = near[0, 0] > 0
+    return float(alpha[~near & ~elsewhere].sum() / silhouette.sum().clamp_min(1))
+
+
+def darkest_over_median(image: Float[Tensor, "H W 3"], where: Bool[Tensor, "H W"]) -> float | None:
+    """Brightness (L*) of the darkest `DARK_SHARE` of the pixels over that of their median; None of too few."""
+    if int(where.sum()) < FEWEST:
+        return None
+    light = cielab(image[where])[:, 0]
+    return float(light.quantile(DARK_SHARE) / light.median().clamp_min(1e-3))
+
+
+def redness(image: Float[Tensor, "H W 3"], where: Bool[Tensor, "H W"]) -> float | None:
+    """Mean a* of CIELAB; None of too few pixels."""
+    return float(cielab(image[where])[:, 1].mean()) if int(where.sum()) >= FEWEST else None
+
+
+def mean_light(image: Float[Tensor, "H W 3"], where: Bool[Tensor, "H W"]) -> Float[Tensor, "3"] | None:
+    """Mean of the linear light of each channel; None of too few pixels."""
+    return linear_light(image[where]).mean(0) if int(where.sum()) >= FEWEST else None

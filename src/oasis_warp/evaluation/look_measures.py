@@ -13,8 +13,17 @@ from oasis_warp.avatar.quality import SEEN
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import HandCrop, Photo, Render
 from oasis_warp.estimation.hand_crop import crop_hand
-from oasis_warp.evaluation.band_energy import SIZE, Contrasts, contrasts, log_brightness, split_bands
-from oasis_warp.evaluation.blemishes import darkest_over_median, haze, mean_light, redness
+from oasis_warp.evaluation.band_energy import (
+    SIZE,
+    Contrasts,
+    contrasts,
+    darkest_over_median,
+    haze,
+    log_brightness,
+    mean_light,
+    redness,
+    split_bands,
+)
 from oasis_warp.evaluation.contact_sheet import Cell
 from oasis_warp.evaluation.kernel_distance import Sample, hand_features
 from oasis_warp.evaluation.real_hands import mostly_shows, read_crop, side_masks

@@ -26,10 +26,9 @@ from oasis_warp.evaluation.kernel_distance import (
 )
 from oasis_warp.evaluation.look_measures import measure_looks
 from oasis_warp.evaluation.methods import prior_digest
-from oasis_warp.evaluation.partial_results import read_result
 from oasis_warp.evaluation.real_hands import measure_real, real_photos, reference_contrasts
 from oasis_warp.evaluation.same_hand import photos_in
-from oasis_warp.evaluation.summary import Record
+from oasis_warp.evaluation.summary import Record, read_result
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.pretraining.objective import Perceptual
 from oasis_warp.reconstruction import reconstruct

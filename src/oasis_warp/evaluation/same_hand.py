@@ -27,9 +27,8 @@ from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
 from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, method_name, prior_digest
 from oasis_warp.evaluation.metrics import COVERED, color_gain
-from oasis_warp.evaluation.partial_results import read_result
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
-from oasis_warp.evaluation.summary import Record, select
+from oasis_warp.evaluation.summary import Record, read_result, select
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
 from oasis_warp.losses.image import masked_psnr, ssim_map

@@ -40,7 +40,6 @@ from oasis_warp.evaluation.held_out import (
 )
 from oasis_warp.evaluation.methods import METHODS, LitGaussians, Method, method_name, prior_digest, reconstructions
 from oasis_warp.evaluation.metrics import TargetTruth, match_colors, score
-from oasis_warp.evaluation.partial_results import read_result
 from oasis_warp.evaluation.pictures import (
     ATTENTION_COLUMNS,
     draw_attention,
@@ -49,7 +48,7 @@ from oasis_warp.evaluation.pictures import (
     write_sheet,
     write_strip,
 )
-from oasis_warp.evaluation.summary import Record, summarise
+from oasis_warp.evaluation.summary import Record, read_result, summarise
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.lpips import Lpips
 from oasis_warp.network.prior import NetworkPrior

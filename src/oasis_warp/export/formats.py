@@ -10,18 +10,16 @@ from torch import Tensor
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, CanonicalGaussians, HandLight, HandPose, Photo
 from oasis_warp.export import usd_stage
-from oasis_warp.export.compressed_ply import write_compressed_ply
 from oasis_warp.export.hand_parameters import write_parameters
 from oasis_warp.export.page_file import write_page
 from oasis_warp.export.request import ExportRequest, Light
 from oasis_warp.export.skinned_gltf import write_skinned_gltf
 from oasis_warp.export.skinned_usd import write_skinned_usd
 from oasis_warp.export.splat_gltf import write_splat_gltf
-from oasis_warp.export.splat_ply import write_ply
-from oasis_warp.export.splat_rows import write_splat
+from oasis_warp.export.splat_ply import write_compressed_ply, write_ply
 from oasis_warp.export.splat_sog import write_sog
-from oasis_warp.export.splat_spz import write_spz
-from oasis_warp.export.splat_usd import write_splat_usd
+from oasis_warp.export.splat_spz import write_splat, write_spz
+from oasis_warp.export.usd_stage import write_splat_usd
 from oasis_warp.export.wavefront import write_obj
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import check_finite

@@ -1,4 +1,8 @@
-"""The .spz of Gaussians, version 3: 20 bytes a Gaussian, zipped (github.com/nianticlabs/spz)."""
+"""Small files of Gaussians: the .spz, version 3, and the .splat.
+
+.spz takes 20 bytes a Gaussian, zipped (github.com/nianticlabs/spz); .splat takes 32, most important first
+(github.com/antimatter15/splat).
+"""
 
 import gzip
 import struct
@@ -7,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from oasis_warp.data.output_files import write_file
-from oasis_warp.data.splat_files import SH_C0, SPZ_COLOR_SCALE, SPZ_MAGIC
+from oasis_warp.data.splat_files import SH_C0, SPLAT_ROW, SPZ_COLOR_SCALE, SPZ_MAGIC
 from oasis_warp.export.request import ExportRequest
-from oasis_warp.export.splats import largest_component, morton_order, posed_splats
+from oasis_warp.export.splats import largest_component, morton_order, posed_splats, y_down
 
 VERSION = 3
 FRACTION_BITS = 20
@@ -55,3 +59,20 @@ def pack_quats(quats: np.ndarray) -> np.ndarray:
         size = np.round(np.abs(column) * np.sqrt(2) * QUAT_STEPS).astype(np.uint32)
         packed = packed << 10 | (column < 0).astype(np.uint32) << 9 | np.minimum(size, QUAT_STEPS)
     return packed.astype("<u4")
+
+
+def write_splat(request: ExportRequest, path: Path) -> None:
+    """Means and scales as float32, colours, opacities and quaternions wxyz as bytes; y down and z forward.
+
+    Sorted by volume times opacity, so that a part of the file already looks right.
+
+    Raises:
+        InputError: a value is not finite, or `path` cannot be written.
+    """
+    means, quats, scales, opacities, colors = (part.numpy() for part in y_down(posed_splats(request)))
+    order = np.argsort(-scales.prod(1) * opacities, kind="stable")
+    rows = np.zeros(len(order), SPLAT_ROW)
+    rows["mean"], rows["scales"] = means[order], scales[order]
+    rows["rgba"] = to_bytes(255 * np.concatenate([colors, opacities[:, None]], 1)[order])
+    rows["quat"] = to_bytes(128 + 128 * quats[order])
+    write_file(path, rows.tobytes())

@@ -13,7 +13,7 @@ from torch import Tensor
 from oasis_warp.core import rotation
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import PosedHand, Side
-from oasis_warp.motion.joint_angles import angles_of_bones
+from oasis_warp.motion.motion import angles_of_bones
 
 FINGERS = {"index": "index", "middle": "middle|mid", "little": "little|pinky|pinkie", "ring": "ring", "thumb": "thumb"}
 """Ours in the hand model's order, and what skeletons call them."""

@@ -16,7 +16,7 @@ from oasis_warp.core.mirror import mirror_points
 from oasis_warp.core.types import PosedHand, Side
 from oasis_warp.hand import mano
 from oasis_warp.hand.template import MANO_DIR
-from oasis_warp.motion.joint_angles import joint_angles
+from oasis_warp.motion.motion import joint_angles
 
 POSES, GLOBALS, PLACES = ("hand_pose", "poses", "pose", "thetas"), ("global_orient", "root_orient"), ("transl", "trans")
 """Names that files have for the rotations of the fingers, also with the wrist's before them, of the wrist, and for

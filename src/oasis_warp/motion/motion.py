@@ -1,4 +1,4 @@
-"""`Motion`: poses at a fixed rate; at other rates, without noise, and how much they shake."""
+"""`Motion`, poses at a fixed rate: at other rates, without noise, how much they shake; and angles from rotations."""
 
 from typing import NamedTuple
 
@@ -10,6 +10,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from oasis_warp.core import rotation
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.rotation import euler_angles
 from oasis_warp.core.types import HandPose
 
 CUTOFF = 6.0
@@ -94,3 +96,19 @@ def jitter(points: Float[Tensor, "T P 3"], fps: float) -> float:
     if len(points) < 3:
         return 0.0
     return float((points[2:] - 2 * points[1:-1] + points[:-2]).norm(dim=-1).mean()) * fps**2
+
+
+def joint_angles(hand: HandModel, local: Float[Tensor, "T 15 3 3"]) -> Float[Tensor, "T 15 3"]:
+    """Flexion, abduction and twist [rad] of bones 1 to 15, each turned by `local` in its parent's frame at rest."""
+    axes = hand.pose_axes[1:].to(local)
+    return euler_angles(axes @ local @ axes.mT)
+
+
+def angles_of_bones(hand: HandModel, turns: Float[Tensor, "T 16 3 3"]) -> Float[Tensor, "T 15 3"]:
+    """Joint angles of bones that are turned by `turns` from rest, in one frame for all; held to the joints' limits.
+
+    The bones of another skeleton are not quite ours: what no joint of the model can do is left out.
+    """
+    local = turns[:, list(hand.parents[1:])].mT @ turns[:, 1:]
+    low, high = hand.pose_limits[1:].to(local).unbind(-1)
+    return torch.minimum(torch.maximum(joint_angles(hand, local), low), high)

@@ -7,7 +7,7 @@ from oasis_warp.core import rotation
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import PosedHand, Side
 from oasis_warp.hand.webxr_rig import TO_WEBXR, webxr_rig
-from oasis_warp.motion.joint_angles import angles_of_bones
+from oasis_warp.motion.motion import angles_of_bones
 
 N_JOINTS = 25
 """Of WebXR (www.w3.org/TR/webxr-hand-input-1, XRHandJoint); OpenXR's XrHandJointEXT has the palm before them."""

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_kernels import constants
-from oasis_warp.core.backgrounds import plain_background
+from oasis_warp.core.color import plain_background
 from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime import picture_node
 from oasis_warp.ops._runtime.declaration import Array, Declaration

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from oasis_warp.core.backgrounds import plain_background
+from oasis_warp.core.color import plain_background
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.types import Camera, Color, Gaussians, Render
 from oasis_warp.ops import BlendWeights, blend_weights, rasterization

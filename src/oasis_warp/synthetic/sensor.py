@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, interpolate, pad
 
-from oasis_warp.synthetic.ops.pixel_noise import pixel_noise
+from oasis_warp.synthetic.ops.surface_patterns import pixel_noise
 
 _LUMA = (0.2126, 0.7152, 0.0722)
 _PLACES = {

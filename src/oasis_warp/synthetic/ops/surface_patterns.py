@@ -1,5 +1,9 @@
-"""Procedural patterns on points of a surface: gradient noise, lines and spots."""
+"""Procedural patterns on points of a surface: gradient noise, lines and spots; and random numbers for pixels.
 
+The numbers depend on one seed per image and nothing else.
+"""
+
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -138,3 +142,16 @@ def surface_dabs(
     ]  # fmt: skip
     launch(kernels.dabs, len(centers), inputs, like=points)
     return out
+
+
+def pixel_noise(seeds: Int[Tensor, "B"], *shape: int) -> Float[Tensor, "B ..."]:
+    """Standard normal float32 numbers of `shape` for each of the seeds, equal on all devices up to rounding.
+
+    Raises:
+        ValueError: `seeds` is not a row.
+    """
+    check_shape("seeds", seeds, "B")
+    n = math.prod(shape)
+    out = torch.empty((len(seeds), n), device=seeds.device)
+    launch_ranges(kernels.normal, out.numel(), [integers(seeds), n, out], like=out)
+    return out.unflatten(1, shape)
