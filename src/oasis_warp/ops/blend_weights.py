@@ -18,7 +18,7 @@ from oasis_warp.ops._runtime.transforms import in_forward_mode, refuse_forward_m
 from oasis_warp.ops._runtime.values import check_finite
 from oasis_warp.ops._runtime.weigh import weigh
 from oasis_warp.ops.checks import check_float, check_shape
-from oasis_warp.ops.projection import check_focal_lengths, project
+from oasis_warp.ops.projection import Projection, check_focal_lengths, project
 
 
 class BlendWeights(NamedTuple):
@@ -95,18 +95,20 @@ def blend_weights(
         check_finite(viewmat=viewmat, K=K)
         check_focal_lengths("K", K)
     check_cameras(viewmat[None], K[None], means, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size)
-    n, pixels = len(means), width * height
     with torch.no_grad():
         projection = project(
             means, quats, scales, opacities, viewmat[None], K[None], width, height,
             near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d, validate=validate,
         )  # fmt: skip
-        splats = Splats(
-            projection.records, opacities[None].contiguous(), means.new_empty(1, n, 0), means.new_empty(1, 0)
-        )
-        w = weigh(splats, width, height, tile_size)
-        matrix = _csr(w.pixel_starts, w.gaussians, w.by_pixel, (pixels, n))
-        transpose = _csr(w.gaussian_starts, w.pixels, w.by_gaussian, (n, pixels))
+        return _weights_of(projection, opacities, width, height, tile_size)
+
+
+def _weights_of(projection: Projection, opacities: Tensor, width: int, height: int, tile_size: int) -> BlendWeights:
+    n, pixels = len(opacities), width * height
+    nothing = opacities.new_empty(1, n, 0), opacities.new_empty(1, 0)
+    w = weigh(Splats(projection.records, opacities[None].contiguous(), *nothing), width, height, tile_size)
+    matrix = _csr(w.pixel_starts, w.gaussians, w.by_pixel, (pixels, n))
+    transpose = _csr(w.gaussian_starts, w.pixels, w.by_gaussian, (n, pixels))
     return BlendWeights(matrix, transpose, w.alphas.view(height, width, 1))
 
 

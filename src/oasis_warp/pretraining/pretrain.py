@@ -7,7 +7,7 @@ import json
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -249,9 +249,13 @@ def pretrain(
         if process.rank == 0 and save_now:
             trainer.save(folder / CHECKPOINT)
             trainer.save_weights(folder / WEIGHTS, {"step": trainer.step, **notes})
-            columns = [column[:SHEET_ROWS].flatten(0, 1) for column in trainer.sheet(batch, result)]
-            write_picture(folder / SHEET, to_uint8(torch.cat(columns, dim=1)))
+            _write_sheet(folder / SHEET, trainer.sheet(batch, result))
     return trainer.step
+
+
+def _write_sheet(path: Path, columns: Sequence[Tensor]) -> None:
+    """Columns of pictures side by side, the first `SHEET_ROWS` of each."""
+    write_picture(path, to_uint8(torch.cat([column[:SHEET_ROWS].flatten(0, 1) for column in columns], dim=1)))
 
 
 def _mean_metrics(result: StepResult, world: int) -> dict[str, float]:
