@@ -4,6 +4,7 @@ from pathlib import Path
 
 import cv2
 import pytest
+import torch
 from disk import full_disk
 
 from oasis_warp.cli import main, summary
@@ -19,12 +20,22 @@ FILES = {"avatar.safetensors", "summary.png", "quality.png", "turntable.mp4", "r
 
 
 @pytest.fixture(autouse=True)
-def small_pictures(monkeypatch):
+def small_pictures(request, monkeypatch):
+    """Pictures are small; tests that do not ask for them to be `drawn` look at folders alone, and get grey ones."""
     monkeypatch.setattr(summary, "WIDTH", 480)
     monkeypatch.setattr(summary, "VIEWS", 2)
     monkeypatch.setattr(summary, "POSES", ("fist", "ok"))
     monkeypatch.setattr(command, "TURNTABLE_FRAMES", 2)
     monkeypatch.setattr(command, "TURNTABLE_SIZE", 64)
+    if "drawn" not in request.fixturenames:
+        grey = torch.full((64, 64, 3), 128, dtype=torch.uint8)
+        for name, made in (("draw_summary", grey), ("draw_quality", grey), ("turntable", [grey, grey])):
+            monkeypatch.setattr(command, name, lambda *_, made=made, **__: made)
+
+
+@pytest.fixture
+def drawn():
+    """For tests of what pictures show, or of how large their files are."""
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +88,7 @@ def names(folder):
     return {path.name for path in folder.iterdir()}
 
 
-def test_one_photo_fills_the_folder_itself(pipeline, photo_file, tmp_path, capsys):
+def test_one_photo_fills_the_folder_itself(pipeline, drawn, photo_file, tmp_path, capsys):
     assert main(["reconstruct", photo_file(), "-o", str(tmp_path / "out")]) == 0
     assert names(tmp_path / "out") == FILES
     assert names(tmp_path) == {"hand.png", "out"}
@@ -87,7 +98,7 @@ def test_one_photo_fills_the_folder_itself(pipeline, photo_file, tmp_path, capsy
     assert "landmarks: " in captured.err
 
 
-def test_what_was_written_can_be_read(pipeline, photo_file, tmp_path):
+def test_what_was_written_can_be_read(pipeline, drawn, photo_file, tmp_path):
     main(["reconstruct", photo_file(), "-o", str(tmp_path / "out"), "--seed", "5", "--steps", "7", "--force"])
     _, header = load_avatar(tmp_path / "out" / "avatar.safetensors")
     report = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -197,7 +208,7 @@ def test_two_palms_are_not_asked_about(pipeline, tmp_path, capsys):
     assert "same-hand" not in capsys.readouterr().err
 
 
-def test_several_photos_of_the_same_hand_make_one_avatar(fusion, photo_file, tmp_path, capsys):
+def test_several_photos_of_the_same_hand_make_one_avatar(fusion, drawn, photo_file, tmp_path, capsys):
     photos = [photo_file(name) for name in ("a.png", "b.png", "c.png")]
     assert main(["reconstruct", *photos, "--same-hand", "-o", str(tmp_path / "out")]) == 0
     assert names(tmp_path / "out") == FILES
@@ -274,7 +285,7 @@ def test_the_output_is_checked_before_the_work_begins(pipeline, photo_file, tmp_
 
 
 @pytest.mark.parametrize("room", [2_000, 50_000, 150_000])
-def test_a_full_disk_is_told_and_leaves_nothing(pipeline, photo_file, tmp_path, capsys, room):
+def test_a_full_disk_is_told_and_leaves_nothing(pipeline, drawn, photo_file, tmp_path, capsys, room):
     photo = photo_file()
     with full_disk(room):
         assert main(["reconstruct", photo, "-o", str(tmp_path / "out")]) == 2
