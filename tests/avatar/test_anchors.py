@@ -1,6 +1,5 @@
 """Gaussians of a hand that nobody has photographed yet: where they lie, their colours, their wrist, their pose."""
 
-
 import math
 
 import pytest

@@ -1,6 +1,5 @@
 """Scenes that benchmarks draw, and how the cost of drawing grows with them."""
 
-
 import json
 import sys
 from dataclasses import replace

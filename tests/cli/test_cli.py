@@ -1,6 +1,5 @@
 """The command line itself, and the commands that answer in words: `oasis info` and `oasis doctor`."""
 
-
 import json
 import shlex
 import shutil

@@ -29,7 +29,6 @@ FILES = {"avatar.safetensors", "summary.png", "quality.png", "turntable.mp4", "r
 OASIS = [sys.executable, "-m", "oasis_warp"]
 
 
-
 def oasis(*arguments, **options):
     return subprocess.run([*OASIS, *map(str, arguments)], capture_output=True, text=True, **options)
 

@@ -1,6 +1,5 @@
 """What a user sees of a reconstruction: its progress, its report, its summary."""
 
-
 import io
 import json
 from pathlib import Path

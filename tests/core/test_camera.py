@@ -1,6 +1,5 @@
 """Cameras, surfaces and backgrounds."""
 
-
 import math
 
 import numpy as np

@@ -1,6 +1,5 @@
 """The 21 landmarks: found by the network, or read from a file."""
 
-
 import json
 import os
 

@@ -1,6 +1,5 @@
 """What is hand in a picture, also against masks drawn by hand."""
 
-
 import json
 from dataclasses import replace
 from pathlib import Path

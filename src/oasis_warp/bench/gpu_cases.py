@@ -140,7 +140,6 @@ def make_avatar(scene: AvatarScene) -> Avatar:
     )
 
 
-
 OURS = "warp"
 UNVALIDATED = {"validate": False}
 """Options of our operators while a graph is captured, which cannot check values. Eager calls check them."""
