@@ -80,10 +80,6 @@ ONE_SHOT_ABLATION = {
 SPEED = {"OASIS": (390.0, 5.0), "OHTA": (0.16, 60.0), "HandAvatar": (0.16, None)}
 """Frames a second on an A100, and minutes for a person ("approximately 5", "around 1 hour"): OASIS, section 4.2."""
 
-PAPER = AdaptConfig(
-    texture="lora", light="keep", calibration_steps=100, texture_steps=400, references="all", reference_views=7
-)
-"""One-shot reconstruction as in the paper's appendix B.3; it names no number of reference views."""
 POSE_ERRORS = (2.0, 5.0, 10.0)
 """Standard deviations [degrees] of the curve."""
 SHIPPED, GUESS = "ours", "ours, no fine-tuning"
