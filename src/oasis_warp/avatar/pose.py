@@ -11,7 +11,7 @@ from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.sky import bounced, exposure, harmonic_basis, largest_nearby
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
-from oasis_warp.ops import RestMesh, face_rotations, pose_on_mesh
+from oasis_warp.ops import RestMesh, carry_gaussians, face_rotations
 from oasis_warp.ops.sky_exposure import sky_directions
 
 GAMMA = 2.2
@@ -227,23 +227,12 @@ def pose_gaussians(
     With an axis of poses before `posed_vertices`, means, quats and scales have it too, and colours where there is a
     `light`: they are drawn in it, past what the posed surface hides of it.
     """
-    turned = face_rotations(rest_vertices, posed_vertices, faces, validate=False)
-    means, quats, scales = pose_on_mesh(
-        posed_vertices,
-        faces,
-        canonical.face_index,
-        canonical.barycentrics,
-        turned.vertex_quats,
-        turned.area_ratio,
-        canonical.quats,
-        canonical.scales,
-        vertex_index=canonical.vertex_index,
-        offsets=canonical.offsets,
-        vertex_area_ratio=turned.vertex_area_ratio,
-        validate=False,
-    )
+    means, quats, scales, turned = carry_gaussians(
+        rest_vertices, posed_vertices, faces, canonical.face_index, canonical.barycentrics, canonical.vertex_index,
+        canonical.offsets, canonical.quats, canonical.scales, turned=light is not None,
+    )  # fmt: skip
     colors = canonical.colors
-    if light is not None:
-        on = lighting(posed_vertices, turned.vertex_quats, light.normals, light.light)
+    if light is not None and turned is not None:
+        on = lighting(posed_vertices, turned, light.normals, light.light)
         colors = (colors * shading_factors(canonical, faces, light.light, on, light.seen)).clamp(0, 1)
     return Gaussians(means, quats, scales, canonical.opacities, colors)

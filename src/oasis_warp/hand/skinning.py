@@ -74,7 +74,13 @@ def corrective_coefficients(hand: HandModel, angles: Float[Tensor, "*B 15 3"]) -
 
 def skin_surface(hand: HandModel, rest: PosedHand, pose: HandPose) -> Float[Tensor, "*B V 3"]:
     """The vertices of `skin` alone."""
-    return _surface(hand, rest, pose, _bones(hand, rest.joints, pose))
+    each = correctives_per_joint(hand)
+    if each == 9:
+        return _surface(hand, rest, pose, _bones(hand, rest.joints, pose))
+    return ops.skinned_vertices(
+        *pose, rest.joints, hand.pose_axes, hand.parents, rest.vertices, hand.weights,
+        hand.corrective_basis if each else None,
+    )  # fmt: skip
 
 
 def _surface(hand: HandModel, rest: PosedHand, pose: HandPose, bones: BoneTransforms) -> Tensor:

@@ -18,6 +18,8 @@ from oasis_warp.ops.face_rotations import FaceRotations as FaceRotations
 from oasis_warp.ops.face_rotations import RestMesh as RestMesh
 from oasis_warp.ops.face_rotations import face_rotations as face_rotations
 from oasis_warp.ops.face_rotations import rest_mesh as rest_mesh
+from oasis_warp.ops.hand_posing import carry_gaussians as carry_gaussians
+from oasis_warp.ops.hand_posing import skinned_vertices as skinned_vertices
 from oasis_warp.ops.mesh_posing import PosedCovars as PosedCovars
 from oasis_warp.ops.mesh_posing import PosedOnMesh as PosedOnMesh
 from oasis_warp.ops.mesh_posing import pose_on_mesh as pose_on_mesh

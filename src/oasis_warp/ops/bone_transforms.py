@@ -24,7 +24,8 @@ class BoneTransforms(NamedTuple):
 
 
 @functools.cache
-def _parents_on(device: torch.device, parents: tuple[int, ...]) -> Tensor:
+def parents_on(device: torch.device, parents: tuple[int, ...]) -> Tensor:
+    """The `parents` of bones on a device."""
     # Cached for the life of the process: a copy to the device at every call would wait, and no graph can capture it.
     return torch.tensor(parents, dtype=torch.int32, device=device)
 
@@ -44,7 +45,7 @@ def _run(name: str, params: dict[str, Any], parents: Sequence[int]) -> None:
     """Run the CPU or CUDA kernel of this name with contiguous tensors."""
     like = params["angles"]
     n_poses = like.shape[:-2].numel()
-    parent_table = _parents_on(like.device, tuple(parents))
+    parent_table = parents_on(like.device, tuple(parents))
     params = params | {"n_joints": len(parents), "n_poses": n_poses, "parents": parent_table}
     scalar = SCALAR_NAMES[like.dtype]
     if like.is_cuda:

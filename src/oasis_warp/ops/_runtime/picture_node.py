@@ -1,6 +1,5 @@
 """`rasterization` of float32 on CUDA as one node of autograd: what an eager call takes if nothing asks for more."""
 
-import threading
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -8,29 +7,18 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import Function
-from torch.nn import Parameter
 
 from oasis_kernels.rasterize.tiles_cuda import INDEX_BITS
 from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime.launch import start
 from oasis_warp.ops._runtime.picture_call import Drawn, Gradients, Needs, Options, Scene
 from oasis_warp.ops._runtime.picture_plan import Plan
+from oasis_warp.ops._runtime.plans import Plans, once, shapes_of
 from oasis_warp.ops._runtime.rasterization_checks import check_cameras, check_colors, check_gaussians
 from oasis_warp.ops._runtime.rules import current_rules
 from oasis_warp.ops._runtime.transforms import in_forward_mode
 
-MOST_PLANS = 32
-"""Kinds of calls that a thread remembers."""
-
-
-class _Plans(threading.local):
-    """One for each kind of call and thread."""
-
-    def __init__(self) -> None:
-        self.plans: dict[tuple[Any, ...], Plan] = {}
-
-
-_plans = _Plans()
+_plans = Plans()
 
 
 def plan_for(scene: Scene, options: Options) -> Plan | None:
@@ -43,28 +31,17 @@ def plan_for(scene: Scene, options: Options) -> Plan | None:
     if is_traced() or in_forward_mode():
         return None
     index = scene.means.get_device()
-    key: list[Any] = [index, options, current_rules()]
-    for tensor in scene:
-        if tensor is None:
-            key.append(None)
-            continue
-        kind = type(tensor)
-        if (
-            (kind is not Tensor and kind is not Parameter)
-            or tensor.dtype is not torch.float32
-            or tensor.get_device() != index
-            or tensor.layout is not torch.strided
-            or tensor.is_neg()
-        ):
-            return None
-        key.append(tensor.shape)
+    shapes = shapes_of(scene, index)
+    if shapes is None:
+        return None
+    key = index, options, current_rules(), *shapes
     if (scene.Ks.requires_grad and torch.is_grad_enabled()) or torch.cuda.is_current_stream_capturing():
         return None
     try:
-        plan = _plans.plans.get(tuple(key))
+        plan = _plans.plans.get(key)
     except TypeError:  # an option that is not a number, which the checks refuse
         return None
-    return plan or _checked_plan(scene, options, tuple(key))
+    return plan or _checked_plan(scene, options, key)
 
 
 def _checked_plan(scene: Scene, options: Options, key: tuple[Any, ...]) -> Plan | None:
@@ -75,10 +52,7 @@ def _checked_plan(scene: Scene, options: Options, key: tuple[Any, ...]) -> Plan 
     if not (len(means) and len(viewmats)) or len(means) > 1 << INDEX_BITS:
         return None
     start()
-    while len(_plans.plans) >= MOST_PLANS:
-        del _plans.plans[next(iter(_plans.plans))]
-    plan = _plans.plans[key] = Plan(scene, options, current_rules())
-    return plan
+    return _plans.keep(key, Plan(scene, options, current_rules()))
 
 
 def draw(plan: Plan, scene: Scene, validate: bool) -> tuple[Tensor, Tensor, "Meta"] | None:
@@ -148,7 +122,7 @@ class _Draw(Function):
         gradients, gradient = ctx.plan.draw_backward(scene, drawn, g_image, g_alphas, needs, means2d is not None)
         if means2d is not None and gradient is not None:
             means2d.grad = gradient.clone() if means2d.grad is None else means2d.grad + gradient
-        return None, None, None, *_once(scene, gradients)
+        return None, None, None, *once("rasterization", scene, gradients)
 
 
 # Below Function.apply, which takes 3 us to look for functorch: `is_traced` has.
@@ -177,27 +151,7 @@ class _Project(Function):
         incoming = [None if g is None else g.contiguous() for g in (g_means2d, g_depths)]
         by_means2d, by_depths = (0 if g is None else g.data_ptr() for g in incoming)
         *shapes, viewmats = ctx.plan.unproject(scene, workspace, by_means2d, 0, by_depths, needs)
-        return None, None, None, *_once(scene, Gradients(*shapes, None, None, viewmats, None, None))
-
-
-class _Once(Function):
-    """Gradients that have no derivative."""
-
-    @staticmethod
-    def forward(ctx: Any, count: int, *tensors: Tensor | None) -> tuple[Tensor | None, ...]:
-        return tuple(None if tensor is None else tensor.view_as(tensor) for tensor in tensors[count:])
-
-    @staticmethod
-    def backward(ctx: Any, *_: Any) -> Any:
-        raise RuntimeError(
-            "rasterization: expected one derivative, got a request for the second. "
-            "It is differentiable once; detach the gradient before you go on with it."
-        )
-
-
-def _once(scene: Scene, gradients: Gradients) -> tuple[Tensor | None, ...]:
-    """`gradients`, which raise if autograd wants to go through them (create_graph=True)."""
-    return _Once.apply(len(scene), *scene, *gradients) if torch.is_grad_enabled() else gradients  # pyright: ignore
+        return None, None, None, *once("rasterization", scene, Gradients(*shapes, None, None, viewmats, None, None))
 
 
 def _versions(tensors: Any) -> list[int]:

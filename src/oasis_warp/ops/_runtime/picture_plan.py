@@ -15,13 +15,12 @@ from oasis_warp.ops._runtime.cuda_launch import CudaLaunch
 from oasis_warp.ops._runtime.launch import block_count, cuda_launch, current_stream
 from oasis_warp.ops._runtime.pair_counts import SORTED, Counts, PolledWords, remember
 from oasis_warp.ops._runtime.picture_call import Drawn, Gradients, Needs, Options, Scene
+from oasis_warp.ops._runtime.plans import ALIGNMENT, lay_out
 from oasis_warp.ops._runtime.projection_backends import as_float32, fill_viewmats
 from oasis_warp.ops._runtime.records import Frame
 from oasis_warp.ops._runtime.tiles import MAX_PAIRS, check_pairs
 from oasis_warp.ops.checks import FINITE_LIMIT
 
-ALIGNMENT = 256
-"""Of the arrays in a workspace [bytes]."""
 SLACK = 1.25
 """Memory for pairs of a Gaussian and a tile, relative to what the last call of a kind had."""
 FIRST_PAIRS = 4
@@ -71,14 +70,9 @@ class Plan:
             "transmittance": 4 * pixels, "stops": 4 * pixels,
             "checkpoints": 4 * tiles * segments * (self.channels + 1) * tiles_cuda.TILE**2,
         }  # fmt: skip
-        self._at: dict[str, int] = {}
-        end = 0
-        for name, size in always.items():
-            self._at[name], end = end, end + -(-size // ALIGNMENT) * ALIGNMENT
-        self._size = end
-        for name, size in kept.items():
-            self._at[name], end = end, end + -(-size // ALIGNMENT) * ALIGNMENT
-        self._size_with_kept = end
+        self._at, self._size = lay_out(always)
+        places, self._size_with_kept = lay_out(kept, self._size)
+        self._at |= places
 
     def _load(self, rules: Rules) -> None:
         """Kernels, and how many blocks of them run."""

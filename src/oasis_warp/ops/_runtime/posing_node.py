@@ -1,0 +1,116 @@
+"""Posing of float32 on CUDA as nodes of autograd: what calls of one pose take once the operators have checked a kind."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import Function
+
+from oasis_warp.core.tracing import is_traced
+from oasis_warp.ops._runtime.plans import Plans, once, shapes_of
+from oasis_warp.ops._runtime.posing_plan import Bones, Riders, RidersPlan, SurfacePlan, Tables
+from oasis_warp.ops._runtime.transforms import in_forward_mode
+
+Kind = tuple[Any, ...]
+_plans = Plans()
+ROW = 16
+"""Kernels read rows of four numbers as one [bytes]."""
+
+
+def kind_of(given: Bones | Riders, others: tuple[Any, ...]) -> Kind | None:
+    """What tells apart calls of other plans; None where only the operators apart can take a call.
+
+    Args:
+        given: Float tensors.
+        others: What else a plan depends on.
+    """
+    first = given[0]
+    if not (isinstance(first, Tensor) and first.is_cuda) or is_traced() or in_forward_mode():
+        return None
+    index = first.get_device()
+    shapes = shapes_of(given, index)
+    if shapes is None:
+        return None
+    for tensor in given:
+        if tensor is not None and (not tensor.is_contiguous() or tensor.data_ptr() % ROW):
+            return None
+    return index, type(given), others, *shapes
+
+
+def plan_of(kind: Kind | None) -> Any:
+    """The plan of a kind that the operators have taken before; else None."""
+    return None if kind is None else _plans.plans.get(kind)
+
+
+def remember_surface(kind: Kind | None, given: Bones, parents: Tensor) -> None:
+    """Plan the next call: the operators, which have taken this one, have checked its kind."""
+    if kind is not None and given.angles.ndim == 2:
+        _plans.keep(kind, SurfacePlan(given, parents))
+
+
+def remember_riders(kind: Kind | None, given: Riders, tables: Tables) -> None:
+    """Plan the next call: the operators, which have taken this one, have checked its kind."""
+    if kind is not None and given.posed_vertices.ndim == 2 and len(given.posed_vertices) and len(tables.face_index):
+        _plans.keep(kind, RidersPlan(given, tables))
+
+
+def pose_surface(plan: SurfacePlan, given: Bones) -> Tensor:
+    """Posed vertices."""
+    return _surface(plan, *given) if _tracked(given) else plan.pose(given)[0]
+
+
+def pose_riders(plan: RidersPlan, given: Riders, tables: Tables, turned: bool) -> tuple[Any, ...]:
+    """Means, quaternions and scales; and with `turned` the rotations of vertices, else None."""
+    if _tracked(given):
+        return _riders(plan, tables, turned, *given)
+    *out, workspace = plan.pose(given, tables, keep=False)
+    return *out, plan.vertex_quats(workspace) if turned else None
+
+
+def _tracked(given: Sequence[Tensor | None]) -> bool:
+    return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in given)
+
+
+class _Surface(Function):
+    @staticmethod
+    def forward(ctx: Any, plan: SurfacePlan, *tensors: Tensor | None) -> Tensor:
+        posed, ctx.workspace = plan.pose(Bones(*tensors))  # pyright: ignore[reportArgumentType]
+        ctx.save_for_backward(*tensors)
+        ctx.plan = plan
+        return posed
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
+        given = Bones(*ctx.saved_tensors)
+        found = ctx.plan.backward(given, ctx.workspace, gradient.contiguous(), ctx.needs_input_grad[1:])
+        return None, *once("skin", given, [*found, None, None, None])
+
+
+class _Riders(Function):
+    @staticmethod
+    def forward(ctx: Any, plan: RidersPlan, tables: Tables, turned: bool, *tensors: Tensor | None) -> Any:
+        needs = ctx.needs_input_grad[3:]
+        surface = needs[0] or needs[1]
+        given = Riders(*tensors)  # pyright: ignore[reportArgumentType]
+        *out, ctx.workspace = plan.pose(given, tables, keep=surface)
+        ctx.save_for_backward(*tensors)
+        ctx.plan, ctx.tables = plan, tables
+        ctx.set_materialize_grads(False)
+        quats = plan.vertex_quats(ctx.workspace) if turned else None
+        if quats is not None and not surface:
+            ctx.mark_non_differentiable(quats)
+        return *out, quats
+
+    @staticmethod
+    def backward(ctx: Any, *incoming: Tensor | None) -> tuple[Any, ...]:
+        given = Riders(*ctx.saved_tensors)
+        if all(gradient is None for gradient in incoming):
+            return (None,) * (3 + len(given))
+        found = ctx.plan.backward(given, ctx.tables, ctx.workspace, incoming, ctx.needs_input_grad[3:])
+        return None, None, None, *once("pose_on_mesh", given, found)
+
+
+# Below Function.apply, which takes 3 us to look for functorch: `is_traced` has.
+_surface: Callable[..., Any] = super(Function, _Surface).apply  # pyright: ignore[reportAttributeAccessIssue]
+_riders: Callable[..., Any] = super(Function, _Riders).apply  # pyright: ignore[reportAttributeAccessIssue]
