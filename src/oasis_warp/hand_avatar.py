@@ -1,6 +1,5 @@
 """`Avatar`: one person's hand, ready to be posed and drawn. No image, network or estimator is needed."""
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,7 +43,7 @@ from oasis_warp.data.avatar_file import LIGHT_HIDDEN, load_avatar, save_avatar
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand, chosen_hand
-from oasis_warp.ops import DeferredFiniteCheck, check_finite, rest_mesh
+from oasis_warp.ops import check_finite, rest_mesh
 from oasis_warp.ops.checks import check_shape
 from oasis_warp.render.render import render
 from oasis_warp.render.replay import CapturedGraph, GraphCache, replayable, replayed
@@ -232,13 +231,15 @@ class Avatar:
 
         size = camera.width, camera.height
         replays = self.shape.dtype == torch.float32 and replayable(self.device, (*inputs, *self._fixed))
-        meanwhile = replays and validate and all(tensor.is_cuda for tensor in named.values())
-        if validate and not meanwhile:
+        if replays:
+
+            def record() -> CapturedGraph:
+                return CapturedGraph(draw, inputs, self.shape, len(named))
+
+            return Render(*replayed(self._graphs, size, record, draw, inputs, tuple(named) if validate else ()))
+        if validate:
             check_finite(**named)
-        if not replays:
-            return Render(*draw(*inputs))
-        with DeferredFiniteCheck(**named) if meanwhile else nullcontext():  # while the picture is drawn
-            return Render(*replayed(self._graphs, size, lambda: CapturedGraph(draw, inputs, self.shape), draw, inputs))
+        return Render(*draw(*inputs))
 
     def in_even_light(self) -> "Avatar":
         """The same hand without its photo's light, as far as that is known."""

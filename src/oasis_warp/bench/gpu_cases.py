@@ -114,7 +114,7 @@ class Learning:
             offsets=offsets, quats=quats, scales=log_scales.exp(), opacities=logit_opacities.sigmoid(), colors=colors
         )
         image = draw_avatar(self.scene, canonical, self.surface)
-        masked_l1(image[0], self.scene.target, self.scene.mask).backward()
+        masked_l1(image.squeeze(0), self.scene.target, self.scene.mask).backward()
         self.optimizer.step()
         return Results((image.detach(),), tuple(leaf.grad for leaf in self.leaves if leaf.grad is not None))
 

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from oasis_warp.ops._runtime.launch import current_stream, wait_for
 from oasis_warp.ops._runtime.pair_counts import watch_overflow
 from oasis_warp.ops.rasterization import rasterization
 
@@ -101,10 +100,12 @@ class _CapturedRasterization:
 
     def draw(self, arguments: tuple[Tensor, ...]) -> bool:
         """Replay the forward graph; False if its memory did not suffice."""
+        device = self.inputs[0].get_device()
+        self.overflow.arm(device)
         with torch.no_grad():
             torch._foreach_copy_(self.inputs, list(arguments))
             self._forward.replay()
-        wait_for(current_stream(self.inputs[0].device))  # only then is it known whether the image is whole
+        self.overflow.wait(device)  # only then is it known whether the image is whole
         return not self.overflow.happened()
 
     def back(self, incoming: tuple[Tensor | None, Tensor | None]) -> list[Tensor | None]:

@@ -31,7 +31,7 @@ def render(gaussians: Gaussians, camera: Camera, *, background: Color = BLACK) -
         backgrounds=backgrounds,
         validate=False,
     )
-    return Render(images[0], alphas[0, ..., 0])
+    return Render(images.squeeze(0), alphas.squeeze((0, 3)))  # whose adjoints, unlike those of indices, fill no zeros
 
 
 def view_weights(gaussians: Gaussians, camera: Camera) -> BlendWeights:

@@ -10,11 +10,14 @@ from collections.abc import Callable, Hashable, Sequence
 import torch
 from torch import Tensor
 
-from oasis_warp.ops import watch_overflow
+from oasis_warp.ops import ReplayedFiniteCheck, check_finite, watch_overflow
 
 Outputs = tuple[Tensor, ...]
 MOST = 8
 """Graphs that a cache keeps: each holds the memory of a whole picture."""
+WARM_UPS = 2
+"""Runs before the capture: the first loads kernels, fills caches and counts what a rasterization needs memory for, the
+second makes plans."""
 
 
 def replayable(device: torch.device, inputs: Sequence[Tensor]) -> bool:
@@ -27,7 +30,7 @@ def replayable(device: torch.device, inputs: Sequence[Tensor]) -> bool:
 class CapturedGraph:
     """A function as a CUDA graph."""
 
-    def __init__(self, function: Callable[..., Outputs], inputs: Sequence[Tensor], like: Tensor):
+    def __init__(self, function: Callable[..., Outputs], inputs: Sequence[Tensor], like: Tensor, checked: int = 0):
         """Run `function` to warm it up, then record it.
 
         Args:
@@ -35,11 +38,13 @@ class CapturedGraph:
                 and copies nothing from the host.
             inputs: A first set of arguments.
             like: A tensor of the device and precision that `function` gets them in.
+            checked: How many inputs, the first ones, are looked at whenever it runs: see `bad`.
         """
         self._graph = torch.cuda.CUDAGraph()
         # What is made here is written to in any mode; and a graph belongs to the current device.
         with torch.cuda.device(like.device), torch.inference_mode(False), torch.no_grad():
             self._allocate(inputs, like)
+            self._check = ReplayedFiniteCheck(self._flat[: sum(tensor.numel() for tensor in inputs[:checked])])
             self._fill(inputs)
             self._record(function)
 
@@ -59,10 +64,13 @@ class CapturedGraph:
         here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
         aside.wait_stream(here)
         with torch.cuda.stream(aside):
-            function(*self._inputs)  # loads modules, fills caches, counts what a rasterization needs memory for
+            self._check.look()
+            for _ in range(WARM_UPS):
+                function(*self._inputs)
         here.wait_stream(aside)
         with watch_overflow() as self._overflow:
             with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+                self._check.look()
                 self._outputs = function(*self._inputs)
 
     def _fill(self, inputs: Sequence[Tensor]) -> None:
@@ -76,16 +84,26 @@ class CapturedGraph:
         if near:
             torch._foreach_copy_(*map(list, zip(*near, strict=True)))
 
+    def bad(self) -> bool:
+        """Whether one of the `checked` inputs of the last call was not finite or absurdly large."""
+        return self._check.bad()
+
     def __call__(self, inputs: Sequence[Tensor]) -> Outputs | None:
-        """The function's outputs, in fresh memory; None where that for its rasterizations did not suffice."""
+        """The function's outputs, in fresh memory; None where that for its rasterizations did not suffice.
+
+        Where it draws, the call returns before the pictures are done, like any on CUDA.
+        """
         if torch.is_inference_mode_enabled() or torch.cuda.current_device() != self._flat.get_device():
             with torch.cuda.device(self._flat.device), torch.inference_mode(False):
                 return self(inputs)
+        device = self._flat.get_device()
+        self._overflow.arm(device)
+        self._check.arm()
         with torch.no_grad():
             self._fill(inputs)
             self._graph.replay()
             outputs = tuple(output.clone() for output in self._outputs)
-        torch.cuda.current_stream().synchronize()  # only then is it known whether the picture is whole
+        self._overflow.wait(device)  # only then is it known whether the picture is whole
         return None if self._overflow.happened() else outputs
 
 
@@ -122,6 +140,7 @@ def replayed(
     record: Callable[[], Callable[[Sequence[Tensor]], Outputs | None]],
     exact: Callable[..., Outputs],
     inputs: Sequence[Tensor],
+    names: Sequence[str] = (),
 ) -> Outputs:
     """What a recorded function makes of `inputs`; where its memory did not suffice, what `exact` makes of them.
 
@@ -131,9 +150,16 @@ def replayed(
         record: Makes a `CapturedGraph`, if there is none under `key` or the last one's memory did not suffice.
         exact: The function itself.
         inputs: Small tensors, on any device.
+        names: Of the inputs that `CapturedGraph` has `checked`, to look at their values.
+
+    Raises:
+        ValueError: an input with a name is not finite.
     """
     with recordings.lock:
-        outputs = recordings.find(key, record)(inputs)
+        recording = recordings.find(key, record)
+        outputs = recording(inputs)
+        if names and isinstance(recording, CapturedGraph) and recording.bad():
+            check_finite(**dict(zip(names, inputs, strict=False)))
         if outputs is not None:
             return outputs
         recordings.forget(key)

@@ -11,7 +11,7 @@ import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -101,11 +101,14 @@ class PolledWords:
 
     def wait(self, device: int) -> None:
         """Wait until the first two, which were made negative before, are not; or until the current stream is done."""
-        values = self.values
-        for _ in range(SPINS):
-            if values[0] >= 0 and values[1] >= 0:
-                return
-        torch.cuda.current_stream(device).synchronize()
+        _poll(self.values, device)
+
+
+def _poll(values: Any, device: int) -> None:
+    for _ in range(SPINS):
+        if values[0] >= 0 and values[1] >= 0:
+            return
+    torch.cuda.current_stream(device).synchronize()
 
 
 class Overflow:
@@ -113,23 +116,42 @@ class Overflow:
 
     def __init__(self, slack: float) -> None:
         self._slack = slack
-        self._reports: list[tuple[Tensor, Counts]] = []
+        self._reports: list[tuple[Tensor, Any, Counts]] = []
+        self._stream: torch.cuda.Stream | None = None
 
     def expect(self, kind: Kind) -> tuple[Tensor, Counts]:
         """Memory for the report, and the capacity, of a captured call of this `kind`."""
         # The slot stays the graph's: it may be replayed after the watch has ended.
         slot, capacity = slots.take().zero_(), capacity_of(kind, self._slack)
-        self._reports.append((slot, capacity))
+        self._reports.append((slot, (ctypes.c_longlong * REPORT).from_address(slot.data_ptr()), capacity))
         return slot, capacity
 
+    def arm(self, device: int) -> None:
+        """Expect the reports of the next replay, on the current stream, after the last one on any."""
+        for _, words, _ in self._reports:
+            words[0] = words[1] = -1
+        if self._stream is None or torch._C._cuda_getCurrentRawStream(device) != self._stream.cuda_stream:
+            here = torch.cuda.current_stream(device)
+            if self._stream is not None:
+                here.wait_stream(self._stream)
+            self._stream = here
+
+    def wait(self, device: int) -> None:
+        """Wait for the reports of a replay on the current stream, which come before its pictures; `arm` it before.
+
+        All that the replay does before its last rasterization has then been done; without one, all that it does.
+        """
+        for _, words, _ in self._reports:
+            _poll(words, device)
+        if not self._reports:
+            torch.cuda.current_stream(device).synchronize()
+
     def happened(self) -> bool:
-        """Whether the last replay overflowed; wait for it first (`torch.cuda.synchronize`).
+        """Whether the last replay overflowed; wait for it first (`wait`, or `torch.cuda.synchronize`).
 
         If so, call eagerly once and capture again.
         """
-        return any(
-            slot[0].item() > capacity.pairs or slot[1].item() > capacity.longest for slot, capacity in self._reports
-        )
+        return any(words[0] > capacity.pairs or words[1] > capacity.longest for _, words, capacity in self._reports)
 
 
 _watching: ContextVar[Overflow | None] = ContextVar("watching", default=None)

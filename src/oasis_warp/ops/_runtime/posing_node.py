@@ -1,4 +1,4 @@
-"""Posing of float32 on CUDA as nodes of autograd: what calls of one pose take once the operators have checked a kind."""
+"""Posing of float32 on CUDA as nodes of autograd: what a pose takes once the operators have checked its kind."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -248,7 +248,7 @@ class RidersPlan(_Plan):
         """Gradients in the order of `Riders` from those by means, quaternions, scales and rotations of vertices."""
         *by_gaussians, by_quats = aligned(*incoming)
         out: list[Tensor | None] = [
-            torch.empty(tensor.shape, dtype=torch.float32, device=self.device) if tensor is not None and needed else None
+            self._empty(*tensor.shape) if tensor is not None and needed else None
             for tensor, needed in zip(given, needs, strict=True)
         ]
         stream = self._stream()

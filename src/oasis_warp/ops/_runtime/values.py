@@ -57,18 +57,7 @@ class DeferredFiniteCheck:
         address = self._slot.data_ptr()
         self._found = ctypes.c_longlong.from_address(address)
         self._found.value = 0
-        stream = current_stream(self._device)
-        launch = cuda_launch(finite.cuda_all_finite(), stream.device)
-        for first in range(0, len(tensors), finite.ARRAYS):
-            some = tensors[first : first + finite.ARRAYS]
-            counts = [t.numel() for t in some]
-            n_blocks = sum(-(-count // finite.CHUNK) for count in counts)
-            if n_blocks:
-                others = (0,) * (finite.ARRAYS - len(some))
-                launch(
-                    n_blocks, stream.cuda_stream, address, checks.FINITE_LIMIT, *[t.data_ptr() for t in some], *others,
-                    *counts, *others, *[t.dtype is torch.float64 for t in some], *others,
-                )  # fmt: skip
+        _look_at(tensors, address)
 
     def __exit__(self, kind: Any, *_: Any) -> None:
         torch.cuda.current_stream(self._device).synchronize()  # even after an error: the kernel writes to the slot
@@ -77,3 +66,41 @@ class DeferredFiniteCheck:
         if bad and kind is None:
             checks.check_finite(**self._given)
             raise AssertionError("the kernel has met a bad value that is not in its inputs")
+
+
+class ReplayedFiniteCheck:
+    """Whether the values of a CUDA tensor are bad, as every replay of a graph finds it."""
+
+    def __init__(self, tensor: Tensor) -> None:
+        """Nothing is looked at yet; `tensor` is contiguous."""
+        self._tensor = tensor
+        self._slot = slots.take()  # stays the graph's: it may be replayed after this is gone
+        self._found = ctypes.c_longlong.from_address(self._slot.data_ptr())
+
+    def look(self) -> None:
+        """Look at the values, where the graph that is being captured does whenever it runs."""
+        _look_at([self._tensor], self._slot.data_ptr())
+
+    def arm(self) -> None:
+        """Forget what the last look has found."""
+        self._found.value = 0
+
+    def bad(self) -> bool:
+        """Whether the last look, which is over, has found a bad value."""
+        return self._found.value != 0
+
+
+def _look_at(tensors: list[Tensor], address: int) -> None:
+    """Write 1 to `address`, host memory, if a number is bad."""
+    stream = current_stream(tensors[0].device)
+    launch = cuda_launch(finite.cuda_all_finite(), stream.device)
+    for first in range(0, len(tensors), finite.ARRAYS):
+        some = tensors[first : first + finite.ARRAYS]
+        counts = [t.numel() for t in some]
+        n_blocks = sum(-(-count // finite.CHUNK) for count in counts)
+        if n_blocks:
+            others = (0,) * (finite.ARRAYS - len(some))
+            launch(
+                n_blocks, stream.cuda_stream, address, checks.FINITE_LIMIT, *[t.data_ptr() for t in some], *others,
+                *counts, *others, *[t.dtype is torch.float64 for t in some], *others,
+            )  # fmt: skip
