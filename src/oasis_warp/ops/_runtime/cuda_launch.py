@@ -26,11 +26,13 @@ class CudaLaunch:
         self._words = (ctypes.c_longlong * size)()
         launch.params_addr[1] = ctypes.c_void_p(ctypes.addressof(self._words))
         self._call = wp._src.context.runtime.core.wp_cuda_launch_kernel
-        self._before = launch.device.context, launch.hooks.forward
-        self._after = (
-            launch.max_blocks, launch.block_dim, int(launch.grid_stride), launch.cluster_dim,
-            launch.hooks.forward_smem_bytes, launch.params_addr,
+        # As ctypes' own numbers, which it passes on as they are.
+        self._before = ctypes.c_void_p(launch.device.context), ctypes.c_void_p(launch.hooks.forward)
+        numbers = (
+            launch.max_blocks, launch.block_dim, launch.grid_stride, launch.cluster_dim,
+            launch.hooks.forward_smem_bytes,
         )  # fmt: skip
+        self._after = *(ctypes.c_int(int(number)) for number in numbers), launch.params_addr
         self._arguments = *self._before, launch.bounds.size, *self._after
 
     def __call__(self, n_blocks: int, stream: int, *words: int | float) -> None:
