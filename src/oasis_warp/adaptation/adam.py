@@ -23,7 +23,8 @@ class Adam:
     @torch.no_grad()
     def step(self, loss: Tensor) -> None:
         """One step down the gradient of `loss`, a number that depends on every parameter."""
-        gradients = torch.autograd.grad(loss, [parameter for parameter, _, _ in self._state])
+        with torch.autograd.set_multithreading_enabled(False):  # on CUDA another thread takes longer than the kernels
+            gradients = torch.autograd.grad(loss, [parameter for parameter, _, _ in self._state])
         self._count += 1
         corrections = [1 - decay**self._count for decay in DECAYS]
         for (parameter, mean, square), gradient in zip(self._state, gradients, strict=True):
