@@ -43,10 +43,10 @@ def skinned_vertices(
     if all(isinstance(part, Tensor) for part in (angles, orientation, translation)):
         angles, orientation, translation = (part.contiguous() for part in (angles, orientation, translation))
     given = Bones(angles, orientation, translation, joints, rest_vertices, axes, weights, displacements)
-    constant = torch.is_grad_enabled() and (
-        axes.requires_grad or weights.requires_grad or (displacements is not None and displacements.requires_grad)
-    )
-    kind = None if constant else posing_node.kind_of(given, tuple(parents))
+    kind = posing_node.kind_of(given, tuple(parents))
+    constant = axes, weights, displacements
+    if kind is not None and torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in constant):
+        kind = None
     plan = posing_node.plan_of(kind)
     if plan is not None:
         return posing_node.pose_surface(plan, given)
@@ -55,7 +55,8 @@ def skinned_vertices(
     posed = skin(
         rest_vertices, None, weights, bones.transforms, displacements=displacements, strengths=strengths, validate=False
     ).means
-    posing_node.remember_surface(kind, given, parents_on(angles.device, tuple(parents)))
+    if kind is not None:
+        posing_node.remember_surface(kind, given, parents_on(angles.device, tuple(parents)))
     return posed
 
 
@@ -88,5 +89,6 @@ def carry_gaussians(
         vertex_index=vertex_index, offsets=offsets,
         vertex_area_ratio=None if vertex_index is None else rotations.vertex_area_ratio, validate=False,
     )  # fmt: skip
-    posing_node.remember_riders(kind, given, tables)
+    if kind is not None:
+        posing_node.remember_riders(kind, given, tables)
     return Carried(*posed, rotations.vertex_quats if turned else None)

@@ -43,15 +43,15 @@ def plan_of(kind: Kind | None) -> Any:
     return None if kind is None else _plans.plans.get(kind)
 
 
-def remember_surface(kind: Kind | None, given: Bones, parents: Tensor) -> None:
+def remember_surface(kind: Kind, given: Bones, parents: Tensor) -> None:
     """Plan the next call: the operators, which have taken this one, have checked its kind."""
-    if kind is not None and given.angles.ndim == 2:
+    if given.angles.ndim == 2:
         _plans.keep(kind, SurfacePlan(given, parents))
 
 
-def remember_riders(kind: Kind | None, given: Riders, tables: Tables) -> None:
+def remember_riders(kind: Kind, given: Riders, tables: Tables) -> None:
     """Plan the next call: the operators, which have taken this one, have checked its kind."""
-    if kind is not None and given.posed_vertices.ndim == 2 and len(given.posed_vertices) and len(tables.face_index):
+    if given.posed_vertices.ndim == 2 and len(given.posed_vertices) and len(tables.face_index):
         _plans.keep(kind, RidersPlan(given, tables))
 
 
