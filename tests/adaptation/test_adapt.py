@@ -131,7 +131,7 @@ def test_a_gpu_finds_what_the_cpu_finds(hand, case):
     crop, _, _, adapted = case
 
     def there(nouns):
-        return type(nouns)(*(part.cuda() if isinstance(part, torch.Tensor) else part for part in nouns))
+        return nouns and type(nouns)(*(part.cuda() if isinstance(part, torch.Tensor) else part for part in nouns))
 
     moved = HandCrop(*(part.cuda() if isinstance(part, torch.Tensor) else there(part) for part in crop))
     found = adapt(hand, [MeanPrior(hand)(moved)], [moved], STEPS).gaussians
