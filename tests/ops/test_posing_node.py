@@ -1,5 +1,7 @@
 """Posing by two nodes of autograd: what the four operators give apart, to the bit."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -30,7 +32,7 @@ def test_parameters_are_given_in_the_order_of_the_kernels():
     assert {name: " ".join(kernel.parameters) for name, kernel in kernels.items()} == ORDERS
 
 
-def scene(p, q, correctives, seed=0):
+def scene(p, q, correctives, seed=0) -> list[dict[str, Any]]:
     """Arguments of `skinned_vertices` and of `carry_gaussians` but for the mesh."""
     random = torch.Generator().manual_seed(seed)
 
@@ -48,7 +50,7 @@ def scene(p, q, correctives, seed=0):
         "vertex_index": torch.randint(V, (p,), generator=random) if p else None,
         "offsets": 0.1 * normal(p, 3) if p else None, "quats": normal(p + q, 4), "scales": normal(p + q, 3).exp(),
     }  # fmt: skip
-    return tuple({k: None if t is None else t.cuda() for k, t in part.items()} for part in (bones, bound))
+    return [{k: None if t is None else t.cuda() for k, t in part.items()} for part in (bones, bound)]
 
 
 def results(bones, bound, wanted, measured, turned):
