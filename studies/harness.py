@@ -29,6 +29,7 @@ import torch
 from oasis_warp.bench.rows import commit
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.processes import using_threads
 from oasis_warp.data.output_files import open_resumable_folder, write_file
 
 Row = dict[str, Any]
@@ -121,9 +122,9 @@ def _each(
 ) -> Iterable[tuple[str, Sequence[Row], float]]:
     threads = options.threads or max(1, (os.cpu_count() or 1) // max(1, options.workers))
     if not options.workers:
-        torch.set_num_threads(threads)
-        for case, arguments in cases.items():
-            yield case, *_timed(measure, arguments)
+        with using_threads(threads):
+            for case, arguments in cases.items():
+                yield case, *_timed(measure, arguments)
         return
     with ProcessPoolExecutor(
         options.workers, get_context("spawn"), initializer=torch.set_num_threads, initargs=(threads,)

@@ -9,6 +9,7 @@ import torch
 
 MOST_WORKERS, MOST_ON_GPU = 8, 2
 """Each takes up to a gigabyte of memory, and one on the device."""
+THREADS = torch.get_num_threads()
 
 
 def pytest_addoption(parser):
@@ -35,6 +36,16 @@ def pytest_collection_modifyitems(config, items):
     if dropped:
         config.hook.pytest_deselected(items=dropped)
         items[:] = [item for item in items if not without & item.keywords.keys()]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown():
+    """Fail a test that leaves torch with other threads: while they wait they spin, and make all later tests slow."""
+    done = yield
+    left = torch.get_num_threads()
+    torch.set_num_threads(THREADS)
+    assert left == THREADS, f"torch is left with {left} threads, not {THREADS}"
+    return done
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
