@@ -1,8 +1,10 @@
-"""A disk that is full, without filling one."""
+"""A disk that is full, without filling one, and files that the user trusts."""
 
 import contextlib
+import hashlib
 import resource
 import signal
+from pathlib import Path
 
 
 @contextlib.contextmanager
@@ -16,3 +18,8 @@ def full_disk(n_bytes: int):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, handler)
+
+
+def trust(path: Path) -> None:
+    """Put the SHA-256 of a file beside it, for weights that are not the published ones."""
+    path.with_name(path.name + ".sha256").write_text(hashlib.sha256(path.read_bytes()).hexdigest())

@@ -7,6 +7,7 @@ import threading
 
 import pytest
 import torch
+from disk import trust
 from torch.nn.functional import conv2d, max_pool2d
 
 from oasis_warp.core import published_files
@@ -144,6 +145,8 @@ def files(request, tmp_path):
         before = channels
     torch.save(trunk, tmp_path / f"{name}net.pth")
     torch.save(heads, tmp_path / f"{name}.pth")
+    trust(tmp_path / f"{name}net.pth")
+    trust(tmp_path / f"{name}.pth")
     return tmp_path / f"{name}net.pth", tmp_path / f"{name}.pth"
 
 
@@ -188,6 +191,9 @@ def test_files_that_hold_something_else_are_refused(files, tmp_path):
     with pytest.raises(InputError, match="none: expected AlexNet, found no such file; download https"):
         load_lpips(tmp_path / "none", files[1])
     (tmp_path / "text").write_text("hello")
+    with pytest.raises(InputError, match=r"text: expected AlexNet with the SHA-256 7be5be791159472b\.\.\., got"):
+        load_lpips(tmp_path / "text", tmp_path / "text")
+    trust(tmp_path / "text")
     with pytest.raises(InputError, match="text: expected weights of LPIPS, got another format"):
         load_lpips(tmp_path / "text", tmp_path / "text")
     with pytest.raises(InputError, match="expected (AlexNet|VGG-16) and LPIPS's layers, missing 'features.0.weight'"):
@@ -221,8 +227,9 @@ def server(tmp_path):
 def test_a_missing_file_is_downloaded_only_where_that_is_allowed(server, tmp_path, monkeypatch, capsys):
     (tmp_path / "shop" / "whole").write_bytes(b"weights")
     (tmp_path / "shop" / "cut").write_bytes(b"weights")
+    digest = hashlib.sha256(b"weights").hexdigest()
     for name in ("whole", "cut", "gone"):
-        monkeypatch.setitem(published_files.PUBLISHED, name, Published(name, f"{server}/{name}", 3))
+        monkeypatch.setitem(published_files.PUBLISHED, name, Published(name, f"{server}/{name}", 3, digest))
     with pytest.raises(InputError, match=r"here: expected whole, found no such file; download http.*whole \(3 MB\) to"):
         published_file(tmp_path / "here", "whole")
     published_file(tmp_path / "new" / "here", "whole", allow_download=True)
@@ -232,19 +239,22 @@ def test_a_missing_file_is_downloaded_only_where_that_is_allowed(server, tmp_pat
     for name, message in messages.items():
         with pytest.raises(InputError, match=message):
             published_file(tmp_path / "other", name, allow_download=True)
+    monkeypatch.setitem(published_files.PUBLISHED, "whole", Published("whole", f"{server}/whole", 3, 64 * "0"))
+    with pytest.raises(InputError, match="other: expected whole with the SHA-256 0000000000000000"):
+        published_file(tmp_path / "other", "whole", allow_download=True)
     assert not (tmp_path / "other").exists() and not list(tmp_path.glob("*.part"))
 
 
-def test_a_file_of_another_digest_is_refused(tmp_path):
-    digest = hashlib.sha256(b"weights").hexdigest()
-    (tmp_path / f"net-{digest[:8]}.pth").write_bytes(b"weights")
-    published_file(tmp_path / f"net-{digest[:8]}.pth", "alex")
-    (tmp_path / f"net-{digest[:8]}.pth").write_bytes(b"weight")
-    with pytest.raises(InputError, match=f"expected a SHA-256 that begins with {digest[:8]}, got .* download it again"):
-        published_file(tmp_path / f"net-{digest[:8]}.pth", "alex")
-    (tmp_path / "model.safetensors").write_bytes(b"weights")
-    (tmp_path / "model.safetensors.sha256").write_text(f"{digest}  model.safetensors\n")
-    published_file(tmp_path / "model.safetensors", "dinov2-large")
-    (tmp_path / "model.safetensors.sha256").write_text("0" * 64)
-    with pytest.raises(InputError, match="begins with 0000000000000000"):
-        published_file(tmp_path / "model.safetensors", "dinov2-large")
+def test_a_file_of_another_digest_is_refused_unless_its_user_trusts_it(tmp_path, monkeypatch):
+    path, digest = tmp_path / "model.safetensors", hashlib.sha256(b"weights").hexdigest()
+    monkeypatch.setitem(published_files.PUBLISHED, "dinov2-large", Published("DINOv2", "https://there", 3, digest))
+    path.write_bytes(b"weights")
+    published_file(path, "dinov2-large")
+    path.write_bytes(b"weight")  # cut
+    with pytest.raises(InputError, match=rf"expected DINOv2 with the SHA-256 {digest[:16]}\.\.\., got .*sha256 if you"):
+        published_file(path, "dinov2-large")
+    trust(path)
+    published_file(path, "dinov2-large")
+    path.write_bytes(b"weights")  # no longer what was trusted
+    with pytest.raises(InputError, match=f"got {digest[:16]}"):
+        published_file(path, "dinov2-large")

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from disk import trust
 from safetensors.torch import load_file, save, save_file
 
 from oasis_warp.avatar.observation import CropBatch, observe_batch
@@ -247,6 +248,7 @@ def test_a_frozen_backbone_stays_in_its_own_file(monkeypatch, make_network, tiny
         load_network(path, hand)
     backbone = tmp_path / "model.safetensors"
     save_file({name: tensor + 0 for name, tensor in network.encoder.state_dict().items()}, backbone)
+    trust(backbone)
     loaded = load_network(path, hand, backbone_weights=backbone)
     torch.testing.assert_close(loaded.encoder.state_dict(), network.encoder.state_dict())
 

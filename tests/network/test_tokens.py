@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from disk import trust
 from safetensors.torch import save_file
 from torch.nn.functional import grid_sample
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -341,6 +342,7 @@ def test_published_weights_land_where_they_belong(small_dino, tmp_path, spelling
     path = tmp_path / "model.safetensors"
     weights = published(small_dino, spelling)
     save_file(weights, path)
+    trust(path)
     before = small_dino(*photo).aligned
     small_dino.load(path)
     after = small_dino(*photo).aligned
@@ -381,11 +383,13 @@ def test_files_that_hold_no_such_backbone_are_refused(small_dino, tmp_path):
         small_dino.load(tmp_path / "none")
     text = tmp_path / "text.safetensors"
     text.write_text("hello")
+    trust(text)
     with pytest.raises(InputError, match="expected the weights of DINOv2, got another format"):
         small_dino.load(text)
     other = tmp_path / "other.safetensors"
     weights = published(small_dino, "files")
     save_file({**weights, "embeddings.register_tokens": torch.zeros(1, 4, 32)}, other)
+    trust(other)
     with pytest.raises(InputError, match="width 32 and 2 layers without registers, but 1 tensors differ"):
         small_dino.load(other)
 

@@ -3,8 +3,10 @@
 from dataclasses import replace
 
 import pytest
+from pretraining.painted_hands import PaintedHands
 
 from oasis_warp.core.config import PAPER_ADAPTATION
+from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.config import PAPER, PROFILES
 from oasis_warp.network.encoders import SIZES, Size
 from studies import paper_profile
@@ -20,7 +22,8 @@ TINY = replace(
 def test_the_papers_network_learns_four_people_by_heart_from_random_weights(monkeypatch, tmp_path):
     monkeypatch.setitem(PROFILES, "paper", TINY)
     monkeypatch.setitem(SIZES, "dinov2-small", Size(32, 2, 2))
-    monkeypatch.setattr(paper_profile, "VIEWS", 1)
+    made = lambda hands, options, planners=0: PaintedHands(bundled_hand(), hands, 1, options.size)(0, 0, 1)  # noqa: E731
+    monkeypatch.setattr(paper_profile, "batches", made)  # people of the synthetic world take long to bake
     few = replace(PAPER_ADAPTATION, calibration_steps=2, texture_steps=3, reference_views=1)
     monkeypatch.setattr(paper_profile, "PAPER_ADAPTATION", few)
     options = Options(
