@@ -186,6 +186,59 @@ def test_a_broken_sample_is_left_out_with_its_reason_and_the_others_stay(kind, m
     assert 0 < len(found.samples) < whole and len(found.samples) + len(found.left_out) >= whole
 
 
+ANYTHING = (None, "text", [], {}, [[1]], [float("nan")], 1e300, 10**400, {"a": [1]}, "\x1b[31m")
+"""What a part of an annotation is replaced with; it is also left out."""
+MISSING = object()
+PARTS = {
+    "interhand": [
+        *(("annotations/train/InterHand2.6M_train_data.json", ("images", 0, key)) for key in ("capture", "frame_idx")),
+        *(("annotations/train/InterHand2.6M_train_data.json", ("annotations", 0, key)) for key in ("image_id", "bbox")),
+        *(("annotations/train/InterHand2.6M_train_camera.json", ("0", key, "400002"))
+          for key in ("campos", "camrot", "focal", "princpt")),
+        *(("annotations/train/InterHand2.6M_train_MANO_NeuralAnnot.json", ("0", "0", "right", key))
+          for key in ("pose", "shape", "trans")),
+    ],
+    "hanco": [("calib/0154/00000001.json", ("K", 0)), ("calib/0154/00000001.json", ("M", 3)),
+              *(("shape/0154/00000001.json", (key,)) for key in ("poses", "shapes", "global_t"))],
+    "freihand": [("training_K.json", (0,)), ("training_K.json", (0, 1)), ("training_K.json", (0, 0, 0)),
+                 ("training_mano.json", (0,)), ("training_mano.json", (0, 0, 5))],
+    "ho3d": [("train/ABF10/meta/0000.pkl", (key,)) for key in ("camMat", "handPose", "handBeta", "handTrans")],
+    "photos": [("some/photo2.json", (key,)) for key in ("global_orient", "hand_pose", "betas", "cam_t")],
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PARTS)
+def test_no_part_of_an_annotation_may_be_anything_else(name, models, mano_dir, tmp_path):
+    WRITERS[name](tmp_path, models)
+    split = "test" if name == "hanco" else "train"
+    whole, kinds = len(read_dataset(name, tmp_path, mano_dir, split).samples), 0
+    for file, (*way, last) in PARTS[name]:
+        path = tmp_path / file
+        kept, pickled = path.read_bytes(), file.endswith(".pkl")
+        for value in (MISSING, *ANYTHING):
+            table = part = pickle.loads(kept) if pickled else json.loads(kept)
+            for key in way:
+                part = part[key]
+            if value is MISSING:
+                del part[last]
+            else:
+                part[last] = value
+            path.write_bytes(pickle.dumps(table, 2) if pickled else json.dumps(table).encode())
+            what = f"{file} {last}: {value!r}"[:200]
+            try:
+                found = read_dataset(name, tmp_path, mano_dir, split)
+                reasons = list(found.left_out.values())
+                assert 0 < len(found.samples) < whole and reasons, what
+            except InputError as error:  # of both photos of a small tree, or of the whole table
+                reasons = [str(error)]
+            for said in reasons:
+                assert said.endswith(".") and "\n" not in said and "\x1b" not in said and len(said) < 700, what
+            kinds += 1
+        path.write_bytes(kept)
+    assert kinds >= 30
+
+
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_folder_that_is_none_of_it_is_refused(name, mano_dir, tmp_path):
     with pytest.raises(InputError, match="expected the folder of"):
@@ -222,12 +275,12 @@ def test_batches_depend_on_their_number_alone_and_broken_photos_are_passed_over(
     assert all(torch.equal(a, b) for a, b in zip(second, again, strict=True))
     assert not torch.equal(first.image, second.image)
     for sample in hands.catalogue.samples[::2]:
-        sample.image.write_bytes(b"")
+        sample.image.path.write_bytes(b"")
     for _ in range(4):
         next(batches)
     assert hands.failed and all("jpg" in reason for reason in hands.failed.values())
     for sample in hands.catalogue.samples:
-        sample.image.write_bytes(b"")
+        sample.image.path.write_bytes(b"")
     with pytest.raises(InputError, match=f"{TRIES} photos of 0.* could not be read, the last"):
         for _ in range(2):  # one batch was loaded ahead, perhaps before the photos were gone
             next(batches)

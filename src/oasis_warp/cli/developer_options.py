@@ -19,6 +19,10 @@ LpipsWeights = Annotated[
     ),
 ]
 AllowDownload = Annotated[bool, arg(help="Download published weights that are missing from where their authors are.")]
+Selection = Annotated[
+    Path | None,
+    arg(help="For interhand: a JSON file with the captures and sequences to take, where they are not the paper's."),
+]
 CsvFile = Annotated[Path | None, arg(help="The same as a table.")]
 Threads = Annotated[int, arg(help="CPU threads.")]
 FamilyName = Literal[
@@ -190,9 +194,10 @@ class Pretrain:
     data: Literal["interhand", "hanco", "freihand", "ho3d", "coco-hand", "whim", "photos"] | None = None
     """For the prior: a data set with MANO's parameters, beside the synthetic people."""
     root: Path | None = None
-    """Its folder."""
+    """Its folder, or one of tar files with what lies there."""
     mano_dir: Path | None = None
     """Folder with MANO_RIGHT.pkl and MANO_LEFT.pkl, for --data; the one that OASIS_MANO_DIR names when not given."""
+    selection: Selection = None
     data_weight: float = 0.5
     """Share of batches that are of the data set, 0 to 1."""
     steps: int = 20_000
@@ -243,6 +248,7 @@ class Evaluate:
     """Folder of a published data set."""
     mano_dir: Path | None = None
     """Folder with MANO_RIGHT.pkl and MANO_LEFT.pkl, for these; the one that OASIS_MANO_DIR names when not given."""
+    selection: Selection = None
     ablations: tuple[Path, ...] = ()
     """For these: weights of networks that were trained with one part switched off, for the paper's ablation."""
     prior: Literal["learned", "none"] | Path = "learned"

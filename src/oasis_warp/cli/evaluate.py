@@ -96,6 +96,8 @@ def check_options(options: Evaluate) -> None:
     for name in ("root", "mano_dir", "ablations"):
         if getattr(options, name) and not published:
             raise InputError(f"--{name.replace('_', '-')}: is for {', '.join(PUBLISHED)}; leave it out.")
+    if options.selection is not None and options.dataset != "interhand":
+        raise InputError("--selection: is for --dataset interhand; leave it out.")
     if photos and options.folder is None:
         kind = "a folder of photos" + (", or one with a subfolder a hand" if options.dataset == "same-hand" else "")
         raise InputError(f"--dataset {options.dataset}: expected {kind}; name it.")
@@ -179,7 +181,7 @@ def on_data_set(options: Evaluate, priors: dict[str, Prior], progress: Progress)
     """The paper's tables on a published data set, also written as files."""
     assert options.root is not None  # checked with the other options
     config = ReconstructConfig(hand_model="mano", mano_dir=options.mano_dir, device=options.device)
-    data = CatalogueData.open(options.dataset, options.root, config, options.size)
+    data = CatalogueData.open(options.dataset, options.root, config, options.size, options.selection)
     ablated = [choose_prior(path, options.backbone_weights) for path in options.ablations]
     rows = rows_of_tables(priors, ablated, options.steps, options.seed)
     perceptual = None if options.lpips is None else load_lpips(*options.lpips, allow_download=options.allow_download)

@@ -19,7 +19,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.published_files import published_file
 from oasis_warp.data.output_files import open_resumable_folder
-from oasis_warp.datasets.readers import read_dataset
+from oasis_warp.datasets.readers import PAPER, read_dataset, read_selection
 from oasis_warp.datasets.training_source import DatasetHands, MixedHands
 from oasis_warp.hand.mano import read_mano
 from oasis_warp.hand.template import MANO_DIR, bundled_hand, chosen_hand
@@ -91,6 +91,8 @@ def check_options(options: Pretrain) -> None:
         raise InputError(f"--data-weight: expected 0 to 1, got {options.data_weight:g}.")
     if (options.data is None) != (options.root is None):
         raise InputError("--data and --root belong together: the name of a data set, and its folder; give both.")
+    if options.selection is not None and options.data != "interhand":
+        raise InputError("--selection: is for --data interhand; leave it out.")
     if options.task == "prior":
         check_prior_options(options)
     else:
@@ -168,7 +170,8 @@ def mixed(
         return hands, {}
     hand = chosen_hand("mano", options.mano_dir)
     folder = Path(options.mano_dir or os.environ[MANO_DIR])
-    catalogue = read_dataset(options.data, options.root, folder)
+    chosen = PAPER if options.selection is None else read_selection(options.selection)
+    catalogue = read_dataset(options.data, options.root, folder, selection=chosen)
     n_samples, left_out = len(catalogue.samples), catalogue.left_out
     print(f"oasis: {n_samples} samples of {options.data}, {len(left_out)} left out", file=sys.stderr)
     for reason in list(left_out.values())[:SHOWN_REASONS]:

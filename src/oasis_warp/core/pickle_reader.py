@@ -53,26 +53,19 @@ _KNOWN = {
 }  # fmt: skip
 
 
-def read_pickle(path: Path | str, what: str) -> Any:
+def read_pickle(path: Path | str, what: str, content: bytes | None = None) -> Any:
     """The value in a pickle: numbers, texts, lists, dicts and arrays; sparse matrices become csc arrays.
 
     Args:
         path: The file.
         what: What it should be, for messages: "MANO's model".
+        content: Its bytes, where they lie elsewhere; `path` is for messages then.
 
     Raises:
         InputError: no such file, larger than `MOST_BYTES`, damaged, or anything in it that is not a plain value.
     """
     path = Path(path)
-    try:
-        if not path.is_file():
-            found = "a folder" if path.is_dir() else "no such file"
-            raise InputError(f"{path}: expected {what}, found {found}; check the name.")
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path}: expected {what}, got more than {MOST_BYTES >> 20} MB; give the right file.")
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the permissions.") from error
+    content = _content(path, what) if content is None else content
     try:
         return _plain(_run(content), 0)
     except InputError:
@@ -81,6 +74,18 @@ def read_pickle(path: Path | str, what: str) -> Any:
             AttributeError, pickle.UnpicklingError) as error:  # fmt: skip
         reason = shortened(str(error).rstrip(".")) or type(error).__name__
         raise InputError(f"{path}: expected {what}, got no pickle of plain arrays ({reason}); get it again.") from error
+
+
+def _content(path: Path, what: str) -> bytes:
+    try:
+        if not path.is_file():
+            found = "a folder" if path.is_dir() else "no such file"
+            raise InputError(f"{path}: expected {what}, found {found}; check the name.")
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path}: expected {what}, got more than {MOST_BYTES >> 20} MB; give the right file.")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the permissions.") from error
 
 
 def _run(content: bytes) -> Any:

@@ -50,7 +50,7 @@ _JPEG_PARTS = {
 _stderr_lock = threading.Lock()
 
 
-def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> Photo:
+def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS, content: bytes | None = None) -> Photo:
     """Read a JPEG, PNG, WebP, AVIF, BMP or TIFF file as an upright 8-bit sRGB photo.
 
     EXIF orientation is applied; 16-bit values are rounded to 8; grey, palette and CMYK become RGB; alpha is kept where
@@ -60,11 +60,16 @@ def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> Photo:
     to four times `max_pixels`, or for other formats the whole picture, up to `MAX_DECODED_BYTES`. (The decoder of
     progressive JPEG needs 3 more bytes per pixel of the file.)
 
+    Args:
+        path: The file.
+        max_pixels: See above.
+        content: Its bytes, where they lie elsewhere; `path` is for messages then.
+
     Raises:
         InputError: the file is missing, unreadable, no image, truncated, damaged, too small or too large.
     """
     path = Path(path)
-    data = read_bytes(path)
+    data = read_bytes(path) if content is None else content
     header = read_header(data)
     if header is None:
         raise _not_an_image(path, data)

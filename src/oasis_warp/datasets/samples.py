@@ -4,7 +4,6 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +14,8 @@ from torch import Tensor
 from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.mirror import mirror_camera
 from oasis_warp.core.types import Camera, Side
-from oasis_warp.data.photo import read_photo
 from oasis_warp.data.square_crop import resample_square
+from oasis_warp.datasets.files import File
 from oasis_warp.hand.mano import ManoModel, ManoPose, mano_surface, mirror_mano_pose
 
 MARGIN = 1.3
@@ -31,8 +30,8 @@ class Sample(NamedTuple):
 
     name: str
     """Path of the photo below the data set's root, and the side."""
-    image: Path
-    mask: Path | None
+    image: File
+    mask: File | None
     """White where the hand is."""
     side: Side
     subject: str
@@ -82,10 +81,10 @@ class Catalogue:
         Raises:
             InputError: no photo, a camera or parameters that are none, or a hand that its camera does not see.
         """
-        if not sample.image.is_file():
-            raise InputError(f"{sample.name}: the photo {sample.image.name} is missing.")
-        if sample.mask is not None and not sample.mask.is_file():
-            raise InputError(f"{sample.name}: the mask {sample.mask.name} is missing.")
+        if not sample.image.exists:
+            raise InputError(f"{sample.name}: the photo {sample.image.path.name} is missing.")
+        if sample.mask is not None and not sample.mask.exists:
+            raise InputError(f"{sample.name}: the mask {sample.mask.path.name} is missing.")
         xy = projected(sample, models)[1]
         if sample.box is not None and (xy.max(0) < sample.box[:2]).any():
             raise InputError(f"{sample.name}: the hand lies outside its box.")
@@ -141,18 +140,17 @@ def projected(sample: Sample, models: Models) -> tuple[np.ndarray, np.ndarray]:
     return vertices, seen[:, :2] / seen[:, 2:]
 
 
-def read_table(path: Path) -> Any:
+def read_table(file: File) -> Any:
     """The value of a JSON file of annotations.
 
     Raises:
         InputError: missing or no JSON.
     """
+    content = file.read()
     try:
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the folder that holds it.") from error
+        return json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected JSON, got {shortened(str(error))}; download it again.") from error
+        raise InputError(f"{file.path}: expected JSON, got {shortened(str(error))}; download it again.") from error
 
 
 def entry(table: Any, *keys: Any, what: str) -> Any:
@@ -177,7 +175,7 @@ def load_picture(sample: Sample, models: Models, size: int, margin: float = MARG
     Raises:
         InputError: the photo or mask cannot be read, or the box is too small.
     """
-    photo = read_photo(sample.image)
+    photo = sample.image.photo(sample.name)
     box = sample.box
     if box is None:
         xy = projected(sample, models)[1]
@@ -190,7 +188,7 @@ def load_picture(sample: Sample, models: Models, size: int, margin: float = MARG
     image = resample_square(photo.rgb.float() / 255, left, top, side, size).clamp(0, 1)
     mask = None
     if sample.mask is not None:
-        white = read_photo(sample.mask)
+        white = sample.mask.photo(sample.name)
         if white.rgb.shape != photo.rgb.shape:
             raise InputError(f"{sample.name}: its mask has another size than the photo.")
         mask = resample_square((white.rgb[..., 0].float() / 255).contiguous(), left, top, side, size).clamp(0, 1)

@@ -4,6 +4,7 @@ All of them estimate a right hand; the crop of a left one is mirrored before. Wi
 and camera are taken as they are. With the bundled hand their 21 points are, and it is fitted to these.
 """
 
+import io
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -80,13 +81,22 @@ def full_camera(
     return np.array([shift[0] + weak[1], shift[1] + weak[2], 2 * focal / scale])
 
 
-def read_estimate(path: Path, photo: Photo, which: Which = "largest") -> Estimate:
+def read_estimate(
+    path: Path, photo: Photo, which: Which = "largest", content: bytes | None = None
+) -> Estimate:
     """One hand of an .npz or pickle file of an estimator.
+
+    Args:
+        path: The file.
+        photo: What it was estimated from.
+        which: Of several hands.
+        content: Its bytes, where they lie elsewhere; `path` is for messages then.
 
     Raises:
         InputError: not such a file, no such hand in it, or entries that are missing or wrong; the sentence names them.
     """
-    records = [estimate for record in _records(path, _load(path)) for estimate in _estimates(path, record, photo)]
+    tables = _records(path, _load(path, content))
+    records = [estimate for table in tables for estimate in _estimates(path, table, photo)]
     if not records:
         raise InputError(f"{path}: no hand in it; give the estimator's output of a photo with a hand.")
     if which == "largest":
@@ -147,14 +157,18 @@ def pose_of(path: Path, found: Estimate, hand: HandModel, photo: Photo) -> tuple
 # ---- files
 
 
-def _load(path: Path) -> Any:
+def _load(path: Path, content: bytes | None) -> Any:
     if path.suffix != ".npz":
-        return read_pickle(path, "an estimator's hands")
+        return read_pickle(path, "an estimator's hands", content)
+
+    def opened() -> Path | io.BytesIO:
+        return path if content is None else io.BytesIO(content)
+
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(opened()) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > MOST_BYTES:
                 raise InputError(f"{path}: unpacks to more than {MOST_BYTES >> 20} MB; give the output of one photo.")
-        with np.load(path, allow_pickle=False) as stored:
+        with np.load(opened(), allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the name.") from error

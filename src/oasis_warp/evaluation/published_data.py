@@ -8,7 +8,7 @@ import torch
 
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import Camera, HandPose, Photo, Side
-from oasis_warp.datasets.readers import DatasetName, read_dataset
+from oasis_warp.datasets.readers import PAPER, DatasetName, read_dataset, read_selection
 from oasis_warp.datasets.samples import Catalogue, Models, load_picture
 from oasis_warp.datasets.training_source import in_camera
 from oasis_warp.estimation.keypoints import fit_of_pose
@@ -28,8 +28,10 @@ class CatalogueData:
         self._hand = chosen_hand(config.hand_model, config.mano_dir)
 
     @classmethod
-    def open(cls, name: DatasetName, root: Path, config: ReconstructConfig, size: int) -> "CatalogueData":
-        """What the paper evaluates on, of the data set below `root`.
+    def open(
+        cls, name: DatasetName, root: Path, config: ReconstructConfig, size: int, selection: Path | None = None
+    ) -> "CatalogueData":
+        """What the paper evaluates on, of the data set below `root`; of InterHand2.6M what a file selects.
 
         Raises:
             InputError: no such folder, no file of MANO, or not one sample.
@@ -37,7 +39,8 @@ class CatalogueData:
         chosen_hand(config.hand_model, config.mano_dir)  # says what is missing
         folder = Path(config.mano_dir or os.environ[MANO_DIR])
         models: Models = {side: read_mano(folder, side) for side in get_args(Side)}
-        return cls(read_dataset(name, root, folder, "test"), models, config, size)
+        chosen = PAPER if selection is None else read_selection(selection)
+        return cls(read_dataset(name, root, folder, "test", chosen), models, config, size)
 
     def read(self, key: Key) -> Sample:
         """The square around the hand, and the annotated pose.
