@@ -139,7 +139,7 @@ def test_files_without_gaussians_are_refused_in_one_sentence(tmp_path, capsys):
         "odd.splat": (bytes(33), "rows of 32 bytes"),
         "empty.splat": (b"", "expected 1 to"),
         "flat.splat": (bytes(32), "got 0 of 1"),
-        "new.spz": (gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 4, 0, 0, 12, 0, 0)), "versions 2 and 3"),
+        "new.spz": (gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 5, 0, 0, 12, 0, 0)), "versions 2 to 4"),
         "other.spz": (gzip.compress(bytes(16)), "it is no .spz"),
         "cut.spz": (gzip.compress(bytes(16))[:-12], "no Gaussians can be read"),
     }

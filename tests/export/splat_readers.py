@@ -7,6 +7,7 @@ import base64
 import json
 import struct
 import zipfile
+from importlib.util import find_spec
 
 import cv2
 import numpy as np
@@ -98,7 +99,10 @@ def read_splat_gltf(path):
 
 
 READERS = {
-    **dict.fromkeys((".ply", ".compressed.ply", ".splat", ".spz"), read_as_view_does),
+    **dict.fromkeys(
+        (".ply", ".compressed.ply", ".splat", ".spz", *((".v4.spz",) if find_spec("zstandard") else ())),
+        read_as_view_does,
+    ),
     ".sog": read_sog,
     ".splats.glb": read_splat_gltf,
     ".splats.gltf": read_splat_gltf,

@@ -1,3 +1,6 @@
+import struct
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -5,13 +8,15 @@ from scipy.spatial import cKDTree
 from tests.export.splat_readers import READERS
 
 from oasis_warp.core import rotation
+from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, Gaussians
+from oasis_warp.data.splat_files import read_splats
 from oasis_warp.export import export_avatar
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.render.render import render
 
 LOSSLESS = {".ply", ".splats.glb", ".splats.gltf"}
-STEPS = {".spz": 2**-20, ".sog": 4e-6, ".compressed.ply": 1e-4}
+STEPS = {".spz": 2**-20, ".v4.spz": 2**-20, ".sog": 4e-6, ".compressed.ply": 1e-4}
 """Of means [m]. A chunk of neighbours may span the 0.2 m of a hand, and the coarsest axis has 1023 steps in it;
 .sog has 65535 for the hand."""
 
@@ -82,6 +87,27 @@ def test_gaussians_keep_their_shapes(left_hand, ending, tmp_path):
     off = np.linalg.norm(off, axis=(1, 2)) / np.linalg.norm(expected[nearest[:, 0]], axis=(1, 2))
     assert alone.mean() > 0.5
     assert np.quantile(off[alone], 0.99) < (1e-3 if ending in LOSSLESS else 0.1)
+
+
+def test_without_zstandard_a_sentence_names_the_extra(right_hand, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    words = r"version 4 of .spz needs the package zstandard; install it: pip install 'oasis-warp\[spz\]'"
+    with pytest.raises(InputError, match=words):
+        export_avatar(right_hand, tmp_path / "hand.v4.spz")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "theirs.spz").write_bytes(struct.pack("<IIIBBBBI", 0x5053474E, 4, 0, 0, 12, 0, 5, 32).ljust(200, b"\0"))
+    with pytest.raises(InputError, match=words):
+        read_splats(tmp_path / "theirs.spz")
+
+
+def test_a_stream_of_zstd_gives_no_more_than_its_due(right_hand, tmp_path):
+    """A few bytes may stand for gigabytes."""
+    zstd = pytest.importorskip("zstandard")
+    bomb = zstd.ZstdCompressor().compress(bytes(1 << 26))
+    head = struct.pack("<IIIBBBBI", 0x5053474E, 4, 1, 0, 12, 0, 5, 32).ljust(32, b"\0")
+    toc = b"".join(struct.pack("<QQ", len(bomb), 1 << 40) for _ in range(5))
+    (tmp_path / "bomb.spz").write_bytes(head + toc + 5 * bomb)
+    assert len(read_splats(tmp_path / "bomb.spz").means) == 1
 
 
 @pytest.mark.parametrize("ending", [".spz", ".sog"])

@@ -89,7 +89,10 @@ def test_the_skin_of_the_avatar_follows_the_words(hand, tmp_path):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ("nothing", "expected a picture, a folder with a diffusers pipeline, or a command with {out} in it"),
+        (
+            "nothing",
+            "expected a picture, a folder with a diffusers pipeline, hosted:MODEL, or a command with {out}",
+        ),
         ("paint 'unfinished {out}", "cannot be read as a command"),
     ],
 )

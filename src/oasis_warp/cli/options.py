@@ -169,7 +169,7 @@ class Compare:
 class Export:
     """Write an avatar for other programs; the ending of the name says the format.
 
-    Gaussians for splat viewers: .ply, .compressed.ply, .splat, .spz, .sog, and .splats.glb (glTF's
+    Gaussians for splat viewers: .ply, .compressed.ply, .splat, .spz, .v4.spz, .sog, and .splats.glb (glTF's
     KHR_gaussian_splatting).
     A mesh with bones, texture and named poses, for engines and Blender: .glb, .gltf. In one pose: .obj. Either in
     OpenUSD: .usdc, .usdz, and .splats.usdc, .splats.usdz. Shape, pose and camera as numbers: .json. A page that shows
@@ -235,8 +235,9 @@ class Text:
     """The person's hand, e.g. "an old fisherman's tanned hand"."""
     out: OutputFolder
     generator: str | None = None
-    """A picture you made from the files, a folder with a diffusers ControlNet pipeline, or a command with {out} in it;
-    also {depth}, {normal}, {canny}, {mask}, {folder}, {prompt} and {seed}."""
+    """A picture you made from the files, a folder with a diffusers ControlNet pipeline, hosted:MODEL for one on the
+    machines of others, or a command with {out} in it; also {depth}, {normal}, {canny}, {mask}, {folder}, {prompt} and
+    {seed}."""
     pose: NamedPose = "open"
     view: Literal["palm", "back"] = "palm"
     side: Literal["left", "right"] = "right"

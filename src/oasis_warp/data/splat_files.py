@@ -4,9 +4,12 @@ Each reader gives means, quats (wxyz), scales, opacities and colours with y down
 them. Spherical harmonics beyond the constant one are left out.
 """
 
+import importlib
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +26,8 @@ SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4
 """Of .splat (github.com/antimatter15/splat)."""
 SPZ_MAGIC, SPZ_COLOR_SCALE = 0x5053474E, 0.15
 """Of .spz (github.com/nianticlabs/spz); a byte of colour holds 0.5 + SPZ_COLOR_SCALE f_dc."""
+SPZ4_HEADER = 32
+"""Length of a version 4's header [bytes]."""
 PLY_KINDS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
@@ -158,22 +163,60 @@ def _read_splat(data: bytes) -> Parts:
     return rows["mean"], (rows["quat"].astype(float) - 128) / 128, rows["scales"], rgba[:, 3], rgba[:, :3]
 
 
+def zstandard(path: Path | str) -> Any:
+    """The package zstandard: Python before 3.14 has no zstd.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return importlib.import_module("zstandard")
+    except ImportError as error:
+        raise InputError(
+            f"{path}: version 4 of .spz needs the package zstandard; install it: pip install 'oasis-warp[spz]'."
+        ) from error
+
+
+def _spz4_streams(data: bytes, widths: Sequence[int]) -> bytes:
+    """The attributes of a file of version 4, one after the other."""
+    count, n_streams, start = *struct.unpack_from("<I3xB", data, 8), struct.unpack_from("<I", data, 16)[0]
+    if n_streams < len(widths):
+        raise ValueError(f"{len(widths)} streams are expected, not {n_streams}")
+    zstd = zstandard("this file")
+    at, streams = start + 16 * n_streams, []
+    for k, width in enumerate(widths):
+        packed, _ = struct.unpack_from("<QQ", data, start + 16 * k)
+        try:  # not more than is due, whatever the stream says of itself
+            with zstd.ZstdDecompressor().stream_reader(data[at : at + packed]) as reader:
+                streams.append(reader.read(count * width))
+        except zstd.ZstdError as error:
+            raise ValueError(str(error)) from error
+        if len(streams[-1]) != count * width:
+            raise ValueError("a stream is too short")
+        at += packed
+    return b"".join(streams)
+
+
 def _read_spz(data: bytes) -> Parts:
-    """Versions 2 and 3, whose y points up."""
+    """Versions 2 to 4, whose y points up."""
     if data[:4] != SPZ_MAGIC.to_bytes(4, "little"):  # version 4 is not zipped as a whole
         data = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(data, MOST_BYTES)
     magic, version, count, _, bits = struct.unpack("<IIIBB", data[:14])
-    if magic != SPZ_MAGIC or version not in (2, 3):
-        raise ValueError(f"versions 2 and 3 are read, not {version}" if magic == SPZ_MAGIC else "it is no .spz")
-    parts, start = [], 16
-    for width in (9, 1, 3, 3, 4 if version == 3 else 3):
+    if magic != SPZ_MAGIC or version not in (2, 3, 4):
+        raise ValueError(f"versions 2 to 4 are read, not {version}" if magic == SPZ_MAGIC else "it is no .spz")
+    if count > MOST_SPLATS:
+        raise ValueError(f"at most {MOST_SPLATS} Gaussians are read, not {count}")
+    widths, parts, start = (9, 1, 3, 3, 3 if version == 2 else 4), [], 16
+    if version == 4:
+        data, start = _spz4_streams(data, widths), 0
+    for width in widths:
         part = np.frombuffer(data, np.uint8, count * width, start) if count else np.zeros(0, np.uint8)
         parts.append(part.reshape(-1, width).astype(np.int64))
         start += count * width
     places, opacities, colors, scales, turns = parts
     means = places.reshape(-1, 3, 3) @ [1, 1 << 8, 1 << 16]
     means = np.where(means >= 1 << 23, means - (1 << 24), means) / float(1 << min(bits, 62))
-    if version == 3:
+    if version > 2:
         words = turns @ [1, 1 << 8, 1 << 16, 1 << 24]
         others = np.stack([words >> shift & 0x3FF for shift in (20, 10, 0)], 1)
         others = np.where(others & 0x200, -1, 1) * (others & 0x1FF) / 511 / np.sqrt(2)

@@ -18,7 +18,7 @@ from oasis_warp.export.skinned_usd import write_skinned_usd
 from oasis_warp.export.splat_gltf import write_splat_gltf
 from oasis_warp.export.splat_ply import write_compressed_ply, write_ply
 from oasis_warp.export.splat_sog import write_sog
-from oasis_warp.export.splat_spz import write_splat, write_spz
+from oasis_warp.export.splat_spz import write_splat, write_spz, write_spz4
 from oasis_warp.export.usd_stage import write_splat_usd
 from oasis_warp.export.wavefront import write_obj
 from oasis_warp.hand_avatar import Avatar
@@ -33,6 +33,7 @@ WRITERS: dict[str, Writer] = {
     ".compressed.ply": write_compressed_ply,
     ".splat": write_splat,
     ".spz": write_spz,
+    ".v4.spz": write_spz4,
     ".sog": write_sog,
     ".splats.glb": write_splat_gltf,
     ".splats.gltf": write_splat_gltf,

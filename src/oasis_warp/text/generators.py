@@ -1,4 +1,4 @@
-"""Where a picture of the described hand comes from: a picture, a command or a diffusers pipeline of the user's."""
+"""Where a picture of the described hand comes from: a file, a command, a pipeline or a hosted model of the user's."""
 
 import inspect
 import shlex
@@ -6,11 +6,12 @@ import subprocess
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from oasis_warp.core.errors import InputError, last_line
+from oasis_warp.core.errors import InputError, last_line, shortened
 from oasis_warp.core.types import Photo
 from oasis_warp.data.photo import read_photo
 
@@ -21,12 +22,21 @@ PLACES = ("{folder}", "{depth}", "{mask}", "{normal}", "{canny}", "{prompt}", "{
 """What a command may name: the folder and its files, the words, the seed, and the picture to write."""
 
 
+HOSTED, HOSTED_SECONDS = "hosted", 300.0
+"""The word for a model of others' machines, and how long one may take."""
+AS_DEPTH = "The given picture is its depth map, near is bright: keep the pose, the outline and the place of the hand."
+"""Tells models that edit pictures what they are given."""
+
+
 def choose_generator(given: str) -> Generator:
-    """A picture's file, a folder with a diffusers ControlNet pipeline, or a command with {out} in it.
+    """A picture's file, a folder with a diffusers pipeline, a command with {out} in it, or "hosted" or "hosted:MODEL".
 
     Raises:
         InputError: it is none of these.
     """
+    service, _, model = given.partition(":")
+    if service == HOSTED:
+        return _hosted(model or None)
     path = Path(given)
     if path.is_file():
         return lambda folder, prompt, seed: read_photo(path)
@@ -35,9 +45,44 @@ def choose_generator(given: str) -> Generator:
     if "{out}" in given:
         return _command(given)
     raise InputError(
-        f"--generator {given}: expected a picture, a folder with a diffusers pipeline, or a command with {{out}} in "
-        f"it, such as 'paint --depth {{depth}} --prompt {{prompt}} --seed {{seed}} -o {{out}}'; give one of these."
+        f"--generator {given}: expected a picture, a folder with a diffusers pipeline, hosted:MODEL, or a command "
+        f"with {{out}} in it, such as 'paint --depth {{depth}} --prompt {{prompt}} -o {{out}}'; give one of these."
     )
+
+
+def _hosted(model: str | None) -> Generator:
+    """An image-to-image model that Hugging Face or one of its providers runs; depth and words are sent there.
+
+    `model` is its name, or the address of an endpoint; None for the one that the service recommends.
+    """
+    name = HOSTED if model is None else f"{HOSTED}:{model}"
+    try:
+        import huggingface_hub
+    except ImportError as error:
+        raise InputError(
+            f"--generator {name}: a hosted model needs its client; run pip install 'oasis-warp[hosted]'."
+        ) from error
+    token = huggingface_hub.get_token()
+    if token is None:
+        raise InputError(f"--generator {name}: needs a token of huggingface.co; put it into HF_TOKEN.")
+    client = huggingface_hub.InferenceClient(model=model, token=token, timeout=HOSTED_SECONDS)
+
+    def generate(folder: Path, prompt: str, seed: int) -> Photo:
+        steer, words = (folder / "depth.png").read_bytes(), f"{prompt}. {AS_DEPTH}"
+        try:
+            picture = client.image_to_image(steer, prompt=words, seed=seed)
+        except Exception as error:  # its HTTP library changes with its version, and each provider has errors of its own
+            raise InputError(
+                f"--generator {name}: no picture came ({shortened(str(error))}); try another model, or later."
+            ) from error
+        return _as_photo(picture, seed)
+
+    return generate
+
+
+def _as_photo(picture: Any, seed: int) -> Photo:
+    """A picture of Pillow."""
+    return Photo(torch.from_numpy(np.array(picture.convert("RGB"))), None, None, f"picture with seed {seed}", 1.0)
 
 
 def _command(line: str) -> Generator:
@@ -104,7 +149,6 @@ def _pipeline(folder: Path) -> Generator:
         steer = Image.open(conditioning / "depth.png").convert("RGB")
         random = torch.Generator().manual_seed(seed)
         made = pipeline(prompt=prompt, width=steer.width, height=steer.height, generator=random, **{depth: steer})
-        pixels = torch.from_numpy(np.array(made.images[0].convert("RGB")))
-        return Photo(pixels, None, None, f"picture with seed {seed}", 1.0)
+        return _as_photo(made.images[0], seed)
 
     return generate
