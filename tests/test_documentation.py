@@ -1,31 +1,77 @@
-"""What the pages say can be done: links lead somewhere, commands are taken, and the tour works word for word."""
+"""What the pages say can be done: links lead somewhere, and every block is run, or at least taken by what would run it.
+
+Commands and Python blocks are run word for word in a folder that holds the files they name: small photos, avatars made
+of them or drawn at random, MANO's files, a data set. What takes minutes, waits for Ctrl-C or needs a GPU, a cluster or
+somebody's generator (`TAKEN`, `NOT_RUN`) is only parsed: by the command line of the program that it calls.
+"""
 
 import ast
 import importlib
+import inspect
 import re
 import shlex
 import shutil
+import tomllib
+from collections.abc import Iterator
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
+import tyro
+from datasets import trees
+from fuzz.targets import BVH, small_avatar
+from ops.rasterization_scenes import ordinary_scene
 
+import oasis_warp
 from oasis_warp.assets import asset
 from oasis_warp.cli import app
+from oasis_warp.core.config import EditConfig, ReconstructConfig
+from oasis_warp.export import export_avatar
+from oasis_warp.hand.mano import read_mano
+from oasis_warp.hand.poses import named_pose
+from studies.__main__ import studies
 
 TOP = Path(__file__).parents[1]
 PAGES = [*sorted((TOP / "docs").glob("*.md")), TOP / "README.md", TOP / "CONTRIBUTING.md"]
 NAMES = [page.name for page in PAGES]
+QUICK = ("compare", "info", "render")
+SLOW = ("animate", "doctor", "edit", "export", "reconstruct", "text")
+TAKEN = ("batch", "bench", "evaluate", "gradcheck", "pretrain", "serve", "synthesize", "view")
+"""Commands that take minutes, or wait for Ctrl-C."""
+SLOW_PYTHON = ("editing.md", "estimator.md", "export.md", "network.md", "same_hand.md", "README.md", "tour.md")
+NOT_RUN = {"batch.md": "Ray is none of our packages", "gpu.md": "needs CUDA", "synthetic.md": "needs CUDA"}
+SIDE = 160
+"""Longer side of the small photos [px]."""
+SHORT = {"animate": ["--size=64"], "edit": ["--steps=2"], "reconstruct": ["--steps=2"]}
+"""Options that stand behind those of the page here, so that minutes become seconds."""
 
 
 def blocks(page, language):
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
 
 
-def commands(page):
-    lines = "".join(blocks(page, "sh")).replace("\\\n", " ").splitlines()
-    return [words for line in lines if (words := shlex.split(line, comments=True))]
+def commands(page) -> Iterator[list[str]]:
+    """Words of each command; those that && joins are several."""
+    for line in "".join(blocks(page, "sh")).replace("\\\n", " ").splitlines():
+        words = shlex.split(line, comments=True)
+        while words:
+            end = words.index("&&") if "&&" in words else len(words)
+            yield [words[0].removeprefix(".venv/bin/"), *words[1:end]]
+            words = words[end + 1 :]
+
+
+def pages_that_run(*which, python=lambda page: False):
+    """Parameters: pages with one of these commands, or with Python blocks that are run."""
+    found = []
+    for page in PAGES:
+        ours = [words[1] for words in commands(page) if words[0] == "oasis" and "--generator" not in words]
+        if page.name != "tour.md" and (set(ours) & set(which) or (blocks(page, "python") and python(page))):
+            found.append(page)
+    return pytest.mark.parametrize("page", found, ids=[page.name for page in found])
 
 
 def anchors(page):
@@ -46,38 +92,194 @@ def test_links_lead_somewhere(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_commands_are_taken(page, monkeypatch):
+def test_every_block_says_what_it_is(page):
+    """A block without a language would be run by nobody."""
+    fences = re.findall(r"^```(.*)$", page.read_text(), re.MULTILINE)
+    assert all(re.fullmatch(r"sh|python|\{[\w-]+\}.*", opened) for opened in fences[::2]) and set(fences[1::2]) <= {""}
+
+
+def small(path, out, side=SIDE):
+    """A photo with this longer side."""
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    scale = side / max(picture.shape[:2])
+    return cv2.imwrite(str(out), cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory, mano_dir):
+    """A folder with what the pages name."""
+    folder = tmp_path_factory.mktemp("prepared")
+    bundled = "src/oasis_warp/assets/photos/palm_open_left_02.png"
+    (folder / bundled).parent.mkdir(parents=True)
+    own = TOP / "tests" / "data" / "photos" / "same_hand" / "a1_wood_right"
+    photos = dict.fromkeys(("photo.jpg", "photo.png", "hand.jpg", "left.jpg", bundled), TOP / bundled)
+    photos |= {"palm.jpg": own / "02_flat_closed.jpg", "back.jpg": own / "03_flat_closed_back.jpg"}
+    photos |= {"right.jpg": own / "02_flat_closed.jpg", "side.jpg": own / "05_c_shape_open.jpg"}
+    for name, photo in photos.items():
+        small(photo, folder / name)
+    painted = cv2.imread(str(folder / "photo.jpg"))
+    cv2.circle(painted, (SIDE // 3, SIDE // 2), 6, (0, 0, 255), -1)
+    cv2.imwrite(str(folder / "painted.png"), painted)
+    avatar = small_avatar(lit=True)
+    for name in ("out/avatar", "out/me/avatar", "one/avatar", "other/avatar", "left", "right", "avatar"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        avatar.save(folder / f"{name}.safetensors")
+    export_avatar(avatar, folder / "scene.ply")
+    finger = "JOINT {0}1\n{{\nOFFSET 5 0 {1}\nCHANNELS 1 Zrotation\n}}\n"
+    fingers = "".join(finger.format(name, k) for k, name in enumerate(("index", "middle", "ring", "little", "thumb")))
+    (folder / "hands.bvh").write_text(BVH.format(fingers=fingers, row=" ".join(["10"] * 8)))
+    shutil.copytree(mano_dir, folder / "mano_v1_2" / "models")
+    with resources.as_file(asset("prior", "compact.safetensors")) as weights:
+        (folder / "network.safetensors").symlink_to(weights)
+    return folder
+
+
+def given(page, folder, mano_dir):
+    """What a page's Python blocks take as there."""
+    if page.name == "operators.md":
+        return dict(vars(ordinary_scene(n=20)))
+    if page.name == "mano.md":
+        named = {"components": 45, "betas": 10, "global_orient": 3, "transl": 3}
+        return {name: np.zeros(size) for name, size in named.items()}
+    if page.name == "viewing.md":
+        avatar = oasis_warp.Avatar.load(folder / "out" / "avatar.safetensors")
+        return {"np": np, "named_pose": named_pose, "avatar": avatar}
+    if page.name == "datasets.md":
+        models = {side: read_mano(mano_dir, side) for side in ("left", "right")}
+        trees.hanco(folder / "hanco", models, "test")
+        return {"root": folder / "hanco", "mano_dir": mano_dir}
+    if page.name == "same_hand.md":
+        return {"oasis_warp": oasis_warp, "paths": [folder / "palm.jpg", folder / "back.jpg"]}
+    return {}
+
+
+def run_python(page, folder, mano_dir):
+    names = given(page, folder, mano_dir)
+    for block in blocks(page, "python"):
+        exec(compile(block, page.name, "exec"), names)
+
+
+def take_oasis(words, monkeypatch):
+    """Parse a command of ours; what it would run."""
     taken = []
     command = SimpleNamespace(run=lambda options: taken.append(options) or 0)
-    monkeypatch.setattr(app.importlib, "import_module", lambda name: command)
-    given = [words[1:] for words in commands(page) if words[0] == "oasis" and "..." not in words]
-    assert all(app.main(words) == 0 for words in given)
-    assert len(taken) == len([words for words in given if words != ["--version"]])
+    with monkeypatch.context() as patch:
+        patch.setattr(app.importlib, "import_module", lambda name: command)
+        assert app.main(words) == 0
+    assert len(taken) == (words != ["--version"])
+
+
+def take_python(words, monkeypatch):
+    """Parse what Python runs: a study, a script of this repository, or the package for environments."""
+    if words[:2] == ["-m", "studies"]:
+        if words[2] == "render":
+            assert set(words[3:]) <= set(studies())
+        elif words[2] not in ("age", "list"):
+            tyro.cli(importlib.import_module(f"studies.{words[2]}").Options, args=words[3:])
+    elif words[0] == "-m":
+        assert words[1:] == ["venv", ".venv"]
+    else:
+        text = (TOP / words[0]).read_text()
+        assert all(f'"{word}"' in text for word in words[1:] if word.startswith("--"))
+
+
+def take_pip(words, monkeypatch):
+    """Look whether the files and extras are there."""
+    with (TOP / "pyproject.toml").open("rb") as file:
+        extras = tomllib.load(file)["project"]["optional-dependencies"]
+    files = [after for word, after in pairwise(words) if word == "-c"]
+    assert words[0] == "install" and all((TOP / file).is_file() for file in files)
+    assert {name for word in words for name in re.findall(r"\[(\w+)\]", word)} <= set(extras)
+
+
+def take_torchrun(words, monkeypatch):
+    run = importlib.import_module("torch.distributed.run").get_args_parser().parse_args(words)
+    assert run.module and run.training_script == "oasis_warp"
+    take_oasis(run.training_script_args, monkeypatch)
+
+
+def take_dask(words, monkeypatch):
+    pytest.importorskip("distributed")
+    command = importlib.import_module(f"distributed.cli.dask_{words[0]}").main
+    command.make_context(words[0], list(words[1:]))
+
+
+@pytest.mark.filterwarnings("ignore")  # of Dask's and torch's own command lines
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_commands_are_taken(page, monkeypatch, pytestconfig):
+    def take_pytest(words, _):
+        asked, unknown = pytestconfig._parser.parse_known_and_unknown_args(words)
+        assert not unknown and all((TOP / path).exists() for path in asked.file_or_dir)
+
+    takers = {
+        "oasis": take_oasis, "python": take_python, "python3": take_python, "pip": take_pip, "pytest": take_pytest,
+        "torchrun": take_torchrun, "dask": take_dask, "export": lambda words, _: None,
+    }  # fmt: skip
+    for words in commands(page):
+        takers[words[0]](words[1:], monkeypatch)
+
+
+def run_commands(page, which):
+    for words in commands(page):
+        assert words[0] != "oasis" or words[1] in (*QUICK, *SLOW, *TAKEN, "--version")
+        if words[0] == "oasis" and words[1] in which and "--generator" not in words:
+            short = (
+                [f"--{name}={value}" for name, value in SHORT.items()] if words[1] in ("edit", "reconstruct") else []
+            )
+            assert app.main([*words[1:], *short]) == 0, words
+
+
+@pages_that_run(*QUICK)
+def test_quick_commands_work_word_for_word(page, prepared, monkeypatch):
+    monkeypatch.chdir(prepared)
+    run_commands(page, QUICK)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_what_python_blocks_import_is_there(page):
+def test_what_python_blocks_call_is_there(page):
+    """Names that are imported from us exist, and take the arguments that they are called with."""
     for block in blocks(page, "python"):
+        ours = {}
         for node in ast.walk(ast.parse(block)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("oasis_warp"):
                 module = importlib.import_module(node.module or "")
-                assert [alias.name for alias in node.names if not hasattr(module, alias.name)] == []
+                ours |= {alias.asname or alias.name: getattr(module, alias.name) for alias in node.names}
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ours:
+                named = {word.arg: None for word in node.keywords if word.arg}
+                inspect.signature(ours[node.func.id]).bind(*[None] * len(node.args), **named)
+
+
+@pages_that_run(python=lambda page: page.name not in (*SLOW_PYTHON, *NOT_RUN))
+def test_quick_python_blocks_work_word_for_word(page, prepared, mano_dir, monkeypatch):
+    monkeypatch.chdir(prepared)
+    run_python(page, prepared, mano_dir)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_the_tour_works_word_for_word(tmp_path, monkeypatch):
-    with resources.as_file(asset("photos", "palm_open_left_02.png")) as photo:
-        shutil.copy(photo, tmp_path / "photo.png")
-    photos = TOP / "tests" / "data" / "photos" / "same_hand" / "a1_wood_right"
-    for name, photo in {"palm": "02_flat_closed", "back": "03_flat_closed_back"}.items():
-        shutil.copy(photos / f"{photo}.jpg", tmp_path / f"{name}.jpg")
+@pages_that_run(*SLOW, python=lambda page: page.name in SLOW_PYTHON)
+def test_slow_commands_and_blocks_work_word_for_word(page, prepared, mano_dir, tmp_path, monkeypatch):
+    folder = shutil.copytree(prepared, tmp_path / "here", symlinks=True)
+    monkeypatch.chdir(folder)
+    for config in (ReconstructConfig, EditConfig):
+        make = inspect.unwrap(config.__init__)  # below the shape checks
+        monkeypatch.setattr(make, "__kwdefaults__", {**make.__kwdefaults__, "steps": 2})
+    run_commands(page, (*QUICK, *SLOW))
+    if page.name in SLOW_PYTHON:
+        run_python(page, folder, mano_dir)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_tour_works_word_for_word_and_makes_what_it_tells(prepared, mano_dir, tmp_path, monkeypatch):
+    for name in ("photo.png", "palm.jpg", "back.jpg"):
+        shutil.copy(prepared / name, tmp_path)
     page = TOP / "docs" / "tour.md"
     monkeypatch.chdir(tmp_path)
-    for words in commands(page):
-        assert words[0] == "oasis" and app.main(words[1:]) == 0
-    for block in blocks(page, "python"):
-        exec(block, {})
+    run_commands(page, (*QUICK, *SLOW))
+    run_python(page, tmp_path, mano_dir)
     made = {path.name for path in tmp_path.iterdir()} | {path.name for path in (tmp_path / "out").iterdir()}
     told = set(re.findall(r"^\| `([\w.]+)` \|", page.read_text(), re.MULTILINE))
     assert told <= made and {"fist.png", "studio.png", "clip.gif", "hand.html", "hand.glb", "hand.spz", "both"} <= made

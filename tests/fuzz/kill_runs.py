@@ -103,6 +103,7 @@ def stop_once(name: str, fault: str, whole: Whole, inputs: Path, out: Path, rng:
     if second is not None and (code := victims.ended(second, victims.PATIENCE)) != 0:
         wrong = f"exit code {code} beside another process"
     if name == "serve":
+        how = "stopped" if how == "ended" else how  # it never ends by itself
         found = victims.finish_photo(out)
         wrong = wrong or ("" if found == "complete" else found)
     elif command.goes_on:

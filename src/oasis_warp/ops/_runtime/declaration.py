@@ -188,8 +188,7 @@ class Operator(Declaration):
             public: As in `Declaration`.
         """
         super().__init__(name, inputs=inputs, outputs=outputs, reference=reference, public=public)
-        parameters = inspect.signature(forward).parameters
-        self._parameters = list(parameters)
+        self._parameters = list(parameters := inspect.signature(forward).parameters)
         self._tensors = [n for n, p in parameters.items() if p.annotation in (Tensor, Tensor | None)]
         checked = [(k, name) for k, name in enumerate(self._parameters) if name in self._floats]
         self.forward = forward
@@ -197,7 +196,8 @@ class Operator(Declaration):
         self._implementation = forward
         if self._parameters[-1] == "validate" and not validates_itself:
             self._implementation = _validating(forward, checked)
-        self.custom_op = torch.library.custom_op(f"{NAMESPACE}::{name}", self._implementation, mutates_args=())
+        described = {"mutates_args": (), "schema": transforms.schema_of(self._implementation)}
+        self.custom_op = torch.library.custom_op(f"{NAMESPACE}::{name}", self._implementation, **described)
         self.custom_op.register_fake(fake)
         self._fake = fake
         self._traced = getattr(getattr(torch.ops, NAMESPACE), name).default

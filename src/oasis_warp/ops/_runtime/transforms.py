@@ -1,11 +1,30 @@
 """Operators under the transforms of torch.func: reverse mode and vmap work, forward mode is refused in words."""
 
+import inspect
+import typing
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+
+
+def schema_of(function: Callable[..., Any]) -> str:
+    """The schema of a custom op, read from the annotations of a function; torch 2.6 knows lists by another name."""
+
+    def named(annotation: Any) -> Any:
+        kind, inner = typing.get_origin(annotation), typing.get_args(annotation)
+        if kind is tuple:
+            return tuple[tuple(map(named, inner))]
+        return typing.List[inner[0]] if kind is list else annotation  # noqa: UP006
+
+    def described() -> None: ...
+
+    signature = inspect.signature(function)
+    parameters = [p.replace(annotation=named(p.annotation)) for p in signature.parameters.values()]
+    described.__signature__ = inspect.Signature(parameters, return_annotation=named(signature.return_annotation))
+    return torch.library.infer_schema(described, mutates_args=())
 
 
 def refuse_forward_mode(caller: str, arguments: Any) -> None:
