@@ -24,6 +24,7 @@ from oasis_warp.cli.batch import finish, share_out
 from oasis_warp.cli.batch_work import ROW, Order, make_avatars
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.processes import worker_pool
+from oasis_warp.data.photo import read_photo
 from oasis_warp.ops import warm_up
 from studies.harness import Row, StudyOptions, measured
 from studies.inputs import PHOTOS, photos_below
@@ -53,7 +54,7 @@ def write_photos(folder: Path, count: int) -> None:
     """Small photos of other bytes each."""
     every = photos_below(PHOTOS)
     for k in range(count):
-        pixels = cv2.imread(str(every[k % len(every)]))
+        pixels = read_photo(every[k % len(every)]).rgb.numpy()[..., ::-1]
         size, cut = (SIDE, round(SIDE * pixels.shape[0] / pixels.shape[1])), k // len(every)
         pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(folder / f"{k:05d}.png"), pixels[cut // 8 :, cut % 8 :])

@@ -17,7 +17,7 @@ from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.avatar.quality import over_photo
 from oasis_warp.core.camera import orbit_camera, project
-from oasis_warp.core.config import AdaptConfig, ReconstructConfig
+from oasis_warp.core.config import PAPER_ADAPTATION, AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.processes import using_threads
@@ -80,6 +80,7 @@ def test_a_photo_may_be_given_as_its_file():
 @pytest.mark.parametrize(("options", "message"), [
     ({"light": "nope"}, "light nope: expected one of fit, keep, even"),
     ({"refine": "nope"}, "refine nope: expected one of on, off"),
+    ({"adapt": "nope"}, "adapt nope: expected one of field, lora"),
     ({"steps": -1}, "steps -1: expected 0 or more"),
     ({"size": 3}, "size 3: expected 64 to 1024 pixels"),
     ({"size": 99999}, "size 99999: expected 64 to 1024 pixels"),
@@ -90,6 +91,11 @@ def test_options_are_checked_before_any_work_from_python_too(options, message):
         object.__setattr__(config, name, value)  # as without the type checker of these tests
     with pytest.raises(InputError, match=message):
         reconstruct("there is no such file.jpg", config)
+
+
+def test_lora_is_for_one_photo():
+    with pytest.raises(InputError, match="adapt lora: learns one photo, got 2; leave it out"):
+        reconstruct_same_hand([read_photo(path) for path in (PALM, BACK)], replace(SMALL, adapt="lora"))
 
 
 def test_photos_of_two_hands_are_refused_before_the_long_work():
@@ -110,6 +116,23 @@ def palm():
 @pytest.fixture(scope="module")
 def alone(palm):
     return reconstruct(palm, SMALL)
+
+
+@pytest.mark.slow
+def test_the_papers_adaptation_trains_the_heads_of_the_guess_as_it_is(palm, monkeypatch):
+    asked = []
+
+    def watched(hand, guesses, crops, config, **options):
+        asked.append((guesses[0], config, options["heads"]))
+        return adapt(hand, guesses, crops, replace(config, calibration_steps=1, reference_views=1), **options)
+
+    monkeypatch.setattr(reconstruction, "adapt", watched)
+    made = reconstruct(palm, replace(SMALL, adapt="lora", light="keep", unseen="plain", steps=2))
+    ((guess, config, heads),) = asked
+    assert config == replace(PAPER_ADAPTATION, texture_steps=2)
+    # A small photo's Gaussians are made fewer elsewhere, but these have heads of their own, a row for each.
+    assert sum(len(head.inputs) for head in heads) == len(guess.colors)
+    assert made.errors["input_psnr_db"] > 15
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ The only file that knows the order of the stages: see `_run`.
 
 import functools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,7 +29,8 @@ from oasis_warp.avatar.quality import (
 )
 from oasis_warp.avatar.wrist import close_wrist
 from oasis_warp.core import surface
-from oasis_warp.core.config import AdaptConfig, ReconstructConfig, check_config
+from oasis_warp.core.config import PAPER_ADAPTATION, AdaptConfig, ReconstructConfig, check_config
+from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_pose
@@ -54,7 +56,8 @@ from oasis_warp.estimation.refine import refine
 from oasis_warp.hand.template import chosen_hand
 from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
 from oasis_warp.losses.image import masked_psnr
-from oasis_warp.network.prior import choose_prior
+from oasis_warp.network.heads import ColorHeads
+from oasis_warp.network.prior import choose_prior, guess_with_heads
 from oasis_warp.ops import warm_up
 
 OTHER_LIGHT = 1.6
@@ -188,6 +191,8 @@ def _run(
     photos: Sequence[Photo], config: ReconstructConfig, keypoints: Path | None, prior: Prior | None, progress: Progress
 ) -> _Outcome:
     """All stages, in their order. `keypoints` are those of a single photo."""
+    if config.adapt == "lora" and len(photos) > 1:
+        raise InputError(f"adapt lora: learns one photo, got {len(photos)}; leave it out for several of a hand.")
     stages: dict[str, float] = {}
     stage = functools.partial(timed_stage, seconds=stages, progress=progress)
     hand = chosen_hand(config.hand_model, config.mano_dir)
@@ -211,7 +216,7 @@ def _run(
     with stage("crop"):
         crops = crop_hands(photos, fits, surfaces, config)
     with stage("prior"):
-        guesses = [prior(crop) for crop in crops]
+        guesses, heads = _guess(prior, crops, config)
     moved = [0.0] * len(photos)
     if config.refine == "on" and isinstance(found[0], Landmarks):  # a given pose is right as it is
         with stage("refinement"):
@@ -219,17 +224,18 @@ def _run(
             if any(moved):
                 surfaces = initial_surfaces(hand, fits)
                 crops = crop_hands(photos, fits, surfaces, config)
-                guesses = [prior(crop) for crop in crops]
+                guesses, heads = _guess(prior, crops, config)
     with stage("outline"):
         surfaces = refine_surfaces(hand, photos, fits, surfaces, guesses, config)
         crops = crop_hands(photos, fits, surfaces, config)
         close = crop_hands(photos, fits, surfaces, config, finer=True)
         scales, close_scales = resolutions(fits, crops), resolutions(fits, close)
     with stage("adaptation"):
-        if is_low_resolution(config, *fits):
+        if is_low_resolution(config, *fits) and heads is None:
             guesses = [coarsen(hand, guess, crops[0].rest) for guess in guesses]
-        settings = AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
-        adaptation = adapt(hand, guesses, crops, settings, resolutions=scales, progress=progress)
+        adaptation = adapt(
+            hand, guesses, crops, _adaptation(config), resolutions=scales, heads=heads, progress=progress
+        )
     with stage("detail"):
         adaptation = add_detail(hand, adaptation, close, close_scales, COARSE_SIZE, progress)
     invented = None
@@ -256,6 +262,24 @@ def _run(
     coverage["n_gaussians"] = float(len(avatar.gaussians.opacities))
     fused = FusedReconstruction(avatar, about, prior.about, stages, coverage, (), quality)
     return _Outcome(fused, warnings, coverage_warnings(coverage))
+
+
+def _guess(
+    prior: Prior, crops: Sequence[HandCrop], config: ReconstructConfig
+) -> tuple[list[CanonicalGaussians], ColorHeads | None]:
+    """The guess of each photo, and the heads behind the only one where they are to be trained."""
+    if config.adapt == "field":
+        return [prior(crop) for crop in crops], None
+    guess, heads = guess_with_heads(prior, crops[0])
+    return [guess], heads
+
+
+def _adaptation(config: ReconstructConfig) -> AdaptConfig:
+    """The options of the adaptation that are not those of a photo as a whole."""
+    if config.adapt == "field":
+        return AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
+    steps = PAPER_ADAPTATION.texture_steps if config.steps is None else config.steps
+    return replace(PAPER_ADAPTATION, light=config.light, texture_steps=steps, seed=config.seed)
 
 
 def _tuples(gains: Float[Tensor, "K 3"]) -> list[tuple[float, float, float]]:

@@ -77,6 +77,9 @@ class ReconstructConfig:
     light: Literal["fit", "keep", "even"] = "fit"
     """The photo's light: fit it, so that it stays where it is when the hand turns; keep it on the skin, shadows too; or
     leave it out wherever one can tell."""
+    adapt: Literal["field", "lora"] = "field"
+    """What learns one photo's detail: a field over the skin; or, as in the paper, low-rank updates of the learned prior
+    in 100 steps of calibration and 400 of learning (the paper's own also has --light keep --unseen plain)."""
     unseen: Literal["painted", "plain"] = "painted"
     """Skin that no photo shows: paint folds, veins and nails of a plausible person in the tone of the hand, another for
     every seed; or leave the smooth colours of the prior."""

@@ -218,7 +218,7 @@ def guess_with_heads(prior: Prior, crop: HandCrop) -> tuple[CanonicalGaussians, 
     """
     if not isinstance(prior, NetworkPrior):
         raise InputError(
-            f"prior {prior.about['name']!r}: has no heads for LoRA to train; choose a learned one, or texture 'field'."
+            f"prior {prior.about['name']!r}: has no heads for LoRA to train; choose a learned one, or the field."
         )
     return prior.with_heads(crop)
 
