@@ -13,20 +13,21 @@ from pathlib import Path
 from typing import Any
 
 from oasis_warp.data.photo import read_photo
-from oasis_warp.evaluation.columns import (
+from oasis_warp.evaluation.methods import Method, method_name
+from oasis_warp.evaluation.summary import (
     COLORS,
     GROUPS,
     LIGHTS,
     PHOTOS,
     SYNTHETIC,
+    Record,
     cells,
     format_number,
     noise_rows,
     pose_name,
+    select,
     with_values,
 )
-from oasis_warp.evaluation.methods import Method, method_name
-from oasis_warp.evaluation.summary import Record, select
 from studies.harness import Row, StudyOptions
 from studies.tables import markdown, section_of, write_jpeg
 

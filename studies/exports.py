@@ -14,8 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from tests.export.gltf_player import play
-from tests.export.splat_readers import READERS, read_gltf
+from tests.export.splat_readers import READERS, play, read_gltf
 from torch import Tensor
 
 from oasis_warp.assets import asset

@@ -28,9 +28,9 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shots import PICTURES_EACH
-from studies.damage import FAULTS, FaultyInput
 from studies.harness import Row, StudyOptions, measured
 from studies.inputs import OUTLINES, PHOTOS, estimator, iou, photos_below, read_masks, synthetic_photo
+from studies.stress import FAULTS, FaultyInput
 from studies.tables import Column, Section, complete, distribution, groups, mean, medians, percent, percentiles, table
 
 MEASURES = (

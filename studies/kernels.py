@@ -22,12 +22,12 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 
-from oasis_warp.bench import gpu_cases, gpu_speed, roofline, scaling
+from oasis_warp.bench import gpu_cases, roofline, scaling, speed
 from oasis_warp.bench.gpu_cases import OURS
-from oasis_warp.bench.gpu_speed import GpuRow
 from oasis_warp.bench.roofline import KernelRow
 from oasis_warp.bench.rows import json_text, read_json
 from oasis_warp.bench.scaling import ScalingRow, steepest
+from oasis_warp.bench.speed import GpuRow
 from oasis_warp.bench.tables import MISSING, can_plot, plot_roofline, plot_scaling, plot_speed
 from oasis_warp.data.output_files import write_file
 from studies.harness import Row, StudyOptions, report
@@ -53,7 +53,7 @@ def measure_part(part: str, options: Options) -> Sequence[Any]:
     """The rows of one part."""
     device = torch.device(options.device)
     if part == "kernels":
-        return gpu_speed.measure_cases(gpu_cases.choose(""), device, groups=GROUPS, progress=report)
+        return speed.measure_cases(gpu_cases.choose(""), device, groups=GROUPS, progress=report)
     if part == "scaling":
         return scaling.measure_scaling(scaling.points(quick=False), device, seconds=SECONDS, progress=report)
     return roofline.measure_roofline(device, progress=report)

@@ -14,10 +14,10 @@ from typing import Any
 import cv2
 
 from oasis_warp.data.photo import read_photo
-from oasis_warp.evaluation.columns import BLEMISHES, LOOKS, REGIONS, cells, kernel_cells, with_values
 from oasis_warp.evaluation.kernel_distance import LAYERS
 from oasis_warp.evaluation.looks import SHEETS, relative_contrasts
 from oasis_warp.evaluation.real_hands import reference_contrasts
+from oasis_warp.evaluation.summary import BLEMISHES, LOOKS, REGIONS, cells, kernel_cells, with_values
 from studies.harness import Row, StudyOptions
 from studies.inputs import PHOTOS
 from studies.tables import Column, Section, markdown, table, write_jpeg

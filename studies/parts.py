@@ -11,10 +11,9 @@ import torch
 
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import AdaptConfig
-from oasis_warp.evaluation.columns import COLORS, LIGHTS, SYNTHETIC, Measure
 from oasis_warp.evaluation.held_out import CaptureConfig
 from oasis_warp.evaluation.methods import ONE_SHOT, Method
-from oasis_warp.evaluation.summary import Record, difference, mean, select
+from oasis_warp.evaluation.summary import COLORS, LIGHTS, SYNTHETIC, Measure, Record, difference, mean, select
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate_people
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.prior import NetworkPrior, choose_prior

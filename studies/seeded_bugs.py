@@ -79,7 +79,7 @@ PIPELINE = [
         "return means * [1, -1, -1], ", "return means, "),
     _of("motion/motion", "motion/test_motion_file", "tracked", "bones turned against their parents' parent",
         "turns[:, list(hand.parents[1:])].mT @ turns[:, 1:]", "turns[:, 1:] @ turns[:, list(hand.parents[1:])].mT"),
-    _of("motion/tracked_joints", "motion/test_motion_file", "tracked", "quaternions wxyz where xyzw stand",
+    _of("motion/motion_file", "motion/test_motion_file", "tracked", "quaternions wxyz where xyzw stand",
         "quats[..., [3, 0, 1, 2]]", "quats"),
     _of("motion/bvh", "motion/test_motion_file", "bent_fingers", "the skeleton's rest pose taken for ours",
         "moved @ _shortest(ahead - ours[bone], there)", "moved"),

@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-from oasis_warp.bench.gpu_speed import GpuRow
 from oasis_warp.bench.roofline import KernelRow
 from oasis_warp.bench.scaling import ScalingRow
+from oasis_warp.bench.speed import GpuRow
 
 ABOUT = {"device": "a GPU", "commit": "0123456789", "versions": "oasis_warp 0"}
 

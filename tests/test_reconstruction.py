@@ -29,8 +29,7 @@ from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.hand_avatar import draw_as_photo, make_avatar
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.reconstruction import reconstruct, reconstruct_same_hand
-from studies.damage import DAMAGES
-from studies.stress import is_sane, likeness, make
+from studies.stress import DAMAGES, is_sane, likeness, make
 
 PHOTOS = Path(__file__).parent / "data" / "photos"
 WOOD = PHOTOS / "same_hand" / "a1_wood_right"

@@ -12,8 +12,7 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.skinning import bone_transforms
-from oasis_warp.synthetic.contact import separate
-from oasis_warp.synthetic.gestures import sample_gesture
+from oasis_warp.synthetic.contact import sample_gesture, separate
 
 TRAIN, HELD_OUT = "train", "held_out"
 SINGLE_STEPS, SIDE_STEPS, POSE_STEPS = 4, 2, 5

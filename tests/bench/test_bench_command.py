@@ -11,12 +11,11 @@ import pytest
 import torch
 from gpu_rows import FRAME, GPU, KERNELS, PEER, POINT, SPEED, STUDY
 
-from oasis_warp.bench import error_time, gpu_speed, knobs, roofline, rows, scaling, speed, tables
+from oasis_warp.bench import error_time, knobs, roofline, rows, scaling, speed, tables
 from oasis_warp.bench.error_time import SettingRow
-from oasis_warp.bench.gpu_speed import GpuRow
 from oasis_warp.bench.rows import csv_text, from_record, json_text, keys, read_json, to_record, write_rows
 from oasis_warp.bench.scenes import layered
-from oasis_warp.bench.speed import SpeedRow
+from oasis_warp.bench.speed import GpuRow, SpeedRow
 from oasis_warp.cli import main
 from oasis_warp.core.errors import InputError
 
@@ -126,7 +125,7 @@ def gpu(monkeypatch):
         asked.update(options, cases=cases, device=device)
         return SPEED
 
-    monkeypatch.setattr(gpu_speed, "measure_cases", measure)
+    monkeypatch.setattr(speed, "measure_cases", measure)
     monkeypatch.setattr(roofline, "measure_roofline", lambda *_: KERNELS)
     return asked
 
@@ -162,7 +161,7 @@ def test_kernels_on_a_gpu_are_its_own_cases_on_both_clocks(gpu, tmp_path, capsys
 def test_what_cannot_be_measured_on_a_gpu_is_refused_in_one_sentence(
     gpu, monkeypatch, arguments, sentence, tmp_path, capsys
 ):
-    monkeypatch.setattr(gpu_speed, "find_spec", lambda name: None)
+    monkeypatch.setattr(speed, "find_spec", lambda name: None)
     assert main(["bench", "kernels", "--device", "cuda", *(a.format(tmp_path) for a in arguments)]) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("oasis: ")

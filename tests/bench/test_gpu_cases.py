@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from oasis_warp.bench import cuda, gpu_speed
+from oasis_warp.bench import cuda, speed
 from oasis_warp.bench.cuda import Captured
 from oasis_warp.bench.gpu_cases import (
     CASES,
@@ -20,8 +20,8 @@ from oasis_warp.bench.gpu_cases import (
     pose_avatar,
     visibility_case,
 )
-from oasis_warp.bench.gpu_speed import errors, measure_case, measure_cases
 from oasis_warp.bench.operators import OPERATORS, Results
+from oasis_warp.bench.speed import errors, measure_case, measure_cases
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
 from oasis_warp.ops._runtime.pair_counts import Overflow
@@ -179,9 +179,9 @@ def test_a_graph_is_timed_by_its_steps_and_its_bits_and_lists_are_looked_at(monk
     def graphs(way, device):
         results = Results(tuple(value + shift for value in way.run().values))
         graph = SimpleNamespace(replay=lambda: replays.append(1))
-        return gpu_speed.Graphs(*(Captured(graph, steps, results, Lists(full)) for steps in (1, 10)))
+        return speed.Graphs(*(Captured(graph, steps, results, Lists(full)) for steps in (1, 10)))
 
-    monkeypatch.setattr(gpu_speed, "make_graphs", graphs)
+    monkeypatch.setattr(speed, "make_graphs", graphs)
     (row,) = measure_case(case, cpu, 2)
     assert (row.launch_ms, row.busy_ms, row.busy_iqr_ms) == (20.0, 2.0, 0.0)
     assert row.not_captured == ""
@@ -200,9 +200,9 @@ def test_the_error_of_most_pixels_leaves_out_one_in_ten_thousand():
 
 
 def test_a_peer_that_is_not_installed_is_told_in_one_sentence(monkeypatch):
-    monkeypatch.setattr(gpu_speed, "find_spec", lambda name: None)
+    monkeypatch.setattr(speed, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"--peer gsplat: the package is not installed; `pip install gsplat`"):
-        gpu_speed.gsplat_draw()
+        speed.gsplat_draw()
 
 
 @pytest.mark.gpu

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import torch
 from synthetic import avatar_of, crop_of
-from tests.export.gltf_player import joint_matrices, play, pose_of_clip
-from tests.export.splat_readers import accessor, read_gltf
+from tests.export.splat_readers import accessor, joint_matrices, play, pose_of_clip, read_gltf
 
 from oasis_warp.core.types import HandPose
 from oasis_warp.export import export_avatar

@@ -33,9 +33,9 @@ from oasis_warp.hand.mano import (
     read_mano,
     rotations,
 )
+from oasis_warp.hand.mano_hand import fit_vertices
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.skinning import bone_transforms, rest_hand, skin
-from oasis_warp.hand.surface_fit import fit_vertices
 from oasis_warp.hand.template import MANO_DIR, chosen_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.reconstruction import reconstruct

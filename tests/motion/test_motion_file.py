@@ -19,7 +19,7 @@ from oasis_warp.hand.skinning import bone_transforms
 from oasis_warp.hand.webxr_rig import TO_WEBXR, webxr_rig
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.motion import Motion, jitter, read_motion, recording, resample, smooth
-from oasis_warp.motion.mano import WRIST
+from oasis_warp.motion.motion_file import WRIST
 
 ANGLES = np.linspace(-1, 1, 4 * 45).reshape(4, 15, 3)
 NAMES = ("open", "fist", "ok", "point")

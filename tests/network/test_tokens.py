@@ -13,8 +13,8 @@ from oasis_warp.core.camera import project
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera
 from oasis_warp.losses.lpips import Lpips
+from oasis_warp.network.attention import CoarseLevel, Refinement, place_coarse_points, to_coarse, to_fine
 from oasis_warp.network.encoders import SIZES, ConvolutionalEncoder, DinoV2Encoder, ImageFeatures, Size
-from oasis_warp.network.refinement import CoarseLevel, Refinement, place_coarse_points, to_coarse, to_fine
 from oasis_warp.network.tokens import Aggregation, PlaceEncoding, PointFeatures, Tokenizer, encode, grid_places
 
 

@@ -2,8 +2,16 @@
 
 import pytest
 import torch
-from projection_runs import OPTIONS, assert_equal_bits, incoming, run
-from rasterization_scenes import CONDITIONS, covariances, ordinary_scene, stiff_scene
+from rasterization_scenes import (
+    CONDITIONS,
+    OPTIONS,
+    assert_equal_bits,
+    covariances,
+    incoming,
+    ordinary_scene,
+    run,
+    stiff_scene,
+)
 
 from oasis_kernels.constants import Rules
 from oasis_warp.ops import projection as module

@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from projection_runs import OPTIONS, incoming, run
-from rasterization_scenes import covariances, frontal_scene, ordinary_scene
+from rasterization_scenes import OPTIONS, covariances, frontal_scene, incoming, ordinary_scene, run
 from test_projection import assert_same
 
 from oasis_warp.ops import rasterization

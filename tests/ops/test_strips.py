@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from projection_runs import OPTIONS
-from rasterization_scenes import CONDITIONS, frontal_scene, intrinsics, ordinary_scene, stiff_scene
+from rasterization_scenes import CONDITIONS, OPTIONS, frontal_scene, intrinsics, ordinary_scene, stiff_scene
 from test_rasterization import INPUTS, draw
 
 from oasis_kernels.constants import Rules

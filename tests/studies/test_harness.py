@@ -14,9 +14,8 @@ from synthetic import crop_of
 
 from oasis_warp.avatar.observation import batch_of_crop
 from oasis_warp.core.errors import InputError
-from oasis_warp.evaluation.columns import SYNTHETIC
 from oasis_warp.evaluation.methods import METHODS
-from oasis_warp.evaluation.summary import summarise
+from oasis_warp.evaluation.summary import SYNTHETIC, summarise
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, save_network

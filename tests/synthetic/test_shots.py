@@ -11,8 +11,7 @@ from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.ops import depth_map
 from oasis_warp.ops.smoothing import smooth_over_faces
 from oasis_warp.synthetic.body import bundled_body
-from oasis_warp.synthetic.contact import bundled_skeleton, overlaps, separate
-from oasis_warp.synthetic.gestures import GESTURE_NAMES, GESTURES, sample_gesture
+from oasis_warp.synthetic.contact import GESTURE_NAMES, GESTURES, bundled_skeleton, overlaps, sample_gesture, separate
 from oasis_warp.synthetic.illumination import look_at
 from oasis_warp.synthetic.ops.batched_lbs import batched_lbs
 from oasis_warp.synthetic.ops.room_tracing import PATTERNS, SHAPES, SOLID_WORDS, trace_rooms

@@ -13,10 +13,9 @@ import torch
 from rich.table import Table
 
 from oasis_warp.bench.error_time import BUDGETS, Group, SettingRow, fastest, groups, non_dominated
-from oasis_warp.bench.gpu_speed import GpuRow
 from oasis_warp.bench.roofline import KernelRow
 from oasis_warp.bench.scaling import ScalingRow, steepest
-from oasis_warp.bench.speed import SpeedRow
+from oasis_warp.bench.speed import GpuRow, SpeedRow
 from oasis_warp.data.output_files import output_file
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from oasis_warp.bench import error_time, gpu_cases, gpu_speed, roofline, scaling, speed, tables
+from oasis_warp.bench import error_time, gpu_cases, roofline, scaling, speed, tables
 from oasis_warp.bench.operators import OPERATORS
 from oasis_warp.bench.rows import csv_text, json_text, write_rows
 from oasis_warp.bench.scenes import HAND_GAUSSIANS
@@ -145,11 +145,11 @@ def run_gpu(options: Kernels) -> None:
     if not cases:
         names = ", ".join(dict.fromkeys(case.name for case in gpu_cases.CASES))
         raise InputError(f"--only {options.only}: expected part of one of {names}.")
-    peers = {"gsplat": gpu_speed.gsplat_draw()} if options.peer else {}
+    peers = {"gsplat": speed.gsplat_draw()} if options.peer else {}
     notes = Console(stderr=True)
     with results(options, tables.plot_speed) as write:
         with show_progress(notes) as progress, using_threads(options.threads):
-            rows = gpu_speed.measure_cases(
+            rows = speed.measure_cases(
                 cases, torch.device("cuda"), groups=options.repeats or GPU_GROUPS, peers=peers, progress=progress
             )
         write(rows)

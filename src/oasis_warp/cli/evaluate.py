@@ -15,23 +15,6 @@ from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.evaluation.band_energy import SIZE
-from oasis_warp.evaluation.columns import (
-    BLEMISHES,
-    COLORS,
-    GROUPS,
-    LIGHTS,
-    LOOKS,
-    PHOTOS,
-    REGIONS,
-    SYNTHETIC,
-    Measure,
-    cells,
-    format_number,
-    kernel_cells,
-    noise_rows,
-    pose_name,
-    with_values,
-)
 from oasis_warp.evaluation.data_sets import Choice, evaluate_data_set
 from oasis_warp.evaluation.held_out import HELD_OUT_SEED, CaptureConfig
 from oasis_warp.evaluation.kernel_distance import LAYERS
@@ -41,7 +24,25 @@ from oasis_warp.evaluation.paper_tables import make_tables, rows_of_tables, writ
 from oasis_warp.evaluation.published_data import CatalogueData
 from oasis_warp.evaluation.real_hands import real_photos
 from oasis_warp.evaluation.same_hand import METRICS, evaluate_photos, photos_in, photos_of_hands
-from oasis_warp.evaluation.summary import Record, select
+from oasis_warp.evaluation.summary import (
+    BLEMISHES,
+    COLORS,
+    GROUPS,
+    LIGHTS,
+    LOOKS,
+    PHOTOS,
+    REGIONS,
+    SYNTHETIC,
+    Measure,
+    Record,
+    cells,
+    format_number,
+    kernel_cells,
+    noise_rows,
+    pose_name,
+    select,
+    with_values,
+)
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate_people
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.lpips import load_lpips

@@ -24,8 +24,8 @@ from oasis_warp.evaluation.band_energy import (
     redness,
     split_bands,
 )
-from oasis_warp.evaluation.contact_sheet import Cell
 from oasis_warp.evaluation.kernel_distance import Sample, hand_features
+from oasis_warp.evaluation.pictures import Cell
 from oasis_warp.evaluation.real_hands import mostly_shows, read_crop, side_masks
 from oasis_warp.evaluation.summary import Record
 from oasis_warp.evaluation.views import (

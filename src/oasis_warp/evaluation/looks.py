@@ -17,7 +17,6 @@ from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.evaluation.band_energy import BANDS
-from oasis_warp.evaluation.contact_sheet import write_cells, write_overview
 from oasis_warp.evaluation.kernel_distance import (
     FEWEST_GROUPS,
     KernelDistance,
@@ -26,6 +25,7 @@ from oasis_warp.evaluation.kernel_distance import (
 )
 from oasis_warp.evaluation.look_measures import measure_looks
 from oasis_warp.evaluation.methods import prior_digest
+from oasis_warp.evaluation.pictures import write_cells, write_overview
 from oasis_warp.evaluation.real_hands import measure_real, real_photos, reference_contrasts
 from oasis_warp.evaluation.same_hand import photos_in
 from oasis_warp.evaluation.summary import Record, read_result

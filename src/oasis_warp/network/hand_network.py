@@ -11,7 +11,7 @@ from oasis_warp.avatar.observation import CropBatch, Observation, observe_batch
 from oasis_warp.avatar.prior import MeanHand, MeanHands
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.surface import faces_of_vertices
-from oasis_warp.network.attention import JointAttention, Perceptron, VisibilityAttention
+from oasis_warp.network.attention import CoarseLevel, JointAttention, Perceptron, Refinement, VisibilityAttention
 from oasis_warp.network.config import NetworkConfig
 from oasis_warp.network.encoders import ConvolutionalEncoder, DinoV2Encoder, ImageFeatures
 from oasis_warp.network.heads import (
@@ -25,7 +25,6 @@ from oasis_warp.network.heads import (
     decode,
     decode_offsets,
 )
-from oasis_warp.network.refinement import CoarseLevel, Refinement
 from oasis_warp.network.tokens import (
     PlaceEncoding,
     PointEvidence,

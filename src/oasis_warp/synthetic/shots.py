@@ -10,8 +10,7 @@ import numpy as np
 
 from oasis_warp.core.types import Side
 from oasis_warp.synthetic.body import bundled_body
-from oasis_warp.synthetic.contact import separate
-from oasis_warp.synthetic.gestures import sample_gesture
+from oasis_warp.synthetic.contact import sample_gesture, separate
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
 from oasis_warp.synthetic.rooms import Room, sample_room
 from oasis_warp.synthetic.sensor import Sensor, sample_sensor
