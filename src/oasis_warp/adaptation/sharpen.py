@@ -114,16 +114,9 @@ def sharpen(
     sources = [_source(e, faces, fading, own) for e, own in zip(crops, believed, strict=True)]
     on = None if light is None else posed_lighting(rest, sources[0].posed, faces, light)
     old = [pose_gaussians(_as_shown(gaussians, faces, light, on), faces, rest, source.posed) for source in sources]
-    spacing = torch.stack([
-        _wanted_spacing(source, render(there, source.canvas.camera).image, faces)
-        for source, there in zip(sources, old, strict=True)
-    ]).amin(0)  # fmt: skip
-    missing = spacing.isfinite()
-    if not bool(missing.any()):
+    around, parts = _parts(rest, faces, sources, old)
+    if not bool(around.any()):
         return SharpenResult(gaussians, 0, ())
-    around = with_neighbours(missing, faces, len(rest))
-    # A face of one part would keep its vertices' Gaussians, which reach into the faces beside it.
-    parts = torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
     dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
     shown = _as_shown(dense, faces, light, on)
     new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
@@ -146,6 +139,19 @@ def sharpen(
     if light is not None and on is not None:
         colors = colors / shading_factors(dense._replace(shade=None), faces, light, on).clamp_min(MIN_FACTOR)
     return SharpenResult(with_photo_colors(dense, changed, colors[changed], trust), n_new, tuple(losses))
+
+
+def _parts(
+    rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], sources: Sequence[Source], old: Sequence[Gaussians]
+) -> tuple[Bool[Tensor, "F"], Int[Tensor, "F"]]:
+    """Faces to be cut, those whose pictures differ and those around them, and into how many parts each is."""
+    spacing = torch.stack([
+        _wanted_spacing(source, render(there, source.canvas.camera).image, faces)
+        for source, there in zip(sources, old, strict=True)
+    ]).amin(0)  # fmt: skip
+    around = with_neighbours(spacing.isfinite(), faces, len(rest))
+    # A face of one part would keep its vertices' Gaussians, which reach into the faces beside it.
+    return around, torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
 
 
 def _as_shown(
