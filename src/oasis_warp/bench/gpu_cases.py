@@ -114,7 +114,9 @@ class Learning:
             offsets=offsets, quats=quats, scales=log_scales.exp(), opacities=logit_opacities.sigmoid(), colors=colors
         )
         image = draw_avatar(self.scene, canonical, self.surface)
-        masked_l1(image.squeeze(0), self.scene.target, self.scene.mask).backward()
+        loss = masked_l1(image.squeeze(0), self.scene.target, self.scene.mask)
+        with torch.autograd.set_multithreading_enabled(False):  # on CUDA to change threads costs more than the kernels
+            loss.backward()
         self.optimizer.step()
         return Results((image.detach(),), tuple(leaf.grad for leaf in self.leaves if leaf.grad is not None))
 
