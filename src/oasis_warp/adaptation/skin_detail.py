@@ -63,7 +63,8 @@ class Places(NamedTuple):
 def sample_detail(hand: HandModel, gaussians: CanonicalGaussians | Places, seed: int) -> SkinDetail:
     """Read the maps of three hands, mixed place by place and a little warped as `seed` says, at every Gaussian."""
     device = gaussians.barycentrics.device
-    noise = _smooth_noise(hand, seed)
+    faces = hand.faces.cpu().contiguous()
+    noise = _smooth_noise(faces.numpy().tobytes(), faces.dtype, len(hand.template), seed)
     weights = torch.softmax(MIX_SHARPNESS * noise[:, :HANDS], 1)
     of_vertices = torch.cat([weights, WARP * noise[:, HANDS:]], 1).to(device)
     first = _first_corner(hand.faces, len(hand.template)).to(device)
@@ -85,11 +86,17 @@ def sample_detail(hand: HandModel, gaussians: CanonicalGaussians | Places, seed:
     return SkinDetail(skin * bare, fold * bare[:, 0], own[:, 2], plate, own[:, 4], own[:, 5])
 
 
-def _smooth_noise(hand: HandModel, seed: int) -> Float[Tensor, "V C"]:
-    """Fields of mean 0 and standard deviation 1: one a hand, two of the warp. On the CPU, for equal bits."""
-    noise = torch.randn(len(hand.template), HANDS + 2, generator=torch.Generator().manual_seed(seed))
-    smooth = surface.smooth_over_mesh(noise, surface.mesh_edges(hand.faces.cpu()), MIX_PASSES)
-    return (smooth - smooth.mean(0)) / smooth.std(0)
+@functools.lru_cache(2)
+def _smooth_noise(faces: bytes, dtype: torch.dtype, n_vertices: int, seed: int) -> Float[Tensor, "V C"]:
+    """Fields of mean 0 and standard deviation 1: one a hand, two of the warp. On the CPU, for equal bits.
+
+    Kept, as a photo asks for it twice and all photos of a seed for the same one; none may write to it.
+    """
+    with torch.inference_mode(False), torch.no_grad():
+        table = torch.frombuffer(bytearray(faces), dtype=dtype).view(-1, 3)
+        noise = torch.randn(n_vertices, HANDS + 2, generator=torch.Generator().manual_seed(seed))
+        smooth = surface.smooth_over_mesh(noise, surface.mesh_edges(table), MIX_PASSES)
+        return (smooth - smooth.mean(0)) / smooth.std(0)
 
 
 def _first_corner(faces: Int[Tensor, "F 3"], n_vertices: int) -> Int[Tensor, "V"]:
