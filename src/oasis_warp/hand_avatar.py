@@ -263,7 +263,7 @@ class Avatar:
         if self.side == "left":
             light = mirror_light(light)
         if self.light is not None:
-            light = light._replace(shade=self.light.shade, facing=self.light.facing)
+            light = light._replace(shade=self.light.shade, facing=self.light.facing, doubt=self.light.doubt)
         return self.with_looks(self.gaussians, light)
 
     def _mean_albedo(self, level: Float[Tensor, "3"]) -> Float[Tensor, "3"]:

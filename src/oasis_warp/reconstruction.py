@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
+from oasis_warp.adaptation.sh_lighting import limit_shade
 from oasis_warp.adaptation.unseen_skin import paint_unseen
 from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask
@@ -245,6 +246,9 @@ def _run(
                 hand, adaptation.gaussians, adaptation.guess, crops[0], adaptation.observations, seed=config.seed
             )
             adaptation, invented = adaptation._replace(gaussians=painted.gaussians), painted.invented
+    if adaptation.light is not None:
+        limited = limit_shade(hand, adaptation.gaussians, crops[0], adaptation.light)
+        adaptation = adaptation._replace(gaussians=limited)
     closed = close_wrist(hand, adaptation.gaussians, crops[0].rest.vertices)
     adaptation = adaptation._replace(gaussians=closed)
     avatar = make_avatar(fits[0], surfaces.shared, crops[0], closed, adaptation.light, invented, hand=hand)

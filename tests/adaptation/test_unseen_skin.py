@@ -8,6 +8,7 @@ import trimesh
 from synthetic import PALM_TO_CAMERA, crop_of
 
 from oasis_warp.adaptation import reliability
+from oasis_warp.ops import depth_map
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.inpainting import FADE_LENGTH, inpaint, laplacian_and_mass
 from oasis_warp.adaptation.reliability import mask_unreliable
@@ -290,6 +291,28 @@ def test_skin_that_looks_like_the_wall_counts(hand, shown):
     crop, drawn = shown
     same = crop._replace(image=drawn)
     assert float(mask_unreliable(hand, drawn, same).mask.mean() / crop.mask.mean()) > 0.95
+
+
+def test_what_is_read_as_another_place_does_not_count(hand, shown):
+    """The tip of a finger that is fitted beside it was printed on the palm."""
+    crop, drawn = shown
+    seen = depth_map(
+        crop.posed.vertices, hand.faces, crop.camera.viewmat, crop.camera.K, *crop.mask.shape, validate=False
+    )
+    places = (hand.template[hand.faces[seen.face_ids.clamp_min(0).long()]] * seen.barycentrics[..., None]).sum(-2)
+    right = torch.cat([places, torch.full_like(crop.mask, 0.005)[..., None]], -1)
+    before = mask_unreliable(hand, drawn, crop).mask
+    assert torch.equal(mask_unreliable(hand, drawn, crop._replace(reading=right)).mask, before)
+    deep = inner_mask(crop.mask, 10) > 0.5
+    for column, value in ((0, 0.03), (3, 0.03)):  # 3 cm off, and unsure
+        wrong = right.clone()
+        wrong[..., column][deep] += value
+        sure = mask_unreliable(hand, drawn, crop._replace(reading=wrong)).mask
+        assert float(sure[deep].max()) == 0 and torch.equal(sure[~grown(deep, 2)], before[~grown(deep, 2)])
+
+
+def grown(where, pixels):
+    return inner_mask(-where.float(), pixels) < 0
 
 
 def test_what_lies_just_behind_a_finger_does_not_count(hand, shown):

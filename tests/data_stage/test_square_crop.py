@@ -10,8 +10,8 @@ from synthetic import posed_hand
 
 from oasis_warp.core.camera import crop_camera, project
 from oasis_warp.core.config import ReconstructConfig
-from oasis_warp.core.mirror import as_right_hand, mirror_camera, mirror_landmarks, mirror_pose
-from oasis_warp.core.types import Camera, HandFit, Landmarks, Photo
+from oasis_warp.core.mirror import as_right_hand, mirror_camera, mirror_landmarks, mirror_pose, mirror_reading
+from oasis_warp.core.types import Camera, HandFit, Landmarks, Photo, SurfaceReading
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.square_crop import find_square, resample_square, square_around
 from oasis_warp.estimation.hand_crop import crop_hand, crop_landmarks
@@ -106,8 +106,10 @@ def right(hand):
     y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
     photo = Photo(torch.stack([x, y % 256, x * 0], -1).to(torch.uint8), None, None, "places.png", 1.0)
     shape = torch.zeros(len(hand.shape_names))
-    fit = HandFit("right", shape, pose, camera, Landmarks(xy, None, "right", 1.0, 1.0, "file"), mask, 0, 0, 1, 0, ())
-    return photo, fit
+    places = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
+    reading = SurfaceReading(places, places[..., 0], low[0] - 7.3, low[1] - 4.8, 0.8 * (high[1] - low[1]))
+    landmarks = Landmarks(xy, None, "right", 1.0, 1.0, "file")
+    return photo, HandFit("right", shape, pose, camera, landmarks, mask, 0, 0, 1, 0, (), reading)
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +119,7 @@ def left(right):
     return photo._replace(rgb=photo.rgb.flip(1).contiguous()), fit._replace(
         side="left", pose=mirror_pose(fit.pose), camera=mirror_camera(fit.camera),
         landmarks=mirror_landmarks(fit.landmarks, WIDTH), mask=fit.mask.flip(1),
+        reading=mirror_reading(fit.reading, WIDTH),
     )  # fmt: skip
 
 
@@ -126,11 +129,22 @@ def crop_of(hand, case, size=95):
 
 def test_the_mirrored_photo_of_the_other_hand_gives_the_same_crop(hand, right, left):
     a, b = crop_of(hand, right), crop_of(hand, left)
-    for name in ("image", "mask", "above_wrist"):
+    for name in ("image", "mask", "above_wrist", "reading"):
         torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=1e-5, rtol=0)
     torch.testing.assert_close(a.camera.K, b.camera.K)
     torch.testing.assert_close(a.posed.vertices, b.posed.vertices)
     torch.testing.assert_close(crop_landmarks(right[1], a.camera), crop_landmarks(left[1], b.camera))
+
+
+def test_a_pixel_of_the_crop_has_the_place_that_was_read_there(hand, right):
+    _, fit = right
+    crop, size = crop_of(hand, right), 95
+    (K, Kc), there = (camera.K for camera in (fit.camera, crop.camera)), fit.reading
+    at = (torch.tensor([40.5, 30.5]) - Kc[:2, 2]) / Kc.diagonal()[:2] * K.diagonal()[:2] + K[:2, 2]
+    column, row = ((at - torch.tensor([there.left, there.top])) / there.side * 32).floor().long().tolist()
+    assert 0 <= row < 32 and 0 <= column < 32
+    assert torch.equal(crop.reading[30, 40, :3], there.places[row, column])
+    assert crop.reading.shape == (size, size, 4) and bool(crop.reading[-1, -1, 3].isinf())  # beyond what was read
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

@@ -16,6 +16,7 @@ from oasis_warp.avatar.anchors import rim_fade, vertex_colors, vertex_to_gaussia
 from oasis_warp.avatar.observation import Observation, observe
 from oasis_warp.avatar.pose import GAMMA, Lighting, posed_lighting, shading
 from oasis_warp.avatar.sky import bounced, harmonic_basis
+from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors, depth_map
@@ -123,11 +124,16 @@ def trust_in_albedo(hand: HandModel, crop: HandCrop, sure: HandCrop, light: Hand
         light: Of the photo.
     """
     on = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces.to(crop.image.device), light)
-    every, believed = (observe(hand, which).confidence for which in (crop, sure))
-    trust = exposed(on) * torch.where(every > 0, believed / every.clamp_min(1e-6), 1).clamp(0, 1)
+    trust = exposed(on) * _believed_share(hand, crop, sure)
     if light.shade is None:
         return trust
     return trust * (1 - light.shade.log().mean(-1).abs() / SHADED).clamp(0, 1)
+
+
+def _believed_share(hand: HandModel, crop: HandCrop, sure: HandCrop) -> Float[Tensor, "V"]:
+    """Confidence with the mask of `sure` over that with all of the mask; 1 where the photo shows nothing."""
+    every, believed = (observe(hand, which).confidence for which in (crop, sure))
+    return torch.where(every > 0, believed / every.clamp_min(1e-6), 1).clamp(0, 1)
 
 
 def _even_light(albedo: Float[Tensor, "3"]) -> HandLight:
@@ -176,7 +182,8 @@ def add_shade(
     believed = observe(hand, sure).confidence * exposed(on)
     doubt = (seen.confidence - believed) * rim_fade(rest[None], hand.rim.to(rest.device))[0]  # the cap has no shade
     occluded = inpaint(rest, faces, missing, doubt, OCCLUDER_FADE / 3, OCCLUDER_FADE)
-    return light._replace(shade=occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp(), facing=on.normals)
+    shade = occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp()
+    return light._replace(shade=shade, facing=on.normals, doubt=1 - _believed_share(hand, crop, sure))
 
 
 def shading_picture(hand: HandModel, crop: HandCrop, light: HandLight) -> Float[Tensor, "H W 3"]:
@@ -263,8 +270,13 @@ def weighted_deviation(values: Float[Tensor, "V 3"], weight: Float[Tensor, "V"])
     return size[order][torch.searchsorted(below, below[-1] / 2).clamp_max(len(order) - 1)]
 
 
-ALBEDO_SHARE = 0.2
-"""Share of a difference that is no mark which becomes albedo."""
+ALBEDO_SHARE, FINE_SHARE = 0.2, 0.8
+"""Share of a difference that is no mark which becomes albedo, and that of its fine part: creases, folds and the rims of
+nails stay on the skin, and light hardly changes so fast on it, but in sharp shadows."""
+FINE_PASSES = 6
+"""Smoothings over the mesh that take the fine part away, about 5 mm."""
+MOST_FINE = 0.3
+"""Largest fine part, as a logarithm; more is a sharp shadow, gloss, or another part of the hand."""
 ACROSS_SHADING = ((-18.0, 21.3, -7.5), (8.8, 4.6, -8.1))
 """Shading moves the logarithms of skin colours along one line, from dark and red to bright and pale. These two
 directions are perpendicular to it, each divided by the standard deviation there, measured on photos of bare hands."""
@@ -289,11 +301,14 @@ def split_albedo_shading(
     ratio = learned.colors.clamp_min(MIN_COLOR) / guess.clamp_min(MIN_COLOR)
     beyond = ratio.log().clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE)
     of_vertices = vertex_colors(learned._replace(colors=beyond), len(hand.template))
-    stays = 1 - (1 - ALBEDO_SHARE) * (1 - mark_probability(of_vertices))
+    faces, no_mark = hand.faces.to(guess.device), 1 - mark_probability(of_vertices)
+    shares = torch.cat([1 - (1 - ALBEDO_SHARE) * no_mark, (FINE_SHARE - ALBEDO_SHARE) * no_mark], 1)
     if trust is not None:
-        stays = stays * trust[:, None]
-    stays = vertex_to_gaussians(stays, hand.faces.to(guess.device), learned)
-    colors = (guess.clamp_min(MIN_COLOR) * (stays * beyond).exp()).clamp(max=1)
+        shares = shares * trust[:, None]
+    fine = of_vertices - surface.smooth_over_mesh(of_vertices, surface.mesh_edges(faces), FINE_PASSES)
+    fine = shares[:, 1:] * fine.clamp(-MOST_FINE, MOST_FINE)
+    read = vertex_to_gaussians(torch.cat([shares[:, :1], fine], 1), faces, learned)
+    colors = (guess.clamp_min(MIN_COLOR) * (read[:, :1] * beyond + read[:, 1:]).exp()).clamp(max=1)
     return learned._replace(colors=colors, shade=learned.colors.clamp_min(MIN_SHOWN) / colors)
 
 
@@ -305,3 +320,38 @@ def mark_probability(beyond: Float[Tensor, "V 3"]) -> Float[Tensor, "V 1"]:
         for measure, (low, high) in ((across, MARK_DISTANCES), (beyond.mean(-1), MARK_BRIGHTNESSES))
     ]
     return torch.maximum(*likely)[:, None]
+
+
+LIKELY_SHADE, LIKELY_HUE = (-0.6, 0.25), 0.1
+"""Range of the logarithm of shade on a slant, and of each channel's difference from the mean of all: light gives no
+more to skin."""
+SLANTED, OPENLY = 0.3, 0.6
+"""Cosines between normal and view up to which and from which skin is seen on a slant and openly."""
+
+
+def limit_shade(
+    hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, light: HandLight
+) -> CanonicalGaussians:
+    """The Gaussians with no more shade than light gives to skin where the photo shows it on a slant.
+
+    There a pixel shows what lies beside an outline as well, floor between fingers for one: in the photo's view a rim of
+    a pixel, from the side a streak along a finger.
+
+    Args:
+        hand: Whose surface it is.
+        gaussians: Adapted to the photo.
+        crop: The photo.
+        light: Of the photo.
+    """
+    if gaussians.shade is None:
+        return gaussians
+    facing = observe(hand, crop).facing
+    slant = ((OPENLY - facing) / (OPENLY - SLANTED)).clamp(0, 1)
+    vertex_shade = torch.ones_like(crop.rest.vertices) if light.shade is None else light.shade
+    on_vertices = torch.cat([vertex_shade, slant[:, None]], 1)
+    own, share = vertex_to_gaussians(on_vertices, hand.faces.to(slant.device), gaussians).split([3, 1], 1)
+    total = (own * gaussians.shade).log()
+    grey = total.mean(-1, keepdim=True)
+    likely = grey.clamp(*LIKELY_SHADE) + (total - grey).clamp(-LIKELY_HUE, LIKELY_HUE)
+    limited = torch.lerp(total, likely, share).exp() / own
+    return gaussians._replace(shade=torch.where(share > 0, limited, gaussians.shade))

@@ -32,7 +32,7 @@ MORE = 1.5
 """Gaussians after painting over those before, at most."""
 PARTS = 2
 """An edge, of faces that are cut for the painting."""
-ON_PALM, ON_BACK = 1.2, 1.1
+ON_PALM, ON_BACK = 1.6, 1.1
 """Gain of the maps' detail on palms and on backs."""
 FOLD, VEIN = (-0.10, -0.14, -0.15), (-0.07, -0.04, -0.04)
 """What a fold and a vein add to the logarithms of the colours."""

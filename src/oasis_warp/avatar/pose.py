@@ -115,6 +115,7 @@ def shares_that_stay(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | 
 
     For deep shade the change of the sky is the largest nearby. Beside the outline of a finger the palm behind sees most
     of the sky, with the finger or without; what is much darker or brighter there is that finger, or its sharp shadow.
+    Where the photo is in doubt weak shade may be that finger, too.
     """
     assert light.facing is not None, "comes with any shade"
     cosine = (on.normals * light.facing).sum(-1, keepdim=True)
@@ -122,7 +123,9 @@ def shares_that_stay(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | 
     if on.exposure is None or seen is None:
         return torch.cat([stays, stays], -1)
     change = (on.exposure[..., 0] - seen).abs()
-    change = torch.stack([largest_nearby(change), change], -1)
+    nearby = largest_nearby(change)
+    own = change if light.doubt is None else torch.lerp(change, nearby, light.doubt)
+    change = torch.stack([nearby, own], -1)
     return stays * ((OTHER_SKY - change) / (OTHER_SKY - SAME_SKY)).clamp(0, 1)
 
 

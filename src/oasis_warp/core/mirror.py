@@ -13,7 +13,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import Camera, CanonicalGaussians, HandFit, HandLight, HandPose, Landmarks
+from oasis_warp.core.types import (
+    Camera,
+    CanonicalGaussians,
+    HandFit,
+    HandLight,
+    HandPose,
+    Landmarks,
+    SurfaceReading,
+)
 
 MIRROR = (-1.0, 1.0, 1.0)
 """Diagonal of M."""
@@ -63,6 +71,12 @@ def mirror_landmarks(landmarks: Landmarks, width: int) -> Landmarks:
     )
 
 
+def mirror_reading(reading: SurfaceReading, width: int) -> SurfaceReading:
+    """The reading of the mirror image of a photo of `width` pixels; places stay, which are on the right hand."""
+    left = width - reading.left - reading.side
+    return SurfaceReading(reading.places.flip(1), reading.spread.flip(1), left, reading.top, reading.side)
+
+
 def as_right_hand(fit: HandFit) -> HandFit:
     """`fit` itself for a right hand; for a left one the fit of the right hand in the mirrored photo."""
     if fit.side == "right":
@@ -73,6 +87,7 @@ def as_right_hand(fit: HandFit) -> HandFit:
         camera=mirror_camera(fit.camera),
         landmarks=mirror_landmarks(fit.landmarks, fit.camera.width),
         mask=fit.mask.flip(1),
+        reading=None if fit.reading is None else mirror_reading(fit.reading, fit.camera.width),
     )
 
 

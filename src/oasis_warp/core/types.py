@@ -75,6 +75,19 @@ class PosedHand(NamedTuple):
     tips: Float[Tensor, "5 3"]
 
 
+class SurfaceReading(NamedTuple):
+    """Which place of the hand each pixel around it shows, as a network reads the photo; a square of R x R samples."""
+
+    places: Float[Tensor, "R R 3"]
+    """On the bundled hand at rest [m]."""
+    spread: Float[Tensor, "R R"]
+    """Scale of their error [m]; infinite where the network sees no hand."""
+    left: float
+    top: float
+    side: float
+    """Of the square [px of the photo]."""
+
+
 class HandFit(NamedTuple):
     """One hand of a photo, explained by the model. All in the photo's own frame, a left hand included."""
 
@@ -97,6 +110,8 @@ class HandFit(NamedTuple):
     """Of the least-squares fit; sums squared residuals in units of their sigmas."""
     warnings: tuple[str, ...]
     """What makes this fit doubtful, in words; empty when nothing does."""
+    reading: SurfaceReading | None = None
+    """What a network reads in the photo; None where none was asked."""
 
 
 class HandCrop(NamedTuple):
@@ -114,6 +129,8 @@ class HandCrop(NamedTuple):
     """The fitted surface at rest."""
     posed: PosedHand
     """The fitted surface in the photo's pose, in the world of `camera`."""
+    reading: Float[Tensor, "S S 4"] | None = None
+    """Places and spread of `SurfaceReading` at the crop's pixels."""
 
 
 class Gaussians(NamedTuple):
@@ -171,6 +188,8 @@ class HandLight(NamedTuple):
     """Factor of the sRGB colours of vertices that face as in the photo, where that may show something else there."""
     facing: Float[Tensor, "V 3"] | None = None
     """Where they faced there, unit; comes with any shade."""
+    doubt: Float[Tensor, "V"] | None = None
+    """How far that photo may show something else there, 0 to 1: all shade ends there when the sky nearby changes."""
     albedo: Float[Tensor, "3"] | None = None
     """Mean reflectance of the skin, from which light bounces into the hollows of the hand. None: nothing is hidden."""
 

@@ -1,9 +1,10 @@
 """The avatar file: safetensors with a JSON header, so that loading one executes no code.
 
-The tables `TENSORS`, `LIGHT`, `SHADE`, `FINE_SHADE`, `ALBEDO` and `INVENTED` describe the tensors. The metadata have
-one entry, "oasis-avatar": the header, a JSON object whose `version` is 5, or less in files without light (1), shade
-(2), shade per Gaussian (3) or light that the hand hides from itself (4). Files of newer versions are refused. There is
-only one entry because safetensors writes several in any order, and the same avatar must give the same bytes.
+The tables `TENSORS`, `LIGHT`, `SHADE`, `FINE_SHADE`, `ALBEDO`, `DOUBT` and `INVENTED` describe the tensors. The
+metadata have one entry, "oasis-avatar": the header, a JSON object whose `version` is 6, or less in files without light
+(1), shade (2), shade per Gaussian (3), light that the hand hides from itself (4) or doubt (5). Files of newer versions
+are refused. There is only one entry because safetensors writes several in any order, and the same avatar must give the
+same bytes.
 """
 
 import json
@@ -25,7 +26,7 @@ from oasis_warp.data.output_files import write_file
 from oasis_warp.data.tensor_file import open_tensors, tensor_shapes
 
 FORMAT = "oasis-avatar"
-VERSION = 5
+VERSION = 6
 LIGHT_HIDDEN = 5
 """First version whose light is fitted with what the hand hides of it."""
 HARMONICS = (4, 9)
@@ -91,6 +92,10 @@ ALBEDO = {
     # Where the hand hides light from itself: with any light, or not at all.
     "light.albedo": Entry(torch.float32, (3,), 0, 1),
 }
+DOUBT = {
+    # Where the photo that the shade is of may show something else: with SHADE, or not at all.
+    "light.doubt": Entry(torch.float32, ("V",), 0, 1),
+}
 INVENTED = {
     # Where skin is painted because no photo shows it: with anything, or not at all.
     "invented": Entry(torch.float32, ("V",), 0, 1),
@@ -108,7 +113,8 @@ def save_avatar(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping
     Args:
         path: Path of the file; an existing one is replaced.
         tensors: One for every name of `TENSORS`, of `LIGHT` or none of them, then of `SHADE` or none, then of
-            `FINE_SHADE` or none, and with `LIGHT` that of `ALBEDO` or none; that of `INVENTED` or none. On any device.
+            `FINE_SHADE` or none, and with `LIGHT` that of `ALBEDO` or none, with `SHADE` that of `DOUBT` or none;
+            that of `INVENTED` or none. On any device.
         header: The keys of `HEADER` and any others; `version`, `units`, `counts` and `creator` are filled in.
 
     Raises:
@@ -218,6 +224,8 @@ def _check_shapes(
             table |= part
     if given.keys() & ALBEDO.keys():
         table |= LIGHT | ALBEDO
+    if given.keys() & DOUBT.keys():
+        table |= LIGHT | SHADE | DOUBT
     if given.keys() & INVENTED.keys():
         table |= INVENTED
     found = {"missing": table.keys() - given.keys(), "unknown": given.keys() - table.keys()}
@@ -245,7 +253,7 @@ def _check_shapes(
 def _check_values(tensors: Mapping[str, Tensor], sizes: Mapping[str, int]) -> None:
     """Refuse values that no hand has, for which drawing would fail or give an empty picture."""
     bounds = {"gaussians.vertex_index": sizes["V"] - 1, "gaussians.face_index": sizes.get("F", MOST_NUMBER) - 1}
-    for name, entry in (TENSORS | LIGHT | SHADE | FINE_SHADE | ALBEDO | INVENTED).items():
+    for name, entry in (TENSORS | LIGHT | SHADE | FINE_SHADE | ALBEDO | DOUBT | INVENTED).items():
         if name not in tensors:
             continue
         low, high, values = entry.low, min(entry.high, bounds.get(name, entry.high)), tensors[name]

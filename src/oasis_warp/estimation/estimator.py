@@ -30,7 +30,7 @@ from oasis_warp.estimation.fit_quality import (
 from oasis_warp.estimation.landmarks import box_size, detect_hands
 from oasis_warp.estimation.networks import networks
 from oasis_warp.estimation.outline import MaskOutline
-from oasis_warp.estimation.pixel_reading import read_pixels, surface_points
+from oasis_warp.estimation.pixel_reading import PixelReading, read_pixels, surface_points, surface_reading
 from oasis_warp.estimation.segmentation import check_opencv, mask_from_alpha, mask_from_reading
 from oasis_warp.hand.kinematics import HandKinematics
 
@@ -47,6 +47,7 @@ class _FittedPixels(NamedTuple):
     found: Solution
     mask: np.ndarray
     points: SurfacePoints
+    reading: PixelReading
     warnings: list[str]
 
 
@@ -118,7 +119,7 @@ class HandEstimator:
         known_shape = None if shape is None else array(shape)
         fitter = Fitter(self.kinematics, view.target, shape=known_shape)
         start = fitter.fit_landmarks()
-        found, mask, points, warnings = self._fit_pixels(view, fitter, start)
+        found, mask, points, reading, warnings = self._fit_pixels(view, fitter, start)
         quality = fit_quality(self.kinematics, view.target, found.state, mask, found.cost)
         detections = second_detections(view.rgb, networks(), view.target.xy)
         fingers = finger_warnings(view.target, detections)
@@ -147,6 +148,7 @@ class HandEstimator:
             mask=real(view.in_photo(mask)),
             **vars(quality),
             warnings=tuple(warnings),
+            reading=surface_reading(reading, view),
         )
 
     def _fit_pixels(self, view: MirroredInput, fitter: Fitter, start: Solution) -> _FittedPixels:
@@ -161,7 +163,7 @@ class HandEstimator:
         outline, points = MaskOutline(mask, xy), surface_points(self.kinematics, reading, scale)
         found = fitter.fit_surface(start.state, points)
         found = fitter.refine(found.state, lambda state: outline.match(self.kinematics, state), _ROUNDS, points)
-        return _FittedPixels(found, mask, points, warnings)
+        return _FittedPixels(found, mask, points, reading, warnings)
 
 
 def choose_hand(

@@ -13,7 +13,7 @@ from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.mirror import as_right_hand
-from oasis_warp.core.types import Camera, CanonicalGaussians, HandCrop, HandFit, Photo, PosedHand
+from oasis_warp.core.types import Camera, CanonicalGaussians, HandCrop, HandFit, Photo, PosedHand, SurfaceReading
 from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.estimation.surface_offsets import outline_offsets, rendered_outline_offsets
@@ -142,7 +142,23 @@ def crop_hand(
         camera=crop._replace(viewmat=crop.viewmat.to(device), K=crop.K.to(device)),
         rest=on_device(rest),
         posed=on_device(posed),
+        reading=None if right.reading is None else _resampled_reading(right.reading, left, top, side, size).to(device),
     )
+
+
+def _resampled_reading(
+    reading: SurfaceReading, left: float, top: float, side: float, size: int
+) -> Float[Tensor, "S S 4"]:
+    """`HandCrop.reading`: that of the nearest sample, because the mean of two fingers' places is no place."""
+    planes = torch.cat([reading.places, reading.spread[..., None]], -1)
+    steps = (torch.arange(size, dtype=torch.float64) + 0.5) / size * side
+    starts = top - reading.top, left - reading.left
+    near = [((start + steps) / reading.side * len(planes)).floor().long() for start in starts]
+    rows, columns = (index.clamp(0, len(planes) - 1) for index in near)
+    read = planes[rows][:, columns]
+    inside = (near[0] == rows)[:, None] & (near[1] == columns)
+    read[..., 3] = torch.where(inside, read[..., 3], torch.inf)
+    return read
 
 
 def crop_hands(

@@ -25,7 +25,7 @@ from oasis_warp.estimation.mano_estimates import (
     pose_of,
     read_estimate,
 )
-from oasis_warp.estimation.pixel_reading import read_pixels
+from oasis_warp.estimation.pixel_reading import read_pixels, surface_reading
 from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_reading
 from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.template import bundled_hand
@@ -194,6 +194,7 @@ def fit_of_pose(
         mask=real(view.in_photo(mask)),
         **vars(quality),
         warnings=(*quality.warnings(), *framing_warnings(view.target, mask)),
+        reading=surface_reading(reading, view),
     )
 
 

@@ -10,8 +10,11 @@ import torch
 from scipy.spatial import KDTree
 
 from oasis_warp.assets import asset
+from oasis_warp.core.mirror import mirror_reading
 from oasis_warp.core.processes import using_threads
+from oasis_warp.core.types import SurfaceReading
 from oasis_warp.estimation.fit import SurfacePoints
+from oasis_warp.estimation.fit_problem import MirroredInput
 from oasis_warp.hand.kinematics import HandKinematics
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.dense_network import FRONT, HAND, SURFACE_UNIT, DenseNetwork, load_dense_network
@@ -167,3 +170,13 @@ def surface_points(kinematics: HandKinematics, reading: PixelReading, scale: flo
         spread=scale * reading.spread[rows, columns].astype(np.float64),
         normal=reading.normal[:, rows, columns].T.astype(np.float64),
     )
+
+
+def surface_reading(reading: PixelReading, view: MirroredInput) -> SurfaceReading:
+    """What the network reads in `view`, in the photo's own frame."""
+    spread = np.where(reading.hand > _HAND, reading.spread, np.inf)
+    x, y = reading.corner / view.scale
+    places = torch.from_numpy(reading.surface).permute(1, 2, 0)
+    side = SIDE / reading.scale / float(view.scale[0])
+    found = SurfaceReading(places, torch.from_numpy(spread), float(x), float(y), side)
+    return mirror_reading(found, view.photo_size[0]) if view.mirrored else found

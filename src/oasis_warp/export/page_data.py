@@ -219,6 +219,8 @@ def _arrays(avatar: Avatar, light: SurfaceLight) -> dict[str, np.ndarray | Packe
         arrays["facing"] = _pack(light.light.facing, "i2", 1.0)
     if light.light.shade is not None:
         arrays["shade"] = _pack(light.light.shade, "u2")
+    if light.light.doubt is not None:
+        arrays["doubt"] = _pack(light.light.doubt, "u1", 1.0)
     if gaussians.shade is not None:
         arrays["fineShade"] = _pack(gaussians.shade, "u2")
     if light.seen is not None:

@@ -19,9 +19,9 @@ function makeShading(body, gaussians) {
 const between = (x, low, high) => Math.min(Math.max((x - low) / (high - low), 0), 1);
 
 // Factors of the colours of every vertex and the share of the photo's weak shade that is left, into shading.factors; that
-// of deep shade into shading.deep: for it the change of the sky is the largest nearby.
+// of deep shade into shading.deep: for it, and where the photo is in doubt, the change of the sky is the largest nearby.
 function lightVertices(body, shading, light, hurry = false) {
-  const { shade, facing } = body.data.arrays, { normals, factors, sky, change, nearby, deep } = shading, { harmonics, limits, albedo, seen } = light;
+  const { shade, facing, doubt } = body.data.arrays, { normals, factors, sky, change, nearby, deep } = shading, { harmonics, limits, albedo, seen } = light;
   if (albedo) exposeVertices(body, sky, normals, harmonics, hurry);
   if (albedo && seen) {
     for (let v = 0; v < body.nVertices; v++) change[v] = Math.abs(sky.exposure[4 * v] - seen[v]);
@@ -46,7 +46,7 @@ function lightVertices(body, shading, light, hurry = false) {
       const factor = got ** (1 / GAMMA);
       factors[4 * v + c] = shade ? factor * (1 + deep[v] * (shade[3 * v + c] - 1)) : factor;
     }
-    factors[4 * v + 3] = left(change[v]);
+    factors[4 * v + 3] = left(doubt ? change[v] + doubt[v] * (nearby[v] - change[v]) : change[v]);
   }
 }
 
