@@ -146,9 +146,8 @@ def test_weak_shade_in_doubt_goes_when_the_sky_changes_nearby():
     facing = torch.tensor([[0.0, 0.0, 1.0]]).expand(n_vertices, 3)
     seen, here = torch.ones(n_vertices), int(sky.vertices[500])
     beside = sky.vertices[sky.faces[sky.vertex_faces[500, 0]]]
-    exposure = torch.ones(n_vertices, 4)
-    exposure[beside[beside != here], 0] = 0.2
-    on, light = Lighting(facing, exposure), LIGHT._replace(facing=facing)
+    seen[beside[beside != here]] = 0.2
+    on, light = Lighting(facing, torch.ones(n_vertices, 4)), LIGHT._replace(facing=facing)
     for doubt, left in ((0.0, 1.0), (1.0, 0.0)):
         stays = shares_that_stay(light._replace(doubt=torch.full((n_vertices,), doubt)), on, seen)
         assert float(stays[here, 0]) == 0 and float(stays[here, 1]) == left

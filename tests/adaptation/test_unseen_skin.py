@@ -8,7 +8,6 @@ import trimesh
 from synthetic import PALM_TO_CAMERA, crop_of
 
 from oasis_warp.adaptation import reliability
-from oasis_warp.ops import depth_map
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.inpainting import FADE_LENGTH, inpaint, laplacian_and_mass
 from oasis_warp.adaptation.reliability import mask_unreliable
@@ -24,6 +23,7 @@ from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.hand.template import bundled_hand
+from oasis_warp.ops import depth_map
 
 MIDDLE, RING = 4, 10
 """First joints of these fingers."""

@@ -46,7 +46,7 @@ def test_a_fist_hides_the_palm_and_an_open_hand_does_not(hand, scene):
     opened = avatar.mesh(pose._replace(angles=named_pose(hand, "open"))).vertices
     palm = (label_regions(hand).palm > 0.9) & (hand.segment == 0) & (hand.template[:, 0] < -0.05)
     in_fist, in_open = (seen(hand, crop, posed)[palm].median() for posed in (crop.posed.vertices, opened))
-    assert float(in_fist) < 0.35 and float(in_open) > 0.85
+    assert float(in_fist) < 0.4 and float(in_open) > 0.85
 
 
 def test_a_stiff_hand_sees_the_same_share_however_it_turns(hand, scene):
@@ -78,11 +78,13 @@ def test_deep_shade_beside_a_finger_that_lay_there_goes_with_it_and_weak_shade_s
     shared = on.exposure[:, 0]
     place = hand.template[(label_regions(hand).palm > 0.9) & (hand.segment == 0)].mean(0)
     away = (hand.template - place).norm(dim=1)
-    was = torch.where(away < 0.003, shared + 0.5, shared)  # there something lay, or has come to lie
+    was = torch.where(away < 0.003, shared - 0.5, shared)  # something lay there
     stays = shares_that_stay(EVEN._replace(facing=on.normals), on, was)
     beside, far = (away > 0.006) & (away < 0.008), away > 0.03
     assert float(stays[beside, 0].max()) < 0.1 and float(stays[beside, 1].min()) == 1
     assert float(stays[far].min()) == 1
+    covered = torch.where(away < 0.003, shared + 0.5, shared)  # now something lies there: a palm's lines stay in a fist
+    assert float(shares_that_stay(EVEN._replace(facing=on.normals), on, covered).min()) == 1
     dark, relief = (
         truth._replace(colors=torch.full_like(truth.colors, 0.5), shade=torch.full_like(truth.colors, factor))
         for factor in (0.4, 0.9)
@@ -178,7 +180,7 @@ def test_an_older_file_looks_as_before_in_its_photo_and_gains_elsewhere(hand, sc
     for k, avatar in enumerate((old, as_left_hand(old))):
         read = Avatar.load(tmp_path / f"{k}.safetensors")
         source, opened = avatar.source_pose, avatar.source_pose._replace(angles=named_pose(hand, "pinch"))
-        torch.testing.assert_close(read.pose(source).colors, avatar.pose(source).colors, atol=1e-5, rtol=0)
+        torch.testing.assert_close(read.pose(source).colors, avatar.pose(source).colors, atol=1e-3, rtol=0)
         assert float((read.pose(opened).colors / avatar.pose(opened).colors).min()) < 0.8
 
 

@@ -20,14 +20,17 @@ AS_IN_PHOTO, TURNED_AWAY = math.cos(math.radians(5)), math.cos(math.radians(20))
 """Cosines of the angle by which skin has turned from where the photo shows it, up to which its shade stays as it is and
 from which it is gone."""
 SAME_SKY, OTHER_SKY = 0.08, 0.25
-"""Changes of the share of the sky that skin sees, up to which its shade stays and from which it is gone: what cast it
-has moved. Buffers of 3 mm err by .05; a finger that lies on the palm hides .5 and more."""
+"""How much more of the sky skin sees than in the photo, up to which its shade stays and from which it is gone: what
+cast it has moved. Where it sees less, nothing that was there has gone, and palm lines stay in a fist. Buffers of 3 mm
+err by .05; a finger that lies on the palm hides .5 and more."""
 WEAK, DEEP = 0.3, 0.6
 """Differences of shade from 1 up to which it is relief or tone of the skin itself, and from which it is a sharp shadow,
 gloss, or another part of the hand. Set by eye on one thumb-up photo with gashes, creases and a red spot."""
 MOST_DETAIL = 0.3
 """Difference of the logarithms of colours up to which detail is skin where it goes against the shade: bright beside a
 shadow that is a pixel off, skin would be white where that shadow goes."""
+MIN_LIGHT = 1e-6
+"""Least share of the light that shade makes up for: deep in a fist hardly any arrives."""
 MIN_COLOR = 1e-3
 """Least colour that has shade: it is a factor."""
 
@@ -96,7 +99,7 @@ def hidden_by_hand(
     on = posed_lighting(rest, photo, faces, hidden)
     assert on.exposure is not None, "there is an albedo"
     before = 1 if light.shade is None else light.shade
-    shade = before / bounced(on.exposure[..., 1:], albedo).clamp_min(MIN_COLOR).pow(1 / GAMMA)
+    shade = before / bounced(on.exposure[..., 1:], albedo).clamp_min(MIN_LIGHT).pow(1 / GAMMA)
     return hidden._replace(shade=shade, facing=on.normals if light.facing is None else light.facing)
 
 
@@ -113,8 +116,8 @@ def shading(light: HandLight, on: Lighting) -> Float[Tensor, "*B V 3"]:
 def shares_that_stay(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None) -> Float[Tensor, "*B V 2"]:
     """Shares of deep and of weak shade that are left on vertices which saw so much of the sky in the photo.
 
-    For deep shade the change of the sky is the largest nearby. Beside the outline of a finger the palm behind sees most
-    of the sky, with the finger or without; what is much darker or brighter there is that finger, or its sharp shadow.
+    For deep shade what has opened of the sky is the largest nearby. Beside the outline of a finger the palm behind sees
+    most of the sky, with the finger or without; what is much darker or brighter there is that finger, or its shadow.
     Where the photo is in doubt weak shade may be that finger, too.
     """
     assert light.facing is not None, "comes with any shade"
@@ -122,7 +125,7 @@ def shares_that_stay(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | 
     stays = ((cosine - TURNED_AWAY) / (AS_IN_PHOTO - TURNED_AWAY)).clamp(0, 1)
     if on.exposure is None or seen is None:
         return torch.cat([stays, stays], -1)
-    change = (on.exposure[..., 0] - seen).abs()
+    change = (on.exposure[..., 0] - seen).clamp_min(0)
     nearby = largest_nearby(change)
     own = change if light.doubt is None else torch.lerp(change, nearby, light.doubt)
     change = torch.stack([nearby, own], -1)

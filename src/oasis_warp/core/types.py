@@ -189,7 +189,7 @@ class HandLight(NamedTuple):
     facing: Float[Tensor, "V 3"] | None = None
     """Where they faced there, unit; comes with any shade."""
     doubt: Float[Tensor, "V"] | None = None
-    """How far that photo may show something else there, 0 to 1: all shade ends there when the sky nearby changes."""
+    """How far that photo may show something else there, 0 to 1: all shade ends there when the sky nearby opens."""
     albedo: Float[Tensor, "3"] | None = None
     """Mean reflectance of the skin, from which light bounces into the hollows of the hand. None: nothing is hidden."""
 

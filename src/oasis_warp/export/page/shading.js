@@ -24,7 +24,7 @@ function lightVertices(body, shading, light, hurry = false) {
   const { shade, facing, doubt } = body.data.arrays, { normals, factors, sky, change, nearby, deep } = shading, { harmonics, limits, albedo, seen } = light;
   if (albedo) exposeVertices(body, sky, normals, harmonics, hurry);
   if (albedo && seen) {
-    for (let v = 0; v < body.nVertices; v++) change[v] = Math.abs(sky.exposure[4 * v] - seen[v]);
+    for (let v = 0; v < body.nVertices; v++) change[v] = Math.max(sky.exposure[4 * v] - seen[v], 0); // what cast the shade has moved
     largestNearby(body, sky, change, nearby);
   }
   const bounce = albedo && albedo.map((a) => [2.0404 * a - 0.3324, -4.7951 * a + 0.6417, 2.7552 * a + 0.6903]);
