@@ -8,9 +8,11 @@ somebody's generator (`TAKEN`, `NOT_RUN`) is only parsed: by the command line of
 import ast
 import importlib
 import inspect
+import json
 import re
 import shlex
 import shutil
+import subprocess
 import tomllib
 from collections.abc import Iterator
 from importlib import resources
@@ -44,6 +46,8 @@ TAKEN = ("batch", "bench", "evaluate", "gradcheck", "pretrain", "serve", "synthe
 """Commands that take minutes, or wait for Ctrl-C."""
 SLOW_PYTHON = ("editing.md", "estimator.md", "export.md", "network.md", "same_hand.md", "README.md", "tour.md")
 NOT_RUN = {"batch.md": "Ray is none of our packages", "gpu.md": "needs CUDA", "synthetic.md": "needs CUDA"}
+PROGRAMS = ("oasis", "python", "python3", "pip", "pytest", "torchrun", "dask", "export")
+"""What a block's first line calls; others are the shell's own, whose grammar alone is checked."""
 SIDE = 160
 """Longer side of the small photos [px]."""
 SHORT = {"animate": ["--size=64"], "edit": ["--steps=2"], "reconstruct": ["--steps=2"]}
@@ -56,7 +60,8 @@ def blocks(page, language):
 
 def commands(page) -> Iterator[list[str]]:
     """Words of each command; those that && joins are several."""
-    for line in "".join(blocks(page, "sh")).replace("\\\n", " ").splitlines():
+    ours = [block for block in blocks(page, "sh") if block.split()[0].removeprefix(".venv/bin/") in PROGRAMS]
+    for line in "".join(ours).replace("\\\n", " ").splitlines():
         words = shlex.split(line, comments=True)
         while words:
             end = words.index("&&") if "&&" in words else len(words)
@@ -95,7 +100,10 @@ def test_links_lead_somewhere(page):
 def test_every_block_says_what_it_is(page):
     """A block without a language would be run by nobody."""
     fences = re.findall(r"^```(.*)$", page.read_text(), re.MULTILINE)
-    assert all(re.fullmatch(r"sh|python|\{[\w-]+\}.*", opened) for opened in fences[::2]) and set(fences[1::2]) <= {""}
+    assert all(re.fullmatch(r"sh|python|json|\{[\w-]+\}.*", opened) for opened in fences[::2])
+    assert set(fences[1::2]) <= {""} and all(map(json.loads, blocks(page, "json")))
+    for block in blocks(page, "sh"):
+        assert subprocess.run(["bash", "-n"], input=block, text=True, check=False).returncode == 0
 
 
 def small(path, out, side=SIDE):
@@ -212,12 +220,11 @@ def test_commands_are_taken(page, monkeypatch, pytestconfig):
         asked, unknown = pytestconfig._parser.parse_known_and_unknown_args(words)
         assert not unknown and all((TOP / path).exists() for path in asked.file_or_dir)
 
-    takers = {
-        "oasis": take_oasis, "python": take_python, "python3": take_python, "pip": take_pip, "pytest": take_pytest,
-        "torchrun": take_torchrun, "dask": take_dask, "export": lambda words, _: None,
-    }  # fmt: skip
+    takers = (
+        take_oasis, take_python, take_python, take_pip, take_pytest, take_torchrun, take_dask, lambda words, _: None
+    )  # fmt: skip
     for words in commands(page):
-        takers[words[0]](words[1:], monkeypatch)
+        dict(zip(PROGRAMS, takers, strict=True))[words[0]](words[1:], monkeypatch)
 
 
 def run_commands(page, which):
