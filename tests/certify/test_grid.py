@@ -143,6 +143,7 @@ def test_sound_operators_give_a_table_a_file_and_zero(capsys, tmp_path):
     assert "all within bounds" in shown and "FAILED" not in shown
     found = json.loads((tmp_path / "all.json").read_text())
     assert found["passed"] and not found["failures"]
+    assert found["command"].startswith("oasis gradcheck --family pose_on_mesh --json ")
     assert {row["family"] for row in found["checks"]} == {"pose_on_mesh"}
     assert all(row["cases"] > 0 and row["failures"] == 0 and row["error"] <= row["bound"] for row in found["checks"])
     assert {row["condition"] for row in found["conditions"]} == set(FAMILIES["pose_on_mesh"].conditions)

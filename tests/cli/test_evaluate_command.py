@@ -176,7 +176,9 @@ def test_photos_of_the_same_hand_are_measured_and_the_run_is_not_done_twice(hand
     assert {(p["source"], p["target"]) for p in found["pairs"]} == {("a.png", "b.png"), ("b.png", "a.png")}
     assert all(p["psnr"] > 25 for p in found["pairs"])
     assert list(found["left_out"]) == ["mine/no_hand.png"]
-    assert {path.name for path in out.iterdir()} == {"evaluation.json", "metrics.json", "sheet.png", "hands"}
+    files = {"evaluation.json", "metrics.json", "sheet.png", "hands", "commands.txt"}
+    assert {path.name for path in out.iterdir()} == files
+    assert (out / "commands.txt").read_text().startswith("oasis evaluate --dataset same-hand ")
     monkeypatch.setattr(same_hand, "HandEstimator", lambda hand: pytest.fail("measured again"))
     assert main(arguments) == 0
     assert json.loads((out / "metrics.json").read_text()) == found

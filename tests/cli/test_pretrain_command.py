@@ -61,7 +61,7 @@ def unbroken(tmp_path_factory):
 
 
 def test_a_training_leaves_weights_metrics_and_pictures(unbroken, hand):
-    names = {CHECKPOINT, WEIGHTS, METRICS, SHEET, command.SETTINGS, command.PEOPLE}
+    names = {CHECKPOINT, WEIGHTS, METRICS, SHEET, command.SETTINGS, command.PEOPLE, "commands.txt"}
     assert {path.name for path in unbroken.iterdir()} == names
     (line,) = map(json.loads, (unbroken / METRICS).read_text().splitlines())
     assert line["step"] == 2 and line["loss"] > 0

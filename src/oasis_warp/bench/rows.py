@@ -48,19 +48,20 @@ def csv_text(rows: Sequence[Any]) -> str:
     return out.getvalue()
 
 
-def json_text(rows: Sequence[Any]) -> str:
-    """Rows as a JSON array of objects."""
-    return json.dumps([to_record(row) for row in rows], indent=1, allow_nan=False) + "\n"
+def json_text(rows: Sequence[Any], command: str | None = None) -> str:
+    """Rows as a JSON array of objects, each with the `command` that measured it if there is one."""
+    about = {} if command is None else {"command": command}
+    return json.dumps([to_record(row) | about for row in rows], indent=1, allow_nan=False) + "\n"
 
 
-def write_rows(rows: Sequence[Any], csv_path: Path, json_path: Path) -> None:
-    """Write both files, each whole or not at all.
+def write_rows(rows: Sequence[Any], csv_path: Path, json_path: Path, command: str | None = None) -> None:
+    """Write both files, each whole or not at all; the JSON with the `command` that measured, if there is one.
 
     Raises:
         InputError: one cannot be written.
     """
     write_file(csv_path, csv_text(rows).encode())
-    write_file(json_path, json_text(rows).encode())
+    write_file(json_path, json_text(rows, command).encode())
 
 
 def from_record(kind: type[Kind], record: dict[str, Any]) -> Kind:

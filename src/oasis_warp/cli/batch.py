@@ -21,6 +21,7 @@ from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED, plain_console, show_r
 from oasis_warp.cli.jobs import SUFFIXES
 from oasis_warp.cli.options import Batch
 from oasis_warp.cli.progress import ManyPhotos
+from oasis_warp.cli.record import exact_command
 from oasis_warp.core.config import ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
@@ -60,6 +61,7 @@ def run(options: Batch) -> int:
         seconds = time.monotonic() - start
     summary = finish(order, tasks)
     summary["this_run"] = {"photos": worked, "workers": n_workers, "seconds": round(seconds, 1)}
+    summary["command"] = exact_command()
     write_file(order.out / "summary.json", (json.dumps(summary, indent=1) + "\n").encode())
     plain_console().print(_table(summary))
     print(f"written: {options.out}{os.sep}; manifest.jsonl there says which photo is where.")

@@ -24,6 +24,7 @@ from oasis_warp.bench.tables import (
 )
 from oasis_warp.cli.console import check_device, print_tables, show_progress
 from oasis_warp.cli.developer_options import Bench, ErrorTime, Kernels, Roofline, Scaling
+from oasis_warp.cli.record import exact_command
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.processes import using_threads
 from oasis_warp.data.output_files import output_file, output_folder
@@ -106,7 +107,7 @@ def run_error_time(options: ErrorTime) -> None:
                 ),
                 progress,
             )
-        write_rows(rows, folder / "error_time.csv", folder / "error_time.json")
+        write_rows(rows, folder / "error_time.csv", folder / "error_time.json", exact_command())
         if with_plots:
             for op in dict.fromkeys(row.op for row in rows):
                 tables.plot_operator(rows, op, folder / f"{op}.png")
@@ -173,7 +174,7 @@ def run_scaling(options: Scaling) -> None:
                 scaling.points(options.quick), torch.device(options.device), seconds=seconds, seed=options.seed,
                 progress=progress,
             )  # fmt: skip
-        write_rows(rows, folder / "scaling.csv", folder / "scaling.json")
+        write_rows(rows, folder / "scaling.csv", folder / "scaling.json", exact_command())
         if with_plot:
             tables.plot_scaling(rows, folder / "scaling.png")
     print_tables([scaling_table(rows), growth_table(rows)], TABLE_WIDTH)
@@ -209,7 +210,7 @@ def results(
 
         def write(rows: Sequence[Any]) -> None:
             if options.json is not None:
-                parts[options.json].write_text(json_text(rows))
+                parts[options.json].write_text(json_text(rows, exact_command()))
             if options.csv is not None:
                 parts[options.csv].write_text(csv_text(rows))
             if options.plot is not None:

@@ -11,6 +11,7 @@ from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.cli.console import INTERRUPTED, check_device, print_tables, show_run
 from oasis_warp.cli.developer_options import Evaluate
 from oasis_warp.cli.progress import Run, Step
+from oasis_warp.cli.record import keep_command
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
@@ -79,8 +80,10 @@ def run(options: Evaluate) -> int:
         with show_run(Console(stderr=True), Run(plan(options, len(priors)))) as shown:
             made = tables[options.dataset](options, priors, shown.progress)
     except KeyboardInterrupt:
+        keep_command(options.out)
         print(f"oasis: stopped; what is whole stays in {options.out}, the same command goes on.", file=sys.stderr)
         return INTERRUPTED
+    keep_command(options.out)
     print_tables(made, TABLE_WIDTH)
     return 0
 

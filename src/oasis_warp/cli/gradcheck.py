@@ -25,6 +25,7 @@ from oasis_warp.certify.compare import Measurement
 from oasis_warp.certify.families import FAMILIES
 from oasis_warp.cli.console import FAULT, show_progress
 from oasis_warp.cli.developer_options import Gradcheck
+from oasis_warp.cli.record import exact_command
 from oasis_warp.cli.report import to_json
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import output_file
@@ -85,6 +86,7 @@ def report(options: Gradcheck, verdict: Verdict, device: torch.device, seconds: 
     return to_json(
         {
             "creator": f"oasis_warp {__version__}",
+            "command": exact_command(),
             "machine": describe_machine(device),
             "seed": options.seed,
             "scenes": options.scenes,

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from oasis_warp.cli.console import INTERRUPTED, check_device, show_progress
 from oasis_warp.cli.developer_options import Pretrain
+from oasis_warp.cli.record import keep_command
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.published_files import published_file
@@ -64,6 +65,8 @@ def run(options: Pretrain) -> int:
                 done = train(options, process, progress)
         except KeyboardInterrupt:
             done = 0
+    if process.rank == 0:
+        keep_command(options.out)
     if done == options.steps:
         return 0
     if process.rank == 0:

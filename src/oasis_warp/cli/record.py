@@ -11,6 +11,8 @@ from typing import Any
 
 from oasis_warp import __version__
 
+COMMANDS = "commands.txt"
+
 
 @dataclass
 class Record:
@@ -29,6 +31,22 @@ def exact_command() -> str | None:
     """The words of the command that runs, as a shell takes them; None outside `oasis`."""
     record = _running.get()
     return None if record is None else record.command
+
+
+def keep_command(folder: Path) -> None:
+    """Add the words of the command to `COMMANDS` in its folder of results: a line for each that worked on them.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    from oasis_warp.data.output_files import write_file  # with torch, which the command has loaded
+
+    file = folder / COMMANDS
+    if (command := exact_command()) is None or not folder.is_dir():
+        return
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+    if command not in lines:
+        write_file(file, "".join(f"{line}\n" for line in [*lines, command]).encode())
 
 
 def is_quiet() -> bool:
