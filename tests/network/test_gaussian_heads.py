@@ -212,6 +212,24 @@ def test_in_every_step_all_reference_views_hold_the_guess_better_than_one_by_col
     assert moved[0] < 0.5 * moved[1]
 
 
+def test_the_photo_and_all_reference_views_are_held_against_their_pictures_by_lpips_too(case, hand):
+    crop, guess, heads = case
+    every, seen = replace(LORA, references="all", texture_steps=3), []
+
+    def difference(images, targets, masks):
+        seen.append((images.shape, masks.shape))
+        return ((images - targets).square() * masks[..., None]).mean((1, 2, 3))
+
+    plain = adapt(hand, [guess], [crop], every, heads=heads)
+    with_it = adapt(hand, [guess], [crop], every, heads=heads, perceptual=difference)
+    size = len(crop.image)
+    assert seen == 3 * 3 * [((1, size, size, 3), (1, size, size))]
+    # At first references are as they were, so that the photo's distance is what its loss gains.
+    assert with_it.losses[0] > plain.losses[0]
+    doubled = adapt(hand, [guess], [crop], replace(every, weight_perceptual=10.0), heads=heads, perceptual=difference)
+    assert doubled.losses[0] - plain.losses[0] == pytest.approx(2 * (with_it.losses[0] - plain.losses[0]), rel=1e-3)
+
+
 def test_what_has_no_heads_is_refused(case, hand):
     crop, guess, _ = case
     with pytest.raises(InputError, match="'none': has no heads"):

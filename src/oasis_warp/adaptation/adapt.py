@@ -1,6 +1,6 @@
 """Fit the colours of a prior's guesses to K photos of one hand; one photo is the case K = 1."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -98,6 +98,7 @@ def adapt(
     *,
     resolutions: Sequence[float] | None = None,
     heads: ColorHeads | None = None,
+    perceptual: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None,
     progress: Progress = silent,
 ) -> Adaptation:
     """Fit colours to the photos; geometry stays.
@@ -115,6 +116,7 @@ def adapt(
         config: Options.
         resolutions: Pixels of each photo for one pixel of its crop, along a line; 1 if not given.
         heads: Of the one guess, for these two: see `network.prior.guess_with_heads`.
+        perceptual: LPIPS, which the paper's loss of pictures has too; only of one photo.
         progress: Called as work goes on.
 
     Raises:
@@ -137,7 +139,7 @@ def adapt(
     result = Adaptation(gaussians, guess, calibration, (), photos.observations, photos.gains, shading, photos.lights)
     if config.light == "even" and photos.lights:  # all that is left to learn is light
         return result._replace(gaussians=in_even_light(gaussians, photos.lights[0]), lights=None)
-    targets = _texture_targets(hand, photos, gaussians, shading, config)
+    targets = _texture_targets(hand, photos, gaussians, shading, config)._replace(perceptual=perceptual)
     if lora is None:
         texture = learn_texture(gaussians, hand.faces.to(shading.device), targets, config, progress)
     else:

@@ -46,6 +46,8 @@ class Targets(NamedTuple):
     """What each reference view must stay like."""
     factors: Float[Tensor, "K N 3"]
     """What the light of each of K photos multiplies colours with; reference views are in even light."""
+    perceptual: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None
+    """Distance of N images and N targets inside N masks, one number each; the paper's LPIPS."""
 
 
 class Texture(NamedTuple):
@@ -104,7 +106,7 @@ def fit_parameters(
     for step in range(total):
         now = colors()
         image = blend_colors(targets.weights, (now * targets.factors).flatten(0, 1)) + beyond
-        loss = _picture_loss(image, targets.picture, targets.mask, config)
+        loss = _picture_loss(image, targets.picture, targets.mask, config, targets.perceptual)
         if targets.references and config.references == "in_turn":
             queue = queue or torch.randperm(len(targets.references), generator=order).tolist()
             loss = loss + config.weight_reference * _reference_loss(now, targets, queue.pop(), config)
@@ -126,8 +128,13 @@ def fit_parameters(
     return tuple(losses)
 
 
-def _picture_loss(image: Tensor, picture: Tensor, mask: Tensor, config: AdaptConfig) -> Tensor:
+def _picture_loss(
+    image: Tensor, picture: Tensor, mask: Tensor, config: AdaptConfig,
+    perceptual: Callable[[Tensor, Tensor, Tensor], Tensor] | None,
+) -> Tensor:  # fmt: skip
     loss = config.weight_rgb * masked_l1(image, picture, mask)
+    if perceptual is not None:
+        loss = loss + config.weight_perceptual * perceptual(image[None], picture[None], mask[None]).mean()
     return loss + config.weight_ssim * masked_dssim(image * mask[..., None], picture * mask[..., None], mask)
 
 
@@ -145,6 +152,9 @@ def _all_reference_losses(colors: Tensor, targets: Targets, config: AdaptConfig)
         image, mask = blend_colors(reference, colors), reference.alphas[..., 0]
         total = total + config.weight_rgb * masked_l1(image, expected, mask)
         total = total + config.weight_ssim * masked_dssim(image, expected, mask)
+        if targets.perceptual is not None:
+            distance = targets.perceptual(image[None], expected[None], mask[None])
+            total = total + config.weight_perceptual * distance.mean()
     return total
 
 

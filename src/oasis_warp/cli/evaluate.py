@@ -189,6 +189,7 @@ def on_data_set(options: Evaluate, priors: dict[str, Prior], progress: Progress)
     ablated = [choose_prior(path, options.backbone_weights) for path in options.ablations]
     rows = rows_of_tables(priors, ablated, options.steps, options.seed)
     perceptual = None if options.lpips is None else load_lpips(*options.lpips, allow_download=options.allow_download)
+    perceptual = perceptual and perceptual.to(options.device)
     found = evaluate_data_set(
         data, priors, rows, Choice(photos=options.people, targets=options.targets, seed=options.seed), options.out,
         config=config, perceptual=perceptual, progress=progress,

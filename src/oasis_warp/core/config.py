@@ -36,6 +36,8 @@ class AdaptConfig:
     """Of the mean absolute colour difference."""
     weight_ssim: float = 1.0
     """Of 1 - SSIM."""
+    weight_perceptual: float = 5.0
+    """Of LPIPS, where a network for it is given."""
     weight_mean: float = 20.0
     """Of the difference of the masked mean colours, in calibration."""
     weight_std: float = 1.0

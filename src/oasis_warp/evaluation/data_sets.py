@@ -265,7 +265,8 @@ class _Measuring(NamedTuple):
         hand, (fit, offsets, crop) = self.hand, cropped
         start = time.perf_counter()
         methods = [Method(row.prior, row.stage)]
-        ((_, made),) = reconstructions(hand, crop, {row.prior: self.priors[row.prior]}, methods, row.adapt)
+        learned = None if row.adapt.texture == "field" else self.perceptual
+        ((_, made),) = reconstructions(hand, crop, {row.prior: self.priors[row.prior]}, methods, row.adapt, learned)
         _wait(self.config.device)
         seconds = time.perf_counter() - start
         return make_avatar(fit, offsets, crop, made.gaussians, made.light, hand=hand), round(seconds, 2)

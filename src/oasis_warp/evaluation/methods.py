@@ -1,7 +1,7 @@
 """The methods that evaluations compare: a prior, and how far its guess is fitted to the photo."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -92,6 +92,7 @@ def reconstructions(
     priors: Mapping[str, Prior],
     methods: Sequence[Method],
     config: AdaptConfig,
+    perceptual: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor] | None = None,
 ) -> Iterator[tuple[Method, LitGaussians]]:
     """The result of each of `methods` whose prior is given; each prior guesses once.
 
@@ -101,6 +102,7 @@ def reconstructions(
         priors: By the names that methods have for them.
         methods: Methods to run.
         config: Of the adaptation; stages other than `ONE_SHOT` replace its light.
+        perceptual: LPIPS, where the paper's way of adaptation is asked for.
 
     Raises:
         InputError: the texture is LoRA, and a prior is no network.
@@ -120,5 +122,5 @@ def reconstructions(
             (EVEN, replace(config, light="even")), (KEEP, replace(config, light="keep")), (ONE_SHOT, config)
         ):  # fmt: skip
             if stage in stages:
-                adapted = adapt(hand, [guess], [crop], settings, heads=heads)
+                adapted = adapt(hand, [guess], [crop], settings, heads=heads, perceptual=perceptual)
                 yield Method(name, stage), LitGaussians(adapted.gaussians, adapted.light)
