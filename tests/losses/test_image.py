@@ -15,6 +15,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.published_files import Published, published_file
 from oasis_warp.losses.image import detail_difference, masked_dssim, masked_l1, masked_psnr, masked_statistics, ssim_map
 from oasis_warp.losses.lpips import SCALE, SHIFT, load_lpips
+from oasis_warp.ops import masked_l1_on_cuda
 
 
 @pytest.fixture
@@ -28,6 +29,34 @@ def left_half(image):
     mask = torch.zeros(image.shape[:2], dtype=image.dtype)
     mask[:, : image.shape[1] // 2] = 1
     return mask
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("size", [(1, 1), (24, 20), (130, 101)])
+@pytest.mark.parametrize("covered", [0.0, 0.001, 0.5])
+def test_the_kernels_of_the_mean_difference_do_what_torch_does(size, covered):
+    """In a mask of less than one pixel too, where pixels agree, and where a value is no number."""
+    generator = torch.Generator().manual_seed(0)
+    image, target = (torch.rand(*size, 3, generator=generator) for _ in range(2))
+    mask = covered * torch.rand(*size, generator=generator)
+    target[0, 0, 0] = image[0, 0, 0]
+
+    def found(*pictures):
+        leaf = pictures[0].clone().requires_grad_()
+        loss = masked_l1(leaf, *pictures[1:])
+        (3 * loss).backward()
+        return loss.detach(), leaf.grad
+
+    given = [part.cuda() for part in (image, target, mask)]
+    assert masked_l1_on_cuda(*given) is not None
+    got, again, want = found(*given), found(*given), found(*(part.double() for part in (image, target, mask)))
+    for mine, same, theirs in zip(got, again, want, strict=True):
+        assert torch.equal(mine, same)
+        torch.testing.assert_close(mine.double().cpu(), theirs, rtol=1e-6, atol=1e-12)
+    given[0][-1, -1, -1] = float("nan")
+    loss, gradient = found(*given)
+    assert loss.isnan() and gradient[-1, -1, -1].isnan() and gradient.isnan().sum() == 1
+
 
 
 def test_losses_of_equal_images_are_zero(pair):

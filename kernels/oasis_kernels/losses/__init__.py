@@ -1,0 +1,1 @@
+"""Losses that are computed at every step of a fit."""
