@@ -188,10 +188,10 @@ class HandLight(NamedTuple):
     """Factor of the sRGB colours of vertices that face as in the photo, where that may show something else there."""
     facing: Float[Tensor, "V 3"] | None = None
     """Where they faced there, unit; comes with any shade."""
-    doubt: Float[Tensor, "V"] | None = None
-    """How far that photo may show something else there, 0 to 1: all shade ends there when the sky nearby opens."""
     albedo: Float[Tensor, "3"] | None = None
     """Mean reflectance of the skin, from which light bounces into the hollows of the hand. None: nothing is hidden."""
+    doubt: Float[Tensor, "V"] | None = None
+    """How far that photo may show something else there, 0 to 1: all shade ends there when the sky nearby opens."""
 
 
 class TrainingBatch(NamedTuple):
