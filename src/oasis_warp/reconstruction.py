@@ -4,7 +4,8 @@ The only file that knows the order of the stages: see `_run`.
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -117,6 +118,10 @@ class FusedReconstruction(NamedTuple):
     """How well each place of the surface is known."""
 
 
+Stage = Callable[[str], AbstractContextManager[None]]
+"""Times the stage of that name."""
+
+
 class _Outcome(NamedTuple):
     """What the stages make of K photos."""
 
@@ -197,19 +202,9 @@ def _run(
     stages: dict[str, float] = {}
     stage = functools.partial(timed_stage, seconds=stages, progress=progress)
     hand = chosen_hand(config.hand_model, config.mano_dir)
-    estimator = HandEstimator(hand)
     with stage("prior"):  # first, because a wrong file must fail before the long work
         prior = prior or choose_prior(config.prior, config.backbone_weights)
-    with stage("landmarks"):
-        found = [
-            read_keypoints(keypoints, p, hand=hand, which=config.hand)
-            if keypoints
-            else choose_hand(estimator.find(p), config.hand, p.name)
-            for p in photos
-        ]
-        check_sides(photos, found)
-    with stage("fit"):
-        fits = fit_together(estimator, photos, found, force=config.force, progress=progress)
+    found, fits = _fit(hand, photos, config, keypoints, stage, progress)
     with stage("outline"):
         surfaces = initial_surfaces(hand, fits)
     with stage("kernels"):  # compiled only once there is a hand to draw
@@ -239,19 +234,9 @@ def _run(
         )
     with stage("detail"):
         adaptation = add_detail(hand, adaptation, close, close_scales, COARSE_SIZE, progress)
-    invented = None
-    if config.unseen == "painted":
-        with stage("painting"):
-            painted = paint_unseen(
-                hand, adaptation.gaussians, adaptation.guess, crops[0], adaptation.observations, seed=config.seed
-            )
-            adaptation, invented = adaptation._replace(gaussians=painted.gaussians), painted.invented
-    if adaptation.light is not None:
-        limited = limit_shade(hand, adaptation.gaussians, crops[0], adaptation.light)
-        adaptation = adaptation._replace(gaussians=limited)
-    closed = close_wrist(hand, adaptation.gaussians, crops[0].rest.vertices)
-    adaptation = adaptation._replace(gaussians=closed)
-    avatar = make_avatar(fits[0], surfaces.shared, crops[0], closed, adaptation.light, invented, hand=hand)
+    adaptation, invented = _finish(hand, adaptation, crops[0], config, stage)
+    gaussians, light = adaptation.gaussians, adaptation.light
+    avatar = make_avatar(fits[0], surfaces.shared, crops[0], gaussians, light, invented, hand=hand)
     with stage("quality"):
         areas = surface.vertex_areas(crops[0].rest.vertices, hand.faces.to(config.device))
         parts = [_assess(hand, adaptation, k, fits[k], surfaces, crops[k], close[k]) for k in range(len(photos))]
@@ -266,6 +251,42 @@ def _run(
     coverage["n_gaussians"] = float(len(avatar.gaussians.opacities))
     fused = FusedReconstruction(avatar, about, prior.about, stages, coverage, (), quality)
     return _Outcome(fused, warnings, coverage_warnings(coverage))
+
+
+def _fit(
+    hand: HandModel,
+    photos: Sequence[Photo],
+    config: ReconstructConfig,
+    keypoints: Path | None,
+    stage: Stage,
+    progress: Progress,
+) -> tuple[list[Landmarks | HandFit], list[HandFit]]:
+    """What is found in each photo, or given, and the fits of one hand to all of them."""
+    estimator = HandEstimator(hand)
+    with stage("landmarks"):
+        found = [
+            read_keypoints(keypoints, p, hand=hand, which=config.hand)
+            if keypoints
+            else choose_hand(estimator.find(p), config.hand, p.name)
+            for p in photos
+        ]
+        check_sides(photos, found)
+    with stage("fit"):
+        return found, fit_together(estimator, photos, found, force=config.force, progress=progress)
+
+
+def _finish(
+    hand: HandModel, adaptation: Adaptation, crop: HandCrop, config: ReconstructConfig, stage: Stage
+) -> tuple[Adaptation, Float[Tensor, "V"] | None]:
+    """The adaptation with what no photo shows, and where that was painted; with a closed wrist."""
+    gaussians, invented = adaptation.gaussians, None
+    if config.unseen == "painted":
+        with stage("painting"):
+            painted = paint_unseen(hand, gaussians, adaptation.guess, crop, adaptation.observations, seed=config.seed)
+            gaussians, invented = painted.gaussians, painted.invented
+    if adaptation.light is not None:
+        gaussians = limit_shade(hand, gaussians, crop, adaptation.light)
+    return adaptation._replace(gaussians=close_wrist(hand, gaussians, crop.rest.vertices)), invented
 
 
 def _guess(
