@@ -95,7 +95,7 @@ def small_avatar(*, lit: bool) -> Avatar:
     facing = torch.nn.functional.normalize(random(len(hand.template), 3) - 0.5, dim=1)
     light = HandLight(
         torch.cat([torch.ones(1, 3), 0.2 * random(8, 3)]), torch.tensor([[0.3] * 3, [2.0] * 3]), torch.ones(3),
-        0.9 + 0.2 * random(len(hand.template), 3), facing, random(len(hand.template)), torch.full((3,), 0.4),
+        0.9 + 0.2 * random(len(hand.template), 3), facing, torch.full((3,), 0.4), random(len(hand.template)),
     )  # fmt: skip
     return Avatar(
         side="left", shape=random(40) - 0.5, surface_offsets=0.002 * (random(len(hand.template), 3) - 0.5),
