@@ -26,8 +26,8 @@ FOLDERS = {"0.2.0": "looks_0.2.0", "now": "looks"}
 """Folders of results by what they are called in tables."""
 FILES = (f"{FOLDERS['now']}/metrics.json",)
 SHOWN = {
-    "looks_best": "back_flat_right_04", "looks_worst_1": "thumb_up_left_06",
-    "looks_worst_2": "pointing_side_right_11", "looks_worst_3": "backs_two_left_05",
+    "looks_best": "back_flat_right_04", "looks_worst_1": "shaka_back_right_12",
+    "looks_worst_2": "thumb_up_cutout_right_07", "looks_worst_3": "two_fingers_dark_skin_16",
 }  # fmt: skip
 """Pictures of docs/_static and the photos whose sheets they are."""
 WIDTH, QUALITY = 1800, 85
