@@ -26,19 +26,15 @@ from oasis_warp.avatar.pose import (
     posed_lighting,
     shading,
     shading_factors,
-    shares_that_stay,
-    split_shade,
     turn_light,
     with_photo,
 )
 from oasis_warp.avatar.prior import MeanPrior
-from oasis_warp.avatar.sky import sky_mesh
 from oasis_warp.core import rotation
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import HandLight
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.render.render import render
 
@@ -140,19 +136,6 @@ def same_light(a, b):
     return all(x is y is None or torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
-def test_weak_shade_in_doubt_goes_when_the_sky_changes_nearby():
-    """A finger's print on the palm has the palm's colour, nearly; beside its outline the sky hardly changes."""
-    n_vertices, sky = len(bundled_hand().template), sky_mesh(torch.device("cpu"))
-    facing = torch.tensor([[0.0, 0.0, 1.0]]).expand(n_vertices, 3)
-    seen, here = torch.ones(n_vertices), int(sky.vertices[500])
-    beside = sky.vertices[sky.faces[sky.vertex_faces[500, 0]]]
-    seen[beside[beside != here]] = 0.2
-    on, light = Lighting(facing, torch.ones(n_vertices, 4)), LIGHT._replace(facing=facing)
-    for doubt, left in ((0.0, 1.0), (1.0, 0.0)):
-        stays = shares_that_stay(light._replace(doubt=torch.full((n_vertices,), doubt)), on, seen)
-        assert float(stays[here, 0]) == 0 and float(stays[here, 1]) == left
-
-
 def test_on_a_slant_shade_is_what_light_does_to_skin(hand, scene):
     even, truth, *_ = scene
     floor = truth._replace(shade=torch.tensor([1.0, 0.8, 0.2]).expand_as(truth.colors))
@@ -196,15 +179,6 @@ def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene, of):
     turned_light = turn_light(light, rotation.from_axis_angle(torch.tensor([0.0, 1.0, 0.0]), torch.tensor(0.7)))
     mirrored = mirror_light(mirror_light(turned_light))
     assert same_light(mirrored, turned_light)
-
-
-def test_colours_and_shade_come_to_what_is_shown():
-    shown = torch.tensor([[0.9, 0.5, 0.0], [1.0, 1.0, 0.2]])
-    shade = torch.tensor([[0.5, 0.5, 0.5], [2.0, 0.5, 1.0]])
-    colors, left = split_shade(shown, shade)
-    assert float(colors.min()) > 0 and float(colors.max()) == 1 and float(left.min()) > 0
-    torch.testing.assert_close(colors * left, shown, atol=2e-3, rtol=0)
-    torch.testing.assert_close(left[1], torch.tensor([2.0, 1.0, 1.0]))
 
 
 def test_where_a_photo_may_show_something_else_that_is_shade(hand, scene):

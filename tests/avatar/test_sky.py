@@ -5,7 +5,15 @@ import torch
 from synthetic import as_left_hand, avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.pose import posed_lighting, shading_factors, shares_that_stay, turn_light, with_photo_colors
+from oasis_warp.avatar.pose import (
+    Lighting,
+    posed_lighting,
+    shading_factors,
+    shares_that_stay,
+    split_shade,
+    turn_light,
+    with_photo_colors,
+)
 from oasis_warp.avatar.sky import bounced, environment_light, harmonic_basis, radiance, sky_mesh, studio_light
 from oasis_warp.core import rotation
 from oasis_warp.core.mirror import mirror_light, mirror_points
@@ -97,6 +105,28 @@ def test_deep_shade_beside_a_finger_that_lay_there_goes_with_it_and_weak_shade_s
     at = beside[truth.vertex_index].nonzero()[:, 0]
     assert float(left[0][at].min()) > 0.9
     torch.testing.assert_close(left[1][at], torch.full_like(left[1][at], 0.9))
+
+
+def test_weak_shade_in_doubt_goes_when_the_sky_changes_nearby(hand):
+    """A finger's print on the palm has the palm's colour, nearly; beside its outline the sky hardly changes."""
+    n_vertices, sky = len(hand.template), sky_mesh(torch.device("cpu"))
+    facing = torch.tensor([[0.0, 0.0, 1.0]]).expand(n_vertices, 3)
+    seen, here = torch.ones(n_vertices), int(sky.vertices[500])
+    beside = sky.vertices[sky.faces[sky.vertex_faces[500, 0]]]
+    seen[beside[beside != here]] = 0.2
+    on, light = Lighting(facing, torch.ones(n_vertices, 4)), EVEN._replace(facing=facing)
+    for doubt, left in ((0.0, 1.0), (1.0, 0.0)):
+        stays = shares_that_stay(light._replace(doubt=torch.full((n_vertices,), doubt)), on, seen)
+        assert float(stays[here, 0]) == 0 and float(stays[here, 1]) == left
+
+
+def test_colours_and_shade_come_to_what_is_shown():
+    shown = torch.tensor([[0.9, 0.5, 0.0], [1.0, 1.0, 0.2]])
+    shade = torch.tensor([[0.5, 0.5, 0.5], [2.0, 0.5, 1.0]])
+    colors, left = split_shade(shown, shade)
+    assert float(colors.min()) > 0 and float(colors.max()) == 1 and float(left.min()) > 0
+    torch.testing.assert_close(colors * left, shown, atol=2e-3, rtol=0)
+    torch.testing.assert_close(left[1], torch.tensor([2.0, 1.0, 1.0]))
 
 
 def test_a_light_without_albedo_reaches_everything(hand, scene):

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.processes import single_threaded_torch
 from oasis_warp.data.json_text import whole
 from oasis_warp.data.output_files import write_file
 from oasis_warp.data.pictures import to_uint8, write_picture
@@ -191,6 +192,7 @@ class Trainer(ABC, Generic[Network, Batch]):
         return StepResult(result.loss.detach(), metrics, tuple(picture.detach() for picture in result.pictures))
 
 
+@single_threaded_torch()
 def pretrain(
     trainer: Trainer[Network, Batch],
     source: BatchSource[Batch],
@@ -204,7 +206,7 @@ def pretrain(
 
     Writes a checkpoint, the weights, a line of JSON every few steps, and a sheet of pictures. Only process 0 writes. On
     the CPU, a training that was stopped and resumed ends with the same bits as one that was not, because steps and
-    batches count from the start and nothing else is random.
+    batches count from the start and nothing else is random; torch has one thread, since its sums depend on how many.
 
     Args:
         trainer: The network in training; changed in place.
