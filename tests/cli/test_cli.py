@@ -311,3 +311,20 @@ def test_a_kernel_cache_that_cannot_be_written_is_found(monkeypatch, tmp_path):
     with pytest.raises(doctor.FaultError, match="cannot be written") as caught:
         doctor.check_kernels()
     assert "OASIS_WARP_CACHE" in caught.value.remedy
+
+
+def test_a_program_that_cannot_be_loaded_says_so(monkeypatch, capsys):
+    """With few descriptors left even the import of the commands fails: a traceback."""
+
+    class Full:
+        def find_spec(self, name, path=None, target=None):
+            if name == "oasis_warp.cli.app":
+                raise OSError(24, "Too many open files")
+
+    monkeypatch.delitem(sys.modules, "oasis_warp.cli.app")
+    monkeypatch.delattr("oasis_warp.cli.app")
+    monkeypatch.setattr(sys, "meta_path", [Full(), *sys.meta_path])
+    assert main(["--version"]) == 1
+    assert capsys.readouterr().err == (
+        "oasis: cannot be loaded (Too many open files); see `ulimit -a`, or install it again.\n"
+    )

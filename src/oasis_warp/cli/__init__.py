@@ -8,8 +8,11 @@ from collections.abc import Sequence
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that `arguments` (the process's own when not given) ask for; the exit code."""
     try:
-        from oasis_warp.cli.app import main as run  # its imports take a while, in which Ctrl-C may come
-
+        try:
+            from oasis_warp.cli.app import main as run  # its imports take a while, in which Ctrl-C may come
+        except OSError as error:  # too few files may be open, say
+            print(f"oasis: cannot be loaded ({error.strerror}); see `ulimit -a`, or install it again.", file=sys.stderr)
+            return 1
         return run(arguments)
     except KeyboardInterrupt:
         print("oasis: stopped, nothing written.", file=sys.stderr)
