@@ -304,11 +304,17 @@ def test_what_is_read_as_another_place_does_not_count(hand, shown):
     before = mask_unreliable(hand, drawn, crop).mask
     assert torch.equal(mask_unreliable(hand, drawn, crop._replace(reading=right)).mask, before)
     deep = inner_mask(crop.mask, 10) > 0.5
-    for column, value in ((0, 0.03), (3, 0.03)):  # 3 cm off, and unsure
-        wrong = right.clone()
-        wrong[..., column][deep] += value
-        sure = mask_unreliable(hand, drawn, crop._replace(reading=wrong)).mask
-        assert float(sure[deep].max()) == 0 and torch.equal(sure[~grown(deep, 2)], before[~grown(deep, 2)])
+    wrong = right.clone()
+    wrong[..., 0][deep] += 0.03
+    sure = mask_unreliable(hand, drawn, crop._replace(reading=wrong)).mask
+    assert float(sure[deep].max()) == 0 and torch.equal(sure[~grown(deep, 2)], before[~grown(deep, 2)])
+    unsure = right.clone()
+    unsure[..., 3] = 0.03
+    assert torch.equal(mask_unreliable(hand, drawn, crop._replace(reading=unsure)).mask, before)
+    unsure[..., 0][deep] += 0.03
+    unsure[..., 3][deep] = 0.005
+    ring = grown(deep, 2) & ~deep  # beside it, as in a picture of 96 px
+    assert float(mask_unreliable(hand, drawn, crop._replace(reading=unsure)).mask[ring].max()) == 0
 
 
 def grown(where, pixels):

@@ -40,10 +40,11 @@ ELSEWHERE = 0.012, 0.024
 from which it does not count [m]. On photos of flat hands 97 % of pixels are below 10 mm; neighbouring fingers are 20 mm
 apart."""
 SURE_PLACE = 0.012, 0.02
-"""Spreads of a place from which a pixel counts less, and from which it does not count: the reading wavers between two
-fingers there [m]."""
-OTHER_REACH = 2 / PRIOR_SIZE
-"""Around pixels of another place, over the picture's side."""
+"""Spreads of a place between which the reading begins to waver between two fingers [m]: beside another place such a
+pixel does not count either."""
+UNSURE_REACH, OTHER_REACH = 6 / PRIOR_SIZE, 1 / PRIOR_SIZE
+"""Around pixels of another place, over the picture's side: in which an unsure reading is of that place, too, and in
+which no pixel counts."""
 OUTSIDE = 0.05
 """Share of hand in a pixel below which it shows the background."""
 
@@ -113,12 +114,16 @@ def _other_places(hand: HandModel, crop: HandCrop) -> Float[Tensor, "S S"] | flo
     corners = model.to(vertices)[faces[seen.face_ids.clamp_min(0).long()]]
     distance = (crop.reading[..., :3] - (corners * seen.barycentrics[..., None]).sum(-2)).norm(dim=-1)
     near, far = ELSEWHERE
-    sure, unsure = SURE_PLACE
-    other = ((distance - near) / (far - near)).clamp(0, 1).maximum(
-        ((crop.reading[..., 3] - sure) / (unsure - sure)).clamp(0, 1)
-    ) * (seen.face_ids >= 0)
-    reach = max(1, round(OTHER_REACH * camera.width))
-    return max_pool2d(other[None, None], 2 * reach + 1, stride=1, padding=reach)[0, 0]
+    spread, (sure, unsure) = crop.reading[..., 3], SURE_PLACE
+    other = ((distance - near) / (far - near)).clamp(0, 1) * (spread < unsure) * (seen.face_ids >= 0)
+    beside = _largest(other, UNSURE_REACH) * ((spread - sure) / (unsure - sure)).clamp(0, 1)
+    return _largest(torch.maximum(other, beside), OTHER_REACH)
+
+
+def _largest(values: Float[Tensor, "S S"], reach: float) -> Float[Tensor, "S S"]:
+    """The largest value around each pixel, up to `reach` times the picture's side."""
+    pixels = round(reach * len(values))
+    return max_pool2d(values[None, None], 2 * pixels + 1, stride=1, padding=pixels)[0, 0]
 
 
 def _nearest(depth: Float[Tensor, "S S"], where: Bool[Tensor, "S S"], reach: int) -> Float[Tensor, "S S"]:
