@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -193,6 +194,7 @@ def reconstruct_same_hand(
 
 
 @single_threaded_torch()
+@torch.enable_grad()  # whatever the caller has
 def _run(
     photos: Sequence[Photo], config: ReconstructConfig, keypoints: Path | None, prior: Prior | None, progress: Progress
 ) -> _Outcome:
