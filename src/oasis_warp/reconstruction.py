@@ -236,7 +236,7 @@ def _run(
         )
     with stage("detail"):
         adaptation = add_detail(hand, adaptation, close, close_scales, COARSE_SIZE, progress)
-    adaptation, invented = _finish(hand, adaptation, crops[0], config, stage)
+    adaptation, invented = _finish(hand, adaptation, crops, config, stage)
     gaussians, light = adaptation.gaussians, adaptation.light
     avatar = make_avatar(fits[0], surfaces.shared, crops[0], gaussians, light, invented, hand=hand)
     with stage("quality"):
@@ -278,17 +278,17 @@ def _fit(
 
 
 def _finish(
-    hand: HandModel, adaptation: Adaptation, crop: HandCrop, config: ReconstructConfig, stage: Stage
+    hand: HandModel, adaptation: Adaptation, crops: Sequence[HandCrop], config: ReconstructConfig, stage: Stage
 ) -> tuple[Adaptation, Float[Tensor, "V"] | None]:
     """The adaptation with what no photo shows, and where that was painted; with a closed wrist."""
-    gaussians, invented = adaptation.gaussians, None
+    gaussians, invented, first = adaptation.gaussians, None, crops[0]
     if config.unseen == "painted":
         with stage("painting"):
-            painted = paint_unseen(hand, gaussians, adaptation.guess, crop, adaptation.observations, seed=config.seed)
+            painted = paint_unseen(hand, gaussians, adaptation.guess, first, adaptation.observations, seed=config.seed)
             gaussians, invented = painted.gaussians, painted.invented
     if adaptation.light is not None:
-        gaussians = limit_shade(hand, gaussians, crop, adaptation.light)
-    return adaptation._replace(gaussians=close_wrist(hand, gaussians, crop.rest.vertices)), invented
+        gaussians = limit_shade(hand, gaussians, crops, adaptation.light)
+    return adaptation._replace(gaussians=close_wrist(hand, gaussians, first.rest.vertices)), invented
 
 
 def _guess(

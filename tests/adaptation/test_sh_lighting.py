@@ -140,7 +140,7 @@ def test_on_a_slant_shade_is_what_light_does_to_skin(hand, scene):
     even, truth, *_ = scene
     floor = truth._replace(shade=torch.tensor([1.0, 0.8, 0.2]).expand_as(truth.colors))
     cosine = vertex_to_gaussians(observe(hand, even).facing[:, None], hand.faces, truth)[:, 0]
-    limited = limit_shade(hand, floor, even, LIGHT).shade
+    limited = limit_shade(hand, floor, [even], LIGHT).shade
     assert limited is not None and floor.shade is not None
     slanted, openly = cosine.abs() < 0.2, cosine > 0.9
     assert float(limited[slanted].log().std(1).median()) < 0.12 < 0.7 < float(floor.shade[0].log().std())

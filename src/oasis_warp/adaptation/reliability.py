@@ -18,7 +18,7 @@ from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandCrop
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.ops import depth_map
+from oasis_warp.ops import DepthMap, depth_map
 
 BEHIND_REACH = 5 / PRIOR_SIZE
 """From the outline of what lies before, over the picture's side."""
@@ -37,8 +37,7 @@ SAME_COLOR = 0.01
 """Squared distance of colours below which skin and background cannot be told apart [sRGB^2]."""
 ELSEWHERE = 0.012, 0.024
 """Distances on the hand at rest between the place that is read and the fitted one, from which a pixel counts less, and
-from which it does not count [m]. On photos of flat hands 97 % of pixels are below 10 mm; neighbouring fingers are 20 mm
-apart."""
+from which it does not count [m]; neighbouring fingers are 20 mm apart."""
 SURE_PLACE = 0.012, 0.02
 """Spreads of a place between which the reading begins to waver between two fingers [m]: beside another place such a
 pixel does not count either."""
@@ -57,8 +56,11 @@ def mask_unreliable(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCr
         drawn: What the hand looks like in the light of the photo, everywhere on it.
         crop: The photo.
     """
-    sure = (1 - _background_share(drawn, crop)) * ~_behind_outline(hand, crop) * (1 - _other_places(hand, crop))
-    return crop._replace(mask=crop.mask * sure)
+    camera = crop.camera
+    vertices, faces = crop.posed.vertices, hand.faces.to(crop.posed.vertices.device)
+    seen = depth_map(vertices, faces, camera.viewmat, camera.K, camera.width, camera.height, validate=False)
+    behind, elsewhere = _behind_outline(hand, seen), _other_places(hand, seen, crop.reading)
+    return crop._replace(mask=crop.mask * (1 - _background_share(drawn, crop)) * ~behind * (1 - elsewhere))
 
 
 def _background_share(drawn: Float[Tensor, "S S 3"], crop: HandCrop) -> Float[Tensor, "S S"]:
@@ -72,66 +74,50 @@ def _background_share(drawn: Float[Tensor, "S S 3"], crop: HandCrop) -> Float[Te
     background = (planes[0, :3] / planes[0, 3:].clamp_min(1e-6)).permute(1, 2, 0)
     way = background - drawn
     share = ((crop.image - drawn) * way).sum(-1) / way.square().sum(-1).clamp_min(SAME_COLOR)
-    reach = max(1, round(STAIN_REACH * side))
-    near = max_pool2d(outside[None, None], 2 * reach + 1, stride=1, padding=reach)[0, 0]
-    return ((share - FEW) / (MANY - FEW)).clamp(0, 1) * near
+    return ((share - FEW) / (MANY - FEW)).clamp(0, 1) * _largest(outside, STAIN_REACH)
 
 
-def _behind_outline(hand: HandModel, crop: HandCrop) -> Tensor:
-    """Whether a pixel lies just past the outline of something nearer than it, [S, S]."""
-    camera, vertices = crop.camera, crop.posed.vertices
-    faces = hand.faces.to(vertices.device)
-    seen = depth_map(
-        vertices, faces, camera.viewmat, camera.K, camera.width, camera.height,
-        outputs=("depth", "face_ids"), validate=False,
-    )  # fmt: skip
-    on_hand = seen.face_ids >= 0
-    reach = max(1, round(BEHIND_REACH * camera.width))
+def _behind_outline(hand: HandModel, seen: DepthMap) -> Bool[Tensor, "S S"]:
+    """Whether a pixel lies just past the outline of something nearer than it."""
+    on_hand, faces = seen.face_ids >= 0, hand.faces.to(seen.face_ids.device)
     segment = hand.segment.to(faces.device)[faces[seen.face_ids.clamp_min(0).long(), 0]]
     finger = torch.where(on_hand & (segment > 0), (segment - 1) // 3, -1)
     bent = on_hand & (segment > 0) & ((segment - 1) % 3 > 0)  # not the first phalanx, which joins the palm
-    behind = on_hand & (seen.depth - _nearest(seen.depth, on_hand, reach) > BEHIND_GAP)
+
+    def before(where: Bool[Tensor, "S S"]) -> Float[Tensor, "S S"]:
+        """How far the nearest of `where` around each pixel lies before it; -inf where there is none."""
+        return seen.depth + _largest(torch.where(where, -seen.depth, -torch.inf), BEHIND_REACH)
+
+    behind = on_hand & (before(on_hand) > BEHIND_GAP)
     for number in range(5):
-        nearest = _nearest(seen.depth, bent & (finger == number), reach)
-        behind |= on_hand & (finger != number) & (seen.depth - nearest > FINGER_GAP)
+        behind |= on_hand & (finger != number) & (before(bent & (finger == number)) > FINGER_GAP)
     return behind
 
 
-def _other_places(hand: HandModel, crop: HandCrop) -> Float[Tensor, "S S"] | float:
+def _other_places(
+    hand: HandModel, seen: DepthMap, reading: Float[Tensor, "S S 4"] | None
+) -> Float[Tensor, "S S"] | float:
     """0 to 1: how surely a pixel shows another place than the fitted surface has there, by the network's reading.
 
     The tip of a finger whose fit lies a little beside it would be printed on the palm. 0 without a reading.
     """
-    if crop.reading is None:
+    if reading is None:
         return 0.0
-    camera, vertices = crop.camera, crop.posed.vertices
-    faces = hand.faces.to(vertices.device)
-    seen = depth_map(
-        vertices, faces, camera.viewmat, camera.K, camera.width, camera.height,
-        outputs=("face_ids", "barycentrics"), validate=False,
-    )  # fmt: skip
     model = hand.template if hand.origin is None else bundled_hand().template  # the network knows places on this one
-    corners = model.to(vertices)[faces[seen.face_ids.clamp_min(0).long()]]
-    distance = (crop.reading[..., :3] - (corners * seen.barycentrics[..., None]).sum(-2)).norm(dim=-1)
-    near, far = ELSEWHERE
-    spread, (sure, unsure) = crop.reading[..., 3], SURE_PLACE
+    corners = model.to(reading)[hand.faces.to(reading.device)[seen.face_ids.clamp_min(0).long()]]
+    distance = (reading[..., :3] - (corners * seen.barycentrics[..., None]).sum(-2)).norm(dim=-1)
+    (near, far), (sure, unsure), spread = ELSEWHERE, SURE_PLACE, reading[..., 3]
     other = ((distance - near) / (far - near)).clamp(0, 1) * (spread < unsure) * (seen.face_ids >= 0)
     beside = _largest(other, UNSURE_REACH) * ((spread - sure) / (unsure - sure)).clamp(0, 1)
     return _largest(torch.maximum(other, beside), OTHER_REACH)
 
 
 def _largest(values: Float[Tensor, "S S"], reach: float) -> Float[Tensor, "S S"]:
-    """The largest value around each pixel, up to `reach` times the picture's side."""
-    pixels = round(reach * len(values))
-    return max_pool2d(values[None, None], 2 * pixels + 1, stride=1, padding=pixels)[0, 0]
-
-
-def _nearest(depth: Float[Tensor, "S S"], where: Bool[Tensor, "S S"], reach: int) -> Float[Tensor, "S S"]:
-    """Least depth of `where` within `reach` pixels of each, along both axes; +inf where there is none."""
-    nearness = torch.where(where, -depth, -torch.inf)[None, None]
-    for size in ((1, 2 * reach + 1), (2 * reach + 1, 1)):  # rows, then columns: the same maximum
-        nearness = max_pool2d(nearness, size, stride=1, padding=(size[0] // 2, size[1] // 2))
-    return -nearness[0, 0]
+    """The largest value around each pixel, up to `reach` times the picture's side along both axes."""
+    pixels, planes = round(reach * len(values)), values[None, None]
+    for size in ((1, 2 * pixels + 1), (2 * pixels + 1, 1)):  # rows, then columns: the same maximum
+        planes = max_pool2d(planes, size, stride=1, padding=(size[0] // 2, size[1] // 2))
+    return planes[0, 0]
 
 
 SHARPNESS = 2.0

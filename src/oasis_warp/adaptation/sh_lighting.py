@@ -6,6 +6,8 @@ shadows, gloss, wrinkles of the pose, and misplaced detail. So most of it become
 keeps and other poses lose. Only marks, whose colours light cannot give to skin, stay in the albedo as a whole.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -124,15 +126,15 @@ def trust_in_albedo(hand: HandModel, crop: HandCrop, sure: HandCrop, light: Hand
         light: Of the photo.
     """
     on = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces.to(crop.image.device), light)
-    trust = exposed(on) * _believed_share(hand, crop, sure)
+    every, believed = (observe(hand, which).confidence for which in (crop, sure))
+    trust = exposed(on) * _believed_share(every, believed)
     if light.shade is None:
         return trust
     return trust * (1 - light.shade.log().mean(-1).abs() / SHADED).clamp(0, 1)
 
 
-def _believed_share(hand: HandModel, crop: HandCrop, sure: HandCrop) -> Float[Tensor, "V"]:
-    """Confidence with the mask of `sure` over that with all of the mask; 1 where the photo shows nothing."""
-    every, believed = (observe(hand, which).confidence for which in (crop, sure))
+def _believed_share(every: Float[Tensor, "V"], believed: Float[Tensor, "V"]) -> Float[Tensor, "V"]:
+    """Confidence with the mask of reliable pixels over that with all of the mask; 1 where the photo shows nothing."""
     return torch.where(every > 0, believed / every.clamp_min(1e-6), 1).clamp(0, 1)
 
 
@@ -179,11 +181,12 @@ def add_shade(
     seen, known = observe(hand, crop), observe(hand, crop._replace(image=lit)).colors
     missing = (seen.colors.clamp_min(MIN_COLOR) / known.clamp_min(MIN_COLOR)).log()
     on = posed_lighting(rest, crop.posed.vertices, faces, light)
-    believed = observe(hand, sure).confidence * exposed(on)
-    doubt = (seen.confidence - believed) * rim_fade(rest[None], hand.rim.to(rest.device))[0]  # the cap has no shade
+    believed = observe(hand, sure).confidence
+    in_rim = rim_fade(rest[None], hand.rim.to(rest.device))[0]  # the cap has no shade
+    doubt = (seen.confidence - believed * exposed(on)) * in_rim
     occluded = inpaint(rest, faces, missing, doubt, OCCLUDER_FADE / 3, OCCLUDER_FADE)
     shade = occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp()
-    return light._replace(shade=shade, facing=on.normals, doubt=1 - _believed_share(hand, crop, sure))
+    return light._replace(shade=shade, facing=on.normals, doubt=1 - _believed_share(seen.confidence, believed))
 
 
 def shading_picture(hand: HandModel, crop: HandCrop, light: HandLight) -> Float[Tensor, "H W 3"]:
@@ -272,7 +275,7 @@ def weighted_deviation(values: Float[Tensor, "V 3"], weight: Float[Tensor, "V"])
 
 ALBEDO_SHARE, FINE_SHARE = 0.2, 0.8
 """Share of a difference that is no mark which becomes albedo, and that of its fine part: creases, folds and the rims of
-nails stay on the skin, and light hardly changes so fast on it, but in sharp shadows."""
+nails stay on the skin, and light hardly changes so fast on it, but in sharp shadows. Set by eye, as the two below."""
 FINE_PASSES = 6
 """Smoothings over the mesh that take the fine part away, about 5 mm."""
 MOST_FINE = 0.3
@@ -323,31 +326,31 @@ def mark_probability(beyond: Float[Tensor, "V 3"]) -> Float[Tensor, "V 1"]:
 
 
 LIKELY_SHADE, LIKELY_HUE = (-0.6, 0.25), 0.1
-"""Range of the logarithm of shade on a slant, and of each channel's difference from the mean of all: light gives no
-more to skin."""
+"""Range of the logarithm of shade on a slant, and of each channel's difference from the mean of all, which light gives
+to skin; set by eye, as the two below, on four of the photos in docs/looks.md."""
 SLANTED, OPENLY = 0.3, 0.6
 """Cosines between normal and view up to which and from which skin is seen on a slant and openly."""
 
 
 def limit_shade(
-    hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, light: HandLight
+    hand: HandModel, gaussians: CanonicalGaussians, crops: Sequence[HandCrop], light: HandLight
 ) -> CanonicalGaussians:
-    """The Gaussians with no more shade than light gives to skin where the photo shows it on a slant.
+    """The Gaussians with no more shade than light gives to skin where all photos show it on a slant.
 
     There a pixel shows what lies beside an outline as well, floor between fingers for one: in the photo's view a rim of
     a pixel, from the side a streak along a finger.
 
     Args:
         hand: Whose surface it is.
-        gaussians: Adapted to the photo.
-        crop: The photo.
-        light: Of the photo.
+        gaussians: Adapted to the photos.
+        crops: The photos.
+        light: Of the first.
     """
     if gaussians.shade is None:
         return gaussians
-    facing = observe(hand, crop).facing
+    facing = torch.stack([observe(hand, crop).facing for crop in crops]).amax(0)
     slant = ((OPENLY - facing) / (OPENLY - SLANTED)).clamp(0, 1)
-    vertex_shade = torch.ones_like(crop.rest.vertices) if light.shade is None else light.shade
+    vertex_shade = torch.ones_like(crops[0].rest.vertices) if light.shade is None else light.shade
     on_vertices = torch.cat([vertex_shade, slant[:, None]], 1)
     own, share = vertex_to_gaussians(on_vertices, hand.faces.to(slant.device), gaussians).split([3, 1], 1)
     total = (own * gaussians.shade).log()
