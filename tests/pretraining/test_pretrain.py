@@ -164,6 +164,17 @@ def test_a_loss_that_is_not_finite_ends_the_training(hand, source, tmp_path):
     assert not (tmp_path / CHECKPOINT).exists()
 
 
+def test_a_gradient_that_is_not_finite_changes_nothing_and_is_counted(hand, source, tmp_path):
+    def poisoned_once(first_step, rank, world):
+        for step, batch in enumerate(source(first_step, rank, world), first_step):
+            yield batch._replace(target_images=batch.target_images * torch.nan) if step == 1 else batch
+
+    trainer = PriorTrainer(small_network(hand), replace(CONFIG, log_every=4, checkpoint_every=4), ALONE)
+    assert pretrain(trainer, poisoned_once, tmp_path) == 4
+    (line,) = [json.loads(line) for line in (tmp_path / METRICS).read_text().splitlines()]
+    assert line["skipped"] == 1 and all(parameter.isfinite().all() for parameter in trainer.trained)
+
+
 def test_half_precision_trains_too(hand, source):
     trainer = PriorTrainer(small_network(hand), replace(CONFIG, precision="bfloat16"), ALONE)
     exact = PriorTrainer(small_network(hand), CONFIG, ALONE)

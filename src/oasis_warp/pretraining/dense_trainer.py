@@ -79,7 +79,7 @@ def dense_loss(said: DensePrediction, true: DenseBatch) -> dict[str, Tensor]:
     count = skin.sum().clamp_min(1)
 
     def on_skin(values: Float[Tensor, "B H W"]) -> Tensor:
-        return (values * skin).sum() / count
+        return torch.where(true.skin, values, 0).sum() / count
 
     off = (said.surface - true.surface).abs().sum(1)
     difference = said.albedo - albedo

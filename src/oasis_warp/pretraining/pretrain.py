@@ -44,6 +44,8 @@ EAGER_STEPS = 4
 """Steps on CUDA before one is captured: they load the kernels, and show how much memory the pictures need."""
 SLACK = 3.0
 """Factor of the memory that pictures needed for their Gaussians, since each hand and pose needs another amount."""
+MOST_SKIPPED = 0.5
+"""Share of the steps since the last line of metrics that a gradient that is not finite may leave without effect."""
 COOLDOWN = 0.2
 """Share of the steps over which a cooldown lowers the learning rate."""
 
@@ -115,6 +117,8 @@ class Trainer(ABC, Generic[Network, Batch]):
         rate = torch.tensor(config.learning_rate, device=process.device) if on_cuda else config.learning_rate
         self.optimizer = torch.optim.Adam(self.trained, lr=rate, fused=on_cuda, capturable=on_cuda)
         self.step = 0
+        self.skipped = torch.zeros((), device=process.device)
+        """Steps so far whose gradient was not finite; they left the weights as they were."""
         self._recorded: CapturedCall[StepResult] | None = None
         self._eager_steps = 0
 
@@ -186,9 +190,15 @@ class Trainer(ABC, Generic[Network, Batch]):
                 gradient = torch.empty_like(parameter).copy_(gradient)  # the fused optimizer needs the same strides
             parameter.grad = gradient
         average_gradients(self.trained, self.process.world)
-        torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
-        self.optimizer.step()
-        metrics = {name: value.detach() for name, value in result.metrics.items()}
+        broken = (~torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip).isfinite()).float()
+        self.skipped += broken
+        if self.process.device.type == "cuda":
+            # As torch.amp.GradScaler does: where this is 1, fused Adam changes nothing, and nobody waits for the device.
+            self.optimizer.found_inf = broken
+            self.optimizer.step()
+        elif not broken:
+            self.optimizer.step()
+        metrics = {name: value.detach() for name, value in result.metrics.items()} | {"skipped": self.skipped.clone()}
         return StepResult(result.loss.detach(), metrics, tuple(picture.detach() for picture in result.pictures))
 
 
@@ -217,13 +227,14 @@ def pretrain(
         progress: Called for every step from here on.
 
     Raises:
-        InputError: a checkpoint of another network, a folder that cannot be written, or a loss that is not finite.
+        InputError: a checkpoint of another network, a folder that cannot be written, or a loss that is not finite in
+            most steps; a step whose gradient is not finite changes nothing and is counted in the metrics.
     """
     config, process = trainer.config, trainer.process
     trainer.resume(folder / CHECKPOINT)
     if process.rank == 0:
         _drop_lines_after(folder / METRICS, trainer.step)
-    start, first = time.perf_counter(), trainer.step
+    start, first, reported, skipped = time.perf_counter(), trainer.step, trainer.step, 0.0
     batches = source(trainer.step, process.rank, process.world)
     stopping = trainer.step >= config.steps
     notes = {**about, **asdict(config)}
@@ -242,12 +253,14 @@ def pretrain(
         if log_now or save_now:
             numbers = _mean_metrics(result, process.world)
             trainer.check_recording()
-            if not math.isfinite(numbers["loss"]):
+            if numbers["skipped"] - skipped > MOST_SKIPPED * (trainer.step - reported):
                 raise InputError(f"{folder}: the loss is not finite at step {trainer.step}; lower the learning rate.")
+            reported, skipped = trainer.step, numbers["skipped"]
             if process.rank == 0:
                 seconds = (time.perf_counter() - start) / (trainer.step - first)
+                finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
                 with (folder / METRICS).open("a") as file:
-                    file.write(json.dumps({"step": trainer.step, "seconds_per_step": seconds, **numbers}) + "\n")
+                    file.write(json.dumps({"step": trainer.step, "seconds_per_step": seconds, **finite}) + "\n")
         if process.rank == 0 and save_now:
             trainer.save(folder / CHECKPOINT)
             trainer.save_weights(folder / WEIGHTS, {"step": trainer.step, **notes})
