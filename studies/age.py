@@ -28,7 +28,7 @@ PACKAGES = {
 ASSETS = PACKAGES["oasis_warp"] / "assets"
 
 
-class Kept(NamedTuple):
+class MeasuredCode(NamedTuple):
     """What measured a file of results."""
 
     code: tuple[str, ...]
@@ -36,7 +36,7 @@ class Kept(NamedTuple):
     commit: str
 
 
-NOT_NOTED = Kept(("unknown",), "")
+NOT_NOTED = MeasuredCode(("unknown",), "")
 """What nobody noted the code of."""
 
 
@@ -124,16 +124,16 @@ def code_digest(study: str) -> str:
     return hashlib.sha256("".join(lines).encode()).hexdigest()[:16]
 
 
-def read_kept(folder: Path, study: str) -> dict[str, Kept]:
+def read_measured(folder: Path, study: str) -> dict[str, MeasuredCode]:
     """What measured each of a study's files of results in a folder."""
     path = folder / f"{study}.code.json"
     found = json.loads(path.read_text()) if path.is_file() else {}
-    return {name: Kept(tuple(one["code"]), one["commit"]) for name, one in found.items()}
+    return {name: MeasuredCode(tuple(one["code"]), one["commit"]) for name, one in found.items()}
 
 
-def write_kept(folder: Path, study: str, kept: dict[str, Kept]) -> None:
-    """The inverse of `read_kept`."""
-    text = json.dumps({name: one._asdict() for name, one in sorted(kept.items())}, indent=1) + "\n"
+def write_measured(folder: Path, study: str, measured: dict[str, MeasuredCode]) -> None:
+    """The inverse of `read_measured`."""
+    text = json.dumps({name: one._asdict() for name, one in sorted(measured.items())}, indent=1) + "\n"
     write_file(folder / f"{study}.code.json", text.encode())
 
 
@@ -149,32 +149,32 @@ def noting_code(folder: Path, study: str, files: Sequence[str]) -> Iterator[None
     try:
         yield
     finally:
-        kept = read_kept(folder, study)
+        measured = read_measured(folder, study)
         for name, time in times(folder, files).items():
             if before.get(name) != time:
-                earlier = kept.get(name, NOT_NOTED).code
-                kept[name] = Kept(tuple(sorted({digest, *(earlier if name in before else ())})), commit())
-        if kept:
-            write_kept(folder, study, kept)
+                earlier = measured.get(name, NOT_NOTED).code
+                measured[name] = MeasuredCode(tuple(sorted({digest, *(earlier if name in before else ())})), commit())
+        if measured:
+            write_measured(folder, study, measured)
 
 
 def keep(study: str, files: Sequence[str], out: Path, results: Path) -> None:
     """Copy the files that a study has left in `out` to the kept results, and what measured them."""
-    kept, noted = read_kept(results, study), read_kept(out, study)
+    measured, noted = read_measured(results, study), read_measured(out, study)
     if not (there := times(out, files)):
         return
     for name in there:
         (results / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(out / name, results / name)
-        kept[name] = noted.get(name, NOT_NOTED)
-    write_kept(results, study, kept)
+        measured[name] = noted.get(name, NOT_NOTED)
+    write_measured(results, study, measured)
 
 
-def age_note(kept: dict[str, Kept], digest: str, commits: str) -> str:
+def age_note(measured: dict[str, MeasuredCode], digest: str, commits: str) -> str:
     """What stands below the tables of a study: nothing where this code has measured them."""
-    if not kept:
+    if not measured:
         return "*Measured with an older version, whose results were not kept.*"
-    if all(one.code == (digest,) for one in kept.values()):
+    if all(one.code == (digest,) for one in measured.values()):
         return ""
     return f"*Measured at {commits}; the code has changed since.*" if commits else "*Measured with older code.*"
 

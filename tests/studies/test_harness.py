@@ -289,7 +289,7 @@ def test_tables_say_when_their_code_has_changed(repository, monkeypatch):
     assert page.read_text().count("*Measured at 0123456789; the code has changed since.*\n<!-- end of a -->") == 1
     assert check() == []
     measure()  # continues rows of the earlier code
-    assert age.read_kept(out, "count")[f"count/{ROWS}"].code == tuple(sorted((before, digest())))
+    assert age.read_measured(out, "count")[f"count/{ROWS}"].code == tuple(sorted((before, digest())))
     (out / "count" / ROWS).unlink()
     measure()
     command.render(["count"], out, docs, results)

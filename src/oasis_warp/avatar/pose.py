@@ -11,7 +11,7 @@ from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.sky import bounced, exposure, harmonic_basis, largest_nearby
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
-from oasis_warp.ops import RestMesh, carry_gaussians, face_rotations
+from oasis_warp.ops import RestMesh, face_rotations, pose_mesh_gaussians
 from oasis_warp.ops.sky_exposure import sky_directions
 
 GAMMA = 2.2
@@ -61,8 +61,8 @@ def posed_lighting(
 
     On the rim of the wrist they are those of its end, whose Gaussians ride there: its sides would shade it in wedges.
     """
-    turned = face_rotations(rest, posed, faces, validate=False).vertex_quats
-    return lighting(posed, turned, surface.closed_normals(rest, faces), light)
+    vertex_quats = face_rotations(rest, posed, faces, validate=False).vertex_quats
+    return lighting(posed, vertex_quats, surface.closed_normals(rest, faces), light)
 
 
 def lighting(
@@ -233,12 +233,12 @@ def pose_gaussians(
     With an axis of poses before `posed_vertices`, means, quats and scales have it too, and colours where there is a
     `light`: they are drawn in it, past what the posed surface hides of it.
     """
-    means, quats, scales, turned = carry_gaussians(
+    means, quats, scales, vertex_quats = pose_mesh_gaussians(
         rest_vertices, posed_vertices, faces, canonical.face_index, canonical.barycentrics, canonical.vertex_index,
-        canonical.offsets, canonical.quats, canonical.scales, turned=light is not None,
+        canonical.offsets, canonical.quats, canonical.scales, with_vertex_quats=light is not None,
     )  # fmt: skip
     colors = canonical.colors
-    if light is not None and turned is not None:
-        on = lighting(posed_vertices, turned, light.normals, light.light)
+    if light is not None and vertex_quats is not None:
+        on = lighting(posed_vertices, vertex_quats, light.normals, light.light)
         colors = (colors * shading_factors(canonical, faces, light.light, on, light.seen)).clamp(0, 1)
     return Gaussians(means, quats, scales, canonical.opacities, colors)

@@ -19,7 +19,7 @@ from oasis_warp.ops.face_rotations import FaceRotations as FaceRotations
 from oasis_warp.ops.face_rotations import RestMesh as RestMesh
 from oasis_warp.ops.face_rotations import face_rotations as face_rotations
 from oasis_warp.ops.face_rotations import rest_mesh as rest_mesh
-from oasis_warp.ops.hand_posing import carry_gaussians as carry_gaussians
+from oasis_warp.ops.hand_posing import pose_mesh_gaussians as pose_mesh_gaussians
 from oasis_warp.ops.hand_posing import skinned_vertices as skinned_vertices
 from oasis_warp.ops.masked_l1 import masked_l1_on_cuda as masked_l1_on_cuda
 from oasis_warp.ops.mesh_posing import PosedCovars as PosedCovars

@@ -23,8 +23,8 @@ class CudaLaunch:
         kinds = [kind for _, kind in native.block_type._fields_]
         code = "".join("d" if kind is ctypes.c_double else "q" * (ctypes.sizeof(kind) // 8) for kind in kinds)
         self._pack = struct.Struct("=" + code).pack_into
-        self._words = (ctypes.c_longlong * size)()
-        launch.params_addr[1] = ctypes.c_void_p(ctypes.addressof(self._words))
+        self._packed = (ctypes.c_longlong * size)()
+        launch.params_addr[1] = ctypes.c_void_p(ctypes.addressof(self._packed))
         self._call = wp._src.context.runtime.core.wp_cuda_launch_kernel
         # As ctypes' own numbers, which it passes on as they are.
         self._before = ctypes.c_void_p(launch.device.context), ctypes.c_void_p(launch.hooks.forward)
@@ -35,20 +35,20 @@ class CudaLaunch:
         self._after = *(ctypes.c_int(int(number)) for number in numbers), launch.params_addr
         self._arguments = *self._before, launch.bounds.size, *self._after
 
-    def __call__(self, n_blocks: int, stream: int, *words: int | float) -> None:
+    def __call__(self, n_blocks: int, stream: int, *parameters: int | float) -> None:
         """Launch `n_blocks` blocks, at least one, on the stream of this handle, which a graph may be capturing.
 
         Args:
             n_blocks: Of `CudaNative.block` threads.
             stream: Of CUDA.
-            words: The parameters in order: addresses and numbers, an array as its elements.
+            *parameters: In the order of the kernel: addresses and numbers, an array as its elements.
 
         Raises:
             RuntimeError: CUDA refuses the launch.
         """
         if n_blocks != self._n_blocks:
             self._resize(n_blocks)
-        self._pack(self._words, 0, *words)
+        self._pack(self._packed, 0, *parameters)
         if self._call(*self._arguments, stream, None):
             raise RuntimeError(f"{self._launch.kernel.key}: {wp._src.context.runtime.get_error_string()}")
 

@@ -58,12 +58,12 @@ def _checked_plan(scene: Scene, options: Options, key: tuple[Any, ...]) -> Plan 
 def draw(plan: Plan, scene: Scene, validate: bool) -> tuple[Tensor, Tensor, "Meta"] | None:
     """Images as blended, alpha and meta; None where `validate` finds a bad value."""
     tracked = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in scene)
-    shown = _Shown() if tracked else None
-    if shown is not None:
-        image, alphas = _draw(plan, validate, shown, *scene)
-        if shown.workspace is None:
+    tracking = _Tracked() if tracked else None
+    if tracking is not None:
+        image, alphas = _draw(plan, validate, tracking, *scene)
+        if tracking.workspace is None:
             return None
-        workspace = shown.workspace
+        workspace = tracking.workspace
     else:
         drawn = plan.draw(scene, keep=False, validate=validate)
         if drawn is None:
@@ -72,11 +72,11 @@ def draw(plan: Plan, scene: Scene, validate: bool) -> tuple[Tensor, Tensor, "Met
         assert image is not None and alphas is not None
     if plan.n_drawn < plan.channels:
         image = image[..., : plan.n_drawn]
-    return image, alphas, Meta(plan, scene, workspace, shown)
+    return image, alphas, Meta(plan, scene, workspace, tracking)
 
 
-class _Shown:
-    """What a picture's adjoint must know of its `meta`."""
+class _Tracked:
+    """What the adjoint needs from the picture's `meta` and workspace."""
 
     def __init__(self) -> None:
         self.means2d: Callable[[], Tensor | None] = lambda: None
@@ -98,14 +98,14 @@ class _Shown:
 
 class _Draw(Function):
     @staticmethod
-    def forward(ctx: Any, plan: Plan, validate: bool, shown: _Shown, *tensors: Tensor | None) -> tuple[Any, ...]:
+    def forward(ctx: Any, plan: Plan, validate: bool, tracking: _Tracked, *tensors: Tensor | None) -> tuple[Any, ...]:
         scene = Scene(*tensors)  # pyright: ignore[reportArgumentType]
         drawn = plan.draw(scene, keep=True, validate=validate)
         if drawn is None:
             return None, None
-        image, alphas, channels, backgrounds, shown.workspace, *kept = drawn
+        image, alphas, channels, backgrounds, tracking.workspace, *saved = drawn
         ctx.save_for_backward(*tensors, channels, backgrounds)
-        ctx.plan, ctx.shown, ctx.kept = plan, shown, kept
+        ctx.plan, ctx.tracking, ctx.saved = plan, tracking, saved
         ctx.set_materialize_grads(False)
         return image, alphas
 
@@ -115,10 +115,10 @@ class _Draw(Function):
             return (None,) * (3 + len(Scene._fields))
         *tensors, channels, backgrounds = ctx.saved_tensors
         scene = Scene(*tensors)
-        shown, needed = ctx.shown, ctx.needs_input_grad
-        drawn = Drawn(None, None, channels, backgrounds, shown.workspace, *ctx.kept)
+        tracking, needed = ctx.tracking, ctx.needs_input_grad
+        drawn = Drawn(None, None, channels, backgrounds, tracking.workspace, *ctx.saved)
         needs = Needs(*needed[3:10], needed[11])
-        means2d = shown.retaining()
+        means2d = tracking.retaining()
         gradients, gradient = ctx.plan.draw_backward(scene, drawn, g_image, g_alphas, needs, means2d is not None)
         if means2d is not None and gradient is not None:
             means2d.grad = gradient.clone() if means2d.grad is None else means2d.grad + gradient
@@ -167,30 +167,30 @@ UNMADE = {"means2d": "_project", "depths": "_project", "opacities": "_opacities"
 class Meta(dict[str, Any]):
     """What was computed on the way to a picture: a dictionary whose tensors are made when somebody looks at them."""
 
-    def __init__(self, plan: Plan, scene: Scene, workspace: Tensor, shown: _Shown | None) -> None:
+    def __init__(self, plan: Plan, scene: Scene, workspace: Tensor, tracking: _Tracked | None) -> None:
         options = plan.options
         super().__init__(
             camera_ids=None, gaussian_ids=None, means2d=None, depths=None, conics=None, radii=None, opacities=None,
             tile_size=options.tile_size, width=options.width, height=options.height, n_cameras=plan.n_cameras,
         )  # fmt: skip
-        versions = [] if shown is None else _versions((*scene[:5], *scene[6:8]))
+        versions = [] if tracking is None else _versions((*scene[:5], *scene[6:8]))
         self._unmade = dict(UNMADE)
-        self._call = plan, scene, workspace, shown, versions
+        self._call = plan, scene, workspace, tracking, versions
 
     def _project(self) -> None:
-        plan, scene, workspace, shown, versions = self._call
-        with torch.enable_grad() if shown is not None else torch.no_grad():
+        plan, scene, workspace, tracking, versions = self._call
+        with torch.enable_grad() if tracking is not None else torch.no_grad():
             projected = [None if name in UNPROJECTED else t for name, t in zip(Scene._fields, scene, strict=True)]
             means2d, depths = _Project.apply(plan, workspace, versions, *projected)  # pyright: ignore[reportGeneralTypeIssues]
-        if shown is not None:
-            shown.means2d = weakref.ref(means2d)
+        if tracking is not None:
+            tracking.means2d = weakref.ref(means2d)
         for name, tensor in (("means2d", means2d), ("depths", depths)):
             if self._unmade.pop(name, None):
                 super().__setitem__(name, tensor)
 
     def _opacities(self) -> None:
-        plan, scene, _, shown, _ = self._call
-        with torch.enable_grad() if shown is not None else torch.no_grad():
+        plan, scene, _, tracking, _ = self._call
+        with torch.enable_grad() if tracking is not None else torch.no_grad():
             self["opacities"] = scene.opacities.expand(plan.n_cameras, -1)
 
     def _read(self) -> None:

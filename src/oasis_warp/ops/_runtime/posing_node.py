@@ -9,7 +9,13 @@ from torch.autograd.function import Function
 
 from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime.plans import Plans, once, shapes_of
-from oasis_warp.ops._runtime.posing_plan import Bones, Riders, RidersPlan, SurfacePlan, Tables
+from oasis_warp.ops._runtime.posing_plan import (
+    GaussianInputs,
+    GaussiansPlan,
+    MeshBinding,
+    SkinningInputs,
+    SkinningPlan,
+)
 from oasis_warp.ops._runtime.transforms import in_forward_mode
 
 Kind = tuple[Any, ...]
@@ -18,7 +24,7 @@ ROW = 16
 """Kernels read rows of four numbers as one [bytes]."""
 
 
-def kind_of(given: Bones | Riders, others: tuple[Any, ...]) -> Kind | None:
+def kind_of(given: SkinningInputs | GaussianInputs, others: tuple[Any, ...]) -> Kind | None:
     """What tells apart calls of other plans; None where only the operators apart can take a call.
 
     Args:
@@ -43,74 +49,78 @@ def plan_of(kind: Kind | None) -> Any:
     return None if kind is None else _plans.plans.get(kind)
 
 
-def remember_surface(kind: Kind, given: Bones, parents: Tensor) -> None:
+def remember_skinning(kind: Kind, given: SkinningInputs, parents: Tensor) -> None:
     """Plan the next call: the operators, which have taken this one, have checked its kind."""
     if given.angles.ndim == 2:
-        _plans.keep(kind, SurfacePlan(given, parents))
+        _plans.keep(kind, SkinningPlan(given, parents))
 
 
-def remember_riders(kind: Kind, given: Riders, tables: Tables) -> None:
+def remember_mesh_gaussians(kind: Kind, given: GaussianInputs, binding: MeshBinding) -> None:
     """Plan the next call: the operators, which have taken this one, have checked its kind."""
-    if given.posed_vertices.ndim == 2 and len(given.posed_vertices) and len(tables.face_index):
-        _plans.keep(kind, RidersPlan(given, tables))
+    if given.posed_vertices.ndim == 2 and len(given.posed_vertices) and len(binding.face_index):
+        _plans.keep(kind, GaussiansPlan(given, binding))
 
 
-def pose_surface(plan: SurfacePlan, given: Bones) -> Tensor:
+def skin_surface(plan: SkinningPlan, given: SkinningInputs) -> Tensor:
     """Posed vertices."""
-    return _surface(plan, *given) if _tracked(given) else plan.pose(given)[0]
+    return _skinning(plan, *given) if _tracked(given) else plan.pose(given)[0]
 
 
-def pose_riders(plan: RidersPlan, given: Riders, tables: Tables, turned: bool) -> tuple[Any, ...]:
-    """Means, quaternions and scales; and with `turned` the rotations of vertices, else None."""
+def pose_mesh_gaussians(
+    plan: GaussiansPlan, given: GaussianInputs, binding: MeshBinding, with_vertex_quats: bool
+) -> tuple[Any, ...]:
+    """Means, quaternions and scales; and with `with_vertex_quats` the rotations of vertices, else None."""
     if _tracked(given):
-        return _riders(plan, tables, turned, *given)
-    *out, workspace = plan.pose(given, tables, keep=False)
-    return *out, plan.vertex_quats(workspace) if turned else None
+        return _mesh_gaussians(plan, binding, with_vertex_quats, *given)
+    *out, workspace = plan.pose(given, binding, keep=False)
+    return *out, plan.vertex_quats(workspace) if with_vertex_quats else None
 
 
 def _tracked(given: Sequence[Tensor | None]) -> bool:
     return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in given)
 
 
-class _Surface(Function):
+class _Skinning(Function):
     @staticmethod
-    def forward(ctx: Any, plan: SurfacePlan, *tensors: Tensor | None) -> Tensor:
-        posed, ctx.workspace = plan.pose(Bones(*tensors))  # pyright: ignore[reportArgumentType]
+    def forward(ctx: Any, plan: SkinningPlan, *tensors: Tensor | None) -> Tensor:
+        posed, ctx.workspace = plan.pose(SkinningInputs(*tensors))  # pyright: ignore[reportArgumentType]
         ctx.save_for_backward(*tensors)
         ctx.plan = plan
         return posed
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
-        given = Bones(*ctx.saved_tensors)
+        given = SkinningInputs(*ctx.saved_tensors)
         found = ctx.plan.backward(given, ctx.workspace, gradient.contiguous(), ctx.needs_input_grad[1:])
         return None, *once("skin", given, [*found, None, None, None])
 
 
-class _Riders(Function):
+class _MeshGaussians(Function):
     @staticmethod
-    def forward(ctx: Any, plan: RidersPlan, tables: Tables, turned: bool, *tensors: Tensor | None) -> Any:
+    def forward(
+        ctx: Any, plan: GaussiansPlan, binding: MeshBinding, with_vertex_quats: bool, *tensors: Tensor | None
+    ) -> Any:
         needs = ctx.needs_input_grad[3:]
         surface = needs[0] or needs[1]
-        given = Riders(*tensors)  # pyright: ignore[reportArgumentType]
-        *out, ctx.workspace = plan.pose(given, tables, keep=surface)
+        given = GaussianInputs(*tensors)  # pyright: ignore[reportArgumentType]
+        *out, ctx.workspace = plan.pose(given, binding, keep=surface)
         ctx.save_for_backward(*tensors)
-        ctx.plan, ctx.tables = plan, tables
+        ctx.plan, ctx.binding = plan, binding
         ctx.set_materialize_grads(False)
-        quats = plan.vertex_quats(ctx.workspace) if turned else None
+        quats = plan.vertex_quats(ctx.workspace) if with_vertex_quats else None
         if quats is not None and not surface:
             ctx.mark_non_differentiable(quats)
         return *out, quats
 
     @staticmethod
     def backward(ctx: Any, *incoming: Tensor | None) -> tuple[Any, ...]:
-        given = Riders(*ctx.saved_tensors)
+        given = GaussianInputs(*ctx.saved_tensors)
         if all(gradient is None for gradient in incoming):
             return (None,) * (3 + len(given))
-        found = ctx.plan.backward(given, ctx.tables, ctx.workspace, incoming, ctx.needs_input_grad[3:])
+        found = ctx.plan.backward(given, ctx.binding, ctx.workspace, incoming, ctx.needs_input_grad[3:])
         return None, None, None, *once("pose_on_mesh", given, found)
 
 
 # Below Function.apply, which takes 3 us to look for functorch: `is_traced` has.
-_surface: Callable[..., Any] = super(Function, _Surface).apply  # pyright: ignore[reportAttributeAccessIssue]
-_riders: Callable[..., Any] = super(Function, _Riders).apply  # pyright: ignore[reportAttributeAccessIssue]
+_skinning: Callable[..., Any] = super(Function, _Skinning).apply  # pyright: ignore[reportAttributeAccessIssue]
+_mesh_gaussians: Callable[..., Any] = super(Function, _MeshGaussians).apply  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,4 +1,4 @@
-"""The plans of float32 posing on CUDA: a surface from joint angles, and the Gaussians that ride on a surface.
+"""The plans of float32 posing on CUDA: a surface from joint angles, and Gaussians bound to its mesh.
 
 One pose a call, with the kernels of the operators apart: `bone_transforms` and `skin` for the surface, `face_rotations`
 and `pose_on_mesh` for the Gaussians. What passes between two kernels lies in one workspace.
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from oasis_kernels.posing import face_rotation_native as rotations
-from oasis_kernels.posing import mesh_gaussians as riders
+from oasis_kernels.posing import mesh_gaussians
 from oasis_kernels.runtime.cuda_native import CudaNative
 from oasis_kernels.skinning import kinematics
 from oasis_kernels.skinning import skinning_native as skinning
@@ -51,7 +51,7 @@ HALF_POWERS = 1
 """Scales go with the root of the area."""
 
 
-class Bones(NamedTuple):
+class SkinningInputs(NamedTuple):
     """Float tensors of a pose of a surface."""
 
     angles: Tensor
@@ -65,7 +65,7 @@ class Bones(NamedTuple):
     displacements: Tensor | None
 
 
-class Riders(NamedTuple):
+class GaussianInputs(NamedTuple):
     """Float tensors of Gaussians on a posed mesh."""
 
     rest_vertices: Tensor
@@ -78,7 +78,7 @@ class Riders(NamedTuple):
     """Of the rest mesh; receives no gradient."""
 
 
-class Tables(NamedTuple):
+class MeshBinding(NamedTuple):
     """What binds Gaussians to a mesh."""
 
     faces: Tensor
@@ -104,10 +104,10 @@ class _Plan:
         return torch.empty(shape, dtype=dtype, device=self.device)
 
 
-class SurfacePlan(_Plan):
+class SkinningPlan(_Plan):
     """Bones, then skin with two pose correctives a joint or none."""
 
-    def __init__(self, given: Bones, parents: Tensor) -> None:
+    def __init__(self, given: SkinningInputs, parents: Tensor) -> None:
         super().__init__(given.angles)
         self._parents = parents
         self._n, self._n_joints = n, n_joints = given.weights.shape
@@ -120,7 +120,7 @@ class SurfacePlan(_Plan):
         self._skin_blocks = block_count(n, skinning.POINTS)
         self._sum_blocks = block_count(n, skinning.BLOCK)
 
-    def pose(self, given: Bones) -> tuple[Tensor, Tensor]:
+    def pose(self, given: SkinningInputs) -> tuple[Tensor, Tensor]:
         """Posed vertices, and the workspace."""
         stream = self._stream()
         angles, orientation, translation, joints, means, axes, weights, displacements = addresses(given)
@@ -137,7 +137,7 @@ class SurfacePlan(_Plan):
         )  # fmt: skip
         return posed, workspace
 
-    def backward(self, given: Bones, workspace: Tensor, gradient: Tensor, needs: Any) -> list[Tensor | None]:
+    def backward(self, given: SkinningInputs, workspace: Tensor, gradient: Tensor, needs: Any) -> list[Tensor | None]:
         """Gradients by angles, orientation, translation, joints and vertices at rest, where they are wanted."""
         stream, n, n_joints = self._stream(), self._n, self._n_joints
         angles, _, _, joints, means, axes, weights, displacements = addresses(given)
@@ -172,22 +172,22 @@ class SurfacePlan(_Plan):
         return out
 
 
-class RidersPlan(_Plan):
+class GaussiansPlan(_Plan):
     """Rotations of faces and vertices, then the Gaussians on them."""
 
-    def __init__(self, given: Riders, tables: Tables) -> None:
+    def __init__(self, given: GaussianInputs, binding: MeshBinding) -> None:
         super().__init__(given.quats)
-        self._n_vertices, self._n_faces = v, f = len(given.posed_vertices), len(tables.faces)
-        self._q, self._n = len(tables.face_index), len(given.quats)
+        self._n_vertices, self._n_faces = v, f = len(given.posed_vertices), len(binding.faces)
+        self._q, self._n = len(binding.face_index), len(given.quats)
         self._p = self._n - self._q
         self._sizes = v, f, self._p, self._q
         self._face_blocks, self._vertex_blocks = block_count(f, rotations.BLOCK), block_count(v, rotations.BLOCK)
-        self._rider_blocks = block_count(self._p, riders.BLOCK) + block_count(self._q, riders.BLOCK)
+        self._gaussian_blocks = block_count(self._p, mesh_gaussians.BLOCK) + block_count(self._q, mesh_gaussians.BLOCK)
         self._at, self._size = lay_out({
             "rows_of_faces": 32 * f, "flat_blocks": 4 * self._face_blocks, "face_quats": 16 * f, "vertex_quats": 16 * v,
             "area_ratio": 4 * f, "vertex_area_ratio": 4 * v,
         })  # fmt: skip
-        places, self._size_with_kept = lay_out({"signs": 12 * f, "sums": 8 * v}, self._size)
+        places, self._size_with_saved = lay_out({"signs": 12 * f, "sums": 8 * v}, self._size)
         self._at |= places
         self._passed_at, self._passed_size = lay_out({
             "gaussian_rows": 32 * self._n, "weights": 12 * self._q, "by_ratio": 4 * self._q, "area_ratio": 4 * f,
@@ -195,32 +195,32 @@ class RidersPlan(_Plan):
         })  # fmt: skip
         self._rotate_faces = self._launch(rotations.rotate_faces)
         self._rotate_vertices = self._launch(rotations.rotate_vertices)
-        self._ride = self._launch(riders.pose_mesh_gaussians)
+        self._pose_gaussians = self._launch(mesh_gaussians.pose_mesh_gaussians)
         self._known: tuple[Any, ...] = ()
 
-    def _bound(self, tables: Tables) -> tuple[Incidence, tuple[int, ...], MeshGaussians]:
-        """What the tables bind, and the addresses of faces and of who rides on which vertex and face."""
-        state = [None if t is None else (t._version, t.data_ptr()) for t in tables]
-        if self._known and self._known[0] == state and _alive(self._known[1], tables):
+    def _bound(self, binding: MeshBinding) -> tuple[Incidence, tuple[int, ...], MeshGaussians]:
+        """What the tables bind, and the addresses of faces and of the Gaussians on each vertex and face."""
+        state = [None if t is None else (t._version, t.data_ptr()) for t in binding]
+        if self._known and self._known[0] == state and _alive(self._known[1], binding):
             return self._known[2]
-        faces, face_index, vertex_index = tables
+        faces, face_index, vertex_index = binding
         bound = find_gaussians(faces, face_index, vertex_index, self._n_vertices, transposed=False)
         on_vertices = None if bound.on_vertices is None else bound.on_vertices.table
         found = bound.corners, tuple(addresses((bound.corners.table, on_vertices, bound.on_faces.table))), bound
-        if not any(t is not None and t.is_inference() for t in tables):  # whose versions are not counted
-            self._known = state, [t if t is None else weakref.ref(t) for t in tables], found
+        if not any(t is not None and t.is_inference() for t in binding):  # whose versions are not counted
+            self._known = state, [t if t is None else weakref.ref(t) for t in binding], found
         return found
 
-    def pose(self, given: Riders, tables: Tables, keep: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def pose(self, given: GaussianInputs, binding: MeshBinding, keep: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Means, quaternions, scales, and the workspace, which holds what the adjoint needs with `keep`."""
         stream, at = self._stream(), self._at
-        corners, (faces, on_vertices, on_faces), _ = self._bound(tables)
+        corners, (faces, on_vertices, on_faces), _ = self._bound(binding)
         rest, posed, barycentrics, offsets, quats, scales, triangles = addresses(given)
-        workspace = self._empty(self._size_with_kept if keep else self._size, dtype=torch.uint8)
+        workspace = self._empty(self._size_with_saved if keep else self._size, dtype=torch.uint8)
         out = self._empty(self._n, 3), self._empty(self._n, 4), self._empty(self._n, 3)
         base = workspace.data_ptr()
         rows, flat, face_quats = base + at["rows_of_faces"], base + at["flat_blocks"], base + at["face_quats"]
-        vertex_quats, of_vertices = base + at["vertex_quats"], base + at["vertex_area_ratio"]
+        vertex_quats, vertex_ratios = base + at["vertex_quats"], base + at["vertex_area_ratio"]
         of_faces = base + at["area_ratio"]
         self._rotate_faces(
             self._face_blocks, stream, self._n_vertices, self._n_faces, rest, faces, triangles, posed, face_quats,
@@ -228,12 +228,12 @@ class RidersPlan(_Plan):
         )  # fmt: skip
         self._rotate_vertices(
             self._vertex_blocks, stream, self._n_vertices, self._n_faces, corners.offsets.data_ptr(),
-            corners.entries.data_ptr(), rows, flat, face_quats, vertex_quats, of_vertices,
+            corners.entries.data_ptr(), rows, flat, face_quats, vertex_quats, vertex_ratios,
             *((base + at["signs"], base + at["sums"]) if keep else (0, 0)),
         )  # fmt: skip
-        self._ride(
-            self._rider_blocks, stream, *self._sizes, HALF_POWERS, posed, faces, on_vertices, on_faces, barycentrics,
-            vertex_quats, of_faces, of_vertices, offsets, quats, scales, *addresses(out),
+        self._pose_gaussians(
+            self._gaussian_blocks, stream, *self._sizes, HALF_POWERS, posed, faces, on_vertices, on_faces, barycentrics,
+            vertex_quats, of_faces, vertex_ratios, offsets, quats, scales, *addresses(out),
         )  # fmt: skip
         return *out, workspace
 
@@ -243,10 +243,10 @@ class RidersPlan(_Plan):
         return workspace[start : start + 16 * self._n_vertices].view(torch.float32).view(-1, 4).clone()
 
     def backward(
-        self, given: Riders, tables: Tables, workspace: Tensor, incoming: Any, needs: Any
+        self, given: GaussianInputs, binding: MeshBinding, workspace: Tensor, incoming: Any, needs: Any
     ) -> list[Tensor | None]:
-        """Gradients in the order of `Riders` from those by means, quaternions, scales and rotations of vertices."""
-        *by_gaussians, by_quats = aligned(*incoming)
+        """Gradients in the order of `GaussianInputs`; `incoming` are those by means, quats, scales and vertex quats."""
+        *by_gaussians, g_quats_out = aligned(*incoming)
         out: list[Tensor | None] = [
             self._empty(*tensor.shape) if tensor is not None and needed else None
             for tensor, needed in zip(given, needs, strict=True)
@@ -254,64 +254,68 @@ class RidersPlan(_Plan):
         stream = self._stream()
         surface = needs[0] or needs[1]
         passed = self._empty(self._passed_size, dtype=torch.uint8) if surface else None
-        by_vertices = by_turns = None
-        rides = any(g is not None for g in by_gaussians)
-        if rides:
+        by_vertices = g_vertex_quats = None
+        has_gaussians = any(g is not None for g in by_gaussians)
+        if has_gaussians:
             by_vertices = self._empty(self._n_vertices, 3) if needs[1] else None
-            by_turns = self._empty(self._n_vertices, 4) if surface else None
-            self._let_go(given, tables, workspace, (by_gaussians, out[2:6]), passed, (by_vertices, by_turns), stream)
+            g_vertex_quats = self._empty(self._n_vertices, 4) if surface else None
+            self._gaussians_backward(
+                given, binding, workspace, (by_gaussians, out[2:6]), passed, (by_vertices, g_vertex_quats), stream
+            )
         if passed is None:
-            return out if rides else [None] * len(out)
-        if by_quats is not None:
-            by_turns = by_quats if by_turns is None else by_turns.add_(by_quats)
-        self._turn_back(given, tables, workspace, by_turns, passed, rides, out, stream)
+            return out if has_gaussians else [None] * len(out)
+        if g_quats_out is not None:
+            g_vertex_quats = g_quats_out if g_vertex_quats is None else g_vertex_quats.add_(g_quats_out)
+        self._rotations_backward(given, binding, workspace, g_vertex_quats, passed, has_gaussians, out, stream)
         if by_vertices is not None and out[1] is not None:
             out[1].add_(by_vertices)
-        return out if rides else [*out[:2], *[None] * (len(out) - 2)]
+        return out if has_gaussians else [*out[:2], *[None] * (len(out) - 2)]
 
-    def _let_go(
-        self, given: Riders, tables: Tables, workspace: Tensor, gradients: tuple[Any, Any], passed: Tensor | None,
-        of_vertices: tuple[Tensor | None, Tensor | None], stream: int,
+    def _gaussians_backward(
+        self, given: GaussianInputs, binding: MeshBinding, workspace: Tensor, gradients: tuple[Any, Any],
+        passed: Tensor | None, of_vertices: tuple[Tensor | None, Tensor | None], stream: int,
     ) -> None:  # fmt: skip
         """The adjoint of the Gaussians: from `gradients[0]` to `gradients[1]`, `passed` and those `of_vertices`."""
         at, base, there = self._at, workspace.data_ptr(), self._passed_at
-        _, (faces, on_vertices, on_faces), bound = self._bound(tables)
+        _, (faces, on_vertices, on_faces), bound = self._bound(binding)
         _, posed, barycentrics, offsets, quats, scales, _ = addresses(given)
         incoming, (g_barycentrics, g_offsets, g_quats, g_scales) = gradients
         to = 0 if passed is None else passed.data_ptr()
         rows, weights, by_ratio = ((to and to + there[name]) for name in ("gaussian_rows", "weights", "by_ratio"))
-        self._launch(riders.pose_mesh_gaussians_backward)(
-            self._rider_blocks, stream, *self._sizes, HALF_POWERS, posed, faces, on_vertices, on_faces, barycentrics,
+        self._launch(mesh_gaussians.pose_mesh_gaussians_backward)(
+            self._gaussian_blocks, stream, *self._sizes, HALF_POWERS, posed, faces, on_vertices, on_faces, barycentrics,
             base + at["vertex_quats"], base + at["area_ratio"], base + at["vertex_area_ratio"], offsets, quats, scales,
             *addresses(incoming), rows, weights, by_ratio,
             *addresses((g_barycentrics, g_quats, g_scales, g_offsets)),
         )  # fmt: skip
         if passed is None:
             return
-        at_vertices = find_gaussians(*tables, self._n_vertices, transposed=True).at_vertices
+        at_vertices = find_gaussians(*binding, self._n_vertices, transposed=True).at_vertices
         assert at_vertices is not None
-        self._launch(riders.gather_mesh_gaussians)(
-            block_count(self._n_vertices, riders.BLOCK) + block_count(self._n_faces, riders.BLOCK), stream,
-            *self._sizes, barycentrics, rows, weights, by_ratio, at_vertices.offsets.data_ptr(),
+        self._launch(mesh_gaussians.gather_mesh_gaussians)(
+            block_count(self._n_vertices, mesh_gaussians.BLOCK) + block_count(self._n_faces, mesh_gaussians.BLOCK),
+            stream, *self._sizes, barycentrics, rows, weights, by_ratio, at_vertices.offsets.data_ptr(),
             at_vertices.entries.data_ptr(), bound.on_faces.offsets.data_ptr(), bound.on_faces.entries.data_ptr(),
             *addresses(of_vertices), to + there["vertex_area_ratio"] if self._p else 0, to + there["area_ratio"],
         )  # fmt: skip
 
-    def _turn_back(
-        self, given: Riders, tables: Tables, workspace: Tensor, by_turns: Tensor | None, passed: Tensor, rides: bool,
-        out: list[Tensor | None], stream: int,
+    def _rotations_backward(
+        self, given: GaussianInputs, binding: MeshBinding, workspace: Tensor, g_vertex_quats: Tensor | None,
+        passed: Tensor, has_gaussians: bool, out: list[Tensor | None], stream: int,
     ) -> None:  # fmt: skip
         """The adjoint of the rotations, into the first two of `out`."""
         at, base, there, to = self._at, workspace.data_ptr(), self._passed_at, passed.data_ptr()
-        corners, (faces, _, _), _ = self._bound(tables)
+        corners, (faces, _, _), _ = self._bound(binding)
         rest, posed, *_, triangles = addresses(given)
         edges = [to + there[name] if g is not None else 0
                  for name, g in zip(("rest_edges", "posed_edges"), out, strict=False)]  # fmt: skip
-        kept = [base + at[name] for name in ("vertex_quats", "face_quats", "vertex_area_ratio", "signs", "sums")]
-        ratios = (to + there["area_ratio"], to + there["vertex_area_ratio"] if self._p else 0) if rides else (0, 0)
+        saved = [base + at[name] for name in ("vertex_quats", "face_quats", "vertex_area_ratio", "signs", "sums")]
+        ratios = (
+            (to + there["area_ratio"], to + there["vertex_area_ratio"] if self._p else 0) if has_gaussians else (0, 0)
+        )
         self._launch(rotations.rotate_faces_backward)(
-            self._face_blocks, stream, self._n_vertices, self._n_faces, rest, faces, triangles, posed, *kept,
-            *addresses((by_turns,)), 0, *ratios, *edges,
+            self._face_blocks, stream, self._n_vertices, self._n_faces, rest, faces, triangles, posed, *saved,
+            *addresses((g_vertex_quats,)), 0, *ratios, *edges,
         )  # fmt: skip
         self._launch(rotations.gather_edges)(
             self._vertex_blocks, stream, self._n_vertices, self._n_faces, corners.offsets.data_ptr(),
@@ -319,5 +323,5 @@ class RidersPlan(_Plan):
         )  # fmt: skip
 
 
-def _alive(references: Any, tables: Tables) -> bool:
-    return all(r is t if r is None else r() is t for r, t in zip(references, tables, strict=True))
+def _alive(references: Any, binding: MeshBinding) -> bool:
+    return all(r is t if r is None else r() is t for r, t in zip(references, binding, strict=True))
