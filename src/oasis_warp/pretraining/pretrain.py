@@ -193,7 +193,7 @@ class Trainer(ABC, Generic[Network, Batch]):
         broken = (~torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip).isfinite()).float()
         self.skipped += broken
         if self.process.device.type == "cuda":
-            # As torch.amp.GradScaler does: where this is 1, fused Adam changes nothing, and nobody waits for the device.
+            # As torch.amp.GradScaler does: where this is 1, fused Adam changes nothing and nobody waits for the device.
             self.optimizer.found_inf = broken
             self.optimizer.step()
         elif not broken:
