@@ -29,8 +29,10 @@ CAP_RINGS = 12
 """Steps of the cap's rings from the rim to its middle: about as far apart as the rim's vertices."""
 INDENT = 0.003
 """How far the cap's widest Gaussians stay inside the rim, where they would make a collar [m]."""
-WHOLE_DISC = math.sqrt(2)
-"""Times by which the rim's vertex Gaussians are wider than for the skin on their one side: half discs are teeth."""
+RIM_PARTS = -1 / 3, 0.0, 1 / 3
+"""Places of Gaussians along the edges at a vertex of the rim, as shares of the edge: one on each vertex makes teeth."""
+RIM_SPREAD = 0.8
+"""Standard deviation of the rim's Gaussians over their distance."""
 CAP_SPREAD = 1.9
 """Standard deviations of the cap's Gaussians over those of vertex Gaussians: no face Gaussians fill their gaps."""
 
@@ -53,10 +55,12 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     own = torch.cat([at_vertices[gaussians.vertex_index], at_faces[gaussians.face_index]])
     kept = gaussians._replace(opacities=(gaussians.opacities / own.clamp_min(END)).clamp(max=OPACITY))
     kept, n_kept = select(kept, own > END), int((own[: len(gaussians.vertex_index)] > END).sum())
-    vertices, on_faces = (torch.nonzero(part < OVERLAP)[:, 0] for part in (at_vertices, at_faces))
+    inside = torch.ones_like(at_vertices).index_fill(0, rim, 0) > 0
+    vertices, on_faces = (torch.nonzero(part)[:, 0] for part in ((at_vertices < OVERLAP) & inside, at_faces < OVERLAP))
     rows = vertices, len(rest) + on_faces
-    index, offsets, cap_quats, cap_scales = rim_cap(rest, rim)
-    scales = full.scales[0].index_copy(0, rim, WHOLE_DISC * full.scales[0, rim])
+    end = rim_line(rest, rim, full.quats[0, rim]), rim_cap(rest, rim)
+    index, offsets, end_quats, end_scales = (torch.cat(parts) for parts in zip(*end, strict=True))
+    scales = full.scales[0]
     points = torch.cat([rest[vertices], rest[index] + offsets])
     looks = gaussians.colors if gaussians.shade is None else torch.cat([gaussians.colors, gaussians.shade], 1)
     read = [_smoothed(gaussians, looks, own, rest, faces, rim, at) for at in (points, rest[faces[on_faces]].mean(1))]
@@ -75,8 +79,8 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
         torch.cat([kept.offsets, torch.zeros_like(rest[vertices]), offsets]),
         torch.cat([kept.face_index, on_faces]),
         torch.cat([kept.barycentrics, rest.new_full((len(on_faces), 3), 1 / 3)]),
-        joined(kept.quats, torch.cat([full.quats[0, rows[0]], cap_quats]), full.quats[0, rows[1]]),
-        joined(kept.scales, torch.cat([scales[rows[0]], cap_scales]), scales[rows[1]]),
+        joined(kept.quats, torch.cat([full.quats[0, rows[0]], end_quats]), full.quats[0, rows[1]]),
+        joined(kept.scales, torch.cat([scales[rows[0]], end_scales]), scales[rows[1]]),
         joined(kept.opacities, *(rest.new_full((len(part),), OPACITY) for part in (points, on_faces))),
         joined(colors, *(part[:, :3] for part in read)),
         None if shade is None else joined(shade, *(part[:, 3:] for part in read)),
@@ -96,6 +100,18 @@ def _smoothed(
     near = torch.cdist(points, centers[before]).square()
     spread = SMOOTHING**2 + near.amin(1, keepdim=True)
     return torch.softmax(-0.5 * near / spread, 1) @ looks[before]
+
+
+def rim_line(
+    rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"], quats: Float[Tensor, "R 4"]
+) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"], Float[Tensor, "M 4"], Float[Tensor, "M 3"]]:
+    """Vertex Gaussians along the rim, as `rim_cap` gives them, with the orientations of its vertices."""
+    edge, n = rest[rim], len(RIM_PARTS)
+    before, after = edge.roll(1, 0) - edge, edge.roll(-1, 0) - edge
+    offsets = torch.stack([part * after if part > 0 else -part * before for part in RIM_PARTS], 1).flatten(0, 1)
+    spread = RIM_SPREAD / n * (before.norm(dim=1) + after.norm(dim=1)) / 2
+    scales = torch.stack([spread, spread, THICKNESS * spread], 1)
+    return rim.repeat_interleave(n), offsets, quats.repeat_interleave(n, 0), scales.repeat_interleave(n, 0)
 
 
 def rim_cap(
