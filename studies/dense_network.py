@@ -29,7 +29,7 @@ from studies.tables import Column, Section, distribution, markdown, mean, percen
 PHOTOS_EACH = 4
 CLAIMED = 0.9
 """Share of coordinates that lie within this quantile of their Laplace distribution, if the confidence is true."""
-LEAST_SKIN = 200
+MIN_SKIN = 200
 """Pixels of visible skin below which a photo says little."""
 SHOWN = ("palm_flat_right_03.jpg", "two_fingers_dark_skin_16.jpg", "ok_sign_left_10.jpg", "pointing_side_right_11.jpg")
 """Photos of the tests that are drawn."""
@@ -62,7 +62,7 @@ class Options(StudyOptions):
 def errors(said: DensePrediction, true: DenseBatch, k: int) -> Row | None:
     """What is wrong in photo `k`; None where hardly any skin is visible."""
     skin = true.skin[k]
-    if int(skin.sum()) < LEAST_SKIN:
+    if int(skin.sum()) < MIN_SKIN:
         return None
     off = (said.surface[k] - true.surface[k])[:, skin]
     distance = off.norm(dim=0) * UNIT * 1e3

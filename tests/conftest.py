@@ -7,7 +7,7 @@ import jaxtyping
 import pytest
 import torch
 
-MOST_WORKERS, MOST_ON_GPU = 8, 2
+MAX_WORKERS, MAX_ON_GPU = 8, 2
 """Each takes up to a gigabyte of memory, and one on the device."""
 THREADS = torch.get_num_threads()
 
@@ -22,7 +22,7 @@ def pytest_xdist_auto_num_workers(config):
     cores = yield
     if any(".py" in argument for argument in config.args):
         return 0
-    return min(cores, MOST_ON_GPU if torch.cuda.is_available() else MOST_WORKERS)
+    return min(cores, MAX_ON_GPU if torch.cuda.is_available() else MAX_WORKERS)
 
 
 def pytest_collection_modifyitems(config, items):

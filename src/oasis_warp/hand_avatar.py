@@ -48,7 +48,7 @@ from oasis_warp.ops.checks import check_shape
 from oasis_warp.render.render import render
 from oasis_warp.render.replay import CapturedGraph, GraphCache, replayable, replayed
 
-LEAST_LIGHT, MOST_LIGHT = 0.05, 10.0
+MIN_LIGHT, MAX_LIGHT = 0.05, 10.0
 """Limits of a light from all around, over its mean: nine harmonics of a small lamp fall below 0 behind it."""
 
 
@@ -255,11 +255,11 @@ class Avatar:
         """
         level = self.shape.new_ones(3) if self.light is None else self.light.even
         around = harmonics.to(level) * level.mean()
-        limits = around[0].mean() * around.new_tensor([LEAST_LIGHT, MOST_LIGHT])[:, None].expand(2, 3)
+        limits = around[0].mean() * around.new_tensor([MIN_LIGHT, MAX_LIGHT])[:, None].expand(2, 3)
         albedo = None if self.light is None else self.light.albedo
         if albedo is None:
             albedo = self._mean_albedo(level)
-        light = HandLight(around, limits.contiguous(), around[0].clamp_min(LEAST_LIGHT), albedo=albedo)
+        light = HandLight(around, limits.contiguous(), around[0].clamp_min(MIN_LIGHT), albedo=albedo)
         if self.side == "left":
             light = mirror_light(light)
         if self.light is not None:

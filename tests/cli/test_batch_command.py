@@ -9,7 +9,7 @@ import pytest
 from disk import full_disk
 
 from oasis_warp.cli import batch, batch_cluster, batch_work, main
-from oasis_warp.cli.batch_work import MOST_TRIES, Order, make_avatars
+from oasis_warp.cli.batch_work import MAX_TRIES, Order, make_avatars
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 
@@ -102,7 +102,7 @@ def test_a_photo_that_ends_its_process_again_and_again_is_left_out(pipeline, pho
     names = [photo("bomb.png", 7), photo("a.png", 9)]
     with monkeypatch.context() as patch:
         patch.setattr(batch_work, "reconstruct", die)
-        for _ in range(MOST_TRIES):
+        for _ in range(MAX_TRIES):
             with pytest.raises(SystemExit):
                 make_avatars(names, order)
     assert make_avatars(names, order) == {"made": 1, "refused": 0, "failed": 1, "kept": 0}

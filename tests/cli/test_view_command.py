@@ -18,8 +18,8 @@ import torch
 
 from oasis_warp.cli import jobs as jobs_module
 from oasis_warp.cli import main
-from oasis_warp.cli.jobs import MOST_WAITING, RESULTS, Jobs
-from oasis_warp.cli.serve import MOST_BYTES, FormServer
+from oasis_warp.cli.jobs import MAX_WAITING, RESULTS, Jobs
+from oasis_warp.cli.serve import MAX_BYTES, FormServer
 from oasis_warp.cli.view import PageServer
 from oasis_warp.core.errors import InputError
 from oasis_warp.export import export_avatar
@@ -261,7 +261,7 @@ def test_strangers_and_other_sites_get_nothing(form_server):
     [
         ("script.py", {}, 422, "script.py: expected a picture, .jpg"),
         ("", {}, 422, "expected a picture"),
-        ("a.jpg", {"Content_Length": str(MOST_BYTES + 1)}, 413, "more than 64 MB"),
+        ("a.jpg", {"Content_Length": str(MAX_BYTES + 1)}, 413, "more than 64 MB"),
         ("a.jpg", {"Content_Length": "-1"}, 411, ""),
     ],
 )
@@ -279,10 +279,10 @@ def look(jobs, job):
 
 def test_a_full_queue_is_said(program, tmp_path):
     jobs = Jobs(tmp_path / "served")
-    first = [jobs.add("a.jpg", b"photo") for _ in range(MOST_WAITING)]
+    first = [jobs.add("a.jpg", b"photo") for _ in range(MAX_WAITING)]
     with pytest.raises(InputError, match="16 photos are waiting already"):
         jobs.add("a.jpg", b"photo")
-    assert [look(jobs, job).ahead for job in first] == list(range(MOST_WAITING))
+    assert [look(jobs, job).ahead for job in first] == list(range(MAX_WAITING))
 
 
 def test_a_restart_goes_on_with_what_waited_and_loses_nothing(form_server, tmp_path):
@@ -299,7 +299,7 @@ def test_a_restart_goes_on_with_what_waited_and_loses_nothing(form_server, tmp_p
 
 
 def test_a_photo_that_takes_too_long_is_ended(program, tmp_path, monkeypatch):
-    monkeypatch.setattr(jobs_module, "MOST_SECONDS", 0.5)
+    monkeypatch.setattr(jobs_module, "MAX_SECONDS", 0.5)
     jobs = Jobs(tmp_path / "served")
     job = jobs.add("a.jpg", b"slow")
     worker = threading.Thread(target=jobs.work)

@@ -293,7 +293,7 @@ def test_a_hundred_megapixels_are_scaled_down_in_bounded_memory(tmp_path, suffix
     assert grown < limit
 
 
-MOST_GROWTH = 300 << 20
+MAX_GROWTH = 300 << 20
 """Of the process's peak memory while one picture is refused [bytes]."""
 
 
@@ -348,7 +348,7 @@ def test_a_hostile_picture_is_refused_at_once_and_without_memory(tmp_path, name)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(InputError, match=words):
         read_photo(tmp_path / "photo")
-    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10 < len(data) + MOST_GROWTH
+    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10 < len(data) + MAX_GROWTH
 
 
 @pytest.mark.timeout(20)
@@ -362,7 +362,7 @@ def test_an_avif_that_takes_more_memory_than_its_header_says_is_refused(tmp_path
     assert read_photo(tmp_path / "photo.avif").rgb.shape == (48, 64, 3)
     child = tmp_path / "child.py"
     source = Path(limited_decoding.__file__).read_text()
-    child.write_text(source.replace("MOST_BYTES, MOST_SECONDS = 4 << 30", "MOST_BYTES, MOST_SECONDS = 1 << 20"))
+    child.write_text(source.replace("MAX_BYTES, MAX_SECONDS = 4 << 30", "MAX_BYTES, MAX_SECONDS = 1 << 20"))
     monkeypatch.setattr(limited_decoding, "__file__", str(child))
     with pytest.raises(InputError, match="damaged or cut short"):
         read_photo(tmp_path / "photo.avif")

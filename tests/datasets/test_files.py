@@ -9,7 +9,7 @@ import torch
 from datasets.trees import WRITERS
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.datasets.files import MOST_BYTES, Tree
+from oasis_warp.datasets.files import MAX_BYTES, Tree
 from oasis_warp.datasets.readers import read_dataset, read_selection
 from oasis_warp.datasets.samples import load_picture
 from oasis_warp.hand.mano import read_mano
@@ -73,7 +73,7 @@ def test_bombs_and_damage_are_refused_or_named(tmp_path):
     archive_of(tmp_path / "a.tar", ("one", b"1" * 600), ("two", b"2" * 600), ("three", b"3" * 600))
     whole = (tmp_path / "a.tar").read_bytes()
     huge = tarfile.TarInfo("huge")
-    huge.size = MOST_BYTES + 1
+    huge.size = MAX_BYTES + 1
     cases = {
         "has more than 256 MB": huge.tobuf() + bytes(2048), "three is cut short": whole[:3800],
         "is damaged after 1536 bytes": whole[:1536] + b"x" * 512 + whole[2048:],

@@ -200,7 +200,7 @@ def test_a_file_that_is_none_is_refused(kind, suffix, mano_dir, photo, tmp_path)
 
 
 def test_an_archive_that_unpacks_without_end_is_refused_before_it_does(photo, tmp_path, monkeypatch):
-    monkeypatch.setattr(mano_estimates, "MOST_BYTES", 1 << 20)
+    monkeypatch.setattr(mano_estimates, "MAX_BYTES", 1 << 20)
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("right.npy", bytes(3 << 20))
     with pytest.raises(InputError, match="unpacks to more than 1 MB"):

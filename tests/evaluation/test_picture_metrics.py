@@ -14,7 +14,7 @@ from oasis_warp.evaluation.kernel_distance import (
     kernel_distance,
     kernel_distances,
 )
-from oasis_warp.evaluation.metrics import ERROR_FLOOR, FEWEST_PIXELS, MEASURES, TargetTruth, match_colors, score
+from oasis_warp.evaluation.metrics import ERROR_FLOOR, MEASURES, MIN_PIXELS, TargetTruth, match_colors, score
 from oasis_warp.losses.image import SSIM_C1
 
 SIDE, LOW, HIGH = 64, 16, 48
@@ -78,7 +78,7 @@ def test_parts_are_told_apart():
 
 def test_of_a_part_of_few_pixels_nothing_is_said():
     few = torch.zeros(SIDE, SIDE, dtype=torch.bool)
-    few[30, 20 : 20 + FEWEST_PIXELS // 2] = True
+    few[30, 20 : 20 + MIN_PIXELS // 2] = True
     found = score(square().image, square(hidden=few))
     assert found["psnr_hidden"] is None
     assert found["psnr_visible"] is not None and found["psnr_stretched"] is None

@@ -165,7 +165,7 @@ def test_an_avatar_without_light_of_its_own_begins_in_even_light(right_hand):
         ("sky.js", "LIFT", sky_exposure.LIFT),
         ("posing.js", "FLAT", posing.FLAT),
         ("posing.js", "DAMPING", posing.DAMPING),
-        ("posing.js", "MOST_GROWTH", posing.LIMIT),
+        ("posing.js", "MAX_GROWTH", posing.LIMIT),
         ("projection.js", "EPS2D", constants.EPS2D),
         ("projection.js", "JACOBIAN_LIMIT", constants.JACOBIAN_LIMIT),
         ("raster.js", "EXACT = { opaque: 1 / 100, reach:", constants.EXTENT_SIGMAS),

@@ -3,7 +3,7 @@
 Each of the jobs is a process of its own with one thread, which notes its memory after a thousand times (a tenth of its
 share if that is less), every `EVERY` seconds and at its end, as lines of JSON in --out. What stands there counts: the
 same command goes on until all jobs together have --count, or --seconds are over. Then it prints a line of JSON with the
-growth of each process's memory since its first note; the exit code is 1 if one grew by more than `MOST_GROWTH`.
+growth of each process's memory since its first note; the exit code is 1 if one grew by more than `MAX_GROWTH`.
 """
 
 import argparse
@@ -37,7 +37,7 @@ EARLY = 1000
 EVERY = 20.0
 FIT_PIXELS = 160 * 160
 """Of the photo that is fitted: the hand in it is some 100 pixels large."""
-MOST_GROWTH = 2.0
+MAX_GROWTH = 2.0
 """Of memory since its first note [%]."""
 
 
@@ -148,7 +148,7 @@ def main() -> int:
     found = {"kind": options.kind, **total(read_lines(options.out, options.kind))}
     found["failed"] = sum(job.exitcode != 0 for job in jobs)
     print(json.dumps(found))
-    return int(bool(found["failed"] or (found["most growth %"] or 0) > MOST_GROWTH))
+    return int(bool(found["failed"] or (found["most growth %"] or 0) > MAX_GROWTH))
 
 
 if __name__ == "__main__":

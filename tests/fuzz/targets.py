@@ -31,7 +31,7 @@ from oasis_warp.network.config import COMPACT, NetworkConfig
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, save_network
 
-MOST_SECONDS, MOST_GROWTH = 10.0, 1 << 30
+MAX_SECONDS, MAX_GROWTH = 10.0, 1 << 30
 """Of one file: processor time, and growth of the peak memory [bytes]."""
 LONGEST = 1100
 """Letters of a sentence."""
@@ -69,8 +69,8 @@ def run(target: Target, seed: int, index: int, folder: Path) -> str:
         assert said.isprintable() and said.endswith(".") and len(said) < LONGEST, said
     seconds = time.process_time() - start
     growth = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10
-    assert seconds < MOST_SECONDS, f"{seconds:.0f} s"
-    assert growth < MOST_GROWTH, f"{growth >> 20} MB"
+    assert seconds < MAX_SECONDS, f"{seconds:.0f} s"
+    assert growth < MAX_GROWTH, f"{growth >> 20} MB"
     return outcome
 
 

@@ -21,8 +21,8 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.losses.image import masked_psnr
 from oasis_warp.network import prior as home
 from oasis_warp.network.prior import (
-    LEAST_OPACITY,
-    MOST_SCALE,
+    COVERING_OPACITY,
+    MAX_SCALE,
     RIM_FIRST,
     RIM_LAST,
     NetworkPrior,
@@ -128,9 +128,9 @@ def test_no_gaussian_floats_off_the_skin(network, hand, crops):
     held = hold_to_surface(wild, surface_of(network, crop))
     above = (held.offsets[0] * surface.vertex_normals(rest, network.faces)).sum(-1)
     assert float(above.max()) < 1e-6
-    assert float(held.scales.max()) <= 1.001 * MOST_SCALE
+    assert float(held.scales.max()) <= 1.001 * MAX_SCALE
     guess = prior(crop)
-    assert float(guess.scales.max()) <= 1.001 * MOST_SCALE
+    assert float(guess.scales.max()) <= 1.001 * MAX_SCALE
 
 
 def test_faint_black_gaussians_leave_no_holes_and_no_specks_in_the_skin(network, hand, crops):
@@ -144,7 +144,7 @@ def test_faint_black_gaussians_leave_no_holes_and_no_specks_in_the_skin(network,
     holes = prediction._replace(opacities=opacities, colors=colors)
     covered = cover_surface(holes, surface_of(network, crop))
     fade = rim_fade(crop.rest.vertices[None], network.rim)[0]
-    assert float((covered.opacities[0, :n] - LEAST_OPACITY * fade).min()) > -1e-6
+    assert float((covered.opacities[0, :n] - COVERING_OPACITY * fade).min()) > -1e-6
     assert float((covered.colors[0, :n][fade > 0.1] - 0.6).abs().max()) < 1e-3
     torch.testing.assert_close(covered.scales[0, :n][faint], prediction.anchor_scales[0, :n][faint], rtol=1e-2, atol=0)
     normals = surface.vertex_normals(crop.rest.vertices, network.faces)

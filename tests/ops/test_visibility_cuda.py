@@ -67,7 +67,7 @@ def test_neither_a_full_queue_nor_few_blocks_lose_a_face(scene, monkeypatch):
     want = depth_map(*in_float64(arguments))
     for queue, blocks in ((0, 1 << 22), (3, 2), (1 << 17, 5)):
         monkeypatch.setattr(depth_buffer_cuda, "QUEUE", queue)
-        monkeypatch.setattr(depth_cuda, "MOST_BLOCKS", blocks)
+        monkeypatch.setattr(depth_cuda, "MAX_BLOCKS", blocks)
         assert_same_picture(depth_map(*arguments), want)
 
 
@@ -123,7 +123,7 @@ def test_repeats_and_few_blocks_give_the_same_bits(monkeypatch):
     arguments = on("cuda", scoring(1))
     first = graded(*arguments)
     for blocks in (1, 2, 1 << 22):
-        monkeypatch.setattr(depth_cuda, "MOST_BLOCKS", blocks)
+        monkeypatch.setattr(depth_cuda, "MAX_BLOCKS", blocks)
         monkeypatch.setattr(depth_buffer_cuda, "PEAKS", min(blocks, 1024))
         for _ in range(5):
             again = graded(*arguments)

@@ -173,7 +173,7 @@ def test_scores_and_gradients_are_those_of_the_plain_kernels(dtype, plainly):
 
 
 def test_neither_threads_nor_parts_of_the_mesh_change_a_bit(hand, with_threads, monkeypatch):
-    monkeypatch.setattr(depth_buffer, "FACES_A_PART", 7)
+    monkeypatch.setattr(depth_buffer, "FACES_PER_PART", 7)
     for scene in (small_faces, one_surface_triangulated_twice, across_the_near_plane):
         vertices, faces, viewmat, K, width, height = make(scene, 1, 130, 47, torch.float32)
 
@@ -204,7 +204,7 @@ def test_nothing_is_written_past_a_buffer(monkeypatch):
         return memory[GUARD : GUARD + size].view(like.dtype).view(like.shape)
 
     monkeypatch.setattr(depth_buffer.DepthScene, "empty", empty)
-    monkeypatch.setattr(depth_buffer, "FACES_A_PART", 20)
+    monkeypatch.setattr(depth_buffer, "FACES_PER_PART", 20)
     for dtype in (torch.float32, torch.float64):
         for seed, (width, height) in enumerate(SIZES):
             for scene in SCENES:

@@ -25,7 +25,7 @@ void transform(unsigned long long address) {
     typedef float F __attribute__((ext_vector_type(8)));
     typedef int I4 __attribute__((ext_vector_type(4)));
     typedef int I4U __attribute__((ext_vector_type(4), aligned(4)));
-    const int ranges = wp::max((job.n_vertices + VERTICES_A_TASK - 1) / VERTICES_A_TASK, 1);
+    const int ranges = wp::max((job.n_vertices + VERTICES_PER_TASK - 1) / VERTICES_PER_TASK, 1);
     const double units = (double)(1 << job.fraction_bits);
     const double reach = (double)(1 << 30) / units;  // of fixed point round the picture's middle [px]
     const double middle_x = width / 2, middle_y = height / 2;
@@ -34,8 +34,8 @@ void transform(unsigned long long address) {
     for (;;) {
         const int task = __atomic_fetch_add(&job.next_transform, 1, __ATOMIC_RELAXED);
         if (task >= job.batch * ranges) break;
-        const int b = task / ranges, first = task % ranges * VERTICES_A_TASK;
-        const int end = wp::min(first + VERTICES_A_TASK, job.n_vertices);
+        const int b = task / ranges, first = task % ranges * VERTICES_PER_TASK;
+        const int end = wp::min(first + VERTICES_PER_TASK, job.n_vertices);
         const View view = view_of(b);
         found |= view.bad;
         const T* vertices = (const T*)job.vertices + b * job.vertices_step;

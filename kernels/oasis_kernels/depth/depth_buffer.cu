@@ -52,10 +52,10 @@ __global__ void draw(
     __shared__ Camera camera;
     __shared__ Small smalls[WARPS][FACES];
     Small* small = smalls[warp];
-    const int groups = (n_faces - 1) / FACES_A_BLOCK + 1;
+    const int groups = (n_faces - 1) / FACES_PER_BLOCK + 1;
     int entry = -1;
     for (long long task = block_index; task < (long long)batch * groups; task += gridDim.x) {
-        const int b = (int)(task / groups), first = (int)(task % groups) * FACES_A_BLOCK + FACES * warp;
+        const int b = (int)(task / groups), first = (int)(task % groups) * FACES_PER_BLOCK + FACES * warp;
         const float* mesh = vertices + b * vertices_step;
         const bool has_corner = lane < 3 * FACES && first + lane / 3 < n_faces;
         float px = 0.f, py = 0.f, pz = 0.f;

@@ -9,7 +9,7 @@ from oasis_kernels.runtime.cuda_native import CudaNative, cuda_native
 
 BLOCK = 256
 """Threads of a block."""
-FACES_A_BLOCK = 64
+FACES_PER_BLOCK = 64
 LARGE = 256
 """Pixels of a box above which a face goes to the queue."""
 SHARE = 512
@@ -21,13 +21,13 @@ QUEUE = 1 << 17
 START_BITS = 44
 """Of the queue's counter, for the number of shares; the bits above count faces. A picture has fewer than 2^31 pixels,
 so that 2^17 faces fit; what other warps add while the queue fills up, eight faces each, fits as well."""
-MOST_PIXELS = 4
+MAX_PIXELS = 4
 """Pixels of a thread of `resolve`."""
 PEAKS = 1024
 """Blocks of `pull` at the most."""
 CONSTANTS = {
-    "FACES_A_BLOCK": FACES_A_BLOCK, "LARGE": LARGE, "SHARE": SHARE, "START_BITS": START_BITS,
-    "WORTH_A_LOOK": WORTH_A_LOOK, "MOST_PIXELS": MOST_PIXELS,
+    "FACES_PER_BLOCK": FACES_PER_BLOCK, "LARGE": LARGE, "SHARE": SHARE, "START_BITS": START_BITS,
+    "WORTH_A_LOOK": WORTH_A_LOOK, "MAX_PIXELS": MAX_PIXELS,
 }  # fmt: skip
 
 

@@ -9,16 +9,16 @@ import warp as wp
 
 from oasis_kernels.runtime.native import cpu_options, defined, header_source, kernel_source
 
-VERTICES_A_TASK = 16384
-POINTS_A_TASK = 2048
-QUADS_A_TASK = 8
+VERTICES_PER_TASK = 16384
+POINTS_PER_TASK = 2048
+QUADS_PER_TASK = 8
 """Rows of blocks that `write` takes at a time."""
 SPARE_COLUMNS = 4
 """Columns of a buffer past the picture's last, for blocks that reach beyond it."""
 CONSTANTS = {
-    "VERTICES_A_TASK": VERTICES_A_TASK,
-    "POINTS_A_TASK": POINTS_A_TASK,
-    "QUADS_A_TASK": QUADS_A_TASK,
+    "VERTICES_PER_TASK": VERTICES_PER_TASK,
+    "POINTS_PER_TASK": POINTS_PER_TASK,
+    "QUADS_PER_TASK": QUADS_PER_TASK,
     "SPARE_COLUMNS": SPARE_COLUMNS,
 }
 C_TYPES = {"long long": ctypes.c_longlong, "int": ctypes.c_int, "double": ctypes.c_double}

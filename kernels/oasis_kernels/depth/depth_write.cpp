@@ -9,12 +9,12 @@ void write(unsigned long long address) {
     typedef T T8U __attribute__((ext_vector_type(8), aligned(sizeof(T))));
     typedef int I8 __attribute__((ext_vector_type(8)));
     typedef int I8U __attribute__((ext_vector_type(8), aligned(4)));
-    const int tasks = (quads + QUADS_A_TASK - 1) / QUADS_A_TASK;
+    const int tasks = (quads + QUADS_PER_TASK - 1) / QUADS_PER_TASK;
     const I8 index8 = {0, 1, 2, 3, 4, 5, 6, 7};
     for (;;) {
         const int task = __atomic_fetch_add(&job.next_write, 1, __ATOMIC_RELAXED);
         if (task >= job.batch * tasks) break;
-        const int entry = task / tasks, first = task % tasks * QUADS_A_TASK;
+        const int entry = task / tasks, first = task % tasks * QUADS_PER_TASK;
         const Scene scene = {view_of(entry), (const double*)job.camera_vertices + 4ll * entry * job.n_vertices};
         const View& view = scene.view;
         T* depth = (T*)job.depth + (long long)entry * height * width;
@@ -94,7 +94,7 @@ void write(unsigned long long address) {
             if (n > 8) write_exactly(x + 8, y, n - 8, shown.hi);
         };
 
-        const int end = wp::min(first + QUADS_A_TASK, quads);
+        const int end = wp::min(first + QUADS_PER_TASK, quads);
         for (int quad = first; quad < end; quad++)
             for (int x = 0; x < width; x += 16) {
                 const long long i = (long long)quad * stride + 4 * x;

@@ -5,7 +5,7 @@ void score(unsigned long long address) {
 #include "vectors.h"
     typedef int I __attribute__((ext_vector_type(8)));
     typedef int I8U __attribute__((ext_vector_type(8), aligned(4)));
-    const int ranges = (job.n_points + POINTS_A_TASK - 1) / POINTS_A_TASK;
+    const int ranges = (job.n_points + POINTS_PER_TASK - 1) / POINTS_PER_TASK;
     const int* vertex_of = (const int*)job.point_vertices;
     const double per_tau = 1.0 / job.tau;
     // e^-x for x >= 0: 2^-n with n the whole number nearest to x / ln 2, times the series of the rest, |r| < 0.35.
@@ -35,8 +35,8 @@ void score(unsigned long long address) {
     for (;;) {
         const int task = __atomic_fetch_add(&job.next_score, 1, __ATOMIC_RELAXED);
         if (task >= job.batch * ranges) break;
-        const int b = task / ranges, first = task % ranges * POINTS_A_TASK;
-        const int end = wp::min(first + POINTS_A_TASK, job.n_points);
+        const int b = task / ranges, first = task % ranges * POINTS_PER_TASK;
+        const int end = wp::min(first + POINTS_PER_TASK, job.n_points);
         const View view = view_of(b);
         const T* points = (const T*)job.points + b * job.points_step;
         const double* camera = (const double*)job.camera_vertices + 4ll * b * job.n_vertices;

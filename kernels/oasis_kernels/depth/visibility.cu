@@ -23,7 +23,7 @@ __global__ void resolve(
     float* depth,              // [batch][height][width], or 0
     int* face_ids,             // [batch][height][width], or 0
     float* barycentrics,       // [batch][height][width][3], or 0
-    int pixels_a_thread,       // up to MOST_PIXELS
+    int pixels_a_thread,       // up to MAX_PIXELS
     volatile long long* found  // set to 1 where a point's vertex is none; or 0
 ) {
 #include "camera_cuda.h"
@@ -115,9 +115,9 @@ __global__ void resolve(
         const long long tasks = scores ? point_tasks : pixel_tasks, place = scores ? task : task - scored;
         const int b = (int)(place / tasks);
         const long long first = (place - b * tasks) * (scores ? BLOCK : task_pixels) + threadIdx.x;
-        int ids[MOST_PIXELS];
+        int ids[MAX_PIXELS];
 #pragma unroll
-        for (int k = 0; k < MOST_PIXELS; k++) {
+        for (int k = 0; k < MAX_PIXELS; k++) {
             const long long i = first + k * BLOCK;
             ids[k] = !scores && k < pixels_a_thread && i < plane ? (int)(unsigned)keys[b * plane + i] : -1;
         }
@@ -135,7 +135,7 @@ __global__ void resolve(
                 const long long i = first + k * BLOCK;
                 if (i < plane) show(b, i, ids[0]);
 #pragma unroll
-                for (int j = 1; j < MOST_PIXELS; j++) ids[j - 1] = ids[j];  // so that they stay in registers
+                for (int j = 1; j < MAX_PIXELS; j++) ids[j - 1] = ids[j];  // so that they stay in registers
             }
         }
     }

@@ -17,7 +17,7 @@ COUNTERS = 5
 empty tiles, longest list, blocks done. All are zero before `count_pairs` and again after `place_tiles`."""
 SPREAD = 8
 """Distance of neighbouring tiles' counters in numbers: those that share 32 bytes wait for each other's atomics."""
-MOST_SPREAD = 1 << 16
+MAX_SPREAD = 1 << 16
 """Tiles beyond which counters stand side by side: there are enough of them not to collide."""
 REPORT = 2
 """64-bit words for the host: pairs, longest list."""
@@ -38,7 +38,7 @@ INDEX_MASK = hex((1 << INDEX_BITS) - 1)
 
 def spread_of(n_tiles: Any) -> int:
     """Distance of the counters of so many tiles."""
-    return SPREAD if n_tiles <= MOST_SPREAD else 1
+    return SPREAD if n_tiles <= MAX_SPREAD else 1
 
 
 def record_size(channels: int, shape: bool, colors: bool) -> int:

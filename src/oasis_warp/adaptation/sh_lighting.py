@@ -278,7 +278,7 @@ ALBEDO_SHARE, FINE_SHARE = 0.2, 0.8
 nails stay on the skin, and light hardly changes so fast on it, but in sharp shadows. Set by eye, as the two below."""
 FINE_PASSES = 6
 """Smoothings over the mesh that take the fine part away, about 5 mm."""
-MOST_FINE = 0.3
+MAX_FINE = 0.3
 """Largest fine part, as a logarithm; more is a sharp shadow, gloss, or another part of the hand."""
 ACROSS_SHADING = ((-18.0, 21.3, -7.5), (8.8, 4.6, -8.1))
 """Shading moves the logarithms of skin colours along one line, from dark and red to bright and pale. These two
@@ -309,7 +309,7 @@ def split_albedo_shading(
     if trust is not None:
         shares = shares * trust[:, None]
     fine = of_vertices - surface.smooth_over_mesh(of_vertices, surface.mesh_edges(faces), FINE_PASSES)
-    fine = shares[:, 1:] * fine.clamp(-MOST_FINE, MOST_FINE)
+    fine = shares[:, 1:] * fine.clamp(-MAX_FINE, MAX_FINE)
     read = vertex_to_gaussians(torch.cat([shares[:, :1], fine], 1), faces, learned)
     colors = (guess.clamp_min(MIN_COLOR) * (read[:, :1] * beyond + read[:, 1:]).exp()).clamp(max=1)
     return learned._replace(colors=colors, shade=learned.colors.clamp_min(MIN_SHOWN) / colors)

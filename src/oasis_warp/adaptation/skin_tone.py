@@ -26,7 +26,7 @@ PALM_BLOOD, TIP_BLOOD, KNUCKLE_BLOOD = 1.1, 0.7, 1.1
 real hands."""
 KNUCKLE_MELANIN = 0.15
 """How much more melanin knuckles have."""
-LEAST_COLOURFUL = 0.4
+MIN_COLOURFUL = 0.4
 """Least saturation of a photo over that of skin in even light: less is taken for a cast of grey light."""
 MIN_COLOR = 0.01
 """Least colour whose logarithm is taken."""
@@ -69,7 +69,7 @@ def infer_tone(
     share = weight * bare / (weight * bare).sum().clamp_min(1e-9)
     shown, mean = ((share[:, None] * logs).sum(0) for logs in (seen.clamp_min(MIN_COLOR).log(), skin))
     colour = mean - mean.mean()
-    colourful = ((shown - shown.mean()) @ colour / colour.square().sum()).clamp(LEAST_COLOURFUL, 1)
+    colourful = ((shown - shown.mean()) @ colour / colour.square().sum()).clamp(MIN_COLOURFUL, 1)
 
     def as_shown(logs: Tensor) -> Tensor:
         """Its difference from the mean, less colourful, on what the photo shows."""

@@ -26,7 +26,7 @@ RIM_PASSES = 3
 JOIN_DETAIL, JOIN_REACH = 0.004, 0.04
 """Length below which seen colours are averaged for the join, and distance over which the painted skin leaves them for
 the person's mean colours [m]."""
-MOST_DIFFERENT = 0.3
+MAX_DIFFERENT = 0.3
 """Difference of the logarithms from the person's mean colours that is carried on: more is dirt, a ring or a shadow."""
 MORE = 1.5
 """Gaussians after painting over those before, at most."""
@@ -98,7 +98,7 @@ def paint_unseen(
     regions = label_regions(hand)
     nail, palm = regions.nail.to(rest), regions.palm.to(rest)
     sure = ((confidence - SEEN) / (1 - SEEN)).clamp(0, 1) * (1 - nail)
-    difference = difference.clamp(-MOST_DIFFERENT, MOST_DIFFERENT)
+    difference = difference.clamp(-MAX_DIFFERENT, MAX_DIFFERENT)
     smooth = inpaint(rest, faces, difference, sure, detail=JOIN_DETAIL, fade=JOIN_REACH)
     bed = _nail_color(tone, seen, confidence * nail, nail.sum())
 

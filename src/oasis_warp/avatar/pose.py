@@ -26,7 +26,7 @@ err by .05; a finger that lies on the palm hides .5 and more."""
 WEAK, DEEP = 0.3, 0.6
 """Differences of shade from 1 up to which it is relief or tone of the skin itself, and from which it is a sharp shadow,
 gloss, or another part of the hand. Set by eye on one thumb-up photo with gashes, creases and a red spot."""
-MOST_DETAIL = 0.3
+MAX_DETAIL = 0.3
 """Difference of the logarithms of colours up to which detail is skin where it goes against the shade: bright beside a
 shadow that is a pixel off, skin would be white where that shadow goes."""
 MIN_LIGHT = 1e-6
@@ -201,7 +201,7 @@ def with_photo_colors(
     if trust is not None:
         news = (shown.clamp_min(MIN_COLOR) / (canonical.colors[changed] * shade).clamp_min(MIN_COLOR)).log()
         most = -shade.log()
-        back = (news - news.clamp(-MOST_DETAIL, MOST_DETAIL)).clamp(most.clamp(max=0), most.clamp(min=0))
+        back = (news - news.clamp(-MAX_DETAIL, MAX_DETAIL)).clamp(most.clamp(max=0), most.clamp(min=0))
         shade = shade * (back + (1 - trust) * (news - back)).exp()
     colors, shade = split_shade(shown, shade)
     return canonical._replace(

@@ -30,7 +30,7 @@ WARM_SECONDS = 0.05
 LONGEST_WARM = 0.3
 GROUP_SECONDS = 0.01
 """Duration of a group of calls: the wait at its end, of some ten microseconds, is a thousandth of it."""
-MOST_CALLS = 1000
+MAX_CALLS = 1000
 """In a group."""
 YARDSTICK_MATRIX, YARDSTICK_FLOATS = 512, 2**20
 
@@ -203,7 +203,7 @@ def time_groups(probes: Sequence[Probe], groups: int, seconds: float | None = No
     if groups < 2:
         raise ValueError(f"groups: expected 2 or more, got {groups}. Quartiles need some.")
     longest = [warm_up(probe) for probe in probes]
-    calls = [max(1, min(MOST_CALLS, round(1e3 * GROUP_SECONDS / ms))) for ms in longest]
+    calls = [max(1, min(MAX_CALLS, round(1e3 * GROUP_SECONDS / ms))) for ms in longest]
     if seconds is not None:
         a_round = 1e-3 * sum((n + 1) * ms for n, ms in zip(calls, longest, strict=True))
         groups = max(2, min(groups, int(seconds / a_round)))

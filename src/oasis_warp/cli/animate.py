@@ -27,9 +27,9 @@ from oasis_warp.motion import read_motion, resample
 from oasis_warp.render.render import render
 
 MAX_FRAMES = 10_000
-MOST_LOOPS = 65_535
+MAX_LOOPS = 65_535
 """What a GIF can count to."""
-MOST_FRAMED = 60
+MAX_FRAMED = 60
 """About so many poses of a film decide what its camera sees."""
 GAP = 0.03
 """Between two hands that stand side by side [m]: a finger's breadth and a half."""
@@ -109,8 +109,8 @@ def still_camera(hands: Sequence[tuple[Avatar, Sequence[HandPose]]], size: int, 
 
 
 def few(poses: Sequence[HandPose]) -> Sequence[HandPose]:
-    """About `MOST_FRAMED` of them."""
-    return poses[:: max(1, len(poses) // MOST_FRAMED)]
+    """About `MAX_FRAMED` of them."""
+    return poses[:: max(1, len(poses) // MAX_FRAMED)]
 
 
 def run(options: Animate) -> int:
@@ -123,8 +123,8 @@ def run(options: Animate) -> int:
     transparent = options.background == "transparent"
     check_film(options.out, transparent=transparent)
     background = None if transparent else read_color(options.background)
-    if not 0 <= options.loop <= MOST_LOOPS:
-        raise InputError(f"--loop {options.loop}: expected 0, for ever, to {MOST_LOOPS}; choose another number.")
+    if not 0 <= options.loop <= MAX_LOOPS:
+        raise InputError(f"--loop {options.loop}: expected 0, for ever, to {MAX_LOOPS}; choose another number.")
     if not 1 <= len(options.avatars) <= 2:
         raise InputError(f"avatars: expected one, or two for one scene, got {len(options.avatars)}; change them.")
     n_frames = count_frames(options.seconds, options.fps)

@@ -27,10 +27,10 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.data.output_files import make_folders, output_file, remove_leftovers, write_file
 
-MOST_PHOTOS, TASKS_A_WORKER = 256, 16
+MAX_PHOTOS, TASKS_A_WORKER = 256, 16
 """Photos of a task at most, and tasks of a worker at least: in the end workers wait for each other for half a task, so
 a 32nd of the time, and a scheduler of Dask has 4,000 tasks for a million photos."""
-MOST_REASONS = 8
+MAX_REASONS = 8
 """Sentences in the table at the end."""
 
 
@@ -109,7 +109,7 @@ def find_photos(source: Path, out: Path) -> list[str]:
 
 def share_out(names: Sequence[str], n_workers: int) -> list[list[str]]:
     """The photos of each task, so many that all workers have some until the end."""
-    n = min(MOST_PHOTOS, max(1, len(names) // (n_workers * TASKS_A_WORKER)))
+    n = min(MAX_PHOTOS, max(1, len(names) // (n_workers * TASKS_A_WORKER)))
     return [list(names[k : k + n]) for k in range(0, len(names), n)]
 
 
@@ -133,7 +133,7 @@ def finish(order: Order, tasks: Sequence[Sequence[str]]) -> dict[str, Any]:
         (order.out / TRIES).rmdir()
     return {
         "photos": dict(photos), "avatars": len(keys - {""}), "seconds": round(seconds, 1),
-        "reasons": dict(reasons.most_common(MOST_REASONS)), "settings": order.settings,
+        "reasons": dict(reasons.most_common(MAX_REASONS)), "settings": order.settings,
     }  # fmt: skip
 
 

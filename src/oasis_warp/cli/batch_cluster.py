@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from oasis_warp.cli.batch_work import MOST_TRIES, Order, make_avatars
+from oasis_warp.cli.batch_work import MAX_TRIES, Order, make_avatars
 from oasis_warp.cli.console import check_device
 from oasis_warp.cli.loopback import LOOPBACK
 from oasis_warp.core.errors import InputError
@@ -122,7 +122,7 @@ def work(client: Any, tasks: Sequence[Sequence[str]], order: Order, told: Callab
                 worked = heard(futures[future], future.result(), end=True)
             except KilledWorker:  # by its photos, whose tries are counted, or from outside
                 killed[futures[future]] += 1
-                if killed[futures[future]] > MOST_TRIES * len(tasks[futures[future]]):
+                if killed[futures[future]] > MAX_TRIES * len(tasks[futures[future]]):
                     raise
                 future.retry()
                 done.add(future)

@@ -41,7 +41,7 @@ from oasis_warp.reconstruction import reconstruct
 
 Row = dict[str, Any]
 AVATARS, ROWS, TRIES, ROW = "avatars", "rows", "tries", "row.json"
-MOST_TRIES = 3
+MAX_TRIES = 3
 """Times that a photo may end its process, by the memory it takes or a fault in a library, until it is left out."""
 COUNTS = ("made", "refused", "failed", "kept")
 MEASURES = ("reprojection_percent", "mask_iou", "input_psnr_db", "seen_percent")
@@ -157,8 +157,8 @@ def _row(name: str, order: Order, before: Row | None) -> tuple[Row, bool]:
     kept = (folder / ROW).is_file()
     if kept:
         row = json.loads((folder / ROW).read_text())
-    elif (tried := _begin(tries)) > MOST_TRIES:
-        row = {"status": "failed", "said": f"{path}: its process ended {MOST_TRIES} times; it may need more memory."}
+    elif (tried := _begin(tries)) > MAX_TRIES:
+        row = {"status": "failed", "said": f"{path}: its process ended {MAX_TRIES} times; it may need more memory."}
     else:
         row = _make(path, key, order) | ({"tries": tried} if tried > 1 else {})
     tries.unlink(missing_ok=True)

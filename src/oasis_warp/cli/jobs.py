@@ -13,9 +13,9 @@ from typing import Literal, NamedTuple
 from oasis_warp.core.errors import InputError, last_line
 from oasis_warp.data.output_files import write_file
 
-MOST_WAITING = 16
+MAX_WAITING = 16
 """Photos in the queue."""
-MOST_SECONDS = 900
+MAX_SECONDS = 900
 """Time for one photo, some fifty times what it takes on two quiet cores."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".avif", ".bmp", ".tif", ".tiff")
 SILENT = "The program said nothing."
@@ -79,8 +79,8 @@ class Jobs:
         if suffix not in SUFFIXES:
             raise InputError(f"{name[:80]}: expected a picture, {', '.join(SUFFIXES)}; save the photo as one of these.")
         with self._changed:
-            if len(self._waiting) >= MOST_WAITING:
-                raise InputError(f"{MOST_WAITING} photos are waiting already; come back in a few minutes.")
+            if len(self._waiting) >= MAX_WAITING:
+                raise InputError(f"{MAX_WAITING} photos are waiting already; come back in a few minutes.")
             job = secrets.token_urlsafe(16)
             home = self.folder / job
             home.mkdir()
@@ -118,7 +118,7 @@ class Jobs:
                 command = [*PROGRAM, "export", str(out / "avatar.safetensors"), "-o", str(path)]
                 if path.suffix == ".html":
                     command += ["--photo", str(next((self.folder / job).glob("photo.*")))]
-                ran = subprocess.run(command, capture_output=True, text=True, timeout=MOST_SECONDS, check=False)
+                ran = subprocess.run(command, capture_output=True, text=True, timeout=MAX_SECONDS, check=False)
                 if ran.returncode:
                     raise InputError(last_line(ran.stderr, SILENT, 500))
         return path
@@ -156,7 +156,7 @@ class Jobs:
                 if self._stopped:
                     process.kill()
             started, line = time.monotonic(), ""  # before the timer, or what it ends would seem to have been in time
-            limit = threading.Timer(MOST_SECONDS, process.kill)
+            limit = threading.Timer(MAX_SECONDS, process.kill)
             limit.start()
             assert process.stderr is not None
             for line in process.stderr:
@@ -166,6 +166,6 @@ class Jobs:
             limit.cancel()
         if code == 0 or self._stopped:
             return
-        late = time.monotonic() - started >= MOST_SECONDS
-        said = f"It took more than {MOST_SECONDS // 60} minutes." if late else last_line(line, SILENT, 500)
+        late = time.monotonic() - started >= MAX_SECONDS
+        said = f"It took more than {MAX_SECONDS // 60} minutes." if late else last_line(line, SILENT, 500)
         write_file(home / "error.txt", said.replace(str(photo), "the photo").replace(photo.name, "the photo").encode())

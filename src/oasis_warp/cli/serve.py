@@ -11,7 +11,7 @@ from oasis_warp.cli.options import Serve
 from oasis_warp.cli.view import serve
 from oasis_warp.core.errors import InputError
 
-MOST_BYTES = 64 << 20
+MAX_BYTES = 64 << 20
 """Of a photo."""
 FORM = {"": "form.html", "form.css": "form.css", "form.js": "form.js"}
 TYPES = {
@@ -61,9 +61,9 @@ class _Handler(LoopbackHandler):
         if path != "jobs" or not length.isdecimal():
             self.send_error(404 if path != "jobs" else 411)
             return
-        if int(length) > MOST_BYTES:
+        if int(length) > MAX_BYTES:
             self.close_connection = True  # the photo is not read
-            self._send_json({"error": f"The photo has more than {MOST_BYTES >> 20} MB; send a smaller one."}, 413)
+            self._send_json({"error": f"The photo has more than {MAX_BYTES >> 20} MB; send a smaller one."}, 413)
             return
         photo = self.rfile.read(int(length))
         if len(photo) < int(length):

@@ -3,7 +3,7 @@
 import difflib
 from collections.abc import Iterable
 
-MOST_LETTERS, MOST_QUOTED = 1000, 80
+MAX_LETTERS, MAX_QUOTED = 1000, 80
 """Longest message and longest quotation: a file's own words may go on for megabytes."""
 
 
@@ -12,7 +12,7 @@ def one_line(text: object) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
-def shortened(text: str, most: int = MOST_QUOTED) -> str:
+def shortened(text: str, most: int = MAX_QUOTED) -> str:
     """At most `most` letters of what a message quotes, the middle left out."""
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-(most // 2) :]}"
 
@@ -30,7 +30,7 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str = ""):
-        super().__init__(one_line(shortened(message, MOST_LETTERS)))
+        super().__init__(one_line(shortened(message, MAX_LETTERS)))
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -16,11 +16,11 @@ from scipy import sparse
 
 from oasis_warp.core.errors import InputError, shortened
 
-MOST_BYTES = 256 << 20
+MAX_BYTES = 256 << 20
 """Of a file: MANO's have 4 MB, an estimator's a few for each hand."""
-MOST_INSTRUCTIONS = 2_000_000
+MAX_INSTRUCTIONS = 2_000_000
 """A million of them take about two seconds."""
-MOST_DIMENSIONS, MOST_NESTED = 8, 20
+MAX_DIMENSIONS, MAX_NESTED = 8, 20
 """Of an array, and of arrays that name other arrays."""
 _NUMBER = re.compile(r"[<>=|]?[fiub][1248]")
 
@@ -62,7 +62,7 @@ def read_pickle(path: Path | str, what: str, content: bytes | None = None) -> An
         content: Its bytes, where they lie elsewhere; `path` is for messages then.
 
     Raises:
-        InputError: no such file, larger than `MOST_BYTES`, damaged, or anything in it that is not a plain value.
+        InputError: no such file, larger than `MAX_BYTES`, damaged, or anything in it that is not a plain value.
     """
     path = Path(path)
     content = _content(path, what) if content is None else content
@@ -81,8 +81,8 @@ def _content(path: Path, what: str) -> bytes:
         if not path.is_file():
             found = "a folder" if path.is_dir() else "no such file"
             raise InputError(f"{path}: expected {what}, found {found}; check the name.")
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path}: expected {what}, got more than {MOST_BYTES >> 20} MB; give the right file.")
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: expected {what}, got more than {MAX_BYTES >> 20} MB; give the right file.")
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the permissions.") from error
@@ -92,8 +92,8 @@ def _run(content: bytes) -> Any:
     stack: list[Any] = []
     memo: dict[int, Any] = {}
     for count, (code, argument, _) in enumerate(pickletools.genops(content)):
-        if count >= MOST_INSTRUCTIONS:
-            raise ValueError(f"more than {MOST_INSTRUCTIONS} instructions")
+        if count >= MAX_INSTRUCTIONS:
+            raise ValueError(f"more than {MAX_INSTRUCTIONS} instructions")
         name = code.name
         if name == "STOP":
             if len(stack) != 1:
@@ -216,8 +216,8 @@ _STEPS: dict[str, Callable[[list[Any], Any], Any]] = {
 
 def _plain(value: Any, depth: int) -> Any:
     """`value` with arrays in the place of what describes them."""
-    if depth > MOST_NESTED:
-        raise ValueError(f"values nested more than {MOST_NESTED} deep")
+    if depth > MAX_NESTED:
+        raise ValueError(f"values nested more than {MAX_NESTED} deep")
     if isinstance(value, _Name) or value is _Mark:
         raise ValueError("a name in the place of a value")
     if isinstance(value, dict):
@@ -260,7 +260,7 @@ def _dense(value: Any, name: str) -> np.ndarray:
 def _shape(shape: Any) -> tuple[int, ...]:
     if isinstance(shape, np.ndarray):
         shape = tuple(shape.tolist())
-    if not isinstance(shape, tuple | list) or len(shape) > MOST_DIMENSIONS:
+    if not isinstance(shape, tuple | list) or len(shape) > MAX_DIMENSIONS:
         raise ValueError("an array without a shape")
     sizes = tuple(int(n) for n in shape)
     if any(not 0 <= n < 2**31 for n in sizes):

@@ -33,11 +33,11 @@ HARMONICS = (4, 9)
 """Rows that `light.harmonics` may have."""
 UNIT_TOLERANCE = 1e-3
 UNITS = {"length": "m", "angle": "rad", "quaternion": "wxyz", "color": "sRGB in [0, 1]", "camera": "OpenCV"}
-MOST_GAUSSIANS = 4_000_000
+MAX_GAUSSIANS = 4_000_000
 """Forty times what the largest photos give; with all their tensors they fill .5 GB."""
-MOST_SIDE = 4096
+MAX_SIDE = 4096
 """Of the source camera's picture, as of the largest painted one [px]: `edit` draws it."""
-MOST_NUMBER = 1e9
+MAX_NUMBER = 1e9
 """Of indices, whose true bounds are the hand model's."""
 
 
@@ -58,9 +58,9 @@ TENSORS = {
     "shape": Entry(torch.float32, ("S",), -10, 10),
     "surface_offsets": Entry(torch.float32, ("V", 3), -0.05, 0.05),
     # The Gaussians at rest: P ride on vertices, then Q on faces.
-    "gaussians.vertex_index": Entry(torch.int64, ("P",), 0, MOST_NUMBER),
+    "gaussians.vertex_index": Entry(torch.int64, ("P",), 0, MAX_NUMBER),
     "gaussians.offsets": Entry(torch.float32, ("P", 3), -0.1, 0.1),
-    "gaussians.face_index": Entry(torch.int64, ("Q",), 0, MOST_NUMBER),
+    "gaussians.face_index": Entry(torch.int64, ("Q",), 0, MAX_NUMBER),
     "gaussians.barycentrics": Entry(torch.float32, ("Q", 3), *SHARE),
     "gaussians.quats": Entry(torch.float32, ("N", 4), -2, 2),
     "gaussians.scales": Entry(torch.float32, ("N", 3), 1e-8, 0.1),
@@ -208,8 +208,8 @@ def _check_header(header: Mapping[str, Any]) -> None:
     if header["side"] not in ("left", "right"):
         raise ValueError(f"header: expected side 'left' or 'right', got {shortened(repr(header['side']))}")
     camera = header["source_camera"]
-    if camera.keys() != CAMERA or not all(whole(camera[key], 1, MOST_SIDE) for key in CAMERA):
-        expected = f"a source_camera with a positive width and height up to {MOST_SIDE}"
+    if camera.keys() != CAMERA or not all(whole(camera[key], 1, MAX_SIDE) for key in CAMERA):
+        expected = f"a source_camera with a positive width and height up to {MAX_SIDE}"
         raise ValueError(f"header: expected {expected}, got {shortened(repr(camera))}")
 
 
@@ -243,8 +243,8 @@ def _check_shapes(
             raise ValueError(f"{name}: expected {entry.dtype}, got {dtype}")
     if known["N"] != known["P"] + known["Q"]:
         raise ValueError(f"gaussians: expected {known['P']} + {known['Q']} rows, got {known['N']}")
-    if not 1 <= known["N"] <= MOST_GAUSSIANS:
-        raise ValueError(f"gaussians: expected 1 to {MOST_GAUSSIANS}, got {known['N']}")
+    if not 1 <= known["N"] <= MAX_GAUSSIANS:
+        raise ValueError(f"gaussians: expected 1 to {MAX_GAUSSIANS}, got {known['N']}")
     if known.get("K", HARMONICS[0]) not in HARMONICS:
         raise ValueError(f"light.harmonics: expected {HARMONICS[0]} or {HARMONICS[1]} rows, got {known['K']}")
     return known
@@ -252,7 +252,7 @@ def _check_shapes(
 
 def _check_values(tensors: Mapping[str, Tensor], sizes: Mapping[str, int]) -> None:
     """Refuse values that no hand has, for which drawing would fail or give an empty picture."""
-    bounds = {"gaussians.vertex_index": sizes["V"] - 1, "gaussians.face_index": sizes.get("F", MOST_NUMBER) - 1}
+    bounds = {"gaussians.vertex_index": sizes["V"] - 1, "gaussians.face_index": sizes.get("F", MAX_NUMBER) - 1}
     for name, entry in (TENSORS | LIGHT | SHADE | FINE_SHADE | ALBEDO | DOUBT | INVENTED).items():
         if name not in tensors:
             continue

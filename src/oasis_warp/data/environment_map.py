@@ -17,7 +17,7 @@ LARGEST = 256
 """Rows to which a map is scaled down: nine harmonics need no more."""
 GAMMA = 2.2
 """Of pictures with 8 or 16 bits."""
-MOST_PIXELS = 1 << 26
+MAX_PIXELS = 1 << 26
 """Of a map: 11,000 x 5,500, decoded .8 GB."""
 _RADIANCE = re.compile(rb"\A#\?.{0,4000}?\n\n-Y (\d{1,6}) \+X (\d{1,6})\n", re.DOTALL)
 
@@ -35,7 +35,7 @@ def read_environment(path: Path | str) -> Float[Tensor, "H W 3"]:
         raise InputError(f"{path}: no such file; give an environment map (.hdr), or photo, even or studio.")
     data = read_bytes(path, "an environment map")
     size = _size(data)
-    if size is not None and size[0] * size[1] > MOST_PIXELS:
+    if size is not None and size[0] * size[1] > MAX_PIXELS:
         raise InputError(f"{path}: {size[0]} x {size[1]} pixels are too many to decode; scale the map down first.")
     try:
         decoded = np.frombuffer(pixels_of_png(data) if is_png(data) else data, np.uint8)

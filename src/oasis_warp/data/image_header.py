@@ -7,7 +7,7 @@ from itertools import islice
 from typing import NamedTuple
 
 WIDTH, HEIGHT, BITS, SAMPLES, TILE_WIDTH, TILE_HEIGHT = 0x0100, 0x0101, 0x0102, 0x0115, 0x0142, 0x0143
-MOST_TILE = 1 << 26
+MAX_TILE = 1 << 26
 """Largest tile of a TIFF [px]."""
 ORIENTATION, EXIF_IFD, FOCAL_35MM = 0x0112, 0x8769, 0xA405
 _LAYOUTS = {1: "B", 3: "H", 4: "I"}
@@ -22,9 +22,9 @@ _PNG_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"eXIf", b"IEND")
 _FILL = re.compile(rb"\xff+")
 _WITHOUT_LENGTH = (0x01, *range(0xD0, 0xDA))
 """Markers of a JPEG that stand alone."""
-MOST_CHUNKS = 200_000
+MAX_CHUNKS = 200_000
 """Of a PNG: three times what the largest has, whose pixels come in chunks of 8 KB."""
-MOST_SEGMENTS = 10_000
+MAX_SEGMENTS = 10_000
 """Of a file's header: more than any camera writes, few enough to be read at once."""
 _AVIF_BRANDS = (b"avif", b"avis")
 _HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
@@ -143,7 +143,7 @@ def unsupported_format(data: bytes) -> str | None:
 
 def _jpeg(data: bytes) -> ImageHeader | None:
     place = 2
-    for _ in range(MOST_SEGMENTS):
+    for _ in range(MAX_SEGMENTS):
         # Garbage before a marker is skipped, as by decoders, and fill bytes are.
         fill = _FILL.match(data, data.index(b"\xff", place))
         place = fill.end() + 1 if fill else place
@@ -160,8 +160,8 @@ def _jpeg(data: bytes) -> ImageHeader | None:
 
 
 def _png(data: bytes) -> ImageHeader | None:
-    chunks = list(islice(_png_chunks(data), MOST_CHUNKS))
-    if len(chunks) == MOST_CHUNKS or any(place + length + 12 > len(data) for _, place, length in chunks):
+    chunks = list(islice(_png_chunks(data), MAX_CHUNKS))
+    if len(chunks) == MAX_CHUNKS or any(place + length + 12 > len(data) for _, place, length in chunks):
         return None  # a decoder would take memory for all that a chunk claims to have
     width, height, depth = struct.unpack_from(">IIB", data, 16)
     return ImageHeader("PNG", width, height, 8 if depth == 16 else 4)
@@ -196,7 +196,7 @@ def _webp_size(data: bytes) -> tuple[int, int]:
 def _avif(data: bytes) -> ImageHeader | None:
     # A tiled picture has one "ispe" box per tile and one for the whole.
     place, largest = data.find(b"ispe"), (0, 0)
-    for _ in range(MOST_SEGMENTS):
+    for _ in range(MAX_SEGMENTS):
         if place < 0:
             return ImageHeader("AVIF", *largest, 8) if largest != (0, 0) else None
         width, height = struct.unpack_from(">II", data, place + 8)
@@ -215,7 +215,7 @@ def _tiff(data: bytes) -> ImageHeader | None:
     tags = read_tags(data)
     samples, bits = tags.get(SAMPLES, 1), tags.get(BITS, 8)
     tile = tags.get(TILE_WIDTH, 1) * tags.get(TILE_HEIGHT, 1)
-    if tile > MOST_TILE or _count_unread(data):
+    if tile > MAX_TILE or _count_unread(data):
         return None
     return ImageHeader("TIFF", tags[WIDTH], tags[HEIGHT], max(samples, 4) * max(bits, 8) // 8)
 

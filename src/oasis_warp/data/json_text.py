@@ -12,7 +12,7 @@ from oasis_warp.core.rotation import is_rotation
 from oasis_warp.core.types import Camera
 from oasis_warp.data.photo import read_bytes
 
-MOST_LETTERS = 1 << 20
+MAX_LETTERS = 1 << 20
 """Longest text; headers, poses and settings have a few thousand letters."""
 
 
@@ -22,8 +22,8 @@ def read_json(text: str | bytes) -> dict[str, Any]:
     Raises:
         ValueError: too long, no JSON, nested too deeply, with numbers that are none, or no object.
     """
-    if len(text) > MOST_LETTERS:
-        raise ValueError(f"expected at most {MOST_LETTERS >> 20} MB of JSON, got {len(text) >> 20} MB")
+    if len(text) > MAX_LETTERS:
+        raise ValueError(f"expected at most {MAX_LETTERS >> 20} MB of JSON, got {len(text) >> 20} MB")
     try:
         value = json.loads(text, parse_constant=_refuse)
     except RecursionError:
@@ -44,7 +44,7 @@ def _refuse(name: str) -> float:
     raise ValueError(f"{name} is no number")
 
 
-MOST_SIDE = 8192
+MAX_SIDE = 8192
 """Of a picture [px]."""
 
 
@@ -61,8 +61,8 @@ def read_cameras(path: Path | str) -> list[Camera]:
         data = read_json(read_bytes(path, "a camera"))
         data = data["camera"] if isinstance(data.get("camera"), dict) else data
         width, height = data.get("width"), data.get("height")
-        if not whole(width, 16, MOST_SIDE) or not whole(height, 16, MOST_SIDE):
-            raise ValueError(f"`width` and `height` from 16 to {MOST_SIDE} are expected")
+        if not whole(width, 16, MAX_SIDE) or not whole(height, 16, MAX_SIDE):
+            raise ValueError(f"`width` and `height` from 16 to {MAX_SIDE} are expected")
         viewmats, K = _numbers(data, "viewmat"), _numbers(data, "K")
         viewmats = viewmats[None] if viewmats.ndim == 2 else viewmats
         if viewmats.ndim != 3 or viewmats.shape[1:] != (4, 4) or not len(viewmats) or K.shape != (3, 3):

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-MOST_BYTES, MOST_SECONDS = 4 << 30, 30
+MAX_BYTES, MAX_SECONDS = 4 << 30, 30
 """Address space and CPU time of the child: four times the largest picture that is decoded, and ample time."""
 PATIENCE = 300
 """Seconds to wait for the child, on a machine that is busy with other things."""
@@ -37,8 +37,8 @@ def _decode() -> None:
     except ImportError:  # Windows has no such limits
         pass
     else:
-        resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
-        resource.setrlimit(resource.RLIMIT_CPU, (MOST_SECONDS, MOST_SECONDS))
+        resource.setrlimit(resource.RLIMIT_AS, (MAX_BYTES, MAX_BYTES))
+        resource.setrlimit(resource.RLIMIT_CPU, (MAX_SECONDS, MAX_SECONDS))
     data = np.frombuffer(sys.stdin.buffer.read(), np.uint8)
     pixels, kinds, chunks = cv2.imdecodeWithMetadata(data, int(sys.argv[1]))
     if pixels is None:

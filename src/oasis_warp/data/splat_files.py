@@ -18,7 +18,7 @@ from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.logging import logger
 from oasis_warp.core.types import Gaussians
 
-MOST_BYTES, MOST_SPLATS = 1 << 30, 4_000_000
+MAX_BYTES, MAX_SPLATS = 1 << 30, 4_000_000
 """Largest file that is read, also unzipped, and most Gaussians: beyond it no browser turns them."""
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 f_dc (Kerbl et al. 2023)."""
@@ -51,8 +51,8 @@ def read_splats(path: Path | str) -> Gaussians:
     if reader is None:
         raise InputError(f"{path}: expected Gaussians in {', '.join(READERS)}; convert the file.")
     try:
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise InputError(f"{path}: expected at most {MOST_BYTES >> 20} MB, got {size >> 20} MB; thin it out.")
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise InputError(f"{path}: expected at most {MAX_BYTES >> 20} MB, got {size >> 20} MB; thin it out.")
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             return _finite(path, reader(path.read_bytes()))
     except OSError as error:
@@ -68,9 +68,9 @@ def _finite(path: Path, parts: Parts) -> Gaussians:
     lengths = np.linalg.norm(quats, axis=1)
     good = np.isfinite(np.concatenate([means, scales, opacities[:, None], colors, lengths[:, None]], 1)).all(1)
     good &= (lengths > 0) & (scales > 0).all(1)
-    if len(means) > MOST_SPLATS or not good.any():
+    if len(means) > MAX_SPLATS or not good.any():
         got = f"{good.sum()} of {len(means)}"
-        raise InputError(f"{path}: expected 1 to {MOST_SPLATS} finite Gaussians, got {got}; give another file.")
+        raise InputError(f"{path}: expected 1 to {MAX_SPLATS} finite Gaussians, got {got}; give another file.")
     if bad := int((~good).sum()):
         logger.warning("%s: %d of %d Gaussians are not finite and left out", path, bad, len(good))
     quats = quats[good] / lengths[good, None]
@@ -200,12 +200,12 @@ def _spz4_streams(data: bytes, widths: Sequence[int]) -> bytes:
 def _read_spz(data: bytes) -> Parts:
     """Versions 2 to 4, whose y points up."""
     if data[:4] != SPZ_MAGIC.to_bytes(4, "little"):  # version 4 is not zipped as a whole
-        data = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(data, MOST_BYTES)
+        data = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(data, MAX_BYTES)
     magic, version, count, _, bits = struct.unpack("<IIIBB", data[:14])
     if magic != SPZ_MAGIC or version not in (2, 3, 4):
         raise ValueError(f"versions 2 to 4 are read, not {version}" if magic == SPZ_MAGIC else "it is no .spz")
-    if count > MOST_SPLATS:
-        raise ValueError(f"at most {MOST_SPLATS} Gaussians are read, not {count}")
+    if count > MAX_SPLATS:
+        raise ValueError(f"at most {MAX_SPLATS} Gaussians are read, not {count}")
     widths, parts, start = (9, 1, 3, 3, 3 if version == 2 else 4), [], 16
     if version == 4:
         data, start = _spz4_streams(data, widths), 0

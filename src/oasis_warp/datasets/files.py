@@ -11,7 +11,7 @@ from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.types import Photo
 from oasis_warp.data.photo import read_photo
 
-MOST_BYTES = 1 << 28
+MAX_BYTES = 1 << 28
 """Of a file in a tar file; annotations of a whole data set are larger, and lie beside it."""
 _BLOCK = 512
 """Of a tar file [bytes]."""
@@ -124,8 +124,8 @@ class Tree:
             what = "is a link, a device or a file with holes"
         elif _UNSAFE.search(name):
             what = "leads out of the folder"
-        elif member.size > MOST_BYTES:
-            what = f"has more than {MOST_BYTES >> 20} MB"
+        elif member.size > MAX_BYTES:
+            what = f"has more than {MAX_BYTES >> 20} MB"
         elif member.offset_data + member.size > total:
             what = "is cut short"
         elif name in self._packed:

@@ -18,7 +18,7 @@ from oasis_warp.hand.mano import mano_surface, mirror_mano_pose, read_mano, thin
 
 DatasetName = Literal["interhand", "hanco", "freihand", "ho3d", "coco-hand", "whim", "photos"]
 Split = Literal["train", "val", "test"]
-MOST_CAPTURES = 1000
+MAX_CAPTURES = 1000
 PAPER_CAPTURES = frozenset({0, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 20, 22, 23, 24, 25})
 """Of InterHand2.6M's training set, those that the paper trains on (appendix C)."""
 EXCLUDED_SEQUENCES = frozenset({
@@ -127,7 +127,7 @@ def _interhand(tree: Tree, models: Models, split: Split, selection: Selection) -
             if image is None:
                 raise InputError(f"{name}: names a photo that is not listed.")
             capture, sequence = int(image["capture"]), image["seq_name"]
-            if not 0 <= capture < MOST_CAPTURES:
+            if not 0 <= capture < MAX_CAPTURES:
                 raise InputError(f"{name}: its capture is {shortened(str(capture))}.")
             if not selection.takes(split, capture, sequence) or annotation["hand_type"] not in models:
                 continue

@@ -20,7 +20,7 @@ from oasis_warp.hand.mano import ManoModel, ManoPose, mano_surface, mirror_mano_
 
 MARGIN = 1.3
 """Side of the crop over the longer side of the box; the paper's."""
-LEAST_BOX, FARTHEST = 8.0, 100.0
+MIN_BOX, FARTHEST = 8.0, 100.0
 """Smallest box [px] and most distant hand [m] that are taken."""
 Models = dict[Side, ManoModel]
 
@@ -181,7 +181,7 @@ def load_picture(sample: Sample, models: Models, size: int, margin: float = MARG
         xy = projected(sample, models)[1]
         box = np.concatenate([xy.min(0), np.ptp(xy, axis=0)])
     side = margin * float(max(box[2:]))
-    if side < LEAST_BOX:
+    if side < MIN_BOX:
         raise InputError(f"{sample.name}: a box of {side:.0f} pixels is too small.")
     left, top = (float(v) for v in box[:2] + box[2:] / 2 - side / 2)
     left, top, side = left * photo.shrink, top * photo.shrink, side * photo.shrink

@@ -19,7 +19,7 @@ from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, rotation_bet
 _PALM = [0, *KNUCKLES]
 _DAMPING = Damping(start=1e-2, grow=4, shrink=3, least=1e-6, floor=1e-6)
 _TRIALS = 6
-_MOST_ROTATION = 0.5
+_MAX_ROTATION = 0.5
 """Largest rotation of a step about an axis [rad]."""
 
 
@@ -240,7 +240,7 @@ class Fitter:
         def move(state: FitState, change: np.ndarray) -> FitState:
             step = np.zeros(7 + self.n_angles + len(state.shape))
             step[free] = change
-            step[:3] *= min(1.0, _MOST_ROTATION / max(float(np.abs(step[:3]).max()), 1e-9))
+            step[:3] *= min(1.0, _MAX_ROTATION / max(float(np.abs(step[:3]).max()), 1e-9))
             return state.moved(step)
 
         return Solution(*minimize(state, model, move, _DAMPING, steps, _TRIALS, tolerance))

@@ -37,7 +37,7 @@ STRAY_SHARE = 0.35
 """Share of all pixels that stray from which a fit is refused. At most .19 where the fit looks right."""
 _STRAY_WARNED, _STRAY_FINGER = 0.2, 0.65
 """Shares of all pixels, and of those of a finger, about which a warning is given."""
-_FEWEST_PIXELS = 12
+_MIN_PIXELS = 12
 """Of a finger that is judged."""
 _FINGERS_OF_JOINTS = ("index", "middle", "little", "ring", "thumb")
 """In the order of the model's joints."""
@@ -174,7 +174,7 @@ def stray_pixels(
     warnings = []
     for number, name in enumerate(_FINGERS_OF_JOINTS, 1):
         own = stray[finger == number]
-        if len(own) >= _FEWEST_PIXELS and own.mean() > _STRAY_FINGER:
+        if len(own) >= _MIN_PIXELS and own.mean() > _STRAY_FINGER:
             warnings.append(
                 f"{name} {'' if name == 'thumb' else 'finger '}doubtful: {100 * own.mean():.0f} % of its pixels lie "
                 "elsewhere on the fitted hand"

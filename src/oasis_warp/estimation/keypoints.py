@@ -13,7 +13,7 @@ from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.mirror import mirror_landmarks
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo, Side
-from oasis_warp.data.json_text import MOST_LETTERS, read_json
+from oasis_warp.data.json_text import MAX_LETTERS, read_json
 from oasis_warp.estimation.fit_problem import FitState, MirroredInput, mirrored_state, real
 from oasis_warp.estimation.fit_quality import fit_quality, framing_warnings
 from oasis_warp.estimation.mano_estimates import (
@@ -34,15 +34,15 @@ _LANDMARK_KEYS = {"side", "xy", "world"}
 _POSE_KEYS = {"side", "angles", "orientation", "translation", "shape", "focal", "centre"}
 FAR_OUT = 1.0
 """Farthest landmark beyond the border of the photo, over its longer side: a hand may be cut, not far away."""
-FEWEST_PIXELS = 8
+MIN_PIXELS = 8
 """Least extent of a hand, of which nothing can be seen below [px of the photo as read]."""
 FOCALS = (0.05, 1000.0)
 """Least and greatest focal length over the photo's longer side: a fisheye, and a crop from far away."""
 DEPTHS = (0.02, 100.0)
 """Nearest and farthest hand [m]."""
-REACH, MOST_SHAPE, MOST_ANGLE = 1.0, 10.0, 2 * math.pi
+REACH, MAX_SHAPE, MAX_ANGLE = 1.0, 10.0, 2 * math.pi
 """Bounds of `world` [m], `shape` [standard deviations] and `angles` [rad]."""
-MOST_NUMBER = 1e9
+MAX_NUMBER = 1e9
 """Of all others, so that float32 holds their squares."""
 
 
@@ -110,11 +110,11 @@ def _pose(path: Path, data: dict[str, Any], side: Side, photo: Photo, hand: Hand
             f'{path}: "focal" must be a positive number of pixels, {low:.0f} to {high:.0f} for this photo; correct it.'
         )
     size = hand.shape_basis.shape[2]
-    shape = _numbers(path, data, "shape", (size,), MOST_SHAPE) if "shape" in data else np.zeros(size)
+    shape = _numbers(path, data, "shape", (size,), MAX_SHAPE) if "shape" in data else np.zeros(size)
     centre = np.array([width, height]) / 2
     if "centre" in data:
         centre = _numbers(path, data, "centre", (2,), FOCALS[1] * longer / photo.shrink) * photo.shrink
-    pose = HandPose(real(_numbers(path, data, "angles", (15, 3), MOST_ANGLE)), real(rotation), real(translation))
+    pose = HandPose(real(_numbers(path, data, "angles", (15, 3), MAX_ANGLE)), real(rotation), real(translation))
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
     camera = Camera(torch.eye(4), real(K), width, height)
     return _checked_fit(path, hand, photo, side, shape, pose, camera)
@@ -144,8 +144,8 @@ def _check_points(name: str, xy: np.ndarray, photo: Photo) -> None:
     beyond = FAR_OUT * max(width, height)
     if not ((xy >= -beyond) & (xy <= np.array([width, height]) + beyond)).all():
         raise InputError(f"{name}: a point lies far beyond the border of {photo.name}; give pixels of the whole photo.")
-    if np.ptp(xy, 0).max() < FEWEST_PIXELS:
-        raise InputError(f"{name}: all points lie within {FEWEST_PIXELS} pixels; give 21 different ones of a hand.")
+    if np.ptp(xy, 0).max() < MIN_PIXELS:
+        raise InputError(f"{name}: all points lie within {MIN_PIXELS} pixels; give 21 different ones of a hand.")
 
 
 def _state(
@@ -203,7 +203,7 @@ def _read_object(path: Path) -> dict[str, Any]:
         if not path.is_file():
             found = "a folder" if path.is_dir() else "a device or pipe" if path.exists() else "no such file"
             raise InputError(f"{path}: expected a JSON file of one hand, found {found}; check the name.")
-        if path.stat().st_size > MOST_LETTERS:
+        if path.stat().st_size > MAX_LETTERS:
             raise InputError(f"{path}: expected a JSON file of one hand, got more than 1 MB; give the right file.")
         return read_json(path.read_bytes())
     except OSError as error:
@@ -215,7 +215,7 @@ def _read_object(path: Path) -> dict[str, Any]:
 
 
 def _numbers(
-    path: Path, data: dict[str, Any], key: str, shape: tuple[int, ...], most: float = MOST_NUMBER
+    path: Path, data: dict[str, Any], key: str, shape: tuple[int, ...], most: float = MAX_NUMBER
 ) -> np.ndarray:
     """The numbers of a key, none beyond `most` in size."""
     expected = " x ".join(map(str, shape)) + " numbers" if shape else "a number"

@@ -17,7 +17,7 @@ import torch
 from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
 from oasis_warp.core.mirror import mirror_pose
-from oasis_warp.core.pickle_reader import MOST_BYTES, read_pickle
+from oasis_warp.core.pickle_reader import MAX_BYTES, read_pickle
 from oasis_warp.core.types import Camera, HandPose, Landmarks, Photo, Side
 from oasis_warp.hand.mano import ManoPose, rotation_vectors
 from oasis_warp.hand.mano_hand import hand_pose_of_mano
@@ -25,7 +25,7 @@ from oasis_warp.hand.mano_hand import hand_pose_of_mano
 SUFFIXES = (".npz", ".pkl", ".pickle")
 NETWORK_FOCAL = 5000.0 / 256
 """Focal length that both estimators assume, over the longer side of the photo, where the file has none."""
-MOST_HANDS, MOST_NUMBER = 1000, 1e6
+MAX_HANDS, MAX_NUMBER = 1000, 1e6
 _NESTED = ("pred_mano_params", "mano_params", "wilor_preds", "params", "out")
 """Entries whose own entries count as those of the file."""
 _NAMES = {
@@ -166,8 +166,8 @@ def _load(path: Path, content: bytes | None) -> Any:
 
     try:
         with zipfile.ZipFile(opened()) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > MOST_BYTES:
-                raise InputError(f"{path}: unpacks to more than {MOST_BYTES >> 20} MB; give the output of one photo.")
+            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
+                raise InputError(f"{path}: unpacks to more than {MAX_BYTES >> 20} MB; give the output of one photo.")
         with np.load(opened(), allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
     except OSError as error:
@@ -190,7 +190,7 @@ def _flat(entries: Mapping[str, Any]) -> dict[str, Any]:
 def _records(path: Path, content: Any) -> list[dict[str, Any]]:
     """Tables of one or more hands each."""
     items = content if isinstance(content, list | tuple) else [content]
-    if len(items) > MOST_HANDS or not all(isinstance(item, Mapping) for item in items):
+    if len(items) > MAX_HANDS or not all(isinstance(item, Mapping) for item in items):
         raise InputError(f"{path}: expected a table of arrays, or a list of them, a hand each; save it that way.")
     return [_flat(item) for item in items]
 
@@ -205,8 +205,8 @@ def _estimates(path: Path, record: Mapping[str, Any], photo: Photo) -> list[Esti
     if "right" not in arrays:
         raise InputError(f'{path}: the entry "right" (1, or 0 for a left hand) is missing; save it too.')
     n_hands = arrays["right"][1].size
-    if n_hands > MOST_HANDS:
-        raise InputError(f"{path}: {n_hands} hands are more than {MOST_HANDS}; give the output of one photo.")
+    if n_hands > MAX_HANDS:
+        raise InputError(f"{path}: {n_hands} hands are more than {MAX_HANDS}; give the output of one photo.")
     hands = []
     for k in range(n_hands):
         hand = {name: _row(path, key, values, k, n_hands, name) for name, (key, values) in arrays.items()}
@@ -220,7 +220,7 @@ def _array(path: Path, key: str, value: Any) -> np.ndarray:
     except ValueError:
         array = np.asarray(None)
     good = array.dtype.kind in "iufb" and bool(np.isfinite(array).all())
-    if not good or np.abs(array.astype(np.float64)).max(initial=0) > MOST_NUMBER:
+    if not good or np.abs(array.astype(np.float64)).max(initial=0) > MAX_NUMBER:
         raise InputError(f'{path}: "{key}" must be finite numbers of common size; save it again.')
     return array.astype(np.float64)
 

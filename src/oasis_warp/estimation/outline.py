@@ -21,7 +21,7 @@ _REACH = 0.10
 """Largest distance of a pair, as a fraction of the box."""
 _PARALLEL = 0.5
 """Smallest cosine between the normals of a pair."""
-_MOST_POINTS = 300
+_MAX_POINTS = 300
 _SUBPIXEL_BITS = 4
 
 
@@ -118,7 +118,7 @@ class MaskOutline:
         height, width = mask.shape
         inside = (points > 1.5).all(1) & (points < np.array([width, height]) - 1.5).all(1)
         chosen = np.flatnonzero(inside & self.line.above(points))
-        chosen = chosen[:: max(1, len(chosen) // _MOST_POINTS)]
+        chosen = chosen[:: max(1, len(chosen) // _MAX_POINTS)]
         self.points, self.normals = points[chosen], normals[chosen]
         x, y = self.points.astype(int).T
         self.weights = np.ones(len(chosen)) if confidence is None else confidence[y, x]
@@ -137,7 +137,7 @@ class MaskOutline:
         to_mesh, to_mask = squared.argmin(1), squared.argmin(0)
         near = np.flatnonzero(squared[np.arange(len(p)), to_mesh] < _REACH**2)
         back = np.flatnonzero(squared[to_mask, np.arange(len(q))] < _REACH**2)
-        back = back[:: max(1, -(-len(back) // _MOST_POINTS))]
+        back = back[:: max(1, -(-len(back) // _MAX_POINTS))]
         row, col = np.r_[near, to_mask[back]], np.r_[to_mesh[near], back]
         return OutlinePairs(
             vertex=vertex[col],

@@ -131,7 +131,7 @@ _HAND = 0.6
 """Least probability of the hand at a pixel that is used."""
 _SPREAD = 0.015
 """Largest spread of the surface point at a pixel that is used [m]."""
-_MOST_POINTS = 500
+_MAX_POINTS = 500
 """More do not fit better: the errors of neighbouring pixels are alike."""
 
 
@@ -151,7 +151,7 @@ def surface_points(kinematics: HandKinematics, reading: PixelReading, scale: flo
     `scale` is in pixels of the photo per metre.
     """
     good = (reading.hand > _HAND) & (reading.spread < _SPREAD)
-    step = max(1, int(np.ceil(np.sqrt(good.sum() / _MOST_POINTS))))
+    step = max(1, int(np.ceil(np.sqrt(good.sum() / _MAX_POINTS))))
     rows, columns = np.nonzero(good[step // 2 :: step, step // 2 :: step])
     rows, columns = rows * step + step // 2, columns * step + step // 2
     places = reading.surface[:, rows, columns].T.astype(np.float64)

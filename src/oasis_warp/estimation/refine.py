@@ -79,11 +79,11 @@ DAMPING = Damping(start=1e-2, grow=5, shrink=4, least=1e-4)
 LONGEST = 0.3
 """Largest change of an unknown in one step."""
 TOLERANCE = 1e-3
-LEAST_OVERLAP = 0.5
+MIN_OVERLAP = 0.5
 """Intersection over union of surface and mask at the start below which nothing is refined."""
-LEAST_PIXELS = 60
+MIN_PIXELS = 60
 """Number of compared pixels below which nothing is refined."""
-LEAST_GAIN = 0.02
+MIN_GAIN = 0.02
 """Fraction by which the photo's residual must fall for the result to be accepted."""
 MASK_SLACK = 0.05
 """Intersection over union with the mask that may be lost for it; masks themselves are off by as much."""
@@ -138,10 +138,10 @@ def refine(
     start = problem.start
     before = problem.explain(start)
     found, after = start, before
-    if before.pixels >= LEAST_PIXELS and before.mask_iou >= LEAST_OVERLAP:
+    if before.pixels >= MIN_PIXELS and before.mask_iou >= MIN_OVERLAP:
         found = problem.solve()
         after = problem.explain(found)
-    accepted = after.gap < (1 - LEAST_GAIN) * before.gap and after.mask_iou > before.mask_iou - MASK_SLACK
+    accepted = after.gap < (1 - MIN_GAIN) * before.gap and after.mask_iou > before.mask_iou - MASK_SLACK
     if not accepted:
         found, after = start, before
     posed = problem.posed_hand(found) if accepted else crop.posed

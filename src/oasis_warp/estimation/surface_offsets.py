@@ -55,7 +55,7 @@ _BORDER = 2
 _BEND, _STAY = 100.0, 0.02
 """Weights relative to one target per vertex. With edges of 2 mm a target is shared along about 3 mm, and its effect
 ends after about 12 mm: (BEND / STAY / 16)^(1/4) edges."""
-_TOLERANCE, _MOST_STEPS = 1e-4, 100
+_TOLERANCE, _MAX_STEPS = 1e-4, 100
 """Relative residual at which conjugate gradients end: no vertex is then off by more than 1e-7 m."""
 _STEP = 0.25
 """Spacing of the samples across the outline, in pixels of the window."""
@@ -256,7 +256,7 @@ class ThinSheet:
             return factors.solve(right)
         solution, _ = cg(
             _operator(system.dot, right.shape), right.ravel(), M=_operator(self._factors.solve, right.shape),
-            rtol=_TOLERANCE, maxiter=_MOST_STEPS,
+            rtol=_TOLERANCE, maxiter=_MAX_STEPS,
         )  # fmt: skip
         return solution.reshape(right.shape)
 

@@ -29,7 +29,7 @@ DARKEST = 0.002
 KEPT = 0.95
 """Share of the pixels that count, those of least contrast: in photos the rest are mostly outlines inside the hand, as a
 fitted mesh misses them by a few pixels."""
-FEWEST_PIXELS = 800
+MIN_PIXELS = 800
 """Fewest pixels whose contrasts are measured: some 4 % of a hand that fills its picture."""
 
 Contrasts = tuple[float, ...]
@@ -48,13 +48,13 @@ def split_bands(values: Float[Tensor, "H W"], weight: Float[Tensor, "H W"]) -> F
 
 
 def contrasts(parts: Sequence[tuple[Float[Tensor, "4 H W"], Bool[Tensor, "H W"]]]) -> Contrasts | None:
-    """Contrasts over some pixels of one or several pictures together; None of fewer than `FEWEST_PIXELS`.
+    """Contrasts over some pixels of one or several pictures together; None of fewer than `MIN_PIXELS`.
 
     Args:
         parts: Bands of each picture, from `split_bands`, and the pixels that count.
     """
     values = torch.cat([bands[:, where] for bands, where in parts], 1).double()
-    if values.shape[1] < FEWEST_PIXELS:
+    if values.shape[1] < MIN_PIXELS:
         return None
     kept = values.square().sort(1).values[:, : round(KEPT * values.shape[1])]
     return tuple(100 * value for value in kept.mean(1).sqrt().tolist())

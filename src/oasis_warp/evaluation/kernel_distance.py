@@ -24,11 +24,11 @@ DEGREE = 3
 """Of the kernel (x . y / d + 1)^3."""
 SUBSETS = 100
 """Halves of the groups that the standard error is taken from."""
-FEWEST_GROUPS = 4
+MIN_GROUPS = 4
 """Fewest groups on either side of which a distance is measured."""
 SPREAD_FLOOR = 1e-3
 """Least standard deviation of a channel, over the largest, that it is divided by."""
-MOST_SPREADS = 3.0
+MAX_SPREADS = 3.0
 """Standard deviations to which channels are clipped: cubed, one odd picture would outweigh all others."""
 
 Features = dict[str, list[float]]
@@ -90,12 +90,12 @@ def kernel_distances(
         subsets: Of `kernel_distance`.
 
     Raises:
-        ValueError: a crowd has fewer than `FEWEST_GROUPS` groups.
+        ValueError: a crowd has fewer than `MIN_GROUPS` groups.
     """
     for name, crowd in (("drawn", drawn), ("real", real)):
         n_groups = len({sample.group for sample in crowd})
-        if n_groups < FEWEST_GROUPS:
-            raise ValueError(f"{name}: expected pictures of {FEWEST_GROUPS} hands or more, got {n_groups}.")
+        if n_groups < MIN_GROUPS:
+            raise ValueError(f"{name}: expected pictures of {MIN_GROUPS} hands or more, got {n_groups}.")
     groups = [[sample.group for sample in crowd] for crowd in (drawn, real)]
     layers = {layer: [_matrix(crowd, layer) for crowd in (drawn, real, scale)] for layer in LAYERS}
     scaled = {layer: _standardised(*three) for layer, three in layers.items()}
@@ -154,5 +154,5 @@ def _matrix(crowd: Sequence[Sample], layer: str) -> np.ndarray:
 def _standardised(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     center, spread = scale.mean(0), scale.std(0)
     spread = np.maximum(spread, SPREAD_FLOOR * spread.max())
-    first, second = (np.clip((values - center) / spread, -MOST_SPREADS, MOST_SPREADS) for values in (x, y))
+    first, second = (np.clip((values - center) / spread, -MAX_SPREADS, MAX_SPREADS) for values in (x, y))
     return first, second

@@ -18,7 +18,7 @@ from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.evaluation.band_energy import BANDS
 from oasis_warp.evaluation.kernel_distance import (
-    FEWEST_GROUPS,
+    MIN_GROUPS,
     KernelDistance,
     Sample,
     kernel_distances,
@@ -222,7 +222,7 @@ def kernel_rows(samples: Mapping[str, Sequence[Sample]], real: Sequence[Record],
     crowd = [Sample(record["hand"], record["mostly"], record["features"]) for record in real]
     backs, palms = ([sample for sample in crowd if sample.mostly == side] for side in ("back", "palm"))
     groups = sorted({sample.group for sample in crowd})
-    if len(groups) < 2 * FEWEST_GROUPS:
+    if len(groups) < 2 * MIN_GROUPS:
         return []
     rows = []
     drawn_backs = [sample for sample in samples["side"] if sample.mostly == "back"]
@@ -232,7 +232,7 @@ def kernel_rows(samples: Mapping[str, Sequence[Sample]], real: Sequence[Record],
         "real palms to real backs": (palms, backs),
     }
     for name, (drawn, others) in pairs.items():
-        if min(len({sample.group for sample in part}) for part in (drawn, others)) >= FEWEST_GROUPS:
+        if min(len({sample.group for sample in part}) for part in (drawn, others)) >= MIN_GROUPS:
             rows.append(_kernel_row(name, len(drawn), kernel_distances(drawn, others, crowd, seed)))
     random, halves = np.random.default_rng(seed), []
     for _ in range(SPLITS):

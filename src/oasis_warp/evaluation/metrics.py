@@ -20,7 +20,7 @@ COVERED = 0.9
 """Alpha from which a pixel counts as covered."""
 COVERAGE_POSES = ("rest", "fist", "pinch", "point")
 COVERAGE_VIEWS = 8
-FEWEST_PIXELS = 50
+MIN_PIXELS = 50
 """Fewest pixels of a part of the hand that is measured."""
 ERROR_FLOOR = 1e-12
 """Smallest mean squared error: PSNR ends at 120 dB."""
@@ -87,7 +87,7 @@ def score(image: Float[Tensor, "H W 3"], truth: TargetTruth, perceptual: Percept
 
 def _psnr(error: Tensor, weight: Tensor) -> float | None:
     total = float(weight.sum())
-    if total < FEWEST_PIXELS:
+    if total < MIN_PIXELS:
         return None
     return -10 * math.log10(max(float((error * weight).sum()) / total, ERROR_FLOOR))
 

@@ -28,7 +28,7 @@ from oasis_warp.hand.template import bundled_hand
 PALM, BACK = 0.7, 0.3
 """Share of the palm from which, and up to which, a pixel counts as palm or back."""
 SIDES = ("palm", "back")
-LEAST_SIDE = 0.75 * SIZE
+MIN_SIDE = 0.75 * SIZE
 """Least side of the square around a hand in its photo [px]: of smaller hands the finest band is empty."""
 DIGITS = 3
 QUARTILES = 4
@@ -62,7 +62,7 @@ def measure_real(photo: Photo, estimator: HandEstimator) -> Record:
     sides = {side: where & (surface.visibility >= SEEN) for side, where in side_masks(surface).items()}
     mostly = mostly_shows(surface)
     bands = split_bands(log_brightness(crop.image), surface.interior.float())
-    found = contrasts([(bands, sides[mostly])]) if crop_side(fit) >= LEAST_SIDE else None
+    found = contrasts([(bands, sides[mostly])]) if crop_side(fit) >= MIN_SIDE else None
     return {
         "crop_px": round(crop_side(fit)),
         "mostly": mostly,

@@ -56,7 +56,7 @@ MEASURES = (
 """Measures of a pair; a colour error is missing where too little of the region is seen."""
 QUARTER = 4
 """Side of the blocks on which structure is compared [px]: a small pose error moves all detail."""
-FEWEST_VERTICES = 20
+MIN_VERTICES = 20
 """Fewest vertices of a region whose colour is compared."""
 
 
@@ -153,7 +153,7 @@ def _region_errors(avatar: Avatar, lit: Float[Tensor, "N 3"], crop: HandCrop, ga
     errors = {}
     for name, where in region_masks(label_regions(hand)).items():
         weight = (where * seen.confidence * present)[:, None]
-        if float(weight.sum()) < FEWEST_VERTICES:
+        if float(weight.sum()) < MIN_VERTICES:
             continue
         difference = ((colors * gain - seen.colors) * weight).sum(0) / weight.sum()
         errors[name] = float(difference.norm())

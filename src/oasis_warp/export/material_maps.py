@@ -19,7 +19,7 @@ DEPTH = 0.41e-3
 people, from their true albedo (docs/export.md says what it is worth)."""
 FINE, COARSE = 0.4e-3, 4e-3
 """Standard deviations between which detail counts as relief [m]: a pixel, and the breadth of a fold with its flanks."""
-LEAST_LUMINANCE = 0.02
+MIN_LUMINANCE = 0.02
 """Whose logarithm is taken of darker pixels: ink and dirt are no abysses."""
 SKIN, PALM, PALM_TIP, NAIL = 0.56, 0.04, -0.06, 0.32
 """GGX roughness of skin, what the palm and its finger tips add, and that of nails: the means of the synthetic world, by
@@ -82,7 +82,7 @@ def relief_slopes(avatar: Avatar, colors: Float[Tensor, "S S 3"], texels: Texels
     edges, steps = (part[:, 1:] - part[:, :1] for part in (corners, uv))
     along = torch.linalg.solve(steps, edges)  # rows: metres for a whole texture in u, in v
     breadth = float(along.norm(dim=-1).median()) / size
-    detail = np.log(luminance(colors).clamp_min(LEAST_LUMINANCE).numpy())
+    detail = np.log(luminance(colors).clamp_min(MIN_LUMINANCE).numpy())
     band = _blurred(detail, inside, FINE / breadth) - _blurred(detail, inside, COARSE / breadth)
     rows, columns = (torch.from_numpy(part[inside]) * size for part in np.gradient(band))
     across = along[:, 0].norm(dim=-1)

@@ -28,7 +28,7 @@ JOINTS = {"thumb": ("Base", "Knuckle", "Tip")}
 """Names of a finger's three joints from the palm outwards; of the other fingers:"""
 FINGER_JOINTS = ("Knuckle", "Middle", "Tip")
 AXES = ("bend", "spread", "twist")
-LEAST_RANGE = math.radians(12)
+MIN_RANGE = math.radians(12)
 """Angles that can move less have no slider."""
 WALK = ("open", "fist", "victory", "point", "ok")
 """Poses of the page's motion."""
@@ -40,7 +40,7 @@ WALK_FRAMES, WALK_SECONDS = 12, 7.5
 """Frames from one of them to the next, which the page blends, and length of the motion."""
 
 
-MOST_SHORTS, FEW_STEPS = 45, 63
+MAX_SHORTS, FEW_STEPS = 45, 63
 """Correctives that have 16 bits: three for each joint. MANO's 135 have so many steps to either side, to within .1 mm in
 all: 16 bits would fill 13 MB of the page."""
 
@@ -154,7 +154,7 @@ def joint_sliders(hand: HandModel) -> list[dict[str, Any]]:
             joint = hand.joint_names.index(f"{finger}{k + 1}")
             for axis, movement in enumerate(AXES):
                 low, high = hand.pose_limits[joint, axis].tolist()
-                if high - low < LEAST_RANGE:
+                if high - low < MIN_RANGE:
                     continue
                 shown = joint_name if axis == 0 else movement.capitalize()
                 rest = float(hand.rest_bend[joint]) if axis == 0 else 0.0
@@ -188,7 +188,7 @@ def _arrays(avatar: Avatar, light: SurfaceLight) -> dict[str, np.ndarray | Packe
     even = torch.ones(3) if own_light is None else own_light.light.even.cpu() ** (1 / GAMMA)
     correctives = hand.corrective_basis.permute(2, 0, 1)
     reach = correctives.abs().amax((1, 2))
-    kind, steps = ("i1", FEW_STEPS) if len(correctives) > MOST_SHORTS else ("i2", np.iinfo("i2").max)
+    kind, steps = ("i1", FEW_STEPS) if len(correctives) > MAX_SHORTS else ("i2", np.iinfo("i2").max)
     arrays: dict[str, np.ndarray | Packed] = {
         "vertices": _numpy(rest.vertices, "f4"),
         "faces": _numpy(hand.faces, "u2"),

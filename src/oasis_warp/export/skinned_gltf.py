@@ -21,7 +21,7 @@ from oasis_warp.export.skinned_mesh import SkinnedMesh, skinned_mesh
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.webxr_rig import Rig, local_bind, local_quats
 
-MOST_FLOATS = 45
+MAX_FLOATS = 45
 """Correctives that are written as floats: three for each joint."""
 KEYS, SECONDS = 8, 0.5
 """Steps and length of the way from one pose to the next; it eases in and out by half a cosine."""
@@ -96,7 +96,7 @@ def _primitive(buffer: GltfBuffer, made: SkinnedMesh) -> dict[str, Any]:
 
 def _packs(made: SkinnedMesh) -> bool:
     """Whether correctives are bytes: MANO's 135 would take 21 MB."""
-    return len(made.correctives) > MOST_FLOATS
+    return len(made.correctives) > MAX_FLOATS
 
 
 def _displacements(buffer: GltfBuffer, move: Tensor, *, as_bytes: bool) -> int:

@@ -15,7 +15,7 @@ from oasis_warp.hand_avatar import Avatar
 
 INFLUENCES = 8
 """Joints that move a vertex, the stronger ones first; none of the bundled hand's vertices has more than 7."""
-LEAST_CORRECTIVE = 1e-9
+MIN_CORRECTIVE = 1e-9
 """Displacement [m] for which a corrective that moves nothing is taken."""
 
 
@@ -57,7 +57,7 @@ def skinned_mesh(avatar: Avatar) -> SkinnedMesh:
     whole = correctives_per_joint(hand) == 9
     parts = [f"turn{k}" for k in range(9)] if whole else ("bend", "bend squared")
     if whole:  # rotations may be negative; a metre at weight 1 suits bytes, see skinned_gltf
-        strengths = 1 / correctives.abs().amax((1, 2)).clamp_min(LEAST_CORRECTIVE)
+        strengths = 1 / correctives.abs().amax((1, 2)).clamp_min(MIN_CORRECTIVE)
     else:
         strengths = torch.stack([corrective_coefficients(hand, end) for end in hand.pose_limits[1:].unbind(-1)]).amax(0)
     return SkinnedMesh(

@@ -13,7 +13,7 @@ from oasis_warp.data.splat_files import SH_C0
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.splats import largest_component, morton_order, posed_splats, y_down
 
-LEAST_OPACITY = 1e-6
+MIN_OPACITY = 1e-6
 """Distance of opacities from 0 and 1, where their logits end."""
 COLUMNS = (
     "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
@@ -30,7 +30,7 @@ def write_ply(request: ExportRequest, path: Path) -> None:
         InputError: a value is not finite, or `path` cannot be written.
     """
     splats = y_down(posed_splats(request))
-    opacities = splats.opacities.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY).logit()
+    opacities = splats.opacities.clamp(MIN_OPACITY, 1 - MIN_OPACITY).logit()
     parts = (
         splats.means, torch.zeros_like(splats.means), (splats.colors - 0.5) / SH_C0, opacities[:, None],
         splats.scales.log(), splats.quats,

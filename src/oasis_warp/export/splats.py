@@ -13,7 +13,7 @@ from oasis_warp.core.logging import logger
 from oasis_warp.core.types import Camera, Gaussians
 from oasis_warp.export.request import ExportRequest
 
-LEAST_SCALE, MOST_SCALE = 1e-6, 0.02
+MIN_SCALE, MAX_SCALE = 1e-6, 0.02
 """Standard deviations that leave [m]: thinner than any skin, wider than a finger. Viewers hang on huge ones."""
 HALF_TURN = (1.0, -1.0, -1.0)
 """Diagonal of the half turn about x, from y down and z forward to y up and z to the viewer, and back."""
@@ -60,9 +60,9 @@ def checked(gaussians: Gaussians) -> Gaussians:
         InputError: a value is not finite.
     """
     check_finite(gaussians)
-    scales = gaussians.scales.clamp(LEAST_SCALE, MOST_SCALE)
+    scales = gaussians.scales.clamp(MIN_SCALE, MAX_SCALE)
     if changed := int((scales != gaussians.scales).any(1).sum()):
-        limits = f"{LEAST_SCALE * 1e3:g} to {MOST_SCALE * 1e3:g} mm"
+        limits = f"{MIN_SCALE * 1e3:g} to {MAX_SCALE * 1e3:g} mm"
         logger.warning("%d of %d Gaussians are held to standard deviations of %s", changed, len(scales), limits)
     return gaussians._replace(scales=scales, opacities=gaussians.opacities.clamp(0, 1))
 

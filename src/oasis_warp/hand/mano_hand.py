@@ -150,7 +150,7 @@ _NEAR_VERTICES = 3
 """Around which the nearest face of a point is looked for at last; edges of MANO-HD are 2 mm long."""
 _RIM = 10.0
 """Weight of the wrist's rim."""
-MOST_TURNED = 40.0
+MAX_TURNED = 40.0
 """Of the palm against the bundled hand's, which lies as MANO's [degrees]."""
 WORST_FIT = 0.004
 """Root of the mean squared distance, after fitting, above which the template is no hand as MANO's [m]."""
@@ -269,10 +269,10 @@ def _along_bones(kinematics: HandKinematics, model: ManoModel) -> PlacedHand:
     palm = [0, 1, 4, 7, 10, 13]
     rotation, translation = align(own[palm], goal[palm])
     turned = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
-    if turned > MOST_TURNED:
+    if turned > MAX_TURNED:
         raise InputError(
             f"MANO's template: its palm is turned by {turned:.0f} degrees against the bundled hand's, expected up to "
-            f"{MOST_TURNED:.0f}; give MANO's own files, fingers to -x, palm to -y, thumb to +z."
+            f"{MAX_TURNED:.0f}; give MANO's own files, fingers to -x, palm to -y, thumb to +z."
         )
     ends = {j: j + 1 for j in range(1, 16) if j % 3} | {15: 16, 3: 17, 6: 18, 12: 20, 9: 19}
     turns, angles = np.repeat(rotation[None], 16, 0), np.zeros((16, 3))

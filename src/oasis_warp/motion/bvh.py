@@ -18,7 +18,7 @@ from oasis_warp.motion.motion import angles_of_bones
 FINGERS = {"index": "index", "middle": "middle|mid", "little": "little|pinky|pinkie", "ring": "ring", "thumb": "thumb"}
 """Ours in the hand model's order, and what skeletons call them."""
 SIDES = {"left": r"left|^l[_.\- ]|[_.\- ]l$|[_.\- ]l[_.\- ]", "right": r"right|^r[_.\- ]|[_.\- ]r$|[_.\- ]r[_.\- ]"}
-MOST_JOINTS = 1000
+MAX_JOINTS = 1000
 
 
 class Bone(NamedTuple):
@@ -84,8 +84,8 @@ def _read_bones(words: Iterator[str]) -> list[Bone]:
             used += len(channels)
         else:
             raise ValueError(f"{word[:40]!r} is not expected in HIERARCHY")
-        if len(bones) > MOST_JOINTS:
-            raise ValueError(f"at most {MOST_JOINTS} joints are expected")
+        if len(bones) > MAX_JOINTS:
+            raise ValueError(f"at most {MAX_JOINTS} joints are expected")
     return bones
 
 

@@ -150,8 +150,8 @@ def _wrist(hand: HandModel, rest: PosedHand, side: Side) -> Tensor:
 VIDEO_SUFFIXES = (".mp4", ".mov", ".webm", ".mkv", ".avi")
 MOTION_SUFFIXES = (".json", ".npz", ".bvh", *VIDEO_SUFFIXES)
 USUAL_FPS = 30.0
-MOST_FRAMES = 100_000
-MOST_BYTES = 1 << 28
+MAX_FRAMES = 100_000
+MAX_BYTES = 1 << 28
 """Of a file with motions: hours of one."""
 LARGEST_ANGLE = 2 * np.pi
 """Beyond it angles are degrees, taken for radians."""
@@ -178,8 +178,8 @@ def read_motion(path: Path | str, avatar: Avatar, *, progress: Progress = silent
 
         return follow_video(path, avatar, progress=progress)
     try:
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise InputError(f"{path}: expected at most {MOST_BYTES >> 20} MB, got {size >> 20} MB; cut the file.")
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise InputError(f"{path}: expected at most {MAX_BYTES >> 20} MB, got {size >> 20} MB; cut the file.")
         if kind == ".bvh":
             skeleton = read_bvh(path.read_text(encoding="utf-8", errors="replace"))
             motion = Motion(hand_angles(*avatar.parts[:2], skeleton, avatar.side), skeleton.fps)
@@ -201,7 +201,7 @@ def _checked(path: Path, motion: Motion) -> Motion:
         InputError: it is empty, too long, too fast, or not finite.
     """
     angles, fps = motion.angles, motion.fps
-    if angles.dim() != 3 or angles.shape[1:] != (15, 3) or not 1 <= len(angles) <= MOST_FRAMES:
+    if angles.dim() != 3 or angles.shape[1:] != (15, 3) or not 1 <= len(angles) <= MAX_FRAMES:
         raise InputError(f"{path}: expected angles of shape [T, 15, 3], got {list(angles.shape)}; change the file.")
     if not bool(angles.isfinite().all()) or float(angles.abs().max()) > LARGEST_ANGLE:
         raise InputError(f"{path}: expected angles in radians, up to {LARGEST_ANGLE:.2f}; change the file.")

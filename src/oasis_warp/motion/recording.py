@@ -13,10 +13,10 @@ from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.motion.motion import Motion, at_frames, jitter, smooth
 
-MOST_FRAMES = 10_000
-MOST_SIDE = 1280
+MAX_FRAMES = 10_000
+MAX_SIDE = 1280
 """Larger frames are scaled down to it: the networks see the hand in 224 to 256 pixels [px]."""
-LEAST_SEEN = 0.5
+MIN_SEEN = 0.5
 """Share of the frames that must show the hand: with fewer the motion would be mostly made up."""
 
 
@@ -30,7 +30,7 @@ def follow_video(path: Path, avatar: Avatar, *, progress: Progress = silent) -> 
     """
     poses, fps = fit_frames(path, avatar, progress)
     seen = [k for k, pose in enumerate(poses) if pose is not None]
-    if len(seen) < max(1, LEAST_SEEN * len(poses)):
+    if len(seen) < max(1, MIN_SEEN * len(poses)):
         raise InputError(
             f"{path}: {len(seen)} of {len(poses)} frames show a {avatar.side} hand, at least half are needed; give a "
             "video of the whole hand in good light, or an avatar of the other side."
@@ -51,10 +51,10 @@ def fit_frames(path: Path, avatar: Avatar, progress: Progress) -> tuple[list[Han
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         fps, count = capture.get(cv2.CAP_PROP_FPS), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if not capture.isOpened() or not 1 <= fps <= 1000 or count > MOST_FRAMES:
-            raise InputError(f"{path}: expected a video of up to {MOST_FRAMES} frames; convert it to MP4, or cut it.")
+        if not capture.isOpened() or not 1 <= fps <= 1000 or count > MAX_FRAMES:
+            raise InputError(f"{path}: expected a video of up to {MAX_FRAMES} frames; convert it to MP4, or cut it.")
         estimator, focal, poses = HandEstimator(avatar.hand.to("cpu")), None, []
-        while len(poses) < MOST_FRAMES and (read := capture.read())[0]:
+        while len(poses) < MAX_FRAMES and (read := capture.read())[0]:
             photo = _as_photo(read[1], f"{path.name}, frame {len(poses) + 1}")
             pose, focal = _fit_frame(estimator, photo, avatar, focal)
             poses.append(pose)
@@ -67,7 +67,7 @@ def fit_frames(path: Path, avatar: Avatar, progress: Progress) -> tuple[list[Han
 
 
 def _as_photo(pixels: cv2.typing.MatLike, name: str) -> Photo:
-    share = min(1.0, MOST_SIDE / max(pixels.shape[:2]))
+    share = min(1.0, MAX_SIDE / max(pixels.shape[:2]))
     if share < 1:
         pixels = cv2.resize(pixels, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
     return Photo(torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)), None, None, name, 1.0)

@@ -11,7 +11,7 @@ MOST = {
     "head_width": 4096, "frequencies": 32, "neighborhood": 15,
 }  # fmt: skip
 """Largest sizes, a few times the paper's: a weights file may say anything, and memory is taken by what it says."""
-MOST_LETTERS = 80
+MAX_LETTERS = 80
 """Of a profile's name."""
 
 
@@ -66,7 +66,7 @@ class NetworkConfig:
                 if type(value) is not int or not 1 <= value <= MOST[field.name]:
                     got = shortened(repr(value))
                     raise ValueError(f"{field.name}: expected a whole number from 1 to {MOST[field.name]}, got {got}.")
-        if not isinstance(self.profile, str) or len(self.profile) > MOST_LETTERS:
+        if not isinstance(self.profile, str) or len(self.profile) > MAX_LETTERS:
             raise ValueError(f"profile: expected a name, got {shortened(repr(self.profile))}.")
         if self.width % self.heads or self.width // self.heads % 8:
             raise ValueError(

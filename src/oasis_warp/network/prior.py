@@ -60,7 +60,7 @@ def blend_rim(prediction: Prediction, on: RestSurface) -> Prediction:
     )
 
 
-MOST_SCALE, MOST_ALONG = 0.0013, 0.0025
+MAX_SCALE, MAX_ALONG = 0.0013, 0.0025
 """Largest standard deviation of a Gaussian, and farthest from its vertex along the surface [m]. The network's vertex
 Gaussians have up to 4.7 mm and lie up to 6 mm off: over other sides' outlines and between fingers they are haze."""
 
@@ -70,13 +70,13 @@ def hold_to_surface(prediction: Prediction, on: RestSurface) -> Prediction:
     normals = surface.gathered_normals(*on[:3])
     above = (prediction.offsets * normals).sum(-1, keepdim=True)
     along = prediction.offsets - above * normals
-    along = along * (MOST_ALONG / along.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1)
+    along = along * (MAX_ALONG / along.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1)
     return prediction._replace(
-        offsets=along + above.clamp(max=0) * normals, scales=prediction.scales.clamp(max=MOST_SCALE)
+        offsets=along + above.clamp(max=0) * normals, scales=prediction.scales.clamp(max=MAX_SCALE)
     )
 
 
-LEAST_OPACITY = 0.8
+COVERING_OPACITY = 0.8
 """Of a vertex's Gaussian. That is what the network gives to nine in ten on faces; half of those on vertices have less
 than .35, and where a bent finger stretched its skin a quarter of what was drawn was the inside of its other side."""
 
@@ -85,8 +85,8 @@ def cover_surface(prediction: Prediction, on: RestSurface) -> Prediction:
     """The prediction of one hand with opaque Gaussians on all vertices, but for the fade at the wrist.
 
     Faint ones were never seen in training: they stand out of the skin and are black as often as not. For what they lack
-    of `LEAST_OPACITY` they become their anchors' discs in the colours of the faces around, below the surface: on it the
-    discs would be teeth in outlines. Without Gaussians on faces nothing changes.
+    of `COVERING_OPACITY` they become their anchors' discs in the colours of the faces around, below the surface: on it
+    the discs would be teeth in outlines. Without Gaussians on faces nothing changes.
     """
     rest, faces, vertex_faces, rim = on
     n = len(rest)
@@ -97,7 +97,7 @@ def cover_surface(prediction: Prediction, on: RestSurface) -> Prediction:
     around = surface.gather_to_vertices(on_faces, vertex_faces) / count
     anchors = batch_anchors(rest[None], faces, vertex_faces, rim)
     quats, scales, fade = (part[:, :n] for part in anchors)
-    own, least = prediction.opacities[:, :n], LEAST_OPACITY * fade
+    own, least = prediction.opacities[:, :n], COVERING_OPACITY * fade
     share = (own / least.clamp_min(MIN_OPACITY)).clamp(max=1)[..., None]
     sunk = -GROUND_DEPTH * surface.gathered_normals(rest, faces, vertex_faces)
     same = torch.where((quats * prediction.quats[:, :n]).sum(-1, keepdim=True) < 0, -quats, quats)

@@ -24,7 +24,7 @@ DISTANCE = 50.0
 MARGIN = 1.03
 """Radius that a buffer shows, in radii of the surface."""
 FOCAL = DISTANCE * SIZE / 2
-LEAST_TASKS = 256
+MIN_TASKS = 256
 """Vertices for which another thread is worth its while."""
 LIFT = 0.002
 """Off the surface from which points look, and length of the ramp from seen to hidden [m]."""
@@ -124,7 +124,7 @@ def sky_exposure(
         seen.depth.unflatten(0, (batch, n)), LIFT, vectors(out, 2),
     ]  # fmt: skip
     count = batch * sizes["V"]
-    parts = max(1, min(torch.get_num_threads(), count // LEAST_TASKS))
+    parts = max(1, min(torch.get_num_threads(), count // MIN_TASKS))
     launch_ranges(kernels.sky_exposure, [count * k // parts for k in range(parts + 1)], inputs, like=vertices)
     return smooth_over_faces(out, faces)
 

@@ -62,7 +62,7 @@ Perceptual = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Distance of N images and N targets inside N masks, one number each."""
 
 
-LEAST_AREA = 0.05
+MIN_AREA = 0.05
 """Least area of a mask as a share of the picture: limits the weight of hands hidden behind their arms."""
 
 
@@ -102,7 +102,7 @@ def objective(
     """
     images, alphas = drawn
     targets, masks = true
-    areas = masks.sum((1, 2)).clamp_min(LEAST_AREA * masks[0].numel())
+    areas = masks.sum((1, 2)).clamp_min(MIN_AREA * masks[0].numel())
     terms = {
         "rgb": torch.vmap(masked_l1)(images, targets, masks).mean(),
         "mask": ((alphas - masks).abs().sum((1, 2)) / areas).mean(),

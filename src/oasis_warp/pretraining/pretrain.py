@@ -44,7 +44,7 @@ EAGER_STEPS = 4
 """Steps on CUDA before one is captured: they load the kernels, and show how much memory the pictures need."""
 SLACK = 3.0
 """Factor of the memory that pictures needed for their Gaussians, since each hand and pose needs another amount."""
-MOST_SKIPPED = 0.5
+MAX_SKIPPED = 0.5
 """Share of the steps since the last line of metrics that a gradient that is not finite may leave without effect."""
 COOLDOWN = 0.2
 """Share of the steps over which a cooldown lowers the learning rate."""
@@ -253,7 +253,7 @@ def pretrain(
         if log_now or save_now:
             numbers = _mean_metrics(result, process.world)
             trainer.check_recording()
-            if numbers["skipped"] - skipped > MOST_SKIPPED * (trainer.step - reported):
+            if numbers["skipped"] - skipped > MAX_SKIPPED * (trainer.step - reported):
                 raise InputError(f"{folder}: the loss is not finite at step {trainer.step}; lower the learning rate.")
             reported, skipped = trainer.step, numbers["skipped"]
             if process.rank == 0:
@@ -297,7 +297,7 @@ def _step_of(line: bytes) -> int | float:
 
 FORMAT = "oasis-pretraining"
 MOMENTS = ("exp_avg", "exp_avg_sq")
-MOST_STEPS = 1 << 24
+MAX_STEPS = 1 << 24
 """Of a training; float32 counts no further, and Adam counts in it."""
 
 
@@ -326,7 +326,7 @@ def load_checkpoint(path: Path, network: nn.Module, optimizer: torch.optim.Adam,
         if header is None:
             raise InputError(f"{path}: expected a checkpoint, got another safetensors file; remove it.")
         step = header.get("step")
-        if not whole(step, 0, MOST_STEPS):
+        if not whole(step, 0, MAX_STEPS):
             raise InputError(f"{path}: damaged, its step is {shortened(repr(step))}; remove it.")
         if header != json.loads(json.dumps({"step": step, **identity})):
             raise InputError(

@@ -18,7 +18,7 @@ UNIT = 0.1
 FINGER_ORDER = tuple(FINGERS.index(name) for name in ("thumb", "index", "middle", "ring", "little"))
 EXPOSURE_JITTER = 0.35
 """Standard deviation of the logarithm of each photo's exposure, beside the sensor's own."""
-LEAST_SKIN = 0.6
+MIN_SKIN = 0.6
 """Share of a pixel that must be visible bare skin for its surface point to count."""
 
 
@@ -95,7 +95,7 @@ def _with_ground_truth(batch: ShadedBatch, image: Tensor, front: Tensor) -> Dens
     return DenseBatch(
         image=image,
         classes=classes,
-        skin=(covered[:, 0] > LEAST_SKIN) & (classes[:, 1] > LEAST_SKIN),
+        skin=(covered[:, 0] > MIN_SKIN) & (classes[:, 1] > MIN_SKIN),
         surface=surface,
         normal=torch.nn.functional.normalize(normal, dim=1),
         albedo=pooled(shaded.albedo).clamp(0, 1),

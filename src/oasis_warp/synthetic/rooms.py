@@ -21,7 +21,7 @@ class Room(NamedTuple):
     """Blur radius of distant things, as a share of the picture's width."""
 
 
-MOST_YAW = 1.5
+MAX_YAW = 1.5
 """Largest rotation of a room about the vertical [rad]: beyond a right angle its wall would be behind the camera."""
 
 
@@ -37,7 +37,7 @@ def sample_room(rng: np.random.Generator, distance: float, reach: float) -> Room
     u = rng.uniform
     down = {"desk": u(0.3, 1.3), "floor": u(0.7, 1.45), "cloth": u(0.1, 1.4), "garden": u(-0.1, 0.35)}
     pitch = down.get(kind, rng.normal(0.05, 0.10))
-    yaw = float(np.clip(rng.normal(0, 0.45), -MOST_YAW, MOST_YAW))
+    yaw = float(np.clip(rng.normal(0, 0.45), -MAX_YAW, MAX_YAW))
     build = Builder(rng, yaw, pitch, rng.normal(0, 0.07))
     KINDS[kind][1](build, distance + reach)
     aperture = float(np.exp(u(np.log(0.0015), np.log(0.035)))) * (1.6 if kind == "room" else 1.0)

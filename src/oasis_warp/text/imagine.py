@@ -11,7 +11,7 @@ from oasis_warp.estimation.landmarks import box_size
 from oasis_warp.text.conditioning import Conditioning
 from oasis_warp.text.generators import Generator
 
-MOST_OFF = 6.0
+MAX_OFF = 6.0
 """Largest mean distance of the landmarks found from those asked for [% of the longer side of their box]. Neighbouring
 knuckles of an open hand are some 12 % apart: from half of that on, a finger may stand in its neighbour's place."""
 SQUARE = 0.02
@@ -72,4 +72,4 @@ def _distance(estimator: HandEstimator, conditioning: Conditioning, photo: Photo
     if not hands:
         return f"no {conditioning.side} hand found"
     off = min(float((hand.xy - asked).norm(dim=-1).mean()) for hand in hands) / size * 100
-    return off if off <= MOST_OFF else f"the landmarks are {off:.0f} % of the hand's size off"
+    return off if off <= MAX_OFF else f"the landmarks are {off:.0f} % of the hand's size off"

@@ -4,7 +4,7 @@
 
 const FLAT = 1e-6; // twice the area over the longest edge squared, up to which a face is flat
 const DAMPING = 0.5e-6; // added to both areas of a ratio, over the longest rest edge squared
-const MOST_GROWTH = 1e4; // limits of area ratios
+const MAX_GROWTH = 1e4; // limits of area ratios
 
 function makeBody(data) {
   const { vertices, faces, weights, correctives, reach } = data.arrays;

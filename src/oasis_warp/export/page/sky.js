@@ -7,7 +7,7 @@ const FAR = 50; // distance of the cameras, in radii of the surface
 const MARGIN = 1.03; // radius that a buffer shows, in radii of the surface
 const LIFT = 0.002; // off the surface from which points look, and length of the ramp from seen to hidden [m]
 const STEEPEST = 3; // tangent up to which depth may differ by a texel's slope
-const LEAST_LIGHT = 1e-6;
+const MIN_LIGHT = 1e-6;
 const NEARBY = 2; // rings of coarse faces within which what hid the sky counts as having moved, as in avatar/sky.py
 const HURRY = 4;
 const LOBE = [1, 2 / 3, 2 / 3, 2 / 3, 1 / 4, 1 / 4, 1 / 4, 1 / 4, 1 / 4]; // what a cosine lobe leaves of each harmonic
@@ -48,7 +48,7 @@ function exposeVertices(body, sky, normals, harmonics, hurry) {
     }
     gather(sky, toSky, shares, skyWeights[k], radiance(harmonics, turned(frame, toSky)));
   }
-  for (let i = 0; i < 4 * count; i++) sky.seen[i] = sky.whole[i] > LEAST_LIGHT ? Math.min(sky.seen[i] / sky.whole[i], 1) : 1;
+  for (let i = 0; i < 4 * count; i++) sky.seen[i] = sky.whole[i] > MIN_LIGHT ? Math.min(sky.seen[i] / sky.whole[i], 1) : 1;
   smoothOverFaces(sky, skyFaces);
   readAtVertices(body, sky);
 }

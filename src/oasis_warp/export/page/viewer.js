@@ -3,8 +3,8 @@
 
 const SLOW = 33, QUICK = 20; // ms a picture above which moving pictures are drawn smaller, and below which larger again
 const REST = 250; // ms without a change after which nothing moves
-const LEAST_SCALE = 0.5; // of the window's own pixels
-const MOST_SCALE = 2; // of CSS pixels: more are not seen
+const MIN_SCALE = 0.5; // of the window's own pixels
+const MAX_SCALE = 2; // of CSS pixels: more are not seen
 
 function makeViewer(canvas, facts, worker, { draw, facing }) {
   const viewer = {
@@ -47,7 +47,7 @@ function step(viewer) {
 }
 
 async function paint(viewer) {
-  const full = Math.min(devicePixelRatio || 1, MOST_SCALE), scale = full * (viewer.moving ? viewer.scale : 1);
+  const full = Math.min(devicePixelRatio || 1, MAX_SCALE), scale = full * (viewer.moving ? viewer.scale : 1);
   const box = viewer.canvas.getBoundingClientRect();
   const width = Math.max(1, Math.round(box.width * scale)), height = Math.max(1, Math.round(box.height * scale));
   const found = await ask(viewer, cameraOf(viewer, width, height), viewer.look, viewer.angles, viewer.moving > 0);
@@ -65,7 +65,7 @@ function countPicture(viewer) {
   if (viewer.times.length < 12) return;
   const usual = viewer.times.sort((a, b) => a - b)[6];
   viewer.times.length = 0;
-  if (usual > SLOW * 1.15) viewer.scale = Math.max(LEAST_SCALE, viewer.scale * 0.85);
+  if (usual > SLOW * 1.15) viewer.scale = Math.max(MIN_SCALE, viewer.scale * 0.85);
   else if (usual < QUICK) viewer.scale = Math.min(1, viewer.scale * 1.1);
 }
 
@@ -87,7 +87,7 @@ function cameraOf({ camera, facts }, width, height) {
 
 // A picture as a PNG with a transparent background. With `fit` the hand fills it, as `oasis render` draws it.
 async function takePicture(viewer, { angles, look, azimuth, elevation, width, height, fit = false } = {}) {
-  const box = viewer.canvas.getBoundingClientRect(), ratio = Math.min(devicePixelRatio || 1, MOST_SCALE);
+  const box = viewer.canvas.getBoundingClientRect(), ratio = Math.min(devicePixelRatio || 1, MAX_SCALE);
   const w = width ?? Math.round(box.width * ratio), h = height ?? Math.round(box.height * ratio);
   const camera = { ...cameraOf(viewer, w, h), ...(fit ? { target: null, zoom: 1 } : {}) };
   camera.azimuth = azimuth ?? camera.azimuth;

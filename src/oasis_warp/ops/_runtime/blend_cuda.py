@@ -15,7 +15,7 @@ from oasis_warp.ops._runtime.records import Frame, GradientFlags, Gradients, Siz
 from oasis_warp.ops._runtime.rules import current_rules
 from oasis_warp.ops._runtime.tiles import MAX_PAIRS, check_pairs, fake_opaque_buffer, opaque_buffer
 
-MOST_CHECKPOINTS = 1 << 16
+MAX_CHECKPOINTS = 1 << 16
 """Tiles times numbers per pixel up to which lists are cut into segments. Beyond, the tiles alone fill a device, and the
 memory for segments would outgrow the images."""
 
@@ -62,7 +62,7 @@ def layout_of(n_cameras: int, n: int, channels: int, frame: Frame) -> Layout:
     width, height, _ = frame
     across, down = -(-width // tiles_cuda.TILE), -(-height // tiles_cuda.TILE)
     n_tiles = n_cameras * across * down
-    segments = tiles_cuda.SEGMENTS if n_tiles * (channels + 1) <= MOST_CHECKPOINTS else 1
+    segments = tiles_cuda.SEGMENTS if n_tiles * (channels + 1) <= MAX_CHECKPOINTS else 1
     return Layout(n_cameras, n, channels, across, down, width, height, n_tiles, n_cameras * height * width, segments)
 
 

@@ -8,7 +8,7 @@ import warp as wp
 
 from oasis_kernels.runtime.cuda_native import CudaNative
 
-MOST_BOUNDS = 256
+MAX_BOUNDS = 256
 """Numbers of blocks of one kernel that a thread remembers."""
 
 
@@ -55,7 +55,7 @@ class CudaLaunch:
     def _resize(self, n_blocks: int) -> None:
         bounds = self._bounds.get(n_blocks)
         if bounds is None:
-            if len(self._bounds) >= MOST_BOUNDS:
+            if len(self._bounds) >= MAX_BOUNDS:
                 self._bounds.clear()
             self._launch.set_dim(n_blocks * self._threads)
             bounds = self._bounds[n_blocks] = self._launch.bounds

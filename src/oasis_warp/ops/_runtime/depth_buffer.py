@@ -11,7 +11,13 @@ from torch import Tensor
 
 from oasis_kernels.depth import depth_buffer as kernels
 from oasis_kernels.depth import depth_buffer_native as vectors
-from oasis_kernels.depth.depth_buffer_native import POINTS_A_TASK, QUADS_A_TASK, SPARE_COLUMNS, VERTICES_A_TASK, Job
+from oasis_kernels.depth.depth_buffer_native import (
+    POINTS_PER_TASK,
+    QUADS_PER_TASK,
+    SPARE_COLUMNS,
+    VERTICES_PER_TASK,
+    Job,
+)
 from oasis_warp.core.processes import kernel_threads
 from oasis_warp.ops._runtime import depth_cuda
 from oasis_warp.ops._runtime.depth_scene import Buffer, BufferParts, DepthScene, Query, Scores, restrict, shared
@@ -23,7 +29,7 @@ from oasis_warp.ops.checks import check_positive
 
 Drawn = tuple[Buffer, Scores | None]
 MAX_FRACTION_BITS = 22
-FACES_A_PART = 4096
+FACES_PER_PART = 4096
 """A mesh is drawn in parts, one per thread, of at least this many faces."""
 
 
@@ -78,7 +84,7 @@ def draw_by_vectors(scene: DepthScene, query: Query | None, outputs: BufferParts
     """`draw` on the CPU."""
     batch, n_vertices, _ = scene.vertices.shape
     width, height = scene.width, scene.height
-    parts = max(1, min(-(-kernel_threads() // max(batch, 1)), scene.faces.shape[0] // FACES_A_PART))
+    parts = max(1, min(-(-kernel_threads() // max(batch, 1)), scene.faces.shape[0] // FACES_PER_PART))
     drawn = outputs._replace(depth=True, face_ids=True)
     buffer = scene.empty_buffer(drawn)
     # One allocation: camera_vertices, screen_vertices and planes, in numbers of 4 bytes.
@@ -115,10 +121,10 @@ def _run_all(job: Job, dtype: str) -> None:
     if kernel_threads() == 1:
         _run("all", dtype, job, 1)
         return
-    _run("transform", dtype, job, -(-job.n_vertices // VERTICES_A_TASK))
+    _run("transform", dtype, job, -(-job.n_vertices // VERTICES_PER_TASK))
     _run("draw", dtype, job, job.parts)
-    _run("write", dtype, job, -(-job.height // (4 * QUADS_A_TASK)))
-    _run("score", dtype, job, -(-job.n_points // POINTS_A_TASK))
+    _run("write", dtype, job, -(-job.height // (4 * QUADS_PER_TASK)))
+    _run("score", dtype, job, -(-job.n_points // POINTS_PER_TASK))
 
 
 def _run(stage: str, dtype: str, job: Job, tasks: int) -> None:
@@ -219,7 +225,7 @@ def vertex_gradients_by_vectors(
         grad_vertices=grad_vertices.data_ptr(),
     )  # fmt: skip
     dtype = SCALAR_NAMES[slopes.dtype]
-    _run("transform", dtype, job, -(-n_vertices // VERTICES_A_TASK))
+    _run("transform", dtype, job, -(-n_vertices // VERTICES_PER_TASK))
     _run("pull", dtype, job, 1)
     return grad_vertices
 

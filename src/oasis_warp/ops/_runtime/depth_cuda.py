@@ -13,9 +13,9 @@ from oasis_kernels.depth.depth_buffer_cuda import BLOCK
 from oasis_warp.ops._runtime.depth_scene import Buffer, BufferParts, DepthScene, Query, Scores, shared
 from oasis_warp.ops._runtime.launch import block_count, current_stream, run_cuda
 
-MOST_BLOCKS = 1 << 22
+MAX_BLOCKS = 1 << 22
 """Of a launch: Warp counts threads in 32 bits. Kernels loop until all is done."""
-PAIRS_A_BLOCK = 4 * BLOCK
+PAIRS_PER_BLOCK = 4 * BLOCK
 """Pairs of keys that a block clears."""
 BLOCKS_AT_ONCE = 3
 """Blocks that a multiprocessor holds. So many draw large faces; four times as many read the keys."""
@@ -75,21 +75,21 @@ def draw(
     keys = scratch.data_ptr()
     counter = keys + 16 * key_pairs
     # A small image has one pixel, or less, for each thread that runs at once.
-    pixels_a_thread = min(max(batch * plane // (2 * BLOCK * at_once), 1), depth_buffer_cuda.MOST_PIXELS)
+    pixels_a_thread = min(max(batch * plane // (2 * BLOCK * at_once), 1), depth_buffer_cuda.MAX_PIXELS)
     params = _scene_params(scene) | _query_params(query, scores) | buffer._asdict() | {
         "near_plane": scene.near_plane, "n_vertices": scene.vertices.shape[1], "keys": keys, "key_pairs": key_pairs,
         "counter": counter, "queue_faces": counter + 8, "queue_starts": counter + 8 + 8 * capacity,
         "capacity": capacity, "pixels_a_thread": pixels_a_thread, "found": found,
     }  # fmt: skip
-    blocks = min(block_count(key_pairs, PAIRS_A_BLOCK), MOST_BLOCKS)
+    blocks = min(block_count(key_pairs, PAIRS_PER_BLOCK), MAX_BLOCKS)
     run_cuda(depth_buffer_cuda.clear, params, blocks, stream)
-    blocks = min(batch * block_count(n_faces, depth_buffer_cuda.FACES_A_BLOCK), MOST_BLOCKS)
+    blocks = min(batch * block_count(n_faces, depth_buffer_cuda.FACES_PER_BLOCK), MAX_BLOCKS)
     run_cuda(depth_buffer_cuda.draw, params, blocks, stream)
     if capacity:
         run_cuda(depth_buffer_cuda.draw_large, params, at_once, stream)
     blocks = block_count(plane, pixels_a_thread * BLOCK) if any(outputs) else 0
     blocks += 0 if query is None else block_count(query.points.shape[1], BLOCK)
-    run_cuda(depth_buffer_cuda.resolve, params, min(batch * blocks, 4 * at_once, MOST_BLOCKS), stream)
+    run_cuda(depth_buffer_cuda.resolve, params, min(batch * blocks, 4 * at_once, MAX_BLOCKS), stream)
     return buffer, scores
 
 
@@ -121,5 +121,5 @@ def gradients(
     if needs_vertices and blocks:
         run_cuda(depth_buffer_cuda.pull, params | {"adds": 1}, blocks, stream)
         params = {"sums": sums, "shift": shift, "n": batch * n_vertices, "grad_vertices": grad_vertices}
-        run_cuda(depth_buffer_cuda.settle, params, min(block_count(batch * n_vertices, BLOCK), MOST_BLOCKS), stream)
+        run_cuda(depth_buffer_cuda.settle, params, min(block_count(batch * n_vertices, BLOCK), MAX_BLOCKS), stream)
     return grad_points, grad_vertices

@@ -30,7 +30,7 @@ VECTORS = {
     torch.float64: {2: wp.vec2d, 3: wp.vec3d, 4: wp.vec4d},
     torch.int32: {2: wp.vec2i, 4: wp.vec4i},
 }
-LEAST_TASKS = 2048
+MIN_TASKS = 2048
 """Of a generic kernel, for which another thread is worth its while."""
 SCALAR_NAMES = {torch.float32: "float", torch.float64: "double"}
 SCALAR = {torch.float32: wp.float32, torch.float64: wp.float64, torch.int32: wp.int32, torch.int64: wp.int64}
@@ -155,8 +155,8 @@ def _pool(process: int, n_threads: int) -> ThreadPoolExecutor:
 
 
 def even_cuts(n: int) -> list[int]:
-    """Bounds 0 .. n of ranges for `launch_ranges`: one for each thread, none with fewer than `LEAST_TASKS`."""
-    parts = max(1, min(kernel_threads(), n // LEAST_TASKS))
+    """Bounds 0 .. n of ranges for `launch_ranges`: one for each thread, none with fewer than `MIN_TASKS`."""
+    parts = max(1, min(kernel_threads(), n // MIN_TASKS))
     return [n * k // parts for k in range(parts + 1)]
 
 

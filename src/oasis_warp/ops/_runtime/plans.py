@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import Function
 from torch.nn import Parameter
 
-MOST_PLANS = 32
+MAX_PLANS = 32
 """Kinds of calls that a thread remembers."""
 ALIGNMENT = 256
 """Of the arrays in a workspace [bytes]."""
@@ -23,7 +23,7 @@ class Plans(threading.local):
 
     def keep(self, key: tuple[Any, ...], plan: Any) -> Any:
         """Remember `plan`, and return it."""
-        while len(self.plans) >= MOST_PLANS:
+        while len(self.plans) >= MAX_PLANS:
             del self.plans[next(iter(self.plans))]
         self.plans[key] = plan
         return plan

@@ -12,7 +12,7 @@ from oasis_warp.ops._runtime.launch import launch_ranges, vectors
 
 MAX_PAIRS = 2**31 - 1
 """Pairs of a Gaussian and a tile that one call can hold."""
-RANGES_A_THREAD = 4
+RANGES_PER_THREAD = 4
 """Ranges of tiles per thread, so that none waits long for the last."""
 
 
@@ -93,7 +93,7 @@ def check_pairs(n_pairs: int) -> None:
 def even_work(starts: Tensor) -> list[int]:
     """Bounds of ranges of tiles with about equally many pairs; an empty tile counts a little too."""
     n_tiles = len(starts) - 1
-    parts = min(RANGES_A_THREAD * kernel_threads(), n_tiles)
+    parts = min(RANGES_PER_THREAD * kernel_threads(), n_tiles)
     if n_tiles == 0 or starts.is_cuda or kernel_threads() == 1:
         return [0, n_tiles]
     work = starts + torch.arange(n_tiles + 1) * 4
