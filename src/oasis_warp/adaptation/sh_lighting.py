@@ -328,7 +328,7 @@ def mark_probability(beyond: Float[Tensor, "V 3"]) -> Float[Tensor, "V 1"]:
 LIKELY_SHADE, LIKELY_HUE = (-0.6, 0.25), 0.1
 """Range of the logarithm of shade on a slant, and of each channel's difference from the mean of all, which light gives
 to skin; set by eye, as the two below, on four of the photos in docs/looks.md."""
-SLANTED, OPENLY = 0.3, 0.6
+SLANTED, OPENLY = 0.15, 0.4
 """Cosines between normal and view up to which and from which skin is seen on a slant and openly."""
 
 
