@@ -82,7 +82,9 @@ def test_a_run_that_was_stopped_goes_on_and_ends_with_the_same_files(whole, tmp_
 def test_a_finished_folder_is_left_as_it_is_and_a_larger_count_adds_to_it(whole, tmp_path):
     folder = tmp_path / "hands"
     write_shards(folder, **(JOB | {"count": 3}))
+    (folder / ".hands-000000.01234567.part.tar").touch()  # a second run was killed while the first finished the shard
     assert write_shards(folder, **(JOB | {"count": 3})) == 0
+    assert not list(folder.glob(".*"))
     assert write_shards(folder, **JOB) == 3  # the last shard was not full
     assert _files(folder) == _files(whole)
 

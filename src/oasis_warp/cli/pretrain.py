@@ -19,7 +19,7 @@ from oasis_warp.cli.record import keep_command
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.published_files import published_file
-from oasis_warp.data.output_files import open_resumable_folder
+from oasis_warp.data.output_files import open_resumable_folder, remove_leftovers
 from oasis_warp.datasets.readers import PAPER, read_dataset, read_selection
 from oasis_warp.datasets.training_source import DatasetHands, MixedHands
 from oasis_warp.hand.mano import read_mano
@@ -146,6 +146,7 @@ def train(options: Pretrain, process: ProcessInfo, progress: Progress) -> int:
         claim(options.out, settings)
         if process.device.type == "cpu":
             (options.out / PEOPLE).mkdir(exist_ok=True)
+            remove_leftovers(options.out / PEOPLE)
     wait_for_all(process)
     hands.bake(met, options.out / PEOPLE, options.workers, progress)
     with stop_signals(can_force=process.world == 1) as should_stop:

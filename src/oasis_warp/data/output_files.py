@@ -276,6 +276,8 @@ def _explain(path: Path | str, error: OSError) -> InputError:
 def open_resumable_folder(folder: Path, name: str, settings: dict[str, Any], content: str) -> None:
     """Create `folder` and write `settings` to its file `name`, or check that the same settings stand there.
 
+    What killed runs left in it is removed: of a file that is complete, nothing else would.
+
     Args:
         folder: Made if it is missing, with those above it.
         name: Name of the JSON file.
@@ -301,6 +303,7 @@ def open_resumable_folder(folder: Path, name: str, settings: dict[str, Any], con
             f"{folder}: holds {content} made with other settings{_first_difference(noted, settings)} (see {name}); "
             "choose another folder."
         )
+    remove_leftovers(folder)
 
 
 def _first_difference(noted: bytes, settings: dict[str, Any]) -> str:
