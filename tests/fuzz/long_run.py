@@ -13,6 +13,7 @@ from pathlib import Path
 
 BATCH = 500
 """Files a process."""
+KINDS = ("avatars", "weights", "keypoints", "fits", "estimates", "images", "splats", "motions")
 PATIENCE = 300.0
 """Seconds to wait for one file, on a machine that is busy with other things."""
 
@@ -57,7 +58,7 @@ def batch(name: str, seed: int, first: int, last: int, report: Callable[[tuple[i
 def main() -> None:
     """Read the command line, run all batches and print what happened."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("target", choices=("avatars", "weights", "keypoints", "fits", "images", "splats", "motions"))
+    parser.add_argument("target", choices=KINDS)
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
@@ -79,6 +80,8 @@ def main() -> None:
             pass
         child.kill()
         child.join()
+        if reached not in outcomes:
+            raise SystemExit(f"{options.target}: cannot be made, exit code {child.exitcode}.")
         if outcomes.get(reached) == "started":
             outcomes[reached] = f"fault: exit code {child.exitcode}"
         first = reached + 1

@@ -138,6 +138,7 @@ def _change_values(rng: np.random.Generator, entry: dict[str, Any], body: bytear
     kinds = {"F32": "<f4", "F16": "<f2", "F64": "<f8", "I64": "<i8", "I32": "<i4"}
     if entry["dtype"] not in kinds or end <= begin:
         return
+    end -= (end - begin) % WIDTHS[entry["dtype"]]  # the type may have been changed before
     values = np.frombuffer(bytes(body[begin:end]), kinds[entry["dtype"]]).copy()
     where = rng.random(len(values)) < choose(rng, (1.0, 0.01, 2 / len(values)))
     with np.errstate(over="ignore", invalid="ignore"):
