@@ -43,7 +43,9 @@ def inpaint(
     data = mass * confidence.detach().cpu().numpy().astype(np.float64) / detail**2
     system = laplacian + sparse.diags(data + mass / fade**2)
     right = data[:, None] * observed.detach().cpu().numpy().astype(np.float64)
-    solution = splu(system.tocsc()).solve(np.ascontiguousarray(right))
+    # Positive definite: an order for symmetric matrices and no pivots halve the time and the memory of the factors.
+    factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    solution = factors.solve(np.ascontiguousarray(right))
     return torch.from_numpy(solution).to(observed)
 
 

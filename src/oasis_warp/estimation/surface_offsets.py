@@ -59,6 +59,8 @@ _TOLERANCE, _MAX_STEPS = 1e-4, 100
 """Relative residual at which conjugate gradients end: no vertex is then off by more than 1e-7 m."""
 _STEP = 0.25
 """Spacing of the samples across the outline, in pixels of the window."""
+_CLOSE = 12.0
+"""Distance up to which outlines are looked for first [px]; nearly all are found there."""
 
 
 def outline_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
@@ -216,9 +218,20 @@ def _compare_rendered(
 
 def crossing(image: np.ndarray, start: np.ndarray, outward: np.ndarray, reach: float) -> np.ndarray:
     """Signed distance from each `start` along `outward` to the nearest place where `image` falls through .5, or NaN."""
+    t = np.arange(-reach, reach + _STEP, _STEP)
+    close = t[np.abs(t) < _CLOSE]
+    if len(close) < 2 or len(close) == len(t):
+        return _nearest_fall(image, start, outward, t)
+    place = _nearest_fall(image, start, outward, close)  # what is found here is nearer than all beyond
+    rest = np.flatnonzero(np.isnan(place))
+    place[rest] = _nearest_fall(image, start[rest], outward[rest], t)
+    return place
+
+
+def _nearest_fall(image: np.ndarray, start: np.ndarray, outward: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """The same among the samples at the distances `t`."""
     if not len(start):  # a few pixels of hand have no outline, and OpenCV reads no empty list
         return np.zeros(0)
-    t = np.arange(-reach, reach + _STEP, _STEP)
     x, y = (start[:, k, None] + outward[:, k, None] * t - 0.5 for k in (0, 1))
     values = cv2.remap(image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
     before, after = values[:, :-1], values[:, 1:]
@@ -234,31 +247,46 @@ class ThinSheet:
     """The surface as a sheet that resists bending, and is drawn to targets at some of its vertices."""
 
     def __init__(self, faces: np.ndarray, n_vertices: int):
-        self._stiffness = _bending(np.ascontiguousarray(faces, np.int64).tobytes(), n_vertices)
-        self._n_vertices = n_vertices
+        self._stiffness, self._order = _bending(np.ascontiguousarray(faces, np.int64).tobytes(), n_vertices)
         self._factors: SuperLU | None = None
+        self._last: np.ndarray | None = None
 
     def solve(self, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """The displacement [V, D] that comes nearest to the targets [K, D] of some vertices [K].
 
-        The first system is factorised. Its factors precondition conjugate gradients for later ones, which have targets
-        at nearly the same vertices: a few iterations take less time than another factorisation. Factors of the sheet
-        without targets, which could be kept for all photos, take three times as many iterations, more than they save.
+        By conjugate gradients from the last solution. Float32 factors of the first system precondition all of them:
+        later ones have targets at nearly the same vertices, and a few iterations take less time than other factors.
+        Those of the sheet without targets, which could be kept for all photos, take three times as many iterations,
+        more than they save.
         """
-        diagonal, right = np.zeros(self._n_vertices), np.zeros((self._n_vertices, target.shape[1]))
+        n = len(self._order)
+        diagonal, right = np.zeros(n), np.zeros((n, target.shape[1]))
         np.add.at(diagonal, vertices, weight)
         np.add.at(right, vertices, weight[:, None] * target)
-        system = (self._stiffness + sparse.diags_array(diagonal)).tocsc()
-        if self._factors is None:
-            options = {"SymmetricMode": True}
-            factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-            self._factors = factors
-            return factors.solve(right)
+        diagonal, right = diagonal[self._order], right[self._order]
+        factors = self._factors or _factorized(self._stiffness + sparse.diags_array(diagonal), "NATURAL")
+        self._factors = factors
+
+        def system(x: np.ndarray) -> np.ndarray:
+            return self._stiffness @ x + diagonal[:, None] * x
+
+        def precondition(residual: np.ndarray) -> np.ndarray:
+            return factors.solve(residual.astype(np.float32)).astype(np.float64)
+
         solution, _ = cg(
-            _operator(system.dot, right.shape), right.ravel(), M=_operator(self._factors.solve, right.shape),
+            _operator(system, right.shape), right.ravel(), self._last, M=_operator(precondition, right.shape),
             rtol=_TOLERANCE, maxiter=_MAX_STEPS,
         )  # fmt: skip
-        return solution.reshape(right.shape)
+        self._last = solution
+        found = np.empty_like(right)
+        found[self._order] = solution.reshape(right.shape)
+        return found
+
+
+def _factorized(system: sparse.sparray, order: str) -> SuperLU:
+    """Float32 factors of a positive definite matrix."""
+    options = {"SymmetricMode": True}
+    return splu(system.tocsc().astype(np.float32), permc_spec=order, diag_pivot_thresh=0.0, options=options)
 
 
 def _operator(function: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int]) -> LinearOperator:
@@ -268,11 +296,17 @@ def _operator(function: Callable[[np.ndarray], np.ndarray], shape: tuple[int, in
 
 
 @functools.lru_cache(1)
-def _bending(faces: bytes, n: int) -> sparse.csc_array:
-    """BEND L^T L + STAY with the umbrella operator L (mean of the neighbours minus the vertex)."""
+def _bending(faces: bytes, n: int) -> tuple[sparse.csc_array, np.ndarray]:
+    """BEND L^T L + STAY with the umbrella operator L (mean of the neighbours minus the vertex), and its order.
+
+    The order of the vertices, in which the matrix is given, makes factors sparse (minimum degree). Targets add to the
+    diagonal alone, so that it serves every photo.
+    """
     a, b, c = np.frombuffer(faces, np.int64).reshape(-1, 3).T
     i, j = np.r_[a, b, c, b, c, a], np.r_[b, c, a, a, b, c]
     pairs = np.unique(np.stack([i, j]), axis=1)
     share = 1 / np.bincount(pairs[0], minlength=n)[pairs[0]]
     umbrella = sparse.csr_array((share, tuple(pairs)), shape=(n, n)) - sparse.eye_array(n)
-    return (_BEND * umbrella.T @ umbrella + _STAY * sparse.eye_array(n)).tocsc()
+    stiffness = (_BEND * umbrella.T @ umbrella + _STAY * sparse.eye_array(n)).tocsc()
+    order = np.argsort(_factorized(stiffness, "MMD_AT_PLUS_A").perm_c)
+    return stiffness[order][:, order].tocsc(), order
