@@ -20,7 +20,7 @@ from typing import ClassVar
 
 import cv2
 
-from oasis_warp.cli.batch import finish, share_out
+from oasis_warp.cli.batch import finish, split_tasks
 from oasis_warp.cli.batch_work import ROW, Order, make_avatars
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.processes import worker_pool
@@ -77,7 +77,7 @@ def measure_many(photos: int, processes: int) -> Row:
         warm_up("cpu")
         order, load = Order(source=source, out=out, config=SMALLEST), os.getloadavg()[0]
         out.mkdir()
-        tasks = share_out(sorted(path.name for path in source.iterdir()), processes)
+        tasks = split_tasks(sorted(path.name for path in source.iterdir()), processes)
         counts, start, before = Counter[str](), time.perf_counter(), cpu_seconds()
         with worker_pool(processes) as pool:
             for done in as_completed([pool.submit(make_avatars, task, order) for task in tasks]):

@@ -1,6 +1,6 @@
-"""How well the hand of a video is followed: films of an avatar whose motion is known, before and after the filter.
+"""How well the hand of a video is followed: videos of an avatar whose motion is known, before and after the filter.
 
-Fills docs/viewing.md (followed). The films have noise, and the avatar is that of `exports`.
+Fills docs/viewing.md (followed). The videos have noise, and the avatar is that of `exports`.
 """
 
 import math
@@ -18,7 +18,7 @@ from oasis_warp.cli.animate import draw_frames
 from oasis_warp.core import rotation
 from oasis_warp.core.logging import silent
 from oasis_warp.core.types import HandPose
-from oasis_warp.data.films import write_video
+from oasis_warp.data.videos import write_video
 from oasis_warp.hand.poses import pose_sequence
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.motion import Motion, jitter, recording, smooth

@@ -137,7 +137,7 @@ def test_photos_are_found_at_any_depth_or_on_a_list_but_not_among_results(tmp_pa
 
 @pytest.mark.parametrize(("n", "workers", "size"), [(1, 4, 1), (40, 2, 1), (1000, 2, 31), (1_000_000, 100, 256)])
 def test_few_photos_are_shared_by_all_workers_and_many_by_few_tasks(n, workers, size):
-    tasks = batch.share_out([str(k) for k in range(n)], workers)
+    tasks = batch.split_tasks([str(k) for k in range(n)], workers)
     assert [name for task in tasks for name in task] == [str(k) for k in range(n)]
     assert {len(task) for task in tasks[:-1]} <= {size} and len(tasks[-1]) <= size
 

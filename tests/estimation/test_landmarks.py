@@ -16,7 +16,7 @@ from oasis_warp.estimation.keypoints import read_keypoints
 from oasis_warp.estimation.landmarks import (
     FINGERS,
     DetectedHand,
-    _turned_back,
+    _undo_rotation,
     box_size,
     crop_of_landmarks,
     detect_hands,
@@ -83,7 +83,7 @@ def test_points_of_a_turned_search_lie_where_they_are_in_the_photo(turns):
     xy = np.tile([[column + 0.5, row + 0.5]], (21, 1))
     down = np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), turns) @ [0, 1]  # "down" of the photo, turned
     seen = DetectedHand(xy, np.tile([[*down, 2.0]], (21, 1)), 1.0, 1.0, 1.0, "")
-    back = _turned_back(seen, turns, marked.shape, margin=1)
+    back = _undo_rotation(seen, turns, marked.shape, margin=1)
     np.testing.assert_allclose(back.xy[0], [6.5 - 1, 1.5 - 1])
     np.testing.assert_allclose(back.world[0], [0, 1, 2])
 

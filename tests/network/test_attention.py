@@ -22,7 +22,7 @@ from oasis_warp.core import rotation, surface
 from oasis_warp.core.surface import faces_of_vertices
 from oasis_warp.hand.skinning import rest_hand
 from oasis_warp.network.attention import (
-    NEVER,
+    MASKED_LOGIT,
     AdaptiveNorm,
     Block,
     CoarseLevel,
@@ -74,7 +74,7 @@ def test_gradients_are_those_of_the_biased_softmax(random):
 def test_a_forbidden_key_is_never_read(random):
     q, k, v = 30 * draw(random, 1, 1, 4, 8), draw(random, 1, 1, 6, 8), draw(random, 1, 1, 6, 8)
     column = torch.zeros(1, 6)
-    column[0, 2] = NEVER
+    column[0, 2] = MASKED_LOGIT
     out, _ = attend(q, k, v, torch.ones(1, 4), column)
     v[..., 2, :] = 1e6
     again, _ = attend(q, k, v, torch.ones(1, 4), column)

@@ -32,9 +32,9 @@ from oasis_warp.network.prior import (
     bundled_prior,
     canonical_gaussians,
     choose_prior,
+    clamp_to_surface,
     color_sources,
     cover_surface,
-    hold_to_surface,
 )
 from oasis_warp.network.weights_file import read_header, save_network
 from oasis_warp.render.render import render
@@ -125,10 +125,10 @@ def test_no_gaussian_floats_off_the_skin(network, hand, crops):
         wild = prior._predict(crop)
     wild = wild._replace(offsets=0.006 * torch.sign(wild.offsets + 1e-9), scales=wild.scales + 0.004)
     rest = crop.rest.vertices
-    held = hold_to_surface(wild, surface_of(network, crop))
-    above = (held.offsets[0] * surface.vertex_normals(rest, network.faces)).sum(-1)
+    clamped = clamp_to_surface(wild, surface_of(network, crop))
+    above = (clamped.offsets[0] * surface.vertex_normals(rest, network.faces)).sum(-1)
     assert float(above.max()) < 1e-6
-    assert float(held.scales.max()) <= 1.001 * MAX_SCALE
+    assert float(clamped.scales.max()) <= 1.001 * MAX_SCALE
     guess = prior(crop)
     assert float(guess.scales.max()) <= 1.001 * MAX_SCALE
 

@@ -13,7 +13,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera
 from oasis_warp.losses.lpips import Lpips
 from oasis_warp.network.encoders import SIZES, ConvolutionalEncoder, DinoV2Encoder, ImageFeatures, Size
-from oasis_warp.network.tokens import Aggregation, PlaceEncoding, PointFeatures, Tokenizer, encode, grid_places
+from oasis_warp.network.tokens import Aggregation, PointFeatures, PositionEncoding, Tokenizer, encode, grid_positions
 
 
 def literal_aggregation(planes, uv, sigma, reach):
@@ -180,17 +180,17 @@ def test_an_encoding_holds_sines_and_cosines_of_every_octave():
 
 
 def test_places_far_apart_are_encoded_differently_and_the_same_place_alike(random):
-    place = PlaceEncoding(32)
+    place = PositionEncoding(32)
     uv = torch.rand(1, 50, 2, generator=random)
     torch.testing.assert_close(place(uv), place(uv.clone()))
     assert float(torch.pdist(place(uv)[0].detach()).min()) > 0.01
 
 
 def test_cells_of_a_map_lie_at_their_centres():
-    places = grid_places(2, 4, like=torch.zeros(1))
-    torch.testing.assert_close(places[0], torch.tensor([0.125, 0.25]))
-    torch.testing.assert_close(places[-1], torch.tensor([0.875, 0.75]))
-    torch.testing.assert_close(places[1] - places[0], torch.tensor([0.25, 0.0]))
+    positions = grid_positions(2, 4, like=torch.zeros(1))
+    torch.testing.assert_close(positions[0], torch.tensor([0.125, 0.25]))
+    torch.testing.assert_close(positions[-1], torch.tensor([0.875, 0.75]))
+    torch.testing.assert_close(positions[1] - positions[0], torch.tensor([0.25, 0.0]))
 
 
 @pytest.fixture

@@ -100,7 +100,7 @@ def slots(monkeypatch):
 def test_a_slot_is_nobody_elses_until_it_is_given_back(slots):
     taken = [slots.take() for _ in range(3000)]  # more than a page
     assert len({slot.data_ptr() for slot in taken}) == len(taken)
-    slots.give(taken[7])
+    slots.release(taken[7])
     assert slots.take() is taken[7]
 
 

@@ -7,7 +7,7 @@ from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin_surface
 from oasis_warp.ops import rasterization
 from oasis_warp.render.render import render
-from oasis_warp.render.replay import MOST, CapturedGraph, GraphCache, replayable, replayed
+from oasis_warp.render.replay import MAX_GRAPHS, CapturedGraph, GraphCache, replayable, replayed
 
 COLOR = (0.25, 0.5, 1.0)
 
@@ -79,9 +79,9 @@ def test_a_recording_is_made_once_for_each_key_and_used_for_every_call():
 
 def test_the_recording_unused_for_longest_makes_room():
     log, recordings = Log(), GraphCache()
-    for key in (*range(MOST), 0, MOST, 0, 1):
+    for key in (*range(MAX_GRAPHS), 0, MAX_GRAPHS, 0, 1):
         log.run(recordings, key)
-    assert log.made == [*range(MOST), MOST, 1]
+    assert log.made == [*range(MAX_GRAPHS), MAX_GRAPHS, 1]
 
 
 def test_where_memory_did_not_suffice_the_exact_result_comes_and_the_next_call_records_anew():

@@ -209,7 +209,7 @@ __global__ void draw_large(
         const unsigned pixels = (unsigned)box.width * (unsigned)box.height;
         for (; share < until; share++) {
             const unsigned first = (unsigned)(share - start) * SHARE, last = min(first + SHARE, pixels);
-            if (pixels > WORTH_A_LOOK && passes_by(camera, t, box, first, last)) continue;
+            if (pixels > CULLED_SHARE && passes_by(camera, t, box, first, last)) continue;
             draw_items(camera, mesh, first, last, [&](unsigned item) -> Hit {
                 return meet(camera, keys + b * plane, t, flat, box.left, box.top, box.width, f, item);
             });

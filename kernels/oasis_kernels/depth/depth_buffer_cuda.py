@@ -14,7 +14,7 @@ LARGE = 256
 """Pixels of a box above which a face goes to the queue."""
 SHARE = 512
 """Pixels of a box in the queue that are handed out at once."""
-WORTH_A_LOOK = 8 * SHARE
+CULLED_SHARE = 8 * SHARE
 """Pixels of a box above which a share is looked at as a whole first: most may lie beside a long, thin triangle."""
 QUEUE = 1 << 17
 """Faces that the queue holds at the most."""
@@ -27,7 +27,7 @@ PEAKS = 1024
 """Blocks of `pull` at the most."""
 CONSTANTS = {
     "FACES_PER_BLOCK": FACES_PER_BLOCK, "LARGE": LARGE, "SHARE": SHARE, "START_BITS": START_BITS,
-    "WORTH_A_LOOK": WORTH_A_LOOK, "MAX_PIXELS": MAX_PIXELS,
+    "CULLED_SHARE": CULLED_SHARE, "MAX_PIXELS": MAX_PIXELS,
 }  # fmt: skip
 
 

@@ -35,7 +35,7 @@ class Native:
 
     kernel: Any
     parameters: tuple[str, ...]
-    """The first is `give_way`: the address of a function without arguments that lets other threads run, or 0."""
+    """The first is `yield_thread`: the address of a function without arguments that lets other threads run, or 0."""
 
 
 def cpu_options() -> dict[str, Any]:
@@ -69,7 +69,7 @@ def native(
         shared: Parameters before those of the function: C++ types by name.
     """
     source = kernel_source(path, name)
-    parameters = {"give_way": "long long", **(shared or {}), **_typed(source.parameters, scalar)}
+    parameters = {"yield_thread": "long long", **(shared or {}), **_typed(source.parameters, scalar)}
     lines = [f"{kind} const {p} = ({kind})words[{k}];" for k, (p, kind) in enumerate(parameters.items())]
     body = source.body
     if body.lstrip().startswith("#pragma"):  # which has to stand at the start of a block

@@ -14,6 +14,6 @@ auto phase = [&](long long* state, long long n, auto&& task) {
 #if defined(__x86_64__)
         __builtin_ia32_pause();
 #endif
-        if (spins > 1000 && give_way) ((void (*)())give_way)();  // the other one may wait for this core
+        if (spins > 1000 && yield_thread) ((void (*)())yield_thread)();  // the other one may wait for this core
     }
 };

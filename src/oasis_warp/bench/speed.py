@@ -64,7 +64,7 @@ class SpeedRow:
     versions: str
 
 
-def ways(operator: Operator, device: torch.device) -> dict[str, Setting]:
+def backends(operator: Operator, device: torch.device) -> dict[str, Setting]:
     """How an operator is computed, by name; the first is ours."""
     scalar = {"scalar": GENERIC} if device.type == "cpu" and operator.vectorised else {}
     return {"warp": DEFAULT, **scalar, "torch": TORCH}
@@ -119,7 +119,7 @@ def measure_operator(
     after_round: Callable[[int], object] | None = None,
 ) -> list[SpeedRow]:
     """Rows of one operator."""
-    named = ways(operator, options.device)
+    named = backends(operator, options.device)
     truth, found = measure_settings_of(
         operator, scene, list(named.values()), options.device, options.threads, options.repeats, after_round
     )

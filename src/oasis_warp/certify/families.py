@@ -118,7 +118,7 @@ def reference_visibility(arguments: Arguments, slack: float) -> tuple[Outputs, O
     named = None if literal else arguments.get("point_vertices")
     margin = 0.0 if literal else arguments.get("margin")
     scores = visibility.score_points(points, hits, arguments["faces"], camera, arguments["tau"], margin, named, near)
-    return (scores,), (visibility.sound_points(points, known, camera, named is not None, near, slack).double(),)
+    return (scores,), (visibility.stable_points(points, known, camera, named is not None, near, slack).double(),)
 
 
 def read_face_rotations(answer: Any) -> Outputs:

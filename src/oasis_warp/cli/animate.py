@@ -18,9 +18,9 @@ from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.core.types import Camera, Color, Gaussians, HandPose
-from oasis_warp.data.films import check_film, write_video
 from oasis_warp.data.json_text import read_cameras
 from oasis_warp.data.pictures import to_uint8
+from oasis_warp.data.videos import check_video, write_video
 from oasis_warp.hand.poses import POSE_NAMES, pose_sequence
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.motion import read_motion, resample
@@ -121,7 +121,7 @@ def run(options: Animate) -> int:
     """
     check_numbers(options)
     transparent = options.background == "transparent"
-    check_film(options.out, transparent=transparent)
+    check_video(options.out, transparent=transparent)
     background = None if transparent else read_color(options.background)
     if not 0 <= options.loop <= MAX_LOOPS:
         raise InputError(f"--loop {options.loop}: expected 0, for ever, to {MAX_LOOPS}; choose another number.")

@@ -50,7 +50,7 @@ def run(options: Batch) -> int:
     order.settings  # noqa: B018 - a wrong prior is refused before any work
     make_folders(options.out, order.out)
     with open_cluster(options.workers, options.scheduler, config.device) as (client, n_workers):
-        tasks, start = share_out(names, n_workers), time.monotonic()
+        tasks, start = split_tasks(names, n_workers), time.monotonic()
         run = ManyPhotos(len(names), config, n_workers)
         try:
             with show_run(Console(stderr=True), run) as shown:
@@ -107,7 +107,7 @@ def find_photos(source: Path, out: Path) -> list[str]:
     return names
 
 
-def share_out(names: Sequence[str], n_workers: int) -> list[list[str]]:
+def split_tasks(names: Sequence[str], n_workers: int) -> list[list[str]]:
     """The photos of each task, so many that all workers have some until the end."""
     n = min(MAX_PHOTOS, max(1, len(names) // (n_workers * TASKS_A_WORKER)))
     return [list(names[k : k + n]) for k in range(0, len(names), n)]

@@ -67,7 +67,7 @@ def open_cluster(workers: int | None, scheduler: str | None, device: str) -> Ite
 def _local(distributed: Any, n: int) -> Iterator[Any]:
     """Workers on this machine that only it reaches, with keys, so that its other users cannot give them work."""
 
-    class Deaf(distributed.WorkerPlugin):
+    class IgnoreInterrupts(distributed.WorkerPlugin):
         """Ctrl-C goes to all processes of a terminal: the one that started the workers ends them."""
 
         def setup(self, worker: Any) -> None:
@@ -81,18 +81,18 @@ def _local(distributed: Any, n: int) -> Iterator[Any]:
         ) as cluster,
         distributed.Client(cluster, security=keys, set_as_default=False) as client,
     ):  # fmt: skip
-        client.register_plugin(Deaf(), name="deaf")
+        client.register_plugin(IgnoreInterrupts(), name="ignore-interrupts")
         yield client
 
 
-def work(client: Any, tasks: Sequence[Sequence[str]], order: Order, told: Callable[[int, int], object]) -> int:
+def work(client: Any, tasks: Sequence[Sequence[str]], order: Order, report: Callable[[int, int], object]) -> int:
     """Have all tasks done; the number of photos that were worked on, and not only found done.
 
     Args:
         client: Of Dask.
         tasks: Names of photos.
         order: What to make of them.
-        told: Called with the numbers of photos so far that were worked on, and that were found done.
+        report: Called with the numbers of photos so far that were worked on, and that were found done.
 
     Raises:
         InputError: the scheduler is lost, or a worker can make no avatars.
@@ -102,7 +102,7 @@ def work(client: Any, tasks: Sequence[Sequence[str]], order: Order, told: Callab
     counts: dict[int, Counter[str]] = {}
     ended, lock = set[int](), threading.Lock()  # events come on a thread of the client
 
-    def heard(task: int, said: Mapping[str, int], *, end: bool) -> int:
+    def count(task: int, said: Mapping[str, int], *, end: bool) -> int:
         with lock:
             if task in ended:
                 return 0
@@ -110,16 +110,16 @@ def work(client: Any, tasks: Sequence[Sequence[str]], order: Order, told: Callab
                 ended.add(task)
             counts[task] = Counter(said)
             total = sum(counts.values(), Counter[str]())
-            told(total.total() - total["kept"], total["kept"])
+            report(total.total() - total["kept"], total["kept"])
         return total.total() - total["kept"]
 
-    client.subscribe_topic(TOPIC, lambda event: heard(event[1]["task"], event[1]["counts"], end=False))
+    client.subscribe_topic(TOPIC, lambda event: count(event[1]["task"], event[1]["counts"], end=False))
     futures = {client.submit(_task, k, names, order, pure=False): k for k, names in enumerate(tasks)}
     worked, killed, done = 0, Counter[int](), as_completed(futures, loop=client.loop)
     try:
         for future in done:
             try:
-                worked = heard(futures[future], future.result(), end=True)
+                worked = count(futures[future], future.result(), end=True)
             except KilledWorker:  # by its photos, whose tries are counted, or from outside
                 killed[futures[future]] += 1
                 if killed[futures[future]] > MAX_TRIES * len(tasks[futures[future]]):

@@ -252,7 +252,7 @@ def check_videos() -> str:
     """Videos of each format can be written and read."""
     import torch
 
-    from oasis_warp.data.films import VIDEO_SUFFIXES, write_video
+    from oasis_warp.data.videos import VIDEO_SUFFIXES, write_video
 
     frames = [torch.full((64, 64, 3), int(127 + 100 * math.sin(i)), dtype=torch.uint8) for i in range(3)]
     with tempfile.TemporaryDirectory() as folder:

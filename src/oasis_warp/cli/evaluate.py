@@ -55,7 +55,7 @@ SIZES = range(64, 1025)
 REAL_SECONDS, LOOKS_SECONDS, AVATAR_SECONDS, PAIR_SECONDS = 2.5, 17.0, 10.0, 0.6
 """To measure a real hand, to make an avatar and draw its looks, to make an avatar in one way, to compare a pair: of the
 process with one thread, for two photos of the tests, in November 2026. Only ratios matter."""
-WAYS = 4
+AVATARS_PER_PHOTO = 4
 """Avatars made of each photo for pairs: without the learned prior, and with it in each of three lights."""
 PUBLISHED = ("interhand", "hanco", "coco-hand", "whim")
 TABLE_WIDTH = 120
@@ -140,8 +140,8 @@ def plan(options: Evaluate, n_priors: int) -> tuple[Step, ...]:
         )
     steps = []
     for name, photos in photos_of_hands(options.folder).items():
-        n, ways = len(photos), 1 if n_priors == 1 else WAYS
-        avatars, pairs = AVATAR_SECONDS * ways * n, PAIR_SECONDS * n * (n - 1)
+        n, n_avatars = len(photos), 1 if n_priors == 1 else AVATARS_PER_PHOTO
+        avatars, pairs = AVATAR_SECONDS * n_avatars * n, PAIR_SECONDS * n * (n - 1)
         steps += [Step(f"avatars of {name}", avatars), Step(f"pairs of {name}", pairs)]
     return tuple(steps)
 

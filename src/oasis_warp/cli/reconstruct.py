@@ -22,10 +22,10 @@ from oasis_warp.core.config import ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.types import Photo
-from oasis_warp.data.films import write_video
 from oasis_warp.data.output_files import make_folders, output_folder
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
+from oasis_warp.data.videos import write_video
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand, palm_and_back
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.network.weights_file import read_header

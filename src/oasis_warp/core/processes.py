@@ -35,12 +35,12 @@ def using_threads(threads: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-_set_aside: ContextVar[int | None] = ContextVar("threads that torch does not use", default=None)
+_kernel_threads: ContextVar[int | None] = ContextVar("threads that torch does not use", default=None)
 
 
 def kernel_threads() -> int:
     """How many CPU threads our kernels may use: as many as torch, or as it had before `single_threaded_torch`."""
-    return _set_aside.get() or torch.get_num_threads()
+    return _kernel_threads.get() or torch.get_num_threads()
 
 
 @contextmanager
@@ -50,9 +50,9 @@ def single_threaded_torch() -> Iterator[None]:
     The bits of torch's convolutions, norms and products depend on the number of its threads, and its waiting threads
     spin: where others need the core, two of them take ten times as long as one. Our kernels do neither.
     """
-    before = _set_aside.set(kernel_threads())
+    before = _kernel_threads.set(kernel_threads())
     try:
         with using_threads(1):
             yield
     finally:
-        _set_aside.reset(before)
+        _kernel_threads.reset(before)

@@ -14,7 +14,7 @@ from oasis_warp.data.json_text import whole
 from oasis_warp.datasets.files import File, Tree
 from oasis_warp.datasets.samples import Catalogue, Models, Sample, entry, numbers, pose_of_48, read_table
 from oasis_warp.estimation.mano_estimates import SUFFIXES, Estimate, estimate_of_entries, read_estimate
-from oasis_warp.hand.mano import mano_surface, mirror_mano_pose, read_mano, thinned
+from oasis_warp.hand.mano import mano_surface, mirror_mano_pose, read_mano, subsample
 
 DatasetName = Literal["interhand", "hanco", "freihand", "ho3d", "coco-hand", "whim", "photos"]
 Split = Literal["train", "val", "test"]
@@ -98,7 +98,7 @@ def read_dataset(
     if not root.is_dir():
         raise InputError(f"{root}: expected the folder of {name}, found none; give --root.")
     # A twentieth of the vertices tells whether a camera sees a hand; joints come from all of them.
-    models: Models = {side: thinned(read_mano(mano_dir, side)) for side in get_args(Side)}
+    models: Models = {side: subsample(read_mano(mano_dir, side)) for side in get_args(Side)}
     tree = Tree(root)
     found = _interhand(tree, models, split, selection) if name == "interhand" else _READERS[name](tree, models, split)
     found.left_out |= tree.left_out

@@ -65,27 +65,27 @@ def detect_hands(rgb: np.ndarray, nets: Networks, *, most: int = 8) -> list[Dete
         return hands
     margin = int(_MARGIN * max(rgb.shape[:2]))
     wide = cv2.copyMakeBorder(rgb, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
-    for turns, min_score, (exponent, light) in itertools.product(range(4), (0.5, 0.25), _BRIGHTENED.items()):
-        image = cv2.LUT(np.ascontiguousarray(np.rot90(wide, turns)), _curve(exponent))
-        turned = f", turned by {90 * turns} degrees" if turns else ""
+    for quarter_turns, min_score, (exponent, light) in itertools.product(range(4), (0.5, 0.25), _BRIGHTENED.items()):
+        image = cv2.LUT(np.ascontiguousarray(np.rot90(wide, quarter_turns)), _brightening_table(exponent))
+        rotated = f", turned by {90 * quarter_turns} degrees" if quarter_turns else ""
         weak = ", weak" if min_score < 0.5 else ""
-        found = _search(image, nets, min_score, most, f"network (margin{light}{turned}{weak})")
+        found = _search(image, nets, min_score, most, f"network (margin{light}{rotated}{weak})")
         sure = [hand for hand in found if min(hand.presence, hand.side_score) >= _MIN_GUESS]
         if sure:
-            return [_turned_back(hand, turns, wide.shape[:2], margin) for hand in sure]
+            return [_undo_rotation(hand, quarter_turns, wide.shape[:2], margin) for hand in sure]
     return []
 
 
-def _curve(exponent: float) -> np.ndarray:
+def _brightening_table(exponent: float) -> np.ndarray:
     """A table of gray levels that brightens where `exponent` is below 1."""
     return np.round(255 * (np.arange(256) / 255) ** exponent).astype(np.uint8)
 
 
-def _turned_back(hand: DetectedHand, turns: int, size: tuple[int, int], margin: int) -> DetectedHand:
+def _undo_rotation(hand: DetectedHand, quarter_turns: int, size: tuple[int, int], margin: int) -> DetectedHand:
     """A hand found after counter-clockwise right angles, in the image of `size` before them, without its margin."""
     xy, world = hand.xy, hand.world
-    for turn in range(turns, 0, -1):
-        height = size[turn % 2]  # of the image after this turn
+    for quarter_turn in range(quarter_turns, 0, -1):
+        height = size[quarter_turn % 2]  # of the image after this turn
         xy = np.stack([height - xy[:, 1], xy[:, 0]], 1)
         world = np.stack([-world[:, 1], world[:, 0], world[:, 2]], 1)
     return replace(hand, xy=xy - margin, world=world)
@@ -98,12 +98,12 @@ def _search(rgb: np.ndarray, nets: Networks, min_score: float, most: int, source
         second = read_crop(rgb, nets, crop_of_landmarks(first.xy), score, source)
         hand = second if second.presence >= min(_MIN_PRESENCE, first.presence) else first
         # Two palms may lead to the same hand.
-        if hand.presence >= _MIN_PRESENCE and not any(_same(hand.xy, other.xy) for other in hands):
+        if hand.presence >= _MIN_PRESENCE and not any(_is_same_hand(hand.xy, other.xy) for other in hands):
             hands.append(hand)
     return hands
 
 
-def _same(a: np.ndarray, b: np.ndarray) -> bool:
+def _is_same_hand(a: np.ndarray, b: np.ndarray) -> bool:
     return float(np.linalg.norm(a - b, axis=1).mean()) < 0.15 * box_size(a)
 
 
@@ -170,10 +170,10 @@ def crop_of_landmarks(xy: np.ndarray) -> Crop:
     """The tighter square around known landmarks."""
     angle = _upright(0.25 * (xy[5] + xy[13]) + 0.5 * xy[9] - xy[0])
     trunk = xy[[0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]]  # without the ends of the fingers
-    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    turned = trunk @ turn.T
-    low, high = turned.min(0), turned.max(0)
-    centre = turn.T @ ((low + high) / 2 - np.array([0, 0.1 * (high[1] - low[1])]))
+    quarter_turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    rotated = trunk @ quarter_turn.T
+    low, high = rotated.min(0), rotated.max(0)
+    centre = quarter_turn.T @ ((low + high) / 2 - np.array([0, 0.1 * (high[1] - low[1])]))
     return Crop(centre, 2.0 * float((high - low).max()), angle)
 
 
@@ -189,9 +189,9 @@ def read_crop(
 ) -> DetectedHand:  # fmt: skip
     """Landmarks in a crop, in pixels of `rgb`; `mirrored` shows the network the crop's mirror image."""
     cos, sin = np.cos(crop.angle), np.sin(crop.angle)
-    turn = np.array([[cos, -sin], [sin, cos]])  # crop -> image
+    quarter_turn = np.array([[cos, -sin], [sin, cos]])  # crop -> image
     pixel = crop.side / HAND_SIZE
-    to_image = turn * pixel @ np.diag([-1.0 if mirrored else 1.0, 1.0])
+    to_image = quarter_turn * pixel @ np.diag([-1.0 if mirrored else 1.0, 1.0])
     middle = np.full(2, HAND_SIZE / 2)
     # OpenCV counts from the centre of the first pixel, we from its corner.
     affine = np.concatenate([to_image, (crop.centre - 0.5 - to_image @ (middle - 0.5))[:, None]], 1)
@@ -208,6 +208,6 @@ def read_crop(
     if mirrored:
         world[:, 0] *= -1
         right = 1 - right
-    world[:, :2] = world[:, :2] @ turn.T
+    world[:, :2] = world[:, :2] @ quarter_turn.T
     xy = (seen.points - middle) @ to_image.T + crop.centre
     return DetectedHand(xy, world, seen.presence, right, palm_score, source)

@@ -89,8 +89,8 @@ MASK_SLACK = 0.05
 """Intersection over union with the mask that may be lost for it; masks themselves are off by as much."""
 
 
-class Explanation(NamedTuple):
-    """How well a pose explains the photo."""
+class PhotoError(NamedTuple):
+    """How far the photo is from a rendering in a pose."""
 
     gap: float
     """Robust mean of the squared residuals of the photo, in sigmas of the start."""
@@ -108,8 +108,8 @@ class Refinement(NamedTuple):
     crop: HandCrop
     """With the surface in that pose."""
     accepted: bool
-    before: Explanation
-    after: Explanation
+    before: PhotoError
+    after: PhotoError
     moved: float
     """Median displacement of the vertices in the image [px of the crop]."""
     turned: float
@@ -136,11 +136,11 @@ def refine(
     """
     problem = _Problem(hand, guess, crop, landmarks, size)
     start = problem.start
-    before = problem.explain(start)
+    before = problem.photo_error(start)
     found, after = start, before
     if before.pixels >= MIN_PIXELS and before.mask_iou >= MIN_OVERLAP:
         found = problem.solve()
-        after = problem.explain(found)
+        after = problem.photo_error(found)
     accepted = after.gap < (1 - MIN_GAIN) * before.gap and after.mask_iou > before.mask_iou - MASK_SLACK
     if not accepted:
         found, after = start, before
@@ -298,7 +298,7 @@ class _Problem:
 
         return minimize(start, model, move, DAMPING, ITERATIONS, TRIALS, TOLERANCE, cost)[0]
 
-    def explain(self, state: FitState) -> Explanation:
+    def photo_error(self, state: FitState) -> PhotoError:
         """How well a state explains the photo at the finest level, in the light that suits it best."""
         rendered = self.rendered([state])
         photo, _, share = self._gaps(rendered, solve_light(self.scene, rendered, 0), LEVELS[-1])
@@ -306,7 +306,7 @@ class _Problem:
         compared = self.scene.compared > CERTAIN
         surface, mask = (rendered.covered[0] > CERTAIN) & compared, (self.scene.mask > CERTAIN) & compared
         overlap = float((surface & mask).sum() / (surface | mask).sum().clamp_min(1))
-        return Explanation(float(loss.sum()) / PHOTO_WEIGHT, overlap, int((share > 0).sum()))
+        return PhotoError(float(loss.sum()) / PHOTO_WEIGHT, overlap, int((share > 0).sum()))
 
 
 def _anchor(

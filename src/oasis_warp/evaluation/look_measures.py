@@ -105,11 +105,11 @@ def measure_looks(
             features = hand_features(*(plane.flip(1) for plane in planes) if left else planes)
             samples[picture.view.kind].append(Sample(group, mostly_shows(picture.surface), features))
     large = crops[1].image.flip(1) if left else crops[1].image
-    cells = [(large, photo.name)] + [(p.large.image, _words(p.view)) for p in pictures if p.view.kind != "back"]
+    cells = [(large, photo.name)] + [(p.large.image, _view_label(p.view)) for p in pictures if p.view.kind != "back"]
     return Looks(record, samples, cells)
 
 
-def _words(view: View) -> str:
+def _view_label(view: View) -> str:
     return {"input": "the photo's view", "side": f"{view.name} degrees"}.get(view.kind, view.name)
 
 

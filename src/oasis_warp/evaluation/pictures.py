@@ -22,7 +22,7 @@ from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import contact_sheet, to_uint8, write_picture
 from oasis_warp.network.attention import VisibilityAttention
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.network.tokens import seen_difference
+from oasis_warp.network.tokens import color_difference
 from oasis_warp.ops import depth_map
 
 TILE = 160
@@ -70,7 +70,7 @@ def draw_attention(network: HandNetwork, inputs: CropBatch) -> list[Float[Tensor
         raise ValueError("network: expected one with visibility-conditioned attention, got another fusion.")
     observation = network.observe(inputs)
     mean = network.mean_hands(observation.colors, observation.confidence)
-    seen = None if network.point_evidence is None else seen_difference(observation, mean)
+    seen = None if network.point_evidence is None else color_difference(observation, mean)
     points, local, context = network.tokens(inputs, observation, mean, seen)
     share = network.fusion.global_share(points, local, context, observation.visibility)
     size, vertices = inputs.image.shape[1], inputs.posed[0]

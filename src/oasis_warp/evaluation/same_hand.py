@@ -284,18 +284,18 @@ def make_avatars(
     """
 
     @functools.cache
-    def ship(prior: str, light: Literal["fit", "even", "keep"]) -> Reconstruction:
+    def reconstruct_with(prior: str, light: Literal["fit", "even", "keep"]) -> Reconstruction:
         return reconstruct(photo, replace(config, size="auto", light=light), prior=priors[prior])
 
     hand, avatars = bundled_hand(), {}
     for method in methods:
-        made = ship(method.prior, LIGHTS[method.stage])
+        made = reconstruct_with(method.prior, LIGHTS[method.stage])
         avatar = made.avatar
         if method.stage == RAW:
             crop = crop_hand(photo, made.fit, initial_offsets(hand, made.fit), replace(config, size="auto"))
             avatar = make_avatar(made.fit, avatar.surface_offsets, crop, priors[method.prior](crop))
         avatars[method_name(method)] = avatar
-    made = ship(methods[-1].prior, LIGHTS[methods[-1].stage])
+    made = reconstruct_with(methods[-1].prior, LIGHTS[methods[-1].stage])
     return avatars, crop_hand(photo, made.fit, made.avatar.surface_offsets.cpu(), config).image
 
 
@@ -318,7 +318,7 @@ def _record(hand: str, pair: Pair, method: Method) -> Record:
 def summarise_pairs(pairs: Sequence[Record]) -> list[Record]:
     """A row for each method: medians over pairs, and the share of pairs on which the last method is better."""
     rows, best = [], PHOTO_METHODS[-1]
-    of_best = {_who(pair): pair for pair in select(pairs, **best._asdict())}
+    of_best = {_pair_key(pair): pair for pair in select(pairs, **best._asdict())}
     for method in PHOTO_METHODS:
         own = select(pairs, **method._asdict())
         if not own:
@@ -329,9 +329,9 @@ def summarise_pairs(pairs: Sequence[Record]) -> list[Record]:
             row[name] = statistics.median(values) if values else None
         for name, sign in (("psnr", 1), ("ssim_quarter", 1), ("error", -1)):
             changes = [
-                sign * (of_best[_who(pair)][name] - pair[name])
+                sign * (of_best[_pair_key(pair)][name] - pair[name])
                 for pair in own
-                if _who(pair) in of_best and name in pair and name in of_best[_who(pair)]
+                if _pair_key(pair) in of_best and name in pair and name in of_best[_pair_key(pair)]
             ]
             compared = bool(changes) and method != best
             row[f"beaten_{name}"] = sum(change > 0 for change in changes) / len(changes) if compared else None
@@ -339,5 +339,5 @@ def summarise_pairs(pairs: Sequence[Record]) -> list[Record]:
     return rows
 
 
-def _who(pair: Record) -> tuple[str, str, str]:
+def _pair_key(pair: Record) -> tuple[str, str, str]:
     return pair["hand"], pair["source"], pair["target"]

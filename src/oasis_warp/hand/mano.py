@@ -197,7 +197,7 @@ def mano_surface(model: ManoModel, pose: ManoPose) -> tuple[np.ndarray, np.ndarr
     return vertices + pose.transl, place + pose.transl
 
 
-def thinned(model: ManoModel, step: int = 20) -> ManoModel:
+def subsample(model: ManoModel, step: int = 20) -> ManoModel:
     """The same joints with every `step`-th vertex, for checks; its faces are those of the whole surface."""
     names = ("template", "shape_basis", "pose_basis", "weights")
     return replace(model, **{name: getattr(model, name)[::step] for name in names})

@@ -114,8 +114,8 @@ def hand_angles(hand: HandModel, rest: PosedHand, skeleton: Skeleton, side: Side
     places = _rest_places(skeleton)
     knuckles = [bone for bone in (1, 4, 7, 10) if bone in chains]
     ours = rest.joints.double()
-    turn = _laid_on(places[[chains[bone] for bone in knuckles]] - places[wrist], ours[knuckles] - ours[0])
-    world = _world_turns(skeleton)
+    turn = _aligning_rotation(places[[chains[bone] for bone in knuckles]] - places[wrist], ours[knuckles] - ours[0])
+    world = _world_rotations(skeleton)
     turns = torch.eye(3, dtype=torch.float64).repeat(len(world), 16, 1, 1)
     for bone in range(1, 16):
         if bone not in chains:
@@ -164,7 +164,7 @@ def _direction(skeleton: Skeleton, places: Tensor, joint: int) -> Tensor:
     return along if float(along.norm()) > 0 else places[joint] - places[skeleton.bones[joint].parent]
 
 
-def _world_turns(skeleton: Skeleton) -> Float[Tensor, "T B 3 3"]:
+def _world_rotations(skeleton: Skeleton) -> Float[Tensor, "T B 3 3"]:
     """Rotation of every joint from rest, in the skeleton's world."""
     axes = dict(zip("XYZ", torch.eye(3, dtype=torch.float64), strict=True))
     turns: list[Tensor] = []
@@ -180,7 +180,7 @@ def _world_turns(skeleton: Skeleton) -> Float[Tensor, "T B 3 3"]:
     return torch.stack(turns, 1)
 
 
-def _laid_on(points: Float[Tensor, "N 3"], targets: Float[Tensor, "N 3"]) -> Float[Tensor, "3 3"]:
+def _aligning_rotation(points: Float[Tensor, "N 3"], targets: Float[Tensor, "N 3"]) -> Float[Tensor, "3 3"]:
     """The rotation that brings points nearest to the directions of others (Kabsch 1976)."""
     u, _, vh = torch.linalg.svd(targets.T @ points)
     sign = torch.det(u @ vh)

@@ -14,9 +14,9 @@ from torch.nn.functional import gelu, scaled_dot_product_attention
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 
-SPARE = 8
+BIAS_DIMENSIONS = 8
 """Dimensions that a biased attention adds to its heads; flash kernels want multiples of 8."""
-NEVER = -(2.0**14)
+MASKED_LOGIT = -(2.0**14)
 """Added to the logit of a key that must not be read; exact in bfloat16."""
 
 
@@ -40,10 +40,10 @@ def attend(
     left = torch.stack([high, scaled - high], dim=-1)
     right = torch.stack([column, column], dim=-1)
 
-    def widen(tensor: Tensor, spare: Tensor | None) -> Tensor:
-        if spare is None:
-            return torch.nn.functional.pad(tensor, (0, SPARE))
-        filled = torch.nn.functional.pad(spare.to(tensor.dtype), (0, SPARE - spare.shape[-1]))
+    def widen(tensor: Tensor, bias_features: Tensor | None) -> Tensor:
+        if bias_features is None:
+            return torch.nn.functional.pad(tensor, (0, BIAS_DIMENSIONS))
+        filled = torch.nn.functional.pad(bias_features.to(tensor.dtype), (0, BIAS_DIMENSIONS - bias_features.shape[-1]))
         return torch.cat([tensor, filled[:, None].expand(-1, heads, -1, -1)], dim=-1)
 
     mixed = scaled_dot_product_attention(

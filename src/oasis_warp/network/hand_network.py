@@ -26,14 +26,14 @@ from oasis_warp.network.heads import (
     decode_offsets,
 )
 from oasis_warp.network.tokens import (
-    PlaceEncoding,
     PointEvidence,
     PointFeatures,
+    PositionEncoding,
     Tokenizer,
     VisualTokens,
+    color_difference,
     encode,
-    grid_places,
-    seen_difference,
+    grid_positions,
 )
 
 
@@ -101,7 +101,7 @@ class HandNetwork(nn.Module):
         self.mean_hands = MeanHands(hand)
         self.geometry = Perceptron(6 * config.frequencies, width, width)
         self.global_token = Perceptron(self.encoder.deep_channels + (TONE if direct else 0), width, width)
-        self.place = PlaceEncoding(width)
+        self.place = PositionEncoding(width)
         if config.vet == "off":
             self.flatten = nn.Linear(self.encoder.deep_channels, width)
         if config.vet != "off" or direct:
@@ -144,7 +144,7 @@ class HandNetwork(nn.Module):
         with torch.autocast(inputs.image.device.type, enabled=False):
             observation = self.observe(inputs)
             mean = self.mean_hands(observation.colors, observation.confidence)
-            seen = None if self.point_evidence is None else seen_difference(observation, mean)
+            seen = None if self.point_evidence is None else color_difference(observation, mean)
         points, local, context = self.tokens(inputs, observation, mean, seen)
         features = self.fuse(points, local, context, observation.visibility)
         if self.refinement is not None:
@@ -222,8 +222,8 @@ class HandNetwork(nn.Module):
     ) -> VisualTokens:
         if self.config.vet == "off" or aligned is None:
             tokens = self.flatten(features.deep.flatten(2).transpose(1, 2))
-            places = grid_places(*features.deep.shape[2:], like=observation.uv)
-            return VisualTokens(tokens, places.expand(len(tokens), -1, -1))
+            positions = grid_positions(*features.deep.shape[2:], like=observation.uv)
+            return VisualTokens(tokens, positions.expand(len(tokens), -1, -1))
         if isinstance(self.tokenizer, Tokenizer):
             return self.tokenizer(aligned, geometric, observation.uv, observation.inside)
         if self.level is None:

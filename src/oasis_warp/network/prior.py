@@ -65,7 +65,7 @@ MAX_SCALE, MAX_ALONG = 0.0013, 0.0025
 Gaussians have up to 4.7 mm and lie up to 6 mm off: over other sides' outlines and between fingers they are haze."""
 
 
-def hold_to_surface(prediction: Prediction, on: RestSurface) -> Prediction:
+def clamp_to_surface(prediction: Prediction, on: RestSurface) -> Prediction:
     """The prediction with no Gaussian above the surface, far from its vertex or larger than skin can hide."""
     normals = surface.gathered_normals(*on[:3])
     above = (prediction.offsets * normals).sum(-1, keepdim=True)
@@ -195,10 +195,10 @@ class NetworkPrior:
     def _gaussians(self, prediction: Prediction, crop: HandCrop, *, covered: bool = True) -> CanonicalGaussians:
         network = self.network
         on = RestSurface(crop.rest.vertices, network.faces, network.vertex_faces, network.rim)
-        held = hold_to_surface(prediction, on)
+        clamped = clamp_to_surface(prediction, on)
         if covered:
-            held = cover_surface(held, on)
-        return canonical_gaussians(blend_rim(held, on), 0)
+            clamped = cover_surface(clamped, on)
+        return canonical_gaussians(blend_rim(clamped, on), 0)
 
     def _predict(self, crop: HandCrop) -> Prediction:
         device, inputs = crop.image.device, batch_of_crop(crop)

@@ -10,7 +10,7 @@ from torch.nn.functional import conv2d, pad
 
 from oasis_warp.avatar.observation import Observation, sample
 from oasis_warp.avatar.prior import MeanHand
-from oasis_warp.network.attention import NEVER, FeedForward, SelfAttention, attend, join_heads, split_heads
+from oasis_warp.network.attention import MASKED_LOGIT, FeedForward, SelfAttention, attend, join_heads, split_heads
 from oasis_warp.network.encoders import ImageFeatures
 from oasis_warp.network.heads import COLOR_MARGIN
 
@@ -89,7 +89,7 @@ class PointFeatures(nn.Module):
         return self.project(read) * inside[..., None]
 
 
-def seen_difference(observation: Observation, mean: MeanHand) -> Float[Tensor, "B V 3"]:
+def color_difference(observation: Observation, mean: MeanHand) -> Float[Tensor, "B V 3"]:
     """How the photo differs from the mean colours at each vertex, in logits; 0 where it does not show the vertex."""
     difference = torch.logit(observation.colors, COLOR_MARGIN) - torch.logit(mean.colors, COLOR_MARGIN)
     return difference * observation.confidence[..., None]
@@ -110,7 +110,7 @@ class PointEvidence(nn.Module):
     def forward(
         self, aligned: Float[Tensor, "B V C"], seen: Float[Tensor, "B V 3"], observation: Observation, mean: MeanHand
     ) -> Float[Tensor, "B V C"]:
-        """To be added to the geometric tokens; `seen` is what `seen_difference` says."""
+        """To be added to the geometric tokens; `seen` is what `color_difference` says."""
         base = torch.logit(mean.colors, COLOR_MARGIN)
         known = torch.cat([base, seen, observation.visibility[..., None], observation.confidence[..., None]], dim=-1)
         return self.seen(aligned * observation.visibility[..., None]) + self.known(known)
@@ -128,7 +128,7 @@ class VisualTokens(NamedTuple):
     """Attention-weighted mean of the projections, the image's corners at 0 and 1."""
 
 
-class PlaceEncoding(nn.Module):
+class PositionEncoding(nn.Module):
     """The encoding of places in the image as a token (P_VET)."""
 
     def __init__(self, width: int):
@@ -167,7 +167,7 @@ class Tokenizer(nn.Module):
         """Tokens of the point-aligned `features`; `key_offsets` are added to what keys are made of, not to values."""
         queries = self.queries.expand(len(features), -1, -1)
         row = queries.new_ones(queries.shape[:2])
-        column = torch.where(inside, 0.0, NEVER)
+        column = torch.where(inside, 0.0, MASKED_LOGIT)
         if self.literal:
             q, k, v = queries, features if key_offsets is None else features + key_offsets, features
             q, k, v = q[:, None], k[:, None], v[:, None]
@@ -184,7 +184,7 @@ class Tokenizer(nn.Module):
         return VisualTokens(tokens + self.feed_forward(tokens), centers)
 
 
-def grid_places(height: int, width: int, like: Tensor) -> Float[Tensor, "N 2"]:
+def grid_positions(height: int, width: int, like: Tensor) -> Float[Tensor, "N 2"]:
     """Centres of the cells of a map, row by row, its corners at 0 and 1."""
     x = (torch.arange(width, dtype=like.dtype, device=like.device) + 0.5) / width
     y = (torch.arange(height, dtype=like.dtype, device=like.device) + 0.5) / height

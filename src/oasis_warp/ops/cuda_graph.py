@@ -101,7 +101,7 @@ class _CapturedRasterization:
     def draw(self, arguments: tuple[Tensor, ...]) -> bool:
         """Replay the forward graph; False if its memory did not suffice."""
         device = self.inputs[0].get_device()
-        self.overflow.arm(device)
+        self.overflow.reset(device)
         with torch.no_grad():
             torch._foreach_copy_(self.inputs, list(arguments))
             self._forward.replay()

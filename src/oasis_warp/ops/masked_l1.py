@@ -12,7 +12,7 @@ from oasis_kernels.losses import masked_l1 as kernels
 from oasis_kernels.runtime.cuda_native import CudaNative
 from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime.launch import block_count, cuda_launch, current_stream
-from oasis_warp.ops._runtime.plans import once, shapes_of
+from oasis_warp.ops._runtime.plans import differentiable_once, shapes_of
 from oasis_warp.ops._runtime.transforms import in_forward_mode
 
 
@@ -43,9 +43,9 @@ def masked_l1_on_cuda(
     return _masked_l1(*given) if tracks and image.requires_grad else _mean(*given)[0]
 
 
-def _launch(native: CudaNative, n_blocks: int, like: Tensor, *words: int) -> None:
+def _launch(native: CudaNative, n_blocks: int, like: Tensor, *values: int) -> None:
     stream = current_stream(like.device)
-    cuda_launch(native, stream.device)(n_blocks, stream.cuda_stream, *words)
+    cuda_launch(native, stream.device)(n_blocks, stream.cuda_stream, *values)
 
 
 def _mean(image: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -75,7 +75,7 @@ class _MaskedL1(Function):
             kernels.spread_difference, block_count(n, kernels.BLOCK), image, n, image.data_ptr(), target.data_ptr(),
             mask.data_ptr(), share, gradient.data_ptr(), by_image.data_ptr(),
         )  # fmt: skip
-        return once("masked_l1", given, (by_image, None, None))
+        return differentiable_once("masked_l1", given, (by_image, None, None))
 
 
 # Below Function.apply, which takes 3 us to look for functorch: `is_traced` has.

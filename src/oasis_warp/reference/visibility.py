@@ -174,7 +174,7 @@ def score_points(
 
 
 @torch.no_grad()
-def sound_points(
+def stable_points(
     points: Tensor, known: Certainty, camera: Camera, named: bool, near_plane: float = 0.01, slack: float = 1.0
 ) -> Tensor:
     """Which points [P] have a score that does not depend on rounding; `named` if `point_vertices` are given."""

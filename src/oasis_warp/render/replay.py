@@ -13,7 +13,7 @@ from torch import Tensor
 from oasis_warp.ops import ReplayedFiniteCheck, check_finite, watch_overflow
 
 Outputs = tuple[Tensor, ...]
-MOST = 8
+MAX_GRAPHS = 8
 """Graphs that a cache keeps: each holds the memory of a whole picture."""
 WARM_UPS = 2
 """Runs before the capture: the first loads kernels, fills caches and counts what a rasterization needs memory for, the
@@ -64,13 +64,13 @@ class CapturedGraph:
         here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
         aside.wait_stream(here)
         with torch.cuda.stream(aside):
-            self._check.look()
+            self._check.check()
             for _ in range(WARM_UPS):
                 function(*self._inputs)
         here.wait_stream(aside)
         with watch_overflow() as self._overflow:
             with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
-                self._check.look()
+                self._check.check()
                 self._outputs = function(*self._inputs)
 
     def _fill(self, inputs: Sequence[Tensor]) -> None:
@@ -97,8 +97,8 @@ class CapturedGraph:
             with torch.cuda.device(self._flat.device), torch.inference_mode(False):
                 return self(inputs)
         device = self._flat.get_device()
-        self._overflow.arm(device)
-        self._check.arm()
+        self._overflow.reset(device)
+        self._check.reset()
         with torch.no_grad():
             self._fill(inputs)
             self._graph.replay()
@@ -124,7 +124,7 @@ class GraphCache:
         """The recording of `key`, made by `record` if there is none; the one unused for longest makes room."""
         if key not in self._kept:
             self._kept[key] = record()
-            while len(self._kept) > MOST:
+            while len(self._kept) > MAX_GRAPHS:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]

@@ -12,7 +12,7 @@ from oasis_warp.synthetic.body import Body, arm_rows
 from oasis_warp.synthetic.ops.batched_lbs import batched_lbs
 from oasis_warp.synthetic.people import Person
 from oasis_warp.synthetic.shot_table import ShotTensors
-from oasis_warp.synthetic.wardrobe import AWAY, bands, sleeves
+from oasis_warp.synthetic.wardrobe import HIDDEN_POSITION, bands, sleeves
 
 _LAST_JOINTS = (15, 3, 6, 12, 9)
 """The last joints of thumb, index, middle, ring and little finger, which move the tips."""
@@ -35,12 +35,12 @@ class PosedPeople(NamedTuple):
 
 
 @functools.cache
-def _away(device: torch.device) -> Tensor:
-    return torch.tensor(AWAY, device=device)
+def _hidden_position(device: torch.device) -> Tensor:
+    return torch.tensor(HIDDEN_POSITION, device=device)
 
 
 @functools.cache
-def _carriers(device: torch.device) -> Tensor:
+def _parent_joints(device: torch.device) -> Tensor:
     """The joints that move the 16 joints and 5 tips."""
     return torch.tensor([*range(16), *_LAST_JOINTS], device=device)
 
@@ -89,11 +89,11 @@ def pose_people(body: Body, people: Sequence[Person], numbers: ShotTensors) -> P
     move = lambda points: _rotate(turn, points) + translation[:, None]  # noqa: E731
     parts = [seen + translation[:, None], move(arm.flatten(1, 2))]
     for k, points in enumerate(worn):
-        parts.append(torch.where(numbers.wears[:, k, None, None] > 0, move(points), _away(points.device)))
+        parts.append(torch.where(numbers.wears[:, k, None, None] > 0, move(points), _hidden_position(points.device)))
 
-    carriers = _carriers(rest.device)[hand.keypoint_index]
+    parent_joints = _parent_joints(rest.device)[hand.keypoint_index]
     points = torch.cat([joints, tips], 1)[:, hand.keypoint_index]
-    marks = _rotate(numbers.rotations[:, carriers], points) + numbers.translations[:, carriers]
+    marks = _rotate(numbers.rotations[:, parent_joints], points) + numbers.translations[:, parent_joints]
     return PosedPeople(
         torch.cat(parts, 1),
         move(marks),

@@ -19,7 +19,7 @@ RING_ROUNDNESS = 0.6
 """Half thickness of a ring [mm]."""
 SKIN_MATERIAL = (0.0, 0.0, 0.0, 0.5, 0.0, 0.0)
 """Material of skin: see `ops.skin_shading`. Its colour comes from the texture."""
-AWAY = (0.0, 0.0, -1.0)
+HIDDEN_POSITION = (0.0, 0.0, -1.0)
 """Position of vertices that an image does not show, in the camera's frame: behind it."""
 
 

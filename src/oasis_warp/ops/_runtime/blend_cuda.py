@@ -10,7 +10,7 @@ from torch import Tensor
 
 from oasis_kernels.rasterize import tiles_cuda
 from oasis_warp.ops._runtime.launch import block_count, current_stream, run_cuda, wait_for
-from oasis_warp.ops._runtime.pair_counts import Counts, own_slot, remember, watching
+from oasis_warp.ops._runtime.pair_counts import Counts, remember, thread_slot, watching
 from oasis_warp.ops._runtime.records import Frame, GradientFlags, Gradients, Size, Splats
 from oasis_warp.ops._runtime.rules import current_rules
 from oasis_warp.ops._runtime.tiles import MAX_PAIRS, check_pairs, fake_opaque_buffer, opaque_buffer
@@ -115,7 +115,7 @@ def draw(splats: Splats, frame: Frame, keep: bool) -> tuple[Tensor, Tensor, Save
     params = _params(splats, layout, lists, planes)
     kind = device, n_cameras, n, frame.width, frame.height
     capturing = torch.cuda.is_current_stream_capturing()
-    report, counts = watching().expect(kind) if capturing else (own_slot(), Counts(MAX_PAIRS, MAX_PAIRS))
+    report, counts = watching().expect(kind) if capturing else (thread_slot(), Counts(MAX_PAIRS, MAX_PAIRS))
     params |= {"capacity": counts.pairs, "longest_sorted": counts.longest, "report": report}
     blocks = block_count(n_cameras * n, tiles_cuda.COUNT_BLOCK)
     run_cuda(tiles_cuda.count_pairs(), params, blocks, stream)

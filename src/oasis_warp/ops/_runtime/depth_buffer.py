@@ -23,7 +23,7 @@ from oasis_warp.ops._runtime import depth_cuda
 from oasis_warp.ops._runtime.depth_scene import Buffer, BufferParts, DepthScene, Query, Scores, restrict, shared
 from oasis_warp.ops._runtime.incidence import _transposed, sum_at_items
 from oasis_warp.ops._runtime.launch import SCALAR_NAMES, launch, run_shared, view
-from oasis_warp.ops._runtime.pair_counts import own_slot
+from oasis_warp.ops._runtime.pair_counts import thread_slot
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
 from oasis_warp.ops.checks import check_positive
 
@@ -138,7 +138,7 @@ def draw_by_keys(scene: DepthScene, query: Query | None, outputs: BufferParts, v
         return depth_cuda.draw(scene, query, outputs)
     points = None if query is None else query.points
     with DeferredFiniteCheck(vertices=scene.vertices, viewmat=scene.viewmats, K=scene.Ks, points=points):
-        found = own_slot()
+        found = thread_slot()
         found[0] = 0
         drawn = depth_cuda.draw(scene, query, outputs, found)
     # Bad values do no harm before they are refused.

@@ -131,7 +131,7 @@ def _load(kernel: Any, device: "wp.Device", block_dim: int = 256) -> None:
             _loaded.add((kernel.module, device.alias))
 
 
-def _seen_by_warp(inputs: Sequence[Any]) -> list[Any]:
+def _with_views(inputs: Sequence[Any]) -> list[Any]:
     """`inputs` of a kernel, with views of tensors."""
     return [view(value) if isinstance(value, Tensor) else value for value in inputs]
 
@@ -145,7 +145,7 @@ def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], like: T
         return
     device, stream = device_and_stream(like)
     _load(kernel, device)
-    wp.launch(kernel, dim=dim, inputs=_seen_by_warp(inputs), device=device, stream=stream, block_dim=256)
+    wp.launch(kernel, dim=dim, inputs=_with_views(inputs), device=device, stream=stream, block_dim=256)
 
 
 @functools.cache
@@ -171,7 +171,7 @@ def launch_ranges(
     second axis of that size. Inputs are as in `launch`.
     """
     device, stream = device_and_stream(like)
-    cuts, inputs = even_cuts(cuts) if isinstance(cuts, int) else cuts, _seen_by_warp(inputs)
+    cuts, inputs = even_cuts(cuts) if isinstance(cuts, int) else cuts, _with_views(inputs)
     if device.is_cuda:
         cuts = [0, cuts[-1]]
     ranges = [(a, b) for a, b in itertools.pairwise(cuts) if b > a]
@@ -234,7 +234,7 @@ def run_shared(kernel: Any, block: int, n_tasks: int) -> None:
 
 
 @functools.cache
-def _give_way() -> int:
+def _sched_yield() -> int:
     """Address of the C library's sched_yield, 0 where there is none."""
     if os.name != "posix":
         return 0
@@ -255,7 +255,7 @@ def run_native(native: Native, params: Parameters, n_tasks: int) -> None:
     """
     values = []
     for name in native.parameters:
-        value = _give_way() if name == "give_way" else params[name]
+        value = _sched_yield() if name == "yield_thread" else params[name]
         if isinstance(value, Tensor):
             assert value.is_contiguous() and value.is_cpu, name
             value = value.data_ptr()
@@ -327,8 +327,8 @@ def run_cuda(native: CudaNative, params: Parameters, n_blocks: int, stream: "wp.
     """
     if not n_blocks:
         return
-    words = []
+    values = []
     for name in native.parameters:
         value = params[name]
-        words.append(value.data_ptr() if isinstance(value, Tensor) else value or 0)
-    cuda_launch(native, stream.device)(n_blocks, stream.cuda_stream, *words)
+        values.append(value.data_ptr() if isinstance(value, Tensor) else value or 0)
+    cuda_launch(native, stream.device)(n_blocks, stream.cuda_stream, *values)

@@ -56,12 +56,12 @@ class _Slots:
                 self.free = list(page[: PAGE // REPORT * REPORT].split(REPORT))
             return self.free.pop()
 
-    def stock(self) -> None:
+    def reserve(self) -> None:
         """Keep a slot ready: during a capture no memory can be page-locked."""
         if not self.free:
-            self.give(self.take())
+            self.release(self.take())
 
-    def give(self, slot: Tensor) -> None:
+    def release(self, slot: Tensor) -> None:
         with self.lock:
             self.free.append(slot)
 
@@ -70,28 +70,28 @@ slots = _Slots()
 """For kernels that report a few numbers to the host."""
 
 
-class _Own(threading.local):
+class _ThreadSlot(threading.local):
     """One slot for each thread, for calls that wait."""
 
     def __init__(self) -> None:
         self.slot = slots.take()
-        weakref.finalize(threading.current_thread(), slots.give, self.slot)
+        weakref.finalize(threading.current_thread(), slots.release, self.slot)
 
 
-_own: _Own | None = None
-_start = threading.Lock()
+_thread_slot: _ThreadSlot | None = None
+_slot_lock = threading.Lock()
 
 
-def own_slot() -> Tensor:
+def thread_slot() -> Tensor:
     """This thread's host memory [REPORT], int64, for a call that waits for the device."""
-    global _own
-    with _start:
-        if _own is None:  # not at import: page-locked memory needs a device
-            _own = _Own()
-    return _own.slot
+    global _thread_slot
+    with _slot_lock:
+        if _thread_slot is None:  # not at import: page-locked memory needs a device
+            _thread_slot = _ThreadSlot()
+    return _thread_slot.slot
 
 
-class PolledWords:
+class PolledCounters:
     """Page-locked words that kernels write and the host looks at while later kernels still run."""
 
     def __init__(self, count: int) -> None:
@@ -126,10 +126,10 @@ class Overflow:
         self._reports.append((slot, (ctypes.c_longlong * REPORT).from_address(slot.data_ptr()), capacity))
         return slot, capacity
 
-    def arm(self, device: int) -> None:
+    def reset(self, device: int) -> None:
         """Expect the reports of the next replay, on the current stream, after the last one on any."""
-        for _, words, _ in self._reports:
-            words[0] = words[1] = -1
+        for _, counters, _ in self._reports:
+            counters[0] = counters[1] = -1
         if self._stream is None or torch._C._cuda_getCurrentRawStream(device) != self._stream.cuda_stream:
             here = torch.cuda.current_stream(device)
             if self._stream is not None:
@@ -137,12 +137,12 @@ class Overflow:
             self._stream = here
 
     def wait(self, device: int) -> None:
-        """Wait for the reports of a replay on the current stream, which come before its pictures; `arm` it before.
+        """Wait for the reports of a replay on the current stream, which come before its pictures; `reset` it before.
 
         All that the replay does before its last rasterization has then been done; without one, all that it does.
         """
-        for _, words, _ in self._reports:
-            _poll(words, device)
+        for _, counters, _ in self._reports:
+            _poll(counters, device)
         if not self._reports:
             torch.cuda.current_stream(device).synchronize()
 
@@ -151,7 +151,9 @@ class Overflow:
 
         If so, call eagerly once and capture again.
         """
-        return any(words[0] > capacity.pairs or words[1] > capacity.longest for _, words, capacity in self._reports)
+        return any(
+            counters[0] > capacity.pairs or counters[1] > capacity.longest for _, counters, capacity in self._reports
+        )
 
 
 _watching: ContextVar[Overflow | None] = ContextVar("watching", default=None)
@@ -202,4 +204,4 @@ def watching() -> Overflow:
 def remember(kind: Kind, counts: Counts) -> None:
     """Record the needs of an eager call for graphs of the same kind."""
     _last[kind] = counts
-    slots.stock()
+    slots.reserve()

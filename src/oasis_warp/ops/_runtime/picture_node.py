@@ -13,7 +13,7 @@ from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime.launch import start
 from oasis_warp.ops._runtime.picture_call import Drawn, Gradients, Needs, Options, Scene
 from oasis_warp.ops._runtime.picture_plan import Plan
-from oasis_warp.ops._runtime.plans import Plans, once, shapes_of
+from oasis_warp.ops._runtime.plans import Plans, differentiable_once, shapes_of
 from oasis_warp.ops._runtime.rasterization_checks import check_cameras, check_colors, check_gaussians
 from oasis_warp.ops._runtime.rules import current_rules
 from oasis_warp.ops._runtime.transforms import in_forward_mode
@@ -122,7 +122,7 @@ class _Draw(Function):
         gradients, gradient = ctx.plan.draw_backward(scene, drawn, g_image, g_alphas, needs, means2d is not None)
         if means2d is not None and gradient is not None:
             means2d.grad = gradient.clone() if means2d.grad is None else means2d.grad + gradient
-        return None, None, None, *once("rasterization", scene, gradients)
+        return None, None, None, *differentiable_once("rasterization", scene, gradients)
 
 
 # Below Function.apply, which takes 3 us to look for functorch: `is_traced` has.
@@ -151,7 +151,12 @@ class _Project(Function):
         incoming = [None if g is None else g.contiguous() for g in (g_means2d, g_depths)]
         by_means2d, by_depths = (0 if g is None else g.data_ptr() for g in incoming)
         *shapes, viewmats = ctx.plan.unproject(scene, workspace, by_means2d, 0, by_depths, needs)
-        return None, None, None, *once("rasterization", scene, Gradients(*shapes, None, None, viewmats, None, None))
+        return (
+            None,
+            None,
+            None,
+            *differentiable_once("rasterization", scene, Gradients(*shapes, None, None, viewmats, None, None)),
+        )
 
 
 def _versions(tensors: Any) -> list[int]:

@@ -13,7 +13,7 @@ from oasis_kernels.runtime.cuda_native import CudaNative
 from oasis_warp.ops._runtime import blend_cuda
 from oasis_warp.ops._runtime.cuda_launch import CudaLaunch
 from oasis_warp.ops._runtime.launch import block_count, cuda_launch, current_stream
-from oasis_warp.ops._runtime.pair_counts import SORTED, Counts, PolledWords, remember
+from oasis_warp.ops._runtime.pair_counts import SORTED, Counts, PolledCounters, remember
 from oasis_warp.ops._runtime.picture_call import Drawn, Gradients, Needs, Options, Scene
 from oasis_warp.ops._runtime.plans import ALIGNMENT, lay_out
 from oasis_warp.ops._runtime.projection_backends import as_float32, fill_viewmats
@@ -131,8 +131,8 @@ class Plan:
         means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds = _contiguous(scene)
         workspace = torch.empty(self._size_with_kept if keep else self._size, dtype=torch.uint8, device=self.device)
         base = workspace.data_ptr()
-        words = _polled.words
-        values, report = words.values, words.address
+        counters = _polled.counters
+        values, report = counters.values, counters.address
         values[0] = values[1] = -1
         values[2] = 0
         bad = report + 16 if validate else 0
@@ -188,7 +188,7 @@ class Plan:
                     options.height, order, *self._kept(base, keep), keys.data_ptr(), image.data_ptr(),
                     alphas.data_ptr(),
                 )  # fmt: skip
-                words.wait(self._index)
+                counters.wait(self._index)
                 counts = Counts(values[0], values[1])
                 if values[2]:
                     return None
@@ -317,13 +317,13 @@ class _Polled(threading.local):
     """Words that this thread's kernels write and it polls."""
 
     def __init__(self) -> None:
-        self._words: PolledWords | None = None
+        self._counters: PolledCounters | None = None
 
     @property
-    def words(self) -> PolledWords:
-        if self._words is None:  # not at import: page-locked memory needs a device
-            self._words = PolledWords(3)
-        return self._words
+    def counters(self) -> PolledCounters:
+        if self._counters is None:  # not at import: page-locked memory needs a device
+            self._counters = PolledCounters(3)
+        return self._counters
 
 
 _polled = _Polled()

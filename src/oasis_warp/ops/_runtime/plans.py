@@ -62,7 +62,7 @@ def addresses(tensors: Iterable[Tensor | None]) -> list[int]:
     return [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
 
 
-class _Once(Function):
+class _DifferentiableOnce(Function):
     """Gradients that have no derivative."""
 
     @staticmethod
@@ -78,6 +78,6 @@ class _Once(Function):
         )
 
 
-def once(caller: str, inputs: Sequence[Tensor | None], gradients: Sequence[Tensor | None]) -> Any:
+def differentiable_once(caller: str, inputs: Sequence[Tensor | None], gradients: Sequence[Tensor | None]) -> Any:
     """`gradients`, which raise if autograd wants to go through them (create_graph=True)."""
-    return _Once.apply(caller, len(inputs), *inputs, *gradients) if torch.is_grad_enabled() else gradients
+    return _DifferentiableOnce.apply(caller, len(inputs), *inputs, *gradients) if torch.is_grad_enabled() else gradients

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import Function
 
 from oasis_warp.core.tracing import is_traced
-from oasis_warp.ops._runtime.plans import Plans, once, shapes_of
+from oasis_warp.ops._runtime.plans import Plans, differentiable_once, shapes_of
 from oasis_warp.ops._runtime.posing_plan import (
     GaussianInputs,
     GaussiansPlan,
@@ -92,7 +92,7 @@ class _Skinning(Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
         given = SkinningInputs(*ctx.saved_tensors)
         found = ctx.plan.backward(given, ctx.workspace, gradient.contiguous(), ctx.needs_input_grad[1:])
-        return None, *once("skin", given, [*found, None, None, None])
+        return None, *differentiable_once("skin", given, [*found, None, None, None])
 
 
 class _MeshGaussians(Function):
@@ -118,7 +118,7 @@ class _MeshGaussians(Function):
         if all(gradient is None for gradient in incoming):
             return (None,) * (3 + len(given))
         found = ctx.plan.backward(given, ctx.binding, ctx.workspace, incoming, ctx.needs_input_grad[3:])
-        return None, None, None, *once("pose_on_mesh", given, found)
+        return None, None, None, *differentiable_once("pose_on_mesh", given, found)
 
 
 # Below Function.apply, which takes 3 us to look for functorch: `is_traced` has.

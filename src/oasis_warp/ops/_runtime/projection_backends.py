@@ -26,7 +26,7 @@ from oasis_warp.ops._runtime.launch import (
     vectors,
     wait_for,
 )
-from oasis_warp.ops._runtime.pair_counts import own_slot
+from oasis_warp.ops._runtime.pair_counts import thread_slot
 from oasis_warp.ops._runtime.records import counters_size, empty_records, table_params, tables
 from oasis_warp.ops._runtime.rules import current_rules
 from oasis_warp.ops._runtime.values import refuse_capture
@@ -139,7 +139,7 @@ def project_cuda(
     bad = None
     if validate:
         refuse_capture()
-        bad = own_slot()
+        bad = thread_slot()
         bad[0] = 0
     total = len(scene.viewmats) * len(scene.means)
     n_blocks = max(1, block_count(total, projection_native.BLOCK))  # at least one, which clears the counters

@@ -57,12 +57,12 @@ class DeferredFiniteCheck:
         address = self._slot.data_ptr()
         self._found = ctypes.c_longlong.from_address(address)
         self._found.value = 0
-        _look_at(tensors, address)
+        _launch_check(tensors, address)
 
     def __exit__(self, kind: Any, *_: Any) -> None:
         torch.cuda.current_stream(self._device).synchronize()  # even after an error: the kernel writes to the slot
         bad = self._found.value
-        slots.give(self._slot)
+        slots.release(self._slot)
         if bad and kind is None:
             checks.check_finite(**self._given)
             raise AssertionError("the kernel has met a bad value that is not in its inputs")
@@ -77,11 +77,11 @@ class ReplayedFiniteCheck:
         self._slot = slots.take()  # stays the graph's: it may be replayed after this is gone
         self._found = ctypes.c_longlong.from_address(self._slot.data_ptr())
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Look at the values, where the graph that is being captured does whenever it runs."""
-        _look_at([self._tensor], self._slot.data_ptr())
+        _launch_check([self._tensor], self._slot.data_ptr())
 
-    def arm(self) -> None:
+    def reset(self) -> None:
         """Forget what the last look has found."""
         self._found.value = 0
 
@@ -90,7 +90,7 @@ class ReplayedFiniteCheck:
         return self._found.value != 0
 
 
-def _look_at(tensors: list[Tensor], address: int) -> None:
+def _launch_check(tensors: list[Tensor], address: int) -> None:
     """Write 1 to `address`, host memory, if a number is bad."""
     stream = current_stream(tensors[0].device)
     launch = cuda_launch(finite.cuda_all_finite(), stream.device)

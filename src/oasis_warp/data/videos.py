@@ -1,4 +1,4 @@
-"""Write films: MP4 (H.264 where `ffmpeg` has it, else VP9), GIF, WebP, and folders of PNG pictures."""
+"""Write videos: MP4 (H.264 where `ffmpeg` has it, else VP9), GIF, WebP, and folders of PNG pictures."""
 
 import contextlib
 import functools
@@ -19,7 +19,7 @@ from oasis_warp.data.pictures import check_suffix, write_picture
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".webp")
 TRANSPARENT = (".webp", "")
-"""Endings of films that can be transparent; a name without ending is a folder of PNG pictures."""
+"""Endings of videos that can be transparent; a name without ending is a folder of PNG pictures."""
 _CODECS = ("vp09", "mp4v")
 """Of OpenCV, in order of preference; its wheel has no H.264. Browsers do not play the second, MPEG-4 part 2."""
 _GIF_PALETTE = (cv2.IMWRITE_GIF_DITHER, 3)
@@ -29,11 +29,11 @@ _H264 = "-c:v libx264 -preset veryfast -crf 16 -pix_fmt yuv420p -threads 1 -movf
 """Of ffmpeg: 4:2:0, which every player knows; one thread, so that the file does not depend on their number."""
 
 
-def check_film(path: Path, *, transparent: bool = False) -> None:
-    """Check that `path` names a film that can be written, before any work is spent on it.
+def check_video(path: Path, *, transparent: bool = False) -> None:
+    """Check that `path` names a video that can be written, before any work is spent on it.
 
     Raises:
-        InputError: another ending, or one of films that cannot be transparent.
+        InputError: another ending, or one of videos that cannot be transparent.
     """
     if path.suffix:
         check_suffix(path, VIDEO_SUFFIXES)
@@ -42,7 +42,7 @@ def check_film(path: Path, *, transparent: bool = False) -> None:
 
 
 def write_video(path: Path | str, frames: Iterable[UInt8[Tensor, "H W C"]], fps: float, *, loops: int = 0) -> int:
-    """Write RGB frames of one size as a film, by the ending of `path`, atomically; the number of frames.
+    """Write RGB frames of one size as a video, by the ending of `path`, atomically; the number of frames.
 
     Without an ending `path` is a folder, and frame 7 becomes its file 0007.png; pictures in it keep their alpha, as
     WebP does. An odd width or height of an MP4 is padded by one pixel, since its chroma is subsampled. A GIF rounds
@@ -50,7 +50,7 @@ def write_video(path: Path | str, frames: Iterable[UInt8[Tensor, "H W C"]], fps:
 
     Args:
         path: File or folder.
-        frames: RGB; RGBA where films can be transparent.
+        frames: RGB; RGBA where videos can be transparent.
         fps: Frames a second.
         loops: How often a GIF or WebP is shown; 0 for ever.
 
@@ -60,7 +60,7 @@ def write_video(path: Path | str, frames: Iterable[UInt8[Tensor, "H W C"]], fps:
     """
     path, rest = Path(path), iter(frames)
     first = next(rest, None)
-    check_film(path, transparent=first is not None and first.shape[2] == 4)
+    check_video(path, transparent=first is not None and first.shape[2] == 4)
     if first is None:
         raise ValueError("frames: expected at least one, got none.")
     every = chain([first], rest)
