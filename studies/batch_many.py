@@ -32,7 +32,7 @@ from studies.tables import Column, Section, table
 
 SIDE = 256
 """Of the photos [px]."""
-SMALLEST = ReconstructConfig(size=64, prior="none", unseen="plain", steps=0)
+SMALLEST = ReconstructConfig(size=64, prior="none", unseen="plain", light="keep", steps=0)
 """What takes least and still goes the whole way."""
 BUSY_PHOTO = "palm_open_left_02.png"
 

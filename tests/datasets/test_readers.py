@@ -286,6 +286,21 @@ def test_batches_depend_on_their_number_alone_and_broken_photos_are_passed_over(
             next(batches)
 
 
+def test_other_processes_load_the_same_pictures_and_say_which_are_broken(models, mano, mano_dir, tmp_path):
+    """Pictures that pass between processes, and the samples that take the place of those that cannot be read."""
+    alone, pool = (
+        source("hanco", tmp_path / "tree", models, mano, mano_dir, hands=1, views=1, workers=n) for n in (0, 1)
+    )
+    for sample in alone.catalogue.samples[::2]:
+        sample.image.path.write_bytes(b"")
+    pairs = zip(alone.loaded(3, 0, 2), pool.loaded(3, 0, 2), strict=False)
+    for (number, *pictures), (other, *others) in itertools.islice(pairs, 4):
+        assert number == other
+        for one, two in zip(itertools.chain(*pictures), itertools.chain(*others), strict=True):
+            assert all(np.array_equal(a, b) for a, b in zip((*one[:4], *one.mano), (*two[:4], *two.mano), strict=True))
+    assert number == 12 and alone.failed and alone.failed == pool.failed
+
+
 def test_a_mixture_takes_its_share_of_each_source_and_resumes_at_any_step():
     class Numbered:
         seed = 0

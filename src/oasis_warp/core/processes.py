@@ -2,7 +2,7 @@
 
 import multiprocessing
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -10,18 +10,21 @@ from contextvars import ContextVar
 import torch
 
 
-def worker_pool(workers: int) -> ProcessPoolExecutor:
-    """A pool of processes with one thread each.
+def worker_pool(workers: int, *keep: Callable[[], object]) -> ProcessPoolExecutor:
+    """A pool of processes with one thread each, which call `keep` first.
 
     They ignore Ctrl-C, which a terminal sends to all processes: the one that started them ends them.
     """
     # A forked child of a process with a CUDA context or threads may hang; a spawned one does not.
-    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_start)
+    spawn = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers, mp_context=spawn, initializer=_start, initargs=keep)
 
 
-def _start() -> None:
+def _start(*keep: Callable[[], object]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
+    for each in keep:
+        each()
 
 
 @contextmanager

@@ -1,20 +1,25 @@
 """Batches of a data set for the prior's training, alone or mixed with synthetic people."""
 
 import itertools
+import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.processes import worker_pool
 from oasis_warp.core.types import HandPose, TrainingBatch
-from oasis_warp.datasets.samples import Catalogue, Models, Picture, Sample, load_picture
+from oasis_warp.datasets.samples import Catalogue, Models, Sample, load_picture
+from oasis_warp.hand.mano import ManoPose
 from oasis_warp.hand.mano_hand import hand_pose_of_mano
 from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.hand_batch import pose_hands
@@ -25,6 +30,8 @@ STREAM, MIX_STREAM = 5, 6
 """Stream numbers of the choice of samples, and of data set or synthetic people, beside those of synthetic sources."""
 TRIES = 20
 """Samples that cannot be loaded, one after the other, before a training ends."""
+AHEAD = 2
+"""Batches of each process that are loading or wait to be taken."""
 NOISE = EstimatorNoise(surface=0.0)
 """Poses of data sets are estimates with errors of their own."""
 
@@ -43,6 +50,45 @@ class DatasetPictures(NamedTuple):
     left: Tensor
 
 
+class Loaded(NamedTuple):
+    """A `Picture` on its way from another process: arrays, and 8 bits a colour as in the photo."""
+
+    image: np.ndarray
+    mask: np.ndarray | None
+    viewmat: np.ndarray
+    K: np.ndarray
+    mano: ManoPose
+
+
+_own = threading.local()
+"""`models` of a process or thread that loads pictures."""
+
+
+def _keep_models(models: Models) -> None:
+    _own.models = models
+
+
+def _load(sample: Sample, models: Models, size: int) -> Loaded:
+    """As `load_picture`."""
+    image, mask, camera, mano = load_picture(sample, models, size)
+    return Loaded(_to_bytes(image), None if mask is None else _to_bytes(mask), *map(np.asarray, camera[:2]), mano)
+
+
+def _to_bytes(values: Tensor) -> np.ndarray:
+    return (255 * values + 0.5).to(torch.uint8).numpy()
+
+
+def _load_all(samples: Sequence[Sample], size: int) -> list[Loaded | str]:
+    """Each sample's picture, or why it cannot be loaded."""
+    found: list[Loaded | str] = []
+    for sample in samples:
+        try:
+            found.append(_load(sample, _own.models, size))
+        except InputError as error:
+            found.append(str(error))
+    return found
+
+
 @dataclass(frozen=True, kw_only=True)
 class DatasetHands:
     """A `BatchSource`: photos, each with `views` other pictures of the same hand of the same person as targets."""
@@ -59,25 +105,44 @@ class DatasetHands:
     """Side of a picture [px]."""
     device: torch.device
     workers: int = 0
-    """Batches that threads load ahead."""
+    """Processes that load batches ahead; 0 for a thread of this one."""
     failed: dict[str, str] = field(default_factory=dict)
     """Samples that could not be loaded, with the reason; others took their place."""
 
     def __call__(self, first_step: int, rank: int, world: int) -> Iterator[TrainingBatch]:
         """Endless batches."""
-        hand, groups = self.hand.to(self.device), self._groups()
-        following = itertools.count(first_step * world + rank, world)
-        with ThreadPoolExecutor(max(self.workers, 1)) as pool:  # decoding and resampling leave Python's lock
+        hand = self.hand.to(self.device)
+        for number, photos, targets in self.loaded(first_step, rank, world):
+            yield self._batch(hand, photos, targets, number)
 
-            def ahead(number: int) -> tuple[int, Future[list[list[Picture]]]]:
-                return number, pool.submit(self._loaded, groups, number)
+    def loaded(self, first_step: int, rank: int, world: int) -> Iterator[tuple[int, list[Loaded], list[Loaded]]]:
+        """Numbers of batches, their photos, and the targets of all photos in turn."""
+        groups, size = self._groups(), int(self.size * SURROUNDINGS)
+        keep, alone = partial(_keep_models, self.models), partial(cv2.setNumThreads, 1)
+        pool = worker_pool(self.workers, keep, alone) if self.workers else ThreadPoolExecutor(1, initializer=keep)
+        numbers = itertools.count(first_step * world + rank, world)
+        waiting = deque[tuple[int, list[list[Sample]], Future[list[Loaded | str]]]]()
 
-            loading = deque(ahead(number) for number in itertools.islice(following, max(self.workers, 1)))
-            while True:
-                number, pictures = loading.popleft()
-                batch = self._batch(hand, pictures.result(), number)
-                loading.append(ahead(next(following)))
-                yield batch
+        def submit() -> None:
+            chosen = self._chosen(groups, number := next(numbers))
+            waiting.append((number, chosen, pool.submit(_load_all, [group[0] for group in chosen], size)))
+
+        with pool:
+            for _ in range(max(1, AHEAD * self.workers)):
+                submit()
+            try:
+                while True:
+                    number, chosen, loading = waiting.popleft()
+                    found = [
+                        self._instead(group, size, picture) if isinstance(picture, str) else picture
+                        for group, picture in zip(chosen, loading.result(), strict=True)
+                    ]
+                    submit()
+                    photos = found[:: 1 + self.views]
+                    yield number, photos, [each for k, each in enumerate(found) if k % (1 + self.views)]
+            finally:
+                for *_, loading in waiting:
+                    loading.cancel()
 
     def _groups(self) -> list[list[Sample]]:
         """Samples of one hand of one person each."""
@@ -86,46 +151,48 @@ class DatasetHands:
             table.setdefault((sample.subject, sample.side), []).append(sample)
         return [table[key] for key in sorted(table)]
 
-    def _loaded(self, groups: list[list[Sample]], number: int) -> list[list[Picture]]:
-        """Of every hand of a batch the photo and its targets."""
+    def _chosen(self, groups: list[list[Sample]], number: int) -> list[list[Sample]]:
+        """For each picture of a batch, those of its hand in the order in which they are tried."""
         random = np.random.default_rng([self.seed, STREAM, number])
-        chosen = [groups[random.integers(len(groups))] for _ in range(self.hands)]
-        return [[self._load(group, random) for _ in range(1 + self.views)] for group in chosen]
+        owners = [groups[random.integers(len(groups))] for _ in range(self.hands)]
+        return [
+            [group[k] for k in random.integers(len(group), size=TRIES)]
+            for group in owners for _ in range(1 + self.views)
+        ]  # fmt: skip
 
-    def _batch(self, hand: HandModel, chosen: list[list[Picture]], number: int) -> TrainingBatch:
-        photos, targets = [each[0] for each in chosen], [picture for each in chosen for picture in each[1:]]
+    def _instead(self, group: list[Sample], size: int, reason: str) -> Loaded:
+        """The next picture that can be loaded after the first; others are noted.
+
+        Raises:
+            InputError: none can.
+        """
+        for failed, sample in itertools.pairwise(group):
+            self.failed[failed.name] = reason
+            try:
+                return _load(sample, self.models, size)
+            except InputError as error:
+                reason = str(error)
+        raise InputError(f"{TRIES} photos of {group[0].subject} could not be read, the last: {reason}")
+
+    def _batch(self, hand: HandModel, photos: list[Loaded], targets: list[Loaded], number: int) -> TrainingBatch:
         seen, goals = (self._pictures(hand, pictures) for pictures in (photos, targets))
         goals = goals._replace(image=goals.image * goals.mask[..., None])
         return training_batch(hand, seen, goals, self.size, seeded(self.seed, STREAM, number), NOISE)
 
-    def _load(self, group: list[Sample], random: np.random.Generator) -> Picture:
-        """A picture of the group; those that cannot be loaded are noted and passed over.
-
-        Raises:
-            InputError: too many of them one after the other.
-        """
-        reason = ""
-        for _ in range(TRIES):
-            sample = group[random.integers(len(group))]
-            try:
-                return load_picture(sample, self.models, int(self.size * SURROUNDINGS))
-            except InputError as error:
-                self.failed[sample.name] = reason = str(error)
-        raise InputError(f"{TRIES} photos of {group[0].subject} could not be read, the last: {reason}")
-
-    def _pictures(self, hand: HandModel, pictures: list[Picture]) -> DatasetPictures:
-        poses = [in_camera(hand, picture) for picture in pictures]
+    def _pictures(self, hand: HandModel, pictures: list[Loaded]) -> DatasetPictures:
+        poses = [in_camera(hand, picture.mano, torch.from_numpy(picture.viewmat)) for picture in pictures]
 
         def stacked(tensors: list[Tensor]) -> Tensor:
             return torch.stack(tensors).float().to(self.device)
 
         angles, orientation, translation = (stacked([pose[k] for pose in poses]) for k in range(3))
         shape = stacked([torch.from_numpy(picture.mano.betas) for picture in pictures])
-        image, K = stacked([p.image for p in pictures]), stacked([p.camera.K for p in pictures])
+        image = torch.from_numpy(np.stack([p.image for p in pictures])).to(self.device).float() / 255
+        K = stacked([torch.from_numpy(p.K) for p in pictures])
         mask = self._silhouettes(hand, (shape, angles, orientation, translation), K, image.shape[1])
         for k, picture in enumerate(pictures):
             if picture.mask is not None:
-                mask[k] = picture.mask.to(mask)
+                mask[k] = torch.from_numpy(picture.mask).to(mask) / 255
         left = torch.zeros(len(image), dtype=torch.int64, device=self.device)
         return DatasetPictures(image, mask, mask, angles, orientation, translation, shape, K, left)
 
@@ -136,9 +203,9 @@ class DatasetHands:
         return (seen.face_ids >= 0).float()
 
 
-def in_camera(hand: HandModel, picture: Picture) -> HandPose:
-    """The right hand's pose in the frame of the picture's camera."""
-    pose, view = hand_pose_of_mano(hand, picture.mano), picture.camera.viewmat.double()
+def in_camera(hand: HandModel, mano: ManoPose, viewmat: Tensor) -> HandPose:
+    """The right hand's pose in the frame of a camera, whose `viewmat` takes the world there."""
+    pose, view = hand_pose_of_mano(hand, mano), viewmat.double()
     turn, shift = view[:3, :3], view[:3, 3]
     return HandPose(pose.angles, turn @ pose.orientation, turn @ pose.translation + shift)
 

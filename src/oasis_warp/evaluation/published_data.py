@@ -52,6 +52,6 @@ class CatalogueData:
         K = picture.camera.K.float()
         rgb = (255 * picture.image).round().to(torch.uint8)
         photo = Photo(rgb, picture.mask, float(K[0, 0]), key.name, 1.0)
-        pose = HandPose(*(part.float() for part in in_camera(self._hand, picture)))
+        pose = HandPose(*(part.float() for part in in_camera(self._hand, picture.mano, picture.camera.viewmat)))
         camera = Camera(torch.eye(4), K, self._size, self._size)
         return Sample(photo, fit_of_pose(self._hand, photo, "right", picture.mano.betas, pose, camera))
