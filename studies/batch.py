@@ -98,9 +98,9 @@ def cost_rows(rows: list[Row]) -> list[Row]:
 def scaling_text(rows: list[Row]) -> str | None:
     """CPU time a photo with several workers over that with one."""
     shipped = [row for row in complete(rows) if row["setting"] == next(iter(SETTINGS))]
-    if not shipped:
+    one = next((row for row in shipped if row["workers"] == 1), None)
+    if one is None:
         return None
-    one = next(row for row in shipped if row["workers"] == 1)
     lines = []
     for row in sorted(shipped, key=lambda row: row["workers"]):
         by_cpu = row["workers"] * one["cpu_s"] / row["cpu_s"]
