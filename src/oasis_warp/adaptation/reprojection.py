@@ -136,12 +136,14 @@ def nearby_cameras(camera: Camera, points: Float[Tensor, "K 3"]) -> list[Camera]
     center = (points.amin(0) + points.amax(0)) / 2
     cameras = []
     for about_x, about_y in NEARBY_ANGLES:
-        turn = from_axis_angle(camera.viewmat.new_tensor([1.0, 0.0, 0.0]), camera.viewmat.new_tensor(about_x))
-        turn = turn @ from_axis_angle(camera.viewmat.new_tensor([0.0, 1.0, 0.0]), camera.viewmat.new_tensor(about_y))
+        rotation = from_axis_angle(camera.viewmat.new_tensor([1.0, 0.0, 0.0]), camera.viewmat.new_tensor(about_x))
+        rotation = rotation @ from_axis_angle(
+            camera.viewmat.new_tensor([0.0, 1.0, 0.0]), camera.viewmat.new_tensor(about_y)
+        )
         local = camera.viewmat[:3, :3] @ center + camera.viewmat[:3, 3]
         viewmat = camera.viewmat.clone()
-        viewmat[:3, :3] = turn @ camera.viewmat[:3, :3]
-        viewmat[:3, 3] = turn @ (camera.viewmat[:3, 3] - local) + local
+        viewmat[:3, :3] = rotation @ camera.viewmat[:3, :3]
+        viewmat[:3, 3] = rotation @ (camera.viewmat[:3, 3] - local) + local
         cameras.append(camera._replace(viewmat=viewmat))
     return cameras
 

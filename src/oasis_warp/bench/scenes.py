@@ -311,11 +311,11 @@ def surface(n: int, size: int = 512, n_views: int = 1, seed: int = 0) -> Gaussia
     areas = (torch.arange(n, dtype=torch.float64) + torch.rand(n, dtype=torch.float64, generator=generator)) * area / n
     face = torch.searchsorted(ends, areas).clamp_max(len(ends) - 1)
     frames = surface_frames(normalize(normals, dim=-1), corners[:, 1] - corners[:, 0])
-    turn = 2 * math.pi * torch.rand(n, generator=generator)
+    angle = 2 * math.pi * torch.rand(n, generator=generator)
     spread = SPREAD * math.sqrt(area / n) * torch.exp(UNEVEN * torch.randn(n, 2, generator=generator))
     viewmats, Ks = cameras_around(posed, size, n_views)
     return GaussianScene(
-        f"surface {n}", seed, points_on(corners[face], generator), turned_about_z(frames[face], turn),
+        f"surface {n}", seed, points_on(corners[face], generator), turned_about_z(frames[face], angle),
         torch.cat([spread, THICKNESS * spread.amin(-1, keepdim=True)], -1), torch.full((n,), OPACITY),
         torch.rand(n, 3, generator=generator), viewmats, Ks, torch.zeros(n_views, 3), size, size,
     )  # fmt: skip

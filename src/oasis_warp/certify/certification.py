@@ -47,8 +47,8 @@ SMALL: dict[str, list[dict[str, Any]]] = {
     ],
     "pose_on_mesh_covars": [{"name": name} for name in ("ordinary", "rigid motion", "large bends")],
     "skin": [
-        {"name": "ordinary", "rotation_only": turn, "with_covars": covars}
-        for turn, covars in ((False, True), (True, True), (False, False))
+        {"name": "ordinary", "rotation_only": rigid, "with_covars": covars}
+        for rigid, covars in ((False, True), (True, True), (False, False))
     ],
 }  # fmt: skip
 """Scenes for finite differences, a hundred calls each."""

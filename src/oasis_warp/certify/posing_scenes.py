@@ -49,16 +49,16 @@ def rigid_motion(rng: Sampler, side: int) -> Bend:
     axis = rng.normal(3)
     axis = rng.pick((axis / axis.norm(), *torch.eye(3, dtype=torch.float64)))
     angle = rng.pick((0.0, 1e-4, 1.0, math.pi - 1e-3, math.pi - 1e-6, math.pi))
-    turn = from_axis_angle(axis, torch.tensor(angle, dtype=torch.float64))
-    return Bend(rest, rest @ turn.T + rng.normal(3), faces)
+    rotation = from_axis_angle(axis, torch.tensor(angle, dtype=torch.float64))
+    return Bend(rest, rest @ rotation.T + rng.normal(3), faces)
 
 
 def nearly_half_a_turn(rng: Sampler, side: int) -> Bend:
     """A small bend, turned by nearly half a turn."""
     rest, faces = rumpled(rng, side)
     axis = rng.normal(3)
-    turn = from_axis_angle(axis / axis.norm(), torch.tensor(math.radians(179.4), dtype=torch.float64))
-    return Bend(rest, (rest + 0.15 * rng.normal(*rest.shape)) @ turn.T, faces)
+    rotation = from_axis_angle(axis / axis.norm(), torch.tensor(math.radians(179.4), dtype=torch.float64))
+    return Bend(rest, (rest + 0.15 * rng.normal(*rest.shape)) @ rotation.T, faces)
 
 
 def uniform_growth(rng: Sampler, side: int) -> Bend:
@@ -337,6 +337,6 @@ def skin_case(
     if not with_covars:
         del floats["covars"]
     floats |= SKINNING[name](rng, floats)
-    turn = rng.pick((False, True)) if rotation_only is None else rotation_only
-    others = {"rotation_only": turn and with_covars} | ({} if with_covars else {"covars": None})
+    rigid = rng.pick((False, True)) if rotation_only is None else rotation_only
+    others = {"rotation_only": rigid and with_covars} | ({} if with_covars else {"covars": None})
     return Case(name, seed, floats, tuple(floats), others, ORDINARY if name == "ordinary" else STIFF)

@@ -42,9 +42,9 @@ def orbit_camera(
     center = (vertices.amin(0) + vertices.amax(0)) / 2
     radius = (vertices - center).norm(dim=-1).amax()
     ca, sa, ce, se = math.cos(azimuth), math.sin(azimuth), math.cos(elevation), math.sin(elevation)
-    turn = torch.tensor([[ca, 0, sa], [0, 1, 0], [-sa, 0, ca]], dtype=vertices.dtype)
+    pan = torch.tensor([[ca, 0, sa], [0, 1, 0], [-sa, 0, ca]], dtype=vertices.dtype)
     tilt = torch.tensor([[1, 0, 0], [0, ce, se], [0, -se, ce]], dtype=vertices.dtype)
-    axes = (turn @ tilt).to(vertices.device)  # columns: the camera's x, y, z in the world
+    axes = (pan @ tilt).to(vertices.device)  # columns: the camera's x, y, z in the world
     position = center - axes[:, 2] * radius * (ORBIT_MARGIN / math.sin(ORBIT_FIELD_OF_VIEW / 2))
     viewmat = torch.eye(4, dtype=vertices.dtype, device=vertices.device)
     viewmat[:3, :3] = axes.T

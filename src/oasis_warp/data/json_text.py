@@ -67,7 +67,7 @@ def read_cameras(path: Path | str) -> list[Camera]:
         viewmats = viewmats[None] if viewmats.ndim == 2 else viewmats
         if viewmats.ndim != 3 or viewmats.shape[1:] != (4, 4) or not len(viewmats) or K.shape != (3, 3):
             raise ValueError("`viewmat` of [4, 4] or [T, 4, 4] and `K` of [3, 3] are expected")
-        if not all(bool(is_rotation(torch.from_numpy(turn))) for turn in viewmats[:, :3, :3]) or K[0, 0] * K[1, 1] <= 0:
+        if not all(bool(is_rotation(torch.from_numpy(R))) for R in viewmats[:, :3, :3]) or K[0, 0] * K[1, 1] <= 0:
             raise ValueError("rotations in `viewmat` and positive focal lengths in `K` are expected")
     except InputError:
         raise

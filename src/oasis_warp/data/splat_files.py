@@ -130,8 +130,8 @@ def _read_compressed(packed: np.ndarray, chunks: np.ndarray) -> Parts:
         least, most = (_columns(chunk, *(f"{end}_{name}" for name in names)) for end in ("min", "max"))
         return least + shares * (most - least)
 
-    turns = _unpack(packed["packed_rotation"], 2, 10, 10, 10)
-    quats = _fill_in(np.round(3 * turns[:, 0]).astype(int), (turns[:, 1:] - 0.5) * np.sqrt(2))
+    rotations = _unpack(packed["packed_rotation"], 2, 10, 10, 10)
+    quats = _fill_in(np.round(3 * rotations[:, 0]).astype(int), (rotations[:, 1:] - 0.5) * np.sqrt(2))
     means = placed(_unpack(packed["packed_position"], 11, 10, 11), *"xyz")
     scales = placed(_unpack(packed["packed_scale"], 11, 10, 11), "scale_x", "scale_y", "scale_z")
     rgba = _unpack(packed["packed_color"], 8, 8, 8, 8)
@@ -213,16 +213,16 @@ def _read_spz(data: bytes) -> Parts:
         part = np.frombuffer(data, np.uint8, count * width, start) if count else np.zeros(0, np.uint8)
         parts.append(part.reshape(-1, width).astype(np.int64))
         start += count * width
-    places, opacities, colors, scales, turns = parts
+    places, opacities, colors, scales, rotations = parts
     means = places.reshape(-1, 3, 3) @ [1, 1 << 8, 1 << 16]
     means = np.where(means >= 1 << 23, means - (1 << 24), means) / float(1 << min(bits, 62))
     if version > 2:
-        words = turns @ [1, 1 << 8, 1 << 16, 1 << 24]
+        words = rotations @ [1, 1 << 8, 1 << 16, 1 << 24]
         others = np.stack([words >> shift & 0x3FF for shift in (20, 10, 0)], 1)
         others = np.where(others & 0x200, -1, 1) * (others & 0x1FF) / 511 / np.sqrt(2)
         quats = _fill_in(words >> 30, others)
     else:
-        quats = _fill_in(np.full(count, 3), turns / 127.5 - 1)
+        quats = _fill_in(np.full(count, 3), rotations / 127.5 - 1)
     x, y, z, w = quats.T
     colors = 0.5 + SH_C0 * (colors / 255 - 0.5) / SPZ_COLOR_SCALE
     # Half a turn about x, from y up: (0, 1, 0, 0) times each quaternion.

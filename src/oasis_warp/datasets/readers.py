@@ -138,12 +138,12 @@ def _interhand(tree: Tree, models: Models, split: Split, selection: Selection) -
             values = entry(mano, capture, image["frame_idx"], side, what="MANO parameters of")
             if values is None:
                 raise InputError(f"{name}: has no MANO parameters of the {side} hand.")
-            place, turn, focal, middle = _camera(cameras, capture, str(image["camera"]))
+            place, rotation, focal, middle = _camera(cameras, capture, str(image["camera"]))
             pose = pose_of_48(models[side], values["pose"], values["shape"], values["trans"], with_mean=False)
             box = numbers(annotation["bbox"], 4, what="bbox")
             sample = Sample(
                 f"{name} {side}", tree.file(f"images/{name}"), None, side, f"{split}/Capture{capture}",
-                _view(turn, -turn @ place / 1000), _intrinsics(*focal, *middle), pose, box,
+                _view(rotation, -rotation @ place / 1000), _intrinsics(*focal, *middle), pose, box,
             )  # fmt: skip
             found.add(sample, models)
     return found

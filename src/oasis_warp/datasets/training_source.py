@@ -206,8 +206,8 @@ class DatasetHands:
 def in_camera(hand: HandModel, mano: ManoPose, viewmat: Tensor) -> HandPose:
     """The right hand's pose in the frame of a camera, whose `viewmat` takes the world there."""
     pose, view = hand_pose_of_mano(hand, mano), viewmat.double()
-    turn, shift = view[:3, :3], view[:3, 3]
-    return HandPose(pose.angles, turn @ pose.orientation, turn @ pose.translation + shift)
+    rotation, shift = view[:3, :3], view[:3, 3]
+    return HandPose(pose.angles, rotation @ pose.orientation, rotation @ pose.translation + shift)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -264,8 +264,8 @@ def _estimate(path: Path, hand: dict[str, np.ndarray], photo: Photo) -> Estimate
         raise InputError(f"{path}: its camera puts the hand {place[2]:.3g} m away; save it in metres, z forward.")
     pose = None
     if all(name in hand for name in ("orient", "pose", "betas")):
-        turns = [_vectors(path, hand[name]) for name in ("orient", "pose")]
-        pose = ManoPose(hand["betas"], turns[0][0], turns[1], np.zeros(3))
+        vectors = [_vectors(path, hand[name]) for name in ("orient", "pose")]
+        pose = ManoPose(hand["betas"], vectors[0][0], vectors[1], np.zeros(3))
     centre = hand.get("centre", np.array(size) / 2)
     points = hand["points"].reshape(21, 3) if "points" in hand else None
     return Estimate(side, pose, points, place, focal, centre)

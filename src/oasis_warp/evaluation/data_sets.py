@@ -287,8 +287,8 @@ def misposed(hand: HandModel, fit: HandFit, degrees: float, seed: int) -> HandFi
     errors = math.radians(degrees) * torch.randn(16, 3, generator=random)
     low, high = hand.pose_limits[1:].unbind(-1)
     angles = torch.minimum(torch.maximum(fit.pose.angles + errors[1:], low), high)
-    turn = torch.linalg.matrix_exp(torch.cross(torch.eye(3), errors[0].expand(3, 3), dim=-1))
-    return fit._replace(pose=fit.pose._replace(angles=angles, orientation=fit.pose.orientation @ turn))
+    rotation = torch.linalg.matrix_exp(torch.cross(torch.eye(3), errors[0].expand(3, 3), dim=-1))
+    return fit._replace(pose=fit.pose._replace(angles=angles, orientation=fit.pose.orientation @ rotation))
 
 
 def target_truth(

@@ -79,5 +79,5 @@ def _parameters_of_mano(avatar: Avatar, pose: HandPose) -> dict[str, Any]:
 
 def _local_rotations(hand: HandModel, joints: Float[Tensor, "16 3"], pose: HandPose) -> Float[Tensor, "15 3 3"]:
     """Rotation of each bone but the wrist's in the frame of its parent at rest."""
-    turns, _ = bone_transforms(hand, joints, pose)
-    return turns[list(hand.parents[1:])].mT @ turns[1:]
+    world, _ = bone_transforms(hand, joints, pose)
+    return world[list(hand.parents[1:])].mT @ world[1:]

@@ -28,8 +28,8 @@ def posed_splats(request: ExportRequest) -> Gaussians:
     """
     avatar, pose = request.avatar, request.pose or request.avatar.source_pose
     shown = avatar.in_even_light() if request.light == "none" else avatar
-    turn, wrist = photo_axes(avatar.source_camera), avatar.mesh(pose).joints[0]
-    return checked(moved(shown.pose(pose), turn, wrist))
+    to_photo, wrist = photo_axes(avatar.source_camera), avatar.mesh(pose).joints[0]
+    return checked(moved(shown.pose(pose), to_photo, wrist))
 
 
 def photo_axes(camera: Camera) -> Float[Tensor, "3 3"]:
@@ -37,10 +37,10 @@ def photo_axes(camera: Camera) -> Float[Tensor, "3 3"]:
     return torch.diag(camera.viewmat.new_tensor(HALF_TURN)) @ camera.viewmat[:3, :3]
 
 
-def moved(gaussians: Gaussians, turn: Float[Tensor, "3 3"], origin: Float[Tensor, "3"]) -> Gaussians:
-    """The same in axes that `turn` leads to, about `origin`; on the CPU, quaternions with w >= 0."""
-    means = (gaussians.means - origin) @ turn.to(gaussians.means).T
-    about = rotation.from_matrix(turn).to(gaussians.quats).expand_as(gaussians.quats)
+def moved(gaussians: Gaussians, R: Float[Tensor, "3 3"], origin: Float[Tensor, "3"]) -> Gaussians:
+    """The same in axes rotated by `R`, about `origin`; on the CPU, quaternions with w >= 0."""
+    means = (gaussians.means - origin) @ R.to(gaussians.means).T
+    about = rotation.from_matrix(R).to(gaussians.quats).expand_as(gaussians.quats)
     quats = rotation.multiply(about, gaussians.quats)
     quats = quats / quats.norm(dim=-1, keepdim=True)
     quats = torch.where(quats[..., :1] < 0, -quats, quats)
@@ -49,8 +49,8 @@ def moved(gaussians: Gaussians, turn: Float[Tensor, "3 3"], origin: Float[Tensor
 
 def y_down(gaussians: Gaussians) -> Gaussians:
     """Half a turn about x: what files of trained scenes have, whose y points down and z forward."""
-    turn = torch.diag(gaussians.means.new_tensor(HALF_TURN))
-    return moved(gaussians, turn, gaussians.means.new_zeros(3))
+    half_turn = torch.diag(gaussians.means.new_tensor(HALF_TURN))
+    return moved(gaussians, half_turn, gaussians.means.new_zeros(3))
 
 
 def checked(gaussians: Gaussians) -> Gaussians:

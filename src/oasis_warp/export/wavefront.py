@@ -22,8 +22,8 @@ def write_obj(request: ExportRequest, path: Path) -> None:
     """
     avatar, pose = request.avatar, request.pose or request.avatar.source_pose
     picture_path = path.with_name(f"{path.stem}_skin.png")
-    posed, mesh, turn = avatar.mesh(pose), topology(avatar), photo_axes(avatar.source_camera)
-    points = (mesh_points(posed.vertices, avatar.hand, mesh) - posed.joints[0]) @ turn.to(posed.joints).T
+    posed, mesh, rotation = avatar.mesh(pose), topology(avatar), photo_axes(avatar.source_camera)
+    points = (mesh_points(posed.vertices, avatar.hand, mesh) - posed.joints[0]) @ rotation.to(posed.joints).T
     corners = 1 + mesh.faces[:, :, None].expand(-1, -1, 3).flatten(1)  # the same row of v, vt and vn
     text = (
         f"mtllib {path.stem}.mtl\n{_rows('v', points)}{_rows('vt', mesh.uv)}{_rows('vn', mesh_normals(points, mesh))}"

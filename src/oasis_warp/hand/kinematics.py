@@ -116,25 +116,25 @@ class HandKinematics:
         rotation[0], position[0], by_shape[0] = np.eye(3), rest[0], self.joint_basis[0]
         for j in range(1, 16):
             parent = self.parents[j]
-            turn = rotation[parent]
-            position[j] = position[parent] + turn @ (rest[j] - rest[parent])
-            by_shape[j] = by_shape[parent] + turn @ (self.joint_basis[j] - self.joint_basis[parent])
+            frame = rotation[parent]
+            position[j] = position[parent] + frame @ (rest[j] - rest[parent])
+            by_shape[j] = by_shape[parent] + frame @ (self.joint_basis[j] - self.joint_basis[parent])
             for a in range(3):
-                axes[j, a] = turn @ self.axes[j, a]
+                axes[j, a] = frame @ self.axes[j, a]
                 if table[j, a] != 0:
-                    turn = turn @ cv2.Rodrigues(self.axes[j, a] * table[j, a])[0]
-            rotation[j] = turn
+                    frame = frame @ cv2.Rodrigues(self.axes[j, a] * table[j, a])[0]
+            rotation[j] = frame
         return PosedJoints(table, shape, rest, rotation, position, by_shape, axes)
 
     def landmarks(self, joints: PosedJoints) -> tuple[np.ndarray, np.ndarray]:
         """The 21 landmarks as the network detects them [m], [21, 3], and d landmarks / d (angles, shape)."""
         joint, dof_joint = self.point_joint, self.dofs[:, 0]
         local = self.points + self.points_basis @ joints.shape - joints.rest[joint] + self.offsets
-        turn = joints.rotation[joint]
-        points = (turn @ local[..., None])[..., 0] + joints.position[joint]
+        frame = joints.rotation[joint]
+        points = (frame @ local[..., None])[..., 0] + joints.position[joint]
         arm = points[:, None] - joints.position[dof_joint]
         by_angle = np.cross(joints.axes[tuple(self.dofs.T)], arm) * self.below[dof_joint][:, joint].T[..., None]
-        by_shape = turn @ (self.points_basis - self.joint_basis[joint]) + joints.position_by_shape[joint]
+        by_shape = frame @ (self.points_basis - self.joint_basis[joint]) + joints.position_by_shape[joint]
         return points, np.concatenate([by_angle.transpose(0, 2, 1), by_shape], 2)
 
     def rest_surface(self, shape: np.ndarray) -> np.ndarray:
@@ -172,8 +172,8 @@ class HandKinematics:
         """Posed vertices `index`, and d vertices / d (angles, shape); their `displacement` [P, 3] stays constant."""
         basis = self.shape_basis[index]
         start, weights = self.template[index] + basis @ joints.shape + displacement, self.weights[index]
-        shifts, turn = self.bone_shifts(joints), self.blended(joints, index)
-        points = (turn @ start[..., None])[..., 0] + weights @ shifts
+        shifts, frame = self.bone_shifts(joints), self.blended(joints, index)
+        points = (frame @ start[..., None])[..., 0] + weights @ shifts
         dof_joint = self.dofs[:, 0]
         below = self.below[dof_joint].T  # bone, angle
         # Each bone's part of the vertex rotates about the joint of the angle if the bone descends from it.
@@ -182,7 +182,7 @@ class HandKinematics:
         arm = moved - (weights @ below)[..., None] * joints.position[dof_joint]
         by_angle = np.cross(joints.axes[tuple(self.dofs.T)], arm)
         shift_by_shape = joints.position_by_shape - joints.rotation @ self.joint_basis
-        by_shape = turn @ basis + np.tensordot(weights, shift_by_shape, 1)
+        by_shape = frame @ basis + np.tensordot(weights, shift_by_shape, 1)
         return points, np.concatenate([by_angle.transpose(0, 2, 1), by_shape], 2)
 
     def normals(self, joints: PosedJoints, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

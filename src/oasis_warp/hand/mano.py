@@ -182,17 +182,17 @@ def rotation_vectors(matrices: np.ndarray) -> np.ndarray:
 
 def mano_surface(model: ManoModel, pose: ManoPose) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] and joints [16, 3] as smplx's layer has them [m]; the wrist turns about its own joint."""
-    turns = rotations(np.concatenate([pose.global_orient.reshape(1, 3), pose.hand_pose.reshape(15, 3)]))
+    world = rotations(np.concatenate([pose.global_orient.reshape(1, 3), pose.hand_pose.reshape(15, 3)]))
     rest = model.joints(pose.betas)
     points = model.template + model.shape_basis @ pose.betas
-    points = points + model.pose_basis @ (turns[1:] - np.eye(3)).ravel()
+    points = points + model.pose_basis @ (world[1:] - np.eye(3)).ravel()
     place = rest.copy()
     for j in range(1, 16):
         parent = PARENTS[j]
-        place[j] = place[parent] + turns[parent] @ (rest[j] - rest[parent])
-        turns[j] = turns[parent] @ turns[j]
-    shifts = place - (turns @ rest[..., None])[..., 0]
-    blended = np.tensordot(model.weights, turns, 1)
+        place[j] = place[parent] + world[parent] @ (rest[j] - rest[parent])
+        world[j] = world[parent] @ world[j]
+    shifts = place - (world @ rest[..., None])[..., 0]
+    blended = np.tensordot(model.weights, world, 1)
     vertices = (blended @ points[..., None])[..., 0] + model.weights @ shifts
     return vertices + pose.transl, place + pose.transl
 

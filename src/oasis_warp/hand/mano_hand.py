@@ -200,10 +200,10 @@ def hand_of_mano(model: ManoModel, registration: Registration) -> HandModel:
     posed = placed.joints(kinematics)
     seen = kinematics.landmarks(posed)[0] @ placed.rotation.T + placed.translation - wrist
     own = np.concatenate([joints, tips])[bundled.keypoint_index.numpy()]
-    turn = placed.rotation @ np.stack([posed.rotation[max(parent, 0)] for parent in PARENTS])
+    frames = placed.rotation @ np.stack([posed.rotation[max(parent, 0)] for parent in PARENTS])
     weights = at_vertices(fine.weights)
     rest = real(placed.angles)
-    axes = np.einsum("jak,jbk->jab", kinematics.axes, turn)
+    axes = np.einsum("jak,jbk->jab", kinematics.axes, frames)
     # R - 1 in the basis of the axes instead of the hand's, so that it depends on the angles alone.
     correctives = fine.pose_basis.reshape(-1, 3, 15, 3, 3)
     correctives = np.einsum("vkjab,jca,jdb->vkjcd", correctives, axes[1:], axes[1:], optimize=True)
@@ -275,14 +275,14 @@ def _along_bones(kinematics: HandKinematics, model: ManoModel) -> PlacedHand:
             f"{MAX_TURNED:.0f}; give MANO's own files, fingers to -x, palm to -y, thumb to +z."
         )
     ends = {j: j + 1 for j in range(1, 16) if j % 3} | {15: 16, 3: 17, 6: 18, 12: 20, 9: 19}
-    turns, angles = np.repeat(rotation[None], 16, 0), np.zeros((16, 3))
+    world, angles = np.repeat(rotation[None], 16, 0), np.zeros((16, 3))
     for j in range(1, 16):
-        parent = turns[PARENTS[j]]
+        parent = world[PARENTS[j]]
         before, after = unit(parent @ (own[ends[j]] - own[j])), unit(goal[ends[j]] - goal[j])
         axis = np.cross(before, after)
         angle = np.arctan2(np.linalg.norm(axis), before @ after)
-        turns[j] = rotations(unit(axis) * angle)[0] @ parent
-        local = parent.T @ turns[j]
+        world[j] = rotations(unit(axis) * angle)[0] @ parent
+        local = parent.T @ world[j]
         axes = kinematics.axes[j]
         angles[j] = euler_angles(torch.from_numpy(axes @ local @ axes.T)).numpy()
     return PlacedHand(angles, np.zeros(kinematics.shape_basis.shape[2]), rotation, translation)
@@ -368,19 +368,19 @@ def _barycentrics(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def hand_pose_of_mano(hand: HandModel, pose: ManoPose) -> HandPose:
     """MANO's parameters of a right hand as a pose of `mano_hand`, float64; the shape is `pose.betas`."""
-    turns = torch.from_numpy(rotations(np.concatenate([pose.global_orient.reshape(1, 3), pose.hand_pose])))
+    matrices = torch.from_numpy(rotations(np.concatenate([pose.global_orient.reshape(1, 3), pose.hand_pose])))
     axes = hand.pose_axes.double().cpu()[1:]
     wrist, moved = _wrist(hand, pose.betas)
-    translation = wrist + torch.from_numpy(pose.transl) - turns[0] @ moved
-    return HandPose(euler_angles(axes @ turns[1:] @ axes.mT), turns[0], translation)
+    translation = wrist + torch.from_numpy(pose.transl) - matrices[0] @ moved
+    return HandPose(euler_angles(axes @ matrices[1:] @ axes.mT), matrices[0], translation)
 
 
 def mano_of_hand_pose(hand: HandModel, shape: torch.Tensor, pose: HandPose) -> ManoPose:
     """MANO's parameters of a right hand's shape and pose: the inverse of `hand_pose_of_mano`."""
     shape, angles, orientation, translation = (part.double().cpu() for part in (shape, *pose))
     axes = hand.pose_axes.double().cpu()[1:]
-    turns = torch.cat([orientation[None], axes.mT @ euler_rotations(angles) @ axes]).numpy()
-    vectors = rotation_vectors(turns)
+    matrices = torch.cat([orientation[None], axes.mT @ euler_rotations(angles) @ axes]).numpy()
+    vectors = rotation_vectors(matrices)
     wrist, moved = _wrist(hand, shape.numpy())
     return ManoPose(shape.numpy(), vectors[0], vectors[1:], (translation - wrist + orientation @ moved).numpy())
 

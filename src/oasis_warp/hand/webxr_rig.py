@@ -98,9 +98,9 @@ def local_quats(
     """
     n = len(angles)
     still = HandPose(angles, torch.eye(3).expand(n, 3, 3).to(angles), angles.new_zeros(n, 3))
-    turns, _ = bone_transforms(hand, rest.joints, still)
+    rotations, _ = bone_transforms(hand, rest.joints, still)
     to_file = torch.tensor(TO_WEBXR[side]).to(angles)
-    world = to_file @ turns[:, list(rig.bones)] @ to_file.T @ rig.bind[:, :3, :3]
+    world = to_file @ rotations[:, list(rig.bones)] @ to_file.T @ rig.bind[:, :3, :3]
     upper = torch.stack([torch.eye(3).expand(n, 3, 3).to(world) if p < 0 else world[:, p] for p in rig.parents], 1)
     quats = rotation.from_matrix(upper.mT @ world)
     for t in range(1, n):

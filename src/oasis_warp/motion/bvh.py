@@ -114,19 +114,19 @@ def hand_angles(hand: HandModel, rest: PosedHand, skeleton: Skeleton, side: Side
     places = _rest_places(skeleton)
     knuckles = [bone for bone in (1, 4, 7, 10) if bone in chains]
     ours = rest.joints.double()
-    turn = _aligning_rotation(places[[chains[bone] for bone in knuckles]] - places[wrist], ours[knuckles] - ours[0])
+    aligning = _aligning_rotation(places[[chains[bone] for bone in knuckles]] - places[wrist], ours[knuckles] - ours[0])
     world = _world_rotations(skeleton)
-    turns = torch.eye(3, dtype=torch.float64).repeat(len(world), 16, 1, 1)
+    rotations = torch.eye(3, dtype=torch.float64).repeat(len(world), 16, 1, 1)
     for bone in range(1, 16):
         if bone not in chains:
-            turns[:, bone] = turns[:, hand.parents[bone]]
+            rotations[:, bone] = rotations[:, hand.parents[bone]]
             continue
         joint = chains[bone]
         ahead = ours[bone + 1] if bone % 3 else rest.tips[(1, 2, 4, 3, 0)[bone // 3 - 1]].double()
-        there = turn @ _direction(skeleton, places, joint)
-        moved = turn @ (world[:, wrist].mT @ world[:, joint]) @ turn.T
-        turns[:, bone] = moved @ _shortest(ahead - ours[bone], there)
-    return angles_of_bones(hand, turns)
+        there = aligning @ _direction(skeleton, places, joint)
+        moved = aligning @ (world[:, wrist].mT @ world[:, joint]) @ aligning.T
+        rotations[:, bone] = moved @ _shortest(ahead - ours[bone], there)
+    return angles_of_bones(hand, rotations)
 
 
 def _is_palm(name: str) -> bool:
@@ -167,17 +167,17 @@ def _direction(skeleton: Skeleton, places: Tensor, joint: int) -> Tensor:
 def _world_rotations(skeleton: Skeleton) -> Float[Tensor, "T B 3 3"]:
     """Rotation of every joint from rest, in the skeleton's world."""
     axes = dict(zip("XYZ", torch.eye(3, dtype=torch.float64), strict=True))
-    turns: list[Tensor] = []
+    rotations: list[Tensor] = []
     for bone in skeleton.bones:
-        turn = torch.eye(3, dtype=torch.float64).expand(len(skeleton.frames), 3, 3)
+        world = torch.eye(3, dtype=torch.float64).expand(len(skeleton.frames), 3, 3)
         if bone.parent >= 0:
-            turn = turns[bone.parent]
+            world = rotations[bone.parent]
         for k, channel in enumerate(bone.channels):
             if channel.endswith("rotation"):
                 angles = skeleton.frames[:, bone.first + k] * (math.pi / 180)
-                turn = turn @ rotation.from_axis_angle(axes[channel[0]].expand(len(angles), 3), angles)
-        turns.append(turn)
-    return torch.stack(turns, 1)
+                world = world @ rotation.from_axis_angle(axes[channel[0]].expand(len(angles), 3), angles)
+        rotations.append(world)
+    return torch.stack(rotations, 1)
 
 
 def _aligning_rotation(points: Float[Tensor, "N 3"], targets: Float[Tensor, "N 3"]) -> Float[Tensor, "3 3"]:

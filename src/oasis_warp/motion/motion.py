@@ -53,18 +53,18 @@ def at_frames(motion: Motion, at: Float[Tensor, "N"]) -> Motion:
     def blend(values: Tensor) -> Tensor:
         return torch.lerp(values[before], values[after], share.to(values).view(-1, *[1] * (values.dim() - 1)))
 
-    turns = motion.orientations
+    rotations = motion.orientations
     return Motion(
         blend(motion.angles),
         motion.fps,
-        None if turns is None else rotation.to_matrix(blend(_smooth_quats(turns))),
+        None if rotations is None else rotation.to_matrix(blend(_smooth_quats(rotations))),
         None if motion.translations is None else blend(motion.translations),
     )
 
 
-def _smooth_quats(turns: Float[Tensor, "T 3 3"]) -> Float[Tensor, "T 4"]:
+def _smooth_quats(rotations: Float[Tensor, "T 3 3"]) -> Float[Tensor, "T 4"]:
     """Quaternions whose neighbours have the same sign."""
-    quats = rotation.from_matrix(turns)
+    quats = rotation.from_matrix(rotations)
     flips = torch.where((quats[1:] * quats[:-1]).sum(-1) < 0, -1.0, 1.0).to(quats)
     return quats * torch.cat([flips.new_ones(1), flips.cumprod(0)])[:, None]
 
@@ -83,10 +83,12 @@ def smooth(motion: Motion) -> Motion:
         passed = sosfiltfilt(sections, values.double().numpy(), axis=0, padlen=reach)
         return torch.from_numpy(np.ascontiguousarray(passed)).to(values)
 
-    turns, places = motion.orientations, motion.translations
+    rotations, places = motion.orientations, motion.translations
     return motion._replace(
         angles=filtered(motion.angles),
-        orientations=None if turns is None else rotation.to_matrix(normalize(filtered(_smooth_quats(turns)), dim=1)),
+        orientations=None
+        if rotations is None
+        else rotation.to_matrix(normalize(filtered(_smooth_quats(rotations)), dim=1)),
         translations=None if places is None else filtered(places),
     )
 
@@ -104,11 +106,11 @@ def joint_angles(hand: HandModel, local: Float[Tensor, "T 15 3 3"]) -> Float[Ten
     return euler_angles(axes @ local @ axes.mT)
 
 
-def angles_of_bones(hand: HandModel, turns: Float[Tensor, "T 16 3 3"]) -> Float[Tensor, "T 15 3"]:
-    """Joint angles of bones that are turned by `turns` from rest, in one frame for all; held to the joints' limits.
+def angles_of_bones(hand: HandModel, rotations: Float[Tensor, "T 16 3 3"]) -> Float[Tensor, "T 15 3"]:
+    """Joint angles of bones at these world `rotations` from rest, clamped to the joints' limits.
 
     The bones of another skeleton are not quite ours: what no joint of the model can do is left out.
     """
-    local = turns[:, list(hand.parents[1:])].mT @ turns[:, 1:]
+    local = rotations[:, list(hand.parents[1:])].mT @ rotations[:, 1:]
     low, high = hand.pose_limits[1:].to(local).unbind(-1)
     return torch.minimum(torch.maximum(joint_angles(hand, local), low), high)

@@ -65,10 +65,10 @@ def read_tracked(
     bind, to_file = rig.bind[:, :3, :3].double(), torch.tensor(TO_WEBXR[side]).double()
     posed = bind[0] @ room[:, :1].mT @ room  # as if the wrist were at rest
     of_joints = to_file.T @ posed @ bind.mT @ to_file
-    turns = torch.stack([of_joints[:, rig.bones.index(bone)] for bone in range(16)], 1)
+    rotations = torch.stack([of_joints[:, rig.bones.index(bone)] for bone in range(16)], 1)
     to_world = torch.diag(bind.new_tensor(HALF_TURN))
     wrist = to_world @ room[:, 0] @ bind[0].T @ to_file
-    angles = angles_of_bones(hand, turns)
+    angles = angles_of_bones(hand, rotations)
     if places is None:
         return angles, wrist, None
     at = places[:, -N_JOINTS] @ to_world

@@ -104,7 +104,7 @@ def decode(
     difference from `colors` in logits, by the share of it that the head trusts.
     """
     identity = torch.nn.functional.pad(torch.ones_like(raw["quats"][..., :1]), (0, 3))
-    turn = normalize(raw["quats"] + identity, dim=-1, eps=1e-6)
+    delta = normalize(raw["quats"] + identity, dim=-1, eps=1e-6)
     larger = math.log(limits.growth)
     shrunk = torch.stack([  # no tensor of the limits: a recording could not bring it to the device
         math.log(limit) * torch.tanh(axis / math.log(limit))
@@ -116,7 +116,7 @@ def decode(
         raw["opacities"][..., 0] + math.log((OPACITY - least) / (1 - OPACITY))
     )
     color = decode_colors(raw, colors, seen)
-    return Attributes(rotation.multiply(quats, turn), scales * change.exp(), fade * opacity, color)
+    return Attributes(rotation.multiply(quats, delta), scales * change.exp(), fade * opacity, color)
 
 
 def decode_colors(

@@ -72,8 +72,8 @@ def polar_rotations(rest: Planes, posed: Planes) -> Tensor:
     cos, sin = m[:, 0, 0] + m[:, 1, 1], m[:, 1, 0] - m[:, 0, 1]
     length = torch.hypot(cos, sin)
     cos, sin, zero, one = cos / length, sin / length, torch.zeros_like(cos), torch.ones_like(cos)
-    turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], -1).view(-1, 3, 3)
-    return from_matrix(posed.axes @ turn @ rest.axes.transpose(1, 2))
+    in_plane = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], -1).view(-1, 3, 3)
+    return from_matrix(posed.axes @ in_plane @ rest.axes.transpose(1, 2))
 
 
 def face_rotations(rest_vertices: Tensor, posed_vertices: Tensor, faces: Tensor) -> Rotations:
@@ -123,24 +123,24 @@ def pose_on_mesh(
     """As `oasis_warp.ops.pose_on_mesh`: means, quats, scales of the Gaussians on vertices, then of those on faces."""
     corners = faces[face_index]
     means = (barycentrics[..., None] * posed_vertices[corners]).sum(1)
-    turns = vertex_quats[corners]
-    signs = torch.where(dots_with_heaviest(turns, barycentrics) < 0, -1.0, 1.0).to(quats)
-    mix = (barycentrics[..., None] * signs[..., None] * turns).sum(1)
+    corner_quats = vertex_quats[corners]
+    signs = torch.where(dots_with_heaviest(corner_quats, barycentrics) < 0, -1.0, 1.0).to(quats)
+    mix = (barycentrics[..., None] * signs[..., None] * corner_quats).sum(1)
     mix, growth = mix / mix.norm(dim=-1, keepdim=True), area_ratio[face_index]
     if vertex_index is not None:
         assert offsets is not None and vertex_area_ratio is not None  # the three come together
-        turn = vertex_quats[vertex_index] / vertex_quats[vertex_index].norm(dim=-1, keepdim=True)
-        shifted = posed_vertices[vertex_index] + (to_matrix(turn) @ offsets[..., None])[..., 0]
-        means, mix = torch.cat([shifted, means]), torch.cat([turn, mix])
+        own = vertex_quats[vertex_index] / vertex_quats[vertex_index].norm(dim=-1, keepdim=True)
+        shifted = posed_vertices[vertex_index] + (to_matrix(own) @ offsets[..., None])[..., 0]
+        means, mix = torch.cat([shifted, means]), torch.cat([own, mix])
         growth = torch.cat([vertex_area_ratio[vertex_index], growth])
     growth = growth.clamp(1 / LIMIT, LIMIT) ** EXPONENTS[scale_law]
     return means, multiply(mix, quats), scales * growth[:, None]
 
 
-def dots_with_heaviest(turns: Tensor, barycentrics: Tensor) -> Tensor:
+def dots_with_heaviest(corner_quats: Tensor, barycentrics: Tensor) -> Tensor:
     """Dot products [Q, 3] of the three rotations of each Gaussian with that of its heaviest corner."""
     heaviest = barycentrics.detach().argmax(-1)[:, None, None].expand(-1, 1, 4)
-    return (turns * torch.take_along_dim(turns, heaviest, 1)).sum(-1)
+    return (corner_quats * torch.take_along_dim(corner_quats, heaviest, 1)).sum(-1)
 
 
 def pose_on_mesh_covars(rest_vertices, posed_vertices, faces, face_index, barycentrics, quats, scales):
@@ -168,8 +168,8 @@ def skin(means: Tensor, covars: Tensor | None, weights: Tensor, transforms: Tens
     moved = (linear @ means[..., None])[..., 0] + shift
     if covars is None:
         return (moved,)
-    turn = nearest_rotations(linear) if rotation_only else linear
-    return moved, turn @ covars @ turn.transpose(1, 2)
+    linear = nearest_rotations(linear) if rotation_only else linear
+    return moved, linear @ covars @ linear.transpose(1, 2)
 
 
 def nearest_rotations(matrices: Tensor) -> Tensor:

@@ -78,15 +78,15 @@ def pose_people(body: Body, people: Sequence[Person], numbers: ShotTensors) -> P
         _rotate(numbers.ring_rotation, ring) + numbers.ring_translation[:, None],
     ]
 
-    turn, distance, fill = numbers.view_rotation, numbers.view_distance, numbers.view_fill
-    seen = _rotate(turn, skinned)
+    rotations, distance, fill = numbers.view_rotation, numbers.view_distance, numbers.view_fill
+    seen = _rotate(rotations, skinned)
     low, high = seen.aminmax(dim=1)
     middle = (low + high) / 2
     extent = (high - low)[:, :2].amax(1)
     focal = fill * distance / extent
     off = torch.cat([numbers.view_shift * (extent / fill)[:, None], distance[:, None]], 1)
     translation = off - middle
-    move = lambda points: _rotate(turn, points) + translation[:, None]  # noqa: E731
+    move = lambda points: _rotate(rotations, points) + translation[:, None]  # noqa: E731
     parts = [seen + translation[:, None], move(arm.flatten(1, 2))]
     for k, points in enumerate(worn):
         parts.append(torch.where(numbers.wears[:, k, None, None] > 0, move(points), _hidden_position(points.device)))

@@ -83,14 +83,14 @@ def sample_view(rng: np.random.Generator, look: PictureStyle, closed: bool) -> V
     """
     u = rng.uniform
     side = rng.choice(list(_VIEW_SHARES), p=list(_VIEW_SHARES.values()))
-    turn = rng.normal(size=4)
-    turn /= np.linalg.norm(turn)
+    quat = rng.normal(size=4)
+    quat /= np.linalg.norm(quat)
     tilts = rng.normal(0, [0.42, 0.30, 0.36])
     sideways = rng.random()
     if closed and side == "back" and rng.random() < 0.65:
         side = "palm" if sideways < 0.4 else "thumb"
     if side == "any" or look == "even":
-        w, x, y, z = turn
+        w, x, y, z = quat
         rotation = np.array([
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -138,9 +138,9 @@ def _harmonics(d: np.ndarray) -> np.ndarray:
 def sphere(n: int) -> np.ndarray:
     """Evenly spread unit vectors (Fibonacci spiral), [n, 3]."""
     k = np.arange(n) + 0.5
-    z, turn = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
+    z, longitude = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
     r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(turn), r * np.sin(turn), z], 1)
+    return np.stack([r * np.cos(longitude), r * np.sin(longitude), z], 1)
 
 
 _SPHERE = sphere(DIRECTIONS)
