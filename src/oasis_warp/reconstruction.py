@@ -264,7 +264,7 @@ def _fit(
     progress: Progress,
 ) -> tuple[list[Landmarks | HandFit], list[HandFit]]:
     """What is found in each photo, or given, and the fits of one hand to all of them."""
-    estimator = HandEstimator(hand)
+    estimator = HandEstimator(hand, config.device)
     with stage("landmarks"):
         found = [
             read_keypoints(keypoints, p, hand=hand, which=config.hand)

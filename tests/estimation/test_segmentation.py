@@ -123,6 +123,19 @@ def test_a_large_photo_gives_a_mask_of_its_own_size(drawing):
     assert iou(cv2.resize(mask, (224, 224), interpolation=cv2.INTER_AREA) > 0.5, hand) > 0.97
 
 
+def test_the_mask_of_a_tiny_hand_follows_the_edges_too(drawing):
+    """Every fourth row and column of it has too few sure pixels for colour models."""
+    picture, xy, _, hand, arm = drawing
+    small = cv2.resize(picture, (32, 32), interpolation=cv2.INTER_AREA)
+    little, beside = (
+        cv2.resize(mask.astype(np.float32), (32, 32), interpolation=cv2.INTER_AREA) > 0.5 for mask in (hand, arm)
+    )
+    coarse = cv2.dilate(little.astype(np.uint8), np.ones((3, 3))) > 0
+    seen = reading_of(coarse & ~beside, beside)
+    before = iou(seen.in_photo(seen.hand, (32, 32)) > 0.5, little)
+    assert iou(mask_from_reading(small, seen, xy / 7) > 0.5, little) > before + 0.05
+
+
 def test_masks_are_repeatable(drawing):
     picture, xy, _, hand, arm = drawing
     first, second = (mask_from_reading(picture, reading_of(hand, arm), xy) for _ in range(2))

@@ -18,7 +18,13 @@ from oasis_warp.core.types import Camera, HandCrop, HandPose
 from oasis_warp.estimation.fit import Fitter, SurfacePoints
 from oasis_warp.estimation.fit_problem import FitState, fit_target
 from oasis_warp.estimation.fit_quality import stray_pixels
-from oasis_warp.estimation.pixel_reading import SIDE, PixelReading, read_pixels, surface_points
+from oasis_warp.estimation.pixel_reading import (
+    SIDE,
+    PixelReading,
+    bundled_dense_network,
+    read_pixels,
+    surface_points,
+)
 from oasis_warp.estimation.refine import _Problem, refine
 from oasis_warp.estimation.surface_state import shape_of, state_of_surface
 from oasis_warp.hand.poses import named_pose
@@ -258,3 +264,15 @@ def test_a_change_is_the_step_that_was_taken(hand, photo, wrong):
     problem = _Problem(hand, photo[1], wrong, None, PRIOR_SIZE)
     step = 0.05 * np.random.default_rng(0).normal(size=problem.n_unknowns)
     np.testing.assert_allclose(problem.change(problem.moved(problem.start, step)), step, atol=1e-12)
+
+
+@pytest.mark.gpu
+def test_a_photo_is_read_on_cuda_as_on_the_cpu(fitted):
+    photo, landmarks, _ = fitted("victory_right_09.jpg")
+    xy = landmarks.xy.numpy().astype(float)
+    here, there, again = (
+        read_pixels(photo.rgb.numpy(), xy, bundled_dense_network(device)) for device in ("cpu", "cuda", "cuda")
+    )
+    for a, b, c in zip(vars(here).values(), vars(there).values(), vars(again).values(), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-3)  # TF32 is off by ten times as much
+        np.testing.assert_array_equal(b, c)

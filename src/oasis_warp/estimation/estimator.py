@@ -30,7 +30,13 @@ from oasis_warp.estimation.fit_quality import (
 from oasis_warp.estimation.landmarks import box_size, detect_hands
 from oasis_warp.estimation.networks import networks
 from oasis_warp.estimation.outline import MaskOutline
-from oasis_warp.estimation.pixel_reading import PixelReading, read_pixels, surface_points, surface_reading
+from oasis_warp.estimation.pixel_reading import (
+    PixelReading,
+    bundled_dense_network,
+    read_pixels,
+    surface_points,
+    surface_reading,
+)
 from oasis_warp.estimation.segmentation import check_opencv, mask_from_alpha, mask_from_reading
 from oasis_warp.hand.kinematics import HandKinematics
 
@@ -64,10 +70,15 @@ def _check_landmarks(landmarks: Landmarks, name: str, least: int) -> None:
 class HandEstimator:
     """Finds hands with the two bundled networks and fits `hand` to them. Same photo, same bits."""
 
-    def __init__(self, hand: HandModel):
-        """Raises InputError where OpenCV is another than the estimator needs."""
+    def __init__(self, hand: HandModel, device: str = "cpu"):
+        """Raises InputError where OpenCV is another than the estimator needs.
+
+        Args:
+            hand: On the CPU.
+            device: Where the dense network reads pixels; all else is done on the CPU.
+        """
         check_opencv()
-        self.hand = hand
+        self.hand, self.device = hand, device
         self.kinematics = HandKinematics(hand)
 
     def find(self, photo: Photo) -> list[Landmarks]:
@@ -155,7 +166,7 @@ class HandEstimator:
         """Fit to the surface that the dense network reads and to the mask's outline."""
         warnings = []
         xy, scale = view.target.xy, start.state.pixels_per_metre()
-        reading = read_pixels(view.rgb, xy)
+        reading = read_pixels(view.rgb, xy, bundled_dense_network(self.device))
         mask = None if view.alpha is None else mask_from_alpha(view.alpha, reading, xy, scale)
         if view.alpha is not None and mask is None:
             warnings.append("the photo's own cut-out was left aside: it does not show this hand alone and whole")

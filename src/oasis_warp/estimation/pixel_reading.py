@@ -71,14 +71,14 @@ class PixelReading:
 
 
 @functools.cache
-def bundled_dense_network() -> DenseNetwork:
-    """The network that ships with the package.
+def bundled_dense_network(device: str) -> DenseNetwork:
+    """The network that ships with the package, on a device.
 
     Raises:
         InputError: its file is missing or damaged.
     """
     with resources.as_file(asset("estimator", "dense.safetensors")) as path:
-        return load_dense_network(path).to(memory_format=torch.channels_last)
+        return load_dense_network(path).to(device, memory_format=torch.channels_last)
 
 
 def read_pixels(rgb: np.ndarray, xy: np.ndarray, network: DenseNetwork | None = None) -> PixelReading:
@@ -87,27 +87,29 @@ def read_pixels(rgb: np.ndarray, xy: np.ndarray, network: DenseNetwork | None = 
     Args:
         rgb: The photo, [H, W, 3] bytes; a left hand mirrored.
         xy: Landmarks [px of the photo], [21, 2]; NaN for those that are not known.
-        network: Another network than the bundled one.
+        network: Another network than the bundled one, or that on another device than the CPU.
     """
-    network = network or bundled_dense_network()
+    network = network or bundled_dense_network("cpu")
+    device = next(network.parameters()).device
     low, high = np.nanmin(xy, 0), np.nanmax(xy, 0)
     side = MARGIN * max(float((high - low).max()), 1.0)
     corner, scale = (low + high) / 2 - side / 2, SIDE / side
     crop = _crop(rgb, corner, scale)
-    with torch.inference_mode(), using_threads(1):  # several share sums out differently, and bits would change
-        image = torch.from_numpy(crop).permute(2, 0, 1)[None].float() / 255
-        points = torch.from_numpy((xy - corner) * scale)[None].float()
+    exact = torch.backends.cudnn.flags(deterministic=True, allow_tf32=False)  # on CUDA as on the CPU
+    with torch.inference_mode(), exact, using_threads(1):  # several share sums out differently, and bits would change
+        image = torch.from_numpy(crop).to(device).permute(2, 0, 1)[None].float() / 255
+        points = torch.from_numpy((xy - corner) * scale)[None].float().to(device)
         out = network(image.contiguous(memory_format=torch.channels_last), points)
         return PixelReading(
             corner,
             scale,
             crop,
-            out.classes[0].softmax(0).numpy(),
-            SURFACE_UNIT * out.surface[0].numpy(),
-            SURFACE_UNIT * out.log_scale[0].exp().numpy(),
-            out.normal[0].numpy(),
-            _linear(out.albedo[0].numpy()),
-            out.finger[0].softmax(0).numpy(),
+            out.classes[0].softmax(0).cpu().numpy(),
+            SURFACE_UNIT * out.surface[0].cpu().numpy(),
+            SURFACE_UNIT * out.log_scale[0].exp().cpu().numpy(),
+            out.normal[0].cpu().numpy(),
+            _linear(out.albedo[0].cpu().numpy()),
+            out.finger[0].softmax(0).cpu().numpy(),
         )
 
 

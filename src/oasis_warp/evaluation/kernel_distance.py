@@ -64,7 +64,7 @@ def hand_features(
         mask: Share of each pixel that is hand.
         network: Another network than the bundled one.
     """
-    network = network or bundled_dense_network()
+    network = network or bundled_dense_network("cpu")
     # The full size has little more than colours.
     _, *planes = network.encode(image.permute(2, 0, 1)[None].cpu(), torch.full((1, 21, 2), torch.nan))
     found: Features = {}
