@@ -262,6 +262,7 @@ def test_strangers_and_other_sites_get_nothing(form_server):
         ("script.py", {}, 422, "script.py: expected a picture, .jpg"),
         ("", {}, 422, "expected a picture"),
         ("a.jpg", {"Content_Length": str(MAX_BYTES + 1)}, 413, "more than 64 MB"),
+        ("a.jpg", {"Content_Length": "9" * 5000}, 413, "more than 64 MB"),
         ("a.jpg", {"Content_Length": "-1"}, 411, ""),
     ],
 )
@@ -275,6 +276,16 @@ def look(jobs, job):
     found = jobs.look(job)
     assert found is not None
     return found
+
+
+def test_a_browser_that_goes_away_leaves_no_traceback(form_server, capsys):
+    for error, words in ((BrokenPipeError(), ""), (TimeoutError(), ""), (ValueError("ours"), "ours")):
+        try:
+            raise error
+        except (OSError, ValueError):
+            form_server.handle_error(None, ("127.0.0.1", 1))
+        said = capsys.readouterr().err
+        assert words in said and bool(said) == bool(words)
 
 
 def test_a_full_queue_is_said(program, tmp_path):

@@ -127,6 +127,10 @@ def _meta(change):
 FIRST = "Capture0/0007_thumbup_relaxed/cam400002/image0.jpg"
 DAMAGE = {
     "no photo": ("interhand", lambda r: (r / "images/train" / FIRST).unlink(), "the photo image0.jpg is missing"),
+    "no photos": ("interhand", _json("annotations/train/InterHand2.6M_train_data.json", lambda v: v.pop("images")),
+                  "has no list of images"),
+    "a number": ("interhand", _json("annotations/train/InterHand2.6M_train_data.json",
+                 lambda v: v.update(annotations=3)), "has no list of annotations"),
     "no camera": ("interhand", _cameras("focal", lambda t: {k: t[k] for k in t if k != "400002"}), "camera 400002"),
     "camera cut": ("interhand", _cameras("campos", lambda t: t | {"400002": [1, 2]}), "campos: expected 3 numbers"),
     "camera turned": ("interhand", _cameras("camrot", lambda t: t | {"400002": [[1, 0]]}), "camrot: expected 3 x 3"),

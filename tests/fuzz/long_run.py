@@ -13,7 +13,8 @@ from pathlib import Path
 
 BATCH = 500
 """Files a process."""
-KINDS = ("avatars", "weights", "keypoints", "fits", "estimates", "images", "splats", "motions")
+KINDS = ("avatars", "weights", "keypoints", "fits", "estimates", "images", "splats", "motions", "mano", "data_sets",
+         "requests")  # fmt: skip
 PATIENCE = 300.0
 """Seconds to wait for one file, on a machine that is busy with other things."""
 
@@ -24,12 +25,8 @@ def make_target(name: str, folder: Path):
 
     if name == "avatars":
         return targets.avatars(folder, lit=True)
-    if name == "weights":
-        return targets.weights(folder)
-    if name == "splats":
-        return targets.splats(folder)
-    if name == "motions":
-        return targets.motions(folder)
+    if name in ("weights", "splats", "motions", "mano", "data_sets", "requests"):
+        return getattr(targets, name)(folder)
     if name == "images":
         return targets.images(avif=True)
     if name == "estimates":

@@ -4,7 +4,11 @@ import io
 import json
 import pickle
 import resource
+import shutil
+import socket
+import threading
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,17 +16,24 @@ from pathlib import Path
 import numpy as np
 import torch
 from data_stage.image_files import encode, exif, picture, tiff
-from fuzz.mutations import Mutation, damaged_bytes, json_file, tensor_file
+from datasets.trees import WRITERS
+from fuzz.mutations import NUMBERS, Mutation, choose, damaged_bytes, json_file, tensor_file
+from mano_files import write_mano
 
+from oasis_warp.cli.jobs import Jobs
+from oasis_warp.cli.serve import FormServer
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, CanonicalGaussians, HandLight, HandPose, Landmarks, Photo
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.splat_files import read_splats
+from oasis_warp.datasets.readers import DatasetName, read_dataset
+from oasis_warp.datasets.samples import load_picture
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.keypoints import read_keypoints
 from oasis_warp.export import export_avatar
 from oasis_warp.export.page_data import splat_facts
+from oasis_warp.hand.mano import read_mano
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
@@ -248,3 +259,94 @@ def images(*, avif: bool) -> Target:
         assert photo.rgb.ndim == 3 and photo.rgb.shape[2] == 3 and photo.rgb.numel() <= 3 * 24_000_000
 
     return Target(files, damaged_bytes, read)
+
+
+def mano(folder: Path) -> Target:
+    """MANO's files: what is taken is finite."""
+    write_mano(folder / "mano")
+    file = folder / "mano" / "MANO_RIGHT.pkl"
+
+    def read(path: Path) -> None:
+        shutil.copy(path, file)
+        model = read_mano(file.parent)
+        assert all(np.isfinite(part).all() for part in (model.template, model.shape_basis, model.weights))
+
+    return Target({".pkl": file.read_bytes()}, damaged_bytes, read)
+
+
+DATA_SETS: tuple[DatasetName, ...] = ("interhand", "hanco", "freihand", "ho3d")
+READ = 3
+"""Samples of a data set that are loaded."""
+
+
+def data_sets(folder: Path) -> Target:
+    """Annotations of data sets: of what is taken, the first samples are loaded."""
+    models = {side: read_mano(write_mano(folder / "mano"), side) for side in ("right", "left")}
+    places: dict[str, tuple[DatasetName, Path]] = {}
+    for name in DATA_SETS:
+        WRITERS[name](folder / name, models)
+        found = sorted(path for path in (folder / name).rglob("*") if path.suffix in (".json", ".pkl"))
+        places |= {f".{name}.{k}{path.suffix}": (name, path) for k, path in enumerate(found[:4])}
+    files = {suffix: path.read_bytes() for suffix, (_, path) in places.items()}
+
+    def read(path: Path) -> None:
+        suffix = path.name.removeprefix("hostile")
+        name, place = places[suffix]
+        shutil.copy(path, place)
+        try:
+            for sample in read_dataset(name, folder / name, folder / "mano").samples[:READ]:
+                loaded = load_picture(sample, models, 32)
+                assert bool(loaded.image.isfinite().all()) and bool(loaded.camera.K.isfinite().all())
+        finally:
+            place.write_bytes(files[suffix])
+
+    def mutate(rng: np.random.Generator, data: bytes) -> bytes:
+        return json_file(rng, data) if data[:1] in b"{[" and rng.random() < 0.9 else damaged_bytes(rng, data)
+
+    return Target(files, mutate, read)
+
+
+def requests(folder: Path) -> Target:
+    """What a browser asks of `oasis serve`: answered or refused, and nothing is written but photos that were taken."""
+    server, raised = FormServer(Jobs(folder / "served")), list[str]()
+    server.handle_error = lambda request, client_address: raised.append(traceback.format_exc())
+    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+    job = server.jobs.add("a.jpg", b"photo")
+    out = folder / "served" / job / "out"
+    out.mkdir()
+    for name in ("report.json", "avatar.safetensors"):
+        (out / name).write_bytes(b"{}")
+    start, host = f"/{server.token}/", f"Host: 127.0.0.1:{server.server_port}"
+    asked_for = (
+        ("GET", "", "\r\n"), ("GET", f"jobs/{job}", "\r\n"), ("GET", f"jobs/{job}/avatar.safetensors", "\r\n"),
+        ("POST", "jobs", "Content-Length: 5\r\nX-Name: b.jpg\r\n\r\nphoto"),
+    )  # fmt: skip
+    files = {
+        f".{k}.http": f"{method} {start}{rest} HTTP/1.1\r\n{host}\r\n{more}".encode()
+        for k, (method, rest, more) in enumerate(asked_for)
+    }
+
+    def mutate(rng: np.random.Generator, data: bytes) -> bytes:
+        kept = data.index(server.token.encode()) + len(server.token) if rng.random() < 0.8 else 0
+        changed = damaged_bytes(rng, data[kept:])
+        if rng.random() < 0.1:
+            length = choose(rng, (*map(str, NUMBERS), "9" * 5000))
+            changed = changed.replace(b"Content-Length: 5", f"Content-Length: {length}".encode())
+        return data[:kept] + changed
+
+    def read(path: Path) -> None:
+        with socket.create_connection(server.server_address[:2], timeout=MAX_SECONDS) as asked:
+            asked.sendall(path.read_bytes())
+            asked.shutdown(socket.SHUT_WR)
+            reply = b""
+            while part := asked.recv(1 << 16):
+                reply += part
+        assert not raised, raised.pop()
+        for extra in {path.name for path in (folder / "served").iterdir()} - {job}:
+            assert [path.name for path in (folder / "served" / extra).iterdir()] == ["photo.jpg"]
+            shutil.rmtree(folder / "served" / extra)
+            server.jobs = Jobs(folder / "served")
+        if not reply or (reply.startswith(b"HTTP/") and reply[9:10] in b"45"):
+            raise InputError("refused.")
+
+    return Target(files, mutate, read)

@@ -45,3 +45,8 @@ def test_damaged_estimates_are_refused_in_one_sentence_or_read(tmp_path):
 @pytest.mark.timeout(60)
 def test_damaged_pictures_are_refused_in_one_sentence_or_read(tmp_path):
     assert outcomes(targets.images(avif=False), 150, tmp_path) == {"refused", "taken"}
+
+
+@pytest.mark.timeout(60)
+def test_damaged_requests_are_answered_or_refused(tmp_path):
+    assert outcomes(targets.requests(tmp_path), 150, tmp_path) == {"refused", "taken"}

@@ -3,6 +3,7 @@
 import hmac
 import secrets
 import socket
+import sys
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 from oasis_warp.core.errors import InputError
@@ -38,6 +39,11 @@ class LoopbackServer(ThreadingHTTPServer):
             raise InputError(f"--port {port}: cannot be used ({error.strerror}); choose another, or 0.") from error
         self.token = secrets.token_urlsafe(18)
         self.hosts = {f"{name}:{self.server_port}" for name in (LOOPBACK, "localhost")}
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Print the traceback of an error that is ours, not of a browser that went away."""
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
 
     @property
     def address(self) -> str:

@@ -11,8 +11,8 @@ from oasis_warp.cli.options import Serve
 from oasis_warp.cli.view import serve
 from oasis_warp.core.errors import InputError
 
-MAX_BYTES = 64 << 20
-"""Of a photo."""
+MAX_BYTES, MAX_DIGITS = 64 << 20, 20
+"""Of a photo, and of the number that says so: Python reads none of more than 4300 digits."""
 FORM = {"": "form.html", "form.css": "form.css", "form.js": "form.js"}
 TYPES = {
     ".html": "text/html; charset=utf-8", ".css": "text/css; charset=utf-8", ".js": "text/javascript; charset=utf-8",
@@ -61,7 +61,7 @@ class _Handler(LoopbackHandler):
         if path != "jobs" or not length.isdecimal():
             self.send_error(404 if path != "jobs" else 411)
             return
-        if int(length) > MAX_BYTES:
+        if len(length) > MAX_DIGITS or int(length) > MAX_BYTES:
             self.close_connection = True  # the photo is not read
             self._send_json({"error": f"The photo has more than {MAX_BYTES >> 20} MB; send a smaller one."}, 413)
             return

@@ -116,10 +116,10 @@ def _interhand(tree: Tree, models: Models, split: Split, selection: Selection) -
     )
     found, frames = Catalogue(), dict[tuple[int, str, int], int]()
     images = {}
-    for image in entry(data, "images", what="table"):
+    for image in _rows(tree, data, "images"):
         with found.reading(f"{split}/{image.get('file_name') if isinstance(image, dict) else '?'}"):
             images[image["id"]] = image
-    for annotation in entry(data, "annotations", what="table"):
+    for annotation in _rows(tree, data, "annotations"):
         number = annotation.get("image_id") if isinstance(annotation, dict) else None
         image = images.get(number) if isinstance(number, int | str) else None
         name = f"{split}/{image['file_name']}" if image and "file_name" in image else f"annotation of {split}"
@@ -147,6 +147,14 @@ def _interhand(tree: Tree, models: Models, split: Split, selection: Selection) -
             )  # fmt: skip
             found.add(sample, models)
     return found
+
+
+def _rows(tree: Tree, data: Any, key: str) -> list[Any]:
+    """InterHand's list of photos or of hands."""
+    rows = data.get(key) if isinstance(data, dict) else None
+    if not isinstance(rows, list):
+        raise InputError(f"{tree.root}: InterHand2.6M_*_data.json has no list of {key}; download it again.")
+    return rows
 
 
 def _camera(cameras: Any, capture: int, number: str) -> list[np.ndarray]:
