@@ -50,6 +50,8 @@ PIPELINE = [
         "-top * scale + 0.5 * scale - 0.5]", "-top * scale + 0.5 * scale]"),
     _of("estimation/segmentation", "estimation/test_segmentation", "without_the_arm", "the arm taken for hand",
         " & (arm < np.maximum(hand, 0.3))", ""),
+    _of("estimation/segmentation", "estimation/test_segmentation", "without_the_arm or edges or slits or finger",
+        "the colours' band ten times as wide", "_BAND = 3.0", "_BAND = 30.0"),
     _of("estimation/fit", "estimation/test_fit", "beyond_its_limits", "no lower pose limits",
         "np.maximum(state.angles - self.high, 0) + np.minimum(state.angles - self.low, 0)",
         "np.maximum(state.angles - self.high, 0)"),
