@@ -10,7 +10,7 @@ import warp as wp
 
 from oasis_kernels.runtime.arrays import place_in
 from oasis_kernels.scene.room_patterns import CLOTH, painted, rough_noise
-from oasis_kernels.scene.sky import blurred, cosine_lobe, disc, dither, harmonics, light_along, lit_share
+from oasis_kernels.scene.sky import Lamps, blurred, cosine_lobe, disc, dither, harmonics, light_along, lit_share
 
 wp.set_module_options({"enable_backward": False})  # fast_math makes NaN of powers: a dot product may exceed 1
 
@@ -137,13 +137,7 @@ def sight(
     turn: float,
     solids: wp.array3d[wp.float32],
     sky: wp.array2d[wp.vec3f],
-    lamps: wp.array2d[wp.vec3f],
-    lamp_colors: wp.array2d[wp.vec3f],
-    lamp_ranges: wp.array2d[wp.float32],
-    lamp_spreads: wp.array2d[wp.float32],
-    lamp_views: wp.array2d[wp.mat44f],
-    lamp_focals: wp.array2d[wp.float32],
-    lamp_depths: wp.array3d[wp.float32],
+    lamps: Lamps,
 ) -> wp.vec4f:
     """Light and depth along the ray `d` from the camera."""
     t = float(FAR)
@@ -216,29 +210,19 @@ def sight(
         open_ -= (reach - clearance(solids, b, p + reach * n, reach)) / reach * 0.36
     open_ = wp.max(open_, 0.12)
     total = light_along(sky, b, cosine_lobe(n)) * open_
-    for lamp in range(lamps.shape[1]):
-        color = lamp_colors[b, lamp]
+    for lamp in range(lamps.positions.shape[1]):
+        color = lamps.colors[b, lamp]
         if color[0] + color[1] + color[2] > 0.0:
-            to = lamps[b, lamp] - p
+            to = lamps.positions[b, lamp] - p
             distance = wp.length(to)
             w = to / distance
             facing = wp.dot(n, w)
             if facing > 0.0:
-                fall = lamp_ranges[b, lamp] / distance
-                share = lit_share(
-                    lamp_depths,
-                    b * lamps.shape[1] + lamp,
-                    lamp_views[b, lamp],
-                    lamp_focals[b, lamp],
-                    lamp_spreads[b, lamp],
-                    p,
-                    n,
-                    turn,
-                    0.002,
-                )
+                fall = lamps.ranges[b, lamp] / distance
+                share = lit_share(lamps, b, lamp, p, n, turn, 0.002)
                 if share > 0.0 and lamp == 0:  # the first lamp's shadows of the solids themselves
                     s = 0.015 + 0.0016 * turn
-                    soft = 1.0 / wp.max(lamp_spreads[b, lamp], 0.05)
+                    soft = 1.0 / wp.max(lamps.spreads[b, lamp], 0.05)
                     rolled = wp.int32(5)
                     for _k in range(rolled):
                         # Further away nothing darkens and no step is longer.
@@ -260,13 +244,7 @@ def trace(
     solids: wp.array3d[wp.float32],
     focals: wp.array[wp.float32],
     sky: wp.array2d[wp.vec3f],
-    lamps: wp.array2d[wp.vec3f],
-    lamp_colors: wp.array2d[wp.vec3f],
-    lamp_ranges: wp.array2d[wp.float32],
-    lamp_spreads: wp.array2d[wp.float32],
-    lamp_views: wp.array2d[wp.mat44f],
-    lamp_focals: wp.array2d[wp.float32],
-    lamp_depths: wp.array3d[wp.float32],
+    lamps: Lamps,
     hidden: wp.array3d[wp.float32],  # where this is 1 the hand covers the pixel and nothing is traced
     light: wp.array3d[wp.vec3f],
     depth: wp.array3d[wp.float32],
@@ -289,12 +267,6 @@ def trace(
                 solids,
                 sky,
                 lamps,
-                lamp_colors,
-                lamp_ranges,
-                lamp_spreads,
-                lamp_views,
-                lamp_focals,
-                lamp_depths,
             )
             total += wp.vec3f(s[0], s[1], s[2]) / float(RAYS)
             nearest = wp.min(nearest, s[3])

@@ -12,7 +12,7 @@ lobes for lamps, low-order harmonics of the sky along the mirrored ray.
 import warp as wp
 
 from oasis_kernels.runtime.arrays import place_in
-from oasis_kernels.scene.sky import blurred, cosine_lobe, dither, harmonics, light_along, lit_share, vec9
+from oasis_kernels.scene.sky import Lamps, blurred, cosine_lobe, dither, harmonics, light_along, lit_share, vec9
 
 wp.set_module_options({"enable_backward": False})  # fast_math makes NaN of powers: a dot product may exceed 1
 
@@ -89,13 +89,7 @@ def shade(
     worn: wp.array3d[wp.float32],  # [image, material, MATERIAL_WORDS]
     tones: wp.array[wp.vec3f],  # mean reflectance of each image's skin
     sky: wp.array2d[wp.vec3f],
-    lamps: wp.array2d[wp.vec3f],  # positions
-    lamp_colors: wp.array2d[wp.vec3f],  # irradiance over pi at distance `lamp_ranges`
-    lamp_ranges: wp.array2d[wp.float32],
-    lamp_spreads: wp.array2d[wp.float32],
-    lamp_views: wp.array2d[wp.mat44f],
-    lamp_focals: wp.array2d[wp.float32],
-    lamp_depths: wp.array3d[wp.float32],  # [image * lamp, row, column]
+    lamps: Lamps,
     texels_a_pixel: wp.array[wp.float32],
     seeds: wp.array[wp.int32],
     light: wp.array3d[wp.vec3f],
@@ -199,29 +193,19 @@ def shade(
     f0 = wp.vec3f(straight, straight, straight) + metal * base
     gloss = wp.vec3f()
     turn = dither(x, y)
-    for lamp in range(lamps.shape[1]):
-        color = lamp_colors[b, lamp]
+    for lamp in range(lamps.positions.shape[1]):
+        color = lamps.colors[b, lamp]
         if color[0] + color[1] + color[2] > 0.0:
-            to = lamps[b, lamp] - p
+            to = lamps.positions[b, lamp] - p
             distance = wp.length(to)
             d = to / distance
-            fall = lamp_ranges[b, lamp] / distance
+            fall = lamps.ranges[b, lamp] / distance
             color = color * (fall * fall)
-            spread = lamp_spreads[b, lamp]
+            spread = lamps.spreads[b, lamp]
             facing = wp.dot(n, d)
             share = wp.float32(0.0)
             if facing > -0.25:
-                share = lit_share(
-                    lamp_depths,
-                    b * lamps.shape[1] + lamp,
-                    lamp_views[b, lamp],
-                    lamp_focals[b, lamp],
-                    spread,
-                    p + 0.0012 * n,
-                    n,
-                    turn,
-                    0.0012,
-                )
+                share = lit_share(lamps, b, lamp, p + 0.0012 * n, n, turn, 0.0012)
             if share > 0.0:
                 nl = wp.dot(m, d)
                 for c in range(3):

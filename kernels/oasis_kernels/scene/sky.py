@@ -58,6 +58,19 @@ def light_along(sky: wp.array2d[wp.vec3f], image: int, b: vec9) -> wp.vec3f:
     return wp.vec3f(wp.max(total[0], 0.0), wp.max(total[1], 0.0), wp.max(total[2], 0.0))
 
 
+@wp.struct
+class Lamps:
+    """L round lamps for each of B images; a black one is none."""
+
+    positions: wp.array2d[wp.vec3f]
+    colors: wp.array2d[wp.vec3f]  # irradiance over pi at distance `ranges`
+    ranges: wp.array2d[wp.float32]
+    spreads: wp.array2d[wp.float32]  # radius over distance
+    views: wp.array2d[wp.mat44f]  # to the lamp's frame
+    focals: wp.array2d[wp.float32]  # of the depth buffers
+    depths: wp.array3d[wp.float32]  # [image * lamp, row, column]
+
+
 @wp.func
 def disc(k: int, n: int, turn: float) -> wp.vec2f:
     """Point k of n that fill the unit disc evenly (Vogel's spiral)."""
@@ -75,25 +88,17 @@ def dither(x: int, y: int) -> float:
 
 
 @wp.func
-def lit_share(
-    depths: wp.array3d[wp.float32],  # [lamp, row, column]: the lamp's own depth buffer
-    lamp: int,
-    view: wp.mat44f,  # to the lamp's frame
-    focal: float,
-    spread: float,  # the lamp's radius over its distance
-    p: wp.vec3f,
-    n: wp.vec3f,
-    turn: float,
-    bias: float,
-) -> float:
-    """Share of a round lamp that `p` sees: percentage-closer soft shadows (Fernando 2005), tilted to the surface."""
-    q = wp.transform_point(view, p)
-    m = wp.transform_vector(view, n)
-    size = depths.shape[1]
+def lit_share(lamps: Lamps, b: int, lamp: int, p: wp.vec3f, n: wp.vec3f, turn: float, bias: float) -> float:
+    """Share of a lamp of image `b` that `p` sees: percentage-closer soft shadows (Fernando 2005), with a slope bias."""
+    q = wp.transform_point(lamps.views[b, lamp], p)
+    m = wp.transform_vector(lamps.views[b, lamp], n)
+    spread = lamps.spreads[b, lamp]
+    buffer = b * lamps.positions.shape[1] + lamp
+    size = lamps.depths.shape[1]
     half = 0.5 * float(size)
     if q[2] < 0.01:
         return 1.0
-    scale = focal / q[2]
+    scale = lamps.focals[b, lamp] / q[2]
     edge = half + WIDEST * scale
     if wp.abs(q[0]) * scale > edge or wp.abs(q[1]) * scale > edge:
         return 1.0  # the lamp's buffer shows all that casts shadows
@@ -107,7 +112,7 @@ def lit_share(
         x = int(wp.floor((q[0] + o[0]) * scale + half))
         y = int(wp.floor((q[1] + o[1]) * scale + half))
         if x >= 0 and x < size and y >= 0 and y < size:
-            z = depths[lamp, y, x]
+            z = lamps.depths[buffer, y, x]
             if z < q[2] + wp.clamp(slope[0] * o[0] + slope[1] * o[1], -search, search) - bias:
                 depth += z
                 found += 1.0
@@ -124,7 +129,7 @@ def lit_share(
         y = int(wp.floor((q[1] + o[1]) * scale + half))
         lit = wp.float32(1.0)
         if x >= 0 and x < size and y >= 0 and y < size:
-            if depths[lamp, y, x] < q[2] + wp.clamp(slope[0] * o[0] + slope[1] * o[1], -radius, radius) - bias:
+            if lamps.depths[buffer, y, x] < q[2] + wp.clamp(slope[0] * o[0] + slope[1] * o[1], -radius, radius) - bias:
                 lit = wp.float32(0.0)
         seen += lit
     return seen / float(TAPS)

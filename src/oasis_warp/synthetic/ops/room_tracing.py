@@ -60,7 +60,7 @@ def trace_rooms(
     sharp, out = hidden.new_empty((*hidden.shape, 3)), hidden.new_empty((*hidden.shape, 3))
     depth, covered = scalars(torch.empty_like(hidden)), scalars(hidden)
     count = hidden.numel()
-    inputs = [scalars(solids), scalars(focals), vectors(sky), *lamps.views(), covered, vectors(sharp), depth]
+    inputs = [scalars(solids), scalars(focals), vectors(sky), lamps.struct(), covered, vectors(sharp), depth]
     launch_ranges(kernels.trace, count, inputs, like=hidden)
     inputs = [depth, covered, scalars(focus), scalars(apertures), vectors(sharp), vectors(out)]
     launch_ranges(kernels.defocus, count, inputs, like=hidden)

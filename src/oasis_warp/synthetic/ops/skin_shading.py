@@ -234,7 +234,7 @@ def shade_skin(
         ids, vectors(seen.barycentrics), vectors(vertices), vectors(normals), scalars(transfer), scalars(stretch),
         table.table, kinds, view(texture.uv.contiguous(), wp.vec2f), integers(texture.uv_faces),
         _addresses(texture.pages, vertices.device), *texture.pages[0].shape[:2], scalars(worn.looks),
-        vectors(tones), vectors(sky), *lamps.views(), scalars(texels_a_pixel), integers(seeds),
+        vectors(tones), vectors(sky), lamps.struct(), scalars(texels_a_pixel), integers(seeds),
         vectors(light), vectors(tone), vectors(mirrored),
     ]  # fmt: skip
     launch_ranges(skin_shading.shade, count, inputs, like=vertices)

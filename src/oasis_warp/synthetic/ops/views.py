@@ -7,6 +7,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_kernels.scene.sky import Lamps as LampArrays
 from oasis_warp.ops._runtime.launch import view
 
 
@@ -44,9 +45,10 @@ class Lamps(NamedTuple):
     """Of the depth buffers [px], whose axis is their middle."""
     depths: Float[Tensor, "B L M M"]
 
-    def views(self) -> list[Any]:
-        """All of these as arguments of a kernel."""
-        return [
-            vectors(self.positions), vectors(self.colors), scalars(self.ranges), scalars(self.spreads),
-            matrices(self.viewmats), scalars(self.focals), scalars(self.depths.flatten(0, 1)),
-        ]  # fmt: skip
+    def struct(self) -> Any:
+        """All of these as one argument of a kernel."""
+        out = LampArrays()
+        out.positions, out.colors = vectors(self.positions), vectors(self.colors)
+        out.ranges, out.spreads, out.focals = (view(t.contiguous()) for t in (self.ranges, self.spreads, self.focals))
+        out.views, out.depths = matrices(self.viewmats), view(self.depths.flatten(0, 1).contiguous())
+        return out
