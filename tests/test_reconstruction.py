@@ -21,14 +21,14 @@ from oasis_warp.core.config import PAPER_ADAPTATION, AdaptConfig, ReconstructCon
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.processes import using_threads
-from oasis_warp.core.types import Landmarks, Photo
+from oasis_warp.core.types import Landmarks, Photo, Render
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_hand
 from oasis_warp.estimation.hand_crop import crop_hand, crop_landmarks, initial_offsets
 from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.hand_avatar import draw_as_photo, make_avatar
-from oasis_warp.losses.image import masked_psnr
-from oasis_warp.reconstruction import reconstruct, reconstruct_same_hand
+from oasis_warp.losses.image import detail_difference, masked_psnr
+from oasis_warp.reconstruction import input_errors, reconstruct, reconstruct_same_hand
 from studies.stress import DAMAGES, is_sane, likeness, make
 
 PHOTOS = Path(__file__).parent / "data" / "photos"
@@ -118,17 +118,34 @@ def alone(palm):
         return reconstruct(palm, SMALL)
 
 
+def test_lpips_is_of_the_hand_above_the_wrist(crop):
+    asked = []
+
+    def perceptual(*pictures):
+        asked.append(pictures)
+        return torch.tensor([0.25])
+
+    drawn = Render(torch.full_like(crop.image, 0.5), torch.ones_like(crop.mask))
+    assert "input_lpips" not in input_errors(drawn, crop)
+    assert input_errors(drawn, crop, perceptual)["input_lpips"] == 0.25
+    ((image, target, mask),) = asked
+    assert torch.equal(image[0], drawn.image) and torch.equal(target[0], crop.image)
+    assert torch.equal(mask[0] > 0, (crop.mask > 0.5) & (crop.above_wrist > 0.5))
+
+
 @pytest.mark.slow
 def test_the_papers_adaptation_trains_the_heads_of_the_guess_as_it_is(palm, monkeypatch):
     asked = []
 
     def watched(hand, guesses, crops, config, **options):
-        asked.append((guesses[0], config, options["heads"]))
+        asked.append((guesses[0], config, options["heads"], options["perceptual"]))
         return adapt(hand, guesses, crops, replace(config, calibration_steps=1, reference_views=1), **options)
 
     monkeypatch.setattr(reconstruction, "adapt", watched)
-    made = reconstruct(palm, replace(SMALL, adapt="lora", light="keep", unseen="plain", steps=2))
-    ((guess, config, heads),) = asked
+    small = replace(SMALL, adapt="lora", light="keep", unseen="plain", steps=2)
+    made = reconstruct(palm, small, perceptual=detail_difference)
+    ((guess, config, heads, perceptual),) = asked
+    assert perceptual is detail_difference and made.errors["input_lpips"] > 0
     assert config == replace(PAPER_ADAPTATION, texture_steps=2)
     # A small photo's Gaussians are made fewer elsewhere, but these have heads of their own, a row for each.
     assert sum(len(head.inputs) for head in heads) == len(guess.colors)

@@ -58,7 +58,7 @@ from oasis_warp.estimation.keypoints import read_keypoints
 from oasis_warp.estimation.refine import refine
 from oasis_warp.hand.template import chosen_hand
 from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
-from oasis_warp.losses.image import masked_psnr
+from oasis_warp.losses.image import Perceptual, masked_psnr
 from oasis_warp.network.heads import ColorHeads
 from oasis_warp.network.prior import choose_prior, guess_with_heads
 from oasis_warp.ops import warm_up
@@ -138,6 +138,7 @@ def reconstruct(
     *,
     keypoints: Path | None = None,
     prior: Prior | None = None,
+    perceptual: Perceptual | None = None,
     progress: Progress = silent,
 ) -> Reconstruction:
     """Make an avatar of one hand of `photo`.
@@ -148,6 +149,8 @@ def reconstruct(
         keypoints: A file with 21 landmarks, or with pose and camera, to use instead of the networks:
             `estimation.keypoints.read_keypoints`.
         prior: What to assume of a hand before its photo is fitted; the one that `config.prior` names when not given.
+        perceptual: LPIPS (`losses.lpips.load_lpips`) on `config.device`, to be measured; with `config.adapt` "lora" it
+            is in the loss too, as in the paper.
         progress: Called as work goes on.
 
     Raises:
@@ -156,7 +159,7 @@ def reconstruct(
     check_config(config)  # before a file is read
     if isinstance(photo, str | Path):
         photo = read_photo(photo)
-    fused, (of_photo,), of_coverage = _run([photo], config, keypoints, prior, progress)
+    fused, (of_photo,), of_coverage = _run([photo], config, keypoints, prior, perceptual, progress)
     (own,) = fused.photos
     errors = {name: value for name, value in own.errors.items() if name != "best_percent"} | fused.errors
     warnings = (*own.fit.warnings, *of_coverage, *of_photo)
@@ -168,6 +171,7 @@ def reconstruct_same_hand(
     config: ReconstructConfig = ReconstructConfig(),  # noqa: B008 - frozen
     *,
     prior: Prior | None = None,
+    perceptual: Perceptual | None = None,
     progress: Progress = silent,
 ) -> FusedReconstruction:
     """Make one avatar of one hand of which there are several photos, of any poses.
@@ -178,6 +182,7 @@ def reconstruct_same_hand(
             evened out.
         config: Options, for every photo.
         prior: What to assume of a hand before its photos are fitted; the one that `config.prior` names when not given.
+        perceptual: As `reconstruct`.
         progress: Called as work goes on.
 
     Raises:
@@ -189,15 +194,16 @@ def reconstruct_same_hand(
         raise ValueError("photos: expected at least one, got none. Read them with oasis_warp.read_photo.")
     check_config(config)
     photos = [read_photo(photo) if isinstance(photo, str | Path) else photo for photo in photos]
-    fused, of_photos, of_coverage = _run(photos, config, None, prior, progress)
+    fused, of_photos, of_coverage = _run(photos, config, None, prior, perceptual, progress)
     return fused._replace(warnings=(*_name_warnings(fused.photos, of_photos), *of_coverage))
 
 
 @single_threaded_torch()
 @torch.enable_grad()  # whatever the caller has
 def _run(
-    photos: Sequence[Photo], config: ReconstructConfig, keypoints: Path | None, prior: Prior | None, progress: Progress
-) -> _Outcome:
+    photos: Sequence[Photo], config: ReconstructConfig, keypoints: Path | None, prior: Prior | None,
+    perceptual: Perceptual | None, progress: Progress,
+) -> _Outcome:  # fmt: skip
     """All stages, in their order. `keypoints` are those of a single photo."""
     if config.adapt == "lora" and len(photos) > 1:
         raise InputError(f"adapt lora: learns one photo, got {len(photos)}; leave it out for several of a hand.")
@@ -232,8 +238,9 @@ def _run(
         if is_low_resolution(config, *fits) and heads is None:
             guesses = [coarsen(hand, guess, crops[0].rest) for guess in guesses]
         adaptation = adapt(
-            hand, guesses, crops, _adaptation(config), resolutions=scales, heads=heads, progress=progress
-        )
+            hand, guesses, crops, _adaptation(config), resolutions=scales, heads=heads,
+            perceptual=None if heads is None else perceptual, progress=progress,
+        )  # fmt: skip
     with stage("detail"):
         adaptation = add_detail(hand, adaptation, close, close_scales, COARSE_SIZE, progress)
     adaptation, invented = _finish(hand, adaptation, crops, config, stage)
@@ -241,7 +248,9 @@ def _run(
     avatar = make_avatar(fits[0], surfaces.shared, crops[0], gaussians, light, invented, hand=hand)
     with stage("quality"):
         areas = surface.vertex_areas(crops[0].rest.vertices, hand.faces.to(config.device))
-        parts = [_assess(hand, adaptation, k, fits[k], surfaces, crops[k], close[k]) for k in range(len(photos))]
+        parts = [
+            _assess(hand, adaptation, k, fits[k], surfaces, crops[k], close[k], perceptual) for k in range(len(photos))
+        ]
         quality = combine_quality([part[0] for part in parts])._replace(invented=invented)
         coverage = coverage_percent(hand, areas, quality)
         shares = coverage_of_photos(areas, adaptation.observations.confidence, adaptation.observations.share)
@@ -328,8 +337,9 @@ def _refine_fits(
 
 
 def _assess(
-    hand: HandModel, adaptation: Adaptation, k: int, fit: HandFit, surfaces: Surfaces, crop: HandCrop, close: HandCrop
-) -> tuple[SurfaceQuality, dict[str, float]]:
+    hand: HandModel, adaptation: Adaptation, k: int, fit: HandFit, surfaces: Surfaces, crop: HandCrop, close: HandCrop,
+    perceptual: Perceptual | None,
+) -> tuple[SurfaceQuality, dict[str, float]]:  # fmt: skip
     """How well photo k is explained, in its own light and on the surface by which it was read."""
     gaussians = adaptation.gaussians
     as_bright = gaussians._replace(colors=(gaussians.colors * adaptation.gains[k]).clamp(0, 1))
@@ -340,23 +350,26 @@ def _assess(
         "reprojection_percent": fit.reprojection,
         "worst_point_percent": fit.worst_point,
         "mask_iou": fit.mask_iou,
-        **input_errors(near, close),
+        **input_errors(near, close, perceptual),
     }
     return assess_surface(hand, crop, over_photo(drawn, crop)), errors
 
 
-def input_errors(drawn: Render, crop: HandCrop) -> dict[str, float]:
+def input_errors(drawn: Render, crop: HandCrop, perceptual: Perceptual | None = None) -> dict[str, float]:
     """How well an avatar, drawn over black as `crop` shows it, explains its photo inside the mask above the wrist."""
     image, alpha = drawn
     judged = crop.above_wrist > 0.5
     inside = ((crop.mask > 0.5) & judged).to(image)
     covered = (alpha > 0.5) & judged
     union = (covered | (inside > 0)).sum().clamp_min(1)
-    return {
+    errors = {
         "input_psnr_db": masked_psnr(image, crop.image, inside),
         "input_psnr_inner_db": masked_psnr(image, crop.image, inner_mask(inside)),
         "render_mask_iou": float((covered & (inside > 0)).sum() / union),
     }
+    if perceptual is not None:
+        errors["input_lpips"] = float(perceptual(image[None], crop.image[None], inside[None]))
+    return errors
 
 
 def _name_warnings(photos: Sequence[PhotoOfHand], warnings: Sequence[Sequence[str]]) -> list[str]:

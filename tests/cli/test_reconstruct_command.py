@@ -61,8 +61,8 @@ def quick_search(monkeypatch, found):
 def pipeline(monkeypatch, made):
     """The pipeline, already knowing the answer; a photo whose name has "bad" in it is refused."""
 
-    def answer(photo, config, *, keypoints, progress):
-        calls.append((photo, config, keypoints))
+    def answer(photo, config, *, keypoints, perceptual, progress):
+        calls.append((photo, config, keypoints, perceptual))
         if "bad" in photo.name:
             raise InputError(f"{photo.name}: no hand was found; give another photo.")
         if "stop" in photo.name:
@@ -98,6 +98,16 @@ def test_one_photo_fills_the_folder_itself(pipeline, drawn, photo_file, tmp_path
     assert "landmarks: " in captured.err
 
 
+def test_lpips_is_measured_with_the_weights_that_are_given(pipeline, photo_file, tmp_path, monkeypatch, capsys):
+    files = [str(tmp_path / name) for name in ("alexnet-owt-7be5be79.pth", "alex.pth")]
+    command_line = ["reconstruct", photo_file(), "-o", str(tmp_path / "out"), "--lpips", *files]
+    assert main(command_line) == 2 and not pipeline
+    assert "alexnet-owt-7be5be79.pth: expected AlexNet, found no such file; download" in capsys.readouterr().err
+    monkeypatch.setattr(command, "load_lpips", lambda *files, allow_download: torch.nn.Identity())
+    assert main(command_line) == 0
+    assert isinstance(pipeline[0][3], torch.nn.Identity)
+
+
 def test_what_was_written_can_be_read(pipeline, drawn, photo_file, tmp_path):
     main(["reconstruct", photo_file(), "-o", str(tmp_path / "out"), "--seed", "5", "--steps", "7", "--force"])
     _, header = load_avatar(tmp_path / "out" / "avatar.safetensors")
@@ -112,7 +122,7 @@ def test_what_was_written_can_be_read(pipeline, drawn, photo_file, tmp_path):
 def test_options_reach_the_pipeline(pipeline, photo_file, tmp_path):
     keypoints = tmp_path / "points.json"
     main(["reconstruct", photo_file(), "-o", str(tmp_path / "out"), "--hand", "1", "--keypoints", str(keypoints)])
-    photo, config, got = pipeline[0]
+    photo, config, got, _ = pipeline[0]
     assert (photo.name, config.hand, got) == ("hand.png", 1, keypoints)
 
 
@@ -162,7 +172,7 @@ def test_a_photo_that_fails_does_not_stop_the_others(pipeline, photo_file, tmp_p
 def fusion(monkeypatch, made, scene):
     """The fusion, already knowing the answer; a photo whose name has "bad" in it is refused."""
 
-    def answer(photos, config, *, progress):
+    def answer(photos, config, *, perceptual, progress):
         for photo in photos:
             if "bad" in photo.name:
                 raise InputError(f"{photo.name}: shows a left hand, the other photos a right one; leave it out.")

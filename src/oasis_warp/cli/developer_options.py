@@ -6,19 +6,11 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from oasis_warp.cli.options import Device, JsonFile, OutputFolder, command
+from oasis_warp.cli.options import AllowDownload, Device, JsonFile, LpipsWeights, OutputFolder, command
 
 BackboneWeights = Annotated[
     Path | None, arg(help="DINOv2's model.safetensors, for a network of your own in the paper's profile.")
 ]
-LpipsWeights = Annotated[
-    tuple[Path, Path] | None,
-    arg(
-        help="Weights of LPIPS: alexnet-owt-7be5be79.pth of torchvision and alex.pth of LPIPS, or vgg16-397923af.pth "
-        "and vgg.pth. Without them evaluation has no LPIPS, and training a term of its own in that place."
-    ),
-]
-AllowDownload = Annotated[bool, arg(help="Download published weights that are missing from where their authors are.")]
 Selection = Annotated[
     Path | None,
     arg(help="For interhand: a JSON file with the captures and sequences to take, where they are not the paper's."),

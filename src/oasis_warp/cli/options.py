@@ -25,6 +25,14 @@ Light = Annotated[
         "environment map, a file such as FILE.hdr."
     ),
 ]
+LpipsWeights = Annotated[
+    tuple[Path, Path] | None,
+    arg(
+        help="Weights of LPIPS: alexnet-owt-7be5be79.pth of torchvision and alex.pth of LPIPS, or vgg16-397923af.pth "
+        "and vgg.pth. Without them LPIPS is not measured, and training has a term of its own in its place."
+    ),
+]
+AllowDownload = Annotated[bool, arg(help="Download published weights that are missing from where their authors are.")]
 Quiet = Annotated[bool, arg(help="Say only what is wrong.")]
 Verbose = Annotated[bool, arg(help="Say more, and where in the program an error arose.")]
 Record = Annotated[Path | None, arg(help="JSON file for what was done: the command, what it wrote, what went wrong.")]
@@ -52,6 +60,8 @@ class _Photos:
     keypoints: Annotated[Path | None, arg(aliases=["--fit"])] = None
     """JSON file with 21 landmarks, or with pose and camera, or what WiLoR or HaMeR found, as .npz or .pkl, to use
     instead of the networks; for one photo only."""
+    lpips: LpipsWeights = None
+    allow_download: AllowDownload = False
 
 
 @command

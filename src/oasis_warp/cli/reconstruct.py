@@ -28,6 +28,8 @@ from oasis_warp.data.pictures import write_picture
 from oasis_warp.data.videos import write_video
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand, palm_and_back
 from oasis_warp.hand.template import bundled_hand
+from oasis_warp.losses.image import Perceptual
+from oasis_warp.losses.lpips import load_lpips
 from oasis_warp.network.weights_file import read_header
 from oasis_warp.reconstruction import FusedReconstruction, Reconstruction, reconstruct, reconstruct_same_hand
 
@@ -46,10 +48,13 @@ def run(options: Reconstruct) -> int:
     check_config(config, "--")
     if isinstance(options.prior, Path):
         read_header(options.prior)  # check it once, not for every photo
+    perceptual = None
+    if options.lpips is not None:
+        perceptual = load_lpips(*options.lpips, allow_download=options.allow_download).to(config.device)
     if len(options.photos) == 1 or options.same_hand or _is_one_hand(options):
-        _print(reconstruct_folder(options.photos, options.out, config, options.keypoints), options.out)
+        _print(reconstruct_folder(options.photos, options.out, config, options.keypoints, perceptual), options.out)
         return 0
-    return _reconstruct_all(options, config)
+    return _reconstruct_all(options, config, perceptual)
 
 
 def _check_photos(options: Reconstruct) -> None:
@@ -85,7 +90,7 @@ def _is_one_hand(options: Reconstruct) -> bool:
     return False
 
 
-def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
+def _reconstruct_all(options: Reconstruct, config: ReconstructConfig, perceptual: Perceptual | None) -> int:
     """Reconstruct every photo into its own folder; one that fails does not stop the others."""
     n_photos, n_done = len(options.photos), 0
     failed: list[str] = []
@@ -96,7 +101,7 @@ def _reconstruct_all(options: Reconstruct, config: ReconstructConfig) -> int:
                 planned.begin(k, f"photo {k + 1} of {n_photos}")
                 folder = options.out / photo.stem
                 try:
-                    report = _write_folder([photo], folder, config, None, shown.progress)
+                    report = _write_folder([photo], folder, config, None, perceptual, shown.progress)
                 except InputError as error:
                     with shown.paused():
                         print(f"oasis: {error}", file=sys.stderr)
@@ -128,11 +133,12 @@ def _shared_folder(path: Path) -> Iterator[None]:
 
 
 def reconstruct_folder(
-    paths: Sequence[Path], folder: Path, config: ReconstructConfig, keypoints: Path | None = None
-) -> dict[str, Any]:
+    paths: Sequence[Path], folder: Path, config: ReconstructConfig, keypoints: Path | None = None,
+    perceptual: Perceptual | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Reconstruct one avatar of the hand on all photos, and write its folder; its report. Shows progress."""
     with show_run(Console(stderr=True), Run(reconstruct_plan(config, len(paths)))) as shown:
-        return _write_folder(paths, folder, config, keypoints, shown.progress)
+        return _write_folder(paths, folder, config, keypoints, perceptual, shown.progress)
 
 
 def _print(report: dict[str, Any], folder: Path) -> None:
@@ -141,16 +147,17 @@ def _print(report: dict[str, Any], folder: Path) -> None:
 
 
 def _write_folder(
-    paths: Sequence[Path], folder: Path, config: ReconstructConfig, keypoints: Path | None, progress: Progress
-) -> dict[str, Any]:
+    paths: Sequence[Path], folder: Path, config: ReconstructConfig, keypoints: Path | None,
+    perceptual: Perceptual | None, progress: Progress,
+) -> dict[str, Any]:  # fmt: skip
     seconds: dict[str, float] = {}
     with output_folder(folder) as part:
         with timed_stage("read", seconds):
             photos = [read_photo(path) for path in paths]
         if len(photos) == 1:
-            made = reconstruct(photos[0], config, keypoints=keypoints, progress=progress)
+            made = reconstruct(photos[0], config, keypoints=keypoints, perceptual=perceptual, progress=progress)
         else:
-            made = reconstruct_same_hand(photos, config, progress=progress)
+            made = reconstruct_same_hand(photos, config, perceptual=perceptual, progress=progress)
         return write_results(part, photos, made, config, seconds, progress=progress)
 
 

@@ -23,6 +23,7 @@ MEASURES = {
     "refined_px": ("refinement moved the surface by", "{:.1f} px"),
     "input_psnr_db": ("likeness to the photo", "{:.1f} dB"),
     "input_psnr_inner_db": ("likeness away from the outline", "{:.1f} dB"),
+    "input_lpips": ("LPIPS to the photo", "{:.3f}"),
     "render_mask_iou": ("overlap of avatar and mask", "{:.3f}"),
     "seen_percent": ("surface that the photo shows", "{:.0f} %"),
     "grazed_percent": ("surface that it grazes", "{:.0f} %"),

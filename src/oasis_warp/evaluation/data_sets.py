@@ -33,7 +33,7 @@ from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, mean
 from oasis_warp.hand.template import chosen_hand
 from oasis_warp.hand_avatar import Avatar, make_avatar
-from oasis_warp.pretraining.objective import Perceptual
+from oasis_warp.losses.image import Perceptual
 
 SETTINGS, METRICS, SHEET, AVATARS = "evaluation.json", "metrics.json", "sheet.png", "avatars"
 """Files that an evaluation writes; the last is a folder with the results of each avatar."""

@@ -12,9 +12,8 @@ from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.losses.image import ssim_map
+from oasis_warp.losses.image import Perceptual, ssim_map
 from oasis_warp.ops import depth_map
-from oasis_warp.pretraining.objective import Perceptual
 
 COVERED = 0.9
 """Alpha from which a pixel counts as covered."""

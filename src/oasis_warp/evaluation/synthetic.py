@@ -50,9 +50,9 @@ from oasis_warp.evaluation.pictures import (
 )
 from oasis_warp.evaluation.summary import Record, read_result, summarise
 from oasis_warp.hand.template import bundled_hand
+from oasis_warp.losses.image import Perceptual
 from oasis_warp.losses.lpips import Lpips
 from oasis_warp.network.prior import NetworkPrior
-from oasis_warp.pretraining.objective import Perceptual
 from oasis_warp.render.render import render
 
 SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (

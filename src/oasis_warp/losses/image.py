@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
@@ -10,6 +11,8 @@ from torch.nn.functional import avg_pool2d
 
 from oasis_warp.ops import masked_l1_on_cuda
 
+Perceptual = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Distance of N images and N targets inside N masks, one number each."""
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 

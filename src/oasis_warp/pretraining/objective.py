@@ -1,6 +1,5 @@
 """The training objective (paper, appendix B.2): render a prediction in the views of its targets, and compare."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,7 +10,7 @@ from torch import Tensor
 from oasis_warp.avatar.anchors import rim_fade
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core.types import TrainingBatch
-from oasis_warp.losses.image import detail_difference, masked_dssim, masked_l1
+from oasis_warp.losses.image import Perceptual, detail_difference, masked_dssim, masked_l1
 from oasis_warp.network.hand_network import HandNetwork, Prediction
 from oasis_warp.network.prior import all_gaussians
 from oasis_warp.ops import depth_map, rasterization
@@ -56,10 +55,6 @@ def true_pictures(batch: TrainingBatch, faces: Int[Tensor, "F 3"], rim: Int[Tens
     fade = torch.where(seen.face_ids >= 0, (at_corners * seen.barycentrics).sum(-1), 1)
     share = fade * batch.target_known.flatten(0, 1)
     return RenderBatch(batch.target_images.flatten(0, 1) * share[..., None], batch.target_masks.flatten(0, 1) * share)
-
-
-Perceptual = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Distance of N images and N targets inside N masks, one number each."""
 
 
 MIN_AREA = 0.05

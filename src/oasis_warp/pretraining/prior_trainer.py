@@ -11,13 +11,12 @@ from torch.nn.functional import interpolate
 
 from oasis_warp.avatar.observation import source_photos
 from oasis_warp.core.types import TrainingBatch
-from oasis_warp.losses.image import detail_difference
+from oasis_warp.losses.image import Perceptual, detail_difference
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import save_network
 from oasis_warp.pretraining.distributed import ProcessInfo
 from oasis_warp.pretraining.objective import (
     LossConfig,
-    Perceptual,
     draw_targets,
     objective,
     picture_psnr,
