@@ -3,7 +3,8 @@
 All of it comes from the metadata of the installed packages, without a network. `sbom` prints a software bill of
 materials as CycloneDX 1.6 JSON, the same bytes for the same installation, with the libraries that wheels bundle.
 `licences` prints the table of docs/security.md. `check` compares versions with known_vulnerabilities.json beside this
-file and fails where one is affected that nobody has accepted with a reason.
+file and fails where one is affected that nobody has accepted with a reason; that list is written from memory, of no
+database, and does not replace `pip-audit`.
 """
 
 import base64
@@ -130,7 +131,8 @@ def check() -> int:
         print(f"{one['package']} {one['installed']}: {one['id']}, {one['about']}; {verdict}.")
     failed = [one for one in found if "accepted" not in one]
     print(
-        f"{len(known['vulnerabilities'])} known, reviewed {known['reviewed']}: {len(found)} here, {len(failed)} open."
+        f"{len(known['vulnerabilities'])} known from memory, reviewed {known['reviewed']}: {len(found)} here, "
+        f"{len(failed)} open. Run pip-audit, too, where a database can be reached."
     )
     return int(bool(failed))
 

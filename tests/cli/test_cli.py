@@ -313,18 +313,21 @@ def test_a_kernel_cache_that_cannot_be_written_is_found(monkeypatch, tmp_path):
     assert "OASIS_WARP_CACHE" in caught.value.remedy
 
 
-def test_a_program_that_cannot_be_loaded_says_so(monkeypatch, capsys):
-    """With few descriptors left even the import of the commands fails: a traceback."""
+@pytest.mark.parametrize(("error", "code", "said"), [
+    (OSError(24, "Too many open files"), 1,
+     "cannot be loaded (Too many open files); see `ulimit -a`, or install it again."),
+    (KeyboardInterrupt(), 130, "stopped, nothing written."),
+], ids=["few descriptors", "Ctrl-C"])  # fmt: skip
+def test_what_happens_while_the_commands_are_imported_is_told(monkeypatch, capsys, error, code, said):
+    """Both were tracebacks."""
 
     class Full:
         def find_spec(self, name, path=None, target=None):
             if name == "oasis_warp.cli.app":
-                raise OSError(24, "Too many open files")
+                raise error
 
     monkeypatch.delitem(sys.modules, "oasis_warp.cli.app")
     monkeypatch.delattr("oasis_warp.cli.app")
     monkeypatch.setattr(sys, "meta_path", [Full(), *sys.meta_path])
-    assert main(["--version"]) == 1
-    assert capsys.readouterr().err == (
-        "oasis: cannot be loaded (Too many open files); see `ulimit -a`, or install it again.\n"
-    )
+    assert main(["--version"]) == code
+    assert capsys.readouterr().err == f"oasis: {said}\n"
