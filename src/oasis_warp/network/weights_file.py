@@ -88,7 +88,7 @@ def load_network(path: Path | str, hand: HandModel, *, backbone_weights: Path | 
                 f"the one in use is {want[0]!r} ({want[1]}, {want[2]}); give weights that fit."
             )
         held = sum(math.prod(shape) for _, shape in tensor_shapes(file).values())
-        with _at_most(path, 2 * held + SLACK + (0 if config.backbone == "convolutional" else BACKBONE)):
+        with _at_most(path, 2 * held + SLACK + (0 if config.backbone == "convolutional" else BACKBONE)), _known(path):
             network = HandNetwork(config, hand)
         network.load_state_dict(read_tensors(path, file, trained_state(network), "copy it again"), strict=False)
     if isinstance(network.encoder, DinoV2Encoder):
@@ -148,8 +148,17 @@ def _checked_header(path: Path, file: Any) -> dict[str, Any]:
 
 
 def _config_of(path: Path, stored: dict[str, Any]) -> NetworkConfig:
-    try:
+    with _known(path):
         return NetworkConfig(**stored)
+
+
+@contextmanager
+def _known(path: Path) -> Iterator[None]:
+    """Tell what no network can be; some sizes are refused only where it is made."""
+    try:
+        yield
+    except InputError:
+        raise
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: its header describes no network known here ({error}); update oasis-warp.") from error
 
