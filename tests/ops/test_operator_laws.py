@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -106,6 +107,28 @@ def test_any_number_of_threads_gives_the_same_results(name, which, with_threads)
     one = with_threads(1, lambda: results(name, **which))
     for n_threads in (2, 7):
         torch.testing.assert_close(with_threads(n_threads, lambda: results(name, **which)), one, **tolerance(name))
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # from Python 3.12 on
+def test_eight_threads_of_the_caller_and_a_forked_process_give_the_same_bits():
+    made = calls()
+
+    def all_results():
+        with torch.no_grad():
+            return [out for name in ONE_OF_EACH for out in made[name].function(*made[name].inputs)]
+
+    alone = all_results()
+    with ThreadPoolExecutor(8) as pool:
+        for beside in pool.map(lambda _: all_results(), range(8)):
+            assert_same_bits(beside, alone)
+    child = os.fork()
+    if not child:
+        same = False
+        try:
+            same = all(map(torch.equal, all_results(), alone))
+        finally:
+            os._exit(0 if same else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
 @EVERY_CALL
