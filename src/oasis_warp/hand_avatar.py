@@ -133,7 +133,7 @@ class Avatar:
 
     @property
     def parts(self) -> AvatarParts:
-        """What `pose` works with, for programs that pose by themselves."""
+        """The inputs of `pose`, for programs with a posing of their own."""
         return AvatarParts(self._model, self._rest, self._canonical, self._light)
 
     @property
@@ -340,7 +340,7 @@ class Avatar:
 
     @torch.no_grad()
     def _with_hidden_light(self) -> "Avatar":
-        """The same from the time when light knew no hollows; the photo's own view stays."""
+        """An avatar of an older file version, whose light ignored self-occlusion; the photo's own view stays."""
         if self.light is None:
             return self
         albedo = self._mean_albedo(self.light.even)
@@ -349,7 +349,7 @@ class Avatar:
 
 
 def check_pose_type(pose: HandPose) -> None:
-    """Refuse what is no pose.
+    """Refuse arguments that are not poses.
 
     Raises:
         TypeError: it is none.

@@ -133,7 +133,7 @@ def open_standard_streams() -> None:
 
 
 def what_ran_out(error: BaseException | None) -> str | None:
-    """What this machine lacked, as a sentence about {device}, if that is why Python, OpenCV, torch or Warp failed."""
+    """A sentence about {device} on the missing resource (memory, disk, descriptors), if that made a library fail."""
     said = ""
     while error is not None:  # packages wrap what the system said
         said += f"{type(error).__name__} {error}\n"

@@ -86,7 +86,7 @@ def _local(distributed: Any, n: int) -> Iterator[Any]:
 
 
 def work(client: Any, tasks: Sequence[Sequence[str]], order: Order, report: Callable[[int, int], object]) -> int:
-    """Have all tasks done; the number of photos that were worked on, and not only found done.
+    """Run all tasks; the number of photos that were processed now, not found done.
 
     Args:
         client: Of Dask.

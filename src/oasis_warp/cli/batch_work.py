@@ -1,4 +1,4 @@
-"""What one worker of `oasis batch` does: photos in, a folder each out, and a line of JSON about each.
+"""One worker of `oasis batch`: photos in; for each a folder and a line of JSON out.
 
     OUT/avatars/ab/abcdef...   results of a photo, named by SHA-256 of photo, settings and version: avatar.safetensors,
                                report.json and row.json, or row.json alone where the photo was refused
@@ -49,7 +49,7 @@ MEASURES = ("reprojection_percent", "mask_iou", "input_psnr_db", "seen_percent")
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """What to make of photos, and where: the same for all tasks of a run."""
+    """Input, output and settings of a run; the same for all of its tasks."""
 
     source: Path
     """Folder that the names of photos are relative to, absolute."""

@@ -1,4 +1,4 @@
-"""What every command shares: exit codes, progress on the terminal, and the check of --device."""
+"""Shared by every command: exit codes, progress on the terminal, and the check of --device."""
 
 import contextlib
 import time

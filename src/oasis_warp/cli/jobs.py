@@ -1,4 +1,4 @@
-"""Photos that wait for their avatars: a folder each, one process after the other, and nothing lost by a restart."""
+"""The queue of `oasis serve`: a folder per photo, one process at a time, kept over restarts."""
 
 import re
 import secrets
@@ -30,7 +30,7 @@ State = Literal["waiting", "running", "done", "failed"]
 
 
 class Job(NamedTuple):
-    """What became of one photo so far."""
+    """State of one photo in the queue."""
 
     state: State
     note: str
@@ -90,7 +90,7 @@ class Jobs:
         return job
 
     def look(self, job: str) -> Job | None:
-        """What became of it; None if there is no such photo."""
+        """State of a photo; None if there is no such photo."""
         with self._changed:
             if self._running is not None and self._running[0] == job:
                 return Job("running", self._running[1], 0)

@@ -1,4 +1,4 @@
-"""What a command did, for programs: its exact words for reports, and the file of `--json`."""
+"""Machine-readable record of a command: its exact words for reports, and the file of `--json`."""
 
 import shlex
 import time

@@ -1,4 +1,4 @@
-"""The error for users, and the name that they may have meant."""
+"""The exception for user errors, and "Did you mean ...?" suggestions."""
 
 import difflib
 from collections.abc import Iterable
@@ -8,7 +8,7 @@ MAX_LETTERS, MAX_QUOTED = 1000, 80
 
 
 def one_line(text: object) -> str:
-    """The text with what no terminal should get, such as line breaks and escape codes, written out."""
+    """The text with control characters, such as line breaks and escape codes, written out."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
@@ -18,7 +18,7 @@ def shortened(text: str, most: int = MAX_QUOTED) -> str:
 
 
 def last_line(said: str, nothing: str = "it said nothing", most: int = 300) -> str:
-    """What a program, ours too, said last before it failed, at most so many letters; `nothing` if it was silent."""
+    """The last line of a failed program's output, at most so many letters; `nothing` if there was none."""
     return (said.strip().splitlines() or [nothing])[-1].removeprefix("oasis: ")[:most]
 
 

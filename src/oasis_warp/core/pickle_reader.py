@@ -29,13 +29,13 @@ class _Mark: ...
 
 
 class _Name(NamedTuple):
-    """A name of a module; nothing behind it."""
+    """A global of a module, by name only; nothing is imported."""
 
     name: str
 
 
 class _Made:
-    """What a name was called with, and the state that was given to it afterwards."""
+    """A call of a global: its arguments, and the state that was set afterwards."""
 
     def __init__(self, name: str, arguments: tuple[Any, ...]):
         self.name, self.arguments, self.state = name, arguments, None
@@ -115,7 +115,7 @@ def _run(content: bytes) -> Any:
 
 
 def _marked(stack: list[Any]) -> list[Any]:
-    """What lies above the last mark, taken off with the mark."""
+    """Pop everything above the last mark, and the mark."""
     for k in range(len(stack) - 1, -1, -1):
         if stack[k] is _Mark:
             items = stack[k + 1 :]
@@ -215,7 +215,7 @@ _STEPS: dict[str, Callable[[list[Any], Any], Any]] = {
 
 
 def _plain(value: Any, depth: int) -> Any:
-    """`value` with arrays in the place of what describes them."""
+    """`value` with the arrays built from their descriptions."""
     if depth > MAX_NESTED:
         raise ValueError(f"values nested more than {MAX_NESTED} deep")
     if isinstance(value, _Name) or value is _Mark:

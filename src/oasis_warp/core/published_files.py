@@ -1,4 +1,4 @@
-"""Weights that others publish: where they come from, whether they came whole, and their download if allowed."""
+"""Weights published by others: addresses, checks of their digests, and their download if allowed."""
 
 import hashlib
 import http.client
@@ -61,7 +61,7 @@ PUBLISHED = {
 
 
 def published_file(path: Path, name: str, *, allow_download: bool = False) -> Path:
-    """`path`, where the published file of that name lies whole.
+    """`path`, after checking that the published file of that name is complete there.
 
     Its SHA-256 must be the published one, or that in PATH.sha256 where there is such a file, as `sha256sum` writes it.
 

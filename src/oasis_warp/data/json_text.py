@@ -1,4 +1,4 @@
-"""Read JSON that others wrote: one object, of bounded length and depth, without NaN; and cameras from it."""
+"""Read untrusted JSON: one object of bounded length and depth, without NaN; and cameras from it."""
 
 import json
 from pathlib import Path

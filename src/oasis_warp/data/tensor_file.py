@@ -1,4 +1,4 @@
-"""Read safetensors files, which execute nothing, or say in one sentence what is wrong with them."""
+"""Read safetensors files, which execute no code; errors are one sentence."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

@@ -1,1 +1,1 @@
-"""Measure what avatars are worth: on synthetic hands where all is known, and on other photos of the same hand."""
+"""Evaluation of avatars: on synthetic hands with ground truth, and on other photos of the same hand."""

@@ -205,7 +205,7 @@ class Crop(NamedTuple):
 
 
 class _Measuring(NamedTuple):
-    """What every avatar is measured with."""
+    """Shared inputs of all measurements of avatars."""
 
     data: DataSet
     priors: Mapping[str, Prior]

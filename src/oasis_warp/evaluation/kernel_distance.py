@@ -1,4 +1,4 @@
-"""How far drawn hands are from real ones as a crowd: the kernel distance (Binkowski et al. 2018, "KID").
+"""Kernel distance between sets of drawn and of real hands (Binkowski et al. 2018, "KID").
 
 The features are those of the dense network that ships, at four resolutions: the mean of each channel over the pixels of
 the hand. Pictures of one hand are alike, so pairs of one group (a person, a photo) are left out of all means, and the
@@ -79,7 +79,7 @@ def hand_features(
 def kernel_distances(
     drawn: Sequence[Sample], real: Sequence[Sample], scale: Sequence[Sample], seed: int = 0, *, subsets: int = SUBSETS
 ) -> dict[str, KernelDistance]:
-    """The distance of two crowds in each of `LAYERS`, and in "all": the features of all layers side by side.
+    """The distance of two sets in each of `LAYERS`, and in "all": the concatenated features of all layers.
 
     Args:
         drawn: One crowd.
@@ -107,7 +107,7 @@ def kernel_distance(
     x: np.ndarray, y: np.ndarray, x_groups: Sequence[str], y_groups: Sequence[str], seed: int = 0, *,
     subsets: int = SUBSETS,
 ) -> KernelDistance:  # fmt: skip
-    """The distance of two crowds, [N, D] and [M, D], and its standard error.
+    """The distance of two sets, [N, D] and [M, D], and its standard error.
 
     The error is the standard deviation over halves of the groups, drawn without replacement: of halves it is that of
     the whole (the delete-d jackknife of Shao and Wu 1989 with d = n / 2). With no subsets it is NaN.

@@ -57,7 +57,7 @@ class Picture(NamedTuple):
 
 
 class Looks(NamedTuple):
-    """What is known of one avatar's looks."""
+    """All measurements of one avatar's looks."""
 
     record: Record
     """Measures; see `measure_looks`."""

@@ -98,7 +98,7 @@ def summarise(records: Iterable[Record]) -> list[Record]:
 
 
 def read_result(file: Path, keys: Sequence[str], pictures: Sequence[Path] = ()) -> Any:
-    """What an earlier run has kept; None where it has not, or where the disk has damaged it, which is logged.
+    """The result that an earlier run saved; None if there is none, or if it is damaged, which is logged.
 
     Args:
         file: JSON: an object with the `keys`, or one that only says why it was "left_out", or a list of such objects.

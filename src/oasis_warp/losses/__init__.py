@@ -1,1 +1,1 @@
-"""What a picture costs."""
+"""Losses on pictures."""

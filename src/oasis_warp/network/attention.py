@@ -294,7 +294,7 @@ def to_fine(
 
 
 class CoarseLevel(nn.Module):
-    """The way of point features to a coarse set of points and back; no parameters, and nothing that is saved."""
+    """Down- and upsampling of point features to a coarse set of points; without parameters or saved buffers."""
 
     pool: Tensor
     blend: Tensor

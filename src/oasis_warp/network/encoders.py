@@ -221,7 +221,7 @@ class DinoV2Encoder(nn.Module):
 
 
 def differing_tensors(own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> list[str]:
-    """Names that only one of them has, or whose shapes differ."""
+    """Names of tensors that only one of the two has, or whose shapes differ."""
     shapes, others = ({name: tensor.shape for name, tensor in tensors.items()} for tensors in (own, given))
     return sorted(name for name in shapes.keys() | others.keys() if shapes.get(name) != others.get(name))
 

@@ -60,7 +60,7 @@ TONE = 7
 
 
 class Described(NamedTuple):
-    """What the heads are asked, of B hands."""
+    """Inputs of the heads, for B hands."""
 
     features: Float[Tensor, "B V C"]
     """Of the points."""

@@ -46,7 +46,7 @@ TRUST = {"trust": 1}
 
 
 class Limits(NamedTuple):
-    """How far a head may go."""
+    """Bounds of a head's outputs."""
 
     growth: float
     """A Gaussian is at most this much larger than its anchor."""
@@ -62,7 +62,7 @@ needs something small and opaque to paint a photo's detail on. Thin they may get
 
 
 class GaussianHead(nn.Module):
-    """Layer norm and a three-layer perceptron that names what it puts out."""
+    """Layer norm and a three-layer perceptron with named outputs."""
 
     def __init__(self, width: int, hidden: int, outputs: dict[str, int]):
         super().__init__()
@@ -139,7 +139,7 @@ COLOR_OUTPUTS = ("colors", "trust")
 
 
 class HeadCache(NamedTuple):
-    """One frozen head, and what it is asked: a row for each Gaussian."""
+    """One frozen head and its inputs: a row for each Gaussian."""
 
     inputs: Float[Tensor, "N C"]
     """Features after the norm."""

@@ -170,7 +170,7 @@ class NetworkPrior:
 
     @torch.no_grad()
     def with_heads(self, crop: HandCrop) -> tuple[CanonicalGaussians, ColorHeads]:
-        """The same, and the heads that its colours come from with all that they are asked: LoRA trains them.
+        """The same guess, and the heads of its colours with their inputs, which LoRA trains.
 
         Faint Gaussians stay as they are: their heads would say other colours than `cover_surface`.
         """
@@ -211,7 +211,7 @@ class NetworkPrior:
 
 
 def guess_with_heads(prior: Prior, crop: HandCrop) -> tuple[CanonicalGaussians, ColorHeads]:
-    """What `prior` makes of one photo, and the heads behind it.
+    """The guess of `prior` for one photo, and the heads that produced it.
 
     Raises:
         InputError: it is no network.

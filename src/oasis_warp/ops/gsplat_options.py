@@ -35,7 +35,7 @@ def compensated_opacities(
 
 
 class _RecordAbsoluteGradients(torch.autograd.Function):
-    """Hands images and alphas through; on the way back it sets `means2d.absgrad`."""
+    """Identity on images and alphas; its backward sets `means2d.absgrad`."""
 
     @staticmethod
     def forward(

@@ -1,4 +1,4 @@
-"""The operators of posing one after the other, as a hand needs them: on CUDA two nodes of autograd instead of four."""
+"""Chains of the posing operators as a hand needs them: on CUDA two nodes of autograd instead of four."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from oasis_warp.ops.skinning import skin
 
 
 class PosedGaussians(NamedTuple):
-    """Gaussians in a pose, those on vertices first, and how the vertices have turned."""
+    """Posed Gaussians, those on vertices first, and the rotations of the vertices."""
 
     means: Float[Tensor, "*B N 3"]
     quats: Float[Tensor, "*B N 4"]

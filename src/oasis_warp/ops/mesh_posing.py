@@ -1,4 +1,4 @@
-"""Gaussians bound to the faces and vertices of a mesh, carried into a pose."""
+"""Posing of Gaussians that are bound to the faces and vertices of a mesh."""
 
 from typing import Any, Literal, NamedTuple
 
@@ -189,7 +189,7 @@ def pose_on_mesh(
 
 
 class PosedCovars(NamedTuple):
-    """Gaussians in a pose, whose covariances need not be rotated and scaled canonical ones."""
+    """Posed Gaussians with full covariances, which need not be rotated and scaled canonical ones."""
 
     means: Float[Tensor, "Q 3"]
     covars: Float[Tensor, "Q 3 3"]
@@ -270,7 +270,7 @@ def pose_on_mesh_covars(
     *,
     validate: bool = True,
 ) -> PosedCovars:
-    """Gaussians on the faces of a mesh, carried into its pose and stretched with it: the scale law "jacobian".
+    """Posed Gaussians on the faces of a mesh, stretched with their faces: the scale law "jacobian".
 
     The covariance becomes F covariance F^T, F the linear map that takes the face's edges and unit normal at rest to
     those of the posed face. A Gaussian grows only along the directions in which its face does, and keeps its

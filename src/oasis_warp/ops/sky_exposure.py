@@ -1,4 +1,4 @@
-"""How much of the light from all around reaches a surface that hides it from itself."""
+"""Sky exposure: how much of the light from all around reaches a surface that occludes itself."""
 
 import functools
 import math

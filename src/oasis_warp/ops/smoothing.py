@@ -1,4 +1,4 @@
-"""Values of vertices, smoothed over the faces around them."""
+"""Smoothing of values at vertices over the faces around them."""
 
 import torch
 from jaxtyping import Float, Int
@@ -16,7 +16,7 @@ _SMOOTH = Declaration(
 
 @torch.no_grad()
 def smooth_over_faces(values: Float[Tensor, "B V C"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "B V C"]:
-    """Mean over the corners of the faces around each vertex, itself counted once per face; lonely vertices stay.
+    """Mean over the corners of the faces around each vertex, itself once per face; vertices without a face keep theirs.
 
     Float32, not differentiable.
 

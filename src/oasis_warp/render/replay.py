@@ -1,4 +1,4 @@
-"""Repeat a function of a few small tensors as a CUDA graph: one copy in, one launch, and copies out.
+"""Replay a function of a few small tensors as a CUDA graph: one copy in, one launch, and copies out.
 
 What the function reads besides its inputs, models and avatars, stays where it was when it was recorded.
 """
@@ -108,7 +108,7 @@ class CapturedGraph:
 
 
 class GraphCache:
-    """The last few functions that were recorded, by what tells them apart."""
+    """The most recently used recorded functions, by key."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -121,7 +121,7 @@ class GraphCache:
     def find(
         self, key: Hashable, record: Callable[[], Callable[[Sequence[Tensor]], Outputs | None]]
     ) -> Callable[[Sequence[Tensor]], Outputs | None]:
-        """The recording of `key`, made by `record` if there is none; the one unused for longest makes room."""
+        """The recording of `key`, made by `record` if there is none; the least recently used one is dropped."""
         if key not in self._kept:
             self._kept[key] = record()
             while len(self._kept) > MAX_GRAPHS:

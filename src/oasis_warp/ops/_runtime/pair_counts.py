@@ -71,7 +71,7 @@ slots = _Slots()
 
 
 class _ThreadSlot(threading.local):
-    """One slot for each thread, for calls that wait."""
+    """One slot per thread, for calls that wait."""
 
     def __init__(self) -> None:
         self.slot = slots.take()
@@ -191,7 +191,7 @@ def capacity_of(kind: Kind, slack: float) -> Counts:
 
 
 def watching() -> Overflow:
-    """The watch over this capture; refuses one without."""
+    """The `Overflow` that watches this capture; refuses a capture without one."""
     overflow = _watching.get()
     if overflow is None:
         raise RuntimeError(

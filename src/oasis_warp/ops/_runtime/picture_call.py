@@ -1,4 +1,4 @@
-"""What a picture by one node of autograd is called with, keeps and gives, and the parameters of its kernels."""
+"""Inputs, saved tensors and results of the single-node rasterizer, and the parameters of its kernels."""
 
 from typing import NamedTuple
 

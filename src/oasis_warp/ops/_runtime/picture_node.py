@@ -1,4 +1,4 @@
-"""`rasterization` of float32 on CUDA as one node of autograd: what an eager call takes if nothing asks for more."""
+"""Float32 `rasterization` on CUDA as one node of autograd, for eager calls without special options."""
 
 import weakref
 from collections.abc import Callable, Iterator
@@ -22,7 +22,7 @@ _plans = Plans()
 
 
 def plan_for(scene: Scene, options: Options) -> Plan | None:
-    """The plan of a call; None where the operators apart must draw it.
+    """The plan for a call; None where the separate operators must draw it.
 
     Raises:
         TypeError: an argument is of the wrong kind.
@@ -130,7 +130,7 @@ _draw: Callable[..., Any] = super(Function, _Draw).apply  # pyright: ignore[repo
 
 
 class _Project(Function):
-    """The projected Gaussians of a picture, for what else they are used for."""
+    """The projected Gaussians of a picture, for uses besides drawing."""
 
     @staticmethod
     def forward(ctx: Any, plan: Plan, workspace: Tensor, versions: list[int], *tensors: Tensor | None) -> Any:
@@ -170,7 +170,7 @@ UNMADE = {"means2d": "_project", "depths": "_project", "opacities": "_opacities"
 
 
 class Meta(dict[str, Any]):
-    """What was computed on the way to a picture: a dictionary whose tensors are made when somebody looks at them."""
+    """gsplat's `meta` of a picture: a dictionary whose tensors are computed when they are first read."""
 
     def __init__(self, plan: Plan, scene: Scene, workspace: Tensor, tracking: _Tracked | None) -> None:
         options = plan.options

@@ -1,4 +1,4 @@
-"""The plan of float32 pictures on CUDA: all that calls of one kind share, so that a call is little but its launches."""
+"""The plan of float32 pictures on CUDA: calls of one kind share it, so that a call only launches kernels."""
 
 import threading
 from typing import Any
@@ -334,7 +334,7 @@ def _contiguous(scene: Scene) -> Any:
 
 
 def _sorted(longest: int) -> int:
-    """Longest list that will be sorted, for one so long."""
+    """Capacity class of the sort for a list of this length."""
     return next(limit for limit in SORTED if limit >= longest)
 
 

@@ -1,4 +1,4 @@
-"""What planned calls on CUDA share: their kinds, places in a workspace, and gradients that have no derivative."""
+"""Shared parts of planned calls on CUDA: cache of plans, workspace layout, and once-differentiable gradients."""
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +16,7 @@ ALIGNMENT = 256
 
 
 class Plans(threading.local):
-    """Plans by kind of call, a thread's own; the oldest makes room."""
+    """Thread-local plans by kind of call; the oldest is dropped."""
 
     def __init__(self) -> None:
         self.plans: dict[tuple[Any, ...], Any] = {}

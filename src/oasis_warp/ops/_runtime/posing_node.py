@@ -1,4 +1,4 @@
-"""Posing of float32 on CUDA as nodes of autograd: what a pose takes once the operators have checked its kind."""
+"""Float32 posing on CUDA as two nodes of autograd, used once the operators have checked a call of the same kind."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -25,7 +25,7 @@ ROW = 16
 
 
 def kind_of(given: SkinningInputs | GaussianInputs, others: tuple[Any, ...]) -> Kind | None:
-    """What tells apart calls of other plans; None where only the operators apart can take a call.
+    """Key of the plan for a call; None where only the separate operators can run it.
 
     Args:
         given: Float tensors.
@@ -45,18 +45,18 @@ def kind_of(given: SkinningInputs | GaussianInputs, others: tuple[Any, ...]) -> 
 
 
 def plan_of(kind: Kind | None) -> Any:
-    """The plan of a kind that the operators have taken before; else None."""
+    """The plan for calls of this kind, if the operators have run one before; else None."""
     return None if kind is None else _plans.plans.get(kind)
 
 
 def remember_skinning(kind: Kind, given: SkinningInputs, parents: Tensor) -> None:
-    """Plan the next call: the operators, which have taken this one, have checked its kind."""
+    """Plan the next call of this kind, which the operators have just checked."""
     if given.angles.ndim == 2:
         _plans.keep(kind, SkinningPlan(given, parents))
 
 
 def remember_mesh_gaussians(kind: Kind, given: GaussianInputs, binding: MeshBinding) -> None:
-    """Plan the next call: the operators, which have taken this one, have checked its kind."""
+    """Plan the next call of this kind, which the operators have just checked."""
     if given.posed_vertices.ndim == 2 and len(given.posed_vertices) and len(binding.face_index):
         _plans.keep(kind, GaussiansPlan(given, binding))
 

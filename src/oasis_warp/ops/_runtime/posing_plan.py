@@ -87,7 +87,7 @@ class MeshBinding(NamedTuple):
 
 
 class _Plan:
-    """Where a kind of call runs."""
+    """The device and stream that calls of one kind run on."""
 
     def __init__(self, like: Tensor) -> None:
         self.device, self._index = like.device, like.get_device()
@@ -199,7 +199,7 @@ class GaussiansPlan(_Plan):
         self._known: tuple[Any, ...] = ()
 
     def _bound(self, binding: MeshBinding) -> tuple[Incidence, tuple[int, ...], MeshGaussians]:
-        """What the tables bind, and the addresses of faces and of the Gaussians on each vertex and face."""
+        """The binding's incidence tables, and the addresses of faces and of the Gaussians on each vertex and face."""
         state = [None if t is None else (t._version, t.data_ptr()) for t in binding]
         if self._known and self._known[0] == state and _alive(self._known[1], binding):
             return self._known[2]

@@ -1,4 +1,4 @@
-"""What the projection hands to the blending, in one allocation, as each tensor costs torch time.
+"""Results of the projection for the blending, in one allocation, because each torch tensor costs time.
 
 Four tables with a row for each (camera, Gaussian), one after the other, and for the CUDA rasterizer the counters of its
 tiles, which are zero between calls.

@@ -1,4 +1,4 @@
-"""The rasterizer's thresholds, replaceable for measuring what each of them costs and buys."""
+"""The rasterizer's thresholds; measurements replace them to see the cost and gain of each."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

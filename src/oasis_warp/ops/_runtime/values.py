@@ -69,24 +69,24 @@ class DeferredFiniteCheck:
 
 
 class ReplayedFiniteCheck:
-    """Whether the values of a CUDA tensor are bad, as every replay of a graph finds it."""
+    """Check for finite values of a CUDA tensor that is captured in a graph and runs with every replay."""
 
     def __init__(self, tensor: Tensor) -> None:
-        """Nothing is looked at yet; `tensor` is contiguous."""
+        """Nothing is checked yet; `tensor` is contiguous."""
         self._tensor = tensor
         self._slot = slots.take()  # stays the graph's: it may be replayed after this is gone
         self._found = ctypes.c_longlong.from_address(self._slot.data_ptr())
 
     def check(self) -> None:
-        """Look at the values, where the graph that is being captured does whenever it runs."""
+        """Record the check into the graph that is being captured."""
         _launch_check([self._tensor], self._slot.data_ptr())
 
     def reset(self) -> None:
-        """Forget what the last look has found."""
+        """Clear the result of the last check."""
         self._found.value = 0
 
     def bad(self) -> bool:
-        """Whether the last look, which is over, has found a bad value."""
+        """Whether the last finished check found a bad value."""
         return self._found.value != 0
 
 

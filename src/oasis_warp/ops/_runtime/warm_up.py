@@ -1,4 +1,4 @@
-"""Compile what an avatar needs before it is needed, so that the wait can be shown."""
+"""Compile the kernels that an avatar needs ahead of time, so that the wait can be shown."""
 
 import torch
 
