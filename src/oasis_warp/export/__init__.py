@@ -1,6 +1,6 @@
 """Avatars in the formats of others: splat viewers, browsers, game engines, Blender, USD.
 
-`formats` chooses a writer by the ending of the file's name. `splats` and `skinned_mesh` make what files hold, and one
+`formats` chooses a writer by the ending of the file's name. `splats` and `surface_mesh` make what files hold, and one
 module a format writes it.
 """
 

@@ -15,10 +15,15 @@ from oasis_warp.export.page_file import write_page
 from oasis_warp.export.request import ExportRequest, Light
 from oasis_warp.export.skinned_gltf import write_skinned_gltf
 from oasis_warp.export.skinned_usd import write_skinned_usd
-from oasis_warp.export.splat_gltf import write_splat_gltf
-from oasis_warp.export.splat_ply import write_compressed_ply, write_ply
-from oasis_warp.export.splat_sog import write_sog
-from oasis_warp.export.splat_spz import write_splat, write_spz, write_spz4
+from oasis_warp.export.splat_formats import (
+    write_compressed_ply,
+    write_ply,
+    write_sog,
+    write_splat,
+    write_splat_gltf,
+    write_spz,
+    write_spz4,
+)
 from oasis_warp.export.usd_stage import write_splat_usd
 from oasis_warp.export.wavefront import write_obj
 from oasis_warp.hand_avatar import Avatar

@@ -15,9 +15,8 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Side
 from oasis_warp.export import texture
 from oasis_warp.export.gltf import INDICES, VERTICES, GltfBuffer, write_gltf
-from oasis_warp.export.material_maps import bake_material
 from oasis_warp.export.request import ExportRequest
-from oasis_warp.export.skinned_mesh import SkinnedMesh, skinned_mesh
+from oasis_warp.export.surface_mesh import SkinnedMesh, skinned_mesh
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.webxr_rig import Rig, local_bind, local_quats
 
@@ -60,7 +59,7 @@ def write_skinned_gltf(request: ExportRequest, path: Path) -> None:
         "nodes": [{"name": "hand", "children": [first]}, {"name": "skin", "mesh": 0, "skin": 0}, *nodes],
         "meshes": [mesh],
         "skins": [{**skin, "inverseBindMatrices": buffer.add(_array(inverse), "MAT4")}],
-        **_material(buffer, bake_material(request, texture.SIZE)),
+        **_material(buffer, texture.bake_material(request, texture.SIZE)),
         "animations": _clips(buffer, made, request.avatar.side),
     }
     if _packs(made):

@@ -7,10 +7,9 @@ import numpy as np
 import torch
 
 from oasis_warp.export import texture
-from oasis_warp.export.material_maps import bake_material
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.skinned_gltf import KEYS, SECONDS, clip_angles
-from oasis_warp.export.skinned_mesh import SkinnedMesh, skinned_mesh
+from oasis_warp.export.surface_mesh import SkinnedMesh, skinned_mesh
 from oasis_warp.export.usd_stage import new_stage, quatf, usd, vec3f, write_stage
 from oasis_warp.hand.webxr_rig import Rig, local_bind, local_quats
 
@@ -55,7 +54,7 @@ def write_skinned_usd(request: ExportRequest, path: Path) -> None:
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     mesh = _mesh(stage, f"{root}/skin", path, made)
     _bind(stage, mesh, skeleton, path, made, shapes)
-    pictures = bake_material(request, texture.SIZE)
+    pictures = texture.bake_material(request, texture.SIZE)
     files = {name: f"{path.stem}_{name}.png" for name in pictures}
     _material(stage, mesh, root, path, files)
     write_stage(stage, path, {files[name]: data for name, data in pictures.items()})
