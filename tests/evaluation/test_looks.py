@@ -24,8 +24,15 @@ from oasis_warp.evaluation.data_sets import Choice, Key, Row, Sample, choose, ev
 from oasis_warp.evaluation.kernel_distance import LAYERS
 from oasis_warp.evaluation.looks import hand_of, kernel_rows, summarise_looks
 from oasis_warp.evaluation.methods import RAW
-from oasis_warp.evaluation.paper_tables import as_latex, letter_of, make_tables, rows_of_tables, write_tables
-from oasis_warp.evaluation.pictures import GAP, SMALL, write_cells, write_overview
+from oasis_warp.evaluation.paper_tables import (
+    as_latex,
+    letter_of,
+    make_tables,
+    pose_curve,
+    rows_of_tables,
+    write_tables,
+)
+from oasis_warp.evaluation.pictures import GAP, MARGIN, SMALL, write_cells, write_curve, write_overview
 from oasis_warp.evaluation.real_hands import real_photos, reference_contrasts, summarise_real
 from oasis_warp.evaluation.views import RIM, WRIST_REACH, clear_of_outlines, read_surface, shrink, wrist_end
 from oasis_warp.hand.mano import read_mano
@@ -282,11 +289,20 @@ def test_tables_hold_what_was_measured_beside_what_papers_print(tmp_path):
     assert [line[0] for line in one_shot.lines][-1] == "f w/o LoRA: full tuning" and one_shot.lines[-1][4] == "26.00"
     assert poses.lines[2][1] == "26.00" and poses.lines[1][1] == ""
     assert speed.lines[-1] == ["ours, here", "50.0", "1.50"]
+    assert pose_curve([{"row": "ours", "psnr": 26.0}, {"row": "pose 5", "psnr": 20.0}]) == [(0.0, 26.0), (5.0, 20.0)]
     written = write_tables(tmp_path, tables)
     with (tmp_path / "results.csv").open() as file:
         assert next(csv.reader(line for line in file if line.startswith("OHTA")))[1] == "26.11"
     assert len(written) == 7 and "| OHTA | 26.11 | 0.864 | 12.93 |" in (tmp_path / "tables.md").read_text()
     assert r"LPIPS*" in as_latex(results) and r"SelfRecon & 26.38 & 0.879 & 14.21" in as_latex(results)
+
+
+def test_a_plot_falls_where_its_numbers_fall(tmp_path):
+    write_curve(tmp_path / "plot.png", [(0.0, 30.0), (5.0, 25.0), (10.0, 20.0)], "degrees", "PSNR")
+    pixels, (width, height) = read_photo(tmp_path / "plot.png").rgb, (480, 320)
+    for share in (0.25, 0.5, 0.75):  # along the line, and beside it
+        x, y = (round(MARGIN + share * (side - 2 * MARGIN)) for side in (width, height))
+        assert pixels[y - 1 : y + 2, x].min() < 100 and pixels[height - y - 9, x].min() > 200
 
 
 @pytest.mark.timeout(120)
@@ -334,7 +350,8 @@ def test_the_command_fills_the_papers_tables_from_stand_ins_of_data_sets(
     measured = [line for line in text.splitlines() if line.startswith(("| ours |", "| d w/o FoM", "| f w/o LoRA"))]
     assert len(measured) == 3 and all(line.split("|")[5].strip() for line in measured)
     assert "Ablation of one-shot" in capsys.readouterr().out
-    assert {"results.csv", "tables.tex", "sheet.png", "metrics.json"} <= {p.name for p in (tmp_path / "out").iterdir()}
+    files = {"results.csv", "tables.tex", "sheet.png", "metrics.json", "attention.png", "pose_errors.png"}
+    assert files <= {path.name for path in (tmp_path / "out").iterdir()}
 
 
 @pytest.fixture

@@ -21,7 +21,8 @@ from oasis_warp.evaluation.held_out import HELD_OUT_SEED, CaptureConfig
 from oasis_warp.evaluation.kernel_distance import LAYERS
 from oasis_warp.evaluation.looks import evaluate_looks
 from oasis_warp.evaluation.methods import Method, method_name
-from oasis_warp.evaluation.paper_tables import make_tables, rows_of_tables, write_tables
+from oasis_warp.evaluation.paper_tables import make_tables, pose_curve, rows_of_tables, write_tables
+from oasis_warp.evaluation.pictures import write_curve
 from oasis_warp.evaluation.published_data import CatalogueData
 from oasis_warp.evaluation.real_hands import real_photos
 from oasis_warp.evaluation.same_hand import METRICS, evaluate_photos, photos_in, photos_of_hands
@@ -196,6 +197,9 @@ def on_data_set(options: Evaluate, priors: dict[str, Prior], progress: Progress)
     )  # fmt: skip
     tables = make_tables(options.dataset, found["summary"])
     write_tables(options.out, tables)
+    write_curve(
+        options.out / "pose_errors.png", pose_curve(found["summary"]), "errors of the pose, degrees", "PSNR, dB"
+    )
     n_out, shown = len(found["left_out"]), []
     for table in tables:
         shown.append(Table(title=table.title))

@@ -29,7 +29,7 @@ from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
 from oasis_warp.estimation.outline import wrist_line
 from oasis_warp.evaluation.methods import Method, prior_digest, reconstructions
 from oasis_warp.evaluation.metrics import TargetTruth, score
-from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
+from oasis_warp.evaluation.pictures import ATTENTION_COLUMNS, tile, write_attention, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, mean
 from oasis_warp.hand.template import chosen_hand
 from oasis_warp.hand_avatar import Avatar, make_avatar
@@ -37,6 +37,8 @@ from oasis_warp.losses.image import Perceptual
 
 SETTINGS, METRICS, SHEET, AVATARS = "evaluation.json", "metrics.json", "sheet.png", "avatars"
 """Files that an evaluation writes; the last is a folder with the results of each avatar."""
+ATTENTION, ATTENTION_END = "attention.png", "_attention.png"
+"""What the network attends to in the photos, and the end of the file's name for one of them."""
 MEASURES = ("psnr", "psnr_whole", "ssim", "ssim_box", "ssim_mask", "lpips")
 DIGITS = 5
 WARM, FRAMES, LONGEST = 2, 20, 0.5
@@ -177,6 +179,9 @@ def evaluate_data_set(
         raise InputError(f"{out}: of no picture of the data set could an avatar be made: {first}")
     strips = [path for photo, _ in chosen if (path := out / AVATARS / f"{photo.file}.png").exists()]
     write_sheet(out / SHEET, strips, ["photo", "truth", *(row.name for row in rows)])
+    maps = [path for photo, _ in chosen if (path := out / AVATARS / f"{photo.file}{ATTENTION_END}").exists()]
+    if maps:
+        write_sheet(out / ATTENTION, maps, ATTENTION_COLUMNS)
     whole = {"settings": settings, "summary": summarise(pictures), "left_out": left_out, "pictures": pictures}
     write_file(out / METRICS, json.dumps(whole, allow_nan=False).encode())
     return whole
@@ -246,6 +251,7 @@ class _Measuring(NamedTuple):
                 if truths:
                     pictures[-1]["fps"] = frames_per_second(avatar)
             strip = [[tile(image) for image in images] for images in list(drawn.values())[:1]]
+            write_attention(folder / f"{photo.file}{ATTENTION_END}", self.priors, next(iter(crops.values())).hand)
         except InputError as error:
             left_out[photo.name] = str(error)
         if strip:

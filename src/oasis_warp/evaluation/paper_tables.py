@@ -191,6 +191,13 @@ def make_tables(data_set: str, summary: Sequence[Record]) -> list[PaperTable]:
     return tables
 
 
+def pose_curve(summary: Sequence[Record]) -> list[tuple[float, float]]:
+    """Errors of the pose [degrees] and the PSNR that is left with them [dB]."""
+    by_name = {row["row"]: row["psnr"] for row in summary}
+    names = {0.0: SHIPPED, **{degrees: f"pose {degrees:g}" for degrees in POSE_ERRORS}}
+    return [(degrees, by_name[name]) for degrees, name in names.items() if by_name.get(name) is not None]
+
+
 def _printed(published: Published) -> list[str]:
     three = [f"{published.psnr:.2f}", f"{published.ssim:.3f}", f"{published.lpips:.2f}"]
     return three + [""] * (len(MEASURES) - 3)

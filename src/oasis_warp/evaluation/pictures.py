@@ -4,7 +4,7 @@ Contact sheets show photo and avatar in the photo's view, from eight sides and i
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -14,14 +14,16 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from oasis_warp.avatar.observation import CropBatch
+from oasis_warp.avatar.observation import CropBatch, batch_of_crop
+from oasis_warp.avatar.prior import Prior
 from oasis_warp.core import surface
 from oasis_warp.core.camera import orbit_camera
-from oasis_warp.core.types import Camera
+from oasis_warp.core.types import Camera, HandCrop
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import contact_sheet, to_uint8, write_picture
 from oasis_warp.network.attention import VisibilityAttention
 from oasis_warp.network.hand_network import HandNetwork
+from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.network.tokens import color_difference
 from oasis_warp.ops import depth_map
 
@@ -54,9 +56,11 @@ def write_sheet(path: Path, strips: Sequence[Path], columns: Sequence[str]) -> N
     write_picture(path, torch.cat([torch.from_numpy(heading), *parts]))
 
 
-def has_attention(network: HandNetwork) -> bool:
-    """Whether the network weighs local tokens against a global one."""
-    return isinstance(network.fusion, VisibilityAttention)
+def write_attention(path: Path, priors: Mapping[str, Prior], crop: HandCrop) -> None:
+    """Write the attention that the learned prior pays to a photo, if its network has any."""
+    prior = priors.get("learned")
+    if isinstance(prior, NetworkPrior) and isinstance(prior.network.fusion, VisibilityAttention):
+        write_strip(path, [draw_attention(prior.network.to(crop.image.device), batch_of_crop(crop))])
 
 
 @torch.no_grad()
@@ -93,6 +97,33 @@ def _draw_field(field: Float[Tensor, "V"], vertices: Tensor, faces: Tensor, came
     facing = -(normals[corners] * seen.barycentrics[..., None]).sum(-2)[..., 2]
     shade = 0.45 + 0.55 * facing.clamp(0, 1)
     return torch.where(on_hand[..., None], color * shade[..., None], torch.ones_like(color))
+
+
+PLOT, MARGIN = (480, 320), 56
+"""Width and height of a plot, and the room around its axes [px]."""
+
+
+def write_curve(path: Path, points: Sequence[tuple[float, float]], across: str, up: str) -> None:
+    """Plot a line through points, each with its two numbers; `across` and `up` say what they are."""
+    width, height = PLOT
+    pixels, values = np.full((height, width, 3), PAPER, np.uint8), np.array(points)
+    low, high = values.min(0), values.max(0)
+    place = (values - low) / np.maximum(high - low, 1e-9) * (width - 2 * MARGIN, height - 2 * MARGIN)
+    xy = np.round(np.stack([MARGIN + place[:, 0], height - MARGIN - place[:, 1]], 1)).astype(np.int32)
+    corners = np.array([(MARGIN, MARGIN), (MARGIN, height - MARGIN), (width - MARGIN, height - MARGIN)])
+    for line in (corners, xy):
+        cv2.polylines(pixels, [line], False, (INK, INK, INK), 1, cv2.LINE_AA)
+
+    def write(words: str, left: int, bottom: int) -> None:
+        cv2.putText(pixels, words, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (INK, INK, INK), 1, cv2.LINE_AA)
+
+    for (x, y), (left, bottom) in zip(points, xy.tolist(), strict=True):
+        cv2.circle(pixels, (left, bottom), 3, (INK, INK, INK), -1, cv2.LINE_AA)
+        write(f"{x:g}", left - 4, height - MARGIN + 18)
+        write(f"{y:.2f}", left + 5, bottom - 7)
+    write(across, MARGIN, height - 14)
+    write(up, 8, MARGIN - 24)
+    write_picture(path, torch.from_numpy(pixels))
 
 
 COLUMNS = 6

@@ -20,7 +20,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp import __version__
-from oasis_warp.avatar.observation import source_photos
 from oasis_warp.avatar.pose import pose_gaussians, turn_light, with_photo
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig
@@ -40,19 +39,11 @@ from oasis_warp.evaluation.held_out import (
 )
 from oasis_warp.evaluation.methods import METHODS, LitGaussians, Method, method_name, prior_digest, reconstructions
 from oasis_warp.evaluation.metrics import TargetTruth, match_colors, score
-from oasis_warp.evaluation.pictures import (
-    ATTENTION_COLUMNS,
-    draw_attention,
-    has_attention,
-    tile,
-    write_sheet,
-    write_strip,
-)
+from oasis_warp.evaluation.pictures import ATTENTION_COLUMNS, tile, write_attention, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, read_result, summarise
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.losses.image import Perceptual
 from oasis_warp.losses.lpips import Lpips
-from oasis_warp.network.prior import NetworkPrior
 from oasis_warp.render.render import render
 
 SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (
@@ -231,7 +222,7 @@ def measure_person(setup: _Setup, folder: Path, device: torch.device, group: Gro
             if factor == config.noise[-1]:
                 rows.append(row)
         if shown and (group, light) == (config.groups[0], config.lights[0]):
-            write_attention(_attention_file(file, number), setup.priors, exact)
+            write_attention(_attention_file(file, number), setup.priors, crop_of(exact))
     if shown:
         write_strip(file.with_suffix(".png"), rows)
     write_file(file, json.dumps(records, allow_nan=False).encode())
@@ -278,13 +269,6 @@ def score_all(images: list[Tensor], truths: list[TargetTruth], perceptual: Perce
             found = score(judged, truth, perceptual)
             numbers = {name: None if value is None else round(value, DIGITS) for name, value in found.items()}
             yield {"target": k, "colors": colors, **numbers}
-
-
-def write_attention(path: Path, priors: Mapping[str, Prior], batch: TrainingBatch) -> None:
-    """Write the attention of the learned prior, if its network has any."""
-    prior = priors.get("learned")
-    if isinstance(prior, NetworkPrior) and has_attention(prior.network):
-        write_strip(path, [draw_attention(prior.network.to(batch.image.device), source_photos(batch))])
 
 
 def crop_of(batch: TrainingBatch) -> HandCrop:
