@@ -59,7 +59,7 @@ def put_corners(a: wp.array2d[Any], i: int, e1: wp.vec3d, e2: wp.vec3d, corners:
 
 
 @wp.func
-def place_in(i: int, rows: int, columns: int):
+def image_row_column(i: int, rows: int, columns: int):
     """Image, row and column of element `i` of a stack of images."""
     image = i // (rows * columns)
     row = (i - image * rows * columns) // columns

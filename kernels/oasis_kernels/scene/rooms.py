@@ -8,9 +8,9 @@ distance fields (Evans 2006), and the lamps with the hand's soft shadow and a ma
 
 import warp as wp
 
-from oasis_kernels.runtime.arrays import place_in
+from oasis_kernels.runtime.arrays import image_row_column
 from oasis_kernels.scene.room_patterns import CLOTH, painted, rough_noise
-from oasis_kernels.scene.sky import Lamps, blurred, cosine_lobe, disc, dither, harmonics, light_along, lit_share
+from oasis_kernels.scene.sky import Lamps, blurred, cosine_lobe, disc, dither, harmonics, lamp_visibility, light_along
 
 wp.set_module_options({"enable_backward": False})  # fast_math makes NaN of powers: a dot product may exceed 1
 
@@ -51,7 +51,7 @@ def from_solid(solids: wp.array3d[wp.float32], b: int, k: int, v: wp.vec3f) -> w
 
 
 @wp.func
-def entry(shape: int, half: wp.vec3f, o: wp.vec3f, d: wp.vec3f) -> float:
+def ray_entry(shape: int, half: wp.vec3f, o: wp.vec3f, d: wp.vec3f) -> float:
     """Distance along the ray to the solid, FAR where it misses or starts inside."""
     t = float(FAR)
     if shape == BOX:
@@ -94,7 +94,7 @@ def entry(shape: int, half: wp.vec3f, o: wp.vec3f, d: wp.vec3f) -> float:
 
 
 @wp.func
-def in_the_way(center: wp.vec3f, half: wp.vec3f, d: wp.vec3f) -> bool:
+def may_hit(center: wp.vec3f, half: wp.vec3f, d: wp.vec3f) -> bool:
     """Whether a ray from the camera may meet a solid: whether it comes near the ball round it, rounding allowed for."""
     ahead = wp.dot(center, d)
     away = wp.dot(center, center)
@@ -103,7 +103,7 @@ def in_the_way(center: wp.vec3f, half: wp.vec3f, d: wp.vec3f) -> bool:
 
 
 @wp.func
-def clearance(solids: wp.array3d[wp.float32], b: int, p: wp.vec3f, limit: float) -> float:
+def signed_distance(solids: wp.array3d[wp.float32], b: int, p: wp.vec3f, limit: float) -> float:
     """Distance to the nearest solid, negative inside one; `limit` where all are further away."""
     least = limit
     for k in range(solids.shape[1]):
@@ -131,10 +131,10 @@ def clearance(solids: wp.array3d[wp.float32], b: int, p: wp.vec3f, limit: float)
 
 
 @wp.func
-def sight(
+def trace_ray(
     b: int,
     d: wp.vec3f,
-    turn: float,
+    angle: float,
     solids: wp.array3d[wp.float32],
     sky: wp.array2d[wp.vec3f],
     lamps: Lamps,
@@ -147,8 +147,8 @@ def sight(
         if shape != NOTHING:
             center = vector_at(solids, b, k, CENTER)
             size = vector_at(solids, b, k, HALF)
-            if in_the_way(center, size, d):
-                s = entry(shape, size, to_solid(solids, b, k, -center), to_solid(solids, b, k, d))
+            if may_hit(center, size, d):
+                s = ray_entry(shape, size, to_solid(solids, b, k, -center), to_solid(solids, b, k, d))
                 if s < t:
                     t = s
                     hit = k
@@ -207,7 +207,7 @@ def sight(
     rolled = wp.int32(2)  # a number that the compiler does not know: code for each turn would not fit into the cache
     for k in range(rolled):
         reach = widest * (0.2 + 0.8 * float(k))
-        open_ -= (reach - clearance(solids, b, p + reach * n, reach)) / reach * 0.36
+        open_ -= (reach - signed_distance(solids, b, p + reach * n, reach)) / reach * 0.36
     open_ = wp.max(open_, 0.12)
     total = light_along(sky, b, cosine_lobe(n)) * open_
     for lamp in range(lamps.positions.shape[1]):
@@ -219,14 +219,14 @@ def sight(
             facing = wp.dot(n, w)
             if facing > 0.0:
                 fall = lamps.ranges[b, lamp] / distance
-                share = lit_share(lamps, b, lamp, p, n, turn, 0.002)
+                share = lamp_visibility(lamps, b, lamp, p, n, angle, 0.002)
                 if share > 0.0 and lamp == 0:  # the first lamp's shadows of the solids themselves
-                    s = 0.015 + 0.0016 * turn
+                    s = 0.015 + 0.0016 * angle
                     soft = 1.0 / wp.max(lamps.spreads[b, lamp], 0.05)
                     rolled = wp.int32(5)
                     for _k in range(rolled):
                         # Further away nothing darkens and no step is longer.
-                        near = clearance(solids, b, p + 0.004 * n + s * w, wp.max(1.01 * s / soft, 0.3))
+                        near = signed_distance(solids, b, p + 0.004 * n + s * w, wp.max(1.01 * s / soft, 0.3))
                         share = wp.min(share, wp.clamp(0.5 + 0.5 * soft * near / s, 0.0, 1.0))
                         s += wp.clamp(near, 0.03, 0.3)
                 total += color * (fall * fall * facing * share)
@@ -250,20 +250,20 @@ def trace(
     depth: wp.array3d[wp.float32],
 ):
     rows, columns = light.shape[1], light.shape[2]
-    b, y, x = place_in(first + wp.tid(), rows, columns)
+    b, y, x = image_row_column(first + wp.tid(), rows, columns)
     total = wp.vec3f()
     nearest = float(FAR)
     if hidden[b, y, x] <= 0.999:
-        turn = dither(x, y)
+        angle = dither(x, y)
         rolled = wp.int32(RAYS)
         for k in range(rolled):
             right = float(x) + (float(k) + 0.5) / float(RAYS) - 0.5 * float(columns)
             down = float(y) + (0.3 if k % 2 == 0 else 0.7) - 0.5 * float(rows)
             d = wp.normalize(wp.vec3f(right / focals[b], down / focals[b], 1.0))
-            s = sight(
+            s = trace_ray(
                 b,
                 d,
-                turn + 1.2 * float(k),
+                angle + 1.2 * float(k),
                 solids,
                 sky,
                 lamps,
@@ -286,17 +286,17 @@ def defocus(
 ):
     """Gathers over a disc as large as the pixel's own circle of confusion; what the hand hides does not count."""
     rows, columns = light.shape[1], light.shape[2]
-    b, y, x = place_in(first + wp.tid(), rows, columns)
+    b, y, x = image_row_column(first + wp.tid(), rows, columns)
     if hidden[b, y, x] > 0.999:
         out[b, y, x] = light[b, y, x]
         return
     radius = apertures[b] * float(columns) * wp.abs(1.0 - focus[b] / depth[b, y, x])
     radius = wp.max(radius, 0.85)
-    turn = dither(x, y)
+    angle = dither(x, y)
     total = light[b, y, x] * 0.5
     weight = wp.float32(0.5)
     for k in range(BLUR_TAPS):
-        o = radius * disc(k, BLUR_TAPS, turn)
+        o = radius * disc(k, BLUR_TAPS, angle)
         u = wp.clamp(int(wp.floor(float(x) + 0.5 + o[0])), 0, columns - 1)
         v = wp.clamp(int(wp.floor(float(y) + 0.5 + o[1])), 0, rows - 1)
         if hidden[b, v, u] < 0.999:

@@ -8,7 +8,7 @@ faces around a vertex, one thread per channel.
 
 import warp as wp
 
-from oasis_kernels.runtime.arrays import place_in
+from oasis_kernels.runtime.arrays import image_row_column
 from oasis_kernels.scene.sky import cosine_lobe, harmonics
 
 wp.set_module_options({"enable_backward": False})
@@ -49,7 +49,7 @@ def smooth(
     entries: wp.array[wp.int32],
     out: wp.array3d[wp.float32],
 ):
-    b, v, c = place_in(first + wp.tid(), values.shape[1], values.shape[2])
+    b, v, c = image_row_column(first + wp.tid(), values.shape[1], values.shape[2])
     begin, end = offsets[v], offsets[v + 1]
     total = wp.float32(0.0)
     for e in range(begin, end):

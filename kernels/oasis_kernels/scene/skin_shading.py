@@ -11,8 +11,8 @@ lobes for lamps, low-order harmonics of the sky along the mirrored ray.
 
 import warp as wp
 
-from oasis_kernels.runtime.arrays import place_in
-from oasis_kernels.scene.sky import Lamps, blurred, cosine_lobe, dither, harmonics, light_along, lit_share, vec9
+from oasis_kernels.runtime.arrays import image_row_column
+from oasis_kernels.scene.sky import Lamps, blurred, cosine_lobe, dither, harmonics, lamp_visibility, light_along, vec9
 
 wp.set_module_options({"enable_backward": False})  # fast_math makes NaN of powers: a dot product may exceed 1
 
@@ -97,7 +97,7 @@ def shade(
     mirrored: wp.array3d[wp.vec3f],
 ):
     rows, columns = face_ids.shape[1], face_ids.shape[2]
-    b, y, x = place_in(first + wp.tid(), rows, columns)
+    b, y, x = image_row_column(first + wp.tid(), rows, columns)
     f = face_ids[b, y, x]
     if f < 0:
         return
@@ -192,7 +192,7 @@ def shade(
     straight = SHEEN * shine * (1.0 - metal)
     f0 = wp.vec3f(straight, straight, straight) + metal * base
     gloss = wp.vec3f()
-    turn = dither(x, y)
+    angle = dither(x, y)
     for lamp in range(lamps.positions.shape[1]):
         color = lamps.colors[b, lamp]
         if color[0] + color[1] + color[2] > 0.0:
@@ -205,7 +205,7 @@ def shade(
             facing = wp.dot(n, d)
             share = wp.float32(0.0)
             if facing > -0.25:
-                share = lit_share(lamps, b, lamp, p + 0.0012 * n, n, turn, 0.0012)
+                share = lamp_visibility(lamps, b, lamp, p + 0.0012 * n, n, angle, 0.0012)
             if share > 0.0:
                 nl = wp.dot(m, d)
                 for c in range(3):
@@ -259,7 +259,7 @@ def scatter(
     out: wp.array3d[wp.vec3f],
 ):
     rows, columns = face_ids.shape[1], face_ids.shape[2]
-    b, y, x = place_in(first + wp.tid(), rows, columns)
+    b, y, x = image_row_column(first + wp.tid(), rows, columns)
     f = face_ids[b, y, x]
     if f < 0:
         return
@@ -308,7 +308,7 @@ def resolve(
     depth: wp.array3d[wp.float32],
 ):
     rows, columns = color.shape[1], color.shape[2]
-    b, y, x = place_in(first + wp.tid(), rows, columns)
+    b, y, x = image_row_column(first + wp.tid(), rows, columns)
     n = face_ids.shape[1] // rows
     total = wp.vec3f()
     covered = wp.float32(0.0)

@@ -72,10 +72,10 @@ class Lamps:
 
 
 @wp.func
-def disc(k: int, n: int, turn: float) -> wp.vec2f:
+def disc(k: int, n: int, angle: float) -> wp.vec2f:
     """Point k of n that fill the unit disc evenly (Vogel's spiral)."""
     r = wp.sqrt((float(k) + 0.5) / float(n))
-    a = turn + float(k) * GOLDEN_ANGLE
+    a = angle + float(k) * GOLDEN_ANGLE
     return wp.vec2f(r * wp.cos(a), r * wp.sin(a))
 
 
@@ -88,7 +88,7 @@ def dither(x: int, y: int) -> float:
 
 
 @wp.func
-def lit_share(lamps: Lamps, b: int, lamp: int, p: wp.vec3f, n: wp.vec3f, turn: float, bias: float) -> float:
+def lamp_visibility(lamps: Lamps, b: int, lamp: int, p: wp.vec3f, n: wp.vec3f, angle: float, bias: float) -> float:
     """Share of a lamp of image `b` that `p` sees: percentage-closer soft shadows (Fernando 2005), with a slope bias."""
     q = wp.transform_point(lamps.views[b, lamp], p)
     m = wp.transform_vector(lamps.views[b, lamp], n)
@@ -108,7 +108,7 @@ def lit_share(lamps: Lamps, b: int, lamp: int, p: wp.vec3f, n: wp.vec3f, turn: f
     depth = wp.float32(0.0)
     found = wp.float32(0.0)
     for k in range(BLOCKERS):
-        o = search * disc(k, BLOCKERS, turn)
+        o = search * disc(k, BLOCKERS, angle)
         x = int(wp.floor((q[0] + o[0]) * scale + half))
         y = int(wp.floor((q[1] + o[1]) * scale + half))
         if x >= 0 and x < size and y >= 0 and y < size:
@@ -124,7 +124,7 @@ def lit_share(lamps: Lamps, b: int, lamp: int, p: wp.vec3f, n: wp.vec3f, turn: f
     radius = wp.min(radius, WIDEST)
     seen = wp.float32(0.0)
     for k in range(TAPS):
-        o = radius * disc(k, TAPS, turn)
+        o = radius * disc(k, TAPS, angle)
         x = int(wp.floor((q[0] + o[0]) * scale + half))
         y = int(wp.floor((q[1] + o[1]) * scale + half))
         lit = wp.float32(1.0)
