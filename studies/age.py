@@ -161,9 +161,9 @@ def noting_code(folder: Path, study: str, files: Sequence[str]) -> Iterator[None
 def keep(study: str, files: Sequence[str], out: Path, results: Path) -> None:
     """Copy the files that a study has left in `out` to the kept results, and what measured them."""
     measured, noted = read_measured(results, study), read_measured(out, study)
-    if not (there := times(out, files)):
+    if not (measured_at := times(out, files)):
         return
-    for name in there:
+    for name in measured_at:
         (results / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(out / name, results / name)
         measured[name] = noted.get(name, NOT_NOTED)

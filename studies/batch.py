@@ -64,14 +64,14 @@ def measure(setting: str, workers: int, n: int, device: str) -> Row:
         flags = (*SETTINGS[setting], "--device", device)
         wall, cpu, peak = batch(listed, out, workers, flags)
         again, start, _ = batch(listed, out, workers, flags)
-        said = [json.loads(line)["status"] for line in (out / "manifest.jsonl").read_text().splitlines()]
+        statuses = [json.loads(line)["status"] for line in (out / "manifest.jsonl").read_text().splitlines()]
         stages = Counter[str]()
         for report in out.glob("avatars/*/*/report.json"):
             stages.update(json.loads(report.read_text())["seconds"])
         size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
-    made, total = said.count("made"), stages.pop("total")
+    made, total = statuses.count("made"), stages.pop("total")
     return {
-        "setting": setting, "workers": workers, "photos": n, "made": made, "declined": said.count("refused"),
+        "setting": setting, "workers": workers, "photos": n, "made": made, "declined": statuses.count("refused"),
         "cpu_s": (cpu - start) / n, "wall_s": wall - again, "start_s": start, "start_wall_s": again, "peak_gib": peak,
         "megabytes": size / made / 1e6, "stages": {stage: value / total for stage, value in stages.most_common()},
     }  # fmt: skip

@@ -85,7 +85,7 @@ PIPELINE = [
     _of("motion/motion_file", "motion/test_motion_file", "tracked", "quaternions wxyz where xyzw stand",
         "quats[..., [3, 0, 1, 2]]", "quats"),
     _of("motion/bvh", "motion/test_motion_file", "bent_fingers", "the skeleton's rest pose taken for ours",
-        "moved @ _shortest(ahead - ours[bone], there)", "moved"),
+        "moved @ _shortest(ahead - ours[bone], direction)", "moved"),
     _of("motion/recording", "motion/test_motion_file", "bridged", "gaps filled by the frame before",
         "before + share)", "before)"),
     _of("evaluation/views", "evaluation/test_looks", "outside", "the inside of the wrist taken for skin",

@@ -307,7 +307,7 @@ def run(options: Options) -> list[Row]:
     return measured("stress", {name: (name, options.config()) for name in options.photos}, measure, options)
 
 
-def said(row: Row) -> str:
+def warnings_of(row: Row) -> str:
     """Refusal, warnings and whether the avatar is broken, in words."""
     refusal = [f"refused: {row['refusal'].split(': ', 1)[-1]}"] if row["refusal"] else []
     broken = [] if row.get("sane", True) else ["**not finite or exploded**"]
@@ -317,6 +317,6 @@ def said(row: Row) -> str:
 COLUMNS = (
     Column("damage", "damage"), Column("own photo, dB", "own_db", ".1f"),
     Column("undamaged avatar, dB", "like_db", ".1f"), Column("overlap of fit and mask", "mask_iou", ".2f"),
-    Column("seen, %", "seen", ".0f"), Column("said", said),
+    Column("seen, %", "seen", ".0f"), Column("said", warnings_of),
 )  # fmt: skip
 SECTIONS = (Section("detail.md", "stress", table(COLUMNS)),)

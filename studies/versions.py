@@ -87,8 +87,8 @@ def measure(python: str, torch: str) -> Row:
 def installed(python: str) -> dict[str, str]:
     """Versions of the packages that matter in an environment."""
     code = f"import json; from importlib.metadata import version; print(json.dumps([version(n) for n in {SHOWN}]))"
-    said = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True, cwd="/").stdout
-    return dict(zip(SHOWN, json.loads(said), strict=True))
+    output = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True, cwd="/").stdout
+    return dict(zip(SHOWN, json.loads(output), strict=True))
 
 
 def run(options: Options) -> list[Row]:

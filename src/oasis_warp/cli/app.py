@@ -78,15 +78,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     before, start = signal.signal(signal.SIGTERM, signal.default_int_handler), time.monotonic()
     try:
         with recorded(chosen, arguments) as record:
-            code, said = _run(chosen, verbose)
+            code, message = _run(chosen, verbose)
             if getattr(chosen, "json", None) is not None and not isinstance(chosen, OWN_JSON):
-                write_record(chosen, record, code, said, start)
+                write_record(chosen, record, code, message, start)
     except InputError as error:  # of the record
-        code, said = BAD_INPUT, str(error)
+        code, message = BAD_INPUT, str(error)
     finally:
         signal.signal(signal.SIGTERM, before)
-    if said is not None:
-        print(f"oasis: {said}", file=sys.stderr)
+    if message is not None:
+        print(f"oasis: {message}", file=sys.stderr)
     return code
 
 
@@ -103,9 +103,9 @@ def _run(chosen: Any, verbose: bool) -> tuple[int, str | None]:
     except KeyboardInterrupt:
         return INTERRUPTED, "stopped, nothing written."
     except Exception as error:
-        if (said := what_ran_out(error)) is None:
+        if (message := what_ran_out(error)) is None:
             raise
-        return BAD_INPUT, said.format(device=getattr(chosen, "device", "cpu"))
+        return BAD_INPUT, message.format(device=getattr(chosen, "device", "cpu"))
 
 
 def _refuse_command(name: str) -> NoReturn:
@@ -134,8 +134,8 @@ def open_standard_streams() -> None:
 
 def what_ran_out(error: BaseException | None) -> str | None:
     """A sentence about {device} on the missing resource (memory, disk, descriptors), if that made a library fail."""
-    said = ""
+    message = ""
     while error is not None:  # packages wrap what the system said
-        said += f"{type(error).__name__} {error}\n"
+        message += f"{type(error).__name__} {error}\n"
         error = error.__cause__ or error.__context__
-    return next((sentence for sentence, signs in SHORTAGES.items() if any(sign in said for sign in signs)), None)
+    return next((sentence for sentence, signs in SHORTAGES.items() if any(sign in message for sign in signs)), None)

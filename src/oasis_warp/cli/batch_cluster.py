@@ -102,13 +102,13 @@ def work(client: Any, tasks: Sequence[Sequence[str]], order: Order, report: Call
     counts: dict[int, Counter[str]] = {}
     ended, lock = set[int](), threading.Lock()  # events come on a thread of the client
 
-    def count(task: int, said: Mapping[str, int], *, end: bool) -> int:
+    def count(task: int, counted: Mapping[str, int], *, end: bool) -> int:
         with lock:
             if task in ended:
                 return 0
             if end:
                 ended.add(task)
-            counts[task] = Counter(said)
+            counts[task] = Counter(counted)
             total = sum(counts.values(), Counter[str]())
             report(total.total() - total["kept"], total["kept"])
         return total.total() - total["kept"]

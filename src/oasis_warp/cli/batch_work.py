@@ -196,6 +196,6 @@ def _make(path: Path, key: str, order: Order) -> Row:
         raise
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
-        said = f"{path}: {type(error).__name__} in {Path(place.filename).name}:{place.lineno}: {error}"
-        return {"status": "failed", "said": str(InputError(said))}  # on one line, and not for pages
+        message = f"{path}: {type(error).__name__} in {Path(place.filename).name}:{place.lineno}: {error}"
+        return {"status": "failed", "said": str(InputError(message))}  # on one line, and not for pages
     return row

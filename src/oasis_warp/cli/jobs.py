@@ -167,5 +167,7 @@ class Jobs:
         if code == 0 or self._stopped:
             return
         late = time.monotonic() - started >= MAX_SECONDS
-        said = f"It took more than {MAX_SECONDS // 60} minutes." if late else last_line(line, SILENT, 500)
-        write_file(home / "error.txt", said.replace(str(photo), "the photo").replace(photo.name, "the photo").encode())
+        message = f"It took more than {MAX_SECONDS // 60} minutes." if late else last_line(line, SILENT, 500)
+        write_file(
+            home / "error.txt", message.replace(str(photo), "the photo").replace(photo.name, "the photo").encode()
+        )

@@ -49,9 +49,9 @@ def run(options: View) -> int:
     return 0
 
 
-def serve(server: LoopbackServer, said: str, *, no_browser: bool) -> None:
-    """Say `said`, open the address unless `no_browser`, and serve until Ctrl-C."""
-    print(said)
+def serve(server: LoopbackServer, message: str, *, no_browser: bool) -> None:
+    """Say `message`, open the address unless `no_browser`, and serve until Ctrl-C."""
+    print(message)
     sys.stdout.flush()
     if not no_browser:
         webbrowser.open(server.address)

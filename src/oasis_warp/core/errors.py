@@ -17,9 +17,9 @@ def shortened(text: str, most: int = MAX_QUOTED) -> str:
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-(most // 2) :]}"
 
 
-def last_line(said: str, nothing: str = "it said nothing", most: int = 300) -> str:
+def last_line(output: str, nothing: str = "it said nothing", most: int = 300) -> str:
     """The last line of a failed program's output, at most so many letters; `nothing` if there was none."""
-    return (said.strip().splitlines() or [nothing])[-1].removeprefix("oasis: ")[:most]
+    return (output.strip().splitlines() or [nothing])[-1].removeprefix("oasis: ")[:most]
 
 
 class InputError(ValueError):

@@ -99,8 +99,8 @@ def check_digest(path: Path, known: Published) -> None:
         InputError: it is another.
     """
     beside = path.with_name(path.name + ".sha256")
-    said = beside.read_text(errors="replace").split()[:1] if beside.is_file() else []
-    expected = said[0].lower() if said else known.sha256
+    recorded = beside.read_text(errors="replace").split()[:1] if beside.is_file() else []
+    expected = recorded[0].lower() if recorded else known.sha256
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if digest != expected:

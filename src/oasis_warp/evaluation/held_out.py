@@ -81,13 +81,13 @@ class CapturedPerson(NamedTuple):
 def capture_person(capture: CaptureConfig, group: Group, number: int, device: torch.device) -> CapturedPerson:
     """Render the photos and targets of person `number`."""
     seed, size, first = capture.seed, int(capture.size * SURROUNDINGS), PICTURES_EACH * number
-    wild = SceneConfig(population=POPULATIONS[group])
-    even = replace(wild, look="even")
-    (photo,) = sample_shots(seed, [first], wild)
+    any_light = SceneConfig(population=POPULATIONS[group])
+    even = replace(any_light, look="even")
+    (photo,) = sample_shots(seed, [first], any_light)
     goals = sample_shots(seed, range(first, first + capture.targets), even)
 
     def planned(shots: list[Shot]) -> ShotTable:
-        return tabulate(seed, shots, wild)
+        return tabulate(seed, shots, any_light)
 
     plain = render_table(seed, planned([_evenly_lit(photo), *goals]), size, device, scene=even)
     studio, even_goals = slice_batch(plain, slice(1)), slice_batch(plain, slice(1, None))
@@ -95,12 +95,12 @@ def capture_person(capture: CaptureConfig, group: Group, number: int, device: to
     studio = studio._replace(image=studio.image + (1 - studio.alpha[..., None]) * wall)
     soft = photo._replace(light=diffuse_light(photo.light, DIRECTED))
     same, same_goals = render_capture(
-        seed, planned([soft]), planned(capture_shots(seed, soft, goals)), size, device, scene=wild
+        seed, planned([soft]), planned(capture_shots(seed, soft, goals)), size, device, scene=any_light
     )
     rotations = torch.from_numpy(np.stack([camera_rotation(seed, goal.index) for goal in goals])).float()
     return CapturedPerson(
         number,
-        {"studio": studio, "same": same, "wild": render_table(seed, planned([photo]), size, device, scene=wild)},
+        {"studio": studio, "same": same, "wild": render_table(seed, planned([photo]), size, device, scene=any_light)},
         {"studio": even_goals, "same": same_goals, "wild": even_goals},
         {"studio": torch.eye(3).expand(capture.targets, 3, 3), "same": rotations, "wild": None},
     )

@@ -123,9 +123,9 @@ def hand_angles(hand: HandModel, rest: PosedHand, skeleton: Skeleton, side: Side
             continue
         joint = chains[bone]
         ahead = ours[bone + 1] if bone % 3 else rest.tips[(1, 2, 4, 3, 0)[bone // 3 - 1]].double()
-        there = aligning @ _direction(skeleton, places, joint)
+        direction = aligning @ _direction(skeleton, places, joint)
         moved = aligning @ (world[:, wrist].mT @ world[:, joint]) @ aligning.T
-        rotations[:, bone] = moved @ _shortest(ahead - ours[bone], there)
+        rotations[:, bone] = moved @ _shortest(ahead - ours[bone], direction)
     return angles_of_bones(hand, rotations)
 
 

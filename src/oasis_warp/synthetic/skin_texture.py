@@ -62,8 +62,8 @@ def _labelled() -> np.ndarray:
     body, rows = bundled_body(), []
     hand = body.hand
     for finger in range(len(FINGERS)):
-        there = ((hand.nail > 0.6) & (hand.segment == 3 * finger + 3)).numpy()
-        along, side, _ = body.bones[finger][2].local(hand.template.double().numpy()[there] * 1e3).T
+        on_nail = ((hand.nail > 0.6) & (hand.segment == 3 * finger + 3)).numpy()
+        along, side, _ = body.bones[finger][2].local(hand.template.double().numpy()[on_nail] * 1e3).T
         rows.append((along.min(), along.max(), side.min(), side.max()))
     return np.array(rows)
 

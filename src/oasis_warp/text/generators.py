@@ -105,8 +105,8 @@ def _command(line: str) -> Generator:
                     f"--generator {words[0]}: cannot be started ({error.strerror}); check its name."
                 ) from error
             if ran.returncode or not out.is_file():
-                said = f"exit code {ran.returncode}: {last_line(ran.stderr)}"
-                raise InputError(f"--generator {words[0]}: wrote no picture ({said}); run it alone.")
+                failure = f"exit code {ran.returncode}: {last_line(ran.stderr)}"
+                raise InputError(f"--generator {words[0]}: wrote no picture ({failure}); run it alone.")
             return read_photo(out)
 
     return generate
