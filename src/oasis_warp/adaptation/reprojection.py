@@ -132,7 +132,7 @@ def reproject(
 
 
 def nearby_cameras(camera: Camera, points: Float[Tensor, "K 3"]) -> list[Camera]:
-    """Cameras turned by `NEARBY_ANGLES` about the middle of `points`."""
+    """Cameras rotated by `NEARBY_ANGLES` about the middle of `points`."""
     center = (points.amin(0) + points.amax(0)) / 2
     cameras = []
     for about_x, about_y in NEARBY_ANGLES:

@@ -57,7 +57,7 @@ def densify(
     *,
     thickness: float = 0.0,
 ) -> Densified:
-    """Replace what rides on some faces by finer Gaussians that look the same.
+    """Replace the Gaussians on some faces by finer ones that look the same.
 
     A face of n > 1 parts an edge is cut into n^2 triangles of its own shape, each with a Gaussian at its centre. The
     face's Gaussians go; vertex Gaussians all of whose faces are cut sink and become the ground under the new ones. A

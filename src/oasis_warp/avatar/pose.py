@@ -59,7 +59,7 @@ def posed_lighting(
 ) -> Lighting:
     """The vertices of a posed surface in `light`; normals are those of the rest surface, turned as Gaussians are.
 
-    On the rim of the wrist they are those of its end, whose Gaussians ride there: its sides would shade it in wedges.
+    On the rim of the wrist they are those of its end, whose Gaussians are bound there: its sides would shade it in wedges.
     """
     vertex_quats = face_rotations(rest, posed, faces, validate=False).vertex_quats
     return lighting(posed, vertex_quats, surface.closed_normals(rest, faces), light)
@@ -68,7 +68,7 @@ def posed_lighting(
 def lighting(
     posed: Float[Tensor, "*B V 3"], quats: Float[Tensor, "*B V 4"], normals: Float[Tensor, "V 3"], light: HandLight
 ) -> Lighting:
-    """The same for vertices that have turned by `quats`; exposure is a constant to derivatives."""
+    """The same for vertices rotated by `quats`; exposure is a constant to derivatives."""
     facing = rotation.rotate(quats, normals.expand_as(posed))
     return Lighting(facing, None if light.albedo is None else exposure(posed, facing, quats, light))
 

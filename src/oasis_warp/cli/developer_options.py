@@ -201,7 +201,7 @@ class Pretrain:
     people: int = 512
     """How many there are."""
     hold_out: tuple[Kind, ...] = ()
-    """Kinds that nobody has, so that `oasis evaluate` can ask for what was never seen."""
+    """Kinds left out of training, so that `oasis evaluate` can test on what was never seen."""
     size: int = 256
     """Side of photos and targets [px], a multiple of 16."""
     seed: int = 0

@@ -20,7 +20,7 @@ MAX_SECONDS = 900
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".avif", ".bmp", ".tif", ".tiff")
 SILENT = "The program said nothing."
 EXPORTS = (".html", ".glb", ".ply", ".spz")
-"""Formats that are written when somebody asks for them."""
+"""Formats that are written on request."""
 PROGRAM = (sys.executable, "-m", "oasis_warp")
 """A process of its own: whatever a photo does to it, the form stays."""
 RESULTS = ("summary.png", "quality.png", "turntable.mp4", "avatar.safetensors", "report.json")

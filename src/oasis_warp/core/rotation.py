@@ -55,7 +55,7 @@ def from_matrix(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
 
 
 def rotate(quats: Float[Tensor, "*batch 4"], vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Vectors turned by unit quaternions."""
+    """Vectors rotated by unit quaternions."""
     axes = quats[..., 1:]
     twice = 2 * torch.linalg.cross(axes, vectors)
     return vectors + quats[..., :1] * twice + torch.linalg.cross(axes, twice)

@@ -146,7 +146,7 @@ class Gaussians(NamedTuple):
 
 
 class CanonicalGaussians(NamedTuple):
-    """Gaussians tied to the hand's surface: P ride on vertices, then Q on faces; N = P + Q."""
+    """Gaussians bound to the hand's surface: P to vertices, then Q to faces; N = P + Q."""
 
     vertex_index: Int[Tensor, "P"]
     offsets: Float[Tensor, "P 3"]

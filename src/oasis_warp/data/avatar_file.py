@@ -54,10 +54,10 @@ class Entry(NamedTuple):
 
 SHARE = (-UNIT_TOLERANCE, 1 + UNIT_TOLERANCE)
 TENSORS = {
-    # The hand the Gaussians ride on: the hand model that the header names, shaped, plus what the outline adds.
+    # The surface that the Gaussians are bound to: the hand model that the header names, shaped, plus what the outline adds.
     "shape": Entry(torch.float32, ("S",), -10, 10),
     "surface_offsets": Entry(torch.float32, ("V", 3), -0.05, 0.05),
-    # The Gaussians at rest: P ride on vertices, then Q on faces.
+    # The Gaussians at rest: P bound to vertices, then Q to faces.
     "gaussians.vertex_index": Entry(torch.int64, ("P",), 0, MAX_NUMBER),
     "gaussians.offsets": Entry(torch.float32, ("P", 3), -0.1, 0.1),
     "gaussians.face_index": Entry(torch.int64, ("Q",), 0, MAX_NUMBER),

@@ -30,7 +30,7 @@ def attend(
 ) -> tuple[Float[Tensor, "B h L D"], Float[Tensor, "B L E"] | None]:
     """softmax(Q K^T / sqrt(D) + row column^T) V, and the mean over the heads of the same softmax times `extra`.
 
-    The rank-one bias rides in spare dimensions of the queries and keys and `extra` in those of the values, so that
+    The rank-one bias is stored in spare dimensions of the queries and keys and `extra` in those of the values, so that
     no mask of L x S exists and every fused kernel serves. Where inputs are rounded to bfloat16, the bias keeps 16 bits:
     it is split in two, and the kernels add the products up in float32. `column` must be exact in bfloat16.
     """

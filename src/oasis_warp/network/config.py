@@ -10,7 +10,7 @@ MOST = {
     "image_size": 1024, "width": 2048, "heads": 64, "n_tokens": 4096, "n_coarse": 16384, "refine_layers": 32,
     "head_width": 4096, "frequencies": 32, "neighborhood": 15,
 }  # fmt: skip
-"""Largest sizes, a few times the paper's: a weights file may say anything, and memory is taken by what it says."""
+"""Largest sizes, a few times the paper's: a weights file is untrusted, and its sizes determine the memory."""
 MAX_LETTERS = 80
 """Of a profile's name."""
 

@@ -131,7 +131,7 @@ def pose_on_mesh(
     vertex_area_ratio: Float[Tensor, "*B V"] | None = None,
     validate: bool = True,
 ) -> PosedOnMesh:
-    """Gaussians on the faces of a mesh, and on its vertices, carried into its pose (OASIS, MM '26, eq. 7, appendix).
+    """Pose Gaussians that are bound to the faces and vertices of a mesh (OASIS, MM '26, eq. 7, appendix).
 
     On a face, the mean is the barycentric mean of the posed corners. The quaternion is dq * canonical, dq the
     normalised barycentric mean of the corners' rotations, sign-aligned to the corner with the largest weight. The scale

@@ -1,4 +1,4 @@
-// Gaussians that ride on the posed surface (the operator pose_on_mesh): P on vertices, then Q on faces.
+// Gaussians bound to the posed surface (the operator pose_on_mesh): P to vertices, then Q to faces.
 "use strict";
 
 function makeGaussians(body) {

@@ -1,4 +1,4 @@
-// Pose the hand: joint angles -> surface -> Gaussians that ride on it. The formulas are those of the Python operators
+// Pose the hand: joint angles -> surface -> Gaussians bound to it. The formulas are those of the Python operators
 // bone_transforms, skin, face_rotations and pose_on_mesh; quaternions are wxyz, lengths metres.
 "use strict";
 

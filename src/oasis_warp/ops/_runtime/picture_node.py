@@ -80,7 +80,7 @@ class _Tracked:
 
     def __init__(self) -> None:
         self.means2d: Callable[[], Tensor | None] = lambda: None
-        """What `meta` has made, if somebody has looked at it."""
+        """The `means2d` that `meta` has computed, if it was read."""
         self.workspace: Tensor | None = None
 
     def retaining(self) -> Tensor | None:
