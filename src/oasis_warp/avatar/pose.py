@@ -57,9 +57,9 @@ class Lighting(NamedTuple):
 def posed_lighting(
     rest: Float[Tensor, "V 3"], posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], light: HandLight
 ) -> Lighting:
-    """The vertices of a posed surface in `light`; normals are those of the rest surface, turned as Gaussians are.
+    """The vertices of a posed surface in `light`; normals are those of the rest surface, rotated as Gaussians are.
 
-    On the rim of the wrist they are those of its end, whose Gaussians are bound there: its sides would shade it in wedges.
+    On the rim of the wrist they are those of its end, to which Gaussians are bound: its sides would shade it in wedges.
     """
     vertex_quats = face_rotations(rest, posed, faces, validate=False).vertex_quats
     return lighting(posed, vertex_quats, surface.closed_normals(rest, faces), light)

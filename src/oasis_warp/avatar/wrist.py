@@ -41,7 +41,7 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     """The same hand with an end: priors let opacity fade out towards the wrist, because photos show an arm there.
 
     Gaussians in the second half of the fade are replaced by opaque ones on every vertex and face; the others become as
-    opaque as they were before the fade. The cap's Gaussians are bound to the rim's vertices. All have the colours of the
+    opaque as they were before the fade. The cap's Gaussians are bound to rim vertices. All have the colours of the
     nearest Gaussians before the fade.
 
     Args:

@@ -54,7 +54,7 @@ class Entry(NamedTuple):
 
 SHARE = (-UNIT_TOLERANCE, 1 + UNIT_TOLERANCE)
 TENSORS = {
-    # The surface that the Gaussians are bound to: the hand model that the header names, shaped, plus what the outline adds.
+    # The surface that Gaussians are bound to: the shaped hand model of the header, plus what the outline adds.
     "shape": Entry(torch.float32, ("S",), -10, 10),
     "surface_offsets": Entry(torch.float32, ("V", 3), -0.05, 0.05),
     # The Gaussians at rest: P bound to vertices, then Q to faces.
