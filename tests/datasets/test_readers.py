@@ -163,6 +163,7 @@ DAMAGE = {
     "row cut": ("hanco", _json("shape/0003/00000000.json", lambda v: v.pop()), "trans: expected 3 numbers"),
     "mano cut": ("freihand", _json("training_mano.json", lambda v: v[0][0].pop()), "mano: expected 61 numbers"),
     "K turned": ("freihand", _json("training_K.json", lambda v: v.__setitem__(0, [1, 2])), "K: expected 3 x 3"),
+    "K of zeros": ("freihand", _json("training_K.json", lambda v: v.__setitem__(0, [[0] * 3] * 3)), "no camera"),
     "scale 0": ("freihand", _json("training_mano.json", lambda v: v[0][0].__setitem__(60, -9.0)), "does not see"),
     "no mask": ("freihand", lambda r: (r / "training/mask/00000000.jpg").unlink(), "the mask 00000000.jpg is missing"),
     "meta cut": ("ho3d", lambda r: (r / "train/ABF10/meta/0000.pkl").write_bytes(b"\x80\x02}"), "no pickle of plain"),

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from oasis_warp.core import pickle_reader
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_hand
 from oasis_warp.core.types import HandFit, Landmarks, Photo
-from oasis_warp.estimation import mano_estimates
 from oasis_warp.estimation.keypoints import read_keypoints
 from oasis_warp.estimation.mano_estimates import full_camera, pose_of, read_estimate
 from oasis_warp.hand.mano import ManoPose, mano_surface, read_mano, rotation_vectors, rotations
@@ -200,7 +200,7 @@ def test_a_file_that_is_none_is_refused(kind, suffix, mano_dir, photo, tmp_path)
 
 
 def test_an_archive_that_unpacks_without_end_is_refused_before_it_does(photo, tmp_path, monkeypatch):
-    monkeypatch.setattr(mano_estimates, "MAX_BYTES", 1 << 20)
+    monkeypatch.setattr(pickle_reader, "MAX_BYTES", 1 << 20)
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("right.npy", bytes(3 << 20))
     with pytest.raises(InputError, match="unpacks to more than 1 MB"):

@@ -1,7 +1,16 @@
 """A few damaged files of every kind; `long_run.py` beside this reads thousands."""
 
+import os
+
 import pytest
 from fuzz import targets
+
+from oasis_warp.core.errors import InputError
+from oasis_warp.data.photo import read_photo
+from oasis_warp.data.splat_files import read_splats
+from oasis_warp.datasets.readers import read_selection
+from oasis_warp.hand_avatar import Avatar
+from oasis_warp.motion import read_motion
 
 SEED = 2026
 
@@ -50,3 +59,17 @@ def test_damaged_pictures_are_refused_in_one_sentence_or_read(tmp_path):
 @pytest.mark.timeout(60)
 def test_damaged_requests_are_answered_or_refused(tmp_path):
     assert outcomes(targets.requests(tmp_path), 150, tmp_path) == {"refused", "taken"}
+
+
+READERS = {
+    ".png": read_photo, ".safetensors": Avatar.load, ".ply": read_splats, ".splat": read_splats, ".spz": read_splats,
+    ".bvh": lambda path: read_motion(path, targets.small_avatar(lit=False)), ".json": read_selection,
+}  # fmt: skip
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("suffix", READERS)
+def test_no_reader_waits_for_a_pipe(suffix, tmp_path):
+    os.mkfifo(tmp_path / f"a{suffix}")
+    with pytest.raises(InputError):
+        READERS[suffix](tmp_path / f"a{suffix}")

@@ -1,6 +1,8 @@
 """What other programs write, or a video shows, comes back as the joint angles that it was made from."""
 
 import json
+import os
+import zipfile
 
 import cv2
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 import torch
 
 from oasis_warp.assets import asset
-from oasis_warp.core import rotation
+from oasis_warp.core import pickle_reader, rotation
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandPose
 from oasis_warp.data.videos import write_video
@@ -254,8 +256,9 @@ def test_fingers_point_where_those_of_a_skeleton_with_bent_fingers_at_rest_point
         ("a.json", json.dumps({"orientations": [[[0, 0, 0, 1]] * 21]}).encode(), "orientations of shape"),
         ("a.json", json.dumps({"orientations": [[[0, 0, 0, 0]] * 25]}).encode(), "leave out frames"),
         ("a.json", json.dumps({"side": "up", "angles": ANGLES.tolist()}).encode(), "the side left or right"),
-        ("a.npz", b"no zip", "not a motion"),
-        ("a.npz", b"PK\x03\x04 cut", "not a motion"),
+        ("a.npz", b"no zip", "expected arrays of numbers"),
+        ("a.npz", b"PK\x03\x04 cut", "expected arrays of numbers"),
+        ("a.json", b'{"hand_pose": [[]]}', "one frame or more"),
         ("a.bvh", b"HIERARCHY", "HIERARCHY and MOTION are expected"),
         ("a.bvh", b"HIERARCHY ROOT a { OFFSET 0 0 } MOTION Frames: 1 Frame Time: 1 ", "not a motion"),
         ("a.bvh", b"HIERARCHY ROOT a { CHANNELS 1 Xrotation } MOTION\nFrames: 2\nFrame Time: .1\n1", "2 frames of 1"),
@@ -267,6 +270,18 @@ def test_what_is_no_motion_is_refused_in_one_sentence(tmp_path, avatars, name, c
     with pytest.raises(InputError, match=expected) as error:
         read_motion(tmp_path / name, avatars["left"])
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.timeout(20)
+def test_a_motion_that_unpacks_without_end_and_a_pipe_are_refused(tmp_path, avatars, monkeypatch):
+    # A few MB of zeros took gigabytes, and a pipe was waited for.
+    monkeypatch.setattr(pickle_reader, "MAX_BYTES", 1 << 20)
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("hand_pose.npy", bytes(3 << 20))
+    os.mkfifo(tmp_path / "pipe.json")
+    for name, words in (("bomb.npz", "unpacks to more than 1 MB"), ("pipe.json", "a device or a pipe")):
+        with pytest.raises(InputError, match=words):
+            read_motion(tmp_path / name, avatars["left"])
 
 
 def closing(avatar, n, fps=30.0):

@@ -1,13 +1,16 @@
-"""Numbers out of pickles without executing them: MANO's model files, and what hand estimators write.
+"""Numbers out of pickles and .npz without executing them: MANO's model files, motions, what hand estimators write.
 
 A pickle is a program for a stack machine. The machine here has only the instructions that build plain values, and of
 all names in a file it knows the few that stand for arrays. Nothing is imported or called, whatever a file says.
 """
 
+import io
 import pickle
 import pickletools
 import re
-from collections.abc import Callable
+import zipfile
+import zlib
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,6 +77,36 @@ def read_pickle(path: Path | str, what: str, content: bytes | None = None) -> An
             AttributeError, pickle.UnpicklingError) as error:  # fmt: skip
         reason = shortened(str(error).rstrip(".")) or type(error).__name__
         raise InputError(f"{path}: expected {what}, got no pickle of plain arrays ({reason}); get it again.") from error
+
+
+def read_npz(path: Path, names: Container[str] | None = None, content: bytes | None = None) -> dict[str, Any]:
+    """Arrays of an .npz, by name.
+
+    Args:
+        path: The file.
+        names: Of those that are read; all when not given.
+        content: Its bytes, where they lie elsewhere; `path` is for messages then.
+
+    Raises:
+        InputError: no such file, more than `MAX_BYTES` when unpacked, damaged, or arrays of other things than numbers.
+    """
+
+    def opened() -> Path | io.BytesIO:
+        return path if content is None else io.BytesIO(content)
+
+    try:
+        with zipfile.ZipFile(opened()) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
+                raise InputError(f"{path}: unpacks to more than {MAX_BYTES >> 20} MB; give less of it.")
+        with np.load(opened(), allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files if names is None or name in names}
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the name.") from error
+    except InputError:
+        raise
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError,
+            RuntimeError, SyntaxError, TypeError, zlib.error, OverflowError, MemoryError) as error:  # fmt: skip
+        raise InputError(f"{path}: expected arrays of numbers in an .npz, got something else; save again.") from error
 
 
 def _content(path: Path, what: str) -> bytes:

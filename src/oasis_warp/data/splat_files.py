@@ -50,6 +50,8 @@ def read_splats(path: Path | str) -> Gaussians:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: expected Gaussians in {', '.join(READERS)}; convert the file.")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: cannot be read (a folder, a device or a pipe); give a file.")
     try:
         if (size := path.stat().st_size) > MAX_BYTES:
             raise InputError(f"{path}: expected at most {MAX_BYTES >> 20} MB, got {size >> 20} MB; thin it out.")

@@ -39,6 +39,8 @@ class File(NamedTuple):
         Raises:
             InputError: it cannot be read, or is shorter than it was.
         """
+        if self.path.exists() and not self.path.is_file():
+            raise InputError(f"{self.path}: cannot be read (a folder, a device or a pipe); give a file.")
         try:
             if self.size is None:
                 return self.path.read_bytes()

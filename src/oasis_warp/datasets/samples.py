@@ -20,8 +20,8 @@ from oasis_warp.hand.mano import ManoModel, ManoPose, mano_surface, mirror_mano_
 
 MARGIN = 1.3
 """Side of the crop over the longer side of the box; the paper's."""
-MIN_BOX, FARTHEST = 8.0, 100.0
-"""Smallest box [px] and most distant hand [m] that are taken."""
+MIN_BOX, MAX_BOX, FARTHEST = 8.0, 1e5, 100.0
+"""Smallest and largest box [px] and most distant hand [m] that are taken."""
 Models = dict[Side, ManoModel]
 
 
@@ -85,6 +85,8 @@ class Catalogue:
             raise InputError(f"{sample.name}: the photo {sample.image.path.name} is missing.")
         if sample.mask is not None and not sample.mask.exists:
             raise InputError(f"{sample.name}: the mask {sample.mask.path.name} is missing.")
+        if not (np.array_equal(sample.K[2], [0, 0, 1]) and sample.K[0, 0] > 0 and sample.K[1, 1] > 0):
+            raise InputError(f"{sample.name}: its K is no camera's.")
         xy = projected(sample, models)[1]
         if sample.box is not None and (xy.max(0) < sample.box[:2]).any():
             raise InputError(f"{sample.name}: the hand lies outside its box.")
@@ -181,8 +183,8 @@ def load_picture(sample: Sample, models: Models, size: int, margin: float = MARG
         xy = projected(sample, models)[1]
         box = np.concatenate([xy.min(0), np.ptp(xy, axis=0)])
     side = margin * float(max(box[2:]))
-    if side < MIN_BOX:
-        raise InputError(f"{sample.name}: a box of {side:.0f} pixels is too small.")
+    if not MIN_BOX <= side <= MAX_BOX:
+        raise InputError(f"{sample.name}: a box of {side:.0f} pixels is too {'small' if side < MIN_BOX else 'large'}.")
     left, top = (float(v) for v in box[:2] + box[2:] / 2 - side / 2)
     left, top, side = left * photo.shrink, top * photo.shrink, side * photo.shrink
     image = resample_square(photo.rgb.float() / 255, left, top, side, size).clamp(0, 1)

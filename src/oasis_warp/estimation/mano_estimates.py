@@ -4,9 +4,6 @@ All of them estimate a right hand; the crop of a left one is mirrored before. Wi
 and camera are taken as they are. With the bundled hand their 21 points are, and it is fitted to these.
 """
 
-import io
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -17,7 +14,7 @@ import torch
 from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
 from oasis_warp.core.mirror import mirror_pose
-from oasis_warp.core.pickle_reader import MAX_BYTES, read_pickle
+from oasis_warp.core.pickle_reader import read_npz, read_pickle
 from oasis_warp.core.types import Camera, HandPose, Landmarks, Photo, Side
 from oasis_warp.hand.mano import ManoPose, rotation_vectors
 from oasis_warp.hand.mano_hand import hand_pose_of_mano
@@ -160,23 +157,7 @@ def pose_of(path: Path, found: Estimate, hand: HandModel, photo: Photo) -> tuple
 def _load(path: Path, content: bytes | None) -> Any:
     if path.suffix != ".npz":
         return read_pickle(path, "an estimator's hands", content)
-
-    def opened() -> Path | io.BytesIO:
-        return path if content is None else io.BytesIO(content)
-
-    try:
-        with zipfile.ZipFile(opened()) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
-                raise InputError(f"{path}: unpacks to more than {MAX_BYTES >> 20} MB; give the output of one photo.")
-        with np.load(opened(), allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the name.") from error
-    except InputError:
-        raise
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError,
-            RuntimeError, SyntaxError, TypeError, zlib.error, OverflowError, MemoryError) as error:  # fmt: skip
-        raise InputError(f"{path}: expected arrays of numbers in an .npz, got something else; save again.") from error
+    return read_npz(path, content=content)
 
 
 def _flat(entries: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,6 @@ our rest pose.
 
 import json
 import os
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.mirror import mirror_hand, mirror_points
+from oasis_warp.core.pickle_reader import read_npz
 from oasis_warp.core.types import PosedHand, Side
 from oasis_warp.hand import mano
 from oasis_warp.hand.template import MANO_DIR
@@ -108,6 +108,8 @@ def read_mano(
     components = get(*COMPONENTS)
     pose = pose[None] if pose.shape in ((45,), (48,), (15, 3), (15, 3, 3)) else pose
     frames = len(pose)
+    if not pose.numel():
+        raise ValueError("one frame or more is expected")
     if pose.shape[1:] != (15, 3, 3):
         pose = pose.reshape(frames, -1)
         if pose.shape[1] == 48:
@@ -177,6 +179,8 @@ def read_motion(path: Path | str, avatar: Avatar, *, progress: Progress = silent
         from oasis_warp.motion.recording import follow_video  # with the estimator's networks, which nothing else needs
 
         return follow_video(path, avatar, progress=progress)
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: cannot be read (a folder, a device or a pipe); give a file.")
     try:
         if (size := path.stat().st_size) > MAX_BYTES:
             raise InputError(f"{path}: expected at most {MAX_BYTES >> 20} MB, got {size >> 20} MB; cut the file.")
@@ -184,12 +188,12 @@ def read_motion(path: Path | str, avatar: Avatar, *, progress: Progress = silent
             skeleton = read_bvh(path.read_text(encoding="utf-8", errors="replace"))
             motion = Motion(hand_angles(*avatar.parts[:2], skeleton, avatar.side), skeleton.fps)
         else:
-            motion = _from_numbers(_read_json(path) if kind == ".json" else _read_npz(path), avatar)
+            motion = _from_numbers(_read_json(path) if kind == ".json" else read_npz(path, READ), avatar)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
     except InputError:
         raise
-    except (ValueError, TypeError, KeyError, zipfile.BadZipFile, RecursionError, OverflowError, EOFError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
         raise InputError(f"{path}: not a motion ({_first_line(error)}); see docs/viewing.md for what is.") from error
     return _checked(path, motion)
 
@@ -260,8 +264,3 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not isinstance(stored, dict):
         raise ValueError(f"a JSON object, not a {type(stored).__name__}, is wanted")
     return stored
-
-
-def _read_npz(path: Path) -> dict[str, Any]:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-        return {name: stored[name] for name in READ & set(stored.files)}
