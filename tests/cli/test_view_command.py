@@ -136,6 +136,7 @@ def test_files_without_gaussians_are_refused_in_one_sentence(tmp_path, capsys):
         "cloud.ply": (ply % b"binary_little_endian" + bytes(12), "a point cloud without rot_0"),
         "text.ply": (ply % b"ascii" + b"0 0 0", "binary_little_endian is read, not ascii"),
         "cut.ply": (ply % b"binary_little_endian", "no Gaussians can be read"),
+        "huge.ply": (ply.replace(b"vertex 1", b"vertex 99999999999999999999") % b"binary_little_endian", "do not fit"),
         "odd.splat": (bytes(33), "rows of 32 bytes"),
         "empty.splat": (b"", "expected 1 to"),
         "flat.splat": (bytes(32), "got 0 of 1"),

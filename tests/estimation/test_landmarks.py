@@ -269,6 +269,7 @@ def test_a_pose_elsewhere_is_warned_about(fitted, tmp_path):
         ({"xy": [[10**400, 0]] * 21}, r'"xy" must be 21 x 2 numbers'),
         ({"xy": [[True, False]] * 21}, r'"xy" must be 21 x 2 numbers'),
         ({"world": [[0, 0, 1e6]] * 21}, r'"world" must be 21 x 3 numbers from -1 to 1'),
+        ({"world": [[0.1, 0, 0.2]] * 21}, r'"world": all points lie within 10 mm'),
         ({"side": "\x1b[31m" * 10_000}, r'"side" must be "left" or "right"'),
         ({"k" * 10_000: 1}, "is not known here"),
         ({"world": [[0, 0]] * 21}, r'"world" must be 21 x 3 numbers'),

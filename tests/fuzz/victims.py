@@ -27,11 +27,14 @@ from oasis_warp.data.output_files import output_folder, write_file
 
 PHOTO = Path(__file__).parents[2] / "src" / "oasis_warp" / "assets" / "photos" / "palm_open_left_02.png"
 SMALL = ["--size", "64", "--steps", "2"]
-TRAINING = ["--hands", "1", "--views", "1", "--people", "1", "--size", "32", "--steps", "6", "--workers", "0",
+STEPS = 6
+TRAINING = ["--hands", "1", "--views", "1", "--people", "1", "--size", "32", "--steps", str(STEPS), "--workers", "0",
             "--device", "cpu", "--precision", "float32"]  # fmt: skip
 SIGNALS = ("SIGKILL", "SIGTERM", "SIGINT")
 PATIENCE = 300.0
 """Seconds in which a run must end after Ctrl-C, and one that nothing stops."""
+NOT_LOADED = 1
+"""Exit code of a program that could not be loaded, say with too few descriptors."""
 TRACEBACK = 70
 """Exit code of a run that ended with a traceback."""
 PHOTOS_OF_BATCH = 2
@@ -188,7 +191,7 @@ def stop(process: int, fault: str, seconds: float) -> str:
         os.kill(process, signal.SIGKILL)
         os.waitpid(process, 0)
         return "hang"
-    if code == BAD_INPUT and not signalled:
+    if code in (BAD_INPUT, NOT_LOADED) and not signalled:
         return "stopped"
     return "ended" if code == 0 else f"exit code {code} after {fault}"
 
@@ -215,9 +218,18 @@ def hidden(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.rglob("*") if path.name.startswith(".") or path.parent.name == "tries")
 
 
+def is_of_an_earlier_step(path: Path) -> bool:
+    """Whether a file holds the weights of a training that was stopped, which are no output yet."""
+    if path.name != "network.safetensors":
+        return False
+    with safe_open(path, framework="np") as file:
+        return json.loads(json.loads(file.metadata()["oasis-network"])["notes"])["step"] < STEPS
+
+
 def digests(folder: Path, names: frozenset[str]) -> dict[str, str]:
-    """Digests of files that exist."""
+    """Digests of files that exist and are done."""
     found = [path for name in names for path in folder.glob(name) if path.is_file()]
+    found = [path for path in found if not is_of_an_earlier_step(path)]
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
 
 

@@ -101,6 +101,8 @@ def _ply_elements(data: bytes) -> dict[str, np.ndarray]:
                 raise ValueError(f"a column is unknown: {line}")
     elements = {}
     for name, count, columns in layout:
+        if count > len(body):
+            raise ValueError(f"{count} of {shortened(name)} do not fit into the file")
         elements[name] = np.frombuffer(body, np.dtype(columns), count) if count else np.zeros(0, np.dtype(columns))
         body = body[elements[name].nbytes :]
     return elements

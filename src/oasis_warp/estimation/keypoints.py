@@ -36,6 +36,8 @@ FAR_OUT = 1.0
 """Farthest landmark beyond the border of the photo, over its longer side: a hand may be cut, not far away."""
 MIN_PIXELS = 8
 """Least extent of a hand, of which nothing can be seen below [px of the photo as read]."""
+MIN_WORLD = 0.01
+"""Least extent of the points of `world` [m]: a fist has a few times as much."""
 FOCALS = (0.05, 1000.0)
 """Least and greatest focal length over the photo's longer side: a fisheye, and a crop from far away."""
 DEPTHS = (0.02, 100.0)
@@ -91,6 +93,9 @@ def _landmarks(path: Path, data: dict[str, Any], side: Side, photo: Photo) -> La
     xy = _numbers(path, data, "xy", (21, 2)) * photo.shrink
     _check_points(f'{path}: "xy"', xy, photo)
     world = _numbers(path, data, "world", (21, 3), REACH) if "world" in data else None
+    if world is not None and np.ptp(world, axis=0).max() < MIN_WORLD:
+        least = f"{1000 * MIN_WORLD:.0f} mm"
+        raise InputError(f'{path}: "world": all points lie within {least}; give those of a hand, in metres.')
     return Landmarks(real(xy), None if world is None else real(world), side, 1.0, 1.0, "file")
 
 
