@@ -72,7 +72,8 @@ def measure(python: str, torch: str) -> Row:
                     break
             lines = [line for line in (done.stdout + "\n" + done.stderr).splitlines() if line.strip()] or [""]
             wrong = next((line for line in lines if line.startswith("FAIL ")), lines[-1])
-            row[step] = "yes" if done.returncode == 0 else f"no: {' '.join(wrong.split())[:150]}"
+            said = " ".join(wrong.removeprefix("FAIL").split(";")[0].split())[:150]
+            row[step] = "yes" if done.returncode == 0 else f"no: {said}"
             if step == "tests" and (counts := re.findall(r"\d+ (?:passed|failed|error)", "\n".join(lines[-3:]))):
                 row[step] = ", ".join(counts)
             if done.returncode:
