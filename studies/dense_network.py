@@ -20,8 +20,7 @@ from oasis_warp.estimation.pixel_reading import read_pixels
 from oasis_warp.network.dense_network import HAND, DenseNetwork, DensePrediction, load_dense_network, read_dense_header
 from oasis_warp.pretraining.dense_trainer import DensePhotos, detected
 from oasis_warp.synthetic.dense_pictures import UNIT, DenseBatch, render_dense
-from oasis_warp.synthetic.shot_table import sample_table
-from oasis_warp.synthetic.shots import SceneConfig, cached_identity
+from oasis_warp.synthetic.shots import SceneConfig, cached_identity, sample_table
 from studies.harness import Row, StudyOptions, measured
 from studies.inputs import estimator, iou, photo_named
 from studies.tables import Column, Section, distribution, markdown, mean, percentiles, write_jpeg

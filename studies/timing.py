@@ -13,8 +13,7 @@ import torch
 
 from oasis_warp.synthetic import picture
 from oasis_warp.synthetic.people import person
-from oasis_warp.synthetic.shot_table import sample_table
-from oasis_warp.synthetic.shots import EVERYBODY, PHOTOS, PICTURES_EACH
+from oasis_warp.synthetic.shots import EVERYBODY, PHOTOS, PICTURES_EACH, sample_table
 from studies.harness import Row, StudyOptions, measured
 from studies.tables import Column, Section, table
 

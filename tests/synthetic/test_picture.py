@@ -13,8 +13,16 @@ from oasis_warp.synthetic import people
 from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.picture import render_batch, stream
 from oasis_warp.synthetic.sensor import expose, jpeg, sample_sensor, sensor_row, srgb
-from oasis_warp.synthetic.shot_table import concatenate_tables, sample_table, sample_tables_ahead
-from oasis_warp.synthetic.shots import EVERYBODY, PHOTOS, PICTURES_EACH, SceneConfig, sample_shot
+from oasis_warp.synthetic.shots import (
+    EVERYBODY,
+    PHOTOS,
+    PICTURES_EACH,
+    SceneConfig,
+    concatenate_tables,
+    sample_shot,
+    sample_table,
+    sample_tables_ahead,
+)
 
 SIZE = 64
 SEED = 13

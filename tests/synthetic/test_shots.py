@@ -19,15 +19,16 @@ from oasis_warp.synthetic.ops.skin_shading import sky_transfer, surface_state
 from oasis_warp.synthetic.ops.surface_patterns import NoiseField, pixel_noise, point_grid, surface_dabs, surface_noise
 from oasis_warp.synthetic.ops.views import Lamps
 from oasis_warp.synthetic.picture import render_batch, render_capture
-from oasis_warp.synthetic.shot_table import arm_rotations, tabulate
 from oasis_warp.synthetic.shots import (
     EVERYBODY,
     PHOTOS,
     PICTURES_EACH,
     SceneConfig,
+    arm_rotations,
     capture_shots,
     sample_shot,
     sample_shots,
+    tabulate,
 )
 from oasis_warp.synthetic.view_and_light import (
     ARM_CONE,

@@ -17,8 +17,7 @@ from oasis_warp.data.pictures import write_picture
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.text.conditioning import keypoints, make_conditioning, write_conditioning
-from oasis_warp.text.generators import choose_generator
-from oasis_warp.text.imagine import imagine
+from oasis_warp.text.generators import choose_generator, imagine
 
 SIZES = (256, 4096)
 """Least and most pixels of a side."""

@@ -19,15 +19,16 @@ from oasis_warp.pretraining.objective import true_pictures
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS, seeded
 from oasis_warp.pretraining.training_batch import EstimatorNoise, training_batch
 from oasis_warp.synthetic.picture import SyntheticBatch, render_capture, render_table, slice_batch
-from oasis_warp.synthetic.shot_table import ShotTable, tabulate
 from oasis_warp.synthetic.shots import (
     EVERYBODY,
     PICTURES_EACH,
     SceneConfig,
     Shot,
+    ShotTable,
     camera_rotation,
     capture_shots,
     sample_shots,
+    tabulate,
 )
 from oasis_warp.synthetic.view_and_light import diffuse_light, sample_light
 from oasis_warp.synthetic.wardrobe import sample_clothes

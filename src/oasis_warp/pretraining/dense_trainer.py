@@ -25,8 +25,7 @@ from oasis_warp.pretraining.pretrain import StepResult, Trainer
 from oasis_warp.pretraining.synthetic_source import SyntheticSource, seeded
 from oasis_warp.synthetic.dense_pictures import DenseBatch, moved, render_dense
 from oasis_warp.synthetic.sensor import srgb
-from oasis_warp.synthetic.shot_table import sample_tables_ahead
-from oasis_warp.synthetic.shots import SceneConfig
+from oasis_warp.synthetic.shots import SceneConfig, sample_tables_ahead
 
 WEIGHTS = {"classes": 1.0, "surface": 0.3, "normal": 0.5, "albedo": 2.0, "edges": 1.0, "finger": 0.1}
 """Weights of the terms of the loss."""

@@ -16,8 +16,7 @@ from oasis_warp.pretraining.training_batch import training_batch
 from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.people import bake_people
 from oasis_warp.synthetic.picture import SyntheticBatch, render_table, slice_batch
-from oasis_warp.synthetic.shot_table import concatenate_tables, sample_tables_ahead
-from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH, SceneConfig
+from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH, SceneConfig, concatenate_tables, sample_tables_ahead
 
 ERROR_STREAM = 3
 """Stream number of the estimator's errors, beside those of identities and pictures with the same seed."""

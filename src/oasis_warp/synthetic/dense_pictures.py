@@ -10,8 +10,7 @@ from torch.nn.functional import affine_grid, avg_pool2d, grid_sample
 from oasis_warp.synthetic.body import FINGERS, body_on, device_name
 from oasis_warp.synthetic.disturbances import disturb
 from oasis_warp.synthetic.picture import SAMPLES, ShadedBatch, scene_light, shade_batch, take_photo
-from oasis_warp.synthetic.shot_table import ShotTable
-from oasis_warp.synthetic.shots import SceneConfig
+from oasis_warp.synthetic.shots import SceneConfig, ShotTable
 
 UNIT = 0.1
 """Length that a surface coordinate of 1 stands for [m]."""

@@ -12,7 +12,7 @@ from oasis_warp.synthetic.body import Body
 from oasis_warp.synthetic.ops.skin_shading import sky_transfer
 from oasis_warp.synthetic.ops.views import Lamps
 from oasis_warp.synthetic.posing import PosedPeople
-from oasis_warp.synthetic.shot_table import ShotTensors
+from oasis_warp.synthetic.shots import ShotTensors
 from oasis_warp.synthetic.view_and_light import sphere
 
 SKY_DIRECTIONS, SKY_SIZE = 40, 112

@@ -25,7 +25,9 @@ from oasis_warp.synthetic.ops.views import Lamps
 from oasis_warp.synthetic.people import Person, person
 from oasis_warp.synthetic.posing import PosedPeople, pose_people
 from oasis_warp.synthetic.sensor import develop, expose, meter, srgb
-from oasis_warp.synthetic.shot_table import (
+from oasis_warp.synthetic.shots import (
+    PHOTOS,
+    SceneConfig,
     ShotTable,
     ShotTensors,
     copy_to,
@@ -33,7 +35,6 @@ from oasis_warp.synthetic.shot_table import (
     sample_tables_ahead,
     shot_tensors,
 )
-from oasis_warp.synthetic.shots import PHOTOS, SceneConfig
 
 SAMPLES = 2
 """Sub-pixels along a pixel's side."""

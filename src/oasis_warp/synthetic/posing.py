@@ -11,7 +11,7 @@ from torch import Tensor
 from oasis_warp.synthetic.body import Body, arm_rows
 from oasis_warp.synthetic.ops.batched_lbs import batched_lbs
 from oasis_warp.synthetic.people import Person
-from oasis_warp.synthetic.shot_table import ShotTensors
+from oasis_warp.synthetic.shots import ShotTensors
 from oasis_warp.synthetic.wardrobe import HIDDEN_POSITION, bands, sleeves
 
 _LAST_JOINTS = (15, 3, 6, 12, 9)

@@ -4,4 +4,4 @@ from oasis_warp.text.conditioning import Conditioning as Conditioning
 from oasis_warp.text.conditioning import make_conditioning as make_conditioning
 from oasis_warp.text.generators import Generator as Generator
 from oasis_warp.text.generators import choose_generator as choose_generator
-from oasis_warp.text.imagine import imagine as imagine
+from oasis_warp.text.generators import imagine as imagine
