@@ -61,6 +61,13 @@ def test_damaged_requests_are_answered_or_refused(tmp_path):
     assert outcomes(targets.requests(tmp_path), 150, tmp_path) == {"refused", "taken"}
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("name", ["mano", "data_sets"])
+def test_damaged_models_and_annotations_are_refused_in_one_sentence_or_read(name, tmp_path):
+    assert outcomes(getattr(targets, name)(tmp_path), 40, tmp_path) <= {"refused", "taken"}
+
+
 READERS = {
     ".png": read_photo, ".safetensors": Avatar.load, ".ply": read_splats, ".splat": read_splats, ".spz": read_splats,
     ".bvh": lambda path: read_motion(path, targets.small_avatar(lit=False)), ".json": read_selection,

@@ -347,7 +347,7 @@ def test_the_same_hand_gets_the_same_points(hand, coarse_points):
 
 
 def test_more_points_than_vertices_are_refused(hand):
-    with pytest.raises(ValueError, match="n_coarse: expected at most 12337, the vertices of the hand, got 12338"):
+    with pytest.raises(ValueError, match="n_coarse: expected 16 to 12337, the vertices of the hand, got 12338"):
         place_coarse_points(hand, 12_338)
 
 

@@ -297,6 +297,10 @@ def many_points(header):
     header["config"]["n_coarse"] = 12_338
 
 
+def few_points(header):
+    header["config"]["n_coarse"] = 15
+
+
 def many_layers(header):
     header["config"]["refine_layers"] = 30
     header["config"]["width"] = 2048
@@ -323,7 +327,8 @@ def whole_numbers(tensors):
     [
         (many_tokens, None, "n_tokens: expected a whole number from 1 to 4096, got 6000000"),
         (odd_size, None, "no network known here .image_size: expected a multiple of 16, got 250"),
-        (many_points, None, "no network known here .n_coarse: expected a"),
+        (many_points, None, "no network known here .n_coarse: expected 16 to"),
+        (few_points, None, "no network known here .n_coarse: expected 16 to"),
         (many_layers, None, "holds fewer weights than the network that its header describes; copy it again"),
         (true_layers, None, "refine_layers: expected a whole number from 1 to 32, got True"),
         (half_a_version, None, "damaged, its header has no valid version"),

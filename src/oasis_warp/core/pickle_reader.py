@@ -8,6 +8,7 @@ import io
 import pickle
 import pickletools
 import re
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Container
@@ -70,7 +71,9 @@ def read_pickle(path: Path | str, what: str, content: bytes | None = None) -> An
     path = Path(path)
     content = _content(path, what) if content is None else content
     try:
-        return _plain(_run(content), 0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of odd escapes in texts, from the decoder
+            return _plain(_run(content), 0)
     except InputError:
         raise
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, EOFError, MemoryError, RecursionError,

@@ -245,10 +245,10 @@ def place_coarse_points(hand: HandModel, count: int) -> CoarsePoints:
     nor the neighbouring finger is near.
 
     Raises:
-        ValueError: more points than vertices.
+        ValueError: more points than vertices, or fewer than a neighbourhood has.
     """
-    if count > len(hand.template):
-        raise ValueError(f"n_coarse: expected at most {len(hand.template)}, the vertices of the hand, got {count}.")
+    if not POOLED <= count <= len(hand.template):
+        raise ValueError(f"n_coarse: expected {POOLED} to {len(hand.template)}, the vertices of the hand, got {count}.")
     normals = surface.vertex_normals(hand.template.double(), hand.faces)
     places = torch.cat([hand.template.double() / POINT_LENGTH, normals, hand.weights.double()], dim=1)
     index, squared = _spread(places, count)
