@@ -18,10 +18,10 @@ Thumb = tuple[float, float, float, float, float]
 """Flexion, abduction and twist of the thumb's base, flexion of its two outer joints [degrees]."""
 
 _FIST: dict[str, Finger] = {
-    "index": (80, 98, 62, 4),
-    "middle": (82, 100, 64, 1),
-    "ring": (82, 99, 64, -2),
-    "little": (80, 96, 62, -5),
+    "index": (79, 98, 64, 4),
+    "middle": (82, 95, 63, 1),
+    "ring": (81, 98, 64, -1),
+    "little": (79, 94, 57, -5),
 }
 
 # Flexion is relative to a straight finger. Abduction, and all angles of the thumb's base, are relative to rest and
@@ -34,7 +34,7 @@ _THUMBS: dict[str, Thumb] = {
     "pinch": (35, 10, -10, 2, 5),
     "thumbs_up": (-12, 18, 0, 0, -6),
     "victory": (38, 21, -16, 40, 45),
-    "point": (21, 21, -22, 44, 50),
+    "point": (20, 22, -23, 44, 49),
     "ok": (32, 10, -11, 13, 12),
 }
 

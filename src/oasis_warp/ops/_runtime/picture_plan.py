@@ -131,8 +131,8 @@ class Plan:
         means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds = _contiguous(scene)
         workspace = torch.empty(self._size_with_kept if keep else self._size, dtype=torch.uint8, device=self.device)
         base = workspace.data_ptr()
-        counters = _polled.counters
-        values, report = counters.values, counters.address
+        polled = _polled.counters
+        values, report = polled.values, polled.address
         values[0] = values[1] = -1
         values[2] = 0
         bad = report + 16 if validate else 0
@@ -188,7 +188,7 @@ class Plan:
                     options.height, order, *self._kept(base, keep), keys.data_ptr(), image.data_ptr(),
                     alphas.data_ptr(),
                 )  # fmt: skip
-                counters.wait(self._index)
+                polled.wait(self._index)
                 counts = Counts(values[0], values[1])
                 if values[2]:
                     return None
