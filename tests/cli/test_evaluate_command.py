@@ -150,7 +150,7 @@ def hands(scene, made, tmp_path, monkeypatch):
         else:
             path.write_text("nothing to see")
     for module in (same_hand, reconstruction):
-        monkeypatch.setattr(module, "HandEstimator", lambda hand: KnownEstimator(scene[1]))
+        monkeypatch.setattr(module, "HandEstimator", lambda *_: KnownEstimator(scene[1]))
     return folder
 
 
@@ -179,7 +179,7 @@ def test_photos_of_the_same_hand_are_measured_and_the_run_is_not_done_twice(hand
     files = {"evaluation.json", "metrics.json", "sheet.png", "hands", "commands.txt"}
     assert {path.name for path in out.iterdir()} == files
     assert (out / "commands.txt").read_text().startswith("oasis evaluate --dataset same-hand ")
-    monkeypatch.setattr(same_hand, "HandEstimator", lambda hand: pytest.fail("measured again"))
+    monkeypatch.setattr(same_hand, "HandEstimator", lambda *_: pytest.fail("measured again"))
     assert main(arguments) == 0
     assert json.loads((out / "metrics.json").read_text()) == found
 
@@ -205,7 +205,7 @@ def test_looks_are_measured_and_drawn_and_the_run_is_not_done_twice(hands, scene
     monkeypatch.setattr(looks, "reconstruct", ship)
     for module in (look_measures, real_hands):
         monkeypatch.setattr(module, "hand_features", lambda image, mask: {"half": [0.0]})  # takes seconds
-    monkeypatch.setattr(looks, "HandEstimator", lambda hand: KnownEstimator(fit))
+    monkeypatch.setattr(looks, "HandEstimator", lambda *_: KnownEstimator(fit))
     for name in ("first.png", "no_hand.png"):
         (hands / name).write_bytes((hands / "mine" / "a.png").read_bytes())
     arguments = ["evaluate", str(hands), "--dataset", "looks", "--out", str(tmp_path / "found"), "--prior", "none",
