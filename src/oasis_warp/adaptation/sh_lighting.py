@@ -182,8 +182,8 @@ def add_shade(
     missing = (seen.colors.clamp_min(MIN_COLOR) / known.clamp_min(MIN_COLOR)).log()
     on = posed_lighting(rest, crop.posed.vertices, faces, light)
     believed = observe(hand, sure).confidence
-    in_rim = rim_fade(rest[None], hand.rim.to(rest.device))[0]  # the cap has no shade
-    doubt = (seen.confidence - believed * exposed(on)) * in_rim
+    fade = rim_fade(rest[None], hand.rim.to(rest.device))[0]  # the cap has no shade
+    doubt = (seen.confidence - believed * exposed(on)) * fade
     occluded = inpaint(rest, faces, missing, doubt, OCCLUDER_FADE / 3, OCCLUDER_FADE)
     shade = occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp()
     return light._replace(shade=shade, facing=on.normals, doubt=1 - _believed_share(seen.confidence, believed))
