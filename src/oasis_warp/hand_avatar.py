@@ -7,14 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.pose import (
-    GAMMA,
-    SurfaceLight,
-    hidden_by_hand,
-    in_even_light,
-    pose_gaussians,
-    with_photo,
-)
+from oasis_warp.avatar.pose import GAMMA, SurfaceLight, hidden_by_hand, in_even_light, pose_gaussians, with_photo
 from oasis_warp.core.color import plain_background
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
@@ -40,13 +33,14 @@ from oasis_warp.core.types import (
     Side,
 )
 from oasis_warp.data.avatar_file import LIGHT_HIDDEN, load_avatar, save_avatar
+from oasis_warp.hand.contact import giving_way
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand, chosen_hand
 from oasis_warp.ops import check_finite, rest_mesh
 from oasis_warp.ops.checks import check_shape
-from oasis_warp.render.render import render
-from oasis_warp.render.replay import CapturedGraph, GraphCache, replayable, replayed
+from oasis_warp.ops.cuda_graph import CapturedGraph, GraphCache, replayable, replayed
+from oasis_warp.render import render
 
 MIN_LIGHT, MAX_LIGHT = 0.05, 10.0
 """Limits of a light from all around, over its mean: nine harmonics of a small lamp fall below 0 behind it."""
@@ -124,7 +118,8 @@ class Avatar:
     def _photo_surface(self) -> Float[Tensor, "V 3"]:
         """Vertices in the photo's pose; of a left hand in the mirror, where faces wind outwards."""
         source = mirror_pose(self.source_pose) if self.side == "left" else self.source_pose
-        return skin_surface(self.hand, self.rest, HandPose(*(part.to(self.shape) for part in source)))
+        posed = skin_surface(self.hand, self.rest, HandPose(*(part.to(self.shape) for part in source)))
+        return giving_way(self.hand, posed)
 
     @property
     def gaussians(self) -> CanonicalGaussians:
@@ -166,6 +161,9 @@ class Avatar:
     def mesh(self, pose: HandPose | str, *, validate: bool = True) -> PosedHand:
         """The surface that carries Gaussians, in `pose` [m]; the faces of a left hand wind the other way.
 
+        Fingers and palm give way to each other where they touch, as in `hand.contact.giving_way`: a constant to
+        derivatives.
+
         Args:
             pose: One, or with an axis in front of every part many; or the name of one, as in `held`.
             validate: Look at the pose's values too. Waits for a CUDA device if they are there.
@@ -174,7 +172,8 @@ class Avatar:
             TypeError: `pose` is neither a pose nor a name.
             ValueError: a part of the pose has another shape or is not finite, or no pose has that name.
         """
-        return skin(self._model, self._rest, self._checked(pose, validate))
+        posed = skin(self._model, self._rest, self._checked(pose, validate))
+        return posed._replace(vertices=giving_way(self.hand, posed.vertices, self.side))
 
     def pose(self, pose: HandPose | str, *, validate: bool = True) -> Gaussians:
         """The Gaussians in `pose`, in the world of its orientation and translation, where its light stays too.
@@ -189,7 +188,7 @@ class Avatar:
             ValueError: a part of the pose has another shape or is not finite, or no pose has that name.
         """
         checked = self._checked(pose, validate)
-        posed = skin_surface(self._model, self._rest, checked)
+        posed = giving_way(self.hand, skin_surface(self._model, self._rest, checked), self.side)
         return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light)
 
     def render(

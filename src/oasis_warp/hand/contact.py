@@ -1,0 +1,150 @@
+"""Flesh that does not pass through flesh: fingers and palm of a posed hand give way to each other."""
+
+import functools
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy import sparse
+from scipy.sparse.csgraph import dijkstra
+from torch import Tensor
+
+from oasis_warp.core import surface
+from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
+from oasis_warp.core.types import Side
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.ops.contact import GROUP, PARTS_OPPOSED, ContactTables, contact_shifts
+
+LIMIT = 0.004
+"""Largest shift of a vertex [m]."""
+FLESH = 0.4
+"""The part of the distance from a finger's bone to its skin that gives way: bones take .42 of it."""
+SPACING = 0.014
+"""Width of patches of skin that are tested as one, and what a right angle between normals counts there [m]."""
+APART = 0.015
+"""Distance over the surface from which two patches may touch [m]: nearer ones only bend."""
+RINGS = 2
+"""Of neighbours, over which a shift is spread: 4 mm."""
+NAIL_EDGE = 2
+"""Rings around a nail over which skin becomes free of it."""
+SAMPLES = 8
+"""Faces whose mean normal is that of a patch."""
+
+
+def giving_way(
+    hand: HandModel, vertices: Float[Tensor, "*B V 3"], side: Side = "right"
+) -> Float[Tensor, "*B V 3"]:
+    """Posed vertices of a hand, led out of each other: both sides of a contact give way, at most by `LIMIT` each.
+
+    Fingers give way by up to `FLESH` of their thickness, nails not at all. Vertices that no contact reaches stay as
+    they are, to the bit, and on the CPU a hand without contact is returned itself. The shifts are constants to
+    derivatives. What lies deeper inside than both sides can give stays inside by the rest, and the skin of one bone is
+    never led out of itself.
+
+    Args:
+        hand: Whose triangles they are.
+        vertices: In poses [m].
+        side: The faces of a left hand wind the other way.
+    """
+    flat = vertices.detach().float().reshape(-1, *vertices.shape[-2:])
+    shifts = contact_shifts(flat, hand.faces, contact_tables(vertices.device), side == "left")
+    return vertices if shifts is None else vertices + shifts.to(vertices).view_as(vertices)
+
+
+@functools.cache
+def contact_tables(device: torch.device) -> ContactTables:
+    """Those of the bundled hand, whose triangles all hands have."""
+    hand = bundled_hand()
+    points, faces = hand.template.double().numpy(), hand.faces.numpy()
+    edges = surface.mesh_edges(hand.faces).numpy()
+    rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
+    adjacent = sparse.csr_array((np.ones(len(rows)), (rows, columns))) + sparse.eye_array(len(points))
+    mean = sparse.csr_array(sparse.diags_array(1 / adjacent.sum(1)) @ adjacent)
+    around = sparse.csr_array(sparse.linalg.matrix_power(mean, RINGS))
+    around.sort_indices()
+    rigid = (hand.nail.numpy() > 0.5).astype(float)
+    for _ in range(NAIL_EDGE):
+        rigid = np.maximum(rigid, mean @ rigid)
+    members, starts = _patches(hand)
+    n_parts = len(starts) - 1
+    part = np.empty_like(members)
+    part[members] = np.repeat(np.arange(n_parts), np.diff(starts))
+    face = np.empty_like(members)
+    face[faces] = np.arange(len(faces))[:, None]  # one of those around each vertex
+    near = sparse.coo_array(around)
+    tables = {
+        "members": members,
+        "starts": starts,
+        "part": part,
+        "samples": face[members[starts[:-1, None] + np.diff(starts)[:, None] * np.arange(SAMPLES) // SAMPLES]],
+        "beside": _beside(part[near.row], part[near.col], n_parts),
+        "allowed": _may_touch(hand, part, edges),
+        "give": np.minimum(LIMIT, FLESH * _thickness(hand)) * (1 - rigid).clip(0),
+        "offsets": around.indptr,
+        "neighbours": around.indices,
+        "weights": around.data,
+    }
+    real = {"give", "weights"}
+    return ContactTables(**{
+        name: torch.from_numpy(array.astype(np.float32 if name in real else np.int32)).to(device)
+        for name, array in tables.items()
+    })  # fmt: skip
+
+
+def _patches(hand: HandModel) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices in patches, and the first of each patch: one bone's, halved until they are small and nearly flat."""
+    normals = surface.vertex_normals(hand.template, hand.faces)
+    places = torch.cat([hand.template, SPACING * normals], 1).double().numpy()
+    waiting = [np.flatnonzero(hand.segment.numpy() == bone) for bone in reversed(range(len(hand.parents)))]
+    patches = []
+    while waiting:
+        own = waiting.pop()
+        extent = np.ptp(places[own], axis=0)
+        if extent.max() < SPACING:
+            patches.append(own)
+            continue
+        along = own[places[own, extent.argmax()].argsort(kind="stable")]
+        waiting += [along[len(along) // 2 :], along[: len(along) // 2]]
+    return np.concatenate(patches), np.cumsum([0, *map(len, patches)])
+
+
+def _beside(a: np.ndarray, b: np.ndarray, n_parts: int) -> np.ndarray:
+    """The patches b of pairs by their patches a, itself first, filled up with -1."""
+    rank = np.full((n_parts, n_parts), 2)
+    rank[a, b] = 1
+    np.fill_diagonal(rank, 0)
+    first = rank.argsort(1, kind="stable")[:, : (rank < 2).sum(1).max()]
+    return np.where(np.take_along_axis(rank, first, 1) < 2, first, -1)
+
+
+def _may_touch(hand: HandModel, part: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Which patches may touch each other in some pose, as bits: not those of one bone, nor two sides of a finger."""
+    n_parts = part.max() + 1
+    normals = surface.vertex_normals(hand.template, hand.faces)
+    sums = np.zeros((n_parts, 7))
+    np.add.at(sums, part, torch.cat([hand.template, normals, torch.ones_like(normals[:, :1])], 1).double().numpy())
+    middle, outward = sums[:, :3] / sums[:, 6:], sums[:, 3:6] / np.linalg.norm(sums[:, 3:6], axis=1, keepdims=True)
+    bone = np.zeros(n_parts, int)
+    bone[part] = hand.segment.numpy()
+    a, b = part[edges].T
+    steps = np.zeros((n_parts, n_parts))  # 0 is no step
+    steps[a, b] = np.linalg.norm(middle[a] - middle[b], axis=1)
+    above = np.array(hand.parents)[bone]
+    joined = (above[:, None] == bone) | (bone[:, None] == above)
+    two_sides = joined & (outward @ outward.T < PARTS_OPPOSED)
+    allowed = (dijkstra(steps, directed=False) > APART) & (bone[:, None] != bone) & ~two_sides
+    filled = np.pad(allowed, ((0, 0), (0, -n_parts % GROUP)))
+    return np.packbits(filled, axis=1, bitorder="little").view("<i4")
+
+
+def _thickness(hand: HandModel) -> np.ndarray:
+    """Distance of each vertex at rest from the axis of its finger's bone [m]; the palm's has no end."""
+    joints, tips, points = (part.double().numpy() for part in (hand.joints, hand.tips, hand.template))
+    found = np.full(len(points), np.inf)
+    for joint in range(1, len(joints)):
+        own = hand.segment.numpy() == joint
+        end = tips[TIP_JOINTS.index(joint)] if joint in TIP_JOINTS else joints[hand.parents.index(joint)]
+        along, arm = end - joints[joint], points[own] - joints[joint]
+        at = np.clip(arm @ along / (along @ along), 0, 1)
+        found[own] = np.linalg.norm(arm - at[:, None] * along, axis=1)
+    return found

@@ -1,0 +1,116 @@
+"""Contact: a posed surface gives way where it lies inside another part of itself."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from oasis_kernels.skinning import contact as kernels
+from oasis_warp.ops._runtime.declaration import Array, Declaration
+from oasis_warp.ops._runtime.incidence import incidence
+from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, vectors
+
+GROUP = 32
+"""Parts of a group: bits of a word."""
+DEEPEST = 0.005
+"""Distance of a vertex inside from the skin above it, at most: past half a finger its other side is nearer [m]."""
+OPPOSED, PARTS_OPPOSED = -0.3, 0.3
+"""Cosines of the normals of skin that touches, and of its parts, at most: they differ by 35 degrees within a part."""
+ASIDE = 0.003
+"""Distance along the surface to the nearest vertex of skin that touches, at most: edges have 2 mm [m]."""
+MARGIN = 0.0005
+"""How far skin is moved out [m]: edges between vertices that just touch would still cross."""
+FADES = 0.5
+"""Share of the skin around a vertex that touches, below which its shift fades: that at the edge of a contact."""
+ROUNDS = 3
+"""Of giving way; later ones make up for what their mean took from the first."""
+PAD = 0.003
+"""Around the flesh under a part, whose normals differ from its own: as far as they lead aside [m]."""
+MIN_PARTS = 64
+"""Parts for which another thread is worth its while."""
+
+
+class ContactTables(NamedTuple):
+    """What contact needs to know of a surface in any pose; indices are int32."""
+
+    members: Int[Tensor, "V"]
+    """The vertices, those of a part together."""
+    starts: Int[Tensor, "P+1"]
+    """First place of each of P parts there; parts in a row, `GROUP` a group, lie near each other."""
+    part: Int[Tensor, "V"]
+    """Of each vertex."""
+    samples: Int[Tensor, "P E"]
+    """Some faces of each part."""
+    beside: Int[Tensor, "P A"]
+    """The part itself and those within the reach of `neighbours`; -1 fills rows up."""
+    allowed: Int[Tensor, "P G"]
+    """The parts of each of G groups that a part may touch, as bits."""
+    give: Float[Tensor, "V"]
+    """How far each vertex can give way [m]; two that touch share what is needed in proportion."""
+    offsets: Int[Tensor, "V+1"]
+    """Rows of `neighbours`."""
+    neighbours: Int[Tensor, "K"]
+    """Vertices around each vertex, itself among them."""
+    weights: Float[Tensor, "K"]
+    """Their weights; each row sums to 1."""
+
+
+_CONTACT = Declaration(
+    "contact_shifts", inputs={"vertices": Array("B V 3"), "faces": Array("F 3", index="V")}, public=False
+)
+
+
+@torch.no_grad()
+def contact_shifts(
+    vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"], tables: ContactTables, mirrored: bool
+) -> Float[Tensor, "B V 3"] | None:
+    """Shifts that lead the vertices of posed surfaces out of other parts of the same surface; None if nothing touches.
+
+    A vertex in other flesh, at most `DEEPEST` from the nearest skin that it faces, moves along the normal of that skin,
+    which comes towards it by its own share. A mean over the vertices around makes a dent of it. Vertices that no
+    contact reaches have a shift of 0. On CUDA no step waits for the device, so None is never returned there. The same
+    bits for a surface in a batch as alone. Float32; values are trusted; not differentiable.
+
+    Args:
+        vertices: Of posed surfaces [m].
+        faces: Corners.
+        tables: Of that surface.
+        mirrored: Whether faces wind the other way.
+
+    Raises:
+        ValueError: a wrong shape or index.
+    """
+    n = _CONTACT.check(vertices=vertices, faces=faces)["V"]
+    t, index = tables, incidence("faces", faces, n, "vertices")
+    batch, n_parts, n_groups = len(vertices), *t.allowed.shape
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return vertices.new_empty((batch, *shape), dtype=dtype)
+
+    points, outward = vectors(vertices.contiguous(), 2), -1.0 if mirrored else 1.0
+    corners, groups = vectors(empty(n_parts, 5, 3), 3), vectors(empty(n_groups, 2, 3), 3)
+    met, any_met, state = (empty(*shape, dtype=torch.int32) for shape in ((n_parts, n_groups), (n_parts,), (n_parts,)))
+    cuts = even_cuts(batch * n_parts, MIN_PARTS)
+    surface = [points, index.table, t.members, t.starts, t.samples, outward, DEEPEST, PAD, corners]
+    launch_ranges(kernels.boxes, cuts, surface, vertices)
+    launch_ranges(kernels.group_boxes, batch * n_groups, [corners, groups], vertices)
+    launch_ranges(kernels.meetings, cuts, [corners, groups, t.allowed, PARTS_OPPOSED, met, any_met], vertices)
+    if vertices.is_cpu and not any_met.any():
+        return None
+    launch_ranges(kernels.reached, cuts, [any_met, t.beside, state], vertices)
+    others, around, normals = empty(n, dtype=torch.int32), [t.offsets, t.neighbours], vectors(empty(n, 3), 2)
+    launch_ranges(kernels.normals, batch * n, [points, *index, t.part, state, outward, normals], vertices)
+    given = [points, normals, t.members, t.starts, t.part, corners, met, state, DEEPEST, OPPOSED, others]
+    launch_ranges(kernels.find, batch * n, given, vertices)
+    shifts, wanted = empty(n, 3).zero_(), empty(n, 4)
+    for k in range(ROUNDS):
+        before, after, leads = vectors(shifts, 2), empty(n, 3), vectors(wanted, 2)
+        given = [points, before, normals, others, *around, t.give, OPPOSED, ASIDE, MARGIN, leads]
+        launch_ranges(kernels.contacts, batch * n, given, vertices)
+        if k == 0 and vertices.is_cpu and not wanted[..., 3].any():
+            return None
+        given = [leads, before, t.part, state, *around, t.weights, t.give, FADES, vectors(after, 2)]
+        launch_ranges(kernels.spread, batch * n, given, vertices)
+        shifts = after
+    return shifts
