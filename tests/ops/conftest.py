@@ -1,5 +1,12 @@
+import os
+import shutil
+
 import pytest
 import torch
+
+from oasis_warp.ops._runtime import picture_extension, picture_node
+from oasis_warp.ops._runtime.launch import start
+from oasis_warp.ops._runtime.plans import Plans
 
 
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
@@ -18,3 +25,21 @@ def with_threads():
 
     yield call
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def extension(request, monkeypatch):
+    """The node, built once for all runs of the tests: nobody else shall find and use it."""
+    start()  # before its folder: Warp, which looks into it when it begins, takes the node for an old kernel
+    monkeypatch.setenv("OASIS_WARP_CACHE", str(request.config.cache.mkdir("extension")))
+    monkeypatch.delenv(picture_extension.VARIABLE, raising=False)
+    picture_extension._load.cache_clear()
+    if not (shutil.which(os.environ.get("CXX", "c++")) and shutil.which("ninja")):
+        pytest.skip("needs a C++ compiler and ninja")
+    if not picture_extension.is_built():
+        picture_extension.build()
+    module = picture_extension.loaded()
+    assert module is not None
+    monkeypatch.setattr(picture_node, "_plans", Plans())
+    yield module
+    picture_extension._load.cache_clear()

@@ -9,15 +9,8 @@ from rasterization_scenes import ordinary_scene
 
 from oasis_warp import ops
 from oasis_warp.ops import DECLARATIONS, rasterization
-from oasis_warp.ops._runtime import tiles
-from oasis_warp.ops.checks import (
-    check_choice,
-    check_finite,
-    check_float,
-    check_index,
-    check_positive,
-    check_shape,
-)
+from oasis_warp.ops._runtime import blend_tiles
+from oasis_warp.ops.checks import check_choice, check_finite, check_float, check_index, check_positive, check_shape
 
 pytestmark = pytest.mark.usefixtures("as_shipped")
 
@@ -312,7 +305,7 @@ def test_harmonics_seen_from_no_place_are_refused():
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_no_camera_at_all_draws_no_picture(dtype, threads, monkeypatch):
-    monkeypatch.setattr(tiles, "kernel_threads", lambda: threads)
+    monkeypatch.setattr(blend_tiles, "kernel_threads", lambda: threads)
     scene = calls(dtype=dtype)["rasterization"].arguments
     none = {name: scene[name][:0] for name in ("viewmats", "Ks", "backgrounds")}
     means = scene["means"].clone().requires_grad_()

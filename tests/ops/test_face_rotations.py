@@ -201,7 +201,7 @@ def test_a_mesh_measured_at_rest_poses_like_its_vertices(n, dtype, device):
     leaf = posed.clone().requires_grad_()
     plain, measured = face_rotations(rest, leaf, faces), face_rotations(rest_mesh(rest, faces), leaf, faces)
     assert all(torch.equal(a, b) for a, b in zip(plain, measured, strict=True))
-    assert torch.equal(*(gradients(turned, [leaf])[0] for turned in (plain, measured)))
+    assert torch.equal(*(gradients(rotated, [leaf])[0] for rotated in (plain, measured)))
 
 
 def test_a_mesh_measured_at_rest_may_have_flat_faces_and_points(device):
@@ -216,8 +216,8 @@ def test_a_mesh_measured_at_rest_may_have_flat_faces_and_points(device):
 def test_a_mesh_measured_at_rest_gets_no_gradient():
     rest, posed, faces = mesh(2, 2, torch.float32)
     still = rest_mesh(rest.requires_grad_(), faces)
-    turned = face_rotations(still, posed.requires_grad_(), faces)
-    (grad,) = torch.autograd.grad(turned.vertex_quats.sum(), posed)
+    rotated = face_rotations(still, posed.requires_grad_(), faces)
+    (grad,) = torch.autograd.grad(rotated.vertex_quats.sum(), posed)
     assert grad.any() and not still.vertices.requires_grad and not still.triangles.requires_grad
 
 

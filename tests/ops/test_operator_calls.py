@@ -56,13 +56,13 @@ def test_functions_without_a_gradient_compile_into_one_graph(as_shipped):
     rest, posed, faces = mesh(2, 3, torch.float32)
     seen = {name: calls()["depth_visibility"].arguments[name] for name in ("vertices", "faces", "viewmat", "K")}
 
-    def turned(posed, vertices):
+    def rotated(posed, vertices):
         covered = ops.depth_map(**seen | {"vertices": vertices}, width=16, height=16).face_ids >= 0
         return *face_rotations(rest_mesh(rest, faces), posed, faces), covered
 
     torch._dynamo.reset()
-    compiled = torch.compile(turned, fullgraph=True, backend="aot_eager")
-    assert_same_bits(compiled(posed, seen["vertices"]), turned(posed, seen["vertices"]))
+    compiled = torch.compile(rotated, fullgraph=True, backend="aot_eager")
+    assert_same_bits(compiled(posed, seen["vertices"]), rotated(posed, seen["vertices"]))
 
 
 @pytest.mark.parametrize(

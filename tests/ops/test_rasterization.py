@@ -86,8 +86,8 @@ def test_mirroring_the_world_mirrors_the_image(device):
     flip = torch.tensor([-1.0, 1, 1], dtype=torch.float64, device=device)
     Ks = scene.Ks.clone()
     Ks[:, 0, 2] = scene.width - Ks[:, 0, 2]
-    turned = scene.quats * torch.tensor([1.0, 1, -1, -1], dtype=torch.float64, device=device)
-    mirrored = scene.with_(means=scene.means * flip, quats=turned, Ks=Ks)
+    rotated = scene.quats * torch.tensor([1.0, 1, -1, -1], dtype=torch.float64, device=device)
+    mirrored = scene.with_(means=scene.means * flip, quats=rotated, Ks=Ks)
     assert torch.allclose(draw(scene)[0].flip(2), draw(mirrored)[0], rtol=0, atol=1e-11)
 
 
@@ -200,8 +200,8 @@ def scene(dtype=torch.float64, device="cpu", n=30):
     scales = torch.exp(torch.randn(n, 3, generator=random) * 0.6 - 3.2)
     opacities = torch.rand(n, generator=random) * 0.8 + 0.1
     colors = torch.rand(n, 3, generator=random)
-    turned = torch.tensor([[0.98, 0, 0.2, 0.05], [0, 1, 0, -0.1], [-0.2, 0, 0.98, 0.3], [0, 0, 0, 1]])
-    viewmats = torch.stack([torch.eye(4), turned])
+    rotated = torch.tensor([[0.98, 0, 0.2, 0.05], [0, 1, 0, -0.1], [-0.2, 0, 0.98, 0.3], [0, 0, 0, 1]])
+    viewmats = torch.stack([torch.eye(4), rotated])
     Ks = torch.tensor([[[30.0, 0, 12], [0, 28.0, 11], [0, 0, 1]]]).expand(2, 3, 3)
     return [t.to(device, dtype).contiguous() for t in (means, quats, scales, opacities, colors, viewmats, Ks)]
 

@@ -263,8 +263,8 @@ def test_nothing_changes_when_surface_and_directions_turn_together(ball_by_wall)
     """Directions that stay in the world make shadows swim while a stiff hand turns."""
     (vertices, faces), n = ball_by_wall
     turn = HALF_TURN.to(vertices) @ rotation.from_axis_angle(torch.tensor([1.0, 0, 0]), torch.tensor(0.4)).to(vertices)
-    turned = vertices @ turn.T + 0.3, faces
-    still, moved = exposed([(vertices, faces)]), exposed([turned], frames=turn[None])
+    rotated = vertices @ turn.T + 0.3, faces
+    still, moved = exposed([(vertices, faces)]), exposed([rotated], frames=turn[None])
     torch.testing.assert_close(moved[0, :n], still[0, :n], atol=0.02, rtol=0)
 
 

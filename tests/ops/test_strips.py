@@ -7,10 +7,10 @@ from test_rasterization import INPUTS, draw
 
 from oasis_kernels.constants import Rules
 from oasis_warp.ops import blending
-from oasis_warp.ops._runtime import blend_strips, tiles
+from oasis_warp.ops._runtime import blend_strips, blend_tiles
+from oasis_warp.ops._runtime.blend_tiles import MAX_PAIRS, bin_to_tiles, opaque_elements
 from oasis_warp.ops._runtime.records import Frame, GradientFlags, Splats
 from oasis_warp.ops._runtime.rules import using
-from oasis_warp.ops._runtime.tiles import MAX_PAIRS, bin_to_tiles, opaque_elements
 from oasis_warp.ops.projection import project
 from oasis_warp.reference import rasterization as reference
 
@@ -169,7 +169,7 @@ def test_lists_hold_each_strips_gaussians_by_depth_and_then_by_index(n, distinct
 
 def test_more_pairs_than_can_be_numbered_are_refused_before_lists_are_made(monkeypatch):
     scene = frontal_scene(torch.tensor([[0.0, 0, 2]]).repeat(9, 1), 9.0, 0.5).to(torch.float32)
-    monkeypatch.setattr(tiles, "MAX_PAIRS", 100)
+    monkeypatch.setattr(blend_tiles, "MAX_PAIRS", 100)
     with pytest.raises(ValueError, match="at most 100 pairs of a Gaussian and a tile, got 288"):
         draw(scene, tile_size=1)
 

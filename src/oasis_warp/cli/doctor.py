@@ -16,8 +16,8 @@ from pathlib import Path
 from rich.console import Console
 
 from oasis_warp import __version__
-from oasis_warp.cli.console import FAULT
 from oasis_warp.cli.developer_options import Doctor
+from oasis_warp.cli.progress import FAULT
 from oasis_warp.cli.record import note
 
 PACKAGES = {
@@ -56,7 +56,8 @@ Check = Callable[[], str]
 
 def run(options: Doctor) -> int:
     """Print a line for every check; the exit code."""
-    console, faults, to_do, found = Console(quiet=options.quiet), 0, checks(), {}
+    console, faults, found = Console(quiet=options.quiet), 0, {}
+    to_do = checks(options.build_extension)
     width = max(map(len, to_do))
     for name, check in to_do.items():
         try:
@@ -73,7 +74,7 @@ def run(options: Doctor) -> int:
     return FAULT if faults else 0
 
 
-def checks() -> dict[str, Check]:
+def checks(build_extension: bool = False) -> dict[str, Check]:
     """All checks by name, in order."""
     packages = {name: lambda name=name: check_package(name) for name in PACKAGES}
     return {
@@ -85,6 +86,7 @@ def checks() -> dict[str, Check]:
         "hand": check_hand,
         "networks": check_networks,
         "prior": check_prior,
+        "C++ node": lambda: check_extension(build_extension),
         "kernels": check_kernels,
         "videos": check_videos,
     }
@@ -208,6 +210,21 @@ def check_kernels() -> str:
     return f"draw what the formula says; loaded or compiled in {times}; cache {cache}"
 
 
+def check_extension(build: bool) -> str:
+    """The optional C++ node of `rasterization` on CUDA is built, or is not, which is no fault."""
+    from oasis_warp.ops._runtime import picture_extension
+
+    if build:
+        try:
+            picture_extension.build()
+        except picture_extension.NotBuiltError as error:
+            remedy = "it needs a C++ compiler, Python's headers and ninja; without it nothing is missing but time"
+            raise FaultError(f"could not be built: {error}", remedy) from error
+    if not picture_extension.is_built():
+        return "not built; Python does its work, and `oasis doctor --build-extension` builds it"
+    return f"built for torch {importlib.metadata.version('torch')}, in {picture_extension.extension_folder()}"
+
+
 def gaussian_error(device: str) -> float:
     """Largest difference between one drawn Gaussian and opacity * exp(-d^2 / 2 / variance) * colour."""
     import torch
@@ -252,7 +269,7 @@ def check_videos() -> str:
     """Videos of each format can be written and read."""
     import torch
 
-    from oasis_warp.data.videos import VIDEO_SUFFIXES, write_video
+    from oasis_warp.data.pictures import VIDEO_SUFFIXES, write_video
 
     frames = [torch.full((64, 64, 3), int(127 + 100 * math.sin(i)), dtype=torch.uint8) for i in range(3)]
     with tempfile.TemporaryDirectory() as folder:

@@ -23,9 +23,8 @@ from oasis_warp.ops._runtime.rasterization_checks import (
     check_invertible,
 )
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck, check_finite
-from oasis_warp.ops.blending import blend
+from oasis_warp.ops.blending import blend, compensated_opacities, record_absolute_gradients
 from oasis_warp.ops.checks import check_choice, refuse_gradient
-from oasis_warp.ops.gsplat_options import compensated_opacities, record_absolute_gradients
 from oasis_warp.ops.projection import Projection, check_values, project
 from oasis_warp.ops.spherical_harmonics import sh_to_rgb
 

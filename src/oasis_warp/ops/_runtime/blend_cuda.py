@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from oasis_kernels.rasterize import tiles_cuda
+from oasis_warp.ops._runtime.blend_tiles import MAX_PAIRS, check_pairs, fake_opaque_buffer, opaque_buffer
 from oasis_warp.ops._runtime.launch import block_count, current_stream, run_cuda, wait_for
 from oasis_warp.ops._runtime.pair_counts import Counts, remember, thread_slot, watching
 from oasis_warp.ops._runtime.records import Frame, GradientFlags, Gradients, Size, Splats
 from oasis_warp.ops._runtime.rules import current_rules
-from oasis_warp.ops._runtime.tiles import MAX_PAIRS, check_pairs, fake_opaque_buffer, opaque_buffer
 
 MAX_CHECKPOINTS = 1 << 16
 """Tiles times numbers per pixel up to which lists are cut into segments. Beyond, the tiles alone fill a device, and the

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from oasis_kernels.rasterize import strips
+from oasis_warp.ops._runtime.blend_tiles import check_pairs, fake_opaque_buffer, opaque_buffer, opaque_elements
 from oasis_warp.ops._runtime.launch import phase_state, run_native
 from oasis_warp.ops._runtime.records import Frame, GradientFlags, Gradients, Splats
 from oasis_warp.ops._runtime.rules import current_rules
-from oasis_warp.ops._runtime.tiles import check_pairs, fake_opaque_buffer, opaque_buffer, opaque_elements
 
 TILES_ACROSS, TILES_DOWN = 16, 2
 """Size of a strip in tiles: 256 x 32 pixels with tiles of 16."""

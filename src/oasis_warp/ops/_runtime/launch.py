@@ -18,8 +18,8 @@ from torch import Tensor
 from oasis_kernels.runtime.cuda_native import CudaNative
 from oasis_kernels.runtime.native import TASK, Native
 from oasis_warp.core.processes import kernel_threads
-from oasis_warp.ops._runtime.cuda_launch import CudaLaunch
 from oasis_warp.ops._runtime.kernel_cache import load_module, writable_cache
+from oasis_warp.ops._runtime.plans import CudaLaunch
 
 _start_lock = threading.Lock()
 _load_lock = threading.Lock()
@@ -154,9 +154,9 @@ def _pool(process: int, n_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(n_threads, thread_name_prefix="oasis_warp")
 
 
-def even_cuts(n: int) -> list[int]:
-    """Bounds 0 .. n of ranges for `launch_ranges`: one for each thread, none with fewer than `MIN_TASKS`."""
-    parts = max(1, min(kernel_threads(), n // MIN_TASKS))
+def even_cuts(n: int, least: int = MIN_TASKS) -> list[int]:
+    """Bounds 0 .. n of ranges for `launch_ranges`: one for each thread, none with fewer than `least` tasks."""
+    parts = max(1, min(kernel_threads(), n // least))
     return [n * k // parts for k in range(parts + 1)]
 
 

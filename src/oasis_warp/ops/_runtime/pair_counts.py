@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from oasis_kernels.rasterize.tiles_cuda import LONGEST, REPORT, RUN
-from oasis_warp.ops._runtime.tiles import MAX_PAIRS
+from oasis_warp.ops._runtime.blend_tiles import MAX_PAIRS
 
 PAGE = 4096
 """Words of host memory per allocation for reports."""

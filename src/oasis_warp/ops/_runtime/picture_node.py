@@ -1,7 +1,7 @@
 """Float32 `rasterization` on CUDA as one node of autograd, for eager calls without special options."""
 
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -11,8 +11,10 @@ from torch.autograd.function import Function
 from oasis_kernels.rasterize.tiles_cuda import INDEX_BITS
 from oasis_warp.core.tracing import is_traced
 from oasis_warp.ops._runtime.launch import start
+from oasis_warp.ops._runtime.pair_counts import Counts
 from oasis_warp.ops._runtime.picture_call import Drawn, Gradients, Needs, Options, Scene
-from oasis_warp.ops._runtime.picture_plan import Plan
+from oasis_warp.ops._runtime.picture_extension import add_adjoints, table_of
+from oasis_warp.ops._runtime.picture_plan import Plan, polled_words
 from oasis_warp.ops._runtime.plans import Plans, differentiable_once, shapes_of
 from oasis_warp.ops._runtime.rasterization_checks import check_cameras, check_colors, check_gaussians
 from oasis_warp.ops._runtime.rules import current_rules
@@ -52,12 +54,24 @@ def _checked_plan(scene: Scene, options: Options, key: tuple[Any, ...]) -> Plan 
     if not (len(means) and len(viewmats)) or len(means) > 1 << INDEX_BITS:
         return None
     start()
-    return _plans.keep(key, Plan(scene, options, current_rules()))
+    plan = Plan(scene, options, current_rules())
+    plan.table = table_of(plan, polled_words())
+    return _plans.keep(key, plan)
 
 
 def draw(plan: Plan, scene: Scene, validate: bool) -> tuple[Tensor, Tensor, "Meta"] | None:
     """Images as blended, alpha and meta; None where `validate` finds a bad value."""
     tracked = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in scene)
+    if plan.table is not None:
+        bad, pairs, longest, image, alphas, workspace, call = plan.table.draw(
+            plan, plan.stream(), *plan.expected, validate, tracked, scene
+        )
+        if bad:
+            return None
+        plan.learn(Counts(pairs, longest))
+        if image is not None:
+            return image, alphas, Meta(plan, scene, workspace, call)
+        # There was no memory for as many pairs, and is now.
     tracking = _Tracked() if tracked else None
     if tracking is not None:
         image, alphas = _draw(plan, validate, tracking, *scene)
@@ -79,21 +93,22 @@ class _Tracked:
     """What the adjoint needs from the picture's `meta` and workspace."""
 
     def __init__(self) -> None:
-        self.means2d: Callable[[], Tensor | None] = lambda: None
+        self.means2d: Callable[[], Tensor | None] | None = None
         """The `means2d` that `meta` has computed, if it was read."""
         self.workspace: Tensor | None = None
 
-    def retaining(self) -> Tensor | None:
-        """The `means2d` that retains its gradient, if any."""
-        means2d = self.means2d()
-        if means2d is None:
-            return None
-        if means2d._backward_hooks:
-            raise RuntimeError(
-                "meta['means2d']: expected retain_grad(), got a hook, which would see no gradient of the picture. "
-                "Draw with absgrad=True, or read means2d.grad after backward."
-            )
-        return means2d if means2d.retains_grad else None
+
+def _retaining(looked_at: Callable[[], Tensor | None] | None) -> Tensor | None:
+    """The `means2d` that retains its gradient, if any."""
+    means2d = looked_at() if looked_at is not None else None
+    if means2d is None:
+        return None
+    if means2d._backward_hooks:
+        raise RuntimeError(
+            "meta['means2d']: expected retain_grad(), got a hook, which would see no gradient of the picture. "
+            "Draw with absgrad=True, or read means2d.grad after backward."
+        )
+    return means2d if means2d.retains_grad else None
 
 
 class _Draw(Function):
@@ -114,15 +129,45 @@ class _Draw(Function):
         if g_image is None and g_alphas is None:
             return (None,) * (3 + len(Scene._fields))
         *tensors, channels, backgrounds = ctx.saved_tensors
-        scene = Scene(*tensors)
         tracking, needed = ctx.tracking, ctx.needs_input_grad
         drawn = Drawn(None, None, channels, backgrounds, tracking.workspace, *ctx.saved)
-        needs = Needs(*needed[3:10], needed[11])
-        means2d = tracking.retaining()
-        gradients, gradient = ctx.plan.draw_backward(scene, drawn, g_image, g_alphas, needs, means2d is not None)
-        if means2d is not None and gradient is not None:
-            means2d.grad = gradient.clone() if means2d.grad is None else means2d.grad + gradient
-        return None, None, None, *differentiable_once("rasterization", scene, gradients)
+        gradients = _differentiate(
+            ctx.plan, tracking.means2d, Needs(*needed[3:10], needed[11]), Scene(*tensors), drawn, g_image, g_alphas
+        )
+        return None, None, None, *gradients
+
+
+def _differentiate(
+    plan: Plan, looked_at: Callable[[], Tensor | None] | None, needs: Needs, scene: Scene, drawn: Drawn,
+    g_image: Tensor | None, g_alphas: Tensor | None,
+) -> Any:  # fmt: skip
+    means2d = _retaining(looked_at)
+    gradients, gradient = plan.draw_backward(scene, drawn, g_image, g_alphas, needs, means2d is not None)
+    if means2d is not None and gradient is not None:
+        means2d.grad = gradient.clone() if means2d.grad is None else means2d.grad + gradient
+    return differentiable_once("rasterization", scene, gradients)
+
+
+def differentiate_for_extension(
+    plan: Plan, looked_at: Callable[[], Tensor | None] | None, needed: Sequence[bool], tensors: Sequence[Tensor | None],
+    saved: tuple[Tensor, Tensor, int], *incoming: Tensor | None,
+) -> Any:  # fmt: skip
+    """Gradients by the tensors of a scene that the C++ node has drawn: of a kind that is new to it, or rare.
+
+    Args:
+        plan: Of the picture.
+        looked_at: As `_Tracked.means2d`.
+        needed: By tensor of the scene, whether its gradient is wanted.
+        tensors: The scene.
+        saved: Workspace, lists and the number of pairs.
+        *incoming: Gradients by image and alpha.
+    """
+    scene, needs = Scene(*tensors), Needs(*needed[:7], needed[8])  # pyright: ignore[reportArgumentType]
+    channels, backgrounds = scene.colors.contiguous(), scene.backgrounds
+    backgrounds = None if backgrounds is None else backgrounds.contiguous()
+    add_adjoints(plan, plan.table, any(needs[:5]) or needs.viewmats, needs.colors)
+    drawn = Drawn(None, None, channels, backgrounds, *saved)
+    return _differentiate(plan, looked_at, needs, scene, drawn, *incoming)
 
 
 # Below Function.apply, which takes 3 us to look for functorch: `is_traced` has.
@@ -172,7 +217,7 @@ UNMADE = {"means2d": "_project", "depths": "_project", "opacities": "_opacities"
 class Meta(dict[str, Any]):
     """gsplat's `meta` of a picture: a dictionary whose tensors are computed when they are first read."""
 
-    def __init__(self, plan: Plan, scene: Scene, workspace: Tensor, tracking: _Tracked | None) -> None:
+    def __init__(self, plan: Plan, scene: Scene, workspace: Tensor, tracking: Any) -> None:
         options = plan.options
         super().__init__(
             camera_ids=None, gaussian_ids=None, means2d=None, depths=None, conics=None, radii=None, opacities=None,

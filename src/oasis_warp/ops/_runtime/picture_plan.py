@@ -6,101 +6,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from oasis_kernels import constants
-from oasis_kernels.constants import Rules
 from oasis_kernels.rasterize import projection_native, tiles_cuda
-from oasis_kernels.runtime.cuda_native import CudaNative
-from oasis_warp.ops._runtime import blend_cuda
-from oasis_warp.ops._runtime.cuda_launch import CudaLaunch
-from oasis_warp.ops._runtime.launch import block_count, cuda_launch, current_stream
+from oasis_warp.ops._runtime.blend_tiles import MAX_PAIRS, check_pairs
 from oasis_warp.ops._runtime.pair_counts import SORTED, Counts, PolledCounters, remember
-from oasis_warp.ops._runtime.picture_call import Drawn, Gradients, Needs, Options, Scene
-from oasis_warp.ops._runtime.plans import ALIGNMENT, lay_out
-from oasis_warp.ops._runtime.projection_backends import as_float32, fill_viewmats
-from oasis_warp.ops._runtime.records import Frame
-from oasis_warp.ops._runtime.tiles import MAX_PAIRS, check_pairs
-from oasis_warp.ops.checks import FINITE_LIMIT
+from oasis_warp.ops._runtime.picture_call import Drawn, Gradients, Needs, Scene
+from oasis_warp.ops._runtime.picture_preparation import Preparation
+from oasis_warp.ops._runtime.plans import ALIGNMENT
+from oasis_warp.ops._runtime.projection_backends import fill_viewmats
 
 SLACK = 1.25
 """Memory for pairs of a Gaussian and a tile, relative to what the last call of a kind had."""
-FIRST_PAIRS = 4
-"""Pairs a Gaussian that the first call of a kind has memory for."""
 
 
-class Plan:
-    """How pictures of one kind are drawn by one thread; `Scene` and `Options` have been checked."""
+class Plan(Preparation):
+    """How pictures of one kind are drawn by one thread."""
 
-    def __init__(self, scene: Scene, options: Options, rules: Rules) -> None:
-        self.n, self.n_cameras = n, n_cameras = len(scene.means), len(scene.viewmats)
-        self.total, self.options = n * n_cameras, options
-        self.device = scene.means.device
-        self._index = scene.means.get_device()
-        self._warp_device = current_stream(self.device).device
-        self.n_colors = scene.colors.shape[-1]
-        depths = {"RGB": 0, "D": 1, "ED": 2, "RGB+D": 1, "RGB+ED": 2}[options.render_mode]
-        self.draws_colors, self.n_depths = options.render_mode.startswith("RGB"), depths
-        self.n_drawn = self.n_colors * self.draws_colors + depths
-        self.channels = next(c for c in constants.CHANNELS if c >= self.n_drawn)
-        self.as_given = self.n_depths == 0 and self.channels == self.n_drawn
-        frame = Frame(options.width, options.height, options.tile_size)
-        self._layout = blend_cuda.layout_of(n_cameras, n, self.channels, frame)
-        self._spread = tiles_cuda.spread_of(self._layout.n_tiles)
-        self._limits = (
-            as_float32(options.near_plane), as_float32(options.far_plane), float(options.radius_clip),
-            as_float32(options.eps2d), as_float32(rules.alpha_min), float(rules.extent_sigmas), FINITE_LIMIT,
-        )  # fmt: skip
-        self._kind = self.device, n_cameras, n, options.width, options.height
-        self._expected = Counts(min(FIRST_PAIRS * self.total, MAX_PAIRS), tiles_cuda.LONGEST)
-        self._lay_out()
-        self._load(rules)
-
-    def _lay_out(self) -> None:
-        """Places of the arrays in a workspace [bytes]; those that only an adjoint reads come last."""
-        total, tiles, pixels = self.total, self._layout.n_tiles, self._layout.pixels
-        counters = 8 * tiles_cuda.COUNTERS + 4 * tiles * self._spread
-        self._n_counters = counters // 4
-        always = {
-            "centers": 16 * total, "whitenings": 16 * total, "boxes": 16 * total, "sort_depths": 8 * total,
-            "counters": counters, "means2d": 8 * total, "covars2d": 24 * total, "depths": 4 * total,
-            "conics": 12 * total, "radii": 8 * total, "tiles": 16 * tiles, "cursors": 4 * self._spread * tiles,
-            "pair_starts": 4 * total,
-        }  # fmt: skip
-        segments = self._layout.segments - 1
-        kept = {
-            "transmittance": 4 * pixels, "stops": 4 * pixels,
-            "checkpoints": 4 * tiles * segments * (self.channels + 1) * tiles_cuda.TILE**2,
-        }  # fmt: skip
-        self._at, self._size = lay_out(always)
-        places, self._size_with_kept = lay_out(kept, self._size)
-        self._at |= places
-
-    def _load(self, rules: Rules) -> None:
-        """Kernels, and how many blocks of them run."""
-        tiles, total = self._layout.n_tiles, self.total
-        self._project_blocks = block_count(total, projection_native.BLOCK)
-        self._unproject_blocks = block_count(self.n, projection_native.BLOCK)
-        self._count_blocks = block_count(total, tiles_cuda.COUNT_BLOCK)
-        self._place_blocks = block_count(tiles, tiles_cuda.PLACE_BLOCK)
-        self._gather_blocks = block_count(total, tiles_cuda.GATHER_BLOCK)
-        self._project = self._launch(projection_native.cuda_project)
-        self._count = self._launch(tiles_cuda.count_pairs())
-        self._place = self._launch(tiles_cuda.place_tiles())
-        self._fill = self._launch(tiles_cuda.fill_tiles())
-        self._sort_long = self._launch(tiles_cuda.sort_long_lists())
-        self._blend = self._launch(tiles_cuda.blend(self.channels, self._layout.segments, rules))
-        self._rules = rules
-
-    def _launch(self, native: CudaNative) -> CudaLaunch:
-        """This thread's launch of a kernel, whose parameters come in the order of `picture_call.ORDERS`."""
-        return cuda_launch(native, self._warp_device)
-
-    def part(self, workspace: Tensor, name: str, dtype: torch.dtype, *row: int) -> Tensor:
-        """An array of a workspace with a row for each camera and Gaussian, [C, N, *row]."""
-        start, numbers = self._at[name], 1
-        for size in row:
-            numbers *= size
-        flat = workspace[start : start + self.total * numbers * dtype.itemsize]
-        return flat.view(dtype).view(self.n_cameras, self.n, *row)
+    def stream(self) -> int:
+        """Handle of torch's current stream."""
+        return torch._C._cuda_getCurrentRawStream(self._index)
 
     def _blended(self, scene: Scene, workspace: Tensor) -> tuple[Tensor, Tensor | None]:
         """Colours and backgrounds to blend, with depths and padded as the kernels want them."""
@@ -127,7 +50,7 @@ class Plan:
         """The picture; None where `validate` finds a bad value. Waits for the count of pairs, not for the picture."""
         options, at, layout = self.options, self._at, self._layout
         n, total, n_cameras = self.n, self.total, self.n_cameras
-        stream = torch._C._cuda_getCurrentRawStream(self._index)
+        stream = self.stream()
         means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds = _contiguous(scene)
         workspace = torch.empty(self._size_with_kept if keep else self._size, dtype=torch.uint8, device=self.device)
         base = workspace.data_ptr()
@@ -157,7 +80,7 @@ class Plan:
             )
             alphas = torch.empty((n_cameras, options.height, options.width, 1), dtype=torch.float32, device=self.device)
             color_step = n if colors.dim() == 3 else 0
-            capacity, longest = self._expected
+            capacity, longest = self.expected
             while True:
                 long = longest > tiles_cuda.LONGEST
                 # One more than there may be, as an empty tensor has no address.
@@ -192,7 +115,7 @@ class Plan:
                 counts = Counts(values[0], values[1])
                 if values[2]:
                     return None
-                check_pairs(counts.pairs)
+                self.learn(counts)
                 if counts.pairs <= capacity and counts.longest <= longest:
                     break
                 capacity = max(capacity, counts.pairs)
@@ -201,9 +124,13 @@ class Plan:
         except BaseException:  # kernels that are on their way still write to the words
             torch.cuda.current_stream(self._index).synchronize()
             raise
-        remember(self._kind, counts)
-        self._expected = Counts(min(int(SLACK * counts.pairs) + ALIGNMENT, MAX_PAIRS), _sorted(counts.longest))
         return Drawn(image, alphas, colors, backgrounds, workspace, lists, counts.pairs)
+
+    def learn(self, counts: Counts) -> None:
+        """Expect the next picture to need what this one did, and some more."""
+        check_pairs(counts.pairs)
+        remember(self._kind, counts)
+        self.expected = Counts(min(int(SLACK * counts.pairs) + ALIGNMENT, MAX_PAIRS), _sorted(counts.longest))
 
     def _kept(self, base: int, keep: bool) -> tuple[int, int, int]:
         """Addresses of what blending keeps for its adjoint."""
@@ -217,14 +144,10 @@ class Plan:
         """Gradients, None where they are not wanted; and with `retains` that by means2d, [C, N, 2]."""
         with_shape = any(needs[:5]) or needs.viewmats
         with_colors = (needs.colors and self.draws_colors) or (with_shape and self.n_depths > 0)
-        # Adjoints run on a thread of autograd, which has launches of its own.
-        native = tiles_cuda.blend_backward(
-            self.channels, self._layout.segments, with_shape, with_colors, self._rules
-        )
-        back = self._launch(native)
+        record, back, gather = self.adjoints(with_shape, with_colors)
         options, at, layout, device = self.options, self._at, self._layout, self.device
         n, total, n_cameras = self.n, self.total, self.n_cameras
-        stream = torch._C._cuda_getCurrentRawStream(self._index)
+        stream = self.stream()
         base = drawn.workspace.data_ptr()
         opacities = scene.opacities.contiguous()
         channels, behind, lists = drawn.channels, drawn.backgrounds, drawn.lists
@@ -232,7 +155,6 @@ class Plan:
         g_alphas = None if g_alphas is None else g_alphas.contiguous()
         shared = scene.colors.dim() == 2
         # One tensor for all that is only passed on: by covars2d (float64) and means2d, then the records.
-        record = tiles_cuda.record_size(self.channels, with_shape, with_colors)
         passed = torch.empty(8 * total * with_shape + drawn.pairs * record + 4, dtype=torch.float32, device=device)
         g_covars2d = passed.data_ptr() if with_shape else 0
         g_means2d = g_covars2d and g_covars2d + 24 * total
@@ -256,8 +178,7 @@ class Plan:
         if with_colors:
             shape = (n, self.channels) if only else (n_cameras, n, self.channels)
             g_channels = torch.empty(shape, dtype=torch.float32, device=device)
-        if with_shape or with_colors:
-            gather = self._launch(tiles_cuda.gather(self.channels, with_shape, with_colors))
+        if gather is not None:
             gather(
                 self._gather_blocks, stream, total, drawn.pairs, base + at["boxes"], base + at["pair_starts"],
                 records, base + at["whitenings"], opacities.data_ptr(), n, g_means2d, g_covars2d,
@@ -301,7 +222,7 @@ class Plan:
         if needs.viewmats or any(gradient is not None for gradient in wanted):
             unproject = self._launch(projection_native.cuda_project_backward)
             unproject(
-                self._unproject_blocks, torch._C._cuda_getCurrentRawStream(self._index), self.n, self.n_cameras,
+                self._unproject_blocks, self.stream(), self.n, self.n_cameras,
                 self.options.width, self.options.height,
                 *[0 if t is None else t.data_ptr() for t in (means, quats, scales, covars, viewmats, Ks)],
                 self.options.ortho, workspace.data_ptr() + self._at["radii"], g_means2d, g_covars2d, g_depths,
@@ -327,6 +248,11 @@ class _Polled(threading.local):
 
 
 _polled = _Polled()
+
+
+def polled_words() -> int:
+    """Address of this thread's three words: pairs, the longest list, and whether a value is bad."""
+    return _polled.counters.address
 
 
 def _contiguous(scene: Scene) -> Any:

@@ -15,11 +15,10 @@ from oasis_kernels.posing import mesh_gaussians
 from oasis_kernels.runtime.cuda_native import CudaNative
 from oasis_kernels.skinning import kinematics
 from oasis_kernels.skinning import skinning_native as skinning
-from oasis_warp.ops._runtime.cuda_launch import CudaLaunch
 from oasis_warp.ops._runtime.incidence import Incidence
 from oasis_warp.ops._runtime.launch import aligned, block_count, cuda_launch, current_stream
 from oasis_warp.ops._runtime.mesh_gaussians import MeshGaussians, find_gaussians
-from oasis_warp.ops._runtime.plans import addresses, lay_out
+from oasis_warp.ops._runtime.plans import CudaLaunch, addresses, lay_out
 
 ORDERS = {
     "bone_transforms": "n_joints angles joints axes parents orientation translation locals transforms bends",

@@ -3,6 +3,7 @@
 import torch
 
 from oasis_warp.ops.blend_weights import blend_weights
+from oasis_warp.ops.contact import ContactTables, contact_shifts
 from oasis_warp.ops.face_rotations import face_rotations
 from oasis_warp.ops.mesh_posing import pose_on_mesh
 from oasis_warp.ops.rasterization import rasterization
@@ -31,6 +32,9 @@ def warm_up(device: torch.device | str = "cpu") -> None:
         each = torch.arange(4, device=device)
         posed = pose_on_mesh(vertices, faces, each, thirds, turned.vertex_quats, turned.area_ratio, quats, scales)
         sky_exposure(vertices[None], vertices[None], faces, viewmat[None, :3, :3], ones.new_ones(1, N_DIRECTIONS, 3))
+        each, none = each.int(), each[:1, None].int()
+        whole = ContactTables(each, 4 * each[:2], 0 * each, none, none, none, ones, 4 * each, each, ones)
+        contact_shifts(vertices[None], faces, whole, False)
         depth_visibility(vertices, vertices, faces, K, viewmat, 16, 16)
         blend_weights(*posed, ones, viewmat, K, 16, 16)
         rasterization(*posed, ones, thirds, viewmat[None], K[None], 16, 16, backgrounds=ones[None, :3])

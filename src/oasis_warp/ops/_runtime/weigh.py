@@ -8,11 +8,17 @@ from torch import Tensor
 from oasis_kernels.rasterize import rasterize_weights as kernels
 from oasis_kernels.rasterize import strips
 from oasis_warp.ops._runtime.blend_strips import count, cut_strips
-from oasis_warp.ops._runtime.blend_tiles import CUDA_LANES, lane_grid, splat_views
+from oasis_warp.ops._runtime.blend_tiles import (
+    CUDA_LANES,
+    bin_to_tiles,
+    even_work,
+    lane_grid,
+    opaque_elements,
+    splat_views,
+)
 from oasis_warp.ops._runtime.launch import SCALAR, has_vectors, launch_ranges, phase_state, run_native
 from oasis_warp.ops._runtime.records import Splats
 from oasis_warp.ops._runtime.rules import current_rules
-from oasis_warp.ops._runtime.tiles import bin_to_tiles, even_work, opaque_elements
 
 MAX_WEIGHTS = 2**31 - 1
 
