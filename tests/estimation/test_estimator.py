@@ -178,9 +178,9 @@ def test_landmarks_that_are_not_finite_are_refused(estimator, fitted):
 def test_the_wrong_side_is_noticed(estimator, fitted):
     photo, landmarks, _ = fitted(RIGHT)
     fit = estimator.fit(photo, landmarks._replace(side="left"), force=True)
-    said = [warning for warning in fit.warnings if warning.startswith("side doubtful")]
-    assert any("landmarks of a right hand would cost 0." in warning for warning in said)
-    assert any("the network sees a right hand" in warning for warning in said)
+    doubts = [warning for warning in fit.warnings if warning.startswith("side doubtful")]
+    assert any("landmarks of a right hand would cost 0." in warning for warning in doubts)
+    assert any("the network sees a right hand" in warning for warning in doubts)
 
 
 @pytest.mark.parametrize("finger", [pytest.param("thumb", marks=pytest.mark.slow), "ring"])
@@ -279,10 +279,10 @@ def test_shapes_that_agree_are_kept():
 def test_the_shared_shape_is_nearer_to_the_truth_than_one_photo_and_than_their_mean():
     alone, mean, shared = [], [], []
     for seed in range(20):
-        true, said = shapes(3, 1.5, seed)
-        alone.append((said[0] - true).norm())
-        mean.append((torch.stack(said).mean(0) - true).norm())
-        shared.append((shared_shape(said) - true).norm())
+        true, predicted = shapes(3, 1.5, seed)
+        alone.append((predicted[0] - true).norm())
+        mean.append((torch.stack(predicted).mean(0) - true).norm())
+        shared.append((shared_shape(predicted) - true).norm())
     assert sum(shared) < 0.95 * sum(mean) < 0.8 * sum(alone)
 
 
@@ -302,8 +302,8 @@ def test_sides_are_right_in_all_photos_and_fits_as_good_as_we_say_in_every_secon
     for path in sorted([*photos.rglob("*.jpg"), *photos.rglob("*.png")]):
         photo = read_photo(path)
         found = estimator.find(photo)
-        told = path.name if path.parent == photos else path.parent.name  # a set of one hand is named after its side
-        side = next((s for s in ("left", "right") if s in told), None)
+        stated = path.name if path.parent == photos else path.parent.name  # a set of one hand is named after its side
+        side = next((s for s in ("left", "right") if s in stated), None)
         if side and any(hand.side != side for hand in found):
             wrong.append(path.name)
         hands += [(path, landmarks) for landmarks in found]

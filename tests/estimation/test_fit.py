@@ -56,7 +56,7 @@ def pixels(kinematics, truth, count, *, seed=0):
     joints = kinematics.pose_joints(truth.angles, truth.shape)
     normals = kinematics.normals(joints, vertex)[0] @ truth.rotation.T
     xy, still = truth.project(kinematics.surface(joints)[vertex]), np.zeros((count, 3))
-    return SurfacePoints(vertex, still, still, xy, np.full(count, 0.003 * truth.pixels_per_metre()), normals)
+    return SurfacePoints(vertex, still, still, xy, np.full(count, 0.0008 * truth.pixels_per_metre()), normals)
 
 
 def test_derivatives_of_all_terms_are_those_of_differences(kinematics):

@@ -91,11 +91,11 @@ def test_points_of_a_turned_search_lie_where_they_are_in_the_photo(turns):
 def test_landmarks_turn_with_the_photo(photos):
     picture = pixels(photos, "victory_right_09.jpg")
     (upright,) = detect_hands(picture, networks())
-    (turned,) = detect_hands(np.ascontiguousarray(np.rot90(picture)), networks())
-    back = np.stack([picture.shape[1] - turned.xy[:, 1], turned.xy[:, 0]], 1)
+    (rotated,) = detect_hands(np.ascontiguousarray(np.rot90(picture)), networks())
+    back = np.stack([picture.shape[1] - rotated.xy[:, 1], rotated.xy[:, 0]], 1)
     assert np.linalg.norm(back - upright.xy, axis=1).mean() < 0.02 * box_size(upright.xy)
     # World points turn along: x to the right and y down in each photo.
-    world = np.stack([-turned.world[:, 1], turned.world[:, 0], turned.world[:, 2]], 1)
+    world = np.stack([-rotated.world[:, 1], rotated.world[:, 0], rotated.world[:, 2]], 1)
     assert np.linalg.norm(world - upright.world, axis=1).mean() < 0.01
 
 

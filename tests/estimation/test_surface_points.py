@@ -29,7 +29,7 @@ from oasis_warp.estimation.refine import _Problem, refine
 from oasis_warp.estimation.surface_state import shape_of, state_of_surface
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 
 SIZE = (300, 300)
 

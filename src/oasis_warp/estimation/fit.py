@@ -53,6 +53,10 @@ class FitSettings:
     """Number of observations that all pairs of the outline together count as."""
     surface: float = 0.008
     """Least sigma of a pixel's place on the surface; the spread that the network gives is added in quadrature."""
+    surface_spread: float = 4.0
+    """That spread counts so many times: neighbouring pixels err alike, and more on real photos than on those that the
+    network learned from. With 1, 2.5, 4 and 6 the IoU of the model with the masks of 15 photos is .953, .957, .959 and
+    .960; on 39 synthetic photos 1, 1.5 and 4 leave the surface 1.53, 1.51 and 1.59 % of the hand's box away."""
     surface_scale: float = 2.0
     """Robust scale in sigmas (Cauchy)."""
     surface_weight: float = 200.0
@@ -195,7 +199,7 @@ class Fitter:
         """Pixels against the projections of their places on the surface, and their normals against those there."""
         s, count = self.settings, len(surface.vertex)
         places = state.linearize(*self.kinematics.vertices(joints, surface.vertex, surface.displacement))
-        sigma = np.hypot(s.surface * self.target.box, surface.spread)
+        sigma = np.hypot(s.surface * self.target.box, s.surface_spread * surface.spread)
         error = (places.image - surface.xy) / sigma[:, None]
         weight, loss = cauchy((error**2).sum(1), s.surface_scale)
         share = s.surface_weight / count

@@ -34,7 +34,7 @@ from oasis_warp.estimation.fit_problem import mirrored_fit
 from oasis_warp.estimation.landmarks import box_size
 from oasis_warp.estimation.outline import WRIST_LINE, is_grazing, window, wrist_line
 from oasis_warp.hand.kinematics import HandKinematics, unit
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 
 LONGEST = 0.006
 """Largest displacement of a vertex by outlines of the mesh [m]."""

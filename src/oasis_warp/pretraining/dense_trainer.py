@@ -38,16 +38,16 @@ class DenseTrainer(Trainer[DenseNetwork, DenseBatch]):
     def evaluate(self, batch: DenseBatch) -> StepResult:
         """Predict and compute the loss; `pictures` are true and predicted masks, surfaces and albedos."""
         with self.autocast():
-            said = self.network(batch.image, batch.landmarks)
-        terms = dense_loss(said, batch)
+            predicted = self.network(batch.image, batch.landmarks)
+        terms = dense_loss(predicted, batch)
         loss = sum((WEIGHTS[name] * term for name, term in terms.items()), torch.zeros_like(terms["classes"]))
         # A graph cannot hold indexing by a mask, whose result has no fixed size; so the mean is over all skin.
-        off = (said.surface - batch.surface).norm(dim=1) * batch.skin
-        terms["surface_mm"] = MILLIMETRES * off.sum() / batch.skin.sum().clamp_min(1)
-        hand = said.classes.softmax(1)[:, HAND]
+        distance = (predicted.surface - batch.surface).norm(dim=1) * batch.skin
+        terms["surface_mm"] = MILLIMETRES * distance.sum() / batch.skin.sum().clamp_min(1)
+        hand = predicted.classes.softmax(1)[:, HAND]
         pictures = (
-            batch.classes[:, HAND], hand, _shown(batch.surface, batch.skin), _shown(said.surface, hand > 0.5),
-            _shown(2 * srgb(batch.albedo) - 1, batch.skin), _shown(2 * said.albedo - 1, hand > 0.5),
+            batch.classes[:, HAND], hand, _shown(batch.surface, batch.skin), _shown(predicted.surface, hand > 0.5),
+            _shown(2 * srgb(batch.albedo) - 1, batch.skin), _shown(2 * predicted.albedo - 1, hand > 0.5),
         )  # fmt: skip
         return StepResult(loss, terms, pictures)
 
@@ -67,7 +67,7 @@ class DenseTrainer(Trainer[DenseNetwork, DenseBatch]):
         return [picture.permute(0, 2, 3, 1) for picture in (batch.image, *pictures)]
 
 
-def dense_loss(said: DensePrediction, true: DenseBatch) -> dict[str, Tensor]:
+def dense_loss(predicted: DensePrediction, true: DenseBatch) -> dict[str, Tensor]:
     """The terms of the loss, each a mean over pixels.
 
     classes, finger: cross-entropy. surface: negative log-likelihood of a Laplace distribution with the predicted
@@ -80,16 +80,16 @@ def dense_loss(said: DensePrediction, true: DenseBatch) -> dict[str, Tensor]:
     def on_skin(values: Float[Tensor, "B H W"]) -> Tensor:
         return torch.where(true.skin, values, 0).sum() / count
 
-    off = (said.surface - true.surface).abs().sum(1)
-    difference = said.albedo - albedo
+    distance = (predicted.surface - true.surface).abs().sum(1)
+    difference = predicted.albedo - albedo
     slopes = [difference.diff(dim=axis).abs().mean(1) * torch.minimum(*_neighbours(skin, axis - 1)) for axis in (2, 3)]
     return {
-        "classes": -(true.classes * said.classes.log_softmax(1)).sum(1).mean(),
-        "surface": on_skin(off * (-said.log_scale).exp() + 3 * said.log_scale),
-        "normal": on_skin(1 - (said.normal * true.normal).sum(1)),
+        "classes": -(true.classes * predicted.classes.log_softmax(1)).sum(1).mean(),
+        "surface": on_skin(distance * (-predicted.log_scale).exp() + 3 * predicted.log_scale),
+        "normal": on_skin(1 - (predicted.normal * true.normal).sum(1)),
         "albedo": on_skin(difference.abs().mean(1)),
         "edges": (slopes[0].sum() + slopes[1].sum()) / count,
-        "finger": on_skin(cross_entropy(said.finger, true.finger, reduction="none")),
+        "finger": on_skin(cross_entropy(predicted.finger, true.finger, reduction="none")),
     }
 
 
