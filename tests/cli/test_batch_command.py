@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from disk import full_disk
 
-from oasis_warp.cli import batch, batch_cluster, batch_work, main
+from oasis_warp.cli import batch, batch_work, main
 from oasis_warp.cli.batch_work import MAX_TRIES, Order, make_avatars
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
@@ -69,9 +69,9 @@ def folders(order):
 
 def test_every_photo_gets_a_line_and_those_with_an_answer_a_folder_of_their_own(pipeline, photo, order):
     names = [photo("hand.png", 9), photo("none.png", 1), photo("fault.png", 2), "gone.png", photo("copy.png", 9)]
-    told = []
-    counts = make_avatars(np.array(names), order, lambda counts: told.append(dict(counts)))
-    assert counts == told[-1] == {"made": 1, "refused": 1, "failed": 2, "kept": 1} and len(told) == 5
+    reports = []
+    counts = make_avatars(np.array(names), order, lambda counts: reports.append(dict(counts)))
+    assert counts == reports[-1] == {"made": 1, "refused": 1, "failed": 2, "kept": 1} and len(reports) == 5
     hand, none, fault, gone, copy = rows(order, names)
     assert (hand["status"], hand["side"], hand["input_psnr_db"]) == ("made", "right", 30.0)
     assert (none["status"], none["said"]) == ("refused", "none.png: found no hand; give another photo.")
@@ -143,18 +143,18 @@ def test_few_photos_are_shared_by_all_workers_and_many_by_few_tasks(n, workers, 
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "output"),
     [
         (["--workers", "0"], "--workers 0: expected 1 or more"),
         (["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "give one of the two"),
         ([], "pip install 'oasis-warp[batch]'"),
     ],
 )
-def test_wrong_options_and_missing_packages_are_told(photo, order, capsys, monkeypatch, options, said):
+def test_wrong_options_and_missing_packages_are_told(photo, order, capsys, monkeypatch, options, output):
     monkeypatch.setitem(sys.modules, "distributed", None)
     photo("a.png", 9)
     assert main(["batch", str(order.source), "-o", str(order.out), "--prior", "none", *options]) == 2
-    assert said in capsys.readouterr().err
+    assert output in capsys.readouterr().err
 
 
 def test_a_batch_ends_with_a_manifest_and_counts_of_what_was_said(pipeline, photo, order, monkeypatch, capsys):
@@ -166,9 +166,9 @@ def test_a_batch_ends_with_a_manifest_and_counts_of_what_was_said(pipeline, phot
             left = order.out / "avatars" / "ab" / ".abcd.01234567.part"  # of a worker that was killed
             left.mkdir(parents=True)
 
-    def work(client, tasks, order, told):
+    def work(client, tasks, order, reports):
         counts = [make_avatars(names, order) for names in tasks]
-        told(5, 0)
+        reports(5, 0)
         return sum(sum(count.values()) - count["kept"] for count in counts)
 
     monkeypatch.setattr(batch, "open_cluster", lambda *_: Cluster())
@@ -189,16 +189,16 @@ def test_a_batch_ends_with_a_manifest_and_counts_of_what_was_said(pipeline, phot
 def test_the_work_of_a_cluster_is_counted_and_a_lost_scheduler_told(pipeline, photo, order):
     distributed = pytest.importorskip("distributed")
     names = [photo(f"{k}.png", shade) for k, shade in enumerate((9, 1, 10))]
-    told = []
+    reports = []
     with distributed.Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None) as client:
         tasks = [names[:2], names[2:]]
-        assert batch_cluster.work(client, tasks, order, lambda *counts: told.append(counts)) == 3
-        assert told[-1] == (3, 0)
-        assert batch_cluster.work(client, tasks, order, lambda *counts: told.append(counts)) == 0
-        assert told[-1] == (0, 3)
+        assert batch.work(client, tasks, order, lambda *counts: reports.append(counts)) == 3
+        assert reports[-1] == (3, 0)
+        assert batch.work(client, tasks, order, lambda *counts: reports.append(counts)) == 0
+        assert reports[-1] == (0, 3)
         wrong = Order(source=order.source, out=order.source / "0.png", config=order.config)
         with pytest.raises(InputError, match="expected the folder"):
-            batch_cluster.work(client, tasks, wrong, lambda *counts: None)
+            batch.work(client, tasks, wrong, lambda *counts: None)
 
 
 @pytest.mark.slow
@@ -207,7 +207,7 @@ def test_the_work_of_a_cluster_is_counted_and_a_lost_scheduler_told(pipeline, ph
 def test_nothing_is_lost_double_or_half_when_parts_are_killed(victim):
     pytest.importorskip("distributed")
     script = Path(__file__).parents[1] / "fuzz" / "kill_batch.py"
-    command = [sys.executable, str(script), victim, "--count", "2", "--photos", "6"]
-    said = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    assert said["kills"] == 2
-    assert not any(said[name] for name in ("half", "lost", "double", "failed", "left")), said
+    command = [sys.executable, str(script), victim, "--count", "1", "--photos", "6"]
+    output = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    assert output["kills"] == 1
+    assert not any(output[name] for name in ("half", "lost", "double", "failed", "left")), output

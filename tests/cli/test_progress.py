@@ -1,7 +1,9 @@
 """What a user sees of a reconstruction: its progress, its report, its summary."""
 
+import contextlib
 import io
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,17 @@ import torch
 from rich.console import Console
 
 from oasis_warp.avatar.quality import SurfaceQuality
-from oasis_warp.cli.console import line_progress, show_progress, show_run
-from oasis_warp.cli.progress import EDIT_PLAN, USUAL_STEPS, ManyPhotos, Run, reconstruct_plan
+from oasis_warp.cli.progress import (
+    EDIT_PLAN,
+    USUAL_STEPS,
+    ManyPhotos,
+    Run,
+    Terminal,
+    line_progress,
+    reconstruct_plan,
+    show_progress,
+    show_run,
+)
 from oasis_warp.cli.record import recorded
 from oasis_warp.cli.report import make_report, print_report, to_json
 from oasis_warp.cli.summary import (
@@ -196,8 +207,8 @@ def test_the_table_says_everything_in_words(scene, made):
     out = io.StringIO()
     print_report(Console(file=out, width=100), make_report([scene[0]], made, ReconstructConfig(), {"fit": 1.234}))
     text = out.getvalue()
-    said = ("fit", "1.23 s", "total", "likeness to the photo", "30.0 dB", "new_measure", "0.1235")
-    for part in ("prior learned", *said):
+    expected = ("fit", "1.23 s", "total", "likeness to the photo", "30.0 dB", "new_measure", "0.1235")
+    for part in ("prior learned", *expected):
         assert part in text
     assert "Warning: the thumb is hidden" in text
 
@@ -220,6 +231,20 @@ def test_a_stage_that_comes_twice_is_timed_twice():
     for done in (0, 1, 0, 1):
         progress("views", done, 1)
     assert lines == ["views: 1.0 s", "views: 2.0 s"]
+
+
+def test_progress_whose_reader_has_gone_ends_no_thread(monkeypatch):
+    """`oasis batch` waited for ever: rich had ended Dask's thread, which counts photos."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as nobody:
+        monkeypatch.setattr("sys.stderr", nobody)
+        with show_progress(Terminal()) as progress:
+            for step in range(3):
+                progress("fit", step + 1, 3)
+        monkeypatch.undo()
+        with contextlib.suppress(BrokenPipeError):
+            nobody.close()
 
 
 @pytest.mark.parametrize("terminal", [True, False])

@@ -9,9 +9,8 @@ import torch
 from datasets.trees import WRITERS
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.datasets.files import MAX_BYTES, Tree
 from oasis_warp.datasets.readers import read_dataset, read_selection
-from oasis_warp.datasets.samples import load_picture
+from oasis_warp.datasets.samples import MAX_BYTES, Tree, load_picture
 from oasis_warp.hand.mano import read_mano
 
 
@@ -61,8 +60,9 @@ def test_nothing_of_an_archive_is_taken_that_is_no_plain_file_of_the_folder(tmp_
     tree = Tree(tmp_path)
     assert [name for name in tree.names() if not name.endswith(".tar")] == ["also", "fine"]
     assert tree.file("fine").read() == b"5" and tree.file("also").read() == b"6"
-    said = " ".join(tree.left_out.values())
-    assert len(tree.left_out) == 7 and "link is a link" in said and "../out leads out" in said and "twice" in said
+    message = " ".join(tree.left_out.values())
+    assert len(tree.left_out) == 7
+    assert "link is a link" in message and "../out leads out" in message and "twice" in message
     for name in ("../out", "/etc/passwd", "a/../../b", "a\\b"):
         with pytest.raises(InputError, match="leads out of the folder"):
             tree.file(name)
@@ -78,10 +78,10 @@ def test_bombs_and_damage_are_refused_or_named(tmp_path):
         "has more than 256 MB": huge.tobuf() + bytes(2048), "three is cut short": whole[:3800],
         "is damaged after 1536 bytes": whole[:1536] + b"x" * 512 + whole[2048:],
     }  # fmt: skip
-    for said, content in cases.items():
+    for message, content in cases.items():
         (tmp_path / "a.tar").write_bytes(content)
         tree = Tree(tmp_path)
-        assert any(said in reason for reason in tree.left_out.values()), (said, tree.left_out)
+        assert any(message in reason for reason in tree.left_out.values()), (message, tree.left_out)
     for content in (b"", b"hello" * 200, b"\x1f\x8b" + whole[2:]):
         (tmp_path / "a.tar").write_bytes(content)
         with pytest.raises(InputError, match="expected a tar file that is not compressed"):
@@ -103,10 +103,10 @@ def test_another_selection_of_interhand_comes_from_a_file(models, mano_dir, tmp_
     assert {sample.subject for sample in taken} == {"train/Capture4"} and len(taken) == 4
     tested = read_dataset("interhand", tmp_path, mano_dir, "test", chosen).samples
     assert len(tested) == 1 and "Capture0/ROM04_X" in tested[0].name
-    for content, said in (
+    for content, message in (
         ([], "expected some of captures"), ({"capture": [1]}, "got capture"), ({"captures": ["1"]}, "list of numbers"),
         ({"excluded": "x"}, "list of names"), ({"test_step": 0}, "whole number from 1"),
     ):  # fmt: skip
         path.write_text(json.dumps(content))
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             read_selection(path)

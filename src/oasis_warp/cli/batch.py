@@ -1,37 +1,172 @@
-"""`oasis batch`: thousands of photos, on the cores of this machine or on a cluster of Dask."""
+"""`oasis batch`: thousands of photos, on the cores of this machine or on a cluster of Dask, and the workers there."""
 
 import contextlib
 import json
+import logging
 import os
 import re
+import signal
 import sys
+import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
-from oasis_warp.cli.batch_cluster import open_cluster, work
-from oasis_warp.cli.batch_work import AVATARS, ROWS, TRIES, Order, read_rows
-from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED, plain_console, show_run
+from oasis_warp.cli.batch_work import AVATARS, MAX_TRIES, ROWS, TRIES, Order, make_avatars, read_rows
 from oasis_warp.cli.jobs import SUFFIXES
+from oasis_warp.cli.loopback import LOOPBACK
 from oasis_warp.cli.options import Batch
-from oasis_warp.cli.progress import ManyPhotos
+from oasis_warp.cli.progress import BAD_INPUT, INTERRUPTED, ManyPhotos, Terminal, check_device, plain_console, show_run
 from oasis_warp.cli.record import exact_command
 from oasis_warp.core.config import ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.data.output_files import make_folders, output_file, remove_leftovers, write_file
+from oasis_warp.ops import warm_up
 
+PATIENCE = 60
+"""Seconds for a scheduler to answer, and for the first worker to come."""
+EVERY = 1.0
+"""Seconds between two words of a worker on how far it is."""
+TOPIC = "oasis batch"
 MAX_PHOTOS, TASKS_A_WORKER = 256, 16
 """Photos of a task at most, and tasks of a worker at least: in the end workers wait for each other for half a task, so
 a 32nd of the time, and a scheduler of Dask has 4,000 tasks for a million photos."""
 MAX_REASONS = 8
 """Sentences in the table at the end."""
+
+
+@contextlib.contextmanager
+def open_cluster(workers: int | None, scheduler: str | None, device: str) -> Iterator[tuple[Any, int]]:
+    """A client of Dask and the number of its workers: new ones on this machine, or those of a scheduler.
+
+    Raises:
+        InputError: both or nonsense is asked for, Dask is missing, no scheduler answers, or it is lost.
+    """
+    if workers is not None and scheduler is not None:
+        raise InputError("--workers: belongs to this machine, --scheduler to a cluster; give one of the two.")
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers {workers}: expected 1 or more; leave it out for all cores.")
+    try:
+        import cryptography  # noqa: F401 - keys of `_local` are made with it
+        import distributed
+    except ImportError as error:
+        raise InputError("oasis batch: needs Dask distributed; install it: pip install 'oasis-warp[batch]'.") from error
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is raised
+    if scheduler is None:
+        check_device(device)
+        warm_up(device)  # kernels are compiled once, and not by all workers at the same time
+        n = workers or len(os.sched_getaffinity(0))
+        with _local(distributed, n) as client:
+            yield client, n
+        return
+    try:
+        client = distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"--scheduler {scheduler}: none answers there ({error}); start one with `dask scheduler`."
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, PATIENCE)
+        except TimeoutError as error:
+            raise InputError(
+                f"--scheduler {scheduler}: has no worker; start some with `dask worker {scheduler} --nthreads 1`."
+            ) from error
+        yield client, len(client.nthreads())
+
+
+@contextlib.contextmanager
+def _local(distributed: Any, n: int) -> Iterator[Any]:
+    """Workers on this machine that only it reaches, with keys, so that its other users cannot give them work."""
+
+    class IgnoreInterrupts(distributed.WorkerPlugin):
+        """Ctrl-C goes to all processes of a terminal: the one that started the workers ends them."""
+
+        def setup(self, worker: Any) -> None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    keys = distributed.Security.temporary()
+    with (
+        distributed.LocalCluster(
+            n_workers=n, threads_per_worker=1, host=LOOPBACK, protocol="tls", security=keys, memory_limit=0,
+            silence_logs=logging.CRITICAL, scheduler_kwargs={"dashboard": False, "dashboard_address": f"{LOOPBACK}:0"},
+        ) as cluster,
+        distributed.Client(cluster, security=keys, set_as_default=False) as client,
+    ):  # fmt: skip
+        client.register_plugin(IgnoreInterrupts(), name="ignore-interrupts")
+        yield client
+
+
+def work(client: Any, tasks: Sequence[Sequence[str]], order: Order, report: Callable[[int, int], object]) -> int:
+    """Run all tasks; the number of photos that were processed now, not found done.
+
+    Args:
+        client: Of Dask.
+        tasks: Names of photos.
+        order: What to make of them.
+        report: Called with the numbers of photos so far that were worked on, and that were found done.
+
+    Raises:
+        InputError: the scheduler is lost, or a worker can make no avatars.
+    """
+    from distributed import CancelledError, KilledWorker, as_completed
+
+    counts: dict[int, Counter[str]] = {}
+    ended, lock = set[int](), threading.Lock()  # events come on a thread of the client
+
+    def count(task: int, counted: Mapping[str, int], *, end: bool) -> int:
+        with lock:
+            if task in ended:
+                return 0
+            if end:
+                ended.add(task)
+            counts[task] = Counter(counted)
+            total = sum(counts.values(), Counter[str]())
+            report(total.total() - total["kept"], total["kept"])
+        return total.total() - total["kept"]
+
+    client.subscribe_topic(TOPIC, lambda event: count(event[1]["task"], event[1]["counts"], end=False))
+    futures = {client.submit(_task, k, names, order, pure=False): k for k, names in enumerate(tasks)}
+    worked, killed, done = 0, Counter[int](), as_completed(futures, loop=client.loop)
+    try:
+        for future in done:
+            try:
+                worked = count(futures[future], future.result(), end=True)
+            except KilledWorker:  # by its photos, whose tries are counted, or from outside
+                killed[futures[future]] += 1
+                if killed[futures[future]] > MAX_TRIES * len(tasks[futures[future]]):
+                    raise
+                future.retry()
+                done.add(future)
+    except (CancelledError, OSError) as error:
+        raise InputError(
+            "oasis batch: the scheduler is lost; start it and its workers again, and the same command goes on."
+        ) from error
+    return worked
+
+
+def _task(number: int, names: Sequence[str], order: Order) -> dict[str, int]:
+    """`make_avatars` on a worker of Dask."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    if worker.state.nthreads != 1:
+        raise InputError(f"{worker.address}: has {worker.state.nthreads} threads; start it with --nthreads 1.")
+    last = 0.0
+
+    def tell(counts: Mapping[str, int]) -> None:
+        nonlocal last
+        if time.monotonic() - last > EVERY:
+            last = time.monotonic()
+            worker.log_event(TOPIC, {"task": number, "counts": dict(counts)})
+
+    return make_avatars(names, order, tell)
 
 
 def run(options: Batch) -> int:
@@ -53,7 +188,7 @@ def run(options: Batch) -> int:
         tasks, start = split_tasks(names, n_workers), time.monotonic()
         run = ManyPhotos(len(names), config, n_workers)
         try:
-            with show_run(Console(stderr=True), run) as shown:
+            with show_run(Terminal(), run) as shown:
                 worked = work(client, tasks, order, lambda made, kept: _count(run, shown.progress, made, kept))
         except KeyboardInterrupt:
             print(f"oasis: stopped; {run.what} are done, the same command goes on.", file=sys.stderr)

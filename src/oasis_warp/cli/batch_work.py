@@ -25,7 +25,7 @@ import torch
 
 from oasis_warp import __version__
 from oasis_warp.avatar.prior import Prior
-from oasis_warp.cli.console import check_device
+from oasis_warp.cli.progress import check_device
 from oasis_warp.cli.reconstruct import write_results
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError

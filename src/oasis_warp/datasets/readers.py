@@ -11,8 +11,7 @@ from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.pickle_reader import read_pickle
 from oasis_warp.core.types import Side
 from oasis_warp.data.json_text import whole
-from oasis_warp.datasets.files import File, Tree
-from oasis_warp.datasets.samples import Catalogue, Models, Sample, entry, numbers, pose_of_48, read_table
+from oasis_warp.datasets.samples import Catalogue, File, Models, Sample, Tree, entry, numbers, pose_of_48, read_table
 from oasis_warp.estimation.mano_estimates import SUFFIXES, Estimate, estimate_of_entries, read_estimate
 from oasis_warp.hand.mano import mano_surface, mirror_mano_pose, read_mano, subsample
 

@@ -22,9 +22,8 @@ from oasis_warp.datasets.samples import Catalogue, Models, Sample, load_picture
 from oasis_warp.hand.mano import ManoPose
 from oasis_warp.hand.mano_hand import hand_pose_of_mano
 from oasis_warp.ops import depth_map
-from oasis_warp.pretraining.hand_batch import pose_hands
 from oasis_warp.pretraining.synthetic_source import SURROUNDINGS, SyntheticHands, seeded
-from oasis_warp.pretraining.training_batch import EstimatorNoise, training_batch
+from oasis_warp.pretraining.training_batch import EstimatorNoise, pose_hands, training_batch
 
 STREAM, MIX_STREAM = 5, 6
 """Stream numbers of the choice of samples, and of data set or synthetic people, beside those of synthetic sources."""
@@ -51,10 +50,11 @@ class DatasetPictures(NamedTuple):
 
 
 class Loaded(NamedTuple):
-    """A `Picture` on its way from another process: arrays, and 8 bits a colour as in the photo."""
+    """A `Picture` of 8 bits a colour, as in the photo."""
 
-    image: np.ndarray
-    mask: np.ndarray | None
+    pixels: Tensor
+    """[S, S, 4]: the image, and its mask where it `has_mask`."""
+    has_mask: bool
     viewmat: np.ndarray
     K: np.ndarray
     mano: ManoPose
@@ -68,25 +68,32 @@ def _keep_models(models: Models) -> None:
     _own.models = models
 
 
-def _load(sample: Sample, models: Models, size: int) -> Loaded:
-    """As `load_picture`."""
+def _load(sample: Sample, models: Models, size: int, pixels: Tensor) -> Loaded:
+    """As `load_picture`, into `pixels`."""
     image, mask, camera, mano = load_picture(sample, models, size)
-    return Loaded(_to_bytes(image), None if mask is None else _to_bytes(mask), *map(np.asarray, camera[:2]), mano)
+    pixels[..., :3] = 255 * image + 0.5
+    if mask is not None:
+        pixels[..., 3] = 255 * mask + 0.5
+    return Loaded(pixels, mask is not None, *map(np.asarray, camera[:2]), mano)
 
 
-def _to_bytes(values: Tensor) -> np.ndarray:
-    return (255 * values + 0.5).to(torch.uint8).numpy()
+def _empty(count: int, size: int) -> Tensor:
+    return torch.zeros(count, size, size, 4, dtype=torch.uint8)
 
 
-def _load_all(samples: Sequence[Sample], size: int) -> list[Loaded | str]:
-    """Each sample's picture, or why it cannot be loaded."""
+def _load_all(samples: Sequence[Sample], size: int) -> tuple[list[Loaded | str], Tensor]:
+    """Each sample's picture, or why it cannot be loaded; and the pixels of all, which these lack.
+
+    Between processes torch shares one tensor by its memory; through a pipe the pixels would take longer than loading.
+    """
     found: list[Loaded | str] = []
-    for sample in samples:
+    pixels, nothing = _empty(len(samples), size), _empty(0, 0)
+    for sample, own in zip(samples, pixels, strict=True):
         try:
-            found.append(_load(sample, _own.models, size))
+            found.append(_load(sample, _own.models, size, own)._replace(pixels=nothing))
         except InputError as error:
             found.append(str(error))
-    return found
+    return found, pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +128,7 @@ class DatasetHands:
         keep, alone = partial(_keep_models, self.models), partial(cv2.setNumThreads, 1)
         pool = worker_pool(self.workers, keep, alone) if self.workers else ThreadPoolExecutor(1, initializer=keep)
         numbers = itertools.count(first_step * world + rank, world)
-        waiting = deque[tuple[int, list[list[Sample]], Future[list[Loaded | str]]]]()
+        waiting = deque[tuple[int, list[list[Sample]], Future[tuple[list[Loaded | str], Tensor]]]]()
 
         def submit() -> None:
             chosen = self._chosen(groups, number := next(numbers))
@@ -134,9 +141,10 @@ class DatasetHands:
                 while True:
                     number, chosen, loading = waiting.popleft()
                     found = [
-                        self._instead(group, size, picture) if isinstance(picture, str) else picture
-                        for group, picture in zip(chosen, loading.result(), strict=True)
-                    ]
+                        self._instead(group, pixels, picture) if isinstance(picture, str)
+                        else picture._replace(pixels=pixels)
+                        for group, picture, pixels in zip(chosen, *loading.result(), strict=True)
+                    ]  # fmt: skip
                     submit()
                     photos = found[:: 1 + self.views]
                     yield number, photos, [each for k, each in enumerate(found) if k % (1 + self.views)]
@@ -160,8 +168,8 @@ class DatasetHands:
             for group in owners for _ in range(1 + self.views)
         ]  # fmt: skip
 
-    def _instead(self, group: list[Sample], size: int, reason: str) -> Loaded:
-        """The next picture that can be loaded after the first; others are noted.
+    def _instead(self, group: list[Sample], pixels: Tensor, reason: str) -> Loaded:
+        """The next picture that can be loaded after the first, into `pixels`; others are noted.
 
         Raises:
             InputError: none can.
@@ -169,7 +177,7 @@ class DatasetHands:
         for failed, sample in itertools.pairwise(group):
             self.failed[failed.name] = reason
             try:
-                return _load(sample, self.models, size)
+                return _load(sample, self.models, len(pixels), pixels)
             except InputError as error:
                 reason = str(error)
         raise InputError(f"{TRIES} photos of {group[0].subject} could not be read, the last: {reason}")
@@ -187,12 +195,13 @@ class DatasetHands:
 
         angles, orientation, translation = (stacked([pose[k] for pose in poses]) for k in range(3))
         shape = stacked([torch.from_numpy(picture.mano.betas) for picture in pictures])
-        image = torch.from_numpy(np.stack([p.image for p in pictures])).to(self.device).float() / 255
+        pixels = torch.stack([picture.pixels for picture in pictures]).to(self.device).float() / 255
+        image = pixels[..., :3].contiguous()
         K = stacked([torch.from_numpy(p.K) for p in pictures])
         mask = self._silhouettes(hand, (shape, angles, orientation, translation), K, image.shape[1])
         for k, picture in enumerate(pictures):
-            if picture.mask is not None:
-                mask[k] = torch.from_numpy(picture.mask).to(mask) / 255
+            if picture.has_mask:
+                mask[k] = pixels[k, ..., 3]
         left = torch.zeros(len(image), dtype=torch.int64, device=self.device)
         return DatasetPictures(image, mask, mask, angles, orientation, translation, shape, K, left)
 
