@@ -25,7 +25,7 @@ from oasis_warp.core.surface import mesh_edges, smooth_over_mesh
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.synthetic.body import bundled_body
 from oasis_warp.synthetic.identity import Population, sample_identity
-from oasis_warp.synthetic.relief import relief_forms
+from oasis_warp.synthetic.people import relief_forms
 from oasis_warp.synthetic.skin_plan import plan_skin
 from oasis_warp.synthetic.skin_texture import nail_maps
 from oasis_warp.synthetic.texels import draw_lines, texels_on

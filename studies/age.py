@@ -23,7 +23,7 @@ TOP = Path(__file__).parents[1]
 RESULTS = TOP / "studies" / "results"
 PACKAGES = {
     "studies": TOP / "studies", "tests": TOP / "tests", "oasis_warp": TOP / "src" / "oasis_warp",
-    "oasis_kernels": TOP / "kernels" / "oasis_kernels",
+    "oasis_kernels": TOP / "kernels" / "oasis_kernels", "asset_build": TOP / "asset_build",
 }  # fmt: skip
 ASSETS = PACKAGES["oasis_warp"] / "assets"
 

@@ -18,7 +18,7 @@ from oasis_warp.core.types import Camera, HandPose
 from oasis_warp.editing import edit
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.losses.image import masked_psnr
+from oasis_warp.losses import masked_psnr
 from studies.harness import AvatarOptions, Row, measured
 from studies.inputs import prior_named
 from studies.painted_truth import (

@@ -28,12 +28,13 @@ from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.splats import posed_splats
 from oasis_warp.export.surface_mesh import mesh_points, topology
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
+from oasis_warp.hand.skinning import skin_surface
 from oasis_warp.hand.webxr_rig import TO_WEBXR
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.losses.image import masked_psnr
+from oasis_warp.losses import masked_psnr
 from oasis_warp.ops import depth_map
 from oasis_warp.reconstruction import reconstruct
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 from studies.harness import Row, StudyOptions, measured
 from studies.tables import Column, Section, power, table
 
@@ -140,7 +141,7 @@ def skinning_errors(avatar: Avatar, path: Path, options: Options) -> Row:
             pose = HandPose(angles, torch.eye(3), torch.zeros(3))
             export_avatar(avatar, path, pose=pose)
             document, binary = read_gltf(path)
-            true = (mesh_points(avatar.mesh(pose).vertices, avatar.hand, mesh) @ turn.T).numpy()[:-1]
+            true = (mesh_points(skin_surface(*avatar.parts[:2], pose), avatar.hand, mesh) @ turn.T).numpy()[:-1]
             for sets, found in away.items():
                 points = play(document, binary, document["nodes"], document["meshes"][0]["weights"], sets)
                 found.append(np.linalg.norm(points[:-1] - true, axis=1))

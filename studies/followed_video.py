@@ -18,7 +18,7 @@ from oasis_warp.cli.animate import draw_frames
 from oasis_warp.core import rotation
 from oasis_warp.core.logging import silent
 from oasis_warp.core.types import HandPose
-from oasis_warp.data.videos import write_video
+from oasis_warp.data.pictures import write_video
 from oasis_warp.hand.poses import pose_sequence
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.motion import Motion, jitter, recording, smooth

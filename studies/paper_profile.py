@@ -19,8 +19,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.evaluation.synthetic import crop_of
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.losses.image import detail_difference
-from oasis_warp.losses.lpips import Lpips
+from oasis_warp.losses import Lpips, detail_difference
 from oasis_warp.network.config import PROFILES
 from oasis_warp.network.encoders import DinoV2Encoder
 from oasis_warp.network.hand_network import HandNetwork

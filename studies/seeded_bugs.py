@@ -113,7 +113,7 @@ PIPELINE = [
         "uv[uv_faces.flatten()[corners]]", "uv[uv_faces.flatten()[corners - 1]]"),
     _of("network/prior", "network/test_network_prior", "floats", "Gaussians above the surface kept",
         "above.clamp(max=0) * normals", "above * normals"),
-    _of("adaptation/mixture", "adaptation/test_adapt", "different_light", "the guesses' gains forgotten",
+    _of("adaptation/prior_guess", "adaptation/test_adapt", "different_light", "the guesses' gains forgotten",
         "_in_one_light([table.colors for table in tables], present)", "[table.colors for table in tables]"),
     _of("editing", "test_editing", "worn_as", "paint under the photo's light",
         "canvas = canvas._replace(image=without_light(avatar.hand, crop, avatar.light).image)", "pass"),
@@ -136,7 +136,7 @@ PIPELINE = [
         "hand[:, 0], hand[:, -1])", "hand[:, 0])"),
     _of("estimation/hand_crop", "data_stage/test_square_crop", "mirrored_photo or wrist_line",
         "a left wrist not mirrored", "image, above = image.flip(1), above.flip(1)", "image = image.flip(1)"),
-    _of("ops/_runtime/tiles", "certify/test_grid", "small_scenes and rasterization", "farthest first",
+    _of("ops/_runtime/blend_tiles", "certify/test_grid", "small_scenes and rasterization", "farthest first",
         "torch.argsort(depths.view(-1)[drawn], stable=True)", "torch.argsort(-depths.view(-1)[drawn], stable=True)"),
 ]  # fmt: skip
 

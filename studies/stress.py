@@ -27,7 +27,7 @@ from oasis_warp.estimation.landmarks import FINGERS, box_size
 from oasis_warp.evaluation.metrics import match_colors
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.losses.image import masked_psnr
+from oasis_warp.losses import masked_psnr
 from oasis_warp.reconstruction import Reconstruction, reconstruct
 from studies.harness import AvatarOptions, Row, measured
 from studies.inputs import photo_named
@@ -317,6 +317,6 @@ def warnings_of(row: Row) -> str:
 COLUMNS = (
     Column("damage", "damage"), Column("own photo, dB", "own_db", ".1f"),
     Column("undamaged avatar, dB", "like_db", ".1f"), Column("overlap of fit and mask", "mask_iou", ".2f"),
-    Column("seen, %", "seen", ".0f"), Column("said", warnings_of),
+    Column("seen, %", "seen", ".0f"), Column("warnings", warnings_of),
 )  # fmt: skip
 SECTIONS = (Section("detail.md", "stress", table(COLUMNS)),)

@@ -10,7 +10,7 @@ from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 
 PALM_TO_CAMERA = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # fingers up, thumb to the right
 BACK_TO_CAMERA = torch.tensor([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])

@@ -105,10 +105,10 @@ def test_the_bill_of_materials_names_all_that_runs_and_is_the_same_each_time():
 
 def test_the_licences_of_the_page_are_those_of_the_installed_packages():
     rows = re.findall(r"^\| ([a-z0-9-]+) \| (.+) \|$", (TOP / "docs" / "security.md").read_text(), re.MULTILINE)
-    told, packages = dict(rows), supply.installed()
+    listed, packages = dict(rows), supply.installed()
     ours = {name: package for name, package in packages.items() if not name.startswith(("nvidia", "triton", "cuda"))}
-    assert set(ours) <= set(told)
-    assert {name: supply.licence(package) for name, package in ours.items()} == {name: told[name] for name in ours}
+    assert set(ours) <= set(listed)
+    assert {name: supply.licence(package) for name, package in ours.items()} == {name: listed[name] for name in ours}
 
 
 def test_versions_with_known_faults_are_found_in_packages_and_in_what_their_wheels_bundle():

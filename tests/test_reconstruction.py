@@ -27,7 +27,7 @@ from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_h
 from oasis_warp.estimation.hand_crop import crop_hand, crop_landmarks, initial_offsets
 from oasis_warp.hand.skinning import hand21, rest_hand, skin
 from oasis_warp.hand_avatar import draw_as_photo, make_avatar
-from oasis_warp.losses.image import detail_difference, masked_psnr
+from oasis_warp.losses import detail_difference, masked_psnr
 from oasis_warp.reconstruction import input_errors, reconstruct, reconstruct_same_hand
 from studies.stress import DAMAGES, is_sane, likeness, make
 
@@ -243,7 +243,7 @@ def test_a_photo_in_much_less_light_is_brought_to_the_first_one_s(palm, alone):
     dark = palm._replace(rgb=(palm.rgb.float() * 0.4).to(torch.uint8), name="dark.jpg")
     made = reconstruct_same_hand([palm, dark], SMALL)
     assert made.photos[1].gain == pytest.approx((0.4, 0.4, 0.4), abs=0.04)
-    assert any(re.match(r"dark.jpg: its light is another, 2\.[3-7] times darker", said) for said in made.warnings)
+    assert any(re.match(r"dark.jpg: its light is another, 2\.[3-7] times darker", warning) for warning in made.warnings)
     mean = [avatar.gaussians.colors.mean(0) for avatar in (alone.avatar, made.avatar)]
     assert torch.allclose(*mean, atol=0.04)
 
@@ -276,7 +276,7 @@ def test_refinement_of_a_left_hand_moves_it_and_keeps_it_on_its_photo(hand):
 
 
 OPEN_PALM = Path(__file__).parent / "data" / "photos" / "palm_open_left_02.png"
-FEW = ReconstructConfig(size=256, steps=20)
+FEW = ReconstructConfig(size=128, steps=5)
 SAID = {
     "mask eroded": "", "mask dilated": "", "landmarks off": "poor fit", "half out": "border", "warm light": "",
     "cold light": "colour of skin", "dark": "dark photo", "blurred": "blurred photo", "tiny": "small hand",

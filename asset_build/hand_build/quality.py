@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 from igl.predicates import find_self_intersections
 
-from hand_build.anatomy import Array, Index
+from .anatomy import Array, Index
 
 FLAT = 1e-6
 """Sine-like measure of an edge and a face below which they count as parallel: neighbours in a flat region."""

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.repaint import RepaintResult, repaint
+from oasis_warp.adaptation.repaint import RepaintResult, find_paint, match_size, read_mask, repaint
 from oasis_warp.adaptation.reprojection import Canvas
 from oasis_warp.adaptation.sh_lighting import without_light
 from oasis_warp.core.camera import crop_camera
@@ -17,11 +17,10 @@ from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_camera, mirror_pose
 from oasis_warp.core.processes import single_threaded_torch
 from oasis_warp.core.types import HandCrop, Photo
-from oasis_warp.data.paint_mask import find_paint, match_size, read_mask
 from oasis_warp.data.square_crop import Square, find_square, resample_square
 from oasis_warp.hand.skinning import skin
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.losses.image import masked_psnr
+from oasis_warp.losses import masked_psnr
 from oasis_warp.ops import warm_up
 
 OTHER_PHOTO = 0.06

@@ -58,7 +58,7 @@ from oasis_warp.estimation.keypoints import read_keypoints
 from oasis_warp.estimation.refine import refine
 from oasis_warp.hand.template import chosen_hand
 from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
-from oasis_warp.losses.image import Perceptual, masked_psnr
+from oasis_warp.losses import Perceptual, masked_psnr
 from oasis_warp.network.heads import ColorHeads
 from oasis_warp.network.prior import choose_prior, guess_with_heads
 from oasis_warp.ops import warm_up
@@ -149,7 +149,7 @@ def reconstruct(
         keypoints: A file with 21 landmarks, or with pose and camera, to use instead of the networks:
             `estimation.keypoints.read_keypoints`.
         prior: What to assume of a hand before its photo is fitted; the one that `config.prior` names when not given.
-        perceptual: LPIPS (`losses.lpips.load_lpips`) on `config.device`, to be measured; with `config.adapt` "lora" it
+        perceptual: LPIPS (`losses.load_lpips`) on `config.device`, to be measured; with `config.adapt` "lora" it
             is in the loss too, as in the paper.
         progress: Called as work goes on.
 

@@ -10,7 +10,7 @@ from synthetic import BACK_TO_CAMERA, PALM_TO_CAMERA, crop_of
 import oasis_warp.adaptation
 from oasis_warp.adaptation.adam import Adam
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.adaptation.mixture import mix_guesses
+from oasis_warp.adaptation.prior_guess import mix_guesses
 from oasis_warp.adaptation.reliability import observe_photos, photo_gains
 from oasis_warp.adaptation.unlit import unlit_detail, view_in_photo
 from oasis_warp.avatar.appearance import label_regions, region_colors
@@ -19,8 +19,8 @@ from oasis_warp.avatar.pose import pose_gaussians, with_photo
 from oasis_warp.avatar.prior import MeanHands, MeanPrior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import CanonicalGaussians, HandCrop
-from oasis_warp.losses.image import masked_psnr
-from oasis_warp.render.render import render
+from oasis_warp.losses import masked_psnr
+from oasis_warp.render import render
 
 CAST = torch.tensor([0.90, 0.85, 0.80])  # a little dim and warm
 STEPS = AdaptConfig(texture_steps=25)

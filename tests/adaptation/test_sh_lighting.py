@@ -36,7 +36,7 @@ from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import HandLight
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 
 LIGHT = HandLight(
     torch.tensor([[0.8, 0.8, 0.8], [0.3, 0.25, 0.2], [-0.2, -0.25, -0.3], [-0.15, -0.15, -0.15]]),
@@ -119,11 +119,11 @@ def test_light_stays_when_the_hand_turns(hand, scene):
     even, truth, pose, _ = scene
     lit = avatar_of(hand, truth, pose, even.camera, LIGHT)
     half = rotation.from_axis_angle(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(torch.pi))
-    turned = pose._replace(orientation=half @ pose.orientation)
-    before, after = lit.pose(pose).colors, lit.pose(turned).colors
+    rotated = pose._replace(orientation=half @ pose.orientation)
+    before, after = lit.pose(pose).colors, lit.pose(rotated).colors
     assert float((before - after).abs().max()) > 0.1
     follows = avatar_of(hand, truth, pose, even.camera, turn_light(LIGHT, half))
-    torch.testing.assert_close(follows.pose(turned).colors, before, atol=1e-5, rtol=0)
+    torch.testing.assert_close(follows.pose(rotated).colors, before, atol=1e-5, rtol=0)
 
 
 def turn(pose, degrees):
@@ -170,8 +170,8 @@ def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene, of):
     torch.testing.assert_close(ratio(0), torch.full_like(truth.colors, 0.9))
     half = ratio(12)
     assert bool((half > 0.9 - 1e-3).all()) and bool((half < 1 + 1e-3).all()) and float(half.std()) > 0.01
-    turned = turn(pose, 180)
-    away = (shaded.pose(turned).colors / plain.pose(turned).colors)[: len(truth.vertex_index)]
+    rotated = turn(pose, 180)
+    away = (shaded.pose(rotated).colors / plain.pose(rotated).colors)[: len(truth.vertex_index)]
     around = light.facing[truth.vertex_index, 0].abs() < 0.7  # others turn by less
     torch.testing.assert_close(away[around], torch.ones_like(away[around]))
     torch.testing.assert_close(shaded.in_even_light().gaussians.colors, plain.in_even_light().gaussians.colors)

@@ -12,8 +12,7 @@ from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.inpainting import FADE_LENGTH, inpaint, laplacian_and_mass
 from oasis_warp.adaptation.reliability import mask_unreliable
 from oasis_warp.adaptation.skin_detail import Places, relief_on_back, sample_detail
-from oasis_warp.adaptation.skin_tone import infer_tone, tone_colors
-from oasis_warp.adaptation.unseen_skin import MORE, SEEN, paint_unseen
+from oasis_warp.adaptation.unseen_skin import MORE, SEEN, infer_tone, paint_unseen, tone_colors
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.densify import coarsen

@@ -26,7 +26,7 @@ from oasis_warp.core.types import HandLight, HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.ops import rest_mesh
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 
 
 @pytest.fixture(scope="module")
@@ -280,8 +280,8 @@ def test_a_rigid_motion_moves_gaussians_rigidly(hand):
     posed = pose_gaussians(canonical, hand.faces, rest.vertices, rest.vertices @ PALM_TO_CAMERA.T + shift)
     still = pose_gaussians(canonical, hand.faces, rest.vertices, rest.vertices)
     torch.testing.assert_close(posed.means, still.means @ PALM_TO_CAMERA.T + shift, atol=1e-6, rtol=0)
-    turned = PALM_TO_CAMERA @ covariances(still) @ PALM_TO_CAMERA.T
-    torch.testing.assert_close(covariances(posed), turned, atol=1e-10, rtol=1e-3)
+    rotated = PALM_TO_CAMERA @ covariances(still) @ PALM_TO_CAMERA.T
+    torch.testing.assert_close(covariances(posed), rotated, atol=1e-10, rtol=1e-3)
 
 
 def test_offsets_turn_with_the_surface(hand):

@@ -27,8 +27,8 @@ from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
-from oasis_warp.losses.image import masked_psnr
-from oasis_warp.render.render import render
+from oasis_warp.losses import masked_psnr
+from oasis_warp.render import render
 
 SIDE = 192.0
 SKIN = torch.tensor([0.75, 0.55, 0.45])
@@ -135,7 +135,7 @@ def test_an_ordinary_photo_raises_no_doubt():
     [
         (photo(0.1 * SKIN), "dark photo"),
         (photo(torch.tensor([1.3, 0.9, 0.8])), "over-exposed photo"),
-        (photo(SKIN.flip(0)), "not the colour of skin"),
+        (photo(SKIN.flip(0)), "not have the colour of skin"),
         (photo(blurs=4), "blurred photo"),
     ],
 )

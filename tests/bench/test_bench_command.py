@@ -36,8 +36,8 @@ def test_error_time_writes_tables_and_says_that_plots_need_matplotlib(short, mon
     records = list(csv.DictReader((tmp_path / "out" / "error_time.csv").read_text().splitlines()))
     assert tuple(records[0]) == keys(error_time.SettingRow)
     assert [r["knob"] for r in records] == ["default", "default", "precision", "precision"]
-    (said,) = {row["command"] for row in json.loads((tmp_path / "out" / "error_time.json").read_text())}
-    assert said.startswith("oasis bench error-time -o ")
+    (command,) = {row["command"] for row in json.loads((tmp_path / "out" / "error_time.json").read_text())}
+    assert command.startswith("oasis bench error-time -o ")
     captured = capsys.readouterr()
     assert captured.err.count("matplotlib is not installed") == 1
     assert "oasis-warp[bench]" in captured.err

@@ -7,15 +7,7 @@ import torch
 from test_bench_command import ROW
 
 from oasis_warp.bench import knobs
-from oasis_warp.bench.error_time import (
-    BUDGETS,
-    Sweep,
-    fastest,
-    groups,
-    measure_settings,
-    non_dominated,
-    standard_plan,
-)
+from oasis_warp.bench.error_time import BUDGETS, Sweep, fastest, groups, measure_settings, non_dominated, standard_plan
 from oasis_warp.bench.knobs import Setting, in_other_order
 from oasis_warp.bench.operators import OPERATORS, draw_in_torch
 from oasis_warp.bench.rows import write_rows
@@ -153,11 +145,11 @@ def test_every_knob_that_is_tried_differs_from_the_default():
         chosen = knobs.settings(op, torch.device("cpu"), 1, 2)
         assert [s.knob for s in chosen].count("default") == 1
         for s in chosen[1:]:
-            turned = [
+            rotated = [
                 s.rules != rules, s.dtype != torch.float32, s.threads is not None, bool(s.options), s.share != 1,
                 s.shrink != 1, s.torch,
             ]  # fmt: skip
-            assert sum(turned) == 1
+            assert sum(rotated) == 1
         labels = [(s.knob, s.value) for s in chosen]
         assert len(set(labels)) == len(labels)
 
@@ -174,13 +166,13 @@ def test_files_hold_every_row(layers, tmp_path):
 
 
 def test_progress_ends_where_it_said(small):
-    told = []
+    reports = []
     measure_settings(
         Sweep(plan=((small, "rasterization"),) * 2, device=torch.device("cpu"), repeats=2,
               settings=lambda *_: (knobs.DEFAULT,)),
-        lambda stage, done, total: told.append((done, total)),
+        lambda stage, done, total: reports.append((done, total)),
     )  # fmt: skip
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert reports == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def row(knob, ms, error, **changes):

@@ -4,8 +4,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from oasis_warp.bench import cuda, speed
-from oasis_warp.bench.cuda import Captured
+from oasis_warp.bench import speed, timing
 from oasis_warp.bench.gpu_cases import (
     CASES,
     OURS,
@@ -22,6 +21,7 @@ from oasis_warp.bench.gpu_cases import (
 )
 from oasis_warp.bench.operators import OPERATORS, Results
 from oasis_warp.bench.speed import errors, measure_case, measure_cases
+from oasis_warp.bench.timing import Captured
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
 from oasis_warp.ops._runtime.pair_counts import Overflow
@@ -173,7 +173,7 @@ class Lists(Overflow):
 @pytest.mark.parametrize(("full", "shift", "equal"), [(False, 0.0, True), (True, 0.0, False), (False, 1e-7, False)])
 def test_a_graph_is_timed_by_its_steps_and_its_bits_and_lists_are_looked_at(monkeypatch, cpu, full, shift, equal):
     case = SMALL["picture"].make(cpu, 0, {})
-    monkeypatch.setattr(cuda, "device_clock", lambda run, times: 20.0 * times)
+    monkeypatch.setattr(timing, "device_clock", lambda run, times: 20.0 * times)
     replays = []
 
     def graphs(way, device):

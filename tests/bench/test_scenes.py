@@ -9,9 +9,9 @@ import torch
 from gpu_rows import POINT, STUDY, line
 
 from oasis_warp.bench import scaling, scenes, speed
-from oasis_warp.bench.counts import count, count_mesh
 from oasis_warp.bench.knobs import generic_kernels
 from oasis_warp.bench.operators import OPERATORS, draw_in_torch, forward
+from oasis_warp.bench.roofline import count, count_mesh
 from oasis_warp.bench.rows import json_text
 from oasis_warp.bench.scaling import Point, measure_scaling, picture_errors, points, steepest
 from oasis_warp.bench.scenes import (

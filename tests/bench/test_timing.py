@@ -12,11 +12,25 @@ import torch
 
 from oasis_warp.bench import roofline
 from oasis_warp.bench import timing as timing_module
-from oasis_warp.bench.counts import count, count_mesh
-from oasis_warp.bench.cuda import KernelTime, NotCaptured, add_up, capture, first_cause, kernel_times, short_name
-from oasis_warp.bench.roofline import MESH_KERNELS, PICTURE_KERNELS, Ceilings, Work, assess
+from oasis_warp.bench.roofline import MESH_KERNELS, PICTURE_KERNELS, Ceilings, Work, assess, count, count_mesh
 from oasis_warp.bench.scenes import hand_scenes
-from oasis_warp.bench.timing import Probe, Sample, Timed, Timing, host_clock, synchronise, time_groups, time_together
+from oasis_warp.bench.timing import (
+    KernelTime,
+    NotCaptured,
+    Probe,
+    Sample,
+    Timed,
+    Timing,
+    add_up,
+    capture,
+    first_cause,
+    host_clock,
+    kernel_times,
+    short_name,
+    synchronise,
+    time_groups,
+    time_together,
+)
 
 
 def test_calls_take_turns_and_each_begins_a_round():

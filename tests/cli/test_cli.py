@@ -106,8 +106,8 @@ def test_quiet_says_only_what_is_wrong_and_verbose_where(avatar_file, tmp_path, 
     assert main([*arguments, "--quiet", "--fps", "0"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert main([*arguments, "--verbose", "--fps", "0"]) == 2
-    said = capsys.readouterr().err
-    assert "in count_frames" in said and said.splitlines()[-1].startswith("oasis: --fps 0")
+    output = capsys.readouterr().err
+    assert "in count_frames" in output and output.splitlines()[-1].startswith("oasis: --fps 0")
 
 
 COMPLETE = """
@@ -202,8 +202,8 @@ def test_a_comparison_names_what_differs_and_nothing_else(scene, avatar_file, tm
     avatar.with_looks(avatar.gaussians._replace(scales=0.9 * avatar.gaussians.scales), None).save(other)
     record = tmp_path / "record.json"
     assert main(["compare", str(one), str(other), "-o", str(tmp_path / "both.png"), "--json", str(record)]) == 0
-    said = capsys.readouterr().out
-    assert "--seed" in said and "--size" not in said and "31.5 dB" in said and "overlap of fit" not in said
+    output = capsys.readouterr().out
+    assert "--seed" in output and "--size" not in output and "31.5 dB" in output and "overlap of fit" not in output
     facts = json.loads(record.read_text())
     assert facts["different"]["--seed"] == ["0", "3"]
     assert facts["different"]["their median size"] == pytest.approx([3, 2.7])
@@ -242,7 +242,7 @@ def test_a_fault_is_told_with_its_remedy_and_exits_with_one(capsys, monkeypatch)
     assert f'FAIL torch           {torch.__version__}, expected >=99; run `pip install "torch>=99"`' in out
     assert 'FAIL no-such-package not installed; run `pip install "no-such-package>=1,<2"`' in out
     assert "FAIL networks" in out
-    assert out.endswith("3 of 11 checks failed.\n")
+    assert out.endswith("3 of 12 checks failed.\n")
 
 
 def test_the_table_of_packages_is_that_of_the_project():
@@ -313,12 +313,12 @@ def test_a_kernel_cache_that_cannot_be_written_is_found(monkeypatch, tmp_path):
     assert "OASIS_WARP_CACHE" in caught.value.remedy
 
 
-@pytest.mark.parametrize(("error", "code", "said"), [
+@pytest.mark.parametrize(("error", "code", "output"), [
     (OSError(24, "Too many open files"), 1,
      "cannot be loaded (Too many open files); see `ulimit -a`, or install it again."),
     (KeyboardInterrupt(), 130, "stopped, nothing written."),
 ], ids=["few descriptors", "Ctrl-C"])  # fmt: skip
-def test_what_happens_while_the_commands_are_imported_is_told(monkeypatch, capsys, error, code, said):
+def test_what_happens_while_the_commands_are_imported_is_told(monkeypatch, capsys, error, code, output):
     """Both were tracebacks."""
 
     class Full:
@@ -330,4 +330,4 @@ def test_what_happens_while_the_commands_are_imported_is_told(monkeypatch, capsy
     monkeypatch.delattr("oasis_warp.cli.app")
     monkeypatch.setattr(sys, "meta_path", [Full(), *sys.meta_path])
     assert main(["--version"]) == code
-    assert capsys.readouterr().err == f"oasis: {said}\n"
+    assert capsys.readouterr().err == f"oasis: {output}\n"

@@ -11,8 +11,8 @@ from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.avatar.quality import SurfaceQuality
 from oasis_warp.cli import evaluate as command
 from oasis_warp.cli import main
-from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
 from oasis_warp.cli.developer_options import Evaluate
+from oasis_warp.cli.progress import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.photo import read_photo
@@ -21,12 +21,7 @@ from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.hand_crop import crop_hand
 from oasis_warp.evaluation import look_measures, looks, real_hands, same_hand, views
 from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
-from oasis_warp.evaluation.same_hand import (
-    compare_pairs,
-    compare_with_photo,
-    photos_of_hands,
-    summarise_pairs,
-)
+from oasis_warp.evaluation.same_hand import compare_pairs, compare_with_photo, photos_of_hands, summarise_pairs
 from oasis_warp.evaluation.summary import read_result
 from oasis_warp.hand_avatar import draw_as_photo
 from oasis_warp.reconstruction import Reconstruction, reconstruct
@@ -170,8 +165,9 @@ def test_photos_of_the_same_hand_are_measured_and_the_run_is_not_done_twice(hand
     arguments = ["evaluate", "--dataset", "same-hand", str(hands), "--out", str(out), "--prior", "none", "--steps", "1",
                  "--size", "64"]  # fmt: skip
     assert main(arguments) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "2 ordered pairs" in said and "photos left out: 1" in said and re.search(r"mean one-shot │ \d\d\.\d\d", said)
+    output = " ".join(capsys.readouterr().out.split())
+    assert "2 ordered pairs" in output and "photos left out: 1" in output
+    assert re.search(r"mean one-shot │ \d\d\.\d\d", output)
     found = json.loads((out / "metrics.json").read_text())
     assert {(p["source"], p["target"]) for p in found["pairs"]} == {("a.png", "b.png"), ("b.png", "a.png")}
     assert all(p["psnr"] > 25 for p in found["pairs"])
@@ -211,8 +207,8 @@ def test_looks_are_measured_and_drawn_and_the_run_is_not_done_twice(hands, scene
     arguments = ["evaluate", str(hands), "--dataset", "looks", "--out", str(tmp_path / "found"), "--prior", "none",
                  "--steps", "1"]  # fmt: skip
     assert main(arguments) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "of 1 avatars" in said and "too few real hands" in said and "photos left out: 1" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert "of 1 avatars" in output and "too few real hands" in output and "photos left out: 1" in output
     found = json.loads((tmp_path / "found" / "metrics.json").read_text())
     record = found["photos"]["first.png"]
     assert record["contrast"]["seen"][0] > 0 and record["haze"] >= 0 and record["lpips"] is None
@@ -270,8 +266,8 @@ def test_folders_without_pairs_are_refused_in_one_sentence(hands, tmp_path, caps
     ):  # fmt: skip
         options = ["--dataset", "same-hand", "--out", str(tmp_path / "found"), "--prior", "none"]
         assert main(["evaluate", str(folder), *options]) == BAD_INPUT
-        said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("oasis: ")]
-        assert len(said) == 1 and words in said[0]
+        output = [line for line in capsys.readouterr().err.splitlines() if line.startswith("oasis: ")]
+        assert len(output) == 1 and words in output[0]
 
 
 @pytest.mark.parametrize(
@@ -295,8 +291,8 @@ def test_wrong_options_are_one_sentence(tmp_path, capsys, arguments, words):
     out = tmp_path / "found"
     prior = [] if "--prior" in arguments else ["--prior", "none"]
     assert main(["evaluate", "--out", str(out), *prior, *arguments]) == BAD_INPUT
-    said = capsys.readouterr().err
-    assert words in said and said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert words in output and output.count("\n") == 1
     assert not out.exists()
 
 
@@ -333,11 +329,11 @@ def test_synthetic_hands_are_measured_and_printed(tmp_path, monkeypatch, capsys)
     monkeypatch.setattr(command, "evaluate_people", found)
     options = ["--people", "3", "--size", "128", "--steps", "5", "--prior", "none"]
     assert main(["evaluate", "--out", str(tmp_path / "found"), *options]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     assert asked == [(["mean"], 3, 128, 5, "cpu")]
-    assert said.count("mean calibrated") == 9 * 2 + 1 and "LPIPS: no weights given" in said
-    assert "The same people with a tattoo" in said and "matched" in said and "visible" not in said
-    assert re.search(r"mean calibrated .*21\.50.*22\.00.*22\.50.*23\.50.*25\.50", said)
+    assert output.count("mean calibrated") == 9 * 2 + 1 and "LPIPS: no weights given" in output
+    assert "The same people with a tattoo" in output and "matched" in output and "visible" not in output
+    assert re.search(r"mean calibrated .*21\.50.*22\.00.*22\.50.*23\.50.*25\.50", output)
 
 
 def test_one_photo_of_a_hand_is_no_pair(tmp_path):

@@ -15,7 +15,7 @@ from safetensors import safe_open
 
 from oasis_warp.cli import main
 from oasis_warp.cli import pretrain as command
-from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli.progress import BAD_INPUT, INTERRUPTED
 from oasis_warp.network.config import COMPACT, PROFILES
 from oasis_warp.network.weights_file import load_network
 from oasis_warp.pretraining.pretrain import CHECKPOINT, METRICS, SHEET, WEIGHTS
@@ -172,50 +172,56 @@ def test_sigterm_ends_it_after_the_step_and_so_does_a_second_one():
         assert asked()
 
 
-def test_two_processes_train_one_network_on_people_of_their_own(tmp_path, hand):
-    folder, script = tmp_path / "prior", Path(__file__).with_name("pretrain_together.py")
-    start = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    done = subprocess.run(
-        [*start, str(script), str(folder), *SMALL, "--people", "2"], capture_output=True, text=True, timeout=280,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert json.loads((folder / command.SETTINGS).read_text())["processes"] == 2
-    assert sorted(path.name for path in (folder / command.PEOPLE).iterdir()) == [
-        "000000.safetensors",
-        "000001.safetensors",
-    ]
-    assert [json.loads(line)["step"] for line in (folder / METRICS).read_text().splitlines()] == [2]
-    assert load_network(folder / WEIGHTS, hand).config == TINY
+TOGETHER = (*SMALL, "--people", "2", "--steps", "4")
 
 
-def agents(folder, options, **environment):
-    """Train on two nodes, an agent of torchrun each, which meet on this machine; the ends of both."""
+def torchrun(folder, *where):
+    """The command that trains together, and its environment."""
     script = Path(__file__).with_name("pretrain_together.py")
+    start = [sys.executable, "-m", "torch.distributed.run", *where, str(script), str(folder), *TOGETHER]
+    # Or those that were restarted wait for the others forever (pytorch, issue 135712; docs/network.md).
+    return start, {**os.environ, "OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory):
+    """A training by two processes of one node, which nothing stopped."""
+    folder = tmp_path_factory.mktemp("together") / "prior"
+    command, environment = torchrun(folder, "--standalone", "--nproc-per-node", "2")
+    done = subprocess.run(command, capture_output=True, text=True, timeout=280, env=environment)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return folder
+
+
+def steps_of(folder):
+    return [json.loads(line)["step"] for line in (folder / METRICS).read_text().splitlines()]
+
+
+def test_two_processes_train_one_network_on_people_of_their_own(together, hand):
+    assert json.loads((together / command.SETTINGS).read_text())["processes"] == 2
+    people_met = sorted(path.name for path in (together / command.PEOPLE).iterdir())
+    assert people_met == ["000000.safetensors", "000001.safetensors"]
+    assert steps_of(together) == [2, 4]
+    assert load_network(together / WEIGHTS, hand).config == TINY
+
+
+@pytest.mark.timeout(600)
+def test_a_killed_process_of_one_of_two_nodes_restarts_all_from_the_checkpoint_and_the_weights_have_the_same_bits(
+    together, tmp_path
+):
+    """An agent of torchrun each, which meet on this machine."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     meeting = ["--nnodes", "2", "--rdzv-backend", "c10d", "--rdzv-endpoint", f"127.0.0.1:{port}", "--rdzv-id", "1"]
-    start = [sys.executable, "-m", "torch.distributed.run", *meeting, "--local-addr", "127.0.0.1"]
-    command = [*start, "--max-restarts", "2", str(script), str(folder), *options]
-    # Or those that were restarted wait for the others forever (pytorch, issue 135712; docs/network.md).
-    env = {**os.environ, "OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1", **environment}
-    nodes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=env) for _ in range(2)]
-    return [(node.communicate(timeout=280)[1], node.returncode) for node in nodes]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_a_killed_process_of_one_node_restarts_all_from_the_checkpoint_and_the_weights_have_the_same_bits(tmp_path):
-    options = [*SMALL, "--people", "2", "--steps", "4"]
-    for name, environment in (("whole", {}), ("killed", {"DIE_AT": "3"})):
-        said, codes = zip(*agents(tmp_path / name, options, **environment), strict=True)
-        assert codes == (0, 0), said
-        assert ("Traceback" in "".join(said)) == (name == "killed")  # of the other process, which lost its peer
-    weights = [(tmp_path / name / WEIGHTS).read_bytes() for name in ("whole", "killed")]
-    assert weights[0] == weights[1]
-    lines = [(tmp_path / name / METRICS).read_text().splitlines() for name in ("whole", "killed")]
-    assert [[json.loads(line)["step"] for line in own] for own in lines] == [[2, 4], [2, 4]]
+    command, environment = torchrun(tmp_path, *meeting, "--local-addr", "127.0.0.1", "--max-restarts", "2")
+    environment["DIE_AT"] = "3"
+    nodes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) for _ in range(2)]
+    said = [node.communicate(timeout=280)[1] for node in nodes]
+    assert [node.returncode for node in nodes] == [0, 0], said
+    assert "Traceback" in "".join(said)  # of the other process, which lost its peer
+    assert (tmp_path / WEIGHTS).read_bytes() == (together / WEIGHTS).read_bytes()
+    assert steps_of(tmp_path) == [2, 4]
 
 
 def test_it_begins_with_weights_that_are_given(tiny, unbroken, tmp_path, capsys):

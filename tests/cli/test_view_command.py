@@ -23,7 +23,7 @@ from oasis_warp.cli.serve import MAX_BYTES, FormServer
 from oasis_warp.cli.view import PageServer
 from oasis_warp.core.errors import InputError
 from oasis_warp.export import export_avatar
-from oasis_warp.export.page_data import unpack_data
+from oasis_warp.export.page_file import unpack_data
 
 
 @pytest.fixture
@@ -258,7 +258,7 @@ def test_strangers_and_other_sites_get_nothing(form_server):
 
 
 @pytest.mark.parametrize(
-    ("name", "headers", "status", "said"),
+    ("name", "headers", "status", "output"),
     [
         ("script.py", {}, 422, "script.py: expected a picture, .jpg"),
         ("", {}, 422, "expected a picture"),
@@ -267,9 +267,9 @@ def test_strangers_and_other_sites_get_nothing(form_server):
         ("a.jpg", {"Content_Length": "-1"}, 411, ""),
     ],
 )
-def test_what_is_no_photo_is_refused(form_server, name, headers, status, said):
+def test_what_is_no_photo_is_refused(form_server, name, headers, status, output):
     got, body = ask_form(form_server, "jobs", "POST", b"photo", X_Name=name, **headers)
-    assert got == status and said in body.decode()
+    assert got == status and output in body.decode()
     assert not list(form_server.jobs.folder.iterdir())
 
 
@@ -285,8 +285,8 @@ def test_a_browser_that_goes_away_leaves_no_traceback(form_server, capsys):
             raise error
         except (OSError, ValueError):
             form_server.handle_error(None, ("127.0.0.1", 1))
-        said = capsys.readouterr().err
-        assert words in said and bool(said) == bool(words)
+        output = capsys.readouterr().err
+        assert words in output and bool(output) == bool(words)
 
 
 def test_a_full_queue_is_said(program, tmp_path):

@@ -5,9 +5,8 @@ import torch
 from disk import full_disk
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.data import videos
-from oasis_warp.data.pictures import to_uint8, write_picture
-from oasis_warp.data.videos import write_video
+from oasis_warp.data import pictures
+from oasis_warp.data.pictures import to_uint8, write_picture, write_video
 
 
 def moving_disc(n_frames=8, height=64, width=96):
@@ -33,8 +32,8 @@ def rms(a, b):
 def encoder(request, monkeypatch):
     """That of MP4s: with and without an ffmpeg that writes H.264."""
     if request.param == "opencv":
-        monkeypatch.setattr(videos, "h264_encoder", lambda: None)
-    return "vp09" if request.param == "opencv" or videos.h264_encoder() is None else "avc1"
+        monkeypatch.setattr(pictures, "h264_encoder", lambda: None)
+    return "vp09" if request.param == "opencv" or pictures.h264_encoder() is None else "avc1"
 
 
 @pytest.mark.parametrize(("suffix", "rate"), [(".mp4", 24), (".gif", 25)])

@@ -15,7 +15,7 @@ from oasis_warp.evaluation.kernel_distance import (
     kernel_distances,
 )
 from oasis_warp.evaluation.metrics import ERROR_FLOOR, MEASURES, MIN_PIXELS, TargetTruth, match_colors, score
-from oasis_warp.losses.image import SSIM_C1
+from oasis_warp.losses import SSIM_C1
 
 SIDE, LOW, HIGH = 64, 16, 48
 """Of the picture, and where the hand, a square, begins and ends."""

@@ -13,6 +13,7 @@ from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.surface_mesh import topology
 from oasis_warp.export.texture import bake_texture, make_texels, material_maps
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
+from oasis_warp.hand.skinning import skin
 
 TURNS = {"right": [[0, 0, -1], [0, 1, 0], [1, 0, 0]], "left": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]}
 """From a hand's frame to the file's: fingers to -z, back to y."""
@@ -29,8 +30,8 @@ def files(left_hand, right_hand, tmp_path_factory):
 
 
 def surface(avatar, angles):
-    """Our own skinning of a hand that stays in place, in the file's axes."""
-    posed = avatar.mesh(HandPose(angles, torch.eye(3), torch.zeros(3)))
+    """Our own skinning of a hand that stays in place, in the file's axes; nothing gives way there."""
+    posed = skin(*avatar.parts[:2], HandPose(angles, torch.eye(3), torch.zeros(3)))
     turn = np.array(TURNS[avatar.side], float)
     return tuple(part.numpy() @ turn.T for part in posed)
 

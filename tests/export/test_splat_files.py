@@ -13,7 +13,7 @@ from oasis_warp.core.types import Camera, Gaussians
 from oasis_warp.data.splat_files import read_splats
 from oasis_warp.export import export_avatar
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 
 LOSSLESS = {".ply", ".splats.glb", ".splats.gltf"}
 STEPS = {".spz": 2**-20, ".v4.spz": 2**-20, ".sog": 4e-6, ".compressed.ply": 1e-4}

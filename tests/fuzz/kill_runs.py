@@ -46,6 +46,8 @@ FEW_FILES, LITTLE_MEMORY = 24, 1 << 30
 FILES = "files"
 MARGIN = 1.3
 """Seconds kept for what is still to be done, over those that it took before."""
+SLOWER = 10
+"""How much longer than before `serve` may take for the photo, as the load of the machine changes."""
 N_FILES = 20
 """Kills of the writer for one fault: each takes 30 ms."""
 
@@ -104,7 +106,7 @@ def stop_once(name: str, fault: str, whole: Whole, inputs: Path, out: Path, rng:
         wrong = f"exit code {code} beside another process"
     if name == "serve":
         how = "stopped" if how == "ended" else how  # it never ends by itself
-        found = victims.finish_photo(out)
+        found = victims.finish_photo(out, max(victims.PATIENCE, SLOWER * whole.seconds))
         wrong = wrong or ("" if found == "complete" else found)
     elif command.goes_on:
         now = victims.digests(out, command.whole)

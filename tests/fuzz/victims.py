@@ -22,7 +22,7 @@ from safetensors import safe_open
 
 from oasis_warp.cli import batch, jobs, main
 from oasis_warp.cli.batch_work import make_avatars
-from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli.progress import BAD_INPUT, INTERRUPTED
 from oasis_warp.data.output_files import output_folder, write_file
 
 PHOTO = Path(__file__).parents[2] / "src" / "oasis_warp" / "assets" / "photos" / "palm_open_left_02.png"
@@ -145,11 +145,15 @@ def make_inputs(folder: Path, *, photos: bool) -> None:
 
 def launch(arguments: Sequence[str], limits: dict[int, int] | None = None) -> int:
     """Run a command in a fork of this process, under limits of its resources; the number of the process."""
+    # Python's own handlers after a fork swallow a Ctrl-C that comes in its first milliseconds.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     child = os.fork()
     if child:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         return child
     code, shown = TRACEBACK, os.fdopen(os.dup(2), "w")
     try:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         nowhere = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(nowhere, stream)
@@ -238,7 +242,7 @@ def run_whole(name: str, inputs: Path, out: Path) -> float:
     start = time.monotonic()
     if name == "serve":
         send_photo(out)
-        assert finish_photo(out) == "complete"
+        assert (found := finish_photo(out, jobs.MAX_SECONDS)) == "complete", found
     else:
         code = ended(launch(COMMANDS[name].arguments(inputs, out)), PATIENCE)
         if code != 0:
@@ -253,15 +257,20 @@ def send_photo(folder: Path) -> None:
     shutil.copy(PHOTO, home / "photo.png")
 
 
-def finish_photo(folder: Path) -> str:
-    """Let `serve` finish the photo; "complete", or what it left."""
+def finish_photo(folder: Path, seconds: float = PATIENCE) -> str:
+    """Let `serve` finish the photo within so many seconds; "complete", or what was wrong."""
     jobs.PROGRAM = (sys.executable, "-c", SERVED)
-    server, end = launch(COMMANDS["serve"].arguments(folder, folder)), time.monotonic() + PATIENCE
+    server, end = launch(COMMANDS["serve"].arguments(folder, folder)), time.monotonic() + seconds
     home = folder / f"{0:022d}"
-    while time.monotonic() < end and not any((home / name).is_file() for name in ("out/report.json", "error.txt")):
+    while not (finished := [name for name in ("out/report.json", "error.txt") if (home / name).is_file()]):
+        if time.monotonic() > end:
+            break
         time.sleep(0.1)
-    stop(server, "SIGINT", 0)
-    return check(home / "out", COMMANDS["reconstruct"].whole)
+    if (how := stop(server, "SIGINT", 0)) not in ("stopped", "ended"):
+        return f"server: {how}"
+    if finished == ["error.txt"]:
+        return f"refused: {(home / 'error.txt').read_text()}"
+    return check(home / "out", COMMANDS["reconstruct"].whole) if finished else f"no answer in {seconds:.0f} s"
 
 
 def write_versions(folder: Path, version: int) -> Iterator[int]:

@@ -279,7 +279,7 @@ def test_pickles_of_hostile_programs_are_refused(content, tmp_path):
 
 def test_a_hand_that_is_not_shaped_as_mano_is_refused(tmp_path):
     arrays = mano_arrays()
-    turned = arrays["v_template"][:, [1, 0, 2]]
-    write_mano(tmp_path, arrays | {"v_template": turned})
+    rotated = arrays["v_template"][:, [1, 0, 2]]
+    write_mano(tmp_path, arrays | {"v_template": rotated})
     with pytest.raises(InputError, match="its palm is turned by .* degrees against the bundled hand's"):
         making.register(read_mano(tmp_path))

@@ -13,8 +13,17 @@ from torch.nn.functional import conv2d, max_pool2d
 from oasis_warp.core import published_files
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.published_files import Published, published_file
-from oasis_warp.losses.image import detail_difference, masked_dssim, masked_l1, masked_psnr, masked_statistics, ssim_map
-from oasis_warp.losses.lpips import SCALE, SHIFT, load_lpips
+from oasis_warp.losses import (
+    SCALE,
+    SHIFT,
+    detail_difference,
+    load_lpips,
+    masked_dssim,
+    masked_l1,
+    masked_psnr,
+    masked_statistics,
+    ssim_map,
+)
 from oasis_warp.ops import masked_l1_on_cuda
 
 

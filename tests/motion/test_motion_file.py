@@ -13,7 +13,7 @@ from oasis_warp.assets import asset
 from oasis_warp.core import pickle_reader, rotation
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandPose
-from oasis_warp.data.videos import write_video
+from oasis_warp.data.pictures import write_video
 from oasis_warp.export import export_avatar
 from oasis_warp.hand.mano import ManoPose, hand_pose, mano_surface, read_mano
 from oasis_warp.hand.poses import named_pose

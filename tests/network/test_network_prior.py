@@ -18,7 +18,7 @@ from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.errors import InputError
-from oasis_warp.losses.image import masked_psnr
+from oasis_warp.losses import masked_psnr
 from oasis_warp.network import prior as home
 from oasis_warp.network.prior import (
     COVERING_OPACITY,
@@ -37,7 +37,7 @@ from oasis_warp.network.prior import (
     cover_surface,
 )
 from oasis_warp.network.weights_file import read_header, save_network
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 
 
 def covariances(gaussians):

@@ -11,7 +11,7 @@ from oasis_warp.avatar.observation import batch_of_crop, observe_batch, project_
 from oasis_warp.core.camera import project
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera
-from oasis_warp.losses.lpips import Lpips
+from oasis_warp.losses import Lpips
 from oasis_warp.network.encoders import SIZES, ConvolutionalEncoder, DinoV2Encoder, ImageFeatures, Size
 from oasis_warp.network.tokens import Aggregation, PointFeatures, PositionEncoding, Tokenizer, encode, grid_positions
 

@@ -12,7 +12,7 @@ from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.types import HandPose, TrainingBatch
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 
 POSES = ("rest", "open", "pinch", "point")
 

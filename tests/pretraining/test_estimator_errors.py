@@ -103,8 +103,8 @@ def test_a_hand_turned_in_the_picture_is_seen_as_wrongly(hand, errors):
     choice = torch.tensor([0, 3, 5])
     centred = {"K": torch.tensor([[500.0, 0, 0], [0, 500, 0], [0, 0, 1]]).expand(3, 3, 3)}
     straight = seen(hand, people(hand) | centred, errors, choice)[1]
-    turned = seen(hand, people(hand, turn=1.2) | centred, errors, choice)[1]
-    torch.testing.assert_close(turned.posed, straight.posed @ about_axis(1.2).T, atol=1e-4, rtol=0)
+    rotated = seen(hand, people(hand, turn=1.2) | centred, errors, choice)[1]
+    torch.testing.assert_close(rotated.posed, straight.posed @ about_axis(1.2).T, atol=1e-4, rtol=0)
 
 
 def test_a_hand_borrows_from_hands_that_look_alike(hand, errors):

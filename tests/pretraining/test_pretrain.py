@@ -19,13 +19,15 @@ from oasis_warp.avatar.observation import source_photos
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.processes import using_threads
 from oasis_warp.core.types import Camera
-from oasis_warp.losses.image import masked_dssim, masked_l1
+from oasis_warp.losses import masked_dssim, masked_l1
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork, Prediction
 from oasis_warp.network.weights_file import load_network, trained_state
 from oasis_warp.pretraining.distributed import ProcessInfo
-from oasis_warp.pretraining.objective import (
+from oasis_warp.pretraining.pretrain import CHECKPOINT, METRICS, SHEET, WEIGHTS, PretrainConfig, learning_rate, pretrain
+from oasis_warp.pretraining.prior_trainer import (
     LossConfig,
+    PriorTrainer,
     RenderBatch,
     draw_targets,
     objective,
@@ -34,17 +36,7 @@ from oasis_warp.pretraining.objective import (
     scaling_loss,
     true_pictures,
 )
-from oasis_warp.pretraining.pretrain import (
-    CHECKPOINT,
-    METRICS,
-    SHEET,
-    WEIGHTS,
-    PretrainConfig,
-    learning_rate,
-    pretrain,
-)
-from oasis_warp.pretraining.prior_trainer import PriorTrainer
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 
 ALONE = ProcessInfo(0, 1, torch.device("cpu"))
 SMALL = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)

@@ -47,7 +47,7 @@ CROP_OF_DOCS = 256
 EXACT = EstimatorNoise(surface=0.0, mask=0.0)
 
 
-def turned(angle):
+def rotated(angle):
     c, s = math.cos(angle), math.sin(angle)
     return torch.tensor([[0, s, c], [1.0, 0, 0], [0, c, -s]])  # fingers up
 
@@ -58,7 +58,7 @@ def photographed(hand, names, left):
     made = []
     for k, (name, is_left) in enumerate(zip(names, left, strict=True)):
         shape = 0.5 * torch.randn(len(hand.shape_names), generator=torch.Generator().manual_seed(k // 3))
-        pose = HandPose(named_pose(hand, name), turned(0.4 * k), torch.tensor([0.01, 0.05, 0.4]))
+        pose = HandPose(named_pose(hand, name), rotated(0.4 * k), torch.tensor([0.01, 0.05, 0.4]))
         vertices = skin(hand, rest_hand(hand, shape), pose).vertices
         if is_left:
             vertices, pose = vertices * torch.tensor([-1.0, 1, 1]), mirror_pose(pose)
@@ -267,7 +267,7 @@ def network():
 def test_the_truth_has_no_loss_but_its_own_uncertainty(batch):
     """A head compared with another field, or a field in another unit, would leave a loss."""
     sure = -6.0
-    said = DensePrediction(
+    predicted = DensePrediction(
         classes=(batch.classes + 1e-9).log(),
         surface=batch.surface,
         log_scale=torch.full_like(batch.surface[:, 0], sure),
@@ -275,7 +275,7 @@ def test_the_truth_has_no_loss_but_its_own_uncertainty(batch):
         albedo=srgb(batch.albedo),
         finger=50 * torch.nn.functional.one_hot(batch.finger, HEADS["finger"]).permute(0, 3, 1, 2).float(),
     )
-    terms = dense_loss(said, batch)
+    terms = dense_loss(predicted, batch)
     entropy = -(batch.classes * (batch.classes + 1e-9).log()).sum(1).mean()
     assert terms["classes"] == pytest.approx(float(entropy), abs=1e-4)
     assert terms["surface"] == pytest.approx(3 * sure, abs=1e-4)

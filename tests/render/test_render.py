@@ -6,8 +6,8 @@ from oasis_warp.core.types import Camera, Gaussians, HandPose
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin_surface
 from oasis_warp.ops import rasterization
-from oasis_warp.render.render import render
-from oasis_warp.render.replay import MAX_GRAPHS, CapturedGraph, GraphCache, replayable, replayed
+from oasis_warp.ops.cuda_graph import MAX_GRAPHS, CapturedGraph, GraphCache, replayable, replayed
+from oasis_warp.render import render
 
 COLOR = (0.25, 0.5, 1.0)
 

@@ -15,11 +15,10 @@ from oasis_warp.synthetic.atlas import HEIGHT, WIDTH, bundled_atlas
 from oasis_warp.synthetic.body import bundled_body, device_name, skin_mesh
 from oasis_warp.synthetic.identity import Population, sample_identity
 from oasis_warp.synthetic.shots import EVERYBODY
-from oasis_warp.synthetic.skin_lines import Palm
+from oasis_warp.synthetic.skin_lines import CORNER_WORDS, KINDS, LINE_WORDS, Palm, Strokes
 from oasis_warp.synthetic.skin_plan import plan_person
 from oasis_warp.synthetic.skin_texture import CHANNELS, bake_texture
 from oasis_warp.synthetic.spectrum import _TO_RGB, ABOVE_MELANIN, Tint, _layers, skin_colors
-from oasis_warp.synthetic.strokes import CORNER_WORDS, KINDS, LINE_WORDS, Strokes
 from oasis_warp.synthetic.texels import draw_lines, texels_on
 
 SEED = 13
@@ -50,7 +49,7 @@ def test_values_spread_from_vertices_to_texels(device):
 
 
 def test_the_coarse_mesh_is_the_one_that_its_tool_builds(hand):
-    from build_coarse_body import coarse_mesh
+    from build_coarse_meshes import coarse_mesh
 
     body, built = bundled_body(), coarse_mesh(skin_mesh(hand))
     np.testing.assert_array_equal(body.coarse_vertices, built["vertices"])

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from oasis_warp import cli
-from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli.progress import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.pictures import contact_sheet, write_picture
 from oasis_warp.synthetic import shards
-from oasis_warp.synthetic.backgrounds import cut_background, list_backgrounds
 from oasis_warp.synthetic.picture import render_batch
+from oasis_warp.synthetic.rooms import cut_background, list_backgrounds
 from oasis_warp.synthetic.shards import write_shards
 from oasis_warp.synthetic.shots import PHOTOS, SceneConfig
 
@@ -135,9 +135,9 @@ def test_a_broken_background_is_refused_in_one_sentence(tmp_path, capsys):
     folder = _folder_of_pictures(tmp_path)
     (folder / "torn.jpg").write_bytes(b"\xff\xd8\xff\xe0 not much of a picture")
     code = cli.main(["synthesize", str(tmp_path / "out"), "--backgrounds", str(folder)])
-    said = capsys.readouterr().err
+    output = capsys.readouterr().err
     assert code == BAD_INPUT
-    assert "torn.jpg" in said and said.count("\n") == 1
+    assert "torn.jpg" in output and output.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 

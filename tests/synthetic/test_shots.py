@@ -122,10 +122,10 @@ def light():
 
 def test_a_turned_camera_sees_the_same_light_from_turned_directions(light):
     rotation = rotation_about([1, 2, -1], 1.1)
-    turned, directions = rotate_light(light, rotation), sphere(50)
-    np.testing.assert_allclose(seen(turned, directions @ rotation.T), seen(light, directions), atol=1e-9)
-    np.testing.assert_allclose(turned.directions, light.directions @ rotation.T)
-    back = rotate_light(turned, rotation.T)
+    rotated, directions = rotate_light(light, rotation), sphere(50)
+    np.testing.assert_allclose(seen(rotated, directions @ rotation.T), seen(light, directions), atol=1e-9)
+    np.testing.assert_allclose(rotated.directions, light.directions @ rotation.T)
+    back = rotate_light(rotated, rotation.T)
     np.testing.assert_allclose(back.sky, light.sky, atol=1e-9)
 
 
@@ -144,7 +144,7 @@ def toward_elbow(view, bend):
 
 
 def test_no_view_is_blocked_by_the_forearm():
-    random, turned = np.random.default_rng(0), 0
+    random, rotated = np.random.default_rng(0), 0
     for _ in range(300):
         bend = np.array([0.0, random.normal(0, 0.15), random.normal(0, 0.3)])
         drawn = sample_view(random, "even", closed=False)
@@ -152,9 +152,9 @@ def test_no_view_is_blocked_by_the_forearm():
         assert toward_elbow(view, bend) < np.cos(ARM_CONE)
         np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(view.rotation) > 0
-        turned += view is not drawn
+        rotated += view is not drawn
         assert (view is drawn) == (toward_elbow(drawn, bend) < np.cos(ARM_CONE))
-    assert 10 < turned < 60  # of a cone of 35 degrees round the arm 9 %
+    assert 10 < rotated < 60  # of a cone of 35 degrees round the arm 9 %
     shots = [sample_shot(SEED, index, SceneConfig(look="even")) for index in range(100)]
     assert max(toward_elbow(shot.view, shot.bend) for shot in shots) < np.cos(ARM_CONE)
 

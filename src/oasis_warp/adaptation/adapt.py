@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.calibrate import Calibration, calibrate
 from oasis_warp.adaptation.inpainting import inpaint
-from oasis_warp.adaptation.mixture import mix_guesses
+from oasis_warp.adaptation.prior_guess import Calibration, calibrate, mix_guesses
 from oasis_warp.adaptation.reliability import VertexObservations, observe_photos, photo_gains
 from oasis_warp.adaptation.sh_lighting import light_evenly, split_albedo_shading
 from oasis_warp.adaptation.sharpen import sharpen
@@ -33,7 +32,7 @@ from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.network.heads import ColorHeads
 from oasis_warp.ops import BlendWeights, blend_colors, stack_weights
-from oasis_warp.render.render import view_weights
+from oasis_warp.render import view_weights
 
 SHADING_LENGTH = 0.01
 """Differences between photos that change over a longer distance along the skin may be light and are averaged [m]."""

@@ -37,7 +37,7 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandCrop, HandLight
 from oasis_warp.ops import blend_colors
-from oasis_warp.render.render import render, view_weights
+from oasis_warp.render import render, view_weights
 
 FACING = 0.3, 0.5
 """Cosines between surface and view below which the photo's detail is left out, and above which it is taken whole."""
@@ -113,12 +113,12 @@ def sharpen(
     fading = with_neighbours(fading[faces].any(1), faces, len(rest))
     sources = [_source(e, faces, fading, own) for e, own in zip(crops, believed, strict=True)]
     on = None if light is None else posed_lighting(rest, sources[0].posed, faces, light)
-    old = [pose_gaussians(_as_shown(gaussians, faces, light, on), faces, rest, source.posed) for source in sources]
+    old = [pose_gaussians(_as_lit(gaussians, faces, light, on), faces, rest, source.posed) for source in sources]
     around, parts = _parts(rest, faces, sources, old)
     if not bool(around.any()):
         return SharpenResult(gaussians, 0, ())
     dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
-    shown = _as_shown(dense, faces, light, on)
+    shown = _as_lit(dense, faces, light, on)
     new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
     start = overlay_pictures(shown.colors[changed], sources, [there.means[changed] for there in new])
     colors = shown.colors.masked_scatter(changed[:, None], start)
@@ -154,7 +154,7 @@ def _parts(
     return around, torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
 
 
-def _as_shown(
+def _as_lit(
     gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"], light: HandLight | None, on: Lighting | None
 ) -> CanonicalGaussians:
     """With the colours that photos show, in `light` if there is one."""
@@ -205,17 +205,17 @@ def _wanted_spacing(source: Source, drawn: Float[Tensor, "S S 3"], faces: Int[Te
     """Distance between Gaussians with which each face would show the picture [m]; infinite where it does already."""
     (image, _, camera), seen = source.canvas, source.seen
 
-    def worst(error: Float[Tensor, "S S 3"]) -> Float[Tensor, "F"]:
+    def largest_error(error: Float[Tensor, "S S 3"]) -> Float[Tensor, "F"]:
         local = avg_pool2d((error.square().mean(-1) * seen.share)[None, None], 3, stride=1, padding=1)[0, 0].sqrt()
         counted = seen.share > MIN_SHARE
         values = torch.zeros(len(faces), dtype=local.dtype, device=local.device)
         return values.scatter_reduce_(0, seen.faces[counted], local[counted], "amax")
 
     spacing = torch.full((len(faces),), torch.inf, device=drawn.device)
-    short = worst(drawn - image) > TOLERANCE
+    short = largest_error(drawn - image) > TOLERANCE
     for finer in SPACINGS:
         spacing = torch.where(short, finer, spacing)
-        short = short & (worst(_sampled(image, finer) - image) > TOLERANCE)
+        short = short & (largest_error(_sampled(image, finer) - image) > TOLERANCE)
     _, depth = project(camera, source.posed)
     return spacing * depth[faces].mean(1) / camera.K[0, 0]
 

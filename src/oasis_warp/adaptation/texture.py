@@ -13,13 +13,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_warp.adaptation.adam import Adam
-from oasis_warp.adaptation.calibrate import Calibration
+from oasis_warp.adaptation.prior_guess import Calibration
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.logging import Progress
 from oasis_warp.core.types import CanonicalGaussians
-from oasis_warp.losses.image import masked_dssim, masked_l1
+from oasis_warp.losses import SsimTarget, masked_dssim, masked_l1, ssim_target
 from oasis_warp.network.heads import ColorHeads, head_colors, zero_updates
 from oasis_warp.ops import BlendWeights, blend_colors
 
@@ -97,16 +97,17 @@ def fit_parameters(
         The loss of every step, reference views and penalty included.
     """
     beyond = (1 - targets.weights.alphas) * targets.picture
+    masked = ssim_target(targets.picture * targets.mask[..., None])
     order = torch.Generator().manual_seed(config.seed)
     optimiser = Adam(parameters, learning_rate)
     total = MAX_STEPS if config.texture_steps is None else config.texture_steps
-    losses: list[float] = []
+    losses: list[Tensor] = []
     queue: list[int] = []
     means = [torch.zeros_like(parameter) for parameter in parameters]
     for step in range(total):
         now = colors()
         image = blend_colors(targets.weights, (now * targets.factors).flatten(0, 1)) + beyond
-        loss = _picture_loss(image, targets.picture, targets.mask, config, targets.perceptual)
+        loss = _picture_loss(image, targets, masked, config)
         if targets.references and config.references == "in_turn":
             queue = queue or torch.randperm(len(targets.references), generator=order).tolist()
             loss = loss + config.weight_reference * _reference_loss(now, targets, queue.pop(), config)
@@ -116,7 +117,7 @@ def fit_parameters(
         optimiser.step(loss)
         for mean, value in zip(means, parameters, strict=True):
             mean.lerp_(value.detach(), max(1 / (step + 1), 1 / AVERAGED))
-        losses.append(loss.item())
+        losses.append(loss.detach())  # read later: on CUDA a step that waits for its loss keeps the next one waiting
         progress("texture", step + 1, total)
         if config.texture_steps is None and _is_flat(losses):
             progress("texture", total, total)
@@ -125,17 +126,16 @@ def fit_parameters(
         with torch.no_grad():
             for value, mean in zip(parameters, means, strict=True):
                 value.copy_(mean)
-    return tuple(losses)
+    return tuple(torch.stack(losses).tolist()) if losses else ()
 
 
-def _picture_loss(
-    image: Tensor, picture: Tensor, mask: Tensor, config: AdaptConfig,
-    perceptual: Callable[[Tensor, Tensor, Tensor], Tensor] | None,
-) -> Tensor:  # fmt: skip
+def _picture_loss(image: Tensor, targets: Targets, masked: SsimTarget, config: AdaptConfig) -> Tensor:
+    """Of `image` beside the photo, which `masked` holds inside its mask."""
+    picture, mask = targets.picture, targets.mask
     loss = config.weight_rgb * masked_l1(image, picture, mask)
-    if perceptual is not None:
-        loss = loss + config.weight_perceptual * perceptual(image[None], picture[None], mask[None]).mean()
-    return loss + config.weight_ssim * masked_dssim(image * mask[..., None], picture * mask[..., None], mask)
+    if targets.perceptual is not None:
+        loss = loss + config.weight_perceptual * targets.perceptual(image[None], picture[None], mask[None]).mean()
+    return loss + config.weight_ssim * masked_dssim(image * mask[..., None], masked, mask)
 
 
 def _reference_loss(colors: Tensor, targets: Targets, k: int, config: AdaptConfig) -> Tensor:
@@ -158,11 +158,11 @@ def _all_reference_losses(colors: Tensor, targets: Targets, config: AdaptConfig)
     return total
 
 
-def _is_flat(losses: list[float]) -> bool:
+def _is_flat(losses: list[Tensor]) -> bool:
     if len(losses) < 2 * FLAT_WINDOW or len(losses) % FLAT_WINDOW:  # ends that differ by a step differ in the result
         return False
-    before = sum(losses[-2 * FLAT_WINDOW : -FLAT_WINDOW])
-    return sum(losses[-FLAT_WINDOW:]) > (1 - FLAT_GAIN) * before
+    last = torch.stack(losses[-2 * FLAT_WINDOW :]).tolist()
+    return sum(last[FLAT_WINDOW:]) > (1 - FLAT_GAIN) * sum(last[:FLAT_WINDOW])
 
 
 LEARNING_RATE = 0.05

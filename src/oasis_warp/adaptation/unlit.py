@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.calibrate import calibrate
+from oasis_warp.adaptation.prior_guess import calibrate
 from oasis_warp.adaptation.reliability import mask_unreliable
 from oasis_warp.adaptation.sh_lighting import add_shade, apply_light, fit_light, trust_in_albedo, without_light
 from oasis_warp.avatar.observation import inner_mask
@@ -15,7 +15,7 @@ from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandCrop, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors
-from oasis_warp.render.render import view_weights
+from oasis_warp.render import view_weights
 
 MIN_ALPHA = 0.05
 """Below it a pixel says nothing about the colour of the hand."""

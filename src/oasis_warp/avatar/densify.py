@@ -12,6 +12,7 @@ from torch import Tensor
 from oasis_warp.avatar.anchors import FACE_SPREAD, MIN_OPACITY, OPACITY, face_shapes, place_anchors, vertex_shapes
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.processes import kernel_threads
 from oasis_warp.core.types import CanonicalGaussians, PosedHand
 
 PART_SPREAD = 1.9
@@ -174,7 +175,7 @@ def read_at(
     centers = torch.cat([on_vertices, on_faces])
     tree = cKDTree(centers.detach().cpu().double().numpy())
     count = min(NEIGHBOURS, len(centers))
-    _, near = tree.query(points.detach().cpu().double().numpy(), count)
+    _, near = tree.query(points.detach().cpu().double().numpy(), count, workers=kernel_threads())
     near = torch.from_numpy(np.asarray(near)).to(points.device).view(len(points), count)
     # Along the surface only: a point of it may lie off a flat Gaussian's plane and still be under it.
     spread = gaussians.scales[:, :2].prod(1).sqrt()

@@ -151,7 +151,7 @@ def photo_warnings(image: Float[Tensor, "S S 3"], mask: Float[Tensor, "S S"], si
     if clipped > CLIPPED:
         notes.append(f"over-exposed photo: {100 * clipped:.0f} % of the hand is white or nearly so and has no detail")
     if red < SKIN_REDNESS * max(green, blue):
-        notes.append("the hand has not the colour of skin: coloured light or a glove, and all of it is taken for skin")
+        notes.append("the hand does not have the colour of skin: coloured light or a glove; all of it counts as skin")
     if (found := _blur(image, mask, side)) > BLURRED:
         notes.append(f"blurred photo: the avatar will be, too (blur {found:.2f}, sharp photos have less than .65)")
     return notes

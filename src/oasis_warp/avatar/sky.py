@@ -27,7 +27,7 @@ pixels off."""
 
 
 class SkyMesh(NamedTuple):
-    """A coarse version of the hand's surface. Built by `asset_build/build_sky_mesh.py`."""
+    """A coarse version of the hand's surface. Built by `asset_build/build_coarse_meshes.py`."""
 
     vertices: Int[Tensor, "C"]
     """Numbers of the hand's vertices that it keeps."""

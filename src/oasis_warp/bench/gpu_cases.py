@@ -28,10 +28,10 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, CanonicalGaussians, Gaussians, HandPose, PosedHand
 from oasis_warp.hand.skinning import skin_surface
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.losses.image import masked_l1
+from oasis_warp.losses import masked_l1
 from oasis_warp.ops import RecordedRasterization, RestMesh, rest_mesh
 from oasis_warp.reference import rasterization
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 
 CONTRAST = 0.2
 """By how much the target image differs from the one that is drawn, up or down at random."""

@@ -10,13 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.bench.counts import Counts, count
-from oasis_warp.bench.cuda import GRAPH_CALLS, NotCaptured, capture
 from oasis_warp.bench.gpu_cases import PASSES, RASTERIZATION, UNVALIDATED
 from oasis_warp.bench.operators import Results, forward, one_pass
+from oasis_warp.bench.roofline import Counts, count
 from oasis_warp.bench.rows import provenance
 from oasis_warp.bench.scenes import GaussianScene, crop, giants, one_tile, surface
-from oasis_warp.bench.timing import Probe, peak_megabytes, synchronise, time_groups
+from oasis_warp.bench.timing import GRAPH_CALLS, NotCaptured, Probe, capture, peak_megabytes, synchronise, time_groups
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.ops import rasterization
 from oasis_warp.reference.errors import most_error, same_bits

@@ -10,13 +10,23 @@ from importlib.util import find_spec
 
 import torch
 
-from oasis_warp.bench.cuda import GRAPH_CALLS, Captured, NotCaptured, capture, kernel_times
 from oasis_warp.bench.gpu_cases import CaseMaker, GpuCase, Implementation, Peers
 from oasis_warp.bench.knobs import DEFAULT, GENERIC, TORCH, Setting, measure_settings_of
 from oasis_warp.bench.operators import Call, Operator, Outputs, Pass, Results
 from oasis_warp.bench.rows import provenance, scene_columns
 from oasis_warp.bench.scenes import GaussianScene, MeshScene, hand_scenes, surfels
-from oasis_warp.bench.timing import Probe, Sample, peak_megabytes, synchronise, time_groups
+from oasis_warp.bench.timing import (
+    GRAPH_CALLS,
+    Captured,
+    NotCaptured,
+    Probe,
+    Sample,
+    capture,
+    kernel_times,
+    peak_megabytes,
+    synchronise,
+    time_groups,
+)
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.reference.errors import largest_error, most_error, same_bits

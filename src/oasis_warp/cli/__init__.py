@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that `arguments` (the process's own when not given) ask for; the exit code."""
+    # NumPy's threads spin while they wait, as torch's do (`core.processes`); read when NumPy is loaded.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         try:
             from oasis_warp.cli.app import main as run  # its imports take a while, in which Ctrl-C may come

@@ -6,25 +6,24 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float, UInt8
-from rich.console import Console
 from torch import Tensor
 
-from oasis_warp.cli.console import show_progress
 from oasis_warp.cli.options import Animate
+from oasis_warp.cli.progress import Terminal, show_progress
 from oasis_warp.cli.record import written
 from oasis_warp.cli.render import check_numbers, choose_pose, load_avatar, read_color, straight_alpha
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
+from oasis_warp.core.processes import single_threaded_torch
 from oasis_warp.core.types import Camera, Color, Gaussians, HandPose
 from oasis_warp.data.json_text import read_cameras
-from oasis_warp.data.pictures import to_uint8
-from oasis_warp.data.videos import check_video, write_video
+from oasis_warp.data.pictures import check_video, to_uint8, write_video
 from oasis_warp.hand.poses import POSE_NAMES, pose_sequence
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.motion import read_motion, resample
-from oasis_warp.render.render import render
+from oasis_warp.render import render
 
 MAX_FRAMES = 10_000
 MAX_LOOPS = 65_535
@@ -113,6 +112,7 @@ def few(poses: Sequence[HandPose]) -> Sequence[HandPose]:
     return poses[:: max(1, len(poses) // MAX_FRAMED)]
 
 
+@single_threaded_torch()
 def run(options: Animate) -> int:
     """Write the film.
 
@@ -133,7 +133,7 @@ def run(options: Animate) -> int:
     if path is not None and options.motion == "turntable":
         raise InputError("--camera: belongs to a moving hand, a turntable turns its own; choose another --motion.")
     avatars = [load_avatar(options, file) for file in options.avatars]
-    with show_progress(Console(stderr=True)) as progress:
+    with show_progress(Terminal()) as progress:
         hands = [(avatar, _poses(avatar, options, n_frames, names, progress)) for avatar in avatars]
         hands = _together(hands, options)
         n_frames = len(hands[0][1])

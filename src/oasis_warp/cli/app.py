@@ -15,7 +15,7 @@ import tyro
 
 from oasis_warp import __version__
 from oasis_warp.cli import developer_options, options
-from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED
+from oasis_warp.cli.progress import BAD_INPUT, INTERRUPTED
 from oasis_warp.cli.record import recorded, write_record
 from oasis_warp.core.errors import InputError, did_you_mean, one_line, shortened
 

@@ -22,8 +22,8 @@ from oasis_warp.bench.tables import (
     setting_table,
     speed_table,
 )
-from oasis_warp.cli.console import check_device, print_tables, show_progress
 from oasis_warp.cli.developer_options import Bench, ErrorTime, Kernels, Roofline, Scaling
+from oasis_warp.cli.progress import Terminal, check_device, print_tables, show_progress
 from oasis_warp.cli.record import exact_command
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.processes import using_threads
@@ -92,7 +92,7 @@ def run_error_time(options: ErrorTime) -> None:
     check_repeats(options.repeats)
     check_threads(options.threads)
     check_size(options.size, 4)
-    notes = Console(stderr=True)
+    notes = Terminal()
     with_plots = can_plot(notes)
     device = torch.device(options.device)
     with output_folder(options.out) as folder:
@@ -128,7 +128,7 @@ def run_kernels(options: Kernels) -> None:
     if not operators:
         raise InputError(f"--only {options.only}: expected part of one of {', '.join(OPERATORS)}.")
     with results(options, tables.plot_speed) as write:
-        with show_progress(Console(stderr=True)) as progress, using_threads(options.threads):
+        with show_progress(Terminal()) as progress, using_threads(options.threads):
             repeats = options.repeats or REPEATS
             run_options = speed.RunOptions(device=torch.device("cpu"), threads=options.threads, repeats=repeats)
             rows = speed.measure_operators(operators, run_options, gaussians=gaussians, size=size, progress=progress)
@@ -147,7 +147,7 @@ def run_gpu(options: Kernels) -> None:
         names = ", ".join(dict.fromkeys(case.name for case in gpu_cases.CASES))
         raise InputError(f"--only {options.only}: expected part of one of {names}.")
     peers = {"gsplat": speed.gsplat_draw()} if options.peer else {}
-    notes = Console(stderr=True)
+    notes = Terminal()
     with results(options, tables.plot_speed) as write:
         with show_progress(notes) as progress, using_threads(options.threads):
             rows = speed.measure_cases(
@@ -166,7 +166,7 @@ def run_scaling(options: Scaling) -> None:
     seconds = options.seconds if options.seconds is not None else 1.0 if options.quick else 2.0
     if not seconds > 0:
         raise InputError(f"--seconds: expected more than 0, got {seconds:g}.")
-    notes = Console(stderr=True)
+    notes = Terminal()
     with_plot = can_plot(notes)
     with output_folder(options.out) as folder:
         with show_progress(notes) as progress, using_threads(options.threads):
@@ -183,7 +183,7 @@ def run_scaling(options: Scaling) -> None:
 def run_roofline(options: Roofline) -> None:
     """`oasis bench roofline`."""
     with results(options, tables.plot_roofline) as write:
-        with show_progress(Console(stderr=True)) as progress:
+        with show_progress(Terminal()) as progress:
             rows = roofline.measure_roofline(torch.device(options.device), options.seed, progress)
         if not rows:
             raise InputError("--device cuda: torch's profiler traces no kernels here; check the driver's permissions.")

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from oasis_warp.cli.console import print_tables
 from oasis_warp.cli.info import FACTS, describe
 from oasis_warp.cli.options import Compare
+from oasis_warp.cli.progress import print_tables
 from oasis_warp.cli.record import note, written
 from oasis_warp.cli.report import MEASURES
 from oasis_warp.cli.summary import GROUND, Panel, make_sheet, panel_side

@@ -142,6 +142,9 @@ class Bench:
 class Doctor:
     """Check that everything is there and computes what it should; each failing line says what to do."""
 
+    build_extension: bool = False
+    """Also compile the C++ node that draws on CUDA with less time on the host; needs a compiler and ninja."""
+
 
 @command
 class Synthesize:

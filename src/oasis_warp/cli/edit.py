@@ -8,9 +8,8 @@ import torch
 from rich.console import Console
 
 from oasis_warp import __version__
-from oasis_warp.cli.console import check_device, plain_console, show_run
 from oasis_warp.cli.options import Edit as Options
-from oasis_warp.cli.progress import EDIT_PLAN, Run
+from oasis_warp.cli.progress import EDIT_PLAN, Run, Terminal, check_device, plain_console, show_run
 from oasis_warp.cli.record import exact_command, written
 from oasis_warp.cli.report import measures_table, print_warnings, to_json
 from oasis_warp.cli.summary import GROUND, WIDTH, Panel, make_sheet, panel_side
@@ -52,7 +51,7 @@ def run(options: Options) -> int:
     out = options.out or options.avatar.with_name(f"{options.avatar.stem}-{options.painted.stem}.safetensors")
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: expected a name that ends in .safetensors; rename the output.")
-    with output_folder(out.parent) as part, show_run(Console(stderr=True), Run(EDIT_PLAN)) as shown:
+    with output_folder(out.parent) as part, show_run(Terminal(), Run(EDIT_PLAN)) as shown:
         _check_outputs(options, out)
         before = Avatar.load(options.avatar, options.device)
         made = edit(

@@ -4,26 +4,23 @@ import sys
 from collections.abc import Mapping, Sequence
 
 import torch
-from rich.console import Console
 from rich.table import Table
 
 from oasis_warp.avatar.prior import MeanPrior, Prior
-from oasis_warp.cli.console import INTERRUPTED, check_device, print_tables, show_run
 from oasis_warp.cli.developer_options import Evaluate
-from oasis_warp.cli.progress import Run, Step
+from oasis_warp.cli.progress import INTERRUPTED, Run, Step, Terminal, check_device, print_tables, show_run
 from oasis_warp.cli.record import keep_command
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.evaluation.band_energy import SIZE
-from oasis_warp.evaluation.data_sets import Choice, evaluate_data_set
+from oasis_warp.evaluation.data_sets import CatalogueData, Choice, evaluate_data_set
 from oasis_warp.evaluation.held_out import HELD_OUT_SEED, CaptureConfig
 from oasis_warp.evaluation.kernel_distance import LAYERS
 from oasis_warp.evaluation.looks import evaluate_looks
 from oasis_warp.evaluation.methods import Method, method_name
 from oasis_warp.evaluation.paper_tables import make_tables, pose_curve, rows_of_tables, write_tables
 from oasis_warp.evaluation.pictures import write_curve
-from oasis_warp.evaluation.published_data import CatalogueData
 from oasis_warp.evaluation.real_hands import real_photos
 from oasis_warp.evaluation.same_hand import METRICS, evaluate_photos, photos_in, photos_of_hands
 from oasis_warp.evaluation.summary import (
@@ -47,7 +44,7 @@ from oasis_warp.evaluation.summary import (
 )
 from oasis_warp.evaluation.synthetic import SyntheticEvaluation, evaluate_people
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.losses.lpips import load_lpips
+from oasis_warp.losses import load_lpips
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.pretraining.synthetic_source import MULTIPLE
 from oasis_warp.synthetic.shots import PICTURES_EACH
@@ -78,7 +75,7 @@ def run(options: Evaluate) -> int:
     tables = dict.fromkeys(PUBLISHED, on_data_set)
     tables |= {"synthetic": on_synthetic_hands, "same-hand": on_photos, "looks": on_looks}
     try:
-        with show_run(Console(stderr=True), Run(plan(options, len(priors)))) as shown:
+        with show_run(Terminal(), Run(plan(options, len(priors)))) as shown:
             made = tables[options.dataset](options, priors, shown.progress)
     except KeyboardInterrupt:
         keep_command(options.out)

@@ -23,8 +23,8 @@ from oasis_warp.certify.certification import (
 )
 from oasis_warp.certify.compare import Measurement
 from oasis_warp.certify.families import FAMILIES
-from oasis_warp.cli.console import FAULT, show_progress
 from oasis_warp.cli.developer_options import Gradcheck
+from oasis_warp.cli.progress import FAULT, Terminal, show_progress
 from oasis_warp.cli.record import exact_command
 from oasis_warp.cli.report import to_json
 from oasis_warp.core.errors import InputError
@@ -42,7 +42,7 @@ def run(options: Gradcheck) -> int:
     start, verdict = time.monotonic(), Verdict()
     # The file is opened first: what cannot be written is refused before a minute of work.
     with output_file(options.json) if options.json else nullcontext() as part:
-        with show_progress(Console(stderr=True)) as progress:
+        with show_progress(Terminal()) as progress:
             for stage, done, total, measured in measurements(options, names, device):
                 verdict.add(measured)
                 progress(stage, done, total)

@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from oasis_warp.cli.console import print_tables
 from oasis_warp.cli.options import Info
+from oasis_warp.cli.progress import print_tables
 from oasis_warp.cli.report import to_json
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.surface import vertex_areas

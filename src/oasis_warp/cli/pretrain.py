@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 
-from oasis_warp.cli.console import INTERRUPTED, check_device, show_progress
 from oasis_warp.cli.developer_options import Pretrain
+from oasis_warp.cli.progress import INTERRUPTED, Terminal, check_device, show_progress
 from oasis_warp.cli.record import keep_command
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
@@ -24,7 +23,7 @@ from oasis_warp.datasets.readers import PAPER, read_dataset, read_selection
 from oasis_warp.datasets.training_source import DatasetHands, MixedHands
 from oasis_warp.hand.mano import read_mano
 from oasis_warp.hand.template import MANO_DIR, bundled_hand, chosen_hand
-from oasis_warp.losses.lpips import load_lpips
+from oasis_warp.losses import load_lpips
 from oasis_warp.network.config import PROFILES, NetworkConfig
 from oasis_warp.network.dense_network import DenseNetwork, load_dense_network
 from oasis_warp.network.encoders import DinoV2Encoder
@@ -59,7 +58,7 @@ def run(options: Pretrain) -> int:
     check_device(options.device)
     check_options(options)
     with join_processes(options.device) as process:
-        shown = show_progress(Console(stderr=True)) if process.rank == 0 else nullcontext(silent)
+        shown = show_progress(Terminal()) if process.rank == 0 else nullcontext(silent)
         try:
             with shown as progress:
                 done = train(options, process, progress)

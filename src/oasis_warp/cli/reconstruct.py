@@ -9,27 +9,32 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from oasis_warp.cli.animate import turntable
-from oasis_warp.cli.console import BAD_INPUT, INTERRUPTED, check_device, plain_console, show_run
 from oasis_warp.cli.options import Reconstruct
-from oasis_warp.cli.progress import Run, reconstruct_plan
+from oasis_warp.cli.progress import (
+    BAD_INPUT,
+    INTERRUPTED,
+    Run,
+    Terminal,
+    check_device,
+    plain_console,
+    reconstruct_plan,
+    show_run,
+)
 from oasis_warp.cli.record import written
 from oasis_warp.cli.report import make_report, print_report, to_json
 from oasis_warp.cli.summary import GROUND, draw_quality, draw_summary
 from oasis_warp.core.config import ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
+from oasis_warp.core.processes import single_threaded_torch
 from oasis_warp.core.types import Photo
 from oasis_warp.data.output_files import make_folders, output_folder
 from oasis_warp.data.photo import read_photo
-from oasis_warp.data.pictures import write_picture
-from oasis_warp.data.videos import write_video
+from oasis_warp.data.pictures import write_picture, write_video
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand, palm_and_back
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.losses.image import Perceptual
-from oasis_warp.losses.lpips import load_lpips
+from oasis_warp.losses import Perceptual, load_lpips
 from oasis_warp.network.weights_file import read_header
 from oasis_warp.reconstruction import FusedReconstruction, Reconstruction, reconstruct, reconstruct_same_hand
 
@@ -95,7 +100,7 @@ def _reconstruct_all(options: Reconstruct, config: ReconstructConfig, perceptual
     n_photos, n_done = len(options.photos), 0
     failed: list[str] = []
     planned = Run(reconstruct_plan(config, 1), n_photos)
-    with _shared_folder(options.out), show_run(Console(stderr=True), planned) as shown:
+    with _shared_folder(options.out), show_run(Terminal(), planned) as shown:
         try:
             for k, photo in enumerate(options.photos):
                 planned.begin(k, f"photo {k + 1} of {n_photos}")
@@ -137,7 +142,7 @@ def reconstruct_folder(
     perceptual: Perceptual | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Reconstruct one avatar of the hand on all photos, and write its folder; its report. Shows progress."""
-    with show_run(Console(stderr=True), Run(reconstruct_plan(config, len(paths)))) as shown:
+    with show_run(Terminal(), Run(reconstruct_plan(config, len(paths)))) as shown:
         return _write_folder(paths, folder, config, keypoints, perceptual, shown.progress)
 
 
@@ -146,6 +151,7 @@ def _print(report: dict[str, Any], folder: Path) -> None:
     written(f"{folder}{os.sep}")
 
 
+@single_threaded_torch()
 def _write_folder(
     paths: Sequence[Path], folder: Path, config: ReconstructConfig, keypoints: Path | None,
     perceptual: Perceptual | None, progress: Progress,

@@ -8,12 +8,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.sky import environment_light, studio_light
-from oasis_warp.cli.console import check_device
 from oasis_warp.cli.options import Animate, Render
+from oasis_warp.cli.progress import check_device
 from oasis_warp.cli.record import written
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError, did_you_mean
+from oasis_warp.core.processes import single_threaded_torch
 from oasis_warp.core.types import HandPose
 from oasis_warp.core.types import Render as Drawn
 from oasis_warp.data.environment_map import read_environment
@@ -93,6 +94,7 @@ def choose_pose(avatar: Avatar, pose: str | Path) -> HandPose:
 
 
 @torch.no_grad()
+@single_threaded_torch()
 def run(options: Render) -> int:
     """Write the picture.
 

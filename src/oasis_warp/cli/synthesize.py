@@ -3,15 +3,14 @@
 import sys
 
 import torch
-from rich.console import Console
 
-from oasis_warp.cli.console import INTERRUPTED, check_device, show_progress
 from oasis_warp.cli.developer_options import Synthesize
+from oasis_warp.cli.progress import INTERRUPTED, Terminal, check_device, show_progress
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, contact_sheet, to_uint8, write_picture
-from oasis_warp.synthetic.backgrounds import list_backgrounds
 from oasis_warp.synthetic.picture import render_batch
+from oasis_warp.synthetic.rooms import list_backgrounds
 from oasis_warp.synthetic.shards import write_shards
 from oasis_warp.synthetic.shots import PICTURES_EACH, SceneConfig
 
@@ -35,7 +34,7 @@ def run(options: Synthesize) -> int:
         raise InputError(f"--seed: expected 0 or more, got {options.seed}; choose another seed.")
     folder = () if options.backgrounds is None else list_backgrounds(options.backgrounds)
     scene = SceneConfig(look=options.look, backgrounds=folder)
-    console = Console(stderr=True)
+    console = Terminal()
     with show_progress(console) as progress:
         if options.sheet:
             check_suffix(options.out, PICTURE_SUFFIXES)

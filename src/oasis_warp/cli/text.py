@@ -6,8 +6,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from oasis_warp.cli.console import show_progress
 from oasis_warp.cli.options import Text
+from oasis_warp.cli.progress import Terminal, show_progress
 from oasis_warp.cli.reconstruct import reconstruct_folder
 from oasis_warp.cli.report import print_report
 from oasis_warp.core.config import ReconstructConfig
@@ -16,8 +16,7 @@ from oasis_warp.data.output_files import output_folder
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.text.conditioning import keypoints, make_conditioning, write_conditioning
-from oasis_warp.text.generators import choose_generator, imagine
+from oasis_warp.text import choose_generator, imagine, keypoints, make_conditioning, write_conditioning
 
 SIZES = (256, 4096)
 """Least and most pixels of a side."""
@@ -51,7 +50,7 @@ def run(options: Text) -> int:
         )
         return 0
     tries = 1 if Path(options.generator or "").is_file() else options.tries  # a file does not change
-    with show_progress(Console(stderr=True)) as progress:
+    with show_progress(Terminal()) as progress:
         made = imagine(
             generator, HandEstimator(hand), conditioning, options.out, prompt,
             seed=options.seed, tries=tries, progress=progress,

@@ -15,7 +15,7 @@ from oasis_warp.core.surface import faces_of_vertices
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.evaluation.metrics import TargetTruth
 from oasis_warp.ops import depth_map
-from oasis_warp.pretraining.objective import true_pictures
+from oasis_warp.pretraining.prior_trainer import true_pictures
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS, seeded
 from oasis_warp.pretraining.training_batch import EstimatorNoise, training_batch
 from oasis_warp.synthetic.picture import SyntheticBatch, render_capture, render_table, slice_batch

@@ -41,7 +41,7 @@ from oasis_warp.evaluation.views import (
 )
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.losses.image import Perceptual
+from oasis_warp.losses import Perceptual
 from oasis_warp.reconstruction import Reconstruction
 
 

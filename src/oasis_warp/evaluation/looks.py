@@ -30,7 +30,7 @@ from oasis_warp.evaluation.real_hands import measure_real, real_photos, referenc
 from oasis_warp.evaluation.same_hand import photos_in
 from oasis_warp.evaluation.summary import Record, read_result
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.losses.image import Perceptual
+from oasis_warp.losses import Perceptual
 from oasis_warp.reconstruction import reconstruct
 
 SETTINGS, METRICS, OVERVIEW = "evaluation.json", "metrics.json", "overview.jpg"

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.adaptation.calibrate import calibrate
+from oasis_warp.adaptation.prior_guess import calibrate
 from oasis_warp.adaptation.unlit import view_in_photo
 from oasis_warp.avatar.pose import in_even_light
 from oasis_warp.avatar.prior import Prior

@@ -12,7 +12,7 @@ from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.losses.image import Perceptual, ssim_map
+from oasis_warp.losses import Perceptual, ssim_map
 from oasis_warp.ops import depth_map
 
 COVERED = 0.9

@@ -31,7 +31,7 @@ from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, read_result, select
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
-from oasis_warp.losses.image import masked_psnr, ssim_map
+from oasis_warp.losses import masked_psnr, ssim_map
 from oasis_warp.reconstruction import Reconstruction, reconstruct
 
 PHOTO_METHODS = (

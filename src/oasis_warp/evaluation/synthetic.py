@@ -42,9 +42,8 @@ from oasis_warp.evaluation.metrics import TargetTruth, match_colors, score
 from oasis_warp.evaluation.pictures import ATTENTION_COLUMNS, tile, write_attention, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, read_result, summarise
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.losses.image import Perceptual
-from oasis_warp.losses.lpips import Lpips
-from oasis_warp.render.render import render
+from oasis_warp.losses import Lpips, Perceptual
+from oasis_warp.render import render
 
 SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (
     "evaluation.json", "metrics.json", "sheet.png", "attention.png", "people"

@@ -9,12 +9,11 @@ from torch import Tensor
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, CanonicalGaussians, HandLight, HandPose, Photo
-from oasis_warp.export import usd_stage
+from oasis_warp.export import usd
 from oasis_warp.export.hand_parameters import write_parameters
 from oasis_warp.export.page_file import write_page
 from oasis_warp.export.request import ExportRequest, Light
 from oasis_warp.export.skinned_gltf import write_skinned_gltf
-from oasis_warp.export.skinned_usd import write_skinned_usd
 from oasis_warp.export.splat_formats import (
     write_compressed_ply,
     write_ply,
@@ -24,8 +23,8 @@ from oasis_warp.export.splat_formats import (
     write_spz,
     write_spz4,
 )
-from oasis_warp.export.usd_stage import write_splat_usd
-from oasis_warp.export.wavefront import write_obj
+from oasis_warp.export.surface_mesh import write_obj
+from oasis_warp.export.usd import write_skinned_usd, write_splat_usd
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import check_finite
 from oasis_warp.ops.checks import check_choice, check_shape
@@ -47,8 +46,8 @@ WRITERS: dict[str, Writer] = {
     ".obj": write_obj,
     ".json": write_parameters,
     ".html": write_page,
-    **{ending: write_skinned_usd for ending in usd_stage.ENDINGS},
-    **{f".splats{ending}": write_splat_usd for ending in usd_stage.ENDINGS},
+    **{ending: write_skinned_usd for ending in usd.ENDINGS},
+    **{f".splats{ending}": write_splat_usd for ending in usd.ENDINGS},
 }
 """By the ending of the file's name; the longest that fits wins."""
 

@@ -24,8 +24,8 @@ from oasis_warp import __version__
 from oasis_warp.core.color import linear_light
 from oasis_warp.data.output_files import write_file
 from oasis_warp.data.splat_files import SH_C0, SPLAT_ROW, SPZ4_HEADER, SPZ_COLOR_SCALE, SPZ_MAGIC, zstandard
-from oasis_warp.export.gltf import VERTICES, GltfBuffer, write_gltf
 from oasis_warp.export.request import ExportRequest
+from oasis_warp.export.skinned_gltf import VERTICES, GltfBuffer, write_gltf
 from oasis_warp.export.splats import largest_component, morton_order, posed_splats, y_down
 
 MIN_OPACITY = 1e-6

@@ -122,7 +122,7 @@ class Body:
     """Faces of hand and forearm: the first of `faces`."""
     coarse_vertices: Int[Tensor, "C"]
     """Vertices of a coarse mesh of hand and forearm, which occludes the sky. Built by
-    `asset_build/build_coarse_body.py`."""
+    `asset_build/build_coarse_meshes.py`."""
     coarse_faces: Int[Tensor, "G 3"]
     knuckle_rise: Float[Tensor, "V 15"]
     """Displacement of the hand's vertices along their normals, for each joint of a finger bent by 90 degrees [m]."""

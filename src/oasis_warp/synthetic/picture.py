@@ -15,7 +15,6 @@ from oasis_warp.ops import depth_map
 from oasis_warp.ops.depth_map import DepthMap
 from oasis_warp.ops.smoothing import smooth_over_faces
 from oasis_warp.synthetic.atlas import HEIGHT, WIDTH
-from oasis_warp.synthetic.backgrounds import cut_background
 from oasis_warp.synthetic.body import RING, Body, body_on, device_name
 from oasis_warp.synthetic.identity import Population
 from oasis_warp.synthetic.illumination import light_lamps, no_lamps, pinhole, see_sky
@@ -24,6 +23,7 @@ from oasis_warp.synthetic.ops.skin_shading import Shaded, Texture, Worn, shade_s
 from oasis_warp.synthetic.ops.views import Lamps
 from oasis_warp.synthetic.people import Person, person
 from oasis_warp.synthetic.posing import PosedPeople, pose_people
+from oasis_warp.synthetic.rooms import cut_background
 from oasis_warp.synthetic.sensor import develop, expose, meter, srgb
 from oasis_warp.synthetic.shots import (
     PHOTOS,

@@ -11,8 +11,7 @@ import numpy as np
 from oasis_warp.synthetic.atlas import bundled_atlas
 from oasis_warp.synthetic.body import FINGERS, bundled_body
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
-from oasis_warp.synthetic.skin_lines import Palm, draw_back, draw_fingers, draw_wrist
-from oasis_warp.synthetic.strokes import Lines, Strokes
+from oasis_warp.synthetic.skin_lines import Lines, Palm, Strokes, draw_back, draw_fingers, draw_wrist
 
 STAR, BANDS = 2, 4
 """Tattoo patterns with a parameter of their own."""

@@ -11,7 +11,7 @@ from torch.nn.functional import embedding_bag
 from oasis_warp.synthetic.atlas import Atlas, bundled_atlas
 from oasis_warp.synthetic.body import FINGERS, THUMB, smoothstep
 from oasis_warp.synthetic.ops.surface_patterns import PointGrid, point_grid, surface_dabs
-from oasis_warp.synthetic.strokes import CORNER_WORDS, KINDS, LINE_WORDS, PLACE_CELL, STRENGTH_CELL, Lines
+from oasis_warp.synthetic.skin_lines import CORNER_WORDS, KINDS, LINE_WORDS, PLACE_CELL, STRENGTH_CELL, Lines
 
 GRID_CELL = 2.0
 """Cell of the grid that lines are drawn on [mm]: about the reach of most lines."""

@@ -1,4 +1,4 @@
-// The data of the page: one stream of gzip in base64, written by page_data.py. Arrays of whole numbers with a "step"
+// The data of the page: one stream of gzip in base64, written by page_file.py. Arrays of whole numbers with a "step"
 // are values over that step.
 "use strict";
 

@@ -1,9 +1,10 @@
-"""Build the coarse mesh on which light on a posed hand is computed, and the way back to the fine one.
+"""Build the coarse meshes on which the sky is computed: of the posed hand, and of hand and forearm in pictures.
 
-    python asset_build/build_sky_mesh.py --out src/oasis_warp/assets/hand/sky_mesh.npz
+    python asset_build/build_coarse_meshes.py sky_mesh --out src/oasis_warp/assets/hand/sky_mesh.npz
+    python asset_build/build_coarse_meshes.py coarse_body --out src/oasis_warp/assets/synthetic/coarse_body.npz
 
-Edges are collapsed by libigl until `FACES` are left. A vertex of the fine mesh reads the three corners of the coarse
-face that is nearest to it at rest.
+Edges are collapsed by libigl until `FACES` are left. The results ship with the package, so that pictures are made where
+libigl is not installed.
 """
 
 import argparse
@@ -15,13 +16,20 @@ from hand_build.source import write_npz
 
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.hand.template import bundled_hand
+from oasis_warp.synthetic.body import SkinMesh, skin_mesh
 
 FACES = 4000
 """Edges of 4 mm: a quarter of a finger's width."""
 
 
+def coarse_mesh(skin: SkinMesh) -> dict[str, np.ndarray]:
+    """Numbers of the vertices that are kept, and the faces between them, as uint16."""
+    _, left, _, kept = igl.decimate(skin.rest.double().numpy(), skin.faces.numpy(), FACES, False)
+    return {"vertices": np.asarray(kept, np.uint16), "faces": np.asarray(left, np.uint16)}
+
+
 def sky_mesh(hand: HandModel) -> dict[str, np.ndarray]:
-    """See `oasis_warp.avatar.sky.SkyMesh`."""
+    """See `oasis_warp.avatar.sky.SkyMesh`; a fine vertex reads the corners of the coarse face nearest to it at rest."""
     points, faces = hand.template.double().numpy(), hand.faces.numpy()
     _, left, _, kept = igl.decimate(points, faces, FACES, False)
     kept, left = np.asarray(kept), np.asarray(left, np.int64)
@@ -43,9 +51,11 @@ def sky_mesh(hand: HandModel) -> dict[str, np.ndarray]:
 def main() -> None:
     """Write the file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("mesh", choices=("sky_mesh", "coarse_body"))
     parser.add_argument("--out", type=Path, required=True)
-    out = parser.parse_args().out
-    print(write_npz(out, sky_mesh(bundled_hand())), out)
+    args = parser.parse_args()
+    made = sky_mesh(bundled_hand()) if args.mesh == "sky_mesh" else coarse_mesh(skin_mesh(bundled_hand()))
+    print(write_npz(args.out, made), args.out)
 
 
 if __name__ == "__main__":

@@ -1,1 +1,0 @@
-"""Losses on pictures."""
