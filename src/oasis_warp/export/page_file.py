@@ -27,6 +27,7 @@ from oasis_warp.core.mirror import mirror_points
 from oasis_warp.core.types import Gaussians, HandPose, Photo
 from oasis_warp.data.output_files import write_file
 from oasis_warp.export.request import ExportRequest
+from oasis_warp.hand.contact import contact_tables
 from oasis_warp.hand.poses import POSE_NAMES, named_pose, pose_sequence
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops.sky_exposure import sky_directions
@@ -52,8 +53,8 @@ MAX_SHORTS, FEW_STEPS = 45, 63
 """Correctives that have 16 bits: three for each joint. MANO's 135 have so many steps to either side, to within .1 mm in
 all: 16 bits would fill 13 MB of the page."""
 WORKER = (
-    "data.js", "surface.js", "posing.js", "gaussians.js", "sky.js", "shading.js", "projection.js", "splats.js",
-    "worker.js",
+    "data.js", "surface.js", "contact.js", "posing.js", "gaussians.js", "sky.js", "shading.js", "projection.js",
+    "splats.js", "worker.js",
 )  # fmt: skip
 RASTER = ("raster.js",)
 SCRIPT = ("graphics.js", "processor.js", "viewer.js", "gestures.js", "controls.js", "main.js")
@@ -206,6 +207,7 @@ def _arrays(avatar: Avatar, light: SurfaceLight) -> dict[str, np.ndarray | Packe
     correctives = hand.corrective_basis.permute(2, 0, 1)
     reach = correctives.abs().amax((1, 2))
     kind, steps = ("i1", FEW_STEPS) if len(correctives) > MAX_SHORTS else ("i2", np.iinfo("i2").max)
+    contact = contact_tables(torch.device("cpu"))
     arrays: dict[str, np.ndarray | Packed] = {
         "vertices": _numpy(rest.vertices, "f4"),
         "faces": _numpy(hand.faces, "u2"),
@@ -215,6 +217,11 @@ def _arrays(avatar: Avatar, light: SurfaceLight) -> dict[str, np.ndarray | Packe
         "joints": _numpy(rest.joints, "f4"),
         "axes": _numpy(hand.pose_axes, "f4"),
         "normals": _pack(mirror_points(normals) if avatar.side == "left" else normals, "i2", 1.0),
+        "contactMembers": _numpy(contact.members, "u2"),
+        "contactStarts": _numpy(contact.starts, "u2"),
+        "contactSamples": _numpy(contact.samples, "u2"),
+        "contactAllowed": _numpy(contact.allowed, "i4"),
+        "contactGive": _pack(contact.give, "u2"),
         "vertexIndex": _numpy(gaussians.vertex_index, "u2"),
         "offsets": _pack(gaussians.offsets, "i2"),
         "faceIndex": _numpy(gaussians.face_index, "u2"),

@@ -3,7 +3,7 @@
 "use strict";
 
 const ARRAYS = {
-  f4: Float32Array, u1: Uint8Array, i1: Int8Array, u2: Uint16Array, i2: Int16Array, u4: Uint32Array,
+  f4: Float32Array, u1: Uint8Array, i1: Int8Array, u2: Uint16Array, i2: Int16Array, u4: Uint32Array, i4: Int32Array,
 };
 
 async function readData(base64) {

@@ -15,6 +15,7 @@ function makeBody(data) {
   body.bends = nonZeroTriples(correctives, reach, body.nVertices);
   body.planes = restPlanes(body);
   Object.assign(body, facesAround(body));
+  body.contact = makeContact(body);
   body.posed = new Float32Array(3 * body.nVertices);
   body.shaped = new Float32Array(3 * body.nVertices);
   body.faceQuats = new Float32Array(4 * body.nFaces);
