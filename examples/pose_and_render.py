@@ -19,7 +19,6 @@ from oasis_warp import Avatar, read_photo, reconstruct
 from oasis_warp.assets import asset
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.data.pictures import to_uint8, write_picture
-from oasis_warp.hand.poses import named_pose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +47,7 @@ def main(options: Options) -> None:
     """Load, then pose, render and write frame by frame."""
     options.out.mkdir(parents=True, exist_ok=True)
     avatar = load(options)
-    first, last = (named_pose(avatar.hand, name) for name in ("open", "fist"))
+    first, last = (avatar.held(name).angles for name in ("open", "fist"))
     seconds = 0.0
     with torch.no_grad():
         for k in range(options.frames):

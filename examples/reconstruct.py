@@ -16,7 +16,6 @@ from oasis_warp import Avatar, read_photo, reconstruct
 from oasis_warp.assets import asset
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.data.pictures import to_uint8, write_picture
-from oasis_warp.hand.poses import named_pose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +41,7 @@ def main(options: Options) -> None:
     made.avatar.save(file)
     avatar = Avatar.load(file)  # from here on, neither photo nor network is needed
 
-    pose = avatar.source_pose._replace(angles=named_pose(avatar.hand, options.pose))
+    pose = avatar.held(options.pose)
     camera = orbit_camera(avatar.mesh(pose).vertices, azimuth=0.5, size=512)
     write_picture(options.out, to_uint8(avatar.render(camera, pose).image))
     print(f"wrote {file} and {options.out}")

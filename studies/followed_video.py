@@ -44,7 +44,7 @@ class Options(exports.Options):
 
 def poses_of(avatar: Avatar, names: tuple[str, ...], options: Options) -> list[HandPose]:
     """The true poses of a film."""
-    angles, source = pose_sequence(avatar.hand, names, options.frames // len(names)), avatar.source_pose
+    angles, source = pose_sequence(avatar.hand, names, options.frames // len(names), avatar.rest), avatar.source_pose
     up = torch.tensor([0.0, 1.0, 0.0])
     turns = [
         TURN * math.sin(2 * math.pi * k / options.fps / TURN_SECONDS) * (len(names) > 1) for k in range(len(angles))

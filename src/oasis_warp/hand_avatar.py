@@ -114,6 +114,7 @@ class Avatar:
             self._light = mirrored if left else known
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
         self._graphs = GraphCache()
+        self._held: dict[str, Tensor] = {}
 
     def _photo_surface(self) -> Float[Tensor, "V 3"]:
         """Vertices in the photo's pose; of a left hand in the mirror, where faces wind outwards."""
@@ -139,10 +140,14 @@ class Avatar:
     def held(self, name: str) -> HandPose:
         """The pose called `name`, one of `hand.poses.POSE_NAMES`, turned and placed as the hand in the photo.
 
+        Fingers of every shape touch each other and the palm where those of the mean hand do.
+
         Raises:
             ValueError: no pose has that name.
         """
-        return self.source_pose._replace(angles=named_pose(self.hand, name).to(self.source_pose.angles))
+        if name not in self._held:
+            self._held[name] = named_pose(self.hand, name, self.rest)
+        return self.source_pose._replace(angles=self._held[name].to(self.source_pose.angles))
 
     def _checked(self, pose: HandPose | str, validate: bool) -> HandPose:
         """The pose in the avatar's precision and place."""

@@ -207,7 +207,7 @@ def test_usds_own_skinning_gives_our_poses(avatar, tmp_path):
         offsets = shapes.ComputeBlendShapePointIndices(), shapes.ComputeSubShapePointOffsets()
         assert shapes.ComputeDeformedPoints(weights, indices, subshapes, *offsets, points)
         assert skinning.ComputeSkinnedPoints(query.ComputeSkinningTransforms(time), points, time)
-        expected = surface(avatar, named_pose(avatar.hand, name))[0]
+        expected = surface(avatar, avatar.held(name).angles)[0]
         assert np.abs(np.array(points)[:-1] - expected[topology(avatar).vertex]).max() < 5e-6
 
 

@@ -54,7 +54,7 @@ def section(page, name):
 
 
 def in_pose(avatar, name):
-    return avatar.source_pose._replace(angles=named_pose(avatar.hand, name))
+    return avatar.held(name)
 
 
 def test_the_page_is_one_file_that_fetches_nothing(pages):

@@ -41,7 +41,7 @@ def test_a_clip_ends_in_the_pose_it_is_named_after(files, side, name):
     """Within float32 of our own skinning, correctives included."""
     avatar, document, binary = files[side]
     points = play(document, binary, *pose_of_clip(document, binary, name))
-    expected, joints, tips = surface(avatar, named_pose(avatar.hand, name))
+    expected, joints, tips = surface(avatar, avatar.held(name).angles)
     mesh = topology(avatar)
     assert np.abs(points[:-1] - expected[mesh.vertex]).max() < 2e-6
     world = joint_matrices(document, pose_of_clip(document, binary, name)[0])
@@ -67,7 +67,7 @@ def test_a_hand_of_mano_has_all_of_its_correctives_in_few_bytes(mano, tmp_path):
     assert (tmp_path / "hand.glb").stat().st_size < 9e6  # 23 MB as floats
     document, binary = read_gltf(tmp_path / "hand.glb")
     points = play(document, binary, *pose_of_clip(document, binary, "fist"))
-    expected = surface(avatar, named_pose(mano, "fist"))[0][topology(avatar).vertex]
+    expected = surface(avatar, avatar.held("fist").angles)[0][topology(avatar).vertex]
     assert np.abs(points[:-1] - expected).max() < 5e-5
 
 
@@ -100,7 +100,7 @@ def test_programs_that_read_four_influences_are_off_by_little(files):
     """The strongest come first: else they would tear the hand."""
     avatar, document, binary = files["right"]
     points = play(document, binary, *pose_of_clip(document, binary, "fist"), sets=1)
-    expected = surface(avatar, named_pose(avatar.hand, "fist"))[0][topology(avatar).vertex]
+    expected = surface(avatar, avatar.held("fist").angles)[0][topology(avatar).vertex]
     away = np.linalg.norm(points[:-1] - expected, axis=1)
     assert away.max() < 5e-3 and away.mean() < 5e-4  # 3.9 mm and .3 mm
 

@@ -12,7 +12,6 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, Gaussians
 from oasis_warp.data.splat_files import read_splats
 from oasis_warp.export import export_avatar
-from oasis_warp.hand.poses import named_pose
 from oasis_warp.render import render
 
 LOSSLESS = {".ply", ".splats.glb", ".splats.gltf"}
@@ -36,7 +35,7 @@ def psnr(a, b):
 
 
 def posed(avatar, name):
-    return avatar.source_pose._replace(angles=named_pose(avatar.hand, name))
+    return avatar.held(name)
 
 
 @pytest.mark.parametrize("ending", READERS)

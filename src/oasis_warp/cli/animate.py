@@ -155,7 +155,7 @@ def _poses(avatar: Avatar, options: Animate, n_frames: int, names: list[str], pr
     if options.motion == "turntable":
         return [choose_pose(avatar, options.pose)] * n_frames
     if not isinstance(options.motion, Path):
-        angles = pose_sequence(avatar.hand, names, max(1, round(n_frames / len(names))))
+        angles = pose_sequence(avatar.hand, names, max(1, round(n_frames / len(names))), avatar.rest)
         return [avatar.source_pose._replace(angles=each) for each in angles]
     motion = resample(read_motion(options.motion, avatar, progress=progress), options.fps)
     count_frames(len(motion.angles) / options.fps, options.fps)

@@ -10,7 +10,6 @@ from torch import Tensor
 from oasis_warp.avatar.anchors import OPACITY, place_anchors
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.core.camera import orbit_camera
-from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses import Perceptual, ssim_map
 from oasis_warp.ops import depth_map
@@ -122,7 +121,7 @@ def coverage(avatar: Avatar, size: int = 256) -> Float[Tensor, "P C"]:
     solid_faces = (solid[faces] >= OPACITY - 1e-4).all(1)
     shares = torch.zeros(len(COVERAGE_POSES), COVERAGE_VIEWS)
     for p, name in enumerate(COVERAGE_POSES):
-        pose = avatar.source_pose._replace(angles=named_pose(avatar.hand, name))
+        pose = avatar.held(name)
         vertices = avatar.mesh(pose).vertices
         for c in range(COVERAGE_VIEWS):
             camera = orbit_camera(vertices, 2 * math.pi * c / COVERAGE_VIEWS, size=size)

@@ -17,7 +17,7 @@ from oasis_warp.core.surface import face_normals
 from oasis_warp.core.types import Camera, HandPose, Render
 from oasis_warp.estimation.hand_crop import CROP_MARGIN
 from oasis_warp.evaluation.band_energy import SIZE
-from oasis_warp.hand.poses import POSE_NAMES, named_pose
+from oasis_warp.hand.poses import POSE_NAMES
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
 
@@ -73,7 +73,7 @@ def views_of(avatar: Avatar) -> list[View]:
     pose, source = avatar.source_pose, avatar.source_camera
     views = [View("input", "photo", crop_camera(source, 0.0, 0.0, float(source.width), DRAWN_SIZE), pose)]
     views += [View("side", str(degrees), frame(avatar, pose, float(degrees)), pose) for degrees in AZIMUTHS]
-    held = {name: pose._replace(angles=named_pose(avatar.hand, name).to(pose.angles)) for name in POSES}
+    held = {name: avatar.held(name) for name in POSES}
     views += [View("pose", name, frame(avatar, each, 0.0), each) for name, each in held.items()]
     return [*views, View("back", "open", frame(avatar, held["open"], 180.0), held["open"])]
 

@@ -28,7 +28,7 @@ from oasis_warp.core.types import Gaussians, HandPose, Photo
 from oasis_warp.data.output_files import write_file
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.hand.contact import contact_tables
-from oasis_warp.hand.poses import POSE_NAMES, named_pose, pose_sequence
+from oasis_warp.hand.poses import POSE_NAMES, pose_sequence
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops.sky_exposure import sky_directions
 
@@ -82,7 +82,7 @@ def page_facts(
     """
     parts = avatar.parts
     poses = {"photo": avatar.source_pose.angles.cpu()}
-    poses |= {name: named_pose(avatar.hand, name).cpu() for name in POSE_NAMES}
+    poses |= {name: avatar.held(name).angles.cpu() for name in POSE_NAMES}
     lights = {} if parts.light is None else {"photo": parts.light}
     studio = avatar.in_light(studio_light()).parts.light
     assert studio is not None, "in_light gives one"
@@ -91,7 +91,7 @@ def page_facts(
     *reached, at_start = _reached(avatar, [*poses.values(), begin])
     everywhere = torch.cat(reached)
     middle = _middle(everywhere)
-    walk = pose_sequence(avatar.hand, WALK, WALK_FRAMES)
+    walk = pose_sequence(avatar.hand, WALK, WALK_FRAMES, avatar.rest)
     facts = {
         "side": avatar.side,
         "parents": list(parts.hand.parents),

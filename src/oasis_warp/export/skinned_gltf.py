@@ -15,14 +15,13 @@ from torch import Tensor
 
 from oasis_warp import __version__
 from oasis_warp.core import rotation
-from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import Side
 from oasis_warp.data.output_files import write_file
 from oasis_warp.export import texture
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.surface_mesh import SkinnedMesh, skinned_mesh
-from oasis_warp.hand.poses import POSE_NAMES, named_pose
+from oasis_warp.hand.poses import POSE_NAMES
 from oasis_warp.hand.webxr_rig import Rig, local_bind, local_quats
+from oasis_warp.hand_avatar import Avatar
 
 AccessorType = Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT4"]
 VERTICES, INDICES = 34962, 34963
@@ -151,7 +150,7 @@ def write_skinned_gltf(request: ExportRequest, path: Path) -> None:
         "meshes": [mesh],
         "skins": [{**skin, "inverseBindMatrices": buffer.add(_array(inverse), "MAT4")}],
         **_material(buffer, texture.bake_material(request, texture.SIZE)),
-        "animations": _clips(buffer, made, request.avatar.side),
+        "animations": _clips(buffer, made, request.avatar),
     }
     if _packs(made):
         document.setdefault("extensionsUsed", []).append("KHR_mesh_quantization")
@@ -231,9 +230,9 @@ def _material(buffer: GltfBuffer, pictures: dict[str, bytes]) -> dict[str, Any]:
     }
 
 
-def clip_angles(hand: HandModel) -> dict[str, Float[Tensor, "T 15 3"]]:
+def clip_angles(avatar: Avatar) -> dict[str, Float[Tensor, "T 15 3"]]:
     """Joint angles [rad] of every clip, `KEYS` steps of `SECONDS` / `KEYS` from each pose to the next."""
-    poses = {name: named_pose(hand, name) for name in POSE_NAMES}
+    poses = {name: avatar.held(name).angles.cpu() for name in POSE_NAMES}
     rest, others = poses["rest"], [name for name in POSE_NAMES if name != "rest"]
     clips = {name: _eased([rest, poses[name]]) for name in others}
     return clips | {"poses": _eased([rest, *(poses[name] for name in others), rest])}
@@ -246,13 +245,13 @@ def _eased(stops: list[Tensor]) -> Float[Tensor, "T 15 3"]:
     return torch.stack(frames)
 
 
-def _clips(buffer: GltfBuffer, made: SkinnedMesh, side: Side) -> list[dict[str, Any]]:
+def _clips(buffer: GltfBuffer, made: SkinnedMesh, avatar: Avatar) -> list[dict[str, Any]]:
     hand, rig = made.hand, made.rig
     moving = [j for j, name in enumerate(rig.names) if rig.bones[j] and not name.endswith("tip")]
     clips = []
-    for name, angles in clip_angles(hand).items():
+    for name, angles in clip_angles(avatar).items():
         times = buffer.add(np.arange(len(angles), dtype="<f4") * np.float32(SECONDS / KEYS), "SCALAR")
-        quats = _array(_xyzw(local_quats(rig, hand, made.rest, angles, side)))
+        quats = _array(_xyzw(local_quats(rig, hand, made.rest, angles, avatar.side)))
         bends = _array(made.corrective_weights(angles))
         outputs = [buffer.add(np.ascontiguousarray(quats[:, j]), "VEC4") for j in moving]
         targets = [{"node": 2 + j, "path": "rotation"} for j in moving] + [{"node": 1, "path": "weights"}]

@@ -133,7 +133,7 @@ def write_skinned_usd(request: ExportRequest, path: Path) -> None:
     animation.CreateBlendShapesAttr(shapes)
     animation.CreateTranslationsAttr(vec3f(path, local_bind(made.rig)[:, :3, 3].numpy()))
     animation.CreateScalesAttr(usd(path, "Vt").Vec3hArray(len(joints), usd(path, "Gf").Vec3h(1, 1, 1)))
-    clip = clip_angles(made.hand)["poses"] if request.pose is None else request.pose.angles[None].to(made.points)
+    clip = clip_angles(request.avatar)["poses"] if request.pose is None else request.pose.angles[None].to(made.points)
     quats = local_quats(made.rig, made.hand, made.rest, clip, request.avatar.side).numpy()
     weights = made.corrective_weights(clip).tolist()
     rotations, bends = animation.CreateRotationsAttr(), animation.CreateBlendShapeWeightsAttr()

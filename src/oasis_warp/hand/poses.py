@@ -10,6 +10,9 @@ from torch import Tensor
 from oasis_warp.core.errors import did_you_mean
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.rotation import euler_angles, euler_rotations
+from oasis_warp.core.types import PosedHand
+from oasis_warp.hand.template import bundled_hand
+from oasis_warp.hand.touching_poses import touch_of_mean_hand, touching_angles
 
 Finger = tuple[float, float, float, float]
 """Flexion of a finger's three joints from the knuckle outwards, and abduction of the knuckle [degrees]."""
@@ -56,8 +59,14 @@ _FINGERS: dict[str, dict[str, Finger]] = {
 POSE_NAMES = ("rest", *_FINGERS)
 
 
-def named_pose(hand: HandModel, name: str) -> Float[Tensor, "15 3"]:
+def named_pose(hand: HandModel, name: str, rest: PosedHand | None = None) -> Float[Tensor, "15 3"]:
     """Joint angles [rad] of the pose called `name`, one of `POSE_NAMES`, as in `HandPose.angles`.
+
+    Args:
+        hand: Any.
+        name: Of the pose.
+        rest: The surface at rest that takes the pose: it touches itself where the bundled mean hand does
+            (`hand.touching_poses`). The angles of the table when not given.
 
     Raises:
         ValueError: no pose has that name.
@@ -65,9 +74,19 @@ def named_pose(hand: HandModel, name: str) -> Float[Tensor, "15 3"]:
     if name not in POSE_NAMES:
         hint = did_you_mean(name, POSE_NAMES)
         raise ValueError(f"pose: expected one of {', '.join(POSE_NAMES)}, got {name!r}.{hint and ' '}{hint}")
-    degrees = torch.zeros(16, 3, dtype=torch.float64)
     if name == "rest":
-        return degrees[1:].to(hand.pose_axes)
+        return torch.zeros_like(hand.pose_axes[1:, 0])
+    bundled = _angles(bundled_hand(), name)
+    angles = bundled if hand.origin is None else _angles(hand, name)
+    if rest is not None:
+        touch = touch_of_mean_hand(tuple(bundled.flatten().tolist()))
+        angles = torch.from_numpy(touching_angles(hand, rest, angles.numpy(), touch))
+    return angles[1:].to(hand.pose_axes)
+
+
+def _angles(hand: HandModel, name: str) -> Float[Tensor, "16 3"]:
+    """Those of the tables, float64 on the CPU."""
+    degrees = torch.zeros(16, 3, dtype=torch.float64)
     for finger, (knuckle, middle, end, abduction) in _FINGERS[name].items():
         first = hand.joint_names.index(finger + "1")
         degrees[first, 1] = abduction
@@ -82,16 +101,16 @@ def named_pose(hand: HandModel, name: str) -> Float[Tensor, "15 3"]:
     angles[:, 0] -= hand.rest_bend.cpu().double() - rest[:, 0]
     if hand.origin is not None:
         angles = euler_angles(euler_rotations(angles) @ euler_rotations(rest).mT)
-    return angles[1:].to(hand.pose_axes)
+    return angles
 
 
 def pose_sequence(
-    hand: HandModel, names: Sequence[str], frames_per_transition: int
+    hand: HandModel, names: Sequence[str], frames_per_transition: int, rest: PosedHand | None = None
 ) -> list[Float[Tensor, "15 3"]]:
     """Joint angles [rad] of a loop through the named poses, `frames_per_transition` for each one.
 
     Frame `i * frames_per_transition` is pose `names[i]`. Angles ease from each pose to the next by half a cosine, and
-    from the last to the first, so the sequence repeats without a jump.
+    from the last to the first, so the sequence repeats without a jump. `rest` is that of `named_pose`.
 
     Raises:
         ValueError: an unknown name, no name, or fewer than one frame a transition.
@@ -100,7 +119,7 @@ def pose_sequence(
         raise ValueError("names: expected at least one pose, got none.")
     if frames_per_transition < 1:
         raise ValueError(f"frames_per_transition: expected 1 or more, got {frames_per_transition}.")
-    poses = [named_pose(hand, name) for name in names]
+    poses = [named_pose(hand, name, rest) for name in names]
     frames = []
     for start, end in zip(poses, [*poses[1:], poses[0]], strict=True):
         for frame in range(frames_per_transition):
