@@ -49,10 +49,8 @@ class Options(StudyOptions):
     seed: int = 11
 
 
-def posed(hand: HandModel, angles: torch.Tensor | str, shape: torch.Tensor) -> PosedHand:
-    """A hand in a pose, of which the name or the angles are given."""
-    if isinstance(angles, str):
-        angles = named_pose(hand, angles, rest_hand(hand, shape.to(hand.template)))
+def posed(hand: HandModel, angles: torch.Tensor, shape: torch.Tensor) -> PosedHand:
+    """A hand in a pose."""
     pose = HandPose(angles.to(hand.template), FACING.to(hand.template), torch.tensor([0.0, 0.0, 0.5]).to(hand.template))
     return skin(hand, rest_hand(hand, shape.to(hand.template)), pose)
 
@@ -62,11 +60,15 @@ def without_correctives(hand: HandModel) -> HandModel:
     return dataclasses.replace(hand, corrective_basis=hand.corrective_basis[..., :0])
 
 
-def measure(pose: str, angles: torch.Tensor | str, shapes: torch.Tensor) -> Iterator[Row]:
-    """A row for each hand, the mean one first: crossing edges, volume [cm^3] and the largest shift [mm]."""
+def measure(pose: str, gesture: torch.Tensor | None, shapes: torch.Tensor) -> Iterator[Row]:
+    """A row for each hand in a named pose or a gesture, the mean one first.
+
+    Crossing edges, volume [cm^3] and the largest shift [mm].
+    """
     hand = bundled_hand()
     faces, rim = hand.faces.numpy(), hand.rim.numpy()
     for number, shape in enumerate(shapes):
+        angles = named_pose(hand, pose, rest_hand(hand, shape)) if gesture is None else gesture
         surfaces = {"skinned": posed(hand, angles, shape).vertices}
         surfaces["contact"] = giving_way(hand, surfaces["skinned"])
         if number == 0:
@@ -88,7 +90,7 @@ def run(options: Options) -> list[Row]:
     apart, _ = separate(drawn, np.tile(1e3 * hand.joints.double().numpy(), (len(drawn), 1, 1)))
     shapes = torch.from_numpy(rng.normal(size=(options.hands, len(hand.shape_names)))).float()
     shapes = torch.cat([torch.zeros_like(shapes[:1]), shapes])
-    cases: dict[str, tuple] = {name: (name, name, shapes) for name in POSE_NAMES}
+    cases: dict[str, tuple] = {name: (name, None, shapes) for name in POSE_NAMES}
     cases |= {f"{GESTURES} {k}": (GESTURES, torch.from_numpy(own[1:]), shapes) for k, own in enumerate(apart)}
     return measured("hand", cases, measure, options)
 

@@ -1,4 +1,5 @@
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -199,6 +200,15 @@ def test_the_work_of_a_cluster_is_counted_and_a_lost_scheduler_told(pipeline, ph
         wrong = Order(source=order.source, out=order.source / "0.png", config=order.config)
         with pytest.raises(InputError, match="expected the folder"):
             batch.work(client, tasks, wrong, lambda *counts: None)
+
+
+@pytest.mark.slow
+def test_workers_keep_the_memory_that_they_were_given():
+    """Dask's own threshold makes page faults of two fifths of their time."""
+    pytest.importorskip("distributed")
+    with batch.open_cluster(1, None, "cpu") as (client, _):
+        (found,) = client.run(lambda: dict(os.environ)).values()
+    assert {name: int(found[name]) for name in batch.MALLOC} == batch.MALLOC
 
 
 @pytest.mark.slow
