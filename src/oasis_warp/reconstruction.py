@@ -30,7 +30,7 @@ from oasis_warp.avatar.quality import (
     over_photo,
     photo_warnings,
 )
-from oasis_warp.avatar.wrist import close_wrist
+from oasis_warp.avatar.wrist import close_wrist, end_shade
 from oasis_warp.core import surface
 from oasis_warp.core.config import PAPER_ADAPTATION, AdaptConfig, ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
@@ -295,9 +295,11 @@ def _finish(
         with stage("painting"):
             painted = paint_unseen(hand, gaussians, adaptation.guess, first, adaptation.observations, seed=config.seed)
             gaussians, invented = painted.gaussians, painted.invented
-    if adaptation.light is not None:
-        gaussians = limit_shade(hand, gaussians, crops, adaptation.light)
-    return adaptation._replace(gaussians=close_wrist(hand, gaussians, first.rest.vertices)), invented
+    rest, lights = first.rest.vertices, adaptation.lights
+    if lights is not None:
+        gaussians = limit_shade(hand, gaussians, crops, lights[0])
+        lights = tuple(end_shade(hand, light, rest) for light in lights)
+    return adaptation._replace(gaussians=close_wrist(hand, gaussians, rest), lights=lights), invented
 
 
 def _guess(

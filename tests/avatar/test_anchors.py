@@ -18,7 +18,7 @@ from oasis_warp.avatar.appearance import (
 )
 from oasis_warp.avatar.densify import densify
 from oasis_warp.avatar.pose import pose_gaussians, with_photo
-from oasis_warp.avatar.wrist import close_wrist
+from oasis_warp.avatar.wrist import close_wrist, end_shade
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.mirror import mirror_canonical, mirror_points
@@ -252,6 +252,20 @@ def test_shade_of_the_arm_ends_before_the_cap(hand, hands):
     after = close_wrist(hand, shaded, rest)
     cap = torch.nonzero(after.offsets.norm(dim=1) > 2e-3)[:, 0]
     assert after.shade is not None and after.shade[cap].min() > 0.999 and after.shade.min() == pytest.approx(0.4)
+
+
+def test_shade_ends_three_centimetres_before_the_wrist_does(hand, hands):
+    """The dark of a sleeve ended a centimetre before it: a burnt stump from every side."""
+    rest, before, _ = hands
+    far = torch.cdist(rest, rest[hand.rim]).amin(1)
+    light = HandLight(torch.ones(1, 3), torch.ones(2, 3), torch.ones(3), torch.full_like(rest, 0.4))
+    of_vertices = end_shade(hand, light, rest).shade
+    after = close_wrist(hand, before._replace(shade=torch.full_like(before.colors, 0.4)), rest)
+    count = len(after.vertex_index)
+    for shade, distance in (of_vertices, far), (after.shade[:count], far[after.vertex_index]):
+        assert shade[distance < 0.008].min() == 1
+        assert 0.55 < shade[(distance > 0.018) & (distance < 0.02)].mean() < 0.75
+        assert shade[distance > 0.0301].max() == pytest.approx(0.4)
 
 
 def canonical_and_rest(hand):

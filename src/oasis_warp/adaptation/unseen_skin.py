@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.reliability import VertexObservations
@@ -17,8 +18,8 @@ from oasis_warp.avatar.appearance import Regions, label_regions, skin_color
 from oasis_warp.avatar.densify import densify, part_centers
 from oasis_warp.avatar.observation import observe
 from oasis_warp.core import surface
-from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import CanonicalGaussians, HandCrop
+from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, PosedHand
 from oasis_warp.hand.template import bundled_hand
 
 LIGHTEST, DARKEST, TONES = 0.006, 0.35, 25
@@ -64,6 +65,9 @@ GRAIN = 0.025
 """Standard deviation of what each Gaussian on a face has of its own: pores and the mesh of fine wrinkles."""
 LUNULA, FREE_EDGE, NAIL_RIM = 0.07, 0.12, 0.16
 """How much paler a nail's lunula and its free edge are than its bed, and how much darker the fold around it."""
+GLOSS, GLOSS_AT, GLOSS_WIDTH = 0.18, 0.15, 0.2
+"""What a nail's gloss adds to the logarithms along a stripe, and takes beside it: where its normal leans to one side by
+this sine, and the stripe's width."""
 KNOWN_NAIL = 0.05
 """Share of all nails that must be seen to count as much as the mean person's."""
 MIN_COLOR = 0.01
@@ -209,8 +213,13 @@ def paint_unseen(
     ).gaussians
     relief = relief_shade(seed, len(rest)).to(rest) * (1 - nail)[:, None]
     read = vertex_to_gaussians(
-        torch.cat([tone.log_skin + relief + smooth, smooth, torch.stack([palm, invented, shown], 1)], 1), faces, fine
-    )
+        torch.cat([
+            tone.log_skin + relief + smooth, smooth + GLOSS * _nail_gloss(hand, crop.rest)[:, None],
+            torch.stack([palm, invented, shown], 1),
+        ], 1),
+        faces,
+        fine,
+    )  # fmt: skip
     detail = _skin_detail(sample := sample_detail(hand, fine, seed), read[:, 6:7]) + _grain(fine, seed)
     painted = _paint(sample, read[:, :3] + _clarity(hand, observations) * detail, bed + read[:, 3:6])
     looks = _mix(fine, painted, *read[:, 7:].clamp(0, 1).split(1, 1))
@@ -241,6 +250,19 @@ def _unseen_share(hand: HandModel, confidence: Float[Tensor, "V"]) -> Float[Tens
     hidden = (1 - confidence / SEEN).clamp(0, 1)[:, None]
     smooth = surface.smooth_over_mesh(hidden, surface.mesh_edges(hand.faces).to(hidden.device), RIM_PASSES)
     return torch.minimum(smooth, (hidden > 0).to(smooth))[:, 0]
+
+
+def _nail_gloss(hand: HandModel, rest: PosedHand) -> Float[Tensor, "V"]:
+    """A stripe along each nail, where it reflects the sky: paint, which goes with the nail and not with the view."""
+    normals = surface.vertex_normals(rest.vertices, hand.faces.to(rest.vertices.device))
+    on_nail, gloss = label_regions(hand).nail.to(normals), torch.zeros_like(normals[:, 0])
+    for joint in TIP_JOINTS:
+        own = (hand.segment.to(normals.device) == joint) & (on_nail > 0)
+        along = rest.vertices[own].mean(0) - rest.joints[joint]
+        across = normalize(torch.linalg.cross(normals[own].mean(0), along), dim=0)
+        stripe = (-(((normals[own] @ across - GLOSS_AT) / GLOSS_WIDTH) ** 2)).exp()
+        gloss[own] = stripe - stripe.mean()
+    return gloss * on_nail
 
 
 def _nail_color(tone: SkinTone, seen: Tensor, weight: Float[Tensor, "V"], total: Tensor) -> Float[Tensor, "3"]:

@@ -14,13 +14,17 @@ from oasis_warp.avatar.anchors import (
     VERTEX_SPREAD,
     batch_anchors,
     surface_frames,
+    vertex_to_gaussians,
 )
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.types import CanonicalGaussians
+from oasis_warp.core.types import CanonicalGaussians, HandLight
 
 END, OVERLAP = 0.5, 0.8
 """Shares of opacity left by the fade at the wrist, below which Gaussians end and their opaque replacements begin."""
+SHADE_FADE = 0.022
+"""The stretch before that fade over which the photo's shade ends [m]: that of a sleeve, or of the turn into the arm,
+looks like a burn where the arm is missing."""
 SMOOTHING = 0.004
 """Standard deviation of the average of colours from before the fade [m]: photos show sleeves and shadows there."""
 CAP_HEIGHT = 0.006
@@ -42,7 +46,7 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
 
     Gaussians in the second half of the fade are replaced by opaque ones on every vertex and face; the others become as
     opaque as they were before the fade. The cap's Gaussians are bound to rim vertices. All have the colours of the
-    nearest Gaussians before the fade.
+    nearest Gaussians before the fade, and no shade; that of the others ends before.
 
     Args:
         hand: Whose surface it is.
@@ -62,18 +66,14 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     index, offsets, end_quats, end_scales = (torch.cat(parts) for parts in zip(*end, strict=True))
     scales = full.scales[0]
     points = torch.cat([rest[vertices], rest[index] + offsets])
-    looks = gaussians.colors if gaussians.shade is None else torch.cat([gaussians.colors, gaussians.shade], 1)
-    read = [_smoothed(gaussians, looks, own, rest, faces, rim, at) for at in (points, rest[faces[on_faces]].mean(1))]
-    # towards the end shade fades too: that of a sleeve or an arm beside it is not the cap's
-    shares = torch.cat([at_vertices[vertices], torch.zeros_like(rest[index, 0])]), at_faces[on_faces]
-    read = [
-        torch.cat([part[:, :3], part[:, 3:] ** share[:, None]], 1) for part, share in zip(read, shares, strict=True)
-    ]
+    read = [_smoothed(gaussians, own, rest, faces, rim, at) for at in (points, rest[faces[on_faces]].mean(1))]
 
     def joined(old: Tensor, of_points: Tensor, of_faces: Tensor) -> Tensor:
         return torch.cat([old[:n_kept], of_points, old[n_kept:], of_faces])
 
-    colors, shade = kept.colors, kept.shade
+    shade = kept.shade
+    if shade is not None:
+        shade = shade ** vertex_to_gaussians(_shade_left(hand, rest), faces, kept)
     return CanonicalGaussians(
         torch.cat([kept.vertex_index, vertices, index]),
         torch.cat([kept.offsets, torch.zeros_like(rest[vertices]), offsets]),
@@ -82,15 +82,27 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
         joined(kept.quats, torch.cat([full.quats[0, rows[0]], end_quats]), full.quats[0, rows[1]]),
         joined(kept.scales, torch.cat([scales[rows[0]], end_scales]), scales[rows[1]]),
         joined(kept.opacities, *(rest.new_full((len(part),), OPACITY) for part in (points, on_faces))),
-        joined(colors, *(part[:, :3] for part in read)),
-        None if shade is None else joined(shade, *(part[:, 3:] for part in read)),
+        joined(kept.colors, *read),
+        None if shade is None else joined(shade, *(torch.ones_like(part) for part in read)),
     )
 
 
+def end_shade(hand: HandModel, light: HandLight, rest: Float[Tensor, "V 3"]) -> HandLight:
+    """`light` whose shade ends before the wrist as that of Gaussians does in `close_wrist`."""
+    return light if light.shade is None else light._replace(shade=light.shade ** _shade_left(hand, rest))
+
+
+def _shade_left(hand: HandModel, rest: Tensor) -> Float[Tensor, "V 1"]:
+    """The power of shade that is left at each vertex."""
+    far = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1, keepdim=True)
+    share = ((far - RIM_FADE) / SHADE_FADE).clamp(0, 1)
+    return share * share * (3 - 2 * share)
+
+
 def _smoothed(
-    gaussians: CanonicalGaussians, looks: Tensor, fade: Tensor, rest: Tensor, faces: Tensor, rim: Tensor, points: Tensor
-) -> Float[Tensor, "M D"]:
-    """The looks of Gaussians just before the fade, averaged around `points`.
+    gaussians: CanonicalGaussians, fade: Tensor, rest: Tensor, faces: Tensor, rim: Tensor, points: Tensor
+) -> Float[Tensor, "M 3"]:
+    """The colours of Gaussians just before the fade, averaged around `points`.
 
     The wider the farther away these are: with one width the middle of the cap would have wedges, each of one colour.
     """
@@ -99,7 +111,7 @@ def _smoothed(
     before = (fade >= 1) & (torch.cdist(centers, rest[rim]).amin(1) < 2 * RIM_FADE)
     near = torch.cdist(points, centers[before]).square()
     spread = SMOOTHING**2 + near.amin(1, keepdim=True)
-    return torch.softmax(-0.5 * near / spread, 1) @ looks[before]
+    return torch.softmax(-0.5 * near / spread, 1) @ gaussians.colors[before]
 
 
 def rim_line(
