@@ -1,5 +1,6 @@
 """`Avatar`: one person's hand, ready to be posed and drawn. No image, network or estimator is needed."""
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,6 +45,8 @@ from oasis_warp.render import render
 
 MIN_LIGHT, MAX_LIGHT = 0.05, 10.0
 """Limits of a light from all around, over its mean: nine harmonics of a small lamp fall below 0 behind it."""
+FREE = math.radians(10)
+"""Change of a joint's angle from the photo's pose up to which skin in contact gives way only in part [rad]."""
 
 
 class AvatarParts(NamedTuple):
@@ -113,6 +116,7 @@ class Avatar:
             mirrored = SurfaceLight(mirror_light(light), mirror_points(known.normals), known.seen)
             self._light = mirrored if left else known
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
+        self._source_angles = source_pose.angles.to(self.shape)
         self._graphs = GraphCache()
         self._held: dict[str, Tensor] = {}
 
@@ -120,7 +124,7 @@ class Avatar:
         """Vertices in the photo's pose; of a left hand in the mirror, where faces wind outwards."""
         source = mirror_pose(self.source_pose) if self.side == "left" else self.source_pose
         posed = skin_surface(self.hand, self.rest, HandPose(*(part.to(self.shape) for part in source)))
-        return giving_way(self.hand, posed)
+        return posed
 
     @property
     def gaussians(self) -> CanonicalGaussians:
@@ -163,11 +167,19 @@ class Avatar:
             check_finite(angles=pose.angles, orientation=pose.orientation, translation=pose.translation)
         return HandPose(*(part.to(self.shape) for part in pose))
 
+    def _giving_way(self, vertices: Float[Tensor, "*B V 3"], pose: HandPose) -> Float[Tensor, "*B V 3"]:
+        """Posed vertices after contact: nothing gives way in the photo's pose, whose colours were learned there."""
+        moved = giving_way(self.hand, vertices, self.side)
+        if moved is vertices:
+            return vertices
+        bent = (pose.angles.detach() - self._source_angles).abs().amax((-2, -1))
+        return torch.lerp(vertices, moved, (bent / FREE).clamp(max=1)[..., None, None])
+
     def mesh(self, pose: HandPose | str, *, validate: bool = True) -> PosedHand:
         """The surface that carries Gaussians, in `pose` [m]; the faces of a left hand wind the other way.
 
         Fingers and palm give way to each other where they touch, as in `hand.contact.giving_way`: a constant to
-        derivatives.
+        derivatives. In the photo's pose they do not, and more and more up to `FREE` away from it.
 
         Args:
             pose: One, or with an axis in front of every part many; or the name of one, as in `held`.
@@ -177,8 +189,9 @@ class Avatar:
             TypeError: `pose` is neither a pose nor a name.
             ValueError: a part of the pose has another shape or is not finite, or no pose has that name.
         """
-        posed = skin(self._model, self._rest, self._checked(pose, validate))
-        return posed._replace(vertices=giving_way(self.hand, posed.vertices, self.side))
+        pose = self._checked(pose, validate)
+        posed = skin(self._model, self._rest, pose)
+        return posed._replace(vertices=self._giving_way(posed.vertices, pose))
 
     def pose(self, pose: HandPose | str, *, validate: bool = True) -> Gaussians:
         """The Gaussians in `pose`, in the world of its orientation and translation, where its light stays too.
@@ -193,7 +206,7 @@ class Avatar:
             ValueError: a part of the pose has another shape or is not finite, or no pose has that name.
         """
         checked = self._checked(pose, validate)
-        posed = giving_way(self.hand, skin_surface(self._model, self._rest, checked), self.side)
+        posed = self._giving_way(skin_surface(self._model, self._rest, checked), checked)
         return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light)
 
     def render(

@@ -5,6 +5,7 @@ const DEEPEST = 0.005, ASIDE = 0.003, PUSH = 0.0005, PAD = 0.003; // metres
 const OPPOSED = -0.3, PARTS_OPPOSED = 0.3; // cosines of normals
 const FADES = 0.5; // share of the skin around a vertex that touches, below which its shift fades
 const ROUNDS = 3;
+const FREE = Math.PI / 18; // change of an angle from the photo's pose
 const BOX = 15; // numbers a part: corners of its skin, corners of its skin with the flesh under it, normal
 
 function makeContact({ data, faces, nVertices: n }) {
@@ -44,8 +45,10 @@ function eachNear({ start, index }, v, use) {
   }
 }
 
-// Move the vertices of body.posed out of each other.
-function giveWay({ posed, faces, around, start, contact }) {
+// Move the vertices of body.posed out of each other; not at all in the photo's pose, and wholly from FREE away from it.
+function giveWay({ data, posed, faces, around, start, contact }, angles) {
+  const bent = Math.max(...angles.map((angle, k) => Math.abs(angle - data.poses[0].angles[k])));
+  if (bent === 0) return;
   boxParts(contact, posed, faces);
   if (!meetParts(contact)) return;
   const { n, part, reached, normals, shifts, mean } = contact;
@@ -62,7 +65,8 @@ function giveWay({ posed, faces, around, start, contact }) {
     leadOut(contact, posed);
     spreadShifts(contact);
   }
-  for (let i = 0; i < posed.length; i++) posed[i] += shifts[i];
+  const share = Math.min(bent / FREE, 1);
+  for (let i = 0; i < posed.length; i++) posed[i] += share * shifts[i];
 }
 
 function addArea(points, faces, f, sum) {

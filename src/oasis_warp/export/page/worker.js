@@ -17,7 +17,7 @@ async function openHand(base64) {
 
 function poseHand({ body, shading }, angles) {
   poseSurface(body, angles);
-  giveWay(body);
+  giveWay(body, angles);
   rotateFaces(body);
   rotateVertices(body);
   turnWithVertices(body.quats, body.data.arrays.normals, shading.normals);
