@@ -262,6 +262,7 @@ def test_shade_ends_three_centimetres_before_the_wrist_does(hand, hands):
     of_vertices = end_shade(hand, light, rest).shade
     after = close_wrist(hand, before._replace(shade=torch.full_like(before.colors, 0.4)), rest)
     count = len(after.vertex_index)
+    assert of_vertices is not None and after.shade is not None
     for shade, distance in (of_vertices, far), (after.shade[:count], far[after.vertex_index]):
         assert shade[distance < 0.008].min() == 1
         assert 0.55 < shade[(distance > 0.018) & (distance < 0.02)].mean() < 0.75
