@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from oasis_warp.core.types import HandPose
+from oasis_warp.core.types import HandPose, PosedHand
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 
@@ -69,3 +69,9 @@ def test_a_hand_of_mano_touches_as_the_bundled_one(mano):
     rest = rest_hand(mano, torch.zeros(mano.shape_basis.shape[2]))
     tips = "thumb3", "index3"
     assert gap(mano, rest, named_pose(mano, "ok", rest), *tips) < 0.002
+
+
+@pytest.mark.gpu
+def test_a_hand_on_the_device_takes_the_same_pose(hand, rests):
+    there = named_pose(hand.to("cuda"), "ok", PosedHand(*(part.cuda() for part in rests[0])))
+    torch.testing.assert_close(there.cpu(), named_pose(hand, "ok", rests[0]))

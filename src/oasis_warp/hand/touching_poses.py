@@ -52,8 +52,9 @@ def touching_angles(hand: HandModel, rest: PosedHand, angles: np.ndarray, touch:
     """
     if len(touch.one) == 0:
         return angles
+    hand = hand.to(torch.device("cpu"))
     own = dataclasses.replace(
-        hand, template=rest.vertices.detach(), joints=rest.joints.detach(),
+        hand, template=rest.vertices.detach().cpu(), joints=rest.joints.detach().cpu(),
         **{name: getattr(hand, name)[..., :0] for name in ("shape_basis", "joint_basis", "tip_basis")},
     )  # fmt: skip
     kinematics, shapeless = HandKinematics(own), np.zeros(0)
