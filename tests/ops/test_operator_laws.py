@@ -36,9 +36,12 @@ SHARED = {
 
 
 def tolerance(name):
-    """Torch computes a sum in these, and rounds as its threads and vectors happen to share it out; else exact."""
+    """Torch computes a sum in these, and rounds as its threads and vectors happen to share it out; else exact.
+
+    Sums of some thirty numbers of size 1: the bits of their rounding differ from processor to processor.
+    """
     summed = name in ("skin correctives", "skin poses", "depth_visibility poses")
-    return {"rtol": 1e-5, "atol": 1e-6} if summed else {"rtol": 0, "atol": 0}
+    return {"rtol": 1e-5, "atol": 4e-6} if summed else {"rtol": 0, "atol": 0}
 
 
 def spread(tensor):
