@@ -1,6 +1,5 @@
 """`Avatar`: one person's hand, ready to be posed and drawn. No image, network or estimator is needed."""
 
-import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,8 +44,6 @@ from oasis_warp.render import render
 
 MIN_LIGHT, MAX_LIGHT = 0.05, 10.0
 """Limits of a light from all around, over its mean: nine harmonics of a small lamp fall below 0 behind it."""
-FREE = math.radians(10)
-"""Change of a joint's angle from the photo's pose up to which skin in contact gives way only in part [rad]."""
 
 
 class AvatarParts(NamedTuple):
@@ -107,9 +104,7 @@ class Avatar:
         self._rest = PosedHand(*map(mirror_points, self.rest)) if left else self.rest
         self._canonical = mirror_canonical(gaussians) if left else gaussians
         vertices = self._rest.vertices
-        self._rest_mesh = (
-            vertices if vertices.requires_grad else rest_mesh(vertices, self.hand.faces, validate=False)
-        )
+        self._rest_mesh = vertices if vertices.requires_grad else rest_mesh(vertices, self.hand.faces, validate=False)
         self._light = None
         if light is not None:
             known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces)
@@ -123,8 +118,7 @@ class Avatar:
     def _photo_surface(self) -> Float[Tensor, "V 3"]:
         """Vertices in the photo's pose; of a left hand in the mirror, where faces wind outwards."""
         source = mirror_pose(self.source_pose) if self.side == "left" else self.source_pose
-        posed = skin_surface(self.hand, self.rest, HandPose(*(part.to(self.shape) for part in source)))
-        return posed
+        return skin_surface(self.hand, self.rest, HandPose(*(part.to(self.shape) for part in source)))
 
     @property
     def gaussians(self) -> CanonicalGaussians:
@@ -169,17 +163,14 @@ class Avatar:
 
     def _giving_way(self, vertices: Float[Tensor, "*B V 3"], pose: HandPose) -> Float[Tensor, "*B V 3"]:
         """Posed vertices after contact: nothing gives way in the photo's pose, whose colours were learned there."""
-        moved = giving_way(self.hand, vertices, self.side)
-        if moved is vertices:
-            return vertices
         bent = (pose.angles.detach() - self._source_angles).abs().amax((-2, -1))
-        return torch.lerp(vertices, moved, (bent / FREE).clamp(max=1)[..., None, None])
+        return giving_way(self.hand, vertices, self.side, bent)
 
     def mesh(self, pose: HandPose | str, *, validate: bool = True) -> PosedHand:
         """The surface that carries Gaussians, in `pose` [m]; the faces of a left hand wind the other way.
 
         Fingers and palm give way to each other where they touch, as in `hand.contact.giving_way`: a constant to
-        derivatives. In the photo's pose they do not, and more and more up to `FREE` away from it.
+        derivatives. In the photo's pose they do not, and more and more up to `hand.contact.FREE` away from it.
 
         Args:
             pose: One, or with an axis in front of every part many; or the name of one, as in `held`.
@@ -247,8 +238,7 @@ class Avatar:
             return tuple(render(gaussians, Camera(viewmat, K, *size), background=color))
 
         size = camera.width, camera.height
-        replays = self.shape.dtype == torch.float32 and replayable(self.device, (*inputs, *self._fixed))
-        if replays:
+        if self.shape.dtype == torch.float32 and replayable(self.device, (*inputs, *self._fixed)):
 
             def record() -> CapturedGraph:
                 return CapturedGraph(draw, inputs, self.shape, len(named))
@@ -389,14 +379,13 @@ def make_avatar(
 
     `hand` is the model of the fit, the bundled one by default.
     """
-    camera = crop.camera
     return Avatar(
         side=fit.side,
         shape=fit.shape.to(crop.image),
         surface_offsets=offsets.to(crop.image),
         gaussians=gaussians,
         source_pose=fit.pose,
-        source_camera=mirror_camera(camera) if fit.side == "left" else camera,
+        source_camera=mirror_camera(crop.camera) if fit.side == "left" else crop.camera,
         light=light,
         invented=invented,
         hand=hand,

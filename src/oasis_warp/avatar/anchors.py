@@ -107,9 +107,14 @@ def batch_anchors(
     )
 
 
-def rim_fade(rest: Float[Tensor, "B V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor, "B V"]:
-    """0 at the open wrist, 1 from `RIM_FADE` on: the share of its opacity that a vertex's Gaussian may have."""
-    fade = (torch.cdist(rest, rest[:, rim]).amin(2) / RIM_FADE).clamp(0, 1)
+def rim_fade(
+    rest: Float[Tensor, "B V 3"], rim: Int[Tensor, "R"], start: float = 0.0, length: float = RIM_FADE
+) -> Float[Tensor, "B V"]:
+    """0 up to `start` [m] from the open wrist, 1 from `length` [m] farther on, smooth between.
+
+    By default the share of its opacity that a vertex's Gaussian may have.
+    """
+    fade = ((torch.cdist(rest, rest[:, rim]).amin(2) - start) / length).clamp(0, 1)
     return fade * fade * (3 - 2 * fade)
 
 

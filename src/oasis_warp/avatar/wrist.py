@@ -13,6 +13,7 @@ from oasis_warp.avatar.anchors import (
     THICKNESS,
     VERTEX_SPREAD,
     batch_anchors,
+    rim_fade,
     surface_frames,
     vertex_to_gaussians,
 )
@@ -94,9 +95,7 @@ def end_shade(hand: HandModel, light: HandLight, rest: Float[Tensor, "V 3"]) -> 
 
 def _shade_left(hand: HandModel, rest: Tensor) -> Float[Tensor, "V 1"]:
     """The power of shade that is left at each vertex."""
-    far = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1, keepdim=True)
-    share = ((far - RIM_FADE) / SHADE_FADE).clamp(0, 1)
-    return share * share * (3 - 2 * share)
+    return rim_fade(rest[None], hand.rim.to(rest.device), RIM_FADE, SHADE_FADE)[0, :, None]
 
 
 def _smoothed(

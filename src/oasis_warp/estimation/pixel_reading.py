@@ -15,8 +15,7 @@ from oasis_warp.core.processes import using_threads
 from oasis_warp.core.types import SurfaceReading
 from oasis_warp.estimation.fit import SurfacePoints
 from oasis_warp.estimation.fit_problem import MirroredInput
-from oasis_warp.hand.kinematics import HandKinematics
-from oasis_warp.hand.template import bundled_hand
+from oasis_warp.hand.kinematics import HandKinematics, bundled_kinematics
 from oasis_warp.network.dense_network import FRONT, HAND, SURFACE_UNIT, DenseNetwork, load_dense_network
 
 SIDE = 256
@@ -138,11 +137,6 @@ _MAX_POINTS = 500
 
 
 @functools.cache
-def _bundled() -> HandKinematics:
-    return HandKinematics(bundled_hand())
-
-
-@functools.cache
 def _rest_places(template: bytes) -> KDTree:
     return KDTree(np.frombuffer(template).reshape(-1, 3))
 
@@ -157,7 +151,8 @@ def surface_points(kinematics: HandKinematics, reading: PixelReading, scale: flo
     rows, columns = np.nonzero(good[step // 2 :: step, step // 2 :: step])
     rows, columns = rows * step + step // 2, columns * step + step // 2
     places = reading.surface[:, rows, columns].T.astype(np.float64)
-    learned = kinematics if kinematics.hand.origin is None else _bundled()  # the network knows places on this hand
+    # the network knows places on the bundled hand
+    learned = kinematics if kinematics.hand.origin is None else bundled_kinematics()
     _, vertex = _rest_places(learned.template.tobytes()).query(places)
     normal = learned.rest_normals[vertex]
     offset = places - learned.template[vertex]

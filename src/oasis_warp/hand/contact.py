@@ -1,6 +1,7 @@
 """Flesh that does not pass through flesh: fingers and palm of a posed hand give way to each other."""
 
 import functools
+import math
 
 import numpy as np
 import torch
@@ -27,12 +28,17 @@ RINGS = 2
 """Of neighbours, over which a shift is spread: 4 mm."""
 NAIL_EDGE = 2
 """Rings around a nail over which skin becomes free of it."""
+FREE = math.radians(10)
+"""Change of a joint's angle up to which skin gives way only in part [rad]."""
 SAMPLES = 8
 """Faces whose mean normal is that of a patch."""
 
 
 def giving_way(
-    hand: HandModel, vertices: Float[Tensor, "*B V 3"], side: Side = "right"
+    hand: HandModel,
+    vertices: Float[Tensor, "*B V 3"],
+    side: Side = "right",
+    bent: Float[Tensor, "*B"] | None = None,
 ) -> Float[Tensor, "*B V 3"]:
     """Posed vertices of a hand, led out of each other: both sides of a contact give way, at most by `LIMIT` each.
 
@@ -45,10 +51,16 @@ def giving_way(
         hand: Whose triangles they are.
         vertices: In poses [m].
         side: The faces of a left hand wind the other way.
+        bent: Largest change of an angle [rad] from a pose in which nothing gives way; from `FREE` on it does wholly.
     """
+    if bent is not None and bent.is_cpu and not bent.any():
+        return vertices
     flat = vertices.detach().float().reshape(-1, *vertices.shape[-2:])
     shifts = contact_shifts(flat, hand.faces, contact_tables(vertices.device), side == "left")
-    return vertices if shifts is None else vertices + shifts.to(vertices).view_as(vertices)
+    if shifts is None:
+        return vertices
+    moved = shifts.to(vertices).view_as(vertices)
+    return vertices + (moved if bent is None else (bent / FREE).clamp(max=1)[..., None, None] * moved)
 
 
 @functools.cache

@@ -4,6 +4,7 @@ The forward kinematics of `skinning`, for the least-squares fit. It has 26 angle
 end joints of fingers only flex. The wrist does not move, because the fit's camera moves instead.
 """
 
+import functools
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +14,7 @@ import torch
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
 from oasis_warp.hand.skinning import corrective_coefficients
+from oasis_warp.hand.template import bundled_hand
 
 # Offsets of the network's landmarks from the hand's joints and tips, in millimetres on a hand of 190 mm: along the bone
 # to the tip, towards the back of the hand, and along the cross product of both. From least squares over 63 photos, then
@@ -196,6 +198,12 @@ class HandKinematics:
         normals, by_angle = normals / length, by_angle / length[:, None]
         by_angle -= normals[:, None] * (by_angle @ normals[..., None])
         return normals, by_angle.transpose(0, 2, 1)
+
+
+@functools.cache
+def bundled_kinematics() -> HandKinematics:
+    """Of the bundled mean hand."""
+    return HandKinematics(bundled_hand())
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel, ModelOrigin
 from oasis_warp.core.rotation import euler_angles, euler_rotations
 from oasis_warp.core.types import HandPose
-from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, rotation_between, unit
+from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, bundled_kinematics, rotation_between, unit
 from oasis_warp.hand.mano import (
     PARENTS,
     TIP_VERTICES,
@@ -196,7 +196,7 @@ def hand_of_mano(model: ManoModel, registration: Registration) -> HandModel:
     joints = model.joints(np.zeros(10)) - wrist
     joint_basis = np.einsum("jv,vks->jks", model.regressor, model.coarse_shapes)
     tips = model.coarse_template[list(TIP_VERTICES)] - wrist
-    kinematics = HandKinematics(bundled)
+    kinematics = bundled_kinematics()
     posed = placed.joints(kinematics)
     seen = kinematics.landmarks(posed)[0] @ placed.rotation.T + placed.translation - wrist
     own = np.concatenate([joints, tips])[bundled.keypoint_index.numpy()]
@@ -234,7 +234,7 @@ def register(model: ManoModel) -> Registration:
     Raises:
         InputError: the template is not shaped and oriented as MANO's.
     """
-    fine, kinematics = mano_hd(model), HandKinematics(bundled_hand())
+    fine, kinematics = mano_hd(model), bundled_kinematics()
     placed = _fitted(kinematics, model, fine)
     start = placed.vertices(kinematics)
     fit_error = float(np.sqrt(((_on_surface(start, fine)[1] - start) ** 2).sum(1).mean()))

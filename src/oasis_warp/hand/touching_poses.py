@@ -11,13 +11,12 @@ from scipy.spatial import cKDTree
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import PosedHand
 from oasis_warp.hand.contact import contact_tables
-from oasis_warp.hand.kinematics import HandKinematics
+from oasis_warp.hand.kinematics import HandKinematics, bundled_kinematics
 from oasis_warp.hand.template import bundled_hand
+from oasis_warp.ops.contact import OPPOSED
 
 NEAR = 0.004
-"""Distance up to which vertices of the mean hand count as touching [m]."""
-OPPOSED = -0.3
-"""Cosine of their normals, at most."""
+"""Distance up to which vertices of the mean hand count as touching, if their normals are `OPPOSED` [m]."""
 APART, ALONG = 0.001, 0.005
 """Errors across and along the skin that weigh as much as the changes of angles below [m]."""
 CHANGES = np.radians([12.0, 6.0, 6.0])
@@ -83,7 +82,7 @@ def touching_angles(hand: HandModel, rest: PosedHand, angles: np.ndarray, touch:
 def touch_of_mean_hand(angles: tuple[float, ...]) -> Touch:
     """Where the bundled mean hand touches itself at these 48 angles [rad]."""
     hand, tables = bundled_hand(), contact_tables(torch.device("cpu"))
-    kinematics = _mean_kinematics()
+    kinematics = bundled_kinematics()
     table = np.array(angles).reshape(16, 3)
     points = kinematics.surface(kinematics.pose_all_joints(table, np.zeros(len(hand.shape_names))))
     normals = kinematics.vertex_normals(points)
@@ -97,8 +96,3 @@ def touch_of_mean_hand(angles: tuple[float, ...]) -> Touch:
     _, first = np.unique(pair[nearest], return_index=True)
     one, other = one[nearest[first]], other[nearest[first]]
     return Touch(one, other, points[one] - points[other], normals[other])
-
-
-@functools.cache
-def _mean_kinematics() -> HandKinematics:
-    return HandKinematics(bundled_hand())
