@@ -15,7 +15,7 @@ from oasis_warp.core.config import BLACK, EditConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_camera, mirror_pose
-from oasis_warp.core.processes import single_threaded_torch
+from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import HandCrop, Photo
 from oasis_warp.data.square_crop import Square, find_square, resample_square
 from oasis_warp.hand.skinning import skin
@@ -50,7 +50,7 @@ class Edit(NamedTuple):
     warnings: tuple[str, ...]
 
 
-@single_threaded_torch()
+@single_threaded_math()
 @torch.no_grad()
 def edit(
     avatar: Avatar,

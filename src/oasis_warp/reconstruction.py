@@ -37,7 +37,7 @@ from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_pose
-from oasis_warp.core.processes import single_threaded_torch
+from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, HandLight, Landmarks, Photo, Render
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_hand, fit_together
@@ -198,7 +198,7 @@ def reconstruct_same_hand(
     return fused._replace(warnings=(*_name_warnings(fused.photos, of_photos), *of_coverage))
 
 
-@single_threaded_torch()
+@single_threaded_math()
 @torch.enable_grad()  # whatever the caller has
 def _run(
     photos: Sequence[Photo], config: ReconstructConfig, keypoints: Path | None, prior: Prior | None,

@@ -16,7 +16,7 @@ from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
-from oasis_warp.core.processes import single_threaded_torch
+from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import Camera, Color, Gaussians, HandPose
 from oasis_warp.data.json_text import read_cameras
 from oasis_warp.data.pictures import check_video, to_uint8, write_video
@@ -112,7 +112,7 @@ def few(poses: Sequence[HandPose]) -> Sequence[HandPose]:
     return poses[:: max(1, len(poses) // MAX_FRAMED)]
 
 
-@single_threaded_torch()
+@single_threaded_math()
 def run(options: Animate) -> int:
     """Write the film.
 

@@ -29,6 +29,7 @@ PACKAGES = {
     "opencv-contrib-python-headless": ("5.0.0.93", None),
     "numpy": ("2", None),
     "safetensors": ("0.5", None),
+    "threadpoolctl": ("3", None),
     "jaxtyping": ("0.3", None),
     "tyro": ("0.9", None),
     "rich": ("13", None),

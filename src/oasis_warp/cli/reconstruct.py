@@ -27,7 +27,7 @@ from oasis_warp.cli.summary import GROUND, draw_quality, draw_summary
 from oasis_warp.core.config import ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
-from oasis_warp.core.processes import single_threaded_torch
+from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import Photo
 from oasis_warp.data.output_files import make_folders, output_folder
 from oasis_warp.data.photo import read_photo
@@ -151,7 +151,7 @@ def _print(report: dict[str, Any], folder: Path) -> None:
     written(f"{folder}{os.sep}")
 
 
-@single_threaded_torch()
+@single_threaded_math()
 def _write_folder(
     paths: Sequence[Path], folder: Path, config: ReconstructConfig, keypoints: Path | None,
     perceptual: Perceptual | None, progress: Progress,

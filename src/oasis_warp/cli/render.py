@@ -14,7 +14,7 @@ from oasis_warp.cli.record import written
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError, did_you_mean
-from oasis_warp.core.processes import single_threaded_torch
+from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import HandPose
 from oasis_warp.core.types import Render as Drawn
 from oasis_warp.data.environment_map import read_environment
@@ -94,7 +94,7 @@ def choose_pose(avatar: Avatar, pose: str | Path) -> HandPose:
 
 
 @torch.no_grad()
-@single_threaded_torch()
+@single_threaded_math()
 def run(options: Render) -> int:
     """Write the picture.
 

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 import torch
+from threadpoolctl import threadpool_limits
 
 
 def worker_pool(workers: int, *keep: Callable[[], object]) -> ProcessPoolExecutor:
@@ -42,20 +43,20 @@ _kernel_threads: ContextVar[int | None] = ContextVar("threads that torch does no
 
 
 def kernel_threads() -> int:
-    """How many CPU threads our kernels may use: as many as torch, or as it had before `single_threaded_torch`."""
+    """How many CPU threads our kernels may use: as many as torch, or as it had before `single_threaded_math`."""
     return _kernel_threads.get() or torch.get_num_threads()
 
 
 @contextmanager
-def single_threaded_torch() -> Iterator[None]:
-    """Run torch's operators on one thread inside the block, and our kernels on as many as before.
+def single_threaded_math() -> Iterator[None]:
+    """Run torch's operators, and the BLAS of NumPy, SciPy and OpenCV, on one thread inside the block.
 
-    The bits of torch's convolutions, norms and products depend on the number of its threads, and its waiting threads
-    spin: where others need the core, two of them take ten times as long as one. Our kernels do neither.
+    Our kernels keep as many threads as before. Results of torch and BLAS depend on their number of threads, and their
+    threads spin while they wait: on 32 cores a photo took 42 s of processor time instead of 5. Our kernels do neither.
     """
     before = _kernel_threads.set(kernel_threads())
     try:
-        with using_threads(1):
+        with using_threads(1), threadpool_limits(limits=1, user_api="blas"):
             yield
     finally:
         _kernel_threads.reset(before)

@@ -11,6 +11,7 @@ from torch import Tensor
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
+from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import HandFit, Landmarks, Photo
 from oasis_warp.estimation.fit import Fitter, Solution, SurfacePoints
 from oasis_warp.estimation.fit_problem import MirroredInput, array, real
@@ -103,6 +104,7 @@ class HandEstimator:
             for hand in found
         ]
 
+    @single_threaded_math()
     def fit(
         self,
         photo: Photo,

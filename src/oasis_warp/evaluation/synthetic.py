@@ -25,7 +25,7 @@ from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.processes import single_threaded_torch, worker_pool
+from oasis_warp.core.processes import single_threaded_math, worker_pool
 from oasis_warp.core.types import Camera, HandCrop, PosedHand, TrainingBatch
 from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.evaluation.held_out import (
@@ -200,7 +200,7 @@ def _measure_in_worker(packed: bytes, folder: Path, device: torch.device, group:
     measure_person(_unpacked(packed), folder, device, group, number)
 
 
-@single_threaded_torch()
+@single_threaded_math()
 def measure_person(setup: _Setup, folder: Path, device: torch.device, group: Group, number: int) -> None:
     """Write pictures of the first few people, then the records of one person."""
     config, hand, file = setup.config, bundled_hand().to(device), _person_file(folder, group, number)

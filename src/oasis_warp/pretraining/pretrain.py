@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from oasis_warp.core.errors import InputError, shortened
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.core.processes import single_threaded_torch
+from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.data.json_text import whole
 from oasis_warp.data.output_files import write_file
 from oasis_warp.data.pictures import to_uint8, write_picture
@@ -202,7 +202,7 @@ class Trainer(ABC, Generic[Network, Batch]):
         return StepResult(result.loss.detach(), metrics, tuple(picture.detach() for picture in result.pictures))
 
 
-@single_threaded_torch()
+@single_threaded_math()
 def pretrain(
     trainer: Trainer[Network, Batch],
     source: BatchSource[Batch],
