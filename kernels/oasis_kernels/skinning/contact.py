@@ -1,9 +1,9 @@
 """Contact of a posed surface with itself: where skin lies inside other skin, and by how much both give way.
 
 Parts are patches of the surface of some millimetres, 32 a group; a word of bits says which parts of a group. One
-thread per part and image: `boxes` of its skin, and of its skin with the flesh under it; `meetings`, the parts that have
-skin where it has flesh, or the other way round; `reached`, whether it or one next to it meets any. One thread per
-group: `group_boxes`. One thread per vertex: `normals` of what is reached; `find`, the nearest skin that the vertex
+thread per part and image: `boxes` of its skin, and of its skin with the flesh under it; `reached`, whether it or one
+next to it meets any. One thread per group: `group_boxes`. One per part and group: `meetings`, the parts of the group
+that have skin where it has flesh, or the other way round. One thread per vertex: `normals` of what is reached; `find`, the nearest skin that the vertex
 faces in those parts; `contacts`, the same again among neighbours of the last one, and the shift that leads out of it;
 `spread`, the mean of the shifts around. Normals are those of the surface before it gives way.
 """
@@ -90,32 +90,32 @@ def meetings(
     allowed: wp.array2d[wp.int32],  # [part, group]: bits of the parts that it may touch
     opposed: float,  # cosine of the normals of parts that touch, at most
     out: wp.array3d[wp.int32],  # [image, part, group]
-    any_met: wp.array2d[wp.int32],  # whether there is a bit
+    any_met: wp.array2d[wp.int32],  # 1 where a part has a bit in any group; 0 before
 ):
     i = first + wp.tid()
-    b = i // out.shape[1]
-    p = i - b * out.shape[1]
-    low = corners[b, p, SKIN_LOW]
-    high = corners[b, p, SKIN_HIGH]
-    deep_low = corners[b, p, FLESH_LOW]
-    deep_high = corners[b, p, FLESH_HIGH]
-    n = corners[b, p, FACING]
-    some = wp.int32(0)
-    for g in range(out.shape[2]):
-        bits = allowed[p, g]
-        met = wp.int32(0)
-        if bits != 0:
-            if overlap(deep_low, deep_high, groups[b, g, 0], groups[b, g, 1]):
-                for k in range(WORD):
-                    if (bits >> k) & 1 == 1:
-                        q = g * WORD + k
-                        if wp.dot(n, corners[b, q, FACING]) < opposed:
-                            one = overlap(low, high, corners[b, q, FLESH_LOW], corners[b, q, FLESH_HIGH])
-                            if one or overlap(corners[b, q, SKIN_LOW], corners[b, q, SKIN_HIGH], deep_low, deep_high):
-                                met = met | (1 << k)
-        out[b, p, g] = met
-        some = some | met
-    any_met[b, p] = wp.where(some != 0, 1, 0)
+    n_groups = out.shape[2]
+    row = i // n_groups
+    g = i - row * n_groups
+    b = row // out.shape[1]
+    p = row - b * out.shape[1]
+    bits = allowed[p, g]
+    met = wp.int32(0)
+    if bits != 0:
+        low = corners[b, p, SKIN_LOW]
+        high = corners[b, p, SKIN_HIGH]
+        deep_low = corners[b, p, FLESH_LOW]
+        deep_high = corners[b, p, FLESH_HIGH]
+        if overlap(deep_low, deep_high, groups[b, g, 0], groups[b, g, 1]):
+            for k in range(WORD):
+                if (bits >> k) & 1 == 1:
+                    q = g * WORD + k
+                    if wp.dot(corners[b, p, FACING], corners[b, q, FACING]) < opposed:
+                        one = overlap(low, high, corners[b, q, FLESH_LOW], corners[b, q, FLESH_HIGH])
+                        if one or overlap(corners[b, q, SKIN_LOW], corners[b, q, SKIN_HIGH], deep_low, deep_high):
+                            met = met | (1 << k)
+    out[b, p, g] = met
+    if met != 0:
+        any_met[b, p] = 1  # whichever thread writes it
 
 
 @wp.kernel

@@ -90,12 +90,14 @@ def contact_shifts(
 
     points, outward = vectors(vertices.contiguous(), 2), -1.0 if mirrored else 1.0
     corners, groups = vectors(empty(n_parts, 5, 3), 3), vectors(empty(n_groups, 2, 3), 3)
-    met, any_met, state = (empty(*shape, dtype=torch.int32) for shape in ((n_parts, n_groups), (n_parts,), (n_parts,)))
+    met, state = empty(n_parts, n_groups, dtype=torch.int32), empty(n_parts, dtype=torch.int32)
+    any_met = torch.zeros_like(state)
     cuts = even_cuts(batch * n_parts, MIN_PARTS)
     surface = [points, index.table, t.members, t.starts, t.samples, outward, DEEPEST, PAD, corners]
     launch_ranges(kernels.boxes, cuts, surface, vertices)
     launch_ranges(kernels.group_boxes, batch * n_groups, [corners, groups], vertices)
-    launch_ranges(kernels.meetings, cuts, [corners, groups, t.allowed, PARTS_OPPOSED, met, any_met], vertices)
+    pairs = even_cuts(batch * n_parts * n_groups, MIN_PARTS * n_groups)
+    launch_ranges(kernels.meetings, pairs, [corners, groups, t.allowed, PARTS_OPPOSED, met, any_met], vertices)
     if vertices.is_cpu and not any_met.any():
         return None
     launch_ranges(kernels.reached, cuts, [any_met, t.beside, state], vertices)
