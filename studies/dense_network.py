@@ -33,10 +33,14 @@ MIN_SKIN = 200
 SHOWN = ("palm_flat_right_03.jpg", "two_fingers_dark_skin_16.jpg", "ok_sign_left_10.jpg", "pointing_side_right_11.jpg")
 """Photos of the tests that are drawn."""
 GAMMA = 2.2
+BESIDE = 6
+"""Width of the strip along arms and along what covers the hand, in which the end of the hand is hard to tell [px]."""
 DARKEST = 1e-3
 """Reflectance below which its logarithm counts as this one's."""
 MEASURES = (
     Column("IoU of the mask", "iou", ".3f"),
+    Column("the same, 6 px away from arms and what covers the hand", "iou_apart", ".3f"),
+    Column("the true mask moved by half a pixel, IoU with itself", "iou_half", ".3f"),
     Column("surface point, median of a photo, mm", "surface_mm", ".1f"),
     Column("surface point, 90 % of a photo, mm", "surface_90_mm", ".1f"),
     Column("normal, median of a photo, degrees", "normal_deg", ".1f"),
@@ -68,9 +72,13 @@ def errors(said: DensePrediction, true: DenseBatch, k: int) -> Row | None:
     cosine = (said.normal[k] * true.normal[k]).sum(0)[skin].clamp(-1, 1)
     albedo, known = (values[:, skin].clamp_min(DARKEST).log() for values in (_linear(said.albedo[k]), true.albedo[k]))
     light = _linear(true.image[k])[:, skin].clamp_min(DARKEST).log()
+    mask, drawn = true.classes[k, HAND] > 0.5, said.classes[k].softmax(0)[HAND] > 0.5
+    other = (true.classes[k].argmax(0) > HAND).float()[None]
+    apart = torch.nn.functional.max_pool2d(other, 2 * BESIDE + 1, 1, BESIDE)[0] == 0
     within = off.abs() / said.log_scale[k][skin].exp() < -torch.log(torch.tensor(1 - CLAIMED))
     return {
-        "iou": iou(said.classes[k].softmax(0)[HAND] > 0.5, true.classes[k, HAND] > 0.5),
+        "iou": iou(drawn, mask), "iou_apart": iou(drawn, mask, apart),
+        "iou_half": mean(iou(moved, mask) for moved in half_a_pixel_off(true.classes[k, HAND])),
         "surface_mm": float(distance.median()), "surface_90_mm": float(distance.quantile(0.9)),
         "normal_deg": float(cosine.acos().rad2deg().median()),
         "finger": float((said.finger[k].argmax(0) == true.finger[k])[skin].float().mean()),
@@ -78,6 +86,11 @@ def errors(said: DensePrediction, true: DenseBatch, k: int) -> Row | None:
         "shading": float(torch.corrcoef(torch.stack([(light - albedo).mean(0), (light - known).mean(0)]))[0, 1]),
         "within": float(within.float().mean()),
     }  # fmt: skip
+
+
+def half_a_pixel_off(mask: Tensor) -> list[Tensor]:
+    """A soft mask moved by half a pixel along one axis and along the other, cut at a half."""
+    return [(mask + mask.roll(1, axis)) / 2 > 0.5 for axis in (0, 1)]
 
 
 def _centred(logarithms: Tensor) -> Tensor:
