@@ -20,7 +20,7 @@ from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandPose, PosedHand
 from oasis_warp.data.pictures import write_picture
-from oasis_warp.hand.contact import giving_way
+from oasis_warp.hand.contact import resolve_contact
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
@@ -70,7 +70,7 @@ def measure(pose: str, gesture: torch.Tensor | None, shapes: torch.Tensor) -> It
     for number, shape in enumerate(shapes):
         angles = named_pose(hand, pose, rest_hand(hand, shape)) if gesture is None else gesture
         surfaces = {"skinned": posed(hand, angles, shape).vertices}
-        surfaces["contact"] = giving_way(hand, surfaces["skinned"])
+        surfaces["contact"] = resolve_contact(hand, surfaces["skinned"])
         if number == 0:
             surfaces["plain"] = posed(without_correctives(hand), angles, shape).vertices
         row: Row = {"pose": pose, "hand": number}
@@ -132,7 +132,7 @@ def draw(rows: list[Row], static: Path) -> None:
     for name in POSE_NAMES:
         angles = named_pose(hand, name)
         plain, full = (posed(model, angles, mean_hand) for model in (without_correctives(hand), hand))
-        full = full._replace(vertices=giving_way(hand, full.vertices))
+        full = full._replace(vertices=resolve_contact(hand, full.vertices))
         strips.append(views(full, name, side))
         if name in CORRECTED_POSES:
             pairs.append(views(plain, f"{name}, before", side) + views(full, "after", side))

@@ -34,7 +34,7 @@ SAMPLES = 8
 """Faces whose mean normal is that of a patch."""
 
 
-def giving_way(
+def resolve_contact(
     hand: HandModel,
     vertices: Float[Tensor, "*B V 3"],
     side: Side = "right",
