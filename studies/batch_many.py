@@ -131,7 +131,7 @@ def measure_busy(others: int) -> Row:
     }  # fmt: skip
 
 
-def measure(kind: str, *about: int) -> Row:
+def measure_load(kind: str, *about: int) -> Row:
     """A case."""
     return measure_many(*about) if kind == "many" else measure_busy(*about)
 
@@ -140,7 +140,7 @@ def run(options: Options) -> list[Row]:
     """All numbers of processes, then all numbers of busy ones."""
     cases: dict[str, tuple] = {f"{options.photos} photos, {n}": ("many", options.photos, n) for n in options.processes}
     cases |= {f"{n} others": ("busy", n) for n in options.others}
-    return measured("batch_many", cases, measure, options)
+    return measured("batch_many", cases, measure_load, options)
 
 
 MANY = (

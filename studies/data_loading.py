@@ -63,7 +63,7 @@ def write_tree(root: Path, photos: int, packed: bool) -> Path:
     return mano
 
 
-def measure(kind: str, photos: int, processes: tuple[int, ...], seconds: float) -> list[Row]:
+def measure_readers(kind: str, photos: int, processes: tuple[int, ...], seconds: float) -> list[Row]:
     """A row for each number of processes."""
     rows, size = [], HANDS * (1 + VIEWS)
     with tempfile.TemporaryDirectory() as name:
@@ -100,7 +100,7 @@ def run(options: Options) -> list[Row]:
     if options.photos % 32:
         raise InputError(f"--photos: expected a multiple of 32, got {options.photos}.")
     about = options.photos, options.processes, options.seconds
-    return measured("data_loading", {kind: (kind, *about) for kind in options.kinds}, measure, options)
+    return measured("data_loading", {kind: (kind, *about) for kind in options.kinds}, measure_readers, options)
 
 
 SECTIONS = (

@@ -89,7 +89,7 @@ def _linear(srgb: Tensor) -> Tensor:
 
 
 @torch.inference_mode()
-def measure(network: DenseNetwork, options: Options, number: int) -> list[Row]:
+def measure_person(network: DenseNetwork, options: Options, number: int) -> list[Row]:
     """Rows of one rendering: two people, with landmarks as a detector finds them, and without."""
     photos = DensePhotos(seed=options.seed, people=options.people, hands=2, size=256, device=torch.device("cpu"))
     scene, random = SceneConfig(people=options.people), torch.Generator().manual_seed(number)
@@ -113,7 +113,7 @@ def run(options: Options) -> list[Row]:
         network = load_dense_network(options.weights or bundled)
     numbers = range(options.people * PHOTOS_EACH // 2)
     cases = {f"rendering {number}": (network, options, number) for number in numbers}
-    return measured("dense_network", cases, measure, options)
+    return measured("dense_network", cases, measure_person, options)
 
 
 def held_out(rows: list[Row]) -> str | None:

@@ -60,7 +60,7 @@ def without_correctives(hand: HandModel) -> HandModel:
     return dataclasses.replace(hand, corrective_basis=hand.corrective_basis[..., :0])
 
 
-def measure(pose: str, gesture: torch.Tensor | None, shapes: torch.Tensor) -> Iterator[Row]:
+def measure_pose(pose: str, gesture: torch.Tensor | None, shapes: torch.Tensor) -> Iterator[Row]:
     """A row for each hand in a named pose or a gesture, the mean one first.
 
     Crossing edges, volume [cm^3] and the largest shift [mm].
@@ -92,7 +92,7 @@ def run(options: Options) -> list[Row]:
     shapes = torch.cat([torch.zeros_like(shapes[:1]), shapes])
     cases: dict[str, tuple] = {name: (name, None, shapes) for name in POSE_NAMES}
     cases |= {f"{GESTURES} {k}": (GESTURES, torch.from_numpy(own[1:]), shapes) for k, own in enumerate(apart)}
-    return measured("hand", cases, measure, options)
+    return measured("hand", cases, measure_pose, options)
 
 
 def lines(rows: list[Row]) -> list[Row]:

@@ -212,7 +212,7 @@ def measure_adaptation(profile: str, network: HandNetwork, batch: TrainingBatch,
     }  # fmt: skip
 
 
-def measure(what: str, options: Options, *about: object) -> list[Row] | Row:
+def measure_profile(what: str, options: Options, *about: object) -> list[Row] | Row:
     """A case."""
     functions: dict[str, Callable[..., list[Row] | Row]] = {"cost": measure_cost, "curve": measure_curve}
     return functions[what](*about, options)
@@ -227,7 +227,7 @@ def run(options: Options) -> list[Row]:
             if profile == "paper":
                 cases[f"{profile}, {hands}, LPIPS"] = ("cost", options, profile, hands, True)
         cases[f"{profile}, curve"] = ("curve", options, profile)
-    return measured("paper_profile", cases, measure, options)
+    return measured("paper_profile", cases, measure_profile, options)
 
 
 # ---- tables
