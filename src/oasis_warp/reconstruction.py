@@ -44,7 +44,6 @@ from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_h
 from oasis_warp.estimation.fit_quality import keeps_quality, with_pose
 from oasis_warp.estimation.hand_crop import (
     COARSE_SIZE,
-    Surfaces,
     crop_hands,
     crop_landmarks,
     crop_side,
@@ -248,17 +247,15 @@ def _run(
     avatar = make_avatar(fits[0], surfaces.shared, crops[0], gaussians, light, invented, hand=hand)
     with stage("quality"):
         areas = surface.vertex_areas(crops[0].rest.vertices, hand.faces.to(config.device))
-        parts = [
-            _assess(hand, adaptation, k, fits[k], surfaces, crops[k], close[k], perceptual) for k in range(len(photos))
-        ]
-        quality = combine_quality([part[0] for part in parts])._replace(invented=invented)
+        views = zip(fits, surfaces.own, crops, close, strict=True)
+        judged = [_assess(hand, adaptation, k, *view, perceptual) for k, view in enumerate(views)]
+        quality = combine_quality([own for own, _ in judged])._replace(invented=invented)
         coverage = coverage_percent(hand, areas, quality)
         shares = coverage_of_photos(areas, adaptation.observations.confidence, adaptation.observations.share)
         warnings = [photo_warnings(c.image, c.mask, crop_side(fit)) for c, fit in zip(close, fits, strict=True)]
-    measured = [{"refined_px": px} | part[1] | own for px, part, own in zip(moved, parts, shares, strict=True)]
+    measured = [{"refined_px": px} | errors | own for px, (_, errors), own in zip(moved, judged, shares, strict=True)]
     lights = adaptation.lights or [None] * len(photos)
-    names = [photo.name for photo in photos]
-    about = tuple(map(PhotoOfHand, names, fits, _tuples(adaptation.gains), measured, lights))
+    about = tuple(map(PhotoOfHand, [p.name for p in photos], fits, _tuples(adaptation.gains), measured, lights))
     coverage["n_gaussians"] = float(len(avatar.gaussians.opacities))
     fused = FusedReconstruction(avatar, about, prior.about, stages, coverage, (), quality)
     return _Outcome(fused, warnings, coverage_warnings(coverage))
@@ -339,14 +336,14 @@ def _refine_fits(
 
 
 def _assess(
-    hand: HandModel, adaptation: Adaptation, k: int, fit: HandFit, surfaces: Surfaces, crop: HandCrop, close: HandCrop,
-    perceptual: Perceptual | None,
+    hand: HandModel, adaptation: Adaptation, k: int, fit: HandFit, offsets: Float[Tensor, "V 3"], crop: HandCrop,
+    close: HandCrop, perceptual: Perceptual | None,
 ) -> tuple[SurfaceQuality, dict[str, float]]:  # fmt: skip
     """How well photo k is explained, in its own light and on the surface by which it was read."""
     gaussians = adaptation.gaussians
     as_bright = gaussians._replace(colors=(gaussians.colors * adaptation.gains[k]).clamp(0, 1))
     light = adaptation.lights[k] if adaptation.lights else None
-    avatar = make_avatar(fit, surfaces.own[k], crop, as_bright, light, hand=hand)
+    avatar = make_avatar(fit, offsets, crop, as_bright, light, hand=hand)
     drawn, near = draw_as_photo(avatar, crop, fit.pose), draw_as_photo(avatar, close, fit.pose)
     errors = {
         "reprojection_percent": fit.reprojection,

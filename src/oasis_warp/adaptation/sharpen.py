@@ -122,20 +122,18 @@ def sharpen(
     new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
     start = overlay_pictures(shown.colors[changed], sources, [there.means[changed] for there in new])
     colors = shown.colors.masked_scatter(changed[:, None], start)
-    whose = vertex_to_gaussians(believed.T, faces, dense).argmax(1)
-    whose_face = believed[:, faces].mean(-1).argmax(0)
+    best = vertex_to_gaussians(believed.T, faces, dense).argmax(1)
+    best_of_face = believed[:, faces].mean(-1).argmax(0)
     losses: list[float] = []
-    for k, source in enumerate(sources):
-        mine = changed & (whose == k)
-        if not bool(mine.any()):
-            continue
-        still = torch.where(mine[:, None], 0, colors)
-        points = source.posed[faces[around & (whose_face == k)]].flatten(0, 1)
-        views = _views(sources, k, points, faces, old[k], new[k], still)
-        learned, own = fit_colors(views, colors[mine], mine, STEPS, progress)
-        colors, losses = still.masked_scatter(mine[:, None], learned), [*losses, *own]
+    for k in best[changed].unique().tolist():
+        fitted = changed & (best == k)
+        fixed = torch.where(fitted[:, None], 0, colors)
+        points = sources[k].posed[faces[around & (best_of_face == k)]].flatten(0, 1)
+        views = _views(sources, k, points, faces, old[k], new[k], fixed)
+        learned, of_photo = fit_colors(views, colors[fitted], fitted, STEPS, progress)
+        colors, losses = fixed.masked_scatter(fitted[:, None], learned), [*losses, *of_photo]
     if trust is not None:
-        trust = vertex_to_gaussians(trust.T, faces, dense).gather(1, whose[:, None])[changed]
+        trust = vertex_to_gaussians(trust.T, faces, dense).gather(1, best[:, None])[changed]
     if light is not None and on is not None:
         colors = colors / shading_factors(dense._replace(shade=None), faces, light, on).clamp_min(MIN_FACTOR)
     return SharpenResult(with_photo_colors(dense, changed, colors[changed], trust), n_new, tuple(losses))
@@ -176,7 +174,7 @@ def _source(
 
 
 def _views(
-    sources: Sequence[Source], k: int, points: Tensor, faces: Tensor, old: Gaussians, new: Gaussians, still: Tensor
+    sources: Sequence[Source], k: int, points: Tensor, faces: Tensor, old: Gaussians, new: Gaussians, fixed: Tensor
 ) -> list[TargetView]:
     """Pictures of `points` in the pose of source k: in the photo's view and beside it, in both sizes."""
     camera, posed, views = sources[k].canvas.camera, sources[k].posed, []
@@ -189,7 +187,7 @@ def _views(
         for goal, shown, scale in ((target / alpha, near, 1), (small, _smaller(near), SHRUNK)):
             weights = view_weights(new, shown)
             # Coverage is not to be fitted: in a small picture the rasterizer draws outlines wider.
-            goal = goal * weights.alphas - blend_colors(weights, still)
+            goal = goal * weights.alphas - blend_colors(weights, fixed)
             views.append(TargetView(weights, goal, weight * scale**2))
     return views
 

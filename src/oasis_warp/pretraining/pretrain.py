@@ -258,14 +258,19 @@ def pretrain(
             reported, skipped = trainer.step, numbers["skipped"]
             if process.rank == 0:
                 seconds = (time.perf_counter() - start) / (trainer.step - first)
-                finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-                with (folder / METRICS).open("a") as file:
-                    file.write(json.dumps({"step": trainer.step, "seconds_per_step": seconds, **finite}) + "\n")
+                _append_line(folder / METRICS, {"step": trainer.step, "seconds_per_step": seconds, **numbers})
         if process.rank == 0 and save_now:
             trainer.save(folder / CHECKPOINT)
             trainer.save_weights(folder / WEIGHTS, {"step": trainer.step, **notes})
             _write_sheet(folder / SHEET, trainer.sheet(batch, result))
     return trainer.step
+
+
+def _append_line(path: Path, numbers: Mapping[str, int | float]) -> None:
+    """Append a line of JSON to `path`, with null for what is not finite."""
+    finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+    with path.open("a") as file:
+        file.write(json.dumps(finite) + "\n")
 
 
 def _write_sheet(path: Path, columns: Sequence[Tensor]) -> None:
