@@ -35,7 +35,7 @@ class Options(StudyOptions):
 
     selecting: ClassVar[frozenset[str]] = frozenset({"processes", "only"})
     photos: int = 16
-    """Of the tests' photos, taken evenly from all."""
+    """Number of the tests' photos, taken evenly from all."""
     processes: tuple[int, ...] = (1, 2)
     """Workers that share the photos as it ships."""
     only: tuple[str, ...] = tuple(SETTINGS)

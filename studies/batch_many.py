@@ -31,7 +31,7 @@ from studies.inputs import PHOTOS, photos_below
 from studies.tables import Column, Section, table
 
 SIDE = 256
-"""Of the photos [px]."""
+"""Side of the photos [px]."""
 SMALLEST = ReconstructConfig(size=64, prior="none", unseen="plain", light="keep", steps=0)
 """What takes least and still goes the whole way."""
 BUSY_PHOTO = "palm_open_left_02.png"
@@ -63,7 +63,7 @@ def write_photos(folder: Path, count: int) -> None:
 
 
 def cpu_seconds() -> float:
-    """Of the processes that this one has started and that have ended."""
+    """CPU seconds of the processes that this one has started and that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

@@ -38,9 +38,9 @@ class Options(StudyOptions):
 
     selecting: ClassVar[frozenset[str]] = frozenset({"kinds"})
     photos: int = 10_016
-    """Of the tree; a multiple of the 32 that are drawn."""
+    """Photos of the tree; a multiple of the 32 that are drawn."""
     processes: tuple[int, ...] = (0, 1, 2)
-    """That load; 0 is a thread of the training."""
+    """Processes that load; 0 is a thread of the training."""
     kinds: tuple[Literal["files", "tar"], ...] = ("files", "tar")
     """As single files or in one tar file."""
     seconds: float = 10.0

@@ -55,7 +55,7 @@ class Options(StudyOptions):
     people: int = 32
     """Each shows PHOTOS_EACH photos."""
     seed: int = 77
-    """Of a world that training does not use."""
+    """Seed of a world that training does not use."""
 
 
 def errors(said: DensePrediction, true: DenseBatch, k: int) -> Row | None:

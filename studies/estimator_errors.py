@@ -46,7 +46,7 @@ from studies.tables import Section, markdown, percentiles
 CROP = 256
 """Side of the crop whose pixels errors are given in [px]."""
 MARGIN = 0.0015
-"""Of visibility, as the network sees it [m]."""
+"""Margin of visibility, as the network sees it [m]."""
 PARTS = ("angles", "orientation", "translation", "shape", "K")
 FILES = ("estimator_errors/tables.json",)
 OUTCOMES = {
@@ -68,7 +68,7 @@ class Options(StudyOptions):
     each: int = 2
     """Pictures of each person."""
     seed: int = 7001
-    """Of a world that is not the training's."""
+    """Seed of a world that training does not use."""
     size: int = 384
     """Side of the pictures [px]."""
     asset: Path | None = None
@@ -223,7 +223,7 @@ class Surfaces:
 
 
 def iou(a: Tensor, b: Tensor) -> Tensor:
-    """Of each pair of masks."""
+    """Intersection over union of each pair of masks."""
     return (a & b).flatten(1).sum(1) / (a | b).flatten(1).sum(1)
 
 

@@ -62,7 +62,7 @@ class Options(StudyOptions):
     repeats: int = 3
     """Times that each file is written; the median counts."""
     seed: int = 0
-    """Of the random poses."""
+    """Seed of the random poses."""
 
 
 def the_avatar(options: Options) -> Avatar:

@@ -72,7 +72,7 @@ class Fitted(NamedTuple):
 
     fit: HandFit
     offsets: Tensor
-    """Of the vertices at rest, onto the outline [m]."""
+    """Offsets of the vertices at rest, onto the outline [m]."""
 
     def surface(self, moved: bool) -> tuple[PosedHand, PosedHand]:
         """At rest, and in the photo; `moved` onto the outline, or as the model has it."""
@@ -187,7 +187,7 @@ def run(options: Options) -> list[Row]:
 
 
 def shares(rows: list[Row]) -> list[Row]:
-    """Of each fault, the share of fits with a warning of each kind."""
+    """Share of fits with a warning of each kind, for each fault."""
     found = []
     for (name,), own in groups([row for row in rows if "fault" in row], "fault").items():
         warned = {

@@ -31,10 +31,10 @@ from studies.tables import Column, Section, groups, table
 FACING = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """Fingers up, palm to the camera."""
 AZIMUTHS = (0.0, math.pi, math.pi / 2, math.pi / 5)
-"""Of the views: palm, back, the thumb's side and between [rad]."""
+"""Azimuths of the views: palm, back, the thumb's side and between [rad]."""
 CORRECTED_POSES = ("fist", "thumbs_up", "pinch", "ok", "open")
 WIDTH = 1500
-"""Of the pictures [px]."""
+"""Width of the pictures [px]."""
 GESTURES = "gestures"
 
 
@@ -43,7 +43,7 @@ class Options(StudyOptions):
     """Options of this study."""
 
     hands: int = 20
-    """Of random shape, beside the mean hand: each coefficient has a standard deviation of 1."""
+    """Hands of random shape, beside the mean hand: each coefficient has a standard deviation of 1."""
     gestures: int = 24
     """Sampled beside the named poses, their parts pushed apart on the mean hand's joints."""
     seed: int = 11

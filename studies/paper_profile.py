@@ -34,7 +34,7 @@ from studies.tables import Column, Section, table
 PEOPLE, VIEWS = 4, 4
 """Synthetic people that are learned by heart, and targets of a photo, which are the paper's."""
 PHOTOS = 1_000_000
-"""That the cost of a training is told for: the paper names neither its steps nor its batch."""
+"""Number of photos that the cost of a training is told for: the paper names neither its steps nor its batch."""
 SPREAD = 0.02
 """Standard deviation of random positions and of the weights of random LPIPS layers, as transformers start with."""
 SHOWN = (0, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)

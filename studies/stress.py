@@ -167,7 +167,7 @@ class FaultyInput(NamedTuple):
     photo: Photo
     landmarks: Landmarks
     other: Landmarks
-    """Of another photo."""
+    """Landmarks of another photo."""
     mask: np.ndarray
     """The right mask of this one."""
     rng: np.random.Generator

@@ -347,7 +347,7 @@ class Avatar:
 
     @torch.no_grad()
     def _with_hidden_light(self) -> "Avatar":
-        """An avatar of an older file version, whose light ignored self-occlusion; the photo's own view stays."""
+        """An avatar of an older file version: its light ignored self-occlusion. The photo's own view stays."""
         if self.light is None:
             return self
         albedo = self._mean_albedo(self.light.even)

@@ -124,7 +124,7 @@ class Layer(NamedTuple):
     """A convolution of a trunk, with what comes before and after it."""
 
     place: int
-    """Of the convolution in torchvision's `features`."""
+    """Place of the convolution in torchvision's `features`."""
     channels: int
     kernel: int
     stride: int
@@ -153,7 +153,7 @@ LAYERS: dict[Trunk, tuple[Layer, ...]] = {
 POOLING = {"alex": (3, 2), "vgg": (2, 2)}
 """Kernel and stride."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Of LPIPS's input layer, for images in [-1, 1]."""
+"""Shift and scale of LPIPS's input layer, for images in [-1, 1]."""
 
 
 class Lpips(nn.Module):

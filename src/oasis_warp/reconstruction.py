@@ -75,13 +75,13 @@ class Reconstruction(NamedTuple):
     fit: HandFit
     """In the photo's own frame."""
     prior: Mapping[str, str | int]
-    """Which prior was used: its `about`."""
+    """`about` of the prior that was used."""
     stages: dict[str, float]
     """Seconds of each stage."""
     errors: dict[str, float]
     """What was measured: reprojection_percent, mask_iou, input_psnr_db, ..."""
     warnings: tuple[str, ...]
-    """Of the fit, the photo and what it shows, in words; empty when nothing is doubtful."""
+    """Warnings about the fit, the photo and what it shows; empty when nothing is doubtful."""
     quality: SurfaceQuality
     """How well each place of the surface is known."""
 
@@ -108,7 +108,7 @@ class FusedReconstruction(NamedTuple):
     """In the light of the first photo, whose pose and camera are its source."""
     photos: tuple[PhotoOfHand, ...]
     prior: Mapping[str, str | int]
-    """Which prior was used: its `about`."""
+    """`about` of the prior that was used."""
     stages: dict[str, float]
     """Seconds of each stage."""
     errors: dict[str, float]
@@ -173,7 +173,7 @@ def reconstruct_same_hand(
     perceptual: Perceptual | None = None,
     progress: Progress = silent,
 ) -> FusedReconstruction:
-    """Make one avatar of one hand of which there are several photos, of any poses.
+    """Make one avatar from several photos of one hand, in any poses.
 
     Args:
         photos: From `oasis_warp.read_photo`, or their files. The first decides on exposure and white balance, the

@@ -55,7 +55,7 @@ class Adaptation(NamedTuple):
     """Before adaptation: the guesses of all photos, mixed."""
     calibration: Calibration
     losses: tuple[float, ...]
-    """Of texture learning, one a step."""
+    """Loss of each step of texture learning."""
     observations: VertexObservations
     """What the photos show without their lights."""
     gains: Float[Tensor, "K 3"]
@@ -82,11 +82,11 @@ class _Photos(NamedTuple):
     gains: Float[Tensor, "K 3"]
     views: Sequence[PhotoView]
     stacked: BlendWeights
-    """Of all views, one below the other."""
+    """Weights of all views, one below the other."""
     belief: Sequence[Float[Tensor, "S S"]]
     """How far each pixel counts beside the other photos; 0 where the guess does not cover it."""
     trust: Float[Tensor, "K V"]
-    """Of `trust_in_albedo`; 1 where light is kept."""
+    """Result of `trust_in_albedo`; 1 where the light is kept."""
 
 
 def adapt(

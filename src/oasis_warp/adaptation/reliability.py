@@ -42,8 +42,8 @@ SURE_PLACE = 0.012, 0.02
 """Spreads of a place between which the reading begins to waver between two fingers [m]: beside another place such a
 pixel does not count either."""
 UNSURE_REACH, OTHER_REACH = 6 / PRIOR_SIZE, 1 / PRIOR_SIZE
-"""Around pixels of another place, over the picture's side: in which an unsure reading is of that place, too, and in
-which no pixel counts."""
+"""Distances from pixels of another place, over the picture's side. Within the first an unsure reading is of that place,
+too; within the second no pixel counts."""
 OUTSIDE = 0.05
 """Share of hand in a pixel below which it shows the background."""
 
@@ -123,10 +123,10 @@ def _largest(values: Float[Tensor, "S S"], reach: float) -> Float[Tensor, "S S"]
 SHARPNESS = 2.0
 """Power of a photo's pixels over those of the best one: with 1, detail that does not quite meet is averaged away."""
 GUESS_WEIGHT = 0.25
-"""Of the prior's guess against a photo that sees a place well, where the light of photos is compared."""
+"""Weight of the prior's guess where the light of photos is compared; a photo that sees a place well has weight 1."""
 LIKELY_DIFFERENCE = 0.15
-"""Of the logarithms of a colour that two photos show of one place, once their light as a whole agrees: shading, a pose
-that is a little off. Larger ones count less."""
+"""Usual difference between the logarithms of a colour that two photos show of one place, once their light as a whole
+agrees: shading, or a pose that is a little off. Larger differences count less."""
 GAIN_ROUNDS = 12
 DARKEST, BRIGHTEST = 0.02, 0.98
 """Values beyond which a sensor is blind, or clips."""

@@ -46,8 +46,8 @@ ROUNDS = 2
 ALBEDOS = 0.02, 0.8
 """Least and greatest reflectance of skin."""
 PRIOR_WEIGHT = 0.01
-"""Weight of this prior, against a light of which every direction is seen: of .001, .003, .01, .03 and .1 the best for
-six synthetic people whom no evaluation uses, by .06 dB and more."""
+"""Weight of this prior against a light that is seen in every direction: of .001, .003, .01, .03 and .1 the best for six
+synthetic people whom no evaluation uses, by .06 dB and more."""
 MIN_CONFIDENCE = 0.1
 """Confidence from which a vertex counts as visible."""
 LIMIT_QUANTILES = 0.03, 0.97

@@ -50,7 +50,7 @@ TOLERANCE = 3 / 255
 SPACINGS = (4.0, 3.0, 2.0)
 """Distances between finer Gaussians to choose from [px]; at 1.5 and 1 they show no more."""
 MIN_SHARE = 0.5
-"""Of a pixel that counts, from which its face may be cut."""
+"""Least share of hand in a pixel that counts; only faces with such pixels are cut."""
 THICKNESS = 0.45e-3
 """Standard deviation of finer Gaussians across the surface [m]. The surface that carries Gaussians lies below the skin,
 which coarse ones reach because they are thick: with thin ones fingers lose half a millimetre. With .6 mm none is lost,
@@ -60,7 +60,7 @@ MIN_ALPHA = 0.05
 MIN_FACTOR = 0.02
 """Least factor of the light by which colours are divided."""
 STEPS = 15
-"""Of the colours' fit, which starts at the colours of the photo; 40 come to the same."""
+"""Steps of the colour fit. It starts at the colours of the photo; 40 steps give the same result."""
 SHRUNK = 2
 """The pictures that are fitted are also fitted this many times smaller: from afar the rasterizer widens fine Gaussians,
 and those in front would hide more of the others than they do from near."""

@@ -35,7 +35,8 @@ class Targets(NamedTuple):
     """What is drawn, and what it must look like."""
 
     weights: BlendWeights
-    """Of the photo; of K photos `ops.stack_weights` of theirs, with `picture` and `mask` one below the other, too."""
+    """Weights of the photo. K photos are stacked by `ops.stack_weights`, their pictures and masks one below the
+    other."""
     picture: Float[Tensor, "H W 3"]
     """The photo. It shows through where the Gaussians leave it free, as at the wrist: over black they would learn to
     glow there."""
@@ -55,7 +56,7 @@ class Texture(NamedTuple):
 
     colors: Float[Tensor, "N 3"]
     losses: tuple[float, ...]
-    """Of every step, reference views included."""
+    """Loss of every step, reference views included."""
 
 
 def make_targets(
@@ -130,7 +131,7 @@ def fit_parameters(
 
 
 def _picture_loss(image: Tensor, targets: Targets, masked: SsimTarget, config: AdaptConfig) -> Tensor:
-    """Of `image` beside the photo, which `masked` holds inside its mask."""
+    """Loss of `image` against the photo; `masked` holds the photo inside its mask."""
     picture, mask = targets.picture, targets.mask
     loss = config.weight_rgb * masked_l1(image, picture, mask)
     if targets.perceptual is not None:
@@ -139,7 +140,7 @@ def _picture_loss(image: Tensor, targets: Targets, masked: SsimTarget, config: A
 
 
 def _reference_loss(colors: Tensor, targets: Targets, k: int, config: AdaptConfig) -> Tensor:
-    """Of view k, for all of them."""
+    """Loss of reference view k, times the number of views."""
     view = targets.references[k]
     drift = masked_l1(blend_colors(view, colors), targets.expected[k], view.alphas[..., 0])
     return config.weight_rgb * len(targets.references) * drift
@@ -166,7 +167,7 @@ def _is_flat(losses: list[Tensor]) -> bool:
 
 
 LEARNING_RATE = 0.05
-"""Of the logits of colour."""
+"""Learning rate of the colour logits."""
 RESIDUAL_DECAY = 0.02
 """Weight of the squared difference of a face's logit from those of its corners: what lies together looks alike."""
 ROUGHNESS_DECAY = 0.5
@@ -231,9 +232,9 @@ def _trust(
 
 
 LORA_LEARNING_RATE, FULL_LEARNING_RATE = 0.01, 0.001
-"""Of both factors of every update, and of all weights, of which each output sums hundreds. The paper names none; at a
-tenth of the first 100 steps come as far as 40 do, and the second lowers the loss of a photo as fast as the first does.
-"""
+"""Learning rates of both factors of every LoRA update, and of all weights in full tuning, where each output sums
+hundreds of weights. The paper names none; at a tenth of the first 100 steps come as far as 40 do, and the second lowers
+the loss of a photo as fast as the first does."""
 
 
 def learn_lora(

@@ -54,7 +54,7 @@ class Unlit(NamedTuple):
     crop: HandCrop
     """As in even light, its mask where the photo surely shows the surface. The photo itself with the light "keep"."""
     light: HandLight | None
-    """Of the photo; None where it is kept."""
+    """Light of the photo; None where it is kept."""
 
 
 def remove_photo_light(

@@ -80,7 +80,7 @@ class SkinTone(NamedTuple):
     log_skin: Float[Tensor, "V 3"]
     """Logarithms of the sRGB colours of skin at the vertices; under nails too."""
     log_nail: Float[Tensor, "3"]
-    """Of a nail's bed through its plate."""
+    """Log colour of a nail's bed, seen through its plate."""
     melanin: float
     """Share on the back."""
 

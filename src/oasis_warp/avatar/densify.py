@@ -37,7 +37,7 @@ class Densified(NamedTuple):
     gaussians: CanonicalGaussians
     """Those on faces that are not cut stay bit for bit and in their order; the parts' own are the last."""
     changed: Bool[Tensor, "N"]
-    """Which are new, or sunk under new ones."""
+    """Whether each Gaussian is new, or sunk under new ones."""
     n_new: int
     """How many are new."""
 

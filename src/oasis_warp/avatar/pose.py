@@ -40,13 +40,13 @@ class SurfaceLight(NamedTuple):
 
     light: HandLight
     normals: Float[Tensor, "V 3"]
-    """Of the surface at rest, unit; the wrist's rim has that of its closed end."""
+    """Unit normals of the surface at rest; the wrist's rim has the normal of its closed end."""
     seen: Float[Tensor, "V"] | None = None
     """Share of the sky that each vertex saw in the photo; None where no shade depends on it."""
 
 
 class Lighting(NamedTuple):
-    """Of the vertices of posed surfaces."""
+    """Normals and sky exposure of the vertices of posed surfaces."""
 
     normals: Float[Tensor, "*B V 3"]
     """Unit, in the world of the photo's camera."""

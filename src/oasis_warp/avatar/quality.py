@@ -110,7 +110,7 @@ def coverage_percent(hand: HandModel, areas: Float[Tensor, "V"], quality: Surfac
 def coverage_of_photos(
     areas: Float[Tensor, "V"], confidence: Float[Tensor, "K V"], share: Float[Tensor, "K V"]
 ) -> list[dict[str, float]]:
-    """Of the surface [%]: what each of K photos shows, and what it shows best of all; see `VertexObservations`."""
+    """Shares of the surface [%] that each of K photos shows, and shows best; see `VertexObservations`."""
     best = (confidence * share).argmax(0)
 
     def percent(where: Tensor) -> float:

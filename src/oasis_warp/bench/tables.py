@@ -156,7 +156,7 @@ def roofline_table(rows: Sequence[KernelRow]) -> Table:
 
 
 UNITS = {"gaussians": ("Gaussian", 1e6, "ns"), "pixels": ("pixel", 1e6, "ns"), "views": ("view", 1e3, "us")}
-"""Of an axis: what it counts, and how milliseconds for one of them are written."""
+"""What each axis counts, and how milliseconds for one of them are written."""
 MARKS = {"forward": "o", "forward + backward": "s"}
 DPI = 110
 ERROR_LABELS = {"forward": "error of values", "forward + backward": "error of values and gradients"}

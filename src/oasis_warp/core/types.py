@@ -42,7 +42,7 @@ class Landmarks(NamedTuple):
     presence: float
     """The network's probability that there is a hand, 0 to 1."""
     source: str
-    """Which way found it: "network", "network (margin)", "file" ..."""
+    """How it was found: "network", "network (margin)", "file" ..."""
 
 
 class Camera(NamedTuple):
@@ -85,7 +85,7 @@ class SurfaceReading(NamedTuple):
     left: float
     top: float
     side: float
-    """Of the square [px of the photo]."""
+    """Side of the square [px of the photo]."""
 
 
 class HandFit(NamedTuple):
@@ -105,9 +105,9 @@ class HandFit(NamedTuple):
     worst_point: float
     """Largest of those distances [%]."""
     mask_iou: float
-    """Of the posed mesh and the mask, above the wrist."""
+    """Intersection over union of the posed mesh and the mask, above the wrist."""
     cost: float
-    """Of the least-squares fit; sums squared residuals in units of their sigmas."""
+    """Cost of the least-squares fit: the sum of squared residuals in units of their sigmas."""
     warnings: tuple[str, ...]
     """What makes this fit doubtful, in words; empty when nothing does."""
     reading: SurfaceReading | None = None
@@ -124,7 +124,7 @@ class HandCrop(NamedTuple):
     above_wrist: Float[Tensor, "S S"]
     """1 on the hand's side of the wrist line: below it mask and surface end at different places."""
     camera: Camera
-    """Of the crop."""
+    """Camera of the crop."""
     rest: PosedHand
     """The fitted surface at rest."""
     posed: PosedHand
@@ -203,15 +203,15 @@ class TrainingBatch(NamedTuple):
     """
 
     image: Float[Tensor, "B S S 3"]
-    """Of the photo: a crop around the hand, its background included."""
+    """Crop of the photo around the hand, its background included."""
     mask: Float[Tensor, "B S S"]
     """Share of each of its pixels that is hand."""
     posed: Float[Tensor, "B V 3"]
     """The surface in the photo's pose [m]."""
     viewmat: Float[Tensor, "B 4 4"]
-    """Of the photo, world to camera."""
+    """World to camera of the photo."""
     K: Float[Tensor, "B 3 3"]
-    """Of the photo [px]."""
+    """Intrinsics of the photo [px]."""
     rest: Float[Tensor, "B V 3"]
     """The surface at rest [m]."""
     target_images: Float[Tensor, "B T H H 3"]

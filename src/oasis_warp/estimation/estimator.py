@@ -43,7 +43,7 @@ from oasis_warp.hand.kinematics import HandKinematics
 _NO_HAND = 16
 """Smaller hands are refused even by force [px]."""
 _ROUNDS = 2
-"""Of pairing outlines."""
+"""Rounds of pairing outlines."""
 _CLEARLY = 0.5
 """Least sine of the angle at the wrist between index and little finger for palm or back to be plain. Of 60 photos
 of flat hands, gestures and fists the plain ones have .53 to .80; hands seen edge-on have .07 to .43."""

@@ -22,7 +22,7 @@ _LARGEST = 800.0
 
 
 def array(tensor: Tensor) -> np.ndarray:
-    """A tensor as float64 numpy, in which the fit computes."""
+    """A tensor as a float64 array: the fit computes in float64."""
     return tensor.detach().cpu().numpy().astype(np.float64)
 
 

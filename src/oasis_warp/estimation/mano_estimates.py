@@ -54,7 +54,7 @@ class Estimate(NamedTuple):
     place: np.ndarray
     """What is added to the hand in the camera's frame [m], [3]."""
     focal: float
-    """Of the file's photo [px]."""
+    """Focal length of the file's photo [px]."""
     centre: np.ndarray
     """[px], [2]."""
 

@@ -12,7 +12,7 @@ from oasis_warp.hand.kinematics import HandKinematics, rotation_between
 _STRIDE = 16
 """Every so many vertices are compared."""
 _SIGMA, _SCALE = 1e-3, 3.0
-"""Of the distance of a vertex from the model [m], and its robust scale in sigmas (Charbonnier)."""
+"""Sigma of the distance of a vertex from the model [m], and its robust scale in sigmas (Charbonnier)."""
 _ANGLE = 2.0
 """Sigma of the angles about rest, which holds those that no vertex determines [rad]."""
 _SILENT = 2e-3

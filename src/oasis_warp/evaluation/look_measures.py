@@ -64,7 +64,7 @@ class Looks(NamedTuple):
     samples: dict[str, list[Sample]]
     """Features of its pictures by kind of view: "input", "side" (but that of the photo) and "pose"."""
     cells: list[Cell]
-    """Of the contact sheet."""
+    """Cells of the contact sheet."""
 
 
 @torch.no_grad()

@@ -46,7 +46,7 @@ WOUND = 0.4
 """Brightness of the darkest percent of an opened palm, over its median, below which that is a wound: the least of seven
 real palms, open or nearly so, is .41."""
 DIGITS = 4
-"""Of numbers over all photos: of medians those that count, of distances those behind the point."""
+"""Digits of numbers over all photos: significant digits of medians, decimals of distances."""
 
 
 def evaluate_looks(

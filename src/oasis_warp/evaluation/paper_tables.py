@@ -100,7 +100,7 @@ class PaperTable(NamedTuple):
     """A table as text."""
 
     name: str
-    """Of its files."""
+    """Name of its files."""
     title: str
     headings: list[str]
     lines: list[list[str]]

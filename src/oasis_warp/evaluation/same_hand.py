@@ -137,7 +137,7 @@ def compare_with_photo(avatar: Avatar, drawn: Render, crop: HandCrop, pose: Hand
 
 
 def _small_ssim(image: Tensor, target: Tensor, weight: Tensor) -> float:
-    """Of the mean colours of blocks, over black beyond `weight`."""
+    """SSIM of the mean colours of blocks, over black beyond `weight`."""
     planes = torch.cat([image * weight[..., None], target * weight[..., None], weight[..., None]], -1)
     small = avg_pool2d(planes.permute(2, 0, 1), QUARTER).permute(1, 2, 0)
     share = small[..., 6]

@@ -52,9 +52,9 @@ SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (
 SHOWN = 4
 """People of each group on the sheet, and hands on the picture of attention."""
 DIGITS = 5
-"""Of the numbers in files."""
+"""Digits of the numbers in files."""
 KEYS = ("group", "person", "light", "noise", "prior", "stage", "target", "colors", "psnr")
-"""Of every record."""
+"""Keys of every record."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +182,7 @@ def _measured(
 
 
 def _packed(setup: _Setup) -> bytes:
-    """Pickled as a whole: single tensors would pass through shared memory, of which containers have little."""
+    """Pickled as a whole: single tensors would pass through shared memory, and containers have little of it."""
     buffer = io.BytesIO()
     pickler = pickle.Pickler(buffer)
     pickler.dispatch_table = {**copyreg.dispatch_table, MappingProxyType: lambda proxy: (dict, (dict(proxy),))}

@@ -44,7 +44,7 @@ WALK = ("open", "fist", "victory", "point", "ok")
 BULK = (0.01, 0.99)
 """Quantiles of the means of foreign Gaussians, which the view frames: some float far away."""
 SPLATS_RADIUS = 0.1
-"""Of what the view frames then [m], a hand's."""
+"""Radius that the framed Gaussians are scaled to [m]: that of a hand."""
 WALK_FRAMES, WALK_SECONDS = 12, 7.5
 """Frames from one of them to the next, which the page blends, and length of the motion."""
 
@@ -194,7 +194,7 @@ def _reached(avatar: Avatar, angles: Sequence[Tensor]) -> Float[Tensor, "B V 3"]
 
 
 def _middle(vertices: Float[Tensor, "N 3"]) -> Float[Tensor, "3"]:
-    """Of the box around them, at which `orbit_camera` looks."""
+    """Middle of the box around the vertices; `orbit_camera` looks there."""
     return (vertices.amin(0) + vertices.amax(0)) / 2
 
 

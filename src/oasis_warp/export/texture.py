@@ -133,7 +133,7 @@ people, from their true albedo (docs/export.md says what it is worth)."""
 FINE, COARSE = 0.4e-3, 4e-3
 """Standard deviations between which detail counts as relief [m]: a pixel, and the breadth of a fold with its flanks."""
 MIN_LUMINANCE = 0.02
-"""Whose logarithm is taken of darker pixels: ink and dirt are no abysses."""
+"""Luminance that darker pixels count with in the logarithm, so that ink and dirt are not deep holes."""
 SKIN, PALM, PALM_TIP, NAIL = 0.56, 0.04, -0.06, 0.32
 """GGX roughness of skin, what the palm and its finger tips add, and that of nails: the means of the synthetic world, by
 which `synthetic.skin_texture` draws its gloss."""

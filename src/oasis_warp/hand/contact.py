@@ -25,7 +25,7 @@ SPACING = 0.014
 APART = 0.015
 """Distance over the surface from which two patches may touch [m]: nearer ones only bend."""
 RINGS = 2
-"""Of neighbours, over which a shift is spread: 4 mm."""
+"""Rings of neighbours over which a shift is spread: 4 mm."""
 NAIL_EDGE = 2
 """Rings around a nail over which skin becomes free of it."""
 FREE = math.radians(10)
@@ -130,7 +130,7 @@ def _beside(a: np.ndarray, b: np.ndarray, n_parts: int) -> np.ndarray:
 
 
 def _may_touch(hand: HandModel, part: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Which patches may touch each other in some pose, as bits: not those of one bone, nor two sides of a finger."""
+    """Bits that say which patches may touch in some pose: not those of one bone, nor two sides of a finger."""
     n_parts = part.max() + 1
     normals = surface.vertex_normals(hand.template, hand.faces)
     sums = np.zeros((n_parts, 7))

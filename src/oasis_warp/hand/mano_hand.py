@@ -151,7 +151,7 @@ _NEAR_VERTICES = 3
 _RIM = 10.0
 """Weight of the wrist's rim."""
 MAX_TURNED = 40.0
-"""Of the palm against the bundled hand's, which lies as MANO's [degrees]."""
+"""Largest rotation of the palm against the bundled hand's, which lies as MANO's [degrees]."""
 WORST_FIT = 0.004
 """Root of the mean squared distance, after fitting, above which the template is no hand as MANO's [m]."""
 

@@ -74,9 +74,9 @@ NEAR = 0.004
 APART, ALONG = 0.001, 0.005
 """Errors across and along the skin that weigh as much as the changes of angles below [m]."""
 CHANGES = np.radians([12.0, 6.0, 6.0])
-"""Of flexion, abduction and twist [rad]."""
+"""Sigmas of changes of flexion, abduction and twist [rad]."""
 STEPS = 8
-"""Of Gauss and Newton."""
+"""Gauss-Newton steps."""
 
 
 def named_pose(hand: HandModel, name: str, rest: PosedHand | None = None) -> Float[Tensor, "15 3"]:
@@ -158,7 +158,7 @@ class Touch(NamedTuple):
     apart: np.ndarray
     """From the other to the one [m], [C, 3]."""
     normals: np.ndarray
-    """Of the other's skin, [C, 3]."""
+    """Normals of the other's skin, [C, 3]."""
 
 
 def touching_angles(hand: HandModel, rest: PosedHand, angles: np.ndarray, touch: Touch) -> np.ndarray:

@@ -31,7 +31,7 @@ from oasis_warp.motion.bvh import hand_angles, read_bvh
 from oasis_warp.motion.motion import Motion, angles_of_bones, joint_angles
 
 N_JOINTS = 25
-"""Of WebXR (www.w3.org/TR/webxr-hand-input-1, XRHandJoint); OpenXR's XrHandJointEXT has the palm before them."""
+"""Joints of WebXR (www.w3.org/TR/webxr-hand-input-1, XRHandJoint); OpenXR's XrHandJointEXT has the palm before them."""
 HALF_TURN = (1.0, -1.0, -1.0)
 """Diagonal of the turn from y up and z to the viewer to y down and z forward."""
 
@@ -154,7 +154,7 @@ MOTION_SUFFIXES = (".json", ".npz", ".bvh", *VIDEO_SUFFIXES)
 USUAL_FPS = 30.0
 MAX_FRAMES = 100_000
 MAX_BYTES = 1 << 28
-"""Of a file with motions: hours of one."""
+"""Largest file with motions: hours of one."""
 LARGEST_ANGLE = 2 * np.pi
 """Beyond it angles are degrees, taken for radians."""
 TRACKED = ("orientations", "positions")

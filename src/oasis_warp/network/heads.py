@@ -135,7 +135,7 @@ def decode_offsets(raw: dict[str, Tensor]) -> Float[Tensor, "B V 3"]:
 
 
 COLOR_OUTPUTS = ("colors", "trust")
-"""Of a head, where it has them."""
+"""Outputs of a head that make colours, where it has them."""
 
 
 class HeadCache(NamedTuple):
@@ -157,7 +157,7 @@ class HeadCache(NamedTuple):
 
 
 ColorHeads = tuple[HeadCache, ...]
-"""Of the vertices' Gaussians, then of the faces' where these have a head: all of a guess, in its order."""
+"""Cache of the vertices' Gaussians, then of the faces' where these have a head: all of a guess, in its order."""
 
 LowRank = list[tuple[Tensor, Tensor]]
 """A head's updates, one a layer: A of shape [rank, inputs] and the transpose of B, [rank, outputs]; the layer's weight

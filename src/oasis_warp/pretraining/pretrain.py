@@ -63,7 +63,7 @@ class PretrainConfig:
     decay: Literal["cosine", "cooldown", "none"] = "cosine"
     """Decay to 0 at the last step, over all steps or linearly over the last `COOLDOWN`, or constant as in the paper."""
     precision: Literal["bfloat16", "float32"] = "bfloat16"
-    """Of attention and perceptrons; geometry, Gaussians and weights are float32."""
+    """Precision of attention and perceptrons; geometry, Gaussians and weights are float32."""
     clip: float = 1.0
     """Norm to which the gradient of all weights is clipped."""
     checkpoint_every: int = 500
@@ -303,7 +303,7 @@ def _step_of(line: bytes) -> int | float:
 FORMAT = "oasis-pretraining"
 MOMENTS = ("exp_avg", "exp_avg_sq")
 MAX_STEPS = 1 << 24
-"""Of a training; float32 counts no further, and Adam counts in it."""
+"""Most steps of a training; float32 counts no further, and Adam counts in it."""
 
 
 def save_checkpoint(

@@ -58,9 +58,9 @@ class EstimatorNoise:
     """Strength of the estimator's errors in the network's input: 1 as measured, 0 for none."""
 
     surface: float = 1.0
-    """Of errors in pose, shape and camera."""
+    """Strength of errors in pose, shape and camera."""
     mask: float = 1.0
-    """Of errors in the mask, and so in the crop around it."""
+    """Strength of errors in the mask, and so in the crop around it."""
 
 
 class Crops(NamedTuple):

@@ -104,9 +104,9 @@ class Body:
     materials: Int[Tensor, "F"]
     """int32: SKIN, SLEEVE, BAND or RING."""
     uv: Float[Tensor, "U 2"]
-    """Of hand and forearm, in [0, 1]."""
+    """Texture coordinates of hand and forearm, in [0, 1]."""
     uv_faces: Int[Tensor, "S 3"]
-    """Of the faces of skin, which come first."""
+    """Texture corners of the faces of skin; these faces come first."""
     n_hand_faces: int
     n_vertices: int
     rest: Float[Tensor, "K 3"]

@@ -151,7 +151,7 @@ class ShadedBatch(NamedTuple):
     seen: DepthMap
     """The body's mesh at `SAMPLES` times the size."""
     normals: Float[Tensor, "B V 3"]
-    """Of the posed vertices, in the camera's frame."""
+    """Normals of the posed vertices, in the camera's frame."""
     lamps: Lamps
     shaded: Shaded
 

@@ -25,7 +25,7 @@ class PosedPeople(NamedTuple):
     """In the order of `body.Body`."""
     landmarks: Float[Tensor, "B 21 3"]
     translation: Float[Tensor, "B 3"]
-    """Of the hand's frame; with the view's rotation the hand's pose."""
+    """Translation of the hand's frame; with the view's rotation the hand's pose."""
     focal: Float[Tensor, "B"]
     """Focal length over the width of the picture."""
     center: Float[Tensor, "B 3"]

@@ -22,7 +22,7 @@ LIGHT_REACH = 3e-3
 
 
 class SurfaceState(NamedTuple):
-    """Of a batch of posed meshes."""
+    """Normals and areas of a batch of posed meshes."""
 
     normals: Float[Tensor, "B V 3"]
     """Unit, area-weighted; zero where no face is."""
@@ -48,7 +48,7 @@ class Texture(NamedTuple):
     uv: Float[Tensor, "U 2"]
     """Texels, centres at .5."""
     uv_faces: Int[Tensor, "S 3"]
-    """Of the faces of skin, which come first."""
+    """Texture corners of the faces of skin; these faces come first."""
 
 
 class Shaded(NamedTuple):
