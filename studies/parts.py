@@ -72,8 +72,8 @@ def ablation_rows(
     """A row for each variant: means, and how they differ from those of the variant `whole`, with errors over people.
 
     Args:
-        records: Of single pictures.
-        light: Of photos and targets.
+        records: Records of single pictures.
+        light: Light of photos and targets.
         colors: "raw", or "matched" to the target.
         stage: How far avatars were adapted.
         variants: Title, and method in the records, by name.

@@ -258,7 +258,7 @@ class Avatar:
         The photo's shade stays where skin faces as in the photo. Light that is part of the colours stays too.
 
         Args:
-            harmonics: Of `avatar.sky.environment_light` or `studio_light`, in the world of the photo's camera.
+            harmonics: Result of `avatar.sky.environment_light` or `studio_light`, in the photo's camera's world.
         """
         level = self.shape.new_ones(3) if self.light is None else self.light.even
         around = harmonics.to(level) * level.mean()

@@ -322,12 +322,12 @@ def imagine(
     """The first picture with this hand in this pose, of the seeds `seed`, `seed` + 1, ...
 
     Args:
-        generator: Of the pictures.
+        generator: Generator of the pictures.
         estimator: Finds the hand in them.
         conditioning: What was asked for.
         folder: With the conditioning's files.
         prompt: The words.
-        seed: Of the first picture.
+        seed: Seed of the first picture.
         tries: Number of pictures to ask for.
         progress: Called for every picture.
 

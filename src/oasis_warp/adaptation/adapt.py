@@ -110,11 +110,11 @@ def adapt(
 
     Args:
         hand: The model.
-        guesses: Of the prior, one for each photo.
+        guesses: Guesses of the prior, one for each photo.
         crops: The photos, with one surface at rest, on one device, of one size.
         config: Options.
         resolutions: Pixels of each photo for one pixel of its crop, along a line; 1 if not given.
-        heads: Of the one guess, for these two: see `network.prior.guess_with_heads`.
+        heads: Colour heads of the one guess, for these two: see `network.prior.guess_with_heads`.
         perceptual: LPIPS, which the paper's loss of pictures has too; only of one photo.
         progress: Called as work goes on.
 
@@ -174,7 +174,7 @@ def add_detail(
         hand: The model.
         adaptation: To these photos.
         crops: The photos again, as large as their detail.
-        resolutions: Of these; see `adapt`.
+        resolutions: Resolutions of these crops; see `adapt`.
         size: Side of the crops that were adapted to [px]. A photo whose crop is no larger has no detail to give, and no
             other photo gives any where it is the best.
         progress: Called as the colours are fitted.

@@ -52,7 +52,7 @@ def mask_unreliable(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCr
     """The same crop with a mask that leaves out what may be background, or another part of the hand.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         drawn: What the hand looks like in the light of the photo, everywhere on it.
         crop: The photo.
     """
@@ -147,7 +147,7 @@ def observe_photos(hand: HandModel, crops: Sequence[HandCrop], resolutions: Sequ
 
     Args:
         hand: The model.
-        crops: Of K photos of one hand.
+        crops: Crops of K photos of one hand.
         resolutions: Pixels of each photo for one pixel of its crop, along a line; below 1 the crop is an enlargement.
     """
     seen = [observe(hand, crop) for crop in crops]
@@ -180,7 +180,7 @@ def photo_gains(observations: VertexObservations, guess: Float[Tensor, "V 3"]) -
     place's own colour is eliminated. Reweighted against shadows and misplaced detail (Cauchy).
 
     Args:
-        observations: Of K photos.
+        observations: Observations of K photos.
         guess: Colours of the vertices as the prior has them, in any light.
     """
     n_photos = len(observations.colors)

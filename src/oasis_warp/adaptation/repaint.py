@@ -164,11 +164,11 @@ def repaint(
 
     Args:
         gaussians: On the surface at rest.
-        faces: Of the surface.
+        faces: Faces of the surface.
         rest: Vertices at rest [m].
         posed: Vertices in the photo's pose [m], in the world of the canvas's camera.
         canvas: What was painted.
-        steps: Of accelerated projected gradient descent.
+        steps: Steps of accelerated projected gradient descent.
         progress: Called as work goes on.
 
     Raises:

@@ -78,7 +78,7 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) ->
     on the harmonics constrains the rest (maximum a posteriori). If nothing is visible, the light is even.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         drawn: The hand in even light, in the photo's view; defined everywhere on the hand.
         crop: The photo.
     """
@@ -120,10 +120,10 @@ def trust_in_albedo(hand: HandModel, crop: HandCrop, sure: HandCrop, light: Hand
     """How far what a photo shows beyond a guess is skin and not shadow, or another part of the hand: 0 to 1.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         crop: The photo.
         sure: The same with the mask of `mask_unreliable`.
-        light: Of the photo.
+        light: Light of the photo.
     """
     on = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces.to(crop.image.device), light)
     every, believed = (observe(hand, which).confidence for which in (crop, sure))
@@ -170,11 +170,11 @@ def add_shade(
     """`light` with a shade for its errors where the photo may show something else than the skin.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         drawn: The hand in even light, in the photo's view; defined everywhere on the hand.
         crop: The photo.
         sure: The same with the mask of `mask_unreliable`.
-        light: Of the photo.
+        light: Light of the photo.
     """
     faces, rest = hand.faces.to(drawn.device), crop.rest.vertices
     lit = apply_light(hand, drawn, crop, light)
@@ -252,8 +252,8 @@ def light_evenly(
         image: The photo.
         drawn: Picture of the calibrated prior.
         missing: `image - drawn` at the vertices.
-        confidence: Of that.
-        view: Of `gaussians` in the photo.
+        confidence: Confidence of the colours.
+        view: View of `gaussians` in the photo.
         gaussians: Which `drawn` shows.
         vertices: The surface at rest [m].
         faces: Corners.
@@ -296,10 +296,10 @@ def split_albedo_shading(
     """The learned Gaussians with part of their colours split off as shade; colours times shade are as before.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         guess: Colours of the Gaussians before they were learned.
         learned: In even light.
-        trust: Of `trust_in_albedo`, 1 if not given: the rest of what was learned is all shade, marks or not.
+        trust: Result of `trust_in_albedo`, 1 if not given: the rest of what was learned is all shade, marks or not.
     """
     ratio = learned.colors.clamp_min(MIN_COLOR) / guess.clamp_min(MIN_COLOR)
     beyond = ratio.log().clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE)
@@ -341,10 +341,10 @@ def limit_shade(
     a pixel, from the side a streak along a finger.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         gaussians: Adapted to the photos.
         crops: The photos.
-        light: Of the first.
+        light: Light of the first.
     """
     if gaussians.shade is None:
         return gaussians

@@ -96,14 +96,14 @@ def sharpen(
     other. At outlines, on a slant and where the wrist ends the avatar stays as it is.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         gaussians: Fitted to the photos, perhaps in smaller pictures of them.
-        crops: Of K photos, as large as their detail, with one surface at rest and in one light.
+        crops: Crops of K photos, as large as their detail, with one surface at rest and in one light.
         believed: How far to believe each at each vertex, at most 1 in all; a single photo wholly.
         trust: How far what each shows is skin, 0 to 1, wholly if not given: the rest of the detail is shade, if there
             is any shade.
-        light: Of a single photo, which is then given as taken. Without, photos are in even light. Divided by a picture
-            of its light, a photo would be wrong where a bright finger and a dark hollow share a pixel.
+        light: Light of a single photo, which is then given as taken; without it, photos are in even light. A photo
+            divided by a picture of its light would be wrong where a bright finger and a dark hollow share a pixel.
         progress: Called as work goes on.
     """
     rest = crops[0].rest.vertices

@@ -86,10 +86,10 @@ def fit_parameters(
 
     Args:
         parameters: Leaves that want gradients.
-        colors: Of the Gaussians with the parameters as they are.
+        colors: Colours of the Gaussians with the parameters as they are.
         penalty: Added to the loss of pictures.
         targets: Those pictures.
-        learning_rate: Of Adam.
+        learning_rate: Learning rate of Adam.
         config: Steps and weights. With `references` "in_turn" one reference view takes part in each step, all of them
             in turn, in an order that `seed` shuffles; with "all" every one, by the photo's loss.
         progress: Called as work goes on.
@@ -245,7 +245,7 @@ def learn_lora(
     Their rank is `config.lora_rank`, or with `config.texture` "full" any.
 
     Args:
-        heads: Of the guess, with what they are asked.
+        heads: Heads of the guess, with what they are asked.
         calibration: Applied to the colours that they put out.
         targets: Pictures of the guess's Gaussians.
         config: Steps and weights.

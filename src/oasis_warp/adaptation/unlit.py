@@ -68,7 +68,7 @@ def remove_photo_light(
         hand: The model.
         guess: What the prior makes of the photo.
         crop: The photo.
-        weights: Of `guess` in the photo.
+        weights: Weights of `guess` in the photo.
         config: Options.
     """
 

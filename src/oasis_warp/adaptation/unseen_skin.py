@@ -185,12 +185,12 @@ def paint_unseen(
     into finer ones.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         gaussians: Fitted to the photos, in even light.
-        guess: Of the prior, before adaptation.
+        guess: Guess of the prior, before adaptation.
         crop: The first photo.
         observations: What the photos show.
-        seed: Of the detail.
+        seed: Seed of the detail.
     """
     rest = crop.rest.vertices
     faces = hand.faces.to(rest.device)

@@ -67,8 +67,8 @@ def densify(
 
     Args:
         gaussians: On the surface at rest.
-        vertices: Of the surface at rest [m].
-        faces: Of the surface.
+        vertices: Vertices of the surface at rest [m].
+        faces: Faces of the surface.
         parts: An edge, for each face; 1 leaves the face as it is.
         thickness: Least standard deviation of the parts' Gaussians across the surface [m].
     """
@@ -193,8 +193,8 @@ def coarsen(hand: HandModel, gaussians: CanonicalGaussians, rest: PosedHand) -> 
     """A third of the Gaussians: wider ones on the vertices alone, in the colours that all have there together.
 
     Args:
-        hand: Whose surface it is.
-        gaussians: Of vertices and faces, on `rest`, without shade.
+        hand: Model of the surface.
+        gaussians: Gaussians of vertices and faces, on `rest`, without shade.
         rest: The surface at rest.
     """
     anchors = place_anchors(hand, rest)

@@ -56,7 +56,7 @@ def assess_surface(hand: HandModel, crop: HandCrop, drawn: Float[Tensor, "S S 3"
     distances d along edges, found by one run of Dijkstra's algorithm from all vertices at once.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         crop: The photo.
         drawn: The avatar in the photo's view, over the photo.
     """
@@ -137,7 +137,7 @@ def photo_warnings(image: Float[Tensor, "S S 3"], mask: Float[Tensor, "S S"], si
     Args:
         image: The square crop around the hand.
         mask: Share of each pixel that is hand.
-        side: Of that square in the photo [px].
+        side: Side of that square in the photo [px].
     """
     inside = inner_mask(mask) > 0.5
     if not bool(inside.any()):

@@ -50,7 +50,7 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     nearest Gaussians before the fade, and no shade; that of the others ends before.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         gaussians: On `rest`.
         rest: The surface at rest [m].
     """

@@ -264,10 +264,10 @@ def assess(
 
     Args:
         case: What it is called.
-        times: Of its kernels, the longest first.
+        times: Times of its kernels, the longest first.
         models: Formulas, by the kernel's name.
         counts: What they count from.
-        ceilings: Of the GPU.
+        ceilings: Ceilings of the GPU.
         about: device, commit and versions.
     """
     rows = []
@@ -349,7 +349,7 @@ def measure_roofline(device: torch.device, seed: int = 0, progress: Progress = s
 
     Args:
         device: A CUDA device.
-        seed: Of the scenes.
+        seed: Seed of the scenes.
         progress: Called after every case.
     """
     ceilings = measure_ceilings(device)

@@ -123,10 +123,10 @@ def measure_scaling(
     """Two rows per point, a forward pass and one with a backward pass.
 
     Args:
-        chosen: Of `points`.
+        chosen: Points of `points` to measure.
         device: Where to compute.
         seconds: Limit for timing a point; slow calls are timed in fewer groups.
-        seed: Of the scenes.
+        seed: Seed of the scenes.
         progress: Called after every point.
     """
     rows: list[ScalingRow] = []

@@ -299,7 +299,7 @@ def surface(n: int, size: int = 512, n_views: int = 1, seed: int = 0) -> Gaussia
         n: Gaussians.
         size: Side of the pictures [px].
         n_views: Cameras, all round.
-        seed: Of positions, sizes and colours.
+        seed: Seed of positions, sizes and colours.
     """
     generator = torch.Generator().manual_seed(seed)
     hand, _, _, posed, _ = hand_parts(generator)

@@ -103,11 +103,11 @@ def measure_operators(
     """Rows of every backend of the `operators`, those of an operator timed in turns.
 
     Args:
-        operators: Of `OPERATORS`.
+        operators: Entries of `OPERATORS`.
         options: Device, threads and repeats.
-        gaussians: Of the hand, to draw.
+        gaussians: Number of Gaussians of the hand to draw.
         size: Side of the image [px].
-        seed: Of the scene.
+        seed: Seed of the scene.
         progress: Called after every round.
     """
     drawn, mesh = surfels(gaussians, size, seed), hand_scenes(size, seed)[1]
@@ -232,8 +232,8 @@ def measure_cases(
     Args:
         cases: What to time.
         device: Where; on the CPU there are no graphs, and host times only.
-        groups: Of calls, at least 2; medians are over them.
-        seed: Of the scenes.
+        groups: Groups of calls, at least 2; medians are over them.
+        seed: Seed of the scenes.
         peers: Other rasterizers, by name.
         progress: Called after every case.
     """

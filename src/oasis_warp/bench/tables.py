@@ -191,7 +191,7 @@ def plot_operator(rows: Sequence[SettingRow], op: str, path: Path, scenes: Seque
     results are known: smaller errors are drawn on it. Time is `SettingRow.cost_ms`.
 
     Args:
-        rows: Of `oasis bench error-time`.
+        rows: Rows of `oasis bench error-time`.
         op: The operator to draw.
         path: The picture to write; its suffix says the format.
         scenes: Those to draw; all when None.

@@ -206,7 +206,7 @@ def time_groups(probes: Sequence[Probe], groups: int, seconds: float | None = No
 
     Args:
         probes: What to time; each is warmed up first.
-        groups: Of each probe; at least 2.
+        groups: Groups of calls of each probe; at least 2.
         seconds: Limit for all groups together: slow calls are made once a group, and in fewer groups.
     """
     if groups < 2:

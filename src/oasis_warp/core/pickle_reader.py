@@ -87,7 +87,7 @@ def read_npz(path: Path, names: Container[str] | None = None, content: bytes | N
 
     Args:
         path: The file.
-        names: Of those that are read; all when not given.
+        names: Names that are read; all when not given.
         content: Its bytes, where they lie elsewhere; `path` is for messages then.
 
     Raises:

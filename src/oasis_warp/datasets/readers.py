@@ -85,10 +85,10 @@ def read_dataset(
     """The samples of a data set below `root`, as the paper takes them.
 
     Args:
-        name: Of the data set.
+        name: Name of the data set.
         root: Its folder. What lies in *.tar files directly in it counts as unpacked there.
         mano_dir: With MANO's files.
-        split: Of the data set.
+        split: Split of the data set.
         selection: What is taken of InterHand2.6M.
 
     Raises:

@@ -250,7 +250,7 @@ def pose_of_48(
     """MANO's parameters from 48 angles, 10 shapes and a translation [m].
 
     Args:
-        model: Of the side.
+        model: Model of the side.
         pose: Wrist and 15 joints, axis times angle [rad].
         betas: Shapes.
         transl: Translation.

@@ -104,7 +104,7 @@ def crop_hand(
 
     Args:
         photo: The photo.
-        fit: Of its hand.
+        fit: Fit of its hand.
         offsets: From the fitted rest surface to the one that carries Gaussians [m].
         config: Size, device and the hand model of `fit`.
         size: Side of the crop [px]; if not given, what `config` wants, up to `COARSE_SIZE`.

@@ -171,10 +171,10 @@ def fit_of_pose(
     Args:
         hand: The model that `shape` and `pose` belong to.
         photo: The photo.
-        side: Of the hand; a left hand's pose describes the mirrored model.
+        side: Side of the hand; a left hand's pose describes the mirrored model.
         shape: Coefficients, [S].
         pose: In the camera's frame.
-        camera: Of the photo, with an identity viewmat.
+        camera: Camera of the photo, with an identity viewmat.
     """
     kinematics = HandKinematics(hand)
     state = _state(kinematics, side, shape, pose, camera)

@@ -68,7 +68,7 @@ def full_camera(
 
     Args:
         weak: Scale and shift of the network; of a left hand with x mirrored back.
-        box_center: Of the crop [px], [2].
+        box_center: Centre of the crop [px], [2].
         box_size: Side of the crop [px].
         size: Width and height of the photo.
         focal: [px].
@@ -86,7 +86,7 @@ def read_estimate(
     Args:
         path: The file.
         photo: What it was estimated from.
-        which: Of several hands.
+        which: The hand to take where there are several.
         content: Its bytes, where they lie elsewhere; `path` is for messages then.
 
     Raises:

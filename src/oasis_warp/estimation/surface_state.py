@@ -55,7 +55,7 @@ def state_of_surface(
         shape: Coefficients, [S], as `shape_of` finds them.
         rest: Surface at rest [m], [V, 3].
         posed: The same surface in the camera's frame [m], [V, 3].
-        focal: Of the camera [px].
+        focal: Focal length of the camera [px].
         centre: Its principal point [px], [2].
     """
     own, n_angles = rest - kinematics.rest_surface(shape), len(kinematics.dofs)

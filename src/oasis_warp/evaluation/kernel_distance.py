@@ -84,10 +84,10 @@ def kernel_distances(
     Args:
         drawn: One crowd.
         real: The other.
-        scale: Whose mean and standard deviation the channels are centred on and divided by: all real hands, so that
+        scale: Features that centre and scale the channels by mean and standard deviation: all real hands, so that
             distances can be compared.
-        seed: Of the subsets.
-        subsets: Of `kernel_distance`.
+        seed: Seed of the subsets.
+        subsets: Subsets of `kernel_distance`.
 
     Raises:
         ValueError: a crowd has fewer than `MIN_GROUPS` groups.

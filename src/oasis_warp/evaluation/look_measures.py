@@ -79,7 +79,7 @@ def measure_looks(
     Args:
         photo: What `made` was made of.
         made: By `reconstruct`.
-        group: Of the hand, for the kernel distance.
+        group: Group of the hand, for the kernel distance.
         perceptual: LPIPS.
     """
     avatar, left = made.avatar, made.avatar.side == "left"

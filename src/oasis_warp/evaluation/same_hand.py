@@ -96,7 +96,7 @@ def compare_pairs(
 
     Args:
         estimator: Fits the second photo, with the shape of the first one's avatars.
-        photos: Of one hand, and where it is in each.
+        photos: Photos of one hand, and where it is in each.
         avatars: By photo and then by a name, all of one photo with the same shape; photos without are targets only.
         config: Size of the pictures and device.
     """

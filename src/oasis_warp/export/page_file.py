@@ -77,7 +77,7 @@ def page_facts(
 
     Args:
         avatar: Any.
-        angles: That the page begins with; those of the photo when not given.
+        angles: Angles that the page begins with; those of the photo when not given.
         look: "photo" or "even" light to begin with; an avatar without light of its own begins in even light.
     """
     parts = avatar.parts
@@ -338,7 +338,7 @@ def page_html(
     Args:
         avatar: Any.
         title: Shown above the controls and by the browser.
-        pose: Whose angles the page begins with; those of the photo when not given.
+        pose: The pose that the page begins with; that of the photo when not given.
         look: "photo" or "even": light that it begins with.
         photo: Shown beside the hand.
     """

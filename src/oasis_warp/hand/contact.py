@@ -48,7 +48,7 @@ def resolve_contact(
     never led out of itself.
 
     Args:
-        hand: Whose triangles they are.
+        hand: Model of the surface.
         vertices: In poses [m].
         side: The faces of a left hand wind the other way.
         bent: Largest change of an angle [rad] from a pose in which nothing gives way; from `FREE` on it does wholly.

@@ -156,7 +156,7 @@ def hand_pose(model: ManoModel, values: np.ndarray, *, flat_hand_mean: bool) -> 
     """The 45 angles of MANO [rad], [15, 3], from principal components or from angles without the mean pose.
 
     Args:
-        model: Whose components and mean pose they refer to.
+        model: The model whose components and mean pose they refer to.
         values: 45 angles, [45] or [15, 3]; or the first n components, [n].
         flat_hand_mean: Whether zeros mean the flat hand, as with smplx's option of that name; else the mean pose.
 

@@ -83,7 +83,7 @@ def step_to_points(
         index: Vertices, [P].
         points: Where they should lie [m], [P, 3].
         normals: Count only distances along these, [P, 3].
-        sigma: Of the distances [m].
+        sigma: Sigma of the distances [m].
     """
     joints, dofs = hand.joints(kinematics), tuple(kinematics.dofs.T)
     moved = kinematics.correctives(hand.angles)[index]
@@ -129,7 +129,7 @@ def fit_vertices(
         kinematics: The hand model.
         vertices: Points [m], [V, 3].
         start: Where to start; at rest, aligned with the points, when not given.
-        steps: Of Gauss and Newton, on every fourth vertex.
+        steps: Gauss-Newton steps on every fourth vertex.
     """
     index = np.arange(0, len(vertices), 4)
     if start is None:

@@ -84,7 +84,7 @@ def named_pose(hand: HandModel, name: str, rest: PosedHand | None = None) -> Flo
 
     Args:
         hand: Any.
-        name: Of the pose.
+        name: Name of the pose.
         rest: The surface at rest that takes the pose: it touches itself where the bundled mean hand does
             (`touching_angles`). The angles of the table when not given.
 
@@ -170,7 +170,7 @@ def touching_angles(hand: HandModel, rest: PosedHand, angles: np.ndarray, touch:
         hand: Any.
         rest: The hand at rest [m].
         angles: [16, 3] [rad].
-        touch: Of the mean hand in that pose.
+        touch: Touch of the mean hand in that pose.
     """
     if len(touch.one) == 0:
         return angles

@@ -73,9 +73,9 @@ def contact_shifts(
     bits for a surface in a batch as alone. Float32; values are trusted; not differentiable.
 
     Args:
-        vertices: Of posed surfaces [m].
+        vertices: Vertices of posed surfaces [m].
         faces: Corners.
-        tables: Of that surface.
+        tables: Tables of that surface.
         mirrored: Whether faces wind the other way.
 
     Raises:

@@ -86,7 +86,7 @@ def sky_exposure(
     same on every device and in a batch as alone up to rounding; to the bit on the CPU.
 
     Args:
-        vertices: Of posed surfaces [m], float32, [B, V, 3].
+        vertices: Vertices of posed surfaces [m], float32, [B, V, 3].
         normals: Unit, [B, V, 3].
         faces: Corners, [F, 3].
         frames: Rotations that turn the directions, [B, 3, 3]: if they turn with the surface, so does the result.

@@ -121,7 +121,7 @@ def render_capture(
     """Render one photo, and pictures of the bare hand over black in its light and exposure, by an ideal camera.
 
     Args:
-        seed: Of the world.
+        seed: Seed of the world.
         photo: One shot with background and sensor.
         others: Shots of `shots.capture_shots` with this photo.
         size: Side of all pictures [px].

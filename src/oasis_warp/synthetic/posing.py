@@ -57,7 +57,7 @@ def pose_people(body: Body, people: Sequence[Person], numbers: ShotTensors) -> P
     Args:
         body: On the people's device.
         people: One per image.
-        numbers: Of the same images.
+        numbers: Numbers of the same images.
     """
     hand = body.hand
     rest, joints, tips, ring = (torch.stack([getattr(p, name) for p in people])

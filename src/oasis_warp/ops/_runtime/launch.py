@@ -322,7 +322,7 @@ def run_cuda(native: CudaNative, params: Parameters, n_blocks: int, stream: "wp.
         native: The kernel.
         params: A number or contiguous tensor for each of its parameters, none of which is an array; others are
             ignored.
-        n_blocks: Of `native.block` threads.
+        n_blocks: Number of blocks of `native.block` threads.
         stream: A `current_stream`.
     """
     if not n_blocks:

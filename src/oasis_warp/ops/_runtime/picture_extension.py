@@ -125,7 +125,7 @@ def table_of(plan: Preparation, report: int) -> Any | None:
     """The table of a plan; None where Python's node draws: without the C++ one, and with depths or padded channels.
 
     Args:
-        plan: Of the calls.
+        plan: Plan of the calls.
         report: Address of three words of host memory that kernels write to: pairs, longest list, bad values.
     """
     extension = loaded() if plan.as_given else None

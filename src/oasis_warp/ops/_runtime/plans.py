@@ -58,8 +58,8 @@ class CudaLaunch:
         """Launch `n_blocks` blocks, at least one, on the stream of this handle, which a graph may be capturing.
 
         Args:
-            n_blocks: Of `CudaNative.block` threads.
-            stream: Of CUDA.
+            n_blocks: Number of blocks of `CudaNative.block` threads.
+            stream: CUDA stream.
             *parameters: In the order of the kernel: addresses and numbers, an array as its elements.
 
         Raises:
