@@ -102,11 +102,12 @@ def adapt(
 ) -> Adaptation:
     """Fit colours to the photos; geometry stays.
 
-    Colours are calibrated, then inpainted beyond the rim of the seen region, then learned with reference views. With
-    `config.light` "fit" the first two steps look at photos without their light, where they surely show the hand; the
-    last one draws colours in that light, and most of what it learns beyond the prior is shade, which goes when the hand
-    turns. With "even" other likely light is left out too, and nothing is learned. With `config.texture` "lora" or
-    "full" nothing is inpainted, as in the paper. Several photos count in each pixel by how well they show the place.
+    The colours are calibrated, then inpainted beyond the rim of the seen region, then learned with reference views.
+    With `config.light` "fit" the first two steps look at photos without their light, and only where they reliably show
+    the hand. The last step draws colours in that light. Most of what it learns beyond the prior becomes shade, which
+    goes when the hand turns. With "even" other likely light is left out, too, and nothing is learned. With
+    `config.texture` "lora" or "full" nothing is inpainted, as in the paper. Several photos count in each pixel by how
+    well they show the place.
 
     Args:
         hand: The model.
@@ -168,7 +169,7 @@ def add_detail(
     size: int,
     progress: Progress = silent,
 ) -> Adaptation:
-    """The adaptation with finer Gaussians, which show each place as the photo does that shows it best.
+    """The adaptation with finer Gaussians. Each place takes its detail from the photo that shows it best.
 
     Args:
         hand: The model.
@@ -205,7 +206,7 @@ def add_detail(
 def light_factors(
     hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, light: HandLight
 ) -> Float[Tensor, "N 3"]:
-    """What the light of a photo multiplies the colours of `gaussians` with in it."""
+    """Factors by which the light of a photo multiplies the colours of `gaussians`."""
     rest, faces = crop.rest.vertices, hand.faces.to(crop.image.device)
     return shading_factors(gaussians, faces, light, posed_lighting(rest, crop.posed.vertices, faces, light))
 
@@ -247,7 +248,7 @@ def _complete(
     pictures: Sequence[Float[Tensor, "S S 3"]],
     config: AdaptConfig,
 ) -> tuple[CanonicalGaussians, Float[Tensor, "K V 3"]]:
-    """Calibrated Gaussians with what the photos show of them, faded out around it, and `Adaptation.shading`.
+    """Calibrated Gaussians, inpainted from what the photos show of them, and `Adaptation.shading`.
 
     `pictures` are the photos without their lights, as bright as the first.
     """
@@ -287,7 +288,7 @@ def _texture_targets(
 ) -> Targets:
     """The photos one below the other, each in its own light, and reference views around the first.
 
-    Divided by a picture of their light, photos would be wrong where two fingers share a pixel.
+    The photos are not divided by a picture of their light: that would be wrong where two fingers share a pixel.
     """
     first, faces = photos.crops[0], hand.faces.to(shading.device)
     references = [
@@ -313,7 +314,7 @@ def _in_first_light(
     hand: HandModel, photo: Float[Tensor, "S S 3"], weights: BlendWeights, gaussians: CanonicalGaussians, gain: Tensor,
     shading: Float[Tensor, "V 3"],
 ) -> Float[Tensor, "S S 3"]:  # fmt: skip
-    """The photo without what its light has of its own, drawn by the `gaussians` of `weights`."""
+    """The photo in the light of the first: without its gain, and with its shading correction as `weights` draw it."""
     own = vertex_to_gaussians(shading, hand.faces.to(photo.device), gaussians)
     return photo / gain + blend_colors(weights, own) / weights.alphas.clamp_min(MIN_ALPHA)
 
@@ -321,10 +322,11 @@ def _in_first_light(
 def _shading_corrections(
     hand: HandModel, rest: Float[Tensor, "V 3"], differences: Float[Tensor, "K V 3"], confidence: Float[Tensor, "K V"]
 ) -> Float[Tensor, "K V 3"]:
-    """What to add to each photo, smoothly over the skin, so that photos agree wherever two show the same place.
+    """Smooth corrections to each photo, so that photos agree wherever two show the same place.
 
-    Lamps stand elsewhere in every photo, and fingers shade each other. No photo is right about it: all move to the mean
-    of what each differs from the guess, the guess itself among them. Detail stays with the photo that shows it best.
+    Every photo has its lamps elsewhere, and fingers shade each other. No photo is right about that, so all move to the
+    mean of their differences from the guess; the guess itself is one of them. Detail stays with the photo that shows it
+    best.
     """
     smooth = torch.stack([
         inpaint(rest, hand.faces, own, seen, detail=SHADING_LENGTH, fade=SHADING_REACH)

@@ -1,7 +1,7 @@
-"""How far photos can be trusted: pixels that surely show the skin there, and vertices that one photo shows best.
+"""How far photos can be trusted: pixels that reliably show the skin, and vertices that one photo shows best.
 
-A fitted hand lies some pixels beside the photo's. At its outlines the photo then shows the background instead, or, of a
-finger in front of the palm, the finger: taken over, they are stains and ghosts in every other pose.
+A fitted hand lies some pixels beside the photo's. At its outlines the photo then shows the background instead, or the
+finger in front of the palm. Taken over, these pixels would be stains and ghosts in every other pose.
 """
 
 from collections.abc import Sequence
@@ -64,7 +64,7 @@ def mask_unreliable(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCr
 
 
 def _background_share(drawn: Float[Tensor, "S S 3"], crop: HandCrop) -> Float[Tensor, "S S"]:
-    """0 to 1: how far, near the border, the photo's colour lies on the way from the hand's to the background's."""
+    """How far the colour near the border lies on the way from the hand's to the background's, 0 to 1."""
     side = len(crop.mask)
     outside = (crop.mask < OUTSIDE).to(drawn)
     planes = torch.cat([crop.image * outside[..., None], outside[..., None]], -1).permute(2, 0, 1)[None]
@@ -97,9 +97,10 @@ def _behind_outline(hand: HandModel, seen: DepthMap) -> Bool[Tensor, "S S"]:
 def _other_places(
     hand: HandModel, seen: DepthMap, reading: Float[Tensor, "S S 4"] | None
 ) -> Float[Tensor, "S S"] | float:
-    """0 to 1: how surely a pixel shows another place than the fitted surface has there, by the network's reading.
+    """How likely a pixel shows another place than the fitted surface there, by the network's reading, 0 to 1.
 
-    The tip of a finger whose fit lies a little beside it would be printed on the palm. 0 without a reading.
+    Without this, the tip of a finger whose fit lies a little beside it would be printed on the palm. 0 without a
+    reading.
     """
     if reading is None:
         return 0.0
@@ -143,7 +144,7 @@ class VertexObservations(NamedTuple):
 
 
 def observe_photos(hand: HandModel, crops: Sequence[HandCrop], resolutions: Sequence[float]) -> VertexObservations:
-    """What every photo shows, and which to believe: most the one that spends most pixels on the skin there.
+    """What every photo shows, and how far to believe each: most the one that spends most pixels on the skin there.
 
     Args:
         hand: The model.
@@ -172,12 +173,12 @@ def _pixel_density(crop: HandCrop, seen: Observation) -> Float[Tensor, "V"]:
 
 
 def photo_gains(observations: VertexObservations, guess: Float[Tensor, "V 3"]) -> Float[Tensor, "K 3"]:
-    """How much brighter each photo shows each channel than the first one does.
+    """Brightness of each channel of each photo, relative to the first photo.
 
-    The least squares of all differences of the logarithms of colours that two photos show of one place, with one
-    unknown a photo and channel. The guess is one more photo, with a small weight: it joins palm and back, which no
-    photo shows together. In a place whose photos weigh w_k, the pair k, l weighs w_k w_l / sum w, as it does when the
-    place's own colour is eliminated. Reweighted against shadows and misplaced detail (Cauchy).
+    Least squares over the differences of the logarithms of colours that two photos show of one place, with one unknown
+    a photo and channel. The guess is one more photo with a small weight: it joins palm and back, which no photo shows
+    together. In a place whose photos have weights w_k, the pair k, l has the weight w_k w_l / sum w; the same follows
+    from eliminating the place's own colour. Shadows and misplaced detail are weighted down (Cauchy).
 
     Args:
         observations: Observations of K photos.

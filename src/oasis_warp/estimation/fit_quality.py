@@ -138,7 +138,7 @@ def keeps_quality(moved: HandFit, fit: HandFit) -> bool:
 
 
 def second_detections(rgb: np.ndarray, nets: Networks, xy: np.ndarray) -> list[DetectedHand]:
-    """Detections in a rotated crop, and in a mirrored one rotated the other way; those without a hand are left out.
+    """Detections in a rotated crop and in a mirrored one rotated the other way, without those that find no hand.
 
     Reliable landmarks move little.
     """

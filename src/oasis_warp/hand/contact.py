@@ -1,4 +1,4 @@
-"""Flesh that does not pass through flesh: fingers and palm of a posed hand give way to each other."""
+"""Contact of a posed hand with itself: fingers and palm that pass through each other are moved apart."""
 
 import functools
 import math
@@ -40,12 +40,11 @@ def resolve_contact(
     side: Side = "right",
     bent: Float[Tensor, "*B"] | None = None,
 ) -> Float[Tensor, "*B V 3"]:
-    """Posed vertices of a hand, led out of each other: both sides of a contact give way, at most by `LIMIT` each.
+    """Move posed vertices of a hand out of each other: both sides of a contact yield, each by at most `LIMIT`.
 
-    Fingers give way by up to `FLESH` of their thickness, nails not at all. Vertices that no contact reaches stay as
-    they are, to the bit, and on the CPU a hand without contact is returned itself. The shifts are constants to
-    derivatives. What lies deeper inside than both sides can give stays inside by the rest, and the skin of one bone is
-    never led out of itself.
+    Fingers yield by up to `FLESH` of their thickness, nails not at all. Vertices that no contact reaches keep their
+    bits; on the CPU a hand without contact is returned itself. Derivatives see the shifts as constants. Skin that lies
+    deeper inside than both sides can yield stays inside by the rest. The skin of one bone is never moved out of itself.
 
     Args:
         hand: Model of the surface.
@@ -65,7 +64,7 @@ def resolve_contact(
 
 @functools.cache
 def contact_tables(device: torch.device) -> ContactTables:
-    """Those of the bundled hand, whose triangles all hands have."""
+    """Tables of the bundled hand; all hands share its triangles."""
     hand = bundled_hand()
     points, faces = hand.template.double().numpy(), hand.faces.numpy()
     edges = surface.mesh_edges(hand.faces).numpy()
@@ -104,7 +103,7 @@ def contact_tables(device: torch.device) -> ContactTables:
 
 
 def _patches(hand: HandModel) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices in patches, and the first of each patch: one bone's, halved until they are small and nearly flat."""
+    """The vertices in patches, and the first of each: parts of one bone, small and nearly flat."""
     normals = surface.vertex_normals(hand.template, hand.faces)
     places = torch.cat([hand.template, SPACING * normals], 1).double().numpy()
     waiting = [np.flatnonzero(hand.segment.numpy() == bone) for bone in reversed(range(len(hand.parents)))]
@@ -121,7 +120,7 @@ def _patches(hand: HandModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _beside(a: np.ndarray, b: np.ndarray, n_parts: int) -> np.ndarray:
-    """The patches b of pairs by their patches a, itself first, filled up with -1."""
+    """The patches beside each patch, itself first, filled up with -1; given as pairs of patches."""
     rank = np.full((n_parts, n_parts), 2)
     rank[a, b] = 1
     np.fill_diagonal(rank, 0)
@@ -150,7 +149,7 @@ def _may_touch(hand: HandModel, part: np.ndarray, edges: np.ndarray) -> np.ndarr
 
 
 def _thickness(hand: HandModel) -> np.ndarray:
-    """Distance of each vertex at rest from the axis of its finger's bone [m]; the palm's has no end."""
+    """Distance of each vertex at rest from the axis of its finger's bone [m]; infinite on the palm."""
     joints, tips, points = (part.double().numpy() for part in (hand.joints, hand.tips, hand.template))
     found = np.full(len(points), np.inf)
     for joint in range(1, len(joints)):
