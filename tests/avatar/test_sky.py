@@ -8,10 +8,10 @@ from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import (
     Lighting,
     posed_lighting,
+    rotate_light,
     shading_factors,
     shares_that_stay,
     split_shade,
-    turn_light,
     with_photo_colors,
 )
 from oasis_warp.avatar.sky import bounced, environment_light, harmonic_basis, radiance, sky_mesh, studio_light
@@ -152,7 +152,7 @@ def test_harmonics_turn_and_mirror_with_the_world(rows):
     n = torch.nn.functional.normalize(torch.randn(20, 3, generator=generator), dim=1)
     turn = rotation.from_axis_angle(torch.tensor([0.0, 0.6, 0.8]), torch.tensor(0.9))
     before = harmonic_basis(n, rows) @ light.harmonics
-    after = harmonic_basis(n @ turn.T, rows) @ turn_light(light, turn).harmonics
+    after = harmonic_basis(n @ turn.T, rows) @ rotate_light(light, turn).harmonics
     torch.testing.assert_close(after, before, atol=1e-5, rtol=1e-4)
     mirrored = harmonic_basis(mirror_points(n), rows) @ mirror_light(light).harmonics
     torch.testing.assert_close(mirrored, before)

@@ -72,8 +72,8 @@ def _background_share(drawn: Float[Tensor, "S S 3"], crop: HandCrop) -> Float[Te
     for _ in range(2):
         planes = avg_pool2d(planes, window, stride=1, padding=window // 2)
     background = (planes[0, :3] / planes[0, 3:].clamp_min(1e-6)).permute(1, 2, 0)
-    way = background - drawn
-    share = ((crop.image - drawn) * way).sum(-1) / way.square().sum(-1).clamp_min(SAME_COLOR)
+    contrast = background - drawn
+    share = ((crop.image - drawn) * contrast).sum(-1) / contrast.square().sum(-1).clamp_min(SAME_COLOR)
     return ((share - FEW) / (MANY - FEW)).clamp(0, 1) * _largest(outside, STAIN_REACH)
 
 
@@ -190,14 +190,14 @@ def photo_gains(observations: VertexObservations, guess: Float[Tensor, "V 3"]) -
     trust = (observations.confidence * observations.share)[..., None] * clear
     trust = torch.cat([trust, GUESS_WEIGHT * (trust.amax(0, keepdim=True) > 0)]).to(logs)
     gains = logs.new_zeros(n_photos + 1, 3)
-    still = 1e-6 * torch.eye(n_photos, dtype=logs.dtype, device=logs.device)  # a photo that shows nothing keeps 1
+    ridge = 1e-6 * torch.eye(n_photos, dtype=logs.dtype, device=logs.device)  # a photo that shows nothing keeps 1
     weight = trust
     for _ in range(GAIN_ROUNDS):
         total = weight.sum(0).clamp_min(1e-12)
         pairs = torch.einsum("kvc,lvc->ckl", weight / total, weight)
         system = torch.diag_embed(pairs.sum(-1)) - pairs
         right = (weight * (logs - (weight * logs).sum(0) / total)).sum(1).T
-        gains[:n_photos] = torch.linalg.solve(system[:, :-1, :-1] + still, right[:, :-1]).T
+        gains[:n_photos] = torch.linalg.solve(system[:, :-1, :-1] + ridge, right[:, :-1]).T
         even = logs - gains[:, None]
         apart = even - (weight * even).sum(0) / total
         weight = trust / (1 + (apart / LIKELY_DIFFERENCE) ** 2)

@@ -196,13 +196,13 @@ def learn_texture(
     n_vertices, n_points = int(faces.max()) + 1, len(gaussians.vertex_index)
     field = torch.zeros(n_vertices, 3, dtype=base.dtype, device=base.device, requires_grad=True)
     residual = torch.zeros(len(gaussians.face_index), 3, dtype=base.dtype, device=base.device, requires_grad=True)
-    still = torch.zeros(n_points, 3, dtype=base.dtype, device=base.device)
+    none = torch.zeros(n_points, 3, dtype=base.dtype, device=base.device)
     trust, vertex_trust = _trust(gaussians, faces, targets.weights)
     edges = surface.mesh_edges(faces)
 
     def colors() -> Tensor:
         learned = vertex_to_gaussians(vertex_trust * field, faces, gaussians)
-        return torch.sigmoid(base + learned + trust * torch.cat([still, residual]))
+        return torch.sigmoid(base + learned + trust * torch.cat([none, residual]))
 
     def penalty() -> Tensor:
         ends = (vertex_trust * field).index_select(0, edges.flatten()).unflatten(0, (-1, 2))

@@ -211,7 +211,7 @@ def with_photo_colors(
     )
 
 
-def turn_light(light: HandLight, rotation: Float[Tensor, "3 3"]) -> HandLight:
+def rotate_light(light: HandLight, rotation: Float[Tensor, "3 3"]) -> HandLight:
     """The same light after the world is rotated by `rotation`."""
     facing = None if light.facing is None else light.facing @ rotation.T
     directions = sky_directions(rotation.device).directions.to(light.harmonics)

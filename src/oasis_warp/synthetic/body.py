@@ -189,8 +189,8 @@ def skin_mesh(hand: HandModel) -> SkinMesh:
     u, v = np.meshgrid(np.linspace(0.01, 0.99, columns + 1), ATLAS_HAND_SHARE + rise)
     uv = np.concatenate([hand.uv.numpy() * [1, ATLAS_HAND_SHARE], np.stack([u, v], -1).reshape(-1, 2)])
 
-    still = torch.eye(3).expand(1, ARM_ROWS, 3, 3)
-    rows = arm_rows(hand.template[hand.rim][None], still, torch.tensor([0.4]))[0]
+    eye = torch.eye(3).expand(1, ARM_ROWS, 3, 3)
+    rows = arm_rows(hand.template[hand.rim][None], eye, torch.tensor([0.4]))[0]
     rest = torch.cat([hand.template, rows.reshape(-1, 3)])
     corners = rest.numpy()[arm_faces[len(arm_faces) // 2]]
     outward = corners[0] - rows[ARM_ROWS // 2].mean(0).numpy()

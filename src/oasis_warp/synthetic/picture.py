@@ -168,8 +168,8 @@ def shade_batch(
     posed = pose_people(body, people, numbers)
     fine = size * SAMPLES
     K = pinhole(posed.focal * fine, fine)
-    still = torch.eye(4, device=device).expand(len(people), 4, 4)
-    seen = depth_map(posed.vertices, body.faces, still, K, fine, fine, validate=False)
+    eye = torch.eye(4, device=device).expand(len(people), 4, 4)
+    seen = depth_map(posed.vertices, body.faces, eye, K, fine, fine, validate=False)
     state = surface_state(posed.vertices, body.faces)
     lit = light_lamps(body, posed, numbers) if lamps else no_lamps(posed.vertices)
     shaded = shade_skin(
