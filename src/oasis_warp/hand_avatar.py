@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.pose import GAMMA, SurfaceLight, hidden_by_hand, in_even_light, pose_gaussians, with_photo
+from oasis_warp.avatar.pose import GAMMA, SurfaceLight, in_even_light, pose_gaussians, with_photo, with_self_occlusion
 from oasis_warp.core.color import plain_background
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
@@ -351,7 +351,7 @@ class Avatar:
         if self.light is None:
             return self
         albedo = self._mean_albedo(self.light.even)
-        light = hidden_by_hand(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
+        light = with_self_occlusion(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
         return self.with_looks(self.gaussians, light)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.prior_guess import Calibration, calibrate, mix_guesses
 from oasis_warp.adaptation.reliability import VertexObservations, observe_photos, photo_gains
-from oasis_warp.adaptation.sh_lighting import light_evenly, split_albedo_shading
+from oasis_warp.adaptation.sh_lighting import match_light, split_albedo_shading
 from oasis_warp.adaptation.sharpen import sharpen
 from oasis_warp.adaptation.texture import Targets, learn_lora, learn_texture, make_targets, reference_azimuths
 from oasis_warp.adaptation.unlit import (
@@ -83,7 +83,7 @@ class _Photos(NamedTuple):
     views: Sequence[PhotoView]
     stacked: BlendWeights
     """Weights of all views, one below the other."""
-    belief: Sequence[Float[Tensor, "S S"]]
+    pixel_shares: Sequence[Float[Tensor, "S S"]]
     """How far each pixel counts beside the other photos; 0 where the guess does not cover it."""
     trust: Float[Tensor, "K V"]
     """Result of `trust_in_albedo`; 1 where the light is kept."""
@@ -126,7 +126,7 @@ def adapt(
     progress("calibration", 0, 1)
     guess, photos = _gather(hand, guesses, crops, resolutions, config)
     evenly_exposed = [crop.image / gain for crop, gain in zip(photos.unlit, photos.gains, strict=True)]
-    trust = [inner_mask(crop.mask, 1) * share for crop, share in zip(photos.unlit, photos.belief, strict=True)]
+    trust = [inner_mask(crop.mask, 1) * share for crop, share in zip(photos.unlit, photos.pixel_shares, strict=True)]
     repeated = guess.colors.repeat(len(crops), 1)
     calibration = calibrate(photos.stacked, repeated, torch.cat(evenly_exposed), torch.cat(trust), config)
     calibrated = gaussians = guess._replace(colors=calibration.apply(guess.colors))
@@ -229,16 +229,16 @@ def _gather(
     guess = mix_guesses(guesses, seen.confidence * seen.share + UNSEEN, faces)
     if guess is not guesses[0]:
         views = [view_in_photo(hand, guess, crop) for crop in crops]
-    belief = []
+    pixel_shares = []
     for view, share in zip(views, seen.share, strict=True):
         others = blend_colors(view.weights, vertex_to_gaussians(1 - share[:, None], faces, guess))
         alphas = view.weights.alphas
-        belief.append(((1 - others / alphas.clamp_min(MIN_ALPHA)) * (alphas > 0.5))[..., 0])
+        pixel_shares.append(((1 - others / alphas.clamp_min(MIN_ALPHA)) * (alphas > 0.5))[..., 0])
     lights = tuple(photo.light for photo in read if photo.light is not None) or None
     gains = photo_gains(seen, vertex_colors(guess, len(hand.template)))
     stacked = stack_weights([view.weights for view in views])
     trust = torch.stack([trust_in_photo(hand, crop, photo) for crop, photo in zip(crops, read, strict=True)])
-    return guess, _Photos(crops, unlit, lights, seen, gains, views, stacked, belief, trust)
+    return guess, _Photos(crops, unlit, lights, seen, gains, views, stacked, pixel_shares, trust)
 
 
 def _complete(
@@ -273,7 +273,7 @@ def _complete(
         missing = differences()
     if config.light == "even":
         pictures = [
-            light_evenly(picture, own, *at_vertices, view.weights, gaussians, rest, faces)
+            match_light(picture, own, *at_vertices, view.weights, gaussians, rest, faces)
             for picture, own, view, *at_vertices in zip(pictures, drawn, views, missing, seen.confidence, strict=True)
         ]
         missing = differences()
@@ -295,7 +295,7 @@ def _texture_targets(
         view_weights(photos.views[0].posed, orbit_camera(first.posed.vertices, azimuth, size=first.camera.width))
         for azimuth in reference_azimuths(config.reference_views)
     ]
-    mask = [c.mask * inner_mask(c.mask, 1) * own for c, own in zip(photos.crops, photos.belief, strict=True)]
+    mask = [c.mask * inner_mask(c.mask, 1) * own for c, own in zip(photos.crops, photos.pixel_shares, strict=True)]
     factors, pictures = [], []
     for k, (crop, view) in enumerate(zip(photos.crops, photos.views, strict=True)):
         factor = photos.gains[k].expand_as(gaussians.colors)

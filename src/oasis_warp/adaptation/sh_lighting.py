@@ -91,7 +91,7 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) ->
     light, on = even, posed_lighting(rest, crop.posed.vertices, faces, even)
     basis = harmonic_basis(on.normals, 4)
     for _ in range(ROUNDS):
-        weighted = seen._replace(confidence=seen.confidence * exposed(on))
+        weighted = seen._replace(confidence=seen.confidence * exposure_confidence(on))
         harmonics = _solve_harmonics(basis, known * _arriving(light, on), weighted)
         light = light._replace(harmonics=harmonics)
         on = posed_lighting(rest, crop.posed.vertices, faces, light)
@@ -108,7 +108,7 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) ->
     )
 
 
-def exposed(on: Lighting) -> Float[Tensor, "V"]:
+def exposure_confidence(on: Lighting) -> Float[Tensor, "V"]:
     """How far the photo shows the colour of skin, by the share of the sky that the skin sees: 0 to 1."""
     if on.exposure is None:
         return torch.ones_like(on.normals[..., 0])
@@ -126,16 +126,16 @@ def trust_in_albedo(hand: HandModel, crop: HandCrop, sure: HandCrop, light: Hand
         light: Light of the photo.
     """
     on = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces.to(crop.image.device), light)
-    every, believed = (observe(hand, which).confidence for which in (crop, sure))
-    trust = exposed(on) * _believed_share(every, believed)
+    every, reliable = (observe(hand, which).confidence for which in (crop, sure))
+    trust = exposure_confidence(on) * _reliable_share(every, reliable)
     if light.shade is None:
         return trust
     return trust * (1 - light.shade.log().mean(-1).abs() / SHADED).clamp(0, 1)
 
 
-def _believed_share(every: Float[Tensor, "V"], believed: Float[Tensor, "V"]) -> Float[Tensor, "V"]:
+def _reliable_share(every: Float[Tensor, "V"], reliable: Float[Tensor, "V"]) -> Float[Tensor, "V"]:
     """Confidence with the mask of reliable pixels, over that with the whole mask; 1 where the photo shows nothing."""
-    return torch.where(every > 0, believed / every.clamp_min(1e-6), 1).clamp(0, 1)
+    return torch.where(every > 0, reliable / every.clamp_min(1e-6), 1).clamp(0, 1)
 
 
 def _even_light(albedo: Float[Tensor, "3"]) -> HandLight:
@@ -181,12 +181,12 @@ def add_shade(
     seen, known = observe(hand, crop), observe(hand, crop._replace(image=lit)).colors
     missing = (seen.colors.clamp_min(MIN_COLOR) / known.clamp_min(MIN_COLOR)).log()
     on = posed_lighting(rest, crop.posed.vertices, faces, light)
-    believed = observe(hand, sure).confidence
+    reliable = observe(hand, sure).confidence
     fade = rim_fade(rest[None], hand.rim.to(rest.device))[0]  # the cap has no shade
-    doubt = (seen.confidence - believed * exposed(on)) * fade
+    doubt = (seen.confidence - reliable * exposure_confidence(on)) * fade
     occluded = inpaint(rest, faces, missing, doubt, OCCLUDER_FADE / 3, OCCLUDER_FADE)
     shade = occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp()
-    return light._replace(shade=shade, facing=on.normals, doubt=1 - _believed_share(seen.confidence, believed))
+    return light._replace(shade=shade, facing=on.normals, doubt=1 - _reliable_share(seen.confidence, reliable))
 
 
 def shading_picture(hand: HandModel, crop: HandCrop, light: HandLight) -> Float[Tensor, "H W 3"]:
@@ -232,7 +232,7 @@ SKIN_DEVIATION = 0.007
 nothing against the prior's own colours and .007 up to .06 dB, but real skin has more to it."""
 
 
-def light_evenly(
+def match_light(
     image: Float[Tensor, "H W 3"],
     drawn: Float[Tensor, "H W 3"],
     missing: Float[Tensor, "V 3"],

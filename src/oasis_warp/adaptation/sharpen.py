@@ -82,24 +82,24 @@ def sharpen(
     hand: HandModel,
     gaussians: CanonicalGaussians,
     crops: Sequence[HandCrop],
-    believed: Float[Tensor, "K V"] | None = None,
+    shares: Float[Tensor, "K V"] | None = None,
     trust: Float[Tensor, "K V"] | None = None,
     light: HandLight | None = None,
     progress: Progress = silent,
 ) -> SharpenResult:
     """Replace Gaussians by finer ones where pictures of the hand show more than they do.
 
-    A face whose picture differs from the avatar's is cut into as many parts as it takes to show what is there; faces
+    A face whose picture differs from the avatar's is cut into as many parts as it takes to show what is there. Faces
     around it are cut as well, so that finer Gaussians fade into coarser ones. The colours minimise the squared
-    difference of pictures that are linear in them: a photo in its own view, and what the surface carries of all photos
-    in four views beside, in both sizes; of several photos each the colours where it is believed most, one after the
-    other. At outlines, on a slant and where the wrist ends the avatar stays as it is.
+    difference of pictures that are linear in them: a photo in its own view, and in four views beside it what the
+    surface carries of all photos, in both sizes. Several photos are fitted one after the other, each with the colours
+    that it shows best. At outlines, on a slant and where the wrist ends the avatar stays as it is.
 
     Args:
         hand: Model of the surface.
         gaussians: Fitted to the photos, perhaps in smaller pictures of them.
         crops: Crops of K photos, as large as their detail, with one surface at rest and in one light.
-        believed: How far to believe each at each vertex, at most 1 in all; a single photo wholly.
+        shares: Share of each photo at each vertex, at most 1 in all; a single photo wholly.
         trust: How far what each shows is skin, 0 to 1, wholly if not given: the rest of the detail is shade, if there
             is any shade.
         light: Light of a single photo, which is then given as taken; without it, photos are in even light. A photo
@@ -108,22 +108,22 @@ def sharpen(
     """
     rest = crops[0].rest.vertices
     faces = hand.faces.to(rest.device)
-    believed = rest.new_ones(1, len(rest)) if believed is None else believed
+    shares = rest.new_ones(1, len(rest)) if shares is None else shares
     fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
     fading = with_neighbours(fading[faces].any(1), faces, len(rest))
-    sources = [_source(e, faces, fading, own) for e, own in zip(crops, believed, strict=True)]
+    sources = [_source(e, faces, fading, own) for e, own in zip(crops, shares, strict=True)]
     on = None if light is None else posed_lighting(rest, sources[0].posed, faces, light)
-    old = [pose_gaussians(_as_lit(gaussians, faces, light, on), faces, rest, source.posed) for source in sources]
+    old = [pose_gaussians(_lit(gaussians, faces, light, on), faces, rest, source.posed) for source in sources]
     around, parts = _parts(rest, faces, sources, old)
     if not bool(around.any()):
         return SharpenResult(gaussians, 0, ())
     dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
-    shown = _as_lit(dense, faces, light, on)
+    shown = _lit(dense, faces, light, on)
     new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
     start = overlay_pictures(shown.colors[changed], sources, [there.means[changed] for there in new])
     colors = shown.colors.masked_scatter(changed[:, None], start)
-    best = vertex_to_gaussians(believed.T, faces, dense).argmax(1)
-    best_of_face = believed[:, faces].mean(-1).argmax(0)
+    best = vertex_to_gaussians(shares.T, faces, dense).argmax(1)
+    best_of_face = shares[:, faces].mean(-1).argmax(0)
     losses: list[float] = []
     for k in best[changed].unique().tolist():
         fitted = changed & (best == k)
@@ -152,7 +152,7 @@ def _parts(
     return around, torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
 
 
-def _as_lit(
+def _lit(
     gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"], light: HandLight | None, on: Lighting | None
 ) -> CanonicalGaussians:
     """With the colours that photos show, in `light` if there is one."""
@@ -163,13 +163,13 @@ def _as_lit(
 
 
 def _source(
-    crop: HandCrop, faces: Tensor, fading: Bool[Tensor, "F"], believed: Float[Tensor, "V"]
+    crop: HandCrop, faces: Tensor, fading: Bool[Tensor, "F"], share: Float[Tensor, "V"]
 ) -> Source:
-    """The photo on its surface, with nothing of it on `fading` faces and elsewhere as much as it is believed."""
+    """The photo on its surface, weighted by `share`, and by 0 on `fading` faces."""
     posed, canvas = crop.posed.vertices, Canvas(crop.image, _faded_in(crop.mask), crop.camera)
     seen = map_surface(posed, faces, canvas, FACING)
     ids = seen.faces.clamp_min(0)
-    trust = torch.where(fading[ids], 0, (believed[faces[ids]] * seen.barycentrics).sum(-1))
+    trust = torch.where(fading[ids], 0, (share[faces[ids]] * seen.barycentrics).sum(-1))
     return Source(canvas, seen._replace(share=seen.share * trust), posed)
 
 

@@ -85,7 +85,7 @@ def with_photo(
     return SurfaceLight(light, normals, None if seen is None else seen[..., 0])
 
 
-def hidden_by_hand(
+def with_self_occlusion(
     light: HandLight,
     albedo: Float[Tensor, "3"],
     rest: Float[Tensor, "V 3"],
@@ -114,7 +114,7 @@ def shading(light: HandLight, on: Lighting) -> Float[Tensor, "*B V 3"]:
     return received.pow(1 / GAMMA)
 
 
-def shares_that_stay(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None) -> Float[Tensor, "*B V 2"]:
+def remaining_shade(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None) -> Float[Tensor, "*B V 2"]:
     """Shares of deep and of weak shade that stay on vertices which saw this share of the sky in the photo.
 
     For deep shade the change of the sky is the largest one nearby. Beside the outline of a finger the palm behind sees
@@ -144,7 +144,7 @@ def shading_factors(
     of_vertices = shading(light, on)
     if light.facing is None:
         return _at_gaussians(of_vertices, faces, canonical)
-    stays = shares_that_stay(light, on, seen)
+    stays = remaining_shade(light, on, seen)
     if light.shade is not None:  # all of it is of pixels beside outlines
         of_vertices = of_vertices * (1 + stays[..., :1] * (light.shade - 1))
     if canonical.shade is None:

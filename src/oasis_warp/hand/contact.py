@@ -18,8 +18,8 @@ from oasis_warp.ops.contact import GROUP, PARTS_OPPOSED, ContactTables, contact_
 
 LIMIT = 0.004
 """Largest shift of a vertex [m]."""
-FLESH = 0.4
-"""The part of the distance from a finger's bone to its skin that gives way: bones take .42 of it."""
+YIELD = 0.4
+"""Share of the distance from a finger's bone to its skin that can yield: bones take .42 of it."""
 SPACING = 0.014
 """Width of patches of skin that are tested as one, and what a right angle between normals counts there [m]."""
 APART = 0.015
@@ -42,7 +42,7 @@ def resolve_contact(
 ) -> Float[Tensor, "*B V 3"]:
     """Move posed vertices of a hand out of each other: both sides of a contact yield, each by at most `LIMIT`.
 
-    Fingers yield by up to `FLESH` of their thickness, nails not at all. Vertices that no contact reaches keep their
+    Fingers yield by up to `YIELD` of their thickness, nails not at all. Vertices that no contact reaches keep their
     bits; on the CPU a hand without contact is returned itself. Derivatives see the shifts as constants. Skin that lies
     deeper inside than both sides can yield stays inside by the rest. The skin of one bone is never moved out of itself.
 
@@ -90,7 +90,7 @@ def contact_tables(device: torch.device) -> ContactTables:
         "samples": face[members[starts[:-1, None] + np.diff(starts)[:, None] * np.arange(SAMPLES) // SAMPLES]],
         "beside": _beside(part[near.row], part[near.col], n_parts),
         "allowed": _may_touch(hand, part, edges),
-        "give": np.minimum(LIMIT, FLESH * _thickness(hand)) * (1 - rigid).clip(0),
+        "give": np.minimum(LIMIT, YIELD * _thickness(hand)) * (1 - rigid).clip(0),
         "offsets": around.indptr,
         "neighbours": around.indices,
         "weights": around.data,
