@@ -69,7 +69,7 @@ class SsimTarget(NamedTuple):
 
 
 def ssim_target(image: Float[Tensor, "H W 3"]) -> SsimTarget:
-    """`image` with what `ssim_map` needs of it."""
+    """`image` with its own statistics, which `ssim_map` needs."""
     y = image.permute(2, 0, 1)
     return SsimTarget(image, *_blur(torch.cat([y, y * y])).split(3))
 
@@ -107,8 +107,8 @@ def detail_difference(
 ) -> Float[Tensor, "N"]:
     """Mean absolute difference of the images' gradients inside the masks, summed over scales.
 
-    Blur and lost lines cost here what a mean of colour differences hardly notices. The place of LPIPS where its
-    weights are not at hand.
+    It penalises blur and lost lines, which a mean colour difference hardly notices. It takes the place of LPIPS where
+    the weights of LPIPS are not available.
     """
     error = ((images - targets) * masks[..., None]).permute(0, 3, 1, 2)
     weight, total = masks[:, None], images.new_zeros(len(images))

@@ -123,7 +123,7 @@ Stage = Callable[[str], AbstractContextManager[None]]
 
 
 class _Outcome(NamedTuple):
-    """What the stages make of K photos."""
+    """Results of all stages for K photos."""
 
     fused: FusedReconstruction
     """Without warnings."""
@@ -269,7 +269,7 @@ def _fit(
     stage: Stage,
     progress: Progress,
 ) -> tuple[list[Landmarks | HandFit], list[HandFit]]:
-    """What is found in each photo, or given, and the fits of one hand to all of them."""
+    """The landmarks that are found in each photo, or given, and the fits of one hand to all photos."""
     estimator = HandEstimator(hand, config.device)
     with stage("landmarks"):
         found = [
@@ -286,7 +286,7 @@ def _fit(
 def _finish(
     hand: HandModel, adaptation: Adaptation, crops: Sequence[HandCrop], config: ReconstructConfig, stage: Stage
 ) -> tuple[Adaptation, Float[Tensor, "V"] | None]:
-    """The adaptation with what no photo shows, and where that was painted; with a closed wrist."""
+    """Paint what no photo shows and close the wrist: the adaptation, and where skin was painted."""
     gaussians, invented, first = adaptation.gaussians, None, crops[0]
     if config.unseen == "painted":
         with stage("painting"):
@@ -302,7 +302,7 @@ def _finish(
 def _guess(
     prior: Prior, crops: Sequence[HandCrop], config: ReconstructConfig
 ) -> tuple[list[CanonicalGaussians], ColorHeads | None]:
-    """The guess of each photo, and the heads behind the only one where they are to be trained."""
+    """The guess of each photo. With "lora" and "full" there is one, and its colour heads come with it to be trained."""
     if config.adapt == "field":
         return [prior(crop) for crop in crops], None
     guess, heads = guess_with_heads(prior, crops[0])
@@ -310,7 +310,7 @@ def _guess(
 
 
 def _adaptation(config: ReconstructConfig) -> AdaptConfig:
-    """The options of the adaptation that are not those of a photo as a whole."""
+    """The options of the adaptation."""
     if config.adapt == "field":
         return AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
     steps = PAPER_ADAPTATION.texture_steps if config.steps is None else config.steps
@@ -324,7 +324,7 @@ def _tuples(gains: Float[Tensor, "K 3"]) -> list[tuple[float, float, float]]:
 def _refine_fits(
     hand: HandModel, guesses: Sequence[CanonicalGaussians], crops: Sequence[HandCrop], fits: Sequence[HandFit]
 ) -> tuple[list[HandFit], list[float]]:
-    """Fits in the poses that explain their photos best, and how far each hand moved [px]; 0 where it is left."""
+    """Fits in the poses that explain their photos best, and how far each hand moved [px]; 0 where that was rejected."""
     refined, moved = [], []
     for guess, crop, fit in zip(guesses, crops, fits, strict=True):
         found = refine(hand, guess, crop, crop_landmarks(fit, crop.camera), native_size(fit))
@@ -339,7 +339,7 @@ def _assess(
     hand: HandModel, adaptation: Adaptation, k: int, fit: HandFit, offsets: Float[Tensor, "V 3"], crop: HandCrop,
     close: HandCrop, perceptual: Perceptual | None,
 ) -> tuple[SurfaceQuality, dict[str, float]]:  # fmt: skip
-    """How well photo k is explained, in its own light and on the surface by which it was read."""
+    """How well photo k is explained, in its own light and on the surface that it was read on."""
     gaussians = adaptation.gaussians
     as_bright = gaussians._replace(colors=(gaussians.colors * adaptation.gains[k]).clamp(0, 1))
     light = adaptation.lights[k] if adaptation.lights else None
@@ -355,7 +355,7 @@ def _assess(
 
 
 def input_errors(drawn: Render, crop: HandCrop, perceptual: Perceptual | None = None) -> dict[str, float]:
-    """How well an avatar, drawn over black as `crop` shows it, explains its photo inside the mask above the wrist."""
+    """Errors of an avatar against its photo, inside the mask above the wrist; it was `drawn` over black."""
     image, alpha = drawn
     judged = crop.above_wrist > 0.5
     inside = ((crop.mask > 0.5) & judged).to(image)

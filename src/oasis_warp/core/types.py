@@ -76,7 +76,7 @@ class PosedHand(NamedTuple):
 
 
 class SurfaceReading(NamedTuple):
-    """Which place of the hand each pixel around it shows, as a network reads the photo; a square of R x R samples."""
+    """The place on the hand that each pixel shows, as a network reads the photo; a square of R x R samples."""
 
     places: Float[Tensor, "R R 3"]
     """On the bundled hand at rest [m]."""
@@ -172,10 +172,10 @@ class Render(NamedTuple):
 class HandLight(NamedTuple):
     """Light that falls on a hand; it stays in the world when the hand turns.
 
-    The light that skin reflects is multiplied with the harmonics in the direction n in which it faces, in the world of
-    the photo's camera, kept within `limits`; and with the share of it that the hand lets through in its pose
-    (`avatar.sky`). What that does not tell, gloss and wrinkles, stays on skin for as long as it faces as in the photo
-    and sees as much of the sky: `shade` here and that of the Gaussians.
+    Colours are multiplied, as light, with the harmonics in the direction n that the skin faces, in the world of the
+    photo's camera, kept within `limits`; and with the share of this light that the hand lets through in its pose
+    (`avatar.sky`). What this does not explain, such as gloss and wrinkles, is shade: `shade` here and that of the
+    Gaussians. It stays on skin as long as the skin faces as in the photo and sees as much of the sky.
     """
 
     harmonics: Float[Tensor, "K 3"]
@@ -195,11 +195,11 @@ class HandLight(NamedTuple):
 
 
 class TrainingBatch(NamedTuple):
-    """B hands, each as one photo shows it and as T pictures must come out: what a prior is trained on.
+    """B hands, each with one photo and the T pictures that a prior is trained to draw of it.
 
     Right hands (left ones mirrored), all pictures square; vertices are those of one hand model. `posed` and `viewmat`
-    of the photo may be off by an estimator's error; `rest` and the targets are true, so that what is learned lands
-    where it belongs.
+    of the photo may have an estimator's error. `rest` and the targets are true, so that the prior learns colours in
+    their true places.
     """
 
     image: Float[Tensor, "B S S 3"]

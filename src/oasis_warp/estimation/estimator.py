@@ -230,10 +230,10 @@ def shared_shape(shapes: Sequence[Float[Tensor, "S"]]) -> Float[Tensor, "S"]:
 
 
 def check_sides(photos: Sequence[Photo], landmarks: Sequence[Landmarks | HandFit]) -> None:
-    """All hands must be of one side: mirrored, the other hand would be another one.
+    """Check that all hands are of one side; a hand of the other side, mirrored, would be another hand.
 
     Raises:
-        InputError: some are not; it names those that the fewer, or less sure, say so.
+        InputError: some are not; it names the photos of the side that is shown less often or less clearly.
     """
     for_right = sum(
         (1 if found.side == "right" else -1) * (found.side_score if isinstance(found, Landmarks) else 1.0)

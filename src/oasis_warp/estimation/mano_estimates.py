@@ -109,7 +109,7 @@ def read_estimate(
 
 
 def estimate_of_entries(path: Path, entries: Mapping[str, Any], photo: Photo) -> Estimate:
-    """The hand of a table of `read_estimate`'s names that comes from elsewhere, as from JSON."""
+    """The hand of a table with `read_estimate`'s names that comes from elsewhere, such as JSON."""
     return _estimates(path, _flat(entries), photo)[0]
 
 

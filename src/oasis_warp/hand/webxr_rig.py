@@ -93,7 +93,7 @@ def local_quats(
 ) -> Float[Tensor, "T J 4"]:
     """Rotation of each joint in the frame of its parent, wxyz, in poses of these joint angles [rad].
 
-    A hand that stays in place: orientation and translation of a pose are no joint's. Neighbours in time have the same
+    The hand stays in place: orientation and translation of a pose belong to no joint. Neighbours in time have the same
     sign, so that they can be interpolated.
     """
     n = len(angles)
