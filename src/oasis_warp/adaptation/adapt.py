@@ -104,10 +104,10 @@ def adapt(
 
     The colours are calibrated, then inpainted beyond the rim of the seen region, then learned with reference views.
     With `config.light` "fit" the first two steps look at photos without their light, and only where they reliably show
-    the hand. The last step draws colours in that light. Most of what it learns beyond the prior becomes shade, which
-    goes when the hand turns. With "even" other likely light is left out, too, and nothing is learned. With
-    `config.texture` "lora" or "full" nothing is inpainted, as in the paper. Several photos count in each pixel by how
-    well they show the place.
+    the hand. The last step draws in that light; most of what it learns beyond the prior becomes shade, which goes when
+    the hand turns. With "even" other likely light is left out, too, and nothing is learned. With `config.texture`
+    "lora" or "full" nothing is inpainted, as in the paper. Several photos count in each pixel by how well they show the
+    place.
 
     Args:
         hand: The model.

@@ -41,7 +41,7 @@ def closed_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) ->
 
 
 def open_vertices(faces: Int[Tensor, "F 3"], n_vertices: int) -> Bool[Tensor, "V"]:
-    """Whether the faces around each vertex leave a gap; in a closed ring every neighbour occurs twice."""
+    """Whether the faces around each vertex leave a gap; in a closed ring every neighbour is entered and left once."""
     come_less_gone = (faces.roll(-1, 1) - faces.roll(1, 1)).flatten().long()
     total = torch.zeros(n_vertices, dtype=torch.int64, device=faces.device)
     return total.index_add_(0, faces.flatten().long(), come_less_gone) != 0
